@@ -1,0 +1,66 @@
+"""What an animated scene is: a camera path, poses and a way to build Mitsuba's scene for one frame.
+
+Mitsuba 3.9 has no animation of its own, so motion is a new set of transforms for every frame. Everything that reads
+animations (the tracers, the motion vectors, the clip writer) sees only the protocol below, so a new family of scenes
+or a loader for a file format is one new class.
+"""
+
+import importlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+
+class Camera(NamedTuple):
+    """A pinhole camera as Mitsuba has it: it looks along its +z axis, +x points LEFT in the image and +y up."""
+
+    to_world: np.ndarray
+    """[4, 4] float64 camera to world, rigid."""
+    x_fov: float
+    """Horizontal field of view in degrees."""
+
+
+@runtime_checkable
+class AnimatedScene(Protocol):
+    """A scene at every point of time; time is counted in frames (a float is allowed), the animation starts at 0."""
+
+    name: str
+    """Short name for messages and records."""
+    frames: int
+    """The suggested number of frames."""
+    record: dict[str, Any]
+    """Everything needed to build it again, as JSON: :func:`scene_from_record` turns it back into a scene."""
+    max_depth: int
+    """Path length in Mitsuba's count: 1 is emission, 2 adds direct light, 3 one indirect bounce."""
+
+    def build(self, frame: float, width: int, height: int) -> Any:
+        """The ``mi.Scene`` of one frame, loaded with ``optimize=False``; its film has a box filter, float32, rgb."""
+        ...
+
+    def camera(self, frame: float) -> Camera:
+        """The camera of one frame, the same one that ``build`` puts into the scene."""
+        ...
+
+    def pose(self, frame: float) -> Mapping[str, np.ndarray]:
+        """Shape id -> [4, 4] float64 world pose of every shape that may move; a shape that is absent stands still.
+
+        Only the ratios ``pose(i)[id] @ inv(pose(i - 1)[id])`` matter.
+        """
+        ...
+
+
+def scene_from_record(record: Mapping[str, Any]) -> AnimatedScene:
+    """Build the scene that a clip's record describes: ``{"family": name, "seed": int, ...}``.
+
+    Keys besides ``family`` become the keyword arguments of the family's function. Raises ValueError for a record
+    that names no known family.
+    """
+    if "family" not in record:
+        raise ValueError(f"scene record: expected a 'family', got the keys {sorted(record)}; see jaxdn.render.families.")
+    families = importlib.import_module("jaxdn.render.families").FAMILIES
+    name = record["family"]
+    if name not in families:
+        raise ValueError(f"scene record: unknown family {name!r}; expected one of {', '.join(sorted(families))}.")
+    options = {key: value for key, value in record.items() if key != "family"}
+    return families[name](**options)
