@@ -1,0 +1,58 @@
+"""What every test runs under: strict broadcasting, full float32 precision, fixed seeds, a compilation cache.
+
+Markers: ``slow`` (more than 10 s), ``browser`` (needs Chromium through Playwright).
+"""
+
+from collections.abc import Iterator
+
+import hypothesis
+import jax
+import numpy as np
+import pytest
+
+hypothesis.settings.register_profile(
+    "jaxdn",
+    deadline=None,  # the first example compiles
+    derandomize=True,
+    max_examples=25,
+    suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture, hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.load_profile("jaxdn")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "slow: takes more than ten seconds")
+    config.addinivalue_line("markers", "browser: needs Chromium through Playwright")
+
+    # [3] against [H, W, 3] has to be written out: silent broadcasting hides a swapped axis.
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+    # NVIDIA devices compute float32 products as TF32 unless told otherwise; the references here are float64.
+    jax.config.update("jax_default_matmul_precision", "highest")
+    # Most of a test's time is compilation, and most of it is the same as in the last run.
+    jax.config.update("jax_compilation_cache_dir", str(config.rootpath / ".pytest_cache" / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+@pytest.fixture(autouse=True)
+def _seed_numpy() -> None:
+    """Legacy global NumPy randomness, should a library draw from it, repeats from run to run."""
+    np.random.seed(0)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A NumPy generator that starts afresh for each test."""
+    return np.random.default_rng(20210629)
+
+
+@pytest.fixture
+def key() -> jax.Array:
+    """A JAX key that starts afresh for each test."""
+    return jax.random.key(20210629)
+
+
+@pytest.fixture
+def x64() -> Iterator[None]:
+    """Double precision for this one test: make every array inside it, not at module level."""
+    with jax.enable_x64(True):
+        yield
