@@ -1,0 +1,52 @@
+# Everything a user needs, from a bare clone: Python >= 3.11 and make. `make train` and `make test` set themselves up.
+PYTHON ?= python3
+BIN := .venv/bin
+SETTINGS ?=
+
+.PHONY: help setup train test test-slow lint format docs weights clean
+
+help:  ## what can be made
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+setup: .venv/ready  ## .venv with the exact versions of constraints.txt (uv where it is found, else pip)
+
+.venv/ready: pyproject.toml constraints.txt
+	@echo "Setting up .venv (Python packages of constraints.txt; a minute or two) ..."
+	@if command -v uv >/dev/null 2>&1; then \
+		uv venv --quiet --allow-existing --python $(PYTHON) .venv && \
+		uv pip install --quiet --python $(BIN)/python -c constraints.txt --group dev -e '.[render,train,peers]'; \
+	else \
+		$(PYTHON) -m venv .venv && \
+		$(BIN)/python -m pip install --quiet --upgrade -c constraints.txt pip && \
+		$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[render,train,peers]'; \
+	fi
+	@touch $@
+
+train: setup  ## the main job: render clips, train the denoiser and its ablations, evaluate, write a report
+	$(BIN)/python -m experiments.ablation $(SETTINGS)
+
+weights: setup  ## the recipe of the shipped weights: hours, resumable
+	$(BIN)/python -m experiments.shipped_weights $(SETTINGS)
+
+test: setup  ## the tests (minutes)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m "not slow" $(SETTINGS)
+
+test-slow: setup  ## the slow tests: real training runs, the notebook, real processes
+	$(BIN)/python -m pytest -q -m slow $(SETTINGS)
+
+lint: setup  ## ruff and the type checker
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: setup  ## let ruff order and format the code
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+docs: setup  ## the reference pages, from the docstrings, into site/
+	@if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python -c constraints.txt --group docs; \
+	else $(BIN)/python -m pip install --quiet -c constraints.txt --group docs; fi
+	$(BIN)/python -m mkdocs build --strict
+
+clean:  ## forget the environment and what was rendered and trained
+	rm -rf .venv runs data site

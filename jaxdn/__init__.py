@@ -1,0 +1,43 @@
+"""jaxdn removes Monte Carlo noise from path-traced animations, in JAX.
+
+Every name below is loaded on first use, so that a notebook that only wants :func:`warp` needs jax and numpy alone:
+Mitsuba, OpenEXR, Orbax and Grain are imported by the rooms that use them, and by nothing else.
+"""
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Frame": "frame",
+    "Clip": "frame",
+    "Denoiser": "frame",
+    "warp": "warp",
+    "dual_motion": "motion",
+    "occlusion_mask": "motion",
+    "normalize_kernels": "kernels",
+    "apply_kernels": "kernels",
+    "compose_scales": "kernels",
+    "denoise": "rollout",
+    "load_weights": "weights",
+    "read_clip": "clips",
+    "write_clip": "clips",
+}
+_ROOMS = ("color", "losses", "metrics", "denoisers")
+
+__all__ = [*_HOMES, *_ROOMS, "__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        value = getattr(importlib.import_module(f"jaxdn.{_HOMES[name]}"), name)
+        globals()[name] = value
+        return value
+    if name in _ROOMS:
+        return importlib.import_module(f"jaxdn.{name}")
+    raise AttributeError(f"module 'jaxdn' has no attribute {name!r}; it has {', '.join(sorted(__all__))}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,163 @@
+"""The vocabulary: what a renderer gives for one frame, what a clip is, what a denoiser is.
+
+``None`` is the neutral element: a buffer that is ``None`` means *this effect is absent*, and every consumer treats it
+exactly as the neutral value written out (no motion is zero motion, no albedo is white, no roughness is 1, no normal and
+no depth is 0). Because ``None`` is part of the pytree's structure, jit specialises on it and an absent effect leaves no
+trace in the compiled program.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+RADIANCE_MAX = 65504.0
+"""Radiance is clamped to the largest float16 on entry."""
+
+FAR = 1e6
+"""View-space depth stored where the camera ray left the scene: large and finite, so that differences stay finite."""
+
+
+class Frame(NamedTuple):
+    """What a renderer gives for one frame; every buffer is ``[H, W, C]`` and all but ``radiance`` may be ``None``."""
+
+    radiance: jax.Array
+    """[H, W, 3] noisy radiance to denoise (for ``ntd``: the indirect part), linear Rec.709, >= 0."""
+    albedo: jax.Array | None = None
+    """[H, W, 3] first-hit diffuse reflectance in [0, 1]; neutral: 1."""
+    normal: jax.Array | None = None
+    """[H, W, 3] unit world-space shading normal, zero where the ray left the scene; neutral: 0."""
+    depth: jax.Array | None = None
+    """[H, W, 1] view-space z along the optical axis, > 0, ``FAR`` on a miss; neutral: 0."""
+    roughness: jax.Array | None = None
+    """[H, W, 1] linear roughness r, GGX alpha = r * r; neutral: 1."""
+    motion: jax.Array | None = None
+    """[H, W, 2] (x, y) px, y down, previous minus current; not finite where there is no history; neutral: 0."""
+    dual_motion: jax.Array | None = None
+    """[H, W, 2] px, as ``motion`` but disoccluded pixels borrow their occluder's; neutral: ``motion``."""
+    visible: jax.Array | None = None
+    """[H, W, 1] bool, the point was seen in the previous frame; neutral: true."""
+    previous_depth: jax.Array | None = None
+    """[H, W, 1] view-space z that the point had in the previous frame; neutral: ``depth``."""
+    ids: jax.Array | None = None
+    """[H, W, 1] int32 shape id, -1 for nothing."""
+    direct: jax.Array | None = None
+    """[H, W, 3] directly reflected light; neutral: 0."""
+    emission: jax.Array | None = None
+    """[H, W, 3] light emitted towards the camera; neutral: 0."""
+
+
+class Clip(NamedTuple):
+    """Consecutive frames and, where it is known, what their ``radiance`` converges to."""
+
+    frames: Frame
+    """A Frame whose buffers have ``T`` in front."""
+    reference: jax.Array | None = None
+    """[T, H, W, 3] the noise-free radiance."""
+
+
+class Denoiser(NamedTuple):
+    """The one interface: four values, three of them pure functions; a clip is a scan over ``step``."""
+
+    init: Callable[[jax.Array, Frame], Any]
+    """(key, frame) -> params; ``{}`` for a filter without weights."""
+    start: Callable[[Any, Frame], Any]
+    """(params, frame) -> state before the first frame."""
+    step: Callable[[Any, Any, Frame], tuple[Any, jax.Array]]
+    """(params, state, frame) -> (state, image [H, W, 3] >= 0)."""
+    reads: frozenset[str]
+    """Names of the Frame buffers that it can make use of."""
+
+
+def frame_at(frames: Frame, index: int | jax.Array) -> Frame:
+    """The frame at one index of a clip's frames (the leading axis of every buffer that is there)."""
+    return jax.tree.map(lambda buffer: buffer[index], frames)
+
+
+def only(frame: Frame, reads: frozenset[str]) -> Frame:
+    """The same frame with every buffer dropped that is not in ``reads`` (``radiance`` always stays)."""
+    kept = {"radiance", *reads}
+    return Frame(**{name: value if name in kept else None for name, value in frame._asdict().items()})
+
+
+def _working_dtype(buffer: jax.Array) -> jax.Array:
+    """Half precisions and integers become float32; float64 stays."""
+    return jnp.asarray(buffer, jnp.promote_types(buffer.dtype, jnp.float32))
+
+
+def repair(frame: Frame) -> tuple[Frame, jax.Array]:
+    """Make a frame safe to compute on; returns it with the number of values that had to be replaced (int32).
+
+    Radiance, direct and emission: not finite or negative -> 0, then at most ``RADIANCE_MAX``. Albedo and roughness:
+    not finite -> 1, then [0, 1]. Normals: not finite or shorter than 1e-6 -> 0, else unit length. Depths: NaN or
+    negative -> 0, above 1e9 -> 1e9. Motion vectors: not finite -> NaN in both components, which means *no history
+    there* (0 would be a legal vector). Half-precision buffers are widened to float32. Never raises on contents.
+    """
+    replaced = jnp.zeros((), jnp.int32)
+
+    def count(bad: jax.Array) -> None:
+        nonlocal replaced
+        replaced = replaced + jnp.sum(bad, dtype=jnp.int32)
+
+    def light(buffer: jax.Array | None) -> jax.Array | None:
+        if buffer is None:
+            return None
+        buffer = _working_dtype(buffer)
+        bad = ~(jnp.isfinite(buffer) & (buffer >= 0))
+        count(bad | (buffer > RADIANCE_MAX))
+        return jnp.minimum(jnp.where(bad, 0.0, buffer), RADIANCE_MAX)
+
+    def fraction(buffer: jax.Array | None) -> jax.Array | None:
+        if buffer is None:
+            return None
+        buffer = _working_dtype(buffer)
+        count(~((buffer >= 0) & (buffer <= 1)))
+        return jnp.clip(jnp.where(jnp.isfinite(buffer), buffer, 1.0), 0.0, 1.0)
+
+    def direction(buffer: jax.Array | None) -> jax.Array | None:
+        if buffer is None:
+            return None
+        buffer = _working_dtype(buffer)
+        largest = jnp.max(jnp.abs(buffer), axis=-1, keepdims=True)
+        usable = jnp.isfinite(largest) & (largest > 1e-6)
+        count(~jnp.isfinite(buffer))
+        scaled = jnp.where(usable, buffer, 1.0) / jnp.where(usable, largest, 1.0)
+        unit = scaled / jnp.sqrt(jnp.sum(scaled * scaled, axis=-1, keepdims=True))
+        return jnp.where(usable, unit, 0.0)
+
+    def distance(buffer: jax.Array | None) -> jax.Array | None:
+        if buffer is None:
+            return None
+        buffer = _working_dtype(buffer)
+        bad = ~(buffer >= 0)
+        count(bad | (buffer > 1e9))
+        return jnp.minimum(jnp.where(bad, 0.0, buffer), 1e9)
+
+    def vector(buffer: jax.Array | None) -> jax.Array | None:
+        if buffer is None:
+            return None
+        buffer = _working_dtype(buffer)
+        known = jnp.all(jnp.isfinite(buffer), axis=-1, keepdims=True)
+        count(~known)
+        return jnp.where(known, buffer, jnp.nan)
+
+    repaired = frame._replace(
+        radiance=light(frame.radiance),
+        albedo=fraction(frame.albedo),
+        normal=direction(frame.normal),
+        depth=distance(frame.depth),
+        roughness=fraction(frame.roughness),
+        motion=vector(frame.motion),
+        dual_motion=vector(frame.dual_motion),
+        previous_depth=distance(frame.previous_depth),
+        direct=light(frame.direct),
+        emission=light(frame.emission),
+    )
+    return repaired, replaced
+
+
+def repair_image(image: jax.Array) -> jax.Array:
+    """A warped history made safe: not finite or negative -> 0, at most ``RADIANCE_MAX``."""
+    bad = ~(jnp.isfinite(image) & (image >= 0))
+    return jnp.minimum(jnp.where(bad, 0.0, image), RADIANCE_MAX)
