@@ -33,12 +33,6 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
-@pytest.fixture(autouse=True)
-def _seed_numpy() -> None:
-    """Legacy global NumPy randomness, should a library draw from it, repeats from run to run."""
-    np.random.seed(0)
-
-
 @pytest.fixture
 def rng() -> np.random.Generator:
     """A NumPy generator that starts afresh for each test."""
