@@ -57,7 +57,7 @@ def scene_from_record(record: Mapping[str, Any]) -> AnimatedScene:
     that names no known family.
     """
     if "family" not in record:
-        raise ValueError(f"scene record: expected a 'family', got the keys {sorted(record)}; see jaxdn.render.families.")
+        raise ValueError(f"scene record: expected a 'family', got {sorted(record)}; see jaxdn.render.families.")
     families = importlib.import_module("jaxdn.render.families").FAMILIES
     name = record["family"]
     if name not in families:

@@ -1,0 +1,38 @@
+"""Random numbers as a function of (seed, frame, stream, pixel, sample): nothing depends on the order of rendering.
+
+A frame rendered alone, again, or in another process gets the same numbers, and the reference never shares a sample
+with the noisy layers. The mixing function is TEA (Zafar, Olano and Curtis 2010), nested so that no two inputs of the
+same level collide.
+"""
+
+NOISY, REFERENCE = 0, 1
+"""The two independent streams of a frame."""
+
+_MASK = 0xFFFFFFFF
+
+
+def tea(first: int, second: int, rounds: int = 8) -> tuple[int, int]:
+    """A bijection of pairs of 32-bit numbers that leaves no structure of its input."""
+    first, second, total = first & _MASK, second & _MASK, 0
+    for _ in range(rounds):
+        total = (total + 0x9E3779B9) & _MASK
+        first += ((second << 4) + 0xA341316C) ^ (second + total) ^ ((second >> 5) + 0xC8013EA4)
+        first &= _MASK
+        second += ((first << 4) + 0xAD90777D) ^ (first + total) ^ ((first >> 5) + 0x7E95761E)
+        second &= _MASK
+    return first, second
+
+
+def frame_key(seed: int, frame: int, stream: int) -> tuple[int, int]:
+    """The 64-bit key of one stream of one frame."""
+    first, second = tea(frame, seed)
+    return tea(first ^ stream, second)
+
+
+def pass_seed(seed: int, frame: int, stream: int, index: int) -> int:
+    """The seed of one whole-image pass of Mitsuba's own integrators.
+
+    Mitsuba multiplies it by the number of pixels modulo 2**32, so only its low bits count: consecutive passes have to
+    get consecutive seeds, and the two streams are kept apart by a fixed distance instead of by chance.
+    """
+    return (tea(frame, seed)[0] + (stream << 17) + index) & _MASK
