@@ -1,0 +1,126 @@
+"""One OpenEXR file: named 2-D channels in, named 2-D channels out.
+
+The Python bindings accept much that they then write or read wrongly, so all traffic goes through here: they write
+non-contiguous arrays scrambled, turn ``[H, W, 1]`` into R, G, B, overflow float16 to infinity, do not notice a full disk
+while a file is small, and announce a truncated file with a printed warning instead of an error.
+"""
+
+import errno
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+
+from jaxdn.clips.files import ClipError, whole
+
+HALF_MAX = 65504.0
+"""The largest float16."""
+
+_NAME_LIMIT = 255  # longer channel names are cut off silently
+_SIDE_LIMIT = 1 << 16  # a header that claims more is taken for a broken one, before anything is allocated for it
+_STORABLE = (np.float16, np.float32, np.uint32)
+
+
+def to_half(values: np.ndarray) -> np.ndarray:
+    """float16, finite values clamped to +-65504 instead of overflowing; NaN and infinities stay what they are."""
+    values = np.asarray(values)
+    clamped = np.clip(values, -HALF_MAX, HALF_MAX)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.where(np.isinf(values), values, clamped).astype(np.float16)
+
+
+def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
+    """Write 2-D channels (float16, float32 or uint32, all of one size) as one ZIP-compressed scanline file.
+
+    The file is written beside its place, read back, and then renamed: it is whole or not there. Raises ValueError for
+    channels that OpenEXR cannot hold and OSError (``errno.ENOSPC`` for a full disk) if the file cannot be written.
+    """
+    path = Path(path)
+    prepared = {name: _storable(path, name, pixels) for name, pixels in channels.items()}
+    sizes = {pixels.shape for pixels in prepared.values()}
+    if len(sizes) != 1:
+        raise ValueError(f"{path}: expected at least one channel and all of one size, got {sorted(sizes)}.")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with whole(path) as beside:
+        try:
+            OpenEXR.File(header, dict(prepared)).write(str(beside))  # the dict is changed by the call
+        except RuntimeError as error:
+            full = "No space left" in str(error)
+            raise OSError(errno.ENOSPC if full else errno.EIO, f"could not write the frame ({error})", str(path)) from error
+        # A disk that fills up within the last buffer goes unnoticed by the writer: look at what is really there.
+        try:
+            found = read_exr(beside)
+        except ClipError as error:
+            raise OSError(errno.ENOSPC, "the file came out incomplete; is the disk full?", str(path)) from error
+        if found.keys() != prepared.keys():
+            raise OSError(errno.EIO, "the file came out without some of its channels", str(path))
+
+
+def read_exr(path: str | Path) -> dict[str, np.ndarray]:
+    """All channels of a file by their full names, 2-D, in the precision they are stored in.
+
+    Of a file with several parts, each channel is named ``part.channel`` unless it already begins with its part's name.
+    Subsampled channels are left out. Raises ClipError, naming the file and the reason, if the file is missing, is no
+    OpenEXR file, is truncated or damaged, or holds deep data.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ClipError(f"{path}: there is no such file.")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            for part in file.parts:
+                _check_header(path, part.header)
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            parts = list(file.parts)
+            if not parts:
+                raise ClipError(f"{path}: the pixel data is truncated or damaged; write the frame again.")
+            found: dict[str, np.ndarray] = {}
+            for part in parts:
+                for name, channel in part.channels.items():
+                    if (channel.xSampling, channel.ySampling) != (1, 1):
+                        continue
+                    pixels = channel.pixels
+                    if not isinstance(pixels, np.ndarray) or pixels.ndim != 2 or pixels.dtype == object:
+                        raise ClipError(f"{path}: channel {name} is no flat image; deep data cannot be read.")
+                    found[_full_name(part.header, name, len(parts))] = pixels
+    except ClipError:
+        raise
+    except (RuntimeError, ValueError, KeyError, TypeError, MemoryError, UnicodeDecodeError) as error:
+        raise ClipError(f"{path}: not readable as OpenEXR ({error}); write the frame again.") from error
+    if not found:
+        raise ClipError(f"{path}: the file has no channels.")
+    return found
+
+
+def write_image(path: str | Path, image: np.ndarray) -> None:
+    """Write ``[H, W, 3]`` as plain R, G, B in float32. Raises as :func:`write_exr` does."""
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[-1] != 3 or 0 in image.shape:
+        raise ValueError(f"{path}: expected an image [H, W, 3], got shape {image.shape}.")
+    write_exr(path, {name: image[..., i].astype(np.float32) for i, name in enumerate("RGB")})
+
+
+def _storable(path: Path, name: str, pixels: np.ndarray) -> np.ndarray:
+    if not name or len(name.encode()) > _NAME_LIMIT:
+        raise ValueError(f"{path}: expected a channel name of 1 to {_NAME_LIMIT} bytes, got {name[:40]!r}.")
+    if not isinstance(pixels, np.ndarray) or pixels.ndim != 2 or 0 in pixels.shape:
+        raise ValueError(f"{path}: channel {name}: expected an array [H, W], got shape {np.shape(pixels)}.")
+    if pixels.dtype not in _STORABLE:
+        raise ValueError(f"{path}: channel {name}: expected float16, float32 or uint32, got {pixels.dtype}.")
+    return np.ascontiguousarray(pixels)
+
+
+def _check_header(path: Path, header: Mapping[str, object]) -> None:
+    window = header.get("dataWindow")
+    if not isinstance(window, tuple) or len(window) != 2:
+        raise ClipError(f"{path}: the header has no data window; the file is damaged.")
+    low, high = (np.asarray(corner, np.int64) for corner in window)
+    sides = high - low + 1
+    if sides.min() < 1 or sides.max() > _SIDE_LIMIT:
+        raise ClipError(f"{path}: the header claims {sides[0]} x {sides[1]} pixels; the file is damaged.")
+
+
+def _full_name(header: Mapping[str, object], name: str, parts: int) -> str:
+    part = str(header.get("name", ""))
+    return name if parts == 1 or not part or name == part or name.startswith(part + ".") else f"{part}.{name}"
