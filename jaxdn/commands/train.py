@@ -1,0 +1,230 @@
+"""``jaxdn train``: the loop around the train step, with data, validation, progress and checkpoints."""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from jaxdn import color, metrics
+from jaxdn.checkpoint import Checkpoints
+from jaxdn.clips import read_clip, training_batches
+from jaxdn.frame import Clip, Denoiser
+from jaxdn.rollout import denoise
+from jaxdn.training import Recipe, TrainState, initial_state, make_train_step
+
+
+class Curve(NamedTuple):
+    """What a run logged: one entry per logged step, and one per validation."""
+
+    step: list[int]
+    loss: list[float]
+    validation_step: list[int]
+    validation_psnr: list[float]
+
+
+class Log:
+    """``log.jsonl`` of a run: one strict JSON object a line, appended as it happens."""
+
+    def __init__(self, path: Path, *, keep_until: int):
+        """Open the log; entries after step ``keep_until`` belong to updates that were lost, and go."""
+        kept = [entry for entry in read_log(path) if entry["step"] <= keep_until]
+        beside = path.with_name(path.name + ".part")
+        beside.write_text("".join(json.dumps(entry) + "\n" for entry in kept))
+        os.replace(beside, path)
+        self._file = path.open("a")
+
+    def write(self, **entry: Any) -> None:
+        """Append one entry and let it reach the file."""
+        self._file.write(json.dumps(entry) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """The entries of a log; a last line torn by a crash is left out, a missing file is an empty log."""
+    entries = []
+    for line in path.read_text().splitlines() if path.is_file() else []:
+        try:
+            entries.append(json.loads(line))
+        except ValueError:
+            break
+    return entries
+
+
+def read_curve(folder: Path) -> Curve:
+    """The loss and validation curves of a run's folder."""
+    entries = read_log(folder / "log.jsonl")
+    losses = [entry for entry in entries if "loss" in entry]
+    checks = [entry for entry in entries if "validation_psnr" in entry]
+    return Curve(
+        [entry["step"] for entry in losses],
+        [entry["loss"] for entry in losses],
+        [entry["step"] for entry in checks],
+        [entry["validation_psnr"] for entry in checks],
+    )
+
+
+def validate(denoiser: Denoiser, params: Any, clips: Sequence[Clip]) -> float:
+    """Mean over the clips of the PSNR of all frames, tone-mapped, in dB; not a number without clips."""
+
+    @jax.jit
+    def score(params: Any, clip: Clip) -> jax.Array:
+        return metrics.psnr(color.tonemap(denoise(denoiser, params, clip)), color.tonemap(clip.reference))
+
+    return float(np.mean([float(score(params, clip)) for clip in clips])) if clips else float("nan")
+
+
+def fit(
+    denoiser: Denoiser,
+    recipe: Recipe,
+    batches: Iterator[Clip],
+    folder: Path,
+    *,
+    label: str,
+    validation: Sequence[Clip] = (),
+    log_every: int = 20,
+    validate_every: int = 200,
+    checkpoint_every: int = 200,
+) -> TrainState:
+    """Train to ``recipe.steps`` updates, continuing from the newest checkpoint in ``folder`` as if never stopped.
+
+    ``batches`` is a Grain iterator (it has ``get_state`` and ``set_state``): its position is kept in every checkpoint.
+    Interrupted (Ctrl-C), the state is written before KeyboardInterrupt goes on. The log is ``folder/log.jsonl``.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    _same_recipe(folder / "recipe.json", recipe)
+    checkpoints = Checkpoints(folder / "checkpoints")
+    first_position = batches.get_state()  # type: ignore[attr-defined]
+    state = initial_state(denoiser, recipe, next(batches))
+    batches.set_state(first_position)  # type: ignore[attr-defined]
+    found = checkpoints.restore(state)
+    if found is not None:
+        state, position = found
+        batches.set_state(position)  # type: ignore[attr-defined]
+    step = int(state.step)
+    log = Log(folder / "log.jsonl", keep_until=step)
+    train_step = make_train_step(denoiser, recipe)
+    # A write of the state while it is being replaced would keep neither: the position belongs to finished updates only.
+    position = batches.get_state()  # type: ignore[attr-defined]
+    saved = step
+    with _Progress(label, recipe, step) as progress:
+        try:
+            while step < recipe.steps:
+                batch = next(batches)
+                state, report = train_step(state, batch)
+                step, position = step + 1, batches.get_state()  # type: ignore[attr-defined]
+                if step % log_every == 0 or step == recipe.steps:
+                    loss = float(report.loss)
+                    log.write(step=step, loss=loss, last_frame_psnr=float(report.validation_psnr))
+                    progress.advance(step, loss=loss, skipped=int(state.skipped))
+                if validation and (step % validate_every == 0 or step == recipe.steps):
+                    psnr = validate(denoiser, state.params, validation)
+                    log.write(step=step, validation_psnr=psnr)
+                    progress.validated(psnr)
+                if step % checkpoint_every == 0 or step == recipe.steps:
+                    checkpoints.save(state, position)
+                    saved = step
+        except KeyboardInterrupt:
+            if saved < step:
+                checkpoints.save(state, position)
+            progress.say(f"{label}: stopped after {step} of {recipe.steps} steps; the same command continues there.")
+            raise
+        finally:
+            checkpoints.close()
+            log.close()
+    return state
+
+
+def load_validation(folders: Sequence[Path], *, spp: int = 1) -> list[Clip]:
+    """Whole held-out clips, as they are validated on."""
+    return [read_clip(folder, spp=spp) for folder in folders]
+
+
+def _same_recipe(path: Path, recipe: Recipe) -> None:
+    """Write the recipe beside a new run; raise ValueError where an old run was made by another one."""
+    wanted = recipe._asdict()
+    if path.is_file():
+        there = json.loads(path.read_text())
+        differing = {key: (there.get(key), value) for key, value in wanted.items() if there.get(key) != value}
+        if differing:
+            told = ", ".join(f"{key} {old!r} -> {new!r}" for key, (old, new) in differing.items())
+            raise ValueError(
+                f"{path}: expected the recipe that this run was started with, got {told}; give the new run another "
+                "name, or delete the folder to start over."
+            )
+        return
+    beside = path.with_name(path.name + ".part")
+    beside.write_text(json.dumps(wanted, indent=1) + "\n")
+    os.replace(beside, path)
+
+
+class _Progress:
+    """A bar with loss, validation PSNR, frames/s and time left; plain lines where nobody watches."""
+
+    def __init__(self, label: str, recipe: Recipe, start: int):
+        self._label, self._recipe, self._first = label, recipe, start
+        self._validation = float("nan")
+        self._console = Console(stderr=False)
+        self._began: float | None = None
+        self._printed = 0.0
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed}/{task.total} steps  {task.fields[told]}"),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not sys.stdout.isatty(),
+        )
+        self._task = self._bar.add_task(label, total=recipe.steps, completed=start, told="compiling ...")
+
+    def __enter__(self) -> "_Progress":
+        self._bar.start()
+        if self._first >= self._recipe.steps:
+            self.say(f"{self._label}: all {self._recipe.steps} steps are there already")
+        elif self._bar.disable:
+            self.say(f"{self._label}: step {self._first} of {self._recipe.steps}, compiling ...")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def say(self, line: str) -> None:
+        """One line above the bar."""
+        self._console.print(line, highlight=False, markup=False)
+
+    def validated(self, psnr: float) -> None:
+        """Remember the newest validation PSNR."""
+        self._validation = psnr
+
+    def advance(self, step: int, *, loss: float, skipped: int) -> None:
+        """Show where training stands after ``step`` updates."""
+        now = time.monotonic()
+        if self._began is None:  # the first report comes after the compilation: count speed from there
+            self._began, self._first = now, step
+        rate = (step - self._first) / max(now - self._began, 1e-9)
+        told = f"loss {loss:.4f}"
+        if self._validation == self._validation:
+            told += f"  validation {self._validation:.2f} dB"
+        if rate > 0:
+            told += f"  {rate * self._recipe.batch * self._recipe.frames:.0f} frames/s"
+        if skipped:
+            told += f"  {skipped} skipped (gradient not finite)"
+        self._bar.update(self._task, completed=step, told=told)
+        if self._bar.disable and (now - self._printed > 15 or step == self._recipe.steps):
+            left = f"  {(self._recipe.steps - step) / rate:.0f} s left" if rate > 0 else ""
+            self.say(f"{self._label}: step {step}/{self._recipe.steps}  {told}{left}")
+            self._printed = now
+
+
+__all__ = ["Curve", "fit", "load_validation", "read_curve", "read_log", "training_batches", "validate"]

@@ -1,0 +1,107 @@
+"""Weights travel as safetensors plus a small JSON that names the denoiser's factory and its options; no pickle."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from jaxdn import denoisers
+from jaxdn.frame import Denoiser
+
+SHIPPED = Path(__file__).parent / "shipped"
+"""Where the weights lie that come with the package."""
+
+
+def shipped_names() -> list[str]:
+    """The names that :func:`load_weights` knows."""
+    return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
+
+
+def flatten(params: dict[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
+    """A nested dict of arrays as one level, keys joined by ``/``."""
+    flat: dict[str, np.ndarray] = {}
+    for key, value in params.items():
+        name = f"{prefix}/{key}" if prefix else str(key)
+        flat.update(flatten(value, name) if isinstance(value, dict) else {name: np.ascontiguousarray(value)})
+    return flat
+
+
+def unflatten(flat: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The inverse of :func:`flatten`, with jax arrays as leaves."""
+    params: dict[str, Any] = {}
+    for name, value in flat.items():
+        *parents, leaf = name.split("/")
+        place = params
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        place[leaf] = jnp.asarray(value)
+    return params
+
+
+def save_weights(
+    path: Path | str, params: dict[str, Any], *, factory: str, options: dict[str, Any], record: dict[str, Any]
+) -> Path:
+    """Write ``path`` (.safetensors) and the JSON beside it; returns the path of the weights.
+
+    ``factory`` is a name in ``jaxdn.denoisers`` and ``options`` its keyword arguments; ``record`` says how the weights
+    came to be (data, recipe, scores). Both files are written beside their place and renamed.
+    """
+    path = Path(path).with_suffix(".safetensors")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    description = {"factory": factory, "options": options, **record}
+    beside = path.with_name(path.name + ".part")
+    save_file(flatten(params), beside)
+    os.replace(beside, path)
+    beside = path.with_name(path.stem + ".json.part")
+    beside.write_text(json.dumps(description, indent=1, sort_keys=True) + "\n")
+    os.replace(beside, path.with_suffix(".json"))
+    return path
+
+
+def load_weights(name_or_path: str | Path) -> tuple[Denoiser, dict[str, Any]]:
+    """A denoiser and its parameters, by a shipped name (``"ntd-large"``) or the path of a .safetensors file.
+
+    The factory and its options are read from the JSON beside the weights. Raises ValueError where nothing of that name
+    exists, a file cannot be read, or the JSON names an unknown factory.
+    """
+    path = SHIPPED / f"{name_or_path}.safetensors"
+    if not path.is_file():
+        path = Path(name_or_path)
+        if not path.is_file():
+            raise ValueError(
+                f"weights {str(name_or_path)!r}: expected one of {', '.join(shipped_names()) or 'none shipped'} or the "
+                "path of a .safetensors file, and there is no such file."
+            )
+    beside = path.with_suffix(".json")
+    try:
+        description = json.loads(beside.read_text())
+        factory, options = description["factory"], dict(description["options"])
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"weights {path}: expected {beside.name} beside it with 'factory' and 'options', got {error!r}; "
+            "copy both files together."
+        ) from error
+    if factory not in denoisers.NAMES:
+        raise ValueError(
+            f"weights {beside}: expected a factory out of {', '.join(denoisers.NAMES)}, got {factory!r}; they may come "
+            "from a newer jaxdn."
+        )
+    try:
+        flat = load_file(path)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise ValueError(f"weights {path}: expected a whole safetensors file, got {error}; copy it again.") from error
+    options = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
+    return getattr(denoisers, factory)(**options), unflatten(flat)
+
+
+def describe(name_or_path: str | Path) -> dict[str, Any]:
+    """The JSON beside the weights: factory, options, and how they were trained."""
+    path = SHIPPED / f"{name_or_path}.json"
+    if not path.is_file():
+        path = Path(name_or_path).with_suffix(".json")
+    return json.loads(path.read_text())
