@@ -23,7 +23,8 @@ def _integrator(max_depth: int) -> Any:
         name: {"type": "path", "max_depth": depth, "rr_depth": _NO_ROULETTE}
         for name, depth in (("all", max_depth), ("direct", min(2, max_depth)), ("emitted", 1))
     }
-    return mi.load_dict({"type": "aov", "aovs": "", **nested})
+    # The integrator insists on a buffer of its own; the nested images come first.
+    return mi.load_dict({"type": "aov", "aovs": "nothing:shape_index", **nested})
 
 
 def accumulate(

@@ -1,0 +1,177 @@
+"""What the camera sees through pixel centres: albedo, normal, depth, roughness, position and shape ids.
+
+Free of noise, because one ray through each pixel centre is all there is to it. Mitsuba's own albedo buffer is no
+reflectance for rough conductors and blends (it evaluates the BSDF at normal incidence), and its depth starts at the
+near plane, so these are taken from the BSDFs and positions directly.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from jaxdn.frame import FAR
+from jaxdn.render.wavefront import camera_rays
+
+
+class GBuffer(NamedTuple):
+    """One ray per pixel; every buffer [H, W, C]."""
+
+    albedo: np.ndarray
+    """[H, W, 3] float32 diffuse reflectance in [0, 1]: 0 for purely glossy or specular surfaces, white on a miss."""
+    normal: np.ndarray
+    """[H, W, 3] float32 unit shading normal turned to the viewer, world space, 0 on a miss."""
+    depth: np.ndarray
+    """[H, W, 1] float32 view-space z, ``FAR`` on a miss."""
+    roughness: np.ndarray
+    """[H, W, 1] float32 linear roughness: 1 diffuse, 0 perfectly specular, GGX alpha = roughness^2."""
+    position: np.ndarray
+    """[H, W, 3] float64 world position, 0 on a miss."""
+    direction: np.ndarray
+    """[H, W, 3] float64 direction of the camera ray."""
+    ids: np.ndarray
+    """[H, W, 1] int32 position of the shape's name in ``names``, -1 on a miss."""
+    names: tuple[str, ...]
+    """The names of the scene's shapes, sorted: the same shape has the same id in every frame."""
+
+
+def shape_names(scene: Any) -> list[str]:
+    """The name of every shape in the scene's own order; one without a name is called after its place."""
+    names = [shape.id() or f"shape_{index:04d}" for index, shape in enumerate(scene.shapes())]
+    if len(set(names)) != len(names):
+        raise ValueError("scene: expected every shape to have an id of its own; load it with optimize=False.")
+    return names
+
+
+def check_scene(scene: Any) -> None:
+    """Raise ValueError for what the tracers would otherwise leave out without a word."""
+    sensor = scene.sensors()[0]
+    if sensor.get_medium() is not None or any(shape.is_medium_transition() for shape in scene.shapes()):
+        raise ValueError("scene: participating media (fog, smoke) are not supported yet; remove them from the scene.")
+    if sensor.needs_aperture_sample():
+        raise ValueError("scene: depth of field is not supported yet; expected a 'perspective' (pinhole) camera.")
+    if sensor.shutter_open_time() > 0:
+        raise ValueError("scene: motion blur is not supported yet; expected an instantaneous shutter.")
+
+
+def gbuffer(scene: Any) -> GBuffer:
+    """Trace one ray through the centre of every pixel of the scene's first sensor, with the current variant."""
+    names = shape_names(scene)
+    ranks = {name: rank for rank, name in enumerate(sorted(names))}
+    trace = _one_by_one if mi.variant().startswith("scalar") else _vectorised
+    width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
+    found = {name: buffer.reshape(height, width, -1) for name, buffer in trace(scene, names, ranks).items()}
+
+    hit = found["ids"] >= 0
+    direction, normal, position = found["direction"], found["normal"], found["position"]
+    to_world = np.array(scene.sensors()[0].world_transform().matrix, np.float64).reshape(4, 4)
+    forward = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2])
+    # Distances along the ray begin at the near plane; the position does not care.
+    depth = (position - to_world[:3, 3]) @ forward[:, None]
+    away = np.sum(normal * direction, axis=-1, keepdims=True) > 0
+    return GBuffer(
+        albedo=np.where(hit, np.clip(np.nan_to_num(found["albedo"]), 0.0, 1.0), 1.0).astype(np.float32),
+        normal=np.where(hit, np.where(away, -normal, normal), 0.0).astype(np.float32),
+        depth=np.where(hit, depth, FAR).astype(np.float32),
+        roughness=np.where(hit, np.clip(np.nan_to_num(found["roughness"], nan=1.0), 0.0, 1.0), 1.0).astype(np.float32),
+        position=np.where(hit, position, 0.0),
+        direction=direction,
+        ids=found["ids"].astype(np.int32),
+        names=tuple(sorted(names)),
+    )
+
+
+def _vectorised(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict[str, np.ndarray]:
+    """All pixels at once; flat buffers."""
+    sensor = scene.sensors()[0]
+    width, height = (int(size) for size in sensor.film().crop_size())
+    pixel = dr.arange(mi.UInt32, width * height)
+    across = dr.opaque(mi.UInt32, width)
+    ray = camera_rays(sensor, pixel % across, pixel // across)
+    hit = scene.ray_intersect(ray)
+    valid = hit.is_valid()
+    bsdf = hit.bsdf(ray)
+
+    flags = bsdf.flags()
+    diffuse = valid & mi.has_flag(flags, mi.BSDFFlags.Diffuse)
+    albedo = dr.select(diffuse, mi.Color3f(bsdf.eval_diffuse_reflectance(hit, diffuse)), 0.0)
+    # "principled" reports its base colour even where all of it is metal or glass.
+    for part in ("metallic", "spec_trans"):
+        there = diffuse & bsdf.has_attribute(part, diffuse)
+        albedo *= 1.0 - dr.select(there, bsdf.eval_attribute_1(part, hit, there), 0.0)
+
+    roughness = dr.select(mi.has_flag(flags, mi.BSDFFlags.Smooth), mi.Float(1.0), 0.0)
+    there = valid & bsdf.has_attribute("alpha", valid)
+    roughness = dr.select(there, dr.sqrt(dr.maximum(bsdf.eval_attribute_1("alpha", hit, there), 0.0)), roughness)
+    there = valid & bsdf.has_attribute("roughness", valid)
+    roughness = dr.select(there, bsdf.eval_attribute_1("roughness", hit, there), roughness)
+
+    instance = dr.reinterpret_array(mi.UInt32, hit.instance)
+    shape = dr.select(instance != 0, instance, dr.reinterpret_array(mi.UInt32, hit.shape))
+    shape = dr.select(valid, shape, 0)
+    buffers = {
+        "albedo": albedo,
+        "normal": hit.sh_frame.n,
+        "position": hit.p,
+        "direction": ray.d,
+        "roughness": roughness,
+        "shape": shape,
+    }
+    dr.eval(buffers)
+    arrays = {name: np.array(buffer).T.astype(np.float64) for name, buffer in buffers.items()}
+    # Registry numbers depend on what else is alive: names are what stays.
+    lookup = {0: -1}
+    for own, name in zip(scene.shapes(), names, strict=True):
+        lookup[int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(own))[0])] = ranks[name]
+    numbers, inverse = np.unique(arrays.pop("shape").astype(np.int64), return_inverse=True)
+    arrays["ids"] = np.array([lookup.get(int(number), -1) for number in numbers])[inverse]
+    return arrays
+
+
+def _one_by_one(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict[str, np.ndarray]:
+    """The same buffers, a pixel at a time, for the variant without vectorisation."""
+    sensor = scene.sensors()[0]
+    width, height = (int(size) for size in sensor.film().crop_size())
+    by_shape = {_address(own): ranks[name] for own, name in zip(scene.shapes(), names, strict=True)}
+    sizes = {"albedo": 3, "normal": 3, "position": 3, "direction": 3, "roughness": 1}
+    arrays = {name: np.zeros((width * height, size)) for name, size in sizes.items()}
+    arrays["ids"] = np.full(width * height, -1)
+    for pixel in range(width * height):
+        row, column = divmod(pixel, width)
+        ray, _ = sensor.sample_ray(0.0, 0.5, [(column + 0.5) / width, (row + 0.5) / height], [0.5, 0.5])
+        arrays["direction"][pixel] = ray.d
+        hit = scene.ray_intersect(ray)
+        if not hit.is_valid():
+            continue
+        owner = hit.instance if hit.instance is not None else hit.shape
+        arrays["ids"][pixel] = by_shape.get(_address(owner), -1)
+        arrays["position"][pixel] = hit.p
+        arrays["normal"][pixel] = hit.sh_frame.n
+        arrays["albedo"][pixel], arrays["roughness"][pixel] = _surface(hit)
+    return arrays
+
+
+def _address(shape: Any) -> str:
+    """Python wrappers of one shape come and go; its id stays."""
+    return str(shape.id())
+
+
+def _surface(hit: Any) -> tuple[np.ndarray, float]:
+    """Albedo and roughness of one hit."""
+    bsdf = hit.bsdf()
+    if bsdf is None:
+        return np.zeros(3), 1.0
+    flags = int(bsdf.flags())
+    albedo = np.zeros(3)
+    if flags & int(mi.BSDFFlags.Diffuse):
+        albedo = np.array(bsdf.eval_diffuse_reflectance(hit), np.float64)
+        for part in ("metallic", "spec_trans"):
+            if bsdf.has_attribute(part):
+                albedo = albedo * (1.0 - bsdf.eval_attribute_1(part, hit))
+    if bsdf.has_attribute("roughness"):
+        return albedo, bsdf.eval_attribute_1("roughness", hit)
+    if bsdf.has_attribute("alpha"):
+        return albedo, max(bsdf.eval_attribute_1("alpha", hit), 0.0) ** 0.5
+    return albedo, 1.0 if flags & int(mi.BSDFFlags.Smooth) else 0.0

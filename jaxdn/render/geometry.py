@@ -1,0 +1,152 @@
+"""Where things were: motion vectors, visibility and previous depths from G-buffers, cameras and poses. NumPy only.
+
+All in float64: a vector is the difference of two projections, each hundreds of pixels large. Pixel coordinates here
+have the centre of the first pixel at (0.5, 0.5) and y down; vectors are previous minus current, so the history of pixel
+``p`` lies at ``p + motion(p)``.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxdn.frame import FAR
+from jaxdn.render.gbuffer import GBuffer
+from jaxdn.render.scene import Camera
+
+SAME_NORMAL = 0.9
+"""Smallest cosine between the normals of what counts as the same surface."""
+SAME_PLANE = 0.005
+"""Largest distance from the surface's plane, as a fraction of the depth."""
+_BEHIND = 1e-6
+
+
+class View(NamedTuple):
+    """One frame as the geometry sees it."""
+
+    gbuffer: GBuffer
+    camera: Camera
+    pose: Mapping[str, np.ndarray]
+
+
+class Motion(NamedTuple):
+    """How the image moved between two frames; see :class:`jaxdn.Frame`."""
+
+    motion: np.ndarray
+    """[H, W, 2] float64 px, previous minus current; NaN where the point was behind the previous camera."""
+    forward_motion: np.ndarray
+    """[H, W, 2] float64 px, for the previous frame's pixels: how far what they show has moved, current minus previous."""
+    visible: np.ndarray
+    """[H, W, 1] bool, the point was seen in the previous frame."""
+    previous_depth: np.ndarray
+    """[H, W, 1] float32 view-space z of the point in the previous frame, ``FAR`` for the sky."""
+
+
+def project(points: np.ndarray, camera: Camera, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """World points [..., 3], or homogeneous [..., 4], to pixels [..., 2] and view-space z [..., 1].
+
+    A homogeneous coordinate of 0 makes a direction at infinity. Mitsuba's camera looks along +z with +x to the left:
+    ``u = 1/2 - cot(fov/2)/2 x/z``, ``v = 1/2 - (W/H) cot(fov/2)/2 y/z``. Pixels are NaN where z <= 1e-6, which is behind
+    the camera. ``size`` is (height, width).
+    """
+    height, width = size
+    inverse = np.linalg.inv(np.asarray(camera.to_world, np.float64))
+    if points.shape[-1] == 3:
+        local = points @ inverse[:3, :3].T + inverse[:3, 3]
+    else:
+        local = (points @ inverse.T)[..., :3]
+    z = local[..., 2:3]
+    front = z > _BEHIND
+    scale = 0.5 * width / np.tan(np.radians(camera.x_fov) / 2)
+    with np.errstate(invalid="ignore"):
+        offset = -scale * local[..., :2] / np.where(front, z, np.nan)
+    return offset + np.array([width / 2, height / 2]), z
+
+
+def relative_poses(names: tuple[str, ...], start: Mapping[str, np.ndarray], end: Mapping[str, np.ndarray]) -> np.ndarray:
+    """[N + 1, 4, 4] motions that carry a point of each shape from pose ``start`` to pose ``end``.
+
+    Exactly the identity for a shape whose pose is the same or absent, and, as the last entry (id -1), for the sky.
+    """
+    motions = np.tile(np.eye(4), (len(names) + 1, 1, 1))
+    for index, name in enumerate(names):
+        if (name in start) != (name in end):
+            raise ValueError(f"pose: shape {name!r} has a pose in one frame but not in the next.")
+        if name in start and not np.array_equal(start[name], end[name]):
+            motions[index] = np.asarray(end[name], np.float64) @ np.linalg.inv(np.asarray(start[name], np.float64))
+    return motions
+
+
+def motion_between(current: View, previous: View) -> Motion:
+    """Motion of the current frame's pixels into the previous frame, and of the previous frame's into the current.
+
+    Traditional motion is ``P'(T^-1 X) - P(X)`` (X the world position, T the shape's rigid motion, P and P' the two
+    projections), and for the sky the projections of its direction: it turns with the camera and knows no translation.
+    Where neither camera nor shape moved it is exactly 0.
+
+    A point counts as seen before if the *nearest* pixel of the previous frame shows the same shape, with normals within
+    ``SAME_NORMAL`` and within ``SAME_PLANE`` of z of the point's plane. Where that pixel is sky while the point is not,
+    nothing can have covered it, so any of the four pixels around may prove it seen.
+    Source: Zeng et al. 2021, eq. 1 and 2. Raises ValueError if the two frames have other sizes or shapes.
+    """
+    now, before = current.gbuffer, previous.gbuffer
+    if now.names != before.names or now.ids.shape != before.ids.shape:
+        raise ValueError("motion: expected two frames of one size with the same shapes; shapes may not come or go.")
+    size = now.ids.shape[:2]
+    back = relative_poses(now.names, current.pose, previous.pose)[now.ids[..., 0]]
+    there = relative_poses(now.names, previous.pose, current.pose)[before.ids[..., 0]]
+    same_camera = _same(current.camera, previous.camera)
+
+    points = _homogeneous(now)
+    old_points = np.einsum("hwij,hwj->hwi", back, points)
+    target, z = project(old_points, previous.camera, size)
+    motion = target - project(points, current.camera, size)[0]
+    motion[same_camera & _still(back)] = 0.0
+
+    borrowed = _homogeneous(before)
+    moved, _ = project(np.einsum("hwij,hwj->hwi", there, borrowed), current.camera, size)
+    forward = moved - project(borrowed, previous.camera, size)[0]
+    forward[same_camera & _still(there)] = 0.0
+
+    normals = np.einsum("hwij,hwj->hwi", back[..., :3, :3], now.normal)
+    lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
+    normals = normals / np.where(lengths > 0, lengths, 1.0)
+    sky = now.ids < 0
+    # From the pixel itself, not from the projected position: the vector is what the denoiser will follow.
+    landing = np.stack(np.meshgrid(np.arange(size[1]), np.arange(size[0])), axis=-1) + 0.5 + motion
+    seen, nearest = _matches(now, before, np.floor(landing), old_points, normals, z)
+    on_sky = (nearest == -1) & ~sky
+    for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        tap, _ = _matches(now, before, np.floor(landing - 0.5) + corner, old_points, normals, z)
+        seen |= on_sky & tap
+    return Motion(motion, forward, seen, np.where(sky, FAR, np.maximum(z, 0.0)).astype(np.float32))
+
+
+def _same(first: Camera, second: Camera) -> bool:
+    return first.x_fov == second.x_fov and np.array_equal(first.to_world, second.to_world)
+
+
+def _still(motions: np.ndarray) -> np.ndarray:
+    return np.all(motions == np.eye(4), axis=(-2, -1))
+
+
+def _homogeneous(gbuffer: GBuffer) -> np.ndarray:
+    """World positions with 1, directions of the sky with 0: [H, W, 4]."""
+    hit = gbuffer.ids >= 0
+    return np.concatenate([np.where(hit, gbuffer.position, gbuffer.direction), hit], axis=-1).astype(np.float64)
+
+
+def _matches(
+    now: GBuffer, before: GBuffer, tap: np.ndarray, points: np.ndarray, normals: np.ndarray, z: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether the previous frame's pixel ``tap`` (column, row) shows the same point, and which id it shows (-2: none)."""
+    height, width = before.ids.shape[:2]
+    with np.errstate(invalid="ignore"):
+        inside = (tap >= 0) & (tap <= [width - 1, height - 1])
+    inside = np.all(inside, axis=-1, keepdims=True)
+    column, row = np.moveaxis(np.where(inside, tap, 0.0).astype(int), -1, 0)
+    ids = np.where(inside, before.ids[row, column], -2)
+    cosine = np.sum(normals * before.normal[row, column], axis=-1, keepdims=True)
+    offset = np.sum(normals * (points[..., :3] - before.position[row, column]), axis=-1, keepdims=True)
+    same_surface = (cosine > SAME_NORMAL) & (np.abs(offset) <= SAME_PLANE * z)
+    return (ids == now.ids) & (same_surface | (now.ids < 0)), ids
