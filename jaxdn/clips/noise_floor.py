@@ -1,0 +1,34 @@
+"""How good a clip's reference is: it is rendered too, and has noise of its own."""
+
+from pathlib import Path
+
+import numpy as np
+
+from jaxdn import color
+from jaxdn.clips.frames import read_frame
+
+
+def noise_floor(reference: np.ndarray, reference_half: np.ndarray) -> float:
+    """Mean squared error of a tone-mapped reference [H, W, 3] itself, from the mean of one half of its samples.
+
+    With the halves ``a`` and ``b = 2 * reference - a``, which are independent, the reference ``(a + b) / 2`` has a
+    quarter of the variance of ``a - b``; so its error is about ``mean((tonemap(a) - tonemap(b))^2) / 4``.
+    """
+    other_half = np.maximum(2.0 * reference - reference_half, 0.0)
+    difference = np.asarray(color.tonemap(reference_half)) - np.asarray(color.tonemap(other_half))
+    return float(np.mean(difference.astype(np.float64) ** 2) / 4.0)
+
+
+def read_noise_floor(folder: str | Path) -> float:
+    """The PSNR in dB that a perfect image would get against this clip's reference, averaged over frames.
+
+    Not a number where the clip has no reference or does not keep its first half.
+    """
+    decibels = []
+    for path in sorted(Path(folder).glob("*.exr")):
+        stored = read_frame(path)
+        if stored.reference is None or stored.reference_half is None:
+            return float("nan")
+        with np.errstate(divide="ignore"):
+            decibels.append(-10.0 * np.log10(noise_floor(stored.reference, stored.reference_half)))
+    return float(np.mean(decibels)) if decibels else float("nan")

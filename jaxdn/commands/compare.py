@@ -1,0 +1,202 @@
+"""``jaxdn compare``: every method on the same clips, scored, timed and laid side by side in one report."""
+
+import platform
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxdn import __version__, color, denoisers, metrics
+from jaxdn.clips import read_clip
+from jaxdn.clips.noise_floor import read_noise_floor
+from jaxdn.frame import Clip, Denoiser
+from jaxdn.report import ClipResult, Results, Scores, TrainingCurve
+from jaxdn.rollout import denoise
+from jaxdn.weights import load_weights, shipped_names
+
+
+class Method(NamedTuple):
+    """One column of the table."""
+
+    label: str
+    denoiser: Denoiser | None
+    """None is the noisy image itself."""
+    params: Any
+
+
+def method_named(name: str) -> Method:
+    """``noisy``, a filter without weights (``svgf``), shipped weights (``ntd-large``) or a .safetensors file.
+
+    Raises ValueError for a name that is none of these.
+    """
+    if name == "noisy":
+        return Method(name, None, {})
+    if name in denoisers.NAMES and name not in denoisers.LEARNED:
+        return Method(name, getattr(denoisers, name)(), {})
+    if name in denoisers.LEARNED:
+        known = [shipped for shipped in shipped_names() if shipped.startswith(name)]
+        raise ValueError(f"method {name!r}: expected its weights, one of {', '.join(known)} or a .safetensors file.")
+    if not name.endswith(".safetensors") and name not in shipped_names():
+        filters = [known for known in denoisers.NAMES if known not in denoisers.LEARNED]
+        raise ValueError(
+            f"method {name!r}: expected one of noisy, {', '.join([*filters, *shipped_names()])} or the path of a "
+            ".safetensors file."
+        )
+    denoiser, params = load_weights(name)
+    return Method(Path(name).stem, denoiser, params)
+
+
+@jax.jit
+def _clip_scores(image: jax.Array, reference: jax.Array, hidden: jax.Array) -> dict[str, jax.Array]:
+    """Every score of a tone-mapped clip, and the curves over its frames."""
+    frame_l1 = jax.vmap(metrics.l1)(image, reference)
+    frame_psnr = jax.vmap(metrics.psnr)(image, reference)
+    masked_l1 = jax.vmap(lambda a, b, m: metrics.l1(a, b, mask=m))(image, reference, hidden)
+    return {
+        "psnr": metrics.psnr(image, reference),
+        "ssim": metrics.ssim(image, reference),
+        "l1": metrics.l1(image, reference),
+        "mse": metrics.mse(image, reference),
+        "temporal_psnr": metrics.temporal_psnr(image, reference),
+        "flip": metrics.flip(image, reference),
+        "disoccluded_l1": metrics.l1(image, reference, mask=hidden),
+        "disoccluded_mse": metrics.mse(image, reference, mask=hidden),
+        "frame_psnr": frame_psnr,
+        "frame_l1": frame_l1,
+        "frame_disoccluded_l1": masked_l1,
+    }
+
+
+def compare(
+    methods: Sequence[Method],
+    folders: Sequence[Path],
+    *,
+    title: str,
+    settings: dict[str, Any],
+    training: dict[str, TrainingCurve] | None = None,
+    spp: int = 1,
+    say: Callable[[str], None] = print,
+) -> Results:
+    """Denoise every clip by every method and score it against the clip's reference.
+
+    Images are tone-mapped (sRGB, clipped to [0, 1]) before they are scored. Disoccluded pixels are those whose point
+    was hidden in the previous frame (``visible`` is false). Milliseconds are the median of three runs of the compiled
+    clip, divided by its frames; compilation is not in them. Raises ValueError for a clip without a reference.
+    """
+    compiled: dict[str, Callable[[Any, Clip], jax.Array]] = {}
+    for method in methods:
+        if method.denoiser is not None:
+            compiled[method.label] = _compile(method.denoiser)
+    clips = []
+    for count, folder in enumerate(folders):
+        clip = read_clip(folder, spp=spp)
+        if clip.reference is None:
+            raise ValueError(f"{folder}: expected a clip with a reference to compare with, got none; render one.")
+        began = time.monotonic()
+        result = _compare_on(clip, folder, methods, compiled, spp)
+        psnr = "  ".join(f"{label} {scores.psnr:.2f}" for label, scores in result.scores.items())
+        say(
+            f"[{count + 1}/{len(folders)}] {result.name}: PSNR {psnr} dB (reference good to "
+            f"{result.noise_floor_psnr:.1f} dB)  {time.monotonic() - began:.0f} s"
+        )
+        clips.append(result)
+    labels = [method.label for method in methods]
+    return Results(title, settings, describe_machine(), labels, clips, training or {})
+
+
+def _compile(denoiser: Denoiser) -> Callable[[Any, Clip], jax.Array]:
+    return jax.jit(lambda params, clip: denoise(denoiser, params, clip))
+
+
+def _compare_on(
+    clip: Clip,
+    folder: Path,
+    methods: Sequence[Method],
+    compiled: dict[str, Callable[[Any, Clip], jax.Array]],
+    spp: int,
+) -> ClipResult:
+    frames = clip.frames
+    inputs = Clip(jax.tree.map(jax.numpy.asarray, frames))
+    reference = color.tonemap(clip.reference)
+    shape = (*np.shape(frames.radiance)[:3], 1)
+    hidden = ~np.asarray(frames.visible, bool) if frames.visible is not None else np.zeros(shape, bool)
+    # At a clip's first frame nobody has a history: what "was hidden before" means nothing there.
+    hidden = np.concatenate([np.zeros_like(hidden[:1]), hidden[1:]])
+    shown = int(np.argmax(hidden.sum((1, 2, 3)))) if hidden.any() else shape[0] - 1
+    scores, per_frame = {}, {}
+    images = {"reference": np.asarray(reference[shown])}
+    for method in methods:
+        if method.denoiser is None:
+            denoised, milliseconds = inputs.frames.radiance, 0.0
+        else:
+            denoised, milliseconds = _timed(compiled[method.label], method.params, inputs, shape[0])
+        image = color.tonemap(denoised)
+        found = {name: np.asarray(value) for name, value in _clip_scores(image, reference, hidden * 1.0).items()}
+        scores[method.label] = _as_scores(found, hidden, milliseconds, spp)
+        per_frame[method.label] = {
+            "psnr": found["frame_psnr"].tolist(),
+            "l1": found["frame_l1"].tolist(),
+            "disoccluded_l1": np.where(hidden.any((1, 2, 3)), found["frame_disoccluded_l1"], np.nan).tolist(),
+        }
+        images[method.label] = np.asarray(image[shown])
+    return ClipResult(
+        folder.name, read_noise_floor(folder), scores, per_frame, shown, images, hidden[shown, ..., 0]
+    )
+
+
+def _as_scores(found: dict[str, np.ndarray], hidden: np.ndarray, milliseconds: float, spp: int) -> Scores:
+    anything = bool(hidden.any())
+    with np.errstate(divide="ignore"):
+        hidden_psnr = float(-10.0 * np.log10(found["disoccluded_mse"]))
+    return Scores(
+        **{name: float(found[name]) for name in ("psnr", "ssim", "l1", "mse", "temporal_psnr", "flip")},
+        disoccluded_l1=float(found["disoccluded_l1"]) if anything else float("nan"),
+        disoccluded_psnr=hidden_psnr if anything else float("nan"),
+        ms_per_frame=milliseconds,
+        spp=float(spp),
+    )
+
+
+def _timed(
+    run: Callable[[Any, Clip], jax.Array], params: Any, clip: Clip, frames: int
+) -> tuple[jax.Array, float]:
+    """The denoised clip and the median milliseconds a frame of three runs after a first one that compiles."""
+    denoised = jax.block_until_ready(run(params, clip))
+    seconds = []
+    for _ in range(3):
+        began = time.perf_counter()
+        jax.block_until_ready(run(params, clip))
+        seconds.append(time.perf_counter() - began)
+    return denoised, 1000.0 * float(np.median(seconds)) / frames
+
+
+def describe_machine() -> dict[str, Any]:
+    """What made a measurement: processor, cores, device, versions."""
+    return {
+        "processor": _processor(),
+        "cores": _cores(),
+        "device": jax.devices()[0].device_kind,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "jaxdn": __version__,
+    }
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _cores() -> int:
+    import os
+
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,94 @@
+"""``jaxdn denoise``: a noisy clip in, denoised EXR frames out, one frame at a time."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxdn import color
+from jaxdn.clips.exr import write_exr
+from jaxdn.clips.folder import frame_path, is_clip, read_frames, read_record
+from jaxdn.clips.import_exr import read_plain_frames, sequence_files
+from jaxdn.commands.compare import Method
+from jaxdn.frame import RADIANCE_MAX, Frame, only
+from jaxdn.report.images import save_png
+
+
+def denoise_files(
+    source: Path,
+    out: Path,
+    method: Method,
+    *,
+    spp: int = 1,
+    preview: bool = False,
+    motion_convention: str | None = None,
+    say: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Path]:
+    """Denoise a clip's folder, or EXR files of another renderer; returns the files written.
+
+    Each output frame has the channels ``R, G, B``: the denoised radiance with the directly reflected and the emitted
+    light of the clip added back (foreign files: the denoised beauty), and ``denoised.R/G/B``, the denoised part alone.
+    With ``preview`` a PNG stands beside each. A clip's frames are read, denoised and written one at a time, so that a
+    sequence of any length takes the memory of one; a file is there whole or not at all. ``say`` hears (done, total).
+    Raises ValueError for input that cannot be read or does not fit together, before the frame concerned is written.
+    """
+    names, frames = _open(source, spp, motion_convention)
+    if out.resolve() in {source.resolve(), *(name.resolve().parent for name in names)}:
+        raise ValueError(f"{out}: expected another folder than the input's, whose frames would be overwritten.")
+    step = _stepper(method)
+    out.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name, frame in zip(names, frames, strict=True):
+        image = step(frame)
+        path = out / f"{name.stem}.exr"
+        beauty = image + _light(frame.direct) + _light(frame.emission)
+        write_exr(path, _channels("", beauty) | _channels("denoised.", image))
+        if preview:
+            save_png(path.with_suffix(".png"), color.tonemap(beauty))
+        written.append(path)
+        say(len(written), len(names))
+    return written
+
+
+def _open(source: Path, spp: int, motion_convention: str | None) -> tuple[list[Path], Iterator[Frame]]:
+    """The files, and their frames, read when asked for."""
+    if is_clip(source):
+        names = [frame_path(source, index) for index in range(read_record(source)["frames"])]
+        return names, (stored.frame for stored in read_frames(source, spp=spp))
+    if spp != 1:
+        raise ValueError(f"{source}: expected spp 1, got {spp}; only rendered clips have several sample counts.")
+    names = sequence_files(source)
+    return names, iter(read_plain_frames(source, motion_convention=motion_convention))
+
+
+def _stepper(method: Method) -> Callable[[Frame], np.ndarray]:
+    """A function from one frame to the next denoised one, which remembers the state; compiled once."""
+    denoiser = method.denoiser
+    if denoiser is None:
+        return lambda frame: _light(frame.radiance)
+    run = jax.jit(denoiser.step, donate_argnums=1)
+    state: Any = None
+
+    def step(frame: Frame) -> np.ndarray:
+        nonlocal state
+        inputs = only(frame, denoiser.reads)
+        if state is None:
+            state = jax.jit(denoiser.start)(method.params, inputs)
+        state, image = run(method.params, state, inputs)
+        return np.asarray(image)
+
+    return step
+
+
+def _light(radiance: np.ndarray | None) -> Any:
+    """Radiance fit to be added: not finite or negative becomes 0, an absent part is 0."""
+    if radiance is None:
+        return 0.0
+    good = np.isfinite(radiance) & (np.asarray(radiance) >= 0)
+    return np.minimum(np.where(good, radiance, 0.0), RADIANCE_MAX).astype(np.float32)
+
+
+def _channels(layer: str, image: np.ndarray) -> dict[str, np.ndarray]:
+    return {f"{layer}{letter}": np.ascontiguousarray(image[..., i], np.float32) for i, letter in enumerate("RGB")}
