@@ -1,0 +1,21 @@
+"""Procedural animated scenes: every seed is a different scene, and the same one for ever.
+
+`FAMILIES` maps a family's name to its function of a seed. Clips record ``{"family": name, "seed": seed}``, so what a
+seed looks like must not change once clips have been rendered from it: add a new family rather than change an old one.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from jaxdn.render.families.fruit import fruit
+from jaxdn.render.families.robot import robot
+from jaxdn.render.families.staging import Stage
+
+FAMILIES: dict[str, Callable[..., Stage]] = {"fruit": fruit, "robot": robot}
+
+
+def family_scene(name: str, seed: int, **options: Any) -> Stage:
+    """The scene of a family for one seed. Options: ``lamp`` "mix" (the seed chooses), "up", "down" or "window"."""
+    if name not in FAMILIES:
+        raise ValueError(f"family: expected one of {', '.join(sorted(FAMILIES))}, got {name!r}.")
+    return FAMILIES[name](seed, **options)
