@@ -1,8 +1,30 @@
-"""Clips on disk: folders of multi-layer OpenEXR frames plus one ``clip.json``, and the training data made from them."""
+"""Clips on disk: folders of multi-layer OpenEXR frames plus one ``clip.json``, and the training data made from them.
+
+Reading and writing needs OpenEXR alone; ``training_batches`` loads Grain on first use.
+"""
+
+import importlib
+from typing import Any
 
 from jaxdn.clips.exr import read_exr as read_exr
 from jaxdn.clips.exr import write_exr as write_exr
 from jaxdn.clips.exr import write_image as write_image
 from jaxdn.clips.files import ClipError as ClipError
+from jaxdn.clips.folder import frame_path as frame_path
+from jaxdn.clips.folder import is_clip as is_clip
+from jaxdn.clips.folder import read_clip as read_clip
+from jaxdn.clips.folder import read_frames as read_frames
+from jaxdn.clips.folder import read_record as read_record
+from jaxdn.clips.folder import write_clip as write_clip
+from jaxdn.clips.folder import write_record as write_record
+from jaxdn.clips.frames import StoredFrame as StoredFrame
 from jaxdn.clips.frames import read_frame as read_frame
 from jaxdn.clips.frames import write_frame as write_frame
+from jaxdn.clips.import_exr import MOTION_CONVENTIONS as MOTION_CONVENTIONS
+from jaxdn.clips.import_exr import detect_channels as detect_channels
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("training_batches", "find_clips"):
+        return getattr(importlib.import_module("jaxdn.clips.dataset"), name)
+    raise AttributeError(f"module 'jaxdn.clips' has no attribute {name!r}")

@@ -1,8 +1,8 @@
 """One OpenEXR file: named 2-D channels in, named 2-D channels out.
 
 The Python bindings accept much that they then write or read wrongly, so all traffic goes through here: they write
-non-contiguous arrays scrambled, turn ``[H, W, 1]`` into R, G, B, overflow float16 to infinity, do not notice a full disk
-while a file is small, and announce a truncated file with a printed warning instead of an error.
+non-contiguous arrays scrambled, turn ``[H, W, 1]`` into R, G, B, overflow float16 to infinity, do not notice that the
+disk is full while a file is small, and announce a truncated file with a printed warning instead of an error.
 """
 
 import errno
@@ -46,8 +46,8 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
         try:
             OpenEXR.File(header, dict(prepared)).write(str(beside))  # the dict is changed by the call
         except RuntimeError as error:
-            full = "No space left" in str(error)
-            raise OSError(errno.ENOSPC if full else errno.EIO, f"could not write the frame ({error})", str(path)) from error
+            code = errno.ENOSPC if "No space left" in str(error) else errno.EIO
+            raise OSError(code, f"could not write the frame ({error})", str(path)) from error
         # A disk that fills up within the last buffer goes unnoticed by the writer: look at what is really there.
         try:
             found = read_exr(beside)

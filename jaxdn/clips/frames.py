@@ -1,8 +1,8 @@
 """One frame of a clip as one multi-layer OpenEXR file that any viewer opens.
 
 Noisy radiance is stored as *independent* layers of 1, 2, 4, ... samples a pixel, so that one rendering gives every
-sample count up to their sum: ``n`` samples are ``sum(2^k * layer_k) / n`` over the bits of ``n`` (Hasselgren et al. 2020,
-sec. 2.2). A buffer that is ``None`` has no channels in the file, and comes back as ``None``.
+sample count up to their sum: ``n`` samples are ``sum(2^k * layer_k) / n`` over the bits of ``n`` (Hasselgren et al.
+2020, sec. 2.2). A buffer that is ``None`` has no channels in the file, and comes back as ``None``.
 """
 
 from collections.abc import Iterable, Mapping
@@ -45,6 +45,9 @@ class StoredFrame(NamedTuple):
     """What :func:`read_frame` finds: numpy arrays, float32 but for ``ids`` (int32) and ``visible`` (bool)."""
 
     frame: Frame
+    """Its radiance has the number of samples that was asked for."""
+    layers: dict[int, np.ndarray]
+    """Every independent noisy image [H, W, 3] by its number of samples."""
     reference: np.ndarray | None
     """[H, W, 3] the converged radiance."""
     reference_half: np.ndarray | None
@@ -61,7 +64,7 @@ def write_frame(
 ) -> None:
     """Write one frame, whole or not at all.
 
-    ``layers`` maps numbers of samples (powers of two) to independent noisy images [H, W, 3]; ``frame.radiance`` is
+    ``layers`` maps numbers of samples (1, 2, 4, ...) to independent noisy images [H, W, 3]; ``frame.radiance`` is
     not stored then. Without ``layers``, ``frame.radiance`` becomes the layer of one sample. Light, albedo, normals and
     roughness are stored in half precision (finite values beyond 65504 are clamped; NaN and infinities are kept), depths
     and motion vectors in single precision. Raises ValueError for shapes that do not fit each other, OSError if the file
@@ -70,8 +73,8 @@ def write_frame(
     layers = {1: frame.radiance} if layers is None else layers
     if not layers:
         raise ValueError(f"{path}: expected at least one noisy layer, got none.")
-    for samples in layers:
-        _check_layer(path, samples)
+    if any(isinstance(samples, bool) or not isinstance(samples, int) or samples < 1 for samples in layers):
+        raise ValueError(f"{path}: layers: expected whole numbers of samples, got {list(layers)}.")
     images = {f"noisy_{samples}spp": (image, _LIGHT) for samples, image in sorted(layers.items())}
     images |= {"reference": (reference, _LIGHT), "reference_half": (reference_half, _LIGHT)}
     images |= {name: (getattr(frame, name), layout) for name, layout in LAYOUT.items()}
@@ -89,19 +92,19 @@ def write_frame(
     write_exr(path, channels)
 
 
-def read_frame(path: str | Path, *, spp: int = 1, layers: Iterable[int] | None = None) -> StoredFrame:
+def read_frame(path: str | Path, *, spp: int = 1) -> StoredFrame:
     """Read one frame with ``spp`` samples a pixel of noise.
 
-    ``layers`` are the layers to combine (default: those in the file). Raises ClipError, naming the file and the reason,
-    if it is unreadable, a channel is missing, or ``spp`` cannot be made of the layers.
+    Raises ClipError, naming the file and the reason, if it is unreadable, a channel is missing, or ``spp`` cannot be
+    made of the layers.
     """
     channels = read_exr(path)
-    available = stored_layers(channels) if layers is None else sorted(layers)
-    chosen = layers_for(spp, available, path)
-    total = sum(samples * _required(path, channels, f"noisy_{samples}spp", _LIGHT) for samples in chosen)
+    layers = {n: _required(path, channels, f"noisy_{n}spp", _LIGHT) for n in stored_layers(channels)}
+    chosen = layers_for(spp, layers, path)
     buffers = {name: _optional(path, channels, name, layout) for name, layout in LAYOUT.items()}
     return StoredFrame(
-        Frame(radiance=np.asarray(total / np.float32(spp), np.float32), **buffers),  # type: ignore[arg-type]
+        Frame(radiance=combine({n: layers[n] for n in chosen}), **buffers),  # type: ignore[arg-type]
+        layers,
         _optional(path, channels, "reference", _LIGHT),
         _optional(path, channels, "reference_half", _LIGHT),
     )
@@ -118,24 +121,33 @@ def stored_layers(channels: Iterable[str]) -> list[int]:
     return sorted(found)
 
 
+def combine(layers: Mapping[int, np.ndarray]) -> np.ndarray:
+    """The float32 mean of independent images, each weighted with its number of samples."""
+    if len(layers) == 1:
+        return np.asarray(next(iter(layers.values())), np.float32)
+    with np.errstate(invalid="ignore"):  # Inf - Inf: what is broken in a layer stays visible in the sum
+        total = sum(np.float32(samples) * image.astype(np.float32) for samples, image in layers.items())
+        return np.asarray(total / np.float32(sum(layers)), np.float32)
+
+
 def layers_for(spp: int, available: Iterable[int], where: str | Path) -> list[int]:
-    """The layers whose samples add up to ``spp`` (its bits). Raises ClipError if one of them is not available."""
+    """The layers whose samples add up to ``spp``: its bits, or a layer of just that many.
+
+    Raises ClipError, saying what there is, if ``spp`` cannot be had.
+    """
     available = sorted(available)
     if isinstance(spp, bool) or not isinstance(spp, int) or spp < 1:
         raise ClipError(f"{where}: spp: expected a whole number of at least 1, got {spp!r}.")
     chosen = [1 << bit for bit in range(spp.bit_length()) if spp >> bit & 1]
+    if not set(chosen) <= set(available) and spp in available:
+        return [spp]
     if not set(chosen) <= set(available):
         layers = ", ".join(map(str, available)) or "none"
         raise ClipError(
-            f"{where}: {spp} samples a pixel are not available; there are independent layers of {layers} "
-            "samples, and any sum of different ones can be asked for."
+            f"{where}: {spp} samples a pixel are not available; there are independent layers of {layers} samples a "
+            "pixel: ask for one of these or, of powers of two, for their sums."
         )
     return chosen
-
-
-def _check_layer(path: str | Path, samples: int) -> None:
-    if isinstance(samples, bool) or not isinstance(samples, int) or samples < 1 or samples & (samples - 1):
-        raise ValueError(f"{path}: layers: expected powers of two as numbers of samples, got {samples!r}.")
 
 
 def _encode(where: str, image: np.ndarray, kind: str) -> np.ndarray:

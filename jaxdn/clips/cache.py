@@ -1,0 +1,166 @@
+"""Clips as memory maps: what training reads instead of decoding EXR files for every crop.
+
+``<folder>/.cache/<clip>.<stamp>/`` holds one ``.npy`` file per buffer of a clip, in the precision it has in the EXR
+files. The stamp is made of the names, sizes and times of those files, so that a clip that changes gets a new cache; the
+cache may be deleted at any time.
+"""
+
+import glob
+import hashlib
+import os
+import shutil
+import tempfile
+import warnings
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxdn.clips.exr import to_half
+from jaxdn.clips.files import ClipError, read_json, write_json
+from jaxdn.clips.folder import frame_path, read_frames, read_record
+from jaxdn.clips.frames import LAYOUT, StoredFrame, combine, layers_for
+from jaxdn.frame import Clip, Frame
+
+_VERSION = 1  # of what the cache holds; another number leaves old caches behind
+_SINGLE = ("motion", "dual_motion", "depth", "previous_depth")
+
+
+class CachedClip(NamedTuple):
+    """One clip, ready for random access; files are opened by :func:`read_window` and not before.
+
+    A memory map holds a file handle for as long as it lives, and a few hundred clips of a dozen buffers would need more
+    of them than a process may have.
+    """
+
+    path: Path
+    """The clip's own folder."""
+    home: Path
+    """Its cache."""
+    shape: tuple[int, int, int]
+    """Frames, height, width."""
+    arrays: frozenset[str]
+    """What is stored: names of buffers, ``reference`` and ``noisy_<n>spp``."""
+    layers: tuple[int, ...]
+    """The sample counts of the noisy layers."""
+
+    @property
+    def buffers(self) -> frozenset[str]:
+        """Names of the Frame buffers that there are, but for ``radiance``."""
+        return self.arrays & frozenset(LAYOUT)
+
+
+def open_cached(path: str | Path, *, cache: str | Path | None = None) -> CachedClip:
+    """Open a clip through its cache (default ``.cache`` beside the clip's folder), making the cache first if need be.
+
+    Reference values that are not finite or negative are 0 in the cache, and a UserWarning names the clip and how many
+    there are; noisy images stay as they are, as denoisers repair their own input. Raises ClipError as
+    :func:`jaxdn.clips.read_clip` does, and OSError if the cache cannot be written.
+    """
+    path = Path(path)
+    record = read_record(path)
+    root = path.parent / ".cache" if cache is None else Path(cache)
+    home = root / f"{path.name}.{_stamp(path, record['frames'])}"
+    if not home.is_dir():
+        _build(path, home)
+        _forget(root, path.name, home)
+    facts = read_json(home / "facts.json")
+    if facts["bad_reference_values"]:
+        warnings.warn(
+            f"{path}: {facts['bad_reference_values']} values of the reference are not finite or negative; "
+            "they are taken as 0.",
+            stacklevel=2,
+        )
+    shape = (record["frames"], record["height"], record["width"])
+    return CachedClip(path, home, shape, frozenset(facts["arrays"]), tuple(facts["layers"]))
+
+
+def read_window(
+    clip: CachedClip,
+    window: tuple[slice, ...],
+    *,
+    spp: int = 1,
+    buffers: Collection[str] | None = None,
+) -> Clip:
+    """The part ``window`` (frames, rows, columns) of a clip as a Clip of plain arrays with ``spp`` samples a pixel.
+
+    Floating-point buffers come out in float32, ids in int32, ``visible`` as bool. ``buffers`` names
+    the ones to read (default: all there are).
+    """
+    wanted = clip.buffers if buffers is None else clip.buffers & set(buffers)
+
+    def read(name: str) -> np.ndarray:
+        part = np.load(clip.home / f"{name}.npy", mmap_mode="r", allow_pickle=False)[window]
+        return np.array(part, np.float32 if np.issubdtype(part.dtype, np.floating) else part.dtype)
+
+    chosen = layers_for(spp, clip.layers, clip.path)
+    radiance = combine({samples: read(f"noisy_{samples}spp") for samples in chosen})
+    frames = Frame(radiance=radiance, **{name: read(name) for name in wanted})  # type: ignore[arg-type]
+    return Clip(frames, read("reference") if "reference" in clip.arrays else None)  # type: ignore[arg-type]
+
+
+def _stamp(path: Path, count: int) -> str:
+    digest = hashlib.sha256(f"{_VERSION}".encode())
+    for file in (path / "clip.json", *(frame_path(path, index) for index in range(count))):
+        try:
+            facts = file.stat()
+        except OSError as error:
+            raise ClipError(f"{file}: {error.strerror}; render the frame again.") from error
+        digest.update(f"{file.name} {facts.st_size} {facts.st_mtime_ns}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+def _build(path: Path, home: Path) -> None:
+    home.parent.mkdir(parents=True, exist_ok=True)
+    beside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=home.parent))
+    try:
+        facts = _fill(path, beside)
+        write_json(beside / "facts.json", facts)
+        try:
+            os.rename(beside, home)
+        except OSError:
+            if not home.is_dir():  # otherwise another process made the same cache meanwhile
+                raise
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def _fill(path: Path, folder: Path) -> dict[str, object]:
+    record = read_record(path)
+    maps: dict[str, np.memmap] = {}
+    bad, layers = 0, []
+    for index, stored in enumerate(read_frames(path, spp=record["layers"][0])):
+        layers = sorted(stored.layers)
+        for name, image in _images(stored):
+            if name == "reference":
+                wrong = ~(np.isfinite(image) & (image >= 0))
+                bad += int(wrong.sum())
+                image = np.where(wrong, np.float32(0), image)
+            if image.dtype == np.float32 and name not in _SINGLE:
+                image = to_half(image)
+            if name not in maps:
+                shape = (record["frames"], *image.shape)
+                maps[name] = np.lib.format.open_memmap(folder / f"{name}.npy", "w+", image.dtype, shape)
+            maps[name][index] = image
+    for array in maps.values():
+        array.flush()
+    return {"arrays": sorted(maps), "layers": layers, "bad_reference_values": bad}
+
+
+def _images(stored: StoredFrame) -> Iterator[tuple[str, np.ndarray]]:
+    for samples, image in stored.layers.items():
+        yield f"noisy_{samples}spp", image
+    for name in LAYOUT:
+        buffer = getattr(stored.frame, name)
+        if buffer is not None:
+            yield name, np.asarray(buffer)
+    if stored.reference is not None:
+        yield "reference", stored.reference
+
+
+def _forget(root: Path, name: str, home: Path) -> None:
+    """Remove this clip's caches of earlier stamps; maps that other processes hold open stay valid for them."""
+    for old in root.glob(f"{glob.escape(name)}.*"):
+        if old != home and old.suffix[1:].isalnum() and len(old.suffix) == 17:
+            shutil.rmtree(old, ignore_errors=True)

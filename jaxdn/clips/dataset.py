@@ -1,0 +1,135 @@
+"""Training data: an endless, shuffled, augmented, resumable stream of batches from a folder of clips.
+
+Every element is one clip's random window of consecutive frames, one random crop of it (the same over all its frames, so
+that history stays meaningful) under one of the eight symmetries of a square. What comes is decided by ``seed`` and the
+position in the stream alone: two streams with the same arguments are equal, and one restored from
+``get_state()`` goes on exactly where the other was.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import grain
+import jax
+import numpy as np
+
+from jaxdn.clips.augment import transform_clip
+from jaxdn.clips.cache import CachedClip, open_cached, read_window
+from jaxdn.clips.files import ClipError
+from jaxdn.clips.folder import is_clip
+from jaxdn.clips.frames import layers_for
+from jaxdn.frame import Clip
+
+
+def find_clips(path: str | Path) -> list[Path]:
+    """The finished clips in a folder (or the folder itself if it is one), by name. Raises ClipError for none."""
+    folder = Path(path)
+    if not folder.is_dir():
+        raise ClipError(f"{folder}: there is no such folder.")
+    found = [folder] if is_clip(folder) else sorted(sub for sub in folder.iterdir() if is_clip(sub))
+    if not found:
+        raise ClipError(f"{folder}: expected a clip (a folder with clip.json) or a folder of clips, found none.")
+    return found
+
+
+def training_batches(
+    clips: str | Path | Sequence[str | Path],
+    *,
+    batch: int,
+    crop: int | tuple[int, int],
+    frames: int = 10,
+    seed: int,
+    spp: int | Sequence[int] = 1,
+    buffers: Sequence[str] | frozenset[str] | None = None,
+    augment: bool = True,
+    threads: int = 1,
+) -> grain.DatasetIterator[Clip]:
+    """An endless iterator over batches: a Clip of numpy arrays ``[B, T, H, W, C]``, reference included.
+
+    Args:
+      clips: a folder of clips, one clip, or a list of either.
+      batch: elements of a batch.
+      crop: side of the square crop, or (height, width), in pixels.
+      frames: consecutive frames of each element.
+      seed: decides the order, windows, crops and symmetries; from 0 to 2^32 - 1.
+      spp: samples a pixel of the noisy radiance; of several numbers, each element takes one at random.
+      buffers: Frame buffers to read, usually ``denoiser.reads`` (default: all that the clips have).
+      augment: flips and quarter turns (no odd turns for a crop that is not square).
+      threads: batches made ahead, each by its own thread; 0 makes them when asked for.
+
+    Its ``get_state()`` is a small dict for a checkpoint, to be given to ``set_state`` of an equal iterator.
+
+    Raises ClipError, naming the clip, for clips that are broken, shorter than ``frames``, smaller than ``crop``,
+    without reference or ``spp``, or that do not all have the same buffers. Warns, naming the clip, of a reference with
+    values that are not finite or negative.
+    """
+    height, width = (crop, crop) if isinstance(crop, int) else crop
+    for name, value in (("batch", batch), ("crop", height), ("crop", width), ("frames", frames)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise ValueError(f"{name}: expected a whole number of at least 1, got {value!r}.")
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"seed: expected 0 to 2^32 - 1, got {seed}.")
+    counts = (spp,) if isinstance(spp, int) else tuple(spp)
+    if not counts:
+        raise ValueError("spp: expected at least one number of samples, got none.")
+    folders = [clips] if isinstance(clips, str | Path) else clips
+    sources = [open_cached(path) for folder in folders for path in find_clips(folder)]
+    if not sources:
+        raise ClipError("clips: expected at least one folder, got none.")
+    for source in sources:
+        _check(source, (frames, height, width), counts)
+    names = _common_buffers(sources, buffers)
+
+    def element(index: int, rng: np.random.Generator) -> Clip:
+        source = sources[index]
+        starts = [int(rng.integers(0, has - wants + 1)) for has, wants in zip(source.shape, sizes, strict=True)]
+        window = tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))
+        samples = counts[int(rng.integers(len(counts)))]
+        clip = read_window(source, window, spp=samples, buffers=names)
+        if not augment:
+            return clip
+        turns = int(rng.integers(4)) if height == width else 2 * int(rng.integers(2))
+        return transform_clip(clip, flip=bool(rng.integers(2)), turns=turns)
+
+    sizes = (frames, height, width)
+    # A clip of 30 frames is worth three of 10: the same number of frames is seen of every clip in proportion.
+    indices = [index for index, source in enumerate(sources) for _ in range(source.shape[0] // frames)]
+    # `repeat` before `random_map`: its generator is seeded by the position in the endless stream.
+    stream = grain.MapDataset.source(indices).seed(seed).shuffle().repeat(None).random_map(element)
+    batches = stream.batch(batch, batch_fn=_stack)
+    # Grain's own default is to keep 500 elements ready, which are batches here.
+    options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=threads)
+    return iter(batches.to_iter_dataset(options))
+
+
+def _stack(clips: Sequence[Clip]) -> Clip:
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *clips)
+
+
+def _check(clip: CachedClip, sizes: tuple[int, int, int], counts: Sequence[int]) -> None:
+    if clip.shape[0] < sizes[0]:
+        raise ClipError(f"{clip.path}: expected at least {sizes[0]} frames, got {clip.shape[0]}; ask for fewer frames.")
+    if clip.shape[1] < sizes[1] or clip.shape[2] < sizes[2]:
+        raise ClipError(
+            f"{clip.path}: expected at least {sizes[2]} x {sizes[1]} pixels for the crop, got {clip.shape[2]} x "
+            f"{clip.shape[1]}; make the crop smaller."
+        )
+    if "reference" not in clip.arrays:
+        raise ClipError(f"{clip.path}: there is no reference to train towards; render the clip with one.")
+    for count in counts:
+        layers_for(count, clip.layers, clip.path)
+
+
+def _common_buffers(clips: Sequence[CachedClip], wanted: Sequence[str] | frozenset[str] | None) -> frozenset[str]:
+    def offered(clip: CachedClip) -> frozenset[str]:
+        return clip.buffers if wanted is None else clip.buffers & frozenset(wanted)
+
+    first = offered(clips[0])
+    for clip in clips:
+        if offered(clip) != first:
+            differing = ", ".join(sorted(offered(clip) ^ first))
+            raise ClipError(
+                f"{clip.path}: expected the same buffers as in {clips[0].path}, but {differing} differs; "
+                "name the ones to read in `buffers`, or leave one of the clips out."
+            )
+    return first

@@ -1,0 +1,170 @@
+"""A clip as a folder: ``clip.json`` and ``frame_0000.exr``, ``frame_0001.exr`` ... beside it.
+
+``clip.json`` is the clip's record: how it was made and what it holds. It is written last, so a folder without one is
+unfinished, never a clip.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxdn.clips.exr import read_exr
+from jaxdn.clips.files import ClipError, read_json, write_json
+from jaxdn.clips.frames import StoredFrame, layers_for, read_frame, stored_layers, write_frame
+from jaxdn.clips.import_exr import read_plain_frames
+from jaxdn.frame import Clip, Frame, frame_at
+
+FORMAT = 1
+"""The version of the layout that this code writes and reads."""
+
+_RECORD = "clip.json"
+
+
+def frame_path(folder: str | Path, index: int) -> Path:
+    """Where frame ``index`` of a clip lies."""
+    return Path(folder) / f"frame_{index:04d}.exr"
+
+
+def is_clip(path: str | Path) -> bool:
+    """Whether ``path`` is a folder with a finished clip in it."""
+    return (Path(path) / _RECORD).is_file()
+
+
+def write_clip(clip: Clip, path: str | Path, *, record: Mapping[str, Any] | None = None, spp: int = 1) -> None:
+    """Write a clip into the folder ``path``, which is made if need be; a clip that is there already is replaced.
+
+    The clip's radiance becomes its one noisy layer of ``spp`` samples a pixel. ``record`` is stored as ``clip.json``
+    with the entries that the frames decide (format, frames, width, height, layers) filled in. Light, albedo, normals
+    and roughness keep half precision. Raises ValueError for shapes that do not fit each other, ClipError for a record
+    that is no JSON, OSError if the disk refuses.
+    """
+    folder = Path(path)
+    if np.ndim(clip.frames.radiance) != 4:
+        raise ValueError(f"{folder}: expected radiance [T, H, W, 3], got shape {np.shape(clip.frames.radiance)}.")
+    clip = jax.tree.map(np.asarray, clip)
+    count, height, width = clip.frames.radiance.shape[:3]
+    lengths = {np.shape(leaf)[0] for leaf in jax.tree.leaves(clip)}
+    if lengths != {count}:
+        raise ValueError(f"{folder}: expected {count} frames in every buffer, got {sorted(lengths)}.")
+    facts = {"format": FORMAT, "frames": count, "width": width, "height": height, "layers": [spp]}
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / _RECORD).unlink(missing_ok=True)
+    for index in range(count):
+        frame = frame_at(clip.frames, index)
+        reference = None if clip.reference is None else clip.reference[index]
+        write_frame(frame_path(folder, index), frame, layers={spp: frame.radiance}, reference=reference)
+    for stale in folder.glob("frame_*.exr"):
+        if stale.stem[6:].isdecimal() and int(stale.stem[6:]) >= count:
+            stale.unlink()
+    write_record({"name": folder.name, **(record or {}), **facts}, folder)
+
+
+def write_record(record: Mapping[str, Any], path: str | Path) -> None:
+    """Write ``clip.json`` of the clip folder ``path``. Raises ClipError if an entry is missing or is no JSON."""
+    file = Path(path) / _RECORD
+    write_json(file, _checked({"format": FORMAT, **record}, file))
+
+
+def read_record(path: str | Path) -> dict[str, Any]:
+    """The record of the clip in folder ``path``. Raises ClipError if it is missing, broken or of another version."""
+    folder = Path(path)
+    if not folder.is_dir():
+        raise ClipError(f"{folder}: there is no such folder.")
+    if not is_clip(folder):
+        raise ClipError(f"{folder}: there is no {_RECORD} in it; the clip was not finished. Render it again.")
+    return _checked(read_json(folder / _RECORD), folder / _RECORD)
+
+
+def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
+    """The frames of a clip one by one, for clips that do not fit into memory. Raises as :func:`read_clip` does."""
+    folder = Path(path)
+    record = read_record(folder)
+    layers_for(spp, record["layers"], folder)
+    count, size = record["frames"], (record["height"], record["width"])
+    missing = [index for index in range(count) if not frame_path(folder, index).is_file()]
+    if missing:
+        shown = ", ".join(map(str, missing[:8])) + (" ..." if len(missing) > 8 else "")
+        raise ClipError(f"{folder}: {len(missing)} of {count} frames are missing ({shown}); render them again.")
+
+    def frames() -> Iterator[StoredFrame]:
+        first: tuple[str, ...] | None = None
+        for index in range(count):
+            file = frame_path(folder, index)
+            stored = read_frame(file, spp=spp)
+            found = stored.frame.radiance.shape[:2]
+            if found != size:
+                raise ClipError(
+                    f"{file}: expected {size[1]} x {size[0]} pixels as {_RECORD} says, got {found[1]} x {found[0]}."
+                )
+            names = _present(stored)
+            first = names if first is None else first
+            if names != first:
+                differing = ", ".join(sorted(set(names) ^ set(first)))
+                raise ClipError(f"{file}: expected the same channels as in frame 0, but {differing} differs.")
+            yield stored
+
+    return frames()
+
+
+def read_clip(
+    path: str | Path,
+    *,
+    spp: int = 1,
+    motion_convention: str | None = None,
+    layers: Mapping[str, str] | None = None,
+) -> Clip:
+    """Read a clip as numpy arrays, float32 but for ``ids`` (int32) and ``visible`` (bool).
+
+    ``path`` is the folder of a clip, of which ``spp`` samples a pixel are read; or a folder of, or a glob pattern for,
+    the EXR files of another renderer, whose channels are found by their names (``motion_convention`` and ``layers``:
+    see :func:`jaxdn.clips.import_exr.read_plain_frames`).
+
+    Raises ClipError, naming the file and the reason: no such folder, no ``clip.json``, another format version, missing
+    or unreadable frames, missing channels, frames that differ in size or channels, or ``spp`` not available.
+    """
+    frames: Sequence[Frame]
+    references: Sequence[np.ndarray | None]
+    if is_clip(path):
+        stored = [(one.frame, one.reference) for one in read_frames(path, spp=spp)]
+        frames, references = zip(*stored, strict=True)
+    elif _unfinished(path):
+        raise ClipError(f"{path}: there is no {_RECORD} in it; the clip was not finished. Render it again.")
+    elif spp != 1:
+        raise ClipError(f"{path}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
+    else:
+        frames = read_plain_frames(path, motion_convention=motion_convention, layers=layers)
+        references = [None] * len(frames)
+    known = [reference for reference in references if reference is not None]
+    stack = jax.tree.map(lambda *buffers: np.stack(buffers), *frames)
+    return Clip(stack, np.stack(known) if known else None)  # type: ignore[arg-type]
+
+
+def _unfinished(path: str | Path) -> bool:
+    first = frame_path(path, 0)
+    return first.is_file() and bool(stored_layers(read_exr(first)))
+
+
+def _present(stored: StoredFrame) -> tuple[str, ...]:
+    buffers = [name for name, buffer in stored.frame._asdict().items() if buffer is not None]
+    light = [f"noisy_{samples}spp" for samples in stored.layers]
+    return (*buffers, *light, *(["reference"] if stored.reference is not None else []))
+
+
+def _checked(record: Any, file: Path) -> dict[str, Any]:
+    if not isinstance(record, dict):
+        raise ClipError(f"{file}: expected a JSON object, got {type(record).__name__}.")
+    if record.get("format") != FORMAT:
+        raise ClipError(
+            f"{file}: expected format {FORMAT}, got {record.get('format')!r}; this clip was written by another version."
+        )
+    for name in ("frames", "width", "height"):
+        value = record.get(name)
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise ClipError(f"{file}: {name}: expected a whole number of at least 1, got {value!r}.")
+    layers = record.get("layers")
+    if not isinstance(layers, list) or not layers or not all(type(n) is int and n > 0 for n in layers):
+        raise ClipError(f"{file}: layers: expected a list of sample counts such as [1, 2, 4], got {layers!r}.")
+    return record
