@@ -27,9 +27,7 @@ def _integrator(max_depth: int) -> Any:
     return mi.load_dict({"type": "aov", "aovs": "nothing:shape_index", **nested})
 
 
-def accumulate(
-    scene: Any, *, seed: int, frame: int, stream: int, first: int, count: int, max_depth: int
-) -> Light:
+def accumulate(scene: Any, *, seed: int, frame: int, stream: int, first: int, count: int, max_depth: int) -> Light:
     """The sums of the passes ``first`` to ``first + count`` of one stream; see :func:`wavefront.accumulate`."""
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     integrator = _integrator(max_depth)

@@ -35,7 +35,7 @@ class Motion(NamedTuple):
     motion: np.ndarray
     """[H, W, 2] float64 px, previous minus current; NaN where the point was behind the previous camera."""
     forward_motion: np.ndarray
-    """[H, W, 2] float64 px, for the previous frame's pixels: how far what they show has moved, current minus previous."""
+    """[H, W, 2] float64 px, of the previous frame's pixels: how far what they show has moved, now minus then."""
     visible: np.ndarray
     """[H, W, 1] bool, the point was seen in the previous frame."""
     previous_depth: np.ndarray
@@ -46,8 +46,8 @@ def project(points: np.ndarray, camera: Camera, size: tuple[int, int]) -> tuple[
     """World points [..., 3], or homogeneous [..., 4], to pixels [..., 2] and view-space z [..., 1].
 
     A homogeneous coordinate of 0 makes a direction at infinity. Mitsuba's camera looks along +z with +x to the left:
-    ``u = 1/2 - cot(fov/2)/2 x/z``, ``v = 1/2 - (W/H) cot(fov/2)/2 y/z``. Pixels are NaN where z <= 1e-6, which is behind
-    the camera. ``size`` is (height, width).
+    ``u = 1/2 - cot(fov/2)/2 x/z``, ``v = 1/2 - (W/H) cot(fov/2)/2 y/z``. Pixels are NaN where z <= 1e-6, behind the
+    camera. ``size`` is (height, width).
     """
     height, width = size
     inverse = np.linalg.inv(np.asarray(camera.to_world, np.float64))
@@ -63,7 +63,9 @@ def project(points: np.ndarray, camera: Camera, size: tuple[int, int]) -> tuple[
     return offset + np.array([width / 2, height / 2]), z
 
 
-def relative_poses(names: tuple[str, ...], start: Mapping[str, np.ndarray], end: Mapping[str, np.ndarray]) -> np.ndarray:
+def relative_poses(
+    names: tuple[str, ...], start: Mapping[str, np.ndarray], end: Mapping[str, np.ndarray]
+) -> np.ndarray:
     """[N + 1, 4, 4] motions that carry a point of each shape from pose ``start`` to pose ``end``.
 
     Exactly the identity for a shape whose pose is the same or absent, and, as the last entry (id -1), for the sky.
@@ -112,12 +114,13 @@ def motion_between(current: View, previous: View) -> Motion:
     lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
     normals = normals / np.where(lengths > 0, lengths, 1.0)
     sky = now.ids < 0
-    # From the pixel itself, not from the projected position: the vector is what the denoiser will follow.
-    landing = np.stack(np.meshgrid(np.arange(size[1]), np.arange(size[0])), axis=-1) + 0.5 + motion
+    # In float32 and from the pixel itself: the pixel looked up must be the one that the stored vector leads to.
+    pixels = np.stack(np.meshgrid(np.arange(size[1]), np.arange(size[0])), axis=-1).astype(np.float32)
+    landing = pixels + motion.astype(np.float32) + np.float32(0.5)
     seen, nearest = _matches(now, before, np.floor(landing), old_points, normals, z)
     on_sky = (nearest == -1) & ~sky
     for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        tap, _ = _matches(now, before, np.floor(landing - 0.5) + corner, old_points, normals, z)
+        tap, _ = _matches(now, before, np.floor(landing - np.float32(0.5)) + corner, old_points, normals, z)
         seen |= on_sky & tap
     return Motion(motion, forward, seen, np.where(sky, FAR, np.maximum(z, 0.0)).astype(np.float32))
 
@@ -139,7 +142,7 @@ def _homogeneous(gbuffer: GBuffer) -> np.ndarray:
 def _matches(
     now: GBuffer, before: GBuffer, tap: np.ndarray, points: np.ndarray, normals: np.ndarray, z: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the previous frame's pixel ``tap`` (column, row) shows the same point, and which id it shows (-2: none)."""
+    """Whether the previous frame's pixel ``tap`` (column, row) shows the same point, and the id it shows (-2: none)."""
     height, width = before.ids.shape[:2]
     with np.errstate(invalid="ignore"):
         inside = (tap >= 0) & (tap <= [width - 1, height - 1])

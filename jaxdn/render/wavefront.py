@@ -105,7 +105,9 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
     return emitted, direct, indirect
 
 
-def _chunk(scene: Any, first_pixel: int, pixels: int, first: int, count: int, key: tuple[int, int], depth: int) -> Light:
+def _chunk(
+    scene: Any, first_pixel: int, pixels: int, first: int, count: int, key: tuple[int, int], depth: int
+) -> Light:
     """The sums of ``count`` samples of a run of pixels, flat [pixels, 3]."""
     sensor = scene.sensors()[0]
     width = dr.opaque(mi.UInt32, int(sensor.film().crop_size()[0]))
@@ -129,9 +131,17 @@ def _chunk(scene: Any, first_pixel: int, pixels: int, first: int, count: int, ke
 
 
 def accumulate(
-    scene: Any, *, seed: int, frame: int, stream: int, first: int, count: int, max_depth: int, max_lanes: int = MAX_LANES
+    scene: Any,
+    *,
+    seed: int,
+    frame: int,
+    stream: int,
+    first: int,
+    count: int,
+    max_depth: int,
+    max_lanes: int = MAX_LANES,
 ) -> Light:
-    """The sums of the samples ``first`` to ``first + count`` of one stream over the film of the scene's first sensor."""
+    """The sums of the samples ``first`` to ``first + count`` of one stream over the scene's film."""
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     key = frame_key(seed, frame, stream)
     pixels = min(width * height, max_lanes)

@@ -1,0 +1,296 @@
+"""Render one frame, or a whole clip into a folder of OpenEXR frames, restartable at any point."""
+
+import importlib.metadata
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdn.clips import ClipError, read_frame, write_frame
+from jaxdn.clips.files import read_json, write_json
+from jaxdn.frame import Frame
+from jaxdn.motion import dual_motion
+from jaxdn.render.gbuffer import check_scene, gbuffer
+from jaxdn.render.geometry import View, motion_between
+from jaxdn.render.scene import AnimatedScene
+from jaxdn.render.seeds import NOISY, REFERENCE
+from jaxdn.render.variant import use_variant
+from jaxdn.render.wavefront import Light
+
+FORMAT = 1
+_FREE = ("frames", "cameras", "versions", "bad_samples")
+"""Entries of a record that may change when rendering goes on."""
+
+
+class RenderError(RuntimeError):
+    """A frame that could not be rendered; the message names the clip, the frame and the reason."""
+
+
+class Rendered(NamedTuple):
+    """One frame with everything a clip stores of it; NumPy arrays."""
+
+    frame: Frame
+    """``radiance`` is the noisy layer with the fewest samples."""
+    layers: dict[int, np.ndarray]
+    """Samples per pixel -> [H, W, 3] independent noisy indirect radiance."""
+    reference: np.ndarray | None
+    """[H, W, 3] converged indirect radiance, of samples that no noisy layer contains."""
+    reference_half: np.ndarray | None
+    """[H, W, 3] the same of the first half of its samples."""
+    view: View
+    """What the next frame's motion vectors need."""
+    bad_samples: int
+    """Samples that were not finite and count as black."""
+
+
+def render_frame(
+    scene: AnimatedScene,
+    frame: int,
+    *,
+    width: int,
+    height: int,
+    layers: Sequence[int] = (1,),
+    reference_spp: int = 0,
+    max_depth: int | None = None,
+    seed: int = 0,
+    variant: str | None = None,
+    previous: View | None = None,
+) -> Rendered:
+    """Render one frame of an animated scene: noisy layers, a reference, G-buffers and motion vectors.
+
+    ``layers`` are numbers of samples, powers of two. ``direct`` and ``emission`` are means over the reference's
+    samples, or over the noisy ones if ``reference_spp`` is 0. ``previous`` is the ``view`` of the frame before,
+    computed if it is not given; frame 0 has none, and its motion is 0. The result depends on nothing but the
+    arguments: the same frame rendered again, alone or in another process, is the same bit for bit.
+    Raises ValueError for options out of range and scenes with effects that are not supported.
+    """
+    _check_options(width, height, layers, reference_spp)
+    accumulate, _ = _tracer(use_variant(variant))
+    depth = scene.max_depth if max_depth is None else max_depth
+    if depth < 1:
+        raise ValueError(f"max_depth: expected at least 1 (emission only), got {depth}.")
+    if previous is None and frame > 0:
+        previous = _view(scene, frame - 1, scene.build(frame - 1, width, height))
+    built = scene.build(frame, width, height)
+    check_scene(built)
+    view = _view(scene, frame, built)
+
+    def light(stream: int, first: int, count: int) -> Light:
+        return accumulate(built, seed=seed, frame=frame, stream=stream, first=first, count=count, max_depth=depth)
+
+    # Layer n always holds the samples n-1 ... 2n-2: the same image whichever other layers are asked for.
+    noisy = {samples: light(NOISY, samples - 1, samples) for samples in sorted(layers)}
+    halves = []
+    if reference_spp:
+        first_half = (reference_spp + 1) // 2
+        halves = [light(REFERENCE, 0, first_half), light(REFERENCE, first_half, reference_spp - first_half)]
+    sums = halves or list(noisy.values())
+    total = sums[0]
+    for part in sums[1:]:
+        total = total + part
+    samples = reference_spp or sum(layers)
+
+    images = {count: _single(part.indirect / count) for count, part in noisy.items()}
+    moved = _motion(view, previous)
+    return Rendered(
+        frame=Frame(
+            radiance=images[min(images)],
+            albedo=view.gbuffer.albedo,
+            normal=view.gbuffer.normal,
+            depth=view.gbuffer.depth,
+            roughness=view.gbuffer.roughness,
+            ids=view.gbuffer.ids,
+            direct=_single(total.direct / samples),
+            emission=_single(total.emitted / samples),
+            **moved,
+        ),
+        layers=images,
+        reference=_single(total.indirect / samples) if halves else None,
+        reference_half=_single(halves[0].indirect / ((reference_spp + 1) // 2)) if halves else None,
+        view=view,
+        bad_samples=sum(part.bad for part in (*noisy.values(), *halves)),
+    )
+
+
+def render_clip(
+    scene: AnimatedScene,
+    folder: str | Path,
+    *,
+    width: int,
+    height: int,
+    frames: int | None = None,
+    layers: Sequence[int] = (1,),
+    reference_spp: int = 0,
+    max_depth: int | None = None,
+    seed: int = 0,
+    variant: str | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Path:
+    """Render the frames 0 ... ``frames`` - 1 into ``folder``: ``clip.json`` and one ``frame_0000.exr`` each.
+
+    Frames that are already there and whole are kept, so that an interrupted rendering goes on where it stopped; the
+    folder's record has to have been made with the same settings (ClipError otherwise). ``progress`` is called with the
+    number of every frame that is finished or found. Returns the folder. Raises RenderError, naming the clip and the
+    frame, if a frame cannot be rendered or written.
+    """
+    folder = Path(folder)
+    frames = scene.frames if frames is None else frames
+    if frames < 1:
+        raise ValueError(f"frames: expected at least 1, got {frames}.")
+    _check_options(width, height, layers, reference_spp)
+    chosen = use_variant(variant)
+    record = {
+        "format": FORMAT,
+        "name": scene.name,
+        "frames": frames,
+        "width": width,
+        "height": height,
+        "layers": sorted(layers),
+        "reference_spp": reference_spp,
+        "variant": chosen,
+        "max_depth": scene.max_depth if max_depth is None else max_depth,
+        "seed": seed,
+        "jittered": _tracer(chosen)[1],
+        "cameras": [_camera_record(scene, frame) for frame in range(frames)],
+        "scene": dict(scene.record),
+        "versions": _versions(),
+        "bad_samples": 0,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    if (folder / "clip.json").exists():
+        before = read_json(folder / "clip.json")
+        _check_settings(folder, record, before)
+        record["bad_samples"] = before.get("bad_samples", 0)
+    write_json(folder / "clip.json", record)
+
+    previous: View | None = None
+    for frame in range(frames):
+        path = folder / f"frame_{frame:04d}.exr"
+        if _is_whole(path):
+            previous = None
+        else:
+            try:
+                rendered = render_frame(
+                    scene,
+                    frame,
+                    width=width,
+                    height=height,
+                    layers=layers,
+                    reference_spp=reference_spp,
+                    max_depth=max_depth,
+                    seed=seed,
+                    variant=chosen,
+                    previous=previous,
+                )
+                write_frame(
+                    path,
+                    rendered.frame,
+                    layers=rendered.layers,
+                    reference=rendered.reference,
+                    reference_half=rendered.reference_half,
+                )
+            except Exception as error:
+                reason = f"{type(error).__name__}: {error}"
+                raise RenderError(f"clip {scene.name!r} in {folder}, frame {frame}: {reason}") from error
+            previous = rendered.view
+            if rendered.bad_samples:
+                record["bad_samples"] += rendered.bad_samples
+                write_json(folder / "clip.json", record)
+        if progress is not None:
+            progress(frame)
+    return folder
+
+
+def _tracer(variant: str) -> tuple[Callable[..., Light], bool]:
+    """The tracer of a variant, and whether it spreads its samples over the pixel."""
+    if variant.startswith("scalar"):
+        from jaxdn.render.exact import accumulate as exact
+
+        return exact, True
+    from jaxdn.render.wavefront import accumulate as wavefront
+
+    return wavefront, False
+
+
+def _view(scene: AnimatedScene, frame: int, built: Any) -> View:
+    pose = {name: np.asarray(matrix, np.float64) for name, matrix in scene.pose(frame).items()}
+    return View(gbuffer(built), scene.camera(frame), pose)
+
+
+def _motion(view: View, previous: View | None) -> dict[str, Any]:
+    """The Frame's buffers about motion; nothing has moved yet in a first frame."""
+    if previous is None:
+        zero = np.zeros((*view.gbuffer.ids.shape[:2], 2), np.float32)
+        seen = np.ones_like(view.gbuffer.ids, bool)
+        return {"motion": zero, "dual_motion": zero, "visible": seen, "previous_depth": view.gbuffer.depth}
+    found = motion_between(view, previous)
+    motion, forward = found.motion.astype(np.float32), found.forward_motion.astype(np.float32)
+    dual = np.asarray(dual_motion(motion, forward, visible=found.visible[..., 0]))
+    # What covered the point is behind the camera now: nothing to borrow, as if it had moved off-screen.
+    dual = np.where(np.isfinite(dual).all(axis=-1, keepdims=True), dual, motion)
+    return {
+        "motion": motion,
+        "dual_motion": dual.astype(np.float32),
+        "visible": found.visible,
+        "previous_depth": found.previous_depth,
+    }
+
+
+def _single(image: np.ndarray) -> np.ndarray:
+    return image.astype(np.float32)
+
+
+def _check_options(width: int, height: int, layers: Sequence[int], reference_spp: int) -> None:
+    if width < 1 or height < 1:
+        raise ValueError(f"width and height: expected at least 1, got {width} x {height}.")
+    powers = all(isinstance(samples, int) and samples >= 1 and samples & (samples - 1) == 0 for samples in layers)
+    if not layers or not powers or len(set(layers)) != len(layers):
+        raise ValueError(f"layers: expected different powers of two, such as (1, 2, 4), got {tuple(layers)}.")
+    if reference_spp < 0 or reference_spp == 1:
+        raise ValueError(f"reference_spp: expected 0 (no reference) or at least 2, got {reference_spp}.")
+
+
+def _camera_record(scene: AnimatedScene, frame: int) -> dict[str, Any]:
+    camera = scene.camera(frame)
+    return {"to_world": np.asarray(camera.to_world, np.float64).tolist(), "x_fov": float(camera.x_fov)}
+
+
+def _versions() -> dict[str, str]:
+    return {
+        "python": platform.python_version(),
+        **{name: importlib.metadata.version(name) for name in ("mitsuba", "drjit")},
+    }
+
+
+def _check_settings(folder: Path, wanted: Mapping[str, Any], found: Any) -> None:
+    """Raise ClipError if the frames in a folder were rendered with other settings."""
+    found = found if isinstance(found, dict) else {}
+    # Compared as JSON gives it back: a tuple has become a list there.
+    differing = [key for key in wanted if key not in _FREE and _plain(found.get(key)) != _plain(wanted[key])]
+    cameras = zip(found.get("cameras", []), wanted["cameras"], strict=False)
+    if any(_plain(first) != _plain(second) for first, second in cameras):
+        differing.append("cameras")
+    if differing:
+        pairs = ((key, str(found.get(key))[:60], str(wanted[key])[:60]) for key in differing)
+        what = "; ".join(f"{key}: {there} there, {asked} wanted" for key, there, asked in pairs)
+        raise ClipError(f"{folder}: was rendered with other settings ({what}); choose another folder or remove it.")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+def _is_whole(path: Path) -> bool:
+    if not path.exists():
+        return False
+    try:
+        read_frame(path)
+    except ClipError:
+        return False
+    return True

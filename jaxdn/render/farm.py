@@ -1,0 +1,184 @@
+"""Render many clips at once, a process for each, one renderer thread in each.
+
+Two processes of one thread are about a third faster than one process of two, and a process that dies takes one clip
+with it. Frames are whole files from the moment they have their name, so whatever ends the work, it goes on from there.
+"""
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxdn.render.scene import scene_from_record
+from jaxdn.render.variant import choose_variant
+
+
+class ClipJob(NamedTuple):
+    """One clip to render; the options are those of :func:`jaxdn.render.render_clip`."""
+
+    scene: dict[str, Any]
+    """The record of the scene, such as ``{"family": "robot", "seed": 3}``."""
+    folder: str
+    width: int
+    height: int
+    frames: int
+    layers: tuple[int, ...] = (1,)
+    reference_spp: int = 0
+    max_depth: int | None = None
+    seed: int = 0
+    variant: str | None = None
+
+
+class _Worker(NamedTuple):
+    job: ClipJob
+    process: BaseProcess
+    messages: Connection
+    finished: list[int]
+    """Frames that it reported."""
+
+
+def render_clips(
+    jobs: Iterable[ClipJob],
+    *,
+    workers: int | None = None,
+    progress: bool | Callable[[int, int], None] = True,
+) -> list[Path]:
+    """Render clips in ``workers`` processes (default: one for every core) and return their folders.
+
+    ``progress`` shows frames done of all frames and the time left, or is called with these two numbers. Ctrl-C stops
+    the processes and keeps every finished frame; calling again goes on. A clip that fails does not stop the others:
+    at the end RenderError names each failed clip, the frame it failed at, and why.
+    """
+    from jaxdn.render.clip import RenderError
+
+    waiting = list(jobs)
+    folders = [job.folder for job in waiting]
+    if len({os.path.abspath(folder) for folder in folders}) != len(folders):
+        raise ValueError("render_clips: expected a folder of its own for every clip.")
+    limit = max(1, min(workers or os.cpu_count() or 1, len(waiting)))
+    for variant in {job.variant for job in waiting}:
+        choose_variant(variant)  # probe once, here: the processes inherit the result
+
+    total, done = sum(job.frames for job in waiting), 0
+    running: list[_Worker] = []
+    failures: list[str] = []
+    with _display(progress, total) as show:
+        try:
+            while waiting or running:
+                while waiting and len(running) < limit:
+                    running.append(_start(waiting.pop(0), threads=1 if limit > 1 else 0))
+                wait([item for worker in running for item in (worker.messages, worker.process.sentinel)])
+                for worker in list(running):
+                    frames, failure, ended = _listen(worker)
+                    done += frames
+                    if ended:
+                        worker.process.join()
+                        worker.messages.close()
+                        running.remove(worker)
+                    if failure:
+                        failures.append(failure)
+                show(done, total)
+        finally:
+            for worker in running:
+                worker.process.terminate()
+            for worker in running:
+                worker.process.join()
+    if failures:
+        raise RenderError(f"{len(failures)} of {len(folders)} clips failed:\n" + "\n".join(failures))
+    return [Path(folder) for folder in folders]
+
+
+def _start(job: ClipJob, *, threads: int) -> _Worker:
+    # A forked child would inherit the renderer's and JAX's threads half-way; a spawned one starts clean.
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_work, args=(job, sender, threads), daemon=True)
+    process.start()
+    sender.close()
+    return _Worker(job, process, receiver, [])
+
+
+def _work(job: ClipJob, messages: Connection, threads: int) -> None:
+    """Runs in a process of its own: render one clip and report each frame."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business, it ends this process
+    os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    try:
+        from jaxdn.render.clip import render_clip
+        from jaxdn.render.variant import use_variant
+
+        use_variant(job.variant)
+        if threads:
+            import drjit
+
+            drjit.set_thread_count(threads)
+        try:
+            scene = scene_from_record(job.scene)
+        except Exception as error:
+            raise ValueError(f"clip in {job.folder}: the scene {job.scene} does not load: {error}") from error
+        options = {name: getattr(job, name) for name in ClipJob._fields if name not in ("scene", "folder")}
+        render_clip(scene, job.folder, **options, progress=messages.send)
+        messages.send("done")
+    except BaseException as error:
+        messages.send(f"{error}" if str(error) else repr(error))
+    finally:
+        messages.close()
+
+
+def _listen(worker: _Worker) -> tuple[int, str, bool]:
+    """What a worker has to say: frames finished since, why it failed ("" if it did not), whether it has ended."""
+    frames = 0
+    while True:
+        try:
+            if not worker.messages.poll():
+                return frames, "", False
+            message = worker.messages.recv()
+        except (EOFError, OSError):
+            # Its end of the pipe is closed and it never said why: something ended the process from outside.
+            worker.process.join()
+            return frames, _death(worker), True
+        if isinstance(message, int):
+            worker.finished.append(message)
+            frames += 1
+        else:
+            return frames, "" if message == "done" else message, True
+
+
+def _death(worker: _Worker) -> str:
+    code = worker.process.exitcode
+    cause = f"exit code {code}"
+    if code is not None and code < 0:
+        cause = signal.Signals(-code).name
+        cause += {"SIGKILL": " (out of memory?)", "SIGABRT": " (an LLVM that does not work?)"}.get(cause, "")
+    frame = worker.finished[-1] + 1 if worker.finished else 0
+    return f"clip in {worker.job.folder}, frame {frame}: the renderer's process died: {cause}. Start again to go on."
+
+
+def _display(
+    progress: bool | Callable[[int, int], None], total: int
+) -> AbstractContextManager[Callable[[int, int], None]]:
+    if progress is not True:
+        return nullcontext(progress if callable(progress) else lambda done, total: None)
+    return _Bar(total)
+
+
+class _Bar:
+    """A progress bar: frames done of all frames, time gone and time left."""
+
+    def __init__(self, total: int) -> None:
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+
+        columns: Sequence[Any] = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        self._bar = Progress("rendering frames", *columns)
+        self._task = self._bar.add_task("frames", total=total)
+
+    def __enter__(self) -> Callable[[int, int], None]:
+        self._bar.start()
+        return lambda done, total: self._bar.update(self._task, completed=done, total=total)
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
