@@ -1,0 +1,105 @@
+"""Curves from linear radiance to what networks, losses, metrics and eyes compare, and the luminance."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn.checks import check_option
+from jaxdn.frame import RADIANCE_MAX
+
+_GAMMA = 2.2
+_TOE = 1e-4
+"""log(1 + x) below which ``compress`` is a straight line: its power has an infinite slope at 0."""
+_TOE_VALUE = _TOE ** (1 / _GAMMA)
+_TOE_SLOPE = _TOE_VALUE / _TOE
+"""About 152."""
+_TOP = 64.0
+"""``expand`` saturates at the largest finite number over this, so that its slope there is finite too."""
+
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""Weights of linear Rec.709 red, green and blue (ITU-R BT.709)."""
+
+OPERATORS = ("srgb", "aces", "reinhard", "compress")
+"""What ``tonemap`` knows."""
+
+
+def compress(x: jax.Array) -> jax.Array:
+    """Squeeze radiance for networks and losses: ``log(1 + x)^(1 / 2.2)``, elementwise.
+
+    Below log(1 + x) = 1e-4 it is the line ``152 log(1 + x)`` through the origin that meets the curve there: continuous,
+    increasing, slope 152 at 0 instead of infinity. Odd: ``compress(-x) = -compress(x)``, so that a negative prediction
+    still has a gradient. Value and slope are finite for every float; infinity counts as the largest finite number
+    (7.7 in float32). NaN stays NaN.
+
+    Hasselgren et al. 2020, sec. 2.1; the toe and the odd continuation are ours.
+    """
+    x = _floating(x)
+    size = jnp.where(x >= 0, x, -x)  # not abs: its derivative at 0 would be 0, and a black pixel would never learn
+    u = jnp.log1p(jnp.minimum(size, float(jnp.finfo(x.dtype).max)))
+    toe = u <= _TOE
+    y = jnp.where(toe, _TOE_SLOPE * u, jnp.where(toe, 1.0, u) ** (1 / _GAMMA))
+    return jnp.where(x >= 0, y, -y)
+
+
+def expand(y: jax.Array) -> jax.Array:
+    """The inverse of ``compress``, elementwise: ``exp(y^2.2) - 1``, linear in the toe, odd.
+
+    Value and slope are finite for every float: it saturates at 1/64 of the largest finite number (5e36 in float32).
+    """
+    y = _floating(y)
+    top = math.log(float(jnp.finfo(y.dtype).max) / _TOP)
+    size = jnp.minimum(jnp.where(y >= 0, y, -y), top ** (1 / _GAMMA))
+    toe = size <= _TOE_VALUE
+    u = jnp.where(toe, size / _TOE_SLOPE, jnp.where(toe, 1.0, size) ** _GAMMA)
+    x = jnp.expm1(u)
+    return jnp.where(y >= 0, x, -x)
+
+
+def luminance(image: jax.Array) -> jax.Array:
+    """Rec.709 luminance ``0.2126 R + 0.7152 G + 0.0722 B`` of linear radiance [..., 3], as [..., 1]."""
+    image = _floating(image)
+    if image.ndim == 0 or image.shape[-1] != 3:
+        raise ValueError(f"image: expected 3 channels in the last axis, got shape {image.shape}.")
+    red, green, blue = LUMINANCE
+    return red * image[..., 0:1] + green * image[..., 1:2] + blue * image[..., 2:3]
+
+
+def tonemap(image: jax.Array, *, operator: str = "srgb") -> jax.Array:
+    """Linear radiance [..., 3] to display-encoded values in [0, 1] of the same shape, for metrics and for looking at.
+
+    Radiance is first clamped to [0, 65504]; a NaN stays NaN. ``operator``:
+
+    * ``"srgb"``: cut at 1, then the sRGB curve (IEC 61966-2-1).
+    * ``"aces"``: ``x (2.51 x + 0.03) / (x (2.43 x + 0.59) + 0.14)``, cut at 1, then the sRGB curve
+      (Narkowicz 2015, "ACES filmic tone mapping curve", without its optional exposure of 0.6).
+    * ``"reinhard"``: ``x / (1 + luminance(x))``, cut at 1, then the sRGB curve (Reinhard et al. 2002, eq. 3).
+    * ``"compress"``: ``compress(x) / compress(65504)``: the domain in which the networks are trained.
+    """
+    check_option(operator, "operator", OPERATORS)
+    x = jnp.clip(_floating(image), 0.0, RADIANCE_MAX)
+    if operator == "compress":
+        return compress(x) / (math.log1p(RADIANCE_MAX) ** (1 / _GAMMA))
+    if operator == "aces":
+        x = x / (1.0 + x)  # the same quotient with both sides over (1 + x)^2: squares of half-precision overflow
+        rest = 1.0 - x
+        x = x * (2.51 * x + 0.03 * rest) / (x * (2.43 * x + 0.59 * rest) + 0.14 * rest * rest)
+    elif operator == "reinhard":
+        x = x / (1.0 + luminance(x))
+    return srgb_encode(jnp.minimum(x, 1.0))
+
+
+def srgb_encode(x: jax.Array) -> jax.Array:
+    """Linear light in [0, 1] to sRGB code values, elementwise (IEC 61966-2-1)."""
+    toe = x <= 0.0031308
+    return jnp.where(toe, 12.92 * x, 1.055 * jnp.where(toe, 1.0, x) ** (1 / 2.4) - 0.055)
+
+
+def srgb_decode(y: jax.Array) -> jax.Array:
+    """sRGB code values in [0, 1] to linear light, elementwise (IEC 61966-2-1)."""
+    toe = y <= 0.04045
+    return jnp.where(toe, y / 12.92, ((jnp.where(toe, 1.0, y) + 0.055) / 1.055) ** 2.4)
+
+
+def _floating(x: jax.Array) -> jax.Array:
+    return jnp.asarray(x, jnp.result_type(x, float))

@@ -1,0 +1,112 @@
+"""What training minimises: L1 distances of whole clips [T, H, W, C], each one scalar.
+
+The images are compared as they are: compress them first (``color.compress``). ``denoised`` and ``reference`` have the
+same shape; other shapes raise ValueError. Every loss has a finite gradient everywhere (0 where the two agree).
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdn.checks import check_image, check_option, check_same_size
+from jaxdn.stencils import correlate, pad_edge
+
+
+def spatial(denoised: jax.Array, reference: jax.Array) -> jax.Array:
+    """Mean of ``|denoised - reference|`` over all elements (Zeng et al. 2021, eq. 5, first term)."""
+    return jnp.mean(jnp.abs(_difference(denoised, reference)))
+
+
+def temporal(denoised: jax.Array, reference: jax.Array) -> jax.Array:
+    """Mean of ``|(I_i - I_{i-1}) - (R_i - R_{i-1})|`` over the T - 1 differences of frames; 0 for a clip of one frame.
+
+    Frames are compared at the same pixel, not along the motion (Zeng et al. 2021, eq. 5, second term; Chaitanya et al.
+    2017, sec. 4.2).
+    """
+    error = _difference(denoised, reference)
+    # The error of the differences is the difference of the errors.
+    return _mean_size(error[1:] - error[:-1])
+
+
+def gradient(denoised: jax.Array, reference: jax.Array, *, operator: str = "difference") -> jax.Array:
+    """Mean absolute difference of the image gradients: edges count, levels do not.
+
+    ``operator="difference"``: forward differences in x and in y, inside the image; the mean is over both together (0
+    for an image of one pixel). ``operator="hfen"``: responses of a Laplacian of Gaussian with sigma 1.5 px on 15 x 15
+    taps of zero sum, edge pixels repeated beyond the border.
+
+    Chaitanya et al. 2017, sec. 4.2, who use HFEN (Ravishankar & Bresler 2011).
+    """
+    check_option(operator, "operator", ("difference", "hfen"))
+    error = _difference(denoised, reference)
+    if operator == "hfen":
+        return jnp.mean(jnp.abs(_laplacian_of_gaussian(error)))
+    horizontal = error[:, :, 1:] - error[:, :, :-1]
+    vertical = error[:, 1:] - error[:, :-1]
+    return _mean_size(horizontal, vertical)
+
+
+def occlusion(
+    denoised: jax.Array,
+    reference: jax.Array,
+    masks: jax.Array,
+    *,
+    weights: tuple[float, ...] = (1.0, 0.8, 0.6),
+) -> jax.Array:
+    """Mean over all elements of ``|(denoised - reference) S|``: errors where something was disoccluded lately.
+
+    ``S_i = sum_k weights[k] M_{i-k}`` with ``masks`` M [T, H, W, 1] in {0, 1} (``jaxdn.occlusion_mask`` of each frame),
+    taken at the same pixel. A mask before the first frame is replaced by frame i's own M_i. S is not clipped, it
+    reaches the sum of the weights. The mean is over the whole image, not over the masked area.
+
+    Zeng et al. 2021, eq. 6.
+    """
+    error = _difference(denoised, reference)
+    check_image(masks, "masks", channels=1, rank=4)
+    check_same_size(denoised, masks, ("denoised", "masks"))
+    masks = jnp.asarray(masks, error.dtype)
+    frames = masks.shape[0]
+    total = jnp.zeros_like(masks)
+    for age, weight in enumerate(weights):
+        missing = min(age, frames)
+        total = total + weight * jnp.concatenate([masks[:missing], masks[: frames - missing]])
+    return jnp.mean(jnp.abs(error * total))
+
+
+def _difference(denoised: jax.Array, reference: jax.Array) -> jax.Array:
+    check_image(denoised, "denoised", rank=4)
+    check_image(reference, "reference", rank=4, channels=denoised.shape[-1])
+    check_same_size(denoised, reference, ("denoised", "reference"))
+    return denoised - reference
+
+
+def _mean_size(*parts: jax.Array) -> jax.Array:
+    """Mean of the absolute values of all parts together; 0 when they are all empty."""
+    count = sum(part.size for part in parts)
+    return sum((jnp.sum(jnp.abs(part)) for part in parts), start=jnp.zeros((), parts[0].dtype)) / max(count, 1)
+
+
+_LOG_RADIUS = 7
+_LOG_SIGMA = 1.5
+
+
+def _laplacian_taps() -> tuple[np.ndarray, np.ndarray]:
+    """[15, 3] taps in x and in y; the sum over the three products is the Laplacian of Gaussian less its mean.
+
+    LoG = g''(x) g(y) + g(x) g''(y), and a constant, the mean of its 225 taps, is a product of two constants.
+    """
+    x = np.arange(-_LOG_RADIUS, _LOG_RADIUS + 1.0)
+    g = np.exp(-0.5 * (x / _LOG_SIGMA) ** 2) / (np.sqrt(2 * np.pi) * _LOG_SIGMA)
+    second = (x * x / _LOG_SIGMA**2 - 1) / _LOG_SIGMA**2 * g
+    mean = 2 * second.sum() * g.sum() / x.size**2
+    ones = np.ones_like(x)
+    return np.stack([second, g, -mean * ones], axis=-1), np.stack([g, second, ones], axis=-1)
+
+
+def _laplacian_of_gaussian(images: jax.Array) -> jax.Array:
+    across, down = _laplacian_taps()
+    frames, height, width, channels = images.shape
+    # Channels move beside the frames, so that the last axis can hold the three products.
+    planes = jnp.moveaxis(images, -1, 1).reshape(frames * channels, height, width, 1)
+    rows = correlate(pad_edge(planes, _LOG_RADIUS, axis=-2), across, axis=-2)
+    return jnp.sum(correlate(pad_edge(rows, _LOG_RADIUS, axis=-3), down, axis=-3), axis=-1)

@@ -1,0 +1,197 @@
+"""How far an image or a clip is from its reference: one number each.
+
+``image`` and ``reference`` are [H, W, C], or clips [T, H, W, C], of the same shape and as the metric is to see them:
+tone-map first (``color.tonemap``), all but ``relative_mse`` (and state the operator beside the number). ``mask``
+[H, W, 1] or [T, H, W, 1] restricts a metric to the pixels where it is above 0 (or true); what lies outside has no
+influence, whatever it is (SSIM and FLIP look at the neighbourhood of the pixels inside). Masked out altogether, images
+count as identical.
+
+A non-finite pixel makes a number non-finite: a metric that passed over it would flatter. For finite images no metric is
+NaN, and all gradients are finite.
+
+On averages: MSE, L1, relative MSE, SSIM and FLIP are means over all pixels of all frames together. PSNR is the mean of
+the frames' PSNRs, so one perfect frame makes it infinite: ``average="mse"`` gives the PSNR of the mean MSE instead.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn.checks import check_image, check_option, check_same_size
+from jaxdn.flip import PIXELS_PER_DEGREE, flip_map
+from jaxdn.stencils import correlate, gaussian_taps
+
+_SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
+
+
+def mse(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = None) -> jax.Array:
+    """Mean squared error over pixels and channels; 0 for an empty mask."""
+    image, reference, inside = _prepare(image, reference, mask)
+    return _mean((image - reference) ** 2, inside)
+
+
+def l1(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = None) -> jax.Array:
+    """Mean absolute error over pixels and channels; 0 for an empty mask. ``l1 ** 2 <= mse``."""
+    image, reference, inside = _prepare(image, reference, mask)
+    return _mean(jnp.abs(image - reference), inside)
+
+
+def relative_mse(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = None) -> jax.Array:
+    """Mean of ``(image - reference)^2 / (reference^2 + 0.01)`` on linear radiance; 0 for an empty mask.
+
+    Rousselle et al. 2011, eq. 10; they and others differ in the constant.
+    """
+    image, reference, inside = _prepare(image, reference, mask)
+    return _mean((image - reference) ** 2 / (reference**2 + 0.01), inside)
+
+
+def psnr(
+    image: jax.Array,
+    reference: jax.Array,
+    *,
+    mask: jax.Array | None = None,
+    peak: float = 1.0,
+    average: str = "frames",
+) -> jax.Array:
+    """Peak signal-to-noise ratio in dB, ``10 log10(peak^2 / MSE)``; of a clip, the mean of its frames' PSNRs.
+
+    Infinite where the two are identical, for a frame and so for its clip, with derivative 0. Frames whose mask is empty
+    are left out of the mean; with all of them empty it is infinite. ``average="mse"``: the PSNR of the mean MSE.
+    ``peak=255`` on images in [0, 1] is the convention of Zeng et al. 2021, table 2: 48.13 dB more.
+    """
+    check_option(average, "average", ("frames", "mse"))
+    image, reference, inside = _prepare(image, reference, mask)
+    return _psnr((image - reference) ** 2, inside, peak=peak, average=average)
+
+
+def temporal_psnr(
+    image: jax.Array,
+    reference: jax.Array,
+    *,
+    mask: jax.Array | None = None,
+    peak: float = 1.0,
+    average: str = "frames",
+) -> jax.Array:
+    """PSNR of the frame-to-frame differences of two clips [T, H, W, C]: flicker, whatever the constant error.
+
+    ``x_i - x_{i-1}`` against ``y_i - y_{i-1}`` at the same pixel, negative differences kept, peak 1 although they span
+    [-1, 1]; the mean of T - 1 PSNRs (Hasselgren et al. 2020, sec. 3). ``mask`` is that of the later frame; the earlier
+    one counts where the later does. Infinite for two clips that change alike, and for clips of one frame. Options as in
+    ``psnr``.
+    """
+    check_option(average, "average", ("frames", "mse"))
+    check_image(image, "image", rank=4)
+    inside = _inside(image, mask)
+    later = None if inside is None else inside[1:]
+    _check_pair(image, reference)
+    changes = [_hide(clip[1:], later) - _hide(clip[:-1], later) for clip in (image, reference)]
+    return _psnr((changes[0] - changes[1]) ** 2, later, peak=peak, average=average)
+
+
+def ssim(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = None) -> jax.Array:
+    """Structural similarity, at most 1: the mean of its map over pixels and channels, each channel by itself.
+
+    11 x 11 Gaussian window of sigma 1.5, population covariance, K1 = 0.01, K2 = 0.03, data range 1 (Wang et al. 2004).
+    The map is taken only where the window fits into the image, so a border of 5 pixels does not count, masked or not;
+    an image smaller than the window uses the largest odd window that fits. 1 for an empty mask.
+    """
+    _check_pair(image, reference)
+    inside = _inside(image, mask)
+    height, width = image.shape[-3:-1]
+    radius = (min(_SSIM_WINDOW, height, width) - 1) // 2
+    taps = gaussian_taps(radius, _SSIM_SIGMA)
+
+    def window_mean(x: jax.Array) -> jax.Array:
+        return correlate(correlate(x, taps, axis=-2), taps, axis=-3)
+
+    x, y = window_mean(image), window_mean(reference)
+    # Variances of what is left after the middle grey: the same numbers, with half the digits lost to cancellation.
+    a, b = image - 0.5, reference - 0.5
+    xx = window_mean(a * a) - (x - 0.5) ** 2
+    yy = window_mean(b * b) - (y - 0.5) ** 2
+    xy = window_mean(a * b) - (x - 0.5) * (y - 0.5)
+    c1, c2 = 0.01**2, 0.03**2
+    similarity = (2 * x * y + c1) * (2 * xy + c2) / ((x * x + y * y + c1) * (xx + yy + c2))
+    if inside is not None:
+        inside = inside[..., radius : height - radius, radius : width - radius, :]
+    return _mean(_hide(similarity, inside), inside, empty=1.0)
+
+
+def flip(
+    image: jax.Array,
+    reference: jax.Array,
+    *,
+    mask: jax.Array | None = None,
+    pixels_per_degree: float = PIXELS_PER_DEGREE,
+) -> jax.Array:
+    """Mean LDR-FLIP error, 0 to 1 (Andersson et al. 2020); see ``jaxdn.flip.flip_map`` for the map and the units.
+
+    Three channels, display-encoded in [0, 1]. 0 for an empty mask.
+    """
+    _check_pair(image, reference, channels=3)
+    inside = _inside(image, mask)
+    return _mean(_hide(flip_map(image, reference, pixels_per_degree=pixels_per_degree), inside), inside)
+
+
+def _check_pair(image: jax.Array, reference: jax.Array, *, channels: int | None = None) -> None:
+    rank = 4 if jnp.ndim(image) == 4 else 3
+    check_image(image, "image", rank=rank, channels=channels)
+    check_image(reference, "reference", rank=rank, channels=image.shape[-1])
+    check_same_size(image, reference, ("image", "reference"))
+
+
+def _inside(image: jax.Array, mask: jax.Array | None) -> jax.Array | None:
+    """[..., H, W, 1] bool, or None for all of it."""
+    if mask is None:
+        return None
+    if jnp.shape(mask) != (*image.shape[:-1], 1):
+        raise ValueError(
+            f"mask: expected shape {(*image.shape[:-1], 1)}, got {jnp.shape(mask)}; it needs the frames and the size "
+            "of the image and one channel."
+        )
+    return jnp.asarray(mask) > 0
+
+
+def _hide(values: jax.Array, inside: jax.Array | None) -> jax.Array:
+    return values if inside is None else jnp.where(inside, values, 0.0)
+
+
+def _prepare(
+    image: jax.Array, reference: jax.Array, mask: jax.Array | None
+) -> tuple[jax.Array, jax.Array, jax.Array | None]:
+    """Both images checked, 0 outside the mask (before anything is computed: gradients stay finite), and the mask."""
+    _check_pair(image, reference)
+    inside = _inside(image, mask)
+    return _hide(image, inside), _hide(reference, inside), inside
+
+
+def _mean(values: jax.Array, inside: jax.Array | None, *, empty: float = 0.0) -> jax.Array:
+    """Mean over all axes of values that are 0 outside the mask."""
+    if inside is None:
+        return jnp.mean(values)
+    count = jnp.sum(inside) * values.shape[-1]
+    mean = jnp.sum(values) / jnp.maximum(count, 1).astype(values.dtype)
+    return jnp.where(count == 0, empty, mean)
+
+
+def _psnr(squares: jax.Array, inside: jax.Array | None, *, peak: float, average: str) -> jax.Array:
+    """``squares`` [H, W, C] or [T, H, W, C], 0 outside the mask."""
+    infinite = jnp.asarray(jnp.inf, squares.dtype)
+    if squares.size == 0:
+        return infinite
+    if average == "mse" or squares.ndim == 3:
+        return _decibels(_mean(squares, inside), peak)
+    if inside is None:
+        return jnp.mean(_decibels(jnp.mean(squares, axis=(1, 2, 3)), peak))
+    counts = jnp.sum(inside, axis=(1, 2, 3))
+    errors = jnp.sum(squares, axis=(1, 2, 3)) / (jnp.maximum(counts, 1) * squares.shape[-1]).astype(squares.dtype)
+    counted = counts > 0
+    total = jnp.sum(jnp.where(counted, _decibels(errors, peak), 0.0))
+    frames = jnp.sum(counted)
+    return jnp.where(frames == 0, infinite, total / jnp.maximum(frames, 1).astype(squares.dtype))
+
+
+def _decibels(error: jax.Array, peak: float) -> jax.Array:
+    same = error == 0  # not `error > 0`: a NaN must not come out as infinitely good
+    return jnp.where(same, jnp.inf, 20 * math.log10(peak) - 10 * jnp.log10(jnp.where(same, 1.0, error)))

@@ -1,0 +1,43 @@
+"""Powers and lengths whose values and derivatives stay finite.
+
+The true derivative of each is infinite or undefined at 0, and one such pixel would make the gradient of a whole clip
+NaN. Each function here says which finite derivative it takes instead. *Tiny* below is the smallest normal number of the
+dtype (1.2e-38 in float32); an infinite argument counts as the largest finite one. NaN stays NaN: hiding it is the
+business of ``frame.repair`` alone.
+"""
+
+import jax
+import jax.numpy as jnp
+
+
+def _largest(x: jax.Array) -> float:
+    return float(jnp.finfo(x.dtype).max)
+
+
+def _tiny(x: jax.Array) -> float:
+    return float(jnp.finfo(x.dtype).tiny)
+
+
+def safe_power(x: jax.Array, exponent: jax.Array | float) -> jax.Array:
+    """``x ** exponent`` for exponents in [0, 1]; 0 with derivative 0 for ``x`` below tiny, negative ones included.
+
+    ``exponent`` may be an array of a shape that broadcasts with ``x`` and has a derivative of its own. 0 ** 0 is 0.
+    """
+    zero = x < _tiny(x)
+    power = jnp.where(zero, 1.0, jnp.minimum(x, _largest(x))) ** exponent
+    return jnp.where(zero, 0.0, power)
+
+
+def safe_norm(x: jax.Array, *, axis: int = -1) -> jax.Array:
+    """Euclidean length over ``axis``, which is kept with size 1; 0 with derivative 0 for a vector shorter than tiny.
+
+    Scaled by the largest component, so that neither tiny nor huge components vanish in their squares. A length beyond
+    the largest finite number saturates there.
+    """
+    x = jnp.clip(x, -_largest(x), _largest(x))
+    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True))
+    zero = scale < _tiny(x)
+    scale = jnp.where(zero, 1.0, scale)
+    unit = jnp.where(zero, 1.0, x / scale)
+    length = jnp.sqrt(jnp.sum(unit * unit, axis=axis, keepdims=True)) * scale
+    return jnp.where(zero, 0.0, jnp.minimum(length, _largest(x)))
