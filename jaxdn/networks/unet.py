@@ -1,0 +1,171 @@
+"""The U-Net that predicts kernels: five resolution levels, heads on the last three decoder levels.
+
+Flax NNX lives behind this door. What comes out are plain nested dicts of arrays and two pure functions, so that
+optimisers, checkpoints and users never meet one of its types.
+
+Architecture (Zeng et al. 2021, sec. 4.3 and fig. 6, after Hasselgren et al. 2020): 3x3 convolutions, LeakyReLU, 2x2
+max-pooling down, nearest upsampling and skip concatenation up. The papers give no widths; :data:`LARGE` is our reading
+of "about 850,000 weights". Xavier-uniform kernels (Glorot and Bengio 2010), zero biases.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+
+from jaxdn.backends.convolution import convolve
+
+LEVELS = 5
+MULTIPLE = 2 ** (LEVELS - 1)
+"""Height and width that the network takes are multiples of this."""
+
+Widths = tuple[tuple[int, ...], ...]
+
+LARGE: Widths = ((32, 32), (64, 64), (64, 64), (80, 80), (96, 96))
+"""Channels of each convolution, level by level from full resolution down; the decoder mirrors the first four."""
+
+SMALL: Widths = ((24,), (32, 32), (48, 48), (64, 64), (64, 64))
+"""About a third of LARGE's time. Most of LARGE's time is its full resolution, so that is where SMALL saves."""
+
+NEGATIVE_SLOPE = 0.01
+
+
+class Network(NamedTuple):
+    """Two pure functions."""
+
+    init: Callable[[jax.Array], dict[str, Any]]
+    """key -> params, nested dicts of float32 arrays."""
+    apply: Callable[[dict[str, Any], Sequence[jax.Array | None]], tuple[jax.Array, ...]]
+    """(params, feature groups [N, H, W, c] or None) -> heads at full, half and quarter resolution."""
+
+
+class Convolution(nnx.Module):
+    """A 3x3 convolution with bias; zeros beyond the border."""
+
+    def __init__(self, inputs: int, outputs: int, rngs: nnx.Rngs) -> None:
+        kernel = nnx.initializers.xavier_uniform()(rngs.params(), (3, 3, inputs, outputs), jnp.float32)
+        self.kernel = nnx.Param(kernel)
+        self.bias = nnx.Param(jnp.zeros((outputs,), jnp.float32))
+
+    def __call__(self, x: jax.Array, used: Sequence[slice] | None = None) -> jax.Array:
+        """``used`` names the slices of the input channels that ``x`` consists of; None is all of them."""
+        kernel = self.kernel[...]
+        if used is not None:
+            kernel = jnp.concatenate([kernel[:, :, channels] for channels in used], axis=2)
+        bias = jnp.reshape(self.bias[...], (1, 1, 1, -1))
+        return convolve(x, kernel.astype(x.dtype)) + bias.astype(x.dtype)
+
+
+class Level(nnx.Module):
+    """The convolutions of one resolution level, each followed by a LeakyReLU."""
+
+    def __init__(self, inputs: int, widths: Sequence[int], rngs: nnx.Rngs) -> None:
+        self.count = len(widths)
+        for index, (before, after) in enumerate(zip((inputs, *widths), widths, strict=False)):
+            setattr(self, f"convolution_{index}", Convolution(before, after, rngs))
+
+    def __call__(self, x: jax.Array, used: Sequence[slice] | None = None) -> jax.Array:
+        for index in range(self.count):
+            x = getattr(self, f"convolution_{index}")(x, used if index == 0 else None)
+            x = jnp.where(x >= 0, x, NEGATIVE_SLOPE * x)
+        return x
+
+
+def pool(x: jax.Array) -> jax.Array:
+    """The maximum of each 2x2 block: [N, H, W, C] -> [N, H/2, W/2, C]."""
+    n, height, width, channels = x.shape
+    return jnp.max(jnp.reshape(x, (n, height // 2, 2, width // 2, 2, channels)), axis=(2, 4))
+
+
+def enlarge(x: jax.Array) -> jax.Array:
+    """Every pixel four times: [N, H, W, C] -> [N, 2H, 2W, C]."""
+    n, height, width, channels = x.shape
+    blocks = jnp.broadcast_to(x[:, :, None, :, None, :], (n, height, 2, width, 2, channels))
+    return jnp.reshape(blocks, (n, 2 * height, 2 * width, channels))
+
+
+class UNet(nnx.Module):
+    """Encoder, decoder and three heads; called on a list of feature groups."""
+
+    def __init__(self, groups: Sequence[int], heads: Sequence[int], widths: Widths, rngs: nnx.Rngs) -> None:
+        self.groups = tuple(groups)
+        self.heads = len(heads)
+        inputs = sum(groups)
+        for level, channels in enumerate(widths):
+            setattr(self, f"encoder_{level}", Level(inputs, channels, rngs))
+            inputs = channels[-1]
+        for level in reversed(range(LEVELS - 1)):
+            setattr(self, f"decoder_{level}", Level(inputs + widths[level][-1], widths[level], rngs))
+            inputs = widths[level][-1]
+        for level, outputs in enumerate(heads):
+            setattr(self, f"head_{level}", Convolution(widths[level][-1], outputs, rngs))
+
+    def __call__(self, features: Sequence[jax.Array | None]) -> tuple[jax.Array, ...]:
+        used, start = [], 0
+        for channels, group in zip(self.groups, features, strict=True):
+            if group is not None:
+                used.append(slice(start, start + channels))
+            start += channels
+        x = jnp.concatenate([group for group in features if group is not None], axis=-1)
+        skips = []
+        for level in range(LEVELS):
+            x = pool(x) if level else x
+            absent = level == 0 and len(used) < len(self.groups)
+            x = getattr(self, f"encoder_{level}")(x, used if absent else None)
+            skips.append(x)
+        outputs: list[jax.Array] = []
+        for level in reversed(range(LEVELS - 1)):
+            x = getattr(self, f"decoder_{level}")(jnp.concatenate([enlarge(x), skips[level]], axis=-1))
+            if level < self.heads:
+                outputs.insert(0, getattr(self, f"head_{level}")(x))
+        return tuple(outputs)
+
+
+def unet(groups: Sequence[int], heads: Sequence[int], *, widths: Widths = LARGE) -> Network:
+    """A U-Net as ``init(key) -> params`` and ``apply(params, features) -> heads``.
+
+    ``groups`` are the channel counts of the feature groups; ``apply`` takes one array ``[N, H, W, c]`` for each, or
+    ``None`` where it is absent, which is the same as an array of zeros but without its share of the first convolution:
+    the shapes of ``params`` never depend on it. H and W are multiples of 16. ``heads`` are the channel counts at full,
+    half and quarter resolution; their outputs are raw (logits). ``widths`` gives the channels of each convolution of
+    each of the five levels; the decoder mirrors the first four. Computes in the features' dtype. Raises ValueError when
+    ``widths`` is not five non-empty levels of positive integers, or the features do not fit.
+    """
+    widths = tuple(tuple(level) for level in widths)
+    if len(widths) != LEVELS or not all(level and all(channels > 0 for channels in level) for level in widths):
+        raise ValueError(
+            f"widths: expected {LEVELS} levels, each a non-empty tuple of channel counts, got {widths!r}; "
+            "see jaxdn.networks.unet.LARGE."
+        )
+
+    def build(key: jax.Array) -> UNet:
+        return UNet(groups, heads, widths, nnx.Rngs(params=key))
+
+    graph, _ = nnx.split(nnx.eval_shape(lambda: build(jax.random.key(0))), nnx.Param, graph=False)
+
+    def init(key: jax.Array) -> dict[str, Any]:
+        _, params = nnx.split(build(key), nnx.Param, graph=False)
+        return nnx.to_pure_dict(params)
+
+    def apply(params: dict[str, Any], features: Sequence[jax.Array | None]) -> tuple[jax.Array, ...]:
+        present = [group for group in features if group is not None]
+        shapes = [None if group is None else group.shape for group in features]
+        fits = len(features) == len(groups) and all(
+            group is None or group.shape == (*present[0].shape[:3], channels)
+            for group, channels in zip(features, groups, strict=False)
+        )
+        if not (present and fits) or any(size % MULTIPLE for size in present[0].shape[1:3]):
+            raise ValueError(
+                f"features: expected [N, H, W, c] or None with c = {tuple(groups)}, H and W multiples of {MULTIPLE}, "
+                f"got shapes {shapes}; pad by the edge and crop the result."
+            )
+        return nnx.merge(graph, params)(features)
+
+    return Network(init, apply)
+
+
+def count(params: Any) -> int:
+    """The number of weights in ``params``."""
+    return sum(leaf.size for leaf in jax.tree.leaves(params))
