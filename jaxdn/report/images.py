@@ -1,0 +1,117 @@
+"""Pictures as PNG: files for ``--preview``, data addresses for the page, error maps and where to zoom in."""
+
+import base64
+import io
+import os
+import uuid
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+NOT_FINITE = (1.0, 0.0, 1.0)
+"""NaN and infinite pixels are painted magenta, so that a broken image does not pass for a black one."""
+
+ERROR_COLORS = ((0, 0, 4), (48, 12, 92), (130, 31, 108), (206, 66, 68), (246, 143, 30), (252, 215, 92), (255, 255, 235))
+"""sRGB bytes at equal steps from no error to the top of the scale; monotone in lightness."""
+
+
+def save_png(path: str | os.PathLike[str], image: Any) -> None:
+    """Write a display-encoded image [H, W, 3] or [H, W] in 0..1 as an 8-bit PNG.
+
+    Values outside 0..1 are clamped, pixels that are not finite are painted magenta. The file is written beside its
+    place and then renamed: no reader ever meets half a picture. Raises ValueError for another shape.
+    """
+    write_atomically({Path(path): encode_png(image)})
+
+
+def encode_png(image: Any) -> bytes:
+    """The bytes of an 8-bit PNG of a display-encoded image [H, W, 3] or [H, W] in 0..1."""
+    pixels = np.asarray(image, np.float64)
+    if pixels.ndim not in (2, 3) or 0 in pixels.shape or (pixels.ndim == 3 and pixels.shape[2] != 3):
+        raise ValueError(f"image: expected [H, W, 3] or [H, W], got shape {pixels.shape}; pass one frame in RGB.")
+    if pixels.ndim == 2:
+        pixels = np.repeat(pixels[..., None], 3, axis=2)
+    finite = np.isfinite(pixels).all(axis=2, keepdims=True)
+    pixels = np.where(finite, np.clip(np.nan_to_num(pixels), 0.0, 1.0), NOT_FINITE)
+    return _encode(Image.fromarray(np.rint(pixels * 255.0).astype(np.uint8)))
+
+
+def error_map(image: Any, reference: Any) -> np.ndarray:
+    """[H, W] float64: mean over channels of |image - reference|; 1 where that is not finite."""
+    difference = np.abs(np.asarray(image, np.float64) - np.asarray(reference, np.float64)).mean(axis=2)
+    return np.where(np.isfinite(difference), difference, 1.0)
+
+
+def error_scale(maps: list[np.ndarray]) -> float:
+    """Upper end of a colour scale shared by all maps: their 99.5th percentile, rounded up to 1, 2 or 5 times 10^n."""
+    top = float(np.percentile(np.concatenate([values.ravel() for values in maps]), 99.5)) if maps else 0.0
+    top = min(max(top, 1e-3), 1.0)
+    power = 10.0 ** np.floor(np.log10(top))
+    return float(min(step * power for step in (1, 2, 5, 10) if step * power >= top * (1 - 1e-9)))
+
+
+def encode_error(error: np.ndarray, scale: float) -> bytes:
+    """The bytes of a PNG with 64 palette colours: ``ERROR_COLORS`` over 0..scale, saturated above."""
+    steps = np.linspace(0.0, 1.0, 64)
+    anchors = np.linspace(0.0, 1.0, len(ERROR_COLORS))
+    palette = np.stack([np.interp(steps, anchors, channel) for channel in np.transpose(ERROR_COLORS)], axis=1)
+    index = np.rint(np.clip(error / scale, 0.0, 1.0) * 63.0).astype(np.uint8)
+    picture = Image.fromarray(index)
+    picture.putpalette(np.rint(palette).astype(np.uint8).ravel().tolist())
+    return _encode(picture)
+
+
+def encode_mask(mask: Any) -> bytes:
+    """The bytes of a PNG that is cyan where the mask is true and transparent elsewhere."""
+    chosen = np.asarray(mask, bool)
+    pixels = np.zeros((*chosen.shape, 4), np.uint8)
+    pixels[chosen] = (0, 229, 255, 255)
+    return _encode(Image.fromarray(pixels))
+
+
+def worst_crop(errors: list[np.ndarray], disoccluded: Any, *, size: int = 40) -> tuple[int, int, int, int]:
+    """(x, y, width, height) of the window with the largest error in disoccluded pixels, summed over ``errors`` [H, W].
+
+    Without disoccluded pixels, the window with the largest error of all; 4:3 in shape and inside the image.
+    """
+    mask = np.asarray(disoccluded, bool)
+    rows, columns = mask.shape
+    weight = np.sum(errors, axis=0) if errors else np.ones(mask.shape)
+    if mask.any():
+        # The smallest addend keeps the window on disoccluded pixels even where nothing is wrong with them.
+        weight = np.where(mask, weight + 1e-9, 0.0)
+    width, height = min(size, columns), min(size * 3 // 4, rows)
+    total = np.pad(np.cumsum(np.cumsum(weight, axis=0), axis=1), ((1, 0), (1, 0)))
+    sums = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
+    # Of equally bad windows take the middle one, which has the fault in its centre rather than in a corner.
+    best = np.argwhere(sums >= sums.max() * (1 - 1e-6) - 1e-12)
+    y, x = best[np.argmin(np.abs(best - best.mean(axis=0)).sum(axis=1))]
+    return int(x), int(y), width, height
+
+
+def data_address(png: bytes) -> str:
+    """The PNG as a ``data:`` address, which needs no file and no server."""
+    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+
+
+def write_atomically(contents: dict[Path, bytes]) -> None:
+    """Write all files beside their places, then rename them; on an error none is replaced and no rest is left."""
+    written: dict[Path, Path] = {}
+    try:
+        for path, content in contents.items():
+            beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
+            written[path] = beside
+            beside.write_bytes(content)
+        for path, beside in written.items():
+            os.replace(beside, path)
+    finally:
+        for beside in written.values():
+            beside.unlink(missing_ok=True)
+
+
+def _encode(picture: Image.Image) -> bytes:
+    buffer = io.BytesIO()
+    picture.save(buffer, format="PNG", compress_level=9)
+    return buffer.getvalue()

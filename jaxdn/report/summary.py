@@ -1,0 +1,206 @@
+"""The results in words and in plain text: what the page opens with and what the terminal prints."""
+
+import math
+import re
+from typing import NamedTuple
+
+from jaxdn.report.results import Results, Scores, mean_noise_floor, mean_scores
+
+NEAR_FLOOR = 3.0
+"""dB; closer to the noise floor than this, half or more of the measured error is the reference's own noise."""
+
+
+class Column(NamedTuple):
+    """How one score is written."""
+
+    field: str
+    label: str
+    better: int
+    """1 where higher is better, -1 where lower is, 0 where it is a fact and no score."""
+    explanation: str
+
+
+COLUMNS = (
+    Column("psnr", "PSNR dB", 1, "peak 1, tone-mapped"),
+    Column("ssim", "SSIM", 1, "structural similarity"),
+    Column("l1", "L1", -1, "mean absolute difference"),
+    Column("mse", "MSE", -1, "mean squared difference"),
+    Column("temporal_psnr", "Temporal PSNR dB", 1, "of differences between consecutive frames"),
+    Column("flip", "FLIP", -1, "perceived difference when flipping"),
+    Column("disoccluded_l1", "Disoccluded L1", -1, "on pixels hidden one frame earlier"),
+    Column("disoccluded_psnr", "Disoccluded PSNR dB", 1, "on pixels hidden one frame earlier"),
+    Column("ms_per_frame", "ms / frame", 0, "on the machine of this report"),
+    Column("spp", "spp", 0, "samples per pixel of the input"),
+)
+
+
+def show(value: float, field: str) -> str:
+    """A score as text: dB with two places, small errors with three figures, an en dash for NaN."""
+    if math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    if field.endswith("psnr"):
+        return f"{value:.2f}".replace("-", "−")
+    if field in ("ssim", "flip"):
+        return f"{value:.4f}".replace("-", "−")
+    if field == "spp":
+        return f"{value:.3g}"
+    if field == "ms_per_frame":
+        return f"{value:.2f}" if value < 10 else f"{value:.1f}" if value < 100 else f"{value:.0f}"
+    if value != 0 and abs(value) < 1e-3:
+        mantissa, exponent = f"{value:.2e}".split("e")
+        return f"{mantissa}e−{abs(int(exponent))}"
+    return f"{value:.4f}" if abs(value) < 10 else f"{value:.3g}"
+
+
+class Headline(NamedTuple):
+    """The four things a reader wants first; NaN or None where the results cannot tell."""
+
+    best: str | None
+    best_psnr: float
+    gain_over_svgf: float
+    """dB PSNR of the best method over svgf; NaN where there is no svgf or it is the best."""
+    svgf: str | None
+    traditional: str | None
+    """The ablation A (traditional motion vectors) that is compared."""
+    occlusion: str | None
+    """The ablation C (dual motion vectors and occlusion loss), of the same size as A."""
+    disoccluded_less: float
+    """By which fraction C's L1 error in disoccluded pixels lies below A's; negative where it lies above."""
+    disoccluded_gain: float
+    """dB PSNR of C over A in disoccluded pixels."""
+    floor: float
+    """dB, mean noise floor of the references."""
+
+
+def headline(results: Results) -> Headline:
+    """Find the best method by mean PSNR, svgf, and the ablations A and C among labels such as ``ntd C SMALL``."""
+    means = mean_scores(results)
+    known = [method for method in results.methods if not math.isnan(means[method].psnr)]
+    best = max(known, key=lambda method: means[method].psnr, default=None)
+    best_psnr = means[best].psnr if best is not None else math.nan
+    svgf = _labelled(results.methods, "svgf")
+    gain = _difference(best_psnr, means[svgf].psnr) if svgf is not None and svgf != best else math.nan
+    traditional, occlusion = _ablation(results.methods)
+    less = decibels = math.nan
+    if traditional is not None and occlusion is not None:
+        a, c = means[traditional], means[occlusion]
+        if a.disoccluded_l1 > 0 and math.isfinite(a.disoccluded_l1):
+            less = 1.0 - c.disoccluded_l1 / a.disoccluded_l1
+        decibels = _difference(c.disoccluded_psnr, a.disoccluded_psnr)
+    return Headline(best, best_psnr, gain, svgf, traditional, occlusion, less, decibels, mean_noise_floor(results))
+
+
+def sentences(results: Results) -> list[str]:
+    """The headline in words, plain text, one sentence or two for each finding."""
+    top, clips = headline(results), results.clips
+    over = f"over {len(clips)} clips" if len(clips) != 1 else f"on the clip {clips[0].name}"
+    said = []
+    if top.best is None:
+        said.append("No method has a PSNR: nothing can be said about which is best.")
+    elif len(results.methods) == 1:
+        said.append(f"{top.best} reaches {show(top.best_psnr, 'psnr')} dB PSNR {over}.")
+    else:
+        value = show(top.best_psnr, "psnr")
+        text = f"{top.best} has the highest PSNR of {len(results.methods)} methods: {value} dB {over}"
+        if math.isfinite(top.gain_over_svgf):
+            text += f", {show(top.gain_over_svgf, 'psnr')} dB more than {top.svgf}"
+        said.append(text + ".")
+    broken = [method for method, scores in mean_scores(results).items() if math.isnan(scores.psnr)]
+    if broken and top.best is not None:
+        said.append(f"Without a PSNR on at least one clip: {', '.join(broken)}.")
+    if top.traditional is not None and top.occlusion is not None:
+        if math.isnan(top.disoccluded_less):
+            said.append("Disoccluded pixels were not scored, so A and C cannot be compared there.")
+        else:
+            means = mean_scores(results)
+            a, c = (means[method].disoccluded_l1 for method in (top.traditional, top.occlusion))
+            word = "lower" if top.disoccluded_less >= 0 else "higher"
+            text = (
+                f"In disoccluded pixels the L1 error of {top.occlusion} is {abs(top.disoccluded_less):.0%} {word} than "
+                f"that of {top.traditional} ({show(c, 'l1')} against {show(a, 'l1')}"
+            )
+            if math.isfinite(top.disoccluded_gain):
+                text += f"; {'+' if top.disoccluded_gain >= 0 else ''}{show(top.disoccluded_gain, 'psnr')} dB PSNR"
+            said.append(text + ").")
+    if math.isnan(top.floor):
+        said.append("The noise floor of the references is not known.")
+    else:
+        text = f"The references are noisy themselves: a perfect image would score {show(top.floor, 'psnr')} dB"
+        said.append(text + (" on average." if len(clips) != 1 else "."))
+        if top.best_psnr > top.floor - NEAR_FLOOR:
+            said.append(
+                f"{top.best} comes within {NEAR_FLOOR:g} dB of that floor, so its true error is smaller than it looks; "
+                "references with more samples would tell."
+            )
+    return said
+
+
+def text_table(results: Results) -> str:
+    """The means over all clips as a table for the terminal, with the noise floor as its last row."""
+    means = mean_scores(results)
+    floor = mean_noise_floor(results)
+    rows = [["method", *(column.label for column in COLUMNS)]]
+    rows += [
+        [method, *(show(getattr(means[method], column.field), column.field) for column in COLUMNS)]
+        for method in results.methods
+    ]
+    rows.append(["noise floor", *(show(floor_score(floor, column.field), column.field) for column in COLUMNS)])
+    widths = [max(len(row[index]) for row in rows) for index in range(len(rows[0]))]
+    lines = [
+        "  ".join(
+            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
+        )
+        for row in rows
+    ]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def floor_score(floor_psnr: float, field: str) -> float:
+    """What a perfect image would score: known for PSNR, and for MSE as 10^(-PSNR / 10)."""
+    if field == "psnr":
+        return floor_psnr
+    if field == "mse" and not math.isnan(floor_psnr):
+        return 10.0 ** (-floor_psnr / 10.0)
+    return math.nan
+
+
+def best_methods(scores: dict[str, Scores], column: Column) -> set[str]:
+    """The methods that are best in a column as it is written; none where the column is no score or has one method."""
+    values = {method: getattr(score, column.field) for method, score in scores.items()}
+    known = {method: value * column.better for method, value in values.items() if not math.isnan(value)}
+    if column.better == 0 or len(known) < 2:
+        return set()
+    top = max(known.values())
+    shown = {show(values[method], column.field) for method, value in known.items() if value == top}
+    return {method for method in known if show(values[method], column.field) in shown}
+
+
+def is_noisy(method: str) -> bool:
+    """Whether a label says that this is the input, not a method."""
+    return "noisy" in method.lower()
+
+
+def _difference(first: float, second: float) -> float:
+    return math.nan if math.isinf(first) and math.isinf(second) else first - second
+
+
+def _labelled(methods: list[str], word: str) -> str | None:
+    """The first method that is called so, or has the word in its label."""
+    exact = [method for method in methods if method.lower() == word]
+    within = [method for method in methods if word in re.split(r"[^a-z0-9]+", method.lower())]
+    return next(iter(exact + within), None)
+
+
+def _ablation(methods: list[str]) -> tuple[str | None, str | None]:
+    """Labels of the ablations A and C: the same label but for the one letter, else the first of each."""
+
+    def lettered(letter: str) -> list[str]:
+        return [method for method in methods if re.search(rf"(?<![A-Za-z0-9]){letter}(?![A-Za-z0-9])", method)]
+
+    for a in lettered("A"):
+        c = re.sub(r"(?<![A-Za-z0-9])A(?![A-Za-z0-9])", "C", a)
+        if c in methods:
+            return a, c
+    return next(iter(lettered("A")), None), next(iter(lettered("C")), None)
