@@ -7,11 +7,22 @@ seed looks like must not change once clips have been rendered from it: add a new
 from collections.abc import Callable
 from typing import Any
 
+from jaxdn.render.families.dash import dash
+from jaxdn.render.families.edge import edge
 from jaxdn.render.families.fruit import fruit
+from jaxdn.render.families.mobile import mobile
+from jaxdn.render.families.pinkroom import pinkroom
 from jaxdn.render.families.robot import robot
 from jaxdn.render.families.staging import Stage
 
-FAMILIES: dict[str, Callable[..., Stage]] = {"fruit": fruit, "robot": robot}
+FAMILIES: dict[str, Callable[..., Stage]] = {
+    "fruit": fruit,
+    "robot": robot,
+    "pinkroom": pinkroom,
+    "mobile": mobile,
+    "edge": edge,
+    "dash": dash,
+}
 
 
 def family_scene(name: str, seed: int, **options: Any) -> Stage:

@@ -115,6 +115,23 @@ def flat(vertices: np.ndarray | list[tuple[float, float, float]], faces: list[tu
     return Mesh(vertices, normals, uv, np.arange(len(vertices)).reshape(-1, 3))
 
 
+def boxes(*spans: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Mesh:
+    """Faceted boxes as one mesh, each given as (centre, half size)."""
+    corners = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [face for a, b, c, d in quads for face in ((a, b, c), (a, c, d))]
+    return join(*(flat(corners * np.asarray(half) + np.asarray(centre), faces) for centre, half in spans))
+
+
+def holed_wall(left: float, right: float, low: float, high: float) -> Mesh:
+    """The square [-1,1]^2 facing +z without the opening given; uv run over the whole square."""
+    pieces = [(-1, left, -1, 1), (right, 1, -1, 1), (left, right, -1, low), (left, right, high, 1)]
+    corners = np.array([(x, y, 0) for x0, x1, y0, y1 in pieces for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))])
+    faces = [(4 * i + a, 4 * i + b, 4 * i + c) for i in range(4) for a, b, c in ((0, 1, 2), (0, 2, 3))]
+    mesh = flat(corners, faces)
+    return mesh._replace(uv=0.5 + 0.5 * mesh.vertices[:, :2])
+
+
 def roof() -> Mesh:
     """A saddle roof over [-1,1]^2 with its ridge along z at y = 1."""
     corners = [

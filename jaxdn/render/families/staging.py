@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdn.render.families import textures
-from jaxdn.render.families.shapes import Mesh, dish, drum, ply_path
+from jaxdn.render.families.shapes import Mesh, boxes, dish, drum, holed_wall, ply_path
 from jaxdn.render.scene import Camera
 
 Motion = Callable[[float], np.ndarray]
@@ -231,23 +231,22 @@ def furnish_room(
 
 
 def _window_wall(stage: Stage, half: tuple[float, float, float], wall: Material) -> None:
-    """The right wall in four strips around an opening, and the bars of the window in it."""
+    """The right wall with an opening, the bars and the sill of the window in it, and the sky outside."""
     width, height, length = half
     centre = stage.rng.uniform(-0.35, 0.15) * length
     near, far = centre + 0.36 * length, centre - 0.36 * length
     low, high = 0.3 * height, 0.82 * height
-    strips = [(-length, far, 0, height), (near, length, 0, height), (far, near, 0, low), (far, near, high, height)]
-    for index, (z0, z1, y0, y1) in enumerate(strips):
-        # Each strip shows its own piece of the wall's texture at the scale of the whole wall.
-        share = ((z1 - z0) / (2 * length), (y1 - y0) / height)
-        piece = wall._replace(repeat=(wall.repeat[0] * share[0], wall.repeat[1] * share[1]))
-        pose = shift(width, (y0 + y1) / 2, (z0 + z1) / 2) @ turn("y", -90) @ scale((z1 - z0) / 2, (y1 - y0) / 2, 1)
-        stage.add(f"wall_right_{index}", RECTANGLE, pose, piece)
-    frame = glossy((0.75, 0.73, 0.7), 0.4)
     middle, reach, rise = (low + high) / 2, (near - far) / 2, (high - low) / 2
-    stage.add("window_bar", "cube", shift(width, middle, centre) @ scale(0.03, rise, 0.03), frame)
-    stage.add("window_cross", "cube", shift(width, middle, centre) @ scale(0.03, 0.03, reach), frame)
-    stage.add("window_sill", "cube", shift(width - 0.08, low - 0.03, centre) @ scale(0.12, 0.03, reach + 0.1), frame)
+    # The wall's own x runs along +z of the room once it is turned to face inwards.
+    opening = (far / length, near / length, 2 * low / height - 1, 2 * high / height - 1)
+    pose = shift(width, height / 2, 0) @ turn("y", -90) @ scale(length, height / 2, 1)
+    stage.add("wall_right", holed_wall(*opening), pose, wall)
+    bars = boxes(
+        ((0, 0, 0), (0.03, rise, 0.03)),
+        ((0, 0, 0), (0.03, 0.03, reach)),
+        ((-0.08, -rise - 0.03, 0), (0.12, 0.03, reach + 0.1)),
+    )
+    stage.add("window_bars", bars, shift(width, middle, centre), glossy((0.75, 0.73, 0.7), 0.4))
     sky = shift(width + 0.45, middle + 0.25, centre) @ turn("y", -90 + stage.rng.uniform(-6, 6)) @ turn("x", 14)
     stage.add("sky", RECTANGLE, sky @ scale(reach + 0.55, rise + 0.45, 1), matte((0.0, 0.0, 0.0)), glow=(1.0, 1.0, 1.0))
 
@@ -269,7 +268,7 @@ def light_room(stage: Stage, spot: tuple[float, float], *, power: float) -> None
         return
     radius = 0.55
     if stage.lamp == "up":
-        y = stage.bounds[1, 1] - 0.62
+        y = 0.76 * stage.bounds[1, 1]
         facing = shift(x, y, z) @ turn("x", -90)
         stage.add(
             "lamp", "disk", facing @ scale(radius), matte((0.0, 0.0, 0.0)), glow=1.4 * strength / radius**2 / np.pi
