@@ -96,7 +96,8 @@ def training_batches(
     indices = [index for index, source in enumerate(sources) for _ in range(source.shape[0] // frames)]
     # `repeat` before `random_map`: its generator is seeded by the position in the endless stream.
     stream = grain.MapDataset.source(indices).seed(seed).shuffle().repeat(None).random_map(element)
-    batches = stream.batch(batch, batch_fn=_stack)
+    # Nothing ever remains of an endless stream, but rounding its length up overflows for batches of one.
+    batches = stream.batch(batch, drop_remainder=True, batch_fn=_stack)
     # Grain's own default is to keep 500 elements ready, which are batches here.
     options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=threads)
     return iter(batches.to_iter_dataset(options))

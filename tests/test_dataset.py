@@ -1,0 +1,184 @@
+"""The stream of training batches: what is in it, that it repeats, that it resumes, and what it refuses."""
+
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from jaxdn import clips
+from jaxdn.clips import ClipError, training_batches
+from jaxdn.clips.cache import open_cached, read_window
+from jaxdn.frame import Clip, Frame
+
+HEIGHT, WIDTH = 12, 15
+
+
+def coordinates(count: int, clip: int) -> np.ndarray:
+    """A clip that says of every value where it came from: (clip, frame, row * 16 + column), exact in half precision."""
+    t, y, x = np.mgrid[:count, :HEIGHT, :WIDTH].astype(np.float32)
+    return np.stack([np.full_like(t, clip), t, y * 16 + x], axis=-1)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """Three clips of 4, 4 and 9 frames with layers of 1 and 2 samples."""
+    for index, count in enumerate((4, 4, 9)):
+        home = tmp_path / "clips" / f"clip{index}"
+        home.mkdir(parents=True)
+        image = coordinates(count, index)
+        for t in range(count):
+            motion = rng.random((HEIGHT, WIDTH, 2), np.float32)
+            frame = Frame(radiance=image[t], motion=motion, depth=image[t, ..., 2:])
+            layers = {1: image[t], 2: image[t] + 4}
+            clips.write_frame(clips.frame_path(home, t), frame, layers=layers, reference=image[t])
+        clips.write_record({"frames": count, "width": WIDTH, "height": HEIGHT, "layers": [1, 2]}, home)
+    return tmp_path / "clips"
+
+
+def equal(one: Clip, other: Clip) -> bool:
+    return all(jax.tree.leaves(jax.tree.map(np.array_equal, one, other)))
+
+
+def test_elements_are_windows_of_one_clip(folder: Path) -> None:
+    stream = training_batches(folder, batch=5, crop=6, frames=3, seed=1, augment=False)
+    starts = set()
+    for _ in range(6):
+        batch = next(stream)
+        assert batch.frames.radiance.shape == (5, 3, 6, 6, 3)
+        assert batch.frames.radiance.dtype == np.float32
+        assert batch.frames.albedo is None
+        np.testing.assert_array_equal(batch.reference, batch.frames.radiance)
+        np.testing.assert_array_equal(batch.frames.depth, batch.frames.radiance[..., 2:])
+        for element in batch.reference:
+            assert np.ptp(element[..., 0]) == 0  # one clip
+            np.testing.assert_array_equal(np.diff(element[:, 0, 0, 1]), 1)  # consecutive frames
+            place = element[0, ..., 2]
+            assert np.ptp(element[..., 2], axis=0).max() == 0  # the same crop in all of them
+            np.testing.assert_array_equal(np.diff(place, axis=1), 1)
+            np.testing.assert_array_equal(np.diff(place, axis=0), 16)
+            starts.add((element[0, 0, 0, 0], element[0, 0, 0, 1], place[0, 0]))
+    assert {clip for clip, _, _ in starts} == {0, 1, 2}
+    assert len(starts) > 20
+
+
+def test_augmented_elements_are_symmetries_and_motion_goes_along(folder: Path) -> None:
+    batch = next(training_batches(folder, batch=24, crop=6, frames=2, seed=3))
+    shapes = set()
+    for element in batch.reference[..., 2]:
+        down, right = element[0, 1, 0] - element[0, 0, 0], element[0, 0, 1] - element[0, 0, 0]
+        shapes.add((down, right))
+    assert len(shapes) == 8
+    assert (batch.frames.motion < 0).any()  # the clips' own motion is positive
+    wide = next(training_batches(folder, batch=16, crop=(4, 8), frames=2, seed=3))
+    assert wide.reference.shape == (16, 2, 4, 8, 3)
+
+
+def test_equal_arguments_give_equal_streams_and_seeds_differ(folder: Path) -> None:
+    one, same = (training_batches(folder, batch=2, crop=5, frames=2, seed=7, threads=n) for n in (0, 2))
+    other = training_batches(folder, batch=2, crop=5, frames=2, seed=8)
+    firsts = [next(one) for _ in range(5)]
+    assert all(equal(batch, next(same)) for batch in firsts)
+    assert not all(equal(batch, next(other)) for batch in firsts)
+    assert not equal(firsts[0], firsts[1])
+
+
+@pytest.mark.parametrize("threads", [0, 2])
+def test_a_restored_stream_goes_on_where_it_was(folder: Path, threads: int) -> None:
+    def stream() -> clips.training_batches:
+        return training_batches(folder, batch=2, crop=5, frames=2, seed=7, threads=threads)
+
+    original = stream()
+    for _ in range(9):  # more than one epoch
+        next(original)
+    state = original.get_state()
+    rest = [next(original) for _ in range(6)]
+    fresh = stream()
+    fresh.set_state(state)
+    assert all(equal(batch, next(fresh)) for batch in rest)
+    # Back in time within one stream as well.
+    original.set_state(state)
+    assert equal(rest[0], next(original))
+
+
+def test_sample_counts_and_buffers_can_be_chosen(folder: Path) -> None:
+    batch = next(training_batches(folder, batch=1, crop=5, frames=2, seed=0, spp=2, buffers=("depth", "albedo")))
+    np.testing.assert_array_equal(batch.frames.radiance, batch.reference + 4)
+    assert batch.frames.motion is None
+    np.testing.assert_array_equal(batch.frames.depth, batch.reference[..., 2:])
+    mixed = next(training_batches(folder, batch=16, crop=5, frames=2, seed=0, spp=(1, 2)))
+    offsets = (mixed.frames.radiance - mixed.reference)[:, 0, 0, 0, 0]
+    assert set(offsets) == {0.0, 4.0}
+
+
+def test_the_cache_holds_the_clip_and_follows_it(folder: Path) -> None:
+    home = folder / "clip0"
+    everything = (slice(None),) * 3
+    for spp in (1, 2, 3):
+        expected, found = clips.read_clip(home, spp=spp), read_window(open_cached(home), everything, spp=spp)
+        assert equal(expected, found)
+    kept = os.listdir(folder / ".cache")
+    assert len(kept) == 1
+    open_cached(home)
+    assert os.listdir(folder / ".cache") == kept
+    clips.write_clip(Clip(Frame(radiance=coordinates(2, 9)), coordinates(2, 9)), home)
+    assert open_cached(home).shape == (2, HEIGHT, WIDTH)
+    np.testing.assert_array_equal(read_window(open_cached(home), everything).reference, coordinates(2, 9))
+    assert len(os.listdir(folder / ".cache")) == 1
+    assert os.listdir(folder / ".cache") != kept
+
+
+def test_a_clip_that_cannot_be_read_leaves_no_cache(folder: Path) -> None:
+    file = clips.frame_path(folder / "clip1", 2)
+    file.write_bytes(file.read_bytes()[:-40])
+    with pytest.raises(ClipError, match=r"frame_0002\.exr"):
+        training_batches(folder, batch=1, crop=4, frames=2, seed=0)
+    assert all(name.startswith("clip0.") for name in os.listdir(folder / ".cache"))
+    file.unlink()
+    with pytest.raises(ClipError, match=r"frame_0002\.exr"):
+        training_batches(folder, batch=1, crop=4, frames=2, seed=0)
+
+
+def test_a_broken_reference_is_zeroed_and_named_while_noise_is_kept(tmp_path: Path) -> None:
+    image = np.ones((2, 4, 4, 3), np.float32)
+    broken = image.copy()
+    broken[0, 1, 1] = (np.nan, np.inf, -1.0)
+    clips.write_clip(Clip(Frame(radiance=broken), broken), tmp_path / "bad")
+    clips.write_clip(Clip(Frame(radiance=image), image), tmp_path / "good")
+    for _ in range(2):  # from the EXR files and from the cache
+        with pytest.warns(UserWarning, match="bad: 3 values of the reference"):
+            stream = training_batches(tmp_path, batch=2, crop=4, frames=2, seed=0, augment=False)
+    batch = next(stream)
+    bad = int(np.argmin(batch.reference.sum(axis=(1, 2, 3, 4))))
+    np.testing.assert_array_equal(batch.reference[bad, 0, 1, 1], 0)
+    np.testing.assert_array_equal(batch.frames.radiance[bad, 0, 1, 1], [np.nan, np.inf, -1.0])
+    np.testing.assert_array_equal(batch.reference[1 - bad], image)
+
+
+def test_what_does_not_fit_is_refused_by_name(folder: Path, tmp_path: Path) -> None:
+    def refused(match: str, **changes: object) -> None:
+        options = {"batch": 1, "crop": 4, "frames": 2, "seed": 0, **changes}
+        with pytest.raises(ValueError, match=match):
+            training_batches(folder, **options)
+
+    refused(r"clip0: expected at least 13 x 13 pixels for the crop, got 15 x 12", crop=13)
+    refused(r"clip0: expected at least 5 frames, got 4", frames=5)
+    refused(r"clip0: 4 samples a pixel are not available", spp=4)
+    refused("batch: expected a whole number", batch=0)
+    refused("crop: expected a whole number", crop=(4, 0))
+    refused("seed: expected", seed=-1)
+    refused("spp: expected at least one", spp=())
+    image = coordinates(4, 3)
+    clips.write_clip(Clip(Frame(radiance=image)), folder / "clip3")
+    refused("clip3: there is no reference")
+    clips.write_clip(Clip(Frame(radiance=image, albedo=image), image), folder / "clip3")
+    refused("clip3: expected the same buffers as in .*clip0, but albedo, depth, motion differs")
+    with pytest.raises(ClipError, match="found none"):
+        training_batches(tmp_path, batch=1, crop=4, seed=0)
+    with pytest.raises(ClipError, match="no such folder"):
+        training_batches(tmp_path / "nowhere", batch=1, crop=4, seed=0)
+    with pytest.raises(ClipError, match="at least one folder"):
+        training_batches([], batch=1, crop=4, seed=0)
+    several = training_batches([folder / "clip0", folder / "clip1"], batch=2, crop=4, frames=2, seed=0)
+    assert set(next(several).reference[..., 0].ravel()) <= {0.0, 1.0}
