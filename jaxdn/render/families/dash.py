@@ -50,11 +50,10 @@ def dash(seed: int, *, lamp: str = "mix") -> Stage:
 
 
 def _partition(stage: Stage, hue: float) -> None:
-    """A wall across the middle with a wide doorway; it ends before the camera, which sees both halves."""
+    """A wall across the middle, open to the front below its lintel, so that the camera sees both halves."""
     paint = matte(textures.speckled(stage.rng, textures.hsv(hue, 0.2, 0.9), textures.hsv(hue, 0.3, 0.8), cells=10))
-    stage.add("partition_back", "cube", shift(-0.05, 1.4, -1.98) @ scale(0.06, 1.4, 0.42), paint)
-    stage.add("partition_top", "cube", shift(-0.05, 2.12, -0.46) @ scale(0.06, 0.68, 1.1), paint)
-    stage.add("post", shapes.drum(), shift(-0.05, 0, 0.68) @ scale(0.07, 2.8, 0.07), metal((0.7, 0.68, 0.65), 0.35))
+    stage.add("partition_back", "cube", shift(-0.05, 1.4, -1.9) @ scale(0.06, 1.4, 0.5), paint)
+    stage.add("partition_top", "cube", shift(-0.05, 2.1, -0.75) @ scale(0.06, 0.7, 0.65), paint)
 
 
 def _things(stage: Stage, hue: float) -> None:

@@ -28,7 +28,7 @@ CLOTH = 0.006  # how far the cloth's surface lies above it
 
 
 def fruit(seed: int, *, lamp: str = "mix") -> Stage:
-    """Apples, an orange and a lemon rolling on a table with a cloth, a turning fruit stand, a pear, a vase and books."""
+    """Apples, an orange and a lemon roll on a table with a cloth, a turning fruit stand, a pear, a vase and books."""
     stage = Stage("fruit", seed, lamp=lamp)
     rng = stage.rng
     hue = rng.random()

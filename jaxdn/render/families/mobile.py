@@ -10,7 +10,6 @@ from jaxdn.render.families.staging import (
     drifting_camera,
     furnish_room,
     glossy,
-    hop,
     light_room,
     matte,
     metal,
@@ -27,11 +26,13 @@ REACH = 0.34  # half the length of the mobile's small arms
 
 
 def mobile(seed: int, *, lamp: str = "mix") -> Stage:
-    """A mobile of two tiers over hills with trees, houses, a pond, a windmill, a little train and a hopping ball."""
+    """A mobile of two tiers over hills with trees, houses, a pond, a little train and a paper glider."""
     stage = Stage("mobile", seed, lamp=lamp)
     rng = stage.rng
     hue = rng.uniform(0.45, 0.75)
-    starry = textures.speckled(rng, textures.hsv(hue, 0.4, 0.85), textures.hsv(0.14, 0.3, 0.95), cells=22, amount=0.18)
+    starry = textures.speckled(
+        rng, textures.hsv(hue, 0.22, 0.94), textures.hsv(0.14, 0.25, 0.97), cells=22, amount=0.25
+    )
     tiled = textures.tiles(rng, textures.hsv(0.1, 0.2, 0.85), textures.hsv(hue, 0.25, 0.65), count=10)
     wall = matte(starry, repeat=(2, 1))
     floor = glossy(tiled, rng.uniform(0.25, 0.4), repeat=(2, 2))
@@ -40,7 +41,7 @@ def mobile(seed: int, *, lamp: str = "mix") -> Stage:
     _landscape(stage)
     _mobile(stage)
     _train(stage)
-    _ball(stage)
+    _glider(stage)
     side = rng.uniform(-0.5, 0.5)
     drifting_camera(stage, (side, 1.62, 1.9), (0.1 * side, 1.02, -0.6), x_fov=60, reach=0.22)
     return stage
@@ -87,7 +88,7 @@ def _landscape(stage: Stage) -> None:
 
 
 def _mobile(stage: Stage) -> None:
-    """An arm that turns under the ceiling; from its ends hang smaller arms with two toys each, from its middle a sun."""
+    """An arm under the ceiling; from its ends hang smaller arms with two toys each, from its middle a sun."""
     rng = stage.rng
     top, main, hue = stage.bounds[1, 1], 1.95, rng.random()
     sense = rng.choice([-1, 1])
@@ -185,16 +186,18 @@ def _train(stage: Stage) -> None:
     stage.add("chimney", shapes.drum(1.0), lambda frame: carriage(frame, 0) @ chimney, metal((0.8, 0.6, 0.35), 0.3))
 
 
-def _ball(stage: Stage) -> None:
-    """A ball that hops across the floor before the table."""
+def _glider(stage: Stage) -> None:
+    """A paper glider that circles outside the mobile and banks into its turn."""
     rng = stage.rng
-    period, phase, beat = rng.uniform(48, 72), rng.random(), rng.uniform(12, 18)
-    leap, radius = rng.uniform(0.4, 0.75), rng.uniform(0.15, 0.19)
-    skin = glossy(textures.stripes(rng, [textures.hsv(hue, 0.65, 0.88) for hue in rng.random(2)], count=6), 0.3)
+    lap, phase = rng.uniform(58, 85) * rng.choice([-1, 1]), rng.uniform(0, 360)
+    radius, height = rng.uniform(1.3, 1.42), rng.uniform(1.2, 1.5)
+    corners = [(0.0, 0.0, 0.6), (-0.45, 0.08, -0.4), (0.45, 0.08, -0.4), (0.0, -0.16, -0.4), (0.0, 0.02, -0.4)]
+    paper = shapes.flat(corners, [(0, 1, 4), (0, 4, 2), (0, 3, 1), (0, 2, 3), (1, 3, 4), (4, 3, 2)])
+    lines = textures.stripes(rng, [np.array((0.85, 0.84, 0.8)), textures.hsv(rng.random(), 0.5, 0.85)], count=6)
 
-    def ball(frame: float) -> np.ndarray:
-        travel = 1.1 * swing(frame, period, phase)
-        lift = radius + leap * hop(frame, beat)
-        return shift(travel, lift, 1.02) @ turn("z", -np.degrees(travel / radius)) @ turn("x", 40) @ scale(radius)
+    def glider(frame: float) -> np.ndarray:
+        around = turn("y", phase + 360 * frame / lap) @ shift(radius, 0, 0) @ turn("y", 180 if lap > 0 else 0)
+        rise = shift(CENTRE[0], height + 0.12 * swing(frame, 0.7 * abs(lap)), CENTRE[1])
+        return rise @ around @ turn("z", 25 if lap > 0 else -25) @ scale(0.4)
 
-    stage.add("ball", "sphere", ball, skin)
+    stage.add("glider", paper, glider, matte(lines))
