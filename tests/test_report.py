@@ -234,6 +234,7 @@ def test_text_table_has_every_method_and_the_floor_in_aligned_columns():
         (math.nan, "l1", "–"),
         (math.inf, "psnr", "∞"),
         (0.00087, "mse", "8.70e−4"),
+        (0.00174, "mse", "0.00174"),
         (0.0, "mse", "0.0000"),
         (0.0123, "l1", "0.0123"),
         (7.86, "ms_per_frame", "7.86"),
@@ -288,7 +289,12 @@ def test_a_write_that_fails_replaces_nothing_and_leaves_nothing(tmp_path):
 def test_error_map_and_its_scale():
     error = pictures.error_map(np.full((2, 2, 3), (0.1, 0.2, 0.6)), np.zeros((2, 2, 3)))
     np.testing.assert_allclose(error, 0.3)
-    assert pictures.error_map(np.full((1, 1, 3), math.nan), np.zeros((1, 1, 3)))[0, 0] == 1.0
+    broken = pictures.error_map(np.full((1, 1, 3), math.inf), np.zeros((1, 1, 3)))
+    assert np.isnan(broken).all()
+    assert pictures.error_scale([broken, np.full((2, 2), 0.02)]) == pytest.approx(0.02)
+    assert pictures.error_scale([broken]) == pytest.approx(1e-3)
+    assert pictures.encode_error(broken, 0.5) == pictures.encode_error(np.ones((1, 1)), 0.5)
+    assert pictures.worst_crop([broken], np.zeros((1, 1), bool)) == (0, 0, 1, 1)
     for top, scale in ((0.3, 0.5), (0.2, 0.2), (0.011, 0.02), (0.0, 1e-3), (7.0, 1.0)):
         assert pictures.error_scale([np.full((4, 4), top)]) == pytest.approx(scale)
     colors = np.asarray(
@@ -530,6 +536,7 @@ def test_the_split_moves_by_keyboard_and_by_pointer(visit):
     assert at() == 0
     tab.get_by_label("left", exact=True).select_option("noisy")
     assert slider.get_attribute("aria-valuetext") == "noisy left, ntd C right"
+    tab.get_by_label("left", exact=True).focus()
     tab.keyboard.press("2")  # belongs to the select now, not to the flip view
     assert shown_label(tab) == "ntd C"
 
@@ -550,8 +557,11 @@ def test_tables_have_all_methods_and_the_floor(visit):
     wanted = show(results.clips[0].scores["ntd C"].disoccluded_l1, "disoccluded_l1")
     assert wanted in overview.inner_text()
     assert tab.locator("#clip-0 tbody tr").count() == 6
-    assert tab.locator("#clip-0 .crops figcaption").all_inner_texts()[:6] == [*METHODS, "reference"]
-    assert tab.locator("#clip-0 .errors figcaption").all_inner_texts() == METHODS
+    captions = [text.split("\n") for text in tab.locator("#clip-0 .crops figcaption").all_inner_texts()]
+    assert [caption[0] for caption in captions[:6]] == [*METHODS, "reference"]
+    clip = results.clips[0]
+    captions = [text.split("\n") for text in tab.locator("#clip-0 .errors figcaption").all_inner_texts()]
+    assert captions == [[method, "L1 " + show(clip.scores[method].l1, "l1")] for method in METHODS]
 
 
 @pytest.mark.browser

@@ -39,25 +39,30 @@ def encode_png(image: Any) -> bytes:
 
 
 def error_map(image: Any, reference: Any) -> np.ndarray:
-    """[H, W] float64: mean over channels of |image - reference|; 1 where that is not finite."""
-    difference = np.abs(np.asarray(image, np.float64) - np.asarray(reference, np.float64)).mean(axis=2)
-    return np.where(np.isfinite(difference), difference, 1.0)
+    """[H, W] float64: mean over channels of |image - reference|; NaN where that is not finite."""
+    finite = np.isfinite(image).all(axis=2, keepdims=True)
+    difference = np.abs(np.where(finite, image, 0.0) - np.asarray(reference, np.float64)).mean(axis=2)
+    return np.where(finite[..., 0], difference, np.nan)
 
 
 def error_scale(maps: list[np.ndarray]) -> float:
-    """Upper end of a colour scale shared by all maps: their 99.5th percentile, rounded up to 1, 2 or 5 times 10^n."""
-    top = float(np.percentile(np.concatenate([values.ravel() for values in maps]), 99.5)) if maps else 0.0
+    """Upper end of a colour scale shared by all maps: their 99.5th percentile, rounded up to 1, 2 or 5 times 10^n.
+
+    NaN does not count: one broken image must not turn all the others black.
+    """
+    known = [values[~np.isnan(values)] for values in maps]
+    top = float(np.percentile(np.concatenate(known), 99.5)) if sum(map(len, known)) else 0.0
     top = min(max(top, 1e-3), 1.0)
     power = 10.0 ** np.floor(np.log10(top))
     return float(min(step * power for step in (1, 2, 5, 10) if step * power >= top * (1 - 1e-9)))
 
 
 def encode_error(error: np.ndarray, scale: float) -> bytes:
-    """The bytes of a PNG with 64 palette colours: ``ERROR_COLORS`` over 0..scale, saturated above."""
+    """The bytes of a PNG with 64 palette colours: ``ERROR_COLORS`` over 0..scale, saturated above and where NaN."""
     steps = np.linspace(0.0, 1.0, 64)
     anchors = np.linspace(0.0, 1.0, len(ERROR_COLORS))
     palette = np.stack([np.interp(steps, anchors, channel) for channel in np.transpose(ERROR_COLORS)], axis=1)
-    index = np.rint(np.clip(error / scale, 0.0, 1.0) * 63.0).astype(np.uint8)
+    index = np.rint(np.clip(np.where(np.isnan(error), 1.0, error / scale), 0.0, 1.0) * 63.0).astype(np.uint8)
     picture = Image.fromarray(index)
     picture.putpalette(np.rint(palette).astype(np.uint8).ravel().tolist())
     return _encode(picture)
@@ -78,7 +83,7 @@ def worst_crop(errors: list[np.ndarray], disoccluded: Any, *, size: int = 40) ->
     """
     mask = np.asarray(disoccluded, bool)
     rows, columns = mask.shape
-    weight = np.sum(errors, axis=0) if errors else np.ones(mask.shape)
+    weight = np.sum(np.nan_to_num(np.asarray(errors, np.float64), nan=1.0), axis=0) if errors else np.ones(mask.shape)
     if mask.any():
         # The smallest addend keeps the window on disoccluded pixels even where nothing is wrong with them.
         weight = np.where(mask, weight + 1e-9, 0.0)
@@ -113,5 +118,5 @@ def write_atomically(contents: dict[Path, bytes]) -> None:
 
 def _encode(picture: Image.Image) -> bytes:
     buffer = io.BytesIO()
-    picture.save(buffer, format="PNG", compress_level=9)
+    picture.save(buffer, format="PNG", compress_level=6)
     return buffer.getvalue()

@@ -138,14 +138,15 @@
     const tiles = Object.entries(clip.errors).map(([label, source]) => {
       const tile = el("div", { class: "tile" }, place(el("img", { src: source, alt: "error of " + label }), [0, 0, clip.width, clip.height], clip));
       tile.style.aspectRatio = clip.width + " / " + clip.height;
-      return el("figure", {}, tile, el("figcaption", {}, label));
+      return el("figure", {}, tile, el("figcaption", {}, label, el("span", {}, "L1 " + clip.error[label])));
     });
-    return tiles.length ? el("div", {}, el("h3", {}, "Error of frame " + clip.shownFrame), el("div", { class: "tiles errors" }, ...tiles)) : "";
+    const scale = document.querySelector(".scale").cloneNode(true);
+    return tiles.length ? el("div", {}, el("h3", {}, "Error of frame " + clip.shownFrame + "\u2003", scale), el("div", { class: "tiles errors" }, ...tiles)) : "";
   }
 
   function crops(clip) {
     const [x, y, w, h] = clip.crop;
-    const tile = (sources, caption) => {
+    const tile = (sources, caption, error) => {
       const box = el("div", { class: "tile" });
       box.style.aspectRatio = w + " / " + h;
       for (const [source, kind] of sources) {
@@ -153,10 +154,10 @@
         image.style.cssText = `width:${(100 * clip.width) / w}%;height:${(100 * clip.height) / h}%;left:${(-100 * x) / w}%;top:${(-100 * y) / h}%`;
         box.append(image);
       }
-      return el("figure", {}, box, el("figcaption", {}, caption));
+      return el("figure", {}, box, el("figcaption", {}, caption, ...(error ? [el("span", {}, "L1 " + error)] : [])));
     };
-    const tiles = clip.labels.map((label) => tile([[clip.images[label], "picture"]], label));
-    if (clip.mask) tiles.push(tile([[clip.images[REFERENCE], ""], [clip.mask, "mask"]], "disoccluded pixels in cyan"));
+    const tiles = clip.labels.map((label) => tile([[clip.images[label], "picture"]], label, clip.cropError[label]));
+    if (clip.mask) tiles.push(tile([[clip.images[REFERENCE], ""], [clip.mask, "mask"]], "disoccluded in cyan, where L1 is taken"));
     const title = clip.mask ? "Worst disocclusion" : "Largest error (this frame has no disoccluded pixels)";
     return el("div", {}, el("h3", {}, `${title}: frame ${clip.shownFrame}, ${w} × ${h} px at (${x}, ${y})`), el("div", { class: "tiles crops" }, ...tiles));
   }

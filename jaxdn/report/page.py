@@ -28,7 +28,7 @@ from jaxdn.report.summary import COLUMNS, best_methods, floor_score, headline, i
 IMAGE_BUDGET = 27_000_000
 """Bytes of pictures (as base64 text) in one page; clips that come after it is spent keep numbers and curves only."""
 
-ARROWS = {1: " ↑", -1: " ↓", 0: ""}
+ARROWS = {1: "\N{NO-BREAK SPACE}↑", -1: "\N{NO-BREAK SPACE}↓", 0: ""}
 
 POINTS = 1000
 """A loss curve is drawn with at most so many points, each the mean of its steps; metrics.json keeps them all."""
@@ -120,6 +120,7 @@ def _top(results: Results) -> str:
         f'<div class="label">{escape(below)}</div></div>'
         for label, figure, below in cards
     )
+    said = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences(results))
     count = f"{len(results.clips)} clip{'s' if len(results.clips) != 1 else ''}"
     links = {"scores": "Scores", "overview": "By clip", "clips": "Pictures", "training": "Training", "made": "Settings"}
     navigation = " ".join(
@@ -131,7 +132,7 @@ def _top(results: Results) -> str:
         f'<header><h1>{escape(results.title)}</h1><p class="note">{count}, {len(results.methods)} methods</p>'
         f"<nav>{navigation}</nav></header>"
         f'<section id="summary"><div class="cards">{shown}</div>'
-        f"<p>{' '.join(escape(sentence) for sentence in sentences(results))}</p></section>"
+        f"<ul>{said}</ul></section>"
     )
 
 
@@ -208,6 +209,10 @@ def _clip(
     judged = [maps[label] for label in labels if not is_noisy(label)] or list(maps.values())
     mask = np.asarray(clip.disoccluded, bool)
     x, y, width, height = images.worst_crop(judged, mask)
+    where = np.zeros_like(mask)
+    where[y : y + height, x : x + width] = True
+    if mask.any():
+        where &= mask
     pictures = {label: images.data_address(images.encode_png(clip.images[label])) for label in [*labels, REFERENCE]}
     wrong = {label: images.data_address(images.encode_error(maps[label], scale)) for label in labels}
     spent = sum(map(len, pictures.values())) + sum(map(len, wrong.values()))
@@ -219,7 +224,8 @@ def _clip(
         "crop": [x, y, width, height],
         "disoccluded": int(mask.sum()),
         "floor": clip.noise_floor_psnr,
-        "psnr": {method: show(clip.scores[method].psnr, "psnr") for method in results.methods},
+        "error": {label: show(float(maps[label].mean()), "l1") for label in labels},
+        "cropError": {label: show(float(maps[label][where].mean()), "l1") for label in labels},
         "curves": _curves(clip),
     }
     notice = ""
@@ -319,7 +325,8 @@ def _swatch(number: int, method: str) -> str:
 
 def _scale_bar(scale: float) -> str:
     colors = ", ".join(f"rgb{color}" for color in images.ERROR_COLORS)
-    return f'<span class="scale">0 <i style="background:linear-gradient(to right, {colors})"></i> {scale:g} and above</span>'
+    bar = f'<i style="background:linear-gradient(to right, {colors})"></i>'
+    return f'<span class="scale">0 {bar} {scale:g} and above</span>'
 
 
 def _json_script(data: Any, attributes: str = "") -> str:

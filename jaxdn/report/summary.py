@@ -29,7 +29,7 @@ COLUMNS = (
     Column("flip", "FLIP", -1, "perceived difference when flipping"),
     Column("disoccluded_l1", "Disoccluded L1", -1, "on pixels hidden one frame earlier"),
     Column("disoccluded_psnr", "Disoccluded PSNR dB", 1, "on pixels hidden one frame earlier"),
-    Column("ms_per_frame", "ms / frame", 0, "on the machine of this report"),
+    Column("ms_per_frame", "ms/frame", 0, "on the machine of this report"),
     Column("spp", "spp", 0, "samples per pixel of the input"),
 )
 
@@ -51,6 +51,8 @@ def show(value: float, field: str) -> str:
     if value != 0 and abs(value) < 1e-3:
         mantissa, exponent = f"{value:.2e}".split("e")
         return f"{mantissa}e−{abs(int(exponent))}"
+    if 0 < abs(value) < 0.01:
+        return f"{value:.5f}"
     return f"{value:.4f}" if abs(value) < 10 else f"{value:.3g}"
 
 
