@@ -29,7 +29,7 @@ COLUMNS = (
     Column("flip", "FLIP", -1, "perceived difference when flipping"),
     Column("disoccluded_l1", "Disoccluded L1", -1, "on pixels hidden one frame earlier"),
     Column("disoccluded_psnr", "Disoccluded PSNR dB", 1, "on pixels hidden one frame earlier"),
-    Column("ms_per_frame", "ms/frame", 0, "on the machine of this report"),
+    Column("ms_per_frame", "ms / frame", 0, "on the machine of this report"),
     Column("spp", "spp", 0, "samples per pixel of the input"),
 )
 
