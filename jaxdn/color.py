@@ -35,7 +35,7 @@ def compress(x: jax.Array) -> jax.Array:
     Hasselgren et al. 2020, sec. 2.1; the toe and the odd continuation are ours.
     """
     x = _floating(x)
-    size = jnp.where(x >= 0, x, -x)  # not abs: its derivative at 0 would be 0, and a black pixel would never learn
+    size = jnp.where(x >= 0, x, -x)  # not abs: with a derivative of 0 at 0 a black pixel would never learn
     u = jnp.log1p(jnp.minimum(size, float(jnp.finfo(x.dtype).max)))
     toe = u <= _TOE
     y = jnp.where(toe, _TOE_SLOPE * u, jnp.where(toe, 1.0, u) ** (1 / _GAMMA))

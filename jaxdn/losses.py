@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.checks import check_image, check_option, check_same_size
+from jaxdn.numerics import absolute
 from jaxdn.stencils import correlate, pad_edge
 
 
 def spatial(denoised: jax.Array, reference: jax.Array) -> jax.Array:
     """Mean of ``|denoised - reference|`` over all elements (Zeng et al. 2021, eq. 5, first term)."""
-    return jnp.mean(jnp.abs(_difference(denoised, reference)))
+    return jnp.mean(absolute(_difference(denoised, reference)))
 
 
 def temporal(denoised: jax.Array, reference: jax.Array) -> jax.Array:
@@ -40,7 +41,7 @@ def gradient(denoised: jax.Array, reference: jax.Array, *, operator: str = "diff
     check_option(operator, "operator", ("difference", "hfen"))
     error = _difference(denoised, reference)
     if operator == "hfen":
-        return jnp.mean(jnp.abs(_laplacian_of_gaussian(error)))
+        return jnp.mean(absolute(_laplacian_of_gaussian(error)))
     horizontal = error[:, :, 1:] - error[:, :, :-1]
     vertical = error[:, 1:] - error[:, :-1]
     return _mean_size(horizontal, vertical)
@@ -70,7 +71,7 @@ def occlusion(
     for age, weight in enumerate(weights):
         missing = min(age, frames)
         total = total + weight * jnp.concatenate([masks[:missing], masks[: frames - missing]])
-    return jnp.mean(jnp.abs(error * total))
+    return jnp.mean(absolute(error * total))
 
 
 def _difference(denoised: jax.Array, reference: jax.Array) -> jax.Array:
@@ -83,7 +84,7 @@ def _difference(denoised: jax.Array, reference: jax.Array) -> jax.Array:
 def _mean_size(*parts: jax.Array) -> jax.Array:
     """Mean of the absolute values of all parts together; 0 when they are all empty."""
     count = sum(part.size for part in parts)
-    return sum((jnp.sum(jnp.abs(part)) for part in parts), start=jnp.zeros((), parts[0].dtype)) / max(count, 1)
+    return sum((jnp.sum(absolute(part)) for part in parts), start=jnp.zeros((), parts[0].dtype)) / max(count, 1)
 
 
 _LOG_RADIUS = 7

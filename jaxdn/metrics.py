@@ -82,9 +82,9 @@ def temporal_psnr(
     """
     check_option(average, "average", ("frames", "mse"))
     check_image(image, "image", rank=4)
+    image, reference = _pair(image, reference)
     inside = _inside(image, mask)
     later = None if inside is None else inside[1:]
-    _check_pair(image, reference)
     changes = [_hide(clip[1:], later) - _hide(clip[:-1], later) for clip in (image, reference)]
     return _psnr((changes[0] - changes[1]) ** 2, later, peak=peak, average=average)
 
@@ -96,7 +96,7 @@ def ssim(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = Non
     The map is taken only where the window fits into the image, so a border of 5 pixels does not count, masked or not;
     an image smaller than the window uses the largest odd window that fits. 1 for an empty mask.
     """
-    _check_pair(image, reference)
+    image, reference = _pair(image, reference)
     inside = _inside(image, mask)
     height, width = image.shape[-3:-1]
     radius = (min(_SSIM_WINDOW, height, width) - 1) // 2
@@ -129,16 +129,19 @@ def flip(
 
     Three channels, display-encoded in [0, 1]. 0 for an empty mask.
     """
-    _check_pair(image, reference, channels=3)
+    image, reference = _pair(image, reference, channels=3)
     inside = _inside(image, mask)
     return _mean(_hide(flip_map(image, reference, pixels_per_degree=pixels_per_degree), inside), inside)
 
 
-def _check_pair(image: jax.Array, reference: jax.Array, *, channels: int | None = None) -> None:
+def _pair(image: jax.Array, reference: jax.Array, *, channels: int | None = None) -> tuple[jax.Array, jax.Array]:
+    """Both images checked, in float32 or better: half precision neither holds small squares nor counts pixels."""
     rank = 4 if jnp.ndim(image) == 4 else 3
     check_image(image, "image", rank=rank, channels=channels)
     check_image(reference, "reference", rank=rank, channels=image.shape[-1])
     check_same_size(image, reference, ("image", "reference"))
+    dtype = jnp.promote_types(jnp.result_type(image, reference), jnp.float32)
+    return jnp.asarray(image, dtype), jnp.asarray(reference, dtype)
 
 
 def _inside(image: jax.Array, mask: jax.Array | None) -> jax.Array | None:
@@ -161,7 +164,7 @@ def _prepare(
     image: jax.Array, reference: jax.Array, mask: jax.Array | None
 ) -> tuple[jax.Array, jax.Array, jax.Array | None]:
     """Both images checked, 0 outside the mask (before anything is computed: gradients stay finite), and the mask."""
-    _check_pair(image, reference)
+    image, reference = _pair(image, reference)
     inside = _inside(image, mask)
     return _hide(image, inside), _hide(reference, inside), inside
 
@@ -170,8 +173,8 @@ def _mean(values: jax.Array, inside: jax.Array | None, *, empty: float = 0.0) ->
     """Mean over all axes of values that are 0 outside the mask."""
     if inside is None:
         return jnp.mean(values)
-    count = jnp.sum(inside) * values.shape[-1]
-    mean = jnp.sum(values) / jnp.maximum(count, 1).astype(values.dtype)
+    count = jnp.sum(inside)
+    mean = jnp.sum(values) / (jnp.maximum(count, 1).astype(values.dtype) * values.shape[-1])
     return jnp.where(count == 0, empty, mean)
 
 
@@ -185,7 +188,7 @@ def _psnr(squares: jax.Array, inside: jax.Array | None, *, peak: float, average:
     if inside is None:
         return jnp.mean(_decibels(jnp.mean(squares, axis=(1, 2, 3)), peak))
     counts = jnp.sum(inside, axis=(1, 2, 3))
-    errors = jnp.sum(squares, axis=(1, 2, 3)) / (jnp.maximum(counts, 1) * squares.shape[-1]).astype(squares.dtype)
+    errors = jnp.sum(squares, axis=(1, 2, 3)) / (jnp.maximum(counts, 1).astype(squares.dtype) * squares.shape[-1])
     counted = counts > 0
     total = jnp.sum(jnp.where(counted, _decibels(errors, peak), 0.0))
     frames = jnp.sum(counted)

@@ -6,6 +6,8 @@ dtype (1.2e-38 in float32); an infinite argument counts as the largest finite on
 business of ``frame.repair`` alone.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 
@@ -16,6 +18,14 @@ def _largest(x: jax.Array) -> float:
 
 def _tiny(x: jax.Array) -> float:
     return float(jnp.finfo(x.dtype).tiny)
+
+
+def absolute(x: jax.Array) -> jax.Array:
+    """``|x|`` with derivative 0 at 0: where prediction and target agree, an L1 loss pulls neither way.
+
+    ``jnp.abs`` has derivative 1 there (or 0, depending on the version of jax).
+    """
+    return x * jax.lax.stop_gradient(jnp.sign(x))
 
 
 def safe_power(x: jax.Array, exponent: jax.Array | float) -> jax.Array:
@@ -32,12 +42,28 @@ def safe_norm(x: jax.Array, *, axis: int = -1) -> jax.Array:
     """Euclidean length over ``axis``, which is kept with size 1; 0 with derivative 0 for a vector shorter than tiny.
 
     Scaled by the largest component, so that neither tiny nor huge components vanish in their squares. A length beyond
-    the largest finite number saturates there.
+    the largest finite number saturates there, and its derivative stays the unit vector.
     """
-    x = jnp.clip(x, -_largest(x), _largest(x))
+    return _norm(jnp.clip(x, -_largest(x), _largest(x)), axis)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _norm(x: jax.Array, axis: int) -> jax.Array:
+    scaled, scale = _scaled(x, axis)
+    length = jnp.sqrt(jnp.sum(scaled * scaled, axis=axis, keepdims=True)) * scale
+    return jnp.minimum(jnp.where(scale == 0, 0.0, length), _largest(x))
+
+
+@_norm.defjvp
+def _norm_jvp(axis: int, primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
+    (x,), (change,) = primals, tangents
+    scaled, scale = _scaled(x, axis)
+    unit = scaled / jnp.sqrt(jnp.sum(scaled * scaled, axis=axis, keepdims=True))
+    return _norm(x, axis), jnp.sum(jnp.where(scale == 0, 0.0, unit) * change, axis=axis, keepdims=True)
+
+
+def _scaled(x: jax.Array, axis: int) -> tuple[jax.Array, jax.Array]:
+    """``x`` over its largest component, and that component; 1 and 0 for a vector of zeros."""
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True))
     zero = scale < _tiny(x)
-    scale = jnp.where(zero, 1.0, scale)
-    unit = jnp.where(zero, 1.0, x / scale)
-    length = jnp.sqrt(jnp.sum(unit * unit, axis=axis, keepdims=True)) * scale
-    return jnp.where(zero, 0.0, jnp.minimum(length, _largest(x)))
+    return jnp.where(zero, 1.0, x / jnp.where(zero, 1.0, scale)), jnp.where(zero, 0.0, scale)
