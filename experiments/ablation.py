@@ -1,0 +1,241 @@
+"""Table 2 and the ablation of Zeng et al. 2021: noisy, svgf, and ntd as A, B and C, on clips none was trained on.
+
+A warps the history with traditional motion vectors, B with dual ones, C adds the motion-occlusion loss in the second
+half of training; all three share the network, the data, the seed and the number of steps.
+
+    python -m experiments.ablation                  # `make train`: a demonstration, about a quarter of an hour
+    python -m experiments.ablation --preset full    # `make weights`: the shipped weights and the table of the README
+
+Everything is kept under ``data/`` and ``runs/``: what was rendered or trained is used again, and what was interrupted
+continues where it stopped.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import tyro
+
+from jaxdn.clips import training_batches
+from jaxdn.commands.compare import Method, compare
+from jaxdn.commands.errors import told_plainly
+from jaxdn.commands.train import fit, load_validation, read_curve
+from jaxdn.denoisers import ntd, svgf
+from jaxdn.render import ClipJob, choose_variant, render_clips
+from jaxdn.report import Results, TrainingCurve, mean_scores, write_report
+from jaxdn.training import Recipe
+from jaxdn.weights import SHIPPED, save_weights
+
+FAMILIES = ("fruit", "robot", "pinkroom", "mobile")
+FAILURES = ("edge", "dash")
+
+
+class ClipSet(NamedTuple):
+    """Clips rendered with the same settings."""
+
+    clips: tuple[tuple[str, int], ...]
+    """(family, seed) of each."""
+    size: int
+    """Width and height in pixels."""
+    frames: int
+    reference_spp: int
+    layers: tuple[int, ...] = (1,)
+
+
+class Run(NamedTuple):
+    """One network to train."""
+
+    label: str
+    size: Literal["small", "large"]
+    motion: Literal["dual", "traditional"]
+    occlusion: bool
+    steps: int
+
+
+class Preset(NamedTuple):
+    """A whole experiment."""
+
+    train: ClipSet
+    validation: ClipSet
+    tests: tuple[ClipSet, ...]
+    runs: tuple[Run, ...]
+    recipe: Recipe
+
+
+def _seeds(families: Sequence[str], seeds: range) -> tuple[tuple[str, int], ...]:
+    return tuple((family, seed) for seed in seeds for family in families)
+
+
+PRESETS = {
+    "demo": Preset(
+        train=ClipSet(_seeds(FAMILIES, range(2)), size=80, frames=10, reference_spp=96),
+        validation=ClipSet((("fruit", 100),), size=64, frames=10, reference_spp=96),
+        tests=(ClipSet((*_seeds(FAMILIES[1:], range(200, 201)), ("edge", 200)), 96, 10, reference_spp=192),),
+        runs=(
+            Run("A", "small", "traditional", occlusion=False, steps=240),
+            Run("B", "small", "dual", occlusion=False, steps=240),
+            Run("C", "small", "dual", occlusion=True, steps=240),
+        ),
+        recipe=Recipe(learning_rate=2e-3),
+    ),
+    "full": Preset(
+        train=ClipSet(_seeds(FAMILIES, range(12)), size=128, frames=10, reference_spp=128),
+        validation=ClipSet(_seeds(FAMILIES, range(100, 101)), size=128, frames=10, reference_spp=256),
+        tests=(
+            ClipSet(
+                (*_seeds(FAMILIES, range(200, 204)), *_seeds(FAILURES, range(200, 202))), 128, 10, 512, layers=(1, 2, 4)
+            ),
+            ClipSet((("mobile", 300),), size=128, frames=110, reference_spp=256),
+        ),
+        runs=(
+            Run("C large", "large", "dual", occlusion=True, steps=1600),
+            Run("C", "small", "dual", occlusion=True, steps=1600),
+            Run("B", "small", "dual", occlusion=False, steps=1600),
+            Run("A", "small", "traditional", occlusion=False, steps=1600),
+        ),
+        recipe=Recipe(),
+    ),
+}
+
+SHIPPED_RUNS = {"C large": "ntd-large", "C": "ntd-small"}
+"""The runs of the full preset whose weights come with the package, and their names there."""
+
+
+@dataclass
+class Settings:
+    """Render clips, train the denoiser and its ablations, evaluate them on clips never seen, write a report."""
+
+    preset: Literal["demo", "full"] = "demo"
+    """demo: SMALL networks and a dozen small clips, to see that it learns. full: the shipped weights."""
+    name: str | None = None
+    """Folder under runs/ for weights, logs and the report; default: the preset's name."""
+    only: Literal["all", "render", "train", "report"] = "all"
+    """Do one part of the work alone (on what the parts before it left)."""
+    runs: tuple[str, ...] = ()
+    """Labels of the runs to train; default: all of the preset."""
+    workers: int | None = None
+    """Processes that render; default: the cores."""
+
+
+def jobs(clips: ClipSet, folder: Path) -> list[Any]:
+    """What to render for a set of clips."""
+    return [
+        ClipJob(
+            {"family": family, "seed": seed},
+            folder / f"{family}-{seed}",
+            width=clips.size,
+            height=clips.size,
+            frames=clips.frames,
+            layers=clips.layers,
+            reference_spp=clips.reference_spp,
+            seed=seed,
+        )
+        for family, seed in clips.clips
+    ]
+
+
+def folders(clips: ClipSet, folder: Path) -> list[Path]:
+    """Where a set's clips lie."""
+    return [folder / f"{family}-{seed}" for family, seed in clips.clips]
+
+
+def train(run: Run, preset: Preset, data: Path, folder: Path) -> None:
+    """Train one network to the end (or find it trained) and write its weights."""
+    options = {"size": run.size, "motion": run.motion}
+    recipe = preset.recipe._replace(steps=run.steps, occlusion=run.occlusion)
+    batches = training_batches(
+        folders(preset.train, data / "train"),
+        batch=recipe.batch,
+        crop=recipe.crop,
+        frames=recipe.frames,
+        seed=recipe.seed,
+    )
+    state = fit(
+        ntd(**options),  # type: ignore[arg-type]
+        recipe,
+        batches,
+        folder,
+        label=run.label,
+        validation=load_validation(folders(preset.validation, data / "validation")),
+    )
+    how = {"trained_on": f"{len(preset.train.clips)} clips of {', '.join(FAMILIES)}", "run": run.label}
+    record = {"recipe": recipe._asdict(), "data": how}
+    save_weights(folder / "weights.safetensors", state.params, factory="ntd", options=options, record=record)
+
+
+def evaluate(preset: Preset, settings: Settings, data: Path, folder: Path, machine: dict[str, Any]) -> Results:
+    """Score every method on the test clips."""
+    from jaxdn.weights import load_weights
+
+    methods = [Method("noisy", None, {}), Method("svgf", svgf(), {})]
+    curves = {}
+    for run in sorted(preset.runs, key=lambda run: (run.size == "large", run.label)):
+        path = folder / _folder_name(run) / "weights.safetensors"
+        if path.is_file():
+            methods.append(Method(run.label, *load_weights(path)))
+            curves[run.label] = TrainingCurve(*read_curve(path.parent))
+    tests = [place for clips in preset.tests for place in folders(clips, data / "test")]
+    told = {
+        "preset": settings.preset,
+        "training clips": len(preset.train.clips),
+        "test clips (never seen)": len(tests),
+        "training steps": ", ".join(f"{run.label} {run.steps}" for run in preset.runs),
+        **{key.replace("_", " "): value for key, value in preset.recipe._asdict().items() if key != "steps"},
+    }
+    results = compare(methods, tests, title="Neural temporal denoising: the ablation", settings=told, training=curves)
+    return results._replace(machine={**results.machine, **machine})
+
+
+def _folder_name(run: Run) -> str:
+    return run.label.replace(" ", "-")
+
+
+def _table(results: Results) -> str:
+    means = mean_scores(results)
+    heads = ("psnr", "ssim", "l1", "mse", "temporal_psnr", "flip", "disoccluded_l1", "disoccluded_psnr", "ms_per_frame")
+    lines = [f"{'':10}" + "".join(f"{head.replace('disoccluded', 'disocc'):>15}" for head in heads) + f"{'spp':>5}"]
+    for method in results.methods:
+        scores = means[method]._asdict()
+        lines.append(f"{method:10}" + "".join(f"{scores[head]:15.4f}" for head in heads) + f"{scores['spp']:5.0f}")
+    return "\n".join(lines)
+
+
+def main(settings: Settings) -> None:
+    """Render, train, evaluate, report."""
+    began = time.monotonic()
+    preset = PRESETS[settings.preset]
+    data, folder = Path("data") / settings.preset, Path("runs") / (settings.name or settings.preset)
+    machine: dict[str, Any] = {}
+    if settings.only in ("all", "render"):
+        choice = choose_variant()
+        machine["renderer"] = f"Mitsuba, {choice.variant}"
+        parts = [(preset.train, "train"), (preset.validation, "validation"), *((each, "test") for each in preset.tests)]
+        render_clips([job for clips, part in parts for job in jobs(clips, data / part)], workers=settings.workers)
+        print(f"rendered: {time.monotonic() - began:.0f} s so far", flush=True)
+    if settings.only in ("all", "train"):
+        for run in preset.runs:
+            if not settings.runs or run.label in settings.runs:
+                train(run, preset, data, folder / _folder_name(run))
+        print(f"trained: {time.monotonic() - began:.0f} s so far", flush=True)
+    if settings.only in ("all", "report"):
+        results = evaluate(preset, settings, data, folder, machine)
+        page = write_report(results, folder)
+        print(_table(results))
+        floors = [clip.noise_floor_psnr for clip in results.clips]
+        print(f"noise floor of the references: {min(floors):.1f} to {max(floors):.1f} dB PSNR")
+        print(f"metrics: {folder / 'metrics.json'}\nreport:  {page}  ({time.monotonic() - began:.0f} s in all)")
+
+
+def ship(folder: Path) -> None:
+    """Copy the weights of the full preset into the package."""
+    for label, name in SHIPPED_RUNS.items():
+        for suffix in (".safetensors", ".json"):
+            source = folder / label.replace(" ", "-") / f"weights{suffix}"
+            (SHIPPED / f"{name}{suffix}").write_bytes(source.read_bytes())
+
+
+if __name__ == "__main__":
+    with told_plainly():
+        main(tyro.cli(Settings, description=Settings.__doc__))

@@ -1,0 +1,45 @@
+"""Which implementation of an operation runs: the fastest the platform supports, or the one that was named."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+_IMPLEMENTATIONS: dict[str, dict[str, tuple[Callable[..., Any], tuple[str, ...]]]] = {}
+
+
+def register(operation: str, name: str, *, preferred_on: tuple[str, ...] = ()) -> Callable[[Any], Any]:
+    """Decorator: make a function the implementation ``name`` of ``operation``.
+
+    ``preferred_on`` are the platforms (``"cpu"``, ``"gpu"``, ``"tpu"``) on which it is the one that None stands for.
+    """
+
+    def keep(function: Callable[..., Any]) -> Callable[..., Any]:
+        _IMPLEMENTATIONS.setdefault(operation, {})[name] = (function, preferred_on)
+        return function
+
+    return keep
+
+
+def implementations(operation: str) -> tuple[str, ...]:
+    """The names of an operation's implementations; ``"reference"`` is always one."""
+    return tuple(_IMPLEMENTATIONS[operation])
+
+
+def resolve(operation: str, implementation: str | None) -> Callable[..., Any]:
+    """The function that runs: the named one, or with None the one preferred on jax's default platform.
+
+    Resolved while tracing, so that nothing of the choice stays in the program. A name never falls back to another:
+    ValueError where it does not exist.
+    """
+    known = _IMPLEMENTATIONS[operation]
+    if implementation is None:
+        platform = jax.default_backend()
+        preferred = (function for function, platforms in known.values() if platform in platforms)
+        return next(preferred, known["reference"][0])
+    if implementation not in known:
+        raise ValueError(
+            f"implementation of {operation}: expected None or one of {', '.join(map(repr, known))}, got "
+            f"{implementation!r}."
+        )
+    return known[implementation][0]

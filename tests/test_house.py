@@ -1,0 +1,133 @@
+"""The house stands: imports point down only, the core needs jax and numpy alone, public names are where they should be."""
+
+import ast
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import jaxdn
+
+PACKAGE = Path(jaxdn.__file__).parent
+
+FLOORS = {
+    "backends": 0,
+    **dict.fromkeys(("frame", "checks", "numerics", "stencils", "color", "warp", "motion", "kernels"), 1),
+    **dict.fromkeys(("losses", "metrics", "flip"), 1),
+    **dict.fromkeys(("denoisers", "networks"), 2),
+    **dict.fromkeys(("rollout", "training"), 3),
+    **dict.fromkeys(("render", "clips", "checkpoint", "report", "weights"), 4),
+    **dict.fromkeys(("cli", "commands"), 5),
+}
+OUTSIDE = {
+    "flax": {"networks"},
+    "optax": {"training"},
+    "mitsuba": {"render"},
+    "drjit": {"render"},
+    "OpenEXR": {"clips"},
+    "grain": {"clips"},
+    "orbax": {"checkpoint"},
+    "matplotlib": {"report"},
+    "PIL": {"report"},
+    "safetensors": {"weights"},
+    "tyro": {"cli"},
+}
+
+
+def _imports(path: Path) -> set[str]:
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {name.name for name in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f"{node.module}.{name.name}" for name in node.names}
+    return found
+
+
+def _room(path: Path) -> str:
+    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+
+
+MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "__init__.py"]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_imports_point_down(path):
+    floor = FLOORS[_room(path)]
+    for name in _imports(path):
+        top, _, rest = name.partition(".")
+        if top == "jaxdn":
+            room = rest.partition(".")[0]
+            if room in FLOORS:
+                assert FLOORS[room] <= floor, f"{path} (floor {floor}) imports {name} (floor {FLOORS[room]})"
+        elif top in OUTSIDE:
+            assert _room(path) in OUTSIDE[top], f"{path} imports {top}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_a_module_is_one_idea(path):
+    assert len(path.read_text().splitlines()) <= 450
+    assert ast.get_docstring(ast.parse(path.read_text())), "the first line says what the module is"
+
+
+ONLY_JAX = """
+import importlib.abc, sys
+ALLOWED = {"jax", "jaxlib", "numpy", "ml_dtypes", "opt_einsum", "scipy", "jaxdn"} | set(sys.stdlib_module_names)
+class Nothing_else(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        # jax itself tries optional packages and copes without them
+        if name.partition(".")[0] not in ALLOWED:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+sys.meta_path.insert(0, Nothing_else())
+import jax.numpy as jnp
+import jaxdn
+image = jnp.ones((8, 8, 3))
+motion = jnp.zeros((8, 8, 2))
+jaxdn.warp(image, jaxdn.dual_motion(motion, motion))
+jaxdn.apply_kernels(image, jaxdn.normalize_kernels(jnp.zeros((8, 8, 25))))
+jaxdn.compose_scales(image, image[::2, ::2], jnp.ones((4, 4, 1)))
+jaxdn.metrics.psnr(image, 0.5 * image), jaxdn.losses.spatial(image[None], image[None])
+svgf = jaxdn.denoisers.svgf()
+clip = jaxdn.Clip(jaxdn.Frame(radiance=image[None]))
+assert jaxdn.denoise(svgf, {}, clip).shape == (1, 8, 8, 3)
+print("alone")
+"""
+
+
+def test_the_maths_needs_jax_and_numpy_alone():
+    done = subprocess.run([sys.executable, "-c", ONLY_JAX], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "alone", done.stderr
+
+
+def test_importing_the_package_loads_nothing():
+    code = "import jaxdn, sys; print(sorted(m for m in sys.modules if m.split('.')[0] in ('jax', 'numpy', 'mitsuba')))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", [name for name in jaxdn.__all__ if name != "__version__"])
+def test_public_names_exist_and_say_what_they_are(name):
+    assert inspect.getdoc(getattr(jaxdn, name))
+
+
+def test_an_unknown_name_says_which_there_are():
+    with pytest.raises(AttributeError, match="warp"):
+        jaxdn.wrap  # noqa: B018
+
+
+FIXED = {
+    "warp": ("image", "motion", "border", "implementation"),
+    "dual_motion": ("motion", "forward_motion", "visible"),
+    "occlusion_mask": ("motion", "dual_motion", "threshold"),
+    "normalize_kernels": ("logits",),
+    "apply_kernels": ("image", "kernels", "implementation"),
+    "compose_scales": ("fine", "coarse", "alpha", "down", "up"),
+    "denoise": ("denoiser", "params", "clip"),
+}
+
+
+@pytest.mark.parametrize(("name", "parameters"), FIXED.items())
+def test_fixed_signatures(name, parameters):
+    assert tuple(inspect.signature(getattr(jaxdn, name)).parameters) == parameters

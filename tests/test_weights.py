@@ -1,0 +1,79 @@
+"""Weights on disk: they come back as they went, and a damaged or foreign file is told plainly."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+import jaxdn
+from jaxdn.denoisers import ntd
+from jaxdn.frame import Frame
+from jaxdn.weights import flatten, save_weights, shipped_names, unflatten
+
+TINY = ((4,), (4,), (4,), (4,), (4,))
+FRAME = Frame(radiance=np.ones((16, 16, 3), np.float32))
+
+
+@pytest.fixture
+def saved(tmp_path):
+    params = ntd(size=TINY).init(jax.random.key(0), FRAME)
+    path = save_weights(tmp_path / "w", params, factory="ntd", options={"size": TINY}, record={"note": "test"})
+    return path, params
+
+
+def test_round_trip(saved):
+    path, params = saved
+    denoiser, loaded = jaxdn.load_weights(path)
+    jax.tree.map(np.testing.assert_array_equal, params, loaded)
+    state = denoiser.start(loaded, FRAME)
+    _, image = denoiser.step(loaded, state, FRAME)
+    assert image.shape == (16, 16, 3)
+
+
+def test_flatten_and_back():
+    nested = {"a": {"b": np.ones(2), "c": {"d": np.zeros(1)}}, "e": np.arange(3.0)}
+    assert set(flatten(nested)) == {"a/b", "a/c/d", "e"}
+    jax.tree.map(np.testing.assert_array_equal, unflatten(flatten(nested)), nested)
+
+
+def test_an_unknown_name_says_which_are_shipped():
+    with pytest.raises(ValueError, match="expected one of"):
+        jaxdn.load_weights("ntd-gigantic")
+
+
+def test_truncated_weights(saved):
+    path, _ = saved
+    whole = path.read_bytes()
+    for cut in (0, 4, 100, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(ValueError, match="whole safetensors file"):
+            jaxdn.load_weights(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "told"), [(None, "beside it"), ("{", "beside it"), ('{"factory": "evil", "options": {}}', "'evil'")]
+)
+def test_bad_description(saved, content, told):
+    path, _ = saved
+    beside = path.with_suffix(".json")
+    beside.unlink() if content is None else beside.write_text(content)
+    with pytest.raises(ValueError, match=told):
+        jaxdn.load_weights(path)
+
+
+def test_the_json_says_how_they_came_to_be(saved):
+    assert json.loads(saved[0].with_suffix(".json").read_text())["note"] == "test"
+
+
+@pytest.mark.parametrize("name", ["ntd-large", "ntd-small"])
+def test_shipped_weights_work(name):
+    assert name in shipped_names()
+    denoiser, params = jaxdn.load_weights(name)
+    rng = np.random.default_rng(0)
+    noisy = rng.exponential(size=(32, 32, 3)).astype(np.float32)
+    clip = jaxdn.Clip(Frame(radiance=np.stack([noisy, rng.permutation(noisy)])))
+    image = jaxdn.denoise(denoiser, params, clip)
+    # A flat grey wall under exponential noise of standard deviation 1: anything that denoises gets far below that.
+    assert float(np.std(image[1])) < 0.5
+    assert abs(float(np.mean(image[1])) - 1.0) < 0.25
