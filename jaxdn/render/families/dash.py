@@ -8,7 +8,9 @@ import numpy as np
 
 from jaxdn.render.families import shapes, textures
 from jaxdn.render.families.staging import (
+    Material,
     Stage,
+    attached,
     drifting_camera,
     furnish_room,
     glossy,
@@ -91,7 +93,7 @@ def _runners(stage: Stage) -> None:
     def sled(frame: float) -> np.ndarray:
         return shift(2.3 * shuttle(frame, period, phase), 0, -1.0)
 
-    parts = {
+    parts: dict[str, tuple[str | shapes.Mesh, np.ndarray, Material]] = {
         "sled": (
             shapes.soft_box(0.3, 0.35),
             shift(0, 0.3, 0) @ scale(0.42, 0.16, 0.24),
@@ -106,7 +108,7 @@ def _runners(stage: Stage) -> None:
         "sled_base": ("cube", shift(0, 0.12, 0) @ scale(0.34, 0.03, 0.2), metal((0.75, 0.72, 0.68), 0.3)),
     }
     for name, (shape, local, material) in parts.items():
-        stage.add(name, shape, lambda frame, local=local: sled(frame) @ local, material)
+        stage.add(name, shape, attached(sled, local), material)
     for index, z in enumerate((-1.14, -0.86)):
         stage.add(f"rail_{index}", "cube", shift(0, 0.045, z) @ scale(2.9, 0.045, 0.02), metal((0.6, 0.58, 0.56), 0.35))
     bands = textures.stripes(

@@ -9,6 +9,7 @@ from jaxdn.render.families.staging import (
     Material,
     Motion,
     Stage,
+    attached,
     drifting_camera,
     furnish_room,
     glossy,
@@ -42,7 +43,7 @@ def fruit(seed: int, *, lamp: str = "mix") -> Stage:
     _still_life(stage, hue)
     _rolling_fruit(stage)
     side = rng.uniform(-0.35, 0.35)
-    drifting_camera(stage, (side, 1.38, 1.62), (0.1 * side, 0.86, -0.1), x_fov=54, reach=0.2)
+    drifting_camera(stage, (side, 1.38, 1.62), (0.1 * side, 0.86, -0.1), x_fov=54, reach=0.24)
     return stage
 
 
@@ -122,7 +123,7 @@ def _stand(stage: Stage) -> None:
         place = (
             turn("y", 120 * index) @ shift(0.115, 0.012 + radius, 0) @ turn("x", rng.uniform(-40, 40)) @ scale(radius)
         )
-        stage.add(f"stand_fruit_{index}", mesh, lambda frame, place=place: spin(frame) @ place, skin)
+        stage.add(f"stand_fruit_{index}", mesh, attached(spin, place), skin)
 
 
 def _rolling_fruit(stage: Stage) -> None:

@@ -7,6 +7,7 @@ from jaxdn.render.families.staging import (
     Material,
     Motion,
     Stage,
+    attached,
     drifting_camera,
     furnish_room,
     glossy,
@@ -43,7 +44,7 @@ def mobile(seed: int, *, lamp: str = "mix") -> Stage:
     _train(stage)
     _glider(stage)
     side = rng.uniform(-0.5, 0.5)
-    drifting_camera(stage, (side, 1.62, 1.9), (0.1 * side, 1.02, -0.6), x_fov=60, reach=0.22)
+    drifting_camera(stage, (side, 1.62, 1.9), (0.1 * side, 1.02, -0.6), x_fov=60, reach=0.32)
     return stage
 
 
@@ -92,7 +93,7 @@ def _mobile(stage: Stage) -> None:
     rng = stage.rng
     top, main, hue = stage.bounds[1, 1], 1.95, rng.random()
     sense = rng.choice([-1, 1])
-    rate = sense * rng.uniform(2.2, 3.6)
+    rate = sense * rng.uniform(3.0, 4.6)
     brass = metal(textures.hsv(0.11, 0.5, 0.88), 0.3)
     x, z = CENTRE
 
@@ -109,7 +110,7 @@ def _mobile(stage: Stage) -> None:
     )
     _toy(stage, "sun", shapes.star(9, inner=0.7), boom, (0, -0.42, 0), 0.17, glossy(textures.hsv(0.13, 0.8, 0.95), 0.3))
     for index, end in enumerate((-0.7, 0.7)):
-        arm = _arm(stage, index, boom, end, -sense * rng.uniform(3.5, 7.0), brass)
+        arm = _arm(stage, index, boom, end, -sense * rng.uniform(5.0, 9.0), brass)
         for side in (-1, 1):
             number = 2 * index + (side + 1) // 2
             shape, size, material = _toy_kind(stage, number, hue)
@@ -172,18 +173,23 @@ def _train(stage: Stage) -> None:
     hue = rng.random()
     boxy = shapes.soft_box(0.25, 0.25)
 
-    def carriage(frame: float, behind: float) -> np.ndarray:
-        angle = 2 * np.pi * (start + (frame - behind) / lap)
-        heading = np.degrees(np.arctan2(wide * np.cos(angle), -deep * np.sin(angle))) + (0 if lap > 0 else 180)
-        return _on_ground(wide * np.sin(angle), 0.02, deep * np.cos(angle)) @ turn("y", heading)
+    def carriage(behind: float) -> Motion:
+        """The motion of a point of the train that passes everywhere `behind` frames after the engine."""
+
+        def motion(frame: float) -> np.ndarray:
+            angle = 2 * np.pi * (start + (frame - behind) / lap)
+            heading = np.degrees(np.arctan2(wide * np.cos(angle), -deep * np.sin(angle))) + (0 if lap > 0 else 180)
+            return _on_ground(wide * np.sin(angle), 0.02, deep * np.cos(angle)) @ turn("y", heading)
+
+        return motion
 
     spacing = 0.3 / (2 * np.pi * 0.86) * abs(lap)
     for index, name in enumerate(("engine", "wagon_0", "wagon_1")):
         paint = glossy(textures.hsv(hue + 0.3 * index, 0.7, 0.85), 0.28)
         local = shift(0, 0.1, 0) @ scale(0.075, 0.075, 0.125)
-        stage.add(name, boxy, lambda frame, index=index, local=local: carriage(frame, index * spacing) @ local, paint)
+        stage.add(name, boxy, attached(carriage(index * spacing), local), paint)
     chimney = shift(0, 0.16, 0.07) @ scale(0.028, 0.11, 0.028)
-    stage.add("chimney", shapes.drum(1.0), lambda frame: carriage(frame, 0) @ chimney, metal((0.8, 0.6, 0.35), 0.3))
+    stage.add("chimney", shapes.drum(1.0), attached(carriage(0), chimney), metal((0.8, 0.6, 0.35), 0.3))
 
 
 def _glider(stage: Stage) -> None:

@@ -5,7 +5,9 @@ import numpy as np
 from jaxdn.render.families import shapes, textures
 from jaxdn.render.families.staging import (
     RECTANGLE,
+    Material,
     Stage,
+    attached,
     drifting_camera,
     furnish_room,
     glossy,
@@ -37,7 +39,7 @@ def pinkroom(seed: int, *, lamp: str = "mix") -> Stage:
     _ball(stage)
     _car(stage)
     side = rng.uniform(-0.2, 0.7)
-    drifting_camera(stage, (side, 1.45, 2.35), (-0.15 + 0.1 * side, 0.72, -0.7), x_fov=62, reach=0.22)
+    drifting_camera(stage, (side, 1.45, 2.35), (-0.15 + 0.1 * side, 0.72, -0.7), x_fov=62, reach=0.42)
     return stage
 
 
@@ -129,7 +131,7 @@ def _toys(stage: Stage) -> None:
 def _ball(stage: Stage) -> None:
     """A striped ball that bounces on an ellipse over the rug, rolling as it flies."""
     rng = stage.rng
-    radius, lap = rng.uniform(0.2, 0.27), rng.uniform(64, 100) * rng.choice([-1, 1])
+    radius, lap = rng.uniform(0.2, 0.27), rng.uniform(52, 84) * rng.choice([-1, 1])
     beat, leap, phase = rng.uniform(13, 19), rng.uniform(0.35, 0.7), rng.random()
     bands = textures.stripes(
         rng, [textures.hsv(hue, 0.7, 0.88) for hue in rng.random() + np.array([0, 0.3, 0.55])], count=6
@@ -146,7 +148,7 @@ def _ball(stage: Stage) -> None:
 def _car(stage: Stage) -> None:
     """A toy car on a circular lap round the rug's front, with a driver and four turning wheels."""
     rng = stage.rng
-    sense, lap, radius = rng.choice([-1.0, 1.0]), rng.uniform(70, 110), rng.uniform(0.42, 0.52)
+    sense, lap, radius = rng.choice([-1.0, 1.0]), rng.uniform(52, 84), rng.uniform(0.42, 0.52)
     start, hue = rng.uniform(0, 360), rng.random()
     paint, trim = glossy(textures.hsv(hue, 0.75, 0.85), 0.22), glossy(textures.hsv(hue + 0.5, 0.4, 0.9), 0.3)
     rubber = matte(textures.stripes(rng, [np.array((0.06, 0.06, 0.07)), np.array((0.5, 0.5, 0.48))], count=6))
@@ -158,11 +160,13 @@ def _car(stage: Stage) -> None:
         return shift(x, 0.013, z) @ turn("y", heading)
 
     body, cabin = shapes.soft_box(0.35, 0.35), shapes.soft_box(0.45, 0.4)
-    parts = [("car_body", body, shift(0, 0.13, 0) @ scale(0.13, 0.08, 0.24), paint)]
+    parts: list[tuple[str, str | shapes.Mesh, np.ndarray, Material]] = [
+        ("car_body", body, shift(0, 0.13, 0) @ scale(0.13, 0.08, 0.24), paint)
+    ]
     parts += [("car_cabin", cabin, shift(0, 0.24, -0.05) @ scale(0.1, 0.08, 0.12), trim)]
     driver = matte(textures.hsv(0.09, 0.4, 0.9))
     for name, shape, local, material in [*parts, ("car_driver", "sphere", shift(0, 0.35, -0.04) @ scale(0.07), driver)]:
-        stage.add(name, shape, lambda frame, local=local: chassis(frame) @ local, material)
+        stage.add(name, shape, attached(chassis, local), material)
     roll = 360 * 2 * np.pi * radius / lap / (2 * np.pi * 0.07)  # degrees a frame
     for index, (x, z) in enumerate([(-0.14, 0.14), (0.14, 0.14), (-0.14, -0.14), (0.14, -0.14)]):
         hub, tyre = shift(x, 0.07, z), turn("z", 90) @ shift(0, -0.025, 0) @ scale(0.07, 0.05, 0.07)

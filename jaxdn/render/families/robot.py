@@ -7,6 +7,7 @@ from jaxdn.render.families.staging import (
     Material,
     Motion,
     Stage,
+    attached,
     drifting_camera,
     furnish_room,
     glossy,
@@ -40,7 +41,7 @@ def robot(seed: int, *, lamp: str = "mix") -> Stage:
     _walk(stage)
     _drone(stage)
     side = rng.uniform(-0.7, 0.7)
-    drifting_camera(stage, (side, 1.5, 3.05), (0.15 * side, 1.05, -0.7), x_fov=58, reach=0.24)
+    drifting_camera(stage, (side, 1.5, 3.05), (0.15 * side, 1.05, -0.7), x_fov=58, reach=0.5)
     return stage
 
 
@@ -102,7 +103,7 @@ def _walk(stage: Stage) -> None:
     """The robot: pelvis on a circle, its height such that the lower foot stands on the ground; limbs hang from it."""
     rng = stage.rng
     sense = rng.choice([-1.0, 1.0])
-    radius, lap, stride = rng.uniform(0.75, 1.0), rng.uniform(80, 130), rng.uniform(15, 22)
+    radius, lap, stride = rng.uniform(0.75, 1.0), rng.uniform(60, 95), rng.uniform(15, 22)
     start = rng.uniform(0, 360)
     centre = np.array([rng.uniform(-0.2, 0.2), -0.9])
     first, second, third = (
@@ -156,7 +157,7 @@ def _part(
     stage: Stage, name: str, shape: str | shapes.Mesh, joint: Motion, local: np.ndarray, material: Material
 ) -> None:
     """A shape fixed to a joint that moves."""
-    stage.add(name, shape, lambda frame: joint(frame) @ local, material)
+    stage.add(name, shape, attached(joint, local), material)
 
 
 def _arm(
@@ -220,7 +221,7 @@ def _leg(
 def _drone(stage: Stage) -> None:
     """A small flying ring with a bright belly that circles above the robot."""
     rng = stage.rng
-    lap, radius, height = rng.uniform(38, 60) * rng.choice([-1, 1]), rng.uniform(1.0, 1.4), rng.uniform(1.95, 2.2)
+    lap, radius, height = rng.uniform(28, 44) * rng.choice([-1, 1]), rng.uniform(1.0, 1.4), rng.uniform(1.95, 2.2)
     phase = rng.uniform(0, 360)
 
     def drone(frame: float) -> np.ndarray:

@@ -30,7 +30,8 @@ def join(*meshes: Mesh) -> Mesh:
     """One mesh out of several; nothing is welded, so creases between them stay sharp."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
-    return Mesh(*(np.concatenate([mesh[i] for mesh in meshes]) for i in range(3)), faces)
+    vertices, normals, uv = (np.concatenate([mesh[i] for mesh in meshes]) for i in range(3))
+    return Mesh(vertices, normals, uv, faces)
 
 
 def placed(mesh: Mesh, offset: tuple[float, float, float], stretch: float | tuple[float, float, float] = 1.0) -> Mesh:
@@ -110,9 +111,9 @@ def flat(vertices: np.ndarray | list[tuple[float, float, float]], faces: list[tu
     corners = np.asarray(vertices, float)[np.asarray(faces)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = np.repeat(normals / np.linalg.norm(normals, axis=-1, keepdims=True), 3, axis=0)
-    vertices = corners.reshape(-1, 3)
-    uv = 0.5 + 0.5 * np.stack([vertices[:, 0] + vertices[:, 2], vertices[:, 1]], -1)
-    return Mesh(vertices, normals, uv, np.arange(len(vertices)).reshape(-1, 3))
+    points = corners.reshape(-1, 3)
+    uv = 0.5 + 0.5 * np.stack([points[:, 0] + points[:, 2], points[:, 1]], -1)
+    return Mesh(points, normals, uv, np.arange(len(points)).reshape(-1, 3))
 
 
 def boxes(*spans: tuple[tuple[float, float, float], tuple[float, float, float]]) -> Mesh:

@@ -62,6 +62,11 @@ def rod(start: Any, end: Any, radius: float) -> np.ndarray:
     return matrix
 
 
+def attached(joint: Motion, local: np.ndarray) -> Motion:
+    """The motion of what is fixed to a joint at the pose `local`."""
+    return lambda frame: joint(frame) @ local
+
+
 def swing(frame: float, period: float, phase: float = 0.0) -> float:
     """A sine in [-1, 1]; periods in frames, phases in turns."""
     return float(np.sin(2 * np.pi * (frame / period + phase)))
@@ -177,18 +182,23 @@ class Stage:
         import mitsuba as mi
 
         camera = self.camera(frame)
-        film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
+        film: dict[str, Any] = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
         film |= {"pixel_format": "rgb", "component_format": "float32"}
-        sensor = {"type": "perspective", "fov": camera.x_fov, "fov_axis": "x", "near_clip": 0.02, "far_clip": 100.0}
+        sensor: dict[str, Any] = {
+            "type": "perspective",
+            "fov": camera.x_fov,
+            "fov_axis": "x",
+            "near_clip": 0.02,
+            "far_clip": 100.0,
+        }
         sensor |= {"to_world": mi.ScalarTransform4f(camera.to_world), "film": film, "sampler": {"type": "independent"}}
         integrator = {"type": "path", "max_depth": self.max_depth, "rr_depth": 1000}
         scene: dict[str, Any] = {"type": "scene", "integrator": integrator, "sensor": sensor}
         for name, part in self.parts.items():
-            shape = (
-                {"type": "ply", "filename": ply_path(part.shape)}
-                if isinstance(part.shape, Mesh)
-                else {"type": part.shape}
-            )
+            if isinstance(part.shape, Mesh):
+                shape: dict[str, Any] = {"type": "ply", "filename": ply_path(part.shape)}
+            else:
+                shape = {"type": part.shape}
             shape |= {"to_world": mi.ScalarTransform4f(part.pose(frame)), "bsdf": part.material.describe()}
             if part.glow is not None:
                 radiance = {"type": "rgb", "value": [float(value) for value in part.glow]}
@@ -292,7 +302,7 @@ def drifting_camera(
     *,
     x_fov: float,
     reach: float = 0.25,
-    period: tuple[float, float] = (55, 110),
+    period: tuple[float, float] = (45, 90),
 ) -> None:
     """A camera on a slow closed path around `origin`, never at rest, that pans around `target` as it goes.
 

@@ -1,0 +1,200 @@
+"""The procedural scenes: reproducible, rigid, well lit, and with the camera inside the room for 120 frames."""
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxdn.render.families import FAMILIES, family_scene, shapes, textures
+from jaxdn.render.families.staging import Stage, look_at, rod, shuttle, turn
+from jaxdn.render.scene import AnimatedScene, scene_from_record
+
+NAMES = sorted(FAMILIES)
+SEEDS = (0, 1, 7)
+
+
+@pytest.fixture
+def mitsuba() -> Any:
+    """Mitsuba in its scalar variant, which runs everywhere; the variant that was active is put back."""
+    mi = pytest.importorskip("mitsuba")
+    before = mi.variant()
+    mi.set_variant("scalar_rgb")
+    yield mi
+    if before is not None:
+        mi.set_variant(before)
+
+
+def _render(mi: Any, scene: Stage, frame: int, *, max_depth: int | None = None, spp: int = 4) -> np.ndarray:
+    """[16, 24, 3] radiance from one sample at a time, so that two depths see the same random numbers."""
+    integrator = mi.load_dict({"type": "path", "max_depth": max_depth or scene.max_depth, "rr_depth": 1000})
+    built = scene.build(frame, 24, 16)
+    return np.mean([np.array(mi.render(built, integrator=integrator, spp=1, seed=s)) for s in range(spp)], axis=0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_seed_is_a_scene_for_ever_and_another_seed_another_one(mitsuba: Any, name: str) -> None:
+    first, again, other = (_render(mitsuba, family_scene(name, seed), 5) for seed in (3, 3, 4))
+    assert first.shape == (16, 24, 3)
+    assert np.isfinite(first).all()
+    assert (first > 0).any(-1).mean() > 0.5  # few paths find an upward lamp
+    np.testing.assert_array_equal(first, again)
+    assert np.abs(first - other).mean() > 0.02
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_indirect_light_is_well_exposed_whatever_the_lamp(mitsuba: Any, name: str) -> None:
+    for lamp in ("up", "down", "window"):
+        scene = family_scene(name, 2, lamp=lamp)
+        direct = _render(mitsuba, scene, 0, max_depth=2, spp=24)
+        indirect = _render(mitsuba, scene, 0, spp=24) - direct
+        assert 0.05 < indirect.mean() < 0.7, (name, lamp, indirect.mean())
+        assert indirect.min() > -1e-4
+        assert direct.mean() < 2.0
+        if lamp == "up" and name != "robot":
+            assert direct.mean() < 0.3 * indirect.mean(), (name, direct.mean())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_pose_names_exists_moves_rigidly_and_the_rest_stands_still(mitsuba: Any, name: str) -> None:
+    scene = family_scene(name, 5)
+    ids = {shape.id() for shape in scene.build(0, 24, 16).shapes()}
+    assert ids == set(scene.parts)
+    assert 17 <= len(ids) <= 48
+    poses = [scene.pose(frame) for frame in (0, 1, 2, 60, 61, 120)]
+    assert set(poses[0]) <= ids
+    assert len(poses[0]) >= 4
+    for before, after in pairwise(poses):
+        assert set(before) == set(after)
+        for part in before:
+            ratio = after[part] @ np.linalg.inv(before[part])
+            np.testing.assert_allclose(ratio[:3, :3] @ ratio[:3, :3].T, np.eye(3), atol=1e-9, err_msg=part)
+            assert np.linalg.det(ratio[:3, :3]) > 0
+            np.testing.assert_array_equal(ratio[3], [0, 0, 0, 1])
+    for part in poses[0]:
+        assert any(not np.allclose(poses[0][part], later[part]) for later in poses[1:]), f"{part} never moves"
+    for part in ids - set(poses[0]):
+        np.testing.assert_array_equal(scene.parts[part].pose(0), scene.parts[part].pose(77.5))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_everything_stays_in_the_room_for_120_frames(name: str) -> None:
+    for seed in SEEDS:
+        scene = family_scene(name, seed)
+        low, high = scene.bounds
+        eyes = []
+        for frame in range(0, 121):
+            to_world, fov = scene.camera(frame)
+            np.testing.assert_allclose(to_world[:3, :3] @ to_world[:3, :3].T, np.eye(3), atol=1e-12)
+            assert 30 < fov < 90
+            eyes.append(to_world[:3, 3])
+            inside = np.minimum(eyes[-1] - low, high - eyes[-1])
+            assert inside.min() > 0.05, (seed, frame)
+            for part, pose in scene.pose(frame).items():
+                inside = np.minimum(pose[:3, 3] - low, high - pose[:3, 3])
+                assert inside.min() > -1e-6, (seed, frame, part)
+        steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
+        assert steps.min() > 5e-4, "the camera always moves a little"
+        assert steps.max() < 0.06
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_things_are_seen_to_move_and_never_jump(name: str) -> None:
+    """The centre of every moving part shifts by less than half a metre a frame, the fastest by more than 2 cm."""
+    for seed in SEEDS[:2]:
+        scene = family_scene(name, seed)
+        poses = [scene.pose(frame) for frame in range(0, 121)]
+        steps = np.array([[np.linalg.norm(b[p][:3, 3] - a[p][:3, 3]) for p in a] for a, b in pairwise(poses)])
+        assert steps.max() < 0.5
+        assert steps.max(axis=0).max() > 0.02
+
+
+def test_a_record_gives_the_same_scene_back() -> None:
+    for name in NAMES:
+        scene = family_scene(name, 11, lamp="up")
+        assert isinstance(scene, AnimatedScene)
+        assert scene.record == {"family": name, "seed": 11, "lamp": "up"}
+        again = scene_from_record(scene.record)
+        for first, second in ((scene.pose(9.5), again.pose(9.5)), (scene.pose(0), again.pose(0))):
+            assert all(np.array_equal(first[part], second[part]) for part in first)
+        assert family_scene(name, 11).record == {"family": name, "seed": 11}
+
+
+def test_about_a_third_of_the_lamps_shine_upwards() -> None:
+    lamps = [Stage("fruit", seed).lamp for seed in range(400)]
+    assert 0.22 < lamps.count("up") / 400 < 0.38
+    assert {"up", "down", "window"} == set(lamps)
+
+
+def test_wrong_names_are_told_what_there_is() -> None:
+    with pytest.raises(ValueError, match="expected one of"):
+        family_scene("vegetables", 0)
+    with pytest.raises(ValueError, match="lamp"):
+        family_scene("fruit", 0, lamp="candle")
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        shapes.apple(),
+        shapes.pear(),
+        shapes.vase(),
+        shapes.dish(),
+        shapes.drum(),
+        shapes.drum(0.0),
+        shapes.soft_box(0.2, 0.4),
+        shapes.ring(),
+        shapes.roof(),
+        shapes.star(),
+        shapes.boxes(((0, 0, 0), (1, 2, 3))),
+    ],
+    ids=lambda mesh: str(len(mesh.vertices)),
+)
+def test_meshes_are_closed_and_their_normals_point_out(mesh: shapes.Mesh) -> None:
+    corners = mesh.vertices[mesh.faces]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    np.testing.assert_allclose(area.sum(0), 0, atol=1e-3 * np.linalg.norm(area, axis=1).sum())
+    assert np.einsum("fi,fi->", corners.mean(1), area) > 0, "the volume is positive: faces wind outwards"
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1, atol=1e-6)
+    agree = np.einsum("fi,fi->f", area, mesh.normals[mesh.faces].mean(1))
+    assert (agree[np.linalg.norm(area, axis=1) > 1e-4] > 0).mean() > 0.99
+
+
+def test_a_mesh_file_is_named_by_its_contents() -> None:
+    path = shapes.ply_path(shapes.vase())
+    assert path == shapes.ply_path(shapes.vase())
+    assert path != shapes.ply_path(shapes.vase(0.4))
+    with open(path, "rb") as file:
+        assert file.read(4) == b"ply\n"
+
+
+def test_textures_are_reflectances_that_wrap(rng: np.random.Generator) -> None:
+    one, two = textures.hsv(0.1, 0.5, 0.9), textures.hsv(0.6, 0.5, 0.5)
+    for make in (
+        textures.wood,
+        textures.tiles,
+        textures.bricks,
+        textures.wallpaper,
+        textures.marble,
+        textures.speckled,
+    ):
+        image = make(rng, one, two)
+        assert image.shape == (256, 256, 3)
+        assert image.dtype == np.float32
+        assert image.min() >= 0.02
+        assert image.max() <= 0.92
+        assert image.std() > 0.01
+    field = textures.noise(rng, 4, octaves=1)
+    assert np.abs(field[0] - field[-1]).max() < 0.1, "the last row continues in the first"
+
+
+def test_transforms() -> None:
+    np.testing.assert_allclose(turn("y", 90) @ [0, 0, 1, 1], [1, 0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(turn("x", 90) @ [0, 1, 0, 1], [0, 0, 1, 1], atol=1e-12)
+    camera = look_at((0, 1, 2), (0, 1, -3))
+    np.testing.assert_allclose(camera @ [0, 0, 5, 1], [0, 1, -3, 1], atol=1e-12)
+    np.testing.assert_allclose(camera @ [1, 0, 0, 0], [-1, 0, 0, 0], atol=1e-12)
+    placed = rod((1, 2, 3), (2, 4, 5), 0.1)
+    np.testing.assert_allclose(placed @ [0, 1, 0, 1], [2, 4, 5, 1], atol=1e-12)
+    assert np.linalg.det(placed) == pytest.approx(0.01 * 3)
+    assert [shuttle(frame, 8) for frame in (0, 2, 4, 8)] == [1, 0, -1, 1]
