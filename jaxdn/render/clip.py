@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.clips import ClipError, read_frame, write_frame
@@ -89,23 +90,19 @@ def render_frame(
     sums = halves or list(noisy.values())
     total = sums[0]
     for part in sums[1:]:
-        total = total + part
+        total = total.plus(part)
     samples = reference_spp or sum(layers)
 
     images = {count: _single(part.indirect / count) for count, part in noisy.items()}
-    moved = _motion(view, previous)
+    buffers: dict[str, Any] = {
+        "radiance": images[min(images)],
+        "direct": _single(total.direct / samples),
+        "emission": _single(total.emitted / samples),
+        **{name: getattr(view.gbuffer, name) for name in ("albedo", "normal", "depth", "roughness", "ids")},
+        **_motion(view, previous),
+    }
     return Rendered(
-        frame=Frame(
-            radiance=images[min(images)],
-            albedo=view.gbuffer.albedo,
-            normal=view.gbuffer.normal,
-            depth=view.gbuffer.depth,
-            roughness=view.gbuffer.roughness,
-            ids=view.gbuffer.ids,
-            direct=_single(total.direct / samples),
-            emission=_single(total.emitted / samples),
-            **moved,
-        ),
+        frame=Frame(**buffers),
         layers=images,
         reference=_single(total.indirect / samples) if halves else None,
         reference_half=_single(halves[0].indirect / ((reference_spp + 1) // 2)) if halves else None,
@@ -141,7 +138,7 @@ def render_clip(
         raise ValueError(f"frames: expected at least 1, got {frames}.")
     _check_options(width, height, layers, reference_spp)
     chosen = use_variant(variant)
-    record = {
+    record: dict[str, Any] = {
         "format": FORMAT,
         "name": scene.name,
         "frames": frames,
@@ -227,12 +224,10 @@ def _motion(view: View, previous: View | None) -> dict[str, Any]:
         return {"motion": zero, "dual_motion": zero, "visible": seen, "previous_depth": view.gbuffer.depth}
     found = motion_between(view, previous)
     motion, forward = found.motion.astype(np.float32), found.forward_motion.astype(np.float32)
-    dual = np.asarray(dual_motion(motion, forward, visible=found.visible[..., 0]))
-    # What covered the point is behind the camera now: nothing to borrow, as if it had moved off-screen.
-    dual = np.where(np.isfinite(dual).all(axis=-1, keepdims=True), dual, motion)
+    dual = np.asarray(dual_motion(*map(jnp.asarray, (motion, forward)), visible=jnp.asarray(found.visible[..., 0])))
     return {
         "motion": motion,
-        "dual_motion": dual.astype(np.float32),
+        "dual_motion": dual,
         "visible": found.visible,
         "previous_depth": found.previous_depth,
     }

@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.seeds import pass_seed
-from jaxdn.render.wavefront import Light
+from jaxdn.render.wavefront import Light, no_light
 
 _NO_ROULETTE = 1000
 
@@ -31,15 +31,16 @@ def accumulate(scene: Any, *, seed: int, frame: int, stream: int, first: int, co
     """The sums of the passes ``first`` to ``first + count`` of one stream; see :func:`wavefront.accumulate`."""
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     integrator = _integrator(max_depth)
-    total = Light(*(np.zeros((height, width, 3)) for _ in range(3)), 0)
+    total = no_light((height, width))
+    render: Any = mi.render
     for index in range(first, first + count):
         seed_of_pass = pass_seed(seed, frame, stream, index)
-        image = np.array(mi.render(scene, integrator=integrator, spp=1, seed=seed_of_pass), np.float64)
+        image = np.array(render(scene, integrator=integrator, spp=1, seed=seed_of_pass), np.float64)
         whole, two, one = image[..., 0:3], image[..., 3:6], image[..., 6:9]
         finite = np.isfinite(image).all(axis=-1, keepdims=True)
         with np.errstate(invalid="ignore"):
             # The film adds in float32: a last-digit difference of two equal sums must not become a negative light.
             direct, indirect = np.maximum(two - one, 0.0), np.maximum(whole - two, 0.0)
-        parts = (np.where(finite, part, 0.0) for part in (one, direct, indirect))
-        total += Light(*parts, int(np.sum(~finite)))
+        one, direct, indirect = (np.where(finite, part, 0.0) for part in (one, direct, indirect))
+        total = total.plus(Light(one, direct, indirect, int(np.sum(~finite))))
     return total

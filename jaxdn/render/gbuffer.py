@@ -60,7 +60,7 @@ def gbuffer(scene: Any) -> GBuffer:
     """Trace one ray through the centre of every pixel of the scene's first sensor, with the current variant."""
     names = shape_names(scene)
     ranks = {name: rank for rank, name in enumerate(sorted(names))}
-    trace = _one_by_one if mi.variant().startswith("scalar") else _vectorised
+    trace = _one_by_one if str(mi.variant()).startswith("scalar") else _vectorised
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     found = {name: buffer.reshape(height, width, -1) for name, buffer in trace(scene, names, ranks).items()}
 
@@ -111,7 +111,7 @@ def _vectorised(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict
     instance = dr.reinterpret_array(mi.UInt32, hit.instance)
     shape = dr.select(instance != 0, instance, dr.reinterpret_array(mi.UInt32, hit.shape))
     shape = dr.select(valid, shape, 0)
-    buffers = {
+    buffers: dict[str, Any] = {
         "albedo": albedo,
         "normal": hit.sh_frame.n,
         "position": hit.p,
@@ -123,8 +123,9 @@ def _vectorised(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict
     arrays = {name: np.array(buffer).T.astype(np.float64) for name, buffer in buffers.items()}
     # Registry numbers depend on what else is alive: names are what stays.
     lookup = {0: -1}
+    reinterpret: Any = dr.reinterpret_array
     for own, name in zip(scene.shapes(), names, strict=True):
-        lookup[int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(own))[0])] = ranks[name]
+        lookup[int(reinterpret(mi.UInt32, mi.ShapePtr(own))[0])] = ranks[name]
     numbers, inverse = np.unique(arrays.pop("shape").astype(np.int64), return_inverse=True)
     arrays["ids"] = np.array([lookup.get(int(number), -1) for number in numbers])[inverse]
     return arrays
@@ -136,7 +137,7 @@ def _one_by_one(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict
     width, height = (int(size) for size in sensor.film().crop_size())
     by_shape = {_address(own): ranks[name] for own, name in zip(scene.shapes(), names, strict=True)}
     sizes = {"albedo": 3, "normal": 3, "position": 3, "direction": 3, "roughness": 1}
-    arrays = {name: np.zeros((width * height, size)) for name, size in sizes.items()}
+    arrays: dict[str, np.ndarray] = {name: np.zeros((width * height, size)) for name, size in sizes.items()}
     arrays["ids"] = np.full(width * height, -1)
     for pixel in range(width * height):
         row, column = divmod(pixel, width)

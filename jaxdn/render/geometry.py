@@ -117,11 +117,13 @@ def motion_between(current: View, previous: View) -> Motion:
     # In float32 and from the pixel itself: the pixel looked up must be the one that the stored vector leads to.
     pixels = np.stack(np.meshgrid(np.arange(size[1]), np.arange(size[0])), axis=-1).astype(np.float32)
     landing = pixels + motion.astype(np.float32) + np.float32(0.5)
-    seen, nearest = _matches(now, before, np.floor(landing), old_points, normals, z)
+    # The very border still belongs to the outermost pixel.
+    tap = np.where(landing == [size[1], size[0]], landing - 1, np.floor(landing))
+    seen, nearest = _matches(now, before, tap, old_points, normals, z)
     on_sky = (nearest == -1) & ~sky
     for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        tap, _ = _matches(now, before, np.floor(landing - np.float32(0.5)) + corner, old_points, normals, z)
-        seen |= on_sky & tap
+        tap = np.floor(landing - np.float32(0.5)) + corner
+        seen |= on_sky & _matches(now, before, tap, old_points, normals, z)[0]
     return Motion(motion, forward, seen, np.where(sky, FAR, np.maximum(z, 0.0)).astype(np.float32))
 
 

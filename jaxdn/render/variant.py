@@ -118,13 +118,13 @@ def choose_variant(requested: str | None = None) -> Choice:
     if requested is not None and requested not in VARIANTS:
         raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {requested!r}.")
     if requested not in _choice:
-        inherited = os.environ.get(_FOUND, "").split("|", 2)
-        if len(inherited) == 3 and requested in (None, inherited[0]):
-            _choice[requested] = Choice(*inherited)
+        entry = f"{_FOUND}_{requested or 'fastest'}".upper()
+        inherited = os.environ.get(entry, "").split("|", 2)
+        if len(inherited) == 3:
+            _choice[requested] = Choice(inherited[0], inherited[1], inherited[2])
         else:
             _choice[requested] = _find(requested)
-            if requested is None:
-                os.environ[_FOUND] = "|".join(_choice[requested])
+            os.environ[entry] = "|".join(_choice[requested])
     return _choice[requested]
 
 

@@ -26,16 +26,29 @@ class Light(NamedTuple):
     bad: int
     """Number of samples that were not finite; they count as black."""
 
-    def __add__(self, other: Any) -> "Light":
-        return Light(*(mine + its for mine, its in zip(self, other, strict=True)))
+    def plus(self, other: "Light") -> "Light":
+        """The sums over both sets of samples."""
+        return Light(
+            self.emitted + other.emitted,
+            self.direct + other.direct,
+            self.indirect + other.indirect,
+            self.bad + other.bad,
+        )
+
+
+def no_light(shape: tuple[int, ...]) -> Light:
+    """The sums over no samples."""
+    emitted, direct, indirect = np.zeros((3, *shape, 3))
+    return Light(emitted, direct, indirect, 0)
 
 
 def generator(pixel: Any, sample: Any, key: tuple[int, int]) -> Any:
     """A PCG32 generator for every lane, a bijection of (pixel, sample) mixed once more with the frame's key."""
     # Literals would be baked into the kernel and compile it again for every frame: opaque values are data.
-    first, second = mi.sample_tea_32(pixel, sample)
-    first, second = mi.sample_tea_32(first ^ dr.opaque(mi.UInt32, key[0]), second ^ dr.opaque(mi.UInt32, key[1]))
-    numbers = mi.PCG32()
+    mix: Any = mi.sample_tea_32
+    first, second = mix(pixel, sample)
+    first, second = mix(first ^ dr.opaque(mi.UInt32, key[0]), second ^ dr.opaque(mi.UInt32, key[1]))
+    numbers: Any = mi.PCG32()
     numbers.seed(mi.UInt64(first), mi.UInt64(second))
     return numbers
 
@@ -44,7 +57,7 @@ def camera_rays(sensor: Any, column: Any, row: Any) -> Any:
     """Rays through the centres of pixels of the sensor's film."""
     width, height = sensor.film().crop_size()
     position = mi.Point2f((mi.Float(column) + 0.5) / float(width), (mi.Float(row) + 0.5) / float(height))
-    ray, _ = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
+    ray: Any = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))[0]
     return mi.Ray3f(ray)
 
 
@@ -58,17 +71,17 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
     context = mi.BSDFContext()
     emitted, direct, indirect = mi.Spectrum(0.0), mi.Spectrum(0.0), mi.Spectrum(0.0)
     throughput = mi.Spectrum(1.0)
-    depth = mi.UInt32(0)
+    depth: Any = mi.UInt32(0)
     ray = mi.Ray3f(ray)
     last = dr.zeros(mi.SurfaceInteraction3f)
     last_pdf = mi.Float(1.0)
-    last_delta = mi.Bool(True)
-    active = mi.Bool(True)
+    last_delta: Any = mi.Bool(True)
+    active: Any = mi.Bool(True)
     while active:
         hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=depth == 0, active=active)
 
         # The BSDF sample found an emitter: weigh it against having sampled that emitter directly.
-        found = mi.DirectionSample3f(scene, hit, last)
+        found: Any = mi.DirectionSample3f(scene, hit, last)
         shines = active & (found.emitter != None)  # noqa: E711  (an array of pointers compares elementwise)
         emitter_pdf = scene.pdf_emitter_direction(last, found, shines & ~last_delta)
         weight = dr.select(last_pdf > 0, last_pdf / (last_pdf + emitter_pdf), 0.0)
@@ -118,9 +131,9 @@ def _chunk(
     pixel = offset + dr.opaque(mi.UInt32, first_pixel)
     row = pixel // width
     ray = camera_rays(sensor, pixel - row * width, row)
-    parts = trace(scene, ray, generator(pixel, sample, key), dr.opaque(mi.UInt32, depth))
-    finite = dr.all(dr.isfinite(parts[0] + parts[1] + parts[2]))
-    parts = [dr.select(finite, part, 0.0) for part in parts]
+    traced: Any = trace(scene, ray, generator(pixel, sample, key), dr.opaque(mi.UInt32, depth))
+    finite = dr.all(dr.isfinite(traced[0] + traced[1] + traced[2]))
+    parts = [dr.select(finite, part, 0.0) for part in traced]
     bad = dr.select(finite, mi.UInt32(0), mi.UInt32(1))
     # One kernel: a block sum of something not yet evaluated would trace everything again, once per sum.
     dr.eval(parts, bad)
@@ -149,9 +162,9 @@ def accumulate(
     runs = []
     for start in range(0, width * height, pixels):
         size = min(pixels, width * height - start)
-        total = Light(*(np.zeros((size, 3)) for _ in range(3)), 0)
+        total = no_light((size,))
         for done in range(0, count, batch):
-            total += _chunk(scene, start, size, first + done, min(batch, count - done), key, max_depth)
+            total = total.plus(_chunk(scene, start, size, first + done, min(batch, count - done), key, max_depth))
         runs.append(total)
     images = [np.concatenate([run[part] for run in runs]).reshape(height, width, 3) for part in range(3)]
     return Light(images[0], images[1], images[2], sum(run.bad for run in runs))
