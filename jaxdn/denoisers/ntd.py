@@ -19,7 +19,7 @@ from jaxdn.checks import check_image, check_option, check_same_size
 from jaxdn.frame import FAR, RADIANCE_MAX, Denoiser, Frame, only, repair, repair_image
 from jaxdn.kernels import apply_kernels, compose_scales, downsample, normalize_kernels
 from jaxdn.networks.unet import LARGE, MULTIPLE, SMALL, unet
-from jaxdn.warp import warp
+from jaxdn.warp import on_screen, warp
 
 TAPS = 25
 SMALLEST_ALBEDO = 0.01
@@ -83,15 +83,6 @@ def depth_feature(depth: jax.Array, *, scale: str = "geometric") -> jax.Array:
     logarithms = jnp.where(known, jnp.log(jnp.where(known, depth, 1.0)), 0.0)
     middle = jnp.exp(jnp.sum(logarithms) / jnp.maximum(jnp.sum(known, dtype=depth.dtype), 1.0))
     return depth / (depth + middle)
-
-
-def on_screen(motion: jax.Array) -> jax.Array:
-    """Whether each pixel's history lies inside the image: bool [H, W, 1] for ``motion`` [H, W, 2]; NaN is outside."""
-    height, width = motion.shape[:2]
-    x = motion[..., 0] + jnp.arange(width, dtype=motion.dtype)[None, :]
-    y = motion[..., 1] + jnp.arange(height, dtype=motion.dtype)[:, None]
-    inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
-    return inside[..., None]
 
 
 def _pad(image: jax.Array | None) -> jax.Array | None:
@@ -223,7 +214,7 @@ def ntd(
         full, half, quarter = heads
         scales = [noisy]
         for _ in range(2):
-            scales.append(downsample(scales[-1], mode=options.pyramid))
+            scales.append(downsample(scales[-1], down=options.pyramid))
         seams = (full[..., 2 * TAPS + 1 :], half[..., TAPS:]) if fine else (half[..., TAPS:], quarter[..., TAPS:])
         composed = filtered(scales[2], quarter[..., :TAPS])
         for image, head, seam in ((scales[1], half, seams[1]), (scales[0], full, seams[0])):
