@@ -95,7 +95,7 @@ def test_everything_stays_in_the_room_for_120_frames(name: str) -> None:
                 assert inside.min() > -1e-6, (seed, frame, part)
         steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
         assert steps.min() > 5e-4, "the camera always moves a little"
-        assert steps.max() < 0.06
+        assert steps.max() < 0.1, "and never leaps"
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -138,7 +138,7 @@ def _ball(stage: Stage) -> None:
     )
 
     def ball(frame: float) -> np.ndarray:
-        x, z = 0.3 + 0.85 * swing(frame, lap, phase), -0.95 + 0.5 * swing(frame, lap, phase + 0.25)
+        x, z = 0.2 + 0.75 * swing(frame, lap, phase), -1.1 + 0.45 * swing(frame, lap, phase + 0.25)
         place = shift(x, radius + 0.013 + leap * hop(frame, beat), z)
         return place @ turn("z", -7.5 * frame) @ turn("x", 30) @ scale(radius)
 

@@ -1,4 +1,4 @@
-"""A robot on its round: it walks a circle in a hall of columns and crates while a small drone circles above it."""
+"""A robot on its round: it walks a circle in a hall of columns and crates while a small drone circles around it."""
 
 import numpy as np
 
@@ -219,9 +219,9 @@ def _leg(
 
 
 def _drone(stage: Stage) -> None:
-    """A small flying ring with a bright belly that circles above the robot."""
+    """A small flying ring with a bright belly that circles around the robot, outside its own circle."""
     rng = stage.rng
-    lap, radius, height = rng.uniform(28, 44) * rng.choice([-1, 1]), rng.uniform(1.0, 1.4), rng.uniform(1.95, 2.2)
+    lap, radius, height = rng.uniform(28, 44) * rng.choice([-1, 1]), rng.uniform(1.68, 1.78), rng.uniform(1.9, 2.1)
     phase = rng.uniform(0, 360)
 
     def drone(frame: float) -> np.ndarray:
