@@ -63,7 +63,10 @@ def _norm_jvp(axis: int, primals: tuple[jax.Array], tangents: tuple[jax.Array]) 
 
 
 def _scaled(x: jax.Array, axis: int) -> tuple[jax.Array, jax.Array]:
-    """``x`` over its largest component, and that component; 1 and 0 for a vector of zeros."""
-    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=axis, keepdims=True))
+    """``x`` over its largest component, and that component; 1 and 0 for a vector of zeros.
+
+    The scale stops at 1/8 of the largest number: XLA may multiply by its reciprocal, which must not be subnormal.
+    """
+    scale = jax.lax.stop_gradient(jnp.minimum(jnp.max(jnp.abs(x), axis=axis, keepdims=True), _largest(x) / 8))
     zero = scale < _tiny(x)
     return jnp.where(zero, 1.0, x / jnp.where(zero, 1.0, scale)), jnp.where(zero, 0.0, scale)

@@ -1,0 +1,163 @@
+"""Losses against loops and sums in float64 NumPy, and their derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jaxdn import losses
+
+SHAPE = (4, 5, 7, 3)
+
+spatial = jax.jit(losses.spatial)
+temporal = jax.jit(losses.temporal)
+gradient = jax.jit(losses.gradient, static_argnames="operator")
+occlusion = jax.jit(losses.occlusion, static_argnames="weights")
+
+
+def pair(rng: np.random.Generator, shape: tuple[int, ...] = SHAPE) -> tuple[np.ndarray, np.ndarray]:
+    return rng.random(shape).astype(np.float32), rng.random(shape).astype(np.float32)
+
+
+def masks(rng: np.random.Generator, shape: tuple[int, ...] = SHAPE) -> np.ndarray:
+    return (rng.random((*shape[:-1], 1)) < 0.4).astype(np.float32)
+
+
+def occlusion_reference(x: np.ndarray, y: np.ndarray, m: np.ndarray, weights: tuple[float, ...]) -> float:
+    total = 0.0
+    for i in range(len(x)):
+        s = sum(w * (m[i - k] if i - k >= 0 else m[i]).astype(np.float64) for k, w in enumerate(weights))
+        total += np.sum(np.abs((x[i].astype(np.float64) - y[i]) * s))
+    return total / x.size
+
+
+def hfen_reference(x: np.ndarray, y: np.ndarray) -> float:
+    axis = np.arange(-7, 8)
+    r2 = axis[:, None] ** 2 + axis[None, :] ** 2
+    s = 1.5
+    kernel = -1 / (np.pi * s**4) * (1 - r2 / (2 * s**2)) * np.exp(-r2 / (2 * s**2))
+    kernel -= kernel.mean()
+    error = np.pad(x.astype(np.float64) - y, ((0, 0), (7, 7), (7, 7), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(error, (15, 15), axis=(1, 2))
+    return np.abs(np.einsum("thwcij,ij->thwc", windows, kernel)).mean()
+
+
+def test_spatial(rng: np.random.Generator) -> None:
+    x, y = pair(rng)
+    np.testing.assert_allclose(spatial(x, y), np.abs(x.astype(np.float64) - y).mean(), rtol=1e-6)
+
+
+def test_temporal(rng: np.random.Generator) -> None:
+    x, y = pair(rng)
+    expected = np.abs(np.diff(x.astype(np.float64), axis=0) - np.diff(y.astype(np.float64), axis=0)).mean()
+    np.testing.assert_allclose(temporal(x, y), expected, rtol=1e-6)
+
+
+def test_temporal_is_blind_to_a_constant_error_and_zero_for_one_frame(rng: np.random.Generator) -> None:
+    x, _ = pair(rng)
+    np.testing.assert_allclose(temporal(x + 0.25, x), 0, atol=1e-7)
+    value, slope = jax.value_and_grad(temporal)(x[:1], x[:1] + 1)
+    assert value == 0
+    assert np.all(slope == 0)
+
+
+def test_gradient_of_differences(rng: np.random.Generator) -> None:
+    x, y = pair(rng)
+    error = x.astype(np.float64) - y
+    both = np.concatenate([np.diff(error, axis=1).ravel(), np.diff(error, axis=2).ravel()])
+    np.testing.assert_allclose(gradient(x, y), np.abs(both).mean(), rtol=1e-6)
+    assert gradient(x[:, :1, :1], y[:, :1, :1]) == 0
+
+
+def test_gradient_hfen(rng: np.random.Generator) -> None:
+    x, y = pair(rng, (2, 17, 9, 2))
+    np.testing.assert_allclose(gradient(x, y, operator="hfen"), hfen_reference(x, y), rtol=1e-5)
+
+
+@pytest.mark.parametrize("operator", ["difference", "hfen"])
+def test_gradient_is_blind_to_a_level(operator: str, rng: np.random.Generator) -> None:
+    x, _ = pair(rng)
+    np.testing.assert_allclose(gradient(x + 0.5, x, operator=operator), 0, atol=1e-6)
+
+
+def test_laplacian_of_a_ramp_is_zero_inside() -> None:
+    ramp = jnp.broadcast_to(jnp.arange(24.0)[:, None, None], (1, 24, 24, 1))
+    response = jax.jit(losses._laplacian_of_gaussian)(ramp)
+    np.testing.assert_allclose(response[:, 7:-7], 0, atol=1e-5)
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 4])
+@pytest.mark.parametrize("weights", [(1.0, 0.8, 0.6), (1.0,), (0.5, 0.0, 0.0, 0.25, 2.0)])
+def test_occlusion(frames: int, weights: tuple[float, ...], rng: np.random.Generator) -> None:
+    x, y = pair(rng)
+    m = masks(rng)
+    result = occlusion(x[:frames], y[:frames], m[:frames], weights=weights)
+    np.testing.assert_allclose(result, occlusion_reference(x[:frames], y[:frames], m[:frames], weights), rtol=1e-6)
+
+
+def test_occlusion_weighs_the_last_three_masks() -> None:
+    """One pixel disoccluded at frame 2 of 5, error 1 everywhere: 1, 0.8 and 0.6 at frames 2, 3 and 4."""
+    m = np.zeros((5, 1, 1, 1), np.float32)
+    m[2] = 1
+    slope = jax.grad(lambda x: occlusion(x, jnp.zeros((5, 1, 1, 1)), m))(jnp.ones((5, 1, 1, 1)))
+    np.testing.assert_allclose(slope.ravel() * 5, [0, 0, 1, 0.8, 0.6], rtol=1e-6)
+
+
+def test_masks_before_the_first_frame_are_each_frames_own() -> None:
+    """A pixel masked in frame 0 alone counts 2.4 there and 0.8 at frame 1; one masked in frame 1 alone counts 1.6."""
+    m = np.zeros((2, 1, 2, 1), np.float32)
+    m[0, 0, 0] = m[1, 0, 1] = 1
+    slope = jax.grad(lambda x: occlusion(x, jnp.zeros((2, 1, 2, 1)), m))(jnp.ones((2, 1, 2, 1)))
+    np.testing.assert_allclose(slope.reshape(2, 2) * 4, [[2.4, 0.0], [0.8, 1.6]], rtol=1e-6)
+
+
+def test_occlusion_without_and_with_full_masks(rng: np.random.Generator) -> None:
+    x, y = pair(rng)
+    nothing = np.zeros((*SHAPE[:-1], 1), np.float32)
+    value, slope = jax.value_and_grad(occlusion)(x, y, nothing)
+    assert value == 0
+    assert np.all(slope == 0)
+    everything = np.ones((*SHAPE[:-1], 1), bool).astype(np.float32)
+    np.testing.assert_allclose(occlusion(x, y, everything), 2.4 * spatial(x, y), rtol=1e-5)
+
+
+CASES = {
+    "spatial": spatial,
+    "temporal": temporal,
+    "difference": gradient,
+    "hfen": lambda x, y: gradient(x, y, operator="hfen"),
+    "occlusion": lambda x, y: occlusion(x, y, jnp.ones((*x.shape[:-1], 1), x.dtype)),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_derivatives(name: str, x64: None, rng: np.random.Generator) -> None:
+    x, y = rng.random((3, 4, 5, 2)), rng.random((3, 4, 5, 2))
+    check_grads(jax.jit(CASES[name]), (x, y), order=1, modes=["rev"], eps=1e-7, atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_symmetric_zero_on_identical_with_finite_gradient(name: str, rng: np.random.Generator) -> None:
+    x, y = pair(rng)
+    loss = jax.jit(CASES[name])
+    np.testing.assert_allclose(loss(x, y), loss(y, x), rtol=1e-6)
+    value, slope = jax.jit(jax.value_and_grad(loss))(x, x)
+    assert value == 0
+    assert np.all(slope == 0)
+    assert loss(x, y).shape == ()
+    assert loss(x, y) > 0
+
+
+def test_shapes_are_checked(rng: np.random.Generator) -> None:
+    x, y = pair(rng)
+    with pytest.raises(ValueError, match="T, H, W, C"):
+        spatial(x[0], y[0])
+    with pytest.raises(ValueError, match="channels"):
+        temporal(x, y[..., :1])
+    with pytest.raises(ValueError, match="same size"):
+        gradient(x, y[:, :4])
+    with pytest.raises(ValueError, match="hfen"):
+        gradient(x, y, operator="sobel")
+    with pytest.raises(ValueError, match="masks"):
+        occlusion(x, y, masks(rng)[:2])
