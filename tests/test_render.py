@@ -51,7 +51,8 @@ def test_the_parts_add_up_to_mitsubas_path_integrator(variant: str, converged: d
     film = np.zeros((2, HEIGHT, WIDTH, 3))
     for index, depth in enumerate((Stage.max_depth, 2)):
         integrator: Any = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 1000})
-        film[index] = np.array(mi.render(scene, integrator=integrator, spp=SAMPLES, seed=77))
+        render: Any = mi.render
+        film[index] = np.array(render(scene, integrator=integrator, spp=SAMPLES, seed=77))
     frame = found.frame
     assert frame.direct is not None
     assert frame.emission is not None
@@ -80,6 +81,17 @@ def test_light_is_never_negative_and_always_finite(variant: str, converged: dict
         assert image.dtype == np.float32
         assert np.isfinite(image).all()
         assert image.min() >= 0
+
+
+def test_light_that_is_not_finite_counts_as_black(variant: str) -> None:
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": 3e38}}
+    lamp = {"type": "sphere", "center": [0, 2, 2], "radius": 1.0, "emitter": emitter}
+    found = render_frame(Stage(shapes={"lamp": lamp}), 0, reference_spp=4, variant=variant, **SIZE)
+    for image in (found.frame.radiance, found.frame.direct, found.frame.emission, found.reference):
+        assert image is not None
+        assert np.isfinite(image).all()
+    # Mitsuba's own film drops such samples before anybody can count them.
+    assert variant == "scalar_rgb" or found.bad_samples > 0
 
 
 def test_without_a_bounce_nothing_is_indirect(variant: str) -> None:
@@ -123,13 +135,13 @@ def test_half_of_the_reference_tells_its_noise(variant: str) -> None:
 
 
 def same(first: Rendered, second: Rendered) -> bool:
-    pairs = [*zip(first.frame, second.frame, strict=True), (first.reference, second.reference)]
+    pairs: list[Any] = [*zip(first.frame, second.frame, strict=True), (first.reference, second.reference)]
     pairs += [(first.layers[samples], second.layers[samples]) for samples in first.layers]
     return all(np.array_equal(one, other) for one, other in pairs if one is not None)
 
 
 def test_a_frame_depends_on_its_arguments_alone(variant: str) -> None:
-    """Rendered after its predecessor, alone, or with other layers: the same bit for bit; another frame or seed differs."""
+    """Rendered after its predecessor, alone, or with other layers: the same bit for bit."""
     scene = sliding()
     options: dict[str, Any] = {"reference_spp": 2, "variant": variant, **SIZE}
     first = render_frame(scene, 0, **options)
@@ -140,7 +152,7 @@ def test_a_frame_depends_on_its_arguments_alone(variant: str) -> None:
     assert np.array_equal(more.layers[1], alone.layers[1])
     assert not np.array_equal(render_frame(scene, 1, seed=1, **options).layers[1], alone.layers[1])
     still = [render_frame(Stage(), frame, **options).layers[1] for frame in (0, 1)]
-    assert not np.array_equal(*still)
+    assert not np.array_equal(still[0], still[1])
 
 
 def test_motion_in_a_frame_is_that_of_the_geometry(variant: str) -> None:
@@ -178,8 +190,10 @@ def test_a_clip_is_written_and_goes_on_where_it_was_interrupted(variant: str, tm
     assert seen == [0, 1, 2]
     assert (parts / "frame_0000.exr").stat().st_mtime_ns == stamp
     for index in range(3):
-        one, other = (read_frame(folder / f"frame_{index:04d}.exr", spp=3) for folder in (whole, parts))
-        assert all(np.array_equal(*pair) for pair in zip(one.frame, other.frame, strict=True))
+        name = f"frame_{index:04d}.exr"
+        one: Any = read_frame(whole / name, spp=3)
+        other: Any = read_frame(parts / name, spp=3)
+        assert all(np.array_equal(mine, its) for mine, its in zip(one.frame, other.frame, strict=True))
         assert np.array_equal(one.reference, other.reference)
     record = json.loads((whole / "clip.json").read_text())
     assert record["variant"] == variant
@@ -211,7 +225,7 @@ def test_a_scene_that_breaks_is_named_with_its_frame(tmp_path: Path) -> None:
     assert (tmp_path / "frame_0000.exr").exists()
 
 
-UNSUPPORTED = {
+UNSUPPORTED: dict[str, dict[str, Any]] = {
     "media": {
         "fog": {
             "type": "sphere",
@@ -227,7 +241,7 @@ UNSUPPORTED = {
 
 @pytest.mark.parametrize("effect", UNSUPPORTED)
 def test_effects_that_would_be_left_out_raise(variant: str, effect: str) -> None:
-    extra: dict[str, Any] = UNSUPPORTED[effect]
+    extra = UNSUPPORTED[effect]
     if "sensor" in extra:
         film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
         extra = {"sensor": {**extra["sensor"], "film": film}}

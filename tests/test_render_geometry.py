@@ -1,5 +1,7 @@
 """Motion vectors against scenes whose motion is known by construction."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -57,8 +59,9 @@ def test_projection_is_mitsubas_own(variant: str) -> None:
 
     scene = Stage(camera=tilted).build(1, WIDTH, HEIGHT)
     sensor = scene.sensors()[0]
+    projection: Any = mi.perspective_projection
     to_film = np.array(
-        mi.perspective_projection([WIDTH, HEIGHT], [WIDTH, HEIGHT], [0, 0], 90.0, NEAR, 1e4).matrix, np.float64
+        projection([WIDTH, HEIGHT], [WIDTH, HEIGHT], [0, 0], 90.0, NEAR, 1e4).matrix, np.float64
     ).reshape(4, 4)
     to_camera = np.linalg.inv(np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4))
     points = np.random.default_rng(0).uniform([-2, -2, 3, 1], [2, 2, 9, 1], (50, 4))
@@ -206,7 +209,7 @@ def test_a_point_is_only_seen_before_on_its_own_surface(change: str) -> None:
     if change == "id":
         before = before._replace(ids=np.ones_like(before.ids))
     elif change == "normal":
-        before = before._replace(normal=np.broadcast_to(np.float32([0.6, 0, -0.8]), before.normal.shape))
+        before = before._replace(normal=np.broadcast_to(np.array([0.6, 0, -0.8], np.float32), before.normal.shape))
     else:
         before = before._replace(position=before.position + [0, 0, 0.006 * 4.0])
     same = motion_between(View(now, camera, {}), View(flat([0] * 8), camera, {}))

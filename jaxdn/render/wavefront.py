@@ -16,6 +16,9 @@ from jaxdn.render.seeds import frame_key
 MAX_LANES = 1 << 20
 """Paths traced at once: about 300 bytes of memory each."""
 
+BRIGHTEST = 1e30
+"""A sample as bright as this is an overflow, and a sum of a few more would be."""
+
 
 class Light(NamedTuple):
     """Sums over samples of the three parts of radiance, each [H, W, 3] float64."""
@@ -24,7 +27,7 @@ class Light(NamedTuple):
     direct: np.ndarray
     indirect: np.ndarray
     bad: int
-    """Number of samples that were not finite; they count as black."""
+    """Number of samples that were not finite (or beyond ``BRIGHTEST``); they count as black."""
 
     def plus(self, other: "Light") -> "Light":
         """The sums over both sets of samples."""
@@ -48,8 +51,10 @@ def generator(pixel: Any, sample: Any, key: tuple[int, int]) -> Any:
     mix: Any = mi.sample_tea_32
     first, second = mix(pixel, sample)
     first, second = mix(first ^ dr.opaque(mi.UInt32, key[0]), second ^ dr.opaque(mi.UInt32, key[1]))
-    numbers: Any = mi.PCG32()
-    numbers.seed(mi.UInt64(first), mi.UInt64(second))
+    pcg: Any = mi.PCG32
+    wide: Any = mi.UInt64
+    numbers = pcg()
+    numbers.seed(wide(first), wide(second))
     return numbers
 
 
@@ -132,7 +137,8 @@ def _chunk(
     row = pixel // width
     ray = camera_rays(sensor, pixel - row * width, row)
     traced: Any = trace(scene, ray, generator(pixel, sample, key), dr.opaque(mi.UInt32, depth))
-    finite = dr.all(dr.isfinite(traced[0] + traced[1] + traced[2]))
+    # Light is not negative: NaN, infinities and what would overflow a sum all fail this one comparison.
+    finite = dr.all(traced[0] + traced[1] + traced[2] < BRIGHTEST)
     parts = [dr.select(finite, part, 0.0) for part in traced]
     bad = dr.select(finite, mi.UInt32(0), mi.UInt32(1))
     # One kernel: a block sum of something not yet evaluated would trace everything again, once per sum.
