@@ -24,7 +24,7 @@ from jaxdn.commands.errors import told_plainly
 from jaxdn.commands.train import fit, load_validation, read_curve
 from jaxdn.denoisers import ntd, svgf
 from jaxdn.render import ClipJob, choose_variant, render_clips
-from jaxdn.report import Results, TrainingCurve, mean_scores, write_report
+from jaxdn.report import Results, TrainingCurve, text_table, write_report
 from jaxdn.training import Recipe
 from jaxdn.weights import SHIPPED, save_weights
 
@@ -81,19 +81,19 @@ PRESETS = {
         recipe=Recipe(learning_rate=2e-3),
     ),
     "full": Preset(
-        train=ClipSet(_seeds(FAMILIES, range(12)), size=128, frames=10, reference_spp=128),
-        validation=ClipSet(_seeds(FAMILIES, range(100, 101)), size=128, frames=10, reference_spp=256),
+        train=ClipSet(_seeds(FAMILIES, range(8)), size=96, frames=10, reference_spp=96),
+        validation=ClipSet(_seeds(FAMILIES, range(100, 101)), size=96, frames=10, reference_spp=96),
         tests=(
             ClipSet(
-                (*_seeds(FAMILIES, range(200, 204)), *_seeds(FAILURES, range(200, 202))), 128, 10, 512, layers=(1, 2, 4)
+                (*_seeds(FAMILIES, range(200, 204)), *_seeds(FAILURES, range(200, 202))), 96, 10, 256, layers=(1, 2, 4)
             ),
-            ClipSet((("mobile", 300),), size=128, frames=110, reference_spp=256),
+            ClipSet((("mobile", 300),), size=96, frames=110, reference_spp=96),
         ),
         runs=(
-            Run("C large", "large", "dual", occlusion=True, steps=1600),
-            Run("C", "small", "dual", occlusion=True, steps=1600),
-            Run("B", "small", "dual", occlusion=False, steps=1600),
-            Run("A", "small", "traditional", occlusion=False, steps=1600),
+            Run("C large", "large", "dual", occlusion=True, steps=1000),
+            Run("C", "small", "dual", occlusion=True, steps=1000),
+            Run("B", "small", "dual", occlusion=False, steps=1000),
+            Run("A", "small", "traditional", occlusion=False, steps=1000),
         ),
         recipe=Recipe(),
     ),
@@ -124,7 +124,7 @@ def jobs(clips: ClipSet, folder: Path) -> list[Any]:
     return [
         ClipJob(
             {"family": family, "seed": seed},
-            folder / f"{family}-{seed}",
+            str(folder / f"{family}-{seed}"),
             width=clips.size,
             height=clips.size,
             frames=clips.frames,
@@ -145,15 +145,17 @@ def train(run: Run, preset: Preset, data: Path, folder: Path) -> None:
     """Train one network to the end (or find it trained) and write its weights."""
     options = {"size": run.size, "motion": run.motion}
     recipe = preset.recipe._replace(steps=run.steps, occlusion=run.occlusion)
+    denoiser = ntd(**options)  # type: ignore[arg-type]
     batches = training_batches(
         folders(preset.train, data / "train"),
+        buffers=denoiser.reads,
         batch=recipe.batch,
         crop=recipe.crop,
         frames=recipe.frames,
         seed=recipe.seed,
     )
     state = fit(
-        ntd(**options),  # type: ignore[arg-type]
+        denoiser,
         recipe,
         batches,
         folder,
@@ -192,16 +194,6 @@ def _folder_name(run: Run) -> str:
     return run.label.replace(" ", "-")
 
 
-def _table(results: Results) -> str:
-    means = mean_scores(results)
-    heads = ("psnr", "ssim", "l1", "mse", "temporal_psnr", "flip", "disoccluded_l1", "disoccluded_psnr", "ms_per_frame")
-    lines = [f"{'':10}" + "".join(f"{head.replace('disoccluded', 'disocc'):>15}" for head in heads) + f"{'spp':>5}"]
-    for method in results.methods:
-        scores = means[method]._asdict()
-        lines.append(f"{method:10}" + "".join(f"{scores[head]:15.4f}" for head in heads) + f"{scores['spp']:5.0f}")
-    return "\n".join(lines)
-
-
 def main(settings: Settings) -> None:
     """Render, train, evaluate, report."""
     began = time.monotonic()
@@ -222,9 +214,7 @@ def main(settings: Settings) -> None:
     if settings.only in ("all", "report"):
         results = evaluate(preset, settings, data, folder, machine)
         page = write_report(results, folder)
-        print(_table(results))
-        floors = [clip.noise_floor_psnr for clip in results.clips]
-        print(f"noise floor of the references: {min(floors):.1f} to {max(floors):.1f} dB PSNR")
+        print(text_table(results))
         print(f"metrics: {folder / 'metrics.json'}\nreport:  {page}  ({time.monotonic() - began:.0f} s in all)")
 
 

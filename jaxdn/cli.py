@@ -1,6 +1,5 @@
 """The command line: ``jaxdn render | train | denoise | compare``; every verb has ``--help`` with examples."""
 
-import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -144,7 +143,7 @@ def _render(options: Render) -> None:
     jobs = [
         ClipJob(
             record,
-            options.out / name,
+            str(options.out / name),
             width=options.width,
             height=options.height,
             frames=options.frames,
@@ -178,8 +177,10 @@ def _train(options: Train) -> None:
     settings = {"size": options.size, "motion": options.motion}
     if options.parity:
         settings["preset"] = "parity"
+    denoiser = ntd(**settings)
     batches = training_batches(
         clip_folders(options.clips),
+        buffers=denoiser.reads,
         batch=recipe.batch,
         crop=recipe.crop,
         frames=recipe.frames,
@@ -187,7 +188,7 @@ def _train(options: Train) -> None:
         spp=options.spp,
     )
     held_out = load_validation(clip_folders(options.validation), spp=options.spp) if options.validation else []
-    state = fit(ntd(**settings), recipe, batches, options.out, label=options.out.name, validation=held_out)
+    state = fit(denoiser, recipe, batches, options.out, label=options.out.name, validation=held_out)
     path = save_weights(
         options.out / "weights.safetensors",
         state.params,
@@ -218,14 +219,14 @@ def _denoise(options: Denoise) -> None:
 
 def _compare(options: Compare) -> None:
     from jaxdn.commands.compare import compare, method_named
-    from jaxdn.report import mean_scores, write_report
+    from jaxdn.report import text_table, write_report
 
     methods = [method_named(name) for name in options.methods]
     folders = clip_folders(options.clips)
     settings = {"clips": len(folders), "spp": options.spp, "methods": options.methods}
     results = compare(methods, folders, title=f"Denoisers on {options.clips.name}", settings=settings, spp=options.spp)
     page = write_report(results, options.out)
-    print(json.dumps({label: round(scores.psnr, 2) for label, scores in mean_scores(results).items()}))
+    print(text_table(results))
     print(f"report: {page}")
 
 
@@ -244,4 +245,3 @@ def main(arguments: list[str] | None = None) -> None:
 
 if __name__ == "__main__":
     main(sys.argv[1:])
-

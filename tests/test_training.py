@@ -119,7 +119,9 @@ def test_a_gradient_that_is_not_finite_changes_nothing(denoiser, step, state):
     broken = state._replace(params=jax.tree.map(jnp.copy, state.params))
     first = jax.tree.leaves(broken.params)[0]
     broken = broken._replace(
-        params=jax.tree.map(lambda leaf: leaf.at[(0,) * leaf.ndim].set(jnp.nan) if leaf is first else leaf, broken.params)
+        params=jax.tree.map(
+            lambda leaf: leaf.at[(0,) * leaf.ndim].set(jnp.nan) if leaf is first else leaf, broken.params
+        )
     )
     after, _ = step(broken, batch_of(make_clip(0), make_clip(1)))
     assert int(after.skipped) == 1

@@ -1,5 +1,6 @@
 """``jaxdn compare``: every method on the same clips, scored, timed and laid side by side in one report."""
 
+import os
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ import numpy as np
 from jaxdn import __version__, color, denoisers, metrics
 from jaxdn.clips import read_clip
 from jaxdn.clips.noise_floor import read_noise_floor
-from jaxdn.frame import Clip, Denoiser
+from jaxdn.frame import Clip, Denoiser, Frame
 from jaxdn.report import ClipResult, Results, Scores, TrainingCurve
 from jaxdn.rollout import denoise
 from jaxdn.weights import load_weights, shipped_names
@@ -34,17 +35,18 @@ def method_named(name: str) -> Method:
     """
     if name == "noisy":
         return Method(name, None, {})
-    if name in denoisers.NAMES and name not in denoisers.LEARNED:
-        return Method(name, getattr(denoisers, name)(), {})
-    if name in denoisers.LEARNED:
-        known = [shipped for shipped in shipped_names() if shipped.startswith(name)]
-        raise ValueError(f"method {name!r}: expected its weights, one of {', '.join(known)} or a .safetensors file.")
-    if not name.endswith(".safetensors") and name not in shipped_names():
-        filters = [known for known in denoisers.NAMES if known not in denoisers.LEARNED]
+    if name in denoisers.NAMES:
+        denoiser = getattr(denoisers, name)()
+        params = denoiser.init(jax.random.key(0), Frame(radiance=np.zeros((16, 16, 3), np.float32)))
+        if not params:
+            return Method(name, denoiser, params)
+        trained = [shipped for shipped in shipped_names() if shipped.startswith(name)]
         raise ValueError(
-            f"method {name!r}: expected one of noisy, {', '.join([*filters, *shipped_names()])} or the path of a "
-            ".safetensors file."
+            f"method {name!r}: expected its weights, one of {', '.join(trained)} or the path of a .safetensors file."
         )
+    if not name.endswith(".safetensors") and name not in shipped_names():
+        known = ["noisy", *denoisers.NAMES, *shipped_names()]
+        raise ValueError(f"method {name!r}: expected one of {', '.join(known)} or the path of a .safetensors file.")
     denoiser, params = load_weights(name)
     return Method(Path(name).stem, denoiser, params)
 
@@ -142,9 +144,7 @@ def _compare_on(
             "disoccluded_l1": np.where(hidden.any((1, 2, 3)), found["frame_disoccluded_l1"], np.nan).tolist(),
         }
         images[method.label] = np.asarray(image[shown])
-    return ClipResult(
-        folder.name, read_noise_floor(folder), scores, per_frame, shown, images, hidden[shown, ..., 0]
-    )
+    return ClipResult(folder.name, read_noise_floor(folder), scores, per_frame, shown, images, hidden[shown, ..., 0])
 
 
 def _as_scores(found: dict[str, np.ndarray], hidden: np.ndarray, milliseconds: float, spp: int) -> Scores:
@@ -160,9 +160,7 @@ def _as_scores(found: dict[str, np.ndarray], hidden: np.ndarray, milliseconds: f
     )
 
 
-def _timed(
-    run: Callable[[Any, Clip], jax.Array], params: Any, clip: Clip, frames: int
-) -> tuple[jax.Array, float]:
+def _timed(run: Callable[[Any, Clip], jax.Array], params: Any, clip: Clip, frames: int) -> tuple[jax.Array, float]:
     """The denoised clip and the median milliseconds a frame of three runs after a first one that compiles."""
     denoised = jax.block_until_ready(run(params, clip))
     seconds = []
@@ -197,6 +195,4 @@ def _processor() -> str:
 
 
 def _cores() -> int:
-    import os
-
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
