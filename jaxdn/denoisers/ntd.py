@@ -85,10 +85,8 @@ def depth_feature(depth: jax.Array, *, scale: str = "geometric") -> jax.Array:
     return depth / (depth + middle)
 
 
-def _pad(image: jax.Array | None) -> jax.Array | None:
+def _pad(image: jax.Array) -> jax.Array:
     """Height and width made multiples of 16 by repeating the last row and column."""
-    if image is None:
-        return None
     height, width = image.shape[:2]
     below, right = -height % MULTIPLE, -width % MULTIPLE
     return jnp.pad(image, ((0, below), (0, right), (0, 0)), mode="edge") if below or right else image
@@ -148,7 +146,7 @@ def ntd(
     check_option(motion, "motion", ("dual", "traditional"))
     check_option(preset, "preset", (None, "parity"))
     check_option(compute_dtype, "compute_dtype", (None, "float32", "bfloat16"))
-    given = {
+    given: dict[str, Any] = {
         "alpha_at": alpha_at,
         "down": down,
         "up": up,
@@ -243,8 +241,8 @@ def ntd(
 
         depth = None if frame.depth is None else _pad(depth_feature(frame.depth, scale=options.depth_scale))
         albedo = None if frame.albedo is None else _pad(frame.albedo - 1.0)
-        normal = _pad(frame.normal)
-        noisy, recalled, absent = _pad(noisy), _pad(recalled), _pad(absent)
+        normal = None if frame.normal is None else _pad(frame.normal)
+        noisy, recalled, absent = (_pad(image) for image in (noisy, recalled, absent))
         squeezed, squeezed_history = color.compress(noisy), color.compress(recalled)
         features = [squeezed, albedo, normal, depth, squeezed_history]
         if flagged:

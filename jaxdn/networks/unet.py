@@ -8,6 +8,8 @@ max-pooling down, nearest upsampling and skip concatenation up. The papers give 
 of "about 850,000 weights". Xavier-uniform kernels (Glorot and Bengio 2010), zero biases.
 """
 
+import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -31,6 +33,9 @@ SMALL: Widths = ((24,), (32, 32), (48, 48), (64, 64), (64, 64))
 
 NEGATIVE_SLOPE = 0.01
 
+FULL_VECTOR = 16
+"""Outputs of a convolution are computed in multiples of this."""
+
 
 class Network(NamedTuple):
     """Two pure functions."""
@@ -41,42 +46,52 @@ class Network(NamedTuple):
     """(params, feature groups [N, H, W, c] or None) -> heads at full, half and quarter resolution."""
 
 
+Part = tuple[jax.Array, Sequence[slice] | None]
+"""An input of a convolution and the slices of the kernel's input channels that it consists of (None: all of them)."""
+
+
 class Convolution(nnx.Module):
     """A 3x3 convolution with bias; zeros beyond the border."""
 
-    def __init__(self, inputs: int, outputs: int, rngs: nnx.Rngs) -> None:
-        kernel = nnx.initializers.xavier_uniform()(rngs.params(), (3, 3, inputs, outputs), jnp.float32)
-        self.kernel = nnx.Param(kernel)
+    def __init__(self, inputs: int, outputs: int) -> None:
+        self.kernel = nnx.Param(jnp.zeros((3, 3, inputs, outputs), jnp.float32))
         self.bias = nnx.Param(jnp.zeros((outputs,), jnp.float32))
 
-    def __call__(self, x: jax.Array, used: Sequence[slice] | None = None) -> jax.Array:
-        """``used`` names the slices of the input channels that ``x`` consists of; None is all of them."""
-        kernel = self.kernel[...]
-        if used is not None:
-            kernel = jnp.concatenate([kernel[:, :, channels] for channels in used], axis=2)
-        bias = jnp.reshape(self.bias[...], (1, 1, 1, -1))
-        return convolve(x, kernel.astype(x.dtype)) + bias.astype(x.dtype)
+    def __call__(self, *parts: Part) -> jax.Array:
+        kernel, dtype = self.kernel[...], parts[0][0].dtype
+        outputs = kernel.shape[-1]
+        # 51 outputs take XLA:CPU 1.4 times as long as 64.
+        kernel = jnp.pad(kernel, ((0, 0), (0, 0), (0, 0), (0, -outputs % FULL_VECTOR))).astype(dtype)
+
+        def share(used: Sequence[slice] | None) -> jax.Array:
+            return kernel if used is None else jnp.concatenate([kernel[:, :, channels] for channels in used], axis=2)
+
+        # A sum of convolutions is the convolution of the parts side by side, and joining them first costs more.
+        total = functools.reduce(jnp.add, [convolve(x, share(used)) for x, used in parts])
+        return total[..., :outputs] + jnp.reshape(self.bias[...].astype(dtype), (1, 1, 1, -1))
 
 
 class Level(nnx.Module):
     """The convolutions of one resolution level, each followed by a LeakyReLU."""
 
-    def __init__(self, inputs: int, widths: Sequence[int], rngs: nnx.Rngs) -> None:
+    def __init__(self, inputs: int, widths: Sequence[int]) -> None:
         self.count = len(widths)
         for index, (before, after) in enumerate(zip((inputs, *widths), widths, strict=False)):
-            setattr(self, f"convolution_{index}", Convolution(before, after, rngs))
+            setattr(self, f"convolution_{index}", Convolution(before, after))
 
-    def __call__(self, x: jax.Array, used: Sequence[slice] | None = None) -> jax.Array:
+    def __call__(self, *parts: Part) -> jax.Array:
         for index in range(self.count):
-            x = getattr(self, f"convolution_{index}")(x, used if index == 0 else None)
+            x = getattr(self, f"convolution_{index}")(*parts)
             x = jnp.where(x >= 0, x, NEGATIVE_SLOPE * x)
+            parts = ((x, None),)
         return x
 
 
 def pool(x: jax.Array) -> jax.Array:
     """The maximum of each 2x2 block: [N, H, W, C] -> [N, H/2, W/2, C]."""
-    n, height, width, channels = x.shape
-    return jnp.max(jnp.reshape(x, (n, height // 2, 2, width // 2, 2, channels)), axis=(2, 4))
+    # Four strided views: 3.6 times as fast on XLA:CPU as reshape and reduce.
+    corners = [x[:, i::2, j::2] for i in (0, 1) for j in (0, 1)]
+    return jnp.maximum(jnp.maximum(corners[0], corners[1]), jnp.maximum(corners[2], corners[3]))
 
 
 def enlarge(x: jax.Array) -> jax.Array:
@@ -89,18 +104,18 @@ def enlarge(x: jax.Array) -> jax.Array:
 class UNet(nnx.Module):
     """Encoder, decoder and three heads; called on a list of feature groups."""
 
-    def __init__(self, groups: Sequence[int], heads: Sequence[int], widths: Widths, rngs: nnx.Rngs) -> None:
+    def __init__(self, groups: Sequence[int], heads: Sequence[int], widths: Widths) -> None:
         self.groups = tuple(groups)
         self.heads = len(heads)
         inputs = sum(groups)
         for level, channels in enumerate(widths):
-            setattr(self, f"encoder_{level}", Level(inputs, channels, rngs))
+            setattr(self, f"encoder_{level}", Level(inputs, channels))
             inputs = channels[-1]
         for level in reversed(range(LEVELS - 1)):
-            setattr(self, f"decoder_{level}", Level(inputs + widths[level][-1], widths[level], rngs))
+            setattr(self, f"decoder_{level}", Level(inputs + widths[level][-1], widths[level]))
             inputs = widths[level][-1]
         for level, outputs in enumerate(heads):
-            setattr(self, f"head_{level}", Convolution(widths[level][-1], outputs, rngs))
+            setattr(self, f"head_{level}", Convolution(widths[level][-1], outputs))
 
     def __call__(self, features: Sequence[jax.Array | None]) -> tuple[jax.Array, ...]:
         used, start = [], 0
@@ -108,19 +123,42 @@ class UNet(nnx.Module):
             if group is not None:
                 used.append(slice(start, start + channels))
             start += channels
-        x = jnp.concatenate([group for group in features if group is not None], axis=-1)
-        skips = []
+        joined = jnp.concatenate([group for group in features if group is not None], axis=-1)
+        part: Part = (joined, used if len(used) < len(self.groups) else None)
+        skips: list[jax.Array] = []
         for level in range(LEVELS):
-            x = pool(x) if level else x
-            absent = level == 0 and len(used) < len(self.groups)
-            x = getattr(self, f"encoder_{level}")(x, used if absent else None)
-            skips.append(x)
+            skips.append(getattr(self, f"encoder_{level}")(part))
+            part = (pool(skips[-1]), None)
+        x = skips.pop()
         outputs: list[jax.Array] = []
         for level in reversed(range(LEVELS - 1)):
-            x = getattr(self, f"decoder_{level}")(jnp.concatenate([enlarge(x), skips[level]], axis=-1))
+            below = x.shape[-1]
+            parts = (enlarge(x), [slice(0, below)]), (skips[level], [slice(below, None)])
+            x = getattr(self, f"decoder_{level}")(*parts)
             if level < self.heads:
-                outputs.insert(0, getattr(self, f"head_{level}")(x))
+                outputs.insert(0, getattr(self, f"head_{level}")((x, None)))
         return tuple(outputs)
+
+
+def xavier_uniform(key: jax.Array, shapes: dict[str, Any]) -> dict[str, Any]:
+    """Kernels uniform within +-sqrt(6 / (fan_in + fan_out)), biases zero (Glorot and Bengio 2010).
+
+    All kernels are cut from one draw: a generator for each of them takes XLA twenty seconds to compile.
+    """
+    leaves, tree = jax.tree.flatten(shapes)
+    draw = jax.random.uniform(
+        key, (sum(math.prod(leaf.shape) for leaf in leaves if leaf.ndim == 4),), jnp.float32, -1, 1
+    )
+    params, start = [], 0
+    for leaf in leaves:
+        if leaf.ndim < 4:
+            params.append(jnp.zeros(leaf.shape, leaf.dtype))
+            continue
+        size = math.prod(leaf.shape)
+        limit = math.sqrt(6 / (math.prod(leaf.shape[:2]) * (leaf.shape[2] + leaf.shape[3])))
+        params.append(limit * jnp.reshape(draw[start : start + size], leaf.shape))
+        start += size
+    return jax.tree.unflatten(tree, params)
 
 
 def unet(groups: Sequence[int], heads: Sequence[int], *, widths: Widths = LARGE) -> Network:
@@ -140,26 +178,24 @@ def unet(groups: Sequence[int], heads: Sequence[int], *, widths: Widths = LARGE)
             "see jaxdn.networks.unet.LARGE."
         )
 
-    def build(key: jax.Array) -> UNet:
-        return UNet(groups, heads, widths, nnx.Rngs(params=key))
-
-    graph, _ = nnx.split(nnx.eval_shape(lambda: build(jax.random.key(0))), nnx.Param, graph=False)
+    abstract = nnx.eval_shape(lambda: UNet(groups, heads, widths))
+    graph, state = nnx.split(abstract, nnx.Param, graph=False)
+    shapes = nnx.to_pure_dict(state)
 
     def init(key: jax.Array) -> dict[str, Any]:
-        _, params = nnx.split(build(key), nnx.Param, graph=False)
-        return nnx.to_pure_dict(params)
+        return xavier_uniform(key, shapes)
 
     def apply(params: dict[str, Any], features: Sequence[jax.Array | None]) -> tuple[jax.Array, ...]:
         present = [group for group in features if group is not None]
-        shapes = [None if group is None else group.shape for group in features]
         fits = len(features) == len(groups) and all(
             group is None or group.shape == (*present[0].shape[:3], channels)
             for group, channels in zip(features, groups, strict=False)
         )
         if not (present and fits) or any(size % MULTIPLE for size in present[0].shape[1:3]):
+            got = [None if group is None else group.shape for group in features]
             raise ValueError(
                 f"features: expected [N, H, W, c] or None with c = {tuple(groups)}, H and W multiples of {MULTIPLE}, "
-                f"got shapes {shapes}; pad by the edge and crop the result."
+                f"got shapes {got}; pad by the edge and crop the result."
             )
         return nnx.merge(graph, params)(features)
 
