@@ -70,30 +70,30 @@ def _seeds(families: Sequence[str], seeds: range) -> tuple[tuple[str, int], ...]
 
 PRESETS = {
     "demo": Preset(
-        train=ClipSet(_seeds(FAMILIES, range(2)), size=80, frames=10, reference_spp=96),
-        validation=ClipSet((("fruit", 100),), size=64, frames=10, reference_spp=96),
-        tests=(ClipSet((*_seeds(FAMILIES[1:], range(200, 201)), ("edge", 200)), 96, 10, reference_spp=192),),
+        train=ClipSet(_seeds(FAMILIES, range(2)), size=64, frames=10, reference_spp=48),
+        validation=ClipSet((("fruit", 100),), size=64, frames=10, reference_spp=48),
+        tests=(ClipSet((*_seeds(FAMILIES[1:], range(200, 201)), ("edge", 200)), 64, 10, reference_spp=96),),
         runs=(
-            Run("A", "small", "traditional", occlusion=False, steps=240),
-            Run("B", "small", "dual", occlusion=False, steps=240),
-            Run("C", "small", "dual", occlusion=True, steps=240),
+            Run("A", "small", "traditional", occlusion=False, steps=150),
+            Run("B", "small", "dual", occlusion=False, steps=150),
+            Run("C", "small", "dual", occlusion=True, steps=150),
         ),
-        recipe=Recipe(learning_rate=2e-3),
+        recipe=Recipe(learning_rate=2e-3, crop=48),
     ),
     "full": Preset(
-        train=ClipSet(_seeds(FAMILIES, range(8)), size=96, frames=10, reference_spp=96),
+        train=ClipSet(_seeds(FAMILIES, range(6)), size=96, frames=10, reference_spp=96),
         validation=ClipSet(_seeds(FAMILIES, range(100, 101)), size=96, frames=10, reference_spp=96),
         tests=(
             ClipSet(
-                (*_seeds(FAMILIES, range(200, 204)), *_seeds(FAILURES, range(200, 202))), 96, 10, 256, layers=(1, 2, 4)
+                (*_seeds(FAMILIES, range(200, 204)), *_seeds(FAILURES, range(200, 202))), 96, 8, 128, layers=(1, 2, 4)
             ),
-            ClipSet((("mobile", 300),), size=96, frames=110, reference_spp=96),
+            ClipSet((("mobile", 300),), size=96, frames=110, reference_spp=64),
         ),
         runs=(
-            Run("C large", "large", "dual", occlusion=True, steps=1000),
-            Run("C", "small", "dual", occlusion=True, steps=1000),
-            Run("B", "small", "dual", occlusion=False, steps=1000),
-            Run("A", "small", "traditional", occlusion=False, steps=1000),
+            Run("C large", "large", "dual", occlusion=True, steps=600),
+            Run("C", "small", "dual", occlusion=True, steps=600),
+            Run("B", "small", "dual", occlusion=False, steps=600),
+            Run("A", "small", "traditional", occlusion=False, steps=600),
         ),
         recipe=Recipe(),
     ),

@@ -17,11 +17,13 @@ _PATH = tyro.conf.Positional[Path]
 class Render:
     """Render animated clips with Mitsuba: noisy indirect light, references, G-buffers and motion vectors.
 
-    A procedural family:
-        jaxdn render fruit --seeds 0 1 2 -o data/train
-    Any Mitsuba 3 scene, with an animation file beside it:
-        jaxdn render kitchen/scene.xml --animation kitchen.json -o data/kitchen
     Run the same command again to continue what was interrupted.
+
+    Examples:
+
+    jaxdn render fruit --seeds 0 1 2 -o data/train
+
+    jaxdn render kitchen/scene.xml --animation kitchen.json -o data/kitchen
     """
 
     scene: tyro.conf.Positional[str]
@@ -48,6 +50,8 @@ class Render:
 @dataclass
 class Train:
     """Train the neural temporal denoiser (ntd) on rendered clips; run it again to continue.
+
+    Example:
 
     jaxdn train data/train --validation data/validation -o runs/mine --size small --steps 3000
     """
@@ -81,7 +85,10 @@ class Train:
 class Denoise:
     """Denoise a clip, or EXR files of any renderer; adds direct and emitted light back where the clip has them.
 
+    Examples:
+
     jaxdn denoise data/test/fruit-7 -o out --preview
+
     jaxdn denoise "shots/*.exr" -o out --method ntd-small --motion-convention cycles
     """
 
@@ -102,6 +109,8 @@ class Denoise:
 @dataclass
 class Compare:
     """Score methods on clips with references; writes metrics.json and report.html, and says who wins.
+
+    Example:
 
     jaxdn compare data/test -o runs/compare --methods noisy svgf ntd-small ntd-large
     """

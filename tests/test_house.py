@@ -1,4 +1,4 @@
-"""The house stands: imports point down only, the core needs jax and numpy alone, public names are where they should be."""
+"""The house stands: imports point down, the core needs jax and numpy alone, public names are where they should be."""
 
 import ast
 import inspect
