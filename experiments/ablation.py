@@ -19,6 +19,7 @@ from typing import Any, Literal, NamedTuple
 import tyro
 
 from jaxdn.clips import training_batches
+from jaxdn.clips.folder import is_clip, read_record
 from jaxdn.commands.compare import Method, compare
 from jaxdn.commands.errors import told_plainly
 from jaxdn.commands.train import fit, load_validation, read_curve
@@ -131,9 +132,15 @@ def jobs(clips: ClipSet, folder: Path) -> list[Any]:
             layers=clips.layers,
             reference_spp=clips.reference_spp,
             seed=seed,
+            variant=_variant_of(folder / f"{family}-{seed}"),
         )
         for family, seed in clips.clips
     ]
+
+
+def _variant_of(folder: Path) -> str | None:
+    """The variant that a clip was begun with: it is finished, and used again, with the same one."""
+    return read_record(folder)["variant"] if is_clip(folder) else None
 
 
 def folders(clips: ClipSet, folder: Path) -> list[Path]:
@@ -203,6 +210,7 @@ def main(settings: Settings) -> None:
     if settings.only in ("all", "render"):
         choice = choose_variant()
         machine["renderer"] = f"Mitsuba, {choice.variant}"
+        print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
         parts = [(preset.train, "train"), (preset.validation, "validation"), *((each, "test") for each in preset.tests)]
         render_clips([job for clips, part in parts for job in jobs(clips, data / part)], workers=settings.workers)
         print(f"rendered: {time.monotonic() - began:.0f} s so far", flush=True)

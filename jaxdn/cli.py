@@ -135,7 +135,7 @@ def clip_folders(folder: Path) -> list[Path]:
 
 
 def _render(options: Render) -> None:
-    from jaxdn.render import ClipJob, render_clips
+    from jaxdn.render import ClipJob, choose_variant, render_clips
     from jaxdn.render.families import FAMILIES
 
     if options.scene in FAMILIES:
@@ -163,6 +163,8 @@ def _render(options: Render) -> None:
         )
         for (name, record), seed in zip(records, options.seeds, strict=True)
     ]
+    choice = choose_variant()
+    print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
     render_clips(jobs, workers=options.workers)
 
 

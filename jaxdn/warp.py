@@ -27,15 +27,13 @@ def on_screen(motion: jax.Array) -> jax.Array:
     return inside[..., None]
 
 
-def warp(
-    image: jax.Array, motion: jax.Array, *, border: str = "clamp", implementation: str | None = None
-) -> jax.Array:
+def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implementation: str | None = None) -> jax.Array:
     """Fetch ``image`` [H, W, C] bilinearly at ``p + motion(p)``: the previous frame as this frame sees it.
 
     ``motion`` [H, W, 2] is (x, y) in pixels, y down, previous minus current. With border ``"clamp"`` the position is
-    clamped to the outermost pixel centres, with ``"zeros"`` pixels outside count as zero (as in PyTorch's grid_sample with
-    align_corners=False). Where the motion is not finite the result is 0. The gradient goes to the image; motion is data
-    and gets none. ``implementation`` is None (the fastest for this platform), ``"reference"`` or ``"pairs"``. Raises
+    clamped to the outermost pixel centres, with ``"zeros"`` pixels outside count as zero (as in PyTorch's grid_sample
+    with align_corners=False). Where the motion is not finite the result is 0. The gradient goes to the image; motion is
+    data and gets none. ``implementation`` is None (the fastest for this platform), ``"reference"`` or ``"pairs"``. Raises
     ValueError for shapes that do not fit and unknown options.
     """
     check_image(image, "image")

@@ -1,8 +1,8 @@
 """3x3 convolution whose gradients stay fast inside a scan.
 
 XLA:CPU runs plain NHWC/HWIO convolutions well, but the ones that automatic differentiation makes fall off the fast path
-inside ``lax.scan`` (28 times slower in a two-layer toy, jax 0.10). The ``"blocked"`` implementation has a VJP of its own:
-the gradient by the image is again a plain convolution, the gradient by the kernel a few matrix products.
+inside ``lax.scan`` (28 times slower in a two-layer toy, jax 0.10). The ``"blocked"`` implementation has a VJP of its
+own: the gradient by the image is again a plain convolution, the gradient by the kernel a few matrix products.
 """
 
 import jax
@@ -62,20 +62,23 @@ def _kernel_gradient(x: jax.Array, cotangent: jax.Array) -> jax.Array:
     around_output = outputs <= inputs
     thin, wide = (cotangent, x) if around_output else (x, cotangent)
     padded = jnp.pad(thin, ((0, 0), (1, 1), (1, 1), (0, 0)))
+    exact = jnp.promote_types(x.dtype, jnp.float32)  # a sum over all pixels needs more digits than bfloat16 has
     rows = height
     while rows % 2 == 0 and count * rows * width * 9 * thin.shape[3] * x.dtype.itemsize > _BLOCK_BYTES:
         rows //= 2
 
     def strip(first: jax.Array | int) -> jax.Array:
         flat = lax.dynamic_slice_in_dim(wide, first, rows, 1).reshape(-1, wide.shape[3])
-        return lax.dot_general(flat, _patches(padded, first, rows), (((0,), (0,)), ((), ())))
+        return lax.dot_general(
+            flat, _patches(padded, first, rows), (((0,), (0,)), ((), ())), preferred_element_type=exact
+        )
 
     if rows == height:
         total = strip(0)
     else:
-        empty = jnp.zeros((wide.shape[3], 9 * thin.shape[3]), x.dtype)
+        empty = jnp.zeros((wide.shape[3], 9 * thin.shape[3]), exact)
         total, _ = lax.scan(lambda sum, index: (sum + strip(index * rows), None), empty, jnp.arange(height // rows))
-    total = total.reshape(wide.shape[3], 3, 3, thin.shape[3])
+    total = total.astype(x.dtype).reshape(wide.shape[3], 3, 3, thin.shape[3])
     if around_output:  # patches of the cotangent run against the offsets of the image
         return jnp.flip(total, (1, 2)).transpose(1, 2, 0, 3)
     return total.transpose(1, 2, 3, 0)

@@ -1,8 +1,8 @@
 """Applying a kernel of its own to every pixel: the reference, and a form whose gradient keeps no copies.
 
-The automatic gradient of K*K shifted products keeps or rebuilds K*K shifted images and scatters each kernel's slice into a
-zero array of its own. ``"recompute"`` keeps only its two arguments and makes both gradients in the shape of the forward
-pass: K*K shifted multiply-adds for the image, K*K short sums laid side by side for the kernels.
+The automatic gradient of K*K shifted products keeps or rebuilds K*K shifted images and pads each kernel slice's share
+to full width before it adds them. ``"recompute"`` keeps only its two arguments and makes both gradients in the shape of
+the forward pass: K*K shifted multiply-adds for the image, K*K short sums laid side by side for the kernels.
 """
 
 import math

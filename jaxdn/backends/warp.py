@@ -61,9 +61,7 @@ def _spread(shape: tuple[int, ...], x: jax.Array, y: jax.Array, cotangent: jax.A
     """The adjoint of the fetch: every value goes back to its four pixels."""
     height, width, channels = max(shape[0], 2), max(shape[1], 2), shape[2]
     left, top, fx, fy = _cells(x, y, height, width)
-    rows = [
-        jnp.concatenate([wy * (1 - fx) * cotangent, wy * fx * cotangent], axis=-1) for wy in (1 - fy, fy)
-    ]
+    rows = [jnp.concatenate([wy * (1 - fx) * cotangent, wy * fx * cotangent], axis=-1) for wy in (1 - fy, fy)]
     blocks = jnp.stack(rows, axis=-2).reshape(-1, 2, 2 * channels)
     where = jnp.stack([top, left * channels], axis=-1).reshape(-1, 2)
     windows = lax.ScatterDimensionNumbers(

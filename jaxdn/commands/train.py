@@ -4,7 +4,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from jaxdn import color, metrics
 from jaxdn.checkpoint import Checkpoints
-from jaxdn.clips import read_clip, training_batches
+from jaxdn.clips import read_clip
 from jaxdn.frame import Clip, Denoiser
 from jaxdn.rollout import denoise
 from jaxdn.training import Recipe, TrainState, initial_state, make_train_step
@@ -75,14 +75,17 @@ def read_curve(folder: Path) -> Curve:
     )
 
 
-def validate(denoiser: Denoiser, params: Any, clips: Sequence[Clip]) -> float:
-    """Mean over the clips of the PSNR of all frames, tone-mapped, in dB; not a number without clips."""
+def make_validation(denoiser: Denoiser, clips: Sequence[Clip]) -> Callable[[Any], float]:
+    """A function of the parameters: the mean over the clips of the PSNR of all their frames, tone-mapped, in dB.
+
+    Compiled once for clips of one size. Not a number without clips.
+    """
 
     @jax.jit
     def score(params: Any, clip: Clip) -> jax.Array:
         return metrics.psnr(color.tonemap(denoise(denoiser, params, clip)), color.tonemap(clip.reference))
 
-    return float(np.mean([float(score(params, clip)) for clip in clips])) if clips else float("nan")
+    return lambda params: float(np.mean([float(score(params, clip)) for clip in clips])) if clips else float("nan")
 
 
 def fit(
@@ -115,6 +118,7 @@ def fit(
     step = int(state.step)
     log = Log(folder / "log.jsonl", keep_until=step)
     train_step = make_train_step(denoiser, recipe)
+    validate = make_validation(denoiser, validation)
     # A write of the state while it is being replaced would keep neither: the position belongs to finished updates only.
     position = batches.get_state()  # type: ignore[attr-defined]
     saved = step
@@ -129,7 +133,7 @@ def fit(
                     log.write(step=step, loss=loss, last_frame_psnr=float(report.validation_psnr))
                     progress.advance(step, loss=loss, skipped=int(state.skipped))
                 if validation and (step % validate_every == 0 or step == recipe.steps):
-                    psnr = validate(denoiser, state.params, validation)
+                    psnr = validate(state.params)
                     log.write(step=step, validation_psnr=psnr)
                     progress.validated(psnr)
                 if step % checkpoint_every == 0 or step == recipe.steps:
@@ -225,6 +229,3 @@ class _Progress:
             left = f"  {(self._recipe.steps - step) / rate:.0f} s left" if rate > 0 else ""
             self.say(f"{self._label}: step {step}/{self._recipe.steps}  {told}{left}")
             self._printed = now
-
-
-__all__ = ["Curve", "fit", "load_validation", "read_curve", "read_log", "training_batches", "validate"]

@@ -170,8 +170,8 @@ def svgf(
         length = jnp.minimum(past[5] + 1.0, history_max)
         share = jnp.maximum(alpha, 1.0 / length)
         share_moments = jnp.maximum(alpha_moments, 1.0 / length)
-        color = past[:3] + share * (now - past[:3])
-        moments = past[3:5] + share_moments * (jnp.stack([level, level * level]) - past[3:5])
+        color = past[:3] + share[None] * (now - past[:3])
+        moments = past[3:5] + share_moments[None] * (jnp.stack([level, level * level]) - past[3:5])
         return jnp.concatenate([color, moments, length[None]]), guides, broken
 
     def _variance(history: jax.Array, edges: Any) -> tuple[jax.Array, jax.Array]:
@@ -184,7 +184,7 @@ def svgf(
             history[:5], edges, stencil(3), needed=needed, sigma_depth=sigma_depth, sigma_normal=sigma_normal
         )
         spatial = jnp.maximum(mean[4] - mean[3] ** 2, 0.0) * (short_history / length)
-        return jnp.where(needed, mean[:3], color), jnp.where(needed, spatial, variance)
+        return jnp.where(needed[None], mean[:3], color), jnp.where(needed, spatial, variance)
 
     return Denoiser(init, start, step, READS)
 
