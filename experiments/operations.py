@@ -68,13 +68,13 @@ def measure(
     times = compare(programs, rounds)
     for name in names:
         chosen = "*" if resolve(op, None) is resolve(op, name) else " "
-        columns = "  ".join(
-            f"{kind} {times[f'{name} {kind}'] * 1e3:8.1f} ms ({times[f'{name} {kind}'] / times[f'reference {kind}']:5.2f})"
-            for kind in ("forward", "gradient")
-        )
+        columns = ""
+        for kind in ("forward", "gradient"):
+            seconds = times[f"{name} {kind}"]
+            columns += f"{kind} {seconds * 1e3:8.1f} ms ({seconds / times[f'reference {kind}']:5.2f})  "
         extra = ""
         if op == "convolution":
-            extra = f"  vmapped / native {times[f'{name} gradient'] / times[f'{name} native']:5.2f}"
+            extra = f"vmapped / native {times[f'{name} gradient'] / times[f'{name} native']:5.2f}"
         print(f"{title:22s} {chosen}{name:10s} {columns}{extra}", flush=True)
 
 
@@ -109,16 +109,11 @@ def main() -> None:
         rounds,
     )
     for border in ("clamp", "zeros"):
-        measure(
-            f"warp {border} RGB",
-            "warp",
-            lambda name, border=border: (
-                lambda scale, x: warp(scale * x[0], 4 * x[1], border=border, implementation=name)
-            ),
-            jnp.ones(()),
-            (random(*here, 3), random(*here, 2)),
-            rounds,
-        )
+
+        def warped(name: str, border: str = border) -> Callable[..., jax.Array]:
+            return lambda scale, x: warp(scale * x[0], 4 * x[1], border=border, implementation=name)
+
+        measure(f"warp {border} RGB", "warp", warped, jnp.ones(()), (random(*here, 3), random(*here, 2)), rounds)
 
 
 if __name__ == "__main__":

@@ -28,8 +28,8 @@ def dual_motion(motion: jax.Array, forward_motion: jax.Array, *, visible: jax.Ar
     """Dual motion vectors [H, W, 2] (Zeng et al. 2021, eq. 2), in pixels.
 
     A point that was hidden has its traditional history ``p + motion(p)`` on the occluder that hid it. With the nearest
-    pixel ``q = floor(p + motion(p) + 0.5)`` and the occluder's own displacement ``forward_motion(q)`` since the previous
-    frame (current minus previous, [H, W, 2], belonging to the PREVIOUS frame's pixels), the result is
+    pixel ``q = floor(p + motion(p) + 0.5)`` and the occluder's own displacement ``forward_motion(q)`` since the
+    previous frame (current minus previous, [H, W, 2], belonging to the PREVIOUS frame's pixels), the result is
     ``-forward_motion(q)``: the pixel borrows the backward motion of what covered it, and its history comes from beside
     the occluder and not from the occluder.
 

@@ -33,8 +33,8 @@ def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implemen
     ``motion`` [H, W, 2] is (x, y) in pixels, y down, previous minus current. With border ``"clamp"`` the position is
     clamped to the outermost pixel centres, with ``"zeros"`` pixels outside count as zero (as in PyTorch's grid_sample
     with align_corners=False). Where the motion is not finite the result is 0. The gradient goes to the image; motion is
-    data and gets none. ``implementation`` is None (the fastest for this platform), ``"reference"`` or ``"pairs"``. Raises
-    ValueError for shapes that do not fit and unknown options.
+    data and gets none. ``implementation`` is None (the fastest for this platform), ``"reference"`` or ``"pairs"``.
+    Raises ValueError for shapes that do not fit and unknown options.
     """
     check_image(image, "image")
     check_image(motion, "motion", channels=2)

@@ -80,13 +80,13 @@ def _pairs(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _forward(image: jax.Array, x: jax.Array, y: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-    # Of the image only the shape matters to the adjoint; an empty slice carries it through a scan for nothing.
+    # Of the image only shape and dtype matter to the adjoint; an empty slice carries it through a scan for nothing.
     return _fetch(image, x, y), (image[:, :, :, None][..., :0], x, y)
 
 
 def _backward(residuals: tuple[jax.Array, ...], cotangent: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     shape, x, y = residuals
-    return _spread(shape.shape[:3], x, y, cotangent), jnp.zeros_like(x), jnp.zeros_like(y)
+    return _spread(shape.shape[:3], x, y, cotangent).astype(shape.dtype), jnp.zeros_like(x), jnp.zeros_like(y)
 
 
 _pairs.defvjp(_forward, _backward)
