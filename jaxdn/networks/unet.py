@@ -28,7 +28,7 @@ Widths = tuple[tuple[int, ...], ...]
 LARGE: Widths = ((32, 32), (64, 64), (64, 64), (80, 80), (96, 96))
 """Channels of each convolution, level by level from full resolution down; the decoder mirrors the first four."""
 
-SMALL: Widths = ((24,), (32, 32), (48, 48), (64, 64), (64, 64))
+SMALL: Widths = ((16,), (32, 32), (48, 48), (64, 64), (64, 64))
 """About a third of LARGE's time. Most of LARGE's time is its full resolution, so that is where SMALL saves."""
 
 NEGATIVE_SLOPE = 0.01
