@@ -91,12 +91,12 @@ PRESETS = {
             ClipSet((("mobile", 300),), size=96, frames=110, reference_spp=64),
         ),
         runs=(
-            Run("C large", "large", "dual", occlusion=True, steps=600),
-            Run("C", "small", "dual", occlusion=True, steps=600),
-            Run("B", "small", "dual", occlusion=False, steps=600),
-            Run("A", "small", "traditional", occlusion=False, steps=600),
+            Run("C large", "large", "dual", occlusion=True, steps=300),
+            Run("C", "small", "dual", occlusion=True, steps=300),
+            Run("B", "small", "dual", occlusion=False, steps=300),
+            Run("A", "small", "traditional", occlusion=False, steps=300),
         ),
-        recipe=Recipe(),
+        recipe=Recipe(learning_rate=2e-3, crop=48),
     ),
 }
 

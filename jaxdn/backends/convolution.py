@@ -86,9 +86,13 @@ def _kernel_gradient(x: jax.Array, cotangent: jax.Array) -> jax.Array:
 
 @_kernel_gradient.def_vmap
 def _one_by_one(size: int, batched: tuple[bool, bool], x: jax.Array, cotangent: jax.Array) -> tuple[jax.Array, bool]:
-    """Under vmap, a plain product for each example: XLA:CPU has no fast path for a batch of them."""
-    each = [_kernel_gradient(x[i] if batched[0] else x, cotangent[i] if batched[1] else cotangent) for i in range(size)]
-    return jnp.stack(each), True
+    """Under vmap, a plain product for each example in turn: XLA:CPU has no fast path for a batch of them.
+
+    A loop and not an unrolled one: it takes about the same time and a third of the compilation.
+    """
+    x = x if batched[0] else jnp.broadcast_to(x, (size, *x.shape))
+    cotangent = cotangent if batched[1] else jnp.broadcast_to(cotangent, (size, *cotangent.shape))
+    return lax.map(lambda pair: _kernel_gradient(*pair), (x, cotangent)), True
 
 
 @register("convolution", "blocked", preferred_on=("cpu",))

@@ -97,8 +97,8 @@ def fit(
     label: str,
     validation: Sequence[Clip] = (),
     log_every: int = 20,
-    validate_every: int = 200,
-    checkpoint_every: int = 200,
+    validate_every: int = 100,
+    checkpoint_every: int = 100,
 ) -> TrainState:
     """Train to ``recipe.steps`` updates, continuing from the newest checkpoint in ``folder`` as if never stopped.
 

@@ -148,13 +148,11 @@ def edge_average(
             sums, ready, offset = carry
             return (add(sums, ready, offset), weight(*tap), tap[0]), None
 
-        centre = taps[0, 2]
-        sums = (
-            [centre * shifted(plane, offsets[0]) for plane in means],
-            None if spread is None else centre**2 * shifted(spread, offsets[0]),
-        )
-        first = (sums, weight(offsets[1], numbers[1]), offsets[1])
-        (sums, ready, offset), _ = lax.scan(body, first, (offsets[2:], numbers[2:]))
+        # The centre waits to be added with its weight h before the first tap's weight is made.
+        nothing = jnp.zeros((rows, width), dtype)
+        sums = ([nothing] * len(means), None if spread is None else nothing)
+        centre = (sums, jnp.full((rows, width), taps[0, 2], dtype), offsets[0])
+        (sums, ready, offset), _ = lax.scan(body, centre, (offsets[1:], numbers[1:]))
         total, total_spread = add(sums, ready, offset)
         some = total[-1] > 0
         share = jnp.where(some, total[-1], 1.0)

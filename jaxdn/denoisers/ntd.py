@@ -49,7 +49,7 @@ class Options(NamedTuple):
     border: str = "clamp"
     first_frame: str = "none"
     missing_history: str = "current"
-    demodulate: bool = False
+    demodulate: bool = True
     truncate: bool = False
 
 
@@ -63,11 +63,13 @@ _CHOICES: dict[str, tuple[Any, ...]] = {
     "border": ("clamp", "zeros"),
     "first_frame": ("none", "noisy"),
     "missing_history": ("current", "blend"),
-    "demodulate": (False, True),
+    "demodulate": (True, False),
     "truncate": (False, True),
 }
 
-PARITY = Options(down="max", depth_scale="unit", border="zeros", first_frame="noisy", missing_history="blend")
+PARITY = Options(
+    down="max", depth_scale="unit", border="zeros", first_frame="noisy", missing_history="blend", demodulate=False
+)
 """The paper's letter: D is max-pooling (eq. 4), warped taps outside are 0, the first frame's history is its noise."""
 
 
