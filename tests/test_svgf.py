@@ -276,38 +276,46 @@ def test_broken_history_is_dropped_where_it_is_broken(rng):
 NEUTRAL = {"albedo": 1.0, "motion": 0.0, "depth": 0.0, "normal": 0.0}
 
 
-@pytest.mark.parametrize("name", [*NEUTRAL, "previous_depth", "all"])
-def test_none_is_the_neutral_value_for_less_work(rng, name):
-    base = moving_frames(rng, 2)
-    names = [*NEUTRAL, "previous_depth"] if name == "all" else [name]
-
-    def written(frame):
-        values = {n: np.full_like(getattr(frame, n), NEUTRAL.get(n, 0)) for n in names}
-        if "previous_depth" in values and "depth" not in values:
+def neutral(frame, names, *, written):
+    """The frame with these buffers absent, or with the same said by their neutral values."""
+    values = dict.fromkeys(names)
+    if written:
+        values = {name: np.full_like(getattr(frame, name), NEUTRAL.get(name, 0.0)) for name in names}
+        if "previous_depth" in names and "depth" not in names:
             values["previous_depth"] = frame.depth
-        return frame._replace(**values)
+    return frame._replace(**values)
 
-    def absent(frame):
-        return frame._replace(**dict.fromkeys(names))
 
-    if name == "depth":
-        base = [frame._replace(previous_depth=None) for frame in base]
-    images, sizes = [], []
-    for variant in (written, absent):
-        frames = [variant(frame) for frame in base]
-        state = DENOISER.start({}, frames[0])
-        step = jax.jit(DENOISER.step)
-        sizes.append(len(step.lower({}, state, frames[0]).as_text().splitlines()))
-        for frame in frames:
-            state, image = step({}, state, frame)
+@pytest.mark.parametrize("names", [("motion", "previous_depth"), (*NEUTRAL, "previous_depth")], ids=["motion", "all"])
+def test_none_is_the_neutral_value_written_out(rng, names):
+    frames = moving_frames(rng, 2)
+    images = []
+    for written in (True, False):
+        given = [neutral(frame, names, written=written) for frame in frames]
+        state = DENOISER.start({}, given[0])
+        for frame in given:
+            state, image = STEP({}, state, frame)
         images.append(image)
     np.testing.assert_allclose(images[0], images[1], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [*NEUTRAL, "previous_depth"])
+def test_an_absent_buffer_leaves_no_operation(rng, name):
+    frame = moving_frames(rng, 1)[0]
+    if name == "depth":
+        frame = frame._replace(previous_depth=None)
+    sizes = []
+    for written in (True, False):
+        given = neutral(frame, (name,), written=written)
+        lowered = jax.jit(DENOISER.step).lower({}, DENOISER.start({}, given), given)
+        sizes.append(len(lowered.as_text().splitlines()))
     assert sizes[1] < sizes[0]
 
 
 POISON = [np.nan, np.inf, -np.inf, 1e30, -1.0]
 
 
+@pytest.mark.slow
 def test_poison_stays_local_and_leaves(rng):
     """One bad pixel in each buffer: finite everywhere, changed within the footprint only, gone when history ran out.
 
@@ -354,6 +362,7 @@ def test_poison_stays_local_and_leaves(rng):
             np.testing.assert_allclose(images[7], expected[7], rtol=1e-4, atol=1e-5, err_msg=f"{name} {value}")
 
 
+@pytest.mark.slow
 def test_a_clip_is_one_program_and_vmap_is_a_loop(rng):
     frames = jax.tree.map(lambda *b: np.stack(b), *moving_frames(rng, 4))
     traced = 0
@@ -379,6 +388,7 @@ def test_a_clip_is_one_program_and_vmap_is_a_loop(rng):
         np.testing.assert_allclose(both[index], alone, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite(rng):
     denoiser = svgf(levels=2)
     frames = moving_frames(rng, 2)
