@@ -3,7 +3,7 @@
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -134,12 +134,16 @@ def clip_folders(folder: Path) -> list[Path]:
     return found
 
 
+def _family(name: str, seed: int) -> dict[str, Any]:
+    return {"family": name, "seed": seed}
+
+
 def _render(options: Render) -> None:
     from jaxdn.render import ClipJob, choose_variant, render_clips
     from jaxdn.render.families import FAMILIES
 
     if options.scene in FAMILIES:
-        records = [(f"{options.scene}-{seed}", {"family": options.scene, "seed": seed}) for seed in options.seeds]
+        records = [(f"{options.scene}-{seed}", _family(options.scene, seed)) for seed in options.seeds]
     elif options.scene.endswith(".xml"):
         from jaxdn.render.scene_file import SceneFile
 
@@ -185,7 +189,7 @@ def _train(options: Train) -> None:
     )
     if options.learning_rate is not None:
         recipe = recipe._replace(learning_rate=options.learning_rate)
-    settings = {"size": options.size, "motion": options.motion}
+    settings: dict[str, Any] = {"size": options.size, "motion": options.motion}
     if options.parity:
         settings["preset"] = "parity"
     denoiser = ntd(**settings)
@@ -243,15 +247,15 @@ def _compare(options: Compare) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Parse the command line and run one verb; what a user can mend ends with one message and exit code 2."""
-    verbs = {Render: _render, Train: _train, Denoise: _denoise, Compare: _compare}
+    verbs: dict[type, Any] = {Render: _render, Train: _train, Denoise: _denoise, Compare: _compare}
     options = tyro.cli(
-        Render | Train | Denoise | Compare,  # type: ignore[arg-type]
+        Render | Train | Denoise | Compare,
         prog="jaxdn",
         description="Remove Monte Carlo noise from path-traced animations.",
         args=arguments,
     )
     with told_plainly():
-        verbs[type(options)](options)  # type: ignore[index]
+        verbs[type(options)](options)
 
 
 if __name__ == "__main__":

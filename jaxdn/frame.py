@@ -18,33 +18,36 @@ RADIANCE_MAX = 65504.0
 FAR = 1e6
 """View-space depth stored where the camera ray left the scene: large and finite, so that differences stay finite."""
 
+Buffer = Any
+"""A jax or NumPy array, or None where the effect is absent."""
+
 
 class Frame(NamedTuple):
     """What a renderer gives for one frame; every buffer is ``[H, W, C]`` and all but ``radiance`` may be ``None``."""
 
-    radiance: jax.Array
+    radiance: Buffer
     """[H, W, 3] noisy radiance to denoise (for ``ntd``: the indirect part), linear Rec.709, >= 0."""
-    albedo: jax.Array | None = None
+    albedo: Buffer = None
     """[H, W, 3] first-hit diffuse reflectance in [0, 1]; neutral: 1."""
-    normal: jax.Array | None = None
+    normal: Buffer = None
     """[H, W, 3] unit world-space shading normal, zero where the ray left the scene; neutral: 0."""
-    depth: jax.Array | None = None
+    depth: Buffer = None
     """[H, W, 1] view-space z along the optical axis, > 0, ``FAR`` on a miss; neutral: 0."""
-    roughness: jax.Array | None = None
+    roughness: Buffer = None
     """[H, W, 1] linear roughness r, GGX alpha = r * r; neutral: 1."""
-    motion: jax.Array | None = None
+    motion: Buffer = None
     """[H, W, 2] (x, y) px, y down, previous minus current; not finite where there is no history; neutral: 0."""
-    dual_motion: jax.Array | None = None
+    dual_motion: Buffer = None
     """[H, W, 2] px, as ``motion`` but disoccluded pixels borrow their occluder's; neutral: ``motion``."""
-    visible: jax.Array | None = None
+    visible: Buffer = None
     """[H, W, 1] bool, the point was seen in the previous frame; neutral: true."""
-    previous_depth: jax.Array | None = None
+    previous_depth: Buffer = None
     """[H, W, 1] view-space z that the point had in the previous frame; neutral: ``depth``."""
-    ids: jax.Array | None = None
+    ids: Buffer = None
     """[H, W, 1] int32 shape id, -1 for nothing."""
-    direct: jax.Array | None = None
+    direct: Buffer = None
     """[H, W, 3] directly reflected light; neutral: 0."""
-    emission: jax.Array | None = None
+    emission: Buffer = None
     """[H, W, 3] light emitted towards the camera; neutral: 0."""
 
 
@@ -53,7 +56,7 @@ class Clip(NamedTuple):
 
     frames: Frame
     """A Frame whose buffers have ``T`` in front."""
-    reference: jax.Array | None = None
+    reference: Buffer = None
     """[T, H, W, 3] the noise-free radiance."""
 
 
@@ -78,7 +81,8 @@ def frame_at(frames: Frame, index: int | jax.Array) -> Frame:
 def only(frame: Frame, reads: frozenset[str]) -> Frame:
     """The same frame with every buffer dropped that is not in ``reads`` (``radiance`` always stays)."""
     kept = {"radiance", *reads}
-    return Frame(**{name: value if name in kept else None for name, value in frame._asdict().items()})
+    dropped: dict[str, Any] = {name: None for name in Frame._fields if name not in kept}
+    return frame._replace(**dropped)
 
 
 def _working_dtype(buffer: jax.Array) -> jax.Array:
@@ -100,7 +104,7 @@ def repair(frame: Frame) -> tuple[Frame, jax.Array]:
         nonlocal replaced
         replaced = replaced + jnp.sum(bad, dtype=jnp.int32)
 
-    def light(buffer: jax.Array | None) -> jax.Array | None:
+    def light(buffer: Any) -> Any:
         if buffer is None:
             return None
         buffer = _working_dtype(buffer)

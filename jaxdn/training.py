@@ -18,7 +18,7 @@ from jaxdn.rollout import unroll
 
 
 class Recipe(NamedTuple):
-    """How a network is trained; the defaults are ours, :data:`PARITY` is the paper's letter (Zeng et al. 2021, sec. 5)."""
+    """How a network is trained: ours by default, :data:`PARITY` is the paper's letter (Zeng et al. 2021, sec. 5)."""
 
     steps: int = 2000
     """Parameter updates in all; the occlusion loss joins in the second half."""

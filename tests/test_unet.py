@@ -1,4 +1,4 @@
-"""The U-Net against a NumPy one, and what its door promises: plain dicts, fixed shapes, absent groups that cost nothing."""
+"""The U-Net against a NumPy one, and its promises: plain dicts, fixed shapes, absent groups that cost nothing."""
 
 import jax
 import jax.numpy as jnp

@@ -96,8 +96,8 @@ def read_window(
 
     chosen = layers_for(spp, clip.layers, clip.path)
     radiance = combine({samples: read(f"noisy_{samples}spp") for samples in chosen})
-    frames = Frame(radiance=radiance, **{name: read(name) for name in wanted})  # type: ignore[arg-type]
-    return Clip(frames, read("reference") if "reference" in clip.arrays else None)  # type: ignore[arg-type]
+    frames = Frame(radiance=radiance, **{name: read(name) for name in wanted})
+    return Clip(frames, read("reference") if "reference" in clip.arrays else None)
 
 
 def _stamp(path: Path, count: int) -> str:

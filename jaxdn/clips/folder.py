@@ -139,7 +139,7 @@ def read_clip(
         references = [None] * len(frames)
     known = [reference for reference in references if reference is not None]
     stack = jax.tree.map(lambda *buffers: np.stack(buffers), *frames)
-    return Clip(stack, np.stack(known) if known else None)  # type: ignore[arg-type]
+    return Clip(stack, np.stack(known) if known else None)
 
 
 def _unfinished(path: str | Path) -> bool:

@@ -103,7 +103,7 @@ def read_frame(path: str | Path, *, spp: int = 1) -> StoredFrame:
     chosen = layers_for(spp, layers, path)
     buffers = {name: _optional(path, channels, name, layout) for name, layout in LAYOUT.items()}
     return StoredFrame(
-        Frame(radiance=combine({n: layers[n] for n in chosen}), **buffers),  # type: ignore[arg-type]
+        Frame(radiance=combine({n: layers[n] for n in chosen}), **buffers),
         layers,
         _optional(path, channels, "reference", _LIGHT),
         _optional(path, channels, "reference_half", _LIGHT),

@@ -182,7 +182,7 @@ def _frame(images: Mapping[str, np.ndarray], convention: str | None) -> Frame:
     if "ids" in images:
         ids = np.nan_to_num(images["ids"].astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
         buffers["ids"] = (np.clip(np.rint(ids), 0, 2**31 - 1) - 1).astype(np.int32)
-    return Frame(**buffers)  # type: ignore[arg-type]
+    return Frame(**buffers)
 
 
 def _motion_convention(

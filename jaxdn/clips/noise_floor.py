@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxdn import color
@@ -15,8 +16,8 @@ def noise_floor(reference: np.ndarray, reference_half: np.ndarray) -> float:
     quarter of the variance of ``a - b``; so its error is about ``mean((tonemap(a) - tonemap(b))^2) / 4``.
     """
     other_half = np.maximum(2.0 * reference - reference_half, 0.0)
-    difference = np.asarray(color.tonemap(reference_half)) - np.asarray(color.tonemap(other_half))
-    return float(np.mean(difference.astype(np.float64) ** 2) / 4.0)
+    first, second = (np.asarray(color.tonemap(jnp.asarray(half))) for half in (reference_half, other_half))
+    return float(np.mean((first.astype(np.float64) - second) ** 2) / 4.0)
 
 
 def read_noise_floor(folder: str | Path) -> float:

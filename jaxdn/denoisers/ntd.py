@@ -18,7 +18,7 @@ from jaxdn import color
 from jaxdn.checks import check_image, check_option, check_same_size
 from jaxdn.frame import FAR, RADIANCE_MAX, Denoiser, Frame, only, repair, repair_image
 from jaxdn.kernels import apply_kernels, compose_scales, downsample, normalize_kernels
-from jaxdn.networks.unet import LARGE, MULTIPLE, SMALL, unet
+from jaxdn.networks import LARGE, MULTIPLE, SMALL
 from jaxdn.warp import on_screen, warp
 
 TAPS = 25
@@ -171,6 +171,9 @@ def ntd(
     groups = (3, 3, 3, 1, 3, 1) if flagged else (3, 3, 3, 1, 3)
     # full: two kernels and alpha^t; half, quarter: one kernel. An alpha lives at one end of each of the two seams.
     heads = (2 * TAPS + 2, TAPS + 1, TAPS) if fine else (2 * TAPS + 1, TAPS + 1, TAPS + 1)
+    # Flax is loaded when a network is built: a filter without weights needs jax and numpy alone.
+    from jaxdn.networks.unet import unet
+
     network = unet(groups, heads, widths=widths)
     reads = frozenset({"albedo", "normal", "depth", "motion"} | ({"dual_motion"} if motion == "dual" else set()))
 
