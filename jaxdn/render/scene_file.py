@@ -1,0 +1,266 @@
+"""Mitsuba scene files set in motion: any scene XML with, beside it, an animation file of keys.
+
+Mitsuba's own loader does the loading: for every frame the XML is edited (the camera replaced, a matrix appended to the
+transform of every shape that moves, inserted shapes added) and handed over as a string. Scenes of the 0.6 format stay
+of that format, so that Mitsuba upgrades them as it would the file.
+"""
+
+import copy
+import os
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxdn.render.animation import CameraKeys, RigidKeys, check_animation, extents, read_animation
+from jaxdn.render.scene import Camera
+
+_DEPTH = 8
+"""Path length where the file asks for endless paths or does not say."""
+_TEXTURES = ("bitmap", "checkerboard", "mesh_attribute", "volume")
+
+
+class SceneFile:
+    """A Mitsuba 3 scene file as an animated scene; see :mod:`jaxdn.render.animation` for what the JSON beside it says.
+
+    Without ``animation_path`` the file ``<scene>.json`` beside the scene is used if there is one, and a scene without
+    an animation is a still. Shapes without an id get ``shape_<n>``, counted from 0 in the order of the file. The camera
+    is the file's first, perspective, sensor; its horizontal field of view is that of the file's own film and stays so
+    at every image size. Raises ValueError for files that cannot be read and animations that do not fit.
+    """
+
+    def __init__(self, path: Path | str, animation_path: Path | str | None = None) -> None:
+        path = Path(path)
+        beside = path.with_suffix(".json")
+        if animation_path is None and beside.is_file():
+            animation_path = beside
+        if animation_path is not None and not Path(animation_path).is_file():
+            raise ValueError(f"animation {animation_path}: expected a file, found none.")
+        self._open(path, {} if animation_path is None else read_animation(Path(animation_path)))
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> "SceneFile":
+        """The scene of a clip's record ``{"file": ..., "animation": {...}}``; the file is found from where one is."""
+        scene = cls.__new__(cls)
+        scene._open(Path(record["file"]), record.get("animation", {}))
+        return scene
+
+    def _open(self, path: Path, animation: dict[str, Any]) -> None:
+        self._tree = _read_xml(path)
+        _absolute_files(self._tree, path)
+        self._shapes = _name_shapes(self._tree)
+        self._rest, self._near, self._far = _rest_camera(self._tree)
+        check_animation(animation, self._shapes, has_camera=self._rest is not None)
+        if self._rest is None and "camera" not in animation:
+            raise ValueError(
+                f"scene {path}: expected a perspective sensor or an animation with camera keys, got neither."
+            )
+        self.name = path.parent.name if path.stem == "scene" and path.parent.name else path.stem
+        self.frames = int(animation.get("frames", 1))
+        self.max_depth = _path_length(self._tree)
+        near = os.path.relpath(path)
+        self.record = {"file": path.resolve().as_posix() if near.startswith("..") else near, "animation": animation}
+        self._camera = CameraKeys(animation["camera"]) if "camera" in animation else None
+        self._motions = {
+            name: RigidKeys(motion["keys"], np.array(motion.get("pivot", (0, 0, 0)), float))
+            for name, motion in animation.get("shapes", {}).items()
+        }
+        self._inserted = {shape["id"]: shape for shape in animation.get("inserted", [])}
+        for name, shape in self._inserted.items():
+            self._motions[name] = RigidKeys(shape.get("keys", [{"frame": 0}]), np.zeros(3))
+        self._tree = _without(self._tree, "sensor", "integrator")
+
+    def camera(self, frame: float) -> Camera:
+        """The camera of one frame."""
+        fov = None if self._camera is None else self._camera.fov(frame)
+        if self._camera is None:
+            assert self._rest is not None
+            return self._rest
+        if fov is None:
+            assert self._rest is not None
+            fov = self._rest.x_fov
+        return Camera(self._camera(frame), fov)
+
+    def pose(self, frame: float) -> dict[str, np.ndarray]:
+        """Shape id -> [4, 4], where the keys have moved the shape from where the file puts it."""
+        return {name: motion(frame) for name, motion in self._motions.items()}
+
+    def build(self, frame: float, width: int, height: int) -> Any:
+        """The ``mi.Scene`` of one frame."""
+        import mitsuba as mi
+
+        text = ET.tostring(self.describe(frame, width, height), encoding="unicode")
+        return mi.load_string(text, optimize=False)
+
+    def describe(self, frame: float, width: int, height: int) -> ET.Element:
+        """The XML of one frame."""
+        scene = copy.deepcopy(self._tree)
+        poses = self.pose(frame)
+        for element in scene.findall("shape"):
+            pose = poses.get(element.get("id", ""))
+            if pose is not None and element.get("id") not in self._inserted:
+                transform = _transform(element)
+                if transform is None:
+                    transform = ET.SubElement(element, "transform", name="to_world")
+                ET.SubElement(transform, "matrix", value=_matrix(pose))
+        for name, shape in self._inserted.items():
+            scene.append(_primitive(shape, poses[name]))
+        ET.SubElement(scene, "integrator", type="path").append(_value("max_depth", self.max_depth))
+        camera = self.camera(frame)
+        sensor = ET.SubElement(scene, "sensor", type="perspective")
+        for key, value in {"fov": camera.x_fov, "near_clip": self._near, "far_clip": self._far}.items():
+            sensor.append(_value(key, float(value)))
+        sensor.append(_value("fov_axis", "x"))
+        to_world = ET.SubElement(sensor, "transform", name="to_world")
+        ET.SubElement(to_world, "matrix", value=_matrix(camera.to_world))
+        ET.SubElement(sensor, "sampler", type="independent")
+        film = ET.SubElement(sensor, "film", type="hdrfilm")
+        settings = {"width": width, "height": height, "pixel_format": "rgb", "component_format": "float32"}
+        for key, setting in settings.items():
+            film.append(_value(key, setting))
+        ET.SubElement(film, "rfilter", type="box")
+        return scene
+
+
+def _read_xml(path: Path) -> ET.Element:
+    """The scene's root with every ``<include>`` put in its place."""
+    try:
+        root = ET.parse(path).getroot()
+    except (OSError, ET.ParseError) as error:
+        raise ValueError(f"scene {path}: expected a Mitsuba scene (XML), could not read it: {error}.") from error
+    if root.tag != "scene":
+        raise ValueError(f"scene {path}: expected <scene> as the outermost element, got <{root.tag}>.")
+    for parent in list(root.iter()):
+        for index, child in reversed(list(enumerate(parent))):
+            if child.tag == "include":
+                included = _read_xml(path.parent / child.get("filename", ""))
+                parent.remove(child)
+                for offset, element in enumerate(included):
+                    parent.insert(index + offset, element)
+    return root
+
+
+def _absolute_files(root: ET.Element, path: Path) -> None:
+    """Make the names of the files that the scene uses absolute; raises ValueError for one that is not there."""
+    folders = [path.parent, *(path.parent / element.get("value", "") for element in root.findall("path"))]
+    for element in root.iter("string"):
+        name = element.get("value", "")
+        if element.get("name") != "filename" or "$" in name:
+            continue
+        found = [folder / name for folder in folders if (folder / name).is_file()]
+        if not found:
+            raise ValueError(f"scene {path}: it uses the file {name!r}, which is not there; put it beside the scene.")
+        element.set("value", str(found[0].resolve()))
+
+
+def _name_shapes(root: ET.Element) -> list[str]:
+    """The ids of the top-level shapes, after those without one have been given theirs."""
+    taken = {element.get("id") for element in root.iter() if element.get("id")}
+    for index, element in enumerate(root.findall("shape")):
+        name = element.get("id") or f"shape_{index}"
+        while element.get("id") is None and name in taken:
+            name += "_"
+        element.set("id", name)
+    return [element.get("id", "") for element in root.findall("shape") if element.get("type") != "shapegroup"]
+
+
+def _rest_camera(root: ET.Element) -> tuple[Camera | None, float, float]:
+    """The file's own camera with its near and far clip, read by Mitsuba; None where the file has no sensor."""
+    sensor = root.find("sensor")
+    if sensor is None:
+        return None, 1e-2, 1e4
+    if sensor.get("type") != "perspective":
+        raise ValueError(f"scene sensor: expected a perspective one, got {sensor.get('type')!r}; change its type.")
+    import mitsuba as mi
+
+    alone = ET.Element("scene", root.attrib)
+    alone.extend([*root.findall("default"), sensor])
+    loaded = mi.load_string(ET.tostring(alone, encoding="unicode"), optimize=False).sensors()[0]
+    values = mi.traverse(loaded)
+    offset = [float(np.ravel(np.array(values[f"principal_point_offset_{axis}"]))[0]) for axis in "xy"]
+    if any(offset):
+        raise ValueError(f"scene sensor: expected no principal point offset, got {offset}; remove it.")
+    fov, near, far = (float(np.ravel(np.array(values[key]))[0]) for key in ("x_fov", "near_clip", "far_clip"))
+    matrix = np.array(loaded.world_transform().matrix, np.float64).reshape(4, 4)
+    return Camera(matrix, fov), near, far
+
+
+def _path_length(root: ET.Element) -> int:
+    """max_depth of the file's integrator, wherever it is nested."""
+    integrator = root.find("integrator")
+    if integrator is not None:
+        for element in integrator.iter("integer"):
+            value = element.get("value", "")
+            if element.get("name") in ("max_depth", "maxDepth") and value.isdigit() and int(value) > 0:
+                return int(value)
+    return _DEPTH
+
+
+def _without(root: ET.Element, *tags: str) -> ET.Element:
+    for element in [child for child in root if child.tag in tags]:
+        root.remove(element)
+    return root
+
+
+def _transform(shape: ET.Element) -> ET.Element | None:
+    for element in shape.findall("transform"):
+        if element.get("name") in ("to_world", "toWorld"):
+            return element
+    return None
+
+
+def _matrix(matrix: np.ndarray) -> str:
+    return " ".join(repr(float(value)) for value in np.ravel(matrix))
+
+
+def _value(name: str, value: Any) -> ET.Element:
+    """One parameter of a plugin as XML: numbers, truth values, strings, colours and nested plugins."""
+    if isinstance(value, Mapping):
+        if value.get("type") in ("rgb", "spectrum") and "value" in value:
+            return ET.Element(value["type"], name=name, value=" ".join(map(str, np.ravel(value["value"]))))
+        element = ET.Element(
+            "texture" if value.get("type") in _TEXTURES else "bsdf", name=name, type=str(value["type"])
+        )
+        element.extend(_value(key, part) for key, part in value.items() if key != "type")
+        return element
+    if isinstance(value, bool):
+        return ET.Element("boolean", name=name, value=str(value).lower())
+    if isinstance(value, int | float):
+        return ET.Element("integer" if isinstance(value, int) else "float", name=name, value=repr(value))
+    if isinstance(value, str):
+        return ET.Element("string", name=name, value=value)
+    return ET.Element("rgb", name=name, value=" ".join(map(str, value)))
+
+
+def _primitive(shape: Mapping[str, Any], pose: np.ndarray) -> ET.Element:
+    """An inserted shape: Mitsuba's own primitive, centred, scaled to its box, posed."""
+    kind = shape["type"]
+    element = ET.Element("shape", type=kind, id=shape["id"])
+    transform = ET.SubElement(element, "transform", name="to_world")
+    size = extents(shape)
+    if kind == "cylinder":  # Mitsuba's has radius 1 and runs from z = 0 to 1
+        ET.SubElement(transform, "translate", z="-0.5")
+        size = size * (0.5, 0.5, 1.0)
+    else:  # the others reach from -1 to 1
+        size = size * 0.5
+    if kind == "sphere":
+        element.append(_value("radius", float(size[0])))
+    else:
+        ET.SubElement(transform, "scale", x=repr(float(size[0])), y=repr(float(size[1])), z=repr(float(size[2])))
+    ET.SubElement(transform, "matrix", value=_matrix(pose))
+    bsdf = shape.get("bsdf")
+    if bsdf is None:
+        color = {"type": "rgb", "value": shape.get("color", (0.5, 0.5, 0.5))}
+        if "roughness" in shape or "metallic" in shape:
+            gloss = {"roughness": float(shape.get("roughness", 0.5)), "metallic": float(shape.get("metallic", 0.0))}
+            inner: dict[str, Any] = {"type": "principled", "base_color": color, **gloss}
+        else:
+            inner = {"type": "diffuse", "reflectance": color}
+        bsdf = {"type": "twosided", "nested": inner}
+    element.append(_value("bsdf", bsdf))
+    if "emission" in shape:
+        emitter = ET.SubElement(element, "emitter", type="area")
+        emitter.append(_value("radiance", {"type": "rgb", "value": shape["emission"]}))
+    return element
