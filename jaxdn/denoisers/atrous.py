@@ -117,7 +117,7 @@ def edge_average(
             return lax.dynamic_slice(plane, (top + offset[0], offset[1]), (rows, width))
 
         def here(plane: jax.Array) -> jax.Array:
-            return lax.dynamic_slice(plane, (top, 0), (rows, width))
+            return lax.dynamic_slice(plane, (top, jnp.zeros_like(top)), (rows, width))
 
         def weight(offset: jax.Array, number: jax.Array) -> jax.Array:
             factor = jnp.full((rows, width), number[3])
@@ -168,7 +168,8 @@ def edge_average(
     def one(top: jax.Array) -> tuple[jax.Array, jax.Array | None]:
         if wanted is None:
             return strip(top)
-        return lax.cond(jnp.any(lax.dynamic_slice(wanted, (top, 0), (rows, width))), strip, skipped, top)
+        some = jnp.any(lax.dynamic_slice(wanted, (top, jnp.zeros_like(top)), (rows, width)))
+        return lax.cond(some, strip, skipped, top)
 
     if strips == 1:
         return one(jnp.zeros((), jnp.int32))
