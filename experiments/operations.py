@@ -20,7 +20,7 @@ import numpy as np
 from jaxdn.backends.convolution import convolve
 from jaxdn.backends.registry import implementations, resolve
 from jaxdn.kernels import apply_kernels, normalize_kernels
-from jaxdn.warp import warp
+from jaxdn.warping import warp
 
 CONVOLUTIONS = ((16, 32), (32, 32), (32, 51), (64, 64))
 """(inputs, outputs) of typical layers."""

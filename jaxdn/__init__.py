@@ -13,7 +13,7 @@ _HOMES = {
     "Frame": "frame",
     "Clip": "frame",
     "Denoiser": "frame",
-    "warp": "warp",
+    "warp": "warping",
     "dual_motion": "motion",
     "occlusion_mask": "motion",
     "normalize_kernels": "kernels",

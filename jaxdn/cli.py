@@ -19,7 +19,7 @@ class Render:
 
     Run the same command again to continue what was interrupted.
 
-    Examples:
+    For example:
 
     jaxdn render fruit --seeds 0 1 2 -o data/train
 
@@ -51,7 +51,7 @@ class Render:
 class Train:
     """Train the neural temporal denoiser (ntd) on rendered clips; run it again to continue.
 
-    Example:
+    For example:
 
     jaxdn train data/train --validation data/validation -o runs/mine --size small --steps 3000
     """
@@ -85,7 +85,7 @@ class Train:
 class Denoise:
     """Denoise a clip, or EXR files of any renderer; adds direct and emitted light back where the clip has them.
 
-    Examples:
+    For example:
 
     jaxdn denoise data/test/fruit-7 -o out --preview
 
@@ -110,7 +110,7 @@ class Denoise:
 class Compare:
     """Score methods on clips with references; writes metrics.json and report.html, and says who wins.
 
-    Example:
+    For example:
 
     jaxdn compare data/test -o runs/compare --methods noisy svgf ntd-small ntd-large
     """

@@ -40,7 +40,7 @@ def test_warping_and_transforming_can_be_exchanged(rng: np.random.Generator, fli
 @pytest.mark.skipif(importlib.util.find_spec("jaxdn.warp") is None, reason="jaxdn.warp is not there")
 @pytest.mark.parametrize(("flip", "turns"), SYMMETRIES)
 def test_the_librarys_own_warp_agrees(rng: np.random.Generator, flip: bool, turns: int) -> None:
-    from jaxdn.warp import warp
+    from jaxdn.warping import warp
 
     history = rng.random((8, 8, 3), np.float32)
     motion = 10 * rng.random((8, 8, 2), np.float32) - 5

@@ -8,7 +8,7 @@ import pytest
 from jaxdn.backends.convolution import convolve
 from jaxdn.backends.registry import implementations, resolve
 from jaxdn.kernels import apply_kernels
-from jaxdn.warp import warp
+from jaxdn.warping import warp
 
 SIZES = [(6, 7), (1, 1), (1, 9)]
 

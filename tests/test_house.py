@@ -14,7 +14,7 @@ PACKAGE = Path(jaxdn.__file__).parent
 
 FLOORS = {
     "backends": 0,
-    **dict.fromkeys(("frame", "checks", "numerics", "stencils", "color", "warp", "motion", "kernels"), 1),
+    **dict.fromkeys(("frame", "checks", "numerics", "stencils", "color", "warping", "motion", "kernels"), 1),
     **dict.fromkeys(("losses", "metrics", "flip"), 1),
     **dict.fromkeys(("denoisers", "networks"), 2),
     **dict.fromkeys(("rollout", "training"), 3),
@@ -73,14 +73,15 @@ def test_a_module_is_one_idea(path):
 
 
 ONLY_JAX = """
-import importlib.abc, sys
-ALLOWED = {"jax", "jaxlib", "numpy", "ml_dtypes", "opt_einsum", "scipy", "jaxdn"} | set(sys.stdlib_module_names)
-class Nothing_else(importlib.abc.MetaPathFinder):
+import importlib.abc, importlib.metadata, sys
+ALLOWED = {"jax", "jaxlib", "numpy", "ml_dtypes", "opt_einsum", "scipy", "jaxdn"}
+INSTALLED = set(importlib.metadata.packages_distributions()) - ALLOWED
+class NothingElse(importlib.abc.MetaPathFinder):
     def find_spec(self, name, path, target=None):
         # jax itself tries optional packages and copes without them
-        if name.partition(".")[0] not in ALLOWED:
+        if name.partition(".")[0] in INSTALLED:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-sys.meta_path.insert(0, Nothing_else())
+sys.meta_path.insert(0, NothingElse())
 import jax.numpy as jnp
 import jaxdn
 image = jnp.ones((8, 8, 3))
@@ -131,3 +132,9 @@ FIXED = {
 @pytest.mark.parametrize(("name", "parameters"), FIXED.items())
 def test_fixed_signatures(name, parameters):
     assert tuple(inspect.signature(getattr(jaxdn, name)).parameters) == parameters
+
+
+def test_no_module_takes_the_place_of_a_public_function():
+    # Importing jaxdn.warp, were there such a module, would bind it over the function of that name.
+    rooms = {path.stem for path in PACKAGE.iterdir()}
+    assert not rooms & (set(jaxdn.__all__) - {"color", "losses", "metrics", "denoisers"})

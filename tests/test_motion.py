@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxdn.motion import dual_motion, occlusion_mask
-from jaxdn.warp import warp
+from jaxdn.warping import warp
 
 SIZE = 24
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from jaxdn.warp import on_screen, warp
+from jaxdn.warping import on_screen, warp
 
 
 def _constant_motion(height, width, x, y):

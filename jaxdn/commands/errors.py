@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import NoReturn
 
 from rich.console import Console
 
@@ -15,25 +16,26 @@ def told_plainly() -> Iterator[None]:
     """
     try:
         yield
-    except (ValueError, OSError) as error:
-        message = str(error) if isinstance(error, ValueError) else _describe(error)
-        Console(stderr=True).print(f"jaxdn: {message}", markup=False, highlight=False, style="red", soft_wrap=True)
-        sys.exit(2)
+    except ValueError as error:
+        _tell(str(error))
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        _tell(f"{where}{error.strerror or error}")
     except ModuleNotFoundError as error:
-        extra = {"mitsuba": "render", "drjit": "render"}.get((error.name or "").partition(".")[0], "train")
-        Console(stderr=True).print(
-            f"jaxdn: this needs the package {error.name!r}: pip install 'jaxdn[{extra}]'.",
-            markup=False,
-            highlight=False,
-            style="red",
-            soft_wrap=True,
-        )
-        sys.exit(2)
+        package = (error.name or "").partition(".")[0]
+        extra = "render" if package in ("mitsuba", "drjit") else "train"
+        _tell(f"this needs the package {package!r}: pip install 'jaxdn[{extra}]'.")
+    except RuntimeError as error:
+        from jaxdn.render.clip import RenderError
+
+        if not isinstance(error, RenderError):
+            raise
+        _tell(str(error))
     except KeyboardInterrupt:
         Console(stderr=True).print("jaxdn: interrupted; what is finished is kept.", highlight=False)
         sys.exit(130)
 
 
-def _describe(error: OSError) -> str:
-    where = f"{error.filename}: " if error.filename else ""
-    return f"{where}{error.strerror or error}"
+def _tell(message: str) -> NoReturn:
+    Console(stderr=True, style="red").print(f"jaxdn: {message}", markup=False, highlight=False, soft_wrap=True)
+    sys.exit(2)

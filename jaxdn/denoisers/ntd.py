@@ -19,7 +19,7 @@ from jaxdn.checks import check_image, check_option, check_same_size
 from jaxdn.frame import FAR, RADIANCE_MAX, Denoiser, Frame, only, repair, repair_image
 from jaxdn.kernels import apply_kernels, compose_scales, downsample, normalize_kernels
 from jaxdn.networks import LARGE, MULTIPLE, SMALL
-from jaxdn.warp import on_screen, warp
+from jaxdn.warping import on_screen, warp
 
 TAPS = 25
 SMALLEST_ALBEDO = 0.01
