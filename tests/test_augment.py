@@ -1,6 +1,5 @@
 """The symmetries: a transformed clip is the clip of the transformed world."""
 
-import importlib.util
 import itertools
 
 import numpy as np
@@ -37,7 +36,6 @@ def test_warping_and_transforming_can_be_exchanged(rng: np.random.Generator, fli
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("jaxdn.warp") is None, reason="jaxdn.warp is not there")
 @pytest.mark.parametrize(("flip", "turns"), SYMMETRIES)
 def test_the_librarys_own_warp_agrees(rng: np.random.Generator, flip: bool, turns: int) -> None:
     from jaxdn.warping import warp
