@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file, save
 
 from jaxdn import denoisers
 from jaxdn.frame import Denoiser
@@ -55,7 +55,7 @@ def save_weights(
     path.parent.mkdir(parents=True, exist_ok=True)
     description = {"factory": factory, "options": options, **record}
     beside = path.with_name(path.name + ".part")
-    save_file(flatten(params), beside)
+    beside.write_bytes(save(flatten(params)))
     os.replace(beside, path)
     beside = path.with_name(path.stem + ".json.part")
     beside.write_text(json.dumps(description, indent=1, sort_keys=True) + "\n")

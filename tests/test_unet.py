@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.networks.unet import LARGE, LEVELS, NEGATIVE_SLOPE, SMALL, count, unet
+from jaxdn.networks import LARGE, LEVELS, SMALL
+from jaxdn.networks.unet import NEGATIVE_SLOPE, count, unet
 
 GROUPS = (3, 3, 3, 1, 3, 1)
 HEADS = (51, 26, 26)

@@ -51,13 +51,15 @@ class AnimatedScene(Protocol):
 
 
 def scene_from_record(record: Mapping[str, Any]) -> AnimatedScene:
-    """Build the scene that a clip's record describes: ``{"family": name, "seed": int, ...}``.
+    """Build the scene that a clip's record describes: ``{"family": name, "seed": int, ...}``, or a scene file's.
 
-    Keys besides ``family`` become the keyword arguments of the family's function. Raises ValueError for a record
-    that names no known family.
+    Keys besides ``family`` become the keyword arguments of the family's function; ``{"file": ..., "animation": ...}``
+    is a scene file in motion. Raises ValueError for a record that names neither.
     """
+    if "file" in record:
+        return importlib.import_module("jaxdn.render.scene_file").SceneFile.from_record(record)
     if "family" not in record:
-        raise ValueError(f"scene record: expected a 'family', got {sorted(record)}; see jaxdn.render.families.")
+        raise ValueError(f"scene record: expected a 'family' or a 'file', got {sorted(record)}; see jaxdn.render.families.")
     families = importlib.import_module("jaxdn.render.families").FAMILIES
     name = record["family"]
     if name not in families:

@@ -1,14 +1,14 @@
 """Mitsuba scene files set in motion: any scene XML with, beside it, an animation file of keys.
 
-Mitsuba's own loader does the loading: for every frame the XML is edited (the camera replaced, a matrix appended to the
-transform of every shape that moves, inserted shapes added) and handed over as a string. Scenes of the 0.6 format stay
-of that format, so that Mitsuba upgrades them as it would the file.
+Mitsuba's own loader does the loading: what stands still is loaded once; for every frame an edited part of the XML (a new
+camera, the shapes that move with a matrix appended to their transform, inserted shapes) is handed over as a string.
+Scenes of the 0.6 format stay of that format, so that Mitsuba upgrades them as it would the file.
 """
 
 import copy
 import os
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +70,7 @@ class SceneFile:
         self._inserted = {shape["id"]: shape for shape in animation.get("inserted", [])}
         for name, shape in self._inserted.items():
             self._motions[name] = RigidKeys(shape.get("keys", [{"frame": 0}]), np.zeros(3))
-        self._tree = _without(self._tree, "sensor", "integrator")
+        self._still: tuple[str, list[Any]] | None = None
 
     def camera(self, frame: float) -> Camera:
         """The camera of one frame."""
@@ -88,23 +88,26 @@ class SceneFile:
         return {name: motion(frame) for name, motion in self._motions.items()}
 
     def build(self, frame: float, width: int, height: int) -> Any:
-        """The ``mi.Scene`` of one frame."""
+        """The ``mi.Scene`` of one frame; what does not move is loaded once and shared by all frames."""
         import mitsuba as mi
 
-        text = ET.tostring(self.describe(frame, width, height), encoding="unicode")
-        return mi.load_string(text, optimize=False)
+        if self._still is None or self._still[0] != mi.variant():
+            still = _load(_kept(self._tree, lambda shape: shape.get("id") not in self._motions))
+            lamps = [emitter for emitter in still.emitters() if emitter.get_shape() is None]
+            self._still = mi.variant(), [*still.shapes(), *lamps]
+        moving = _load(self.describe(frame, width, height))
+        parts = [*self._still[1], *moving.shapes(), moving.sensors()[0], moving.integrator()]
+        return mi.load_dict({"type": "scene"} | {f"part_{i}": part for i, part in enumerate(parts)}, optimize=False)
 
     def describe(self, frame: float, width: int, height: int) -> ET.Element:
-        """The XML of one frame."""
-        scene = copy.deepcopy(self._tree)
+        """The XML of what one frame has for itself: camera, film and the shapes that move."""
         poses = self.pose(frame)
+        scene = copy.deepcopy(_kept(self._tree, lambda shape: shape.get("id") in poses, emitters=False))
         for element in scene.findall("shape"):
-            pose = poses.get(element.get("id", ""))
-            if pose is not None and element.get("id") not in self._inserted:
-                transform = _transform(element)
-                if transform is None:
-                    transform = ET.SubElement(element, "transform", name="to_world")
-                ET.SubElement(transform, "matrix", value=_matrix(pose))
+            transform = _transform(element)
+            if transform is None:
+                transform = ET.SubElement(element, "transform", name="to_world")
+            ET.SubElement(transform, "matrix", value=_matrix(poses[element.get("id", "")]))
         for name, shape in self._inserted.items():
             scene.append(_primitive(shape, poses[name]))
         ET.SubElement(scene, "integrator", type="path").append(_value("max_depth", self.max_depth))
@@ -122,6 +125,29 @@ class SceneFile:
             film.append(_value(key, setting))
         ET.SubElement(film, "rfilter", type="box")
         return scene
+
+
+def _load(root: ET.Element) -> Any:
+    import mitsuba as mi
+
+    return mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False)
+
+
+def _kept(root: ET.Element, shapes: Callable[[ET.Element], bool], *, emitters: bool = True) -> ET.Element:
+    """The scene with the chosen top-level shapes, what they refer to, and, if wanted, the lamps that are no shapes."""
+    named = {element.get("id"): element for element in root if element.get("id")}
+    chosen = [element for element in root if element.tag == "shape" and shapes(element)]
+    chosen += [element for element in root if element.tag == "emitter" and emitters]
+    needed = set(map(id, chosen))
+    while chosen:
+        for reference in chosen.pop().iter("ref"):
+            target = named.get(reference.get("id"))
+            if target is not None and id(target) not in needed:
+                needed.add(id(target))
+                chosen.append(target)
+    kept = ET.Element("scene", root.attrib)
+    kept.extend([element for element in root if element.tag == "default" or id(element) in needed])
+    return kept
 
 
 def _read_xml(path: Path) -> ET.Element:
@@ -177,7 +203,7 @@ def _rest_camera(root: ET.Element) -> tuple[Camera | None, float, float]:
 
     alone = ET.Element("scene", root.attrib)
     alone.extend([*root.findall("default"), sensor])
-    loaded = mi.load_string(ET.tostring(alone, encoding="unicode"), optimize=False).sensors()[0]
+    loaded = _load(alone).sensors()[0]
     values = mi.traverse(loaded)
     offset = [float(np.ravel(np.array(values[f"principal_point_offset_{axis}"]))[0]) for axis in "xy"]
     if any(offset):
@@ -196,12 +222,6 @@ def _path_length(root: ET.Element) -> int:
             if element.get("name") in ("max_depth", "maxDepth") and value.isdigit() and int(value) > 0:
                 return int(value)
     return _DEPTH
-
-
-def _without(root: ET.Element, *tags: str) -> ET.Element:
-    for element in [child for child in root if child.tag in tags]:
-        root.remove(element)
-    return root
 
 
 def _transform(shape: ET.Element) -> ET.Element | None:
