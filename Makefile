@@ -26,7 +26,7 @@ train: setup  ## the main job: render clips, train the denoiser and its ablation
 	$(BIN)/python -m experiments.ablation $(SETTINGS)
 
 weights: setup  ## the recipe of the shipped weights: hours, resumable
-	$(BIN)/python -m experiments.shipped_weights $(SETTINGS)
+	$(BIN)/python -m experiments.ablation --preset full --ship $(SETTINGS)
 
 test: setup  ## the tests (minutes)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m "not slow" $(SETTINGS)

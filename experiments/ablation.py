@@ -27,7 +27,7 @@ from jaxdn.denoisers import ntd, svgf
 from jaxdn.render import ClipJob, choose_variant, render_clips
 from jaxdn.report import Results, TrainingCurve, text_table, write_report
 from jaxdn.training import Recipe
-from jaxdn.weights import SHIPPED, save_weights
+from jaxdn.weights import SHIPPED, load_weights, save_weights
 
 FAMILIES = ("fruit", "robot", "pinkroom", "mobile")
 FAILURES = ("edge", "dash")
@@ -118,6 +118,8 @@ class Settings:
     """Labels of the runs to train; default: all of the preset."""
     workers: int | None = None
     """Processes that render; default: the cores."""
+    ship: bool = False
+    """Put the weights of the full preset into the package."""
 
 
 def jobs(clips: ClipSet, folder: Path) -> list[Any]:
@@ -176,8 +178,6 @@ def train(run: Run, preset: Preset, data: Path, folder: Path) -> None:
 
 def evaluate(preset: Preset, settings: Settings, data: Path, folder: Path, machine: dict[str, Any]) -> Results:
     """Score every method on the test clips."""
-    from jaxdn.weights import load_weights
-
     methods = [Method("noisy", None, {}), Method("svgf", svgf(), {})]
     curves = {}
     for run in sorted(preset.runs, key=lambda run: (run.size == "large", run.label)):
@@ -219,6 +219,8 @@ def main(settings: Settings) -> None:
             if not settings.runs or run.label in settings.runs:
                 train(run, preset, data, folder / _folder_name(run))
         print(f"trained: {time.monotonic() - began:.0f} s so far", flush=True)
+    if settings.ship:
+        ship(folder)
     if settings.only in ("all", "report"):
         results = evaluate(preset, settings, data, folder, machine)
         page = write_report(results, folder)

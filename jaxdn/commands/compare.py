@@ -48,7 +48,9 @@ def method_named(name: str) -> Method:
         known = ["noisy", *denoisers.NAMES, *shipped_names()]
         raise ValueError(f"method {name!r}: expected one of {', '.join(known)} or the path of a .safetensors file.")
     denoiser, params = load_weights(name)
-    return Method(Path(name).stem, denoiser, params)
+    path = Path(name)
+    # A run's folder says more than the name that all weights have there.
+    return Method(path.parent.name if path.stem == "weights" else path.stem, denoiser, params)
 
 
 @jax.jit
