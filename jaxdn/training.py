@@ -134,7 +134,7 @@ def make_train_step(denoiser: Denoiser, recipe: Recipe) -> Callable[[TrainState,
         second_half = state.step >= recipe.steps // 2
         occlusion = jnp.where(second_half, 1.0, 0.0) if recipe.occlusion else jnp.zeros(())
         (loss, psnr), gradient = jax.value_and_grad(batch_loss, has_aux=True)(state.params, batch, occlusion)
-        norm = optax.global_norm(gradient)
+        norm = optax.tree.norm(gradient)
         usable = jnp.isfinite(norm) & jnp.isfinite(loss)
         updates, optimizer_state = update_rule.update(gradient, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)

@@ -1,7 +1,7 @@
 """Mitsuba scene files set in motion: any scene XML with, beside it, an animation file of keys.
 
-Mitsuba's own loader does the loading: what stands still is loaded once; for every frame an edited part of the XML (a new
-camera, the shapes that move with a matrix appended to their transform, inserted shapes) is handed over as a string.
+Mitsuba's own loader does the loading: what stands still is loaded once; for every frame an edited part of the XML (a
+new camera, the shapes that move with a matrix appended to their transform, inserted shapes) is loaded beside it.
 Scenes of the 0.6 format stay of that format, so that Mitsuba upgrades them as it would the file.
 """
 
@@ -26,9 +26,9 @@ class SceneFile:
     """A Mitsuba 3 scene file as an animated scene; see :mod:`jaxdn.render.animation` for what the JSON beside it says.
 
     Without ``animation_path`` the file ``<scene>.json`` beside the scene is used if there is one, and a scene without
-    an animation is a still. Shapes without an id get ``shape_<n>``, counted from 0 in the order of the file. The camera
-    is the file's first, perspective, sensor; its horizontal field of view is that of the file's own film and stays so
-    at every image size. Raises ValueError for files that cannot be read and animations that do not fit.
+    an animation is a still. Shapes without an id get ``shape_<n>``, counted from 0 in the order of the file, and a dot
+    in an id becomes an underscore. The camera is the file's first sensor, which must be a perspective one; its
+    horizontal field of view is that of the file's own film and stays so at every image size. Raises ValueError for files that cannot be read and animations that do not fit.
     """
 
     def __init__(self, path: Path | str, animation_path: Path | str | None = None) -> None:
@@ -91,13 +91,16 @@ class SceneFile:
         """The ``mi.Scene`` of one frame; what does not move is loaded once and shared by all frames."""
         import mitsuba as mi
 
-        if self._still is None or self._still[0] != mi.variant():
+        variant = str(mi.variant())
+        if self._still is None or self._still[0] != variant:
             still = _load(_kept(self._tree, lambda shape: shape.get("id") not in self._motions))
             lamps = [emitter for emitter in still.emitters() if emitter.get_shape() is None]
-            self._still = mi.variant(), [*still.shapes(), *lamps]
+            self._still = variant, [*still.shapes(), *lamps]
         moving = _load(self.describe(frame, width, height))
-        parts = [*self._still[1], *moving.shapes(), moving.sensors()[0], moving.integrator()]
-        return mi.load_dict({"type": "scene"} | {f"part_{i}": part for i, part in enumerate(parts)}, optimize=False)
+        parts = {part.id(): part for part in [*self._still[1], *moving.shapes()]}
+        parts |= {"animation_sensor": moving.sensors()[0], "animation_integrator": moving.integrator()}
+        # A key of this dictionary becomes the object's id.
+        return mi.load_dict({"type": "scene", **parts}, optimize=False)
 
     def describe(self, frame: float, width: int, height: int) -> ET.Element:
         """The XML of what one frame has for itself: camera, film and the shapes that move."""
@@ -188,7 +191,7 @@ def _name_shapes(root: ET.Element) -> list[str]:
         name = element.get("id") or f"shape_{index}"
         while element.get("id") is None and name in taken:
             name += "_"
-        element.set("id", name)
+        element.set("id", name if element.get("type") == "shapegroup" else name.replace(".", "_"))
     return [element.get("id", "") for element in root.findall("shape") if element.get("type") != "shapegroup"]
 
 
