@@ -362,3 +362,22 @@ def test_clips_are_rendered_side_by_side_and_failures_do_not_stop_the_others(tmp
     assert len(list((tmp_path / "good").glob("frame_*.exr"))) == 2
     with pytest.raises(ValueError, match="folder of its own"):
         farm.render_clips([good, good], progress=False)
+
+
+@pytest.mark.slow
+def test_a_finished_clip_takes_no_process(tmp_path, monkeypatch):
+    from jaxdn.render import ClipJob, farm
+
+    job = ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "c"), 16, 12, 2, reference_spp=2, variant="scalar_rgb")
+    farm.render_clips([job], progress=False)
+    started = []
+    start = farm._start
+    monkeypatch.setattr(farm, "_start", lambda *a, **k: started.append(a) or start(*a, **k))
+    seen = []
+    farm.render_clips([job], progress=lambda done, total: seen.append((done, total)))
+    assert not started
+    assert seen == [(2, 2)]
+    (tmp_path / "c" / "frame_0001.exr").unlink()
+    farm.render_clips([job], progress=False)
+    assert len(started) == 1
+    assert (tmp_path / "c" / "frame_0001.exr").is_file()

@@ -14,6 +14,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxdn.clips.folder import frame_path, is_clip, read_record
 from jaxdn.render.scene import scene_from_record
 from jaxdn.render.variant import choose_variant
 
@@ -60,14 +61,17 @@ def render_clips(
     folders = [job.folder for job in waiting]
     if len({os.path.abspath(folder) for folder in folders}) != len(folders):
         raise ValueError("render_clips: expected a folder of its own for every clip.")
+    total = sum(job.frames for job in waiting)
+    waiting = [job for job in waiting if not _finished(job)]
     limit = max(1, min(workers or os.cpu_count() or 1, len(waiting)))
     for variant in {job.variant for job in waiting}:
         choose_variant(variant)  # probe once, here: the processes inherit the result
 
-    total, done = sum(job.frames for job in waiting), 0
+    done = total - sum(job.frames for job in waiting)
     running: list[_Worker] = []
     failures: list[str] = []
     with _display(progress, total) as show:
+        show(done, total)
         try:
             while waiting or running:
                 while waiting and len(running) < limit:
@@ -91,6 +95,21 @@ def render_clips(
     if failures:
         raise RenderError(f"{len(failures)} of {len(folders)} clips failed:\n" + "\n".join(failures))
     return [Path(folder) for folder in folders]
+
+
+def _finished(job: ClipJob) -> bool:
+    """Whether a clip is there with all its frames, as it was asked for: it takes no process to find that out."""
+    if not is_clip(job.folder):
+        return False
+    record = read_record(job.folder)
+    wanted = {"width": job.width, "height": job.height, "frames": job.frames, "seed": job.seed}
+    wanted |= {"layers": sorted(job.layers), "reference_spp": job.reference_spp, "scene": job.scene}
+    chosen = {"max_depth": job.max_depth, "variant": job.variant}
+    wanted |= {key: value for key, value in chosen.items() if value is not None}
+    # A frame's file has its name from the moment it is whole.
+    return all(record.get(key) == value for key, value in wanted.items()) and all(
+        frame_path(job.folder, frame).is_file() for frame in range(job.frames)
+    )
 
 
 def _start(job: ClipJob, *, threads: int) -> _Worker:
