@@ -28,7 +28,8 @@ class SceneFile:
     Without ``animation_path`` the file ``<scene>.json`` beside the scene is used if there is one, and a scene without
     an animation is a still. Shapes without an id get ``shape_<n>``, counted from 0 in the order of the file, and a dot
     in an id becomes an underscore. The camera is the file's first sensor, which must be a perspective one; its
-    horizontal field of view is that of the file's own film and stays so at every image size. Raises ValueError for files that cannot be read and animations that do not fit.
+    horizontal field of view is that of the file's own film and stays so at every image size. Raises ValueError for
+    files that cannot be read and animations that do not fit.
     """
 
     def __init__(self, path: Path | str, animation_path: Path | str | None = None) -> None:
