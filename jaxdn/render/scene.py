@@ -59,7 +59,9 @@ def scene_from_record(record: Mapping[str, Any]) -> AnimatedScene:
     if "file" in record:
         return importlib.import_module("jaxdn.render.scene_file").SceneFile.from_record(record)
     if "family" not in record:
-        raise ValueError(f"scene record: expected a 'family' or a 'file', got {sorted(record)}; see jaxdn.render.families.")
+        raise ValueError(
+            f"scene record: expected a 'family' or a 'file', got {sorted(record)}; see jaxdn.render.families."
+        )
     families = importlib.import_module("jaxdn.render.families").FAMILIES
     name = record["family"]
     if name not in families:
