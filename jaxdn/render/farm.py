@@ -102,7 +102,7 @@ def _finished(job: ClipJob) -> bool:
     if not is_clip(job.folder):
         return False
     record = read_record(job.folder)
-    wanted = {"width": job.width, "height": job.height, "frames": job.frames, "seed": job.seed}
+    wanted: dict[str, Any] = {"width": job.width, "height": job.height, "frames": job.frames, "seed": job.seed}
     wanted |= {"layers": sorted(job.layers), "reference_spp": job.reference_spp, "scene": job.scene}
     chosen = {"max_depth": job.max_depth, "variant": job.variant}
     wanted |= {key: value for key, value in chosen.items() if value is not None}
@@ -193,11 +193,23 @@ class _Bar:
 
         columns: Sequence[Any] = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
         self._bar = Progress("rendering frames", *columns)
+        self._bar.disable = not self._bar.console.is_terminal
         self._task = self._bar.add_task("frames", total=total)
+        self._told = -1
 
     def __enter__(self) -> Callable[[int, int], None]:
         self._bar.start()
-        return lambda done, total: self._bar.update(self._task, completed=done, total=total)
+        return self._show if self._bar.console.is_terminal else self._say
 
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
+
+    def _show(self, done: int, total: int) -> None:
+        self._bar.update(self._task, completed=done, total=total)
+
+    def _say(self, done: int, total: int) -> None:
+        """A line for each tenth where nobody watches a bar move."""
+        self._show(done, total)
+        if 10 * done // max(total, 1) > self._told:
+            self._told = 10 * done // max(total, 1)
+            print(f"rendered {done} of {total} frames", flush=True)
