@@ -50,6 +50,7 @@ def run(clips, folder, **options):
     return fit(ntd(size=TINY), RECIPE, options.pop("source", batches(clips)), folder, label="t", log_every=1, **options)
 
 
+@pytest.mark.slow
 def test_interrupted_training_ends_in_bit_identical_weights(clips, tmp_path):
     whole = run(clips, tmp_path / "whole", checkpoint_every=100)
     with pytest.raises(KeyboardInterrupt):

@@ -308,6 +308,7 @@ def test_gradient_through_time(name: str, rng: np.random.Generator, key: jax.Arr
         np.testing.assert_allclose(measured, claimed, rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("truncate", [False, True])
 def test_truncation_stops_the_gradient_at_the_history(truncate: bool, rng: np.random.Generator, key: jax.Array) -> None:
     denoiser = tiny(truncate=truncate)
@@ -320,6 +321,7 @@ def test_truncation_stops_the_gradient_at_the_history(truncate: bool, rng: np.ra
     assert np.any(slope[0]) != truncate
 
 
+@pytest.mark.slow
 def test_batch_is_each_clip_alone(rng: np.random.Generator, key: jax.Array) -> None:
     denoiser = tiny()
     clips = [random_frames(rng) for _ in range(2)]

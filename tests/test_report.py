@@ -447,6 +447,7 @@ def visit(browser, tmp_path):
         context = browser.new_context(viewport={"width": width, "height": height}, **options)
         contexts.append(context)
         tab = context.new_page()
+        tab.set_default_timeout(180_000)  # a busy machine is no fault of the page
         tab.on("console", lambda message: complaints.append(message.text) if message.type != "log" else None)
         tab.on("pageerror", lambda error: complaints.append(str(error)))
         tab.on("request", lambda request: requests.append(request.url))

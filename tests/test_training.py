@@ -70,6 +70,7 @@ def test_the_loss_is_the_papers_sum_on_all_frames_but_the_last(denoiser, state):
         np.testing.assert_allclose(loss, without + weight * joined, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_last_frame_gives_no_gradient(denoiser, state):
     clip = make_clip(0)
     changed = clip._replace(reference=clip.reference.copy())
@@ -95,6 +96,7 @@ def test_a_step_learns_and_compiles_once_over_both_phases(step, state):
     assert int(state.step) == RECIPE.steps
 
 
+@pytest.mark.slow
 def test_rematerialised_gradients_are_the_same(denoiser, state):
     clip = make_clip(3)
 
