@@ -1,6 +1,8 @@
 """Scene files in motion: what the keys say is what Mitsuba renders, and mistakes are named where they are."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -261,3 +263,15 @@ def test_includes_are_followed(folder):
         shape_at(animated(folder, ANIMATION), 4, *map(round, pixel_of(SceneFile(folder / "scene.xml"), 0, (1, 1, 1.5))))
         == "Box"
     )
+
+
+def test_a_scene_opens_before_a_variant_was_chosen(tmp_path):
+    # Found by rendering a room from the command line: other tests choose a variant first, a user does not.
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><sensor type="perspective"><float name="fov" value="40"/></sensor>'
+        '<shape type="sphere" id="ball"/></scene>'
+    )
+    code = f"from jaxdn.render.scene_file import SceneFile; print(SceneFile({str(path)!r}).frames)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "1", done.stderr

@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxdn.render.animation import CameraKeys, RigidKeys, check_animation, extents, read_animation
 from jaxdn.render.scene import Camera
+from jaxdn.render.variant import use_variant
 
 _DEPTH = 8
 """Path length where the file asks for endless paths or does not say."""
@@ -134,6 +135,8 @@ class SceneFile:
 def _load(root: ET.Element) -> Any:
     import mitsuba as mi
 
+    if mi.variant() is None:  # whoever opens a scene need not have chosen a variant yet
+        use_variant()
     return mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False)
 
 
