@@ -71,9 +71,9 @@ def _seeds(families: Sequence[str], seeds: range) -> tuple[tuple[str, int], ...]
 
 PRESETS = {
     "demo": Preset(
-        train=ClipSet(_seeds(FAMILIES, range(2)), size=64, frames=10, reference_spp=48),
-        validation=ClipSet((("fruit", 100),), size=64, frames=10, reference_spp=48),
-        tests=(ClipSet((*_seeds(FAMILIES[1:], range(200, 201)), ("edge", 200)), 64, 10, reference_spp=96),),
+        train=ClipSet(_seeds(FAMILIES, range(2)), size=64, frames=10, reference_spp=32),
+        validation=ClipSet((("fruit", 100),), size=64, frames=10, reference_spp=32),
+        tests=(ClipSet((*_seeds(FAMILIES[1:], range(200, 201)), ("edge", 200)), 64, 10, reference_spp=64),),
         runs=(
             Run("A", "small", "traditional", occlusion=False, steps=80),
             Run("B", "small", "dual", occlusion=False, steps=80),
