@@ -1,6 +1,6 @@
-"""Render many clips at once, a process for each, one renderer thread in each.
+"""Render many clips at once, a process for each.
 
-Two processes of one thread are about a third faster than one process of two, and a process that dies takes one clip
+Several processes of few threads are about a third faster than one process of many, and a process that dies takes one clip
 with it. Frames are whole files from the moment they have their name, so whatever ends the work, it goes on from there.
 """
 
@@ -17,6 +17,9 @@ from typing import Any, NamedTuple
 from jaxdn.clips.folder import frame_path, is_clip, read_record
 from jaxdn.render.scene import scene_from_record
 from jaxdn.render.variant import choose_variant
+
+_THREADS = 2
+"""Renderer threads of each process. With a single one Mitsuba's loader waits for ever on some scenes' textures."""
 
 
 class ClipJob(NamedTuple):
@@ -75,7 +78,7 @@ def render_clips(
         try:
             while waiting or running:
                 while waiting and len(running) < limit:
-                    running.append(_start(waiting.pop(0), threads=1 if limit > 1 else 0))
+                    running.append(_start(waiting.pop(0), threads=_THREADS if limit > 1 else 0))
                 wait([item for worker in running for item in (worker.messages, worker.process.sentinel)])
                 for worker in list(running):
                     frames, failure, ended = _listen(worker)

@@ -102,7 +102,7 @@ class SceneFile:
         parts = {part.id(): part for part in [*self._still[1], *moving.shapes()]}
         parts |= {"animation_sensor": moving.sensors()[0], "animation_integrator": moving.integrator()}
         # A key of this dictionary becomes the object's id.
-        return mi.load_dict({"type": "scene", **parts}, optimize=False, parallel=False)
+        return mi.load_dict({"type": "scene", **parts}, optimize=False)
 
     def describe(self, frame: float, width: int, height: int) -> ET.Element:
         """The XML of what one frame has for itself: camera, film and the shapes that move."""
@@ -137,7 +137,6 @@ def _load(root: ET.Element) -> Any:
 
     if mi.variant() is None:  # whoever opens a scene need not have chosen a variant yet
         use_variant()
-    # Loaded in parallel, a scene waits for ever for helpers where the renderer has a single thread.
     return mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False, parallel=False)
 
 
