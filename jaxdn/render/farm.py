@@ -1,7 +1,7 @@
 """Render many clips at once, a process for each.
 
 Several processes of few threads are about a third faster than one process of many, and a process that dies takes one
-clip with it. Frames are whole files from the moment they have their name: whatever ends the work, it goes on from there.
+clip with it. Frames are whole files from the moment they have their name: whatever ends the work, it goes on there.
 """
 
 import multiprocessing

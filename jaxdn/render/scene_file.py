@@ -137,7 +137,7 @@ def _load(root: ET.Element) -> Any:
 
     if mi.variant() is None:  # whoever opens a scene need not have chosen a variant yet
         use_variant()
-    return mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False, parallel=False)
+    return mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False)
 
 
 def _kept(root: ET.Element, shapes: Callable[[ET.Element], bool], *, emitters: bool = True) -> ET.Element:
