@@ -15,6 +15,7 @@ import tyro
 from jaxdn.commands.compare import Method, compare, method_named
 from jaxdn.commands.errors import told_plainly
 from jaxdn.render import ClipJob, choose_variant, render_clips
+from jaxdn.render.clip import RenderError
 from jaxdn.render.scene_file import SceneFile
 from jaxdn.report import text_table, write_report
 from jaxdn.weights import load_weights
@@ -60,7 +61,11 @@ def main(settings: Settings) -> None:
         raise ValueError(f"{settings.scenes}: expected folders out of {names} with a scene.xml each, found none.")
     choice = choose_variant()
     print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
-    folders = render_clips(jobs)
+    try:
+        render_clips(jobs)
+    except RenderError as error:  # a room with something that is not supported is left out of the table, not hidden
+        print(error)
+    folders = [Path(job.folder) for job in jobs if len(list(Path(job.folder).glob("*.exr"))) == settings.frames]
     methods = [method_named("noisy"), method_named("svgf")]
     if settings.runs is not None:
         for path in sorted(settings.runs.glob("*/weights.safetensors"), key=lambda path: ("large" in str(path), path)):
