@@ -77,3 +77,12 @@ def test_shipped_weights_work(name):
     # A flat grey wall under exponential noise of standard deviation 1: anything that denoises gets far below that.
     assert float(np.std(image[1])) < 0.5
     assert abs(float(np.mean(image[1])) - 1.0) < 0.25
+
+
+@pytest.mark.parametrize("size", [(72, 128), (33, 57), (1, 1)])
+def test_shipped_weights_take_any_size(size):
+    # 72 x 128 was found on a real room: the coarsest level, 5 x 8 there, was pooled once too often.
+    denoiser, params = jaxdn.load_weights("ntd-small")
+    frame = Frame(radiance=np.ones((*size, 3), np.float32))
+    _, image = jax.eval_shape(lambda p, f: denoiser.step(p, denoiser.start(p, f), f), params, frame)
+    assert image.shape == (*size, 3)

@@ -116,8 +116,9 @@ class UNet(nnx.Module):
         part: Part = (joined, used if len(used) < len(self.groups) else None)
         skips: list[jax.Array] = []
         for level in range(LEVELS):
+            if level:
+                part = (pool(skips[-1]), None)
             skips.append(getattr(self, f"encoder_{level}")(part))
-            part = (pool(skips[-1]), None)
         x = skips.pop()
         outputs: list[jax.Array] = []
         for level in reversed(range(LEVELS - 1)):
