@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optax
 
 from jaxdn import color, losses, metrics
+from jaxdn.backends.compiler import training_options
 from jaxdn.frame import Clip, Denoiser, Frame
 from jaxdn.motion import occlusion_mask
 from jaxdn.rollout import unroll
@@ -144,4 +145,4 @@ def make_train_step(denoiser: Denoiser, recipe: Recipe) -> Callable[[TrainState,
         skipped = state.skipped + jnp.where(usable, 0, 1)
         return TrainState(params, optimizer_state, state.step + 1, skipped), Report(loss, psnr, norm)
 
-    return jax.jit(train_step, donate_argnums=0)
+    return jax.jit(train_step, donate_argnums=0, compiler_options=training_options())
