@@ -24,7 +24,7 @@ _HOMES = {
     "read_clip": "clips",
     "write_clip": "clips",
 }
-_ROOMS = ("color", "losses", "metrics", "denoisers")
+_ROOMS = ("color", "losses", "metrics", "denoisers", "effects")
 
 __all__ = [*_HOMES, *_ROOMS, "__version__"]
 

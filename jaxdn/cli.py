@@ -1,4 +1,4 @@
-"""The command line: ``jaxdn render | train | denoise | compare``; every verb has ``--help`` with examples."""
+"""The command line: ``jaxdn inspect | render | train | denoise | compare``; every verb has ``--help`` with examples."""
 
 import sys
 from dataclasses import dataclass, field
@@ -11,6 +11,31 @@ from rich.console import Console
 from jaxdn.commands.errors import told_plainly
 
 _PATH = tyro.conf.Positional[Path]
+
+
+@dataclass
+class Inspect:
+    """Say which effects a scene has and why, what will be rendered for them, and what that saves.
+
+    For example:
+
+    jaxdn inspect kitchen/scene.xml --animation kitchen.json --denoiser ntd-large
+
+    jaxdn inspect data/test/fruit-200 --json
+    """
+
+    scene: tyro.conf.Positional[str]
+    """A Mitsuba scene (.xml), a family, or a finished clip: its folder, or EXR files of any renderer."""
+    animation: Path | None = None
+    """Animation file for a scene file."""
+    denoiser: str | None = None
+    """Plan for this denoiser (svgf, ntd-large ...); default: for whatever any denoiser may read."""
+    width: int = 128
+    height: int = 128
+    frames: int | None = None
+    """How many frames to look at; default: all that the animation has."""
+    json: bool = False
+    """Print one JSON object and nothing else: {"effects": [...], "plan": {...}, "uncertain": [...]}."""
 
 
 @dataclass
@@ -43,6 +68,8 @@ class Render:
     """Independent noisy layers, in samples a pixel (powers of two)."""
     max_depth: int | None = None
     """Path length (1 emission, 2 direct, 3 one bounce of indirect light ...); default: what the scene asks for."""
+    effects: str = "auto"
+    """auto: what the scene calls for (see `jaxdn inspect`); all: everything; or effects by name, joined by commas."""
     workers: int | None = None
     """Processes; default: the cores."""
 
@@ -138,8 +165,23 @@ def _family(name: str, seed: int) -> dict[str, Any]:
     return {"family": name, "seed": seed}
 
 
+def _inspect(options: Inspect) -> None:
+    from jaxdn.commands.inspect import inspect_to_terminal
+
+    inspect_to_terminal(
+        options.scene,
+        animation=options.animation,
+        denoiser=options.denoiser,
+        width=options.width,
+        height=options.height,
+        frames=options.frames,
+        as_json=options.json,
+    )
+
+
 def _render(options: Render) -> None:
-    from jaxdn.render import ClipJob, choose_variant, render_clips
+    from jaxdn.commands.inspect import plan_clip
+    from jaxdn.render import ClipJob, choose_variant, render_clips, scene_from_record
     from jaxdn.render.families import FAMILIES
 
     if options.scene in FAMILIES:
@@ -153,8 +195,22 @@ def _render(options: Render) -> None:
         raise ValueError(
             f"scene {options.scene!r}: expected a family ({', '.join(sorted(FAMILIES))}) or a Mitsuba scene (.xml)."
         )
-    jobs = [
-        ClipJob(
+    choice = choose_variant()
+    print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
+    jobs = []
+    for (name, record), seed in zip(records, options.seeds, strict=True):
+        planned = plan_clip(
+            scene_from_record(record),
+            effects=options.effects,
+            width=options.width,
+            height=options.height,
+            frames=options.frames,
+            max_depth=options.max_depth,
+        )
+        if planned is not None:
+            found, made = planned
+            print(f"{name}: {', '.join(found) or 'no effects'}; paths of depth {made.max_depth}", flush=True)
+        job = ClipJob(
             record,
             str(options.out / name),
             width=options.width,
@@ -164,11 +220,9 @@ def _render(options: Render) -> None:
             reference_spp=options.reference_spp,
             max_depth=options.max_depth,
             seed=seed,
+            plan=None if planned is None else planned[1].record(),
         )
-        for (name, record), seed in zip(records, options.seeds, strict=True)
-    ]
-    choice = choose_variant()
-    print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
+        jobs.append(job)
     render_clips(jobs, workers=options.workers)
 
 
@@ -247,9 +301,9 @@ def _compare(options: Compare) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Parse the command line and run one verb; what a user can mend ends with one message and exit code 2."""
-    verbs: dict[type, Any] = {Render: _render, Train: _train, Denoise: _denoise, Compare: _compare}
+    verbs: dict[type, Any] = {Inspect: _inspect, Render: _render, Train: _train, Denoise: _denoise, Compare: _compare}
     options = tyro.cli(
-        Render | Train | Denoise | Compare,
+        Inspect | Render | Train | Denoise | Compare,
         prog="jaxdn",
         description="Remove Monte Carlo noise from path-traced animations.",
         args=arguments,

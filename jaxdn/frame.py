@@ -6,11 +6,12 @@ no depth is 0). Because ``None`` is part of the pytree's structure, jit speciali
 trace in the compiled program.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 RADIANCE_MAX = 65504.0
 """Radiance is clamped to the largest float16 on entry."""
@@ -83,6 +84,37 @@ def only(frame: Frame, reads: frozenset[str]) -> Frame:
     kept = {"radiance", *reads}
     dropped: dict[str, Any] = {name: None for name in Frame._fields if name not in kept}
     return frame._replace(**dropped)
+
+
+def written_out(frame: Frame, names: Iterable[str]) -> Frame:
+    """The same frame (or a clip's frames) with the neutral value in place of every ``None`` among ``names``.
+
+    What comes out gives the same image, at a higher cost: for where frames with and without an effect have to be
+    stacked. ``ids`` are -1 where they are unknown. NumPy arrays in, NumPy arrays out.
+    """
+    light = frame.radiance
+    numbers = np if isinstance(light, np.ndarray) else jnp
+    one = light[..., :1]
+
+    def neutral(name: str) -> Any:
+        if name == "dual_motion":
+            return filled["motion"] if filled["motion"] is not None else numbers.zeros_like(light[..., :2])
+        if name == "previous_depth":
+            return filled["depth"] if filled["depth"] is not None else numbers.zeros_like(one)
+        if name in ("albedo", "roughness"):
+            return numbers.ones_like(light if name == "albedo" else one)
+        if name == "visible":
+            return numbers.ones(one.shape, bool)
+        if name == "ids":
+            return numbers.full(one.shape, -1, numbers.int32)
+        size = {"motion": 2, "depth": 1}.get(name, 3)
+        return numbers.zeros_like(light[..., :size])
+
+    filled = frame._asdict()
+    for name in Frame._fields[1:]:  # in this order: motion comes before the dual one, depth before the previous one
+        if name in set(names) and filled[name] is None:
+            filled[name] = neutral(name)
+    return Frame(**filled)
 
 
 def _working_dtype(buffer: jax.Array) -> jax.Array:

@@ -17,7 +17,7 @@ FLOORS = {
     **dict.fromkeys(("frame", "checks", "numerics", "stencils", "color", "warping", "motion", "kernels"), 1),
     **dict.fromkeys(("losses", "metrics", "flip"), 1),
     **dict.fromkeys(("denoisers", "networks"), 2),
-    **dict.fromkeys(("rollout", "training"), 3),
+    **dict.fromkeys(("rollout", "training", "effects"), 3),
     **dict.fromkeys(("render", "clips", "checkpoint", "report", "weights"), 4),
     **dict.fromkeys(("cli", "commands"), 5),
 }
@@ -137,4 +137,4 @@ def test_fixed_signatures(name, parameters):
 def test_no_module_takes_the_place_of_a_public_function():
     # Importing jaxdn.warp, were there such a module, would bind it over the function of that name.
     rooms = {path.stem for path in PACKAGE.iterdir()}
-    assert not rooms & (set(jaxdn.__all__) - {"color", "losses", "metrics", "denoisers"})
+    assert not rooms & (set(jaxdn.__all__) - {"color", "losses", "metrics", "denoisers", "effects"})

@@ -11,7 +11,7 @@ pass of a 720p frame gains nothing, so this is not for denoising."""
 
 @cache
 def training_options() -> dict[str, str]:
-    """Compiler options for a train step on jax's default platform; an option that this jax does not know is left out."""
+    """Compiler options for a train step on jax's default platform, those that the installed jax knows."""
     options = _CANDIDATES.get(jax.default_backend(), {})
     return {name: value for name, value in options.items() if _known(name, value)}
 

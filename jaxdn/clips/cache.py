@@ -11,17 +11,17 @@ import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxdn.clips.exr import to_half
 from jaxdn.clips.files import ClipError, read_json, write_json
-from jaxdn.clips.folder import frame_path, read_frames, read_record
+from jaxdn.clips.folder import frame_path, is_planned, read_frames, read_record
 from jaxdn.clips.frames import LAYOUT, StoredFrame, combine, layers_for
-from jaxdn.frame import Clip, Frame
+from jaxdn.frame import Clip, Frame, written_out
 
 _VERSION = 1  # of what the cache holds; another number leaves old caches behind
 _SINGLE = ("motion", "dual_motion", "depth", "previous_depth")
@@ -44,6 +44,8 @@ class CachedClip(NamedTuple):
     """What is stored: names of buffers, ``reference`` and ``noisy_<n>spp``."""
     layers: tuple[int, ...]
     """The sample counts of the noisy layers."""
+    planned: bool = False
+    """Whether a buffer that is missing is an absent effect, equal to its neutral value."""
 
     @property
     def buffers(self) -> frozenset[str]:
@@ -73,7 +75,7 @@ def open_cached(path: str | Path, *, cache: str | Path | None = None) -> CachedC
             stacklevel=2,
         )
     shape = (record["frames"], record["height"], record["width"])
-    return CachedClip(path, home, shape, frozenset(facts["arrays"]), tuple(facts["layers"]))
+    return CachedClip(path, home, shape, frozenset(facts["arrays"]), tuple(facts["layers"]), is_planned(record))
 
 
 def read_window(
@@ -86,9 +88,11 @@ def read_window(
     """The part ``window`` (frames, rows, columns) of a clip as a Clip of plain arrays with ``spp`` samples a pixel.
 
     Floating-point buffers come out in float32, ids in int32, ``visible`` as bool. ``buffers`` names
-    the ones to read (default: all there are).
+    the ones to read (default: all there are); of a clip that was rendered by a plan, those that it lacks are written
+    out.
     """
-    wanted = clip.buffers if buffers is None else clip.buffers & set(buffers)
+    asked = clip.buffers if buffers is None else set(buffers) & set(LAYOUT)
+    wanted = clip.buffers & asked
 
     def read(name: str) -> np.ndarray:
         part = np.load(clip.home / f"{name}.npy", mmap_mode="r", allow_pickle=False)[window]
@@ -97,6 +101,7 @@ def read_window(
     chosen = layers_for(spp, clip.layers, clip.path)
     radiance = combine({samples: read(f"noisy_{samples}spp") for samples in chosen})
     frames = Frame(radiance=radiance, **{name: read(name) for name in wanted})
+    frames = written_out(frames, asked) if clip.planned else frames
     return Clip(frames, read("reference") if "reference" in clip.arrays else None)
 
 
@@ -130,7 +135,7 @@ def _fill(path: Path, folder: Path) -> dict[str, object]:
     record = read_record(path)
     maps: dict[str, np.memmap] = {}
     bad, layers = 0, []
-    for index, stored in enumerate(read_frames(path, spp=record["layers"][0])):
+    for index, stored in enumerate(_uniform(path, record)):
         layers = sorted(stored.layers)
         for name, image in _images(stored):
             if name == "reference":
@@ -146,6 +151,13 @@ def _fill(path: Path, folder: Path) -> dict[str, object]:
     for array in maps.values():
         array.flush()
     return {"arrays": sorted(maps), "layers": layers, "bad_reference_values": bad}
+
+
+def _uniform(path: Path, record: Mapping[str, Any]) -> Iterator[StoredFrame]:
+    """The frames of a clip, all with the same buffers."""
+    named = {name for names in record["plan"]["frames"] for name in names} if is_planned(record) else set()
+    for stored in read_frames(path, spp=record["layers"][0]):
+        yield stored._replace(frame=written_out(stored.frame, named))
 
 
 def _images(stored: StoredFrame) -> Iterator[tuple[str, np.ndarray]]:

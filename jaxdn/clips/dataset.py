@@ -122,15 +122,17 @@ def _check(clip: CachedClip, sizes: tuple[int, int, int], counts: Sequence[int])
 
 
 def _common_buffers(clips: Sequence[CachedClip], wanted: Sequence[str] | frozenset[str] | None) -> frozenset[str]:
+    """What every element will have: of clips rendered by a plan, what one lacks is written out where others have it."""
+
     def offered(clip: CachedClip) -> frozenset[str]:
         return clip.buffers if wanted is None else clip.buffers & frozenset(wanted)
 
-    first = offered(clips[0])
+    union = frozenset().union(*(offered(clip) for clip in clips))
     for clip in clips:
-        if offered(clip) != first:
-            differing = ", ".join(sorted(offered(clip) ^ first))
+        if offered(clip) != union and not clip.planned:
+            differing = ", ".join(sorted(offered(clip) ^ union))
             raise ClipError(
-                f"{clip.path}: expected the same buffers as in {clips[0].path}, but {differing} differs; "
+                f"{clip.path}: expected the same buffers as in the other clips, but {differing} differs; "
                 "name the ones to read in `buffers`, or leave one of the clips out."
             )
-    return first
+    return union

@@ -15,7 +15,7 @@ from jaxdn.clips.exr import read_exr
 from jaxdn.clips.files import ClipError, read_json, write_json
 from jaxdn.clips.frames import StoredFrame, layers_for, read_frame, stored_layers, write_frame
 from jaxdn.clips.import_exr import read_plain_frames
-from jaxdn.frame import Clip, Frame, frame_at
+from jaxdn.frame import Clip, Frame, frame_at, only, written_out
 
 FORMAT = 1
 """The version of the layout that this code writes and reads."""
@@ -79,7 +79,12 @@ def read_record(path: str | Path) -> dict[str, Any]:
 
 
 def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
-    """The frames of a clip one by one, for clips that do not fit into memory. Raises as :func:`read_clip` does."""
+    """The frames of a clip one by one, for clips that do not fit into memory. Raises as :func:`read_clip` does.
+
+    A clip that was rendered by a plan may have frames with other buffers than their neighbours (an object that starts
+    to move): what a frame lacks is ``None`` in it. A frame that shows what an earlier one did has its buffers and its
+    reference from there.
+    """
     folder = Path(path)
     record = read_record(folder)
     layers_for(spp, record["layers"], folder)
@@ -88,9 +93,11 @@ def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
     if missing:
         shown = ", ".join(map(str, missing[:8])) + (" ..." if len(missing) > 8 else "")
         raise ClipError(f"{folder}: {len(missing)} of {count} frames are missing ({shown}); render them again.")
+    held = held_frames(record, folder)
 
     def frames() -> Iterator[StoredFrame]:
         first: tuple[str, ...] | None = None
+        source: tuple[int, StoredFrame] | None = None
         for index in range(count):
             file = frame_path(folder, index)
             stored = read_frame(file, spp=spp)
@@ -99,14 +106,55 @@ def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
                 raise ClipError(
                     f"{file}: expected {size[1]} x {size[0]} pixels as {_RECORD} says, got {found[1]} x {found[0]}."
                 )
+            if held[index] == index:
+                source = index, stored
+            elif source is None or source[0] != held[index]:
+                source = held[index], read_frame(frame_path(folder, held[index]), spp=spp)
+            if held[index] != index:
+                stored = _from(stored, source[1])
+            if is_planned(record):
+                wanted = set(record["plan"]["frames"][index])
+                stored = _checked_buffers(stored, wanted, file)
             names = _present(stored)
             first = names if first is None else first
-            if names != first:
+            if names != first and not is_planned(record):
                 differing = ", ".join(sorted(set(names) ^ set(first)))
                 raise ClipError(f"{file}: expected the same channels as in frame 0, but {differing} differs.")
             yield stored
 
     return frames()
+
+
+def is_planned(record: Mapping[str, Any]) -> bool:
+    """Whether a clip was rendered by a plan: what it lacks is an absent effect, not something forgotten."""
+    return record.get("plan") is not None
+
+
+def held_frames(record: Mapping[str, Any], folder: str | Path) -> list[int]:
+    """For each frame of a clip the one whose buffers it shares; raises ClipError for a record that makes no sense."""
+    count = record["frames"]
+    if not is_planned(record):
+        return list(range(count))
+    plan = record["plan"]
+    held = plan.get("held") if isinstance(plan, Mapping) else None
+    frames = plan.get("frames") if isinstance(plan, Mapping) else None
+    sound = isinstance(held, list) and len(held) == count and isinstance(frames, list) and len(frames) == count
+    if not sound or not all(type(at) is int and 0 <= at <= index for index, at in enumerate(held or [])):
+        raise ClipError(f"{Path(folder) / _RECORD}: plan: expected what each of {count} frames holds; render it again.")
+    return list(held or [])
+
+
+def _from(stored: StoredFrame, source: StoredFrame) -> StoredFrame:
+    """The noise of one frame with everything else of another."""
+    frame = source.frame._replace(radiance=stored.frame.radiance)
+    return StoredFrame(frame, stored.layers, source.reference, source.reference_half)
+
+
+def _checked_buffers(stored: StoredFrame, wanted: set[str], file: Path) -> StoredFrame:
+    there = {name for name in Frame._fields[1:] if getattr(stored.frame, name) is not None}
+    if wanted - there:
+        raise ClipError(f"{file}: expected the buffers {', '.join(sorted(wanted - there))}; render the frame again.")
+    return stored._replace(frame=only(stored.frame, frozenset(wanted)))
 
 
 def read_clip(
@@ -117,6 +165,8 @@ def read_clip(
     layers: Mapping[str, str] | None = None,
 ) -> Clip:
     """Read a clip as numpy arrays, float32 but for ``ids`` (int32) and ``visible`` (bool).
+
+    A buffer that some frames have and others lack is written out in those (:func:`jaxdn.frame.written_out`).
 
     ``path`` is the folder of a clip, of which ``spp`` samples a pixel are read; or a folder of, or a glob pattern for,
     the EXR files of another renderer, whose channels are found by their names (``motion_convention`` and ``layers``:
@@ -130,6 +180,8 @@ def read_clip(
     if is_clip(path):
         stored = [(one.frame, one.reference) for one in read_frames(path, spp=spp)]
         frames, references = zip(*stored, strict=True)
+        present = {name for frame in frames for name in Frame._fields[1:] if getattr(frame, name) is not None}
+        frames = [written_out(frame, present) for frame in frames]
     elif _unfinished(path):
         raise ClipError(f"{path}: there is no {_RECORD} in it; the clip was not finished. Render it again.")
     elif spp != 1:

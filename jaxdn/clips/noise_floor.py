@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn import color
-from jaxdn.clips.frames import read_frame
+from jaxdn.clips.folder import read_frames, read_record
 
 
 def noise_floor(reference: np.ndarray, reference_half: np.ndarray) -> float:
@@ -26,8 +26,7 @@ def read_noise_floor(folder: str | Path) -> float:
     Not a number where the clip has no reference or does not keep its first half.
     """
     decibels = []
-    for path in sorted(Path(folder).glob("*.exr")):
-        stored = read_frame(path)
+    for stored in read_frames(folder, spp=read_record(folder)["layers"][0]):
         if stored.reference is None or stored.reference_half is None:
             return float("nan")
         with np.errstate(divide="ignore"):

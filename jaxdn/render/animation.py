@@ -8,14 +8,15 @@ One JSON object beside the scene file; every part may be left out:
                              "keys": [{"frame": 0}, {"frame": 15, "translation": [0.2, 0, 0],
                                                      "axis": [0, 1, 0], "angle": 90}]}},
      "inserted": [{"id": "ball", "type": "sphere", "size": 0.4, "color": [0.8, 0.2, 0.1], "roughness": 0.3,
-                   "keys": [{"frame": 0, "translation": [0, 0.2, 1]}, ...]}]}
+                   "keys": [{"frame": 0, "translation": [0, 0.2, 1]}, ...]}],
+     "lights": {"lamp": [{"frame": 0, "scale": 1}, {"frame": 8, "scale": 0}]}}
 
 Camera keys have ``origin``, ``target``, ``up`` or a rigid camera-to-world ``matrix``, and ``fov``, the horizontal
 field of view in degrees. A shape's keys move it from where the scene file puts it: a rotation about its ``pivot``,
 then a translation. An inserted shape is a sphere, cube, cylinder (along z) or rectangle (facing +z) that fills a box of
 ``size`` (one number or its extents) around the origin; its keys place it. Between keys positions run linearly,
 rotations about one axis linearly in the angle, others along the great arc; before the first and after the last key
-things rest.
+things rest. ``lights`` names emitters, or shapes that emit, and scales their radiance.
 """
 
 import difflib
@@ -27,7 +28,7 @@ from typing import Any
 import numpy as np
 
 PRIMITIVES = ("sphere", "cube", "cylinder", "rectangle")
-_TOP = ("frames", "camera", "shapes", "inserted")
+_TOP = ("frames", "camera", "shapes", "inserted", "lights")
 _LOOK = ("origin", "target", "up")
 _RIGID = ("frame", "translation", "axis", "angle")
 _INSERTED = ("id", "type", "size", "color", "roughness", "metallic", "bsdf", "emission", "keys")
@@ -52,14 +53,14 @@ class RigidKeys:
         """[4, 4] float64: rotate about the pivot, then translate."""
         first, second, share = _between(self.frames, frame)
         if np.allclose(self.axes[first], self.axes[second]):
-            angle = (1 - share) * self.angles[first] + share * self.angles[second]
+            angle = _mix(self.angles[first], self.angles[second], share)
             rotation = rotation_matrix(self.axes[first], angle)
         else:
             ends = [rotation_matrix(self.axes[end], self.angles[end]) for end in (first, second)]
             rotation = slerp(ends[0], ends[1], share)
         matrix = np.eye(4)
         matrix[:3, :3] = rotation
-        translation = (1 - share) * self.translations[first] + share * self.translations[second]
+        translation = _mix(self.translations[first], self.translations[second], share)
         matrix[:3, 3] = translation + self.pivot - rotation @ self.pivot
         return matrix
 
@@ -79,11 +80,10 @@ class CameraKeys:
             ends = [np.array(key["matrix"], float).reshape(4, 4) for key in (one, other)]
             matrix = np.eye(4)
             matrix[:3, :3] = slerp(ends[0][:3, :3], ends[1][:3, :3], share)
-            matrix[:3, 3] = (1 - share) * ends[0][:3, 3] + share * ends[1][:3, 3]
+            matrix[:3, 3] = _mix(ends[0][:3, 3], ends[1][:3, 3], share)
             return matrix
         origin, target, up = (
-            (1 - share) * np.array(one.get(name, (0, 1, 0)), float)
-            + share * np.array(other.get(name, (0, 1, 0)), float)
+            _mix(np.array(one.get(name, (0, 1, 0)), float), np.array(other.get(name, (0, 1, 0)), float), share)
             for name in _LOOK
         )
         return look_at(origin, target, up)
@@ -93,6 +93,13 @@ class CameraKeys:
         if "fov" not in self.keys[0]:
             return None
         return float(np.interp(frame, self.frames, [key["fov"] for key in self.keys]))
+
+
+def light_scale(keys: Sequence[Mapping[str, Any]], frame: float) -> float:
+    """The factor on a light's radiance at one time."""
+    frames, scales = [key["frame"] for key in keys], [float(key["scale"]) for key in keys]
+    first, second, share = _between(np.array(frames, float), frame)
+    return float(_mix(scales[first], scales[second], share))
 
 
 def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -121,6 +128,8 @@ def rotation_matrix(axis: np.ndarray, degrees: float) -> np.ndarray:
 
 def slerp(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
     """The rotation that lies at ``share`` of the great arc between two: first (first^T second)^share."""
+    if np.array_equal(first, second):  # by its own test below, rounding may turn what stands still
+        return first
     between = first.T @ second
     cosine = np.clip((np.trace(between) - 1) / 2, -1.0, 1.0)
     angle = np.arccos(cosine)
@@ -149,7 +158,10 @@ def read_animation(path: Path) -> dict[str, Any]:
 
 
 def check_animation(animation: Any, shape_ids: Iterable[str], *, has_camera: bool = True) -> None:
-    """Raise ValueError with the place of the mistake unless ``animation`` fits a scene with these shapes."""
+    """Raise ValueError with the place of the mistake unless ``animation`` fits a scene with these shapes.
+
+    Whether its lights are lights of the scene is for who loads the scene to say.
+    """
     ids = list(shape_ids)
     _known(animation, _TOP, "animation")
     frames = animation.get("frames", 1)
@@ -181,6 +193,16 @@ def check_animation(animation: Any, shape_ids: Iterable[str], *, has_camera: boo
             )
         ids.append(name)
         _check_inserted(shape, place)
+    lights = animation.get("lights", {})
+    if not isinstance(lights, Mapping):
+        raise ValueError(f"animation lights: expected an object of light to keys, got {lights!r}.")
+    for name, keys in lights.items():
+        _check_frames(keys, f"animation lights {name!r}")
+        for index, key in enumerate(keys):
+            at = f"animation lights {name!r}[{index}]"
+            _known(key, ("frame", "scale"), at)
+            if _numbers([key.get("scale")], 1, f"{at} scale")[0] < 0:
+                raise ValueError(f"{at} scale: expected a factor >= 0, got {key['scale']!r}.")
 
 
 def _check_camera(keys: Any, has_camera: bool) -> None:
@@ -280,6 +302,11 @@ def _numbers(value: Any, count: int, place: str) -> np.ndarray:
     if not sound or any(isinstance(x, bool) or not isinstance(x, int | float) or not np.isfinite(x) for x in value):
         raise ValueError(f"{place}: expected {count} finite number{'s' * (count > 1)}, got {value!r}.")
     return np.array(value, float)
+
+
+def _mix(first: Any, second: Any, share: float) -> Any:
+    """From one to the other, and exactly the one where both are equal: what rests must not tremble."""
+    return first + share * (second - first)
 
 
 def _unit(axis: Any) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxdn.clips import ClipError, read_frame, write_frame
 from jaxdn.clips.files import read_json, write_json
+from jaxdn.effects.planning import Plan
 from jaxdn.frame import Frame
 from jaxdn.motion import dual_motion
 from jaxdn.render.gbuffer import check_scene, gbuffer
@@ -18,9 +19,11 @@ from jaxdn.render.geometry import View, motion_between
 from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.seeds import NOISY, REFERENCE
 from jaxdn.render.variant import use_variant
-from jaxdn.render.wavefront import Light
+from jaxdn.render.wavefront import Light, no_light
 
 FORMAT = 1
+_MOTION = frozenset({"motion", "previous_depth", "dual_motion", "visible"})
+_DISOCCLUSION = frozenset({"dual_motion", "visible"})
 _FREE = ("frames", "cameras", "versions", "bad_samples")
 """Entries of a record that may change when rendering goes on."""
 
@@ -40,8 +43,8 @@ class Rendered(NamedTuple):
     """[H, W, 3] converged indirect radiance, of samples that no noisy layer contains."""
     reference_half: np.ndarray | None
     """[H, W, 3] the same of the first half of its samples."""
-    view: View
-    """What the next frame's motion vectors need."""
+    view: View | None
+    """What the next frame's motion vectors need; None where the plan asked for no look at the scene."""
     bad_samples: int
     """Samples that were not finite and count as black."""
 
@@ -58,6 +61,7 @@ def render_frame(
     seed: int = 0,
     variant: str | None = None,
     previous: View | None = None,
+    plan: Plan | None = None,
 ) -> Rendered:
     """Render one frame of an animated scene: noisy layers, a reference, G-buffers and motion vectors.
 
@@ -65,26 +69,38 @@ def render_frame(
     samples, or over the noisy ones if ``reference_spp`` is 0. ``previous`` is the ``view`` of the frame before,
     computed if it is not given; frame 0 has none, and its motion is 0. The result depends on nothing but the
     arguments: the same frame rendered again, alone or in another process, is the same bit for bit.
+
+    A ``plan`` leaves out what the scene does not call for: buffers that are None then, paths longer than its
+    ``max_depth`` (one given here wins), and, in a frame that shows what an earlier one did (``plan.held``), everything
+    but the noise. What is left is the same as without a plan, bit for bit.
+
     Raises ValueError for options out of range and scenes with effects that are not supported.
     """
     _check_options(width, height, layers, reference_spp)
-    accumulate, _ = _tracer(use_variant(variant))
-    depth = scene.max_depth if max_depth is None else max_depth
-    if depth < 1:
-        raise ValueError(f"max_depth: expected at least 1 (emission only), got {depth}.")
-    if previous is None and frame > 0:
+    accumulate, _ = tracer(use_variant(variant))
+    depth = max_depth or (plan and plan.max_depth) or scene.max_depth
+    if max_depth is not None and max_depth < 1:
+        raise ValueError(f"max_depth: expected at least 1 (emission only), got {max_depth}.")
+    repeated = plan is not None and plan.held[frame] != frame
+    wanted = frozenset(Frame._fields if plan is None else () if repeated else plan.frames[frame])
+    if wanted & _MOTION and previous is None and frame > 0:
         previous = _view(scene, frame - 1, scene.build(frame - 1, width, height))
     built = scene.build(frame, width, height)
     check_scene(built)
-    view = _view(scene, frame, built)
+    view = previous if repeated else _view(scene, frame, built) if wanted else None
+
+    dark = plan is not None and plan.integrator == "none"
+    noise_only = plan is not None and not plan.indirect
 
     def light(stream: int, first: int, count: int) -> Light:
+        if dark or (noise_only and stream == NOISY and reference_spp):
+            return no_light((height, width))
         return accumulate(built, seed=seed, frame=frame, stream=stream, first=first, count=count, max_depth=depth)
 
     # Layer n always holds the samples n-1 ... 2n-2: the same image whichever other layers are asked for.
     noisy = {samples: light(NOISY, samples - 1, samples) for samples in sorted(layers)}
     halves = []
-    if reference_spp:
+    if reference_spp and not repeated:
         first_half = (reference_spp + 1) // 2
         halves = [light(REFERENCE, 0, first_half), light(REFERENCE, first_half, reference_spp - first_half)]
     sums = halves or list(noisy.values())
@@ -94,15 +110,14 @@ def render_frame(
     samples = reference_spp or sum(layers)
 
     images = {count: _single(part.indirect / count) for count, part in noisy.items()}
-    buffers: dict[str, Any] = {
-        "radiance": images[min(images)],
-        "direct": _single(total.direct / samples),
-        "emission": _single(total.emitted / samples),
-        **{name: getattr(view.gbuffer, name) for name in ("albedo", "normal", "depth", "roughness", "ids")},
-        **_motion(view, previous),
-    }
+    found: dict[str, Any] = {"direct": _single(total.direct / samples), "emission": _single(total.emitted / samples)}
+    if view is not None:
+        found |= {name: getattr(view.gbuffer, name) for name in ("albedo", "normal", "depth", "roughness", "ids")}
+        if wanted & _MOTION:
+            found |= _motion(view, previous, disocclusion=bool(wanted & _DISOCCLUSION))
+    buffers = {name: buffer for name, buffer in found.items() if name in wanted}
     return Rendered(
-        frame=Frame(**buffers),
+        frame=Frame(radiance=images[min(images)], **buffers),
         layers=images,
         reference=_single(total.indirect / samples) if halves else None,
         reference_half=_single(halves[0].indirect / ((reference_spp + 1) // 2)) if halves else None,
@@ -123,13 +138,15 @@ def render_clip(
     max_depth: int | None = None,
     seed: int = 0,
     variant: str | None = None,
+    plan: Plan | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Path:
     """Render the frames 0 ... ``frames`` - 1 into ``folder``: ``clip.json`` and one ``frame_0000.exr`` each.
 
     Frames that are already there and whole are kept, so that an interrupted rendering goes on where it stopped; the
     folder's record has to have been made with the same settings (ClipError otherwise). ``progress`` is called with the
-    number of every frame that is finished or found. Returns the folder. Raises RenderError, naming the clip and the
+    number of every frame that is finished or found. A ``plan`` for these frames is obeyed and kept in the record.
+    Returns the folder. Raises RenderError, naming the clip and the
     frame, if a frame cannot be rendered or written.
     """
     folder = Path(folder)
@@ -137,6 +154,8 @@ def render_clip(
     if frames < 1:
         raise ValueError(f"frames: expected at least 1, got {frames}.")
     _check_options(width, height, layers, reference_spp)
+    if plan is not None and len(plan.frames) != frames:
+        raise ValueError(f"plan: expected one for {frames} frames, got one for {len(plan.frames)}.")
     chosen = use_variant(variant)
     record: dict[str, Any] = {
         "format": FORMAT,
@@ -147,9 +166,10 @@ def render_clip(
         "layers": sorted(layers),
         "reference_spp": reference_spp,
         "variant": chosen,
-        "max_depth": scene.max_depth if max_depth is None else max_depth,
+        "max_depth": max_depth or (plan and plan.max_depth) or scene.max_depth,
+        "plan": None if plan is None else plan.record(),
         "seed": seed,
-        "jittered": _tracer(chosen)[1],
+        "jittered": tracer(chosen)[1],
         "cameras": [_camera_record(scene, frame) for frame in range(frames)],
         "scene": dict(scene.record),
         "versions": _versions(),
@@ -180,6 +200,7 @@ def render_clip(
                     seed=seed,
                     variant=chosen,
                     previous=previous,
+                    plan=plan,
                 )
                 write_frame(
                     path,
@@ -200,7 +221,7 @@ def render_clip(
     return folder
 
 
-def _tracer(variant: str) -> tuple[Callable[..., Light], bool]:
+def tracer(variant: str) -> tuple[Callable[..., Light], bool]:
     """The tracer of a variant, and whether it spreads its samples over the pixel."""
     if variant.startswith("scalar"):
         from jaxdn.render.exact import accumulate as exact
@@ -216,21 +237,20 @@ def _view(scene: AnimatedScene, frame: int, built: Any) -> View:
     return View(gbuffer(built), scene.camera(frame), pose)
 
 
-def _motion(view: View, previous: View | None) -> dict[str, Any]:
+def _motion(view: View, previous: View | None, *, disocclusion: bool) -> dict[str, Any]:
     """The Frame's buffers about motion; nothing has moved yet in a first frame."""
     if previous is None:
         zero = np.zeros((*view.gbuffer.ids.shape[:2], 2), np.float32)
         seen = np.ones_like(view.gbuffer.ids, bool)
         return {"motion": zero, "dual_motion": zero, "visible": seen, "previous_depth": view.gbuffer.depth}
-    found = motion_between(view, previous)
-    motion, forward = found.motion.astype(np.float32), found.forward_motion.astype(np.float32)
-    dual = np.asarray(dual_motion(*map(jnp.asarray, (motion, forward)), visible=jnp.asarray(found.visible[..., 0])))
-    return {
-        "motion": motion,
-        "dual_motion": dual,
-        "visible": found.visible,
-        "previous_depth": found.previous_depth,
-    }
+    found = motion_between(view, previous, disocclusion=disocclusion)
+    motion = found.motion.astype(np.float32)
+    buffers = {"motion": motion, "previous_depth": found.previous_depth}
+    if found.forward_motion is not None and found.visible is not None:
+        forward = jnp.asarray(found.forward_motion.astype(np.float32))
+        dual = dual_motion(jnp.asarray(motion), forward, visible=jnp.asarray(found.visible[..., 0]))
+        buffers |= {"visible": found.visible, "dual_motion": np.asarray(dual)}
+    return buffers
 
 
 def _single(image: np.ndarray) -> np.ndarray:

@@ -36,6 +36,8 @@ class ClipJob(NamedTuple):
     max_depth: int | None = None
     seed: int = 0
     variant: str | None = None
+    plan: dict[str, Any] | None = None
+    """The record of a :class:`jaxdn.effects.Plan`; None renders everything."""
 
 
 class _Worker(NamedTuple):
@@ -108,6 +110,9 @@ def _finished(job: ClipJob) -> bool:
     wanted: dict[str, Any] = {"width": job.width, "height": job.height, "frames": job.frames, "seed": job.seed}
     wanted |= {"layers": sorted(job.layers), "reference_spp": job.reference_spp, "scene": job.scene}
     chosen = {"max_depth": job.max_depth, "variant": job.variant}
+    # A clip from before there were plans has no such entry, and everything in it.
+    if record.get("plan") != job.plan:
+        return False
     wanted |= {key: value for key, value in chosen.items() if value is not None}
     # A frame's file has its name from the moment it is whole.
     return all(record.get(key) == value for key, value in wanted.items()) and all(
@@ -130,6 +135,7 @@ def _work(job: ClipJob, messages: Connection, threads: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business, it ends this process
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     try:
+        from jaxdn.effects import plan_from_record
         from jaxdn.render.clip import render_clip
         from jaxdn.render.variant import use_variant
 
@@ -142,8 +148,9 @@ def _work(job: ClipJob, messages: Connection, threads: int) -> None:
             scene = scene_from_record(job.scene)
         except Exception as error:
             raise ValueError(f"clip in {job.folder}: the scene {job.scene} does not load: {error}") from error
-        options = {name: getattr(job, name) for name in ClipJob._fields if name not in ("scene", "folder")}
-        render_clip(scene, job.folder, **options, progress=messages.send)
+        options = {name: getattr(job, name) for name in ClipJob._fields if name not in ("scene", "folder", "plan")}
+        plan = None if job.plan is None else plan_from_record(job.plan)
+        render_clip(scene, job.folder, **options, plan=plan, progress=messages.send)
         messages.send("done")
     except BaseException as error:
         messages.send(f"{error}" if str(error) else repr(error))

@@ -34,9 +34,9 @@ class Motion(NamedTuple):
 
     motion: np.ndarray
     """[H, W, 2] float64 px, previous minus current; NaN where the point was behind the previous camera."""
-    forward_motion: np.ndarray
+    forward_motion: np.ndarray | None
     """[H, W, 2] float64 px, of the previous frame's pixels: how far what they show has moved, now minus then."""
-    visible: np.ndarray
+    visible: np.ndarray | None
     """[H, W, 1] bool, the point was seen in the previous frame."""
     previous_depth: np.ndarray
     """[H, W, 1] float32 view-space z of the point in the previous frame, ``FAR`` for the sky."""
@@ -79,8 +79,10 @@ def relative_poses(
     return motions
 
 
-def motion_between(current: View, previous: View) -> Motion:
+def motion_between(current: View, previous: View, *, disocclusion: bool = True) -> Motion:
     """Motion of the current frame's pixels into the previous frame, and of the previous frame's into the current.
+
+    Without ``disocclusion`` the latter, and what was visible, are not computed and None.
 
     Traditional motion is ``P'(T^-1 X) - P(X)`` (X the world position, T the shape's rigid motion, P and P' the two
     projections), and for the sky the projections of its direction: it turns with the camera and knows no translation.
@@ -96,7 +98,6 @@ def motion_between(current: View, previous: View) -> Motion:
         raise ValueError("motion: expected two frames of one size with the same shapes; shapes may not come or go.")
     size = now.ids.shape[:2]
     back = relative_poses(now.names, current.pose, previous.pose)[now.ids[..., 0]]
-    there = relative_poses(now.names, previous.pose, current.pose)[before.ids[..., 0]]
     same_camera = _same(current.camera, previous.camera)
 
     points = _homogeneous(now)
@@ -104,7 +105,12 @@ def motion_between(current: View, previous: View) -> Motion:
     target, z = project(old_points, previous.camera, size)
     motion = target - project(points, current.camera, size)[0]
     motion[same_camera & _still(back)] = 0.0
+    sky = now.ids < 0
+    previous_depth = np.where(sky, FAR, np.maximum(z, 0.0)).astype(np.float32)
+    if not disocclusion:
+        return Motion(motion, None, None, previous_depth)
 
+    there = relative_poses(now.names, previous.pose, current.pose)[before.ids[..., 0]]
     borrowed = _homogeneous(before)
     moved, _ = project(np.einsum("hwij,hwj->hwi", there, borrowed), current.camera, size)
     forward = moved - project(borrowed, previous.camera, size)[0]
@@ -113,7 +119,6 @@ def motion_between(current: View, previous: View) -> Motion:
     normals = np.einsum("hwij,hwj->hwi", back[..., :3, :3], now.normal)
     lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
     normals = normals / np.where(lengths > 0, lengths, 1.0)
-    sky = now.ids < 0
     # In float32 and from the pixel itself: the pixel looked up must be the one that the stored vector leads to.
     pixels = np.stack(np.meshgrid(np.arange(size[1]), np.arange(size[0])), axis=-1).astype(np.float32)
     landing = pixels + motion.astype(np.float32) + np.float32(0.5)
@@ -124,7 +129,7 @@ def motion_between(current: View, previous: View) -> Motion:
     for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
         tap = np.floor(landing - np.float32(0.5)) + corner
         seen |= on_sky & _matches(now, before, tap, old_points, normals, z)[0]
-    return Motion(motion, forward, seen, np.where(sky, FAR, np.maximum(z, 0.0)).astype(np.float32))
+    return Motion(motion, forward, seen, previous_depth)
 
 
 def _same(first: Camera, second: Camera) -> bool:

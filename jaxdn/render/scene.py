@@ -50,6 +50,11 @@ class AnimatedScene(Protocol):
         ...
 
 
+def brightness(scene: AnimatedScene, frame: float) -> Mapping[str, float]:
+    """Light -> factor on its radiance, of scenes that have a method of this name; in others no light changes."""
+    return getattr(scene, "brightness", lambda frame: {})(frame)
+
+
 def scene_from_record(record: Mapping[str, Any]) -> AnimatedScene:
     """Build the scene that a clip's record describes: ``{"family": name, "seed": int, ...}``, or a scene file's.
 

@@ -14,7 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from jaxdn.render.animation import CameraKeys, RigidKeys, check_animation, extents, read_animation
+from jaxdn.render.animation import (
+    CameraKeys,
+    RigidKeys,
+    check_animation,
+    extents,
+    light_scale,
+    read_animation,
+)
 from jaxdn.render.scene import Camera
 from jaxdn.render.variant import use_variant
 
@@ -72,6 +79,8 @@ class SceneFile:
         self._inserted = {shape["id"]: shape for shape in animation.get("inserted", [])}
         for name, shape in self._inserted.items():
             self._motions[name] = RigidKeys(shape.get("keys", [{"frame": 0}]), np.zeros(3))
+        self._lights = animation.get("lights", {})
+        _check_lights(self._tree, self._lights, path)
         self._still: tuple[str, list[Any]] | None = None
 
     def camera(self, frame: float) -> Camera:
@@ -89,17 +98,25 @@ class SceneFile:
         """Shape id -> [4, 4], where the keys have moved the shape from where the file puts it."""
         return {name: motion(frame) for name, motion in self._motions.items()}
 
+    def brightness(self, frame: float) -> dict[str, float]:
+        """Light -> factor on its radiance, where the keys change it."""
+        return {name: light_scale(keys, frame) for name, keys in self._lights.items()}
+
     def build(self, frame: float, width: int, height: int) -> Any:
         """The ``mi.Scene`` of one frame; what does not move is loaded once and shared by all frames."""
         import mitsuba as mi
 
+        from jaxdn.render.plugins import shape_groups
+
         variant = str(mi.variant())
         if self._still is None or self._still[0] != variant:
-            still = _load(_kept(self._tree, lambda shape: shape.get("id") not in self._motions))
-            lamps = [emitter for emitter in still.emitters() if emitter.get_shape() is None]
-            self._still = variant, [*still.shapes(), *lamps]
+            rests = _kept(self._tree, lambda element: element.get("id") not in {*self._motions, *self._lights})
+            still = _load(rests)
+            # A group is handed on for those who look at the scene: its instances do not tell what is in it.
+            self._still = variant, [*still.shapes(), *shape_groups(still), *_lamps(still)]
         moving = _load(self.describe(frame, width, height))
-        parts = {part.id(): part for part in [*self._still[1], *moving.shapes()]}
+        fresh = [*moving.shapes(), *shape_groups(moving), *_lamps(moving)]
+        parts = {part.id(): part for part in [*self._still[1], *fresh]}
         parts |= {"animation_sensor": moving.sensors()[0], "animation_integrator": moving.integrator()}
         # A key of this dictionary becomes the object's id.
         return mi.load_dict({"type": "scene", **parts}, optimize=False)
@@ -107,8 +124,13 @@ class SceneFile:
     def describe(self, frame: float, width: int, height: int) -> ET.Element:
         """The XML of what one frame has for itself: camera, film and the shapes that move."""
         poses = self.pose(frame)
-        scene = copy.deepcopy(_kept(self._tree, lambda shape: shape.get("id") in poses, emitters=False))
+        changing = {*poses, *self._lights}
+        scene = copy.deepcopy(_kept(self._tree, lambda element: element.get("id") in changing))
+        for name, factor in self.brightness(frame).items():
+            _scale_light(_light(scene, name), factor)
         for element in scene.findall("shape"):
+            if element.get("id") not in poses:
+                continue
             transform = _transform(element)
             if transform is None:
                 transform = ET.SubElement(element, "transform", name="to_world")
@@ -140,11 +162,15 @@ def _load(root: ET.Element) -> Any:
     return mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False)
 
 
-def _kept(root: ET.Element, shapes: Callable[[ET.Element], bool], *, emitters: bool = True) -> ET.Element:
-    """The scene with the chosen top-level shapes, what they refer to, and, if wanted, the lamps that are no shapes."""
+def _lamps(scene: Any) -> list[Any]:
+    """The emitters of a loaded scene that are no shapes."""
+    return [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
+
+
+def _kept(root: ET.Element, wanted: Callable[[ET.Element], bool]) -> ET.Element:
+    """The scene with the chosen top-level shapes and lamps, and what they refer to."""
     named = {element.get("id"): element for element in root if element.get("id")}
-    chosen = [element for element in root if element.tag == "shape" and shapes(element)]
-    chosen += [element for element in root if element.tag == "emitter" and emitters]
+    chosen = [element for element in root if element.tag in ("shape", "emitter") and wanted(element)]
     needed = set(map(id, chosen))
     while chosen:
         for reference in chosen.pop().iter("ref"):
@@ -229,6 +255,46 @@ def _path_length(root: ET.Element) -> int:
             if element.get("name") in ("max_depth", "maxDepth") and value.isdigit() and int(value) > 0:
                 return int(value)
     return _DEPTH
+
+
+def _light(root: ET.Element, name: str) -> ET.Element | None:
+    """The emitter of this name, or the one of the shape of this name."""
+    for element in root:
+        if element.get("id") == name:
+            return element if element.tag == "emitter" else element.find("emitter")
+    return None
+
+
+def _check_lights(root: ET.Element, keys: Mapping[str, Any], path: Path) -> None:
+    """Raise ValueError for a name that is no light of the scene, or a light whose radiance is no number."""
+    for name in keys:
+        emitter = _light(root, name)
+        if emitter is None:
+            ids = [element.get("id", "") for element in root]
+            lights = ", ".join(one for one in ids if one and _light(root, one) is not None) or "none with an id"
+            raise ValueError(f"animation lights: the scene {path} has no light {name!r}; it has {lights}.")
+        if not _powers(emitter) and emitter.get("type") != "envmap":
+            raise ValueError(f"animation lights: {name!r} has no colour or number to scale; give it one in the scene.")
+
+
+def _powers(emitter: ET.Element) -> list[ET.Element]:
+    """The elements that say how bright an emitter is."""
+    names = ("radiance", "intensity", "irradiance", "power")
+    return [part for part in emitter if part.get("name") in names and part.tag in ("rgb", "spectrum", "float")]
+
+
+def _scale_light(emitter: ET.Element | None, factor: float) -> None:
+    assert emitter is not None  # _check_lights has found it
+    if emitter.get("type") == "envmap":
+        own = next((part for part in emitter if part.get("name") == "scale"), None)
+        if own is None:
+            own = ET.SubElement(emitter, "float", name="scale", value="1")
+        own.set("value", repr(float(own.get("value", "1")) * factor))
+    for part in _powers(emitter):
+        numbers = part.get("value", "0").replace(",", " ").split()
+        # "wavelength:value" pairs of a spectrum scale in their values.
+        pairs = [number.rpartition(":") for number in numbers]
+        part.set("value", " ".join(f"{head}{colon}{float(value) * factor!r}" for head, colon, value in pairs))
 
 
 def _transform(shape: ET.Element) -> ET.Element | None:

@@ -5,8 +5,8 @@ with the noisy layers. The mixing function is TEA (Zafar, Olano and Curtis 2010)
 same level collide.
 """
 
-NOISY, REFERENCE = 0, 1
-"""The two independent streams of a frame."""
+NOISY, REFERENCE, DEPTH = 0, 1, 2
+"""The independent streams of a frame: noisy layers, reference, and the few samples that measure the path length."""
 
 _MASK = 0xFFFFFFFF
 
@@ -33,6 +33,6 @@ def pass_seed(seed: int, frame: int, stream: int, index: int) -> int:
     """The seed of one whole-image pass of Mitsuba's own integrators.
 
     Mitsuba multiplies it by the number of pixels modulo 2**32, so only its low bits count: consecutive passes have to
-    get consecutive seeds, and the two streams are kept apart by a fixed distance instead of by chance.
+    get consecutive seeds, and the streams are kept apart by a fixed distance instead of by chance.
     """
     return (tea(frame, seed)[0] + (stream << 17) + index) & _MASK
