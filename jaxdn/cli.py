@@ -283,7 +283,8 @@ def _denoise(options: Denoise) -> None:
             motion_convention=options.motion_convention,
             say=lambda done, total: status.update(f"{options.method}: frame {done} of {total}"),
         )
-    print(f"{len(written)} frames denoised by {options.method} in {options.out}")
+    compiled = f"{written.programs} program{'s' * (written.programs != 1)} compiled"
+    print(f"{len(written.files)} frames denoised by {options.method} in {options.out} ({compiled})")
 
 
 def _compare(options: Compare) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -16,6 +16,14 @@ from jaxdn.frame import RADIANCE_MAX, Frame, only
 from jaxdn.report.images import save_png
 
 
+class Written(NamedTuple):
+    """What was denoised."""
+
+    files: list[Path]
+    programs: int
+    """Steps that were compiled: one for each set of buffers that some frame has."""
+
+
 def denoise_files(
     source: Path,
     out: Path,
@@ -25,7 +33,7 @@ def denoise_files(
     preview: bool = False,
     motion_convention: str | None = None,
     say: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Path]:
+) -> Written:
     """Denoise a clip's folder, or EXR files of another renderer; returns the files written.
 
     Each output frame has the channels ``R, G, B``: the denoised radiance with the directly reflected and the emitted
@@ -37,7 +45,7 @@ def denoise_files(
     names, frames = _open(source, spp, motion_convention)
     if out.resolve() in {source.resolve(), *(name.resolve().parent for name in names)}:
         raise ValueError(f"{out}: expected another folder than the input's, whose frames would be overwritten.")
-    step = _stepper(method)
+    step, programs = _stepper(method)
     out.mkdir(parents=True, exist_ok=True)
     written = []
     for name, frame in zip(names, frames, strict=True):
@@ -49,7 +57,7 @@ def denoise_files(
             save_png(path.with_suffix(".png"), color.tonemap(beauty))
         written.append(path)
         say(len(written), len(names))
-    return written
+    return Written(written, len(programs))
 
 
 def _open(source: Path, spp: int, motion_convention: str | None) -> tuple[list[Path], Iterator[Frame]]:
@@ -63,23 +71,25 @@ def _open(source: Path, spp: int, motion_convention: str | None) -> tuple[list[P
     return names, iter(read_plain_frames(source, motion_convention=motion_convention))
 
 
-def _stepper(method: Method) -> Callable[[Frame], np.ndarray]:
-    """A function from one frame to the next denoised one, which remembers the state; compiled once."""
+def _stepper(method: Method) -> tuple[Callable[[Frame], np.ndarray], set[tuple[str, ...]]]:
+    """A function from one frame to the next denoised one, and the sets of buffers that it was compiled for so far."""
     denoiser = method.denoiser
+    programs: set[tuple[str, ...]] = set()
     if denoiser is None:
-        return lambda frame: _light(frame.radiance)
+        return lambda frame: _light(frame.radiance), programs
     run = jax.jit(denoiser.step, donate_argnums=1)
     state: Any = None
 
     def step(frame: Frame) -> np.ndarray:
         nonlocal state
         inputs = only(frame, denoiser.reads)
+        programs.add(tuple(name for name, buffer in inputs._asdict().items() if buffer is not None))
         if state is None:
             state = jax.jit(denoiser.start)(method.params, inputs)
         state, image = run(method.params, state, inputs)
         return np.asarray(image)
 
-    return step
+    return step, programs
 
 
 def _light(radiance: np.ndarray | None) -> Any:
