@@ -12,7 +12,7 @@ GEOMETRY = frozenset({"albedo", "normal", "depth", "ids"})
 COMPOSED = frozenset({"direct", "emission"})
 """Buffers that no denoiser need read: they are added to its image."""
 BOUND = 0.01
-"""Share of a picture's light that may be missing when paths end."""
+"""Share of a picture's reflected light that may be missing when paths end."""
 
 
 class Plan(NamedTuple):

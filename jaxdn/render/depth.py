@@ -25,22 +25,23 @@ class PathDepth(NamedTuple):
     max_depth: int
     """Path length in Mitsuba's count: 1 is emission, 2 direct, 3 one bounce of indirect light."""
     remaining: float
-    """Estimated share of the light that longer paths would add."""
+    """Estimated share of the reflected light that longer paths would add."""
     bound: float
     """The share that was allowed."""
     light: dict[int, float]
-    """Path length -> mean radiance, as measured."""
+    """Path length -> mean reflected radiance, as measured."""
 
 
 def measure_depth(
     scene: AnimatedScene, *, bound: float = BOUND, frame: int = 0, variant: str | None = None
 ) -> PathDepth:
-    """The shortest path length that leaves out at most ``bound`` of the picture's light, measured in one frame.
+    """The shortest path length that leaves out at most ``bound`` of the reflected light, measured in one frame.
 
-    16 samples for each of 24 x 24 pixels; all depths follow the same paths, so that their differences are exact. Never
-    longer than the scene's own ``max_depth``, and never so short that there is no indirect light. What remains after
-    depth D is taken as a geometric series with the ratio of the last two bounces measured, or of the last four if they
-    decay slower. Raises ValueError for a bound outside (0, 1).
+    Light that the camera sees directly does not count: beside a bright window everything else would be negligible.
+    There are 16 samples for each of 24 x 24 pixels; all depths follow the same paths, so that their differences are
+    exact. Never longer than the scene's own ``max_depth``, and never so short that there is no indirect light. What
+    remains after depth D is taken as a geometric series with the ratio of the last two bounces measured, or of the last
+    three if they decay slower. Raises ValueError for a bound outside (0, 1).
     """
     if not 0 < bound < 1:
         raise ValueError(f"bound: expected a share of the light between 0 and 1, got {bound!r}.")
@@ -51,7 +52,7 @@ def measure_depth(
     light: dict[int, float] = {}
     for depth in sorted({min(depth, scene.max_depth) for depth in _DEPTHS}):
         sums = accumulate(built, seed=0, frame=frame, stream=DEPTH, first=0, count=_SAMPLES, max_depth=depth)
-        light[depth] = float(np.mean(sums.emitted + sums.direct + sums.indirect)) / _SAMPLES
+        light[depth] = float(np.mean(sums.direct + sums.indirect)) / _SAMPLES
         if depth >= 4 and _remaining(light) <= bound:
             break
     return _shortest(light, bound)
