@@ -5,7 +5,7 @@ SETTINGS ?=
 # Huge pages for large buffers (glibc; ignored elsewhere): a train step takes 0.87 of its time.
 export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 
-.PHONY: help setup train test test-slow lint format docs weights clean
+.PHONY: help setup train test test-slow hard-cases lint format docs weights clean
 
 help:  ## what can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -35,6 +35,9 @@ test: setup  ## the tests (minutes)
 
 test-slow: setup  ## the slow tests: real training runs, the notebook, real processes
 	$(BIN)/python -m pytest -q -m slow $(SETTINGS)
+
+hard-cases: setup  ## every hard case, operation, denoiser and precision: runs/hard-cases/table.html
+	$(BIN)/python -m tests.hard_cases.table
 
 lint: setup  ## ruff and the type checker
 	$(BIN)/ruff check .

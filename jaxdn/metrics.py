@@ -20,6 +20,7 @@ import jax.numpy as jnp
 
 from jaxdn.checks import check_image, check_option, check_same_size
 from jaxdn.flip import PIXELS_PER_DEGREE, flip_map
+from jaxdn.numerics import safe_norm
 from jaxdn.stencils import correlate, gaussian_taps
 
 _SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
@@ -43,7 +44,9 @@ def relative_mse(image: jax.Array, reference: jax.Array, *, mask: jax.Array | No
     Rousselle et al. 2011, eq. 10; they and others differ in the constant.
     """
     image, reference, inside = _prepare(image, reference, mask)
-    return _mean((image - reference) ** 2 / (reference**2 + 0.01), inside)
+    # Divided before it is squared: the square of a firefly in the reference overflows, the ratio does not.
+    scale = safe_norm(jnp.stack([reference, jnp.full_like(reference, 0.1)], axis=-1))[..., 0]
+    return _mean(((image - reference) / scale) ** 2, inside)
 
 
 def psnr(

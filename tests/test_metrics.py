@@ -279,3 +279,10 @@ def test_shapes_are_checked(rng: np.random.Generator) -> None:
         metrics.flip(x[..., :1], y[..., :1])
     with pytest.raises(ValueError, match="average"):
         metrics.psnr(x, y, average="median")
+
+
+def test_relative_mse_survives_a_firefly_in_the_reference():
+    reference = np.full((4, 4, 3), 1e30, np.float32)
+    assert METRICS["relative_mse"](np.zeros_like(reference), reference) == pytest.approx(1.0)
+    slope = jax.grad(lambda image: metrics.relative_mse(image, jnp.asarray(reference)))(jnp.zeros((4, 4, 3)))
+    assert bool(jnp.all(jnp.isfinite(slope)))

@@ -1,0 +1,1 @@
+"""Hard cases as data, crossed with every denoiser, operation, precision and direction: see ``make hard-cases``."""

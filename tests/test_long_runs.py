@@ -1,0 +1,112 @@
+"""Thousands of frames: the recurrent state stays bounded, does not drift, and forgets one poisoned frame.
+
+python -m pytest tests/test_long_runs.py -m slow -s        # prints the curves' figures
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import jaxdn
+from jaxdn.frame import RADIANCE_MAX, Frame
+
+SIZE = 32
+LONG, SHORT = 2000, 240
+METHODS = ["svgf", "ntd-small"]
+FORGETS = {"svgf": 120, "ntd-small": 80}
+"""Frames after which a poisoned frame has to be forgotten, to 1 % of the clean run."""
+
+
+def method(name):
+    if name in jaxdn.denoisers.NAMES:
+        return getattr(jaxdn.denoisers, name)(), {}
+    return jaxdn.load_weights(name)
+
+
+def wall():
+    rows, columns = np.mgrid[:SIZE, :SIZE].astype(np.float32)
+    albedo = np.stack([0.4 + 0.3 * np.sin(columns / 3), 0.5 + 0 * rows, 0.6 + 0.2 * np.cos(rows / 5)], axis=-1)
+    zero = np.zeros((SIZE, SIZE, 1), np.float32)
+    return Frame(
+        radiance=(0.6 * albedo).astype(np.float32),
+        albedo=albedo.astype(np.float32),
+        normal=np.concatenate([zero, zero, zero + 1], axis=-1),
+        depth=zero + 4,
+        roughness=zero + 1,
+        ids=np.zeros((SIZE, SIZE, 1), np.int32),
+    )
+
+
+@functools.cache
+def compiled(name, frames):
+    """A run of so many frames over a wall, before which the camera slides there and back for ever."""
+    denoiser, params = method(name)
+    base = jax.tree.map(jnp.asarray, wall())
+
+    def body(settings, state, index):
+        speed, poison, at, dark = settings
+        noise = jax.random.exponential(jax.random.fold_in(jax.random.key(1), index), (SIZE, SIZE, 1))
+        radiance = jnp.where(index < dark, base.radiance * noise, 0.0)
+        radiance = jnp.where(index == at, poison, radiance)
+        across = jnp.where((index // 8) % 2 == 0, speed, -speed)
+        motion = jnp.broadcast_to(jnp.stack([across, 0.5 * across]), (SIZE, SIZE, 2))
+        state, image = denoiser.step(params, state, base._replace(radiance=radiance, motion=motion))
+        healthy = jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
+        return state, (jnp.mean(image), jnp.max(image), healthy & jnp.all(jnp.isfinite(image)), image[::4, ::4])
+
+    def run(settings):
+        _, seen = lax.scan(functools.partial(body, settings), denoiser.start(params, base), jnp.arange(frames))
+        return seen
+
+    return jax.jit(run)
+
+
+def run(name, frames, *, speed=0.7, poison=0.0, at=-1, dark=10**6):
+    """Mean and largest value of every output frame, whether all was finite, and every fourth pixel."""
+    settings = (jnp.float32(speed), jnp.float32(poison), jnp.int32(at), jnp.int32(dark))
+    return tuple(np.asarray(seen) for seen in compiled(name, frames)(settings))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("speed", [0.0, 0.7])
+def test_two_thousand_frames_neither_explode_nor_drift(name, speed):
+    mean, top, healthy, _ = run(name, LONG, speed=speed)
+    assert healthy.all()
+    assert top.max() <= RADIANCE_MAX
+    early, late = mean[100:300].mean(), mean[-200:].mean()
+    print(
+        f"{name}, {speed} px: mean {early:.4f} after 100 frames, {late:.4f} after {LONG}, largest {top[100:].max():.3f}"
+    )
+    assert late == pytest.approx(early, rel=0.02)
+    assert top[100:].max() < 10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("poison", [np.nan, np.inf, 1e30, -5.0])
+def test_one_poisoned_frame_is_forgotten(name, poison):
+    at = 60
+    clean = run(name, SHORT)
+    spoilt = run(name, SHORT, poison=poison, at=at)
+    assert spoilt[2].all(), "neither state nor image ever holds what is not a number"
+    difference = np.abs(spoilt[3] - clean[3]).max(axis=(1, 2, 3)) / np.abs(clean[3]).mean(axis=(1, 2, 3))
+    bad = np.flatnonzero(difference > 0.01)
+    recovered = int(bad.max()) + 1 - at if bad.size else 0
+    print(f"{name}: {poison:g} forgotten to 1 % after {recovered} frames")
+    assert np.array_equal(spoilt[3][:at], clean[3][:at])
+    assert recovered <= FORGETS[name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
+def test_a_light_switched_off_does_not_linger(name):
+    mean, _, healthy, _ = run(name, SHORT, dark=100)
+    assert healthy.all()
+    gone = int(np.flatnonzero(mean[100:] < 0.01 * mean[50:100].mean())[0])
+    print(f"{name}: dark after {gone} frames")
+    assert gone <= 40
