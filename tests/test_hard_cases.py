@@ -20,7 +20,15 @@ def assert_green(subject, **options):
     "subject", [one for one in operation_subjects() if one.name not in LONG_TO_COMPILE], ids=lambda one: one.name
 )
 def test_operations_withstand_every_case(subject):
-    assert_green(subject, precisions=("float32",))
+    assert_green(subject, precisions=("float32",), directions=("forward",))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "subject", [one for one in operation_subjects() if one.name not in LONG_TO_COMPILE], ids=lambda one: one.name
+)
+def test_gradients_of_operations_withstand_every_case(subject):
+    assert_green(subject, precisions=("float32",), directions=("gradient",))
 
 
 @pytest.mark.slow
