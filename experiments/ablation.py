@@ -75,9 +75,9 @@ PRESETS = {
         validation=ClipSet((("fruit", 100),), size=64, frames=10, reference_spp=32),
         tests=(ClipSet((*_seeds(FAMILIES[1:], range(200, 201)), ("edge", 200)), 64, 10, reference_spp=64),),
         runs=(
-            Run("A", "small", "traditional", occlusion=False, steps=80),
-            Run("B", "small", "dual", occlusion=False, steps=80),
-            Run("C", "small", "dual", occlusion=True, steps=80),
+            Run("A", "small", "traditional", occlusion=False, steps=100),
+            Run("B", "small", "dual", occlusion=False, steps=100),
+            Run("C", "small", "dual", occlusion=True, steps=100),
         ),
         recipe=Recipe(learning_rate=2e-3, crop=48),
     ),

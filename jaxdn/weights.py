@@ -5,13 +5,14 @@ import os
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
 from jaxdn import denoisers
-from jaxdn.frame import Denoiser
+from jaxdn.frame import Denoiser, Frame
 
 SHIPPED = Path(__file__).parent / "shipped"
 """Where the weights lie that come with the package."""
@@ -67,7 +68,8 @@ def load_weights(name_or_path: str | Path) -> tuple[Denoiser, dict[str, Any]]:
     """A denoiser and its parameters, by a shipped name (``"ntd-large"``) or the path of a .safetensors file.
 
     The factory and its options are read from the JSON beside the weights. Raises ValueError where nothing of that name
-    exists, a file cannot be read, or the JSON names an unknown factory.
+    exists, a file cannot be read, the JSON names an unknown factory or option, or the weights are not those of the
+    denoiser that it describes.
     """
     path = SHIPPED / f"{name_or_path}.safetensors"
     if not path.is_file():
@@ -95,8 +97,38 @@ def load_weights(name_or_path: str | Path) -> tuple[Denoiser, dict[str, Any]]:
         flat = load_file(path)
     except (SafetensorError, OSError, ValueError) as error:
         raise ValueError(f"weights {path}: expected a whole safetensors file, got {error}; copy it again.") from error
-    options = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
-    return getattr(denoisers, factory)(**options), unflatten(flat)
+    options = {str(key): tuple(value) if isinstance(value, list) else value for key, value in options.items()}
+    try:
+        denoiser = getattr(denoisers, factory)(**options)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"weights {beside}: expected options of {factory}, got {options} ({error}); they may come from a newer "
+            "jaxdn."
+        ) from error
+    _check_params(flat, denoiser, path)
+    return denoiser, unflatten(flat)
+
+
+def _check_params(flat: dict[str, np.ndarray], denoiser: Denoiser, path: Path) -> None:
+    """Raise ValueError unless the arrays are what the denoiser is initialised with, in name, shape and type."""
+    frame = Frame(jax.ShapeDtypeStruct((16, 16, 3), jnp.float32))
+    wanted = _shapes(jax.eval_shape(denoiser.init, jax.random.key(0), frame))
+    found = {name: (array.shape, array.dtype) for name, array in flat.items()}
+    if found != wanted:
+        differing = sorted(name for name in {*found, *wanted} if found.get(name) != wanted.get(name))
+        first = differing[0]
+        raise ValueError(
+            f"weights {path}: expected the weights that its JSON describes, but {len(differing)} of them differ, such "
+            f"as {first}: expected {wanted.get(first)}, got {found.get(first)}; copy both files together."
+        )
+
+
+def _shapes(tree: dict[str, Any], prefix: str = "") -> dict[str, tuple[tuple[int, ...], Any]]:
+    shapes: dict[str, tuple[tuple[int, ...], Any]] = {}
+    for key, value in tree.items():
+        name = f"{prefix}/{key}" if prefix else str(key)
+        shapes |= _shapes(value, name) if isinstance(value, dict) else {name: (value.shape, np.dtype(value.dtype))}
+    return shapes
 
 
 def describe(name_or_path: str | Path) -> dict[str, Any]:

@@ -183,7 +183,7 @@ def albedo_tiny(inputs: Inputs) -> Inputs:
     return _filled(inputs, "albedo", 1e-5)
 
 
-@case("a mirror")
+@case("a polished mirror")
 def roughness_zero(inputs: Inputs) -> Inputs:
     return _filled(inputs, "roughness", 0.0)
 
