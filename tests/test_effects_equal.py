@@ -54,7 +54,7 @@ def assert_the_same(everything, auto):
         np.testing.assert_allclose(first, second, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
-FAST = ["static grey box", "moving: ball, later", "only emission"]
+FAST = ["static grey box", "moving: ball, later"]
 
 
 @pytest.mark.parametrize("name", FAST)
@@ -108,6 +108,7 @@ def test_a_frame_that_lacks_what_its_plan_says_is_refused(tmp_path):
         read_clip(auto)
 
 
+@pytest.mark.slow
 def test_training_mixes_clips_of_different_effects(tmp_path):
     from jaxdn.clips import training_batches
 
@@ -132,6 +133,7 @@ def test_a_finished_clip_is_inspected_without_its_scene(tmp_path):
     assert "emission" not in blind
 
 
+@pytest.mark.slow
 def test_a_clip_whose_effects_change_is_denoised_by_two_programs(tmp_path):
     from jaxdn.cli import main
 

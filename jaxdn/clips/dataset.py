@@ -127,12 +127,14 @@ def _common_buffers(clips: Sequence[CachedClip], wanted: Sequence[str] | frozens
     def offered(clip: CachedClip) -> frozenset[str]:
         return clip.buffers if wanted is None else clip.buffers & frozenset(wanted)
 
-    union = frozenset().union(*(offered(clip) for clip in clips))
-    for clip in clips:
-        if offered(clip) != union and not clip.planned:
-            differing = ", ".join(sorted(offered(clip) ^ union))
-            raise ClipError(
-                f"{clip.path}: expected the same buffers as in the other clips, but {differing} differs; "
-                "name the ones to read in `buffers`, or leave one of the clips out."
-            )
+    sets = [offered(clip) for clip in clips]
+    union, usual = frozenset().union(*sets), max(sets, key=sets.count)
+    for expected in (usual, union):
+        for clip, found in zip(clips, sets, strict=True):
+            if found != expected and not clip.planned:
+                raise ClipError(
+                    f"{clip.path}: expected the same buffers as in the other clips, but "
+                    f"{', '.join(sorted(found ^ expected))} differs; name the ones to read in `buffers`, or leave one "
+                    "of the clips out."
+                )
     return union
