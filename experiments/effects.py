@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxdn
-from experiments.small_rooms import CASES, Case
+from experiments.small_rooms import CASES, FRAMES, Case
 from jaxdn import effects
 from jaxdn.clips import read_frames
 from jaxdn.commands.errors import told_plainly
@@ -58,7 +58,6 @@ class Settings:
     """Three scenes, few samples."""
     size: int = 128
     """Width and height in pixels."""
-    frames: int = 8
     reference_spp: int = 64
     out: Path = Path("runs/effects.json")
 
@@ -76,8 +75,7 @@ def in_turns(programs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, f
 
 def render(case: Case, settings: Settings, folder: Path) -> tuple[dict[str, Any], dict[str, Path]]:
     """Render one scene with everything and by plan; seconds, bytes and the clips."""
-    frames = settings.frames
-    scene = SceneFile(case._replace(animation={**case.animation, "frames": frames}).write(folder))
+    scene = SceneFile(case.write(folder))
     render_clip(scene, folder / "warm", width=settings.size, height=settings.size, frames=1, reference_spp=2)
 
     start = time.perf_counter()
@@ -99,7 +97,7 @@ def render(case: Case, settings: Settings, folder: Path) -> tuple[dict[str, Any]
                 clips[name][-1],
                 width=settings.size,
                 height=settings.size,
-                frames=frames,
+                frames=FRAMES,
                 reference_spp=settings.reference_spp,
                 plan=plans[name],
             )
@@ -124,6 +122,7 @@ def denoise(denoiser: jaxdn.Denoiser, params: Any, clips: dict[str, Path]) -> di
     runs: dict[str, Callable[[], Any]] = {}
     told: dict[str, Any] = {"bytes": {}, "operations": {}}
     for name, clip in clips.items():
+        # The last frame: what moves has begun to move by then, and has not come to rest.
         frame = [jax.tree.map(jax.numpy.asarray, stored.frame) for stored in read_frames(clip)][-1]
         used: Frame = only(frame, denoiser.reads)
         state = denoiser.start(params, used)
@@ -148,7 +147,7 @@ def main(settings: Settings) -> None:
     """Measure every scene, print the table, write the JSON."""
     print(f"rendering with Mitsuba's {use_variant()}", flush=True)
     if settings.quick:
-        settings.size, settings.reference_spp, settings.frames = 64, 8, 4
+        settings.size, settings.reference_spp = 64, 8
     svgf, network = jaxdn.denoisers.svgf(), jaxdn.denoisers.ntd(size="small")
     params = network.init(jax.random.key(0), Frame(np.zeros((16, 16, 3), np.float32)))
     results: dict[str, Any] = {}
