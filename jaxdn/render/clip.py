@@ -78,9 +78,7 @@ def render_frame(
     """
     _check_options(width, height, layers, reference_spp)
     accumulate, _ = tracer(use_variant(variant))
-    depth = max_depth or (plan and plan.max_depth) or scene.max_depth
-    if max_depth is not None and max_depth < 1:
-        raise ValueError(f"max_depth: expected at least 1 (emission only), got {max_depth}.")
+    depth = _path_length(scene, max_depth, plan)
     repeated = plan is not None and plan.held[frame] != frame
     wanted = frozenset(Frame._fields if plan is None else () if repeated else plan.frames[frame])
     if wanted & _MOTION and previous is None and frame > 0:
@@ -166,7 +164,7 @@ def render_clip(
         "layers": sorted(layers),
         "reference_spp": reference_spp,
         "variant": chosen,
-        "max_depth": max_depth or (plan and plan.max_depth) or scene.max_depth,
+        "max_depth": _path_length(scene, max_depth, plan),
         "plan": None if plan is None else plan.record(),
         "seed": seed,
         "jittered": tracer(chosen)[1],
@@ -219,6 +217,13 @@ def render_clip(
         if progress is not None:
             progress(frame)
     return folder
+
+
+def _path_length(scene: AnimatedScene, max_depth: int | None, plan: Plan | None) -> int:
+    """A user's own wins, then the plan's, then the scene's."""
+    if max_depth is not None and max_depth < 1:
+        raise ValueError(f"max_depth: expected at least 1 (emission only), got {max_depth}.")
+    return max_depth or (plan.max_depth if plan else None) or scene.max_depth
 
 
 def tracer(variant: str) -> tuple[Callable[..., Light], bool]:

@@ -32,10 +32,8 @@ class PathDepth(NamedTuple):
     """Path length -> mean reflected radiance, as measured."""
 
 
-def measure_depth(
-    scene: AnimatedScene, *, bound: float = BOUND, frame: int = 0, variant: str | None = None
-) -> PathDepth:
-    """The shortest path length that leaves out at most ``bound`` of the reflected light, measured in one frame.
+def measure_depth(scene: AnimatedScene, *, bound: float = BOUND) -> PathDepth:
+    """The shortest path length that leaves out at most ``bound`` of the reflected light, measured in the first frame.
 
     Light that the camera sees directly does not count: beside a bright window everything else would be negligible.
     There are 16 samples for each of 24 x 24 pixels; all depths follow the same paths, so that their differences are
@@ -47,11 +45,11 @@ def measure_depth(
         raise ValueError(f"bound: expected a share of the light between 0 and 1, got {bound!r}.")
     from jaxdn.render.clip import tracer
 
-    accumulate, _ = tracer(use_variant(variant))
-    built = scene.build(frame, _SIDE, _SIDE)
+    accumulate, _ = tracer(use_variant())
+    built = scene.build(0, _SIDE, _SIDE)
     light: dict[int, float] = {}
     for depth in sorted({min(depth, scene.max_depth) for depth in _DEPTHS}):
-        sums = accumulate(built, seed=0, frame=frame, stream=DEPTH, first=0, count=_SAMPLES, max_depth=depth)
+        sums = accumulate(built, seed=0, frame=0, stream=DEPTH, first=0, count=_SAMPLES, max_depth=depth)
         light[depth] = float(np.mean(sums.direct + sums.indirect)) / _SAMPLES
         if depth >= 4 and _remaining(light) <= bound:
             break

@@ -47,7 +47,7 @@ class Choice(NamedTuple):
     """A variant that was seen to work, the LLVM library it needs ("" for none), and a sentence that says why."""
 
     variant: str
-    library: str
+    llvm: str
     reason: str
 
 
@@ -131,8 +131,8 @@ def choose_variant(requested: str | None = None) -> Choice:
 def use_variant(requested: str | None = None) -> str:
     """Switch this thread to the variant of :func:`choose_variant` and return its name."""
     choice = choose_variant(requested)
-    if choice.library:
-        os.environ[_LIBRARY] = choice.library
+    if choice.llvm:
+        os.environ[_LIBRARY] = choice.llvm
     mitsuba: Any = importlib.import_module("mitsuba")
     if mitsuba.variant() != choice.variant:
         mitsuba.set_variant(choice.variant)

@@ -26,8 +26,6 @@ class Subject(NamedTuple):
     repairs: bool = False
     """It has to make something usable of anything; the others may hand on what is no number in their input."""
     bounds: tuple[float, float] = (-np.inf, np.inf)
-    computes: tuple[str, ...] = ("float32", "bfloat16 inputs")
-    """Precisions that it has."""
 
 
 def denoiser_subjects() -> list[Subject]:
