@@ -1,39 +1,39 @@
 """Broken files: only documented errors, never a crash, a hang, a huge allocation or a file where none was asked for.
 
-    python -m experiments.fuzz --inputs 100000      # resumes nothing: input n is the same in every run
+    python -m experiments.fuzz --inputs 100000      # some minutes; counts in runs/fuzz.json
     python -m experiments.fuzz --only exr --first 4711 --inputs 1
 
-Real files (a frame as EXR, a clip's record, an animation, weights and their JSON) are broken in one to eight ways each:
-bits flipped, bytes cut, doubled, or replaced by numbers that are often badly handled. Reading happens in processes of
-their own with a limit on memory and on time, so that whatever dies is told with the number of the input that killed it.
+Input n of a kind is the same in every run (:mod:`experiments.fuzz_inputs`), so ``--first`` continues where another run
+stopped and repeats a single input. Reading happens in processes of their own with a limit on memory and on time, so
+that whatever dies is told with the number of the input that killed it.
 """
 
 import contextlib
+import faulthandler
 import json
 import os
-import random
 import resource
-import signal
+import shutil
 import subprocess
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import tyro
 
+from experiments.fuzz_inputs import KINDS, broken, good_files
 from jaxdn.commands.errors import told_plainly
 
-KINDS = ("exr", "record", "animation", "weights", "description")
 DOCUMENTED = (ValueError, OSError)
 """What a broken file may raise: ClipError is a ValueError; a file of nothing may not open."""
-SECONDS = 20
-MEMORY = 6 << 30
-_NUMBERS = (b"-1", b"0", b"1e999", b"NaN", b"99999999999999999999", b"null", b'"x"', b"[]", b"{}", b"true", b"-0.0")
+SECONDS = 30
+MEMORY = 1 << 30
+"""Bytes that reading a file of some kilobytes may take beyond what the process has already."""
 
 
 @dataclass
@@ -42,75 +42,39 @@ class Settings:
 
     inputs: int = 100_000
     """How many in all, shared between the kinds."""
-    only: Literal["all", "exr", "record", "animation", "weights", "description"] = "all"
+    only: Literal["all", "exr", "foreign", "record", "animation", "weights", "description"] = "all"
     first: int = 0
-    """Number of the first input."""
-    batch: int = 2000
+    """Number of the first input of each kind."""
+    batch: int = 5000
     """Inputs for each process."""
+    out: Path = Path("runs/fuzz.json")
+    """Where the counts go, after every batch."""
 
 
-def good_files(folder: Path) -> dict[str, bytes]:
-    """One whole file of each kind."""
-    import jax
+class Told(NamedTuple):
+    """What became of inputs."""
 
-    from jaxdn.clips import write_clip
-    from jaxdn.denoisers import ntd
-    from jaxdn.frame import Clip, Frame
-    from jaxdn.weights import save_weights
+    read: int
+    refused: int
+    """With a documented error."""
+    bad: list[tuple[int, str]]
+    """The number of each input that was not handled, and what happened."""
 
-    rng = np.random.default_rng(0)
-    light = rng.random((2, 6, 8, 3), np.float32)
-    frames = Frame(light, albedo=light, depth=light[..., :1], motion=light[..., :2])
-    write_clip(Clip(frames, light), folder / "clip", record={"cameras": [{"x_fov": 60.0}] * 2, "plan": None})
-    tiny = {"size": [[1]] * 5}
-    params = ntd(size=((1,),) * 5).init(jax.random.key(0), Frame(light[0]))
-    save_weights(folder / "weights.safetensors", params, factory="ntd", options=tiny, record={})
-    animation = {
-        "frames": 4,
-        "camera": [{"frame": 0, "origin": [0, 1, 5], "target": [0, 1, 0], "fov": 40}, {"frame": 3, "origin": [1, 1, 5],
-                   "target": [0, 1, 0], "fov": 40}],
-        "shapes": {"box": {"pivot": [0, 0, 0], "keys": [{"frame": 0, "angle": 10, "axis": [0, 1, 0]}]}},
-        "inserted": [{"id": "ball", "type": "sphere", "size": 0.4, "color": [0.8, 0.2, 0.1], "roughness": 0.3}],
-        "lights": {"lamp": [{"frame": 0, "scale": 1}]},
-    }  # fmt: skip
-    return {
-        "exr": (folder / "clip" / "frame_0000.exr").read_bytes(),
-        "record": (folder / "clip" / "clip.json").read_bytes(),
-        "animation": json.dumps(animation).encode(),
-        "weights": (folder / "weights.safetensors").read_bytes(),
-        "description": (folder / "weights.json").read_bytes(),
-    }
-
-
-def broken(good: bytes, number: int) -> bytes:
-    """Input ``number``: the good bytes with one to eight things wrong."""
-    draw = random.Random(number)
-    data = bytearray(good)
-    for _ in range(draw.randint(1, 8)):
-        at, length = draw.randrange(len(data) + 1), draw.randint(1, 16)
-        how = draw.randrange(6)
-        if how == 0 and data:
-            data[at % len(data)] ^= 1 << draw.randrange(8)
-        elif how == 1:
-            del data[at : at + length]
-        elif how == 2:
-            data[at:at] = data[at : at + length]
-        elif how == 3:
-            data[at : at + length] = draw.randbytes(length)
-        elif how == 4:
-            data[at : at + draw.randint(1, 4)] = draw.choice(_NUMBERS)
-        elif draw.random() < 0.2:
-            del data[at:]
-        else:
-            data[at : at + 4] = draw.choice((0, 1, 2**31 - 1, 2**32 - 1, 2**24)).to_bytes(4, "little")
-    return bytes(data)
+    @property
+    def inputs(self) -> int:
+        """How many there were."""
+        return self.read + self.refused + len(self.bad)
 
 
 def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
     """For each kind a function that writes the bytes where they belong and reads them as a user would."""
     from jaxdn.clips import read_clip, read_frame
-    from jaxdn.render.animation import check_animation, read_animation
+    from jaxdn.clips.cache import open_cached
+    from jaxdn.clips.facts import read_facts
+    from jaxdn.render.animation import CameraKeys, RigidKeys, check_animation, light_scale, read_animation
     from jaxdn.weights import load_weights
+
+    clip, foreign, weights = folder / "clip", folder / "foreign", folder / "weights.safetensors"
 
     def reader(path: Path, read: Callable[[], Any]) -> Callable[[bytes], Any]:
         def run(data: bytes) -> Any:
@@ -120,103 +84,156 @@ def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
         return run
 
     def animated() -> None:
-        check_animation(read_animation(folder / "animation.json"), ["box"])
+        keys = read_animation(folder / "animation.json")
+        check_animation(keys, ["box"])
+        if "camera" in keys:
+            CameraKeys(keys["camera"])(1.5)
+        for motion in keys.get("shapes", {}).values():
+            RigidKeys(motion["keys"], motion.get("pivot", (0, 0, 0)))(1.5)
+        for scales in keys.get("lights", {}).values():
+            light_scale(scales, 1.5)
 
-    clip, weights = folder / "clip", folder / "weights.safetensors"
+    def trained_on() -> None:
+        read_clip(clip)
+        read_facts(clip)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a reference that is not finite is told, and taken as 0
+            open_cached(clip, cache=folder / "cache")
+
     return {
         "exr": reader(clip / "frame_0000.exr", lambda: read_frame(clip / "frame_0000.exr")),
-        "record": reader(clip / "clip.json", lambda: read_clip(clip)),
+        "foreign": reader(foreign / "shot_0001.exr", lambda: read_clip(foreign)),
+        "record": reader(clip / "clip.json", trained_on),
         "animation": reader(folder / "animation.json", animated),
         "weights": reader(weights, lambda: load_weights(weights)),
         "description": reader(weights.with_suffix(".json"), lambda: load_weights(weights)),
     }
 
 
-def child(kind: str, first: int, count: int) -> None:
-    """Read a run of inputs; a line for each that raised what it should not, with its number."""
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    signal.signal(signal.SIGALRM, _too_long)
+def child(kind: str, first: int, count: int, source: Path) -> None:
+    """Read a run of inputs; a line for each that says what became of it."""
+    faulthandler.enable()
+    good = [file.read_bytes() for file in sorted((source / "good" / kind).iterdir())]
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place) / "in"
-        folder.mkdir()
-        good = good_files(folder)
+        shutil.copytree(source / "in", folder)
         read = readers(folder)[kind]
-        expected = _listing(Path(place)) | {Path("in/animation.json")}
+        read(good[0])  # imports what it needs, before memory is counted
+        room = _address_space() + MEMORY
+        resource.setrlimit(resource.RLIMIT_AS, (room, room))
+        expected = _listing(Path(place))
         for number in range(first, first + count):
             print(f"@{number}", flush=True)
-            signal.alarm(SECONDS)
-            try:
-                with contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
-                    read(broken(good[kind], number))
-                outcome = "read"
-            except DOCUMENTED:
-                outcome = "refused"
-            except BaseException as error:
-                outcome = f"BAD {type(error).__name__}: {str(error)[:200]}"
-            signal.alarm(0)
+            faulthandler.dump_traceback_later(SECONDS, exit=True)  # even where no Python runs
+            outcome = _read_one(read, broken(kind, good, number))
+            faulthandler.cancel_dump_traceback_later()
             stray = _listing(Path(place)) - expected
             if stray:
                 outcome = f"BAD wrote {sorted(map(str, stray))}"
-            print(outcome.replace("\n", " "), flush=True)
+            print(outcome.encode("ascii", "backslashreplace").decode().replace("\n", " "), flush=True)
 
 
-def _too_long(*_: Any) -> None:
-    raise TimeoutError(f"more than {SECONDS} s")
+def _read_one(read: Callable[[bytes], Any], data: bytes) -> str:
+    try:
+        with contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
+            read(data)
+        return "read"
+    except DOCUMENTED as error:
+        greedy = isinstance(error.__cause__ or error.__context__, MemoryError)
+        return f"BAD more than {MEMORY >> 20} MiB: {str(error)[:300]}" if greedy else "refused"
+    except BaseException as error:
+        return f"BAD {type(error).__name__}: {str(error)[:300]}"
+
+
+def _address_space() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def _listing(folder: Path) -> set[Path]:
-    return {path.relative_to(folder) for path in folder.rglob("*")}
+    """Every file under a folder but those of the cache that reading a clip for training is told to make."""
+    found = {path.relative_to(folder) for path in folder.rglob("*")}
+    return {path for path in found if path.parts[:2] != ("in", "cache")}
 
 
-def run_kind(kind: str, first: int, count: int, batch: int) -> dict[str, Any]:
-    """Feed one kind in processes of ``batch`` inputs; a process that dies loses its own input, not the ones after."""
-    told: dict[str, Any] = {"read": 0, "refused": 0, "bad": []}
+def prepare(source: Path) -> Path:
+    """Write the good files where the processes that read find them; returns the folder."""
+    (source / "in").mkdir(parents=True)
+    for kind, files in good_files(source / "in").items():
+        (source / "good" / kind).mkdir(parents=True)
+        for index, data in enumerate(files):
+            (source / "good" / kind / f"{index:02d}").write_bytes(data)
+    return source
+
+
+def run_kind(kind: str, first: int, count: int, source: Path, *, repeat: bool = True) -> Told:
+    """Feed inputs of one kind; a process that dies loses its own input, not the ones after.
+
+    With ``repeat`` that input gets a second chance: a machine that stood still for a while is no hang.
+    """
+    counts, bad = {"read": 0, "refused": 0}, []
     done = first
     while done < first + count:
-        wanted = min(batch, first + count - done)
-        command = [sys.executable, "-m", "experiments.fuzz", "--child", kind, str(done), str(wanted)]
+        command = [sys.executable, "-m", "experiments.fuzz", "--child", kind, *map(str, (done, first + count - done))]
         environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-        process = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-        last = done - 1
+        process = subprocess.run(
+            [*command, str(source)], capture_output=True, text=True, errors="replace", env=environment, check=False
+        )
+        last, open_input = done - 1, False
         for line in process.stdout.splitlines():
             if line.startswith("@"):
-                last = int(line[1:])
-            elif line.startswith("BAD"):
-                told["bad"].append((last, line[4:]))
-            elif line in told:
-                told[line] += 1
-        finished = told["read"] + told["refused"] + len(told["bad"]) == last + 1 - first
-        if process.returncode and not (finished and last == done + wanted - 1):
-            if last < done:
-                raise RuntimeError(f"the fuzzer's own process failed: {process.stderr[-2000:]}")
-            told["bad"].append((last, f"the process died ({process.returncode}): {process.stderr[-200:]}"))
+                last, open_input = int(line[1:]), True
+            elif open_input and (line in counts or line.startswith("BAD ")):
+                open_input = False
+                if line in counts:
+                    counts[line] += 1
+                else:
+                    bad.append((last, line[4:]))
+        if last < done:
+            raise RuntimeError(f"the fuzzer's own process failed: {process.stderr[-2000:]}")
+        if open_input and repeat:
+            again = run_kind(kind, last, 1, source, repeat=False)
+            bad += again.bad
+            counts["read"], counts["refused"] = counts["read"] + again.read, counts["refused"] + again.refused
+        elif open_input:
+            bad.append((last, f"the process died ({process.returncode}): {process.stderr[-600:]}"))
         done = last + 1
-    return told
+    return Told(counts["read"], counts["refused"], bad)
 
 
 def main(settings: Settings) -> int:
     """Feed all kinds, print the counts and every input that was not handled; the exit code says whether any was."""
     kinds = KINDS if settings.only == "all" else (settings.only,)
-    worst = 0
-    for kind in kinds:
-        start = time.monotonic()
-        told = run_kind(kind, settings.first, -(-settings.inputs // len(kinds)), settings.batch)
-        bad = told["bad"]
-        count = told["read"] + told["refused"] + len(bad)
-        print(
-            f"{kind}: {count} inputs, {told['read']} read, {told['refused']} refused, {len(bad)} bad "
-            f"({time.monotonic() - start:.0f} s)",
-            flush=True,
-        )
-        for number, reason in bad[:20]:
-            print(f"  input {number}: {reason}", flush=True)
-        worst |= bool(bad)
-    return worst
+    each = -(-settings.inputs // len(kinds))
+    report: dict[str, Any] = {"first": settings.first, "inputs": 0, "read": 0, "refused": 0, "bad": 0, "kinds": {}}
+    settings.out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as place:
+        source = prepare(Path(place) / "source")
+        for kind in kinds:
+            began, told = time.monotonic(), Told(0, 0, [])
+            while told.inputs < each:
+                size = min(settings.batch, each - told.inputs)
+                new = run_kind(kind, settings.first + told.inputs, size, source)
+                told = Told(told.read + new.read, told.refused + new.refused, told.bad + new.bad)
+                seconds = time.monotonic() - began
+                report["kinds"][kind] = {"inputs": told.inputs, **told._asdict(), "seconds": round(seconds, 1)}
+                for name in ("inputs", "read", "refused"):
+                    report[name] = sum(entry[name] for entry in report["kinds"].values())
+                report["bad"] = sum(len(entry["bad"]) for entry in report["kinds"].values())
+                settings.out.write_text(json.dumps(report, indent=1) + "\n")
+                print(
+                    f"{kind}: {told.inputs} of {each} inputs, {told.read} read, {told.refused} refused, "
+                    f"{len(told.bad)} bad ({seconds:.0f} s)",
+                    flush=True,
+                )
+                for number, reason in new.bad[:20]:
+                    print(f"  input {number}: {reason}", flush=True)
+    print(f"{report['inputs']} inputs, {report['bad']} not handled: {settings.out}")
+    return int(report["bad"] > 0)
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--child"]:
-        child(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))
+        child(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]), Path(sys.argv[5]))
     else:
         with told_plainly():
             sys.exit(main(tyro.cli(Settings, description=Settings.__doc__)))

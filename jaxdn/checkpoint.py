@@ -1,28 +1,41 @@
 """Checkpoints of a training run (Orbax): parameters, optimiser and the position in the data, all or nothing."""
 
+import hashlib
+import json
+import shutil
+import warnings
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
 
 from jaxdn.training import TrainState
+
+_DIGEST = "sha256"
+"""Where the digest lies in what is stored beside the state; checkpoints of earlier versions have none."""
 
 
 class Checkpoints:
     """The checkpoints of one run in one folder; the newest two are kept.
 
     Orbax writes each beside its place and renames it when it is whole: a run killed while writing continues from the
-    one before. Saving happens in the background; :meth:`close` waits for it.
+    one before. Each holds a digest of its own values, so that damage which still parses is noticed too. Saving happens
+    in the background; :meth:`close` waits for it.
     """
 
     def __init__(self, folder: Path):
+        self._folder = folder.absolute()
         options = ocp.CheckpointManagerOptions(max_to_keep=2, cleanup_tmp_directories=True)
-        self._manager = ocp.CheckpointManager(folder.absolute(), options=options)
+        self._manager = ocp.CheckpointManager(self._folder, options=options)
 
     def save(self, state: TrainState, data: dict[str, Any]) -> None:
         """Keep the state after ``state.step`` updates with the data iterator's own state (JSON)."""
-        arguments = ocp.args.Composite(state=ocp.args.StandardSave(state._asdict()), data=ocp.args.JsonSave(data))
+        # Copies: on a CPU an array may be written from where it lies, and the next update takes over its memory.
+        values = jax.tree.map(np.array, state._asdict())
+        beside = {**data, _DIGEST: digest(values, data)}
+        arguments = ocp.args.Composite(state=ocp.args.StandardSave(values), data=ocp.args.JsonSave(beside))
         self._manager.save(int(state.step), args=arguments, force=True)
 
     def latest(self) -> int | None:
@@ -32,26 +45,50 @@ class Checkpoints:
     def restore(self, like: TrainState) -> tuple[TrainState, dict[str, Any]] | None:
         """The newest checkpoint as a state shaped ``like`` this one, and the data's position; None where there is none.
 
-        A checkpoint that cannot be read (torn by a crash of the machine) is passed over for the one before it.
-        Raises ValueError when the newest readable one belongs to another network or recipe.
+        A checkpoint that cannot be read (torn by a crash of the machine, or damaged) is moved out of the way, into
+        ``damaged-<step>`` beside the folder, with a UserWarning, and the one before it is taken. Raises ValueError when
+        none of them can be read as this network's.
         """
+        failed: dict[int, Exception] = {}
         for step in sorted(self._manager.all_steps(), reverse=True):
-            template = ocp.args.StandardRestore(jax.tree.map(ocp.utils.to_shape_dtype_struct, like._asdict()))
             try:
-                found = self._manager.restore(
-                    step, args=ocp.args.Composite(state=template, data=ocp.args.JsonRestore())
-                )
-            except (FileNotFoundError, OSError):
+                found = self._read(step, like)
+            except Exception as error:  # what a damaged byte leads to in Orbax has no common base
+                failed[step] = error
                 continue
-            except (ValueError, KeyError) as error:
-                if _is_torn(error):
-                    continue
-                raise ValueError(
-                    f"checkpoint {self._manager.directory / str(step)}: expected the parameters of this network, got "
-                    f"others ({str(error).splitlines()[0]}); give the run another name or delete the folder."
-                ) from error
-            return TrainState(**found.state), found.data
+            for damaged, error in failed.items():
+                self._put_aside(damaged, error, continues=step)
+            if failed:
+                self._manager.reload()
+            return found
+        if failed:
+            newest = max(failed)
+            raise ValueError(
+                f"checkpoints {self._folder}: expected the parameters of this network, and none of the checkpoints "
+                f"({', '.join(map(str, sorted(failed)))}) can be read as such ({_told(failed[newest])}). If another "
+                "network was trained here, give the run another name; if the files are damaged, delete the folder and "
+                "start over."
+            ) from failed[newest]
         return None
+
+    def _read(self, step: int, like: TrainState) -> tuple[TrainState, dict[str, Any]]:
+        template = ocp.args.StandardRestore(jax.tree.map(ocp.utils.to_shape_dtype_struct, like._asdict()))
+        found = self._manager.restore(step, args=ocp.args.Composite(state=template, data=ocp.args.JsonRestore()))
+        data = dict(found.data)
+        stored = data.pop(_DIGEST, None)
+        if stored is not None and stored != digest(found.state, data):
+            raise ValueError("its values are not those that were written")
+        return TrainState(**found.state), data
+
+    def _put_aside(self, step: int, error: Exception, *, continues: int) -> None:
+        aside = self._folder.parent / f"damaged-{step}"
+        shutil.rmtree(aside, ignore_errors=True)
+        shutil.move(self._folder / str(step), aside)
+        warnings.warn(
+            f"checkpoint {self._folder / str(step)} is damaged ({_told(error)}) and was moved to {aside}; training "
+            f"continues from the checkpoint after {continues} updates.",
+            stacklevel=3,
+        )
 
     def close(self) -> None:
         """Wait until everything is on disk."""
@@ -59,7 +96,15 @@ class Checkpoints:
         self._manager.close()
 
 
-def _is_torn(error: Exception) -> bool:
-    """Whether an error speaks of damaged bytes and not of another tree."""
-    words = str(error).lower()
-    return any(word in words for word in ("corrupt", "data_loss", "truncated", "decode", "checksum", "out_of_range"))
+def digest(values: Any, data: dict[str, Any]) -> str:
+    """SHA-256 of the names, shapes, types and bytes of all arrays, and of the data's position."""
+    found = hashlib.sha256(json.dumps(data, sort_keys=True).encode())
+    for path, leaf in jax.tree_util.tree_leaves_with_path(values):
+        array = np.ascontiguousarray(leaf)
+        found.update(f"{jax.tree_util.keystr(path)} {np.shape(leaf)} {array.dtype}".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()
+
+
+def _told(error: Exception) -> str:
+    return f"{type(error).__name__}: {str(error).splitlines()[0][:200]}" if str(error) else type(error).__name__

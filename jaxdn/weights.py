@@ -83,7 +83,7 @@ def load_weights(name_or_path: str | Path) -> tuple[Denoiser, dict[str, Any]]:
     try:
         description = json.loads(beside.read_text())
         factory, options = description["factory"], dict(description["options"])
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(
             f"weights {path}: expected {beside.name} beside it with 'factory' and 'options', got {error!r}; "
             "copy both files together."

@@ -7,6 +7,7 @@ cache may be deleted at any time.
 
 import glob
 import hashlib
+import itertools
 import os
 import shutil
 import tempfile
@@ -107,7 +108,8 @@ def read_window(
 
 def _stamp(path: Path, count: int) -> str:
     digest = hashlib.sha256(f"{_VERSION}".encode())
-    for file in (path / "clip.json", *(frame_path(path, index) for index in range(count))):
+    frames = (frame_path(path, index) for index in range(count))  # one by one: the record may claim any number
+    for file in itertools.chain([path / "clip.json"], frames):
         try:
             facts = file.stat()
         except OSError as error:

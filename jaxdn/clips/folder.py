@@ -4,6 +4,7 @@
 unfinished, never a clip.
 """
 
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ FORMAT = 1
 """The version of the layout that this code writes and reads."""
 
 _RECORD = "clip.json"
+_BUFFERS = frozenset(Frame._fields[1:])
 
 
 def frame_path(folder: str | Path, index: int) -> Path:
@@ -89,11 +91,8 @@ def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
     record = read_record(folder)
     layers_for(spp, record["layers"], folder)
     count, size = record["frames"], (record["height"], record["width"])
-    missing = [index for index in range(count) if not frame_path(folder, index).is_file()]
-    if missing:
-        shown = ", ".join(map(str, missing[:8])) + (" ..." if len(missing) > 8 else "")
-        raise ClipError(f"{folder}: {len(missing)} of {count} frames are missing ({shown}); render them again.")
-    held = held_frames(record, folder)
+    _all_there(folder, count)
+    held = held_frames(record)
 
     def frames() -> Iterator[StoredFrame]:
         first: tuple[str, ...] | None = None
@@ -130,18 +129,19 @@ def is_planned(record: Mapping[str, Any]) -> bool:
     return record.get("plan") is not None
 
 
-def held_frames(record: Mapping[str, Any], folder: str | Path) -> list[int]:
-    """For each frame of a clip the one whose buffers it shares; raises ClipError for a record that makes no sense."""
-    count = record["frames"]
-    if not is_planned(record):
-        return list(range(count))
-    plan = record["plan"]
-    held = plan.get("held") if isinstance(plan, Mapping) else None
-    frames = plan.get("frames") if isinstance(plan, Mapping) else None
-    sound = isinstance(held, list) and len(held) == count and isinstance(frames, list) and len(frames) == count
-    if not sound or not all(type(at) is int and 0 <= at <= index for index, at in enumerate(held or [])):
-        raise ClipError(f"{Path(folder) / _RECORD}: plan: expected what each of {count} frames holds; render it again.")
-    return list(held or [])
+def held_frames(record: Mapping[str, Any]) -> list[int]:
+    """For each frame of a clip the one whose buffers it shares."""
+    return list(record["plan"]["held"]) if is_planned(record) else list(range(record["frames"]))
+
+
+def _all_there(folder: Path, count: int) -> None:
+    """Raise ClipError unless there are ``count`` frames; as fast for a record that claims any number of them."""
+    numbers = {int(path.stem[6:]) for path in folder.glob("frame_*.exr") if path.stem[6:].isdecimal()}
+    there = {index for index in numbers if index < count and frame_path(folder, index).is_file()}
+    if len(there) < count:
+        first = list(itertools.islice((index for index in range(count) if index not in there), 9))
+        shown = ", ".join(map(str, first[:8])) + (" ..." if len(first) > 8 else "")
+        raise ClipError(f"{folder}: {count - len(there)} of {count} frames are missing ({shown}); render them again.")
 
 
 def _from(stored: StoredFrame, source: StoredFrame) -> StoredFrame:
@@ -219,4 +219,22 @@ def _checked(record: Any, file: Path) -> dict[str, Any]:
     layers = record.get("layers")
     if not isinstance(layers, list) or not layers or not all(type(n) is int and n > 0 for n in layers):
         raise ClipError(f"{file}: layers: expected a list of sample counts such as [1, 2, 4], got {layers!r}.")
+    _check_plan(record.get("plan"), record["frames"], file)
+    cameras = record.get("cameras")
+    if cameras is not None and (not isinstance(cameras, list) or len(cameras) < record["frames"]):
+        raise ClipError(f"{file}: cameras: expected a list with one for each frame; render the clip again.")
     return record
+
+
+def _check_plan(plan: Any, count: int, file: Path) -> None:
+    """Raise ClipError unless a plan is None or says, for each frame, which buffers it has and whose they are."""
+    if plan is None:
+        return
+    held = plan.get("held") if isinstance(plan, Mapping) else None
+    frames = plan.get("frames") if isinstance(plan, Mapping) else None
+    sound = isinstance(held, list) and isinstance(frames, list) and len(held) == len(frames) == count
+    if not sound or not all(type(at) is int and 0 <= at <= index for index, at in enumerate(held or [])):
+        raise ClipError(f"{file}: plan: expected what each of {count} frames holds; render it again.")
+    for names in frames or []:
+        if not isinstance(names, list) or not all(isinstance(name, str) and name in _BUFFERS for name in names):
+            raise ClipError(f"{file}: plan: expected names of buffers, got {names!r}; render it again.")

@@ -21,6 +21,7 @@ things rest. ``lights`` names emitters, or shapes that emit, and scales their ra
 
 import difflib
 import json
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -152,7 +153,7 @@ def read_animation(path: Path) -> dict[str, Any]:
 
     try:
         animation = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
-    except (ValueError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"animation {path}: expected JSON, got something else ({error}).") from error
     return animation
 
@@ -299,7 +300,10 @@ def _known(value: Any, names: Sequence[str], place: str) -> None:
 
 def _numbers(value: Any, count: int, place: str) -> np.ndarray:
     sound = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == count
-    if not sound or any(isinstance(x, bool) or not isinstance(x, int | float) or not np.isfinite(x) for x in value):
+    # Compared and not asked whether it is finite: a whole number may be larger than any float.
+    if not sound or not all(
+        isinstance(x, int | float) and not isinstance(x, bool) and abs(x) <= sys.float_info.max for x in value
+    ):
         raise ValueError(f"{place}: expected {count} finite number{'s' * (count > 1)}, got {value!r}.")
     return np.array(value, float)
 
