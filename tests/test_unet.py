@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxdn.networks import LARGE, LEVELS, SMALL
-from jaxdn.networks.unet import NEGATIVE_SLOPE, count, unet
+from jaxdn.networks.unet import NEGATIVE_SLOPE, Network, count, unet
 
 GROUPS = (3, 3, 3, 1, 3, 1)
 HEADS = (51, 26, 26)
@@ -129,3 +129,54 @@ def test_errors_say_what_was_expected(rng: np.random.Generator, key: jax.Array) 
         network.apply(params, features(rng, (3, 3)))
     with pytest.raises(ValueError, match="features: expected"):
         network.apply(params, [None, None])
+
+
+@pytest.mark.parametrize("absent", [(), (1, 3)])
+def test_onnxruntime_is_the_same_network(absent: tuple[int, ...], rng: np.random.Generator, key: jax.Array) -> None:
+    """Values of the engine and its gradient, with all features and without some."""
+    pytest.importorskip("onnxruntime")
+    plain, engine = (unet(GROUPS, HEADS, widths=TINY, implementation=name) for name in (None, "onnxruntime"))
+    params = jax.tree.map(lambda leaf: leaf + 0.01, plain.init(key))
+    inputs = [None if index in absent else group for index, group in enumerate(features(rng, GROUPS))]
+
+    def both(network: Network) -> tuple:
+        def loss(params: dict) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+            heads = network.apply(params, inputs)
+            return sum(jnp.sum(jnp.sin(head)) for head in heads), heads
+
+        return jax.jit(jax.grad(loss, has_aux=True))(params)
+
+    wanted, got = both(plain), both(engine)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), got, wanted)
+
+
+def test_onnxruntime_follows_the_weights_under_scan_and_vmap(rng: np.random.Generator, key: jax.Array) -> None:
+    """The engine keeps weights laid out for itself; other weights in the next call give the other image."""
+    pytest.importorskip("onnxruntime")
+    plain, engine = (unet((3, 2), (5, 3, 2), widths=TINY, implementation=name) for name in (None, "onnxruntime"))
+    inputs = [jnp.stack([group, 2 * group]) for group in features(rng, (3, 2))]
+    run = jax.jit(engine.apply)
+    for scale in (1.0, 1.5, 1.0):
+        params = jax.tree.map(lambda leaf, scale=scale: scale * leaf, plain.init(key))
+        wanted = jax.vmap(lambda *groups, params=params: plain.apply(params, list(groups)))(*inputs)
+        for index in range(2):
+            got = run(params, [group[index] for group in inputs])
+            jax.tree.map(lambda a, b, i=index: np.testing.assert_allclose(a, b[i], rtol=1e-4, atol=1e-5), got, wanted)
+        mapped = jax.vmap(lambda *groups, params=params: engine.apply(params, list(groups)))(*inputs)
+        _, scanned = jax.lax.scan(lambda _, groups, params=params: (None, engine.apply(params, groups)), None, inputs)
+        for got in (mapped, scanned):
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), got, wanted)
+
+
+def test_onnxruntime_takes_float32_alone(rng: np.random.Generator, key: jax.Array) -> None:
+    pytest.importorskip("onnxruntime")
+    network = unet((3, 2), (5, 3, 2), widths=TINY, implementation="onnxruntime")
+    inputs = [group.astype(jnp.bfloat16) for group in features(rng, (3, 2))]
+    with pytest.raises(ValueError, match="float32"):
+        network.apply(network.init(key), inputs)
+
+
+def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"pip install .*jaxdn\[onnx\]"):
+        unet((3, 2), (5, 3, 2), widths=TINY, implementation="onnxruntime")

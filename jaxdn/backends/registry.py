@@ -1,21 +1,31 @@
 """Which implementation of an operation runs: the fastest the platform supports, or the one that was named."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
-_IMPLEMENTATIONS: dict[str, dict[str, tuple[Callable[..., Any], tuple[str, ...]]]] = {}
+
+class _Implementation(NamedTuple):
+    function: Callable[..., Any]
+    preferred_on: tuple[str, ...]
+    requires: Callable[[], None]
 
 
-def register(operation: str, name: str, *, preferred_on: tuple[str, ...] = ()) -> Callable[[Any], Any]:
+_IMPLEMENTATIONS: dict[str, dict[str, _Implementation]] = {}
+
+
+def register(
+    operation: str, name: str, *, preferred_on: tuple[str, ...] = (), requires: Callable[[], None] = lambda: None
+) -> Callable[[Any], Any]:
     """Decorator: make a function the implementation ``name`` of ``operation``.
 
     ``preferred_on`` are the platforms (``"cpu"``, ``"gpu"``, ``"tpu"``) on which it is the one that None stands for.
+    ``requires`` raises ValueError, saying what is missing, where the implementation cannot run.
     """
 
     def keep(function: Callable[..., Any]) -> Callable[..., Any]:
-        _IMPLEMENTATIONS.setdefault(operation, {})[name] = (function, preferred_on)
+        _IMPLEMENTATIONS.setdefault(operation, {})[name] = _Implementation(function, preferred_on, requires)
         return function
 
     return keep
@@ -30,16 +40,17 @@ def resolve(operation: str, implementation: str | None) -> Callable[..., Any]:
     """The function that runs: the named one, or with None the one preferred on jax's default platform.
 
     Resolved while tracing, so that nothing of the choice stays in the program. A name never falls back to another:
-    ValueError where it does not exist.
+    ValueError where it does not exist or cannot run.
     """
     known = _IMPLEMENTATIONS[operation]
     if implementation is None:
         platform = jax.default_backend()
-        preferred = (function for function, platforms in known.values() if platform in platforms)
-        return next(preferred, known["reference"][0])
+        preferred = (candidate.function for candidate in known.values() if platform in candidate.preferred_on)
+        return next(preferred, known["reference"].function)
     if implementation not in known:
         raise ValueError(
             f"implementation of {operation}: expected None or one of {', '.join(map(repr, known))}, got "
             f"{implementation!r}."
         )
-    return known[implementation][0]
+    known[implementation].requires()
+    return known[implementation].function

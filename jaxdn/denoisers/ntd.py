@@ -118,6 +118,7 @@ def ntd(
     demodulate: bool | None = None,
     truncate: bool | None = None,
     compute_dtype: str | None = None,
+    implementation: str | None = None,
 ) -> Denoiser:
     """The neural temporal denoiser; ``None`` takes an option's value from the preset. The first choice is the default.
 
@@ -141,6 +142,7 @@ def ntd(
     * ``demodulate``: filter radiance divided by albedo.
     * ``truncate``: no gradient flows through the history.
     * ``compute_dtype``: ``None`` (the images' dtype) or ``"bfloat16"``, for the U-Net alone.
+    * ``implementation``: of the U-Net, None (XLA) or ``"onnxruntime"`` (inference on CPUs; the extra ``onnx``).
 
     Raises ValueError for an unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
     """
@@ -174,7 +176,7 @@ def ntd(
     # Flax is loaded when a network is built: a filter without weights needs jax and numpy alone.
     from jaxdn.networks.unet import unet
 
-    network = unet(groups, heads, widths=widths)
+    network = unet(groups, heads, widths=widths, implementation=implementation)
     reads = frozenset({"albedo", "normal", "depth", "motion"} | ({"dual_motion"} if motion == "dual" else set()))
 
     def init(key: jax.Array, frame: Frame) -> dict[str, Any]:

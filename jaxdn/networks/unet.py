@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from flax import nnx
 
 from jaxdn.backends.convolution import convolve
-from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths
+from jaxdn.backends.registry import register, resolve
+from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, onnx
 
 NEGATIVE_SLOPE = 0.01
 
@@ -91,12 +92,10 @@ def enlarge(x: jax.Array) -> jax.Array:
 
 
 class UNet(nnx.Module):
-    """Encoder, decoder and three heads; called on a list of feature groups."""
+    """Encoder, decoder and three heads; called on features and the slices of the first kernel that belong to them."""
 
-    def __init__(self, groups: Sequence[int], heads: Sequence[int], widths: Widths) -> None:
-        self.groups = tuple(groups)
+    def __init__(self, inputs: int, heads: Sequence[int], widths: Widths) -> None:
         self.heads = len(heads)
-        inputs = sum(groups)
         for level, channels in enumerate(widths):
             setattr(self, f"encoder_{level}", Level(inputs, channels))
             inputs = channels[-1]
@@ -106,14 +105,8 @@ class UNet(nnx.Module):
         for level, outputs in enumerate(heads):
             setattr(self, f"head_{level}", Convolution(widths[level][-1], outputs))
 
-    def __call__(self, features: Sequence[jax.Array | None]) -> tuple[jax.Array, ...]:
-        used, start = [], 0
-        for channels, group in zip(self.groups, features, strict=True):
-            if group is not None:
-                used.append(slice(start, start + channels))
-            start += channels
-        joined = jnp.concatenate([group for group in features if group is not None], axis=-1)
-        part: Part = (joined, used if len(used) < len(self.groups) else None)
+    def __call__(self, features: jax.Array, used: Sequence[slice] | None) -> tuple[jax.Array, ...]:
+        part: Part = (features, used)
         skips: list[jax.Array] = []
         for level in range(LEVELS):
             if level:
@@ -151,16 +144,26 @@ def xavier_uniform(key: jax.Array, shapes: dict[str, Any]) -> dict[str, Any]:
     return jax.tree.unflatten(tree, params)
 
 
-def unet(groups: Sequence[int], heads: Sequence[int], *, widths: Widths = LARGE) -> Network:
+@register("unet", "reference")
+def reference(plain: onnx.Apply, *, heads: int, slope: float, used: Sequence[slice] | None) -> onnx.Apply:
+    """The network as XLA compiles it: ``plain`` itself."""
+    return plain
+
+
+def unet(
+    groups: Sequence[int], heads: Sequence[int], *, widths: Widths = LARGE, implementation: str | None = None
+) -> Network:
     """A U-Net as ``init(key) -> params`` and ``apply(params, features) -> heads``.
 
     ``groups`` are the channel counts of the feature groups; ``apply`` takes one array ``[N, H, W, c]`` for each, or
     ``None`` where it is absent, which is the same as an array of zeros but without its share of the first convolution:
     the shapes of ``params`` never depend on it. H and W are multiples of 16. ``heads`` are the channel counts at full,
     half and quarter resolution; their outputs are raw (logits). ``widths`` gives the channels of each convolution of
-    each of the five levels; the decoder mirrors the first four. Computes in the features' dtype. Raises ValueError when
-    ``widths`` is not five non-empty levels of positive integers, or the features do not fit.
+    each of the five levels; the decoder mirrors the first four. Computes in the features' dtype. ``implementation``:
+    None or "reference" (XLA), or "onnxruntime", see :mod:`jaxdn.networks.onnx`. Raises ValueError when ``widths`` is
+    not five non-empty levels of positive integers, the features do not fit, or the implementation cannot run here.
     """
+    run = resolve("unet", implementation)
     widths = tuple(tuple(level) for level in widths)
     if len(widths) != LEVELS or not all(level and all(channels > 0 for channels in level) for level in widths):
         raise ValueError(
@@ -168,7 +171,7 @@ def unet(groups: Sequence[int], heads: Sequence[int], *, widths: Widths = LARGE)
             "see jaxdn.networks.unet.LARGE."
         )
 
-    abstract = nnx.eval_shape(lambda: UNet(groups, heads, widths))
+    abstract = nnx.eval_shape(lambda: UNet(sum(groups), heads, widths))
     graph, state = nnx.split(abstract, nnx.Param, graph=False)
     shapes = nnx.to_pure_dict(state)
 
@@ -187,7 +190,18 @@ def unet(groups: Sequence[int], heads: Sequence[int], *, widths: Widths = LARGE)
                 f"features: expected [N, H, W, c] or None with c = {tuple(groups)}, H and W multiples of {MULTIPLE}, "
                 f"got shapes {got}; pad by the edge and crop the result."
             )
-        return nnx.merge(graph, params)(features)
+        used, start = [], 0
+        for channels, group in zip(groups, features, strict=True):
+            if group is not None:
+                used.append(slice(start, start + channels))
+            start += channels
+        parts = used if len(used) < len(groups) else None
+
+        def plain(params: dict[str, Any], joined: jax.Array) -> tuple[jax.Array, ...]:
+            return nnx.merge(graph, params)(joined, parts)
+
+        joined = jnp.concatenate(present, axis=-1)
+        return run(plain, heads=len(heads), slope=NEGATIVE_SLOPE, used=parts)(params, joined)
 
     return Network(init, apply)
 

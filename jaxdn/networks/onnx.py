@@ -1,0 +1,215 @@
+"""The U-Net run by ONNX Runtime, an inference engine for CPUs, from inside a jitted program.
+
+XLA:CPU convolves at about two thirds of what the machine can do. ONNX Runtime keeps activations in blocks of 16
+channels from one convolution to the next and needs 0.6 to 0.75 of the time for a 720p frame (``make bench``). It is an
+extra (``pip install jaxdn[onnx]``) and for inference only: the gradient is that of the U-Net in plain XLA, computed
+anew. Nothing of this leaves the room: ``unet(..., implementation="onnxruntime")`` is the same pure function.
+"""
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+
+from jaxdn.backends.registry import register
+from jaxdn.networks import LEVELS
+
+OPSET = 17
+BLOCK = 16
+"""Channels that the engine computes at a time; an input of another count takes a slow path (3 times the time)."""
+
+Apply = Callable[[dict[str, Any], jax.Array], tuple[jax.Array, ...]]
+
+
+def available() -> bool:
+    """Whether ONNX Runtime can be imported and jax computes on the CPU."""
+    from importlib.util import find_spec
+
+    return jax.default_backend() == "cpu" and all(find_spec(name) is not None for name in ("onnxruntime", "onnx"))
+
+
+def check_available() -> None:
+    """Raise ValueError, with what to do, where the engine cannot run."""
+    if jax.default_backend() != "cpu":
+        raise ValueError(
+            f'implementation: "onnxruntime" runs on the CPU, and jax computes on {jax.default_backend()!r}; '
+            "leave it None, or set JAX_PLATFORMS=cpu."
+        )
+    if not available():
+        raise ValueError(
+            'implementation: "onnxruntime" needs the packages onnxruntime and onnx; pip install "jaxdn[onnx]".'
+        )
+
+
+def model(
+    params: dict[str, Any], shape: tuple[int, ...], used: Sequence[slice] | None, heads: int, slope: float
+) -> bytes:
+    """The U-Net with these weights as a serialised ONNX graph.
+
+    ``shape`` [N, H, W, c] is that of the input ``features``, padded to a multiple of :data:`BLOCK` channels; ``used``
+    are the slices of the first kernel's inputs that it consists of (None: all). Outputs ``head_0`` ... are
+    [N, H / 2^i, W / 2^i, channels].
+    """
+    from onnx import TensorProto, helper, numpy_helper
+
+    nodes: list[Any] = []
+    constants: list[Any] = []
+
+    def constant(array: np.ndarray) -> str:
+        constants.append(numpy_helper.from_array(np.ascontiguousarray(array), f"constant_{len(constants)}"))
+        return constants[-1].name
+
+    def node(kind: str, *inputs: str, output: str | None = None, **attributes: Any) -> str:
+        output = output or f"value_{len(nodes)}"
+        nodes.append(helper.make_node(kind, list(inputs), [output], **attributes))
+        return output
+
+    def convolution(x: str, kernel: np.ndarray, bias: np.ndarray | None) -> str:
+        """HWIO as OIHW; zeros beyond the border."""
+        arguments = [x, constant(kernel.transpose(3, 2, 0, 1)), *([] if bias is None else [constant(bias)])]
+        return node("Conv", *arguments, kernel_shape=[3, 3], pads=[1, 1, 1, 1])
+
+    def activated(x: str) -> str:
+        return node("LeakyRelu", x, alpha=slope)
+
+    def level(x: str, name: str, first: int = 0) -> str:
+        layers = params[name]
+        for index in range(first, len(layers)):
+            layer = layers[f"convolution_{index}"]
+            x = activated(convolution(x, layer["kernel"], layer["bias"]))
+        return x
+
+    entry = params["encoder_0"]["convolution_0"]
+    kernel = entry["kernel"]
+    if used is not None:
+        kernel = np.concatenate([kernel[:, :, channels] for channels in used], axis=2)
+    kernel = np.pad(kernel, ((0, 0), (0, 0), (0, shape[3] - kernel.shape[2]), (0, 0)))
+    x = node("Transpose", "features", perm=[0, 3, 1, 2])
+    x = level(activated(convolution(x, kernel, entry["bias"])), "encoder_0", first=1)
+    skips, channels = [x], [_outputs(params["encoder_0"])]
+    for depth in range(1, LEVELS):
+        x = level(node("MaxPool", x, kernel_shape=[2, 2], strides=[2, 2]), f"encoder_{depth}")
+        skips.append(x)
+        channels.append(_outputs(params[f"encoder_{depth}"]))
+    twice = constant(np.asarray([1, 1, 2, 2], np.float32))
+    below = channels[-1]
+    for depth in reversed(range(LEVELS - 1)):
+        larger = node(
+            "Resize", x, "", twice, mode="nearest", nearest_mode="floor", coordinate_transformation_mode="asymmetric"
+        )
+        layer = params[f"decoder_{depth}"]["convolution_0"]
+        # A sum of two convolutions, which the engine adds up in place, is cheaper than joining their inputs.
+        total = node(
+            "Add",
+            convolution(larger, layer["kernel"][:, :, :below], None),
+            convolution(skips[depth], layer["kernel"][:, :, below:], layer["bias"]),
+        )
+        x = level(activated(total), f"decoder_{depth}", first=1)
+        below = channels[depth]
+        if depth < heads:
+            head = params[f"head_{depth}"]
+            planes = convolution(x, head["kernel"], head["bias"])
+            node("Transpose", planes, output=f"head_{depth}", perm=[0, 2, 3, 1])
+
+    def value(name: str, shape: Sequence[int]) -> Any:
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, list(shape))
+
+    outputs = [value(f"head_{depth}", head_shape(params, shape, depth)) for depth in range(heads)]
+    graph = helper.make_graph(nodes, "unet", [value("features", shape)], outputs, constants)
+    whole = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)])
+    whole.ir_version = 8
+    return whole.SerializeToString()
+
+
+def _outputs(level: dict[str, Any]) -> int:
+    return level[f"convolution_{len(level) - 1}"]["bias"].shape[0]
+
+
+def head_shape(params: dict[str, Any], shape: Sequence[int], depth: int) -> tuple[int, ...]:
+    """[N, H, W, channels] of a head, for an input of ``shape``."""
+    return shape[0], shape[1] >> depth, shape[2] >> depth, params[f"head_{depth}"]["bias"].shape[0]
+
+
+class Engine:
+    """One shape's session, made for the weights it was last called with.
+
+    The engine lays weights out anew for its blocks, so they belong to the session; that they are those of the call is
+    made sure of at every call (a comparison of bytes, about a millisecond), which keeps the function pure.
+    """
+
+    def __init__(self, describe: Callable[[list[np.ndarray]], bytes]) -> None:
+        self._describe = describe
+        self._weights: list[np.ndarray] = []
+        self._session: Any = None
+        self._lock = threading.Lock()
+
+    def __call__(self, context: Any, outputs: Sequence[Any], features: Any, *weights: Any) -> None:
+        """Fill ``outputs``; all arguments are views of XLA's own buffers."""
+        with self._lock:
+            self._prepare([np.asarray(weight) for weight in weights])
+            binding = self._session.io_binding()
+            image = np.asarray(features)
+            binding.bind_input("features", "cpu", 0, np.float32, image.shape, image.ctypes.data)
+            for depth, output in enumerate(outputs):
+                head = np.asarray(output)
+                binding.bind_output(f"head_{depth}", "cpu", 0, np.float32, head.shape, head.ctypes.data)
+            self._session.run_with_iobinding(binding)
+
+    def _prepare(self, weights: list[np.ndarray]) -> None:
+        same = len(weights) == len(self._weights) and all(
+            np.array_equal(new.view(np.int32), old.view(np.int32))
+            for new, old in zip(weights, self._weights, strict=True)
+        )
+        if same:
+            return
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
+        options.log_severity_level = 3
+        # Threads that wait busily would take the processors from the XLA part of the step.
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        self._weights = [weight.copy() for weight in weights]
+        self._session = onnxruntime.InferenceSession(
+            self._describe(self._weights), options, providers=["CPUExecutionProvider"]
+        )
+
+
+@register("unet", "onnxruntime", requires=check_available)
+def engine(plain: Apply, *, heads: int, slope: float, used: Sequence[slice] | None) -> Apply:
+    """``plain`` (params, joined features [N, H, W, c]) -> heads, run by ONNX Runtime; the gradient is ``plain``'s.
+
+    Raises ValueError for features that are not float32.
+    """
+
+    @jax.custom_vjp
+    def run(params: dict[str, Any], features: jax.Array) -> tuple[jax.Array, ...]:
+        features = jnp.pad(features, ((0, 0), (0, 0), (0, 0), (0, -features.shape[-1] % BLOCK)))
+        weights, tree = jax.tree.flatten(params)
+        shape = features.shape
+        results = [jax.ShapeDtypeStruct(head_shape(params, shape, depth), jnp.float32) for depth in range(heads)]
+        session = Engine(lambda weights: model(jax.tree.unflatten(tree, weights), shape, used, heads, slope))
+        return tuple(buffer_callback(session, results, vmap_method="sequential")(features, *weights))
+
+    def forward(params: dict[str, Any], features: jax.Array) -> tuple[Any, Any]:
+        return run(params, features), (params, features)
+
+    def backward(residuals: Any, cotangents: tuple[jax.Array, ...]) -> Any:
+        return jax.vjp(plain, *residuals)[1](cotangents)
+
+    run.defvjp(forward, backward)
+
+    def checked(params: dict[str, Any], features: jax.Array) -> tuple[jax.Array, ...]:
+        if features.dtype != jnp.float32:
+            raise ValueError(
+                f'implementation: "onnxruntime" computes in float32, got features in {features.dtype}; '
+                "leave implementation or compute_dtype None."
+            )
+        return run(params, features)
+
+    return checked
