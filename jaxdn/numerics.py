@@ -20,6 +20,11 @@ def _tiny(x: jax.Array) -> float:
     return float(jnp.finfo(x.dtype).tiny)
 
 
+def _finite(x: jax.Array) -> jax.Array:
+    """Infinities as the largest numbers; not ``jnp.clip``, which halves the derivative at the largest number itself."""
+    return jnp.where(jnp.isinf(x), jnp.copysign(_largest(x), x), x)
+
+
 def absolute(x: jax.Array) -> jax.Array:
     """``|x|`` with derivative 0 at 0: where prediction and target agree, an L1 loss pulls neither way.
 
@@ -34,7 +39,7 @@ def safe_power(x: jax.Array, exponent: jax.Array | float) -> jax.Array:
     ``exponent`` may be an array of a shape that broadcasts with ``x`` and has a derivative of its own. 0 ** 0 is 0.
     """
     zero = x < _tiny(x)
-    power = jnp.where(zero, 1.0, jnp.minimum(x, _largest(x))) ** exponent
+    power = jnp.where(zero, 1.0, _finite(x)) ** exponent
     return jnp.where(zero, 0.0, power)
 
 
@@ -44,7 +49,7 @@ def safe_norm(x: jax.Array, *, axis: int = -1) -> jax.Array:
     Scaled by the largest component, so that neither tiny nor huge components vanish in their squares. A length beyond
     the largest finite number saturates there, and its derivative stays the unit vector.
     """
-    return _norm(jnp.clip(x, -_largest(x), _largest(x)), axis)
+    return _norm(_finite(x), axis)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))

@@ -16,43 +16,74 @@ length_and_slope = jax.jit(jax.vmap(jax.value_and_grad(lambda v: safe_norm(v)[0]
 
 
 def magnitudes() -> np.ndarray:
-    """0, subnormals, every decade of float32, its ends and infinity."""
-    decades = np.array([10.0**exponent for exponent in range(-45, 39)], np.float32)
-    ends = np.array([0.0, np.finfo(np.float32).tiny, np.finfo(np.float32).max, np.inf], np.float32)
-    return np.sort(np.concatenate([ends, decades]))
+    """0, every power of two that float32 has, subnormal ones included, with 16 mantissas each, and infinity."""
+    mantissas = np.unique([0, 1, *np.linspace(0, 2**23 - 1, 13).astype(np.uint32), 2**22, 2**23 - 2, 2**23 - 1])
+    exponents = np.arange(255, dtype=np.uint32) << 23
+    numbers = (exponents[:, None] | mantissas[None].astype(np.uint32)).view(np.float32).ravel()
+    below_normal = np.ldexp(np.float32(1), np.arange(-149, -126))
+    return np.unique(np.concatenate([numbers, below_normal, np.float32([np.inf])]))
 
 
-@pytest.mark.parametrize("exponent", [0.0, 0.5, 0.7, 1.0])
+def normal_and_finite(x: np.ndarray) -> np.ndarray:
+    """Where single precision can represent the argument; below, hardware may read it as 0."""
+    return (x >= np.finfo(np.float32).tiny) & np.isfinite(x)
+
+
+def test_the_sweep_is_of_every_magnitude() -> None:
+    x = magnitudes()
+    assert np.all(np.diff(x) > 0)
+    assert x[0] == 0
+    assert x[1] == 2.0**-149
+    assert x[-2] == np.finfo(np.float32).max
+    assert x[-1] == np.inf
+    assert set(np.frexp(x[1:-1])[1]) == set(range(-148, 129))
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1 / 2.2, 0.5, 0.7, 1.0])
 def test_power_is_true_where_normal_and_finite_everywhere(exponent: float) -> None:
     x = magnitudes()
-    value, slope = power_and_slope(x, exponent)
+    value, slope = (np.asarray(found) for found in power_and_slope(x, exponent))
     assert np.all(np.isfinite(value))
     assert np.all(np.isfinite(slope))
-    assert np.all(np.diff(value) >= 0)
-    normal = (x > 2e-38) & np.isfinite(x)
-    np.testing.assert_allclose(value[normal], x[normal].astype(np.float64) ** exponent, rtol=3e-6)
-    assert value[0] == 0
-    assert slope[0] == 0
+    # An ulp up and down is what a power may waver by.
+    assert np.all(value[1:] >= value[:-1] * (1 - 3e-7))
+    normal, wide = normal_and_finite(x), x[normal_and_finite(x)].astype(np.float64)
+    np.testing.assert_allclose(value[normal], wide**exponent, rtol=2e-5)
+    true_slope = exponent * wide ** (exponent - 1)
+    np.testing.assert_allclose(slope[normal], true_slope, rtol=2e-5)
+    assert value[0] == slope[0] == 0
+    assert value[-1] == value[-2]
+    low, flat = power_and_slope(-x, exponent)
+    assert not np.any(low)
+    assert not np.any(flat)
 
 
 def test_power_has_a_finite_derivative_by_its_exponent() -> None:
-    slope = power_by_exponent(magnitudes(), 0.3)
-    assert np.all(np.isfinite(slope))
-
-
-@pytest.mark.parametrize("other", ["zero", "same"])
-def test_norm_is_true_where_normal_and_finite_everywhere(other: str) -> None:
     x = magnitudes()
-    vectors = np.stack([x, np.zeros_like(x) if other == "zero" else x, np.zeros_like(x)], axis=-1)
-    value, slope = length_and_slope(vectors)
+    slope = np.asarray(power_by_exponent(x, 0.3))
+    assert np.all(np.isfinite(slope))
+    normal = normal_and_finite(x)
+    wide = x[normal].astype(np.float64)
+    np.testing.assert_allclose(slope[normal], wide**0.3 * np.log(wide), rtol=1e-5)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("other", ["zero", "same", "small"])
+def test_norm_is_true_where_normal_and_finite_everywhere(other: str, sign: float) -> None:
+    x = sign * magnitudes()
+    beside = {"zero": np.zeros_like(x), "same": x, "small": x * np.float32(2.0**-20)}[other]
+    vectors = np.stack([x, beside, np.zeros_like(x)], axis=-1).astype(np.float32)
+    value, slope = (np.asarray(found) for found in length_and_slope(vectors))
     assert np.all(np.isfinite(value))
     assert np.all(np.isfinite(slope))
-    normal = (x > 2e-38) & (x < 2e38)
-    expected = np.linalg.norm(vectors[normal].astype(np.float64), axis=-1)
-    np.testing.assert_allclose(value[normal], expected, rtol=1e-6)
-    # the derivative of a length is the unit vector
-    np.testing.assert_allclose(np.linalg.norm(slope[normal], axis=-1), 1.0, rtol=1e-5)
-    assert np.all(slope[0] == 0)
+    normal = normal_and_finite(np.abs(x))
+    wide = vectors[normal].astype(np.float64)
+    expected = np.minimum(np.linalg.norm(wide, axis=-1), np.finfo(np.float32).max)
+    np.testing.assert_allclose(value[normal, 0] if value.ndim > 1 else value[normal], expected, rtol=1e-6)
+    # The derivative of a length is the unit vector.
+    unit = wide / np.linalg.norm(wide, axis=-1, keepdims=True)
+    np.testing.assert_allclose(slope[normal], unit, rtol=1e-5, atol=1e-6)
+    assert not np.any(slope[0])
 
 
 def test_nan_stays_nan() -> None:
@@ -60,14 +91,19 @@ def test_nan_stays_nan() -> None:
     assert np.isnan(length(jnp.asarray([1.0, jnp.nan])))
 
 
-def test_negative_arguments_of_a_power_count_as_zero() -> None:
-    assert power(jnp.float32(-2.0), 0.5) == 0
-
-
 def test_absolute_pulls_neither_way_at_zero() -> None:
     value, slope = jax.jit(jax.vmap(jax.value_and_grad(absolute)))(jnp.asarray([-2.0, -0.0, 0.0, 3.0]))
     np.testing.assert_array_equal(value, [2, 0, 0, 3])
     np.testing.assert_array_equal(slope, [-1, 0, 0, 1])
+
+
+def test_absolute_is_the_size_of_every_number() -> None:
+    x = np.concatenate([-magnitudes()[::-1], magnitudes()])
+    value, slope = (np.asarray(found) for found in jax.jit(jax.vmap(jax.value_and_grad(absolute)))(x))
+    normal = (np.abs(x) >= np.finfo(np.float32).tiny) | (x == 0)
+    np.testing.assert_array_equal(value[normal], np.abs(x[normal]))
+    np.testing.assert_array_equal(slope[normal], np.sign(x[normal]))
+    assert np.all(np.abs(slope) <= 1)
 
 
 def test_derivatives(x64: None, rng: np.random.Generator) -> None:
