@@ -16,11 +16,11 @@ setup: .venv/ready  ## .venv with the exact versions of constraints.txt (uv wher
 	@echo "Setting up .venv (Python packages of constraints.txt; a minute or two) ..."
 	@if command -v uv >/dev/null 2>&1; then \
 		uv venv --quiet --allow-existing --python $(PYTHON) .venv && \
-		uv pip install --quiet --python $(BIN)/python -c constraints.txt --group dev -e '.[render,train,peers]'; \
+		uv pip install --quiet --python $(BIN)/python -c constraints.txt --group dev -e '.[render,train,peers,onnx]'; \
 	else \
 		$(PYTHON) -m venv .venv && \
 		$(BIN)/python -m pip install --quiet --upgrade -c constraints.txt pip && \
-		$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[render,train,peers]'; \
+		$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[render,train,peers,onnx]'; \
 	fi
 	@touch $@
 
@@ -37,7 +37,7 @@ test-slow: setup  ## the slow tests: real training runs, the notebook, real proc
 	$(BIN)/python -m pytest -q -m slow $(SETTINGS)
 
 hard-cases: setup  ## every hard case, operation, denoiser and precision: runs/hard-cases/table.html
-	$(BIN)/python -m tests.hard_cases.table
+	$(BIN)/python -m tests.hard_cases
 
 lint: setup  ## ruff and the type checker
 	$(BIN)/ruff check .

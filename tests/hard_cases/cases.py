@@ -1,26 +1,17 @@
 """What goes wrong in practice, as inputs: each case is one function of a clip in which nothing is wrong.
 
-All cases share shapes and buffers, so that one compiled program serves them all. A new case is one more function here.
+All cases have the same buffers, and all but the last four the same shapes, so that one compiled program serves
+them. A new case is one more function here.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxdn.frame import FAR, Clip, Frame
-
-FRAMES, HEIGHT, WIDTH = 3, 16, 24
-
-
-class Inputs(NamedTuple):
-    """What denoisers and operations are given."""
-
-    clip: Clip
-    logits: np.ndarray
-    """[H, W, 25] of predicted kernels."""
-    blend: np.ndarray
-    """[H / 2, W / 2, 1] of a composition, before the sigmoid."""
+from jaxdn.frame import FAR, Frame
+from tests.hard_cases.inputs import WIDTH, Inputs, dotted, filled, good, replaced
 
 
 class Case(NamedTuple):
@@ -35,67 +26,17 @@ class Case(NamedTuple):
 CASES: dict[str, Case] = {}
 
 
-def case(sentence: str) -> Callable[[Callable[[Inputs], Inputs]], Callable[[Inputs], Inputs]]:
-    """Decorator: make a function of good inputs a case, under its own name."""
+def case(
+    sentence: str, *, name: str | None = None
+) -> Callable[[Callable[[Inputs], Inputs]], Callable[[Inputs], Inputs]]:
+    """Decorator: make a function of good inputs a case, under its own name unless another is given."""
 
     def keep(make: Callable[[Inputs], Inputs]) -> Callable[[Inputs], Inputs]:
-        name = make.__name__.replace("_", " ")
-        CASES[name] = Case(name, sentence, make)
+        known = name or make.__name__.replace("_", " ")
+        CASES[known] = Case(known, sentence, make)
         return make
 
     return keep
-
-
-def good(seed: int = 0, *, frames: int = FRAMES, height: int = HEIGHT, width: int = WIDTH) -> Inputs:
-    """A wall, and a square that moves over it by 1.5 px a frame: noisy, with every buffer, and nothing wrong."""
-    rng = np.random.default_rng(seed)
-    rows, columns = np.mgrid[:height, :width].astype(np.float32)
-    wall = 0.4 + 0.2 * np.sin(columns / 3) * np.cos(rows / 4)
-
-    def square(t: float) -> np.ndarray:
-        left = 4 + 1.5 * t
-        return (columns >= left) & (columns < left + 7) & (rows >= 4) & (rows < 11)
-
-    shape = (frames, height, width)
-    inside = np.stack([square(t) for t in range(frames)])[..., None]
-    before = np.stack([square(t - 1) for t in range(frames)])[..., None]
-    reference = np.where(inside, [0.2, 0.5, 0.9], wall[None, ..., None] * [1.0, 0.8, 0.6]).astype(np.float32)
-    motion = np.where(inside, [-1.5, 0.0], 0.0).astype(np.float32)
-    normal = np.where(inside, [0.0, 0.6, 0.8], [0.0, 0.0, 1.0]).astype(np.float32)
-    frame = Frame(
-        radiance=(reference * rng.exponential(size=(*shape, 1))).astype(np.float32),
-        albedo=np.where(inside, [0.3, 0.6, 0.9], 0.7).astype(np.float32),
-        normal=normal,
-        depth=np.where(inside, 2.0, 5.0 + columns[None, ..., None] / 50).astype(np.float32),
-        roughness=np.where(inside, 0.3, 1.0).astype(np.float32),
-        motion=motion,
-        dual_motion=np.where(before & ~inside, [1.5, 0.0], motion).astype(np.float32),
-        visible=inside | ~before,
-        previous_depth=np.where(inside, 2.0, 5.0 + columns[None, ..., None] / 50).astype(np.float32),
-        ids=np.where(inside, 1, 0).astype(np.int32),
-        direct=(0.1 * reference).astype(np.float32),
-        emission=np.zeros((*shape, 3), np.float32),
-    )
-    logits = rng.standard_normal((height, width, 25)).astype(np.float32)
-    blend = rng.standard_normal((height // 2, width // 2, 1)).astype(np.float32)
-    return Inputs(Clip(frame, reference), logits, blend)
-
-
-def _with(inputs: Inputs, **buffers: Any) -> Inputs:
-    frames = {name: np.asarray(buffer) for name, buffer in buffers.items()}
-    return inputs._replace(clip=inputs.clip._replace(frames=inputs.clip.frames._replace(**frames)))
-
-
-def _filled(inputs: Inputs, name: str, value: Any) -> Inputs:
-    buffer = getattr(inputs.clip.frames, name)
-    return _with(inputs, **{name: np.full_like(buffer, value)})
-
-
-def _dotted(inputs: Inputs, name: str, value: Any, *, every: int = 7) -> Inputs:
-    """A value in every seventh pixel of a buffer."""
-    buffer = np.array(getattr(inputs.clip.frames, name))
-    buffer.reshape(-1, buffer.shape[-1])[::every] = value
-    return _with(inputs, **{name: buffer})
 
 
 @case("nothing is wrong: what the others are compared with")
@@ -105,12 +46,22 @@ def control(inputs: Inputs) -> Inputs:
 
 @case("a path finds a small lamp: one pixel in seven is brighter than all others together")
 def fireflies(inputs: Inputs) -> Inputs:
-    return _dotted(inputs, "radiance", 1e4)
+    return dotted(inputs, "radiance", 1e4)
+
+
+@case("indirect light through a crack: the mildest kind")
+def fireflies_of_1e2(inputs: Inputs) -> Inputs:
+    return dotted(inputs, "radiance", 1e2)
+
+
+@case("the brightest that a half-precision file holds")
+def fireflies_of_65504(inputs: Inputs) -> Inputs:
+    return dotted(inputs, "radiance", 65504.0)
 
 
 @case("beyond what a half-precision file holds")
 def fireflies_beyond_half_precision(inputs: Inputs) -> Inputs:
-    return _dotted(inputs, "radiance", 1e30)
+    return dotted(inputs, "radiance", 1e30)
 
 
 @case("the reference itself has fireflies left")
@@ -122,126 +73,173 @@ def fireflies_in_the_reference(inputs: Inputs) -> Inputs:
 
 @case("a renderer divides zero by zero")
 def radiance_not_a_number(inputs: Inputs) -> Inputs:
-    return _dotted(inputs, "radiance", np.nan)
+    return dotted(inputs, "radiance", np.nan)
 
 
 @case("a renderer divides by zero, or a half-precision file overflowed")
 def radiance_infinite(inputs: Inputs) -> Inputs:
-    return _dotted(_dotted(inputs, "radiance", np.inf), "radiance", -np.inf, every=11)
+    return dotted(dotted(inputs, "radiance", np.inf), "radiance", -np.inf, every=11)
 
 
 @case("a filter with negative lobes was in the renderer")
 def radiance_negative(inputs: Inputs) -> Inputs:
-    return _dotted(inputs, "radiance", -3.0)
+    return dotted(inputs, "radiance", -3.0)
 
 
 @case("every buffer has some pixels that are not a number")
 def everything_not_a_number(inputs: Inputs) -> Inputs:
     for name in ("radiance", "albedo", "normal", "depth", "roughness", "motion", "dual_motion", "previous_depth"):
-        inputs = _dotted(inputs, name, np.nan)
+        inputs = dotted(inputs, name, np.nan)
     return inputs
 
 
 @case("every buffer has some pixels at infinity")
 def everything_infinite(inputs: Inputs) -> Inputs:
     for name in ("radiance", "albedo", "normal", "depth", "roughness", "motion", "dual_motion", "previous_depth"):
-        inputs = _dotted(inputs, name, np.inf)
+        inputs = dotted(inputs, name, np.inf)
     return inputs
+
+
+def _broken(buffer: str, value: tuple[float, ...], inputs: Inputs) -> Inputs:
+    for every, one in zip((7, 11), value, strict=False):
+        inputs = dotted(inputs, buffer, one, every=every)
+    return inputs
+
+
+_SIGNED = {"normal", "motion", "dual_motion"}
+for _buffer in (name for name in Frame._fields[1:] if name not in ("visible", "ids")):
+    for _told, _value in (("not a number", (np.nan,)), ("infinite", (np.inf, -np.inf)), ("negative", (-3.0,))):
+        if _told != "negative" or _buffer not in _SIGNED:
+            _name = f"{_buffer.replace('_', ' ')} {_told}"
+            CASES[_name] = Case(_name, f"one buffer alone is broken: {_name}", partial(_broken, _buffer, _value))
 
 
 @case("the light is off")
 def black(inputs: Inputs) -> Inputs:
-    inputs = _filled(inputs, "radiance", 0.0)
+    inputs = filled(inputs, "radiance", 0.0)
     return inputs._replace(clip=inputs.clip._replace(reference=np.zeros_like(inputs.clip.reference)))
 
 
 @case("a converged background of one colour: no variance anywhere")
 def constant(inputs: Inputs) -> Inputs:
-    inputs = _filled(inputs, "radiance", 0.5)
+    inputs = filled(inputs, "radiance", 0.5)
     return inputs._replace(clip=inputs.clip._replace(reference=np.full_like(inputs.clip.reference, 0.5)))
+
+
+@case("a converged still image shown again and again: no change from frame to frame")
+def identical_frames(inputs: Inputs) -> Inputs:
+    first = {name: np.broadcast_to(buffer[:1], buffer.shape) for name, buffer in inputs.clip.frames._asdict().items()}
+    still = inputs.clip._replace(reference=np.broadcast_to(inputs.clip.reference[:1], inputs.clip.reference.shape))
+    return replaced(inputs._replace(clip=still), **first)
 
 
 @case("the first sample that ever hit anything")
 def one_bright_pixel(inputs: Inputs) -> Inputs:
     radiance = np.zeros_like(inputs.clip.frames.radiance)
     radiance[:, 5, 7] = 6e4
-    return _with(inputs, radiance=radiance)
+    return replaced(inputs, radiance=radiance)
 
 
 @case("the noisy image is the reference: zero loss, infinite PSNR")
 def identical_to_the_reference(inputs: Inputs) -> Inputs:
-    return _with(inputs, radiance=inputs.clip.reference)
+    return replaced(inputs, radiance=inputs.clip.reference)
 
 
 @case("a pure metal has no diffuse reflectance to divide by")
 def albedo_zero(inputs: Inputs) -> Inputs:
-    return _filled(inputs, "albedo", 0.0)
+    return filled(inputs, "albedo", 0.0)
 
 
 @case("a nearly black cloth: dividing by its albedo multiplies noise by thousands")
 def albedo_tiny(inputs: Inputs) -> Inputs:
-    return _filled(inputs, "albedo", 1e-5)
+    return filled(inputs, "albedo", 1e-5)
 
 
 @case("a polished mirror")
 def roughness_zero(inputs: Inputs) -> Inputs:
-    return _filled(inputs, "roughness", 0.0)
+    return filled(inputs, "roughness", 0.0)
+
+
+@case("chalk")
+def roughness_one(inputs: Inputs) -> Inputs:
+    return filled(inputs, "roughness", 1.0)
 
 
 @case("the camera's rays hit nothing")
 def normals_zero(inputs: Inputs) -> Inputs:
-    return _filled(inputs, "normal", 0.0)
+    return filled(inputs, "normal", 0.0)
 
 
 @case("an exporter forgot to normalise")
 def normals_of_any_length(inputs: Inputs) -> Inputs:
     normal = inputs.clip.frames.normal * np.linspace(1e-3, 1e3, WIDTH, dtype=np.float32)[:, None]
-    return _with(inputs, normal=normal)
+    return replaced(inputs, normal=normal)
 
 
-@case("neighbours seen from both sides: cosines at and below zero")
+@case("the edges of a box: every cosine between neighbours is zero")
+def normals_at_right_angles(inputs: Inputs) -> Inputs:
+    normal = np.zeros_like(inputs.clip.frames.normal)
+    normal[:, :, ::2, 0] = normal[:, :, 1::2, 1] = 1
+    return replaced(inputs, normal=normal)
+
+
+@case("neighbours seen from both sides: cosines below zero")
 def normals_opposite(inputs: Inputs) -> Inputs:
     normal = np.array(inputs.clip.frames.normal)
     normal[:, ::2] *= -1
-    return _with(inputs, normal=normal)
+    return replaced(inputs, normal=normal)
 
 
 @case("a near plane at zero")
 def depth_zero(inputs: Inputs) -> Inputs:
-    return _filled(_filled(inputs, "depth", 0.0), "previous_depth", 0.0)
+    return filled(filled(inputs, "depth", 0.0), "previous_depth", 0.0)
 
 
 @case("nothing but background")
 def depth_far(inputs: Inputs) -> Inputs:
-    return _filled(_filled(inputs, "depth", FAR), "previous_depth", FAR)
+    return filled(filled(inputs, "depth", FAR), "previous_depth", FAR)
 
 
-@case("an insect on the lens before a mountain")
-def depth_from_1e_6_to_1e6(inputs: Inputs) -> Inputs:
+@case(
+    "an insect on the lens before a mountain, through a hole in the mesh, under an infinite sky",
+    name="depth of 0, 1e-6, 1e6 and infinity in one frame",
+)
+def depth_of_all_kinds(inputs: Inputs) -> Inputs:
     depth = np.array(inputs.clip.frames.depth)
-    depth[:, :, ::2], depth[:, :, 1::2] = 1e-6, 1e6
-    return _with(inputs, depth=depth, previous_depth=depth)
+    for column, value in enumerate((1e-6, 1e6, 0.0, np.inf)):
+        depth[:, :, column::4] = value
+    return replaced(inputs, depth=depth, previous_depth=depth)
+
+
+@case("nothing moves, and the renderer says so with zeros")
+def motion_of_zero(inputs: Inputs) -> Inputs:
+    return filled(filled(inputs, "motion", 0.0), "dual_motion", 0.0)
+
+
+@case("the renderer has no vector for any pixel: fire, water, a mirror")
+def no_vector_anywhere(inputs: Inputs) -> Inputs:
+    return filled(filled(inputs, "motion", np.nan), "dual_motion", np.nan)
 
 
 @case("exactly between two pixels")
 def motion_of_half_a_pixel(inputs: Inputs) -> Inputs:
-    return _filled(_filled(inputs, "motion", 0.5), "dual_motion", 0.5)
+    return filled(filled(inputs, "motion", 0.5), "dual_motion", 0.5)
 
 
 @case("a cut, or a teleport: every vector leads far outside")
 def every_pixel_off_screen(inputs: Inputs) -> Inputs:
-    return _filled(_filled(inputs, "motion", 1e4), "dual_motion", 1e4)
+    return filled(filled(inputs, "motion", 1e4), "dual_motion", 1e4)
 
 
 @case("a vector that no integer holds")
 def motion_of_1e30(inputs: Inputs) -> Inputs:
-    return _filled(_filled(inputs, "motion", 1e30), "dual_motion", -1e30)
+    return filled(filled(inputs, "motion", 1e30), "dual_motion", -1e30)
 
 
 @case("a new object fills the picture: nothing was seen before")
 def every_pixel_disoccluded(inputs: Inputs) -> Inputs:
-    inputs = _with(inputs, visible=np.zeros_like(inputs.clip.frames.visible))
-    return _filled(inputs, "dual_motion", 3.0)
+    inputs = replaced(inputs, visible=np.zeros_like(inputs.clip.frames.visible))
+    return filled(inputs, "dual_motion", 3.0)
 
 
 @case("another room from one frame to the next, and motion says nothing of it")
@@ -252,36 +250,41 @@ def cut(inputs: Inputs) -> Inputs:
         buffer = np.array(getattr(inputs.clip.frames, name))
         buffer[2:] = getattr(other, name)[2:, ::-1]
         frames[name] = buffer
-    return _with(inputs, **frames)
+    return replaced(inputs, **frames)
 
 
 @case("somebody switches the light off")
 def light_switched_off(inputs: Inputs) -> Inputs:
     radiance = np.array(inputs.clip.frames.radiance)
     radiance[1:] = 0
-    return _with(inputs, radiance=radiance)
+    return replaced(inputs, radiance=radiance)
+
+
+def _scaled(inputs: Inputs, factor: float) -> Inputs:
+    frames = inputs.clip.frames
+    return replaced(inputs, depth=factor * frames.depth, previous_depth=factor * frames.previous_depth)
 
 
 @case("a scene in kilometres, modelled in millimetres")
 def scene_scaled_by_1e4(inputs: Inputs) -> Inputs:
-    return _with(inputs, depth=1e4 * inputs.clip.frames.depth, previous_depth=1e4 * inputs.clip.frames.previous_depth)
+    return _scaled(inputs, 1e4)
 
 
-@case("a scene in millimetres, modelled in kilometres")
-def scene_scaled_by_1e_4(inputs: Inputs) -> Inputs:
-    return _with(inputs, depth=1e-4 * inputs.clip.frames.depth, previous_depth=1e-4 * inputs.clip.frames.previous_depth)
+@case("a scene in millimetres, modelled in kilometres", name="scene scaled by 1e-4")
+def scene_made_small(inputs: Inputs) -> Inputs:
+    return _scaled(inputs, 1e-4)
 
 
 @case("radiance in physical units, outdoors")
 def brightness_times_1e3(inputs: Inputs) -> Inputs:
     inputs = inputs._replace(clip=inputs.clip._replace(reference=1e3 * inputs.clip.reference))
-    return _with(inputs, radiance=1e3 * inputs.clip.frames.radiance)
+    return replaced(inputs, radiance=1e3 * inputs.clip.frames.radiance)
 
 
-@case("radiance in physical units, by moonlight")
-def brightness_times_1e_3(inputs: Inputs) -> Inputs:
+@case("radiance in physical units, by moonlight", name="brightness times 1e-3")
+def brightness_made_small(inputs: Inputs) -> Inputs:
     inputs = inputs._replace(clip=inputs.clip._replace(reference=1e-3 * inputs.clip.reference))
-    return _with(inputs, radiance=1e-3 * inputs.clip.frames.radiance)
+    return replaced(inputs, radiance=1e-3 * inputs.clip.frames.radiance)
 
 
 @case("a network that was trained too fast")
@@ -301,6 +304,43 @@ def logits_one_hot(inputs: Inputs) -> Inputs:
     return inputs._replace(logits=logits)
 
 
+@case("a network one of whose weights has become no number")
+def logits_with_one_that_is_not_a_number(inputs: Inputs) -> Inputs:
+    logits = np.array(inputs.logits)
+    logits[..., 3] = np.nan
+    return inputs._replace(logits=logits)
+
+
+@case("a metric of what was disoccluded, where nothing was")
+def mask_of_nothing(inputs: Inputs) -> Inputs:
+    return inputs._replace(mask=np.zeros_like(inputs.mask))
+
+
+@case("a metric of what was disoccluded, right after a cut")
+def mask_of_everything(inputs: Inputs) -> Inputs:
+    return inputs._replace(mask=np.ones_like(inputs.mask))
+
+
 @case("numbers too small to be normal")
 def subnormal_radiance(inputs: Inputs) -> Inputs:
-    return _filled(inputs, "radiance", 1e-40)
+    return filled(inputs, "radiance", 1e-40)
+
+
+@case("a probe, or a test that somebody reduced to the utmost")
+def size_1x1(inputs: Inputs) -> Inputs:
+    return good(height=1, width=1)
+
+
+@case("one line of a still image")
+def size_1x9_and_one_frame(inputs: Inputs) -> Inputs:
+    return good(frames=1, height=1, width=9)
+
+
+@case("smaller than every filter kernel, and the shortest clip that has a history")
+def size_3x3_and_two_frames(inputs: Inputs) -> Inputs:
+    return good(frames=2, height=3, width=3)
+
+
+@case("a crop by hand: no power of two divides it")
+def size_17x31(inputs: Inputs) -> Inputs:
+    return good(height=17, width=31)

@@ -1,5 +1,6 @@
 """What the hard cases are put to: every registered denoiser and every public operation, as functions of the inputs."""
 
+import inspect
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -9,11 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdn
-from jaxdn import color, losses, metrics, numerics
+from jaxdn import color, kernels, losses, metrics, numerics, warping
 from jaxdn.frame import RADIANCE_MAX, Frame, repair
-from tests.hard_cases.cases import HEIGHT, WIDTH, Inputs
+from tests.hard_cases.inputs import HEIGHT, WIDTH, Inputs
 
-_BOTH_WAYS = ("clamp", "zeros")
+_BORDERS = ("clamp", "zeros")
+_METRICS = ("psnr", "temporal_psnr", "ssim", "l1", "mse", "flip", "relative_mse")
+_PICTURED = {*(f"warp, {border}" for border in _BORDERS), "apply_kernels", "compose_scales"}
 
 
 class Subject(NamedTuple):
@@ -26,21 +29,35 @@ class Subject(NamedTuple):
     repairs: bool = False
     """It has to make something usable of anything; the others may hand on what is no number in their input."""
     bounds: tuple[float, float] = (-np.inf, np.inf)
+    truth: Callable[[Any, Inputs], Any] | None = None
+    """The same without its reduced precision inside, for the comparison in double; None: ``run`` itself."""
+    pictured: bool = False
+    """What comes out is worth looking at."""
+    kind: str = "operation"
 
 
 def denoiser_subjects() -> list[Subject]:
-    """Every denoiser by its factory; a network with the weights it starts from."""
+    """Every denoiser by its factory, and in each precision that it knows; a network with the weights it starts from."""
     subjects = []
     for name in jaxdn.denoisers.NAMES:
         factory = getattr(jaxdn.denoisers, name)
-        variants: dict[str, dict[str, Any]] = {name: {}}
-        if name == "ntd":
-            variants = {"ntd": {"size": "small"}, "ntd bfloat16": {"size": "small", "compute_dtype": "bfloat16"}}
-        for label, options in variants.items():
-            denoiser = factory(**options)
-            params = denoiser.init(jax.random.key(0), Frame(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
-            run = partial(_denoised, denoiser)
-            subjects.append(Subject(label, run, params, repairs=True, bounds=(0.0, RADIANCE_MAX)))
+        knows = inspect.signature(factory).parameters
+        options = {"size": "small"} if "size" in knows else {}
+        denoiser = factory(**options)
+        params = denoiser.init(jax.random.key(0), Frame(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
+        usual = Subject(
+            name,
+            partial(_denoised, denoiser),
+            params,
+            repairs=True,
+            bounds=(0.0, RADIANCE_MAX),
+            pictured=True,
+            kind="denoiser",
+        )
+        subjects.append(usual)
+        if "compute_dtype" in knows:
+            half = factory(**options, compute_dtype="bfloat16")
+            subjects.append(usual._replace(name=f"{name} bfloat16", run=partial(_denoised, half), truth=usual.run))
     return subjects
 
 
@@ -67,59 +84,85 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         return jax.vmap(jaxdn.occlusion_mask)(inputs.clip.frames.motion, inputs.clip.frames.dual_motion)
 
     def filtered(inputs: Inputs) -> jax.Array:
-        return jaxdn.apply_kernels(inputs.clip.frames.radiance[0], jaxdn.normalize_kernels(inputs.logits))
+        return jaxdn.apply_kernels(inputs.clip.frames.radiance[-1], jaxdn.normalize_kernels(inputs.logits))
+
+    def even(inputs: Inputs) -> jax.Array:
+        """As the error for odd sizes says."""
+        image = inputs.clip.frames.radiance[-1]
+        height, width = image.shape[:2]
+        return jnp.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
 
     def composed(inputs: Inputs) -> jax.Array:
-        fine = inputs.clip.frames.radiance[0]
+        fine = even(inputs)
         return jaxdn.compose_scales(fine, fine[::2, ::2], jax.nn.sigmoid(inputs.blend))
 
-    def squeezed(loss: Callable[..., jax.Array]) -> Callable[[Inputs], jax.Array]:
-        return lambda inputs: loss(*(color.compress(image) for image in _images(inputs)))
+    def lost(inputs: Inputs, loss: Callable[..., jax.Array], *arguments: Any, **options: Any) -> jax.Array:
+        return loss(*(color.compress(image) for image in _images(inputs)), *arguments, **options)
 
-    def toned(metric: Callable[..., jax.Array]) -> Callable[[Inputs], jax.Array]:
-        return lambda inputs: metric(*(color.tonemap(image) for image in _images(inputs)))
+    def measured(inputs: Inputs, name: str, *, masked: bool) -> jax.Array:
+        images = _images(inputs)
+        if name != "relative_mse":
+            images = tuple(jnp.clip(image, 0.0, 1.0) for image in images)  # a tone curve that half precision holds
+        return getattr(metrics, name)(*images, mask=inputs.mask if masked else None)
 
-    found: dict[str, Callable[[Inputs], Any]] = {
-        **{f"warp, {border}": partial(warped, border=border) for border in _BOTH_WAYS},
+    def of_light(function: Callable[..., jax.Array], **options: Any) -> Callable[[Inputs], jax.Array]:
+        return lambda inputs: function(inputs.clip.frames.radiance, **options)
+
+    return {
+        **{f"warp, {border}": partial(warped, border=border) for border in _BORDERS},
+        "on_screen": lambda inputs: jax.vmap(warping.on_screen)(inputs.clip.frames.motion).astype(jnp.float32),
         "dual_motion": dual,
         "occlusion_mask": masks,
         "normalize_kernels": lambda inputs: jaxdn.normalize_kernels(inputs.logits),
         "apply_kernels": filtered,
         "compose_scales": composed,
-        "color.compress": lambda inputs: color.compress(inputs.clip.frames.radiance),
+        "downsample": lambda inputs: kernels.downsample(even(inputs)),
+        "upsample": lambda inputs: kernels.upsample(inputs.clip.frames.radiance[-1]),
+        "color.compress": of_light(color.compress),
         "color.expand": lambda inputs: color.expand(jnp.minimum(inputs.clip.frames.radiance, 2.0)),
-        "color.luminance": lambda inputs: color.luminance(inputs.clip.frames.radiance),
-        "color.tonemap": lambda inputs: color.tonemap(inputs.clip.frames.radiance),
+        "color.luminance": of_light(color.luminance),
+        **{f"color.tonemap, {one}": of_light(color.tonemap, operator=one) for one in color.OPERATORS},
+        "color.srgb_encode": lambda inputs: color.srgb_encode(jnp.clip(inputs.clip.frames.radiance, 0.0, 1.0)),
+        "color.srgb_decode": lambda inputs: color.srgb_decode(jnp.clip(inputs.clip.frames.radiance, 0.0, 1.0)),
+        "numerics.absolute": of_light(numerics.absolute),
         "numerics.safe_norm": lambda inputs: numerics.safe_norm(inputs.clip.frames.normal),
-        "numerics.safe_power": lambda inputs: numerics.safe_power(inputs.clip.frames.radiance, 0.45),
-        "losses.occlusion": lambda inputs: losses.occlusion(
-            *(color.compress(image) for image in _images(inputs)), masks(inputs)
-        ),
+        "numerics.safe_norm of light": of_light(numerics.safe_norm),
+        "numerics.safe_power": of_light(numerics.safe_power, exponent=0.45),
+        **{f"losses.{name}": partial(lost, loss=getattr(losses, name)) for name in ("spatial", "temporal", "gradient")},
+        "losses.gradient, hfen": partial(lost, loss=losses.gradient, operator="hfen"),
+        "losses.occlusion": lambda inputs: lost(inputs, losses.occlusion, inputs.mask),
+        **{f"metrics.{name}": partial(measured, name=name, masked=False) for name in _METRICS},
+        **{f"metrics.{name}, masked": partial(measured, name=name, masked=True) for name in _METRICS},
     }
-    found |= {f"losses.{name}": squeezed(getattr(losses, name)) for name in ("spatial", "temporal", "gradient")}
-    names = ("psnr", "temporal_psnr", "ssim", "l1", "mse", "flip")
-    found |= {f"metrics.{name}": toned(getattr(metrics, name)) for name in names}
-    return found | {"metrics.relative_mse": lambda inputs: metrics.relative_mse(*_images(inputs))}
 
 
 def operation_subjects() -> list[Subject]:
     """Every public operation, and the frame's repair, which every denoiser begins with."""
-    pure = [Subject(name, lambda params, inputs, run=run: run(inputs)) for name, run in _operations().items()]
+    pure = [
+        Subject(name, lambda params, inputs, run=run: run(inputs), pictured=name in _PICTURED)
+        for name, run in _operations().items()
+    ]
 
     def repaired(params: Any, inputs: Inputs) -> jax.Array:
         return repair(inputs.clip.frames)[0].radiance
 
-    return [*pure, Subject("frame.repair", repaired, repairs=True, bounds=(0.0, RADIANCE_MAX))]
+    mended = Subject("frame.repair", repaired, repairs=True, bounds=(0.0, RADIANCE_MAX), pictured=True)
+    return [*pure, mended]
 
 
-def gradient_of(subject: Subject) -> Callable[[Any, Inputs], Any]:
-    """The gradient of the mean of what a subject gives, by its parameters, the radiance and the logits."""
+def gradient_of(run: Callable[[Any, Inputs], Any]) -> Callable[[Any, Inputs], Any]:
+    """The gradient of a weighted mean of what ``run`` gives, by its parameters, the radiance and the logits.
+
+    The weights differ from value to value, up to 1 and of both signs: of weights that sum to 1 a plain mean has no
+    gradient at all.
+    """
 
     def mean(params: Any, radiance: Any, logits: Any, inputs: Inputs) -> jax.Array:
         frames = inputs.clip.frames._replace(radiance=radiance)
         changed = inputs._replace(clip=inputs.clip._replace(frames=frames), logits=logits)
-        out = subject.run(params, changed)
-        return jnp.mean(jnp.asarray(out, jnp.promote_types(out.dtype, jnp.float32)))
+        out = run(params, changed)
+        out = jnp.asarray(out, jnp.promote_types(out.dtype, jnp.float32))
+        return jnp.mean(out * np.cos(np.arange(out.size)).reshape(out.shape).astype(out.dtype))
 
     def gradient(params: Any, inputs: Inputs) -> Any:
         return jax.grad(mean, (0, 1, 2), allow_int=True)(params, inputs.clip.frames.radiance, inputs.logits, inputs)

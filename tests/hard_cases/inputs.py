@@ -1,0 +1,76 @@
+"""What denoisers and operations are given: a clip in which nothing is wrong, and the ways to spoil one buffer of it."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdn.frame import Clip, Frame
+
+FRAMES, HEIGHT, WIDTH = 3, 16, 24
+
+
+class Inputs(NamedTuple):
+    """What denoisers and operations are given."""
+
+    clip: Clip
+    logits: np.ndarray
+    """[H, W, 25] of predicted kernels."""
+    blend: np.ndarray
+    """[H / 2, W / 2, 1] of a composition, before the sigmoid; rounded up where the size is odd."""
+    mask: np.ndarray
+    """[T, H, W, 1] in {0, 1}: the pixels that a metric or the occlusion loss is about."""
+
+
+def good(seed: int = 0, *, frames: int = FRAMES, height: int = HEIGHT, width: int = WIDTH) -> Inputs:
+    """A wall, and a square that moves over it by 1.5 px a frame: noisy, with every buffer, and nothing wrong."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:height, :width].astype(np.float32)
+    wall = 0.4 + 0.2 * np.sin(columns / 3) * np.cos(rows / 4)
+
+    def square(t: float) -> np.ndarray:
+        left = 4 + 1.5 * t
+        return (columns >= left) & (columns < left + 7) & (rows >= 4) & (rows < 11)
+
+    shape = (frames, height, width)
+    inside = np.stack([square(t) for t in range(frames)])[..., None]
+    before = np.stack([square(t - 1) for t in range(frames)])[..., None]
+    reference = np.where(inside, [0.2, 0.5, 0.9], wall[None, ..., None] * [1.0, 0.8, 0.6]).astype(np.float32)
+    motion = np.where(inside, [-1.5, 0.0], 0.0).astype(np.float32)
+    normal = np.where(inside, [0.0, 0.6, 0.8], [0.0, 0.0, 1.0]).astype(np.float32)
+    frame = Frame(
+        radiance=(reference * rng.exponential(size=(*shape, 1))).astype(np.float32),
+        albedo=np.where(inside, [0.3, 0.6, 0.9], 0.7).astype(np.float32),
+        normal=normal,
+        depth=np.where(inside, 2.0, 5.0 + columns[None, ..., None] / 50).astype(np.float32),
+        roughness=np.where(inside, 0.3, 1.0).astype(np.float32),
+        motion=motion,
+        dual_motion=np.where(before & ~inside, [1.5, 0.0], motion).astype(np.float32),
+        visible=inside | ~before,
+        previous_depth=np.where(inside, 2.0, 5.0 + columns[None, ..., None] / 50).astype(np.float32),
+        ids=np.where(inside, 1, 0).astype(np.int32),
+        direct=(0.1 * reference).astype(np.float32),
+        emission=np.zeros((*shape, 3), np.float32),
+    )
+    logits = rng.standard_normal((height, width, 25)).astype(np.float32)
+    blend = rng.standard_normal((-(-height // 2), -(-width // 2), 1)).astype(np.float32)
+    mask = np.broadcast_to((rows + columns)[None, ..., None] % 4 < 3, (*shape, 1)).astype(np.float32)
+    return Inputs(Clip(frame, reference), logits, blend, mask)
+
+
+def replaced(inputs: Inputs, **buffers: Any) -> Inputs:
+    """The same inputs with other buffers in their frames."""
+    frames = {name: np.asarray(buffer) for name, buffer in buffers.items()}
+    return inputs._replace(clip=inputs.clip._replace(frames=inputs.clip.frames._replace(**frames)))
+
+
+def filled(inputs: Inputs, name: str, value: Any) -> Inputs:
+    """One value in all of a buffer."""
+    buffer = getattr(inputs.clip.frames, name)
+    return replaced(inputs, **{name: np.full_like(buffer, value)})
+
+
+def dotted(inputs: Inputs, name: str, value: Any, *, every: int = 7) -> Inputs:
+    """One value in every seventh pixel of a buffer."""
+    buffer = np.array(getattr(inputs.clip.frames, name))
+    buffer.reshape(-1, buffer.shape[-1])[::every] = value
+    return replaced(inputs, **{name: buffer})
