@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn.backends import kernels as backend
+from jaxdn.backends import softmax_filter as filters
 from jaxdn.checks import check_image, check_option, check_same_size
 
 
@@ -30,13 +31,34 @@ def apply_kernels(image: jax.Array, kernels: jax.Array, *, implementation: str |
     check_image(image, "image")
     check_image(kernels, "kernels")
     check_same_size(image, kernels, ("image", "kernels"))
-    taps = jnp.shape(kernels)[-1]
-    if math.isqrt(taps) ** 2 != taps or taps % 2 == 0:
-        raise ValueError(
-            f"kernels: expected K*K taps with K odd (1, 9, 25, ...) in the last axis, got {taps}; "
-            "split other outputs of the network off first."
-        )
+    _check_taps(jnp.shape(kernels)[-1], "kernels")
     return backend.apply_kernels(jnp.asarray(image), jnp.asarray(kernels), implementation=implementation)
+
+
+def softmax_filter(
+    images: jax.Array, logits: jax.Array, *, taps: int = 25, implementation: str | None = None
+) -> jax.Array:
+    """Filter images with kernels given as logits: ``apply_kernels(image, normalize_kernels(logits))``, faster.
+
+    images: [n, H, W, C], any colour space. logits: [H, W, m] with m >= n * taps; image i has the ``taps`` = K*K, K odd,
+    from ``i * taps`` on, further channels are not read: a network's head goes in as it is. Returns [n, H, W, C] in
+    float32 at least. ``implementation``: "reference" or "strips"; None picks the fastest. Raises ValueError for sizes
+    that differ, too few logits, and taps that are not the square of an odd number.
+    """
+    images, logits = jnp.asarray(images), jnp.asarray(logits)
+    check_image(logits, "logits")
+    if images.ndim != 4 or images.shape[1:3] != logits.shape[:2]:
+        raise ValueError(
+            f"images: expected [n, {logits.shape[0]}, {logits.shape[1]}, C] as the logits, got {images.shape}."
+        )
+    _check_taps(taps, "taps")
+    if logits.shape[-1] < images.shape[0] * taps:
+        raise ValueError(
+            f"logits: expected {images.shape[0]} x {taps} channels at least, got {logits.shape[-1]}; "
+            "each image has taps of its own."
+        )
+    dtype = jnp.promote_types(jnp.promote_types(images.dtype, logits.dtype), jnp.float32)
+    return filters.softmax_filter(images.astype(dtype), logits.astype(dtype), taps=taps, implementation=implementation)
 
 
 def downsample(image: jax.Array, *, down: str = "mean") -> jax.Array:
@@ -109,6 +131,14 @@ def compose_scales(
     raise ValueError(
         f"alpha: expected the size of fine or of coarse, {fine.shape[:2]} or {coarse.shape[:2]}, got {alpha.shape[:2]}."
     )
+
+
+def _check_taps(taps: int, name: str) -> None:
+    if math.isqrt(taps) ** 2 != taps or taps % 2 == 0:
+        raise ValueError(
+            f"{name}: expected K*K taps with K odd (1, 9, 25, ...) in the last axis, got {taps}; "
+            "split other outputs of the network off first."
+        )
 
 
 def _check_even(height: int, width: int, name: str) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from jaxdn.backends.convolution import convolve
 from jaxdn.backends.registry import implementations, resolve
-from jaxdn.kernels import apply_kernels
+from jaxdn.kernels import apply_kernels, softmax_filter
 from jaxdn.warping import warp
 
 SIZES = [(6, 7), (1, 1), (1, 9)]
@@ -44,6 +44,15 @@ def numpy_apply_kernels(image, kernels):
                 j = min(max(column + tap % size - size // 2, 0), width - 1)
                 out[row, column] += kernels[row, column, tap] * image[i, j]
     return out
+
+
+def numpy_softmax_filter(images, logits, taps):
+    filtered = []
+    for index, image in enumerate(images):
+        own = logits[..., index * taps : (index + 1) * taps]
+        weights = np.exp(own - own.max(axis=-1, keepdims=True))
+        filtered.append(numpy_apply_kernels(image, weights / weights.sum(axis=-1, keepdims=True)))
+    return np.stack(filtered)
 
 
 def numpy_convolution(x, kernel):
@@ -84,6 +93,15 @@ def _case(op, size, rng):
             lambda implementation, image, kernels: apply_kernels(image, kernels, implementation=implementation),
             numpy_apply_kernels,
         )
+    if op.startswith("softmax_filter"):
+        taps, count, spare = map(int, op.removeprefix("softmax_filter_").split("_"))
+        return (
+            (rng.standard_normal((count, *size, 3)), 3 * rng.standard_normal((*size, count * taps + spare))),
+            lambda implementation, images, logits: softmax_filter(
+                images, logits, taps=taps, implementation=implementation
+            ),
+            lambda images, logits: numpy_softmax_filter(images, logits, taps),
+        )
     inputs, outputs = map(int, op.removeprefix("convolution_").split("_"))
     return (
         (rng.standard_normal((2, *size, inputs)), rng.standard_normal((3, 3, inputs, outputs))),
@@ -114,6 +132,14 @@ CASES = [
 ]
 
 
+FILTERS = [
+    (case, name)
+    for case in ("softmax_filter_25_1_0", "softmax_filter_9_2_1")
+    for name in implementations("softmax_filter")
+]
+"""Not linear in its logits, so that its gradient has a test of its own."""
+
+
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize(("case", "name"), CASES)
@@ -131,7 +157,26 @@ def test_value_and_gradient(case, name, size, rng):
 
 
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize(("case", "name"), CASES)
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(("case", "name"), FILTERS)
+def test_filter_and_its_gradient(case, name, size, rng):
+    """Values equal NumPy's, the VJP NumPy's central difference along a direction."""
+    arguments, function, expected = _case(case, size, rng)
+    values = expected(*arguments)
+    cotangent = rng.standard_normal(values.shape)
+    out, gradients = _pull_back(function, name)(jnp.asarray(cotangent), *map(jnp.asarray, arguments))
+    np.testing.assert_allclose(out, values, atol=1e-12)
+    for index, gradient in enumerate(gradients):
+        step = 1e-6 * rng.standard_normal(arguments[index].shape)
+        ahead, behind = (
+            expected(*(a + sign * step if i == index else a for i, a in enumerate(arguments))) for sign in (1, -1)
+        )
+        slope = np.sum(cotangent * (ahead - behind)) / 2
+        np.testing.assert_allclose(np.sum(step * gradient), slope, rtol=1e-6, atol=1e-13)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize(("case", "name"), CASES + FILTERS)
 def test_vmap_and_scan_change_nothing(case, name, rng):
     """grad(scan(vmap)) of three examples equals the sum, or the stack, of three gradients."""
     arguments, function, _ = _case(case, (5, 7), rng)
@@ -167,7 +212,7 @@ def test_keeps_the_dtype(case, name, dtype, rng):
     np.testing.assert_allclose(np.asarray(out, np.float64), values, atol=40 * float(jnp.finfo(dtype).eps))
 
 
-@pytest.mark.parametrize("op", ["warp", "apply_kernels", "convolution"])
+@pytest.mark.parametrize("op", ["warp", "apply_kernels", "softmax_filter", "convolution", "unet"])
 def test_a_name_is_that_one_or_an_error(op):
     assert len(implementations(op)) > 1
     for name in implementations(op):
@@ -175,3 +220,20 @@ def test_a_name_is_that_one_or_an_error(op):
     assert resolve(op, None) in [resolve(op, name) for name in implementations(op)]
     with pytest.raises(ValueError, match=r"'reference'.*'no such'"):
         resolve(op, "no such")
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("height", [5, 7, 8])
+def test_strips_of_any_number_of_rows_are_the_whole_image(height, rng, monkeypatch):
+    """Two rows a strip: heights that they divide and others, whose last strip computes a row again."""
+    monkeypatch.setattr("jaxdn.backends.softmax_filter._STRIP", 2 * 6 * 51)
+    images, logits = rng.standard_normal((2, height, 6, 3)), rng.standard_normal((height, 6, 51))
+    cotangent = rng.standard_normal(images.shape)
+
+    def both(implementation):
+        value, pull = jax.vjp(lambda *at: softmax_filter(*at, implementation=implementation), images, logits)
+        return value, pull(cotangent)
+
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), both("strips"), both("reference")
+    )

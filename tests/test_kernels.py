@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from jaxdn.kernels import apply_kernels, compose_scales, downsample, normalize_kernels, upsample
+from jaxdn.kernels import apply_kernels, compose_scales, downsample, normalize_kernels, softmax_filter, upsample
 
 SCALES = [(down, up) for down in ("mean", "max") for up in ("bilinear", "nearest")]
 
@@ -25,6 +25,28 @@ def test_normalized_kernels_of_half_precision_sum_to_one(rng):
     kernels = normalize_kernels(jnp.asarray(rng.standard_normal((4, 4, 25)), jnp.bfloat16))
     assert kernels.dtype == jnp.float32
     np.testing.assert_allclose(jnp.sum(kernels, axis=-1), 1, rtol=1e-6)
+
+
+def test_softmax_filter_is_normalizing_and_applying(rng):
+    images, head = rng.random((2, 6, 5, 3)).astype(np.float32), rng.standard_normal((6, 5, 51)).astype(np.float32)
+    own = [head[..., :25], head[..., 25:50]]
+    expected = [apply_kernels(image, normalize_kernels(logits)) for image, logits in zip(images, own, strict=True)]
+        apply_kernels(image, normalize_kernels(head[..., 25 * i : 25 * i + 25])) for i, image in enumerate(images)
+    ]
+    np.testing.assert_allclose(softmax_filter(images, head), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("images", "logits", "taps", "message"),
+    [
+        ((2, 6, 5, 3), (6, 5, 49), 25, "2 x 25 channels"),
+        ((6, 5, 3), (6, 5, 25), 25, r"\[n, 6, 5, C\]"),
+        ((1, 6, 5, 3), (6, 5, 25), 24, "K odd"),
+    ],
+)
+def test_softmax_filter_says_what_does_not_fit(images, logits, taps, message):
+    with pytest.raises(ValueError, match=message):
+        softmax_filter(np.zeros(images), np.zeros(logits), taps=taps)
 
 
 @pytest.mark.parametrize("tap", [0, 7, 12, 24])

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxdn import color
 from jaxdn.checks import check_image, check_option, check_same_size
 from jaxdn.frame import FAR, RADIANCE_MAX, Denoiser, Frame, only, repair, repair_image
-from jaxdn.kernels import apply_kernels, compose_scales, downsample, normalize_kernels
+from jaxdn.kernels import compose_scales, downsample, softmax_filter
 from jaxdn.networks import LARGE, MULTIPLE, SMALL
 from jaxdn.warping import on_screen, warp
 
@@ -213,20 +213,18 @@ def ntd(
     def blend(heads: list[jax.Array], noisy: jax.Array, recalled: jax.Array, absent: jax.Array) -> jax.Array:
         """Kernels applied and composed, in whatever domain the images are in."""
 
-        def filtered(image: jax.Array, logits: jax.Array) -> jax.Array:
-            return apply_kernels(image, normalize_kernels(logits))
-
         full, half, quarter = heads
         scales = [noisy]
         for _ in range(2):
             scales.append(downsample(scales[-1], down=options.pyramid))
         seams = (full[..., 2 * TAPS + 1 :], half[..., TAPS:]) if fine else (half[..., TAPS:], quarter[..., TAPS:])
-        composed = filtered(scales[2], quarter[..., :TAPS])
-        for image, head, seam in ((scales[1], half, seams[1]), (scales[0], full, seams[0])):
-            composed = compose_scales(
-                filtered(image, head[..., :TAPS]), composed, jax.nn.sigmoid(seam), down=options.down, up=options.up
-            )
-        temporal = filtered(recalled, full[..., TAPS : 2 * TAPS])
+        coarsest, middle = (
+            softmax_filter(image[None], head)[0] for image, head in ((scales[2], quarter), (scales[1], half))
+        )
+        finest, temporal = softmax_filter(jnp.stack([noisy, recalled]), full)
+        composed = coarsest
+        for image, seam in ((middle, seams[1]), (finest, seams[0])):
+            composed = compose_scales(image, composed, jax.nn.sigmoid(seam), down=options.down, up=options.up)
         current = jax.nn.sigmoid(full[..., 2 * TAPS : 2 * TAPS + 1])
         current = jnp.where(absent, 1.0, current)
         return current * composed + (1.0 - current) * temporal

@@ -172,8 +172,6 @@ class Engine:
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
         options.log_severity_level = 3
-        # Threads that wait busily would take the processors from the XLA part of the step.
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         self._weights = [weight.copy() for weight in weights]
         self._session = onnxruntime.InferenceSession(
             self._describe(self._weights), options, providers=["CPUExecutionProvider"]
