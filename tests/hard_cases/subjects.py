@@ -16,7 +16,7 @@ from tests.hard_cases.inputs import HEIGHT, WIDTH, Inputs
 
 _BORDERS = ("clamp", "zeros")
 _METRICS = ("psnr", "temporal_psnr", "ssim", "l1", "mse", "flip", "relative_mse")
-_PICTURED = {*(f"warp, {border}" for border in _BORDERS), "apply_kernels", "compose_scales"}
+_PICTURED = {*(f"warp, {border}" for border in _BORDERS), "apply_kernels", "softmax_filter", "compose_scales"}
 
 
 class Subject(NamedTuple):
@@ -86,6 +86,9 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
     def filtered(inputs: Inputs) -> jax.Array:
         return jaxdn.apply_kernels(inputs.clip.frames.radiance[-1], jaxdn.normalize_kernels(inputs.logits))
 
+    def filtered_by_logits(inputs: Inputs) -> jax.Array:
+        return kernels.softmax_filter(inputs.clip.frames.radiance[-1:], inputs.logits)[0]
+
     def even(inputs: Inputs) -> jax.Array:
         """As the error for odd sizes says."""
         image = inputs.clip.frames.radiance[-1]
@@ -115,6 +118,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "occlusion_mask": masks,
         "normalize_kernels": lambda inputs: jaxdn.normalize_kernels(inputs.logits),
         "apply_kernels": filtered,
+        "softmax_filter": filtered_by_logits,
         "compose_scales": composed,
         "downsample": lambda inputs: kernels.downsample(even(inputs)),
         "upsample": lambda inputs: kernels.upsample(inputs.clip.frames.radiance[-1]),
