@@ -5,7 +5,7 @@ SETTINGS ?=
 # Huge pages for large buffers (glibc; ignored elsewhere): a train step takes 0.87 of its time.
 export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 
-.PHONY: help setup train test test-slow hard-cases lint format docs weights clean
+.PHONY: help setup train test test-slow bench chart hard-cases lint format docs weights clean
 
 help:  ## what can be made
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -38,6 +38,24 @@ test-slow: setup  ## the slow tests: real training runs, the notebook, real proc
 
 hard-cases: setup  ## every hard case, operation, denoiser and precision: runs/hard-cases/table.html
 	$(BIN)/python -m tests.hard_cases
+
+# What people use today, to compare with. Only a CPU build of PyTorch is taken, from wherever pip is told to look, else
+# through uv from PyTorch's own index: the default build brings gigabytes of CUDA packages.
+.venv/tools: .venv/ready
+	@echo "Adding what people use today (PyTorch's CPU build, Open Image Denoise) to compare with ..."
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip >/dev/null
+	@$(BIN)/python -m pip install --quiet -c constraints.txt pyoidn || \
+		echo "Open Image Denoise (pyoidn) could not be installed: its rows will be left out"
+	@$(BIN)/python -m pip install --quiet -c constraints.txt torch 2>/dev/null || \
+		uv pip install --quiet --python $(BIN)/python --torch-backend cpu -c constraints.txt torch 2>/dev/null || \
+		echo "no CPU build of PyTorch could be installed: its rows will be left out"
+	@touch $@
+
+bench: .venv/tools  ## time operations, steps and training against PyTorch and Open Image Denoise: runs/bench.json
+	$(BIN)/python -m experiments.bench $(SETTINGS)
+
+chart: .venv/tools  ## error against time of every way to an image: runs/chart/chart.html
+	$(BIN)/python -m experiments.chart $(SETTINGS)
 
 lint: setup  ## ruff and the type checker
 	$(BIN)/ruff check .
