@@ -205,6 +205,8 @@ def main(settings: Settings) -> int:
     kinds = KINDS if settings.only == "all" else (settings.only,)
     each = -(-settings.inputs // len(kinds))
     report: dict[str, Any] = {"first": settings.first, "inputs": 0, "read": 0, "refused": 0, "bad": 0, "kinds": {}}
+    if settings.only != "all" and settings.out.is_file():
+        report["kinds"] = json.loads(settings.out.read_text())["kinds"]  # of the kinds that another run has fed
     settings.out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place:
         source = prepare(Path(place) / "source")

@@ -40,7 +40,7 @@ def good_files(folder: Path) -> dict[str, list[bytes]]:
     frames = Frame(light, albedo=light, depth=light[..., :1], motion=light[..., :2])
     record: dict[str, Any] = {"cameras": [{"x_fov": 60.0}] * 2, "plan": None}
     write_clip(Clip(frames, light), folder / "clip", record=record)
-    plan = {"frames": [["albedo", "depth", "motion"]] * 2, "held": [0, 0]}
+    plan = {"frames": [["albedo", "depth", "motion"]] * 2, "held": [0, 0], "effects": ["textures"]}
     planned = json.loads((folder / "clip" / "clip.json").read_bytes()) | {"plan": plan}
     tiny = {"size": [[1]] * 5}
     params = ntd(size=((1,),) * 5).init(jax.random.key(0), Frame(light[0]))
@@ -143,8 +143,8 @@ def blindly(good: bytes, draw: random.Random) -> bytes:
 def _header(good: bytes, draw: random.Random) -> bytes:
     """An EXR file with a wrong number in the value of one of its header's attributes, or one of its letters wrong."""
     data = bytearray(good)
-    attributes = (b"dataWindow", b"displayWindow", b"channels", b"compression", b"lineOrder", b"tiles", b"type", b"name")
-    at = data.find(draw.choice(attributes) + b"\0")
+    attributes = ["dataWindow", "displayWindow", "channels", "compression", "lineOrder", "tiles", "type", "name"]
+    at = data.find(draw.choice(attributes).encode() + b"\0")
     if at < 0 or draw.random() < 0.2:
         at = draw.randrange(8, len(data) // 2)
         data[at] = draw.randrange(256)
@@ -153,7 +153,8 @@ def _header(good: bytes, draw: random.Random) -> bytes:
     size = int.from_bytes(data[start : start + 4], "little")
     place = start + 4 * draw.randint(0, max(1, min(size, 64) // 4))
     if draw.random() < 0.5:
-        data[place : place + 4] = draw.choice((*_INTEGERS, draw.randrange(2**32), draw.randrange(99))).to_bytes(4, "little")
+        number = draw.choice((*_INTEGERS, draw.randrange(2**32), draw.randrange(99)))
+        data[place : place + 4] = number.to_bytes(4, "little")
     else:
         data[start + draw.randrange(size + 4)] = draw.randrange(256)
     return bytes(data)

@@ -56,8 +56,8 @@ class Checkpoints:
             except Exception as error:  # what a damaged byte leads to in Orbax has no common base
                 failed[step] = error
                 continue
-            for damaged, error in failed.items():
-                self._put_aside(damaged, error, continues=step)
+            for damaged, reason in failed.items():
+                self._put_aside(damaged, reason, continues=step)
             if failed:
                 self._manager.reload()
             return found
@@ -80,12 +80,12 @@ class Checkpoints:
             raise ValueError("its values are not those that were written")
         return TrainState(**found.state), data
 
-    def _put_aside(self, step: int, error: Exception, *, continues: int) -> None:
+    def _put_aside(self, step: int, reason: Exception, *, continues: int) -> None:
         aside = self._folder.parent / f"damaged-{step}"
         shutil.rmtree(aside, ignore_errors=True)
         shutil.move(self._folder / str(step), aside)
         warnings.warn(
-            f"checkpoint {self._folder / str(step)} is damaged ({_told(error)}) and was moved to {aside}; training "
+            f"checkpoint {self._folder / str(step)} is damaged ({_told(reason)}) and was moved to {aside}; training "
             f"continues from the checkpoint after {continues} updates.",
             stacklevel=3,
         )

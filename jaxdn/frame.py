@@ -130,11 +130,12 @@ def repair(frame: Frame) -> tuple[Frame, jax.Array]:
     negative -> 0, above 1e9 -> 1e9. Motion vectors: not finite -> NaN in both components, which means *no history
     there* (0 would be a legal vector). Half-precision buffers are widened to float32. Never raises on contents.
     """
-    replaced = jnp.zeros((), jnp.int32)
+    replaced: dict[tuple[int, ...], jax.Array] = {}
 
     def count(bad: jax.Array) -> None:
-        nonlocal replaced
-        replaced = replaced + jnp.sum(bad, dtype=jnp.int32)
+        # Summed up to one array for each shape: every reduction to a number is a pass over memory of its own.
+        flags = jnp.asarray(bad, jnp.int32)
+        replaced[bad.shape] = replaced[bad.shape] + flags if bad.shape in replaced else flags
 
     def light(buffer: Any) -> Any:
         if buffer is None:
@@ -155,11 +156,15 @@ def repair(frame: Frame) -> tuple[Frame, jax.Array]:
         if buffer is None:
             return None
         buffer = _working_dtype(buffer)
-        largest = jnp.max(jnp.abs(buffer), axis=-1, keepdims=True)
+        # Written out for three components: XLA:CPU takes four times as long for reductions over so short an axis.
+        sizes = [jnp.abs(buffer[..., i : i + 1]) for i in range(3)]
+        largest = jnp.maximum(jnp.maximum(sizes[0], sizes[1]), sizes[2])
         usable = jnp.isfinite(largest) & (largest > 1e-6)
         count(~jnp.isfinite(buffer))
-        scaled = jnp.where(usable, buffer, 1.0) / jnp.where(usable, largest, 1.0)
-        unit = scaled / jnp.sqrt(jnp.sum(scaled * scaled, axis=-1, keepdims=True))
+        # XLA may multiply by the divisor's reciprocal, which must not be subnormal.
+        divisor = jnp.where(usable, jnp.minimum(largest, float(jnp.finfo(buffer.dtype).max) / 8), 1.0)
+        x, y, z = (jnp.where(usable, size, 1.0) / divisor for size in sizes)
+        unit = jnp.where(usable, buffer, 1.0) / divisor / jnp.sqrt(x * x + y * y + z * z)
         return jnp.where(usable, unit, 0.0)
 
     def distance(buffer: jax.Array | None) -> jax.Array | None:
@@ -190,7 +195,7 @@ def repair(frame: Frame) -> tuple[Frame, jax.Array]:
         direct=light(frame.direct),
         emission=light(frame.emission),
     )
-    return repaired, replaced
+    return repaired, jnp.sum(jnp.stack([jnp.sum(flags) for flags in replaced.values()]))
 
 
 def repair_image(image: jax.Array) -> jax.Array:

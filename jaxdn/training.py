@@ -13,7 +13,7 @@ import optax
 
 from jaxdn import color, losses, metrics
 from jaxdn.backends.compiler import training_options
-from jaxdn.frame import Clip, Denoiser, Frame
+from jaxdn.frame import Clip, Denoiser, Frame, repair_image
 from jaxdn.motion import occlusion_mask
 from jaxdn.rollout import unroll
 
@@ -87,8 +87,8 @@ def disocclusions(frames: Frame) -> jax.Array:
 
 
 def clean(reference: jax.Array) -> jax.Array:
-    """A reference that cannot poison a weight: not finite or negative values become 0."""
-    return jnp.where(jnp.isfinite(reference) & (reference >= 0), reference, 0.0)
+    """A reference that cannot poison a weight: not finite or negative -> 0, at most what a denoiser may return."""
+    return repair_image(reference)
 
 
 def clip_loss(
@@ -120,7 +120,8 @@ def initial_state(denoiser: Denoiser, recipe: Recipe, batch: Clip) -> TrainState
 def make_train_step(denoiser: Denoiser, recipe: Recipe) -> Callable[[TrainState, Clip], tuple[TrainState, Report]]:
     """The jitted update ``(state, batch of clips) -> (state, report)``; the old state's memory is donated.
 
-    A gradient that is not finite changes no weight: the state stays as it was and ``skipped`` counts it.
+    An update that is not finite, or whose loss is not, changes no weight: the state stays as it was and ``skipped``
+    counts it.
     """
     update_rule = optimizer(recipe)
 
@@ -136,9 +137,11 @@ def make_train_step(denoiser: Denoiser, recipe: Recipe) -> Callable[[TrainState,
         occlusion = jnp.where(second_half, 1.0, 0.0) if recipe.occlusion else jnp.zeros(())
         (loss, psnr), gradient = jax.value_and_grad(batch_loss, has_aux=True)(state.params, batch, occlusion)
         norm = optax.tree.norm(gradient)
-        usable = jnp.isfinite(norm) & jnp.isfinite(loss)
         updates, optimizer_state = update_rule.update(gradient, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)
+        # A finite gradient times too high a learning rate is no finite weight: what would be kept is what is tested.
+        kept = jax.tree.leaves((params, optimizer_state))
+        usable = jnp.isfinite(norm) & jnp.isfinite(loss) & jnp.stack([jnp.isfinite(x).all() for x in kept]).all()
         params, optimizer_state = jax.tree.map(
             lambda new, old: jnp.where(usable, new, old), (params, optimizer_state), (state.params, state.optimizer)
         )

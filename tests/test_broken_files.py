@@ -1,4 +1,4 @@
-"""Broken files that the fuzzer found not to be refused as they should: each is one input of a kind it had trouble with."""
+"""Broken files that the fuzzer found and that were not refused as they should be."""
 
 import json
 import time
@@ -8,6 +8,7 @@ import pytest
 
 from jaxdn.clips import ClipError, read_clip, write_clip
 from jaxdn.clips.cache import open_cached
+from jaxdn.clips.facts import read_facts
 from jaxdn.frame import Clip, Frame
 from jaxdn.render.animation import check_animation, read_animation
 from jaxdn.weights import load_weights
@@ -36,18 +37,20 @@ def test_a_record_that_claims_endless_frames_is_refused_at_once(clip, read):
     assert time.monotonic() - began < 5
 
 
-@pytest.mark.parametrize("read", [read_clip, open_cached])
+@pytest.mark.parametrize("read", [read_clip, open_cached, read_facts])
 @pytest.mark.parametrize(
     "plan",
     [
-        {"frames": [[3], ["depth"]], "held": [0, 1]},
-        {"frames": [[["depth"]], ["depth"]], "held": [0, 1]},
-        {"frames": [7, ["depth"]], "held": [0, 1]},
-        {"frames": ["depth", ["depth"]], "held": [0, 1]},
-        {"frames": [["colour"], ["depth"]], "held": [0, 1]},
+        {"frames": [[3], ["depth"]], "held": [0, 1], "effects": []},
+        {"frames": [[["depth"]], ["depth"]], "held": [0, 1], "effects": []},
+        {"frames": [7, ["depth"]], "held": [0, 1], "effects": []},
+        {"frames": ["depth", ["depth"]], "held": [0, 1], "effects": []},
+        {"frames": [["colour"], ["depth"]], "held": [0, 1], "effects": []},
         {"frames": [["depth"], ["depth"]], "held": [0, 2]},
         {"frames": [["depth"]], "held": [0]},
         {"held": [0, 1]},
+        {"frames": [["depth"], ["depth"]], "held": [0, 1]},
+        {"frames": [["depth"], ["depth"]], "held": [0, 1], "effects": 3},
         ["frames"],
     ],
 )
@@ -55,6 +58,12 @@ def test_a_plan_that_makes_no_sense_is_refused(clip, read, plan):
     rewrite(clip, plan=plan)
     with pytest.raises(ClipError, match="plan: expected"):
         read(clip)
+
+
+def test_a_record_with_fewer_cameras_than_frames_is_refused(clip):
+    rewrite(clip, cameras=[{"x_fov": 60.0}])
+    with pytest.raises(ClipError, match="cameras: expected"):
+        read_facts(clip)
 
 
 @pytest.mark.parametrize("number", [10**400, -(10**400)])

@@ -106,14 +106,42 @@ def test_rematerialised_gradients_are_the_same(denoiser, state):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(False), gradient(True))
 
 
-@pytest.mark.parametrize("poison", [np.nan, np.inf, -np.inf, -1e30, 1e38])
-def test_bad_radiance_never_makes_a_bad_weight(step, state, poison):
-    clip = make_clip(0)
-    clip.frames.radiance[1, 3:6, 3:6] = poison
-    clip.reference[2, 8, 8] = poison
-    state, report = step(state, batch_of(clip, make_clip(1)))
-    assert np.isfinite(report.loss) or int(state.skipped) == 1
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.params))
+def sound(state):
+    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.params, state.optimizer)))
+
+
+POISONS = [np.nan, np.inf, -np.inf, 1e30, -1e30, 1e38]
+
+
+@pytest.mark.parametrize("buffer", ["radiance", "albedo", "normal", "depth", "motion", "dual_motion", "reference"])
+def test_a_poisoned_buffer_never_makes_a_bad_weight_and_learning_goes_on(step, state, buffer):
+    batch = batch_of(make_clip(0), make_clip(1))
+    before = jax.tree.map(np.array, state.params)
+    for poison in POISONS:
+        if buffer == "reference":
+            spoilt = batch._replace(reference=batch.reference.at[:, 1, 3:9].set(poison))
+        else:
+            values = getattr(batch.frames, buffer).at[:, 1, 3:9].set(poison)
+            spoilt = batch._replace(frames=batch.frames._replace(**{buffer: values}))
+        state, report = step(state, spoilt)
+        assert np.isfinite(report.loss), poison
+        assert sound(state), poison
+    assert int(state.skipped) == 0
+    changed = [np.any(new != old) for new, old in zip(*map(jax.tree.leaves, (state.params, before)), strict=True)]
+    assert any(changed)
+
+
+def test_a_black_batch_is_one_like_any_other(step, state):
+    batch = batch_of(make_clip(0), make_clip(1))
+    black = jax.tree.map(jnp.zeros_like, batch)
+    state, _ = step(state, black)
+    state, report = step(state, black)
+    assert np.isfinite(report.loss)
+    assert np.isfinite(report.gradient_norm)
+    assert sound(state)
+    assert int(state.skipped) == 0
+    state, _ = step(state, batch)
+    assert sound(state)
 
 
 def test_a_gradient_that_is_not_finite_changes_nothing(denoiser, step, state):

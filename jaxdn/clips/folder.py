@@ -227,7 +227,7 @@ def _checked(record: Any, file: Path) -> dict[str, Any]:
 
 
 def _check_plan(plan: Any, count: int, file: Path) -> None:
-    """Raise ClipError unless a plan is None or says, for each frame, which buffers it has and whose they are."""
+    """Raise ClipError unless a plan is None or says what each frame holds, whose it is, and for which effects."""
     if plan is None:
         return
     held = plan.get("held") if isinstance(plan, Mapping) else None
@@ -235,6 +235,9 @@ def _check_plan(plan: Any, count: int, file: Path) -> None:
     sound = isinstance(held, list) and isinstance(frames, list) and len(held) == len(frames) == count
     if not sound or not all(type(at) is int and 0 <= at <= index for index, at in enumerate(held or [])):
         raise ClipError(f"{file}: plan: expected what each of {count} frames holds; render it again.")
+    effects = plan.get("effects")
+    if not isinstance(effects, list) or not all(isinstance(name, str) for name in effects):
+        raise ClipError(f"{file}: plan: expected a list of effects, got {effects!r}; render the clip again.")
     for names in frames or []:
         if not isinstance(names, list) or not all(isinstance(name, str) and name in _BUFFERS for name in names):
             raise ClipError(f"{file}: plan: expected names of buffers, got {names!r}; render it again.")

@@ -1,6 +1,7 @@
 """``jaxdn train``: the loop around the train step, with data, validation, progress and checkpoints."""
 
 import json
+import math
 import os
 import sys
 import time
@@ -42,8 +43,9 @@ class Log:
         self._file = path.open("a")
 
     def write(self, **entry: Any) -> None:
-        """Append one entry and let it reach the file."""
-        self._file.write(json.dumps(entry) + "\n")
+        """Append one entry and let it reach the file; what is not finite is null, which strict JSON has a word for."""
+        entry = {key: value if math.isfinite(value) else None for key, value in entry.items()}
+        self._file.write(json.dumps(entry, allow_nan=False) + "\n")
         self._file.flush()
 
     def close(self) -> None:
@@ -63,15 +65,19 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 
 def read_curve(folder: Path) -> Curve:
-    """The loss and validation curves of a run's folder."""
+    """The loss and validation curves of a run's folder; not a number where the log has null."""
+
+    def number(value: float | None) -> float:
+        return float("nan") if value is None else value
+
     entries = read_log(folder / "log.jsonl")
     losses = [entry for entry in entries if "loss" in entry]
     checks = [entry for entry in entries if "validation_psnr" in entry]
     return Curve(
         [entry["step"] for entry in losses],
-        [entry["loss"] for entry in losses],
+        [number(entry["loss"]) for entry in losses],
         [entry["step"] for entry in checks],
-        [entry["validation_psnr"] for entry in checks],
+        [number(entry["validation_psnr"]) for entry in checks],
     )
 
 
@@ -104,6 +110,7 @@ def fit(
 
     ``batches`` is a Grain iterator (it has ``get_state`` and ``set_state``): its position is kept in every checkpoint.
     Interrupted (Ctrl-C), the state is written before KeyboardInterrupt goes on. The log is ``folder/log.jsonl``.
+    Raises ValueError, saying what to change, when none of many updates in a row was of any effect.
     """
     folder.mkdir(parents=True, exist_ok=True)
     _same_recipe(folder / "recipe.json", recipe)
@@ -122,6 +129,7 @@ def fit(
     # A write of the state while it is being replaced would keep neither: the position belongs to finished updates only.
     position = batches.get_state()  # type: ignore[attr-defined]
     saved = step
+    watch = _Divergence(label, recipe, step, int(state.skipped))
     with _Progress(label, recipe, step) as progress:
         try:
             while step < recipe.steps:
@@ -129,9 +137,10 @@ def fit(
                 state, report = train_step(state, batch)
                 step, position = step + 1, batches.get_state()  # type: ignore[attr-defined]
                 if step % log_every == 0 or step == recipe.steps:
-                    loss = float(report.loss)
+                    loss, skipped = float(report.loss), int(state.skipped)
                     log.write(step=step, loss=loss, last_frame_psnr=float(report.validation_psnr))
-                    progress.advance(step, loss=loss, skipped=int(state.skipped))
+                    progress.advance(step, loss=loss, skipped=skipped)
+                    watch.look(step, skipped=skipped, norm=float(report.gradient_norm))
                 if validation and (step % validate_every == 0 or step == recipe.steps):
                     psnr = validate(state.params)
                     log.write(step=step, validation_psnr=psnr)
@@ -171,6 +180,31 @@ def _same_recipe(path: Path, recipe: Recipe) -> None:
     beside = path.with_name(path.name + ".part")
     beside.write_text(json.dumps(wanted, indent=1) + "\n")
     os.replace(beside, path)
+
+
+class _Divergence:
+    """Raises where training goes on without learning: for 100 updates, or half of all, none was of any effect."""
+
+    def __init__(self, label: str, recipe: Recipe, step: int, skipped: int):
+        self._label, self._recipe = label, recipe
+        self._patience = max(1, min(100, recipe.steps // 2))
+        self._learned = self._seen = step
+        self._skipped = skipped
+
+    def look(self, step: int, *, skipped: int, norm: float) -> None:
+        """Take in that of ``step`` updates ``skipped`` were not finite, and the norm of the newest gradient.
+
+        Weights that have grown beyond all measure may still give finite images, from which no gradient comes back.
+        """
+        if skipped - self._skipped < step - self._seen and norm != 0:
+            self._learned = step
+        self._seen, self._skipped = step, skipped
+        if step - self._learned >= self._patience:
+            raise ValueError(
+                f"{self._label}: nothing was learned in the updates {self._learned + 1} to {step} ({skipped} so far "
+                f"were not finite, the newest gradient's norm is {norm:g}); start again under another name with a "
+                f"learning rate below {self._recipe.learning_rate:g}, and look for clips that are black."
+            )
 
 
 class _Progress:
