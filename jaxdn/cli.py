@@ -131,6 +131,8 @@ class Denoise:
     """Write a PNG beside every EXR."""
     motion_convention: str | None = None
     """For foreign files with motion vectors: whose convention they follow; an unknown one lists those known."""
+    implementation: Literal["auto", "reference", "onnxruntime"] = "auto"
+    """What runs the network: XLA (reference) or ONNX Runtime (CPU; the extra onnx); auto: the latter where it can."""
 
 
 @dataclass
@@ -269,22 +271,22 @@ def _train(options: Train) -> None:
 
 
 def _denoise(options: Denoise) -> None:
-    from jaxdn.commands.compare import method_named
-    from jaxdn.commands.denoise import denoise_files
+    from jaxdn.commands.denoise import denoise_files, method_on
 
     console = Console(stderr=True)
+    method, engine = method_on(options.method, options.implementation)
     with console.status(f"{options.method}: reading ...") as status:
         written = denoise_files(
             options.clip,
             options.out,
-            method_named(options.method),
+            method,
             spp=options.spp,
             preview=options.preview,
             motion_convention=options.motion_convention,
             say=lambda done, total: status.update(f"{options.method}: frame {done} of {total}"),
         )
     compiled = f"{written.programs} program{'s' * (written.programs != 1)} compiled"
-    print(f"{len(written.files)} frames denoised by {options.method} in {options.out} ({compiled})")
+    print(f"{len(written.files)} frames denoised by {options.method} in {options.out} ({engine}, {compiled})")
 
 
 def _compare(options: Compare) -> None:

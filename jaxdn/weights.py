@@ -64,10 +64,11 @@ def save_weights(
     return path
 
 
-def load_weights(name_or_path: str | Path) -> tuple[Denoiser, dict[str, Any]]:
+def load_weights(name_or_path: str | Path, **options_instead: Any) -> tuple[Denoiser, dict[str, Any]]:
     """A denoiser and its parameters, by a shipped name (``"ntd-large"``) or the path of a .safetensors file.
 
-    The factory and its options are read from the JSON beside the weights. Raises ValueError where nothing of that name
+    The factory and its options are read from the JSON beside the weights; ``options_instead`` take their place, such
+    as ``implementation="onnxruntime"`` or ``compute_dtype="bfloat16"``. Raises ValueError where nothing of that name
     exists, a file cannot be read, the JSON names an unknown factory or option, or the weights are not those of the
     denoiser that it describes.
     """
@@ -105,6 +106,8 @@ def load_weights(name_or_path: str | Path) -> tuple[Denoiser, dict[str, Any]]:
             f"weights {beside}: expected options of {factory}, got {options} ({error}); they may come from a newer "
             "jaxdn."
         ) from error
+    if options_instead:
+        denoiser = getattr(denoisers, factory)(**options | options_instead)
     _check_params(flat, denoiser, path)
     return denoiser, unflatten(flat)
 

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from importlib.util import find_spec
 
 import numpy as np
 import OpenEXR
@@ -68,13 +69,19 @@ def test_denoise_plain_exr_files_with_the_shipped_network(tmp_path):
         pixels["R"][3, 4], pixels["G"][5, 6], pixels["B"][7, 8] = np.nan, np.inf, -3.0
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         OpenEXR.File(header, pixels).write(str(tmp_path / f"shot_{index:04d}.exr"))
-    done = jaxdn("denoise", tmp_path / "shot_*.exr", "-o", tmp_path / "out", "--method", "ntd-small")
-    assert done.returncode == 0, done.stderr
-    with OpenEXR.File(str(tmp_path / "out" / "shot_0001.exr"), separate_channels=True) as file:
-        red = file.channels()["R"].pixels
-    assert red.shape == (33, 57)
-    assert np.isfinite(red).all()
-    assert red.std() < 0.7  # exponential noise has a standard deviation of 1
+    engines = ["reference", *(["onnxruntime"] if find_spec("onnxruntime") else [])]
+    reds = []
+    for engine in engines:
+        out = tmp_path / engine
+        done = jaxdn("denoise", tmp_path / "shot_*.exr", "-o", out, "--method", "ntd-small", "--implementation", engine)
+        assert done.returncode == 0, done.stderr
+        assert engine in done.stdout
+        with OpenEXR.File(str(out / "shot_0001.exr"), separate_channels=True) as file:
+            reds.append(file.channels()["R"].pixels)
+    assert reds[0].shape == (33, 57)
+    assert np.isfinite(reds[0]).all()
+    assert reds[0].std() < 0.7  # exponential noise has a standard deviation of 1
+    np.testing.assert_allclose(reds[0], reds[-1], rtol=2e-3, atol=2e-3)  # stored in half precision
 
 
 def test_compare_ends_with_a_report(clip, tmp_path):
@@ -94,6 +101,7 @@ def test_compare_ends_with_a_report(clip, tmp_path):
         (("denoise", "CLIP", "-o", "CLIP", "--method", "svgf"), "another folder"),
         (("denoise", "CLIP", "-o", "out", "--method", "svgf", "--spp", "2"), "2 samples a pixel are not available"),
         (("denoise", "CLIP", "-o", "out", "--wrong"), "--wrong"),
+        (("denoise", "CLIP", "-o", "out", "--method", "svgf", "--implementation", "onnxruntime"), "with weights"),
         (("compare", "nowhere", "-o", "out", "--methods", "noisy"), "no clip.json"),
         (("render", "castle", "-o", "out"), "fruit"),
         (("render", "none.xml", "-o", "out"), "none.xml"),

@@ -31,8 +31,6 @@ def test_softmax_filter_is_normalizing_and_applying(rng):
     images, head = rng.random((2, 6, 5, 3)).astype(np.float32), rng.standard_normal((6, 5, 51)).astype(np.float32)
     own = [head[..., :25], head[..., 25:50]]
     expected = [apply_kernels(image, normalize_kernels(logits)) for image, logits in zip(images, own, strict=True)]
-        apply_kernels(image, normalize_kernels(head[..., 25 * i : 25 * i + 25])) for i, image in enumerate(images)
-    ]
     np.testing.assert_allclose(softmax_filter(images, head), expected, rtol=1e-6)
 
 

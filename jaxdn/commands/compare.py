@@ -28,11 +28,14 @@ class Method(NamedTuple):
     params: Any
 
 
-def method_named(name: str) -> Method:
+def method_named(name: str, **options: Any) -> Method:
     """``noisy``, a filter without weights (``svgf``), shipped weights (``ntd-large``) or a .safetensors file.
 
-    Raises ValueError for a name that is none of these.
+    ``options`` take the place of those that the weights were saved with. Raises ValueError for a name that is none of
+    these, and for options where there are no weights.
     """
+    if options and (name == "noisy" or name in denoisers.NAMES):
+        raise ValueError(f"{', '.join(options)}: expected a method with weights, got {name!r}; leave it out.")
     if name == "noisy":
         return Method(name, None, {})
     if name in denoisers.NAMES:
@@ -47,7 +50,7 @@ def method_named(name: str) -> Method:
     if not name.endswith(".safetensors") and name not in shipped_names():
         known = ["noisy", *denoisers.NAMES, *shipped_names()]
         raise ValueError(f"method {name!r}: expected one of {', '.join(known)} or the path of a .safetensors file.")
-    denoiser, params = load_weights(name)
+    denoiser, params = load_weights(name, **options)
     path = Path(name)
     # A run's folder says more than the name that all weights have there.
     return Method(path.parent.name if path.stem == "weights" else path.stem, denoiser, params)

@@ -11,9 +11,11 @@ from jaxdn import color
 from jaxdn.clips.exr import write_exr
 from jaxdn.clips.folder import frame_path, is_clip, read_frames, read_record
 from jaxdn.clips.import_exr import read_plain_frames, sequence_files
-from jaxdn.commands.compare import Method
+from jaxdn.commands.compare import Method, method_named
 from jaxdn.frame import RADIANCE_MAX, Frame, only
+from jaxdn.networks import onnx
 from jaxdn.report.images import save_png
+from jaxdn.weights import describe
 
 
 class Written(NamedTuple):
@@ -22,6 +24,21 @@ class Written(NamedTuple):
     files: list[Path]
     programs: int
     """Steps that were compiled: one for each set of buffers that some frame has."""
+
+
+def method_on(name: str, implementation: str = "auto") -> tuple[Method, str]:
+    """The method of that name on an engine, and the engine's name: "reference" (XLA) or "onnxruntime".
+
+    ``"auto"`` is the faster engine where it can run: on a CPU, installed, for a network that computes in float32.
+    Raises ValueError for a name that is no method, and for an engine that cannot run it.
+    """
+    method = method_named(name)
+    if implementation == "auto":
+        fits = bool(method.params) and describe(name)["options"].get("compute_dtype") != "bfloat16"
+        implementation = "onnxruntime" if fits and onnx.available() else "reference"
+    if implementation == "reference":
+        return method, implementation
+    return method_named(name, implementation=implementation), implementation
 
 
 def denoise_files(
