@@ -1,0 +1,123 @@
+"""The clips of the chart: rendered with noisy layers from 1 sample a pixel up to what a user would wait for."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdn import effects
+from jaxdn.clips import ClipError, read_clip, read_record
+from jaxdn.clips.noise_floor import read_noise_floor
+from jaxdn.frame import Frame
+from jaxdn.render import ClipJob, choose_variant, render_clips
+
+
+class Sizes(NamedTuple):
+    """What is rendered and timed."""
+
+    scenes: tuple[tuple[str, int], ...]
+    """(family, seed): seeds that no network was trained or validated on."""
+    pixels: int
+    """Width and height."""
+    frames: int
+    most_samples: int
+    """The largest noisy layer, a power of two."""
+    reference_spp: int
+    timed: tuple[int, int]
+    """Height and width of the frame that is timed."""
+    rounds: int
+    methods: tuple[str, ...] | None = None
+    """Names of the methods to measure; None is all of them."""
+
+    @property
+    def layers(self) -> tuple[int, ...]:
+        """1, 2, 4 ... samples a pixel."""
+        return tuple(2**power for power in range(self.most_samples.bit_length()))
+
+
+FULL = Sizes((("pinkroom", 400), ("mobile", 400)), 64, 6, 1024, 2048, (720, 1280), rounds=3)
+QUICK = Sizes(
+    (("mobile", 400),), 32, 4, 16, 32, (48, 64), rounds=2, methods=("svgf", "ntd-small", "oidn high", "ntd tiny")
+)
+SCORED = 4
+"""Frames at a clip's end that are scored: recurrent methods have a history by then."""
+
+
+class Footage(NamedTuple):
+    """One clip, read."""
+
+    name: str
+    folder: Path
+    record: dict[str, Any]
+    frames: Frame
+    """[T, H, W, C] the buffers that the effects of the clip call for; ``radiance`` is that of the smallest layer."""
+    noisy: dict[int, np.ndarray]
+    """Samples a pixel -> [T, H, W, 3]."""
+    reference: np.ndarray
+    hidden: np.ndarray
+    """[T, H, W, 1] bool, pixels whose point was hidden one frame earlier."""
+    shown: int
+    """The frame that the page shows: of the scored ones, the one with the most hidden pixels."""
+    noise_floor: float
+    """PSNR in dB that a perfect image would have against the reference; NaN where it is not known."""
+
+
+def render(sizes: Sizes, folder: Path) -> list[Path]:
+    """Render the clips into ``folder``, or find them there; returns their folders."""
+    places = [folder / f"{family}-{seed}" for family, seed in sizes.scenes]
+    variants = [_variant(place) for place in places]
+    jobs = [
+        ClipJob(
+            {"family": family, "seed": seed},
+            str(place),
+            width=sizes.pixels,
+            height=sizes.pixels,
+            frames=sizes.frames,
+            layers=sizes.layers,
+            reference_spp=sizes.reference_spp,
+            seed=seed,
+            variant=variant,
+        )
+        for (family, seed), place, variant in zip(sizes.scenes, places, variants, strict=True)
+    ]
+    return render_clips(jobs)
+
+
+def _variant(place: Path) -> str:
+    """The variant that a clip was begun with: it is finished, and used again, with the same one."""
+    return read_record(place)["variant"] if (place / "clip.json").is_file() else choose_variant().variant
+
+
+def read(folder: Path) -> Footage:
+    """Read a clip. Raises ClipError where it has no reference or fewer frames than are scored."""
+    record = read_record(folder)
+    layers = sorted(record["layers"])
+    clip = read_clip(folder, spp=layers[0])
+    count = record["frames"]
+    if clip.reference is None:
+        raise ClipError(f"{folder}: expected a clip with a reference to compare with; render one with reference_spp.")
+    if count <= SCORED:
+        raise ClipError(f"{folder}: expected more than {SCORED} frames, the last {SCORED} are scored; got {count}.")
+    noisy = {spp: np.asarray(read_clip(folder, spp=spp).frames.radiance) for spp in layers}
+    visible = clip.frames.visible
+    hidden = np.zeros((*np.shape(clip.reference)[:3], 1), bool) if visible is None else ~np.asarray(visible, bool)
+    shown = count - SCORED + int(np.argmax(hidden[-SCORED:].sum((1, 2, 3))))
+    planned = effects.plan(effects.inspect(folder)).buffers
+    frames = clip.frames._replace(
+        **{name: None for name in Frame._fields[1:] if name not in planned}  # type: ignore[arg-type]
+    )
+    floor = read_noise_floor(folder)
+    return Footage(folder.name, folder, record, frames, noisy, np.asarray(clip.reference), hidden, shown, floor)
+
+
+def common_layers(clips: Sequence[Footage]) -> list[int]:
+    """The numbers of samples that every clip has. Raises ClipError where there are none, or the sizes differ."""
+    shared = set.intersection(*(set(clip.noisy) for clip in clips))
+    shapes = {clip.reference.shape[1:3] for clip in clips}
+    if not shared or len(shapes) > 1:
+        raise ClipError(
+            f"clips: expected clips of one size with sample counts in common, got sizes {sorted(shapes)} and counts "
+            f"{[sorted(clip.noisy) for clip in clips]}."
+        )
+    return sorted(shared)

@@ -1,0 +1,50 @@
+"""The raw measurements in one file that is whole after every point: an interrupted run goes on where it stopped."""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jaxdn.clips.files import read_json, write_json
+from jaxdn.report.results import json_ready
+
+PARTS = ("clips", "errors", "times", "render", "breakdown", "left_out")
+"""errors: "method @ spp" -> clip -> measure -> number. times: method -> size -> what was measured. render: size ->
+clip -> cost. breakdown: network -> part -> timing."""
+
+
+class Store:
+    """``chart.json`` and what it was measured with."""
+
+    def __init__(self, path: Path, settings: Mapping[str, Any], machine: Mapping[str, Any]) -> None:
+        self.path = path
+        made_with = json_ready({"settings": settings, "machine": machine})
+        text = json.dumps(made_with, sort_keys=True)
+        mark = hashlib.sha256(text.encode()).hexdigest()[:16]
+        self.data: dict[str, Any] = {"fingerprint": mark, **made_with, **{part: {} for part in PARTS}}
+        self.kept = False
+        """Measurements of an earlier run were found, made with the same settings on the same machine."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.exists():
+            before = read_json(path)
+            if isinstance(before, dict) and before.get("fingerprint") == mark:
+                self.data, self.kept = before, True
+            else:
+                # Numbers of another machine or other settings do not mix with these, and may have taken long.
+                os.replace(path, path.with_name("chart.before.json"))
+
+    def put(self, part: str, key: str, value: Any) -> None:
+        """Keep one measurement and write the file anew, beside its place and then renamed."""
+        self.data[part][key] = json_ready(value)
+        write_json(self.path, self.data)
+
+    def has(self, part: str, key: str) -> bool:
+        """Whether this was measured."""
+        return key in self.data[part]
+
+
+def point_key(method: str, spp: int) -> str:
+    """How a point is called in the file."""
+    return f"{method} @ {spp}"
