@@ -64,6 +64,11 @@ def fireflies_beyond_half_precision(inputs: Inputs) -> Inputs:
     return dotted(inputs, "radiance", 1e30)
 
 
+@case("an overflow that was clipped: the largest number there is")
+def fireflies_of_the_largest_number(inputs: Inputs) -> Inputs:
+    return dotted(inputs, "radiance", np.finfo(np.float32).max)
+
+
 @case("the reference itself has fireflies left")
 def fireflies_in_the_reference(inputs: Inputs) -> Inputs:
     reference = np.array(inputs.clip.reference)
@@ -180,6 +185,13 @@ def normals_of_any_length(inputs: Inputs) -> Inputs:
 def normals_at_right_angles(inputs: Inputs) -> Inputs:
     normal = np.zeros_like(inputs.clip.frames.normal)
     normal[:, :, ::2, 0] = normal[:, :, 1::2, 1] = 1
+    return replaced(inputs, normal=normal)
+
+
+@case("a transformation with a scale nobody meant: lengths near the largest number, and near the smallest")
+def normals_of_extreme_length(inputs: Inputs) -> Inputs:
+    normal = 3e38 * inputs.clip.frames.normal
+    normal[:, ::2] = 2e-38 * inputs.clip.frames.normal[:, ::2]
     return replaced(inputs, normal=normal)
 
 
