@@ -197,11 +197,10 @@ def unet(
             start += channels
         parts = used if len(used) < len(groups) else None
 
-        def plain(params: dict[str, Any], joined: jax.Array) -> tuple[jax.Array, ...]:
-            return nnx.merge(graph, params)(joined, parts)
+        def plain(params: dict[str, Any], present: list[jax.Array]) -> tuple[jax.Array, ...]:
+            return nnx.merge(graph, params)(jnp.concatenate(present, axis=-1), parts)
 
-        joined = jnp.concatenate(present, axis=-1)
-        return run(plain, heads=len(heads), slope=NEGATIVE_SLOPE, used=parts)(params, joined)
+        return run(plain, heads=len(heads), slope=NEGATIVE_SLOPE, used=parts)(params, present)
 
     return Network(init, apply)
 
