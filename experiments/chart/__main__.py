@@ -8,6 +8,7 @@ Writes ``runs/chart/chart.json`` (raw measurements) and ``runs/chart/chart.html`
 is measured is kept after every point: interrupted, it goes on where it stopped, and repeats only what is missing.
 """
 
+import hashlib
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -73,7 +74,7 @@ class Run:
             "clips": {clip.name: clip.record for clip in clips},
             "sizes": sizes._asdict(),
             "scored frames": footage.SCORED,
-            "weights": {path.name: path.stat().st_size for path in sorted(SHIPPED.glob("*.safetensors"))},
+            "weights": {path.name: _digest(path) for path in sorted(SHIPPED.glob("*.safetensors"))},
         }
         self.store = Store(folder / "chart.json", settings, describe_machine())
         self._progress: Progress | None = None
@@ -157,7 +158,7 @@ class Run:
         frames = {self.timed_size: made, self.own_size: own}
         groups: dict[str, list[Method]] = {}
         for method in self.methods:
-            if not all(size in self.store.data["times"].get(method.name, {}) for size in frames):
+            if not all(size in self.store.data["times"].get(method.name, {}) for size in self._sizes_of(method)):
                 groups.setdefault(method.group, []).append(method)
         with self.counted("times", len(groups)) as done:
             for group, members in groups.items():
@@ -170,12 +171,12 @@ class Run:
                         self.store.put("times", name, sizes)
                 done(group)
 
+    def _sizes_of(self, method: Method) -> tuple[str, ...]:
+        """PyTorch compiles for each size anew, and a small one tells nothing that the timed one does not."""
+        return (self.timed_size,) if method.family == "PyTorch" else (self.timed_size, self.own_size)
+
     def _timed(self, members: Sequence[Method], frame: Frame, size: str) -> dict[str, dict[str, Any]]:
-        calls = {}
-        for method in members:
-            # PyTorch compiles for each size anew, and a small one tells nothing that the timed one does not.
-            if method.family != "PyTorch" or size == self.timed_size:
-                calls[method.name] = method.timed(frame)
+        calls = {method.name: method.timed(frame) for method in members if size in self._sizes_of(method)}
         # Small frames vary more, and cost nothing.
         rounds = self.sizes.rounds if size == self.timed_size else 7 * self.sizes.rounds
         found: dict[str, dict[str, Any]] = {}
@@ -202,6 +203,10 @@ class Run:
                 self.store.put("breakdown", name, parts)
                 told = ", ".join(f"{part} {timing.median_ms:.0f} ms" for part, timing in parts.items())
                 self.say(f"one frame of {name}: {told}")
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 def main(settings: Settings) -> None:

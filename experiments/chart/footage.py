@@ -38,7 +38,7 @@ class Sizes(NamedTuple):
 
 FULL = Sizes((("pinkroom", 400), ("mobile", 400)), 64, 6, 1024, 2048, (720, 1280), rounds=3)
 QUICK = Sizes(
-    (("mobile", 400),), 32, 4, 16, 32, (48, 64), rounds=2, methods=("svgf", "ntd-small", "oidn high", "ntd tiny")
+    (("mobile", 400),), 32, 5, 16, 32, (48, 64), rounds=2, methods=("svgf", "ntd-small", "oidn high", "ntd tiny")
 )
 SCORED = 4
 """Frames at a clip's end that are scored: recurrent methods have a history by then."""
@@ -104,9 +104,7 @@ def read(folder: Path) -> Footage:
     hidden = np.zeros((*np.shape(clip.reference)[:3], 1), bool) if visible is None else ~np.asarray(visible, bool)
     shown = count - SCORED + int(np.argmax(hidden[-SCORED:].sum((1, 2, 3))))
     planned = effects.plan(effects.inspect(folder)).buffers
-    frames = clip.frames._replace(
-        **{name: None for name in Frame._fields[1:] if name not in planned}  # type: ignore[arg-type]
-    )
+    frames = clip.frames._replace(**{name: None for name in Frame._fields[1:] if name not in planned})
     floor = read_noise_floor(folder)
     return Footage(folder.name, folder, record, frames, noisy, np.asarray(clip.reference), hidden, shown, floor)
 

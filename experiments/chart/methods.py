@@ -30,6 +30,10 @@ STILL = frozenset({"motion", "dual_motion", "previous_depth", "visible"})
 """The buffers that a scene in which nothing moves does not have."""
 
 
+ALL = "effects all"
+"""The variant with every buffer written out: the image is that of the plain form, to be told by its time alone."""
+
+
 class Method(NamedTuple):
     """One way from noisy frames to images."""
 
@@ -115,7 +119,7 @@ def variants(
         yield ours(name, "bfloat16", *load(compute_dtype="bfloat16"))
     if "demodulate" in options:
         yield ours(name, "not demodulated", *load(demodulate=False))
-    yield ours(name, "effects all", denoiser, params, prepare=everything(denoiser.reads))
+    yield ours(name, ALL, denoiser, params, prepare=everything(denoiser.reads))
     yield ours(name, "still scene", denoiser, params, prepare=standing_still, scored=False)
 
 

@@ -8,13 +8,13 @@
   };
   const el = (tag, attributes, ...children) => put(document.createElement(tag), attributes, children);
   const svg = (tag, attributes, ...children) => put(document.createElementNS("http://www.w3.org/2000/svg", tag), attributes, children);
-  const state = { measure: page.measures[0].field, size: page.sizes[0], render: true, clip: Object.keys(page.pictures)[0], chosen: null, hidden: new Set() };
+  const state = { measure: page.measures[0].field, size: page.sizes[0], render: true, clip: Object.keys(page.pictures)[0], chosen: null, far: false, hidden: new Set() };
   const colorOf = (family) => (family === page.renderer ? "cn" : "c" + ((page.families.indexOf(family) + 7) % 8));
   const digits = (value, places) => (value === null || value === undefined ? "–" : Number(value).toFixed(places));
   const ms = (value) => (value >= 100 ? value.toFixed(0) : value >= 10 ? value.toFixed(1) : value.toFixed(2)) + " ms";
 
   // ---- signs: a variant is a shape, a family a colour -----------------------------------------------------------------
-  const SHAPES = ["circle", "square", "triangle", "diamond", "down", "plus", "star", "cross", "bar"];
+  const SHAPES = ["circle", "square", "triangle", "diamond", "down", "plus", "star", "cross", "bar", "pentagon", "hourglass"];
   const corners = (count, inner, turn) => Array.from({ length: count }, (_, i) => {
     const angle = turn + (2 * Math.PI * i) / count, r = i % 2 ? inner : 1;
     return [Math.cos(angle) * r, Math.sin(angle) * r];
@@ -27,6 +27,8 @@
     plus: [[-0.35, -1.1], [0.35, -1.1], [0.35, -0.35], [1.1, -0.35], [1.1, 0.35], [0.35, 0.35], [0.35, 1.1], [-0.35, 1.1], [-0.35, 0.35], [-1.1, 0.35], [-1.1, -0.35], [-0.35, -0.35]],
     star: corners(10, 0.5, -Math.PI / 2).map(([x, y]) => [1.2 * x, 1.2 * y]),
     cross: corners(8, 0.4, Math.PI / 4).map(([x, y]) => [1.2 * x, 1.2 * y]),
+    pentagon: corners(5, 1, -Math.PI / 2).map(([x, y]) => [1.1 * x, 1.1 * y]),
+    hourglass: [[-0.9, -1], [0.9, -1], [-0.9, 1], [0.9, 1]],
     bar: [[-0.3, -1.2], [0.3, -1.2], [0.3, 1.2], [-0.3, 1.2]],
   };
   const sign = (variant, x, y, r, attributes) => {
@@ -48,7 +50,7 @@
   const errorOf = (point) => { const value = point.errors[state.measure]; return typeof value === "number" ? value : null; };
   const measure = () => page.measures.find((each) => each.field === state.measure);
   const front = (points) => {
-    const sorted = points.filter((p) => state.render || p.method !== page.renderer).sort((a, b) => timeOf(a) - timeOf(b));
+    const sorted = points.filter((p) => p.variant !== page.all && (state.render || p.method !== page.renderer)).sort((a, b) => timeOf(a) - timeOf(b));
     let best = Infinity;
     return sorted.filter((p) => { const loss = -measure().better * errorOf(p); if (loss >= best) return false; best = loss; return true; });
   };
@@ -62,7 +64,10 @@
     return found;
   };
   function draw() {
-    const shown = page.points.filter((p) => timeOf(p) !== null && !state.hidden.has(p.family) && !state.hidden.has("variant " + p.variant));
+    const slowest = Math.max(...page.points.filter((p) => p.method !== page.renderer).map((p) => timeOf(p) || 0));
+    // The renderer's curve goes on for two more decades, and would leave the rest a corner.
+    const near = (p) => state.far || p.method !== page.renderer || !slowest || timeOf(p) < 4 * slowest;
+    const shown = page.points.filter((p) => timeOf(p) !== null && near(p) && !state.hidden.has(p.family) && !state.hidden.has("variant " + p.variant));
     const scored = shown.filter((p) => p.spp !== null && errorOf(p) !== null), bare = shown.filter((p) => p.spp === null);
     const box = document.getElementById("plot");
     if (!scored.length) { box.replaceChildren(el("p", { class: "note" }, "Nothing to draw: every family or variant is hidden, or nothing was timed.")); return; }
@@ -98,10 +103,15 @@
       return node;
     };
     for (const p of bare) root.append(act(sign(p.variant, x(timeOf(p)), H - B + 14, 6, { class: `mark hollow ${colorOf(p.family)}`, tabindex: 0, "aria-label": p.key }), p));
+    const written = [];
     for (const p of scored) {
       const px = x(timeOf(p)), py = y(errorOf(p));
       root.append(act(sign(p.variant, px, py, 5.5, { class: `mark ${colorOf(p.family)}${p.key === state.chosen ? " chosen" : ""}`, tabindex: 0, "aria-label": p.key }), p));
-      if (best.includes(p)) root.append(svg("text", { class: "spp", x: px - 8, y: py - 7, "text-anchor": "end" }, (p.method === page.renderer ? "" : p.method + ", ") + p.spp + " spp"));
+      const text = (p.method === page.renderer ? "" : p.method + ", ") + p.spp + " spp";
+      const room = [px - 8 - 5.6 * text.length, px - 8, py - 7];
+      if (!best.includes(p) || room[0] < L || written.some((other) => Math.abs(other[2] - room[2]) < 11 && other[0] < room[1] && room[0] < other[1])) continue;
+      written.push(room);
+      root.append(svg("text", { class: "spp", x: px - 8, y: py - 7, "text-anchor": "end" }, text));
     }
     box.replaceChildren(root);
   }
@@ -141,12 +151,14 @@
   };
   const render = el("input", { type: "checkbox", checked: true });
   render.addEventListener("change", () => { state.render = render.checked; draw(); });
+  const far = el("input", { type: "checkbox" });
+  far.addEventListener("change", () => { state.far = far.checked; draw(); });
   const known = page.points.some((p) => Object.keys(p.render_ms).length);
   if (!known) state.render = false;
   document.getElementById("controls").append(
     choice("error ", page.measures.map((each) => [each.field, each.label]), "measure"),
     choice("time for one frame of ", page.sizes.map((size, index) => [size, size + (index ? " (the clips' own)" : "")]), "size"),
-    ...(known ? [el("label", {}, render, "rendering included")] : []));
+    ...(known ? [el("label", {}, render, "rendering included"), el("label", {}, far, "the renderer's whole curve")] : []));
   const legend = (id, entries) => {
     for (const [key, text, node] of entries) {
       const button = el("button", { type: "button", "aria-pressed": "true" }, node, text);

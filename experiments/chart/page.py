@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from experiments.chart.breakdown import WHOLE
+from experiments.chart.methods import ALL
 from experiments.chart.scores import MEASURES
 from experiments.chart.summary import RENDERER, Equal, Point, pareto, render_cost, told
 from jaxdn.report import images
@@ -72,6 +73,7 @@ def page(
         "families": list(dict.fromkeys(point.family for point in points)),
         "variants": list(dict.fromkeys(point.variant for point in points)),
         "renderer": RENDERER,
+        "all": ALL,
         "points": [_for_script(point, data, equals, most) for point in points],
         "pictures": {
             clip: {key: images.data_address(images.encode_png(image)) for key, image in shown.items()}
@@ -148,6 +150,8 @@ def _top(data: Mapping[str, Any], sizes: tuple[str, str]) -> str:
         "Rendering beyond four samples a pixel is extrapolated: its time is a line in the number of samples.",
         "Marks at the bottom of the plot have no error: untrained widths, the same network in PyTorch, and the time "
         "of a frame in which nothing moves.",
+        "Effects all writes out every buffer that a denoiser reads, plain only what a clip calls for: the same image, "
+        "and the same program where the clip calls for everything.",
         *(escape(sentence) for sentence in data["left_out"]["here"]),
     ]
     sentences = "".join(f"<li>{sentence}</li>" for sentence in said)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from experiments.chart.methods import ALL
 from experiments.chart.render_cost import Cost, mean_cost
 from experiments.chart.scores import MEASURES, Measure
 
@@ -44,11 +45,16 @@ class Equal(NamedTuple):
 
 
 def points(data: Mapping[str, Any], labels: Mapping[str, tuple[str, str, str]]) -> list[Point]:
-    """The points of the raw data; ``labels``: method -> (family, variant, guides)."""
+    """The points of the raw data; ``labels``: method -> (family, variant, guides).
+
+    Methods without a label are left out: they were measured when something was installed that is not there now.
+    """
     costs = {size: render_cost(data, size) for size in data["render"]}
     found = []
     for key, clips in data["errors"].items():
         method, _, spp = key.rpartition(" @ ")
+        if method not in labels:
+            continue
         family, variant, guides = labels[method]
         errors = {measure.field: _mean([scores[measure.field] for scores in clips.values()]) for measure in MEASURES}
         rendered = {size: 1e3 * cost.at(int(spp), guides) for size, cost in costs.items() if cost}
@@ -58,7 +64,7 @@ def points(data: Mapping[str, Any], labels: Mapping[str, tuple[str, str, str]]) 
         found.append(Point(key, method, family, variant, int(spp), errors, times, rendered))
     scored = {point.method for point in found}
     for method, sizes in data["times"].items():
-        if method not in scored:
+        if method not in scored and method in labels:
             family, variant, _ = labels[method]
             times = {size: timing["median_ms"] for size, timing in sizes.items()}
             found.append(Point(method, method, family, variant, None, {}, times, {}))
@@ -72,9 +78,15 @@ def render_cost(data: Mapping[str, Any], size: str, kind: str = "seconds") -> Co
 
 
 def pareto(points: Sequence[Point], measure: Measure, size: str, *, render: bool = True) -> list[Point]:
-    """The points that no other one beats in both time and error, by rising time."""
+    """The points that no other one beats in both time and error, by rising time.
+
+    What writes every buffer out is left aside: its image is the plain form's, and where nothing is left out the time
+    is too, so that chance would choose between them.
+    """
     known = []
     for point in points:
+        if point.variant == ALL:
+            continue
         time, error = point.milliseconds(size, render=render), point.errors.get(measure.field, math.nan)
         if math.isfinite(time) and not math.isnan(error):
             known.append((time, -measure.better * error, point))
