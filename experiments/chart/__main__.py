@@ -81,7 +81,7 @@ class Run:
 
     def say(self, line: str) -> None:
         """A line that stays."""
-        self.console.print(line, highlight=False, markup=False)
+        self.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     @contextmanager
     def counted(self, title: str, total: int) -> Iterator[Any]:
@@ -192,7 +192,9 @@ class Run:
         height, width = self.sizes.timed
         frame = jax.tree.map(jnp.asarray, frame_at(scene.clip(2, height, width).frames, 1))
         engines = ["reference", *(["onnxruntime"] if onnx.available() else [])]
-        widths = {"small": SMALL} if self.sizes.methods else {"large": LARGE, "small": SMALL}
+        widths = {"large": LARGE, "small": SMALL}
+        if self.sizes.methods is not None:
+            engines, widths = engines[:1], {"small": SMALL}
         for size in widths:
             for engine in engines:
                 name = f"ntd-{size}, {engine}"

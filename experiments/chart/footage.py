@@ -37,9 +37,7 @@ class Sizes(NamedTuple):
 
 
 FULL = Sizes((("pinkroom", 400), ("mobile", 400)), 64, 6, 1024, 2048, (720, 1280), rounds=3)
-QUICK = Sizes(
-    (("mobile", 400),), 32, 5, 16, 32, (48, 64), rounds=2, methods=("svgf", "ntd-small", "oidn high", "ntd tiny")
-)
+QUICK = Sizes((("mobile", 400),), 32, 5, 16, 32, (48, 64), rounds=2, methods=("svgf", "ntd-small", "oidn high"))
 SCORED = 4
 """Frames at a clip's end that are scored: recurrent methods have a history by then."""
 

@@ -74,7 +74,7 @@ def page(
         "variants": list(dict.fromkeys(point.variant for point in points)),
         "renderer": RENDERER,
         "all": ALL,
-        "points": [_for_script(point, data, equals, most) for point in points],
+        "points": [_for_script(point, data, equals, most, sizes[0]) for point in points],
         "pictures": {
             clip: {key: images.data_address(images.encode_png(image)) for key, image in shown.items()}
             for clip, shown in pictures.items()
@@ -118,14 +118,17 @@ def page(
     )
 
 
-def _for_script(point: Point, data: Mapping[str, Any], equals: Mapping[str, Equal], most: int) -> dict[str, Any]:
+def _for_script(
+    point: Point, data: Mapping[str, Any], equals: Mapping[str, Equal], most: int, timed: str
+) -> dict[str, Any]:
     equal = equals.get(point.key)
     timings = data["times"].get(point.method, {})
     return {
         **point._asdict(),
         "equal": None if equal is None else told(equal, most),
         "spread": {size: [timing["min_ms"], timing["max_ms"]] for size, timing in timings.items()},
-        "compile": {size: timing["first_ms"] for size, timing in timings.items()},
+        # At the clips' own size the program was compiled while scoring.
+        "compile": {size: timing["first_ms"] for size, timing in timings.items() if size == timed},
         "peak": {size: timing["peak_mib"] for size, timing in timings.items()},
     }
 
