@@ -124,6 +124,7 @@ def test_points_add_what_the_renderer_has_to_give(data):
     assert by_key["filter @ 2"].milliseconds(SIZE, render=True) == pytest.approx(30 + 1350)
     assert by_key["filter @ 2"].milliseconds(SIZE, render=False) == pytest.approx(30)
     assert by_key["wide net"].spp is None
+    assert by_key["wide net"].milliseconds(SIZE, render=True) == pytest.approx(30 + 850)
 
 
 def test_the_page_has_every_point_and_needs_no_network(data):

@@ -41,7 +41,6 @@
   const timeOf = (point) => {
     const alone = point.denoise_ms[state.size];
     if (alone === undefined) return null;
-    if (point.spp === null) return alone;
     const rendered = point.render_ms[state.size];
     if (point.method === page.renderer) return rendered === undefined ? null : rendered;
     if (!state.render) return alone;
@@ -121,7 +120,7 @@
     if (p.method === page.renderer) parts.push(`rendering ${ms(p.render_ms[state.size])}`);
     else {
       parts.push(`denoising ${ms(p.denoise_ms[state.size])}` + (spread ? ` (${ms(spread[0])} – ${ms(spread[1])})` : ""));
-      if (p.spp !== null && p.render_ms[state.size] !== undefined) parts.push(`rendering ${ms(p.render_ms[state.size])}`);
+      if (p.render_ms[state.size] !== undefined) parts.push(`rendering ${ms(p.render_ms[state.size])}` + (p.spp === null ? " at 1 spp" : ""));
       if (p.compile[state.size]) parts.push(`first call ${(p.compile[state.size] / 1000).toFixed(1)} s`);
       if (p.peak[state.size]) parts.push(`peak ${p.peak[state.size].toFixed(0)} MiB`);
     }

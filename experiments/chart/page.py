@@ -152,7 +152,7 @@ def _top(data: Mapping[str, Any], sizes: tuple[str, str]) -> str:
         f"Time is for one frame of {sizes[0]} (median of repeats, methods in turns), or of the clips' own size. "
         "Rendering beyond four samples a pixel is extrapolated: its time is a line in the number of samples.",
         "Marks at the bottom of the plot have no error: untrained widths, the same network in PyTorch, and the time "
-        "of a frame in which nothing moves.",
+        "of a frame in which nothing moves. They stand at the time of a frame with 1 sample a pixel.",
         "Effects all writes out every buffer that a denoiser reads, plain only what a clip calls for: the same image, "
         "and the same program where the clip calls for everything.",
         *(escape(sentence) for sentence in data["left_out"]["here"]),

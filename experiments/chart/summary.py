@@ -27,7 +27,8 @@ class Point(NamedTuple):
     denoise_ms: Mapping[str, float]
     """Size -> milliseconds a frame, 0 for the renderer alone."""
     render_ms: Mapping[str, float]
-    """Size -> milliseconds of rendering the frame that goes in; empty where it is not known."""
+    """Size -> milliseconds of rendering the frame that goes in (where ``spp`` is None, with one sample); empty where it
+    is not known."""
 
     def milliseconds(self, size: str, *, render: bool) -> float:
         """Per frame; NaN where it is not known."""
@@ -65,9 +66,10 @@ def points(data: Mapping[str, Any], labels: Mapping[str, tuple[str, str, str]]) 
     scored = {point.method for point in found}
     for method, sizes in data["times"].items():
         if method not in scored and method in labels:
-            family, variant, _ = labels[method]
+            family, variant, guides = labels[method]
             times = {size: timing["median_ms"] for size, timing in sizes.items()}
-            found.append(Point(method, method, family, variant, None, {}, times, {}))
+            rendered = {size: 1e3 * cost.at(1, guides) for size, cost in costs.items() if cost}
+            found.append(Point(method, method, family, variant, None, {}, times, rendered))
     return found
 
 
