@@ -3,9 +3,10 @@
     python -m experiments.fuzz --inputs 100000      # some minutes; counts in runs/fuzz.json
     python -m experiments.fuzz --only exr --first 4711 --inputs 1
 
-Input n of a kind is the same in every run (:mod:`experiments.fuzz_inputs`), so ``--first`` continues where another run
-stopped and repeats a single input. Reading happens in processes of their own with a limit on memory and on time, so
-that whatever dies is told with the number of the input that killed it.
+Input n of a kind is the same in every run (:mod:`experiments.fuzz_inputs`), so ``--first`` repeats a single one. A run
+that was interrupted continues from the counts it left; without that file it starts over. Reading happens in processes
+of their own with a limit on memory and on time, so that whatever dies is told with the number of the input that killed
+it.
 """
 
 import contextlib
@@ -31,7 +32,8 @@ from jaxdn.commands.errors import told_plainly
 
 DOCUMENTED = (ValueError, OSError)
 """What a broken file may raise: ClipError is a ValueError; a file of nothing may not open."""
-SECONDS = 30
+SECONDS = 20
+"""Of a processor, for one input; and thirty times as long by the clock, as a machine may stand still."""
 MEMORY = 1 << 30
 """Bytes that reading a file of some kilobytes may take beyond what the process has already."""
 
@@ -124,7 +126,9 @@ def child(kind: str, first: int, count: int, source: Path) -> None:
         expected = _listing(Path(place))
         for number in range(first, first + count):
             print(f"@{number}", flush=True)
-            faulthandler.dump_traceback_later(SECONDS, exit=True)  # even where no Python runs
+            # Both end the process even where no Python runs.
+            resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time()) + SECONDS, resource.RLIM_INFINITY))
+            faulthandler.dump_traceback_later(30 * SECONDS, exit=True)
             outcome = _read_one(read, broken(kind, good, number))
             faulthandler.cancel_dump_traceback_later()
             stray = _listing(Path(place)) - expected
@@ -205,13 +209,17 @@ def main(settings: Settings) -> int:
     kinds = KINDS if settings.only == "all" else (settings.only,)
     each = -(-settings.inputs // len(kinds))
     report: dict[str, Any] = {"first": settings.first, "inputs": 0, "read": 0, "refused": 0, "bad": 0, "kinds": {}}
-    if settings.only != "all" and settings.out.is_file():
-        report["kinds"] = json.loads(settings.out.read_text())["kinds"]  # of the kinds that another run has fed
+    if settings.out.is_file():
+        before = json.loads(settings.out.read_text())
+        report = before if before["first"] == settings.first else report
     settings.out.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as place:
         source = prepare(Path(place) / "source")
         for kind in kinds:
             began, told = time.monotonic(), Told(0, 0, [])
+            if kind in report["kinds"]:
+                told = Told(*(report["kinds"][kind][name] for name in Told._fields))
+                began -= report["kinds"][kind]["seconds"]
             while told.inputs < each:
                 size = min(settings.batch, each - told.inputs)
                 new = run_kind(kind, settings.first + told.inputs, size, source)
