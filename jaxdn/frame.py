@@ -195,7 +195,9 @@ def repair(frame: Frame) -> tuple[Frame, jax.Array]:
         direct=light(frame.direct),
         emission=light(frame.emission),
     )
-    return repaired, jnp.sum(jnp.stack([jnp.sum(flags) for flags in replaced.values()]))
+    # Where double precision is enabled a sum of int32 is int64, which no scan takes back as the int32 it began with.
+    counts = jnp.stack([jnp.sum(flags, dtype=jnp.int32) for flags in replaced.values()])
+    return repaired, jnp.sum(counts, dtype=jnp.int32)
 
 
 def repair_image(image: jax.Array) -> jax.Array:

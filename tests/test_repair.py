@@ -58,3 +58,10 @@ def test_every_buffer_that_had_to_be_changed_is_counted():
     assert count.dtype == jnp.int32
     for name in ("radiance", "direct", "albedo", "depth", "roughness"):
         assert np.isfinite(getattr(found, name)).all(), name
+
+
+def test_the_count_is_of_one_type_in_double_precision_too(x64):
+    found, count = repaired(frame(depth=np.full((4, 4, 1), np.nan)))
+    assert found.depth.dtype == jnp.float64
+    assert count.dtype == jnp.int32
+    assert count == 16
