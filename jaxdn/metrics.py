@@ -44,9 +44,11 @@ def relative_mse(image: jax.Array, reference: jax.Array, *, mask: jax.Array | No
     Rousselle et al. 2011, eq. 10; they and others differ in the constant.
     """
     image, reference, inside = _prepare(image, reference, mask)
-    # Divided before it is squared: the square of a firefly in the reference overflows, the ratio does not.
+    # Divided before it is squared: the square of a firefly in the reference overflows, the ratio does not. An error
+    # near the largest number does so as well, and its derivative with it: it counts as a 64th of that number.
     scale = safe_norm(jnp.stack([reference, jnp.full_like(reference, 0.1)], axis=-1))[..., 0]
-    return _mean(((image - reference) / scale) ** 2, inside)
+    most = float(jnp.finfo(image.dtype).max) / 64
+    return _mean((jnp.clip(image - reference, -most, most) / scale) ** 2, inside)
 
 
 def psnr(

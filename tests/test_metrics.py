@@ -286,3 +286,12 @@ def test_relative_mse_survives_a_firefly_in_the_reference():
     assert METRICS["relative_mse"](np.zeros_like(reference), reference) == pytest.approx(1.0)
     slope = jax.grad(lambda image: metrics.relative_mse(image, jnp.asarray(reference)))(jnp.zeros((4, 4, 3)))
     assert bool(jnp.all(jnp.isfinite(slope)))
+
+
+@pytest.mark.parametrize("extreme", [1e36, np.finfo(np.float32).max])
+def test_relative_mse_has_a_finite_gradient_up_to_the_largest_number(extreme):
+    image = np.full((2, 2, 3), 0.5, np.float32)
+    image[0, 0] = extreme
+    reference = np.full((2, 2, 3), 0.01, np.float32)
+    assert np.isfinite(jax.grad(metrics.relative_mse)(image, reference)).all()
+    assert metrics.relative_mse(image, reference) == np.inf, "it is not flattered"
