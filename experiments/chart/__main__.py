@@ -77,7 +77,6 @@ class Run:
             "weights": {path.name: _digest(path) for path in sorted(SHIPPED.glob("*.safetensors"))},
         }
         self.store = Store(folder / "chart.json", settings, describe_machine())
-        self._progress: Progress | None = None
 
     def say(self, line: str) -> None:
         """A line that stays."""
