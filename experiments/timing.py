@@ -1,0 +1,91 @@
+"""How long calls take beside each other, and how much memory one takes.
+
+A machine that others use is fast one minute and slow the next: what is compared is measured in turns, in one process,
+and read as ratios of medians.
+"""
+
+import ctypes
+import gc
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Call = Callable[[], Any]
+"""Something to time; it returns when its work is done (``jax.block_until_ready`` inside)."""
+
+PAUSE_S = 0.01
+"""Between two calls: threads of the one before may still spin for work."""
+
+
+class Timing(NamedTuple):
+    """What one call took, in milliseconds."""
+
+    median_ms: float
+    min_ms: float
+    max_ms: float
+    first_ms: float
+    """The first call, which compiles; it is not among the others."""
+    rounds: int
+
+
+def measure(calls: Mapping[str, Call], *, rounds: int = 7, budget_s: float = 60.0) -> dict[str, Timing]:
+    """Time each call in turns: once to compile, then ``rounds`` times or until ``budget_s`` is spent, at least twice.
+
+    The budget counts from the end of the first calls. Rounds are whole: every call is timed equally often.
+    """
+    first, samples = {}, {name: [] for name in calls}  # type: dict[str, float], dict[str, list[float]]
+    for name, call in calls.items():
+        first[name] = _milliseconds(call)
+    began = time.perf_counter()
+    for done in range(rounds):
+        # The next round takes about as long as the mean one so far.
+        spent = time.perf_counter() - began
+        if done >= 2 and spent * (done + 1) / done > budget_s:
+            break
+        for name, call in calls.items():
+            time.sleep(PAUSE_S)
+            samples[name].append(_milliseconds(call))
+    return {
+        name: Timing(float(np.median(values)), min(values), max(values), first[name], len(values))
+        for name, values in samples.items()
+    }
+
+
+def _milliseconds(call: Call) -> float:
+    began = time.perf_counter()
+    call()
+    return 1e3 * (time.perf_counter() - began)
+
+
+def peak_mib(call: Call) -> float | None:
+    """Growth of the process's resident memory at the call's peak, in MiB; None where the system does not tell (Linux).
+
+    What the caller holds already (arguments, weights) is not in it; what comes back is. Call once before, so that
+    compilation is not in it either. Memory that an engine keeps between calls is not counted: give a call that builds
+    the engine too.
+    """
+    if sys.platform != "linux":
+        return None
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)  # what the allocator keeps would hide the growth
+    try:
+        Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
+    except OSError:  # some sandboxes forbid it
+        return None
+    before = _status("VmRSS")
+    result = call()
+    peak = _status("VmHWM") - before
+    del result
+    return max(peak, 0.0)
+
+
+def _status(name: str) -> float:
+    """An entry of /proc/self/status in MiB."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(name + ":"):
+            return int(line.split()[1]) / 1024
+    raise KeyError(name)

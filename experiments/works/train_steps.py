@@ -1,0 +1,73 @@
+"""One update of training: batch 4, 10 frames, back-propagation through all of them, ours and PyTorch's."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import peers, roofline
+from experiments.timing import Call
+from experiments.works import Work, scene
+from experiments.works.steps import WIDTHS
+from jaxdn.denoisers import ntd
+from jaxdn.frame import Clip
+from jaxdn.training import Recipe, initial_state, make_train_step
+
+RECIPE = Recipe(decay=False)
+CASES = (("large", 64), ("small", 64), ("large", 128), ("small", 128))
+"""(size, crop in pixels): the quick ones first."""
+
+
+def batch_of(size: int, recipe: Recipe = RECIPE) -> Clip:
+    """A batch of clips [B, T, H, W, C] as NumPy arrays."""
+    clips = [scene.clip(recipe.frames, size, size, seed=seed) for seed in range(recipe.batch)]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *clips)
+
+
+def ours(size: str, batch: Clip, recipe: Recipe) -> Call:
+    """A call that makes one update; state and batch lie on the device, the old state's memory is donated."""
+    denoiser = ntd(size=size)
+    state = [initial_state(denoiser, recipe, batch)]
+    step, there = make_train_step(denoiser, recipe), jax.tree.map(jnp.asarray, batch)
+
+    def call() -> float:
+        state[0], report = step(state[0], there)
+        return float(report.loss)
+
+    return call
+
+
+def pytorch(size: str, batch: Clip, recipe: Recipe, *, compiled: bool) -> Call:
+    """The same in PyTorch."""
+    from experiments.peers.pytorch_training import Trainer, batch_tensors
+
+    params = initial_state(ntd(size=size), recipe, batch).params
+    trainer = Trainer(WIDTHS[size], params, recipe, compiled=compiled)
+    tensors = batch_tensors(batch)
+    return lambda: trainer(*tensors)
+
+
+def works(*, recipe: Recipe = RECIPE, cases: tuple[tuple[str, int], ...] = CASES) -> Iterator[Work]:
+    """``train-large-64`` and so on, plain and rematerialised."""
+    lacking = peers.missing()
+    for size, crop in cases:
+        batch = batch_of(crop, recipe)
+
+        def own(again: bool, size: str = size, batch: Clip = batch) -> Callable[[], Call]:
+            return lambda: ours(size, batch, recipe._replace(rematerialize=again))
+
+        def torch(compiled: bool, size: str = size, batch: Clip = batch) -> Callable[[], Call]:
+            return lambda: pytorch(size, batch, recipe, compiled=compiled)
+
+        mine: dict[str, Callable[[], Call]] = {"xla": own(False)}
+        others: dict[str, Callable[[], Call]] = {}
+        if size == "large":
+            mine["xla-remat"] = own(True)
+        if "torch" not in lacking:
+            others["torch-eager"] = torch(False)
+        if "torch-compiled" not in lacking and (size, crop) == cases[0]:
+            others["torch-compiled"] = torch(True)
+        costs: Any = roofline.train_step(WIDTHS[size], crop, batch=recipe.batch, frames=recipe.frames)
+        yield Work(f"train-{size}-{crop}", mine, others, costs, rounds=4 if crop < 128 else 3)
