@@ -177,11 +177,11 @@ def groups(cache: Path, probe: Probe, say: Callable[[str], None]) -> dict[str, I
             yield partial(run, work, probe, budget_s=ONE_WORK_S[group], say=say)
 
     return {
-        "compile": (partial(compile_rows, program, cache, say=say) for program in compilation.PROGRAMS),
         "steps": timed("steps", steps.works()),
         "operations": timed("operations", operations.works()),
         "train": timed("train", train_steps.works()),
         "input": iter([input_rows]),
+        "compile": (partial(compile_rows, program, cache, say=say) for program in compilation.PROGRAMS),
     }
 
 
