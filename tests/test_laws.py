@@ -310,7 +310,7 @@ def test_on_a_static_scene_the_variance_of_svgf_falls_with_history(seed):
     noise = np.random.default_rng(seed).exponential(size=(FRAMES, SIZE, SIZE, 1)).astype(np.float32)
     frames = Frame(np.broadcast_to(noise, (FRAMES, SIZE, SIZE, 3)))
     variance = np.asarray(blended(frames))[..., 0].var(axis=(1, 2))
-    # What time alone does: over a blank wall the neighbourhood of the whole filter has averaged nearly all away at once.
+    # What time alone does: on a blank wall the whole filter averages nearly all away at once.
     # 1 / N while the history is a mean, alpha / (2 - alpha) = 1 / 9 once it is a moving average.
     np.testing.assert_allclose(variance[:5] / variance[0], 1 / np.arange(1, 6), rtol=0.5)
     assert np.all(np.diff(variance[:4]) < 0)
