@@ -24,6 +24,7 @@ from jax import lax
 import jaxdn
 from jaxdn.commands.errors import told_plainly
 from jaxdn.frame import Denoiser, Frame
+from jaxdn.weights import shipped_names
 
 SIZE, TURN = 48, 16
 """Pixels of a side, and frames after which the clip runs the other way."""
@@ -34,7 +35,7 @@ POISONS = {"NaN": float("nan"), "1e30": 1e30}
 class Settings:
     """Denoise for thousands of frames and keep curves."""
 
-    subjects: tuple[str, ...] = field(default_factory=lambda: (*_filters(), *jaxdn.weights.shipped_names()))
+    subjects: tuple[str, ...] = field(default_factory=lambda: (*_filters(), *shipped_names()))
     """Factories without weights, and names of weights; default: all that come with the package."""
     frames: int = 2000
     out: Path = Path("runs/long-runs")
