@@ -2,19 +2,29 @@
 
     python -m experiments.works.compilation xla step-large-720p     # what a child process runs: prints seconds
 
-Tracing, lowering and compilation are counted; starting Python and importing are not. PyTorch compiles when it first
-runs, so one run (two of the train step's passes) is in its figure.
+Programs are named as the works are, ``train-large-64-remat`` is the rematerialised step. Tracing, lowering and
+compilation are counted; starting Python and importing are not. PyTorch compiles when it first runs, so one run is in
+its figure.
 """
 
 import os
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-ENGINES = ("xla", "torch")
-PROGRAMS = ("step-large-720p", "train-large-64")
+
+def warm(programs: Sequence[tuple[str, str]], cache: Path, *, limit_s: float) -> dict[tuple[str, str], float | None]:
+    """Compile (engine, program) pairs into the caches in ``cache``, a process for each core, and say what each took.
+
+    What they took is no measurement: they were in each other's way.
+    """
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        seconds = pool.map(lambda pair: compile_seconds(pair[0], pair[1], cache, limit_s=limit_s), programs)
+        return dict(zip(programs, seconds, strict=True))
 
 
 def compile_seconds(engine: str, program: str, cache: Path, *, limit_s: float) -> float | None:
@@ -46,8 +56,8 @@ def _xla(program: str) -> float:
     from jaxdn.frame import frame_at
     from jaxdn.training import initial_state, make_train_step
 
-    kind, size, detail = program.split("-")
-    denoiser = ntd(size=size)
+    kind, size, detail, *remat = program.split("-")
+    denoiser, recipe = ntd(size=size), train_steps.RECIPE._replace(rematerialize=bool(remat))
     step: Any
     arguments: tuple[Any, ...]
     if kind == "step":
@@ -56,8 +66,8 @@ def _xla(program: str) -> float:
         step, arguments = jax.jit(denoiser.step, donate_argnums=1), (params, denoiser.start(params, frame), frame)
     else:
         batch = train_steps.batch_of(int(detail))
-        state = initial_state(denoiser, train_steps.RECIPE, batch)
-        step, arguments = make_train_step(denoiser, train_steps.RECIPE), (state, batch)
+        state = initial_state(denoiser, recipe, batch)
+        step, arguments = make_train_step(denoiser, recipe), (state, batch)
     began = time.perf_counter()
     step.lower(*arguments).compile()
     return time.perf_counter() - began

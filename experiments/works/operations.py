@@ -15,7 +15,7 @@ from experiments.timing import Call
 from experiments.works import Work
 from jaxdn.backends.convolution import convolve
 from jaxdn.backends.registry import implementations, resolve
-from jaxdn.kernels import apply_kernels, normalize_kernels
+from jaxdn.kernels import softmax_filter
 from jaxdn.warping import warp
 
 CONVOLUTIONS = ((1, 720, 1280, 32, 32), (1, 360, 640, 128, 64), (4, 128, 128, 96, 64), (4, 64, 64, 64, 64))
@@ -88,7 +88,7 @@ def kernel_works(height: int, width: int, title: str) -> Iterator[Work]:
     here = jnp.asarray(image), jnp.asarray(logits)
 
     def filtered(name: str | None) -> Function:
-        return lambda image, logits: apply_kernels(image, normalize_kernels(logits), implementation=name)
+        return lambda image, logits: softmax_filter(image[None], logits, implementation=name)[0]
 
     def peer(form: str) -> Function:
         def run(image: Any, logits: Any) -> Any:
@@ -103,7 +103,7 @@ def kernel_works(height: int, width: int, title: str) -> Iterator[Work]:
             f"apply-kernels-{title}{kind}",
             {
                 shown: jitted(with_gradient(filtered(name), (0, 1)) if gradient else filtered(name), *here)
-                for shown, name in forms("apply_kernels").items()
+                for shown, name in forms("softmax_filter").items()
             },
             torch_calls(
                 peer("loop"),
