@@ -307,7 +307,8 @@ def test_svgf_stays_inside_what_it_has_been_shown(seed):
 @settings(max_examples=8)
 @given(seed=seeds)
 def test_on_a_static_scene_the_variance_of_svgf_falls_with_history(seed):
-    noise = np.random.default_rng(seed).exponential(size=(FRAMES, SIZE, SIZE, 1)).astype(np.float32)
+    # Uniform noise: of 256 pixels with long tails, the variance itself would be too uncertain to follow.
+    noise = np.random.default_rng(seed).uniform(0, 2, (FRAMES, SIZE, SIZE, 1)).astype(np.float32)
     frames = Frame(np.broadcast_to(noise, (FRAMES, SIZE, SIZE, 3)))
     variance = np.asarray(blended(frames))[..., 0].var(axis=(1, 2))
     # What time alone does: on a blank wall the whole filter averages nearly all away at once.

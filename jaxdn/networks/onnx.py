@@ -52,9 +52,9 @@ def model(
 ) -> bytes:
     """The U-Net with these weights as a serialised ONNX graph.
 
-    ``shape`` [N, H, W, c] is that of the input ``features``, their channels a multiple of :data:`BLOCK`; ``used``
-    are the slices of the first kernel's inputs that it consists of (None: all). Outputs ``head_0`` ... are
-    [N, H / 2^i, W / 2^i, channels].
+    ``shape`` [N, c, H, W] is that of the input ``planes``, c a multiple of :data:`BLOCK`; ``used`` are the slices of
+    the first kernel's inputs that they consist of (None: all). Outputs ``head_0`` ... are [N, H / 2^i, W / 2^i,
+    channels].
     """
     from onnx import TensorProto, helper, numpy_helper
 
@@ -89,9 +89,8 @@ def model(
     kernel = entry["kernel"]
     if used is not None:
         kernel = np.concatenate([kernel[:, :, channels] for channels in used], axis=2)
-    kernel = np.pad(kernel, ((0, 0), (0, 0), (0, shape[3] - kernel.shape[2]), (0, 0)))
-    x = node("Transpose", "features", perm=[0, 3, 1, 2])
-    x = level(activated(convolution(x, kernel, entry["bias"])), "encoder_0", first=1)
+    kernel = np.pad(kernel, ((0, 0), (0, 0), (0, shape[1] - kernel.shape[2]), (0, 0)))
+    x = level(activated(convolution("planes", kernel, entry["bias"])), "encoder_0", first=1)
     skips, channels = [x], [_outputs(params["encoder_0"])]
     for depth in range(1, LEVELS):
         x = level(node("MaxPool", x, kernel_shape=[2, 2], strides=[2, 2]), f"encoder_{depth}")
@@ -121,7 +120,7 @@ def model(
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, list(shape))
 
     outputs = [value(f"head_{depth}", head_shape(params, shape, depth)) for depth in range(heads)]
-    graph = helper.make_graph(nodes, "unet", [value("features", shape)], outputs, constants)
+    graph = helper.make_graph(nodes, "unet", [value("planes", shape)], outputs, constants)
     whole = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)])
     whole.ir_version = 8
     return whole.SerializeToString()
@@ -132,8 +131,8 @@ def _outputs(level: dict[str, Any]) -> int:
 
 
 def head_shape(params: dict[str, Any], shape: Sequence[int], depth: int) -> tuple[int, ...]:
-    """[N, H, W, channels] of a head, for an input of ``shape``."""
-    return shape[0], shape[1] >> depth, shape[2] >> depth, params[f"head_{depth}"]["bias"].shape[0]
+    """[N, H, W, channels] of a head, for planes of ``shape`` [N, c, H, W]."""
+    return shape[0], shape[2] >> depth, shape[3] >> depth, params[f"head_{depth}"]["bias"].shape[0]
 
 
 class Engine:
@@ -143,19 +142,25 @@ class Engine:
     made sure of at every call (a comparison of bytes, about a millisecond), which keeps the function pure.
     """
 
-    def __init__(self, describe: Callable[[list[np.ndarray]], bytes]) -> None:
-        self._describe = describe
+    def __init__(self, shape: tuple[int, ...], groups: int, describe: Callable[[list[np.ndarray]], bytes]) -> None:
+        self._groups, self._describe = groups, describe
+        self._planes = np.zeros(shape, np.float32)  # kept: fresh memory costs more than what is written into it
         self._weights: list[np.ndarray] = []
         self._session: Any = None
         self._lock = threading.Lock()
 
-    def __call__(self, context: Any, outputs: Sequence[Any], features: Any, *weights: Any) -> None:
-        """Fill ``outputs``; all arguments are views of XLA's own buffers."""
+    def __call__(self, context: Any, outputs: Sequence[Any], *arguments: Any) -> None:
+        """Fill ``outputs``; the arguments, feature groups and then weights, are views of XLA's own buffers."""
         with self._lock:
-            self._prepare([np.asarray(weight) for weight in weights])
+            arrays = [np.asarray(argument) for argument in arguments]
+            self._prepare(arrays[self._groups :])
+            first = 0
+            for group in arrays[: self._groups]:
+                last = first + group.shape[-1]
+                np.copyto(self._planes[:, first:last], group.transpose(0, 3, 1, 2))
+                first = last
             binding = self._session.io_binding()
-            image = np.asarray(features)
-            binding.bind_input("features", "cpu", 0, np.float32, image.shape, image.ctypes.data)
+            binding.bind_input("planes", "cpu", 0, np.float32, self._planes.shape, self._planes.ctypes.data)
             for depth, output in enumerate(outputs):
                 head = np.asarray(output)
                 binding.bind_output(f"head_{depth}", "cpu", 0, np.float32, head.shape, head.ctypes.data)
@@ -188,14 +193,13 @@ def engine(plain: Apply, *, heads: int, slope: float, used: Sequence[slice] | No
 
     @jax.custom_vjp
     def run(params: dict[str, Any], groups: list[jax.Array]) -> tuple[jax.Array, ...]:
-        spare = -sum(group.shape[-1] for group in groups) % BLOCK
-        # Zeros joined with the rest: padding what is joined takes XLA ten times as long.
-        features = jnp.concatenate([*groups, jnp.zeros((*groups[0].shape[:3], spare), jnp.float32)], axis=-1)
+        channels = sum(group.shape[-1] for group in groups)
+        shape = (groups[0].shape[0], channels + -channels % BLOCK, *groups[0].shape[1:3])
         weights, tree = jax.tree.flatten(params)
-        shape = features.shape
         results = [jax.ShapeDtypeStruct(head_shape(params, shape, depth), jnp.float32) for depth in range(heads)]
-        session = Engine(lambda weights: model(jax.tree.unflatten(tree, weights), shape, used, heads, slope))
-        return tuple(buffer_callback(session, results, vmap_method="sequential")(features, *weights))
+        session = Engine(shape, len(groups), lambda weights: model(jax.tree.unflatten(tree, weights), shape, used, heads, slope))
+        # The groups go in as they are: joining them takes XLA three times as long as writing them into kept planes.
+        return tuple(buffer_callback(session, results, vmap_method="sequential")(*groups, *weights))
 
     def forward(params: dict[str, Any], groups: list[jax.Array]) -> tuple[Any, Any]:
         return run(params, groups), (params, groups)
