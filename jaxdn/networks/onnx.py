@@ -197,7 +197,9 @@ def engine(plain: Apply, *, heads: int, slope: float, used: Sequence[slice] | No
         shape = (groups[0].shape[0], channels + -channels % BLOCK, *groups[0].shape[1:3])
         weights, tree = jax.tree.flatten(params)
         results = [jax.ShapeDtypeStruct(head_shape(params, shape, depth), jnp.float32) for depth in range(heads)]
-        session = Engine(shape, len(groups), lambda weights: model(jax.tree.unflatten(tree, weights), shape, used, heads, slope))
+        session = Engine(
+            shape, len(groups), lambda weights: model(jax.tree.unflatten(tree, weights), shape, used, heads, slope)
+        )
         # The groups go in as they are: joining them takes XLA three times as long as writing them into kept planes.
         return tuple(buffer_callback(session, results, vmap_method="sequential")(*groups, *weights))
 
