@@ -34,7 +34,7 @@ test: setup  ## the tests (minutes)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m "not slow" $(SETTINGS)
 
 test-slow: setup  ## the slow tests: real training runs, the notebook, real processes
-	$(BIN)/python -m pytest -q -m slow $(SETTINGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m slow $(SETTINGS)
 
 hard-cases: setup  ## every hard case, operation, denoiser and precision: runs/hard-cases/table.html
 	$(BIN)/python -m tests.hard_cases

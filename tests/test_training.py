@@ -10,6 +10,7 @@ from jaxdn.denoisers import ntd
 from jaxdn.frame import Clip, Frame
 from jaxdn.motion import occlusion_mask
 from jaxdn.training import PARITY, Recipe, clip_loss, initial_state, make_train_step
+from tests.plainly import jit_plainly
 
 TINY = ((4,), (4,), (4,), (4,), (4,))
 RECIPE = Recipe(steps=8, batch=2, crop=16, frames=4)
@@ -75,7 +76,7 @@ def test_the_last_frame_gives_no_gradient(denoiser, state):
     clip = make_clip(0)
     changed = clip._replace(reference=clip.reference.copy())
     changed.reference[-1] *= 3.0
-    gradient = jax.grad(lambda params, clip: clip_loss(denoiser, params, clip)[0])
+    gradient = jit_plainly(jax.grad(lambda params, clip: clip_loss(denoiser, params, clip)[0]))
     for one, other in zip(
         jax.tree.leaves(gradient(state.params, clip)), jax.tree.leaves(gradient(state.params, changed)), strict=True
     ):
@@ -101,7 +102,9 @@ def test_rematerialised_gradients_are_the_same(denoiser, state):
     clip = make_clip(3)
 
     def gradient(rematerialize):
-        return jax.jit(jax.grad(lambda p: clip_loss(denoiser, p, clip, rematerialize=rematerialize)[0]))(state.params)
+        return jit_plainly(jax.grad(lambda p: clip_loss(denoiser, p, clip, rematerialize=rematerialize)[0]))(
+            state.params
+        )
 
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(False), gradient(True))
 

@@ -1,4 +1,4 @@
-"""How long a program takes to compile, each time in a fresh process: cold, and from the cache on disk.
+"""How long a program takes to compile, each time in a process of its own: cold, and from the cache on disk.
 
     python -m experiments.works.compilation xla step-large-720p     # what a child process runs: prints seconds
 
@@ -16,11 +16,14 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+Program = tuple[str, str]
+"""Engine, "xla" or "torch", and a program's name."""
 
-def warm(programs: Sequence[tuple[str, str]], cache: Path, *, limit_s: float) -> dict[tuple[str, str], float | None]:
-    """Compile (engine, program) pairs into the caches in ``cache``, a process for each core, and say what each took.
 
-    What they took is no measurement: they were in each other's way.
+def warm(programs: Sequence[Program], cache: Path, *, limit_s: float) -> dict[Program, float | None]:
+    """Compile into the caches in ``cache``, a process for each core, and return the seconds that each took.
+
+    They are in each other's way a little, all of them alike.
     """
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         seconds = pool.map(lambda pair: compile_seconds(pair[0], pair[1], cache, limit_s=limit_s), programs)

@@ -20,7 +20,7 @@ from jaxdn.denoisers import ntd
 from jaxdn.training import Recipe, initial_state, make_train_step
 
 
-def measure_input(recipe: Recipe, *, size: str = "small", windows: int = 4, steps: int = 4) -> dict[str, Timing]:
+def measure_input(recipe: Recipe, *, size: str = "large", windows: int = 3, steps: int = 4) -> dict[str, Timing]:
     """``wait`` and ``loop`` (milliseconds a step of a training loop), and ``alone`` (the step on a batch at hand).
 
     Each is sampled ``windows`` times over ``steps`` updates, in turns.
