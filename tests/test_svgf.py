@@ -439,3 +439,20 @@ def test_a_rejected_tap_may_be_anything(rng):
 def test_options_out_of_range_raise(options, word):
     with pytest.raises(ValueError, match=word):
         svgf(**options)
+
+
+def test_a_pixel_without_a_surface_among_strangers_spoils_no_gradient(rng):
+    """Its neighbours weigh 1e-20 together: a square that is 0 in single precision, by which the variance was divided."""
+    values = jnp.asarray(rng.uniform(1, 2, (3, 5, 5)), jnp.float32)
+    hit = jnp.ones((5, 5), bool).at[2, 2].set(False)
+    edges = edges_of(jnp.full((5, 5, 1), 2.0), None, None)._replace(hit=hit)
+    level = values[0].at[2, 2].add(46.0)
+
+    def spread(values, level):
+        light = (level, jnp.ones((5, 5), jnp.float32))
+        mean, variance = edge_average(values, edges, stencil(1), variance=values[1], luminance=light)
+        return jnp.sum(mean) + jnp.sum(variance)
+
+    value, slopes = jax.value_and_grad(spread, (0, 1))(values, level)
+    assert jnp.isfinite(value)
+    assert all(jnp.isfinite(slope).all() for slope in slopes)

@@ -22,6 +22,8 @@ from jaxdn.denoisers.reprojection import depth_slopes, hit_mask
 
 B3_SPLINE = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
 _STRIP_PIXELS = 16384
+_NO_WEIGHT = 1e-10
+"""Taps that weigh less together count as none: the cube of their sum, in the variance's gradient, would be 0."""
 
 
 class Edges(NamedTuple):
@@ -83,7 +85,7 @@ def edge_average(
     ``variance`` [H, W] becomes ``sum w^2 variance / (sum w)^2``. ``luminance`` is (l, 1 / (sigma_l sqrt(var) + eps)),
     each [H, W]; ``None`` drops w_l. ``needed`` [H, W] bool: strips of the image without a needed pixel are skipped and
     come back as 0. Taps outside the image or without a surface weigh nothing; the centre weighs h exactly; a pixel
-    without any tap gives 0.
+    without any tap, or with taps that weigh less than 1e-10 together, gives 0.
     """
     _, height, width = values.shape
     dtype = values.dtype
@@ -154,7 +156,7 @@ def edge_average(
         centre = (sums, jnp.full((rows, width), taps[0, 2], dtype), offsets[0])
         (sums, ready, offset), _ = lax.scan(body, centre, (offsets[1:], numbers[1:]))
         total, total_spread = add(sums, ready, offset)
-        some = total[-1] > 0
+        some = total[-1] > _NO_WEIGHT
         share = jnp.where(some, total[-1], 1.0)
         mean = jnp.stack([jnp.where(some, plane, 0.0) / share for plane in total[:-1]])
         return mean, None if total_spread is None else jnp.where(some, total_spread, 0.0) / share**2
