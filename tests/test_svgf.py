@@ -442,7 +442,7 @@ def test_options_out_of_range_raise(options, word):
 
 
 def test_a_pixel_without_a_surface_among_strangers_spoils_no_gradient(rng):
-    """Its neighbours weigh 1e-20 together: a square that is 0 in single precision, by which the variance was divided."""
+    """Its neighbours weigh 1e-20 together, the square of which, 0 in single precision, divided the variance."""
     values = jnp.asarray(rng.uniform(1, 2, (3, 5, 5)), jnp.float32)
     hit = jnp.ones((5, 5), bool).at[2, 2].set(False)
     edges = edges_of(jnp.full((5, 5, 1), 2.0), None, None)._replace(hit=hit)
