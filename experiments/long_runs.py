@@ -159,7 +159,7 @@ def draw(curves: dict[str, dict[str, np.ndarray]], path: Path) -> None:
             at = len(apart) // 2
             row[2].plot(np.arange(-10, 150), np.maximum(apart[at - 10 : at + 150], 1e-7), label=label)
         row[2].axhline(0.01, color="grey", linewidth=0.8, linestyle="--", label="1 %")
-        titles = ("largest value in the state", "error of the output", "from the clean run, after one poisoned frame")
+        titles = ("largest value in the state", "error of the output", "distance after a poisoned frame")
         for axis, title in zip(row, titles, strict=True):
             axis.set(yscale="log", title=f"{name}: {title}", xlabel="frame")
             axis.legend(fontsize="small")
