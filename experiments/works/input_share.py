@@ -19,13 +19,13 @@ from jaxdn.clips import training_batches, write_clip
 from jaxdn.denoisers import ntd
 from jaxdn.training import Recipe, initial_state, make_train_step
 
+WINDOWS, STEPS = 3, 4
+"""Each figure is sampled so many times, over so many updates."""
 
-def measure_input(recipe: Recipe, *, size: str = "large", windows: int = 3, steps: int = 4) -> dict[str, Timing]:
-    """``wait`` and ``loop`` (milliseconds a step of a training loop), and ``alone`` (the step on a batch at hand).
 
-    Each is sampled ``windows`` times over ``steps`` updates, in turns.
-    """
-    denoiser = ntd(size=size)
+def measure_input(recipe: Recipe) -> dict[str, Timing]:
+    """``wait`` and ``loop`` (milliseconds a step of a training loop), and ``alone`` (the step on a batch at hand)."""
+    denoiser = ntd(size="large")  # its program has been compiled for the train steps
     with tempfile.TemporaryDirectory() as place:
         side = recipe.crop + recipe.crop // 2
         for seed in range(2 * recipe.batch):
@@ -45,24 +45,24 @@ def measure_input(recipe: Recipe, *, size: str = "large", windows: int = 3, step
             """Milliseconds a step that were waited, and in all."""
             nonlocal state
             waited, began = 0.0, time.perf_counter()
-            for _ in range(steps):
+            for _ in range(STEPS):
                 asked = time.perf_counter()
                 batch = next_batch()
                 waited += time.perf_counter() - asked
                 state, report = step(state, batch)
                 float(report.loss)
-            return 1e3 * waited / steps, 1e3 * (time.perf_counter() - began) / steps
+            return 1e3 * waited / STEPS, 1e3 * (time.perf_counter() - began) / STEPS
 
         began = time.perf_counter()
         window(lambda: held)  # compiles
         first = 1e3 * (time.perf_counter() - began)
         samples: dict[str, list[float]] = {"wait": [], "loop": [], "alone": []}
-        for _ in range(windows):
+        for _ in range(WINDOWS):
             waited, whole = window(lambda: next(batches))
             samples["wait"].append(waited)
             samples["loop"].append(whole)
             samples["alone"].append(window(lambda: held)[1])
     return {
-        name: Timing(float(np.median(values)), min(values), max(values), first, windows)
+        name: Timing(float(np.median(values)), min(values), max(values), first, WINDOWS)
         for name, values in samples.items()
     }

@@ -49,25 +49,25 @@ def pytorch(size: str, batch: Clip, recipe: Recipe, *, compiled: bool) -> Call:
     return lambda: trainer(*tensors)
 
 
-def works(*, recipe: Recipe = RECIPE, cases: tuple[tuple[str, int], ...] = CASES) -> Iterator[Work]:
+def works() -> Iterator[Work]:
     """``train-large-64`` and so on, plain and rematerialised."""
     lacking = peers.missing()
-    for size, crop in cases:
-        batch = batch_of(crop, recipe)
+    for size, crop in CASES:
+        batch = batch_of(crop)
 
         def own(again: bool, size: str = size, batch: Clip = batch) -> Callable[[], Call]:
-            return lambda: ours(size, batch, recipe._replace(rematerialize=again))
+            return lambda: ours(size, batch, RECIPE._replace(rematerialize=again))
 
         def torch(compiled: bool, size: str = size, batch: Clip = batch) -> Callable[[], Call]:
-            return lambda: pytorch(size, batch, recipe, compiled=compiled)
+            return lambda: pytorch(size, batch, RECIPE, compiled=compiled)
 
         mine: dict[str, Callable[[], Call]] = {"xla": own(False)}
         others: dict[str, Callable[[], Call]] = {}
         if "torch" not in lacking:
             others["torch-eager"] = torch(False)
-        if (size, crop) == cases[0]:
+        if (size, crop) == CASES[0]:
             mine["xla-remat"] = own(True)
             if "torch-compiled" not in lacking:
                 others["torch-compiled"] = torch(True)
-        costs: Any = roofline.train_step(WIDTHS[size], crop, batch=recipe.batch, frames=recipe.frames)
+        costs: Any = roofline.train_step(WIDTHS[size], crop, batch=RECIPE.batch, frames=RECIPE.frames)
         yield Work(f"train-{size}-{crop}", mine, others, costs, rounds=4 if crop < 128 else 3)
