@@ -16,11 +16,11 @@ setup: .venv/ready  ## .venv with the exact versions of constraints.txt (uv wher
 	@echo "Setting up .venv (Python packages of constraints.txt; a minute or two) ..."
 	@if command -v uv >/dev/null 2>&1; then \
 		uv venv --quiet --allow-existing --python $(PYTHON) .venv && \
-		uv pip install --quiet --python $(BIN)/python -c constraints.txt --group dev -e '.[render,train,peers,onnx]'; \
+		uv pip install --quiet --python $(BIN)/python -c constraints.txt --group dev -e '.[render,train,peers,onnx,onednn]'; \
 	else \
 		$(PYTHON) -m venv .venv && \
 		$(BIN)/python -m pip install --quiet --upgrade -c constraints.txt pip && \
-		$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[render,train,peers,onnx]'; \
+		$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[render,train,peers,onnx,onednn]'; \
 	fi
 	@touch $@
 

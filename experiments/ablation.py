@@ -22,7 +22,7 @@ from jaxdn.clips import training_batches
 from jaxdn.clips.folder import is_clip, read_record
 from jaxdn.commands.compare import Method, compare
 from jaxdn.commands.errors import told_plainly
-from jaxdn.commands.train import fit, load_validation, read_curve
+from jaxdn.commands.train import fit, load_validation, read_curve, training_engine
 from jaxdn.denoisers import ntd, svgf
 from jaxdn.render import ClipJob, choose_variant, render_clips
 from jaxdn.report import Results, TrainingCurve, text_table, write_report
@@ -154,7 +154,9 @@ def train(run: Run, preset: Preset, data: Path, folder: Path) -> None:
     """Train one network to the end (or find it trained) and write its weights."""
     options = {"size": run.size, "motion": run.motion}
     recipe = preset.recipe._replace(steps=run.steps, occlusion=run.occlusion)
-    denoiser = ntd(**options)  # type: ignore[arg-type]
+    engine = training_engine()
+    denoiser = ntd(**options, implementation=engine)  # type: ignore[arg-type]
+    print(f"{run.label}: convolutions run on {engine}", flush=True)
     batches = training_batches(
         folders(preset.train, data / "train"),
         buffers=denoiser.reads,

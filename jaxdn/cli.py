@@ -105,6 +105,8 @@ class Train:
     """Peak learning rate; default: 1e-3, with --parity 1e-4 throughout."""
     rematerialize: bool = False
     """A seventh of the memory for about 1.35 of the time."""
+    implementation: Literal["auto", "reference", "onednn"] = "auto"
+    """What convolves: XLA (reference) or oneDNN (CPU; the extra onednn); auto: the latter where it can."""
     seed: int = 0
 
 
@@ -230,7 +232,7 @@ def _render(options: Render) -> None:
 
 def _train(options: Train) -> None:
     from jaxdn.clips import training_batches
-    from jaxdn.commands.train import fit, load_validation
+    from jaxdn.commands.train import fit, load_validation, training_engine
     from jaxdn.denoisers import ntd
     from jaxdn.training import PARITY, Recipe
     from jaxdn.weights import save_weights
@@ -248,7 +250,9 @@ def _train(options: Train) -> None:
     settings: dict[str, Any] = {"size": options.size, "motion": options.motion}
     if options.parity:
         settings["preset"] = "parity"
-    denoiser = ntd(**settings)
+    engine = training_engine(options.implementation)
+    denoiser = ntd(**settings, implementation=engine)
+    print(f"{options.out.name}: convolutions run on {engine}", flush=True)
     batches = training_batches(
         clip_folders(options.clips),
         buffers=denoiser.reads,

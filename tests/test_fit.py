@@ -1,13 +1,14 @@
 """The training loop: stopped at any moment and started again, it continues as if never stopped."""
 
 import json
+from functools import partial
 
 import jax
 import numpy as np
 import pytest
 
 from jaxdn.clips import training_batches, write_clip
-from jaxdn.commands.train import fit, read_curve, read_log
+from jaxdn.commands.train import fit, read_curve, read_log, training_engine
 from jaxdn.denoisers import ntd
 from jaxdn.training import Recipe
 from tests.test_training import TINY, make_clip
@@ -46,12 +47,18 @@ class Stopping:
         self.source.set_state(state)
 
 
-def run(clips, folder, **options):
-    return fit(ntd(size=TINY), RECIPE, options.pop("source", batches(clips)), folder, label="t", log_every=1, **options)
+def run_on(engine, clips, folder, **options):
+    denoiser, source = ntd(size=TINY, implementation=engine), options.pop("source", batches(clips))
+    return fit(denoiser, RECIPE, source, folder, label="t", log_every=1, **options)
+
+
+run = partial(run_on, None)
 
 
 @pytest.mark.slow
-def test_interrupted_training_ends_in_bit_identical_weights(clips, tmp_path):
+@pytest.mark.parametrize("engine", dict.fromkeys(("reference", training_engine())))
+def test_interrupted_training_ends_in_bit_identical_weights(engine, clips, tmp_path):
+    run = partial(run_on, engine)
     whole = run(clips, tmp_path / "whole", checkpoint_every=100)
     with pytest.raises(KeyboardInterrupt):
         run(clips, tmp_path / "stopped", source=Stopping(batches(clips), 4), checkpoint_every=2)

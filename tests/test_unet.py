@@ -1,11 +1,14 @@
 """The U-Net against a NumPy one, and its promises: plain dicts, fixed shapes, absent groups that cost nothing."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.networks import LARGE, LEVELS, SMALL
+from jaxdn.backends import onednn
+from jaxdn.networks import LARGE, LEVELS, SMALL, onnx
 from jaxdn.networks.unet import NEGATIVE_SLOPE, Network, count, unet
 
 GROUPS = (3, 3, 3, 1, 3, 1)
@@ -132,10 +135,14 @@ def test_errors_say_what_was_expected(rng: np.random.Generator, key: jax.Array) 
 
 
 @pytest.mark.parametrize("absent", [(), (1, 3)])
-def test_onnxruntime_is_the_same_network(absent: tuple[int, ...], rng: np.random.Generator, key: jax.Array) -> None:
+@pytest.mark.parametrize(("name", "installed"), [("onnxruntime", onnx.available), ("onednn", onednn.available)])
+def test_an_engine_runs_the_same_network(
+    name: str, installed: Callable[[], bool], absent: tuple[int, ...], rng: np.random.Generator, key: jax.Array
+) -> None:
     """Values of the engine and its gradient, with all features and without some."""
-    pytest.importorskip("onnxruntime")
-    plain, engine = (unet(GROUPS, HEADS, widths=TINY, implementation=name) for name in (None, "onnxruntime"))
+    if not installed():
+        pytest.skip(f"{name} is not installed")
+    plain, engine = (unet(GROUPS, HEADS, widths=TINY, implementation=each) for each in (None, name))
     params = jax.tree.map(lambda leaf: leaf + 0.01, plain.init(key))
     inputs = [None if index in absent else group for index, group in enumerate(features(rng, GROUPS))]
 

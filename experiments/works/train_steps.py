@@ -26,9 +26,9 @@ def batch_of(size: int, recipe: Recipe = RECIPE) -> Clip:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *clips)
 
 
-def ours(size: str, batch: Clip, recipe: Recipe) -> Call:
+def ours(size: str, batch: Clip, recipe: Recipe, *, implementation: str | None = None) -> Call:
     """A call that makes one update; state and batch lie on the device, the old state's memory is donated."""
-    denoiser = ntd(size=size)
+    denoiser = ntd(size=size, implementation=implementation)
     state = [initial_state(denoiser, recipe, batch)]
     step, there = make_train_step(denoiser, recipe), jax.tree.map(jnp.asarray, batch)
 

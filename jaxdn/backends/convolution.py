@@ -2,7 +2,8 @@
 
 XLA:CPU runs plain NHWC/HWIO convolutions well, but the ones that automatic differentiation makes fall off the fast path
 inside ``lax.scan`` (28 times slower in a two-layer toy, jax 0.10). The ``"blocked"`` implementation has a VJP of its
-own: the gradient by the image is again a plain convolution, the gradient by the kernel a few matrix products.
+own: the gradient by the image is again a plain convolution, the gradient by the kernel a few matrix products. The
+``"onednn"`` implementation has another engine do all three.
 """
 
 import jax
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
+from jaxdn.backends import onednn
 from jaxdn.backends.registry import register, resolve
 
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
@@ -98,4 +100,25 @@ def _one_by_one(size: int, batched: tuple[bool, bool], x: jax.Array, cotangent: 
 @register("convolution", "blocked", preferred_on=("cpu",))
 def blocked(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """XLA's convolution with gradients that are plain convolutions and blocked matrix products."""
+    return _blocked(x, kernel)
+
+
+@jax.custom_vjp
+def _by_engine(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    return onednn.forward(x, kernel)
+
+
+def _engine_backward(residuals: tuple[jax.Array, jax.Array], cotangent: jax.Array) -> tuple[jax.Array, jax.Array]:
+    x, kernel = residuals
+    return onednn.image_gradient(cotangent, kernel), onednn.kernel_gradient(x, cotangent)
+
+
+_by_engine.defvjp(lambda x, kernel: (onednn.forward(x, kernel), (x, kernel)), _engine_backward)
+
+
+@register("convolution", "onednn", requires=onednn.check_available)
+def engine(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """oneDNN for float32, value and gradients; other types, which it has no fast form of, as ``"blocked"``."""
+    if x.dtype == kernel.dtype == jnp.float32:
+        return _by_engine(x, kernel)
     return _blocked(x, kernel)

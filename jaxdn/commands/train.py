@@ -15,11 +15,19 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from jaxdn import color, metrics
+from jaxdn.backends import onednn
 from jaxdn.checkpoint import Checkpoints
 from jaxdn.clips import read_clip
 from jaxdn.frame import Clip, Denoiser
 from jaxdn.rollout import denoise
 from jaxdn.training import Recipe, TrainState, initial_state, make_train_step
+
+
+def training_engine(implementation: str = "auto") -> str:
+    """What convolves while training: "onednn" where it can run, else "reference" (XLA alone); or what was named."""
+    if implementation == "auto":
+        return "onednn" if onednn.available() else "reference"
+    return implementation
 
 
 class Curve(NamedTuple):

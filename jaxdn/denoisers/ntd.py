@@ -142,7 +142,8 @@ def ntd(
     * ``demodulate``: filter radiance divided by albedo.
     * ``truncate``: no gradient flows through the history.
     * ``compute_dtype``: ``None`` (the images' dtype) or ``"bfloat16"``, for the U-Net alone.
-    * ``implementation``: of the U-Net, None (XLA) or ``"onnxruntime"`` (inference on CPUs; the extra ``onnx``).
+    * ``implementation``: of the U-Net, None (XLA), on CPUs also ``"onnxruntime"`` (inference; the extra ``onnx``) or
+      ``"onednn"`` (training; the extra ``onednn``).
 
     Raises ValueError for an unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
     """

@@ -16,7 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-from jaxdn.backends.registry import register
 from jaxdn.networks import LEVELS
 
 OPSET = 17
@@ -184,7 +183,6 @@ class Engine:
         )
 
 
-@register("unet", "onnxruntime", requires=check_available)
 def engine(plain: Apply, *, heads: int, slope: float, used: Sequence[slice] | None) -> Apply:
     """``plain``, the network in XLA, run by ONNX Runtime; the gradient is ``plain``'s.
 
