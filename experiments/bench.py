@@ -189,7 +189,8 @@ def compiled(
     listed = list(works())
     programs: list[compilation.Program] = [("torch", work.name) for work in listed if "torch-compiled" in work.peers]
     for work in listed:
-        programs += [("xla", work.name + name.removeprefix("xla")) for name in work.ours if name.startswith("xla")]
+        ours = [name for name in work.ours if name != "onnxruntime"]
+        programs += [("xla", f"{work.name}-{name}".replace("-xla", "")) for name in ours]
     say(f"compiling {', '.join(sorted({name for _, name in programs}))} ...")
     taken |= compilation.warm(programs, cache, limit_s=COMPILE_S)
     for work in listed:

@@ -1,6 +1,7 @@
 """The hot operations alone, forward and gradient: the forms that are registered, PyTorch's, and the roofline.
 
-The chosen form (``implementation=None``) is called ``xla``; the others, but for the reference, carry their names.
+The chosen form (``implementation=None``) is called ``xla``; the others, but for the reference, carry their names. An
+engine that is not installed is left out.
 """
 
 from collections.abc import Callable, Iterator
@@ -13,6 +14,7 @@ import numpy as np
 from experiments import peers, roofline
 from experiments.timing import Call
 from experiments.works import Work
+from jaxdn.backends import onednn
 from jaxdn.backends.convolution import convolve
 from jaxdn.backends.registry import implementations, resolve
 from jaxdn.kernels import softmax_filter
@@ -26,11 +28,10 @@ Function = Callable[..., Any]
 
 def forms(operation: str) -> dict[str, str | None]:
     """Name in the results -> name in the registry; what None stands for is ``xla``."""
-    chosen = resolve(operation, None)
-    others = [
-        name for name in implementations(operation) if name != "reference" and resolve(operation, name) is not chosen
-    ]
-    return {"xla": None, **{f"xla-{name}": name for name in others}}
+    engines = ["onednn"] if operation == "convolution" and onednn.available() else []
+    ways = [name for name in implementations(operation) if name not in ("reference", "onednn")]
+    others = [name for name in ways if resolve(operation, name) is not resolve(operation, None)]
+    return {"xla": None, **{f"xla-{name}": name for name in others}, **{name: name for name in engines}}
 
 
 def jitted(function: Function, *arguments: jax.Array) -> Callable[[], Call]:

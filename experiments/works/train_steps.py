@@ -11,6 +11,7 @@ from experiments import peers, roofline
 from experiments.timing import Call
 from experiments.works import Work, scene
 from experiments.works.steps import WIDTHS
+from jaxdn.backends import onednn
 from jaxdn.denoisers import ntd
 from jaxdn.frame import Clip
 from jaxdn.training import Recipe, initial_state, make_train_step
@@ -50,23 +51,27 @@ def pytorch(size: str, batch: Clip, recipe: Recipe, *, compiled: bool) -> Call:
 
 
 def works() -> Iterator[Work]:
-    """``train-large-64`` and so on, plain and rematerialised."""
+    """``train-large-64`` and so on: plain, with oneDNN's convolutions where they are installed, and rematerialised."""
     lacking = peers.missing()
     for size, crop in CASES:
         batch = batch_of(crop)
 
-        def own(again: bool, size: str = size, batch: Clip = batch) -> Callable[[], Call]:
-            return lambda: ours(size, batch, RECIPE._replace(rematerialize=again))
+        def own(
+            size: str = size, batch: Clip = batch, *, again: bool = False, engine: str | None = None
+        ) -> Callable[[], Call]:
+            return lambda: ours(size, batch, RECIPE._replace(rematerialize=again), implementation=engine)
 
         def torch(compiled: bool, size: str = size, batch: Clip = batch) -> Callable[[], Call]:
             return lambda: pytorch(size, batch, RECIPE, compiled=compiled)
 
-        mine: dict[str, Callable[[], Call]] = {"xla": own(False)}
+        mine: dict[str, Callable[[], Call]] = {"xla": own()}
+        if onednn.available():
+            mine["onednn"] = own(engine="onednn")
         others: dict[str, Callable[[], Call]] = {}
         if "torch" not in lacking:
             others["torch-eager"] = torch(False)
         if (size, crop) == CASES[0]:
-            mine["xla-remat"] = own(True)
+            mine["xla-remat"] = own(again=True)
             if "torch-compiled" not in lacking:
                 others["torch-compiled"] = torch(True)
         costs: Any = roofline.train_step(WIDTHS[size], crop, batch=RECIPE.batch, frames=RECIPE.frames)
