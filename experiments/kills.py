@@ -60,14 +60,14 @@ def train(clips: Path, folder: Path, sizes: Sizes) -> None:
     import jax
 
     from jaxdn.clips import training_batches
-    from jaxdn.commands.train import fit
+    from jaxdn.commands.train import fit, training_engine
     from jaxdn.denoisers import ntd
     from jaxdn.training import Recipe
     from jaxdn.weights import save_weights
 
     jax.config.update("jax_compilation_cache_dir", str(clips.parent / "programs"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    denoiser = ntd(size=WIDTHS)
+    denoiser = ntd(size=WIDTHS, implementation=training_engine())
     recipe = Recipe(steps=sizes.steps, batch=2, crop=16, frames=4)
     batches = training_batches(clips, buffers=denoiser.reads, batch=2, crop=16, frames=4, seed=0)
     every = sizes.checkpoint_every
