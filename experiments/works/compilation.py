@@ -2,9 +2,9 @@
 
     python -m experiments.works.compilation xla step-large-720p     # what a child process runs: prints seconds
 
-Programs are named as the works are: ``train-large-64-remat`` is the rematerialised step, ``train-large-64-onednn`` the
-one with oneDNN's convolutions. Tracing, lowering and compilation are counted; starting Python and importing are not.
-PyTorch compiles when it first runs, so one run is in its figure.
+Programs are named as the works are, ``train-large-64-remat`` is the rematerialised step. Tracing, lowering and
+compilation are counted; starting Python and importing are not. PyTorch compiles when it first runs, so one run is in
+its figure.
 """
 
 import os
@@ -59,9 +59,8 @@ def _xla(program: str) -> float:
     from jaxdn.frame import frame_at
     from jaxdn.training import initial_state, make_train_step
 
-    kind, size, detail, *form = program.split("-")
-    denoiser = ntd(size=size, implementation="onednn" if "onednn" in form else None)
-    recipe = train_steps.RECIPE._replace(rematerialize="remat" in form)
+    kind, size, detail, *remat = program.split("-")
+    denoiser, recipe = ntd(size=size), train_steps.RECIPE._replace(rematerialize=bool(remat))
     step: Any
     arguments: tuple[Any, ...]
     if kind == "step":

@@ -16,7 +16,6 @@ import numpy as np
 from experiments.timing import Timing
 from experiments.works import scene
 from jaxdn.clips import training_batches, write_clip
-from jaxdn.commands.train import training_engine
 from jaxdn.denoisers import ntd
 from jaxdn.training import Recipe, initial_state, make_train_step
 
@@ -26,7 +25,7 @@ WINDOWS, STEPS = 3, 4
 
 def measure_input(recipe: Recipe) -> dict[str, Timing]:
     """``wait`` and ``loop`` (milliseconds a step of a training loop), and ``alone`` (the step on a batch at hand)."""
-    denoiser = ntd(size="large", implementation=training_engine())  # its program has been compiled for the train steps
+    denoiser = ntd(size="large")  # its program has been compiled for the train steps
     with tempfile.TemporaryDirectory() as place:
         side = recipe.crop + recipe.crop // 2
         for seed in range(2 * recipe.batch):
