@@ -189,7 +189,7 @@ def compiled(
     listed = list(works())
     programs: list[compilation.Program] = [("torch", work.name) for work in listed if "torch-compiled" in work.peers]
     for work in listed:
-        # Programs that call an engine are not kept in jax's cache: the engine's address is in them.
+        # Programs that call an engine are compiled where they run: another process does not find them in jax's cache.
         programs += [("xla", work.name + name.removeprefix("xla")) for name in work.ours if name.startswith("xla")]
     say(f"compiling {', '.join(sorted({name for _, name in programs}))} ...")
     taken |= compilation.warm(programs, cache, limit_s=COMPILE_S)

@@ -14,7 +14,7 @@ def unroll(denoiser: Denoiser, params: Any, frames: Frame, *, rematerialize: boo
 
     ``start`` sees the first frame once, then ``step`` is scanned over all T frames. With ``rematerialize`` the backward
     pass recomputes each step from its carried state, so that memory grows by one frame's state per frame and not by one
-    network's activations (about a seventh of the memory for 1.35 times the time; Chen et al. 2016).
+    network's activations (about a quarter of the memory for 1.1 to 1.4 times the time; Chen et al. 2016).
     """
     frames = only(frames, denoiser.reads)
 

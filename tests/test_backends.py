@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxdn.networks.unet  # noqa: F401  (registers the networks' implementations)
 from jaxdn.backends.convolution import convolve
 from jaxdn.backends.registry import implementations, resolve
 from jaxdn.kernels import apply_kernels, softmax_filter
@@ -229,6 +230,7 @@ def test_keeps_the_dtype(case, name, dtype, rng):
 def test_a_name_is_that_one_or_an_error(op):
     assert len(implementations(op)) > 1
     assert "reference" in runnable(op)
+    assert set(implementations(op)) - set(runnable(op)) <= {"onednn", "onnxruntime"}  # engines are extras
     assert resolve(op, None) in [resolve(op, name) for name in runnable(op)]
     with pytest.raises(ValueError, match=r"'reference'.*'no such'"):
         resolve(op, "no such")

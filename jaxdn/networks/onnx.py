@@ -1,7 +1,7 @@
 """The U-Net run by ONNX Runtime, an inference engine for CPUs, from inside a jitted program.
 
 XLA:CPU convolves at about two thirds of what the machine can do. ONNX Runtime keeps activations in blocks of 16
-channels from one convolution to the next; a 720p step takes 0.77 to 0.91 of XLA's time (``docs/performance.md``). It
+channels from one convolution to the next; a 720p step takes 0.77 to 1.03 of XLA's time (``docs/performance.md``). It
 is an extra (``pip install jaxdn[onnx]``) and for inference only: the gradient is that of the U-Net in plain XLA,
 computed anew. Nothing of this leaves the room: ``unet(..., implementation="onnxruntime")`` is the same pure function.
 """
