@@ -25,10 +25,10 @@ setup: .venv/ready  ## .venv with the exact versions of constraints.txt (uv wher
 	@touch $@
 
 train: setup  ## the main job: render clips, train the denoiser and its ablations, evaluate, write a report
-	$(BIN)/python -m experiments.ablation $(SETTINGS)
+	$(BIN)/python -m experiments.papers.ablation $(SETTINGS)
 
 weights: setup  ## the recipe of the shipped weights: hours, resumable
-	$(BIN)/python -m experiments.ablation --preset full --ship $(SETTINGS)
+	$(BIN)/python -m experiments.papers.ablation --preset full --ship $(SETTINGS)
 
 test: setup  ## the tests (minutes)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m "not slow" $(SETTINGS)
@@ -52,10 +52,10 @@ hard-cases: setup  ## every hard case, operation, denoiser and precision: runs/h
 	@touch $@
 
 bench: .venv/tools  ## time operations, steps and training against PyTorch and Open Image Denoise: runs/bench.json
-	$(BIN)/python -m experiments.bench $(SETTINGS)
+	$(BIN)/python -m experiments.speed.bench $(SETTINGS)
 
 chart: .venv/tools  ## error against time of every way to an image: runs/chart/chart.html
-	$(BIN)/python -m experiments.chart $(SETTINGS)
+	$(BIN)/python -m experiments.speed.chart $(SETTINGS)
 
 lint: setup  ## ruff and the type checker
 	$(BIN)/ruff check .

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from jaxdn.training import TrainState
+from jaxdn.learning.step import TrainState
 
 _DIGEST = "sha256"
 """Where the digest lies in what is stored beside the state; checkpoints of earlier versions have none."""

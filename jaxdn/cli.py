@@ -234,7 +234,8 @@ def _train(options: Train) -> None:
     from jaxdn.clips import training_batches
     from jaxdn.commands.train import fit, load_validation, training_engine
     from jaxdn.denoisers import ntd
-    from jaxdn.training import PARITY, Recipe
+    from jaxdn.learning.step import PARITY
+    from jaxdn.recipe import Recipe
     from jaxdn.weights import save_weights
 
     recipe = (PARITY if options.parity else Recipe())._replace(

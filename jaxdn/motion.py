@@ -73,3 +73,23 @@ def occlusion_mask(motion: jax.Array, dual_motion: jax.Array, *, threshold: floa
     difference = jnp.asarray(dual_motion) - jnp.asarray(motion)
     squared = jnp.sum(difference * difference, axis=-1, keepdims=True)
     return (squared > threshold * threshold).astype(difference.dtype)
+
+
+def targets(motion: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The array position (x, y) that each pixel's vector points at."""
+    height, width = motion.shape[:2]
+    x = jnp.arange(width, dtype=motion.dtype)[None, :] + motion[..., 0]
+    y = jnp.arange(height, dtype=motion.dtype)[:, None] + motion[..., 1]
+    return x, y
+
+
+def on_screen(motion: jax.Array) -> jax.Array:
+    """Whether each pixel's history lies on the screen: bool [H, W, 1] for ``motion`` [H, W, 2].
+
+    On-screen means -0.5 <= x <= W - 0.5 in array indices, likewise y; a vector that is not finite points nowhere.
+    """
+    check_image(motion, "motion", channels=2)
+    height, width = motion.shape[:2]
+    x, y = targets(motion)
+    inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
+    return inside[..., None]

@@ -1,15 +1,37 @@
-"""A clip is a scan over frames: the one loop that inference and training share."""
+"""Stepping through a clip: as one scan, which is what training and notebooks want, or frame by frame as they come."""
 
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax import lax
 
 from jaxdn.checks import check_image
-from jaxdn.frame import Clip, Denoiser, Frame, frame_at, only
+from jaxdn.denoiser import Denoiser, Params, State
+from jaxdn.frame import Clip, Frame, frame_at, only, present
+from jaxdn.sampling import from_layers
+
+Layers = Mapping[int, jax.Array] | None
+"""Samples a pixel -> independent noisy radiance; see :class:`jaxdn.Clip`."""
 
 
-def unroll(denoiser: Denoiser, params: Any, frames: Frame, *, rematerialize: bool = False) -> jax.Array:
+def sampled(denoiser: Denoiser, params: Params, state: State, frame: Frame, layers: Layers) -> Frame:
+    """The frame with the samples that the denoiser asks for, served from stored layers; as it is if it asks for none.
+
+    Raises ValueError where it asks and there are no layers.
+    """
+    if denoiser.samples is None:
+        return only(frame, denoiser.reads)
+    if layers is None:
+        raise ValueError("layers: expected independent noisy layers, as this denoiser asks for samples, got None.")
+    radiance, counts = from_layers(layers, denoiser.samples(params, state, only(frame, denoiser.reads)))
+    return only(frame._replace(radiance=radiance, sample_count=counts), denoiser.reads)
+
+
+def unroll(
+    denoiser: Denoiser, params: Params, frames: Frame, layers: Layers = None, *, rematerialize: bool = False
+) -> jax.Array:
     """Denoise consecutive frames ``[T, H, W, C]`` with one recurrent state; returns images ``[T, H, W, 3]``.
 
     ``start`` sees the first frame once, then ``step`` is scanned over all T frames. With ``rematerialize`` the backward
@@ -17,16 +39,17 @@ def unroll(denoiser: Denoiser, params: Any, frames: Frame, *, rematerialize: boo
     network's activations (about a quarter of the memory for 1.1 to 1.4 times the time; Chen et al. 2016).
     """
     frames = only(frames, denoiser.reads)
+    layers = layers if denoiser.samples is not None else None
 
-    def step(state: Any, frame: Frame) -> tuple[Any, jax.Array]:
-        return denoiser.step(params, state, frame)
+    def step(state: State, given: tuple[Frame, Layers]) -> tuple[State, jax.Array]:
+        return denoiser.step(params, state, sampled(denoiser, params, state, *given))
 
     body = jax.checkpoint(step, prevent_cse=False) if rematerialize else step
-    _, images = lax.scan(body, denoiser.start(params, frame_at(frames, 0)), frames)
+    _, images = lax.scan(body, denoiser.start(params, frame_at(frames, 0)), (frames, layers))
     return images
 
 
-def denoise(denoiser: Denoiser, params: Any, clip: Clip) -> jax.Array:
+def denoise(denoiser: Denoiser, params: Params, clip: Clip) -> jax.Array:
     """Denoise a clip; returns linear radiance ``[T, H, W, 3]``, >= 0.
 
     ``clip.frames`` are T frames of linear radiance with whatever other buffers the renderer gave; those that
@@ -41,4 +64,49 @@ def denoise(denoiser: Denoiser, params: Any, clip: Clip) -> jax.Array:
                 f"clip.frames.{name}: expected [T, H, W] = {radiance.shape[:3]} as the radiance has, "
                 f"got {buffer.shape[:3]}; crop or resample it."
             )
-    return unroll(denoiser, params, clip.frames)
+    return unroll(denoiser, params, clip.frames, clip.layers)
+
+
+class Stream:
+    """Frames in, images out, one at a time: the recurrent state is kept between calls. Made by :func:`stream`.
+
+    A step is compiled for each set of buffers that some frame has, and its state's memory is used again.
+    """
+
+    def __init__(self, denoiser: Denoiser, params: Params) -> None:
+        self._denoiser, self._params = denoiser, params
+        self._start = jax.jit(denoiser.start)
+        self._step = jax.jit(self._one, donate_argnums=1)
+        self._state: Any = None
+        self.programs: set[tuple[str, ...]] = set()
+        """The sets of buffers, besides radiance, that a step was compiled for."""
+
+    def _one(self, params: Params, state: State, frame: Frame, layers: Layers) -> tuple[State, jax.Array]:
+        return self._denoiser.step(params, state, sampled(self._denoiser, params, state, frame, layers))
+
+    def __call__(self, frame: Frame, layers: Layers = None) -> jax.Array:
+        """Denoise the next frame [H, W, C]; returns [H, W, 3]."""
+        frame = only(frame, self._denoiser.reads)
+        self.programs.add(present(frame))
+        if self._state is None:
+            # Copied: what is donated to the step must not lie in one place twice.
+            self._state = jax.tree.map(jnp.copy, self._start(self._params, frame))
+        self._state, image = self._step(self._params, self._state, frame, layers)
+        return image
+
+    def each(self, frames: Iterable[Frame]) -> Iterator[jax.Array]:
+        """The image of every frame, made when it is asked for."""
+        return (self(frame) for frame in frames)
+
+    @property
+    def repaired(self) -> int:
+        """Values of frames and histories that had to be replaced so far."""
+        return int(getattr(self._state, "repaired", 0))
+
+
+def stream(denoiser: Denoiser, params: Params) -> Stream:
+    """A function from each frame of a sequence to its denoised image; memory is that of one frame.
+
+    The one way of stepping that the command line, the chart and notebooks share; gives the images of :func:`denoise`.
+    """
+    return Stream(denoiser, params)

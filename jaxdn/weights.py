@@ -12,7 +12,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
 from jaxdn import denoisers
-from jaxdn.frame import Denoiser, Frame
+from jaxdn.denoiser import Denoiser
+from jaxdn.frame import Frame
 
 SHIPPED = Path(__file__).parent / "shipped"
 """Where the weights lie that come with the package."""

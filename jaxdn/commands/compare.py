@@ -13,7 +13,8 @@ import numpy as np
 from jaxdn import __version__, color, denoisers, metrics
 from jaxdn.clips import read_clip
 from jaxdn.clips.noise_floor import read_noise_floor
-from jaxdn.frame import Clip, Denoiser, Frame
+from jaxdn.denoiser import Denoiser
+from jaxdn.frame import Clip, Frame
 from jaxdn.report import ClipResult, Results, Scores, TrainingCurve
 from jaxdn.rollout import denoise
 from jaxdn.weights import load_weights, shipped_names

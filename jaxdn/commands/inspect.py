@@ -14,8 +14,9 @@ from rich.table import Table
 from jaxdn import denoisers
 from jaxdn.clips.frames import LAYOUT
 from jaxdn.commands.compare import method_named
+from jaxdn.denoiser import Denoiser
 from jaxdn.effects import EFFECTS, Effects, Plan, chosen, inspect, plan
-from jaxdn.frame import Denoiser, Frame
+from jaxdn.frame import Frame
 
 _BYTES = {"half": 2, "float": 4, "ids": 4, "bool": 2}
 
@@ -71,7 +72,7 @@ def inspect_to_terminal(
             found = inspect(source, animation, frames=frames)
             made = plan(found, reader)
         else:
-            from jaxdn.render.facts import open_scene
+            from jaxdn.render.scene_facts import open_scene
 
             scene = open_scene(source, animation)
             count = scene.frames if frames is None else frames

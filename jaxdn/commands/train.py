@@ -15,12 +15,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from jaxdn import color, metrics
-from jaxdn.backends import onednn
 from jaxdn.checkpoint import Checkpoints
 from jaxdn.clips import read_clip
-from jaxdn.frame import Clip, Denoiser
+from jaxdn.denoiser import Denoiser
+from jaxdn.frame import Clip
+from jaxdn.learning.step import TrainState, initial_state, make_train_step
+from jaxdn.ops import onednn
+from jaxdn.recipe import Recipe
 from jaxdn.rollout import denoise
-from jaxdn.training import Recipe, TrainState, initial_state, make_train_step
 
 
 def training_engine(implementation: str = "auto") -> str:

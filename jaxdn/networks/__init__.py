@@ -3,6 +3,9 @@
 Flax is imported by the modules of this room and by nothing else; what a denoiser must know beforehand stands here.
 """
 
+import jax
+import jax.numpy as jnp
+
 LEVELS = 5
 MULTIPLE = 2 ** (LEVELS - 1)
 """Height and width that the network takes are multiples of this."""
@@ -14,3 +17,15 @@ LARGE: Widths = ((32, 32), (64, 64), (64, 64), (80, 80), (96, 96))
 
 SMALL: Widths = ((16,), (32, 32), (48, 48), (64, 64), (64, 64))
 """About a third of LARGE's time. Most of LARGE's time is its full resolution, so that is where SMALL saves."""
+
+
+def pad(image: jax.Array, multiple: int = MULTIPLE) -> jax.Array:
+    """[H, W, C] with height and width made multiples of ``multiple`` by repeating the last row and column."""
+    height, width = image.shape[:2]
+    below, right = -height % multiple, -width % multiple
+    return jnp.pad(image, ((0, below), (0, right), (0, 0)), mode="edge") if below or right else image
+
+
+def crop(image: jax.Array, size: tuple[int, int]) -> jax.Array:
+    """The first rows and columns, ``size`` of them: the inverse of :func:`pad`."""
+    return image[: size[0], : size[1]]

@@ -17,10 +17,10 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from jaxdn.backends import onednn
-from jaxdn.backends.convolution import convolve
-from jaxdn.backends.registry import register, resolve
 from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, onnx
+from jaxdn.ops import onednn
+from jaxdn.ops.convolution import convolve
+from jaxdn.ops.registry import register, resolve
 
 NEGATIVE_SLOPE = 0.01
 
@@ -184,7 +184,7 @@ def unet(
     half and quarter resolution; their outputs are raw (logits). ``widths`` gives the channels of each convolution of
     each of the five levels; the decoder mirrors the first four. Computes in the features' dtype. ``implementation``:
     None or "reference" (XLA), "onnxruntime" (inference, see :mod:`jaxdn.networks.onnx`) or "onednn" (convolutions and
-    their gradients, see :mod:`jaxdn.backends.onednn`). Raises ValueError when ``widths`` is not five non-empty levels
+    their gradients, see :mod:`jaxdn.ops.onednn`). Raises ValueError when ``widths`` is not five non-empty levels
     of positive integers, the features do not fit, or the implementation cannot run here.
     """
     run = resolve("unet", implementation)

@@ -11,9 +11,9 @@ import numpy as np
 
 from jaxdn.clips import ClipError, read_frame, write_frame
 from jaxdn.clips.files import read_json, write_json
-from jaxdn.effects.planning import Plan
 from jaxdn.frame import Frame
 from jaxdn.motion import dual_motion
+from jaxdn.planning.plan import Plan
 from jaxdn.render.gbuffer import check_scene, gbuffer
 from jaxdn.render.geometry import View, motion_between
 from jaxdn.render.scene import AnimatedScene

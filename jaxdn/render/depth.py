@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdn.effects.planning import BOUND
+from jaxdn.planning.plan import BOUND
 from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.seeds import DEPTH
 from jaxdn.render.variant import use_variant

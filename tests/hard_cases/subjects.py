@@ -11,7 +11,8 @@ import numpy as np
 
 import jaxdn
 from jaxdn import color, kernels, losses, metrics, numerics, warping
-from jaxdn.frame import RADIANCE_MAX, Frame, repair
+from jaxdn.frame import RADIANCE_MAX, Frame
+from jaxdn.repair import repair
 from tests.hard_cases.inputs import HEIGHT, WIDTH, Inputs
 
 _BORDERS = ("clamp", "zeros")

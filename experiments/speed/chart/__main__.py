@@ -1,0 +1,245 @@
+"""`make chart`: error against time per frame of every way to an image, measured on this machine.
+
+    python -m experiments.speed.chart                          # everything, about 20 minutes on two cores
+    python -m experiments.speed.chart --quick                  # a few methods on one tiny clip: a minute
+    python -m experiments.speed.chart --clips my/clip other    # your own clips (with layers and a reference)
+
+Writes ``runs/chart/chart.json`` (raw measurements) and ``runs/chart/chart.html`` (a page that needs no network). What
+is measured is kept after every point: interrupted, it goes on where it stopped, and repeats only what is missing.
+"""
+
+import hashlib
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
+
+from experiments.speed import peers
+from experiments.speed.chart import footage, summary
+from experiments.speed.chart.breakdown import breakdown
+from experiments.speed.chart.energy import NOT_MEASURABLE, Meter, find_meter
+from experiments.speed.chart.footage import Footage, Sizes
+from experiments.speed.chart.methods import DENOISED_SPP, Method, left_out, methods
+from experiments.speed.chart.page import write_page
+from experiments.speed.chart.render_cost import measure_cost
+from experiments.speed.chart.scores import MEASURES, picture, score
+from experiments.speed.chart.store import Store, point_key
+from experiments.speed.chart.summary import RENDERER
+from experiments.speed.timing import measure, peak_mib
+from experiments.speed.works import scene
+from jaxdn.commands.compare import describe_machine
+from jaxdn.commands.errors import told_plainly
+from jaxdn.frame import Frame, frame_at, written_out
+from jaxdn.networks import LARGE, SMALL, onnx
+from jaxdn.render import scene_from_record, use_variant
+from jaxdn.report import save_png
+from jaxdn.weights import SHIPPED, load_weights
+
+
+@dataclass
+class Settings:
+    """Measure error and time of every method on the same clips; write runs/chart/chart.html."""
+
+    quick: bool = False
+    """A few methods on one tiny clip, to see that everything works."""
+    clips: tuple[Path, ...] = ()
+    """Folders of your own clips, with noisy layers and a reference; default: two of the scene families."""
+    out: Path | None = None
+    """Folder of the results; default: runs/chart, with --quick runs/chart-quick."""
+
+
+class Run:
+    """One run: what it measures, where it keeps it, and how it tells."""
+
+    def __init__(self, sizes: Sizes, clips: Sequence[Footage], folder: Path, console: Console) -> None:
+        self.sizes, self.clips, self.folder, self.console = sizes, clips, folder, console
+        wanted = sizes.methods
+        self.methods = [each for each in methods() if wanted is None or each.name in wanted]
+        self.labels = {each.name: (each.family, each.variant, each.guides) for each in self.methods}
+        self.labels[RENDERER] = (RENDERER, "plain", "none")
+        self.layers = footage.common_layers(clips)
+        self.meter: Meter | None = find_meter()
+        height, width = clips[0].reference.shape[1:3]
+        self.own_size, self.timed_size = f"{width}x{height}", f"{sizes.timed[1]}x{sizes.timed[0]}"
+        settings = {
+            "clips": {clip.name: clip.record for clip in clips},
+            "sizes": sizes._asdict(),
+            "scored frames": footage.SCORED,
+            "weights": {path.name: _digest(path) for path in sorted(SHIPPED.glob("*.safetensors"))},
+        }
+        self.store = Store(folder / "chart.json", settings, describe_machine())
+
+    def say(self, line: str) -> None:
+        """A line that stays."""
+        self.console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+    @contextmanager
+    def counted(self, title: str, total: int) -> Iterator[Any]:
+        """A bar where somebody watches, lines elsewhere; calls ``done(what)`` after each part."""
+        columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), "{task.fields[what]}")
+        with Progress(title, *columns, console=self.console, disable=not self.console.is_terminal) as bar:
+            task = bar.add_task(title, total=total, what="")
+
+            def done(what: str) -> None:
+                bar.update(task, advance=1, what=what)
+                if not self.console.is_terminal:
+                    self.say(f"{title}: {what}")
+
+            yield done
+
+    def errors(self) -> None:
+        """Score the renderer and every denoised point on every clip, and keep the picture that the page shows."""
+        spps = {RENDERER: self.layers}
+        scored = {RENDERER: None, **{each.name: each for each in self.methods if each.images is not None}}
+        spps |= {each.name: [spp for spp in DENOISED_SPP if spp in self.layers] for each in self.methods}
+        todo = [
+            (name, spp)
+            for name in scored
+            for spp in spps[name]
+            if not self.store.has("errors", point_key(name, spp)) or not self._pictured(point_key(name, spp))
+        ]
+        for clip in self.clips:
+            facts = {"shown": clip.shown, "noise_floor": clip.noise_floor, "hidden": float(clip.hidden.mean())}
+            self.store.put("clips", clip.name, facts)
+            save_png(self._picture("reference", clip), picture(clip.reference[clip.shown]))
+        with self.counted("errors", len(todo)) as done:
+            for name, spp in todo:
+                key, found = point_key(name, spp), {}
+                for clip in self.clips:
+                    frames, method = clip.frames._replace(radiance=clip.noisy[spp]), scored[name]
+                    images = clip.noisy[spp] if method is None else method.images(frames)  # type: ignore[misc]
+                    found[clip.name] = score(images, clip)
+                    save_png(self._picture(key, clip), picture(images[clip.shown]))
+                self.store.put("errors", key, found)
+                done(f"{key}: {np.mean([scores['psnr'] for scores in found.values()]):.2f} dB")
+
+    def _picture(self, key: str, clip: Footage) -> Path:
+        folder = self.folder / "images" / clip.name
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder / f"{key.replace(' ', '_')}.png"
+
+    def _pictured(self, key: str) -> bool:
+        return all(self._picture(key, clip).is_file() for clip in self.clips)
+
+    def render_costs(self) -> None:
+        """What rendering a frame of each clip costs, at its own size and at the timed one."""
+        use_variant()
+        sizes = {self.own_size: self.clips[0].reference.shape[1:3], self.timed_size: self.sizes.timed}
+        with self.counted("rendering", len(sizes) * len(self.clips)) as done:
+            for size, (height, width) in sizes.items():
+                costs = dict(self.store.data["render"].get(size, {}))
+                for clip in self.clips:
+                    if clip.name not in costs:
+                        try:
+                            animated = scene_from_record(clip.record.get("scene") or {})
+                        except ValueError as error:
+                            self.say(f"{clip.name}: what rendering it costs cannot be told: {error}")
+                            continue
+                        costs[clip.name] = measure_cost(animated, height, width, self.meter)
+                        self.store.put("render", size, costs)
+                    done(f"{clip.name} at {size}")
+
+    def times(self) -> None:
+        """Time every method, the methods of a group in turns, at both sizes."""
+        own = jax.tree.map(np.asarray, frame_at(self.clips[0].frames, self.clips[0].shown))
+        present = [name for name in Frame._fields if getattr(own, name) is not None]
+        height, width = self.sizes.timed
+        made = written_out(frame_at(scene.clip(2, height, width).frames, 1), present)
+        frames = {self.timed_size: made, self.own_size: own}
+        groups: dict[str, list[Method]] = {}
+        for method in self.methods:
+            if not all(size in self.store.data["times"].get(method.name, {}) for size in self._sizes_of(method)):
+                groups.setdefault(method.group, []).append(method)
+        with self.counted("times", len(groups)) as done:
+            for group, members in groups.items():
+                found: dict[str, dict[str, Any]] = {method.name: {} for method in members}
+                for size, frame in frames.items():
+                    for name, timing in self._timed(members, frame, size).items():
+                        found[name][size] = timing
+                for name, sizes in found.items():
+                    if sizes:
+                        self.store.put("times", name, sizes)
+                done(group)
+
+    def _sizes_of(self, method: Method) -> tuple[str, ...]:
+        """PyTorch compiles for each size anew, and a small one tells nothing that the timed one does not."""
+        return (self.timed_size,) if method.family == "PyTorch" else (self.timed_size, self.own_size)
+
+    def _timed(self, members: Sequence[Method], frame: Frame, size: str) -> dict[str, dict[str, Any]]:
+        calls = {method.name: method.timed(frame) for method in members if size in self._sizes_of(method)}
+        # Small frames vary more, and cost nothing.
+        rounds = self.sizes.rounds if size == self.timed_size else 7 * self.sizes.rounds
+        found: dict[str, dict[str, Any]] = {}
+        for name, timing in measure(calls, rounds=rounds, budget_s=150 if size == self.timed_size else 10).items():
+            found[name] = {**timing._asdict(), "peak_mib": peak_mib(calls[name])}
+            if self.meter is not None:
+                found[name]["joules"] = self.meter.joules(calls[name])
+            self.say(f"  {name} at {size}: {timing.median_ms:.1f} ms, compiled in {timing.first_ms / 1e3:.1f} s")
+        return found
+
+    def breakdowns(self) -> None:
+        """Where the time of one frame of ``ntd`` goes."""
+        height, width = self.sizes.timed
+        frame = jax.tree.map(jnp.asarray, frame_at(scene.clip(2, height, width).frames, 1))
+        engines = ["reference", *(["onnxruntime"] if onnx.available() else [])]
+        widths = {"large": LARGE, "small": SMALL}
+        if self.sizes.methods is not None:
+            engines, widths = engines[:1], {"small": SMALL}
+        for size in widths:
+            for engine in engines:
+                name = f"ntd-{size}, {engine}"
+                if self.store.has("breakdown", name):
+                    continue
+                denoiser, params = load_weights(f"ntd-{size}", implementation=engine)
+                parts = breakdown(widths[size], denoiser, params, frame, engine, rounds=self.sizes.rounds)
+                self.store.put("breakdown", name, parts)
+                told = ", ".join(f"{part} {timing.median_ms:.0f} ms" for part, timing in parts.items())
+                self.say(f"one frame of {name}: {told}")
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def main(settings: Settings) -> None:
+    """Render, score, time, draw."""
+    began = time.monotonic()
+    console = Console()
+    sizes = footage.QUICK if settings.quick else footage.FULL
+    folder = settings.out or Path("runs") / ("chart-quick" if settings.quick else "chart")
+    places = list(settings.clips) or footage.render(sizes, Path("data") / folder.name)
+    run = Run(sizes, [footage.read(place) for place in places], folder, console)
+    lacking = left_out() + ([] if run.meter else [NOT_MEASURABLE])
+    run.store.put("left_out", "here", lacking)
+    for sentence in lacking:
+        run.say(sentence)
+    if run.store.kept:
+        run.say(f"{run.store.path}: going on from what was measured before with these settings on this machine")
+    if "torch" not in peers.missing():
+        from experiments.speed.peers import pytorch
+
+        pytorch.prepare_process()
+    run.errors()
+    run.render_costs()
+    run.times()
+    run.breakdowns()
+    found = summary.points(run.store.data, run.labels)
+    equals = summary.equal_quality(found, summary.render_cost(run.store.data, run.timed_size))
+    page = write_page(folder, run.store.data, found, equals, (run.timed_size, run.own_size))
+    front = summary.pareto(found, MEASURES[0], run.timed_size, render=bool(run.store.data["render"]))
+    print(summary.front_table(front, equals, run.timed_size, max(run.layers)))
+    print(f"raw numbers: {run.store.path}\npage:        {page}  ({time.monotonic() - began:.0f} s in all)")
+
+
+if __name__ == "__main__":
+    with told_plainly():
+        main(tyro.cli(Settings, description=Settings.__doc__))

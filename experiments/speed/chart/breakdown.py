@@ -1,0 +1,99 @@
+"""Where the time of one ``ntd`` frame goes, in the paper's four parts, each jitted by itself.
+
+A step compiled as a whole shares memory between its parts, so the parts together may take longer than it does.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from experiments.speed.timing import Call, Timing, measure
+from experiments.speed.works import steps
+from jaxdn import color
+from jaxdn.denoiser import Denoiser
+from jaxdn.frame import Frame
+from jaxdn.methods.ntd import SMALLEST_ALBEDO, TAPS, depth_feature
+from jaxdn.motion import on_screen
+from jaxdn.networks import MULTIPLE, Widths
+from jaxdn.networks.unet import unet
+from jaxdn.ops.softmax_filter import softmax_filter
+from jaxdn.ops.warp import warp
+from jaxdn.repair import repair, repair_image
+from jaxdn.scales import compose_scales, downsample
+
+GROUPS = (3, 3, 3, 1, 3, 1)
+HEADS = (2 * TAPS + 1, TAPS + 1, TAPS + 1)
+
+REPROJECTION, NETWORK, FILTERING, BLENDING = "reprojection", "features and kernels", "applying kernels", "blending"
+WHOLE = "whole step"
+
+
+def reproject(history: jax.Array, frame: Frame, noisy: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The warped history, the noisy pixel where there is none, and where that is."""
+    lost = ~on_screen(frame.dual_motion)
+    return jnp.where(lost, noisy, repair_image(warp(history, frame.dual_motion))), lost
+
+
+def apply_kernels(noisy: jax.Array, recalled: jax.Array, heads: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    """The noisy image at three scales and the history, filtered."""
+    full, half, quarter = heads
+    middle = downsample(noisy)
+    coarse = softmax_filter(downsample(middle)[None], quarter)[0]
+    finest, temporal = softmax_filter(jnp.stack([noisy, recalled]), full)
+    return coarse, softmax_filter(middle[None], half)[0], finest, temporal
+
+
+def blend(
+    filtered: tuple[jax.Array, ...], heads: tuple[jax.Array, ...], lost: jax.Array, colors: jax.Array
+) -> jax.Array:
+    """The scales composed, blended with the history, multiplied by the albedo."""
+    coarse, middle, finest, temporal = filtered
+    full, half, quarter = heads
+    composed = compose_scales(middle, coarse, jax.nn.sigmoid(quarter[..., TAPS:]))
+    composed = compose_scales(finest, composed, jax.nn.sigmoid(half[..., TAPS:]))
+    current = jnp.where(lost, 1.0, jax.nn.sigmoid(full[..., 2 * TAPS :]))
+    return jnp.maximum(current * composed + (1.0 - current) * temporal, 0.0) * colors
+
+
+def breakdown(
+    widths: Widths, denoiser: Denoiser, params: Any, frame: Frame, implementation: str | None, *, rounds: int
+) -> dict[str, Timing]:
+    """The four parts and the whole step, timed in turns, for a frame whose sides are multiples of 16."""
+    height, width = frame.radiance.shape[:2]
+    if height % MULTIPLE or width % MULTIPLE:
+        raise ValueError(f"frame: expected sides that are multiples of {MULTIPLE}, got {height} x {width}.")
+    network = unet(GROUPS, HEADS, widths=widths, implementation=implementation)
+
+    def predict(params: Any, frame: Frame, noisy: jax.Array, recalled: jax.Array, lost: jax.Array) -> Any:
+        frame, _ = repair(frame)
+        features = [
+            color.compress(noisy),
+            frame.albedo - 1.0,
+            frame.normal,
+            depth_feature(frame.depth),
+            color.compress(recalled),
+            lost.astype(noisy.dtype),
+        ]
+        return tuple(head[0] for head in network.apply(params, [feature[None] for feature in features]))
+
+    colors = jnp.where(frame.albedo > SMALLEST_ALBEDO, frame.albedo, 1.0)
+    noisy = frame.radiance / colors
+    reproject_jit, predict_jit = jax.jit(reproject), jax.jit(predict)
+    recalled, lost = reproject_jit(noisy, frame, noisy)
+    heads = predict_jit(params, frame, noisy, recalled, lost)
+    apply_jit = jax.jit(apply_kernels)
+    filtered = apply_jit(noisy, recalled, heads)
+    calls: dict[str, Call] = {
+        REPROJECTION: _waiting(reproject_jit, noisy, frame, noisy),
+        NETWORK: _waiting(predict_jit, params, frame, noisy, recalled, lost),
+        FILTERING: _waiting(apply_jit, noisy, recalled, heads),
+        BLENDING: _waiting(jax.jit(blend), filtered, heads, lost, colors),
+        WHOLE: steps.recurrent(denoiser, params, frame),
+    }
+    return measure(calls, rounds=rounds)
+
+
+def _waiting(function: Callable[..., Any], *arguments: Any) -> Call:
+    return lambda: jax.block_until_ready(function(*arguments))

@@ -1,0 +1,192 @@
+"""What leaving out absent effects saves: rendering, disk, denoising and memory, ``auto`` against ``all``.
+
+    python -m experiments.speed.effects            # a minute or two a scene on two cores
+    python -m experiments.speed.effects --quick    # fewer samples, three scenes
+
+For each scene of :mod:`experiments.speed.small_rooms` that is listed here the same clip is rendered twice, in turns, and
+denoised frame by frame, in turns. What is printed are ratios auto / all of one run; ``runs/effects.json`` has the raw
+numbers too. Path length is measured for ``auto`` and the scene's own for ``all``; the column ``same depth`` is the
+rendering time of ``auto`` at the scene's own path length, so that the two savings are told apart.
+"""
+
+import functools
+import json
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+import jaxdn
+from experiments.speed.small_rooms import CASES, FRAMES, Case
+from jaxdn import effects
+from jaxdn.clips import read_frames
+from jaxdn.commands.errors import told_plainly
+from jaxdn.effects import Plan
+from jaxdn.frame import Frame, only
+from jaxdn.render import use_variant
+from jaxdn.render.clip import render_clip
+from jaxdn.render.depth import measure_depth
+from jaxdn.render.scene_file import SceneFile
+
+SCENES = (
+    "static grey box",
+    "static textured box",
+    "a ball: rough metal",
+    "moving: camera",
+    "moving: ball",
+    "moving: ball, later",
+    "moving: behind the camera",
+    "only emission",
+    "a room in which everything moves",
+)
+ROUNDS = 3
+
+
+@dataclass
+class Settings:
+    """Measure what the planner saves, scene by scene."""
+
+    quick: bool = False
+    """Three scenes, few samples."""
+    size: int = 128
+    """Width and height in pixels."""
+    reference_spp: int = 64
+    out: Path = Path("runs/effects.json")
+
+
+def in_turns(programs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
+    """Median seconds of each program, run in turn."""
+    times: dict[str, list[float]] = {name: [] for name in programs}
+    for _ in range(rounds):
+        for name, program in programs.items():
+            start = time.perf_counter()
+            program()
+            times[name].append(time.perf_counter() - start)
+    return {name: float(np.median(values)) for name, values in times.items()}
+
+
+def render(case: Case, settings: Settings, folder: Path) -> tuple[dict[str, Any], dict[str, Path]]:
+    """Render one scene with everything and by plan; seconds, bytes and the clips."""
+    scene = SceneFile(case.write(folder))
+    render_clip(scene, folder / "warm", width=settings.size, height=settings.size, frames=1, reference_spp=2)
+
+    start = time.perf_counter()
+    found = effects.inspect(scene, width=settings.size, height=settings.size)
+    inspected = time.perf_counter() - start
+    start = time.perf_counter()
+    depth = measure_depth(scene) if "indirect" in found else None
+    measured = time.perf_counter() - start
+    at_own_depth = effects.plan(found)
+    plan = at_own_depth if depth is None else effects.plan(found, max_depth=depth.max_depth, bound=depth.bound)
+    plans: dict[str, Plan | None] = {"all": None, "auto": plan, "same depth": at_own_depth}
+    clips: dict[str, list[Path]] = {name: [] for name in plans}
+
+    def one(name: str) -> Callable[[], Any]:
+        def run() -> None:
+            clips[name].append(folder / f"{name}-{len(clips[name])}")
+            render_clip(
+                scene,
+                clips[name][-1],
+                width=settings.size,
+                height=settings.size,
+                frames=FRAMES,
+                reference_spp=settings.reference_spp,
+                plan=plans[name],
+            )
+
+        return run
+
+    seconds = in_turns({name: one(name) for name in plans}, 1 if settings.quick else ROUNDS)
+    size = {name: sum(file.stat().st_size for file in clips[name][0].glob("*.exr")) for name in plans}
+    told = {
+        "effects": list(found),
+        "depth": {"all": scene.max_depth, "auto": plan.max_depth},
+        "render seconds": seconds,
+        "bytes": size,
+        "inspection seconds": inspected,
+        "depth seconds": measured,
+    }
+    return told, {name: clips[name][0] for name in ("all", "auto")}
+
+
+def denoise(denoiser: jaxdn.Denoiser, params: Any, clips: dict[str, Path]) -> dict[str, Any]:
+    """Steady-state milliseconds a frame, bytes and operations of the step, with everything and by plan."""
+    runs: dict[str, Callable[[], Any]] = {}
+    told: dict[str, Any] = {"bytes": {}, "operations": {}}
+    for name, clip in clips.items():
+        # The last frame: what moves has begun to move by then, and has not come to rest.
+        frame = [jax.tree.map(jax.numpy.asarray, stored.frame) for stored in read_frames(clip)][-1]
+        used: Frame = only(frame, denoiser.reads)
+        state = denoiser.start(params, used)
+        lowered = jax.jit(denoiser.step).lower(params, state, used)
+        step = lowered.compile()
+        memory: Any = step.memory_analysis()
+        told["bytes"][name] = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
+        told["operations"][name] = lowered.as_text().count("stablehlo.")
+        for _ in range(8):  # past the first frames, whose history is short
+            state, image = step(params, state, used)
+        jax.block_until_ready(image)
+        runs[name] = functools.partial(_wait_for, step, params, state, used)
+    told["milliseconds"] = {name: 1e3 * seconds for name, seconds in in_turns(runs, 15).items()}
+    return told
+
+
+def _wait_for(step: Callable[..., Any], *arguments: Any) -> Any:
+    return jax.block_until_ready(step(*arguments))
+
+
+def main(settings: Settings) -> None:
+    """Measure every scene, print the table, write the JSON."""
+    print(f"rendering with Mitsuba's {use_variant()}", flush=True)
+    if settings.quick:
+        settings.size, settings.reference_spp = 64, 8
+    svgf, network = jaxdn.denoisers.svgf(), jaxdn.denoisers.ntd(size="small")
+    params = network.init(jax.random.key(0), Frame(np.zeros((16, 16, 3), np.float32)))
+    results: dict[str, Any] = {}
+    for name in (SCENES[0], SCENES[5], SCENES[-1]) if settings.quick else SCENES:
+        print(f"{name} ...", flush=True)
+        with tempfile.TemporaryDirectory() as place:
+            told, clips = render(CASES[name], settings, Path(place))
+            told["svgf"] = denoise(svgf, {}, clips)
+            told["ntd small"] = denoise(network, params, clips)
+        results[name] = told
+    settings.out.parent.mkdir(parents=True, exist_ok=True)
+    settings.out.write_text(json.dumps({"settings": {**vars(settings), "out": None}, "scenes": results}, indent=1))
+    show(results)
+    print(f"raw numbers: {settings.out}")
+
+
+def ratio(pair: dict[str, float], name: str = "auto") -> str:
+    """auto / all."""
+    return f"{pair[name] / pair['all']:.2f}"
+
+
+def show(results: dict[str, Any]) -> None:
+    """One row a scene, ratios auto / all."""
+    table = Table(title="auto / all")
+    kinds = ("time", "memory", "operations")
+    titles = ["scene", "depth", "render", "same depth", "inspection", "disk"]
+    for title in titles + [f"{method} {kind}" for method in ("svgf", "ntd small") for kind in kinds]:
+        table.add_column(title, overflow="fold")
+    for name, told in results.items():
+        seconds = told["render seconds"]
+        looked = (told["inspection seconds"] + told["depth seconds"]) / seconds["all"]
+        row = [name, f"{told['depth']['auto']}/{told['depth']['all']}", ratio(seconds), ratio(seconds, "same depth")]
+        row += [f"{looked:.3f}", ratio(told["bytes"])]
+        for method in ("svgf", "ntd small"):
+            row += [ratio(told[method][kind]) for kind in ("milliseconds", "bytes", "operations")]
+        table.add_row(*row)
+    Console(width=160).print(table)
+
+
+if __name__ == "__main__":
+    with told_plainly():
+        main(tyro.cli(Settings, description=Settings.__doc__))

@@ -1,0 +1,160 @@
+"""The least time that a work can take here: its operations and bytes over what this machine reaches.
+
+The ceilings are measured in turns with the work. Operations and bytes are counted from the shapes, not from a
+compiled program: every convolution reads its input once, writes its output once and does ``2 * 9 * Ci * Co`` operations
+a pixel. Nothing stays in a cache from one convolution to the next, and nothing else is counted that could be fused
+into one of them.
+"""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.speed.timing import Call, measure
+from jaxdn.methods.ntd import TAPS
+from jaxdn.networks import LEVELS, Widths
+
+FLOAT = 4
+"""Bytes of a number."""
+
+
+class Cost(NamedTuple):
+    """What one pass over memory costs at least."""
+
+    operations: float
+    bytes: float
+
+
+class Ceilings(NamedTuple):
+    """What the machine reaches."""
+
+    copy_gb_s: float
+    """Bytes read plus bytes written, in 1e9 a second."""
+    matmul_gflop_s: float
+    """float32, multiplication and addition counted apart."""
+
+
+class Probe(NamedTuple):
+    """Calls that reach the ceilings, to be timed in turns with the work: a shared machine's ceilings move."""
+
+    copy: Call
+    bytes: float
+    matmul: Call
+    operations: float
+
+    def ceilings(self, copy_ms: float, matmul_ms: float) -> Ceilings:
+        """From what the two calls took."""
+        return Ceilings(self.bytes / copy_ms / 1e6, self.operations / matmul_ms / 1e6)
+
+
+def probe() -> Probe:
+    """Copying, and the fastest float32 matrix product at hand, on jax's default device."""
+    cpu = jax.default_backend() == "cpu"
+    size = 1536 if cpu else 8192
+    a = np.random.default_rng(0).standard_normal((size, size), np.float32)
+    on_device = jnp.asarray(a)
+    product = jax.jit(lambda a: jnp.dot(a, a, precision="highest"))
+    matmul: Call = lambda: product(on_device).block_until_ready()  # noqa: E731
+    if cpu:  # NumPy's library is sometimes the faster one
+        by_numpy: Call = lambda: a @ a  # noqa: E731
+        times = measure({"jax": matmul, "numpy": by_numpy}, rounds=5)
+        matmul = matmul if times["jax"].median_ms < times["numpy"].median_ms else by_numpy
+    copy, copied = _copy_by_threads() if cpu else _copy_on_device()
+    return Probe(copy, copied, matmul, 2.0 * size**3)
+
+
+def _copy_by_threads() -> tuple[Call, float]:
+    """A copy of 128 MiB, a share for each core, and the bytes it moves."""
+    cores = os.cpu_count() or 1
+    source, target = (np.ones((cores, (32 << 20) // cores), np.float32) for _ in range(2))
+    pool = ThreadPoolExecutor(cores)
+    return lambda: list(pool.map(np.copyto, target, source)), 2.0 * source.nbytes
+
+
+def _copy_on_device() -> tuple[Call, float]:
+    """512 MiB read, changed and written back in place."""
+    x = [jnp.zeros(1 << 27, jnp.float32)]
+    add = jax.jit(lambda x: x + 1, donate_argnums=0)
+
+    def copy() -> None:
+        x[0] = jax.block_until_ready(add(x[0]))
+
+    return copy, 2.0 * x[0].nbytes
+
+
+def milliseconds(costs: Sequence[Cost], ceilings: Ceilings) -> float:
+    """The roofline of passes one after another: each takes the longer of its operations and its bytes."""
+    seconds = [
+        max(cost.operations / (1e9 * ceilings.matmul_gflop_s), cost.bytes / (1e9 * ceilings.copy_gb_s))
+        for cost in costs
+    ]
+    return 1e3 * sum(seconds)
+
+
+def convolution(count: int, height: int, width: int, inputs: int, outputs: int) -> Cost:
+    """A 3x3 convolution of [count, height, width, inputs]; its gradient by image or by kernel costs the same."""
+    pixels = count * height * width
+    weights = 9 * inputs * outputs
+    return Cost(2.0 * pixels * weights, FLOAT * (pixels * (inputs + outputs) + weights))
+
+
+def kernel_application(height: int, width: int, *, gradient: bool = False) -> Cost:
+    """Softmax of 25 logits and 25 multiply-adds of RGB; with ``gradient`` the forward pass and both gradients.
+
+    Logits and image are read once and the result is written; the gradient reads them and the result's gradient again,
+    and writes theirs.
+    """
+    pixels = height * width
+    forward = Cost(pixels * (3.0 * TAPS + 6 * TAPS), FLOAT * pixels * (TAPS + 6.0))
+    if not gradient:
+        return forward
+    return Cost(3 * forward.operations, forward.bytes + FLOAT * pixels * 2.0 * (TAPS + 3) + FLOAT * pixels * 3)
+
+
+def bilinear_warp(height: int, width: int, *, gradient: bool = False) -> Cost:
+    """A bilinear fetch of RGB: image and vectors are read once, the result is written.
+
+    With ``gradient`` (by the image alone): the result's gradient and the vectors read, the image's gradient written.
+    """
+    pixels = height * width
+    once = Cost(pixels * 24.0, FLOAT * pixels * 8.0)
+    return Cost(2 * once.operations, 2 * once.bytes) if gradient else once
+
+
+def network(
+    widths: Widths, height: int, width: int, *, count: int = 1, features: int = 14, heads: Sequence[int] = (51, 26, 26)
+) -> list[Cost]:
+    """The convolutions of the U-Net, of ``count`` images."""
+    costs, inputs = [], features
+
+    def level_of(n: int, inputs: int, channels: Sequence[int]) -> int:
+        for outputs in channels:
+            costs.append(convolution(count, height >> n, width >> n, inputs, outputs))
+            inputs = outputs
+        return inputs
+
+    for n, channels in enumerate(widths):
+        inputs = level_of(n, inputs, channels)
+    for n in reversed(range(LEVELS - 1)):
+        inputs = level_of(n, inputs + widths[n][-1], widths[n])
+        if n < len(heads):
+            costs.append(convolution(count, height >> n, width >> n, inputs, heads[n]))
+    return costs
+
+
+def step(widths: Widths, height: int, width: int) -> list[Cost]:
+    """One recurrent step: warp, network, kernels at three scales and on the history."""
+    kernels = [kernel_application(height >> n, width >> n) for n in (0, 0, 1, 2)]
+    return [bilinear_warp(height, width), *network(widths, height, width), *kernels]
+
+
+def train_step(widths: Widths, size: int, *, batch: int, frames: int) -> list[Cost]:
+    """One update on ``batch`` clips of ``frames`` frames: three times the convolutions (forward and two gradients) for
+    all frames but the last, which is only looked at."""
+    convolutions = network(widths, size, size, count=batch)
+    return convolutions * (3 * (frames - 1) + 1)

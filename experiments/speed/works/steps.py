@@ -1,0 +1,100 @@
+"""One recurrent ``ntd`` step at 1280x720: ours in each engine, the same network in PyTorch, Open Image Denoise."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.speed import peers, roofline
+from experiments.speed.timing import Call
+from experiments.speed.works import Work, scene
+from jaxdn.denoiser import Denoiser
+from jaxdn.denoisers import ntd
+from jaxdn.frame import Frame, frame_at
+from jaxdn.networks import LARGE, SMALL
+
+HEIGHT, WIDTH = 720, 1280
+WIDTHS = {"large": LARGE, "small": SMALL}
+IMPLEMENTATIONS: dict[str, dict[str, Any]] = {
+    "xla": {},
+    "onnxruntime": {"implementation": "onnxruntime"},
+}
+"""Name in the results -> options of ``ntd``."""
+
+
+def recurrent(denoiser: Denoiser, params: Any, frame: Frame) -> Call:
+    """A call that denoises ``frame`` once more, jitted, the state carried on and its memory donated."""
+    step = jax.jit(denoiser.step, donate_argnums=1)
+    state = [jax.tree.map(jnp.copy, denoiser.start(params, frame))]
+
+    def call() -> jax.Array:
+        state[0], image = step(params, state[0], frame)
+        return jax.block_until_ready(image)
+
+    return call
+
+
+def pytorch(size: str, params: Any, frame: Frame, *, compiled: bool) -> Call:
+    """The same with PyTorch's step, in inference mode."""
+    import torch
+
+    from experiments.speed.peers import pytorch as peer
+
+    step = peer.NTD(
+        WIDTHS[size],
+        params,
+        apply_kernels=peer.apply_kernels_loop,
+        compile_network=compiled,
+        compile_kernels=compiled,
+    ).eval()
+    buffers = {name: buffer[None] for name, buffer in peer.tensors(frame).items()}
+    state = [peer.start(buffers["radiance"])]
+
+    def call() -> torch.Tensor:
+        with torch.inference_mode():
+            state[0], image = step(state[0], buffers)
+        return image
+
+    return call
+
+
+def open_image_denoise(frame: Frame, quality: str) -> Call:
+    """Open Image Denoise on the same radiance, albedo and normal; building the filter is not timed."""
+    from experiments.speed.peers.oidn import oidn
+
+    arrays = tuple(np.asarray(buffer, np.float32) for buffer in (frame.radiance, frame.albedo, frame.normal))
+    denoise = oidn(*arrays[0].shape[:2], quality=quality)
+    return lambda: denoise(*arrays)
+
+
+def works(*, height: int = HEIGHT, width: int = WIDTH, title: str = "720p") -> Iterator[Work]:
+    """``step-large-720p`` and ``step-small-720p``."""
+    lacking = peers.missing()
+    frame = jax.tree.map(jnp.asarray, frame_at(scene.clip(2, height, width).frames, 1))
+    for size, widths in WIDTHS.items():
+        params = ntd(size=size).init(jax.random.key(0), frame)
+
+        def ours(options: dict[str, Any], size: str = size, params: Any = params) -> Callable[[], Call]:
+            return lambda: recurrent(ntd(size=size, **options), params, frame)
+
+        def torch(compiled: bool, size: str = size, params: Any = params) -> Callable[[], Call]:
+            return lambda: pytorch(size, params, frame, compiled=compiled)
+
+        others: dict[str, Callable[[], Call]] = {}
+        if "torch-compiled" not in lacking:
+            others["torch-compiled"] = torch(True)
+        if "torch" not in lacking:
+            others["torch-eager"] = torch(False)
+        alone = {}
+        if "pyoidn" not in lacking:
+            others["oidn-high"] = lambda: open_image_denoise(frame, "high")
+            alone["oidn-high"] = lambda: open_image_denoise(frame, "high")()
+        yield Work(
+            f"step-{size}-{title}",
+            {name: ours(options) for name, options in IMPLEMENTATIONS.items()},
+            others,
+            roofline.step(widths, height, width),
+            alone=alone,
+        )

@@ -1,0 +1,79 @@
+"""One update of training: batch 4, 10 frames, back-propagation through all of them, ours and PyTorch's."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.speed import peers, roofline
+from experiments.speed.timing import Call
+from experiments.speed.works import Work, scene
+from experiments.speed.works.steps import WIDTHS
+from jaxdn.denoisers import ntd
+from jaxdn.frame import Clip
+from jaxdn.learning.step import initial_state, make_train_step
+from jaxdn.ops import onednn
+from jaxdn.recipe import Recipe
+
+RECIPE = Recipe(decay=False)
+CASES = (("large", 64), ("large", 128))
+"""(size, crop in pixels). What compiles longest is compared at the first alone: rematerialised, and by PyTorch."""
+
+
+def batch_of(size: int, recipe: Recipe = RECIPE) -> Clip:
+    """A batch of clips [B, T, H, W, C] as NumPy arrays."""
+    clips = [scene.clip(recipe.frames, size, size, seed=seed) for seed in range(recipe.batch)]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *clips)
+
+
+def ours(size: str, batch: Clip, recipe: Recipe, *, implementation: str | None = None) -> Call:
+    """A call that makes one update; state and batch lie on the device, the old state's memory is donated."""
+    denoiser = ntd(size=size, implementation=implementation)
+    state = [initial_state(denoiser, recipe, batch)]
+    step, there = make_train_step(denoiser, recipe), jax.tree.map(jnp.asarray, batch)
+
+    def call() -> float:
+        state[0], report = step(state[0], there)
+        return float(report.loss)
+
+    return call
+
+
+def pytorch(size: str, batch: Clip, recipe: Recipe, *, compiled: bool) -> Call:
+    """The same in PyTorch."""
+    from experiments.speed.peers.pytorch_training import Trainer, batch_tensors
+
+    params = initial_state(ntd(size=size), recipe, batch).params
+    trainer = Trainer(WIDTHS[size], params, recipe, compiled=compiled)
+    tensors = batch_tensors(batch)
+    return lambda: trainer(*tensors)
+
+
+def works() -> Iterator[Work]:
+    """``train-large-64`` and so on: plain, with oneDNN's convolutions where they are installed, and rematerialised."""
+    lacking = peers.missing()
+    for size, crop in CASES:
+        batch = batch_of(crop)
+
+        def own(
+            size: str = size, batch: Clip = batch, *, again: bool = False, engine: str | None = None
+        ) -> Callable[[], Call]:
+            return lambda: ours(size, batch, RECIPE._replace(rematerialize=again), implementation=engine)
+
+        def torch(compiled: bool, size: str = size, batch: Clip = batch) -> Callable[[], Call]:
+            return lambda: pytorch(size, batch, RECIPE, compiled=compiled)
+
+        mine: dict[str, Callable[[], Call]] = {"xla": own()}
+        if onednn.available():
+            mine["onednn"] = own(engine="onednn")
+        others: dict[str, Callable[[], Call]] = {}
+        if "torch" not in lacking:
+            others["torch-eager"] = torch(False)
+        if (size, crop) == CASES[0]:
+            mine["xla-remat"] = own(again=True)
+            if "torch-compiled" not in lacking:
+                others["torch-compiled"] = torch(True)
+        costs: Any = roofline.train_step(WIDTHS[size], crop, batch=RECIPE.batch, frames=RECIPE.frames)
+        yield Work(f"train-{size}-{crop}", mine, others, costs, rounds=4 if crop < 128 else 3)

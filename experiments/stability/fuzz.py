@@ -1,0 +1,249 @@
+"""Broken files: only documented errors, never a crash, a hang, a huge allocation or a file where none was asked for.
+
+    python -m experiments.stability.fuzz --inputs 100000      # some minutes; counts in runs/fuzz.json
+    python -m experiments.stability.fuzz --only exr --first 4711 --inputs 1
+
+Input n of a kind is the same in every run (:mod:`experiments.stability.fuzz_inputs`), so ``--first`` repeats a single one. A run
+that was interrupted continues from the counts it left; without that file it starts over. Reading happens in processes
+of their own with a limit on memory and on time, so that whatever dies is told with the number of the input that killed
+it.
+"""
+
+import contextlib
+import faulthandler
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import tyro
+
+from experiments.stability.fuzz_inputs import KINDS, broken, good_files
+from jaxdn.commands.errors import told_plainly
+
+DOCUMENTED = (ValueError, OSError)
+"""What a broken file may raise: ClipError is a ValueError; a file of nothing may not open."""
+SECONDS = 20
+"""Of a processor, for one input; and thirty times as long by the clock, as a machine may stand still."""
+MEMORY = 1 << 30
+"""Bytes that reading a file of some kilobytes may take beyond what the process has already."""
+
+
+@dataclass
+class Settings:
+    """Feed broken files to everything that reads files."""
+
+    inputs: int = 100_000
+    """How many in all, shared between the kinds."""
+    only: Literal["all", "exr", "foreign", "record", "animation", "weights", "description"] = "all"
+    first: int = 0
+    """Number of the first input of each kind."""
+    batch: int = 5000
+    """Inputs for each process."""
+    out: Path = Path("runs/fuzz.json")
+    """Where the counts go, after every batch."""
+
+
+class Told(NamedTuple):
+    """What became of inputs."""
+
+    read: int
+    refused: int
+    """With a documented error."""
+    bad: list[tuple[int, str]]
+    """The number of each input that was not handled, and what happened."""
+
+    @property
+    def inputs(self) -> int:
+        """How many there were."""
+        return self.read + self.refused + len(self.bad)
+
+
+def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
+    """For each kind a function that writes the bytes where they belong and reads them as a user would."""
+    from jaxdn.clips import read_clip, read_frame
+    from jaxdn.clips.cache import open_cached
+    from jaxdn.clips.evidence import read_facts
+    from jaxdn.render.animation import CameraKeys, RigidKeys, check_animation, light_scale, read_animation
+    from jaxdn.weights import load_weights
+
+    clip, foreign, weights = folder / "clip", folder / "foreign", folder / "weights.safetensors"
+
+    def reader(path: Path, read: Callable[[], Any]) -> Callable[[bytes], Any]:
+        def run(data: bytes) -> Any:
+            path.write_bytes(data)
+            return read()
+
+        return run
+
+    def animated() -> None:
+        keys = read_animation(folder / "animation.json")
+        check_animation(keys, ["box"])
+        if "camera" in keys:
+            CameraKeys(keys["camera"])(1.5)
+        for motion in keys.get("shapes", {}).values():
+            RigidKeys(motion["keys"], motion.get("pivot", (0, 0, 0)))(1.5)
+        for scales in keys.get("lights", {}).values():
+            light_scale(scales, 1.5)
+
+    def trained_on() -> None:
+        read_clip(clip)
+        read_facts(clip)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a reference that is not finite is told, and taken as 0
+            open_cached(clip, cache=folder / "cache")
+
+    return {
+        "exr": reader(clip / "frame_0000.exr", lambda: read_frame(clip / "frame_0000.exr")),
+        "foreign": reader(foreign / "shot_0001.exr", lambda: read_clip(foreign)),
+        "record": reader(clip / "clip.json", trained_on),
+        "animation": reader(folder / "animation.json", animated),
+        "weights": reader(weights, lambda: load_weights(weights)),
+        "description": reader(weights.with_suffix(".json"), lambda: load_weights(weights)),
+    }
+
+
+def child(kind: str, first: int, count: int, source: Path) -> None:
+    """Read a run of inputs; a line for each that says what became of it."""
+    faulthandler.enable()
+    good = [file.read_bytes() for file in sorted((source / "good" / kind).iterdir())]
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / "in"
+        shutil.copytree(source / "in", folder)
+        read = readers(folder)[kind]
+        read(good[0])  # imports what it needs, before memory is counted
+        room = _address_space() + MEMORY
+        resource.setrlimit(resource.RLIMIT_AS, (room, room))
+        expected = _listing(Path(place))
+        for number in range(first, first + count):
+            print(f"@{number}", flush=True)
+            # Both end the process even where no Python runs.
+            resource.setrlimit(resource.RLIMIT_CPU, (int(time.process_time()) + SECONDS, resource.RLIM_INFINITY))
+            faulthandler.dump_traceback_later(30 * SECONDS, exit=True)
+            outcome = _read_one(read, broken(kind, good, number))
+            faulthandler.cancel_dump_traceback_later()
+            stray = _listing(Path(place)) - expected
+            if stray:
+                outcome = f"BAD wrote {sorted(map(str, stray))}"
+            print(outcome.encode("ascii", "backslashreplace").decode().replace("\n", " "), flush=True)
+
+
+def _read_one(read: Callable[[bytes], Any], data: bytes) -> str:
+    try:
+        with contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
+            read(data)
+        return "read"
+    except DOCUMENTED as error:
+        greedy = isinstance(error.__cause__ or error.__context__, MemoryError)
+        return f"BAD more than {MEMORY >> 20} MiB: {str(error)[:300]}" if greedy else "refused"
+    except BaseException as error:
+        return f"BAD {type(error).__name__}: {str(error)[:300]}"
+
+
+def _address_space() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _listing(folder: Path) -> set[Path]:
+    """Every file under a folder but those of the cache that reading a clip for training is told to make."""
+    found = {path.relative_to(folder) for path in folder.rglob("*")}
+    return {path for path in found if path.parts[:2] != ("in", "cache")}
+
+
+def prepare(source: Path) -> Path:
+    """Write the good files where the processes that read find them; returns the folder."""
+    (source / "in").mkdir(parents=True)
+    for kind, files in good_files(source / "in").items():
+        (source / "good" / kind).mkdir(parents=True)
+        for index, data in enumerate(files):
+            (source / "good" / kind / f"{index:02d}").write_bytes(data)
+    return source
+
+
+def run_kind(kind: str, first: int, count: int, source: Path, *, repeat: bool = True) -> Told:
+    """Feed inputs of one kind; a process that dies loses its own input, not the ones after.
+
+    With ``repeat`` that input gets a second chance: a machine that stood still for a while is no hang.
+    """
+    counts, bad = {"read": 0, "refused": 0}, []
+    done = first
+    while done < first + count:
+        command = [sys.executable, "-m", "experiments.stability.fuzz", "--child", kind, *map(str, (done, first + count - done))]
+        environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+        process = subprocess.run(
+            [*command, str(source)], capture_output=True, text=True, errors="replace", env=environment, check=False
+        )
+        last, open_input = done - 1, False
+        for line in process.stdout.splitlines():
+            if line.startswith("@"):
+                last, open_input = int(line[1:]), True
+            elif open_input and (line in counts or line.startswith("BAD ")):
+                open_input = False
+                if line in counts:
+                    counts[line] += 1
+                else:
+                    bad.append((last, line[4:]))
+        if last < done:
+            raise RuntimeError(f"the fuzzer's own process failed: {process.stderr[-2000:]}")
+        if open_input and repeat:
+            again = run_kind(kind, last, 1, source, repeat=False)
+            bad += again.bad
+            counts["read"], counts["refused"] = counts["read"] + again.read, counts["refused"] + again.refused
+        elif open_input:
+            bad.append((last, f"the process died ({process.returncode}): {process.stderr[-600:]}"))
+        done = last + 1
+    return Told(counts["read"], counts["refused"], bad)
+
+
+def main(settings: Settings) -> int:
+    """Feed all kinds, print the counts and every input that was not handled; the exit code says whether any was."""
+    kinds = KINDS if settings.only == "all" else (settings.only,)
+    each = -(-settings.inputs // len(kinds))
+    report: dict[str, Any] = {"first": settings.first, "inputs": 0, "read": 0, "refused": 0, "bad": 0, "kinds": {}}
+    if settings.out.is_file():
+        before = json.loads(settings.out.read_text())
+        report = before if before["first"] == settings.first else report
+    settings.out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as place:
+        source = prepare(Path(place) / "source")
+        for kind in kinds:
+            began, told = time.monotonic(), Told(0, 0, [])
+            if kind in report["kinds"]:
+                told = Told(*(report["kinds"][kind][name] for name in Told._fields))
+                began -= report["kinds"][kind]["seconds"]
+            while told.inputs < each:
+                size = min(settings.batch, each - told.inputs)
+                new = run_kind(kind, settings.first + told.inputs, size, source)
+                told = Told(told.read + new.read, told.refused + new.refused, told.bad + new.bad)
+                seconds = time.monotonic() - began
+                report["kinds"][kind] = {"inputs": told.inputs, **told._asdict(), "seconds": round(seconds, 1)}
+                for name in ("inputs", "read", "refused"):
+                    report[name] = sum(entry[name] for entry in report["kinds"].values())
+                report["bad"] = sum(len(entry["bad"]) for entry in report["kinds"].values())
+                settings.out.write_text(json.dumps(report, indent=1) + "\n")
+                print(
+                    f"{kind}: {told.inputs} of {each} inputs, {told.read} read, {told.refused} refused, "
+                    f"{len(told.bad)} bad ({seconds:.0f} s)",
+                    flush=True,
+                )
+                for number, reason in new.bad[:20]:
+                    print(f"  input {number}: {reason}", flush=True)
+    print(f"{report['inputs']} inputs, {report['bad']} not handled: {settings.out}")
+    return int(report["bad"] > 0)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--child"]:
+        child(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]), Path(sys.argv[5]))
+    else:
+        with told_plainly():
+            sys.exit(main(tyro.cli(Settings, description=Settings.__doc__)))

@@ -1,0 +1,193 @@
+"""Training that is killed (SIGKILL) at random moments ends in the same weights, bit for bit.
+
+    python -m experiments.stability.kills --kills 60      # counts in runs/kills.json
+
+A tiny network is trained once in peace, and then by processes that are killed again and again: while they start and
+compile, between two steps, and while a checkpoint is being written. Started once more each time, training must lose
+nothing but the steps since its last checkpoint, and end with the weights, and the log, of the undisturbed run.
+"""
+
+import json
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tyro
+
+from jaxdn.commands.errors import told_plainly
+
+WIDTHS = ((4,), (4,), (4,), (4,), (4,))
+
+
+class Sizes(NamedTuple):
+    """How long a run is."""
+
+    steps: int = 600
+    checkpoint_every: int = 5
+
+
+@dataclass
+class Settings:
+    """Kill a training run at random moments and see what is left."""
+
+    kills: int = 60
+    seed: int = 0
+    """Decides the moments."""
+    out: Path = Path("runs/kills.json")
+
+
+def make_clips(folder: Path) -> None:
+    """Three small clips of noise around a slope."""
+    from jaxdn.clips import write_clip
+    from jaxdn.frame import Clip, Frame
+
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        reference = np.broadcast_to(np.linspace(0.1, 0.9, 20, dtype=np.float32)[:, None, None], (5, 20, 20, 3))
+        noisy = (reference * rng.exponential(size=(5, 20, 20, 1))).astype(np.float32)
+        write_clip(Clip(Frame(noisy, albedo=np.ascontiguousarray(reference)), reference), folder / f"clip-{seed}")
+
+
+def train(clips: Path, folder: Path, sizes: Sizes) -> None:
+    """Train to the end, from wherever the folder stands, and write the weights."""
+    import jax
+
+    from jaxdn.clips import training_batches
+    from jaxdn.commands.train import fit, training_engine
+    from jaxdn.denoisers import ntd
+    from jaxdn.recipe import Recipe
+    from jaxdn.weights import save_weights
+
+    jax.config.update("jax_compilation_cache_dir", str(clips.parent / "programs"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    denoiser = ntd(size=WIDTHS, implementation=training_engine())
+    recipe = Recipe(steps=sizes.steps, batch=2, crop=16, frames=4)
+    batches = training_batches(clips, buffers=denoiser.reads, batch=2, crop=16, frames=4, seed=0)
+    every = sizes.checkpoint_every
+    state = fit(denoiser, recipe, batches, folder, label="killed", log_every=1, checkpoint_every=every)
+    save_weights(folder / "weights.safetensors", state.params, factory="ntd", options={"size": WIDTHS}, record={})
+
+
+def start(clips: Path, folder: Path, sizes: Sizes) -> subprocess.Popen[str]:
+    """The training as a process of its own."""
+    command = [sys.executable, "-m", "experiments.stability.kills", "--child", str(clips), str(folder), *map(str, sizes)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+
+def newest(folder: Path) -> int:
+    """Steps in the newest checkpoint."""
+    steps = [int(path.name) for path in (folder / "checkpoints").glob("*") if path.name.isdecimal()]
+    return max(steps, default=0)
+
+
+def logged(folder: Path) -> int:
+    """Steps in the log."""
+    log = folder / "log.jsonl"
+    return log.read_bytes().count(b"\n") if log.is_file() else 0
+
+
+def writing(folder: Path) -> bool:
+    """Whether a checkpoint is being written, or was when its process died."""
+    return any(not path.name.isdecimal() for path in (folder / "checkpoints").glob("*"))
+
+
+def wait(until: Callable[[], bool], process: subprocess.Popen[str]) -> bool:
+    """Look every millisecond; False if the process ended first."""
+    while process.poll() is None:
+        if until():
+            return True
+        time.sleep(0.001)
+    return False
+
+
+def shoot(process: subprocess.Popen[str], folder: Path, draw: random.Random) -> str | None:
+    """Kill at a random moment, of one of three sorts in turn; None if the process was faster."""
+    sort = draw.choice(("starting", "training", "training", "writing", "writing"))
+    if sort == "starting":
+        moment = time.monotonic() + draw.uniform(0.0, 8.0)
+        alive = wait(lambda: time.monotonic() > moment, process)
+    else:
+        # The log of an earlier process may be ahead of its checkpoint: the new one first cuts it there.
+        newer = newest(folder)
+        first = newer + 1 + draw.randrange(30)
+        alive = wait(lambda: logged(folder) == newer, process) and wait(lambda: logged(folder) >= first, process)
+        alive = alive and (sort == "training" or wait(lambda: writing(folder), process))
+        time.sleep(draw.uniform(0.0, 0.01))
+    if not alive or process.poll() is not None:
+        return None
+    process.kill()
+    process.communicate()
+    return sort
+
+
+def main(settings: Settings) -> int:
+    """Train in peace, train under fire, compare."""
+    draw, sizes = random.Random(settings.seed), Sizes()
+    told: dict[str, Any] = {"kills": 0, "while writing a checkpoint": 0, "runs": 0, "equal": 0, "each": []}
+    with tempfile.TemporaryDirectory() as place:
+        clips, calm = Path(place) / "clips", Path(place) / "calm"
+        make_clips(clips)
+        began = time.monotonic()
+        said, _ = start(clips, calm, sizes).communicate()
+        if not (calm / "weights.safetensors").is_file():
+            print(said)
+            return 1
+        print(f"undisturbed: {sizes.steps} steps in {time.monotonic() - began:.0f} s", flush=True)
+        while told["kills"] < settings.kills:
+            shot = Path(place) / f"shot-{told['runs']}"
+            if not _under_fire(clips, shot, sizes, draw, told, settings.kills):
+                return 1
+            told["runs"] += 1
+            told["equal"] += same(calm, shot)
+            lost = [each["lost"] for each in told["each"]]
+            told |= {"most steps lost": max(lost), "mean steps lost": round(float(np.mean(lost)), 2), **sizes._asdict()}
+            settings.out.parent.mkdir(parents=True, exist_ok=True)
+            settings.out.write_text(json.dumps(told, indent=1) + "\n")
+            print(
+                f"{told['kills']} kills, {told['while writing a checkpoint']} of them while a checkpoint was being "
+                f"written, at most {max(lost)} steps lost; {told['equal']} of {told['runs']} runs ended in the "
+                f"undisturbed weights and log ({time.monotonic() - began:.0f} s)",
+                flush=True,
+            )
+    # Saving is asynchronous: the newest checkpoint may still have been on its way, and one more interval is lost.
+    return int(told["equal"] < told["runs"] or told["most steps lost"] > 2 * sizes.checkpoint_every)
+
+
+def _under_fire(clips: Path, folder: Path, sizes: Sizes, draw: random.Random, told: dict[str, Any], kills: int) -> bool:
+    """One run to its end, killed as often as there are kills left; False if it could not go on."""
+    while True:
+        process = start(clips, folder, sizes)
+        before = logged(folder)
+        sort = shoot(process, folder, draw) if told["kills"] < kills else None
+        if sort is None:
+            said, _ = process.communicate()
+            if process.returncode == 0:
+                return True
+            print(f"after {told['kills']} kills the run did not go on:\n{said}")
+            return False
+        seen, kept, torn = logged(folder), newest(folder), sort != "starting" and writing(folder)
+        told["kills"] += 1
+        told["while writing a checkpoint"] += torn
+        told["each"].append({"when": sort, "logged": seen, "resumes from": kept, "lost": max(seen - kept, 0)})
+        print(f"kill {told['kills']}, {sort}: step {before} to {seen}, resumes from {kept}", flush=True)
+
+
+def same(first: Path, second: Path) -> bool:
+    """Whether two runs ended with the same bytes."""
+    names = ("weights.safetensors", "log.jsonl")
+    return all((first / name).read_bytes() == (second / name).read_bytes() for name in names)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--child"]:
+        train(Path(sys.argv[2]), Path(sys.argv[3]), Sizes(*map(int, sys.argv[4:6])))
+    else:
+        with told_plainly():
+            sys.exit(main(tyro.cli(Settings, description=Settings.__doc__)))

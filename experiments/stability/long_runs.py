@@ -1,0 +1,193 @@
+"""Thousands of frames: does the recurrent state of each denoiser stay bounded, drift, or keep what poisoned it?
+
+    python -m experiments.stability.long_runs      # curves.json and curves.png in runs/long-runs/
+
+Three runs of 2,000 frames for each subject: a camera that rests; a clip played forwards and backwards, over and over;
+and the same with one frame in the middle in which every value is NaN or 1e30. Per frame: the largest magnitude in the
+state, the error of the output against the noise-free image, and, for a poisoned run, how far it is from the clean one.
+"""
+
+import functools
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jax import lax
+
+import jaxdn
+from jaxdn.commands.errors import told_plainly
+from jaxdn.denoiser import Denoiser
+from jaxdn.frame import Frame
+from jaxdn.weights import shipped_names
+
+SIZE, TURN = 48, 16
+"""Pixels of a side, and frames after which the clip runs the other way."""
+POISONS = {"NaN": float("nan"), "1e30": 1e30}
+
+
+@dataclass
+class Settings:
+    """Denoise for thousands of frames and keep curves."""
+
+    subjects: tuple[str, ...] = field(default_factory=lambda: (*_filters(), *shipped_names()))
+    """Factories without weights, and names of weights; default: all that come with the package."""
+    frames: int = 2000
+    out: Path = Path("runs/long-runs")
+
+
+class Curves(NamedTuple):
+    """One value per frame of one run."""
+
+    state: np.ndarray
+    """Largest magnitude in the recurrent state, its counters aside."""
+    error: np.ndarray
+    """Mean absolute error against the noise-free image, relative to its mean."""
+    healthy: np.ndarray
+    """Whether state and image are finite."""
+    sample: np.ndarray
+    """[frames, 6, 6, 3] every eighth pixel of the output."""
+
+
+def _filters() -> list[str]:
+    """The registered denoisers that need no weights."""
+    frame = Frame(np.zeros((16, 16, 3), np.float32))
+    key = jax.random.key(0)
+    return [name for name in jaxdn.denoisers.NAMES if not _made(name)[0].init(key, frame)]
+
+
+def _made(name: str) -> tuple[Denoiser, Any]:
+    return (getattr(jaxdn.denoisers, name)(), {}) if name in jaxdn.denoisers.NAMES else jaxdn.load_weights(name)
+
+
+def _world(columns: jax.Array, rows: jax.Array) -> Frame:
+    """A textured wall before which stands a nearer, brighter square, noise-free."""
+    inside = ((columns > 20) & (columns < 34) & (rows > 14) & (rows < 30))[..., None]
+    texture = jnp.stack([0.5 + 0.3 * jnp.sin(columns / 3), 0.5 + 0 * rows, 0.6 + 0.2 * jnp.cos(rows / 5)], axis=-1)
+    albedo = jnp.where(inside, 0.8, texture)
+    normal = jnp.where(inside, jnp.asarray([0.0, 0.6, 0.8]), jnp.asarray([0.0, 0.0, 1.0]))
+    one = jnp.ones((*columns.shape, 1))
+    depth = jnp.where(inside, 2.0, 4.0) * one
+    return Frame(0.6 * albedo, albedo=albedo, normal=normal, depth=depth, ids=jnp.where(inside, 1, 0))
+
+
+def compiled(denoiser: Denoiser, params: Any, frames: int) -> Callable[[Any], Any]:
+    """(speed, poison, frame poisoned) -> the values of :class:`Curves`."""
+    rows, columns = jnp.mgrid[:SIZE, :SIZE].astype(jnp.float32)
+
+    def seen_at(offset: jax.Array) -> Frame:
+        return _world(columns + offset, rows)
+
+    def body(settings: Any, state: Any, index: jax.Array) -> tuple[Any, Any]:
+        speed, poison, poisoned = settings
+        forwards = (index // TURN) % 2 == 0
+        phase = index % TURN
+        offset = speed * jnp.where(forwards, phase, TURN - 1 - phase).astype(jnp.float32)
+        moved = jnp.where(phase == 0, 0.0, jnp.where(forwards, speed, -speed))
+        clean = seen_at(offset)
+        noise = jax.random.exponential(jax.random.fold_in(jax.random.key(1), index), (SIZE, SIZE, 1))
+        noisy = jnp.where(index == poisoned, poison, clean.radiance * noise)
+        motion = jnp.broadcast_to(jnp.stack([moved, jnp.zeros(())]), (SIZE, SIZE, 2))
+        state, image = denoiser.step(params, state, clean._replace(radiance=noisy, motion=motion))
+        leaves = [leaf for leaf in jax.tree.leaves(state) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(leaf), initial=0.0) for leaf in leaves]))
+        error = jnp.mean(jnp.abs(image - clean.radiance)) / jnp.mean(clean.radiance)
+        return state, (largest, error, jnp.isfinite(largest) & jnp.isfinite(image).all(), image[::8, ::8])
+
+    def run(settings: Any) -> Any:
+        first = seen_at(jnp.zeros(()))
+        start = denoiser.start(params, first._replace(motion=jnp.zeros((SIZE, SIZE, 2))))
+        return lax.scan(functools.partial(body, settings), start, jnp.arange(frames))[1]
+
+    return jax.jit(run)
+
+
+def recovery(clean: Curves, spoilt: Curves, at: int) -> int:
+    """Frames from the poisoned one until the output stays within 1 % of the clean run's mean level."""
+    bad = np.flatnonzero(distance(clean, spoilt) > 0.01)
+    return int(bad.max()) + 1 - at if bad.size else 0
+
+
+def distance(clean: Curves, spoilt: Curves) -> np.ndarray:
+    """Per frame the largest difference of the samples, relative to the clean run's mean."""
+    apart = np.abs(spoilt.sample - clean.sample).max(axis=(1, 2, 3))
+    return np.asarray(apart / np.abs(clean.sample).mean(axis=(1, 2, 3)))
+
+
+def examine(name: str, frames: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """All runs of one subject: what they came to, and their curves."""
+    run = compiled(*_made(name), frames)
+    at = frames // 2
+
+    def curves(speed: float, poison: float = 0.0, poisoned: int = -1) -> Curves:
+        return Curves(*map(np.asarray, run((jnp.float32(speed), jnp.float32(poison), jnp.int32(poisoned)))))
+
+    runs = {"static": curves(0.0), "to and fro": curves(0.7)}
+    runs |= {label: curves(0.7, poison, at) for label, poison in POISONS.items()}
+    told: dict[str, Any] = {}
+    lines: dict[str, np.ndarray] = {}
+    for label, found in runs.items():
+        level = {"early": found.error[frames // 20 : frames // 5].mean(), "late": found.error[-frames // 10 :].mean()}
+        told[label] = {key: round(float(value), 4) for key, value in level.items()}
+        told[label] |= {"largest state": float(found.state.max()), "healthy": bool(found.healthy.all())}
+        lines |= {f"{label}, state": found.state, f"{label}, error": found.error}
+    for label in POISONS:
+        told[label]["frames to within 1 %"] = recovery(runs["to and fro"], runs[label], at)
+        lines[f"{label}, distance"] = distance(runs["to and fro"], runs[label])
+    return told, lines
+
+
+def draw(curves: dict[str, dict[str, np.ndarray]], path: Path) -> None:
+    """State and error over all frames, and the frames around the poisoned one, a row for each subject."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(len(curves), 3, figsize=(15, 3.2 * len(curves)), squeeze=False, layout="constrained")
+    for row, (name, lines) in zip(axes, curves.items(), strict=True):
+        for label in ("static", "to and fro"):
+            row[0].plot(lines[f"{label}, state"], label=label, linewidth=0.8)
+            row[1].plot(lines[f"{label}, error"], label=label, linewidth=0.8)
+        for label in POISONS:
+            apart = lines[f"{label}, distance"]
+            at = len(apart) // 2
+            row[2].plot(np.arange(-10, 150), np.maximum(apart[at - 10 : at + 150], 1e-7), label=label)
+        row[2].axhline(0.01, color="grey", linewidth=0.8, linestyle="--", label="1 %")
+        titles = ("largest value in the state", "error of the output", "distance after a poisoned frame")
+        for axis, title in zip(row, titles, strict=True):
+            axis.set(yscale="log", title=f"{name}: {title}", xlabel="frame")
+            axis.legend(fontsize="small")
+    figure.savefig(path, dpi=90)
+
+
+def main(settings: Settings) -> None:
+    """Run all subjects, write curves.json and curves.png, print what they came to."""
+    settings.out.mkdir(parents=True, exist_ok=True)
+    told: dict[str, Any] = {}
+    curves: dict[str, dict[str, np.ndarray]] = {}
+    for name in settings.subjects:
+        began = time.monotonic()
+        told[name], curves[name] = examine(name, settings.frames)
+        print(f"{name} ({time.monotonic() - began:.0f} s)", flush=True)
+        for label, facts in told[name].items():
+            print(f"  {label}: " + ", ".join(f"{key} {value}" for key, value in facts.items()), flush=True)
+    per_frame = {
+        name: {label: [float(f"{value:.5g}") for value in line] for label, line in lines.items()}
+        for name, lines in curves.items()
+    }
+    report = {"frames": settings.frames, "size": SIZE, "subjects": told, "curves": per_frame}
+    (settings.out / "curves.json").write_text(json.dumps(report) + "\n")
+    draw(curves, settings.out / "curves.png")
+    print(f"{settings.out / 'curves.json'}, {settings.out / 'curves.png'}")
+
+
+if __name__ == "__main__":
+    with told_plainly():
+        main(tyro.cli(Settings, description=Settings.__doc__))

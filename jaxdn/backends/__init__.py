@@ -1,1 +1,0 @@
-"""The few hot operations, each with a readable reference and faster implementations of the same maths."""

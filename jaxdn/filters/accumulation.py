@@ -1,0 +1,28 @@
+"""Blending a new frame into its history: colour, moments of luminance, history length, as planes [6, H, W]."""
+
+import jax
+import jax.numpy as jnp
+
+_LUMINANCE = (0.2126, 0.7152, 0.0722)
+
+
+def luminance(planes: jax.Array) -> jax.Array:
+    """Rec.709 luminance of planar colour [3, H, W]."""
+    red, green, blue = _LUMINANCE
+    return red * planes[0] + green * planes[1] + blue * planes[2]
+
+
+def accumulate(past: jax.Array, now: jax.Array, *, alpha: float, alpha_moments: float, history_max: int) -> jax.Array:
+    """The history [6, H, W] with colour ``now`` [3, H, W] blended in (Schied et al. 2017, sec. 4.1 and 4.2).
+
+    Planes are colour, the first and second moment of its luminance, and the history length N in frames; ``past`` is 0
+    where there is none. The new frame has the share ``max(alpha, 1 / N)`` in colour, likewise in moments, at a length N
+    of at most ``history_max``: without a history it is the new frame alone.
+    """
+    level = luminance(now)
+    length = jnp.minimum(past[5] + 1.0, history_max)
+    share = jnp.maximum(alpha, 1.0 / length)
+    share_moments = jnp.maximum(alpha_moments, 1.0 / length)
+    color = past[:3] + share[None] * (now - past[:3])
+    moments = past[3:5] + share_moments[None] * (jnp.stack([level, level * level]) - past[3:5])
+    return jnp.concatenate([color, moments, length[None]])

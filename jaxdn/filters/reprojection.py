@@ -1,0 +1,119 @@
+"""History fetched by motion, every tap tested on its own: what SVGF and its descendants do instead of a plain warp.
+
+A plain bilinear warp mixes whatever lies under the four taps. Here each tap is accepted or rejected (same object,
+expected depth, same orientation), the accepted ones are renormalised, and where none is left the 3x3 neighbourhood of
+the target is tried (Schied et al. 2017).
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxdn.filters.guides import Guides, cosine, depth_slopes
+from jaxdn.frame import Frame
+
+WEIGHT_MIN = 0.01
+"""Least sum of accepted bilinear weights that counts as history."""
+
+
+def same_surface(
+    frame: Frame, guides: jax.Array, place: Guides, *, depth_tolerance: float, normal_threshold: float, first: int
+) -> Callable[[jax.Array], jax.Array]:
+    """The test of one tap for :func:`reproject`: does it show the surface that is seen now?
+
+    ``guides`` and ``place`` are the frame's own (:func:`jaxdn.filters.guides.pack_guides`); a tap has its guides from
+    layer ``first`` on. It passes where ids agree, ``|z - z_expected| <= depth_tolerance z_expected + 2 (|dz/dx| +
+    |dz/dy|)`` and the cosine of the normals exceeds ``normal_threshold``; what the frame lacks is not tested.
+    """
+    if frame.depth is not None:
+        expected = (frame.depth if frame.previous_depth is None else frame.previous_depth)[..., 0]
+        slope_x, slope_y = depth_slopes(frame.depth, frame.ids)
+        tolerance = depth_tolerance * expected + 2 * (jnp.abs(slope_x) + jnp.abs(slope_y))
+
+    def accept(tap: jax.Array) -> jax.Array:
+        before = tap[..., first:]
+        accepted = jnp.ones(before.shape[:2], bool)
+        if place.depth is not None:
+            accepted &= jnp.abs(before[..., place.depth] - expected) <= tolerance
+        if place.normal is not None:
+            accepted &= cosine(before[..., place.normal], guides[..., place.normal]) > normal_threshold
+        if place.ids is not None:
+            accepted &= before[..., place.ids] == guides[..., place.ids]
+        return accepted
+
+    return accept
+
+
+def reproject(
+    packed: jax.Array,
+    motion: jax.Array | None,
+    accept: Callable[[jax.Array], jax.Array],
+) -> tuple[jax.Array, jax.Array]:
+    """Fetch ``packed`` [H, W, C] of the previous frame at ``p + motion(p)`` from accepted taps only.
+
+    ``accept`` gets one tap for every pixel, [H, W, C], and returns [H, W] bool. Taps outside the image count as
+    rejected, rejected values are never multiplied (they may be NaN), and no gradient flows into the motion. Returns the
+    renormalised mean [H, W, C], 0 where there is none, and [H, W] bool: there is one. Motion that is not finite means
+    none; no motion (``None``) is zero motion without a gather.
+    """
+    height, width, channels = packed.shape
+    dtype = packed.dtype
+    rows = lax.broadcasted_iota(jnp.int32, (height, width), 0)
+    columns = lax.broadcasted_iota(jnp.int32, (height, width), 1)
+
+    if motion is None:
+        column, row = columns.astype(dtype), rows.astype(dtype)
+        known = jnp.ones((height, width), bool)
+        margin = jnp.pad(packed, ((1, 1), (1, 1), (0, 0)))
+    else:
+        vector = lax.stop_gradient(motion).astype(dtype)
+        known = jnp.all(jnp.isfinite(vector), axis=-1)
+        vector = jnp.where(known[..., None], vector, 0.0)
+        # Clipped before the cast: converting a huge float to an integer is undefined.
+        column = jnp.clip(columns + vector[..., 0], -2.0, width + 1.0)
+        row = jnp.clip(rows + vector[..., 1], -2.0, height + 1.0)
+        flat = packed.reshape(height * width, channels)
+
+    def tap(base_row: jax.Array, base_column: jax.Array, dy: int, dx: int) -> tuple[jax.Array, jax.Array]:
+        y, x = base_row + dy, base_column + dx
+        inside = known & (y >= 0) & (y < height) & (x >= 0) & (x < width)
+        if motion is None:
+            value = margin[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+        else:
+            index = jnp.clip(y, 0, height - 1) * width + jnp.clip(x, 0, width - 1)
+            value = flat.at[index].get(mode="promise_in_bounds")
+        accepted = inside & accept(value)
+        return jnp.where(accepted[..., None], value, 0.0), accepted
+
+    if motion is None:
+        total, accepted = tap(rows, columns, 0, 0)
+        weight = accepted.astype(dtype)
+    else:
+        top, left = jnp.floor(row).astype(jnp.int32), jnp.floor(column).astype(jnp.int32)
+        down, right = row - top, column - left
+        total, weight = jnp.zeros_like(packed), jnp.zeros((height, width), dtype)
+        for dy, dx in np.ndindex(2, 2):
+            share = (down if dy else 1 - down) * (right if dx else 1 - right)
+            value, accepted = tap(top, left, dy, dx)
+            share = jnp.where(accepted, share, 0.0)
+            total, weight = total + share[..., None] * value, weight + share
+    valid = weight >= WEIGHT_MIN
+    mean = jnp.where(valid[..., None], total, 0.0) / jnp.where(valid, weight, 1.0)[..., None]
+
+    def second_chance(mean: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
+        near_row, near_column = (jnp.floor(at + 0.5).astype(jnp.int32) for at in (row, column))
+        if motion is None:
+            near_row, near_column = rows, columns
+        total, count = jnp.zeros_like(packed), jnp.zeros((height, width), dtype)
+        for dy, dx in np.ndindex(3, 3):
+            value, accepted = tap(near_row, near_column, dy - 1, dx - 1)
+            total, count = total + value, count + accepted
+        found = ~valid & (count > 0)
+        around = total / jnp.where(found, count, 1.0)[..., None]
+        return jnp.where(found[..., None], around, mean), valid | found
+
+    # A still camera rejects nothing: then the nine fetches are skipped.
+    return lax.cond(jnp.all(valid | ~known), lambda mean, valid: (mean, valid), second_chance, mean, valid)

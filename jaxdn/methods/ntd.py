@@ -1,0 +1,207 @@
+"""Neural temporal denoising for indirect illumination (``ntd``).
+
+A U-Net predicts, for every pixel, 5x5 softmax kernels for the noisy image at three scales, one 5x5 kernel for the
+previous output warped by *dual* motion vectors, and how to blend them. What the paper leaves open is an option here;
+``preset="parity"`` takes the exact paper settings.
+
+Yan Zeng, Lu Wang, Yanning Xu, Xiangxu Meng, "Neural Temporal Denoising for Indirect Illumination", 2021 ("Zeng et al.
+2021" here). Dual motion vectors: Zheng Zeng et al., "Temporally Reliable Motion Vectors for Better Use of Temporal
+Information", 2021.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn import color
+from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.frame import FAR, RADIANCE_MAX, Frame
+from jaxdn.methods.demodulated import demodulated
+from jaxdn.methods.table import method
+from jaxdn.motion import on_screen
+from jaxdn.networks import LARGE, SMALL, Widths, crop, pad
+from jaxdn.objectives import indirect_illumination
+from jaxdn.ops.softmax_filter import softmax_filter
+from jaxdn.ops.warp import warp
+from jaxdn.recipe import Recipe
+from jaxdn.repair import repair_image
+from jaxdn.scales import compose_scales, downsample
+
+TAPS = 25
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the paper leaves open; the first choice is the default."""
+
+    size: Literal["large", "small"] | Widths = "large"
+    """The U-Net's widths, by name or as such (see :func:`jaxdn.networks.unet.unet`)."""
+    motion: Literal["dual", "traditional"] = "dual"
+    """Vectors that warp the history: ``dual_motion``, or ``motion`` where there is none; or always ``motion``."""
+    alpha_at: Literal["coarse", "fine"] = "coarse"
+    """The blending weight of two scales inside U, or outside of it, a weight for each fine pixel."""
+    down: Literal["mean", "max"] = "mean"
+    """D of a 2x2 block; the maximum (the paper's) biases dark."""
+    up: Literal["bilinear", "nearest"] = "bilinear"
+    """U."""
+    pyramid: Literal["mean", "max"] = "mean"
+    """How the noisy image is downsampled."""
+    domain: Literal["linear", "compressed"] = "linear"
+    """What kernels work on: radiance, or compressed radiance (robust to fireflies, biased dark)."""
+    depth_scale: Literal["geometric", "unit"] = "geometric"
+    """See :func:`depth_feature`."""
+    border: Literal["clamp", "zeros"] = "clamp"
+    """Of the warp."""
+    first_frame: Literal["none", "noisy"] = "none"
+    """No history at age 0 and alpha^t = 1, or the first frame's own noise as history."""
+    missing_history: Literal["current", "blend"] = "current"
+    """Off-screen or without a vector: the noisy pixel as history, alpha^t = 1, and one more channel that tells the
+    network; or left to the network."""
+    demodulate: bool = True
+    """Filter radiance divided by albedo."""
+    truncate: bool = False
+    """No gradient flows through the history."""
+    compute_dtype: Literal["float32", "bfloat16"] | None = None
+    """Of the U-Net alone; None is the images' dtype."""
+    implementation: Literal["reference", "onnxruntime", "onednn"] | None = None
+    """Of the U-Net: XLA, or on CPUs ONNX Runtime (inference; the extra ``onnx``) or oneDNN (training; the extra
+    ``onednn``). None is XLA."""
+
+
+PARITY = Options(
+    down="max", depth_scale="unit", border="zeros", first_frame="noisy", missing_history="blend", demodulate=False
+)
+"""The exact paper settings: D is max-pooling (eq. 4), warped taps outside are 0, the first history is noise."""
+
+
+def depth_feature(depth: jax.Array, *, scale: str = "geometric") -> jax.Array:
+    """Depth as ``z / (z + g)`` in [0, 1); g is the geometric mean of what is not background, or 1 with ``"unit"``.
+
+    ``depth`` [H, W, 1] >= 0; 0 (the neutral value) gives 0. With the geometric mean the feature does not change with
+    the scene's unit of length.
+    """
+    if scale == "unit":
+        return depth / (depth + 1.0)
+    known = (depth > 0) & (depth < FAR)
+    logarithms = jnp.where(known, jnp.log(jnp.where(known, depth, 1.0)), 0.0)
+    middle = jnp.exp(jnp.sum(logarithms) / jnp.maximum(jnp.sum(known, dtype=depth.dtype), 1.0))
+    return depth / (depth + middle)
+
+
+def _recall(
+    options: Options, state: jax.Array, frame: Frame, first: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The warped history, where there is none (bool [H, W, 1]), and how many of its values were broken."""
+    noisy = frame.radiance
+    absent = first if options.first_frame == "none" else jnp.zeros_like(first)
+    absent = jnp.broadcast_to(absent, (*noisy.shape[:2], 1))
+    history = jax.lax.stop_gradient(state) if options.truncate else state
+    vectors = frame.motion if frame.dual_motion is None else frame.dual_motion
+    if vectors is not None:
+        vectors = jax.lax.stop_gradient(vectors)
+        history = warp(history, vectors, border=options.border)
+    sound = repair_image(history)
+    broken = jnp.sum((sound != history) & ~first, dtype=jnp.int32)
+    recalled = jnp.where(first, noisy, sound)
+    if vectors is not None and options.missing_history == "current":
+        lost = ~on_screen(vectors) & ~first
+        recalled = jnp.where(lost, noisy, recalled)
+        absent = absent | lost
+    return recalled, absent, broken
+
+
+def _blend(
+    options: Options, heads: list[jax.Array], noisy: jax.Array, recalled: jax.Array, absent: jax.Array
+) -> jax.Array:
+    """Kernels applied and composed, in whatever domain the images are in."""
+    full, half, quarter = heads
+    scales = [noisy]
+    for _ in range(2):
+        scales.append(downsample(scales[-1], down=options.pyramid))
+    fine = options.alpha_at == "fine"
+    seams = (full[..., 2 * TAPS + 1 :], half[..., TAPS:]) if fine else (half[..., TAPS:], quarter[..., TAPS:])
+    coarsest, middle = (
+        softmax_filter(image[None], head)[0] for image, head in ((scales[2], quarter), (scales[1], half))
+    )
+    finest, temporal = softmax_filter(jnp.stack([noisy, recalled]), full)
+    composed = coarsest
+    for image, seam in ((middle, seams[1]), (finest, seams[0])):
+        composed = compose_scales(image, composed, jax.nn.sigmoid(seam), down=options.down, up=options.up)
+    current = jax.nn.sigmoid(full[..., 2 * TAPS : 2 * TAPS + 1])
+    current = jnp.where(absent, 1.0, current)
+    return current * composed + (1.0 - current) * temporal
+
+
+@method(
+    Options,
+    title="Neural temporal denoising for indirect illumination (Zeng et al. 2021)",
+    presets={"parity": PARITY},
+    recipes={
+        "usual": Recipe(indirect_illumination()),
+        "without-occlusion": Recipe(indirect_illumination(occlusion=False)),
+        "parity": Recipe(indirect_illumination(), learning_rate=1e-4, decay=False, clip_norm=0.0),
+    },
+    variants={"ntd-large": {"size": "large"}, "ntd-small": {"size": "small"}},
+    engines=("onnxruntime", "onednn"),
+)
+def ntd(options: Options) -> Denoiser:
+    """The neural temporal denoiser.
+
+    With x the noisy radiance, i^s its 5x5 kernel-filtered versions at scales s = 1, 1/2, 1/4 and t the kernel-filtered
+    warped history, ``o^c = i^1/4``, ``o^f = i^f - U(alpha D(i^f)) + U(alpha o^c)`` for the two finer scales, and the
+    output is ``alpha^t o^1 + (1 - alpha^t) t`` (Zeng et al. 2021, eq. 1 and 4): alpha^t weighs the *current* frame.
+
+    The paper trains with Adam at a constant 1e-4 for 200 epochs of 142 clips (the recipe "parity"). Raises ValueError
+    for an unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
+    """
+    flagged = options.missing_history == "current"
+    groups = (3, 3, 3, 1, 3, 1) if flagged else (3, 3, 3, 1, 3)
+    # full: two kernels and alpha^t; half, quarter: one kernel. An alpha lives at one end of each of the two seams.
+    fine = options.alpha_at == "fine"
+    heads = (2 * TAPS + 2, TAPS + 1, TAPS) if fine else (2 * TAPS + 1, TAPS + 1, TAPS + 1)
+    # Flax is loaded when a network is built: a filter without weights needs jax and numpy alone.
+    from jaxdn.networks.unet import unet
+
+    sizes = {"large": LARGE, "small": SMALL}
+    widths = sizes[options.size] if isinstance(options.size, str) else options.size
+    network = unet(groups, heads, widths=widths, implementation=options.implementation)
+    reads = frozenset({"albedo", "normal", "depth", "motion", *(["dual_motion"] if options.motion == "dual" else [])})
+
+    def init(key: jax.Array, frame: Frame) -> dict[str, Any]:
+        return network.init(key)
+
+    def start(params: Params, frame: Frame) -> jax.Array:
+        return jnp.zeros_like(frame.radiance)
+
+    def predict(params: Params, features: list[jax.Array | None], dtype: jnp.dtype) -> list[jax.Array]:
+        """The heads [H, W, c] for feature groups [H, W, c]."""
+        inner = jnp.dtype(jnp.bfloat16) if options.compute_dtype == "bfloat16" else dtype
+        batch = [None if group is None else group[None].astype(inner) for group in features]
+        return [head[0].astype(dtype) for head in network.apply(params, batch)]
+
+    def step(
+        params: Params, state: jax.Array, frame: Frame, first: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        size = frame.radiance.shape[:2]
+        recalled, absent, broken = _recall(options, state, frame, first)
+        depth = None if frame.depth is None else pad(depth_feature(frame.depth, scale=options.depth_scale))
+        albedo = None if frame.albedo is None else pad(frame.albedo - 1.0)
+        normal = None if frame.normal is None else pad(frame.normal)
+        noisy, recalled, absent = (pad(image) for image in (frame.radiance, recalled, absent))
+        squeezed, squeezed_history = color.compress(noisy), color.compress(recalled)
+        features = [squeezed, albedo, normal, depth, squeezed_history]
+        if flagged:
+            features.append(absent.astype(noisy.dtype))
+        predicted = predict(params, features, noisy.dtype)
+
+        if options.domain == "compressed":
+            image = color.expand(jnp.maximum(_blend(options, predicted, squeezed, squeezed_history, absent), 0.0))
+        else:
+            image = _blend(options, predicted, noisy, recalled, absent)
+        image = jnp.clip(crop(image, size), 0.0, RADIANCE_MAX)
+        return image, image, broken
+
+    plain = recurrent(Core(start, step, reads, init))
+    return demodulated(plain, by="albedo" if options.demodulate else "none")

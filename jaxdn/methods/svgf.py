@@ -1,0 +1,169 @@
+"""Spatiotemporal variance-guided filtering (``svgf``), the reference point of real-time denoising.
+
+Each frame: divide by the albedo, fetch the history with every tap tested, blend colour and the moments of luminance
+into it, estimate the variance per pixel (from time, or from a 7x7 neighbourhood while the history is short), then five
+a-trous levels whose reach over luminance edges is set by that variance, and multiply by the albedo again.
+
+What is kept as colour history is the image after the first level (``feedback_level``), demodulated, not the image
+shown: feeding the whole cascade back would blur more with every frame. This is the algorithm's own rule and the one
+difference from the learned denoisers here, which keep the image they show.
+
+Christoph Schied et al., "Spatiotemporal Variance-Guided Filtering: Real-Time Reconstruction for Path-Traced Global
+Illumination", 2017.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.filters.accumulation import accumulate, luminance
+from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
+from jaxdn.filters.blur import blur_variance
+from jaxdn.filters.guides import hit_mask, pack_guides
+from jaxdn.filters.reprojection import reproject, same_surface
+from jaxdn.filters.variance import estimate_variance
+from jaxdn.filters.weights import Weight, depth_weight, luminance_weight, normal_weight
+from jaxdn.frame import Frame
+from jaxdn.methods.demodulated import demodulated
+from jaxdn.methods.table import method
+from jaxdn.options import Range
+
+READS = frozenset({"normal", "depth", "previous_depth", "motion", "ids"})
+_TAPS = stencil(2, kernel=B3_SPLINE)
+_POSITIVE = Range(0, without_low=True)
+_SHARE = Range(0, 1, without_low=True)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Its parameters, with the defaults of the paper where it gives them."""
+
+    alpha: Annotated[float, _SHARE] = 0.2
+    """Least share of the new frame in colour, ``max(alpha, 1 / N)`` at history length N."""
+    alpha_moments: Annotated[float, _SHARE] = 0.2
+    """The same in the moments of luminance."""
+    sigma_depth: Annotated[float, _POSITIVE] = 1.0
+    """Reach over differences in depth."""
+    sigma_normal: Annotated[float, Range(0)] = 128.0
+    """Exponent of the cosine of normals."""
+    sigma_luminance: Annotated[float, _POSITIVE] = 4.0
+    """Reach over differences in luminance, in standard deviations."""
+    levels: Annotated[int, Range(0, 10)] = 5
+    """Levels of the a-trous filter."""
+    feedback_level: Annotated[int, Range(0, 10)] = 1
+    """The level whose image becomes the colour history; 0 is what time alone has blended."""
+    history_max: Annotated[int, Range(1)] = 32
+    """Longest history length N in frames."""
+    short_history: Annotated[int, Range(0)] = 4
+    """At N below this the variance is that of the 7x7 neighbourhood."""
+    depth_tolerance: Annotated[float, Range(0)] = 0.02
+    """Relative difference from the expected depth that a tap of the history may have, besides its slope."""
+    normal_threshold: float = 0.9
+    """The cosine of normals that a tap of the history has to exceed."""
+    demodulate: bool = True
+    """Filter radiance divided by albedo."""
+
+    def __post_init__(self) -> None:
+        if self.feedback_level > self.levels:
+            raise ValueError(
+                f"svgf feedback_level: expected a whole number from 0 to levels ({self.levels}), "
+                f"got {self.feedback_level!r}."
+            )
+
+
+class SvgfState(NamedTuple):
+    """What one frame leaves to the next."""
+
+    history: jax.Array
+    """[H, W, 6] demodulated colour, first and second moment of its luminance, history length in frames."""
+    guides: jax.Array
+    """[H, W, 0..5] depth, normal and ids of the previous frame, those that the frames have."""
+
+
+@method(Options, title="Spatiotemporal variance-guided filtering (Schied et al. 2017)")
+def svgf(options: Options) -> Denoiser:
+    """SVGF, a filter without weights (``params`` is ``{}``).
+
+    Reads albedo, normal, depth, previous_depth, motion and ids; a buffer that is ``None`` takes its test or weight with
+    it. Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for options out of range
+    and radiance that is not [H, W, 3].
+    """
+
+    def start(params: Params, frame: Frame) -> SvgfState:
+        guides, _ = pack_guides(frame.depth, frame.normal, frame.ids, frame.radiance)
+        return SvgfState(jnp.zeros((*frame.radiance.shape[:2], 6), guides.dtype), jnp.zeros_like(guides))
+
+    def step(
+        params: Params, state: SvgfState, frame: Frame, first: jax.Array
+    ) -> tuple[SvgfState, jax.Array, jax.Array]:
+        past, guides, broken = _recall(options, state, frame, first)
+        history = accumulate(
+            past,
+            frame.radiance.transpose(2, 0, 1),
+            alpha=options.alpha,
+            alpha_moments=options.alpha_moments,
+            history_max=options.history_max,
+        )
+        hit = hit_mask(frame.depth, frame.ids)
+        weights: list[Weight] = []
+        if frame.depth is not None:
+            weights.append(depth_weight(frame.depth, frame.ids, sigma=options.sigma_depth))
+        if frame.normal is not None:
+            weights.append(normal_weight(frame.normal, sigma=options.sigma_normal))
+        color, variance = estimate_variance(history, hit, weights, short_history=options.short_history)
+        feedback = color if options.feedback_level else history[:3]
+        image, feedback = _filter(options, color, variance, feedback, hit, weights)
+        image = image.transpose(1, 2, 0)
+        if hit is not None:
+            image = jnp.where(hit[..., None], image, frame.radiance)
+        kept = jnp.concatenate([feedback, history[3:]]).transpose(1, 2, 0)
+        return SvgfState(kept, guides), image, broken
+
+    plain = recurrent(Core(start, step, READS))
+    return demodulated(plain, by="albedo" if options.demodulate else "none")
+
+
+def _recall(
+    options: Options, state: SvgfState, frame: Frame, first: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The fetched history [6, H, W], 0 where there is none; this frame's guides; the count of broken pixels."""
+    guides, place = pack_guides(frame.depth, frame.normal, frame.ids, frame.radiance)
+    tolerances = {"depth_tolerance": options.depth_tolerance, "normal_threshold": options.normal_threshold}
+    accept = same_surface(frame, guides, place, **tolerances, first=6)
+    packed = jnp.concatenate([state.history, state.guides], axis=-1)
+    past, valid = reproject(packed, frame.motion, lambda tap: accept(tap) & ~first)
+    past = past[..., :6]
+    sound = jnp.all(jnp.isfinite(past) & (past >= 0), axis=-1)
+    broken = jnp.sum(valid & ~sound, dtype=jnp.int32)
+    return jnp.where((valid & sound)[..., None], past, 0.0).transpose(2, 0, 1), guides, broken
+
+
+def _filter(
+    options: Options,
+    color: jax.Array,
+    variance: jax.Array,
+    feedback: jax.Array,
+    hit: jax.Array | None,
+    weights: list[Weight],
+) -> tuple[jax.Array, jax.Array]:
+    """The a-trous cascade: the image [3, H, W] and what is fed back."""
+    levels = options.levels
+
+    def filter_level(carry: tuple[jax.Array, ...], level: jax.Array) -> tuple[tuple[jax.Array, ...], None]:
+        color, variance, feedback = carry
+        deviation = jnp.sqrt(jnp.maximum(blur_variance(variance), 1e-10))
+        light = luminance_weight(luminance(color), deviation, sigma=options.sigma_luminance)
+        color, spread = edge_average(
+            color, hit, [*weights, light], _TAPS, step=2**level, step_max=2 ** (levels - 1), variance=variance
+        )
+        assert spread is not None
+        return (color, spread, jnp.where(level + 1 == options.feedback_level, color, feedback)), None
+
+    if levels:
+        carry = (color, variance, feedback)
+        (color, _, feedback), _ = lax.scan(filter_level, carry, jnp.arange(levels, dtype=jnp.int32))
+    return color, feedback

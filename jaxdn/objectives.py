@@ -1,0 +1,55 @@
+"""What training minimises, as values: ``(images, clip, progress) -> loss``.
+
+``images`` [T, H, W, 3] are a clip's denoised frames in linear radiance, ``clip`` has the frames and a reference without
+broken values, and ``progress`` in [0, 1] is the share of the updates that lie behind (traced, so that all phases of
+training run in one compiled program).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn import color, losses
+from jaxdn.frame import Clip, Frame
+from jaxdn.motion import occlusion_mask
+
+Loss = Callable[[jax.Array, Clip, jax.Array], jax.Array]
+
+
+class Objective(NamedTuple):
+    """A loss and the name under which a run's record keeps it."""
+
+    name: str
+    loss: Loss
+
+
+def indirect_illumination(*, occlusion: bool = True) -> Objective:
+    """``spatial + temporal + motion-occlusion`` on compressed radiance (Zeng et al. 2021, eq. 5 and 6).
+
+    Over all frames but the last, which gives no gradient and is left for validation; a clip of one frame is trained on.
+    Radiance is compressed by ``log(1 + x)^(1/2.2)``: in linear radiance one firefly would outweigh a frame. The
+    motion-occlusion loss joins in the second half of training (C in the paper; ``occlusion=False`` is A and B).
+    """
+
+    def loss(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:
+        trained = slice(0, max(1, images.shape[0] - 1))
+        denoised, wanted = color.compress(images[trained]), color.compress(clip.reference[trained])
+        total = losses.spatial(denoised, wanted) + losses.temporal(denoised, wanted)
+        if not occlusion:
+            return total
+        share = jnp.where(progress >= 0.5, 1.0, 0.0)
+        return total + share * losses.occlusion(denoised, wanted, disocclusions(clip.frames)[trained])
+
+    return Objective("indirect illumination" if occlusion else "indirect illumination without occlusion", loss)
+
+
+def disocclusions(frames: Frame) -> jax.Array:
+    """The masks ``[T, H, W, 1]`` of the occlusion loss: where the dual vector differs from the traditional one.
+
+    No vectors, or no dual vectors: nothing is disoccluded, and the mask is zero.
+    """
+    if frames.motion is None or frames.dual_motion is None:
+        return jnp.zeros_like(frames.radiance[..., :1])
+    return jax.vmap(occlusion_mask)(frames.motion, frames.dual_motion)

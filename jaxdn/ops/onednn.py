@@ -1,0 +1,236 @@
+"""oneDNN's 3x3 convolutions and their gradients, called from inside a jitted program on CPUs.
+
+XLA:CPU has no fast form of a convolution's gradient by its kernel, and its convolutions reach two thirds of what the
+machine can do. oneDNN (Apache-2.0; the engine under PyTorch on CPUs) is an extra, ``pip install jaxdn[onednn]``: a
+shared library, spoken to through its C interface (version 3) by ctypes, so that nothing needs a compiler. It reads and
+writes XLA's own buffers. :mod:`jaxdn.ops.convolution` makes one differentiable operation of the three functions.
+"""
+
+import ctypes
+import functools
+import threading
+from collections.abc import Callable, Sequence
+from ctypes import byref, c_int, c_int64, c_size_t, c_void_p
+from importlib import metadata
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+
+PACKAGE = "onednn-cpu-gomp"
+_LIBRARY = "libdnnl.so.3"
+
+# The C interface's numbers (oneapi/dnnl/dnnl_types.h).
+_CPU, _FLOAT32, _ANY_LAYOUT, _IN_ORDER, _TRAINING, _DIRECT = 1, 3, 1, 1, 64, 1
+_ASK_WEIGHTS, _ASK_WEIGHTS_GRADIENT = 131, 132
+_SOURCE, _DESTINATION, _WEIGHTS = 1, 17, 33
+_SOURCE_GRADIENT, _DESTINATION_GRADIENT, _WEIGHTS_GRADIENT = 129, 145, 161
+_OWN_MEMORY, _NO_MEMORY = c_void_p(-1), c_void_p(None)
+
+_Dims = c_int64 * 12
+_ONE, _ZERO = _Dims(1, 1), _Dims(0, 0)
+
+
+class _Argument(ctypes.Structure):
+    _fields_ = (("role", c_int), ("memory", c_void_p))
+
+
+def _path() -> Any:
+    """Where the installed package has its library; None where it is not installed."""
+    try:
+        files = metadata.files(PACKAGE) or []
+    except metadata.PackageNotFoundError:
+        return None
+    return next((file.locate() for file in files if file.name == _LIBRARY), None)
+
+
+@functools.cache
+def _library() -> Any:
+    """The C functions; those that are called at every convolution with their types, so that ctypes checks little."""
+    library = ctypes.CDLL(str(_path()))
+    library.dnnl_primitive_desc_query_md.restype = c_void_p
+    library.dnnl_primitive_desc_query_md.argtypes = (c_void_p, c_int, c_int)
+    library.dnnl_primitive_execute.argtypes = (c_void_p, c_void_p, c_int, c_void_p)
+    library.dnnl_memory_set_data_handle.argtypes = (c_void_p, c_void_p)
+    return library
+
+
+def available() -> bool:
+    """Whether the library can be loaded and jax computes on the CPU."""
+    if jax.default_backend() != "cpu" or _path() is None:
+        return False
+    try:
+        _library()
+    except OSError:
+        return False
+    return True
+
+
+def check_available() -> None:
+    """Raise ValueError, with what to do, where oneDNN cannot run."""
+    if jax.default_backend() != "cpu":
+        raise ValueError(
+            f'implementation: "onednn" runs on the CPU, and jax computes on {jax.default_backend()!r}; '
+            "leave it None, or set JAX_PLATFORMS=cpu."
+        )
+    if not available():
+        raise ValueError(
+            f'implementation: "onednn" needs the package {PACKAGE} (Linux, x86-64); pip install "jaxdn[onednn]".'
+        )
+
+
+def _call(function: str, *arguments: Any) -> None:
+    status = getattr(_library(), function)(*arguments)
+    if status:
+        raise RuntimeError(f"oneDNN: {function} failed with status {status}.")
+
+
+def _made(function: str, *arguments: Any) -> c_void_p:
+    """What a ``dnnl_..._create`` function puts into its first argument."""
+    made = c_void_p()
+    _call(function, byref(made), *arguments)
+    return made
+
+
+@functools.cache
+def _engine() -> tuple[c_void_p, c_void_p]:
+    """The CPU, and a stream of work for it. Neither is ever given back: they live as long as the process."""
+    engine = _made("dnnl_engine_create", _CPU, c_size_t(0))
+    return engine, _made("dnnl_stream_create", engine, _IN_ORDER)
+
+
+def _images(count: int, height: int, width: int, channels: int) -> c_void_p:
+    """Describes [N, H, W, C] in memory; oneDNN's dimensions are N, C, H, W whatever the order in memory."""
+    strides = _Dims(height * width * channels, 1, width * channels, channels)
+    dims = _Dims(count, channels, height, width)
+    return _made("dnnl_memory_desc_create_with_strides", 4, dims, _FLOAT32, strides)
+
+
+class _Convolution:
+    """One direction of a convolution of one shape, made once; called with addresses.
+
+    The library picks the layout of the kernel; it is put there, or brought back, at every call (a few microseconds).
+    """
+
+    def __init__(self, direction: str, count: int, height: int, width: int, inputs: int, outputs: int) -> None:
+        engine, self._stream = _engine()
+        x, y = _images(count, height, width, inputs), _images(count, height, width, outputs)
+        dims = _Dims(outputs, inputs, 3, 3)
+        free = _made("dnnl_memory_desc_create_with_tag", 4, dims, _FLOAT32, _ANY_LAYOUT)
+        ours = _made(
+            "dnnl_memory_desc_create_with_strides",
+            *(4, dims, _FLOAT32, _Dims(1, outputs, 3 * inputs * outputs, inputs * outputs)),
+        )
+        window = (_ONE, _ZERO, _ONE, _ONE)  # stride, dilation, zeros before and after
+        forward = _made(
+            "dnnl_convolution_forward_primitive_desc_create",
+            *(engine, _TRAINING, _DIRECT, x, free, None, y, *window, None),
+        )
+        what, asked = forward, _ASK_WEIGHTS
+        roles = _SOURCE, _WEIGHTS, _DESTINATION
+        if direction == "image gradient":
+            what = _made(
+                "dnnl_convolution_backward_data_primitive_desc_create",
+                *(engine, _DIRECT, x, free, y, *window, forward, None),
+            )
+            x, y, roles = y, x, (_DESTINATION_GRADIENT, _WEIGHTS, _SOURCE_GRADIENT)
+        elif direction == "kernel gradient":
+            what = _made(
+                "dnnl_convolution_backward_weights_primitive_desc_create",
+                *(engine, _DIRECT, x, free, None, y, *window, forward, None),
+            )
+            asked, roles = _ASK_WEIGHTS_GRADIENT, (_SOURCE, _WEIGHTS_GRADIENT, _DESTINATION_GRADIENT)
+        theirs = c_void_p(_library().dnnl_primitive_desc_query_md(what, asked, 0))
+        backward = direction == "kernel gradient"
+        turn = _made(
+            "dnnl_reorder_primitive_desc_create",
+            *((theirs, engine, ours, engine, None) if backward else (ours, engine, theirs, engine, None)),
+        )
+        # Memory without an address: it is told at every call.
+        self._given = [_made("dnnl_memory_create", each, engine, _NO_MEMORY) for each in (x, ours, y)]
+        inside = _made("dnnl_memory_create", theirs, engine, _OWN_MEMORY)
+        first, kernel, last = self._given
+        convolve = self._prepared(what, (roles[0], first), (roles[1], inside), (roles[2], last))
+        if backward:
+            self._work = [convolve, self._prepared(turn, (_SOURCE, inside), (_DESTINATION, kernel))]
+        else:
+            self._work = [self._prepared(turn, (_SOURCE, kernel), (_DESTINATION, inside)), convolve]
+
+    @staticmethod
+    def _prepared(description: c_void_p, *arguments: tuple[int, c_void_p]) -> tuple[c_void_p, int, Any]:
+        primitive = _made("dnnl_primitive_create", description)
+        return primitive, len(arguments), (_Argument * len(arguments))(*[_Argument(*each) for each in arguments])
+
+    def __call__(self, first: int, kernel: int, last: int) -> None:
+        """Addresses of x (the cotangent for the image's gradient), of the kernel or its gradient, and of y."""
+        for memory, address in zip(self._given, (first, kernel, last), strict=True):
+            _call("dnnl_memory_set_data_handle", memory, address)
+        for primitive, count, arguments in self._work:
+            _call("dnnl_primitive_execute", primitive, self._stream, count, arguments)
+
+
+_made_once = functools.cache(_Convolution)
+"""Kept for good, as jax keeps the programs that call them: a kernel's size of memory for each."""
+
+_ALONE = threading.Lock()
+"""One convolution at a time: each of them uses all cores, and they share what is prepared for their shape."""
+
+
+def _address(array: np.ndarray) -> int:
+    return array.__array_interface__["data"][0]
+
+
+def _forward(context: Any, out: Any, x: Any, kernel: Any) -> None:
+    _with_kernel("forward", np.asarray(x), np.asarray(kernel), np.asarray(out))
+
+
+def _image_gradient(context: Any, out: Any, cotangent: Any, kernel: Any) -> None:
+    _with_kernel("image gradient", np.asarray(cotangent), np.asarray(kernel), np.asarray(out))
+
+
+def _with_kernel(direction: str, images: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
+    """Images of any number at once under one kernel; where vmap has brought several kernels, one after the other."""
+    inputs, outputs = kernel.shape[-2:]
+    if kernel.size == 9 * inputs * outputs:
+        images, out = (array.reshape(1, -1, *array.shape[-3:]) for array in (images, out))
+        kernel = kernel.reshape(1, 3, 3, inputs, outputs)
+    run = _made_once(direction, *images.shape[-4:-1], inputs, outputs)
+    with _ALONE:
+        for index in np.ndindex(out.shape[:-4]):
+            run(*(_address(_at(array, index)) for array in (images, kernel, out)))
+
+
+def _at(array: np.ndarray, index: Sequence[int]) -> np.ndarray:
+    """The example of that index; an axis that vmap did not batch has length 1."""
+    return array[tuple(place if size > 1 else 0 for place, size in zip(index, array.shape, strict=False))]
+
+
+def _kernel_gradient(context: Any, out: Any, x: Any, cotangent: Any) -> None:
+    """Each example of a batch has a gradient of its own: that is what vmap means, and what jax adds up afterwards."""
+    images, gradients, cotangents = (np.asarray(array) for array in (x, out, cotangent))
+    run = _made_once("kernel gradient", *images.shape[-4:], cotangents.shape[-1])
+    with _ALONE:
+        for index in np.ndindex(images.shape[:-4]):
+            run(*(_address(array[index]) for array in (images, gradients, cotangents)))
+
+
+def _program(callback: Callable[..., None], shape: Sequence[int], *arguments: jax.Array, batch: str) -> jax.Array:
+    return buffer_callback(callback, jax.ShapeDtypeStruct(tuple(shape), jnp.float32), vmap_method=batch)(*arguments)
+
+
+def forward(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """``x`` [N, H, W, Ci] convolved with ``kernel`` [3, 3, Ci, Co], float32, stride 1, zeros outside."""
+    return _program(_forward, (*x.shape[:3], kernel.shape[3]), x, kernel, batch="expand_dims")
+
+
+def image_gradient(cotangent: jax.Array, kernel: jax.Array) -> jax.Array:
+    """The cotangent [N, H, W, Co] brought back to the image: [N, H, W, Ci]."""
+    return _program(_image_gradient, (*cotangent.shape[:3], kernel.shape[2]), cotangent, kernel, batch="expand_dims")
+
+
+def kernel_gradient(x: jax.Array, cotangent: jax.Array) -> jax.Array:
+    """The cotangent brought back to the kernel, ``sum_p x(p + offset) cotangent(p)``: [3, 3, Ci, Co]."""
+    shape = (3, 3, x.shape[3], cotangent.shape[3])
+    return _program(_kernel_gradient, shape, x, cotangent, batch="broadcast_all")

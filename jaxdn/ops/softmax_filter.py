@@ -1,0 +1,177 @@
+"""Kernels straight from logits: the softmax over the taps and the filter in one, strip by strip.
+
+A 720p frame's 25 logits a pixel are 92 MB. Softmax, then filter, then whatever uses the result: XLA:CPU writes and
+reads those megabytes at every step and, as it fuses the filter into each of its users, computes it once for each of
+them. ``"strips"`` takes some rows at a time, so that the weights never leave the cache and the result is a result. Its
+gradient keeps the arguments alone and makes the weights anew.
+"""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxdn.checks import check_image
+from jaxdn.ops import kernels
+from jaxdn.ops.kernels import check_taps
+from jaxdn.ops.registry import register, resolve
+
+_STRIP = 1_000_000
+"""Logits in a strip, about: 15 rows of two kernels at 720p."""
+
+
+def softmax_filter(
+    images: jax.Array, logits: jax.Array, *, taps: int = 25, implementation: str | None = None
+) -> jax.Array:
+    """Filter images with kernels given as logits: ``apply_kernels(image, normalize_kernels(logits))``, faster.
+
+    images: [n, H, W, C], any colour space. logits: [H, W, m] with m >= n * taps; image i has the ``taps`` = K*K, K odd,
+    from ``i * taps`` on, further channels are not read: a network's head goes in as it is. Returns [n, H, W, C] in
+    float32 at least. ``implementation``: "reference" or "strips"; None picks the fastest. Raises ValueError for sizes
+    that differ, too few logits, and taps that are not the square of an odd number.
+    """
+    images, logits = jnp.asarray(images), jnp.asarray(logits)
+    check_image(logits, "logits")
+    if images.ndim != 4 or images.shape[1:3] != logits.shape[:2]:
+        raise ValueError(
+            f"images: expected [n, {logits.shape[0]}, {logits.shape[1]}, C] as the logits, got {images.shape}."
+        )
+    check_taps(taps, "taps")
+    if logits.shape[-1] < images.shape[0] * taps:
+        raise ValueError(
+            f"logits: expected {images.shape[0]} x {taps} channels at least, got {logits.shape[-1]}; "
+            "each image has taps of its own."
+        )
+    dtype = jnp.promote_types(jnp.promote_types(images.dtype, logits.dtype), jnp.float32)
+    return resolve("softmax_filter", implementation)(images.astype(dtype), logits.astype(dtype), taps)
+
+
+def _weights(logits: jax.Array, count: int, taps: int) -> list[jax.Array]:
+    """Each image's kernels [H, W, taps]."""
+    return [jax.nn.softmax(logits[..., index * taps : (index + 1) * taps], axis=-1) for index in range(count)]
+
+
+@register("softmax_filter", "reference", preferred_on=("gpu", "tpu"))
+def reference(images: jax.Array, logits: jax.Array, taps: int) -> jax.Array:
+    """The softmax, then the filter, with the gradients that the filter's best implementation has."""
+    kernels_of = _weights(logits, images.shape[0], taps)
+    return jnp.stack([kernels.apply_kernels(image, one) for image, one in zip(images, kernels_of, strict=True)])
+
+
+def _rows(logits: jax.Array) -> int:
+    """Rows in a strip."""
+    height, width, depth = logits.shape
+    return min(height, max(1, _STRIP // (width * depth)))
+
+
+def _strips(height: int, rows: int) -> int:
+    return -(-height // rows)
+
+
+def _extend(images: jax.Array, radius: int) -> jax.Array:
+    return jnp.pad(images, ((0, 0), (radius, radius), (radius, radius), (0, 0)), mode="edge")
+
+
+def _radius(taps: int) -> int:
+    return math.isqrt(taps) // 2
+
+
+def _filtered(extended: jax.Array, logits: jax.Array, taps: int) -> jax.Array:
+    """Filter a strip: extended images [n, h + 2r, w + 2r, C], logits [h, w, m] -> [n, h, w, C]."""
+    height, width = logits.shape[:2]
+    radius = _radius(taps)
+    images = []
+    for image, weights in zip(extended, _weights(logits, extended.shape[0], taps), strict=True):
+        total = jnp.zeros((height, width, image.shape[-1]), image.dtype)
+        for tap, (i, j) in enumerate(kernels.offsets(radius)):
+            total = total + weights[:, :, tap : tap + 1] * image[i : i + height, j : j + width]
+        images.append(total)
+    return jnp.stack(images)
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _by_strips(images: jax.Array, logits: jax.Array, taps: int) -> jax.Array:
+    radius, rows, height = _radius(taps), _rows(logits), logits.shape[0]
+    extended = _extend(images, radius)
+
+    def strip(index: jax.Array | int, out: jax.Array) -> jax.Array:
+        first = jnp.minimum(index * rows, height - rows)  # the last strip may compute some rows again
+        part = _filtered(
+            lax.dynamic_slice_in_dim(extended, first, rows + 2 * radius, 1),
+            lax.dynamic_slice_in_dim(logits, first, rows, 0),
+            taps,
+        )
+        return lax.dynamic_update_slice_in_dim(out, part, first, 1)
+
+    return lax.fori_loop(0, _strips(height, rows), strip, jnp.zeros_like(images))
+
+
+def _forward(images: jax.Array, logits: jax.Array, taps: int) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+    return _by_strips(images, logits, taps), (images, logits)
+
+
+def _gradients(extended: jax.Array, logits: jax.Array, cotangents: jax.Array, taps: int) -> tuple[jax.Array, jax.Array]:
+    """A strip's gradients by the extended images [n, h + 2r, w + 2r, C] and by the logits [h, w, m].
+
+    With w the softmax and d_t = <cotangent, image(p + offset_t)>, that by the logits is ``w_t (d_t - sum_s w_s d_s)``.
+    """
+    height, width = logits.shape[:2]
+    radius = _radius(taps)
+    around = ((2 * radius, 2 * radius), (2 * radius, 2 * radius), (0, 0))
+    by_image, by_logits = [], []
+    for image, weights, cotangent in zip(extended, _weights(logits, extended.shape[0], taps), cotangents, strict=True):
+        inner = []
+        for i, j in kernels.offsets(radius):
+            shifted = image[i : i + height, j : j + width]
+            terms = [cotangent[..., c : c + 1] * shifted[..., c : c + 1] for c in range(image.shape[-1])]
+            inner.append(sum(terms[1:], terms[0]))
+        slopes = jnp.concatenate(inner, axis=-1)
+        by_logits.append(weights * (slopes - jnp.sum(weights * slopes, axis=-1, keepdims=True)))
+        # Gathered: pixel e of the extended image receives tap t of pixel e - offset_t wherever that exists.
+        wide_weights, wide_cotangent = jnp.pad(weights, around), jnp.pad(cotangent, around)
+        total = jnp.zeros_like(image)
+        for tap, (i, j) in enumerate(kernels.offsets(radius)):
+            y, x = 2 * radius - i, 2 * radius - j
+            weight = wide_weights[y : y + height + 2 * radius, x : x + width + 2 * radius, tap : tap + 1]
+            total = total + weight * wide_cotangent[y : y + height + 2 * radius, x : x + width + 2 * radius]
+        by_image.append(total)
+    by_logits.append(jnp.zeros_like(logits[..., taps * len(by_image) :]))
+    return jnp.stack(by_image), jnp.concatenate(by_logits, axis=-1)
+
+
+def _backward(taps: int, residuals: tuple[jax.Array, jax.Array], cotangent: jax.Array) -> tuple[jax.Array, jax.Array]:
+    images, logits = residuals
+    radius, rows, height = _radius(taps), _rows(logits), logits.shape[0]
+    extended, undo = jax.vjp(lambda images: _extend(images, radius), images)
+
+    def strip(index: jax.Array | int, sums: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        by_images, by_logits = sums
+        first = jnp.minimum(index * rows, height - rows)
+        fresh = first + jnp.arange(rows) >= index * rows  # rows that the strip before has had count once
+        part_images, part_logits = _gradients(
+            lax.dynamic_slice_in_dim(extended, first, rows + 2 * radius, 1),
+            lax.dynamic_slice_in_dim(logits, first, rows, 0),
+            jnp.where(fresh[:, None, None], lax.dynamic_slice_in_dim(cotangent, first, rows, 1), 0),
+            taps,
+        )
+        before = lax.dynamic_slice_in_dim(by_images, first, rows + 2 * radius, 1)
+        known = lax.dynamic_slice_in_dim(by_logits, first, rows, 0)
+        return (
+            lax.dynamic_update_slice_in_dim(by_images, before + part_images, first, 1),
+            lax.dynamic_update_slice_in_dim(by_logits, known + part_logits, first, 0),
+        )
+
+    sums = (jnp.zeros_like(extended), jnp.zeros_like(logits))
+    by_images, by_logits = lax.fori_loop(0, _strips(height, rows), strip, sums)
+    return undo(by_images)[0], by_logits
+
+
+_by_strips.defvjp(_forward, _backward)
+
+
+@register("softmax_filter", "strips", preferred_on=("cpu",))
+def strips(images: jax.Array, logits: jax.Array, taps: int) -> jax.Array:
+    """Some rows at a time; the gradients recompute the weights."""
+    return _by_strips(images, logits, taps)

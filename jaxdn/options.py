@@ -1,0 +1,107 @@
+"""The options of a method: one frozen dataclass, read by its factory, the command line and the docs.
+
+A field's annotation is all that is declared: ``Literal`` for a choice, ``Annotated[float, Range(...)]`` for a number,
+``bool``, ``None`` and unions of these, nested tuples of numbers. What is given is checked here and nowhere else.
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+
+T = TypeVar("T")
+
+
+class Range(NamedTuple):
+    """The numbers that an option may be, from ``low`` to ``high``."""
+
+    low: float = -float("inf")
+    high: float = float("inf")
+    without_low: bool = False
+    """``low`` itself is not one of them."""
+
+    def __contains__(self, value: object) -> bool:
+        inside = isinstance(value, int | float) and self.low <= value <= self.high
+        return inside and not (self.without_low and value == self.low)
+
+    def __str__(self) -> str:
+        if self.high == float("inf"):
+            return f"{'>' if self.without_low else '>='} {self.low:g}"
+        return f"in {'(' if self.without_low else '['}{self.low:g}, {self.high:g}]"
+
+
+def make(cls: type[T], given: Mapping[str, Any], *, method: str, base: T | None = None) -> T:
+    """The options ``cls`` with the ``given`` values in place of those of ``base`` (default: the declared defaults).
+
+    Lists become tuples, as JSON has no others. Raises ValueError, naming what there is, for an option that does not
+    exist or a value that it cannot have.
+    """
+    hints = get_type_hints(cls, include_extras=True)
+    unknown = [name for name in given if name not in hints]
+    if unknown:
+        raise ValueError(f"{method}: expected options out of {', '.join(hints)}, got {', '.join(map(repr, unknown))}.")
+    values = {name: _tuples(value) for name, value in given.items()}
+    for name, value in values.items():
+        if not _fits(value, hints[name]):
+            raise ValueError(f"{method} {name}: expected {_told(hints[name])}, got {value!r}.")
+    return cls(**values) if base is None else dataclasses.replace(base, **values)  # type: ignore[type-var]
+
+
+def parse(assignments: Sequence[str]) -> dict[str, Any]:
+    """``["size=small", "levels=3"]`` as a dict: values are JSON where they can be read as such, else words.
+
+    Raises ValueError for what is not ``option=value``.
+    """
+    parsed: dict[str, Any] = {}
+    for assignment in assignments:
+        name, sign, text = assignment.partition("=")
+        if not (name and sign):
+            raise ValueError(f"--set {assignment!r}: expected option=value, such as size=small.")
+        try:
+            parsed[name] = json.loads(text)
+        except ValueError:
+            parsed[name] = {"True": True, "False": False, "None": None}.get(text, text)
+    return parsed
+
+
+def describe(cls: type) -> str:
+    """One line an option: its name, what it may be, and its default."""
+    hints = get_type_hints(cls, include_extras=True)
+    fields = dataclasses.fields(cls)
+    return "\n".join(f"* ``{each.name}``: {_told(hints[each.name])}; default {each.default!r}" for each in fields)
+
+
+def _tuples(value: Any) -> Any:
+    return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return _fits(value, arguments[0]) and all(value in rule for rule in arguments[1:] if isinstance(rule, Range))
+    if origin in (Union, UnionType):
+        return any(_fits(value, one) for one in arguments)
+    if origin is Literal:
+        return any(value == choice and type(value) is type(choice) for choice in arguments)
+    if origin is tuple:
+        return isinstance(value, tuple) and len(value) > 0 and all(_fits(item, arguments[0]) for item in value)
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, NoneType if hint is None else hint)
+
+
+def _told(hint: Any) -> str:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return " ".join([_told(arguments[0]), *(str(rule) for rule in arguments[1:] if isinstance(rule, Range))])
+    if origin in (Union, UnionType):
+        return " or ".join(_told(one) for one in arguments)
+    if origin is Literal:
+        return "one of " + ", ".join(map(repr, arguments)) if len(arguments) > 1 else repr(arguments[0])
+    if origin is tuple:
+        return f"a tuple of {_told(arguments[0])}"
+    names = {float: "a number", int: "a whole number", bool: "True or False", NoneType: "None", str: "a word"}
+    return names.get(hint, str(hint))

@@ -1,0 +1,164 @@
+"""The effects that a scene may have: how each is found, what it takes to simulate it, and what its absence equals.
+
+An effect is data. The planner knows none of them by name: a later method that reads a new buffer adds it to the effects
+that produce it, or adds an effect, and everything else follows.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from jaxdn.planning.facts import Facts, Moment
+
+
+class Effect(NamedTuple):
+    """One thing that may happen in a scene."""
+
+    name: str
+    sentence: str
+    """What it is, for a user."""
+    found: Callable[[Facts, Moment], str]
+    """Why it is there in one frame; an empty string where it is not."""
+    buffers: frozenset[str] = frozenset()
+    """What it makes worth storing: buffers of a Frame."""
+    rays: str = ""
+    """What it asks of the renderer."""
+    neutral: str = ""
+    """What leaving its buffers out is equal to."""
+    in_time: bool = False
+    """It is about two frames: the first frame of a clip takes it from the second."""
+
+
+def _list(names: Iterable[str]) -> str:
+    ordered = sorted(names)
+    return ", ".join(ordered[:3]) + (f" and {len(ordered) - 3} more" if len(ordered) > 3 else "")
+
+
+def _surfaces(facts: Facts, lobe: str, told: str) -> str:
+    names = [surface.name for surface in facts.surfaces if lobe in surface.lobes]
+    return f"{_list(names)}: {told}" if names else ""
+
+
+def _camera_motion(facts: Facts, moment: Moment) -> str:
+    return "the camera moves" if moment.camera else ""
+
+
+def _object_motion(facts: Facts, moment: Moment) -> str:
+    return f"{_list(moment.seen)} moves on screen" if moment.seen else ""
+
+
+def _disocclusion(facts: Facts, moment: Moment) -> str:
+    if not moment.reveals:
+        return ""
+    return f"behind {_list(moment.seen)} things come into view" if moment.seen else "the camera sees past edges"
+
+
+def _reflecting(facts: Facts) -> list[str]:
+    return [surface.name for surface in facts.surfaces if surface.lobes]
+
+
+def _indirect(facts: Facts, moment: Moment) -> str:
+    reflecting = _reflecting(facts)
+    if not (facts.lights and reflecting and facts.interreflects):
+        return ""
+    return f"light of {_list(light.name for light in facts.lights)} goes on from {_list(reflecting)}"
+
+
+def _glossy(facts: Facts, moment: Moment) -> str:
+    return _surfaces(facts, "glossy", "rougher than a mirror, smoother than roughness 1")
+
+
+def _mirror(facts: Facts, moment: Moment) -> str:
+    return _surfaces(facts, "mirror", "reflects as a mirror")
+
+
+def _transmission(facts: Facts, moment: Moment) -> str:
+    return _surfaces(facts, "transmission", "lets light through")
+
+
+def _moving_shadow(facts: Facts, moment: Moment) -> str:
+    if not (moment.moving and facts.lights and _reflecting(facts)):
+        return ""
+    unseen = moment.moving - moment.seen
+    told = f"{_list(moment.moving)} moves through light"
+    return f"{told} ({_list(unseen)} off screen: its shadow may fall into view)" if unseen else told
+
+
+def _changing_light(facts: Facts, moment: Moment) -> str:
+    return f"{_list(moment.changing)} moves or changes in brightness" if moment.changing else ""
+
+
+def _texture(facts: Facts, moment: Moment) -> str:
+    names = [surface.name for surface in facts.surfaces if surface.textured and "diffuse" in surface.lobes]
+    return f"{_list(names)}: the reflectance varies over the surface" if names else ""
+
+
+def _environment(facts: Facts, moment: Moment) -> str:
+    names = [light.name for light in facts.lights if light.environment]
+    return f"{_list(names)} shines from all around" if names else ""
+
+
+def _media(facts: Facts, moment: Moment) -> str:
+    names = [surface.name for surface in facts.surfaces if surface.medium]
+    return f"{_list(names)} bounds a medium" if names else "the camera stands in a medium" if facts.medium else ""
+
+
+def _emission(facts: Facts, moment: Moment) -> str:
+    return f"{_list(moment.shining)} is seen by the camera" if moment.shining else ""
+
+
+_SURFACE = frozenset({"roughness"})
+
+EFFECTS: tuple[Effect, ...] = (
+    Effect(
+        "camera-motion",
+        "The camera moves, turns or zooms.",
+        _camera_motion,
+        frozenset({"motion", "previous_depth"}),
+        "the previous frame's camera",
+        "motion 0",
+        in_time=True,
+    ),
+    Effect(
+        "object-motion",
+        "Something on screen moves.",
+        _object_motion,
+        frozenset({"motion", "previous_depth"}),
+        "the previous frame's poses",
+        "motion 0",
+        in_time=True,
+    ),
+    Effect(
+        "disocclusion",
+        "Something comes into view that was hidden in the frame before.",
+        _disocclusion,
+        frozenset({"dual_motion", "visible"}),
+        "the previous frame's G-buffer",
+        "dual motion equal to motion, all visible",
+        in_time=True,
+    ),
+    Effect("indirect", "Light arrives after more than one reflection.", _indirect, rays="paths of depth 3 and more"),
+    Effect("glossy", "A surface reflects sharper than a diffuse one.", _glossy, _SURFACE, "", "roughness 1"),
+    Effect("mirror", "A surface reflects like a mirror.", _mirror, _SURFACE, "", "roughness 1"),
+    Effect("transmission", "Light passes through a surface.", _transmission, _SURFACE, "longer paths", "roughness 1"),
+    Effect(
+        "moving-shadow",
+        "Something that moves blocks or reflects light; it need not be on screen itself.",
+        _moving_shadow,
+        rays="a reference of its own for every frame",
+        in_time=True,
+    ),
+    Effect(
+        "changing-light",
+        "A light moves, or becomes brighter or darker.",
+        _changing_light,
+        rays="a reference of its own for every frame",
+        in_time=True,
+    ),
+    Effect("texture", "Diffuse reflectance varies over a surface: dividing by the albedo pays.", _texture),
+    Effect("environment", "Light comes from all around the scene.", _environment, rays="those that leave the scene"),
+    Effect("media", "Light is scattered between surfaces: fog, smoke.", _media, rays="a volumetric integrator"),
+    Effect("emission", "A light is seen by the camera.", _emission, frozenset({"emission"}), "", "emission 0"),
+)
+"""All effects, in the order in which they are listed."""
+
+NAMES: tuple[str, ...] = tuple(effect.name for effect in EFFECTS)

@@ -1,0 +1,123 @@
+"""Which effects a scene has, frame by frame, and why."""
+
+import importlib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from jaxdn.planning.catalogue import EFFECTS, NAMES
+from jaxdn.planning.facts import Facts
+
+IN_TIME = frozenset(effect.name for effect in EFFECTS if effect.in_time)
+
+
+@dataclass(frozen=True)
+class Effects:
+    """The effects of a clip. ``"glossy" in effects`` asks for one, iterating gives their names in a fixed order."""
+
+    names: tuple[str, ...]
+    """Effects present in some frame."""
+    why: Mapping[str, str]
+    """Effect -> the reason, in the first frame that has it."""
+    uncertain: Mapping[str, str]
+    """Effect -> why it could not be decided; it counts as present."""
+    frames: tuple[frozenset[str], ...]
+    """The effects of every frame. The first frame has those of the second: nothing has moved yet, but a step compiled
+    for it alone would be a second program in nearly every clip."""
+    held: tuple[int, ...]
+    """For every frame the earliest one that shows the same: nothing moved or changed since, but for the noise."""
+    lit: bool = True
+    """There is light at all."""
+    max_depth: int | None = None
+    """The path length that the scene itself asks for."""
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def find(facts: Facts) -> Effects:
+    """The effects that follow from facts. Raises ValueError for facts without a frame."""
+    if not facts.moments:
+        raise ValueError("facts: expected at least one frame, got none.")
+    why: dict[str, str] = {}
+    frames: list[frozenset[str]] = []
+    for moment in facts.moments:
+        present = set(facts.uncertain)
+        for effect in EFFECTS:
+            reason = effect.found(facts, moment)
+            if reason:
+                present.add(effect.name)
+                why.setdefault(effect.name, reason)
+        frames.append(frozenset(present))
+    held: list[int] = []
+    for index, present_now in enumerate(frames):
+        held.append(held[-1] if index and not present_now & IN_TIME else index)
+    if len(frames) > 1:
+        frames[0] = (frames[0] - IN_TIME) | (frames[1] & IN_TIME)
+    why |= {name: why.get(name, "it could not be ruled out") for name in facts.uncertain}
+    names = tuple(name for name in NAMES if name in why)
+    return Effects(names, why, facts.uncertain, tuple(frames), tuple(held), bool(facts.lights), facts.max_depth)
+
+
+def chosen(names: Iterable[str], frames: int) -> Effects:
+    """Just the named effects, in every frame. Raises ValueError for a name that is none, listing those there are."""
+    wanted = set(names)
+    unknown = sorted(wanted - set(NAMES))
+    if unknown:
+        raise ValueError(f"effects: unknown {', '.join(map(repr, unknown))}; expected auto, all or {', '.join(NAMES)}.")
+    still = not wanted & IN_TIME
+    return Effects(
+        tuple(name for name in NAMES if name in wanted),
+        dict.fromkeys(wanted, "asked for"),
+        {},
+        (frozenset(wanted),) * frames,
+        (0,) * frames if still else tuple(range(frames)),
+    )
+
+
+def everything(frames: int) -> Effects:
+    """Every effect in every frame: what a renderer does that looks at nothing."""
+    return chosen(NAMES, frames)
+
+
+def inspect(
+    scene: Any, animation: Any = None, *, width: int = 128, height: int = 128, frames: int | None = None
+) -> Effects:
+    """The effects that a scene, or a finished clip, has.
+
+    Args:
+      scene: a Mitsuba scene file, the name of a family, a folder of a clip or of EXR files of any renderer, an
+        :class:`jaxdn.render.AnimatedScene`, a loaded ``mi.Scene`` (``optimize=False``), or :class:`Facts`.
+      animation: animation file (or what it says, as a dict) for a scene file or a loaded scene.
+      width: of the picture; the view decides what is on screen.
+      height: of the picture.
+      frames: how many to look at; default: all that the scene's animation, or the clip, has.
+
+    What cannot be decided counts as present and is told in ``uncertain``. A scene takes milliseconds beyond loading it,
+    a clip has to be read. Raises ValueError for what is none of these, or cannot be read.
+    """
+    if frames is not None and frames < 1:
+        raise ValueError(f"frames: expected at least 1, got {frames}.")
+    if isinstance(scene, Facts):
+        return find(scene._replace(moments=scene.moments[:frames]))
+    # The one look upwards: who calls for facts of a scene needs the rooms that can read one.
+    if _is_footage(scene):
+        facts = importlib.import_module("jaxdn.clips.evidence").read_facts(scene, animation)
+        return find(facts._replace(moments=facts.moments[:frames]))
+    reader = importlib.import_module("jaxdn.render.scene_facts")
+    return find(reader.read_facts(scene, animation, width=width, height=height, frames=frames))
+
+
+def _is_footage(scene: Any) -> bool:
+    """A folder of frames, or a pattern for EXR files."""
+    from pathlib import Path
+
+    if not isinstance(scene, str | Path):
+        return False
+    return Path(scene).is_dir() or str(scene).endswith(".exr")

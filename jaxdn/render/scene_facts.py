@@ -1,0 +1,238 @@
+"""Facts about an animated scene: what its surfaces and lights are, and what moves between which frames.
+
+The scene is built once, for its first frame; what happens later is in its poses, its camera and its lights' brightness.
+"""
+
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxdn.planning.facts import Facts, Light, Moment, Surface
+from jaxdn.render.animation import CameraKeys, RigidKeys, check_animation, read_animation
+from jaxdn.render.scene import AnimatedScene, Camera, brightness, scene_from_record
+from jaxdn.render.variant import use_variant
+from jaxdn.render.visibility import corners, fills_view, may_be_seen, moved
+
+_LOOK = 16
+"""Height of the picture that is looked at, in pixels."""
+
+
+def read_facts(
+    scene: Any, animation: Any = None, *, width: int = 128, height: int = 128, frames: int | None = None
+) -> Facts:
+    """Facts about a scene file, a family's name, an animated scene, a loaded ``mi.Scene`` or a scene as a dict.
+
+    Raises ValueError for anything else, and for files that cannot be read.
+    """
+    return facts_of(open_scene(scene, animation), width=width, height=height, frames=frames)
+
+
+def open_scene(scene: Any, animation: Any = None) -> AnimatedScene:
+    """What :func:`read_facts` takes, as an animated scene."""
+    from jaxdn.render.families import FAMILIES
+
+    if isinstance(scene, str | Path):
+        if str(scene) in FAMILIES:
+            return scene_from_record({"family": str(scene), "seed": 0})
+        if Path(scene).suffix == ".xml":
+            from jaxdn.render.scene_file import SceneFile
+
+            if isinstance(animation, Mapping):
+                return SceneFile.from_record({"file": str(scene), "animation": dict(animation)})
+            return SceneFile(scene, animation)
+        raise ValueError(
+            f"scene {str(scene)!r}: expected a Mitsuba scene (.xml), a folder of frames, or a family "
+            f"({', '.join(sorted(FAMILIES))})."
+        )
+    if isinstance(scene, Mapping):
+        use_variant()
+        import mitsuba as mi
+
+        return LoadedScene(mi.load_dict(dict(scene), optimize=False), animation)
+    if hasattr(scene, "shapes") and hasattr(scene, "sensors"):
+        return LoadedScene(scene, animation)
+    if not isinstance(scene, AnimatedScene):
+        raise ValueError(f"scene: expected a scene file, a family, an mi.Scene or an AnimatedScene, got {type(scene)}.")
+    return scene
+
+
+class LoadedScene:
+    """A scene that is loaded already, as an animated one to look at; its animation moves nothing in it."""
+
+    name = "scene"
+    max_depth = 8
+
+    def __init__(self, scene: Any, animation: Any = None) -> None:
+        keys = read_animation(Path(animation)) if isinstance(animation, str | Path) else dict(animation or {})
+        check_animation(keys, [shape.id() for shape in scene.shapes()], has_camera=bool(scene.sensors()))
+        if "inserted" in keys or "lights" in keys:
+            raise ValueError("animation: inserted shapes and lights need a scene file, this scene is loaded already.")
+        self.frames = int(keys.get("frames", 1))
+        self.record: dict[str, Any] = {}
+        self._scene = scene
+        self._camera = CameraKeys(keys["camera"]) if "camera" in keys else None
+        self._motions = {
+            name: RigidKeys(motion["keys"], np.array(motion.get("pivot", (0, 0, 0)), float))
+            for name, motion in keys.get("shapes", {}).items()
+        }
+
+    def build(self, frame: float, width: int, height: int) -> Any:
+        """The scene as it was given."""
+        return self._scene
+
+    def camera(self, frame: float) -> Camera:
+        """The camera of one frame."""
+        import mitsuba as mi
+
+        sensor = self._scene.sensors()[0]
+        rest = Camera(
+            np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4),
+            float(np.ravel(np.array(mi.traverse(sensor)["x_fov"]))[0]),
+        )
+        if self._camera is None:
+            return rest
+        fov = self._camera.fov(frame)
+        return Camera(self._camera(frame), rest.x_fov if fov is None else fov)
+
+    def pose(self, frame: float) -> dict[str, np.ndarray]:
+        """Shape id -> [4, 4], where the keys have moved it."""
+        return {name: motion(frame) for name, motion in self._motions.items()}
+
+
+def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | None = None) -> Facts:
+    """Facts about the first ``frames`` frames of an animated scene."""
+    use_variant()
+    # Mitsuba's names exist once a variant is chosen.
+    from jaxdn.render.gbuffer import gbuffer, shape_names
+    from jaxdn.render.materials import NOTHING, material_of
+    from jaxdn.render.plugins import children, shape_groups
+
+    # A small picture of the same shape: enough to see whether rays leave the scene.
+    built = scene.build(0, max(1, round(_LOOK * width / height)), _LOOK)
+    shapes = dict(zip(shape_names(built), built.shapes(), strict=True))
+    grouped = [part for group in shape_groups(built) for _, part in children(group) if hasattr(part, "bsdf")]
+
+    surfaces: list[Surface] = []
+    uncertain: dict[str, str] = {}
+    for name, shape in shapes.items():
+        members = grouped if shape.class_name() == "Instance" else [shape]
+        materials = [NOTHING if part.bsdf() is None else material_of(part.bsdf()) for part in members]
+        for material in materials:
+            uncertain |= {effect: f"{name}: {told}" for effect, told in material.unsure.items()}
+        if shape.class_name() == "Instance" and not members:
+            told = f"{name}: what an instance shows could not be read"
+            uncertain |= dict.fromkeys(("glossy", "mirror", "transmission", "texture"), told)
+        lobes = frozenset().union(*(material.lobes for material in materials))
+        textured = any(material.textured for material in materials)
+        surfaces.append(Surface(name, lobes, textured, bool(shape.is_medium_transition())))
+
+    lights: list[Light] = []
+    by_id = {shape.id(): name for name, shape in shapes.items()}
+    for index, emitter in enumerate(built.emitters()):
+        owner = emitter.get_shape()
+        name = by_id[owner.id()] if owner is not None else emitter.id() or f"light_{index}"
+        lights.append(Light(name, bool(emitter.is_environment())))
+    around = frozenset(light.name for light in lights if light.environment)
+    if around and not np.any(gbuffer(built).ids < 0):
+        uncertain["emission"] = "the environment is not seen in a small picture of frame 0, but may be later"
+        around = frozenset()
+
+    stage = _Stage(scene, shapes, (height, width), around)
+    count = scene.frames if frames is None else frames
+    return Facts(
+        surfaces=tuple(surfaces),
+        lights=tuple(lights),
+        moments=tuple(stage.moment(frame, lights) for frame in range(count)),
+        medium=built.sensors()[0].get_medium() is not None,
+        interreflects=_interreflects(stage, shapes, surfaces, lights),
+        max_depth=scene.max_depth,
+        uncertain=uncertain,
+    )
+
+
+class _Stage:
+    """Where shapes are in each frame, against the view."""
+
+    def __init__(
+        self, scene: AnimatedScene, shapes: Mapping[str, Any], size: tuple[int, int], around: frozenset[str]
+    ) -> None:
+        self.scene, self.size, self.around = scene, size, around
+        self.pose, self.camera = cache(scene.pose), cache(scene.camera)  # an articulated pose takes milliseconds
+        self.rest = {name: np.asarray(pose, np.float64) for name, pose in self.pose(0).items()}
+        self.boxes: dict[str, np.ndarray] = {}
+        self.squares: dict[str, np.ndarray] = {}
+        for name, shape in shapes.items():
+            box = shape.bbox()
+            self.boxes[name] = corners(np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel())
+            if shape.class_name() == "Rectangle":
+                self.squares[name] = _to_world(shape)
+
+    def place(self, name: str, pose: Mapping[str, np.ndarray]) -> np.ndarray:
+        """How a shape has moved since frame 0, where it was built."""
+        return np.asarray(pose[name]) @ np.linalg.inv(self.rest[name]) if name in pose else np.eye(4)
+
+    def on_screen(self, name: str, frame: float) -> bool:
+        """Whether a shape's box may be in view."""
+        points = moved(self.boxes[name], self.place(name, self.pose(frame)))
+        return may_be_seen(points, self.camera(frame), self.size)
+
+    def moment(self, frame: int, lights: Sequence[Light]) -> Moment:
+        """What happens between a frame and the one before it."""
+        emitting = (light.name for light in lights if light.name in self.boxes)
+        shining = self.around.union(name for name in emitting if self.on_screen(name, frame))
+        if frame == 0:
+            return Moment(shining=shining)
+        now, before = self.camera(frame), self.camera(frame - 1)
+        camera = now.x_fov != before.x_fov or not np.array_equal(now.to_world, before.to_world)
+        pose, last = self.pose(frame), self.pose(frame - 1)
+        moving = frozenset(name for name in pose if not (name in last and np.array_equal(pose[name], last[name])))
+        seen = frozenset(
+            name for name in moving if name in self.boxes and any(self.on_screen(name, at) for at in (frame - 1, frame))
+        )
+        changing = {light.name for light in lights} & moving
+        bright, dim = brightness(self.scene, frame), brightness(self.scene, frame - 1)
+        changing |= {name for name in bright if bright[name] != dim[name]}
+        reveals = (camera or bool(seen)) and not self._one_flat_view(frame)
+        return Moment(camera, moving, seen, reveals, frozenset(changing), shining)
+
+    def _one_flat_view(self, frame: int) -> bool:
+        """One flat surface fills the picture now and before: nothing can come out from behind anything."""
+        there = {name for name in self.boxes for at in (frame - 1, frame) if self.on_screen(name, at)}
+        if len(there) != 1 or not there <= set(self.squares):
+            return False
+        name = there.pop()
+        return all(
+            fills_view(self.place(name, self.pose(at)) @ self.squares[name], self.camera(at), self.size)
+            for at in (frame - 1, frame)
+        )
+
+
+def _to_world(shape: Any) -> np.ndarray:
+    import mitsuba as mi
+
+    matrix = mi.traverse(shape)["to_world"].matrix
+    return np.array(matrix, np.float64).reshape(4, 4)
+
+
+def _interreflects(
+    stage: _Stage, shapes: Mapping[str, Any], surfaces: Sequence[Surface], lights: Sequence[Light]
+) -> bool:
+    """False where a single flat reflector, or a convex one lit and seen from outside, is all there is."""
+    reflecting = [surface for surface in surfaces if surface.lobes]
+    if len(reflecting) != 1 or "transmission" in reflecting[0].lobes:
+        return True
+    name = reflecting[0].name
+    kind = shapes[name].class_name()
+    if kind in ("Rectangle", "Disk"):
+        return False
+    # A point light's place is not looked up, and a pose may carry the shape anywhere.
+    placed = all(light.environment or light.name in shapes for light in lights)
+    if kind not in ("Sphere", "Cube") or not placed or stage.rest:
+        return True
+    low, high = stage.boxes[name].min(axis=0), stage.boxes[name].max(axis=0)
+    others = [stage.boxes[light.name] for light in lights if light.name in shapes and light.name != name]
+    others += [np.asarray(stage.scene.camera(frame).to_world)[None, :3, 3] for frame in range(stage.scene.frames)]
+    return any(np.all(box.max(axis=0) >= low) and np.all(box.min(axis=0) <= high) for box in others)

@@ -1,0 +1,79 @@
+"""The symmetries: a transformed clip is the clip of the transformed world."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from jaxdn.clips.augment import transform_clip, transform_image, transform_motion
+from jaxdn.frame import Clip, Frame
+
+SYMMETRIES = list(itertools.product([False, True], range(4)))
+
+
+def warp_reference(image: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """Bilinear at p + motion(p), positions clamped to the outermost pixel centres, in float64."""
+    height, width = image.shape[:2]
+    rows, columns = np.mgrid[:height, :width].astype(np.float64)
+    x = np.clip(columns + motion[..., 0], 0, width - 1)
+    y = np.clip(rows + motion[..., 1], 0, height - 1)
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    fx, fy = (x - left)[..., None], (y - top)[..., None]
+    upper = image[top, left] * (1 - fx) + image[top, right] * fx
+    lower = image[bottom, left] * (1 - fx) + image[bottom, right] * fx
+    return upper * (1 - fy) + lower * fy
+
+
+@pytest.mark.parametrize(("flip", "turns"), SYMMETRIES)
+def test_warping_and_transforming_can_be_exchanged(rng: np.random.Generator, flip: bool, turns: int) -> None:
+    history = rng.random((9, 13, 3))
+    motion = 10 * rng.random((9, 13, 2)) - 5
+    expected = transform_image(warp_reference(history, motion), flip=flip, turns=turns)
+    found = warp_reference(
+        transform_image(history, flip=flip, turns=turns), transform_motion(motion, flip=flip, turns=turns)
+    )
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(("flip", "turns"), SYMMETRIES)
+def test_the_librarys_own_warp_agrees(rng: np.random.Generator, flip: bool, turns: int) -> None:
+    from jaxdn.ops.warp import warp
+
+    history = rng.random((8, 8, 3), np.float32)
+    motion = 10 * rng.random((8, 8, 2), np.float32) - 5
+    expected = transform_image(np.asarray(warp(history, motion)), flip=flip, turns=turns)
+    moved = transform_motion(motion, flip=flip, turns=turns)
+    found = warp(np.ascontiguousarray(transform_image(history, flip=flip, turns=turns)), moved)
+    np.testing.assert_allclose(np.asarray(found), expected, atol=2e-6)
+
+
+def test_the_eight_are_different_and_make_a_group(rng: np.random.Generator) -> None:
+    motion = rng.random((5, 5, 2))
+    results = [transform_motion(motion, flip=flip, turns=turns) for flip, turns in SYMMETRIES]
+    for one, other in itertools.combinations(results, 2):
+        assert not np.array_equal(one, other)
+    for result, (flip, turns) in zip(results, SYMMETRIES, strict=True):
+        # The inverse of a rotation turns back; every reflection is its own inverse.
+        back = transform_motion(result, flip=flip, turns=turns if flip else -turns)
+        np.testing.assert_array_equal(back, motion)
+
+
+def test_a_clip_is_transformed_in_every_buffer(rng: np.random.Generator) -> None:
+    frames = Frame(
+        radiance=rng.random((2, 4, 6, 3)),
+        normal=rng.random((2, 4, 6, 3)),
+        motion=rng.random((2, 4, 6, 2)),
+        dual_motion=rng.random((2, 4, 6, 2)),
+        ids=rng.integers(-1, 4, (2, 4, 6, 1)),
+    )
+    clip = transform_clip(Clip(frames, frames.radiance + 1), flip=True, turns=1)
+    assert clip.frames.albedo is None
+    np.testing.assert_array_equal(clip.reference, clip.frames.radiance + 1)
+    # Pixel (x, y) of a picture 6 wide goes to 5 - x by the flip, and then (x, y) -> (y, 5 - x) by the turn: (y, x).
+    np.testing.assert_array_equal(clip.frames.radiance[:, 5, 1], frames.radiance[:, 1, 5])
+    np.testing.assert_array_equal(clip.frames.normal[:, 5, 1], frames.normal[:, 1, 5])  # world space: unchanged
+    np.testing.assert_array_equal(clip.frames.ids[:, 5, 1], frames.ids[:, 1, 5])
+    for name in ("motion", "dual_motion"):
+        before, after = getattr(frames, name), getattr(clip.frames, name)
+        np.testing.assert_array_equal(after[:, 5, 1], before[:, 1, 5, ::-1])

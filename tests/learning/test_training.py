@@ -1,0 +1,180 @@
+"""Training: the loss, the step, two phases, bad data, and a run that is stopped and goes on as if it never was."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdn import color, losses
+from jaxdn.denoisers import ntd
+from jaxdn.frame import Clip, Frame
+from jaxdn.learning.step import PARITY, clip_loss, initial_state, make_train_step
+from jaxdn.motion import occlusion_mask
+from jaxdn.recipe import Recipe
+from tests.plainly import jit_plainly
+
+TINY = ((4,), (4,), (4,), (4,), (4,))
+RECIPE = Recipe(steps=8, batch=2, crop=16, frames=4)
+
+
+def make_clip(seed, *, frames=4, size=16):
+    """A moving ramp under noise, with a strip that the dual vectors call disoccluded."""
+    rng = np.random.default_rng(seed)
+    ramp = np.linspace(0.1, 1.0, size, dtype=np.float32)[None, None, :, None] * np.ones((frames, size, size, 3))
+    reference = (ramp + 0.1 * np.arange(frames)[:, None, None, None]).astype(np.float32)
+    motion = np.zeros((frames, size, size, 2), np.float32)
+    dual = motion.copy()
+    dual[1:, 4:8, 4:6] = (3.0, 0.0)
+    return Clip(
+        Frame(
+            radiance=(reference * rng.exponential(size=reference.shape)).astype(np.float32),
+            albedo=np.full_like(reference, 0.5),
+            normal=np.broadcast_to(np.float32([0, 0, 1]), reference.shape),
+            depth=np.full((frames, size, size, 1), 2.0, np.float32),
+            motion=motion,
+            dual_motion=dual,
+        ),
+        reference,
+    )
+
+
+def batch_of(*clips):
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *clips)
+
+
+@pytest.fixture(scope="module")
+def denoiser():
+    return ntd(size=TINY)
+
+
+@pytest.fixture(scope="module")
+def step(denoiser):
+    return make_train_step(denoiser, RECIPE)
+
+
+@pytest.fixture
+def state(denoiser):
+    return initial_state(denoiser, RECIPE, batch_of(make_clip(0), make_clip(1)))
+
+
+def test_the_loss_is_the_papers_sum_on_all_frames_but_the_last(denoiser, state):
+    clip = make_clip(0)
+    from jaxdn.rollout import denoise
+
+    images = denoise(denoiser, state.params, clip)
+    masks = jax.vmap(occlusion_mask)(clip.frames.motion, clip.frames.dual_motion)[:3]
+    ours, wanted = color.compress(images[:3]), color.compress(clip.reference[:3])
+    without = losses.spatial(ours, wanted) + losses.temporal(ours, wanted)
+    joined = losses.occlusion(ours, wanted, masks)
+    assert joined > 0
+    for weight in (0.0, 1.0):
+        loss, _ = clip_loss(denoiser, state.params, clip, occlusion=weight)
+        np.testing.assert_allclose(loss, without + weight * joined, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_last_frame_gives_no_gradient(denoiser, state):
+    clip = make_clip(0)
+    changed = clip._replace(reference=clip.reference.copy())
+    changed.reference[-1] *= 3.0
+    gradient = jit_plainly(jax.grad(lambda params, clip: clip_loss(denoiser, params, clip)[0]))
+    for one, other in zip(
+        jax.tree.leaves(gradient(state.params, clip)), jax.tree.leaves(gradient(state.params, changed)), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_step_learns_and_compiles_once_over_both_phases(step, state):
+    batch = batch_of(make_clip(0), make_clip(1))
+    reports = []
+    for _ in range(RECIPE.steps):
+        state, report = step(state, batch)
+        reports.append(report)
+    assert step._cache_size() == 1
+    assert reports[3].loss < reports[0].loss
+    # The occlusion loss joins at half of the steps: the same weights would have cost less without it.
+    assert reports[4].loss > reports[3].loss
+    assert int(state.skipped) == 0
+    assert int(state.step) == RECIPE.steps
+
+
+@pytest.mark.slow
+def test_rematerialised_gradients_are_the_same(denoiser, state):
+    clip = make_clip(3)
+
+    def gradient(rematerialize):
+        return jit_plainly(jax.grad(lambda p: clip_loss(denoiser, p, clip, rematerialize=rematerialize)[0]))(
+            state.params
+        )
+
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(False), gradient(True))
+
+
+def sound(state):
+    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.params, state.optimizer)))
+
+
+POISONS = [np.nan, np.inf, -np.inf, 1e30, -1e30, 1e38]
+
+
+@pytest.mark.parametrize("buffer", ["radiance", "albedo", "normal", "depth", "motion", "dual_motion", "reference"])
+def test_a_poisoned_buffer_never_makes_a_bad_weight_and_learning_goes_on(step, state, buffer):
+    batch = batch_of(make_clip(0), make_clip(1))
+    before = jax.tree.map(np.array, state.params)
+    for poison in POISONS:
+        if buffer == "reference":
+            spoilt = batch._replace(reference=batch.reference.at[:, 1, 3:9].set(poison))
+        else:
+            values = getattr(batch.frames, buffer).at[:, 1, 3:9].set(poison)
+            spoilt = batch._replace(frames=batch.frames._replace(**{buffer: values}))
+        state, report = step(state, spoilt)
+        assert np.isfinite(report.loss), poison
+        assert sound(state), poison
+    assert int(state.skipped) == 0
+    changed = [np.any(new != old) for new, old in zip(*map(jax.tree.leaves, (state.params, before)), strict=True)]
+    assert any(changed)
+
+
+def test_a_black_batch_is_one_like_any_other(step, state):
+    batch = batch_of(make_clip(0), make_clip(1))
+    black = jax.tree.map(jnp.zeros_like, batch)
+    state, _ = step(state, black)
+    state, report = step(state, black)
+    assert np.isfinite(report.loss)
+    assert np.isfinite(report.gradient_norm)
+    assert sound(state)
+    assert int(state.skipped) == 0
+    state, _ = step(state, batch)
+    assert sound(state)
+
+
+def test_a_gradient_that_is_not_finite_changes_nothing(denoiser, step, state):
+    before = jax.tree.map(np.array, state.params)
+    broken = state._replace(params=jax.tree.map(jnp.copy, state.params))
+    first = jax.tree.leaves(broken.params)[0]
+    broken = broken._replace(
+        params=jax.tree.map(
+            lambda leaf: leaf.at[(0,) * leaf.ndim].set(jnp.nan) if leaf is first else leaf, broken.params
+        )
+    )
+    after, _ = step(broken, batch_of(make_clip(0), make_clip(1)))
+    assert int(after.skipped) == 1
+    jax.tree.map(
+        lambda new, old: np.testing.assert_array_equal(new[np.isfinite(new)], old[np.isfinite(new)]),
+        jax.tree.map(np.array, after.params),
+        before,
+    )
+
+
+def test_nothing_moves_nothing_is_disoccluded(denoiser, state):
+    clip = make_clip(0)
+    still = clip._replace(frames=clip.frames._replace(motion=None, dual_motion=None))
+    with_occlusion, _ = clip_loss(denoiser, state.params, still, occlusion=1.0)
+    without, _ = clip_loss(denoiser, state.params, still, occlusion=0.0)
+    assert with_occlusion == without
+
+
+def test_the_papers_recipe_is_constant_adam():
+    assert PARITY.learning_rate == 1e-4
+    assert not PARITY.decay
+    assert PARITY.clip_norm == 0

@@ -1,0 +1,97 @@
+"""Training when things go wrong: bad clips, a rate that explodes, a torn checkpoint, a process that is killed."""
+
+import json
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.stability import kills
+from jaxdn.checkpoint import Checkpoints
+from jaxdn.commands.train import Log, fit, read_curve
+from jaxdn.denoiser import Denoiser
+from jaxdn.frame import RADIANCE_MAX
+from jaxdn.learning.step import clean, initial_state
+from tests import test_fit
+from tests.learning.test_checkpoint import torn
+
+clips = test_fit.clips
+
+
+def test_a_reference_is_bounded_as_what_it_is_compared_with():
+    bad = jnp.asarray([np.nan, np.inf, -np.inf, -1.0, 1e30, 0.25], jnp.float32)
+    np.testing.assert_array_equal(clean(bad), [0, 0, 0, 0, RADIANCE_MAX, 0.25])
+
+
+def brighter():
+    """A denoiser of one weight, which compiles in a moment: radiance times 1 + gain^2."""
+
+    def step(params, state, frame):
+        return state + 1, frame.radiance * (1 + params["gain"] ** 2)
+
+    def start(params, frame):
+        return jnp.zeros((), jnp.int32)
+
+    return Denoiser(lambda key, frame: {"gain": jnp.full((), 0.1)}, start, step, frozenset({"radiance"}))
+
+
+def run(clips, folder, recipe=test_fit.RECIPE, source=None, every=2):
+    batches = test_fit.batches(clips) if source is None else source
+    return fit(brighter(), recipe, batches, folder, label="t", log_every=1, checkpoint_every=every)
+
+
+@pytest.mark.parametrize(("rate", "kept"), [(1e30, 1), (np.inf, 0)])
+def test_a_rate_that_explodes_ends_with_what_to_change_and_finite_weights(clips, tmp_path, rate, kept):
+    recipe = test_fit.RECIPE._replace(learning_rate=rate, decay=False)
+    told = rf"nothing was learned in the updates {kept + 1} to {kept + 3}.*learning rate"
+    with pytest.raises(ValueError, match=told):
+        run(clips, tmp_path, recipe, every=1)
+    with pytest.raises(ValueError, match="learning rate"):  # nor does it go on when it is started again
+        run(clips, tmp_path, recipe, every=1)
+    kept_state, _ = Checkpoints(tmp_path / "checkpoints").restore(
+        initial_state(brighter(), recipe, next(test_fit.batches(clips)))
+    )
+    assert np.isfinite(kept_state.params["gain"])
+
+
+def test_a_log_is_strict_json_whatever_the_loss(tmp_path):
+    log = Log(tmp_path / "log.jsonl", keep_until=0)
+    log.write(step=1, loss=float("nan"))
+    log.write(step=2, loss=0.5)
+    log.close()
+    for line in (tmp_path / "log.jsonl").read_text().splitlines():
+        json.loads(line, parse_constant=pytest.fail)
+    np.testing.assert_array_equal(read_curve(tmp_path).loss, [np.nan, 0.5])
+
+
+def test_with_the_newest_checkpoint_torn_it_continues_from_the_one_before_to_the_same_weights(clips, tmp_path):
+    whole = run(clips, tmp_path / "whole", every=100)
+    stopping = test_fit.Stopping(test_fit.batches(clips), 5)
+    with pytest.raises(KeyboardInterrupt):
+        run(clips, tmp_path / "stopped", source=stopping)
+    (tmp_path / "stopped" / "checkpoints").rename(tmp_path / "kept")
+    torn(tmp_path / "kept", tmp_path / "stopped" / "checkpoints", 4)
+    with pytest.warns(UserWarning, match="continues from the checkpoint after 2 updates"):
+        continued = run(clips, tmp_path / "stopped")
+    jax.tree.map(np.testing.assert_array_equal, whole.params, continued.params)
+    assert read_curve(tmp_path / "whole") == read_curve(tmp_path / "stopped")
+
+
+@pytest.mark.slow
+def test_a_killed_process_loses_only_the_steps_since_its_last_checkpoint(tmp_path):
+    kills.make_clips(tmp_path / "clips")
+    sizes = kills.Sizes(steps=60, checkpoint_every=5)
+    kills.start(tmp_path / "clips", tmp_path / "calm", sizes).communicate()
+    process = kills.start(tmp_path / "clips", tmp_path / "shot", sizes)
+    until = time.monotonic() + 300
+    while kills.logged(tmp_path / "shot") < 23 and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.002)
+    process.kill()
+    process.communicate()
+    seen, kept = kills.logged(tmp_path / "shot"), kills.newest(tmp_path / "shot")
+    assert 23 <= seen < 60
+    assert seen - kept <= 2 * sizes.checkpoint_every  # one may have been on its way to the disk
+    said, _ = kills.start(tmp_path / "clips", tmp_path / "shot", sizes).communicate()
+    assert kills.same(tmp_path / "calm", tmp_path / "shot"), said

@@ -1,0 +1,254 @@
+"""One shared test for every implementation of every operation, against float64 NumPy references."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdn.networks.unet  # noqa: F401  (registers the networks' implementations)
+from jaxdn.ops.convolution import convolve
+from jaxdn.ops.kernels import apply_kernels
+from jaxdn.ops.registry import implementations, resolve
+from jaxdn.ops.softmax_filter import softmax_filter
+from jaxdn.ops.warp import warp
+
+SIZES = [(6, 7), (1, 1), (1, 9)]
+
+
+def numpy_warp(image, motion, border):
+    """Every tap of every pixel in a loop."""
+    height, width, channels = image.shape
+    out = np.zeros((height, width, channels))
+    for row in range(height):
+        for column in range(width):
+            if not np.all(np.isfinite(motion[row, column])):
+                continue
+            x, y = column + motion[row, column, 0], row + motion[row, column, 1]
+            if border == "clamp":
+                x, y = min(max(x, 0.0), width - 1.0), min(max(y, 0.0), height - 1.0)
+            x, y = min(max(x, -2.0), width + 1.0), min(max(y, -2.0), height + 1.0)
+            left, top = int(np.floor(x)), int(np.floor(y))
+            for i, weight_y in ((top, 1 - (y - top)), (top + 1, y - top)):
+                for j, weight_x in ((left, 1 - (x - left)), (left + 1, x - left)):
+                    if 0 <= i < height and 0 <= j < width:
+                        out[row, column] += weight_y * weight_x * image[i, j]
+    return out
+
+
+def numpy_apply_kernels(image, kernels):
+    height, width, channels = image.shape
+    size = int(np.sqrt(kernels.shape[-1]))
+    out = np.zeros((height, width, channels))
+    for row in range(height):
+        for column in range(width):
+            for tap in range(size * size):
+                i = min(max(row + tap // size - size // 2, 0), height - 1)
+                j = min(max(column + tap % size - size // 2, 0), width - 1)
+                out[row, column] += kernels[row, column, tap] * image[i, j]
+    return out
+
+
+def numpy_softmax_filter(images, logits, taps):
+    filtered = []
+    for index, image in enumerate(images):
+        own = logits[..., index * taps : (index + 1) * taps]
+        weights = np.exp(own - own.max(axis=-1, keepdims=True))
+        filtered.append(numpy_apply_kernels(image, weights / weights.sum(axis=-1, keepdims=True)))
+    return np.stack(filtered)
+
+
+def numpy_convolution(x, kernel):
+    count, height, width, _ = x.shape
+    padded = np.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
+    out = np.zeros((count, height, width, kernel.shape[3]))
+    for row in range(height):
+        for column in range(width):
+            window = padded[:, row : row + 3, column : column + 3]
+            out[:, row, column] = np.einsum("nijc,ijco->no", window, kernel)
+    return out
+
+
+def _motion(rng, size):
+    motion = rng.uniform(-3, 3, (*size, 2))
+    special = [np.nan, np.inf, -np.inf, 1e30, -1e30, 0.0, 1.0, -0.5, 0.5, -1.0]
+    spots = rng.integers(0, motion.size, 4)
+    motion.reshape(-1)[spots] = rng.choice(special, 4)
+    return motion
+
+
+def _case(op, size, rng):
+    """(differentiable arguments, function of them and an implementation, NumPy reference of them)."""
+    if op.startswith("warp"):
+        border = op.removeprefix("warp_")
+        motion = _motion(rng, size)
+        return (
+            (rng.standard_normal((*size, 3)),),
+            lambda implementation, image: warp(
+                image, jnp.asarray(motion), border=border, implementation=implementation
+            ),
+            lambda image: numpy_warp(image, motion, border),
+        )
+    if op.startswith("apply_kernels"):
+        taps = int(op.removeprefix("apply_kernels_"))
+        return (
+            (rng.standard_normal((*size, 3)), rng.standard_normal((*size, taps))),
+            lambda implementation, image, kernels: apply_kernels(image, kernels, implementation=implementation),
+            numpy_apply_kernels,
+        )
+    if op.startswith("softmax_filter"):
+        taps, count, spare = map(int, op.removeprefix("softmax_filter_").split("_"))
+        return (
+            (rng.standard_normal((count, *size, 3)), 3 * rng.standard_normal((*size, count * taps + spare))),
+            lambda implementation, images, logits: softmax_filter(
+                images, logits, taps=taps, implementation=implementation
+            ),
+            lambda images, logits: numpy_softmax_filter(images, logits, taps),
+        )
+    inputs, outputs = map(int, op.removeprefix("convolution_").split("_"))
+    return (
+        (rng.standard_normal((2, *size, inputs)), rng.standard_normal((3, 3, inputs, outputs))),
+        lambda implementation, x, kernel: convolve(x, kernel, implementation=implementation),
+        numpy_convolution,
+    )
+
+
+def _pull_back(function, name):
+    """(cotangent, *arguments) -> value and gradients, compiled."""
+
+    def both(cotangent, *arguments):
+        out, pull = jax.vjp(lambda *arguments: function(name, *arguments), *arguments)
+        return out, pull(cotangent)
+
+    return jax.jit(both)
+
+
+def runnable(op):
+    """The implementations that can run here: engines are extras."""
+
+    def runs(name):
+        try:
+            resolve(op, name)
+        except ValueError:
+            return False
+        return True
+
+    return tuple(filter(runs, implementations(op)))
+
+
+CASES = [
+    (case, name)
+    for op, cases in {
+        "warp": ("warp_clamp", "warp_zeros"),
+        "apply_kernels": ("apply_kernels_1", "apply_kernels_25"),
+        "convolution": ("convolution_2_3", "convolution_3_2"),
+    }.items()
+    for case in cases
+    for name in runnable(op)
+]
+
+
+FILTERS = [
+    (case, name)
+    for case in ("softmax_filter_25_1_0", "softmax_filter_9_2_1")
+    for name in implementations("softmax_filter")
+]
+"""Not linear in its logits, so that its gradient has a test of its own."""
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(("case", "name"), CASES)
+def test_value_and_gradient(case, name, size, rng):
+    """Values equal NumPy's; these maps are linear in each argument, so the VJP is checked by the inner product."""
+    arguments, function, expected = _case(case, size, rng)
+    values = expected(*arguments)
+    cotangent = rng.standard_normal(values.shape)
+    out, gradients = _pull_back(function, name)(jnp.asarray(cotangent), *map(jnp.asarray, arguments))
+    np.testing.assert_allclose(out, values, atol=1e-12)
+    for index, gradient in enumerate(gradients):
+        direction = rng.standard_normal(arguments[index].shape)
+        moved = expected(*(direction if i == index else a for i, a in enumerate(arguments)))
+        np.testing.assert_allclose(np.sum(direction * gradient), np.sum(cotangent * moved), rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(("case", "name"), FILTERS)
+def test_filter_and_its_gradient(case, name, size, rng):
+    """Values equal NumPy's, the VJP NumPy's central difference along a direction."""
+    arguments, function, expected = _case(case, size, rng)
+    values = expected(*arguments)
+    cotangent = rng.standard_normal(values.shape)
+    out, gradients = _pull_back(function, name)(jnp.asarray(cotangent), *map(jnp.asarray, arguments))
+    np.testing.assert_allclose(out, values, atol=1e-12)
+    for index, gradient in enumerate(gradients):
+        step = 1e-6 * rng.standard_normal(arguments[index].shape)
+        ahead, behind = (
+            expected(*(a + sign * step if i == index else a for i, a in enumerate(arguments))) for sign in (1, -1)
+        )
+        slope = np.sum(cotangent * (ahead - behind)) / 2
+        np.testing.assert_allclose(np.sum(step * gradient), slope, rtol=1e-6, atol=1e-13)
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize(("case", "name"), CASES + FILTERS)
+def test_vmap_and_scan_change_nothing(case, name, rng):
+    """grad(scan(vmap)) of three examples equals the sum, or the stack, of three gradients."""
+    arguments, function, _ = _case(case, (5, 7), rng)
+    first = jnp.stack([jnp.asarray(arguments[0]) * scale for scale in (1.0, -0.5, 2.0)])
+    rest = tuple(map(jnp.asarray, arguments[1:]))
+
+    def one(first, *rest):
+        return jnp.sum(jnp.sin(function(name, first, *rest)))
+
+    def looped(first, *rest):
+        def body(total, _):
+            return total + jnp.sum(jax.vmap(lambda image: one(image, *rest))(first)), None
+
+        return jax.lax.scan(body, jnp.zeros(()), length=2)[0]
+
+    together = jax.jit(jax.grad(looped, tuple(range(len(arguments)))))(first, *rest)
+    single = jax.jit(jax.grad(one, tuple(range(len(arguments)))))
+    alone = [single(image, *rest) for image in first]
+    np.testing.assert_allclose(together[0], 2 * jnp.stack([gradient[0] for gradient in alone]), atol=1e-10)
+    for index in range(1, len(arguments)):
+        np.testing.assert_allclose(together[index], 2 * sum(gradient[index] for gradient in alone), atol=1e-10)
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float32])
+@pytest.mark.parametrize(("case", "name"), CASES)
+def test_keeps_the_dtype(case, name, dtype, rng):
+    arguments, function, expected = _case(case, (6, 8), rng)
+    rounded = [jnp.asarray(argument, dtype) for argument in arguments]
+    values = expected(*(np.asarray(argument, np.float64) for argument in rounded))
+    out, gradients = _pull_back(function, name)(jnp.asarray(values, dtype), *rounded)
+    assert out.dtype == dtype
+    assert all(gradient.dtype == dtype for gradient in gradients)
+    np.testing.assert_allclose(np.asarray(out, np.float64), values, atol=40 * float(jnp.finfo(dtype).eps))
+
+
+@pytest.mark.parametrize("op", ["warp", "apply_kernels", "softmax_filter", "convolution", "unet"])
+def test_a_name_is_that_one_or_an_error(op):
+    assert len(implementations(op)) > 1
+    assert "reference" in runnable(op)
+    assert set(implementations(op)) - set(runnable(op)) <= {"onednn", "onnxruntime"}  # engines are extras
+    assert resolve(op, None) in [resolve(op, name) for name in runnable(op)]
+    with pytest.raises(ValueError, match=r"'reference'.*'no such'"):
+        resolve(op, "no such")
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("height", [5, 7, 8])
+def test_strips_of_any_number_of_rows_are_the_whole_image(height, rng, monkeypatch):
+    """Two rows a strip: heights that they divide and others, whose last strip computes a row again."""
+    monkeypatch.setattr("jaxdn.ops.softmax_filter._STRIP", 2 * 6 * 51)
+    images, logits = rng.standard_normal((2, height, 6, 3)), rng.standard_normal((height, 6, 51))
+    cotangent = rng.standard_normal(images.shape)
+
+    def both(implementation):
+        value, pull = jax.vjp(lambda *at: softmax_filter(*at, implementation=implementation), images, logits)
+        return value, pull(cotangent)
+
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), both("strips"), both("reference")
+    )

@@ -1,0 +1,127 @@
+"""The convolution and its hand-written gradient."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jaxdn.ops import onednn
+from jaxdn.ops.convolution import convolve
+
+needs_onednn = pytest.mark.skipif(not onednn.available(), reason="the extra onednn is not installed")
+
+
+def _operands(inputs, outputs, size=(5, 6), count=2, dtype=jnp.float32):
+    rng = np.random.default_rng(inputs * 10 + outputs)
+    x = jnp.asarray(rng.standard_normal((count, *size, inputs)), dtype)
+    return x, jnp.asarray(rng.standard_normal((3, 3, inputs, outputs)), dtype)
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), [(2, 3), (3, 2), (2, 2)])
+@pytest.mark.parametrize("size", [(5, 6), (1, 4)])
+def test_gradient_is_that_of_the_function(inputs, outputs, size):
+    with jax.enable_x64(True):
+        x, kernel = _operands(inputs, outputs, size, dtype=jnp.float64)
+        check_grads(lambda x, k: convolve(x, k, implementation="blocked"), (x, kernel), order=1, modes=["rev"])
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), [(2, 3), (3, 2)])
+def test_training_form_agrees_with_automatic_gradient(inputs, outputs):
+    """grad(loss(scan(checkpoint(vmap(step))))) with one image per example, against jax's own convolution gradient."""
+    with jax.enable_x64(True):
+        frames, kernel = _operands(inputs, outputs, count=6, dtype=jnp.float64)
+        frames = frames.reshape(3, 2, *frames.shape[1:])
+
+        def gradient(implementation):
+            def step(state, x):
+                state = jnp.tanh(0.5 * state + convolve(x[None], kernel_, implementation=implementation)[0])
+                return state, jnp.sum(state**2)
+
+            def loss(k, frames):
+                nonlocal kernel_
+                kernel_ = k
+                state = jnp.zeros((*frames.shape[1:4], outputs))
+                return jnp.sum(jax.lax.scan(jax.checkpoint(jax.vmap(step)), state, frames)[1])
+
+            kernel_ = kernel
+            return jax.jit(jax.grad(loss, (0, 1)))(kernel, frames)
+
+        for ours, theirs in zip(gradient("blocked"), gradient("reference"), strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
+
+
+def test_bfloat16_kernel_gradient_is_summed_in_float32():
+    x, kernel = jnp.ones((1, 40, 40, 1), jnp.bfloat16), jnp.zeros((3, 3, 1, 1), jnp.bfloat16)
+    gradient = jax.grad(lambda k: jnp.sum(convolve(x, k, implementation="blocked").astype(jnp.float32)))(kernel)
+    assert gradient.dtype == jnp.bfloat16
+    assert float(gradient[1, 1, 0, 0]) == 1600.0  # a bfloat16 running sum of ones stops at 256
+
+
+def _all_of(function, implementation):
+    """(cotangent, x, kernel) -> value and both gradients, compiled."""
+
+    def run(cotangent, *arguments):
+        out, pull = jax.vjp(function(lambda x, k: convolve(x, k, implementation=implementation)), *arguments)
+        return out, *pull(cotangent)
+
+    return jax.jit(run)
+
+
+def _agree(function, cotangent, x, kernel):
+    """oneDNN's value and gradients are the automatic ones to single precision's digits, relative to the largest."""
+    got = _all_of(function, "onednn")(*(jnp.asarray(array, jnp.float32) for array in (cotangent, x, kernel)))
+    with jax.enable_x64(True):
+        wanted = _all_of(function, "reference")(*(jnp.asarray(array, jnp.float64) for array in (cotangent, x, kernel)))
+    for ours, theirs in zip(got, wanted, strict=True):
+        assert ours.dtype == jnp.float32
+        assert ours.shape == theirs.shape
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=3e-6 * float(np.abs(theirs).max()))
+
+
+@needs_onednn
+@pytest.mark.parametrize("size", [(6, 7), (1, 1), (1, 9), (17, 31)])
+@pytest.mark.parametrize(("count", "inputs", "outputs"), [(1, 14, 32), (3, 32, 51), (2, 3, 2)])
+def test_onednn_in_single_precision(size, count, inputs, outputs):
+    """What the shared contract cannot see, as it computes in double precision."""
+    rng = np.random.default_rng(inputs)
+    x, cotangent = (rng.standard_normal((count, *size, channels)) for channels in (inputs, outputs))
+    _agree(lambda convolve: convolve, cotangent, x, rng.standard_normal((3, 3, inputs, outputs)))
+
+
+@needs_onednn
+@pytest.mark.parametrize(
+    ("batch", "over_images", "over_kernels"),
+    [
+        (lambda f: jax.vmap(f, (0, None)), (3,), ()),
+        (lambda f: jax.vmap(f, (None, 0)), (), (3,)),
+        (jax.vmap, (3,), (3,)),
+        (lambda f: jax.vmap(jax.vmap(f, (None, 0)), (0, None)), (3,), (4,)),
+        (lambda f: jax.vmap(jax.vmap(f, (0, None)), (None, 0)), (3,), (4,)),
+    ],
+)
+def test_onednn_under_vmap(batch, over_images, over_kernels):
+    """Of images, of kernels, of both together and of both crossed; the gradients are those of the mapped function."""
+    rng = np.random.default_rng(0)
+    x, kernel = rng.standard_normal((*over_images, 2, 6, 7, 3)), rng.standard_normal((*over_kernels, 3, 3, 3, 5))
+    shape = jax.eval_shape(batch(convolve), jnp.asarray(x, jnp.float32), jnp.asarray(kernel, jnp.float32)).shape
+    _agree(batch, rng.standard_normal(shape), x, kernel)
+
+
+@needs_onednn
+def test_onednn_keeps_what_is_no_number_beside_its_pixel():
+    """A Winograd form, which is never asked for, would spread it over its tile."""
+    rng = np.random.default_rng(0)
+    x, kernel = rng.standard_normal((1, 12, 12, 16)).astype(np.float32), rng.standard_normal((3, 3, 16, 16))
+    x[0, 5, 6, 0] = np.nan
+    out = convolve(jnp.asarray(x), jnp.asarray(kernel, jnp.float32), implementation="onednn")
+    spoilt = np.zeros((12, 12), bool)
+    spoilt[4:7, 5:8] = True
+    np.testing.assert_array_equal(np.isnan(out[0]).any(axis=-1), spoilt)
+
+
+def test_onednn_that_is_not_installed_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("jaxdn.ops.onednn.PACKAGE", "no-such-package")
+    assert not onednn.available()
+    with pytest.raises(ValueError, match=r"pip install .*jaxdn\[onednn\]"):
+        convolve(*_operands(2, 3), implementation="onednn")

@@ -1,0 +1,145 @@
+"""Kernel application and scale composition."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from jax.test_util import check_grads
+
+from jaxdn.ops.kernels import apply_kernels, normalize_kernels
+from jaxdn.ops.softmax_filter import softmax_filter
+from jaxdn.scales import compose_scales, downsample, upsample
+
+SCALES = [(down, up) for down in ("mean", "max") for up in ("bilinear", "nearest")]
+
+
+@given(seed=st.integers(0, 2**16), scale=st.sampled_from([0.0, 1.0, 1e4]), taps=st.sampled_from([1, 9, 25]))
+def test_normalized_kernels_pass_a_constant_image_border_included(seed, scale, taps):
+    logits = np.random.default_rng(seed).standard_normal((5, 7, taps)).astype(np.float32) * scale
+    kernels = normalize_kernels(logits)
+    np.testing.assert_allclose(jnp.sum(kernels, axis=-1), 1, rtol=1e-6)
+    np.testing.assert_allclose(apply_kernels(jnp.full((5, 7, 3), 3.0), kernels), 3, rtol=1e-6)
+
+
+def test_normalized_kernels_of_half_precision_sum_to_one(rng):
+    kernels = normalize_kernels(jnp.asarray(rng.standard_normal((4, 4, 25)), jnp.bfloat16))
+    assert kernels.dtype == jnp.float32
+    np.testing.assert_allclose(jnp.sum(kernels, axis=-1), 1, rtol=1e-6)
+
+
+def test_softmax_filter_is_normalizing_and_applying(rng):
+    images, head = rng.random((2, 6, 5, 3)).astype(np.float32), rng.standard_normal((6, 5, 51)).astype(np.float32)
+    own = [head[..., :25], head[..., 25:50]]
+    expected = [apply_kernels(image, normalize_kernels(logits)) for image, logits in zip(images, own, strict=True)]
+    np.testing.assert_allclose(softmax_filter(images, head), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("images", "logits", "taps", "message"),
+    [
+        ((2, 6, 5, 3), (6, 5, 49), 25, "2 x 25 channels"),
+        ((6, 5, 3), (6, 5, 25), 25, r"\[n, 6, 5, C\]"),
+        ((1, 6, 5, 3), (6, 5, 25), 24, "K odd"),
+    ],
+)
+def test_softmax_filter_says_what_does_not_fit(images, logits, taps, message):
+    with pytest.raises(ValueError, match=message):
+        softmax_filter(np.zeros(images), np.zeros(logits), taps=taps)
+
+
+@pytest.mark.parametrize("tap", [0, 7, 12, 24])
+def test_one_tap_is_a_shift_with_repeated_edges(tap, rng):
+    image = rng.random((5, 7, 3)).astype(np.float32)
+    row, column = divmod(tap, 5)
+    expected = np.pad(image, ((2, 2), (2, 2), (0, 0)), mode="edge")[row : row + 5, column : column + 7]
+    kernels = jnp.broadcast_to(jax.nn.one_hot(tap, 25), (5, 7, 25))
+    np.testing.assert_array_equal(apply_kernels(image, kernels), expected)
+
+
+@pytest.mark.usefixtures("x64")
+def test_gradients_of_kernel_application(rng):
+    image, logits = jnp.asarray(rng.random((4, 3, 2))), jnp.asarray(rng.standard_normal((4, 3, 9)))
+
+    def filtered(image, logits):
+        def again(image, _):
+            return jnp.tanh(apply_kernels(image, normalize_kernels(logits))), None
+
+        return jax.lax.scan(again, image, length=2)[0]
+
+    check_grads(filtered, (image, logits), order=1, modes=["rev"])
+
+
+def test_bilinear_upsampling_is_a_resize(rng):
+    for size in [(4, 3), (1, 1), (1, 5)]:
+        image = rng.random((*size, 2)).astype(np.float32)
+        expected = jax.image.resize(image, (2 * size[0], 2 * size[1], 2), "bilinear")
+        np.testing.assert_allclose(upsample(image), expected, rtol=1e-6)
+    np.testing.assert_array_equal(upsample(image, up="nearest"), np.repeat(np.repeat(image, 2, 0), 2, 1))
+
+
+def test_downsampling_takes_blocks(rng):
+    image = rng.random((4, 6, 2)).astype(np.float32)
+    blocks = image.reshape(2, 2, 3, 2, 2)
+    np.testing.assert_allclose(downsample(image), blocks.mean((1, 3)), rtol=1e-6)
+    np.testing.assert_array_equal(downsample(image, down="max"), blocks.max((1, 3)))
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize(("down", "up"), SCALES)
+@pytest.mark.parametrize("alpha_size", [(4, 6), (2, 3)])
+def test_composition_is_the_formula(down, up, alpha_size, rng):
+    fine, coarse, alpha = rng.random((4, 6, 2)), rng.random((2, 3, 2)), rng.random((*alpha_size, 1))
+    blocks = fine.reshape(2, 2, 3, 2, 2)
+    small = blocks.mean((1, 3)) if down == "mean" else blocks.max((1, 3))
+
+    def larger(image):
+        if up == "nearest":
+            return np.repeat(np.repeat(image, 2, 0), 2, 1)
+        padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
+        out = np.empty((4, 6, 2))
+        for row in range(4):
+            for column in range(6):
+                y, x = (row + 0.5) / 2 + 0.5, (column + 0.5) / 2 + 0.5  # half-pixel centres, one pixel of padding
+                i, j = int(y), int(x)
+                fy, fx = y - i, x - j
+                upper = (1 - fx) * padded[i, j] + fx * padded[i, j + 1]
+                lower = (1 - fx) * padded[i + 1, j] + fx * padded[i + 1, j + 1]
+                out[row, column] = (1 - fy) * upper + fy * lower
+        return out
+
+    if alpha_size == (2, 3):
+        expected = fine - larger(alpha * small) + larger(alpha * coarse)
+    else:
+        expected = fine - alpha * larger(small) + alpha * larger(coarse)
+    out = compose_scales(fine, coarse, alpha, down=down, up=up)
+    np.testing.assert_allclose(out, expected, atol=1e-12)
+    check_grads(
+        lambda *arrays: jnp.sin(compose_scales(*arrays, down=down, up=up)),
+        tuple(map(jnp.asarray, (fine, coarse, alpha))),
+        order=1,
+        modes=["rev"],
+    )
+
+
+def test_composition_of_constants_is_constant():
+    for alpha in (jnp.full((4, 6, 1), 0.3), jnp.full((2, 3, 1), 0.3)):
+        out = compose_scales(jnp.full((4, 6, 3), 2.0), jnp.full((2, 3, 3), 2.0), alpha)
+        np.testing.assert_allclose(out, 2, rtol=1e-6)
+
+
+def test_errors_say_what_to_do():
+    image = jnp.zeros((4, 6, 3))
+    with pytest.raises(ValueError, match=r"K odd.*24"):
+        apply_kernels(image, jnp.zeros((4, 6, 24)))
+    with pytest.raises(ValueError, match=r"K odd.*16"):
+        apply_kernels(image, jnp.zeros((4, 6, 16)))
+    with pytest.raises(ValueError, match="multiple of 16"):
+        downsample(image[:3])
+    with pytest.raises(ValueError, match="multiple of 16"):
+        compose_scales(image[:3], image[:2, :3], image[:3, :, :1])
+    with pytest.raises(ValueError, match="half of fine"):
+        compose_scales(image, image, image[..., :1])
+    with pytest.raises(ValueError, match=r"alpha.*\(4, 6\) or \(2, 3\), got \(3, 6\)"):
+        compose_scales(image, image[:2, :3], image[:3, :, :1])

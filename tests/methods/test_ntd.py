@@ -1,0 +1,403 @@
+"""The neural temporal denoiser: its data flow against NumPy, hard cases, and gradients through time."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdn.denoiser import Denoiser
+from jaxdn.frame import FAR, Frame, frame_at
+from jaxdn.methods.ntd import State, depth_feature, ntd
+from jaxdn.rollout import unroll
+from tests.plainly import jit_plainly
+
+TINY = ((4,), (4,), (5,), (5,), (6,))
+VARIANTS: dict[str, dict[str, Any]] = {
+    "default": {},
+    "parity": {"preset": "parity"},
+    "fine": {"alpha_at": "fine", "up": "nearest", "first_frame": "noisy", "truncate": True},
+    "max": {"down": "max", "pyramid": "max", "depth_scale": "unit", "missing_history": "blend"},
+    "compressed": {"domain": "compressed", "motion": "traditional", "demodulate": False},
+}
+
+
+def tiny(**options: Any) -> Denoiser:
+    return ntd(size=TINY, **options)
+
+
+def random_frames(rng: np.random.Generator, size: tuple[int, int] = (16, 16), count: int = 2) -> Frame:
+    """Whole buffers of a clip; vectors of a pixel or two."""
+    shape = (count, *size)
+
+    def buffer(values: np.ndarray) -> jax.Array:
+        return jnp.asarray(values, jnp.float32)
+
+    motion = rng.normal(size=(*shape, 2))
+    return Frame(
+        radiance=buffer(rng.exponential(size=(*shape, 3))),
+        albedo=buffer(rng.uniform(size=(*shape, 3))),
+        normal=buffer(rng.normal(size=(*shape, 3))),
+        depth=buffer(rng.uniform(1, 9, size=(*shape, 1))),
+        motion=buffer(motion),
+        dual_motion=buffer(motion + rng.normal(size=(*shape, 2))),
+    )
+
+
+def initial(denoiser: Denoiser, key: jax.Array, frames: Frame) -> Any:
+    """Parameters whose biases matter too."""
+    params = denoiser.init(key, frame_at(frames, 0))
+    return jax.tree.map(lambda leaf: 1.5 * leaf + 0.1 * jax.random.normal(key, leaf.shape), params)
+
+
+def run(denoiser: Denoiser) -> Callable[[Any, Frame], jax.Array]:
+    return jax.jit(lambda params, frames: unroll(denoiser, params, frames))
+
+
+# What a frame goes through, in NumPy.
+
+
+def box(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    padded = np.pad(image, ((2, 2), (2, 2), (0, 0)), mode="edge")
+    return sum(kernel[5 * i + j] * padded[i : i + height, j : j + width] for i in range(5) for j in range(5))
+
+
+def half(image: np.ndarray, down: str = "mean") -> np.ndarray:
+    height, width, channels = image.shape
+    blocks = image.reshape(height // 2, 2, width // 2, 2, channels)
+    return blocks.mean(axis=(1, 3)) if down == "mean" else blocks.max(axis=(1, 3))
+
+
+def double(image: np.ndarray, up: str = "bilinear") -> np.ndarray:
+    for axis in (0, 1):
+        length = image.shape[axis]
+        position = (np.arange(2 * length) + 0.5) / 2 - 0.5
+        low = np.floor(position).astype(int)
+        weight = np.expand_dims(position - low, [other for other in range(3) if other != axis])
+        below, above = (image.take(np.clip(low + step, 0, length - 1), axis) for step in (0, 1))
+        image = np.repeat(image, 2, axis) if up == "nearest" else (1 - weight) * below + weight * above
+    return image
+
+
+def softmax(logits: np.ndarray) -> np.ndarray:
+    return np.exp(logits) / np.exp(logits).sum()
+
+
+def sigmoid(logit: float) -> float:
+    return 1 / (1 + np.exp(-logit))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"alpha_at": "fine", "up": "nearest", "down": "max"}, {"preset": "parity", "pyramid": "max"}],
+    ids=["default", "fine", "parity"],
+)
+def test_data_flow_with_known_heads(options: dict[str, Any], rng: np.random.Generator) -> None:
+    """Zero weights and chosen biases: the heads are constants, and the image can be worked out by hand."""
+    denoiser = tiny(**options)
+    fine = options.get("alpha_at") == "fine"
+    down = "max" if options else "mean"
+    up = options.get("up", "bilinear")
+    noisy, history = rng.exponential(size=(2, 16, 32, 3))
+    frame = Frame(jnp.asarray(noisy, jnp.float32))
+    params = jax.tree.map(jnp.zeros_like, denoiser.init(jax.random.key(0), frame))
+    heads = [rng.normal(size=params[f"head_{level}"]["bias"].shape) for level in range(3)]
+    assert [len(head) for head in heads] == ([52, 26, 25] if fine else [51, 26, 26])
+    for level, head in enumerate(heads):
+        params[f"head_{level}"]["bias"] = jnp.asarray(head, jnp.float32)
+    state = State(jnp.asarray(history, jnp.float32), jnp.asarray(3), jnp.asarray(0))
+    after, image = jax.jit(denoiser.step)(params, state, frame)
+
+    pyramid = options.get("pyramid", "mean")
+    scales = [noisy, half(noisy, pyramid), half(half(noisy, pyramid), pyramid)]
+    full, middle, coarse = (box(scale, softmax(head[:25])) for scale, head in zip(scales, heads, strict=True))
+    for finer, alpha in ((middle, heads[1][25] if fine else heads[2][25]), (full, heads[0][51 if fine else 0])):
+        if not fine and finer is full:
+            alpha = heads[1][25]
+        coarse = finer - sigmoid(alpha) * double(half(finer, down), up) + sigmoid(alpha) * double(coarse, up)
+    temporal = box(history, softmax(heads[0][25:50]))
+    current = sigmoid(heads[0][50])
+    wanted = np.maximum(current * coarse + (1 - current) * temporal, 0)
+    np.testing.assert_allclose(image, wanted, atol=1e-5)
+    np.testing.assert_array_equal(after.history, image)
+    assert after.age == 4
+
+
+def blending(params: Any, logit: float) -> Any:
+    """The same parameters with alpha^t the same everywhere."""
+    head = params["head_0"]
+    kernel, bias = head["kernel"].at[..., 50].set(0.0), head["bias"].at[50].set(logit)
+    return {**params, "head_0": {"kernel": kernel, "bias": bias}}
+
+
+def test_alpha_weighs_the_current_frame_and_missing_history_is_not_used(
+    rng: np.random.Generator, key: jax.Array
+) -> None:
+    denoiser = tiny(demodulate=False)
+    frames = random_frames(rng)
+    params, frame = initial(denoiser, key, frames), frame_at(frames, 1)
+    broken = frame.dual_motion.at[4, 5].set(jnp.nan).at[9, 9].set(jnp.asarray([40.0, 0.0]))
+    frame = frame._replace(dual_motion=jnp.clip(broken, -1e3, 1e3))
+    step = jax.jit(denoiser.step)
+
+    def image(logit: float, level: float) -> np.ndarray:
+        state = State(jnp.full((16, 16, 3), level), jnp.asarray(1), jnp.asarray(0))
+        return np.asarray(step(blending(params, logit), state, frame)[1])
+
+    # A history of 1000 against a noise of about 1: where it is used, it shows.
+    brightest = image(-50.0, 1000.0)
+    assert np.median(brightest) > 500
+    assert brightest[4, 5].max() < 20
+    assert brightest[9, 9].max() < 20
+    assert image(50.0, 1000.0).max() < 20
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_constant_radiance_stays(name: str, rng: np.random.Generator, key: jax.Array) -> None:
+    """Softmax kernels, means and maxima keep a constant, the border ring included, whatever the network says."""
+    denoiser = tiny(**VARIANTS[name])
+    frames = random_frames(rng, (19, 21))
+    frames = frames._replace(radiance=jnp.full_like(frames.radiance, 0.7))
+    if name == "parity":  # the paper's zeros beyond the border are not constant
+        frames = frames._replace(motion=None, dual_motion=None)
+    if VARIANTS[name].get("demodulate", name != "parity"):  # radiance over albedo is what is constant here
+        usable = jnp.where(frames.albedo > 0.01, frames.albedo, 1.0)
+        frames = frames._replace(radiance=0.7 * usable)
+    images = run(denoiser)(initial(denoiser, key, frames), frames)
+    np.testing.assert_allclose(images, frames.radiance, rtol=3e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (33, 57)])
+def test_any_size(size: tuple[int, int], rng: np.random.Generator, key: jax.Array) -> None:
+    denoiser = tiny()
+    frames = random_frames(rng, size)
+    images = np.asarray(run(denoiser)(initial(denoiser, key, frames), frames))
+    assert images.shape == (2, *size, 3)
+    assert np.all(np.isfinite(images))
+    assert images.min() >= 0
+    assert np.std(images) > 0
+
+
+@pytest.mark.parametrize("preset", [None, "parity"])
+def test_none_is_the_neutral_value_written_out(preset: str | None, rng: np.random.Generator, key: jax.Array) -> None:
+    denoiser = tiny(preset=preset)
+    frames = random_frames(rng)
+    bare = Frame(frames.radiance)
+    zero = jnp.zeros_like(frames.motion)
+    written = Frame(
+        frames.radiance,
+        albedo=jnp.ones_like(frames.albedo),
+        normal=jnp.zeros_like(frames.normal),
+        depth=jnp.zeros_like(frames.depth),
+        motion=zero,
+        dual_motion=zero,
+    )
+    params = initial(denoiser, key, frames)
+    assert jax.tree.all(jax.tree.map(lambda a, b: a.shape == b.shape, params, denoiser.init(key, frame_at(bare, 0))))
+    forward = run(denoiser)
+    np.testing.assert_allclose(forward(params, bare), forward(params, written), atol=1e-5)
+    flops = [forward.lower(params, each).cost_analysis()["flops"] for each in (bare, written)]
+    assert flops[0] < flops[1]
+    assert len(forward.lower(params, bare).as_text()) < len(forward.lower(params, written).as_text())
+
+
+def test_without_motion_nothing_is_gathered(rng: np.random.Generator, key: jax.Array) -> None:
+    denoiser = tiny()
+    frame = frame_at(random_frames(rng), 0)
+    params = denoiser.init(key, frame)
+
+    def text(frame: Frame) -> str:
+        return jax.jit(denoiser.step).lower(params, denoiser.start(params, frame), frame).as_text()
+
+    assert "gather" in text(frame)
+    assert "gather" not in text(frame._replace(motion=None, dual_motion=None))
+
+
+def test_dual_motion_falls_back_and_traditional_ignores_it(rng: np.random.Generator, key: jax.Array) -> None:
+    frames = random_frames(rng)
+    dual, traditional = tiny(), tiny(motion="traditional")
+    assert dual.reads == {"albedo", "normal", "depth", "motion", "dual_motion"}
+    assert traditional.reads == {"albedo", "normal", "depth", "motion"}
+    params = initial(dual, key, frames)
+    with_dual = run(dual)(params, frames)
+    fallen_back = run(dual)(params, frames._replace(dual_motion=None))
+    np.testing.assert_array_equal(run(traditional)(params, frames), fallen_back)
+    assert np.abs(with_dual - fallen_back).max() > 1e-3
+
+
+@pytest.mark.parametrize("preset", [None, "parity"])
+def test_first_frame_uses_no_history_and_no_motion(
+    preset: str | None, rng: np.random.Generator, key: jax.Array
+) -> None:
+    denoiser = tiny(preset=preset)
+    frames = random_frames(rng)
+    params, frame = initial(denoiser, key, frames), frame_at(frames, 0)
+    step = jax.jit(denoiser.step)
+    start = denoiser.start(params, frame)
+    _, image = step(params, start, frame)
+    poisoned = start._replace(history=jnp.full_like(start.history, jnp.nan))
+    elsewhere = frame._replace(motion=3 * frame.motion, dual_motion=jnp.full_like(frame.motion, 7.3))
+    np.testing.assert_array_equal(step(params, poisoned, elsewhere)[1], image)
+
+
+POISON = (np.nan, np.inf, -np.inf, 1e30, -1.0)
+
+
+def test_poison_stays_finite_and_is_counted(rng: np.random.Generator, key: jax.Array) -> None:
+    denoiser = tiny()
+    frames = random_frames(rng)
+    params = initial(denoiser, key, frames)
+    gradient = jax.jit(jax.value_and_grad(lambda params, frames: jnp.sum(jnp.log1p(unroll(denoiser, params, frames)))))
+    step = jax.jit(denoiser.step)
+    for name in ("radiance", "albedo", "normal", "depth", "motion", "dual_motion"):
+        for value in POISON:
+            buffer = getattr(frames, name).at[0, 3, 4, 0].set(value)
+            poisoned = frames._replace(**{name: buffer})
+            total, slope = gradient(params, poisoned)
+            assert np.isfinite(total), (name, value)
+            assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slope)), (name, value)
+    first = frame_at(frames, 0)
+    broken = first._replace(radiance=first.radiance.at[3, 4].set(jnp.nan))
+    state, image = step(params, denoiser.start(params, broken), broken)
+    assert state.repaired == 3
+    assert np.all(np.isfinite(image))
+    state = state._replace(history=state.history.at[2, 2].set(jnp.nan).at[3, 3].set(jnp.inf))
+    state, image = step(params, state, first)
+    assert np.all(np.isfinite(image))
+    assert np.all(np.isfinite(state.history))
+    assert image.max() <= 65504
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["default", "parity", "compressed"])
+def test_gradient_through_time(name: str, rng: np.random.Generator, key: jax.Array, x64: None) -> None:
+    """Scan and unrolled loop agree, and with central differences along random directions."""
+    denoiser = tiny(**VARIANTS[name])
+    frames = jax.tree.map(lambda buffer: jnp.asarray(buffer, jnp.float64), random_frames(rng))
+    params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), initial(denoiser, key, frames))
+    weights = jnp.asarray(rng.normal(size=frames.radiance.shape))
+
+    def scanned(params: Any) -> jax.Array:
+        return jnp.mean(weights * unroll(denoiser, params, frames))
+
+    def looped(params: Any) -> jax.Array:
+        state, images = denoiser.start(params, frame_at(frames, 0)), []
+        for index in range(2):
+            state, image = denoiser.step(params, state, frame_at(frames, index))
+            images.append(image)
+        return jnp.mean(weights * jnp.stack(images))
+
+    gradient = jit_plainly(jax.grad(scanned))(params)
+    flat = jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(gradient)])
+    assert jnp.linalg.norm(flat) > 1e-3
+    if name == "default":
+        same = jit_plainly(jax.grad(looped))(params)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), gradient, same)
+    value = jit_plainly(scanned)
+    for seed in range(3):
+        keys = jax.random.split(jax.random.key(seed), len(jax.tree.leaves(params)))
+        keys = jax.tree.unflatten(jax.tree.structure(params), list(keys))
+        way = jax.tree.map(lambda key, leaf: jax.random.normal(key, leaf.shape, leaf.dtype), keys, params)
+        ahead, behind = (jax.tree.map(lambda p, d, s=s: p + s * d, params, way) for s in (1e-7, -1e-7))
+        measured = (value(ahead) - value(behind)) / 2e-7
+        claimed = sum(jnp.vdot(a, b) for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(way), strict=True))
+        np.testing.assert_allclose(measured, claimed, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("truncate", [False, True])
+def test_truncation_stops_the_gradient_at_the_history(truncate: bool, rng: np.random.Generator, key: jax.Array) -> None:
+    denoiser = tiny(truncate=truncate)
+    frames = random_frames(rng)
+    params = initial(denoiser, key, frames)
+    slope = jit_plainly(
+        jax.grad(lambda radiance: jnp.sum(unroll(denoiser, params, frames._replace(radiance=radiance))[1]))
+    )(frames.radiance)
+    assert np.any(slope[1])
+    assert np.any(slope[0]) != truncate
+
+
+@pytest.mark.slow
+def test_batch_is_each_clip_alone(rng: np.random.Generator, key: jax.Array) -> None:
+    denoiser = tiny()
+    clips = [random_frames(rng) for _ in range(2)]
+    batch = jax.tree.map(lambda *buffers: jnp.stack(buffers), *clips)
+    params = initial(denoiser, key, clips[0])
+
+    def loss(params: Any, frames: Frame) -> jax.Array:
+        return jnp.mean(unroll(denoiser, params, frames) ** 2)
+
+    alone = jit_plainly(jax.value_and_grad(loss))
+    together = jit_plainly(jax.value_and_grad(lambda params: jnp.mean(jax.vmap(loss, (None, 0))(params, batch))))
+    value, slope = together(params)
+    values, slopes = zip(*[alone(params, clip) for clip in clips], strict=True)
+    np.testing.assert_allclose(value, sum(values) / 2, rtol=1e-5)
+    for whole, first, second in zip(*map(jax.tree.leaves, (slope, *slopes)), strict=True):
+        np.testing.assert_allclose(whole, (first + second) / 2, atol=1e-4 * max(1e-3, np.abs(whole).max()))
+
+
+def test_a_clip_is_one_program(rng: np.random.Generator, key: jax.Array) -> None:
+    denoiser, traced = tiny(), []
+
+    def step(*arguments: Any) -> Any:
+        traced.append(arguments)
+        return denoiser.step(*arguments)
+
+    counted = run(denoiser._replace(step=step))
+    frames = random_frames(rng, count=5)
+    params = initial(denoiser, key, frames)
+    counted(params, frames)
+    counted(params, random_frames(rng, count=5))
+    assert counted._cache_size() == 1
+    assert len(traced) == 1
+
+
+def test_half_precision_is_close(rng: np.random.Generator, key: jax.Array) -> None:
+    frames = random_frames(rng)
+    params = initial(tiny(), key, frames)
+    images = run(tiny(compute_dtype="bfloat16"))(params, frames)
+    assert images.dtype == jnp.float32
+    wanted = run(tiny())(params, frames)
+    assert np.abs(images - wanted).max() < 0.1
+    assert np.abs(images - wanted).max() > 0
+
+
+def test_depth_feature_is_free_of_units(rng: np.random.Generator) -> None:
+    depth = jnp.asarray(rng.uniform(0.5, 40, size=(6, 7, 1)), jnp.float32).at[0, 0].set(FAR)
+    feature = depth_feature(depth)
+    middle = np.exp(np.mean(np.log(np.delete(np.asarray(depth, np.float64).ravel(), 0))))
+    np.testing.assert_allclose(feature, depth / (depth + middle), rtol=1e-5)
+    np.testing.assert_allclose(depth_feature(jnp.where(depth == FAR, FAR, 1000 * depth))[1:], feature[1:], rtol=1e-5)
+    np.testing.assert_allclose(depth_feature(depth, scale="unit"), depth / (depth + 1))
+    for empty in (jnp.zeros((2, 2, 1)), jnp.full((2, 2, 1), FAR)):
+        assert np.all(np.isfinite(jax.grad(lambda z: jnp.sum(depth_feature(z)))(empty)))
+    assert not np.any(depth_feature(jnp.zeros((2, 2, 1))))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        *({name: "nonsense"} for name in ("size", "motion", "preset", "alpha_at", "down", "up", "pyramid", "domain")),
+        *({name: "nonsense"} for name in ("depth_scale", "border", "first_frame", "missing_history")),
+        *({name: "nonsense"} for name in ("demodulate", "truncate", "compute_dtype")),
+    ],
+    ids=lambda options: next(iter(options)),
+)
+def test_unknown_options_raise(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(options))):
+        ntd(**options)
+
+
+def test_wrong_shapes_raise(rng: np.random.Generator, key: jax.Array) -> None:
+    denoiser = tiny()
+    frames = random_frames(rng)
+    frame = frame_at(frames, 0)
+    params = denoiser.init(key, frame)
+    state = denoiser.start(params, frame)
+    with pytest.raises(ValueError, match=r"frame\.radiance: expected \[H, W, C\]"):
+        denoiser.step(params, state, frames)
+    with pytest.raises(ValueError, match=r"frame\.albedo"):
+        denoiser.step(params, state, frame._replace(albedo=frame.albedo[:8]))

@@ -1,0 +1,458 @@
+"""SVGF against a float64 reference written pixel by pixel, and what must hold for any filter of its kind."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdn.filters.atrous import B3_SPLINE, edge_average, edges_of, stencil
+from jaxdn.filters.reprojection import reproject
+from jaxdn.frame import FAR, Frame
+from jaxdn.methods.svgf import SvgfState, svgf
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+HEIGHT, WIDTH = 10, 12
+DENOISER = svgf(levels=3)
+STEP = jax.jit(DENOISER.step)
+
+
+def moving_frames(rng, count=3, dtype=np.float32):
+    """A slanted plane behind a box that slides to the right while the camera pans by parts of a pixel; sky above."""
+    frames = []
+    y, x = np.mgrid[:HEIGHT, :WIDTH].astype(np.float64)
+    for index in range(count):
+        ids = np.zeros((HEIGHT, WIDTH), np.int32)
+        depth = 6 + 0.3 * x + 0.1 * y
+        normal = np.broadcast_to(np.array([0.0, 0.6, -0.8]), (HEIGHT, WIDTH, 3)).copy()
+        motion = np.broadcast_to(np.array([0.4, -0.3]), (HEIGHT, WIDTH, 2)).copy()
+        previous = depth + 0.3 * 0.4 - 0.1 * 0.3
+        left = 2 + index
+        box = (x >= left) & (x < left + 5) & (y >= 4) & (y < 8)
+        ids[box], depth[box], previous[box] = 3, 3.0, 3.05
+        normal[box] = np.array([0.05, 0.0, -1.0]) / np.hypot(0.05, 1.0)
+        motion[box] = np.array([-1.25, 0.5])
+        sky = y < 1
+        ids[sky], depth[sky], previous[sky], normal[sky] = -1, FAR, FAR, 0.0
+        motion[2, 3] = np.nan
+        buffers = {
+            "radiance": rng.gamma(0.5, 1.0, (HEIGHT, WIDTH, 3)),
+            "albedo": np.where(rng.random((HEIGHT, WIDTH, 3)) < 0.1, 0.0, rng.uniform(0.1, 1.0, (HEIGHT, WIDTH, 3))),
+            "normal": normal,
+            "depth": depth[..., None],
+            "previous_depth": previous[..., None],
+            "motion": motion,
+        }
+        frames.append(Frame(**{k: v.astype(dtype) for k, v in buffers.items()}, ids=ids[..., None]))
+    return frames
+
+
+# The reference: plain loops, float64, written from the equations.
+
+
+def reference_slopes(depth, ids):
+    out = np.zeros((*depth.shape, 2))
+    height, width = depth.shape
+    for y in range(height):
+        for x in range(width):
+            for axis, (dy, dx) in enumerate(((0, 1), (1, 0))):
+                found = []
+                for sign in (1, -1):
+                    v, u = y + sign * dy, x + sign * dx
+                    if 0 <= v < height and 0 <= u < width and ids[v, u] == ids[y, x]:
+                        found.append(sign * (depth[v, u] - depth[y, x]))
+                out[y, x, axis] = min(found, key=abs) if found else 0.0
+    return out
+
+
+def reference_average(values, taps, p, geometry, step=1, light=None, variance=None):
+    """Mean of values [H,W,C] at p = (y, x) and the variance of the mean; geometry = (hit, depth, slopes, normal)."""
+    hit, depth, slopes, normal = geometry
+    height, width = depth.shape
+    y, x = p
+    total, weights, spread = 0.0, 0.0, 0.0
+    for dy, dx, h in taps:
+        v, u = y + int(dy) * step, x + int(dx) * step
+        if not (0 <= v < height and 0 <= u < width) or not hit[v, u]:
+            continue
+        w = h
+        if (dy, dx) != (0, 0):
+            offset = np.array([dx, dy]) * step
+            eps = 1e-3 * depth[p] * np.hypot(*offset) / height
+            w *= np.exp(-abs(depth[p] - depth[v, u]) / (abs(slopes[p] @ offset) + eps))
+            w *= max(0.0, normal[p] @ normal[v, u]) ** 128
+            if light is not None:
+                w *= np.exp(-abs(light[0][p] - light[0][v, u]) / (4 * light[1][p] + 1e-4))
+        total, weights = total + w * values[v, u], weights + w
+        spread += 0 if variance is None else w * w * variance[v, u]
+    return total / weights, spread / weights**2
+
+
+def reference_blur(variance):
+    wide = np.pad(variance, 1, mode="edge")
+    kernel = np.outer([1, 2, 1], [1, 2, 1]) / 16
+    return sum(
+        kernel[i, j] * wide[i : i + variance.shape[0], j : j + variance.shape[1]] for i in range(3) for j in range(3)
+    )
+
+
+def reference_history(past, frame, p, expected_tolerance):
+    """Mean of the accepted taps of past = (history, depth, normal, ids) for pixel p, or None."""
+    history, depth, normal, ids = past
+    height, width = depth.shape
+    y, x = p
+    m = frame.motion[p].astype(np.float64)
+    if not np.isfinite(m).all():
+        return None
+
+    def accepted(v, u):
+        if not (0 <= v < height and 0 <= u < width):
+            return False
+        expected, tolerance = expected_tolerance
+        close = abs(depth[v, u] - expected[p]) <= tolerance[p]
+        return close and normal[v, u] @ frame.normal[p] > 0.9 and ids[v, u] == frame.ids[p][0]
+
+    row, column = y + m[1], x + m[0]
+    top, left = int(np.floor(row)), int(np.floor(column))
+    total, weights = np.zeros(6), 0.0
+    for v in (top, top + 1):
+        for u in (left, left + 1):
+            share = (1 - abs(row - v)) * (1 - abs(column - u))
+            if accepted(v, u):
+                total, weights = total + share * history[v, u], weights + share
+    if weights >= 0.01:
+        return total / weights
+    near = int(np.floor(row + 0.5)), int(np.floor(column + 0.5))
+    found = [
+        history[near[0] + i, near[1] + j] for i in (-1, 0, 1) for j in (-1, 0, 1) if accepted(near[0] + i, near[1] + j)
+    ]
+    return np.mean(found, axis=0) if found else None
+
+
+def reference_step(past, frame, levels=3):
+    frame = Frame(*(None if b is None else np.asarray(b, np.float64) for b in frame))
+    ids, depth = frame.ids[..., 0], frame.depth[..., 0]
+    hit = (ids >= 0) & (depth < FAR)
+    slopes = reference_slopes(depth, ids)
+    geometry = (hit, depth, slopes, frame.normal)
+    expected = frame.previous_depth[..., 0]
+    tolerance = 0.02 * expected + 2 * np.abs(slopes).sum(-1)
+    divisor = np.where(frame.albedo > 0.01, frame.albedo, 1.0)
+    incident = frame.radiance / divisor
+    light = incident @ LUMINANCE
+    history = np.zeros((HEIGHT, WIDTH, 6))
+    for p in np.ndindex(HEIGHT, WIDTH):
+        fetched = None if past is None else reference_history(past, frame, p, (expected, tolerance))
+        now = np.concatenate([incident[p], [light[p], light[p] ** 2]])
+        if fetched is None:
+            history[p] = [*now, 1.0]
+        else:
+            length = min(fetched[5] + 1, 32)
+            share = max(0.2, 1 / length)
+            history[p] = [*((1 - share) * fetched[:5] + share * now), length]
+    color = history[..., :3].copy()
+    variance = np.maximum(history[..., 4] - history[..., 3] ** 2, 0)
+    seven = [(dy, dx, 1.0) for dy in range(-3, 4) for dx in range(-3, 4)]
+    for p in np.ndindex(HEIGHT, WIDTH):
+        if history[p][5] < 4 and hit[p]:
+            mean, _ = reference_average(history[..., :5], seven, p, geometry)
+            color[p], variance[p] = mean[:3], max(0, mean[4] - mean[3] ** 2) * 4 / history[p][5]
+    spline = np.array([1, 4, 6, 4, 1]) / 16
+    taps = [(i - 2, j - 2, spline[i] * spline[j]) for i in range(5) for j in range(5)]
+    for level in range(levels):
+        guide = np.sqrt(np.maximum(reference_blur(variance), 1e-10))
+        levels_light = color @ LUMINANCE
+        filtered, spread = color.copy(), variance.copy()
+        for p in np.ndindex(HEIGHT, WIDTH):
+            if hit[p]:
+                filtered[p], spread[p] = reference_average(
+                    color, taps, p, geometry, 2**level, (levels_light, guide), variance
+                )
+        # A pixel that sees nothing has no variance of its own; the blur of the next level may look at it.
+        color, variance = filtered, spread
+        if level == 0:
+            feedback = color
+    image = np.where(hit[..., None], color * divisor, frame.radiance)
+    kept = np.concatenate([feedback, history[..., 3:]], axis=-1)
+    return (kept, depth, frame.normal, ids), image, hit
+
+
+def test_three_frames_match_the_reference(rng):
+    frames = moving_frames(rng)
+    state, past = DENOISER.start({}, frames[0]), None
+    lengths = []
+    for frame in frames:
+        state, image = STEP({}, state, frame)
+        past, expected, hit = reference_step(past, frame)
+        np.testing.assert_allclose(image, expected, rtol=2e-3, atol=2e-4)
+        np.testing.assert_allclose(state.history[hit], past[0][hit], rtol=2e-3, atol=2e-4)
+        lengths.append(np.asarray(state.history[..., 5])[hit])
+    # The clip exercises what it should: short and long histories, and their mixtures.
+    assert (lengths[0] == 1).all()
+    assert (lengths[2] == 1).any()
+    assert (lengths[2] == 3).any()
+
+
+def test_pixels_without_a_surface_pass_through(rng):
+    frame = moving_frames(rng, 1)[0]
+    _, image = STEP({}, DENOISER.start({}, frame), frame)
+    np.testing.assert_array_equal(image[0], frame.radiance[0])
+
+
+def test_a_constant_image_stays(rng):
+    frame = moving_frames(rng, 1)[0]
+    frame = frame._replace(radiance=frame.albedo * 0 + np.float32(0.37), albedo=np.full_like(frame.albedo, 0.6))
+    state = DENOISER.start({}, frame)
+    for _ in range(3):
+        state, image = STEP({}, state, frame)
+        np.testing.assert_allclose(image, 0.37, rtol=1e-5)
+
+
+def test_static_history_counts_up_and_is_the_mean_while_it_does(rng):
+    denoiser = svgf(levels=1, feedback_level=0, history_max=6, demodulate=False)
+    step = jax.jit(denoiser.step)
+    noise = rng.gamma(0.5, 1.0, (8, 6, 7, 3)).astype(np.float32)
+    state = denoiser.start({}, Frame(noise[0]))
+    for index, radiance in enumerate(noise):
+        state, _ = step({}, state, Frame(radiance))
+        length = min(index + 1, 6)
+        np.testing.assert_array_equal(state.history[..., 5], length)
+        if index < 5:  # 1/N is still at least alpha
+            seen = noise[: index + 1].astype(np.float64)
+            np.testing.assert_allclose(state.history[..., :3], seen.mean(0), rtol=1e-5)
+            light = seen @ LUMINANCE
+            moments = np.stack([light.mean(0), (light**2).mean(0)], -1)
+            np.testing.assert_allclose(state.history[..., 3:5], moments, rtol=1e-5)
+    assert int(state.age) == 8
+
+
+def test_variance_of_white_noise_after_one_level():
+    """All weights open: the 5x5 B3 kernel leaves (70/256)^2 = 0.0747681 of the variance, and the mean."""
+    values = jnp.ones((3, 15, 17))
+    mean, variance = edge_average(
+        values, edges_of(None, None, None), stencil(2, kernel=B3_SPLINE), variance=jnp.full((15, 17), 2.0)
+    )
+    np.testing.assert_allclose(mean, 1.0, rtol=1e-6)
+    np.testing.assert_allclose(variance[2:-2, 2:-2], 2.0 * 0.0747681, rtol=1e-5)
+    assert float(variance[0, 0]) > 2.0 * 0.0747681  # half the taps at the border
+
+
+def test_strips_do_not_show(rng, monkeypatch):
+    values = rng.random((2, 19, 11)).astype(np.float32)
+    depth = (3 + rng.random((19, 11, 1))).astype(np.float32)
+    needed = np.zeros((19, 11), bool)
+    needed[9, 4] = True
+    arguments = (values, edges_of(jnp.asarray(depth), None, None), stencil(3))
+    whole, _ = edge_average(*arguments)
+    monkeypatch.setattr("jaxdn.filters.atrous._STRIP_PIXELS", 1)
+    strips, _ = edge_average(*arguments)
+    some, _ = edge_average(*arguments, needed=jnp.asarray(needed))
+    np.testing.assert_allclose(strips, whole, rtol=1e-6)
+    np.testing.assert_allclose(some[:, 8:16], whole[:, 8:16], rtol=1e-6)
+    np.testing.assert_array_equal(some[:, 16:], 0)
+
+
+def test_the_first_frame_reads_no_history_and_no_motion(rng):
+    frame = moving_frames(rng, 1)[0]
+    clean = DENOISER.start({}, frame)
+    poisoned = SvgfState(clean.history * np.nan, clean.guides * np.nan, clean.age, clean.repaired)
+    elsewhere = frame._replace(motion=np.full_like(frame.motion, 3.3))
+    expected_state, expected = STEP({}, clean, frame)
+    for state, given in ((poisoned, frame), (clean, elsewhere)):
+        after, image = STEP({}, state, given)
+        np.testing.assert_array_equal(image, expected)
+        np.testing.assert_array_equal(after.history, expected_state.history)
+
+
+def test_broken_history_is_dropped_where_it_is_broken(rng):
+    frames = moving_frames(rng, 2)
+    state, _ = STEP({}, DENOISER.start({}, frames[0]), frames[0])
+    broken = state._replace(history=state.history.at[6, 4, 1].set(np.nan))
+    after, image = STEP({}, broken, frames[1])
+    assert np.isfinite(image).all()
+    assert np.isfinite(after.history).all()
+    assert int(after.repaired) > int(STEP({}, state, frames[1])[0].repaired)
+
+
+NEUTRAL = {"albedo": 1.0, "motion": 0.0, "depth": 0.0, "normal": 0.0}
+
+
+def neutral(frame, names, *, written):
+    """The frame with these buffers absent, or with the same said by their neutral values."""
+    values = dict.fromkeys(names)
+    if written:
+        values = {name: np.full_like(getattr(frame, name), NEUTRAL.get(name, 0.0)) for name in names}
+        if "previous_depth" in names and "depth" not in names:
+            values["previous_depth"] = frame.depth
+    return frame._replace(**values)
+
+
+@pytest.mark.parametrize("names", [("motion", "previous_depth"), (*NEUTRAL, "previous_depth")], ids=["motion", "all"])
+def test_none_is_the_neutral_value_written_out(rng, names):
+    frames = moving_frames(rng, 2)
+    images = []
+    for written in (True, False):
+        given = [neutral(frame, names, written=written) for frame in frames]
+        state = DENOISER.start({}, given[0])
+        for frame in given:
+            state, image = STEP({}, state, frame)
+        images.append(image)
+    np.testing.assert_allclose(images[0], images[1], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [*NEUTRAL, "previous_depth"])
+def test_an_absent_buffer_leaves_no_operation(rng, name):
+    frame = moving_frames(rng, 1)[0]
+    if name == "depth":
+        frame = frame._replace(previous_depth=None)
+    sizes = []
+    for written in (True, False):
+        given = neutral(frame, (name,), written=written)
+        lowered = jax.jit(DENOISER.step).lower({}, DENOISER.start({}, given), given)
+        sizes.append(len(lowered.as_text().splitlines()))
+    assert sizes[1] < sizes[0]
+
+
+POISON = [np.nan, np.inf, -np.inf, 1e30, -1.0]
+
+
+@pytest.mark.slow
+def test_poison_stays_local_and_leaves(rng):
+    """One bad pixel in each buffer: finite everywhere, changed within the footprint only, gone when history ran out.
+
+    The footprint of 1 level after a 7x7 estimate is 3 + 2 + 1 px, of the history one pixel more a frame. With
+    ``history_max`` the poisoned frame's share falls by 1 - alpha a frame; where the renderer repeats the same data the
+    first-moment history forgets 1e-4 of the clamped value only after 60 frames, so the test shortens alpha to 1.
+    """
+    denoiser = svgf(levels=1, alpha=1.0, alpha_moments=1.0)
+    step = jax.jit(denoiser.step)
+    size = 24
+    radiance = rng.gamma(0.5, 1.0, (size, size, 3)).astype(np.float32)
+    ones = np.ones((size, size, 1), np.float32)
+    clean = Frame(
+        radiance,
+        albedo=np.full((size, size, 3), 0.5, np.float32),
+        normal=ones * np.array([[[0, 0, 1]]], np.float32),
+        depth=5 * ones,
+        previous_depth=5 * ones,
+        motion=np.zeros((size, size, 2), np.float32),
+    )
+
+    def run(frames):
+        state, images = denoiser.start({}, clean), []
+        for frame in frames:
+            state, image = step({}, state, frame)
+            images.append(np.asarray(image))
+        assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
+        return images
+
+    expected = run([clean] * 8)
+    rows, columns = np.mgrid[:size, :size]
+    for name in ("radiance", "albedo", "normal", "depth", "previous_depth", "motion"):
+        for value in POISON:
+            bad = np.array(getattr(clean, name))
+            bad[12, 12, 0] = value
+            images = run([clean, clean._replace(**{name: bad}), *[clean] * 6])
+            for index, (image, truth) in enumerate(zip(images, expected, strict=True)):
+                assert np.isfinite(image).all()
+                assert (image >= 0).all()
+                reach = 6 + max(0, index - 1)
+                outside = np.maximum(abs(rows - 12), abs(columns - 12)) > reach
+                np.testing.assert_allclose(image[outside], truth[outside], rtol=1e-5, err_msg=f"{name} {value} {index}")
+            # N is back at 4 five frames later: nothing tells the clips apart.
+            np.testing.assert_allclose(images[7], expected[7], rtol=1e-4, atol=1e-5, err_msg=f"{name} {value}")
+
+
+@pytest.mark.slow
+def test_a_clip_is_one_program_and_vmap_is_a_loop(rng):
+    frames = jax.tree.map(lambda *b: np.stack(b), *moving_frames(rng, 4))
+    traced = 0
+
+    def body(state, frame):
+        nonlocal traced
+        traced += 1
+        return DENOISER.step({}, state, frame)
+
+    start = DENOISER.start({}, jax.tree.map(lambda b: b[0], frames))
+    _, images = jax.jit(lambda s, f: jax.lax.scan(body, s, f))(start, frames)
+    assert traced == 1
+    state = start
+    for index in range(4):
+        state, image = STEP({}, state, jax.tree.map(lambda b, i=index: b[i], frames))
+        np.testing.assert_allclose(images[index], image, rtol=1e-4, atol=1e-5)
+
+    pair = jax.tree.map(lambda b: b[:2], frames)
+    starts = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)
+    _, both = jax.jit(jax.vmap(DENOISER.step, in_axes=({}, 0, 0)))({}, starts, pair)
+    for index in range(2):
+        _, alone = STEP({}, state, jax.tree.map(lambda b, i=index: b[i], pair))
+        np.testing.assert_allclose(both[index], alone, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_gradients_are_finite(rng):
+    denoiser = svgf(levels=2)
+    frames = moving_frames(rng, 2)
+    black = [frame._replace(radiance=frame.radiance * (frame.ids != 3)) for frame in frames]
+    names = ("radiance", "albedo", "normal", "depth", "previous_depth")
+
+    def loss(given):
+        state = denoiser.start({}, black[0])
+        for frame, buffers in zip(black, given, strict=True):
+            state, image = denoiser.step({}, state, frame._replace(**buffers))
+        return jnp.sum(image**2)
+
+    given = [{name: jnp.asarray(getattr(frame, name)) for name in names} for frame in black]
+    gradient = jax.jit(jax.grad(loss))(given)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    assert all(float(jnp.abs(each["radiance"]).max()) > 0 for each in gradient)
+
+
+def test_double_precision_stays_double(x64, rng):
+    frame = moving_frames(rng, 1, np.float64)[0]
+    frame = jax.tree.map(jnp.asarray, frame)
+    denoiser = svgf(levels=1)
+    state, image = jax.eval_shape(lambda f: denoiser.step({}, denoiser.start({}, f), f), frame)
+    assert image.dtype == state.history.dtype == jnp.float64
+
+
+def test_a_rejected_tap_may_be_anything(rng):
+    packed = rng.random((5, 6, 2)).astype(np.float32)
+    packed[2, 3] = np.nan
+    motion = np.full((5, 6, 2), 0.5, np.float32)
+    fetch = jax.jit(lambda packed, motion: reproject(packed, motion, lambda tap: jnp.isfinite(tap[..., 0])))
+    mean, valid = fetch(packed, motion)
+    assert np.isfinite(mean).all()
+    assert bool(valid.all())
+    np.testing.assert_allclose(mean[1, 2], (packed[1, 2] + packed[1, 3] + packed[2, 2]) / 3, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"alpha": 0.0}, "alpha"),
+        ({"levels": 11}, "levels"),
+        ({"feedback_level": 6}, "feedback_level"),
+        ({"sigma_depth": 0.0}, "sigma_depth"),
+        ({"history_max": 0}, "history_max"),
+    ],
+)
+def test_options_out_of_range_raise(options, word):
+    with pytest.raises(ValueError, match=word):
+        svgf(**options)
+
+
+def test_a_pixel_without_a_surface_among_strangers_spoils_no_gradient(rng):
+    """Its neighbours weigh 1e-20 together, the square of which, 0 in single precision, divided the variance."""
+    values = jnp.asarray(rng.uniform(1, 2, (3, 5, 5)), jnp.float32)
+    hit = jnp.ones((5, 5), bool).at[2, 2].set(False)
+    edges = edges_of(jnp.full((5, 5, 1), 2.0), None, None)._replace(hit=hit)
+    level = values[0].at[2, 2].add(46.0)
+
+    def spread(values, level):
+        light = (level, jnp.ones((5, 5), jnp.float32))
+        mean, variance = edge_average(values, edges, stencil(1), variance=values[1], luminance=light)
+        return jnp.sum(mean) + jnp.sum(variance)
+
+    value, slopes = jax.value_and_grad(spread, (0, 1))(values, level)
+    assert jnp.isfinite(value)
+    assert all(jnp.isfinite(slope).all() for slope in slopes)

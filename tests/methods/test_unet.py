@@ -1,0 +1,189 @@
+"""The U-Net against a NumPy one, and its promises: plain dicts, fixed shapes, absent groups that cost nothing."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdn.networks import LARGE, LEVELS, SMALL, onnx
+from jaxdn.networks.unet import NEGATIVE_SLOPE, Network, count, unet
+from jaxdn.ops import onednn
+
+GROUPS = (3, 3, 3, 1, 3, 1)
+HEADS = (51, 26, 26)
+TINY = ((4, 5), (6,), (5,), (4, 4), (7,))
+
+
+def features(rng: np.random.Generator, groups: tuple[int, ...], size: tuple[int, int] = (16, 32)) -> list[jax.Array]:
+    return [jnp.asarray(rng.normal(size=(2, *size, channels)), jnp.float32) for channels in groups]
+
+
+def numpy_convolution(x: np.ndarray, layer: dict[str, np.ndarray]) -> np.ndarray:
+    height, width = x.shape[1:3]
+    padded = np.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
+    taps = (padded[:, i : i + height, j : j + width] @ layer["kernel"][i, j] for i in range(3) for j in range(3))
+    return sum(taps) + layer["bias"]
+
+
+def numpy_unet(params: dict, x: np.ndarray, heads: int) -> list[np.ndarray]:
+    """The same network in float64, written from the paper's figure: join, then convolve."""
+    params = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), params)
+
+    def level(name: str, x: np.ndarray) -> np.ndarray:
+        for index in range(len(params[name])):
+            x = numpy_convolution(x, params[name][f"convolution_{index}"])
+            x = np.maximum(x, 0) + NEGATIVE_SLOPE * np.minimum(x, 0)
+        return x
+
+    skips = []
+    for depth in range(LEVELS):
+        if depth:
+            n, height, width, channels = x.shape
+            x = x.reshape(n, height // 2, 2, width // 2, 2, channels).max(axis=(2, 4))
+        x = level(f"encoder_{depth}", x)
+        skips.append(x)
+    outputs = {}
+    for depth in reversed(range(LEVELS - 1)):
+        x = np.concatenate([x.repeat(2, axis=1).repeat(2, axis=2), skips[depth]], axis=-1)
+        x = level(f"decoder_{depth}", x)
+        if depth < heads:
+            outputs[depth] = numpy_convolution(x, params[f"head_{depth}"])
+    return [outputs[depth] for depth in range(heads)]
+
+
+@pytest.mark.parametrize(("widths", "weights"), [(LARGE, 895_495), (SMALL, 434_423)])
+def test_weight_counts(widths: tuple, weights: int, key: jax.Array) -> None:
+    network = unet(GROUPS, HEADS, widths=widths)
+    assert count(jax.eval_shape(network.init, key)) == weights
+
+
+def test_small_computes_a_third_of_large(key: jax.Array) -> None:
+    def flops(widths: tuple) -> float:
+        network = unet(GROUPS, HEADS, widths=widths)
+        inputs = [jax.ShapeDtypeStruct((1, 64, 64, channels), jnp.float32) for channels in GROUPS]
+        return jax.jit(network.apply).lower(jax.eval_shape(network.init, key), inputs).cost_analysis()["flops"]
+
+    assert 0.25 < flops(SMALL) / flops(LARGE) < 0.4
+
+
+def test_forward_is_the_numpy_network(rng: np.random.Generator, key: jax.Array) -> None:
+    network = unet((3, 2), (5, 3, 2), widths=TINY)
+    params = network.init(key)
+    params = jax.tree.map(lambda leaf: leaf + 0.1 * jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype), params)
+    inputs = features(rng, (3, 2))
+    heads = jax.jit(network.apply)(params, inputs)
+    assert [head.shape for head in heads] == [(2, 16, 32, 5), (2, 8, 16, 3), (2, 4, 8, 2)]
+    wanted = numpy_unet(params, np.concatenate(inputs, axis=-1).astype(np.float64), 3)
+    for head, reference in zip(heads, wanted, strict=True):
+        np.testing.assert_allclose(head, reference, atol=2e-5 * np.abs(reference).max())
+
+
+def test_an_absent_group_is_zeros_at_a_lower_cost(rng: np.random.Generator, key: jax.Array) -> None:
+    network = unet(GROUPS, (3, 3, 2), widths=TINY)
+    params = network.init(key)
+    whole = features(rng, GROUPS)
+    absent = [group if index in (0, 3) else None for index, group in enumerate(whole)]
+    zeros = [group if index in (0, 3) else jnp.zeros_like(group) for index, group in enumerate(whole)]
+    apply = jax.jit(network.apply)
+    for first, second in zip(apply(params, absent), apply(params, zeros), strict=True):
+        np.testing.assert_allclose(first, second, atol=1e-5)
+    flops = [apply.lower(params, group).cost_analysis()["flops"] for group in (absent, zeros)]
+    assert flops[0] < flops[1]
+
+
+def test_parameters_are_plain_and_xavier(key: jax.Array) -> None:
+    params = unet(GROUPS, HEADS, widths=SMALL).init(key)
+    assert type(params) is dict
+    assert all(type(level) is dict for level in params.values())
+    for path, leaf in jax.tree.leaves_with_path(params):
+        assert leaf.dtype == jnp.float32
+        if path[-1].key == "bias":
+            assert not np.any(leaf)
+        else:
+            limit = np.sqrt(6 / (9 * (leaf.shape[2] + leaf.shape[3])))
+            assert np.abs(leaf).max() <= limit
+            np.testing.assert_allclose(np.std(leaf), limit / np.sqrt(3), rtol=0.1)
+    other = unet(GROUPS, HEADS, widths=SMALL).init(jax.random.key(1))
+    assert not np.array_equal(params["head_0"]["kernel"], other["head_0"]["kernel"])
+
+
+def test_nothing_but_the_network_room_imports_flax() -> None:
+    import pathlib
+
+    import jaxdn
+
+    package = pathlib.Path(jaxdn.__file__).parent
+    users = {path.parent.name for path in package.rglob("*.py") if "from flax" in path.read_text()}
+    assert users == {"networks"}
+
+
+def test_errors_say_what_was_expected(rng: np.random.Generator, key: jax.Array) -> None:
+    with pytest.raises(ValueError, match="widths: expected 5 levels"):
+        unet(GROUPS, HEADS, widths=((4,), (4,)))
+    with pytest.raises(ValueError, match="widths: expected 5 levels"):
+        unet(GROUPS, HEADS, widths=((4,), (), (4,), (4,), (4,)))
+    network = unet((3, 2), (5, 3, 2), widths=TINY)
+    params = network.init(key)
+    with pytest.raises(ValueError, match="multiples of 16"):
+        network.apply(params, features(rng, (3, 2), (16, 24)))
+    with pytest.raises(ValueError, match="features: expected"):
+        network.apply(params, features(rng, (3, 3)))
+    with pytest.raises(ValueError, match="features: expected"):
+        network.apply(params, [None, None])
+
+
+@pytest.mark.parametrize("absent", [(), (1, 3)])
+@pytest.mark.parametrize(("name", "installed"), [("onnxruntime", onnx.available), ("onednn", onednn.available)])
+def test_an_engine_runs_the_same_network(
+    name: str, installed: Callable[[], bool], absent: tuple[int, ...], rng: np.random.Generator, key: jax.Array
+) -> None:
+    """Values of the engine and its gradient, with all features and without some."""
+    if not installed():
+        pytest.skip(f"{name} is not installed")
+    plain, engine = (unet(GROUPS, HEADS, widths=TINY, implementation=each) for each in (None, name))
+    params = jax.tree.map(lambda leaf: leaf + 0.01, plain.init(key))
+    inputs = [None if index in absent else group for index, group in enumerate(features(rng, GROUPS))]
+
+    def both(network: Network) -> tuple:
+        def loss(params: dict) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+            heads = network.apply(params, inputs)
+            return sum(jnp.sum(jnp.sin(head)) for head in heads), heads
+
+        return jax.jit(jax.grad(loss, has_aux=True))(params)
+
+    wanted, got = both(plain), both(engine)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), got, wanted)
+
+
+def test_onnxruntime_follows_the_weights_under_scan_and_vmap(rng: np.random.Generator, key: jax.Array) -> None:
+    """The engine keeps weights laid out for itself; other weights in the next call give the other image."""
+    pytest.importorskip("onnxruntime")
+    plain, engine = (unet((3, 2), (5, 3, 2), widths=TINY, implementation=name) for name in (None, "onnxruntime"))
+    inputs = [jnp.stack([group, 2 * group]) for group in features(rng, (3, 2))]
+    run = jax.jit(engine.apply)
+    for scale in (1.0, 1.5, 1.0):
+        params = jax.tree.map(lambda leaf, scale=scale: scale * leaf, plain.init(key))
+        wanted = jax.vmap(lambda *groups, params=params: plain.apply(params, list(groups)))(*inputs)
+        for index in range(2):
+            got = run(params, [group[index] for group in inputs])
+            jax.tree.map(lambda a, b, i=index: np.testing.assert_allclose(a, b[i], rtol=1e-4, atol=1e-5), got, wanted)
+        mapped = jax.vmap(lambda *groups, params=params: engine.apply(params, list(groups)))(*inputs)
+        _, scanned = jax.lax.scan(lambda _, groups, params=params: (None, engine.apply(params, groups)), None, inputs)
+        for got in (mapped, scanned):
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), got, wanted)
+
+
+def test_onnxruntime_takes_float32_alone(rng: np.random.Generator, key: jax.Array) -> None:
+    pytest.importorskip("onnxruntime")
+    network = unet((3, 2), (5, 3, 2), widths=TINY, implementation="onnxruntime")
+    inputs = [group.astype(jnp.bfloat16) for group in features(rng, (3, 2))]
+    with pytest.raises(ValueError, match="float32"):
+        network.apply(network.init(key), inputs)
+
+
+def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"pip install .*jaxdn\[onnx\]"):
+        unet((3, 2), (5, 3, 2), widths=TINY, implementation="onnxruntime")

@@ -1,0 +1,184 @@
+"""The chart: going on after an interruption, the Pareto front, equal quality, the page; the whole of it is slow."""
+
+import json
+import math
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from experiments.speed.chart.energy import find_meter
+from experiments.speed.chart.methods import methods
+from experiments.speed.chart.page import page
+from experiments.speed.chart.render_cost import Cost, fit
+from experiments.speed.chart.scores import MEASURES
+from experiments.speed.chart.store import Store, point_key
+from experiments.speed.chart.summary import RENDERER, Point, equal_quality, equal_samples, front_table, pareto, points
+
+SIZE, OWN = "1280x720", "64x64"
+PSNR = MEASURES[0]
+TIMING = {"median_ms": 30.0, "min_ms": 29.0, "max_ms": 33.0, "first_ms": 4000.0, "rounds": 3, "peak_mib": 100.0}
+
+
+def point(name, spp, psnr, milliseconds, family="a"):
+    errors = {measure.field: psnr if measure.better > 0 else 1 / psnr for measure in MEASURES}
+    return Point(point_key(name, spp), name, family, "plain", spp, errors, {SIZE: milliseconds}, {SIZE: 10.0 * spp})
+
+
+def scores(psnr):
+    return {measure.field: psnr if measure.better > 0 else 1 / psnr for measure in MEASURES}
+
+
+@pytest.fixture
+def data():
+    """Raw measurements as a run leaves them."""
+    errors = {point_key(RENDERER, spp): {"room": scores(20 + 3 * math.log2(spp))} for spp in (1, 2, 4, 8)}
+    errors |= {point_key("filter", spp): {"room": scores(24.5 + 3 * math.log2(spp))} for spp in (1, 2)}
+    cost = {"seconds": {"fixed": 0.1, "sample": 0.5, "features": 0.05, "motion": 0.2}}
+    return {
+        "fingerprint": "0123",
+        "settings": {"scored frames": 4},
+        "machine": {"processor": "a <fast> one"},
+        "clips": {"room": {"shown": 3, "noise_floor": 45.0, "hidden": 0.1}},
+        "errors": errors,
+        "times": {"filter": {SIZE: TIMING, OWN: TIMING}, "wide net": {SIZE: TIMING}},
+        "render": {SIZE: {"room": cost}, OWN: {"room": cost}},
+        "breakdown": {},
+        "left_out": {"here": ["A peer is not installed."]},
+    }
+
+
+LABELS = {
+    RENDERER: (RENDERER, "plain", "none"),
+    "filter": ("filter", "plain", "motion"),
+    "wide net": ("untrained widths", "untrained", "motion"),
+}
+
+
+def test_the_file_is_whole_after_every_point_and_goes_on(tmp_path):
+    path = tmp_path / "runs" / "chart.json"
+    store = Store(path, {"frames": 4}, {"cores": 2})
+    assert not store.kept
+    store.put("errors", "a @ 1", {"room": {"psnr": np.float32(20), "disoccluded_psnr": math.nan}})
+    assert json.loads(path.read_text())["errors"]["a @ 1"]["room"] == {"psnr": 20.0, "disoccluded_psnr": None}
+    again = Store(path, {"frames": 4}, {"cores": 2})
+    assert again.kept
+    assert again.has("errors", "a @ 1")
+    assert not again.has("errors", "a @ 2")
+    assert [each.name for each in path.parent.iterdir()] == ["chart.json"]
+
+
+def test_other_settings_or_another_machine_start_afresh_and_keep_the_old(tmp_path):
+    path = tmp_path / "chart.json"
+    Store(path, {"frames": 4}, {"cores": 2}).put("errors", "a @ 1", {})
+    other = Store(path, {"frames": 4}, {"cores": 64})
+    assert not other.kept
+    assert not other.has("errors", "a @ 1")
+    assert "a @ 1" in json.loads((tmp_path / "chart.before.json").read_text())["errors"]
+
+
+def test_the_front_is_what_nothing_else_beats(rng):
+    cloud = [
+        point(f"m{index}", 1, float(psnr), float(ms)) for index, (psnr, ms) in enumerate(rng.uniform(1, 40, (60, 2)))
+    ]
+    front = pareto(cloud, PSNR, SIZE, render=True)
+    for candidate in cloud:
+        time, psnr = candidate.milliseconds(SIZE, render=True), candidate.errors["psnr"]
+        beaten = any(other.milliseconds(SIZE, render=True) <= time and other.errors["psnr"] > psnr for other in cloud)
+        assert (candidate in front) == (not beaten)
+    assert [each.milliseconds(SIZE, render=True) for each in front] == sorted(
+        each.milliseconds(SIZE, render=True) for each in front
+    )
+    assert pareto(cloud, MEASURES[2], SIZE) == front  # of an error that is lower where PSNR is higher
+
+
+def test_equal_samples_agree_with_a_line_in_the_logarithm():
+    spp = 2.0 ** np.arange(11)
+    curve = {int(n): float(18 + 2.7 * np.log2(n)) for n in spp}
+    for psnr in np.linspace(18, 45, 50):
+        expected = 2 ** np.interp(psnr, list(curve.values()), np.log2(spp))
+        assert equal_samples(psnr, curve) == pytest.approx(expected)
+    assert equal_samples(17.9, curve) == 0
+    assert equal_samples(45.1, curve) == math.inf
+
+
+def test_a_dip_in_the_curve_counts_for_fewer_samples():
+    assert equal_samples(25, {1: 20.0, 2: 26.0, 4: 24.0, 8: 30.0}) == pytest.approx(2 ** (5 / 6))
+
+
+def test_equal_quality_tells_samples_and_seconds(data):
+    found = points(data, LABELS)
+    equals = equal_quality(found, Cost(0.1, 0.5, 0.05, 0.2))
+    assert equals["filter @ 1"].spp == pytest.approx(2**1.5)
+    assert equals["filter @ 1"].seconds == pytest.approx(0.1 + 0.5 * 2**1.5)
+    assert set(equals) == {"filter @ 1", "filter @ 2"}
+    text = front_table(pareto(found, PSNR, SIZE), equals, SIZE, 8)
+    assert "3 spp, 1.5 s" in text
+
+
+def test_points_add_what_the_renderer_has_to_give(data):
+    by_key = {each.key: each for each in points(data, LABELS)}
+    assert by_key["renderer @ 4"].milliseconds(SIZE, render=True) == pytest.approx(2100)
+    assert by_key["filter @ 2"].milliseconds(SIZE, render=True) == pytest.approx(30 + 1350)
+    assert by_key["filter @ 2"].milliseconds(SIZE, render=False) == pytest.approx(30)
+    assert by_key["wide net"].spp is None
+    assert by_key["wide net"].milliseconds(SIZE, render=True) == pytest.approx(30 + 850)
+
+
+def test_the_page_has_every_point_and_needs_no_network(data):
+    found = points(data, LABELS)
+    shown = {key: np.full((8, 8, 3), 0.5) for key in ("reference", *data["errors"])}
+    text = page(data, found, equal_quality(found, None), (SIZE, OWN), {"room": shown})
+    content = json.loads(re.search(r'id="page-data">(.*?)</script>', text, re.S)[1])
+    assert [each["key"] for each in content["points"]] == [each.key for each in found]
+    assert set(content["pictures"]["room"]) == set(shown)
+    table = text[text.index('<section id="points">') :]
+    table = table[: table.index("</section>")]
+    assert table.count('<th scope="row">') == len(found)
+    assert "a &lt;fast&gt; one" in text
+    assert "A peer is not installed." in text
+    assert not re.search(r'(src|href)="(https?:)?//', text)
+
+
+def test_the_fit_gives_back_the_cost():
+    cost = Cost(0.3, 0.2, 0.05, 0.1)
+    light = {spp: cost.at(spp) for spp in (1, 2, 4)}
+    assert fit(light, cost.at(1, "features"), cost.at(1, "motion")) == pytest.approx(cost)
+
+
+def test_energy_counters_wrap(tmp_path):
+    assert find_meter(tmp_path) is None
+    zone = tmp_path / "intel-rapl:0"
+    zone.mkdir()
+    (zone / "energy_uj").write_text("9000000\n")
+    (zone / "max_energy_range_uj").write_text("10000000\n")
+    assert find_meter(tmp_path).joules(lambda: (zone / "energy_uj").write_text("1500000\n")) == pytest.approx(2.5)
+
+
+def test_every_registered_method_is_there_with_its_variants():
+    listed = methods()
+    found = {method.name: method for method in listed}
+    assert len(found) == len(listed)
+    for name in ("svgf", "ntd-large", "ntd-small"):
+        assert found[name].images is not None
+        assert f"{name}, not demodulated" in found
+        assert found[f"{name}, still scene"].images is None
+    assert "ntd-large, bfloat16" in found
+    assert found["ntd tiny"].images is None
+
+
+@pytest.mark.slow
+def test_the_whole_of_it_quickly_and_again(tmp_path):
+    pytest.importorskip("mitsuba")
+    command = [sys.executable, "-m", "experiments.speed.chart", "--quick", "--out", str(tmp_path / "chart-quick")]
+    first = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert first.returncode == 0, first.stderr
+    raw = json.loads((tmp_path / "chart-quick" / "chart.json").read_text())
+    assert {f"ntd-small @ {spp}" for spp in (1, 2, 4, 8)} <= set(raw["errors"])
+    assert {"renderer @ 1", "renderer @ 16"} <= set(raw["errors"])
+    assert "bare renderer needs" in first.stdout
+    again = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert "going on from what was measured before" in again.stdout
+    assert json.loads((tmp_path / "chart-quick" / "chart.json").read_text()) == raw

@@ -1,0 +1,136 @@
+"""The command line as a user meets it: real processes, messages instead of tracebacks, exit code 2, whole files."""
+
+import subprocess
+import sys
+from importlib.util import find_spec
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from jaxdn.clips import write_clip
+from jaxdn.frame import Clip, Frame
+from tests.learning.test_training import make_clip
+
+
+def jaxdn(*arguments, timeout=300):
+    return subprocess.run(
+        [sys.executable, "-m", "jaxdn.cli", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
+
+
+def fails(*arguments):
+    """Run a command that a user got wrong; returns what it says."""
+    done = jaxdn(*arguments)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+    return " ".join((done.stdout + done.stderr).split())
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clips") / "square"
+    source = make_clip(0, frames=3, size=20)
+    frames = source.frames._replace(
+        direct=np.full_like(source.reference, 0.25), emission=np.full_like(source.reference, 0.5)
+    )
+    write_clip(Clip(frames, source.reference), folder)
+    return folder
+
+
+@pytest.mark.parametrize("verb", [(), ("render",), ("train",), ("denoise",), ("compare",)])
+def test_help_says_what_to_type(verb):
+    done = jaxdn(*verb, "--help")
+    assert done.returncode == 0
+    assert "jaxdn" in done.stdout
+    if verb:
+        assert "For example" in done.stdout
+
+
+def test_denoise_adds_direct_and_emitted_light_back(clip, tmp_path):
+    done = jaxdn("denoise", clip, "-o", tmp_path / "out", "--method", "svgf", "--preview")
+    assert done.returncode == 0, done.stderr
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == [f"frame_{i:04d}.{kind}" for i in range(3) for kind in ("exr", "png")]
+    with OpenEXR.File(str(tmp_path / "out" / "frame_0001.exr"), separate_channels=True) as file:
+        channels = {name: channel.pixels for name, channel in file.channels().items()}
+    for letter in "RGB":
+        np.testing.assert_allclose(channels[letter] - channels[f"denoised.{letter}"], 0.75, atol=1e-5)
+
+
+def test_denoise_plain_exr_files_with_the_shipped_network(tmp_path):
+    rng = np.random.default_rng(0)
+    for index in range(2):
+        pixels = {letter: rng.exponential(size=(33, 57)).astype(np.float32) for letter in "RGB"}
+        pixels["R"][3, 4], pixels["G"][5, 6], pixels["B"][7, 8] = np.nan, np.inf, -3.0
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, pixels).write(str(tmp_path / f"shot_{index:04d}.exr"))
+    engines = ["reference", *(["onnxruntime"] if find_spec("onnxruntime") else [])]
+    reds = []
+    for engine in engines:
+        out = tmp_path / engine
+        done = jaxdn("denoise", tmp_path / "shot_*.exr", "-o", out, "--method", "ntd-small", "--implementation", engine)
+        assert done.returncode == 0, done.stderr
+        assert engine in done.stdout
+        with OpenEXR.File(str(out / "shot_0001.exr"), separate_channels=True) as file:
+            reds.append(file.channels()["R"].pixels)
+    assert reds[0].shape == (33, 57)
+    assert np.isfinite(reds[0]).all()
+    assert reds[0].std() < 0.7  # exponential noise has a standard deviation of 1
+    np.testing.assert_allclose(reds[0], reds[-1], rtol=2e-3, atol=2e-3)  # stored in half precision
+
+
+def test_compare_ends_with_a_report(clip, tmp_path):
+    done = jaxdn("compare", clip, "-o", tmp_path, "--methods", "noisy", "svgf")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "report.html").is_file()
+    assert (tmp_path / "metrics.json").is_file()
+    assert "svgf" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("denoise", "nowhere", "-o", "out"), "nowhere"),
+        (("denoise", "CLIP", "-o", "out", "--method", "magic"), "expected one of noisy, ntd, svgf"),
+        (("denoise", "CLIP", "-o", "out", "--method", "ntd"), "expected its weights"),
+        (("denoise", "CLIP", "-o", "CLIP", "--method", "svgf"), "another folder"),
+        (("denoise", "CLIP", "-o", "out", "--method", "svgf", "--spp", "2"), "2 samples a pixel are not available"),
+        (("denoise", "CLIP", "-o", "out", "--wrong"), "--wrong"),
+        (("denoise", "CLIP", "-o", "out", "--method", "svgf", "--implementation", "onnxruntime"), "with weights"),
+        (("compare", "nowhere", "-o", "out", "--methods", "noisy"), "no clip.json"),
+        (("render", "castle", "-o", "out"), "fruit"),
+        (("render", "none.xml", "-o", "out"), "none.xml"),
+        (("train", "CLIP", "-o", "out", "--steps", "1"), "expected at least 10 frames, got 3"),
+    ],
+)
+def test_mistakes_are_told_plainly(clip, tmp_path, monkeypatch, arguments, told):
+    monkeypatch.chdir(tmp_path)
+    assert told in fails(*(clip if word == "CLIP" else word for word in arguments))
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_a_truncated_frame_names_the_file(clip, tmp_path):
+    damaged = tmp_path / "damaged"
+    damaged.mkdir()
+    for path in clip.iterdir():
+        (damaged / path.name).write_bytes(path.read_bytes())
+    frame = damaged / "frame_0001.exr"
+    frame.write_bytes(frame.read_bytes()[:2000])
+    assert "frame_0001.exr" in fails("denoise", damaged, "-o", tmp_path / "out", "--method", "svgf")
+    assert not (tmp_path / "out" / "frame_0001.exr").exists()
+
+
+def test_sizes_that_differ_are_refused(clip, tmp_path):
+    mixed = tmp_path / "mixed"
+    mixed.mkdir()
+    for path in clip.iterdir():
+        (mixed / path.name).write_bytes(path.read_bytes())
+    small = make_clip(1, frames=1, size=16)
+    write_clip(Clip(Frame(radiance=small.frames.radiance)), tmp_path / "small")
+    (mixed / "frame_0002.exr").write_bytes((tmp_path / "small" / "frame_0000.exr").read_bytes())
+    assert "frame_0002.exr" in fails("denoise", mixed, "-o", tmp_path / "out", "--method", "svgf")
