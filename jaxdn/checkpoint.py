@@ -14,15 +14,15 @@ import orbax.checkpoint as ocp
 from jaxdn.learning.step import TrainState
 
 _DIGEST = "sha256"
-"""Where the digest lies in what is stored beside the state; checkpoints of earlier versions have none."""
+"""Where the digest lies in what is stored with the state; checkpoints of earlier versions have none."""
 
 
 class Checkpoints:
     """The checkpoints of one run in one folder; the newest two are kept.
 
-    Orbax writes each beside its place and renames it when it is whole: a run killed while writing continues from the
-    one before. Each holds a digest of its own values, so that damage which still parses is noticed too. Saving happens
-    in the background; :meth:`close` waits for it.
+    Orbax writes each under a temporary name and renames it when it is whole: a run killed while writing continues from
+    the one before. Each holds a digest of its own values, so that damage which still parses is noticed too. Saving
+    happens in the background; :meth:`close` waits for it.
     """
 
     def __init__(self, folder: Path):
@@ -34,20 +34,16 @@ class Checkpoints:
         """Keep the state after ``state.step`` updates with the data iterator's own state (JSON)."""
         # Copies: on a CPU an array may be written from where it lies, and the next update takes over its memory.
         values = jax.tree.map(np.array, state._asdict())
-        beside = {**data, _DIGEST: digest(values, data)}
-        arguments = ocp.args.Composite(state=ocp.args.StandardSave(values), data=ocp.args.JsonSave(beside))
+        position = {**data, _DIGEST: digest(values, data)}
+        arguments = ocp.args.Composite(state=ocp.args.StandardSave(values), data=ocp.args.JsonSave(position))
         self._manager.save(int(state.step), args=arguments, force=True)
-
-    def latest(self) -> int | None:
-        """The number of updates in the newest whole checkpoint; None where there is none."""
-        return self._manager.latest_step()
 
     def restore(self, like: TrainState) -> tuple[TrainState, dict[str, Any]] | None:
         """The newest checkpoint as a state shaped ``like`` this one, and the data's position; None where there is none.
 
         A checkpoint that cannot be read (torn by a crash of the machine, or damaged) is moved out of the way, into
-        ``damaged-<step>`` beside the folder, with a UserWarning, and the one before it is taken. Raises ValueError when
-        none of them can be read as this network's.
+        ``damaged-<step>`` next to the folder, with a UserWarning, and the one before it is taken. Raises ValueError
+        when none of them can be read as this network's.
         """
         failed: dict[int, Exception] = {}
         for step in sorted(self._manager.all_steps(), reverse=True):
@@ -65,7 +61,7 @@ class Checkpoints:
             newest = max(failed)
             raise ValueError(
                 f"checkpoints {self._folder}: expected the parameters of this network, and none of the checkpoints "
-                f"({', '.join(map(str, sorted(failed)))}) can be read as such ({_told(failed[newest])}). If another "
+                f"({', '.join(map(str, sorted(failed)))}) can be read as such ({_short(failed[newest])}). If another "
                 "network was trained here, give the run another name; if the files are damaged, delete the folder and "
                 "start over."
             ) from failed[newest]
@@ -85,7 +81,7 @@ class Checkpoints:
         shutil.rmtree(aside, ignore_errors=True)
         shutil.move(self._folder / str(step), aside)
         warnings.warn(
-            f"checkpoint {self._folder / str(step)} is damaged ({_told(reason)}) and was moved to {aside}; training "
+            f"checkpoint {self._folder / str(step)} is damaged ({_short(reason)}) and was moved to {aside}; training "
             f"continues from the checkpoint after {continues} updates.",
             stacklevel=3,
         )
@@ -106,5 +102,5 @@ def digest(values: Any, data: dict[str, Any]) -> str:
     return found.hexdigest()
 
 
-def _told(error: Exception) -> str:
+def _short(error: Exception) -> str:
     return f"{type(error).__name__}: {str(error).splitlines()[0][:200]}" if str(error) else type(error).__name__

@@ -3,12 +3,12 @@
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
 
-from jaxdn.commands.errors import told_plainly
+from jaxdn.commands.errors import plain_errors
 
 _PATH = tyro.conf.Positional[Path]
 
@@ -76,11 +76,13 @@ class Render:
 
 @dataclass
 class Train:
-    """Train the neural temporal denoiser (ntd) on rendered clips; run it again to continue.
+    """Train a method that learns on rendered clips; run it again to continue.
 
     For example:
 
-    jaxdn train data/train --validation data/validation -o runs/mine --size small --steps 3000
+    jaxdn train data/train --validation data/validation -o runs/mine --steps 3000
+
+    jaxdn train data/train -o runs/traditional --variant ntd-large --set motion=traditional
     """
 
     clips: _PATH
@@ -89,25 +91,26 @@ class Train:
     """The run's folder: checkpoints, log, and in the end weights.safetensors with its JSON."""
     validation: Path | None = None
     """Folder of whole clips held out for validation."""
-    size: Literal["large", "small"] = "small"
-    motion: Literal["dual", "traditional"] = "dual"
-    """Vectors that warp the history (B and C: dual, A: traditional)."""
-    occlusion: bool = True
-    """Let the motion-occlusion loss join in the second half (C)."""
-    parity: bool = False
-    """The paper's letter, in the network and in the optimiser."""
-    steps: int = 2000
-    batch: int = 4
-    crop: int = 64
+    method: str = "ntd"
+    """What to train; an unknown name lists the methods there are."""
+    variant: str | None = None
+    """One of the method's variants (ntd-large, ntd-small); default: the fastest."""
+    set: list[str] = field(default_factory=list)
+    """Options of the method as option=value, such as motion=traditional preset=parity; an unknown one lists them."""
+    recipe: str | None = None
+    """One of the method's recipes (for ntd: usual, without-occlusion, parity); default: the usual one."""
+    steps: int | None = None
+    batch: int | None = None
+    crop: int | None = None
+    learning_rate: float | None = None
+    """These four, and the next two: default as in the recipe."""
+    rematerialize: bool | None = None
+    """A quarter of the memory for 1.1 to 1.4 of the time."""
+    seed: int | None = None
     spp: int = 1
     """Samples a pixel of the noisy input."""
-    learning_rate: float | None = None
-    """Peak learning rate; default: 1e-3, with --parity 1e-4 throughout."""
-    rematerialize: bool = False
-    """A quarter of the memory for 1.1 to 1.4 of the time."""
-    implementation: Literal["auto", "reference", "onednn"] = "auto"
-    """What convolves: XLA (reference) or oneDNN (CPU; the extra onednn); auto: the latter where it can."""
-    seed: int = 0
+    implementation: str = "auto"
+    """What convolves: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest that runs here."""
 
 
 @dataclass
@@ -118,7 +121,7 @@ class Denoise:
 
     jaxdn denoise data/test/fruit-7 -o out --preview
 
-    jaxdn denoise "shots/*.exr" -o out --method ntd-small --motion-convention cycles
+    jaxdn denoise "shots/*.exr" -o out --method ntd-small --motion-convention cycles --channels albedo=DiffCol
     """
 
     clip: tyro.conf.Positional[Path]
@@ -130,11 +133,13 @@ class Denoise:
     spp: int = 1
     """Samples a pixel to take from the clip's layers."""
     preview: bool = False
-    """Write a PNG beside every EXR."""
+    """Write a PNG next to every EXR."""
     motion_convention: str | None = None
     """For foreign files with motion vectors: whose convention they follow; an unknown one lists those known."""
-    implementation: Literal["auto", "reference", "onnxruntime"] = "auto"
-    """What runs the network: XLA (reference) or ONNX Runtime (CPU; the extra onnx); auto: the latter where it can."""
+    channels: list[str] = field(default_factory=list)
+    """For foreign files: buffer=layer, where the layer of a buffer is not found by its name."""
+    implementation: str = "auto"
+    """What runs a network: reference (XLA), onnxruntime (CPU; the extra onnx); auto: the fastest that runs here."""
 
 
 @dataclass
@@ -150,23 +155,9 @@ class Compare:
     """Folder of clips, or one clip."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the report."""
-    methods: list[str] = field(default_factory=lambda: ["noisy", "svgf", "ntd-small", "ntd-large"])
-    """noisy, filters, shipped weights or .safetensors files."""
+    methods: list[str] = field(default_factory=list)
+    """noisy, filters, shipped weights or .safetensors files; default: all that come with the package."""
     spp: int = 1
-
-
-def clip_folders(folder: Path) -> list[Path]:
-    """The clips in a folder (or the folder itself, if it is one); raises ValueError where there is none."""
-    if (folder / "clip.json").is_file():
-        return [folder]
-    found = sorted(path.parent for path in folder.glob("*/clip.json"))
-    if not found:
-        raise ValueError(f"{folder}: expected a clip or a folder of clips, found no clip.json; render some first.")
-    return found
-
-
-def _family(name: str, seed: int) -> dict[str, Any]:
-    return {"family": name, "seed": seed}
 
 
 def _inspect(options: Inspect) -> None:
@@ -184,102 +175,52 @@ def _inspect(options: Inspect) -> None:
 
 
 def _render(options: Render) -> None:
-    from jaxdn.commands.inspect import plan_clip
-    from jaxdn.render import ClipJob, choose_variant, render_clips, scene_from_record
-    from jaxdn.render.families import FAMILIES
+    from jaxdn.commands.render import render
 
-    if options.scene in FAMILIES:
-        records = [(f"{options.scene}-{seed}", _family(options.scene, seed)) for seed in options.seeds]
-    elif options.scene.endswith(".xml"):
-        from jaxdn.render.scene_file import SceneFile
-
-        scene = SceneFile(Path(options.scene), options.animation)
-        records = [(f"{scene.name}-{seed}", scene.record) for seed in options.seeds]
-    else:
-        raise ValueError(
-            f"scene {options.scene!r}: expected a family ({', '.join(sorted(FAMILIES))}) or a Mitsuba scene (.xml)."
-        )
-    choice = choose_variant()
-    print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
-    jobs = []
-    for (name, record), seed in zip(records, options.seeds, strict=True):
-        planned = plan_clip(
-            scene_from_record(record),
-            effects=options.effects,
-            width=options.width,
-            height=options.height,
-            frames=options.frames,
-            max_depth=options.max_depth,
-        )
-        if planned is not None:
-            found, made = planned
-            print(f"{name}: {', '.join(found) or 'no effects'}; paths of depth {made.max_depth}", flush=True)
-        job = ClipJob(
-            record,
-            str(options.out / name),
-            width=options.width,
-            height=options.height,
-            frames=options.frames,
-            layers=tuple(options.layers),
-            reference_spp=options.reference_spp,
-            max_depth=options.max_depth,
-            seed=seed,
-            plan=None if planned is None else planned[1].record(),
-        )
-        jobs.append(job)
-    render_clips(jobs, workers=options.workers)
+    render(
+        options.scene,
+        options.out,
+        animation=options.animation,
+        seeds=options.seeds,
+        width=options.width,
+        height=options.height,
+        frames=options.frames,
+        reference_spp=options.reference_spp,
+        layers=options.layers,
+        max_depth=options.max_depth,
+        effects=options.effects,
+        workers=options.workers,
+    )
 
 
 def _train(options: Train) -> None:
-    from jaxdn.clips import training_batches
-    from jaxdn.commands.train import fit, load_validation, training_engine
-    from jaxdn.denoisers import ntd
-    from jaxdn.learning.step import PARITY
-    from jaxdn.recipe import Recipe
-    from jaxdn.weights import save_weights
+    from jaxdn.commands.train import train
+    from jaxdn.methods.table import method_named
+    from jaxdn.options import parse
 
-    recipe = (PARITY if options.parity else Recipe())._replace(
-        steps=options.steps,
-        occlusion=options.occlusion,
-        batch=options.batch,
-        crop=options.crop,
-        rematerialize=options.rematerialize,
-        seed=options.seed,
-    )
-    if options.learning_rate is not None:
-        recipe = recipe._replace(learning_rate=options.learning_rate)
-    settings: dict[str, Any] = {"size": options.size, "motion": options.motion}
-    if options.parity:
-        settings["preset"] = "parity"
-    engine = training_engine(options.implementation)
-    denoiser = ntd(**settings, implementation=engine)
-    print(f"{options.out.name}: convolutions run on {engine}", flush=True)
-    batches = training_batches(
-        clip_folders(options.clips),
-        buffers=denoiser.reads,
-        batch=recipe.batch,
-        crop=recipe.crop,
-        frames=recipe.frames,
-        seed=recipe.seed,
+    method = method_named(options.method)
+    recipe = method.recipe_named(options.recipe)
+    changed = {name: getattr(options, name) for name in recipe._fields if hasattr(options, name)}
+    recipe = recipe._replace(**{name: value for name, value in changed.items() if value is not None})
+    path = train(
+        method,
+        recipe,
+        [options.clips],
+        options.out,
+        options={**method.variant_named(options.variant), **parse(options.set)},
+        validation=[options.validation] if options.validation else [],
         spp=options.spp,
-    )
-    held_out = load_validation(clip_folders(options.validation), spp=options.spp) if options.validation else []
-    state = fit(denoiser, recipe, batches, options.out, label=options.out.name, validation=held_out)
-    path = save_weights(
-        options.out / "weights.safetensors",
-        state.params,
-        factory="ntd",
-        options=settings,
-        record={"recipe": recipe._asdict(), "skipped": int(state.skipped)},
+        implementation=options.implementation,
     )
     print(f"{path}: denoise with `jaxdn denoise CLIP -o OUT --method {path}`")
 
 
 def _denoise(options: Denoise) -> None:
-    from jaxdn.commands.denoise import denoise_files, method_on
+    from jaxdn.commands.denoise import candidate_on, denoise_files
+    from jaxdn.options import parse
 
     console = Console(stderr=True)
-    method, engine = method_on(options.method, options.implementation)
+    method, engine = candidate_on(options.method, options.implementation)
     with console.status(f"{options.method}: reading ...") as status:
         written = denoise_files(
             options.clip,
@@ -288,19 +229,25 @@ def _denoise(options: Denoise) -> None:
             spp=options.spp,
             preview=options.preview,
             motion_convention=options.motion_convention,
+            channels=parse(options.channels, option="--channels"),
             say=lambda done, total: status.update(f"{options.method}: frame {done} of {total}"),
         )
     compiled = f"{written.programs} program{'s' * (written.programs != 1)} compiled"
     print(f"{len(written.files)} frames denoised by {options.method} in {options.out} ({engine}, {compiled})")
+    if written.repaired:
+        print(f"{written.repaired} values were not usable numbers (NaN, infinite, negative ...) and were repaired")
 
 
 def _compare(options: Compare) -> None:
-    from jaxdn.commands.compare import compare, method_named
+    from jaxdn.candidates import all_names, candidate
+    from jaxdn.clips import find_clips
+    from jaxdn.commands.compare import compare
     from jaxdn.report import text_table, write_report
 
-    methods = [method_named(name) for name in options.methods]
-    folders = clip_folders(options.clips)
-    settings = {"clips": len(folders), "spp": options.spp, "methods": options.methods}
+    names = options.methods or all_names()
+    methods = [candidate(name) for name in names]
+    folders = find_clips(options.clips)
+    settings = {"clips": len(folders), "spp": options.spp, "methods": names}
     results = compare(methods, folders, title=f"Denoisers on {options.clips.name}", settings=settings, spp=options.spp)
     page = write_report(results, options.out)
     print(text_table(results))
@@ -316,7 +263,7 @@ def main(arguments: list[str] | None = None) -> None:
         description="Remove Monte Carlo noise from path-traced animations.",
         args=arguments,
     )
-    with told_plainly():
+    with plain_errors():
         verbs[type(options)](options)
 
 

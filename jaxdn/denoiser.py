@@ -80,7 +80,7 @@ class Ritual:
 
 
 def recurrent(core: Core) -> Denoiser:
-    """The denoiser of a core; ``start`` and ``step`` raise ValueError for shapes that do not fit, never for contents."""
+    """The denoiser of a core. Its functions raise ValueError for shapes that do not fit, never for pixel contents."""
 
     def start(params: Params, frame: Frame) -> Recurrent:
         frame, _ = repair(checked(frame, core.reads))

@@ -3,8 +3,8 @@
 import json
 import os
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,40 +17,59 @@ def whole(path: str | Path) -> Iterator[Path]:
     disk, a kill: the last leaves a hidden ``.tmp`` file, never a broken one). The data is on disk before the rename.
     Raises FileNotFoundError if the folder is missing, and OSError as the system reports it.
     """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; create it first.")
-    # Two processes, or two threads of one, may write the same file: each needs its own.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.tmp")
-    try:
+    with _renamed([Path(path)]) as (temporary,):
         yield temporary
-        handle = os.open(temporary, os.O_RDONLY)
-        try:
-            os.fsync(handle)  # a full or failing disk may only say so here
-        finally:
-            os.close(handle)
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def write_whole(contents: Mapping[Path, bytes | str]) -> None:
-    """Write files, text as UTF-8, and then rename them in this order; on an error while writing none is replaced."""
-    with ExitStack() as stack:
-        for path, content in reversed(contents.items()):  # the stack renames in the opposite order
-            stack.enter_context(whole(path)).write_bytes(content.encode() if isinstance(content, str) else content)
+    """Write files, text as UTF-8, and rename them in this order when all are on disk.
+
+    On an error while writing none is replaced and nothing is left behind. Raises as :func:`whole` does, TypeError for
+    contents that are neither bytes nor text, and ValueError for text that UTF-8 has no bytes for.
+    """
+    with _renamed(list(contents)) as temporaries:
+        for temporary, content in zip(temporaries, contents.values(), strict=True):
+            temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def write_json(path: str | Path, value: Any) -> None:
     """Write strict JSON (no NaN, no Infinity), indented, whole or not at all.
 
-    Raises ValueError, naming the file, if ``value`` holds something that JSON has no word for.
+    Raises ValueError, naming the file, if ``value`` holds something that JSON has no word for, and as :func:`whole`
+    does.
     """
     try:
         text = json.dumps(value, indent=1, allow_nan=False)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(
             f"{path}: cannot be written as JSON ({error}); use plain lists, strings and finite numbers."
         ) from error
     write_whole({Path(path): text + "\n"})
+
+
+@contextmanager
+def _renamed(paths: Sequence[Path]) -> Iterator[list[Path]]:
+    """A temporary path next to each path; renamed if the block succeeds and all their data is on disk, else removed."""
+    for path in paths:
+        if not path.parent.is_dir():
+            raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; create it first.")
+    # Two processes, or two threads of one, may write the same file: each needs its own.
+    temporaries = [path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.tmp") for path in paths]
+    try:
+        yield temporaries
+        for temporary in temporaries:
+            _sync(temporary)
+        for temporary, path in zip(temporaries, paths, strict=True):
+            os.replace(temporary, path)
+    finally:
+        for temporary in temporaries:
+            temporary.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    """Wait until the disk has a file: a full or failing one may only say so here."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -14,14 +14,14 @@ from jaxdn.stencils import correlate, pad_edge
 
 
 def spatial(denoised: jax.Array, reference: jax.Array) -> jax.Array:
-    """Mean of ``|denoised - reference|`` over all elements (Zeng et al. 2021, eq. 5, first term)."""
+    """Mean of ``|denoised - reference|`` over all elements (Zeng et al. 2021, eq. 6, first term)."""
     return jnp.mean(absolute(_difference(denoised, reference)))
 
 
 def temporal(denoised: jax.Array, reference: jax.Array) -> jax.Array:
     """Mean of ``|(I_i - I_{i-1}) - (R_i - R_{i-1})|`` over the T - 1 differences of frames; 0 for a clip of one frame.
 
-    Frames are compared at the same pixel, not along the motion (Zeng et al. 2021, eq. 5, second term; Chaitanya et al.
+    Frames are compared at the same pixel, not along the motion (Zeng et al. 2021, eq. 6, second term; Chaitanya et al.
     2017, sec. 4.2).
     """
     error = _difference(denoised, reference)
@@ -62,7 +62,7 @@ def occlusion(
     taken at the same pixel. A mask before the first frame is replaced by frame i's own M_i. S is not clipped, it
     reaches the sum of the weights. The mean is over the whole image, not over the masked area.
 
-    Zeng et al. 2021, eq. 6.
+    Zeng et al. 2021, eq. 5.
     """
     error = _difference(denoised, reference)
     check_image(masks, "masks", channels=1, rank=4)

@@ -48,16 +48,16 @@ def make(cls: type[T], given: Mapping[str, Any], *, method: str, base: T | None 
     return cls(**values) if base is None else dataclasses.replace(base, **values)  # type: ignore[type-var]
 
 
-def parse(assignments: Sequence[str]) -> dict[str, Any]:
+def parse(assignments: Sequence[str], *, option: str = "--set") -> dict[str, Any]:
     """``["size=small", "levels=3"]`` as a dict: values are JSON where they can be read as such, else words.
 
-    Raises ValueError for what is not ``option=value``.
+    Raises ValueError, naming the command line's ``option``, for what is not ``name=value``.
     """
     parsed: dict[str, Any] = {}
     for assignment in assignments:
         name, sign, text = assignment.partition("=")
         if not (name and sign):
-            raise ValueError(f"--set {assignment!r}: expected option=value, such as size=small.")
+            raise ValueError(f"{option} {assignment!r}: expected name=value.")
         try:
             parsed[name] = json.loads(text)
         except ValueError:

@@ -103,7 +103,8 @@ _REPAIRS: dict[str, Callable[[jax.Array, Buffer], Repaired]] = {
 }
 
 
-def repair_image(image: jax.Array) -> jax.Array:
+def repair_image(image: jax.typing.ArrayLike) -> jax.Array:
     """An image that cannot poison anything: not finite or negative -> 0, at most ``RADIANCE_MAX``."""
+    image = jnp.asarray(image)
     bad = ~(jnp.isfinite(image) & (image >= 0))
     return jnp.minimum(jnp.where(bad, 0.0, image), RADIANCE_MAX)

@@ -12,7 +12,7 @@ from jaxdn.denoiser import Denoiser, Params, State
 from jaxdn.frame import Clip, Frame, frame_at, only, present
 from jaxdn.sampling import from_layers
 
-Layers = Mapping[int, jax.Array] | None
+Layers = Mapping[int, Any] | None
 """Samples a pixel -> independent noisy radiance; see :class:`jaxdn.Clip`."""
 
 

@@ -1,7 +1,6 @@
 """Weights travel as safetensors plus a small JSON that names the denoiser's factory and its options; no pickle."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +10,10 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
-from jaxdn import denoisers
 from jaxdn.denoiser import Denoiser
+from jaxdn.files import write_whole
 from jaxdn.frame import Frame
+from jaxdn.methods.table import method_named
 
 SHIPPED = Path(__file__).parent / "shipped"
 """Where the weights lie that come with the package."""
@@ -48,69 +48,78 @@ def unflatten(flat: dict[str, np.ndarray]) -> dict[str, Any]:
 def save_weights(
     path: Path | str, params: dict[str, Any], *, factory: str, options: dict[str, Any], record: dict[str, Any]
 ) -> Path:
-    """Write ``path`` (.safetensors) and the JSON beside it; returns the path of the weights.
+    """Write ``path`` (.safetensors) and the JSON file of the same name; returns the path of the weights.
 
     ``factory`` is a name in ``jaxdn.denoisers`` and ``options`` its keyword arguments; ``record`` says how the weights
-    came to be (data, recipe, scores). Both files are written beside their place and renamed.
+    came to be (data, recipe, scores). Each file is whole or not there.
     """
     path = Path(path).with_suffix(".safetensors")
     path.parent.mkdir(parents=True, exist_ok=True)
-    description = {"factory": factory, "options": options, **record}
-    beside = path.with_name(path.name + ".part")
-    beside.write_bytes(save(flatten(params)))
-    os.replace(beside, path)
-    beside = path.with_name(path.stem + ".json.part")
-    beside.write_text(json.dumps(description, indent=1, sort_keys=True) + "\n")
-    os.replace(beside, path.with_suffix(".json"))
+    description = json.dumps({"factory": factory, "options": options, **record}, indent=1, sort_keys=True) + "\n"
+    write_whole({path: save(flatten(params)), path.with_suffix(".json"): description})
     return path
 
 
 def load_weights(name_or_path: str | Path, **options_instead: Any) -> tuple[Denoiser, dict[str, Any]]:
     """A denoiser and its parameters, by a shipped name (``"ntd-large"``) or the path of a .safetensors file.
 
-    The factory and its options are read from the JSON beside the weights; ``options_instead`` take their place, such
+    The factory and its options are read from the JSON file of the same name; ``options_instead`` take their place, such
     as ``implementation="onnxruntime"`` or ``compute_dtype="bfloat16"``. Raises ValueError where nothing of that name
     exists, a file cannot be read, the JSON names an unknown factory or option, or the weights are not those of the
     denoiser that it describes.
     """
-    path = SHIPPED / f"{name_or_path}.safetensors"
-    if not path.is_file():
-        path = Path(name_or_path)
-        if not path.is_file():
-            raise ValueError(
-                f"weights {str(name_or_path)!r}: expected one of {', '.join(shipped_names()) or 'none shipped'} or the "
-                "path of a .safetensors file, and there is no such file."
-            )
-    beside = path.with_suffix(".json")
-    try:
-        description = json.loads(beside.read_text())
-        factory, options = description["factory"], dict(description["options"])
-    except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise ValueError(
-            f"weights {path}: expected {beside.name} beside it with 'factory' and 'options', got {error!r}; "
-            "copy both files together."
-        ) from error
-    if factory not in denoisers.NAMES:
-        raise ValueError(
-            f"weights {beside}: expected a factory out of {', '.join(denoisers.NAMES)}, got {factory!r}; they may come "
-            "from a newer jaxdn."
-        )
+    path = weights_path(name_or_path)
+    description = describe(path)
+    method, options = method_named(description["factory"]), description["options"]
     try:
         flat = load_file(path)
     except (SafetensorError, OSError, ValueError) as error:
         raise ValueError(f"weights {path}: expected a whole safetensors file, got {error}; copy it again.") from error
-    options = {str(key): tuple(value) if isinstance(value, list) else value for key, value in options.items()}
     try:
-        denoiser = getattr(denoisers, factory)(**options)
+        denoiser = method.factory(**options)
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"weights {beside}: expected options of {factory}, got {options} ({error}); they may come from a newer "
-            "jaxdn."
+            f"weights {path.with_suffix('.json')}: expected options of {method.name}, got {options} ({error}); they "
+            "may come from a newer jaxdn."
         ) from error
     if options_instead:
-        denoiser = getattr(denoisers, factory)(**options | options_instead)
+        denoiser = method.factory(**options | options_instead)
     _check_params(flat, denoiser, path)
     return denoiser, unflatten(flat)
+
+
+def weights_path(name_or_path: str | Path) -> Path:
+    """The .safetensors file of a shipped name, or the path itself. Raises ValueError where there is no such file."""
+    path = SHIPPED / f"{name_or_path}.safetensors"
+    if not path.is_file():
+        path = Path(name_or_path)
+    if not path.is_file():
+        raise ValueError(
+            f"weights {str(name_or_path)!r}: expected one of {', '.join(shipped_names()) or 'none shipped'} or the "
+            "path of a .safetensors file, and there is no such file."
+        )
+    return path
+
+
+def describe(name_or_path: str | Path) -> dict[str, Any]:
+    """The JSON of weights: ``factory``, ``options``, and how they were trained.
+
+    Raises ValueError where it cannot be read, or names a method that is not in the table.
+    """
+    file = weights_path(name_or_path).with_suffix(".json")
+    try:
+        description = json.loads(file.read_text())
+        factory, options = str(description["factory"]), dict(description["options"])
+    except (OSError, KeyError, TypeError, ValueError, RecursionError) as error:
+        raise ValueError(
+            f"weights {file.with_suffix('.safetensors')}: expected {file.name} in the same folder with 'factory' and "
+            f"'options', got {error!r}; copy both files together."
+        ) from error
+    try:
+        method_named(factory)
+    except ValueError as error:
+        raise ValueError(f"weights {file}: factory: {error} They may come from a newer jaxdn.") from error
+    return {**description, "factory": factory, "options": options}
 
 
 def _check_params(flat: dict[str, np.ndarray], denoiser: Denoiser, path: Path) -> None:
@@ -133,11 +142,3 @@ def _shapes(tree: dict[str, Any], prefix: str = "") -> dict[str, tuple[tuple[int
         name = f"{prefix}/{key}" if prefix else str(key)
         shapes |= _shapes(value, name) if isinstance(value, dict) else {name: (value.shape, np.dtype(value.dtype))}
     return shapes
-
-
-def describe(name_or_path: str | Path) -> dict[str, Any]:
-    """The JSON beside the weights: factory, options, and how they were trained."""
-    path = SHIPPED / f"{name_or_path}.json"
-    if not path.is_file():
-        path = Path(name_or_path).with_suffix(".json")
-    return json.loads(path.read_text())

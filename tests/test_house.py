@@ -12,18 +12,32 @@ import jaxdn
 
 PACKAGE = Path(jaxdn.__file__).parent
 
+MATHS = (
+    "checks",
+    "options",
+    "frame",
+    "repair",
+    "denoiser",
+    "numerics",
+    "stencils",
+    "color",
+    "motion",
+    "scales",
+    "ops",
+    "brdf",
+)
 FLOORS = {
-    "backends": 0,
-    **dict.fromkeys(("frame", "checks", "numerics", "stencils", "color", "warping", "motion", "kernels"), 1),
-    **dict.fromkeys(("losses", "metrics", "flip"), 1),
-    **dict.fromkeys(("denoisers", "networks"), 2),
-    **dict.fromkeys(("rollout", "training", "effects"), 3),
-    **dict.fromkeys(("render", "clips", "checkpoint", "report", "weights"), 4),
-    **dict.fromkeys(("cli", "commands"), 5),
+    **dict.fromkeys((*MATHS, "ops", "losses", "metrics", "flip", "sampling", "objectives", "recipe"), 1),
+    **dict.fromkeys(("filters", "networks"), 2),
+    **dict.fromkeys(("methods", "denoisers"), 3),
+    **dict.fromkeys(("rollout", "learning", "planning"), 4),
+    **dict.fromkeys(("files", "render", "clips", "checkpoint", "report", "weights", "candidates"), 5),
+    "effects": 6,
+    **dict.fromkeys(("cli", "commands"), 7),
 }
 OUTSIDE = {
     "flax": {"networks"},
-    "optax": {"training"},
+    "optax": {"learning"},
     "mitsuba": {"render"},
     "drjit": {"render"},
     "OpenEXR": {"clips"},
@@ -46,6 +60,13 @@ def _imports(path: Path) -> set[str]:
     return found
 
 
+def _imported_by_name(path: Path) -> list[ast.expr]:
+    """The arguments of all calls of ``import_module``."""
+    calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    names = ((getattr(call.func, "attr", getattr(call.func, "id", "")), call) for call in calls)
+    return [call.args[0] for name, call in names if name == "import_module"]
+
+
 def _room(path: Path) -> str:
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
@@ -64,6 +85,17 @@ def test_imports_point_down(path):
                 assert FLOORS[room] <= floor, f"{path} (floor {floor}) imports {name} (floor {FLOORS[room]})"
         elif top in OUTSIDE:
             assert _room(path) in OUTSIDE[top], f"{path} imports {top}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_nothing_is_imported_by_name_but_from_a_rooms_own_door(path):
+    """An import that no import statement shows would get around the test above."""
+    for argument in _imported_by_name(path):
+        written = ast.unparse(argument)
+        room = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts[:2])
+        own = written.startswith(("__package__", "f'{__package__}", f"f'{room}.", f"'{room}."))
+        outside = isinstance(argument, ast.Constant) and not str(argument.value).startswith("jaxdn")
+        assert own or outside, f"{path} imports {written}; write an import statement"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
@@ -138,3 +170,20 @@ def test_no_module_takes_the_place_of_a_public_function():
     # Importing jaxdn.warp, were there such a module, would bind it over the function of that name.
     rooms = {path.stem for path in PACKAGE.iterdir()}
     assert not rooms & (set(jaxdn.__all__) - {"color", "losses", "metrics", "denoisers", "effects"})
+
+
+def test_a_method_is_a_function_in_denoisers_and_a_module_in_methods():
+    code = """
+import importlib, types
+import jaxdn.methods.ntd as module
+from jaxdn.denoisers import ntd
+import jaxdn.methods.ntd
+assert isinstance(module, types.ModuleType) and isinstance(ntd, types.FunctionType)
+assert jaxdn.denoisers.ntd is ntd
+try:
+    import jaxdn.denoisers.ntd as m
+except ModuleNotFoundError:
+    print("no such module")
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "no such module", done.stderr

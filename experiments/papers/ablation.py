@@ -1,36 +1,38 @@
-"""Table 2 and the ablation of Zeng et al. 2021: noisy, svgf, and ntd as A, B and C, on clips none was trained on.
+"""Table 2 and the ablation of Zeng et al. 2021: noisy, filters, and ntd as A, B and C, on clips none was trained on.
 
 A warps the history with traditional motion vectors, B with dual ones, C adds the motion-occlusion loss in the second
 half of training; all three share the network, the data, the seed and the number of steps.
 
     python -m experiments.papers.ablation                  # `make train`: a demonstration, about a quarter of an hour
-    python -m experiments.papers.ablation --preset full    # `make weights`: the shipped weights and the table of the README
+    python -m experiments.papers.ablation --preset full    # `make weights`: the shipped weights, the README's table
 
 Everything is kept under ``data/`` and ``runs/``: what was rendered or trained is used again, and what was interrupted
 continues where it stopped.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import tyro
 
-from jaxdn.clips import training_batches
-from jaxdn.clips.folder import is_clip, read_record
-from jaxdn.commands.compare import Method, compare
-from jaxdn.commands.errors import told_plainly
-from jaxdn.commands.train import fit, load_validation, read_curve, training_engine
-from jaxdn.denoisers import ntd, svgf
+from jaxdn.candidates import NOISY, candidate, filters
+from jaxdn.commands.compare import compare
+from jaxdn.commands.errors import plain_errors
+from jaxdn.commands.log import read_curve
+from jaxdn.commands.train import train
+from jaxdn.methods.table import Method, method_named
 from jaxdn.recipe import Recipe
 from jaxdn.render import ClipJob, choose_variant, render_clips
 from jaxdn.report import Results, TrainingCurve, text_table, write_report
-from jaxdn.weights import SHIPPED, load_weights, save_weights
+from jaxdn.weights import SHIPPED
 
 FAMILIES = ("fruit", "robot", "pinkroom", "mobile")
 FAILURES = ("edge", "dash")
+METHOD = "ntd"
+"""The method that the ablation is of."""
 
 
 class ClipSet(NamedTuple):
@@ -49,10 +51,16 @@ class Run(NamedTuple):
     """One network to train."""
 
     label: str
-    size: Literal["small", "large"]
-    motion: Literal["dual", "traditional"]
-    occlusion: bool
+    options: Mapping[str, Any]
+    """The method's."""
+    recipe: str
+    """The name of one of the method's recipes."""
     steps: int
+
+    @property
+    def folder(self) -> str:
+        """The name of its folder."""
+        return self.label.replace(" ", "-")
 
 
 class Preset(NamedTuple):
@@ -62,11 +70,26 @@ class Preset(NamedTuple):
     validation: ClipSet
     tests: tuple[ClipSet, ...]
     runs: tuple[Run, ...]
-    recipe: Recipe
+    learning: Mapping[str, Any]
+    """Entries of the runs' recipes that differ from the method's own."""
+
+    def recipe(self, method: Method, run: Run) -> Recipe:
+        """How a run is trained."""
+        return method.recipe_named(run.recipe)._replace(**self.learning, steps=run.steps)
 
 
 def _seeds(families: Sequence[str], seeds: range) -> tuple[tuple[str, int], ...]:
     return tuple((family, seed) for seed in seeds for family in families)
+
+
+def _abc(steps: int) -> dict[str, Run]:
+    """The three runs of the paper's ablation, with the small network."""
+    traditional, dual = ({"size": "small", "motion": motion} for motion in ("traditional", "dual"))
+    return {
+        "A": Run("A", traditional, "without-occlusion", steps),
+        "B": Run("B", dual, "without-occlusion", steps),
+        "C": Run("C", dual, "usual", steps),
+    }
 
 
 PRESETS = {
@@ -74,12 +97,8 @@ PRESETS = {
         train=ClipSet(_seeds(FAMILIES, range(2)), size=64, frames=10, reference_spp=32),
         validation=ClipSet((("fruit", 100),), size=64, frames=10, reference_spp=32),
         tests=(ClipSet((*_seeds(FAMILIES[1:], range(200, 201)), ("edge", 200)), 64, 10, reference_spp=64),),
-        runs=(
-            Run("A", "small", "traditional", occlusion=False, steps=100),
-            Run("B", "small", "dual", occlusion=False, steps=100),
-            Run("C", "small", "dual", occlusion=True, steps=100),
-        ),
-        recipe=Recipe(learning_rate=2e-3, crop=48),
+        runs=tuple(_abc(steps=100).values()),
+        learning={"learning_rate": 2e-3, "crop": 48},
     ),
     "full": Preset(
         train=ClipSet(_seeds(FAMILIES, range(6)), size=96, frames=10, reference_spp=96),
@@ -91,12 +110,10 @@ PRESETS = {
             ClipSet((("mobile", 300),), size=96, frames=110, reference_spp=64),
         ),
         runs=(
-            Run("C large", "large", "dual", occlusion=True, steps=1200),
-            Run("C", "small", "dual", occlusion=True, steps=1200),
-            Run("B", "small", "dual", occlusion=False, steps=1200),
-            Run("A", "small", "traditional", occlusion=False, steps=1200),
+            Run("C large", {"size": "large", "motion": "dual"}, "usual", 1200),
+            *reversed(_abc(steps=1200).values()),
         ),
-        recipe=Recipe(learning_rate=2e-3, crop=48),
+        learning={"learning_rate": 2e-3, "crop": 48},
     ),
 }
 
@@ -122,27 +139,21 @@ class Settings:
     """Put the weights of the full preset into the package."""
 
 
-def jobs(clips: ClipSet, folder: Path) -> list[Any]:
+def jobs(clips: ClipSet, folder: Path) -> list[ClipJob]:
     """What to render for a set of clips."""
     return [
         ClipJob(
             {"family": family, "seed": seed},
-            str(folder / f"{family}-{seed}"),
+            str(place),
             width=clips.size,
             height=clips.size,
             frames=clips.frames,
             layers=clips.layers,
             reference_spp=clips.reference_spp,
             seed=seed,
-            variant=_variant_of(folder / f"{family}-{seed}"),
         )
-        for family, seed in clips.clips
+        for (family, seed), place in zip(clips.clips, folders(clips, folder), strict=True)
     ]
-
-
-def _variant_of(folder: Path) -> str | None:
-    """The variant that a clip was begun with: it is finished, and used again, with the same one."""
-    return read_record(folder)["variant"] if is_clip(folder) else None
 
 
 def folders(clips: ClipSet, folder: Path) -> list[Path]:
@@ -150,57 +161,52 @@ def folders(clips: ClipSet, folder: Path) -> list[Path]:
     return [folder / f"{family}-{seed}" for family, seed in clips.clips]
 
 
-def train(run: Run, preset: Preset, data: Path, folder: Path) -> None:
-    """Train one network to the end (or find it trained) and write its weights."""
-    options = {"size": run.size, "motion": run.motion}
-    recipe = preset.recipe._replace(steps=run.steps, occlusion=run.occlusion)
-    engine = training_engine()
-    denoiser = ntd(**options, implementation=engine)  # type: ignore[arg-type]
-    print(f"{run.label}: convolutions run on {engine}", flush=True)
-    batches = training_batches(
+def render(preset: Preset, data: Path, workers: int | None) -> dict[str, Any]:
+    """Render all clips of a preset, or find them rendered; returns what the report says of the renderer."""
+    choice = choose_variant()
+    print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
+    parts = [(preset.train, "train"), (preset.validation, "validation"), *((each, "test") for each in preset.tests)]
+    render_clips([job for clips, part in parts for job in jobs(clips, data / part)], workers=workers)
+    return {"renderer": f"Mitsuba, {choice.variant}"}
+
+
+def train_run(run: Run, preset: Preset, data: Path, folder: Path) -> Path:
+    """Train one network to the end (or find it trained); returns the path of its weights."""
+    method = method_named(METHOD)
+    origin = {"trained_on": f"{len(preset.train.clips)} clips of {', '.join(FAMILIES)}", "run": run.label}
+    return train(
+        method,
+        preset.recipe(method, run),
         folders(preset.train, data / "train"),
-        buffers=denoiser.reads,
-        batch=recipe.batch,
-        crop=recipe.crop,
-        frames=recipe.frames,
-        seed=recipe.seed,
-    )
-    state = fit(
-        denoiser,
-        recipe,
-        batches,
-        folder,
+        folder / run.folder,
+        options=run.options,
+        validation=folders(preset.validation, data / "validation"),
         label=run.label,
-        validation=load_validation(folders(preset.validation, data / "validation")),
+        record={"data": origin},
     )
-    how = {"trained_on": f"{len(preset.train.clips)} clips of {', '.join(FAMILIES)}", "run": run.label}
-    record = {"recipe": recipe._asdict(), "data": how}
-    save_weights(folder / "weights.safetensors", state.params, factory="ntd", options=options, record=record)
 
 
 def evaluate(preset: Preset, settings: Settings, data: Path, folder: Path, machine: dict[str, Any]) -> Results:
-    """Score every method on the test clips."""
-    methods = [Method("noisy", None, {}), Method("svgf", svgf(), {})]
+    """Score the noisy image, every filter and every run that has weights on the test clips."""
+    contestants = [candidate(name) for name in (NOISY, *filters())]
     curves = {}
-    for run in sorted(preset.runs, key=lambda run: (run.size == "large", run.label)):
-        path = folder / _folder_name(run) / "weights.safetensors"
+    for run in sorted(preset.runs, key=lambda run: run.label):
+        path = folder / run.folder / "weights.safetensors"
         if path.is_file():
-            methods.append(Method(run.label, *load_weights(path)))
+            contestants.append(candidate(str(path))._replace(label=run.label))
             curves[run.label] = TrainingCurve(*read_curve(path.parent))
     tests = [place for clips in preset.tests for place in folders(clips, data / "test")]
-    told = {
+    recipe = preset.recipe(method_named(METHOD), preset.runs[0]).record()
+    facts = {
         "preset": settings.preset,
         "training clips": len(preset.train.clips),
         "test clips (never seen)": len(tests),
         "training steps": ", ".join(f"{run.label} {run.steps}" for run in preset.runs),
-        **{key.replace("_", " "): value for key, value in preset.recipe._asdict().items() if key != "steps"},
+        **{key.replace("_", " "): value for key, value in recipe.items() if key not in ("steps", "objective")},
     }
-    results = compare(methods, tests, title="Neural temporal denoising: the ablation", settings=told, training=curves)
+    title = "Neural temporal denoising: the ablation"
+    results = compare(contestants, tests, title=title, settings=facts, training=curves)
     return results._replace(machine={**results.machine, **machine})
-
-
-def _folder_name(run: Run) -> str:
-    return run.label.replace(" ", "-")
 
 
 def main(settings: Settings) -> None:
@@ -210,16 +216,12 @@ def main(settings: Settings) -> None:
     data, folder = Path("data") / settings.preset, Path("runs") / (settings.name or settings.preset)
     machine: dict[str, Any] = {}
     if settings.only in ("all", "render"):
-        choice = choose_variant()
-        machine["renderer"] = f"Mitsuba, {choice.variant}"
-        print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
-        parts = [(preset.train, "train"), (preset.validation, "validation"), *((each, "test") for each in preset.tests)]
-        render_clips([job for clips, part in parts for job in jobs(clips, data / part)], workers=settings.workers)
+        machine = render(preset, data, settings.workers)
         print(f"rendered: {time.monotonic() - began:.0f} s so far", flush=True)
     if settings.only in ("all", "train"):
         for run in preset.runs:
             if not settings.runs or run.label in settings.runs:
-                train(run, preset, data, folder / _folder_name(run))
+                train_run(run, preset, data, folder)
         print(f"trained: {time.monotonic() - began:.0f} s so far", flush=True)
     if settings.ship:
         ship(folder)
@@ -232,12 +234,13 @@ def main(settings: Settings) -> None:
 
 def ship(folder: Path) -> None:
     """Copy the weights of the full preset into the package."""
-    for label, name in SHIPPED_RUNS.items():
-        for suffix in (".safetensors", ".json"):
-            source = folder / label.replace(" ", "-") / f"weights{suffix}"
-            (SHIPPED / f"{name}{suffix}").write_bytes(source.read_bytes())
+    for run in PRESETS["full"].runs:
+        if run.label in SHIPPED_RUNS:
+            for suffix in (".safetensors", ".json"):
+                source = folder / run.folder / f"weights{suffix}"
+                (SHIPPED / f"{SHIPPED_RUNS[run.label]}{suffix}").write_bytes(source.read_bytes())
 
 
 if __name__ == "__main__":
-    with told_plainly():
+    with plain_errors():
         main(tyro.cli(Settings, description=Settings.__doc__))

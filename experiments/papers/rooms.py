@@ -3,7 +3,8 @@
     python -m experiments.papers.rooms SCENES [--runs runs/full]
 
 SCENES is a folder with Benedikt Bitterli's scenes for Mitsuba (``living-room/scene.xml``, ``staircase2``,
-``cornell_box_picture``); their animations are the files in ``experiments/papers/rooms/``. Writes ``runs/rooms/report.html``.
+``cornell_box_picture``); their animations are the files in ``experiments/papers/rooms/``. Writes
+``runs/rooms/report.html``.
 """
 
 from dataclasses import dataclass
@@ -12,13 +13,13 @@ from typing import Annotated
 
 import tyro
 
-from jaxdn.commands.compare import Method, compare, method_named
-from jaxdn.commands.errors import told_plainly
+from jaxdn.candidates import NOISY, Candidate, all_names, candidate, filters
+from jaxdn.commands.compare import compare
+from jaxdn.commands.errors import plain_errors
 from jaxdn.render import ClipJob, choose_variant, render_clips
-from jaxdn.render.clip import RenderError
+from jaxdn.render.errors import RenderError
 from jaxdn.render.scene_file import SceneFile
 from jaxdn.report import text_table, write_report
-from jaxdn.weights import load_weights
 
 ANIMATIONS = Path(__file__).parent / "rooms"
 
@@ -30,25 +31,24 @@ class Settings:
     scenes: Annotated[Path, tyro.conf.Positional]
     """Folder of the rooms: one folder with a scene.xml each."""
     runs: Path | None = None
-    """Folder of the ablation's runs: its A, B and C are compared as well as the shipped weights."""
+    """Folder of the ablation's runs, which are compared in place of the shipped weights."""
     width: int = 128
     height: int = 72
     frames: int = 8
     reference_spp: int = 128
 
 
-def main(settings: Settings) -> None:
-    """Render, compare, report."""
-    jobs = []
+def jobs(settings: Settings) -> list[ClipJob]:
+    """What to render: every room whose scene is there. Raises ValueError if none is."""
+    found = []
     for animation in sorted(ANIMATIONS.glob("*.json")):
         path = settings.scenes / animation.stem / "scene.xml"
         if not path.is_file():
             print(f"{path} is not there: this room is left out")
             continue
-        scene = SceneFile(path, animation)
-        jobs.append(
+        found.append(
             ClipJob(
-                scene.record,
+                SceneFile(path, animation).record,
                 str(Path("data/rooms") / animation.stem),
                 width=settings.width,
                 height=settings.height,
@@ -56,29 +56,37 @@ def main(settings: Settings) -> None:
                 reference_spp=settings.reference_spp,
             )
         )
-    if not jobs:
+    if not found:
         names = ", ".join(path.stem for path in sorted(ANIMATIONS.glob("*.json")))
         raise ValueError(f"{settings.scenes}: expected folders out of {names} with a scene.xml each, found none.")
+    return found
+
+
+def contestants(runs: Path | None) -> list[Candidate]:
+    """The noisy image, every filter, and the weights in a folder of runs, or else those that are shipped."""
+    if runs is None:
+        return [candidate(name) for name in all_names()]
+    weights = [str(path) for path in sorted(runs.glob("*/weights.safetensors"))]
+    return [candidate(name) for name in (NOISY, *filters(), *weights)]
+
+
+def main(settings: Settings) -> None:
+    """Render, compare, report."""
+    rooms = jobs(settings)
     choice = choose_variant()
     print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
     try:
-        render_clips(jobs)
+        render_clips(rooms)
     except RenderError as error:  # a room with something that is not supported is left out of the table, not hidden
         print(error)
-    folders = [Path(job.folder) for job in jobs if len(list(Path(job.folder).glob("*.exr"))) == settings.frames]
-    methods = [method_named("noisy"), method_named("svgf")]
-    if settings.runs is not None:
-        for path in sorted(settings.runs.glob("*/weights.safetensors"), key=lambda path: ("large" in str(path), path)):
-            methods.append(Method(path.parent.name, *load_weights(path)))
-    else:
-        methods += [method_named("ntd-small"), method_named("ntd-large")]
-    told = {"rooms": len(jobs), "reference spp": settings.reference_spp, "frames": settings.frames}
-    results = compare(methods, folders, title="Rooms that no network was trained on", settings=told)
+    folders = [Path(job.folder) for job in rooms if len(list(Path(job.folder).glob("*.exr"))) == settings.frames]
+    facts = {"rooms": len(rooms), "reference spp": settings.reference_spp, "frames": settings.frames}
+    results = compare(contestants(settings.runs), folders, title="Rooms that no network was trained on", settings=facts)
     page = write_report(results, Path("runs/rooms"))
     print(text_table(results))
     print(f"report: {page}")
 
 
 if __name__ == "__main__":
-    with told_plainly():
+    with plain_errors():
         main(tyro.cli(Settings, description=Settings.__doc__))

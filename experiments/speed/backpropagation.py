@@ -13,10 +13,9 @@ import jax
 import numpy as np
 import tyro
 
-from jaxdn.denoisers import ntd
 from jaxdn.frame import Clip, Frame
 from jaxdn.learning.step import initial_state, make_train_step
-from jaxdn.recipe import Recipe
+from jaxdn.methods.table import method_named
 
 
 @dataclass
@@ -43,14 +42,16 @@ def random_batch(settings: Settings, frames: int) -> Clip:
 
 def main(settings: Settings) -> None:
     """Measure and print a table."""
+    method = method_named("ntd")
+    usual = method.recipe_named(None)._replace(batch=settings.batch, crop=settings.crop)
     print(f"ntd {settings.size}, batch {settings.batch}, {settings.crop} px, on {jax.devices()[0].device_kind}")
     print(f"{'frames':>6} {'rematerialised':>15} {'temporary MiB':>14} {'ms a step':>10} {'compile s':>10}")
     for rematerialize in (False, True):
         before = None
         for frames in (2, 5, 10):
-            recipe = Recipe(batch=settings.batch, crop=settings.crop, frames=frames, rematerialize=rematerialize)
+            recipe = usual._replace(frames=frames, rematerialize=rematerialize)
             batch = random_batch(settings, frames)
-            denoiser = ntd(size=settings.size)
+            denoiser = method.factory(size=settings.size)
             state = initial_state(denoiser, recipe, batch)
             began = time.perf_counter()
             step = make_train_step(denoiser, recipe).lower(state, batch).compile()  # type: ignore[attr-defined]

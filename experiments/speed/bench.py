@@ -5,11 +5,10 @@
 
 Writes ``runs/bench.json``, a list of rows ``{"work", "implementation", "median_ms", "min_ms", "max_ms", "peak_mib",
 "against", "ratio"}`` with ``ratio`` = own median over that of ``against``, and prints a table. What is compared is
-measured in turns in one process. The peers are optional (`make bench` installs them); rows are left out with a word
+measured interleaved in one process. The peers are optional (`make bench` installs them); rows are left out with a word
 where one cannot be had.
 """
 
-import json
 import os
 import tempfile
 import time
@@ -28,7 +27,8 @@ from experiments.speed import peers, roofline
 from experiments.speed.roofline import Probe
 from experiments.speed.timing import Call, Timing, measure, peak_mib
 from experiments.speed.works import Work, compilation, input_share, operations, steps, train_steps
-from jaxdn.commands.errors import told_plainly
+from jaxdn.commands.errors import plain_errors
+from jaxdn.files import write_json
 
 Row = dict[str, Any]
 
@@ -38,7 +38,7 @@ compiled beforehand does not count; on two cores it takes about as long as all o
 ONE_WORK_S = {"steps": 45, "operations": 6, "train": 60}
 """Seconds for the rounds of one work; at least two rounds are run."""
 COMPILED = ("step-large-720p", "train-large-64")
-"""The programs whose compile time is told."""
+"""The programs whose compile time is measured."""
 COMPILE_S = 240
 """A compilation is given up after so many seconds."""
 
@@ -60,11 +60,9 @@ class Report:
         path.parent.mkdir(parents=True, exist_ok=True)
 
     def add(self, rows: Sequence[Row]) -> None:
-        """Keep the rows and write the file anew, beside and then in its place."""
+        """Keep the rows and write the file anew."""
         self.rows.extend(rows)
-        beside = self.path.with_name(self.path.name + ".part")
-        beside.write_text(json.dumps(self.rows, indent=1) + "\n")
-        os.replace(beside, self.path)
+        write_json(self.path, self.rows)
 
 
 def row(work: str, name: str, timing: Timing, peak: float | None, against: str, other_ms: float) -> Row:
@@ -98,7 +96,7 @@ def compare(
 
 
 def run(work: Work, probe: Probe, *, budget_s: float, say: Callable[[str], None]) -> list[Row]:
-    """Build what the work compares, time it and the ceilings in turns, then take each peak."""
+    """Build what the work compares, time it interleaved with the ceilings, then take each peak."""
     calls: dict[str, Call] = {}
     for name, build in {**work.ours, **work.peers}.items():
         try:
@@ -123,18 +121,18 @@ def compile_rows(
 ) -> list[Row]:
     """Compile time of one program: cold (``taken``, or now), again from the cache, and PyTorch's."""
     work, seconds = f"compile-{program}", {}
-    engines = ["xla"] if "torch-compiled" in peers.missing() else ["xla", "torch"]
-    for pair in [(engine, program) for engine in engines]:
+    compilers = ["xla"] if "torch-compiled" in peers.missing() else ["xla", "torch"]
+    for pair in [(compiler, program) for compiler in compilers]:
         if pair not in taken:
             taken[pair] = compilation.compile_seconds(*pair, cache, limit_s=COMPILE_S)
-    seconds["xla-cold"], seconds["torch-compiled"] = (taken.get((engine, program)) for engine in ("xla", "torch"))
+    seconds["xla-cold"], seconds["torch-compiled"] = (taken.get((compiler, program)) for compiler in ("xla", "torch"))
     if seconds["xla-cold"] is not None:
         seconds["xla-cached"] = compilation.compile_seconds("xla", program, cache, limit_s=COMPILE_S)
     timings = {}
     for name, value in seconds.items():
         if value is not None:
             timings[name] = Timing(1e3 * value, 1e3 * value, 1e3 * value, 1e3 * value, 1)
-        elif name.split("-")[0] in engines:
+        elif name.split("-")[0] in compilers:
             say(f"{work}: {name} did not end within {COMPILE_S} s, its rows are left out")
     pairs = (("xla-cold", "torch-compiled"), ("xla-cached", "xla-cold"), ("torch-compiled", "xla-cold"))
     return [
@@ -260,5 +258,5 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    with told_plainly():
+    with plain_errors():
         main(tyro.cli(Settings, description=Settings.__doc__))

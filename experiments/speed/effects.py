@@ -3,10 +3,10 @@
     python -m experiments.speed.effects            # a minute or two a scene on two cores
     python -m experiments.speed.effects --quick    # fewer samples, three scenes
 
-For each scene of :mod:`experiments.speed.small_rooms` that is listed here the same clip is rendered twice, in turns, and
-denoised frame by frame, in turns. What is printed are ratios auto / all of one run; ``runs/effects.json`` has the raw
-numbers too. Path length is measured for ``auto`` and the scene's own for ``all``; the column ``same depth`` is the
-rendering time of ``auto`` at the scene's own path length, so that the two savings are told apart.
+For each scene of :mod:`experiments.speed.small_rooms` that is listed here the same clip is rendered both ways and
+denoised frame by frame, each program once a round. What is printed are ratios auto / all of one run;
+``runs/effects.json`` has the raw numbers too. Path length is measured for ``auto`` and the scene's own for ``all``; the
+column ``same depth`` is the rendering time of ``auto`` at the scene's own path length, which separates the two savings.
 """
 
 import functools
@@ -28,7 +28,7 @@ import jaxdn
 from experiments.speed.small_rooms import CASES, FRAMES, Case
 from jaxdn import effects
 from jaxdn.clips import read_frames
-from jaxdn.commands.errors import told_plainly
+from jaxdn.commands.errors import plain_errors
 from jaxdn.effects import Plan
 from jaxdn.frame import Frame, only
 from jaxdn.render import use_variant
@@ -62,8 +62,8 @@ class Settings:
     out: Path = Path("runs/effects.json")
 
 
-def in_turns(programs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Median seconds of each program, run in turn."""
+def medians(programs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
+    """Median seconds of each program; every round runs each of them once, so that all meet the same machine."""
     times: dict[str, list[float]] = {name: [] for name in programs}
     for _ in range(rounds):
         for name, program in programs.items():
@@ -82,10 +82,10 @@ def render(case: Case, settings: Settings, folder: Path) -> tuple[dict[str, Any]
     found = effects.inspect(scene, width=settings.size, height=settings.size)
     inspected = time.perf_counter() - start
     start = time.perf_counter()
-    depth = measure_depth(scene) if "indirect" in found else None
-    measured = time.perf_counter() - start
     at_own_depth = effects.plan(found)
-    plan = at_own_depth if depth is None else effects.plan(found, max_depth=depth.max_depth, bound=depth.bound)
+    depth = measure_depth(scene) if at_own_depth.indirect else None
+    measured = time.perf_counter() - start
+    plan = at_own_depth if depth is None else effects.plan(found, max_depth=depth.max_depth)
     plans: dict[str, Plan | None] = {"all": None, "auto": plan, "same depth": at_own_depth}
     clips: dict[str, list[Path]] = {name: [] for name in plans}
 
@@ -104,9 +104,9 @@ def render(case: Case, settings: Settings, folder: Path) -> tuple[dict[str, Any]
 
         return run
 
-    seconds = in_turns({name: one(name) for name in plans}, 1 if settings.quick else ROUNDS)
+    seconds = medians({name: one(name) for name in plans}, 1 if settings.quick else ROUNDS)
     size = {name: sum(file.stat().st_size for file in clips[name][0].glob("*.exr")) for name in plans}
-    told = {
+    figures = {
         "effects": list(found),
         "depth": {"all": scene.max_depth, "auto": plan.max_depth},
         "render seconds": seconds,
@@ -114,13 +114,13 @@ def render(case: Case, settings: Settings, folder: Path) -> tuple[dict[str, Any]
         "inspection seconds": inspected,
         "depth seconds": measured,
     }
-    return told, {name: clips[name][0] for name in ("all", "auto")}
+    return figures, {name: clips[name][0] for name in ("all", "auto")}
 
 
 def denoise(denoiser: jaxdn.Denoiser, params: Any, clips: dict[str, Path]) -> dict[str, Any]:
     """Steady-state milliseconds a frame, bytes and operations of the step, with everything and by plan."""
     runs: dict[str, Callable[[], Any]] = {}
-    told: dict[str, Any] = {"bytes": {}, "operations": {}}
+    figures: dict[str, Any] = {"bytes": {}, "operations": {}}
     for name, clip in clips.items():
         # The last frame: what moves has begun to move by then, and has not come to rest.
         frame = [jax.tree.map(jax.numpy.asarray, stored.frame) for stored in read_frames(clip)][-1]
@@ -129,14 +129,15 @@ def denoise(denoiser: jaxdn.Denoiser, params: Any, clips: dict[str, Path]) -> di
         lowered = jax.jit(denoiser.step).lower(params, state, used)
         step = lowered.compile()
         memory: Any = step.memory_analysis()
-        told["bytes"][name] = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
-        told["operations"][name] = lowered.as_text().count("stablehlo.")
+        sizes = (memory.temp_size_in_bytes, memory.argument_size_in_bytes, memory.output_size_in_bytes)
+        figures["bytes"][name] = sum(sizes)
+        figures["operations"][name] = lowered.as_text().count("stablehlo.")
         for _ in range(8):  # past the first frames, whose history is short
             state, image = step(params, state, used)
         jax.block_until_ready(image)
         runs[name] = functools.partial(_wait_for, step, params, state, used)
-    told["milliseconds"] = {name: 1e3 * seconds for name, seconds in in_turns(runs, 15).items()}
-    return told
+    figures["milliseconds"] = {name: 1e3 * seconds for name, seconds in medians(runs, 15).items()}
+    return figures
 
 
 def _wait_for(step: Callable[..., Any], *arguments: Any) -> Any:
@@ -154,10 +155,10 @@ def main(settings: Settings) -> None:
     for name in (SCENES[0], SCENES[5], SCENES[-1]) if settings.quick else SCENES:
         print(f"{name} ...", flush=True)
         with tempfile.TemporaryDirectory() as place:
-            told, clips = render(CASES[name], settings, Path(place))
-            told["svgf"] = denoise(svgf, {}, clips)
-            told["ntd small"] = denoise(network, params, clips)
-        results[name] = told
+            figures, clips = render(CASES[name], settings, Path(place))
+            figures["svgf"] = denoise(svgf, {}, clips)
+            figures["ntd small"] = denoise(network, params, clips)
+        results[name] = figures
     settings.out.parent.mkdir(parents=True, exist_ok=True)
     settings.out.write_text(json.dumps({"settings": {**vars(settings), "out": None}, "scenes": results}, indent=1))
     show(results)
@@ -176,17 +177,22 @@ def show(results: dict[str, Any]) -> None:
     titles = ["scene", "depth", "render", "same depth", "inspection", "disk"]
     for title in titles + [f"{method} {kind}" for method in ("svgf", "ntd small") for kind in kinds]:
         table.add_column(title, overflow="fold")
-    for name, told in results.items():
-        seconds = told["render seconds"]
-        looked = (told["inspection seconds"] + told["depth seconds"]) / seconds["all"]
-        row = [name, f"{told['depth']['auto']}/{told['depth']['all']}", ratio(seconds), ratio(seconds, "same depth")]
-        row += [f"{looked:.3f}", ratio(told["bytes"])]
+    for name, figures in results.items():
+        seconds = figures["render seconds"]
+        looked = (figures["inspection seconds"] + figures["depth seconds"]) / seconds["all"]
+        row = [
+            name,
+            f"{figures['depth']['auto']}/{figures['depth']['all']}",
+            ratio(seconds),
+            ratio(seconds, "same depth"),
+        ]
+        row += [f"{looked:.3f}", ratio(figures["bytes"])]
         for method in ("svgf", "ntd small"):
-            row += [ratio(told[method][kind]) for kind in ("milliseconds", "bytes", "operations")]
+            row += [ratio(figures[method][kind]) for kind in ("milliseconds", "bytes", "operations")]
         table.add_row(*row)
     Console(width=160).print(table)
 
 
 if __name__ == "__main__":
-    with told_plainly():
+    with plain_errors():
         main(tyro.cli(Settings, description=Settings.__doc__))

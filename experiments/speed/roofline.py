@@ -1,6 +1,6 @@
 """The least time that a work can take here: its operations and bytes over what this machine reaches.
 
-The ceilings are measured in turns with the work. Operations and bytes are counted from the shapes, not from a
+The ceilings are measured interleaved with the work. Operations and bytes are counted from the shapes, not from a
 compiled program: every convolution reads its input once, writes its output once and does ``2 * 9 * Ci * Co`` operations
 a pixel. Nothing stays in a cache from one convolution to the next, and nothing else is counted that could be fused
 into one of them.
@@ -40,7 +40,7 @@ class Ceilings(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """Calls that reach the ceilings, to be timed in turns with the work: a shared machine's ceilings move."""
+    """Calls that reach the ceilings, to be timed interleaved with the work: a shared machine's ceilings move."""
 
     copy: Call
     bytes: float

@@ -173,7 +173,7 @@ class Case(NamedTuple):
     uncertain: frozenset[str] = frozenset()
 
     def write(self, folder: Path) -> Path:
-        """Write the scene with its animation beside it; returns the scene's path."""
+        """Write the scene with its animation next to it; returns the scene's path."""
         path = folder / "scene.xml"
         write_image(folder / "bumps.exr", np.random.default_rng(0).random((8, 8, 3)).astype(np.float32))
         path.write_text(f'<scene version="3.0.0">{INTEGRATOR}{SENSOR}{self.xml}</scene>')

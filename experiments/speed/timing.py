@@ -1,7 +1,7 @@
-"""How long calls take beside each other, and how much memory one takes.
+"""How long calls take compared with each other, and how much memory one takes.
 
-A machine that others use is fast one minute and slow the next: what is compared is measured in turns, in one process,
-and read as ratios of medians.
+A machine that others use is fast one minute and slow the next: what is compared is measured interleaved, in one
+process, and read as ratios of medians.
 """
 
 import ctypes
@@ -33,9 +33,10 @@ class Timing(NamedTuple):
 
 
 def measure(calls: Mapping[str, Call], *, rounds: int = 7, budget_s: float = 60.0) -> dict[str, Timing]:
-    """Time each call in turns: once to compile, then ``rounds`` times or until ``budget_s`` is spent, at least twice.
+    """Time calls interleaved: each once to compile, then ``rounds`` times, or until ``budget_s`` is spent.
 
-    The budget counts from the end of the first calls. Rounds are whole: every call is timed equally often.
+    There are at least two rounds, and all are whole: every call is timed equally often. The budget counts from the end
+    of the first calls.
     """
     first, samples = {}, {name: [] for name in calls}  # type: dict[str, float], dict[str, list[float]]
     for name, call in calls.items():

@@ -3,10 +3,10 @@
     python -m experiments.stability.fuzz --inputs 100000      # some minutes; counts in runs/fuzz.json
     python -m experiments.stability.fuzz --only exr --first 4711 --inputs 1
 
-Input n of a kind is the same in every run (:mod:`experiments.stability.fuzz_inputs`), so ``--first`` repeats a single one. A run
-that was interrupted continues from the counts it left; without that file it starts over. Reading happens in processes
-of their own with a limit on memory and on time, so that whatever dies is told with the number of the input that killed
-it.
+Input n of a kind is the same in every run (:mod:`experiments.stability.fuzz_inputs`), so ``--first`` repeats a single
+one. A run that was interrupted continues from the counts it left; without that file it starts over. Reading happens in
+processes of their own with a limit on memory and on time, so that whatever dies is reported with the number of the
+input that killed it.
 """
 
 import contextlib
@@ -28,7 +28,8 @@ from typing import Any, Literal, NamedTuple
 import tyro
 
 from experiments.stability.fuzz_inputs import KINDS, broken, good_files
-from jaxdn.commands.errors import told_plainly
+from jaxdn.commands.errors import plain_errors
+from jaxdn.files import write_json
 
 DOCUMENTED = (ValueError, OSError)
 """What a broken file may raise: ClipError is a ValueError; a file of nothing may not open."""
@@ -53,7 +54,7 @@ class Settings:
     """Where the counts go, after every batch."""
 
 
-class Told(NamedTuple):
+class Counts(NamedTuple):
     """What became of inputs."""
 
     read: int
@@ -99,7 +100,7 @@ def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
         read_clip(clip)
         read_facts(clip)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a reference that is not finite is told, and taken as 0
+            warnings.simplefilter("ignore")  # a reference that is not finite is warned of, and taken as 0
             open_cached(clip, cache=folder / "cache")
 
     return {
@@ -154,7 +155,7 @@ def _address_space() -> int:
 
 
 def _listing(folder: Path) -> set[Path]:
-    """Every file under a folder but those of the cache that reading a clip for training is told to make."""
+    """Every file under a folder but those of the cache that reading a clip for training makes."""
     found = {path.relative_to(folder) for path in folder.rglob("*")}
     return {path for path in found if path.parts[:2] != ("in", "cache")}
 
@@ -169,27 +170,28 @@ def prepare(source: Path) -> Path:
     return source
 
 
-def run_kind(kind: str, first: int, count: int, source: Path, *, repeat: bool = True) -> Told:
+def run_kind(kind: str, first: int, count: int, source: Path, *, repeat: bool = True) -> Counts:
     """Feed inputs of one kind; a process that dies loses its own input, not the ones after.
 
     With ``repeat`` that input gets a second chance: a machine that stood still for a while is no hang.
     """
-    counts, bad = {"read": 0, "refused": 0}, []
+    found, bad = {"read": 0, "refused": 0}, []
     done = first
     while done < first + count:
-        command = [sys.executable, "-m", "experiments.stability.fuzz", "--child", kind, *map(str, (done, first + count - done))]
+        numbers = map(str, (done, first + count - done))
+        command = [sys.executable, "-m", "experiments.stability.fuzz", "--child", kind, *numbers, str(source)]
         environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
         process = subprocess.run(
-            [*command, str(source)], capture_output=True, text=True, errors="replace", env=environment, check=False
+            command, capture_output=True, text=True, errors="replace", env=environment, check=False
         )
         last, open_input = done - 1, False
         for line in process.stdout.splitlines():
             if line.startswith("@"):
                 last, open_input = int(line[1:]), True
-            elif open_input and (line in counts or line.startswith("BAD ")):
+            elif open_input and (line in found or line.startswith("BAD ")):
                 open_input = False
-                if line in counts:
-                    counts[line] += 1
+                if line in found:
+                    found[line] += 1
                 else:
                     bad.append((last, line[4:]))
         if last < done:
@@ -197,11 +199,11 @@ def run_kind(kind: str, first: int, count: int, source: Path, *, repeat: bool = 
         if open_input and repeat:
             again = run_kind(kind, last, 1, source, repeat=False)
             bad += again.bad
-            counts["read"], counts["refused"] = counts["read"] + again.read, counts["refused"] + again.refused
+            found["read"], found["refused"] = found["read"] + again.read, found["refused"] + again.refused
         elif open_input:
             bad.append((last, f"the process died ({process.returncode}): {process.stderr[-600:]}"))
         done = last + 1
-    return Told(counts["read"], counts["refused"], bad)
+    return Counts(found["read"], found["refused"], bad)
 
 
 def main(settings: Settings) -> int:
@@ -216,23 +218,23 @@ def main(settings: Settings) -> int:
     with tempfile.TemporaryDirectory() as place:
         source = prepare(Path(place) / "source")
         for kind in kinds:
-            began, told = time.monotonic(), Told(0, 0, [])
+            began, counts = time.monotonic(), Counts(0, 0, [])
             if kind in report["kinds"]:
-                told = Told(*(report["kinds"][kind][name] for name in Told._fields))
+                counts = Counts(*(report["kinds"][kind][name] for name in Counts._fields))
                 began -= report["kinds"][kind]["seconds"]
-            while told.inputs < each:
-                size = min(settings.batch, each - told.inputs)
-                new = run_kind(kind, settings.first + told.inputs, size, source)
-                told = Told(told.read + new.read, told.refused + new.refused, told.bad + new.bad)
+            while counts.inputs < each:
+                size = min(settings.batch, each - counts.inputs)
+                new = run_kind(kind, settings.first + counts.inputs, size, source)
+                counts = Counts(counts.read + new.read, counts.refused + new.refused, counts.bad + new.bad)
                 seconds = time.monotonic() - began
-                report["kinds"][kind] = {"inputs": told.inputs, **told._asdict(), "seconds": round(seconds, 1)}
+                report["kinds"][kind] = {"inputs": counts.inputs, **counts._asdict(), "seconds": round(seconds, 1)}
                 for name in ("inputs", "read", "refused"):
                     report[name] = sum(entry[name] for entry in report["kinds"].values())
                 report["bad"] = sum(len(entry["bad"]) for entry in report["kinds"].values())
-                settings.out.write_text(json.dumps(report, indent=1) + "\n")
+                write_json(settings.out, report)
                 print(
-                    f"{kind}: {told.inputs} of {each} inputs, {told.read} read, {told.refused} refused, "
-                    f"{len(told.bad)} bad ({seconds:.0f} s)",
+                    f"{kind}: {counts.inputs} of {each} inputs, {counts.read} read, {counts.refused} refused, "
+                    f"{len(counts.bad)} bad ({seconds:.0f} s)",
                     flush=True,
                 )
                 for number, reason in new.bad[:20]:
@@ -245,5 +247,5 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--child"]:
         child(sys.argv[2], int(sys.argv[3]), int(sys.argv[4]), Path(sys.argv[5]))
     else:
-        with told_plainly():
+        with plain_errors():
             sys.exit(main(tyro.cli(Settings, description=Settings.__doc__)))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 KINDS = ("exr", "foreign", "record", "animation", "weights", "description")
-"""Frames of ours, frames of other renderers, clip.json, animation files, safetensors, the JSON beside them."""
+"""Frames of ours, frames of other renderers, clip.json, animation files, safetensors, the JSON that goes with them."""
 _WORDS = (b"-1", b"0", b"1e999", b"NaN", b"99999999999999999999", b"null", b'"x"', b"[]", b"{}", b"true", b"-0.0")
 _INTEGERS = (0, 1, 2**31 - 1, 2**32 - 1, 2**24, 65536)
 _DEEP = "<deep>"  # becomes brackets in brackets, which json.dumps could not write

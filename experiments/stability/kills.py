@@ -7,7 +7,6 @@ compile, between two steps, and while a checkpoint is being written. Started onc
 nothing but the steps since its last checkpoint, and end with the weights, and the log, of the undisturbed run.
 """
 
-import json
 import random
 import subprocess
 import sys
@@ -21,7 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import tyro
 
-from jaxdn.commands.errors import told_plainly
+from jaxdn.commands.errors import plain_errors
+from jaxdn.files import write_json
 
 WIDTHS = ((4,), (4,), (4,), (4,), (4,))
 
@@ -60,25 +60,28 @@ def train(clips: Path, folder: Path, sizes: Sizes) -> None:
     import jax
 
     from jaxdn.clips import training_batches
-    from jaxdn.commands.train import fit, training_engine
-    from jaxdn.denoisers import ntd
-    from jaxdn.recipe import Recipe
+    from jaxdn.commands.fit import fit
+    from jaxdn.methods.table import method_named
     from jaxdn.weights import save_weights
 
     jax.config.update("jax_compilation_cache_dir", str(clips.parent / "programs"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    denoiser = ntd(size=WIDTHS, implementation=training_engine())
-    recipe = Recipe(steps=sizes.steps, batch=2, crop=16, frames=4)
-    batches = training_batches(clips, buffers=denoiser.reads, batch=2, crop=16, frames=4, seed=0)
+    method = method_named("ntd")
+    denoiser = method.factory(size=WIDTHS, implementation=method.engine("training"))
+    recipe = method.recipe_named(None)._replace(steps=sizes.steps, batch=2, crop=16, frames=4)
+    batches = training_batches(
+        clips, buffers=denoiser.reads, batch=recipe.batch, crop=recipe.crop, frames=recipe.frames, seed=recipe.seed
+    )
     every = sizes.checkpoint_every
     state = fit(denoiser, recipe, batches, folder, label="killed", log_every=1, checkpoint_every=every)
-    save_weights(folder / "weights.safetensors", state.params, factory="ntd", options={"size": WIDTHS}, record={})
+    save_weights(folder / "weights.safetensors", state.params, factory=method.name, options={"size": WIDTHS}, record={})
 
 
 def start(clips: Path, folder: Path, sizes: Sizes) -> subprocess.Popen[str]:
     """The training as a process of its own."""
-    command = [sys.executable, "-m", "experiments.stability.kills", "--child", str(clips), str(folder), *map(str, sizes)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    command = [sys.executable, "-m", "experiments.stability.kills", "--child"]
+    arguments = map(str, (clips, folder, *sizes))
+    return subprocess.Popen([*command, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
 
 def newest(folder: Path) -> int:
@@ -108,7 +111,7 @@ def wait(until: Callable[[], bool], process: subprocess.Popen[str]) -> bool:
 
 
 def shoot(process: subprocess.Popen[str], folder: Path, draw: random.Random) -> str | None:
-    """Kill at a random moment, of one of three sorts in turn; None if the process was faster."""
+    """Kill at a random moment, of one of three sorts; None if the process was faster."""
     sort = draw.choice(("starting", "training", "training", "writing", "writing"))
     if sort == "starting":
         moment = time.monotonic() + draw.uniform(0.0, 8.0)
@@ -130,7 +133,7 @@ def shoot(process: subprocess.Popen[str], folder: Path, draw: random.Random) -> 
 def main(settings: Settings) -> int:
     """Train in peace, train under fire, compare."""
     draw, sizes = random.Random(settings.seed), Sizes()
-    told: dict[str, Any] = {"kills": 0, "while writing a checkpoint": 0, "runs": 0, "equal": 0, "each": []}
+    counts: dict[str, Any] = {"kills": 0, "while writing a checkpoint": 0, "runs": 0, "equal": 0, "each": []}
     with tempfile.TemporaryDirectory() as place:
         clips, calm = Path(place) / "clips", Path(place) / "calm"
         make_clips(clips)
@@ -140,43 +143,46 @@ def main(settings: Settings) -> int:
             print(said)
             return 1
         print(f"undisturbed: {sizes.steps} steps in {time.monotonic() - began:.0f} s", flush=True)
-        while told["kills"] < settings.kills:
-            shot = Path(place) / f"shot-{told['runs']}"
-            if not _under_fire(clips, shot, sizes, draw, told, settings.kills):
+        while counts["kills"] < settings.kills:
+            shot = Path(place) / f"shot-{counts['runs']}"
+            if not _under_fire(clips, shot, sizes, draw, counts, settings.kills):
                 return 1
-            told["runs"] += 1
-            told["equal"] += same(calm, shot)
-            lost = [each["lost"] for each in told["each"]]
-            told |= {"most steps lost": max(lost), "mean steps lost": round(float(np.mean(lost)), 2), **sizes._asdict()}
+            counts["runs"] += 1
+            counts["equal"] += same(calm, shot)
+            lost = [each["lost"] for each in counts["each"]]
+            mean = round(float(np.mean(lost)), 2)
+            counts |= {"most steps lost": max(lost), "mean steps lost": mean, **sizes._asdict()}
             settings.out.parent.mkdir(parents=True, exist_ok=True)
-            settings.out.write_text(json.dumps(told, indent=1) + "\n")
+            write_json(settings.out, counts)
             print(
-                f"{told['kills']} kills, {told['while writing a checkpoint']} of them while a checkpoint was being "
-                f"written, at most {max(lost)} steps lost; {told['equal']} of {told['runs']} runs ended in the "
+                f"{counts['kills']} kills, {counts['while writing a checkpoint']} of them while a checkpoint was being "
+                f"written, at most {max(lost)} steps lost; {counts['equal']} of {counts['runs']} runs ended in the "
                 f"undisturbed weights and log ({time.monotonic() - began:.0f} s)",
                 flush=True,
             )
     # Saving is asynchronous: the newest checkpoint may still have been on its way, and one more interval is lost.
-    return int(told["equal"] < told["runs"] or told["most steps lost"] > 2 * sizes.checkpoint_every)
+    return int(counts["equal"] < counts["runs"] or counts["most steps lost"] > 2 * sizes.checkpoint_every)
 
 
-def _under_fire(clips: Path, folder: Path, sizes: Sizes, draw: random.Random, told: dict[str, Any], kills: int) -> bool:
+def _under_fire(
+    clips: Path, folder: Path, sizes: Sizes, draw: random.Random, counts: dict[str, Any], kills: int
+) -> bool:
     """One run to its end, killed as often as there are kills left; False if it could not go on."""
     while True:
         process = start(clips, folder, sizes)
         before = logged(folder)
-        sort = shoot(process, folder, draw) if told["kills"] < kills else None
+        sort = shoot(process, folder, draw) if counts["kills"] < kills else None
         if sort is None:
             said, _ = process.communicate()
             if process.returncode == 0:
                 return True
-            print(f"after {told['kills']} kills the run did not go on:\n{said}")
+            print(f"after {counts['kills']} kills the run did not go on:\n{said}")
             return False
         seen, kept, torn = logged(folder), newest(folder), sort != "starting" and writing(folder)
-        told["kills"] += 1
-        told["while writing a checkpoint"] += torn
-        told["each"].append({"when": sort, "logged": seen, "resumes from": kept, "lost": max(seen - kept, 0)})
-        print(f"kill {told['kills']}, {sort}: step {before} to {seen}, resumes from {kept}", flush=True)
+        counts["kills"] += 1
+        counts["while writing a checkpoint"] += torn
+        counts["each"].append({"when": sort, "logged": seen, "resumes from": kept, "lost": max(seen - kept, 0)})
+        print(f"kill {counts['kills']}, {sort}: step {before} to {seen}, resumes from {kept}", flush=True)
 
 
 def same(first: Path, second: Path) -> bool:
@@ -189,5 +195,5 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--child"]:
         train(Path(sys.argv[2]), Path(sys.argv[3]), Sizes(*map(int, sys.argv[4:6])))
     else:
-        with told_plainly():
+        with plain_errors():
             sys.exit(main(tyro.cli(Settings, description=Settings.__doc__)))

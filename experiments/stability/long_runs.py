@@ -21,23 +21,26 @@ import numpy as np
 import tyro
 from jax import lax
 
-import jaxdn
-from jaxdn.commands.errors import told_plainly
+from jaxdn.candidates import NOISY, all_names, candidate
+from jaxdn.commands.errors import plain_errors
 from jaxdn.denoiser import Denoiser
+from jaxdn.files import write_whole
 from jaxdn.frame import Frame
-from jaxdn.weights import shipped_names
+from jaxdn.rollout import sampled
 
 SIZE, TURN = 48, 16
 """Pixels of a side, and frames after which the clip runs the other way."""
 POISONS = {"NaN": float("nan"), "1e30": 1e30}
+LAYERS = (1, 2, 4, 8)
+"""Samples of the noise that whoever asks for samples is served."""
 
 
 @dataclass
 class Settings:
     """Denoise for thousands of frames and keep curves."""
 
-    subjects: tuple[str, ...] = field(default_factory=lambda: (*_filters(), *shipped_names()))
-    """Factories without weights, and names of weights; default: all that come with the package."""
+    subjects: tuple[str, ...] = field(default_factory=lambda: tuple(name for name in all_names() if name != NOISY))
+    """Filters, and names or paths of weights; default: all that come with the package."""
     frames: int = 2000
     out: Path = Path("runs/long-runs")
 
@@ -53,17 +56,6 @@ class Curves(NamedTuple):
     """Whether state and image are finite."""
     sample: np.ndarray
     """[frames, 6, 6, 3] every eighth pixel of the output."""
-
-
-def _filters() -> list[str]:
-    """The registered denoisers that need no weights."""
-    frame = Frame(np.zeros((16, 16, 3), np.float32))
-    key = jax.random.key(0)
-    return [name for name in jaxdn.denoisers.NAMES if not _made(name)[0].init(key, frame)]
-
-
-def _made(name: str) -> tuple[Denoiser, Any]:
-    return (getattr(jaxdn.denoisers, name)(), {}) if name in jaxdn.denoisers.NAMES else jaxdn.load_weights(name)
 
 
 def _world(columns: jax.Array, rows: jax.Array) -> Frame:
@@ -84,6 +76,11 @@ def compiled(denoiser: Denoiser, params: Any, frames: int) -> Callable[[Any], An
     def seen_at(offset: jax.Array) -> Frame:
         return _world(columns + offset, rows)
 
+    def layers(noisy: jax.Array, clean: Frame) -> dict[int, jax.Array] | None:
+        if denoiser.samples is None:
+            return None
+        return {samples: clean.radiance + (noisy - clean.radiance) / samples**0.5 for samples in LAYERS}
+
     def body(settings: Any, state: Any, index: jax.Array) -> tuple[Any, Any]:
         speed, poison, poisoned = settings
         forwards = (index // TURN) % 2 == 0
@@ -94,7 +91,8 @@ def compiled(denoiser: Denoiser, params: Any, frames: int) -> Callable[[Any], An
         noise = jax.random.exponential(jax.random.fold_in(jax.random.key(1), index), (SIZE, SIZE, 1))
         noisy = jnp.where(index == poisoned, poison, clean.radiance * noise)
         motion = jnp.broadcast_to(jnp.stack([moved, jnp.zeros(())]), (SIZE, SIZE, 2))
-        state, image = denoiser.step(params, state, clean._replace(radiance=noisy, motion=motion))
+        frame = clean._replace(radiance=noisy, motion=motion)
+        state, image = denoiser.step(params, state, sampled(denoiser, params, state, frame, layers(noisy, clean)))
         leaves = [leaf for leaf in jax.tree.leaves(state) if jnp.issubdtype(leaf.dtype, jnp.floating)]
         largest = jnp.max(jnp.stack([jnp.max(jnp.abs(leaf), initial=0.0) for leaf in leaves]))
         error = jnp.mean(jnp.abs(image - clean.radiance)) / jnp.mean(clean.radiance)
@@ -122,7 +120,10 @@ def distance(clean: Curves, spoilt: Curves) -> np.ndarray:
 
 def examine(name: str, frames: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """All runs of one subject: what they came to, and their curves."""
-    run = compiled(*_made(name), frames)
+    subject = candidate(name)
+    if subject.denoiser is None:
+        raise ValueError(f"subject {name!r}: expected something that denoises, got the noisy image itself.")
+    run = compiled(subject.denoiser, subject.params, frames)
     at = frames // 2
 
     def curves(speed: float, poison: float = 0.0, poisoned: int = -1) -> Curves:
@@ -130,17 +131,17 @@ def examine(name: str, frames: int) -> tuple[dict[str, Any], dict[str, np.ndarra
 
     runs = {"static": curves(0.0), "to and fro": curves(0.7)}
     runs |= {label: curves(0.7, poison, at) for label, poison in POISONS.items()}
-    told: dict[str, Any] = {}
+    outcome: dict[str, Any] = {}
     lines: dict[str, np.ndarray] = {}
     for label, found in runs.items():
         level = {"early": found.error[frames // 20 : frames // 5].mean(), "late": found.error[-frames // 10 :].mean()}
-        told[label] = {key: round(float(value), 4) for key, value in level.items()}
-        told[label] |= {"largest state": float(found.state.max()), "healthy": bool(found.healthy.all())}
+        outcome[label] = {key: round(float(value), 4) for key, value in level.items()}
+        outcome[label] |= {"largest state": float(found.state.max()), "healthy": bool(found.healthy.all())}
         lines |= {f"{label}, state": found.state, f"{label}, error": found.error}
     for label in POISONS:
-        told[label]["frames to within 1 %"] = recovery(runs["to and fro"], runs[label], at)
+        outcome[label]["frames to within 1 %"] = recovery(runs["to and fro"], runs[label], at)
         lines[f"{label}, distance"] = distance(runs["to and fro"], runs[label])
-    return told, lines
+    return outcome, lines
 
 
 def draw(curves: dict[str, dict[str, np.ndarray]], path: Path) -> None:
@@ -170,24 +171,24 @@ def draw(curves: dict[str, dict[str, np.ndarray]], path: Path) -> None:
 def main(settings: Settings) -> None:
     """Run all subjects, write curves.json and curves.png, print what they came to."""
     settings.out.mkdir(parents=True, exist_ok=True)
-    told: dict[str, Any] = {}
+    outcomes: dict[str, Any] = {}
     curves: dict[str, dict[str, np.ndarray]] = {}
     for name in settings.subjects:
         began = time.monotonic()
-        told[name], curves[name] = examine(name, settings.frames)
+        outcomes[name], curves[name] = examine(name, settings.frames)
         print(f"{name} ({time.monotonic() - began:.0f} s)", flush=True)
-        for label, facts in told[name].items():
+        for label, facts in outcomes[name].items():
             print(f"  {label}: " + ", ".join(f"{key} {value}" for key, value in facts.items()), flush=True)
     per_frame = {
         name: {label: [float(f"{value:.5g}") for value in line] for label, line in lines.items()}
         for name, lines in curves.items()
     }
-    report = {"frames": settings.frames, "size": SIZE, "subjects": told, "curves": per_frame}
-    (settings.out / "curves.json").write_text(json.dumps(report) + "\n")
+    report = {"frames": settings.frames, "size": SIZE, "subjects": outcomes, "curves": per_frame}
+    write_whole({settings.out / "curves.json": json.dumps(report) + "\n"})
     draw(curves, settings.out / "curves.png")
     print(f"{settings.out / 'curves.json'}, {settings.out / 'curves.png'}")
 
 
 if __name__ == "__main__":
-    with told_plainly():
+    with plain_errors():
         main(tyro.cli(Settings, description=Settings.__doc__))

@@ -2,17 +2,16 @@
 
     python -m experiments.stability.protection      # runs/protection.json
 
-Both programs run in one process in turn, so that whatever else the machine does falls on both; each pair gives a ratio
-and the median of the ratios counts, of wall time and of the processors' time, which others disturb less. What is taken
-away is every ``repair`` and ``repair_image`` that a denoiser calls. The safe powers and lengths of
-:mod:`jaxdn.numerics` are part of both: without them there is no gradient to speak of.
+Both programs run in one process, interleaved, so that whatever else the machine does falls on both; each pair gives a
+ratio and the median of the ratios counts, of wall time and of the processors' time, which others disturb less. What is
+taken away is every ``repair`` and ``repair_image`` of :mod:`jaxdn.repair` that a denoiser calls. The safe powers and
+lengths of :mod:`jaxdn.numerics` are part of both: without them there is no gradient to speak of.
 """
 
 import contextlib
-import json
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,71 +21,86 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-import jaxdn
-from jaxdn.commands.errors import told_plainly
-from jaxdn.frame import Frame
+from jaxdn.commands.errors import plain_errors
+from jaxdn.files import write_json
+from jaxdn.frame import BUFFERS, Buffer, Frame
+from jaxdn.methods.table import Method, methods
+from jaxdn.repair import repair, repair_image
 
-SUBJECTS: dict[str, dict[str, Any]] = {
-    "svgf": {"factory": "svgf"},
-    "ntd small": {"factory": "ntd", "size": "small"},
-    "ntd large": {"factory": "ntd", "size": "large"},
+_RANGES = {
+    "light": (0.0, 2.0),
+    "signed": (-1.0, 1.0),
+    "fraction": (0.1, 0.9),
+    "direction": (-1.0, 1.0),
+    "distance": (1.0, 9.0),
+    "vector": (-3.0, 3.0),
+    "count": (1.0, 9.0),
+    "flag": (0.0, 1.0),
+    "id": (0.0, 9.0),
 }
+"""Lowest and highest value of each kind of buffer; of a direction, before it is normalised."""
+
+Subject = tuple[Method, Mapping[str, Any]]
+"""A row of the table of methods, and options."""
+
+
+def subjects() -> dict[str, Subject]:
+    """Filters by name, as they are by default, and each variant of the methods that learn."""
+    found: dict[str, Subject] = {}
+    for name, method in methods().items():
+        found |= {variant: (method, options) for variant, options in (method.variants or {name: {}}).items()}
+    return found
 
 
 @dataclass
 class Settings:
     """Time a step with and without its protection."""
 
-    subjects: tuple[str, ...] = field(default_factory=lambda: tuple(SUBJECTS))
+    subjects: tuple[str, ...] = field(default_factory=lambda: tuple(subjects()))
     pairs: int = 15
     height: int = 720
     width: int = 1280
     out: Path = Path("runs/protection.json")
 
 
-def frame_of(height: int, width: int) -> Frame:
-    """A noisy frame with every buffer that the subjects read, and nothing wrong in it."""
+def frame_of(reads: Collection[str], height: int, width: int) -> Frame:
+    """A noisy frame with every buffer in ``reads``, and nothing wrong in it."""
     rng = np.random.default_rng(0)
 
-    def made(low: float, high: float, channels: int) -> np.ndarray:
-        return rng.uniform(low, high, (height, width, channels)).astype(np.float32)
+    def drawn(buffer: Buffer) -> np.ndarray:
+        low, high = _RANGES[buffer.kind]
+        values = rng.uniform(low, high, (height, width, buffer.channels))
+        if buffer.kind == "direction":
+            values /= np.linalg.norm(values, axis=-1, keepdims=True)
+        return values.astype(buffer.dtype)
 
-    normal = made(-1, 1, 3)
-    motion = made(-3, 3, 2)
-    return Frame(
-        radiance=made(0, 2, 3),
-        albedo=made(0.1, 0.9, 3),
-        normal=normal / np.linalg.norm(normal, axis=-1, keepdims=True),
-        depth=made(1, 9, 1),
-        motion=motion,
-        dual_motion=motion,
-        ids=rng.integers(0, 9, (height, width, 1), np.int32),
-    )
+    return Frame(**{name: drawn(buffer) for name, buffer in BUFFERS.items() if name == "radiance" or name in reads})
 
 
 @contextlib.contextmanager
 def unprotected() -> Iterator[None]:
     """While this lasts, denoisers are traced without repair."""
+    kept = {"repair": repair, "repair_image": repair_image}
     neutral: dict[str, Callable[..., Any]] = {
         "repair": lambda frame: (frame, jnp.zeros((), jnp.int32)),
         "repair_image": lambda image: image,
     }
-    modules = [module for name, module in sys.modules.items() if name.startswith("jaxdn.denoisers.")]
-    places = [(module, name) for module in modules for name in neutral if hasattr(module, name)]
-    kept = [(module, name, getattr(module, name)) for module, name in places]
+    modules = [module for name, module in sys.modules.items() if name.startswith("jaxdn.")]
+    places = [(module, name) for module in modules for name in kept if vars(module).get(name) is kept[name]]
     try:
         for module, name in places:
             setattr(module, name, neutral[name])
         yield
     finally:
-        for module, name, function in kept:
-            setattr(module, name, function)
+        for module, name in places:
+            setattr(module, name, kept[name])
 
 
-def stepper(options: dict[str, Any], frame: Frame) -> Callable[[], None]:
+def stepper(subject: Subject, height: int, width: int) -> Callable[[], None]:
     """A function that takes one step further, compiled under whatever protection there is now."""
-    options = dict(options)
-    denoiser = getattr(jaxdn.denoisers, options.pop("factory"))(**options)
+    method, options = subject
+    denoiser = method.factory(**options)  # a new one each time: jax would take the trace of an old one
+    frame = jax.tree.map(jnp.asarray, frame_of(denoiser.reads, height, width))
     params = denoiser.init(jax.random.key(0), frame)
     states = [jax.tree.map(jnp.copy, denoiser.start(params, frame))]  # what is donated must not be given twice
     step = jax.jit(denoiser.step, donate_argnums=1).lower(params, states[0], frame).compile()
@@ -105,11 +119,11 @@ def seconds(run: Callable[[], None]) -> tuple[float, float]:
     return time.perf_counter() - wall, time.process_time() - busy
 
 
-def measure(options: dict[str, Any], frame: Frame, pairs: int) -> dict[str, Any]:
+def measure(subject: Subject, pairs: int, *, height: int, width: int) -> dict[str, Any]:
     """Median times of both programs and the median of their ratios, with its quartiles."""
-    with_it = stepper(options, frame)
+    with_it = stepper(subject, height, width)
     with unprotected():
-        without = stepper(options, frame)
+        without = stepper(subject, height, width)
     for run in (with_it, without):
         run()
         run()
@@ -134,15 +148,19 @@ def measure(options: dict[str, Any], frame: Frame, pairs: int) -> dict[str, Any]
 
 def main(settings: Settings) -> None:
     """Measure all subjects and write what they cost."""
-    frame = jax.tree.map(jnp.asarray, frame_of(settings.height, settings.width))
-    told: dict[str, Any] = {"width": settings.width, "height": settings.height, "device": str(jax.devices()[0])}
+    size = {"height": settings.height, "width": settings.width}
+    known = subjects()
+    unknown = [name for name in settings.subjects if name not in known]
+    if unknown:
+        raise ValueError(f"subjects: expected some of {', '.join(known)}, got {', '.join(map(repr, unknown))}.")
+    costs: dict[str, Any] = {**size, "device": str(jax.devices()[0])}
     settings.out.parent.mkdir(parents=True, exist_ok=True)
     for name in settings.subjects:
-        told[name] = measure(SUBJECTS[name], frame, settings.pairs)
-        print(f"{name}: " + ", ".join(f"{key} {value}" for key, value in told[name].items()), flush=True)
-        settings.out.write_text(json.dumps(told, indent=1) + "\n")
+        costs[name] = measure(known[name], settings.pairs, **size)
+        print(f"{name}: " + ", ".join(f"{key} {value}" for key, value in costs[name].items()), flush=True)
+        write_json(settings.out, costs)
 
 
 if __name__ == "__main__":
-    with told_plainly():
+    with plain_errors():
         main(tyro.cli(Settings, description=Settings.__doc__))

@@ -1,8 +1,9 @@
 """The eight symmetries of a square, applied to a clip: what makes many clips out of one.
 
-A symmetry moves pixels *and* turns the vectors that live in the image plane: flipping the image left to right negates
-the x component of ``motion`` and ``dual_motion``, a quarter turn exchanges the components. Then warping a transformed
-history with transformed motion gives the transformed warped image, exactly.
+A symmetry moves pixels *and* turns the vectors that live in the image plane, which are the buffers of the kind
+"vector" (:data:`jaxdn.frame.BUFFERS`): flipping the image left to right negates their x component, a quarter turn
+exchanges the components. Then warping a transformed history with transformed motion gives the transformed warped image,
+exactly.
 
 World-space normals stay as they are (only view-space ones would have to change; Hasselgren et al. 2020, sec. 2.2). For
 a quarter turn this is exact physics: the camera rolled, the world did not. A flipped image shows the mirrored world
@@ -12,11 +13,10 @@ axes point, as every camera sees them differently.
 
 from typing import Any
 
+import jax
 import numpy as np
 
-from jaxdn.frame import Clip, Frame
-
-_IN_PLANE = ("motion", "dual_motion")
+from jaxdn.frame import BUFFERS, Clip, Frame
 
 
 def transform_image(image: np.ndarray, *, flip: bool, turns: int) -> np.ndarray:
@@ -36,12 +36,16 @@ def transform_motion(motion: np.ndarray, *, flip: bool, turns: int) -> np.ndarra
 
 
 def transform_clip(clip: Clip, *, flip: bool, turns: int) -> Clip:
-    """Every buffer of a clip, and its reference, under one symmetry; buffers that are ``None`` stay so."""
+    """Every buffer of a clip, its reference and its layers under one symmetry; what is ``None`` stays so."""
 
-    def transform(name: str, buffer: Any) -> Any:
-        if buffer is None:
-            return None
-        return (transform_motion if name in _IN_PLANE else transform_image)(buffer, flip=flip, turns=turns)
+    def moved(images: Any) -> Any:
+        return jax.tree.map(lambda image: transform_image(image, flip=flip, turns=turns), images)
 
-    frames = Frame(**{name: transform(name, buffer) for name, buffer in clip.frames._asdict().items()})
-    return Clip(frames, transform("reference", clip.reference))
+    frames = Frame(
+        **{
+            name: transform_motion(buffer, flip=flip, turns=turns) if BUFFERS[name].kind == "vector" else moved(buffer)
+            for name, buffer in clip.frames._asdict().items()
+            if buffer is not None
+        }
+    )
+    return Clip(frames, moved(clip.reference), moved(clip.layers))

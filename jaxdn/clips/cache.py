@@ -19,13 +19,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdn.clips.exr import to_half
-from jaxdn.clips.files import ClipError, read_json, write_json
-from jaxdn.clips.folder import frame_path, is_planned, read_frames, read_record
-from jaxdn.clips.frames import LAYOUT, StoredFrame, combine, layers_for
-from jaxdn.frame import Clip, Frame, written_out
+from jaxdn.clips.files import ClipError, read_json
+from jaxdn.clips.folder import frame_path, read_frames, read_record
+from jaxdn.clips.frames import StoredFrame, combine, doubling_layers, layers_for
+from jaxdn.clips.record import is_planned
+from jaxdn.files import write_json
+from jaxdn.frame import BUFFERS, GUIDES, Buffer, Clip, Frame, present, written_out
 
 _VERSION = 1  # of what the cache holds; another number leaves old caches behind
-_SINGLE = ("motion", "dual_motion", "depth", "previous_depth")
+_LIGHT = BUFFERS["radiance"]
+"""How noisy layers and references are held."""
 
 
 class CachedClip(NamedTuple):
@@ -51,11 +54,11 @@ class CachedClip(NamedTuple):
     @property
     def buffers(self) -> frozenset[str]:
         """Names of the Frame buffers that there are, but for ``radiance``."""
-        return self.arrays & frozenset(LAYOUT)
+        return self.arrays & frozenset(GUIDES)
 
 
 def open_cached(path: str | Path, *, cache: str | Path | None = None) -> CachedClip:
-    """Open a clip through its cache (default ``.cache`` beside the clip's folder), making the cache first if need be.
+    """Open a clip through its cache (default: ``.cache`` next to the clip's folder), which is made if need be.
 
     Reference values that are not finite or negative are 0 in the cache, and a UserWarning names the clip and how many
     there are; noisy images stay as they are, as denoisers repair their own input. Raises ClipError as
@@ -85,25 +88,28 @@ def read_window(
     *,
     spp: int = 1,
     buffers: Collection[str] | None = None,
+    layers: bool = False,
 ) -> Clip:
     """The part ``window`` (frames, rows, columns) of a clip as a Clip of plain arrays with ``spp`` samples a pixel.
 
-    Floating-point buffers come out in float32, ids in int32, ``visible`` as bool. ``buffers`` names
-    the ones to read (default: all there are); of a clip that was rendered by a plan, those that it lacks are written
-    out.
+    Buffers come out with the dtypes of :attr:`jaxdn.frame.Buffer.dtype`. ``buffers`` names the ones to read (default:
+    all there are); of a clip that was rendered by a plan, those that it lacks are written out. With ``layers`` the
+    clip's independent noisy layers of 1, 2, 4, ... samples are read too (``Clip.layers``).
     """
-    asked = clip.buffers if buffers is None else set(buffers) & set(LAYOUT)
-    wanted = clip.buffers & asked
+    asked = clip.buffers if buffers is None else set(buffers) & set(GUIDES)
 
-    def read(name: str) -> np.ndarray:
+    def read(name: str, buffer: Buffer = _LIGHT) -> np.ndarray:
         part = np.load(clip.home / f"{name}.npy", mmap_mode="r", allow_pickle=False)[window]
-        return np.array(part, np.float32 if np.issubdtype(part.dtype, np.floating) else part.dtype)
+        return np.array(part, buffer.dtype)
 
     chosen = layers_for(spp, clip.layers, clip.path)
-    radiance = combine({samples: read(f"noisy_{samples}spp") for samples in chosen})
-    frames = Frame(radiance=radiance, **{name: read(name) for name in wanted})
-    frames = written_out(frames, asked) if clip.planned else frames
-    return Clip(frames, read("reference") if "reference" in clip.arrays else None)
+    radiance = combine({samples: read(_noisy(samples)) for samples in chosen})
+    frames = Frame(radiance=radiance, **{name: read(name, BUFFERS[name]) for name in clip.buffers & asked})
+    return Clip(
+        written_out(frames, asked) if clip.planned else frames,
+        read("reference") if "reference" in clip.arrays else None,
+        {samples: read(_noisy(samples)) for samples in doubling_layers(clip.layers, clip.path)} if layers else None,
+    )
 
 
 def _stamp(path: Path, count: int) -> str:
@@ -120,17 +126,16 @@ def _stamp(path: Path, count: int) -> str:
 
 def _build(path: Path, home: Path) -> None:
     home.parent.mkdir(parents=True, exist_ok=True)
-    beside = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=home.parent))
+    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=home.parent))
     try:
-        facts = _fill(path, beside)
-        write_json(beside / "facts.json", facts)
+        write_json(temporary / "facts.json", _fill(path, temporary))
         try:
-            os.rename(beside, home)
+            os.rename(temporary, home)
         except OSError:
             if not home.is_dir():  # otherwise another process made the same cache meanwhile
                 raise
     finally:
-        shutil.rmtree(beside, ignore_errors=True)
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _fill(path: Path, folder: Path) -> dict[str, object]:
@@ -139,12 +144,12 @@ def _fill(path: Path, folder: Path) -> dict[str, object]:
     bad, layers = 0, []
     for index, stored in enumerate(_uniform(path, record)):
         layers = sorted(stored.layers)
-        for name, image in _images(stored):
+        for name, image, buffer in _images(stored):
             if name == "reference":
                 wrong = ~(np.isfinite(image) & (image >= 0))
                 bad += int(wrong.sum())
                 image = np.where(wrong, np.float32(0), image)
-            if image.dtype == np.float32 and name not in _SINGLE:
+            if buffer.stored == "half":
                 image = to_half(image)
             if name not in maps:
                 shape = (record["frames"], *image.shape)
@@ -162,15 +167,18 @@ def _uniform(path: Path, record: Mapping[str, Any]) -> Iterator[StoredFrame]:
         yield stored._replace(frame=written_out(stored.frame, named))
 
 
-def _images(stored: StoredFrame) -> Iterator[tuple[str, np.ndarray]]:
+def _images(stored: StoredFrame) -> Iterator[tuple[str, np.ndarray, Buffer]]:
+    """Everything to hold of a frame: the array's name, the array, and how it is stored."""
     for samples, image in stored.layers.items():
-        yield f"noisy_{samples}spp", image
-    for name in LAYOUT:
-        buffer = getattr(stored.frame, name)
-        if buffer is not None:
-            yield name, np.asarray(buffer)
+        yield _noisy(samples), image, _LIGHT
+    for name in present(stored.frame):
+        yield name, np.asarray(getattr(stored.frame, name)), BUFFERS[name]
     if stored.reference is not None:
-        yield "reference", stored.reference
+        yield "reference", stored.reference, _LIGHT
+
+
+def _noisy(samples: int) -> str:
+    return f"noisy_{samples}spp"
 
 
 def _forget(root: Path, name: str, home: Path) -> None:

@@ -16,20 +16,9 @@ import numpy as np
 from jaxdn.clips.augment import transform_clip
 from jaxdn.clips.cache import CachedClip, open_cached, read_window
 from jaxdn.clips.files import ClipError
-from jaxdn.clips.folder import is_clip
-from jaxdn.clips.frames import layers_for
+from jaxdn.clips.folder import find_clips
+from jaxdn.clips.frames import doubling_layers, layers_for
 from jaxdn.frame import Clip
-
-
-def find_clips(path: str | Path) -> list[Path]:
-    """The finished clips in a folder (or the folder itself if it is one), by name. Raises ClipError for none."""
-    folder = Path(path)
-    if not folder.is_dir():
-        raise ClipError(f"{folder}: there is no such folder.")
-    found = [folder] if is_clip(folder) else sorted(sub for sub in folder.iterdir() if is_clip(sub))
-    if not found:
-        raise ClipError(f"{folder}: expected a clip (a folder with clip.json) or a folder of clips, found none.")
-    return found
 
 
 def training_batches(
@@ -41,6 +30,7 @@ def training_batches(
     seed: int,
     spp: int | Sequence[int] = 1,
     buffers: Sequence[str] | frozenset[str] | None = None,
+    layers: bool = False,
     augment: bool = True,
     threads: int = 1,
 ) -> grain.DatasetIterator[Clip]:
@@ -54,14 +44,16 @@ def training_batches(
       seed: decides the order, windows, crops and symmetries; from 0 to 2^32 - 1.
       spp: samples a pixel of the noisy radiance; of several numbers, each element takes one at random.
       buffers: Frame buffers to read, usually ``denoiser.reads`` (default: all that the clips have).
+      layers: give the independent noisy layers of 1, 2, 4, ... samples that every clip has too (``Clip.layers``), for a
+        denoiser that asks for samples.
       augment: flips and quarter turns (no odd turns for a crop that is not square).
       threads: batches made ahead, each by its own thread; 0 makes them when asked for.
 
     Its ``get_state()`` is a small dict for a checkpoint, to be given to ``set_state`` of an equal iterator.
 
     Raises ClipError, naming the clip, for clips that are broken, shorter than ``frames``, smaller than ``crop``,
-    without reference or ``spp``, or that do not all have the same buffers. Warns, naming the clip, of a reference with
-    values that are not finite or negative.
+    without reference, ``spp`` or ``layers``, or that do not all have the same buffers. Warns, naming the clip, of a
+    reference with values that are not finite or negative, and of an interrupted clip, which is left out.
     """
     height, width = (crop, crop) if isinstance(crop, int) else crop
     for name, value in (("batch", batch), ("crop", height), ("crop", width), ("frames", frames)):
@@ -79,13 +71,17 @@ def training_batches(
     for source in sources:
         _check(source, (frames, height, width), counts)
     names = _common_buffers(sources, buffers)
+    # Each clip's are a beginning of 1, 2, 4, ...: the fewest are what all of them have.
+    common = min((doubling_layers(source.layers, source.path) for source in sources), key=len) if layers else []
 
     def element(index: int, rng: np.random.Generator) -> Clip:
         source = sources[index]
         starts = [int(rng.integers(0, has - wants + 1)) for has, wants in zip(source.shape, sizes, strict=True)]
         window = tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))
         samples = counts[int(rng.integers(len(counts)))]
-        clip = read_window(source, window, spp=samples, buffers=names)
+        clip = read_window(source, window, spp=samples, buffers=names, layers=layers)
+        if clip.layers is not None:
+            clip = clip._replace(layers={count: clip.layers[count] for count in common})
         if not augment:
             return clip
         turns = int(rng.integers(4)) if height == width else 2 * int(rng.integers(2))

@@ -4,15 +4,15 @@ Buffers show less than a scene does. Where they cannot decide, the effect is unc
 that was rendered by a plan says in its record what it was rendered for.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxdn.clips.folder import is_clip, is_planned, read_frames, read_record
-from jaxdn.clips.import_exr import read_plain_frames
-from jaxdn.frame import FAR, Frame
+from jaxdn.clips.folder import is_clip, open_frames, read_record
+from jaxdn.clips.record import is_planned
+from jaxdn.frame import BUFFERS, FAR, Frame
 from jaxdn.planning.facts import NO_NAMES, Facts, Light, Moment, Surface
 
 _ANYTHING = frozenset({"what moves"})
@@ -36,15 +36,11 @@ def read_facts(path: str | Path, animation: Any = None) -> Facts:
         raise ValueError(f"animation {animation}: expected none, as {path} is a finished clip; leave it out.")
     record: Mapping[str, Any] = read_record(path) if is_clip(path) else {}
     look = _Look(record)
-    for frame in _frames(path, record):
-        look.at(frame)
+    # Whether anything moves is the same in every convention of motion vectors.
+    _, frames = open_frames(path, spp=record["layers"][0] if record else 1, motion_convention="previous-current")
+    for stored in frames:
+        look.at(stored.frame)
     return look.facts()
-
-
-def _frames(path: str | Path, record: Mapping[str, Any]) -> Iterator[Frame]:
-    if not record:
-        return iter(read_plain_frames(path))
-    return (stored.frame for stored in read_frames(path, spp=record["layers"][0]))
 
 
 class _Look:
@@ -61,7 +57,7 @@ class _Look:
     def at(self, frame: Frame) -> None:
         """Look at the next frame."""
         index = len(self._moments)
-        self._lit |= any(_some(part) for part in (frame.radiance, frame.direct, frame.emission))
+        self._lit |= any(_some(getattr(frame, name)) for name, buffer in BUFFERS.items() if buffer.kind == "light")
         self._surface(frame)
         shining = frozenset({"a light"}) if _some(frame.emission) else NO_NAMES
         if frame.emission is not None:
@@ -74,8 +70,8 @@ class _Look:
     def _moment(self, frame: Frame, index: int) -> Moment:
         moved = frame.motion is not None and bool(np.any(np.asarray(frame.motion) != 0))
         if frame.motion is None and self._plan is None:
-            told = "there are no motion vectors"
-            self._unsure |= dict.fromkeys(("camera-motion", "object-motion", "disocclusion"), told)
+            why = "there are no motion vectors"
+            self._unsure |= dict.fromkeys(("camera-motion", "object-motion", "disocclusion"), why)
         if index == 0:
             return Moment()
         if frame.dual_motion is not None:
@@ -88,8 +84,8 @@ class _Look:
         if self._cameras is None:
             camera, objects = moved, moved
             if moved:
-                told = "the vectors do not say whether the camera moves or what it sees"
-                self._unsure |= dict.fromkeys(("camera-motion", "object-motion"), told)
+                why = "the vectors do not say whether the camera moves or what it sees"
+                self._unsure |= dict.fromkeys(("camera-motion", "object-motion"), why)
         else:
             camera = self._cameras[index] != self._cameras[index - 1]
             objects = moved and (not camera or self._had("object-motion"))
@@ -118,11 +114,11 @@ class _Look:
 
     def facts(self) -> Facts:
         """What all frames together show."""
-        hidden = {name: told for name, told in _HIDDEN.items() if self._had(name)}
+        hidden = {name: why for name, why in _HIDDEN.items() if self._had(name)}
         if self._plan is None and not self._lit:
             hidden = {}
         if len(self._moments) == 1:
-            hidden = {name: told for name, told in hidden.items() if name not in ("moving-shadow", "changing-light")}
+            hidden = {name: why for name, why in hidden.items() if name not in ("moving-shadow", "changing-light")}
         if self._sky_shines:
             hidden.pop("environment", None)
         surface = Surface("what is seen", frozenset(self._lobes), self._textured)

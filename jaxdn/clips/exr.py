@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 
-from jaxdn.clips.files import ClipError, whole
+from jaxdn.clips.files import ClipError
+from jaxdn.files import whole
 
 HALF_MAX = 65504.0
 """The largest float16."""
@@ -33,8 +34,8 @@ def to_half(values: np.ndarray) -> np.ndarray:
 def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
     """Write 2-D channels (float16, float32 or uint32, all of one size) as one ZIP-compressed scanline file.
 
-    The file is written beside its place, read back, and then renamed: it is whole or not there. Raises ValueError for
-    channels that OpenEXR cannot hold and OSError (``errno.ENOSPC`` for a full disk) if the file cannot be written.
+    The file is written under a temporary name, read back, and then renamed: it is whole or not there. Raises ValueError
+    for channels that OpenEXR cannot hold and OSError (``errno.ENOSPC`` for a full disk) if the file cannot be written.
     """
     path = Path(path)
     prepared = {name: _storable(path, name, pixels) for name, pixels in channels.items()}
@@ -42,15 +43,15 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
     if len(sizes) != 1:
         raise ValueError(f"{path}: expected at least one channel and all of one size, got {sorted(sizes)}.")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with whole(path) as beside:
+    with whole(path) as temporary:
         try:
-            OpenEXR.File(header, dict(prepared)).write(str(beside))  # the dict is changed by the call
+            OpenEXR.File(header, dict(prepared)).write(str(temporary))  # the dict is changed by the call
         except RuntimeError as error:
             code = errno.ENOSPC if "No space left" in str(error) else errno.EIO
             raise OSError(code, f"could not write the frame ({error})", str(path)) from error
         # A disk that fills up within the last buffer goes unnoticed by the writer: look at what is really there.
         try:
-            found = read_exr(beside)
+            found = read_exr(temporary)
         except ClipError as error:
             raise OSError(errno.ENOSPC, "the file came out incomplete; is the disk full?", str(path)) from error
         if found.keys() != prepared.keys():

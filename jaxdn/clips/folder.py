@@ -1,11 +1,13 @@
-"""A clip as a folder: ``clip.json`` and ``frame_0000.exr``, ``frame_0001.exr`` ... beside it.
+"""A clip as a folder: ``clip.json`` and ``frame_0000.exr``, ``frame_0001.exr`` ... in it.
 
-``clip.json`` is the clip's record: how it was made and what it holds. It is written last, so a folder without one is
-unfinished, never a clip.
+``clip.json`` is the clip's record: how it was made and what it holds. It is written last. While frames are being
+written the folder has ``clip.unfinished.json`` instead, by which an interrupted rendering goes on; such a folder is no
+clip yet.
 """
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +15,15 @@ import jax
 import numpy as np
 
 from jaxdn.clips.exr import read_exr
-from jaxdn.clips.files import ClipError, read_json, write_json
-from jaxdn.clips.frames import StoredFrame, layers_for, read_frame, stored_layers, write_frame
-from jaxdn.clips.import_exr import read_plain_frames
-from jaxdn.frame import Clip, Frame, frame_at, only, written_out
-
-FORMAT = 1
-"""The version of the layout that this code writes and reads."""
+from jaxdn.clips.files import ClipError, read_json
+from jaxdn.clips.frames import StoredFrame, doubling_layers, layers_for, read_frame, stored_layers, write_frame
+from jaxdn.clips.import_exr import plain_frames
+from jaxdn.clips.record import FORMAT, checked, held_frames, is_planned
+from jaxdn.files import write_json
+from jaxdn.frame import Clip, frame_at, only, present, written_out
 
 _RECORD = "clip.json"
-_BUFFERS = frozenset(Frame._fields[1:])
+_UNFINISHED = "clip.unfinished.json"
 
 
 def frame_path(folder: str | Path, index: int) -> Path:
@@ -35,49 +36,107 @@ def is_clip(path: str | Path) -> bool:
     return (Path(path) / _RECORD).is_file()
 
 
+def begin_record(record: Mapping[str, Any], folder: str | Path) -> None:
+    """Say in a clip's folder, which is made if need be, what is about to be written into it.
+
+    Writes ``record`` as ``clip.unfinished.json`` and takes ``clip.json`` away: a finished clip that gets more frames is
+    unfinished until :func:`finish_record`. To be called again when an entry changes in between. Raises ClipError if an
+    entry is missing or wrong and ValueError if one is no JSON, with the folder as it was; OSError if the disk refuses.
+    """
+    folder = Path(folder)
+    record = checked({"format": FORMAT, **record}, folder / _UNFINISHED)
+    folder.mkdir(parents=True, exist_ok=True)
+    # In this order: whatever interrupts it, there is a record, and until the second step it is the finished clip's.
+    write_json(folder / _UNFINISHED, record)
+    (folder / _RECORD).unlink(missing_ok=True)
+
+
+def finish_record(record: Mapping[str, Any], folder: str | Path) -> None:
+    """Make a folder whose frames are all written a clip: writes ``clip.json``, removes ``clip.unfinished.json``.
+
+    Raises as :func:`begin_record` does.
+    """
+    folder = Path(folder)
+    write_json(folder / _RECORD, checked({"format": FORMAT, **record}, folder / _RECORD))
+    (folder / _UNFINISHED).unlink(missing_ok=True)
+
+
+def begun_record(folder: str | Path) -> dict[str, Any] | None:
+    """The record of a clip that is finished or was interrupted; None where none was begun.
+
+    Raises ClipError if the record is broken or of another version.
+    """
+    for file in (Path(folder) / _RECORD, Path(folder) / _UNFINISHED):  # where both are there, the clip is finished
+        if file.is_file():
+            return checked(read_json(file), file)
+    return None
+
+
+def read_record(path: str | Path) -> dict[str, Any]:
+    """The record of the finished clip in folder ``path``.
+
+    Raises ClipError if it is missing, broken or of another version, or if rendering the clip was interrupted.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise ClipError(f"{folder}: there is no such folder.")
+    if not is_clip(folder):
+        raise _unfinished(folder)
+    return checked(read_json(folder / _RECORD), folder / _RECORD)
+
+
+def find_clips(path: str | Path) -> list[Path]:
+    """The finished clips in a folder (or the folder itself if it is one), by name.
+
+    Warns of those that are left out because their rendering was interrupted. Raises ClipError if there is no finished
+    one.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise ClipError(f"{folder}: there is no such folder.")
+    if is_clip(folder):
+        return [folder]
+    if (folder / _UNFINISHED).is_file():
+        raise _unfinished(folder)
+    inside = sorted(folder.iterdir())
+    found = [sub for sub in inside if is_clip(sub)]
+    interrupted = [sub for sub in inside if (sub / _UNFINISHED).is_file() and sub not in found]
+    if not found and interrupted:
+        raise _unfinished(interrupted[0])
+    if not found:
+        raise ClipError(f"{folder}: expected a clip (a folder with {_RECORD}) or a folder of clips, found none.")
+    for sub in interrupted:
+        warnings.warn(f"{_unfinished(sub)} It is left out.", stacklevel=2)
+    return found
+
+
 def write_clip(clip: Clip, path: str | Path, *, record: Mapping[str, Any] | None = None, spp: int = 1) -> None:
     """Write a clip into the folder ``path``, which is made if need be; a clip that is there already is replaced.
 
     The clip's radiance becomes its one noisy layer of ``spp`` samples a pixel. ``record`` is stored as ``clip.json``
-    with the entries that the frames decide (format, frames, width, height, layers) filled in. Light, albedo, normals
-    and roughness keep half precision. Raises ValueError for shapes that do not fit each other, ClipError for a record
-    that is no JSON, OSError if the disk refuses.
+    with the entries that the frames decide (format, frames, width, height, layers) filled in. Light, fractions and
+    directions keep half precision (:attr:`jaxdn.frame.Buffer.stored`). Raises ValueError for shapes that do not fit
+    each other or a record that is no JSON, before anything is written; OSError if the disk refuses.
     """
     folder = Path(path)
     if np.ndim(clip.frames.radiance) != 4:
         raise ValueError(f"{folder}: expected radiance [T, H, W, 3], got shape {np.shape(clip.frames.radiance)}.")
-    clip = jax.tree.map(np.asarray, clip)
+    clip = jax.tree.map(np.asarray, clip._replace(layers=None))
     count, height, width = clip.frames.radiance.shape[:3]
     lengths = {np.shape(leaf)[0] for leaf in jax.tree.leaves(clip)}
     if lengths != {count}:
         raise ValueError(f"{folder}: expected {count} frames in every buffer, got {sorted(lengths)}.")
     facts = {"format": FORMAT, "frames": count, "width": width, "height": height, "layers": [spp]}
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / _RECORD).unlink(missing_ok=True)
+    whole_record = {"name": folder.name, **(record or {}), **facts}
+    begin_record(whole_record, folder)
     for index in range(count):
         frame = frame_at(clip.frames, index)
         reference = None if clip.reference is None else clip.reference[index]
         write_frame(frame_path(folder, index), frame, layers={spp: frame.radiance}, reference=reference)
-    for stale in folder.glob("frame_*.exr"):
-        if stale.stem[6:].isdecimal() and int(stale.stem[6:]) >= count:
+    for number, stale in _numbered(folder):
+        if number >= count:
             stale.unlink()
-    write_record({"name": folder.name, **(record or {}), **facts}, folder)
-
-
-def write_record(record: Mapping[str, Any], path: str | Path) -> None:
-    """Write ``clip.json`` of the clip folder ``path``. Raises ClipError if an entry is missing or is no JSON."""
-    file = Path(path) / _RECORD
-    write_json(file, _checked({"format": FORMAT, **record}, file))
-
-
-def read_record(path: str | Path) -> dict[str, Any]:
-    """The record of the clip in folder ``path``. Raises ClipError if it is missing, broken or of another version."""
-    folder = Path(path)
-    if not folder.is_dir():
-        raise ClipError(f"{folder}: there is no such folder.")
-    if not is_clip(folder):
-        raise ClipError(f"{folder}: there is no {_RECORD} in it; the clip was not finished. Render it again.")
-    return _checked(read_json(folder / _RECORD), folder / _RECORD)
+    finish_record(whole_record, folder)
 
 
 def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
@@ -95,7 +154,7 @@ def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
     held = held_frames(record)
 
     def frames() -> Iterator[StoredFrame]:
-        first: tuple[str, ...] | None = None
+        first: set[str] | None = None
         source: tuple[int, StoredFrame] | None = None
         for index in range(count):
             file = frame_path(folder, index)
@@ -114,30 +173,19 @@ def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
             if is_planned(record):
                 wanted = set(record["plan"]["frames"][index])
                 stored = _checked_buffers(stored, wanted, file)
-            names = _present(stored)
+            names = _names(stored, planned=is_planned(record))
             first = names if first is None else first
-            if names != first and not is_planned(record):
-                differing = ", ".join(sorted(set(names) ^ set(first)))
+            if names != first:
+                differing = ", ".join(sorted(names ^ first))
                 raise ClipError(f"{file}: expected the same channels as in frame 0, but {differing} differs.")
             yield stored
 
     return frames()
 
 
-def is_planned(record: Mapping[str, Any]) -> bool:
-    """Whether a clip was rendered by a plan: what it lacks is an absent effect, not something forgotten."""
-    return record.get("plan") is not None
-
-
-def held_frames(record: Mapping[str, Any]) -> list[int]:
-    """For each frame of a clip the one whose buffers it shares."""
-    return list(record["plan"]["held"]) if is_planned(record) else list(range(record["frames"]))
-
-
 def _all_there(folder: Path, count: int) -> None:
     """Raise ClipError unless there are ``count`` frames; as fast for a record that claims any number of them."""
-    numbers = {int(path.stem[6:]) for path in folder.glob("frame_*.exr") if path.stem[6:].isdecimal()}
-    there = {index for index in numbers if index < count and frame_path(folder, index).is_file()}
+    there = {index for index, _ in _numbered(folder) if index < count and frame_path(folder, index).is_file()}
     if len(there) < count:
         first = list(itertools.islice((index for index in range(count) if index not in there), 9))
         shown = ", ".join(map(str, first[:8])) + (" ..." if len(first) > 8 else "")
@@ -151,93 +199,88 @@ def _from(stored: StoredFrame, source: StoredFrame) -> StoredFrame:
 
 
 def _checked_buffers(stored: StoredFrame, wanted: set[str], file: Path) -> StoredFrame:
-    there = {name for name in Frame._fields[1:] if getattr(stored.frame, name) is not None}
-    if wanted - there:
-        raise ClipError(f"{file}: expected the buffers {', '.join(sorted(wanted - there))}; render the frame again.")
+    missing = wanted - set(present(stored.frame))
+    if missing:
+        raise ClipError(f"{file}: expected the buffers {', '.join(sorted(missing))}; render the frame again.")
     return stored._replace(frame=only(stored.frame, frozenset(wanted)))
+
+
+def open_frames(
+    path: str | Path,
+    *,
+    spp: int = 1,
+    motion_convention: str | None = None,
+    channels: Mapping[str, str] | None = None,
+) -> tuple[list[Path], Iterator[StoredFrame]]:
+    """The files of a clip, or of another renderer's sequence, and their frames, each read when it is asked for.
+
+    Takes what :func:`read_clip` takes and raises as it does. The frames of another renderer have no ``layers`` and no
+    reference.
+    """
+    if is_clip(path):
+        files = [frame_path(path, index) for index in range(read_record(path)["frames"])]
+        return files, read_frames(path, spp=spp)
+    if _looks_unfinished(path):
+        raise _unfinished(Path(path))
+    if spp != 1:
+        raise ClipError(f"{path}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
+    files, frames = plain_frames(path, motion_convention=motion_convention, channels=channels)
+    return files, (StoredFrame(frame, {}, None, None) for frame in frames)
 
 
 def read_clip(
     path: str | Path,
     *,
     spp: int = 1,
+    layers: bool = False,
     motion_convention: str | None = None,
-    layers: Mapping[str, str] | None = None,
+    channels: Mapping[str, str] | None = None,
 ) -> Clip:
-    """Read a clip as numpy arrays, float32 but for ``ids`` (int32) and ``visible`` (bool).
+    """Read a clip as NumPy arrays, with the dtypes of :attr:`jaxdn.frame.Buffer.dtype`.
 
     A buffer that some frames have and others lack is written out in those (:func:`jaxdn.frame.written_out`).
 
-    ``path`` is the folder of a clip, of which ``spp`` samples a pixel are read; or a folder of, or a glob pattern for,
-    the EXR files of another renderer, whose channels are found by their names (``motion_convention`` and ``layers``:
-    see :func:`jaxdn.clips.import_exr.read_plain_frames`).
+    ``path`` is the folder of a clip, of which ``spp`` samples a pixel are read, and with ``layers`` the independent
+    noisy layers of 1, 2, 4, ... samples too (``Clip.layers``); or a folder of, or a glob pattern for, the EXR files of
+    another renderer, whose channels are found by their names (``motion_convention`` and ``channels``: see
+    :func:`jaxdn.clips.import_exr.plain_frames`).
 
     Raises ClipError, naming the file and the reason: no such folder, no ``clip.json``, another format version, missing
-    or unreadable frames, missing channels, frames that differ in size or channels, or ``spp`` not available.
+    or unreadable frames, missing channels, frames that differ in size or channels, ``spp`` or ``layers`` not available.
     """
-    frames: Sequence[Frame]
-    references: Sequence[np.ndarray | None]
-    if is_clip(path):
-        stored = [(one.frame, one.reference) for one in read_frames(path, spp=spp)]
-        frames, references = zip(*stored, strict=True)
-        present = {name for frame in frames for name in Frame._fields[1:] if getattr(frame, name) is not None}
-        frames = [written_out(frame, present) for frame in frames]
-    elif _unfinished(path):
-        raise ClipError(f"{path}: there is no {_RECORD} in it; the clip was not finished. Render it again.")
-    elif spp != 1:
-        raise ClipError(f"{path}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
-    else:
-        frames = read_plain_frames(path, motion_convention=motion_convention, layers=layers)
-        references = [None] * len(frames)
-    known = [reference for reference in references if reference is not None]
-    stack = jax.tree.map(lambda *buffers: np.stack(buffers), *frames)
-    return Clip(stack, np.stack(known) if known else None)
+    _, opened = open_frames(path, spp=spp, motion_convention=motion_convention, channels=channels)
+    stored = list(opened)
+    counts = doubling_layers(stored[0].layers, path) if layers else []
+    named = {name for one in stored for name in present(one.frame)}
+    frames = jax.tree.map(lambda *buffers: np.stack(buffers), *(written_out(one.frame, named) for one in stored))
+    references = [one.reference for one in stored if one.reference is not None]
+    return Clip(
+        frames,
+        np.stack(references) if references else None,
+        {count: np.stack([one.layers[count] for one in stored]) for count in counts} if layers else None,
+    )
 
 
-def _unfinished(path: str | Path) -> bool:
+def _unfinished(folder: Path) -> ClipError:
+    """What is wrong with a folder that is no clip."""
+    if (folder / _UNFINISHED).is_file():
+        return ClipError(f"{folder}: rendering this clip was interrupted; run the same command again to finish it.")
+    return ClipError(f"{folder}: there is no {_RECORD} in it; the clip was not finished. Render it again.")
+
+
+def _looks_unfinished(path: str | Path) -> bool:
     first = frame_path(path, 0)
-    return first.is_file() and bool(stored_layers(read_exr(first)))
+    return (Path(path) / _UNFINISHED).is_file() or (first.is_file() and bool(stored_layers(read_exr(first))))
 
 
-def _present(stored: StoredFrame) -> tuple[str, ...]:
-    buffers = [name for name, buffer in stored.frame._asdict().items() if buffer is not None]
-    light = [f"noisy_{samples}spp" for samples in stored.layers]
-    return (*buffers, *light, *(["reference"] if stored.reference is not None else []))
+def _names(stored: StoredFrame, *, planned: bool) -> set[str]:
+    """What all frames of a clip have to have; the buffers are the plan's own business."""
+    light = {f"noisy_{samples}spp" for samples in stored.layers}
+    light |= set() if stored.reference is None else {"reference"}
+    return light if planned else light | set(present(stored.frame))
 
 
-def _checked(record: Any, file: Path) -> dict[str, Any]:
-    if not isinstance(record, dict):
-        raise ClipError(f"{file}: expected a JSON object, got {type(record).__name__}.")
-    if record.get("format") != FORMAT:
-        raise ClipError(
-            f"{file}: expected format {FORMAT}, got {record.get('format')!r}; this clip was written by another version."
-        )
-    for name in ("frames", "width", "height"):
-        value = record.get(name)
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise ClipError(f"{file}: {name}: expected a whole number of at least 1, got {value!r}.")
-    layers = record.get("layers")
-    if not isinstance(layers, list) or not layers or not all(type(n) is int and n > 0 for n in layers):
-        raise ClipError(f"{file}: layers: expected a list of sample counts such as [1, 2, 4], got {layers!r}.")
-    _check_plan(record.get("plan"), record["frames"], file)
-    cameras = record.get("cameras")
-    if cameras is not None and (not isinstance(cameras, list) or len(cameras) < record["frames"]):
-        raise ClipError(f"{file}: cameras: expected a list with one for each frame; render the clip again.")
-    return record
-
-
-def _check_plan(plan: Any, count: int, file: Path) -> None:
-    """Raise ClipError unless a plan is None or says what each frame holds, whose it is, and for which effects."""
-    if plan is None:
-        return
-    held = plan.get("held") if isinstance(plan, Mapping) else None
-    frames = plan.get("frames") if isinstance(plan, Mapping) else None
-    sound = isinstance(held, list) and isinstance(frames, list) and len(held) == len(frames) == count
-    if not sound or not all(type(at) is int and 0 <= at <= index for index, at in enumerate(held or [])):
-        raise ClipError(f"{file}: plan: expected what each of {count} frames holds; render it again.")
-    effects = plan.get("effects")
-    if not isinstance(effects, list) or not all(isinstance(name, str) for name in effects):
-        raise ClipError(f"{file}: plan: expected a list of effects, got {effects!r}; render the clip again.")
-    for names in frames or []:
-        if not isinstance(names, list) or not all(isinstance(name, str) and name in _BUFFERS for name in names):
-            raise ClipError(f"{file}: plan: expected names of buffers, got {names!r}; render it again.")
+def _numbered(folder: Path) -> list[tuple[int, Path]]:
+    """The frames' files in a folder with their numbers."""
+    files = folder.glob("frame_*.exr")
+    return [(int(file.stem[6:]), file) for file in files if file.stem[6:].isdecimal()]

@@ -2,7 +2,8 @@
 
 Noisy radiance is stored as *independent* layers of 1, 2, 4, ... samples a pixel, so that one rendering gives every
 sample count up to their sum: ``n`` samples are ``sum(2^k * layer_k) / n`` over the bits of ``n`` (Hasselgren et al.
-2020, sec. 2.2). A buffer that is ``None`` has no channels in the file, and comes back as ``None``.
+2020, sec. 2.2). A buffer that is ``None`` has no channels in the file, and comes back as ``None``. How a buffer is
+stored follows from its row in :data:`jaxdn.frame.BUFFERS`.
 """
 
 from collections.abc import Iterable, Mapping
@@ -13,36 +14,14 @@ import numpy as np
 
 from jaxdn.clips.exr import read_exr, to_half, write_exr
 from jaxdn.clips.files import ClipError
-from jaxdn.frame import Frame
+from jaxdn.frame import BUFFERS, GUIDES, Buffer, Frame
 
-
-class _Layout(NamedTuple):
-    channels: str
-    """The last letter of each channel's name."""
-    kind: str
-    """"half", "float", "ids" (int32 stored as uint32, one up, so that 0 is nothing) or "bool"."""
-
-
-LAYOUT = {
-    "albedo": _Layout("RGB", "half"),
-    "normal": _Layout("XYZ", "half"),
-    "depth": _Layout("Z", "float"),
-    "roughness": _Layout("Y", "half"),
-    "motion": _Layout("XY", "float"),
-    "dual_motion": _Layout("XY", "float"),
-    "visible": _Layout("Y", "bool"),
-    "previous_depth": _Layout("Z", "float"),
-    "ids": _Layout("Y", "ids"),
-    "direct": _Layout("RGB", "half"),
-    "emission": _Layout("RGB", "half"),
-}
-"""How every buffer of a Frame but the radiance lies in the file."""
-
-_LIGHT = _Layout("RGB", "half")
+_LIGHT = BUFFERS["radiance"]
+"""How noisy layers and references lie in the file; the radiance itself is made of the layers."""
 
 
 class StoredFrame(NamedTuple):
-    """What :func:`read_frame` finds: numpy arrays, float32 but for ``ids`` (int32) and ``visible`` (bool)."""
+    """What :func:`read_frame` finds: NumPy arrays with the dtypes of :attr:`jaxdn.frame.Buffer.dtype`."""
 
     frame: Frame
     """Its radiance has the number of samples that was asked for."""
@@ -65,10 +44,10 @@ def write_frame(
     """Write one frame, whole or not at all.
 
     ``layers`` maps numbers of samples (1, 2, 4, ...) to independent noisy images [H, W, 3]; ``frame.radiance`` is
-    not stored then. Without ``layers``, ``frame.radiance`` becomes the layer of one sample. Light, albedo, normals and
-    roughness are stored in half precision (finite values beyond 65504 are clamped; NaN and infinities are kept), depths
-    and motion vectors in single precision. Raises ValueError for shapes that do not fit each other, OSError if the file
-    cannot be written.
+    not stored then. Without ``layers``, ``frame.radiance`` becomes the layer of one sample. Each buffer is stored as
+    :attr:`jaxdn.frame.Buffer.stored` says: light, fractions and directions in half precision (finite values beyond
+    65504 are clamped; NaN and infinities are kept), distances and vectors in single precision. Raises ValueError for
+    shapes that do not fit each other, OSError if the file cannot be written.
     """
     layers = {1: frame.radiance} if layers is None else layers
     if not layers:
@@ -77,18 +56,18 @@ def write_frame(
         raise ValueError(f"{path}: layers: expected whole numbers of samples, got {list(layers)}.")
     images = {f"noisy_{samples}spp": (image, _LIGHT) for samples, image in sorted(layers.items())}
     images |= {"reference": (reference, _LIGHT), "reference_half": (reference_half, _LIGHT)}
-    images |= {name: (getattr(frame, name), layout) for name, layout in LAYOUT.items()}
+    images |= {name: (getattr(frame, name), BUFFERS[name]) for name in GUIDES}
     size = np.shape(next(iter(layers.values())))[:2]
     channels: dict[str, np.ndarray] = {}
-    for name, (image, layout) in images.items():
+    for name, (image, buffer) in images.items():
         if image is None:
             continue
         image = np.asarray(image)
-        expected = (*size, len(layout.channels))
+        expected = (*size, buffer.channels)
         if image.shape != expected:
             raise ValueError(f"{path}: {name}: expected shape {expected}, got {image.shape}.")
-        stored = _encode(f"{path}: {name}", image, layout.kind)
-        channels |= {f"{name}.{letter}": stored[..., i] for i, letter in enumerate(layout.channels)}
+        stored = _encode(f"{path}: {name}", image, buffer)
+        channels |= {f"{name}.{letter}": stored[..., i] for i, letter in enumerate(buffer.letters)}
     write_exr(path, channels)
 
 
@@ -101,7 +80,7 @@ def read_frame(path: str | Path, *, spp: int = 1) -> StoredFrame:
     channels = read_exr(path)
     layers = {n: _required(path, channels, f"noisy_{n}spp", _LIGHT) for n in stored_layers(channels)}
     chosen = layers_for(spp, layers, path)
-    buffers = {name: _optional(path, channels, name, layout) for name, layout in LAYOUT.items()}
+    buffers = {name: _optional(path, channels, name, BUFFERS[name]) for name in GUIDES}
     return StoredFrame(
         Frame(radiance=combine({n: layers[n] for n in chosen}), **buffers),
         layers,
@@ -119,6 +98,23 @@ def stored_layers(channels: Iterable[str]) -> list[int]:
         if head == f"noisy_{count}spp" and count.isdecimal():
             found.add(int(count))
     return sorted(found)
+
+
+def doubling_layers(available: Iterable[int], where: str | Path) -> list[int]:
+    """The layers of 1, 2, 4, ... samples up to the first that is missing: what any number of samples is made of.
+
+    Raises ClipError if there is none of 1 sample.
+    """
+    counts = set(available)
+    found: list[int] = []
+    while 1 << len(found) in counts:
+        found.append(1 << len(found))
+    if not found:
+        raise ClipError(
+            f"{where}: expected independent noisy layers of 1, 2, 4, ... samples a pixel, got "
+            f"{', '.join(map(str, sorted(counts))) or 'none'}; render the clip with --layers 1 2 4."
+        )
+    return found
 
 
 def combine(layers: Mapping[int, np.ndarray]) -> np.ndarray:
@@ -150,12 +146,12 @@ def layers_for(spp: int, available: Iterable[int], where: str | Path) -> list[in
     return chosen
 
 
-def _encode(where: str, image: np.ndarray, kind: str) -> np.ndarray:
-    if kind == "half":
+def _encode(where: str, image: np.ndarray, buffer: Buffer) -> np.ndarray:
+    if buffer.stored == "half":
         return to_half(image)
-    if kind == "float":
+    if buffer.stored == "single":
         return image.astype(np.float32)
-    if kind == "bool":
+    if buffer.stored == "flag":
         return (image != 0).astype(np.float16)
     if not np.issubdtype(image.dtype, np.integer):
         raise ValueError(f"{where}: expected whole numbers, got {image.dtype}.")
@@ -164,22 +160,22 @@ def _encode(where: str, image: np.ndarray, kind: str) -> np.ndarray:
     return (image.astype(np.int64) + 1).astype(np.uint32)
 
 
-def _decode(image: np.ndarray, kind: str) -> np.ndarray:
-    if kind == "bool":
+def _decode(image: np.ndarray, buffer: Buffer) -> np.ndarray:
+    if buffer.stored == "flag":
         return image > 0.5
-    if kind == "ids":
-        return (image.astype(np.int64) - 1).astype(np.int32)
-    return image.astype(np.float32)
+    if buffer.stored == "id":
+        image = image.astype(np.int64) - 1
+    return image.astype(buffer.dtype)
 
 
-def _required(path: str | Path, channels: Mapping[str, np.ndarray], name: str, layout: _Layout) -> np.ndarray:
-    missing = [f"{name}.{letter}" for letter in layout.channels if f"{name}.{letter}" not in channels]
+def _required(path: str | Path, channels: Mapping[str, np.ndarray], name: str, buffer: Buffer) -> np.ndarray:
+    missing = [f"{name}.{letter}" for letter in buffer.letters if f"{name}.{letter}" not in channels]
     if missing:
         raise ClipError(f"{path}: expected the channels {', '.join(missing)}, found {', '.join(sorted(channels))}.")
-    return _decode(np.stack([channels[f"{name}.{letter}"] for letter in layout.channels], axis=-1), layout.kind)
+    return _decode(np.stack([channels[f"{name}.{letter}"] for letter in buffer.letters], axis=-1), buffer)
 
 
-def _optional(path: str | Path, channels: Mapping[str, np.ndarray], name: str, layout: _Layout) -> np.ndarray | None:
+def _optional(path: str | Path, channels: Mapping[str, np.ndarray], name: str, buffer: Buffer) -> np.ndarray | None:
     # One channel of a group is a damaged group, not an absent effect.
-    there = any(f"{name}.{letter}" in channels for letter in layout.channels)
-    return _required(path, channels, name, layout) if there else None
+    there = any(f"{name}.{letter}" in channels for letter in buffer.letters)
+    return _required(path, channels, name, buffer) if there else None

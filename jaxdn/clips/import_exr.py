@@ -8,7 +8,7 @@ says so.
 
 import glob
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxdn.clips.exr import read_exr
 from jaxdn.clips.files import ClipError
-from jaxdn.frame import FAR, Frame
+from jaxdn.frame import BUFFERS, FAR, Buffer, Frame, present
 
 MOTION_CONVENTIONS: dict[str, str] = {
     "previous-current": "pixels, previous minus current position, y down (ours; NTASD, Zeng et al., SVGF)",
@@ -28,46 +28,55 @@ MOTION_CONVENTIONS: dict[str, str] = {
 }
 """What ``motion_convention`` may be, in words."""
 
-_COLOR = (("r", "g", "b"), ("red", "green", "blue"))
-_VECTOR = (("x", "y", "z"), *_COLOR)
-_SINGLE = (("z",), ("y",), ("v",), ("x",), ("r",), ("i",), ("",))
-_PLANE = (("x", "y"), ("r", "g"), ("u", "v"))
-
-
-class _Rule(NamedTuple):
-    layers: tuple[str, ...]
-    """Names in the order of preference, lower case."""
-    components: tuple[tuple[str, ...], ...]
-
-
-_RULES = {
-    "radiance": _Rule(("noisy image", "", "beauty", "rgba", "combined", "color", "ci"), _COLOR),
-    "albedo": _Rule(
-        (
-            "albedo",
-            "denoising albedo",
-            "diffuse_albedo",
-            "diffuse_albedo_noice",
-            "visiblediffuse",
-            "diffcol",
-            "diffuse",
-        ),
-        _COLOR,
+_LAYERS: dict[str, tuple[str, ...]] = {
+    "radiance": ("noisy image", "", "beauty", "rgba", "combined", "color", "ci"),
+    "albedo": (
+        "albedo",
+        "denoising albedo",
+        "diffuse_albedo",
+        "diffuse_albedo_noice",
+        "visiblediffuse",
+        "diffcol",
+        "diffuse",
     ),
-    "normal": _Rule(
-        ("denoising normal", "normal", "normals", "sh_normal", "n", "ns", "n_noice", "visiblenormals", "optixnormals"),
-        _VECTOR,
+    "normal": (
+        "denoising normal",
+        "normal",
+        "normals",
+        "sh_normal",
+        "n",
+        "ns",
+        "n_noice",
+        "visiblenormals",
+        "optixnormals",
     ),
-    "depth": _Rule(("depth", "denoising depth", "z"), (("z",), ("v",), ("y",), ("",))),
-    "motion": _Rule(("vector", "motionvector", "motion", "mvec", "backward"), _PLANE),
-    "ids": _Rule(("ids", "indexob", "shape_index", "object_id", "id"), _SINGLE),
+    "depth": ("depth", "denoising depth", "z"),
+    "motion": ("vector", "motionvector", "motion", "mvec", "backward"),
+    "ids": ("ids", "indexob", "shape_index", "object_id", "id"),
 }
+"""The buffers that other renderers have a name for, with the names of their layers: lower case, the first that is
+there is taken."""
+
+Channels = tuple[str, ...]
+"""The full names of the channels that make up one buffer, in order."""
 
 
-def detect_channels(names: Sequence[str], *, layers: Mapping[str, str] | None = None) -> dict[str, tuple[str, ...]]:
+def _components(buffer: Buffer) -> tuple[Channels, ...]:
+    """What the channels of such a buffer may be called within their layer, lower case; the first that fits is taken."""
+    color = (("r", "g", "b"), ("red", "green", "blue"))
+    if buffer.channels == 3:
+        return (("x", "y", "z"), *color) if buffer.kind == "direction" else color
+    if buffer.channels == 2:
+        return (("x", "y"), ("r", "g"), ("u", "v"))
+    if buffer.kind == "distance":
+        return (("z",), ("v",), ("y",), ("",))
+    return (("z",), ("y",), ("v",), ("x",), ("r",), ("i",), ("",))
+
+
+def detect_channels(names: Sequence[str], *, channels: Mapping[str, str] | None = None) -> dict[str, Channels]:
     """Which channels make up which buffer, by their names; buffers without channels are left out.
 
-    ``layers`` names the layer of a buffer outright, for example ``{"radiance": "ViewLayer.Combined"}``. Raises
+    ``channels`` names the layer of a buffer outright, for example ``{"radiance": "ViewLayer.Combined"}``. Raises
     ClipError if two layers fit a buffer equally well, if a named layer is not there, or if there is no radiance.
     """
     groups: dict[str, dict[str, str]] = {}
@@ -76,19 +85,17 @@ def detect_channels(names: Sequence[str], *, layers: Mapping[str, str] | None = 
         groups.setdefault(layer, {})[component.lower()] = name
         if not layer:
             groups.setdefault(name, {})[""] = name  # a channel that is a layer of its own, such as "Z"
-    layers = layers or {}
-    unknown = set(layers) - set(_RULES)
+    stated = channels or {}
+    unknown = set(stated) - set(_LAYERS)
     if unknown:
-        raise ClipError(f"layers: expected names among {', '.join(_RULES)}, got {', '.join(sorted(unknown))}.")
+        raise ClipError(f"channels: expected buffers among {', '.join(_LAYERS)}, got {', '.join(sorted(unknown))}.")
     found = {}
-    for buffer, rule in _RULES.items():
-        channels = _named(groups, buffer, rule, layers[buffer]) if buffer in layers else _detect(groups, buffer, rule)
-        if channels:
-            found[buffer] = channels
+    for buffer in _LAYERS:
+        fitting = _named(groups, buffer, stated[buffer]) if buffer in stated else _detect(groups, buffer)
+        if fitting:
+            found[buffer] = fitting
     if "radiance" not in found:
-        raise ClipError(
-            f"no radiance among the channels {', '.join(sorted(names))}; name its layer: layers={{'radiance': ...}}."
-        )
+        raise ClipError(f"no radiance among the channels {', '.join(sorted(names))}; {_name_it('radiance')}.")
     return found
 
 
@@ -142,63 +149,91 @@ def sequence_files(path: str | Path) -> list[Path]:
     return [frames[number] for number in sorted(frames)]
 
 
-def read_plain_frames(
-    path: str | Path, *, motion_convention: str | None = None, layers: Mapping[str, str] | None = None
-) -> list[Frame]:
-    """The frames of another renderer's sequence, all with the same buffers.
+def plain_frames(
+    path: str | Path, *, motion_convention: str | None = None, channels: Mapping[str, str] | None = None
+) -> tuple[list[Path], Iterator[Frame]]:
+    """The files of another renderer's sequence, and their frames, each read when it is asked for.
 
-    ``motion_convention`` says what the motion vectors mean (a key of ``MOTION_CONVENTIONS``) and is needed as soon as
-    there are any that are not Cycles' ``Vector``; ``"none"`` leaves them out. ``layers``: see :func:`detect_channels`.
-    Depth is taken for view-space z (far or infinite becomes ``FAR``); ids count from 1 with 0 for nothing, and are
-    left out if they say nothing. Normals are expected in world space.
-    Raises ClipError, naming the file, where the files do not make one clip.
+    All frames have the size and the buffers of the first. ``motion_convention`` says what the motion vectors mean (a
+    key of ``MOTION_CONVENTIONS``) and is needed as soon as there are any that are not Cycles' ``Vector``; ``"none"``
+    leaves them out. ``channels``: see :func:`detect_channels`. Depth is taken for view-space z (far or infinite becomes
+    ``FAR``); ids count from 1 with 0 for nothing, and are left out of all frames if they say nothing in the first.
+    Normals are expected in world space.
+
+    Raises ClipError at once where the files are no sequence, and, naming the file, when a frame is asked for that
+    cannot be read or differs from the first.
     """
+    if motion_convention not in (None, "none", *MOTION_CONVENTIONS):
+        raise ClipError(f"motion_convention: {_conventions()}; got {motion_convention!r}.")
     files = sequence_files(path)
-    frames: list[Frame] = []
+    return files, _frames(files, motion_convention, channels)
+
+
+def _frames(
+    files: Sequence[Path], motion_convention: str | None, channels: Mapping[str, str] | None
+) -> Iterator[Frame]:
+    first: _First | None = None
     for file in files:
-        channels = read_exr(file)
-        try:
-            found = detect_channels(list(channels), layers=layers)
-            convention = _motion_convention(found, channels, motion_convention)
-        except ClipError as error:
-            raise ClipError(f"{file}: {error}") from error
-        if convention is None:
-            found.pop("motion", None)
-        images = {name: np.stack([channels[c] for c in found[name]], axis=-1) for name in found}
-        frames.append(_frame(images, convention))
-        _check_like_first(file, frames[-1], frames[0])
-    if all(frame.ids is None or np.all(frame.ids < 0) for frame in frames):
-        frames = [frame._replace(ids=None) for frame in frames]
-    return frames
+        frame = _read(file, motion_convention, channels)
+        if first is None:
+            # Renderers write zeros where nobody asked for ids. Whether all frames do is not known before the last one.
+            silent = frame.ids is not None and bool(np.all(frame.ids < 0))
+            first = _First(frame.radiance.shape, present(frame), silent)
+        _check_like_first(file, frame, first)
+        yield frame._replace(ids=None) if first.silent else frame
 
 
-def _frame(images: Mapping[str, np.ndarray], convention: str | None) -> Frame:
-    buffers = {name: image.astype(np.float32) for name, image in images.items() if name != "ids"}
-    if convention is not None:
-        buffers["motion"] = convert_motion(buffers["motion"], convention)
-    if "depth" in buffers:
-        depth = buffers["depth"]
-        buffers["depth"] = np.where(np.isfinite(depth) & (depth < FAR), depth, np.float32(FAR))
-    if "ids" in images:
-        ids = np.nan_to_num(images["ids"].astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
-        buffers["ids"] = (np.clip(np.rint(ids), 0, 2**31 - 1) - 1).astype(np.int32)
-    return Frame(**buffers)
+class _First(NamedTuple):
+    """What all later frames have in common with the first."""
+
+    shape: tuple[int, ...]
+    buffers: tuple[str, ...]
+    silent: bool
+    """Its ids say nothing."""
+
+
+def _read(file: Path, motion_convention: str | None, channels: Mapping[str, str] | None) -> Frame:
+    there = read_exr(file)
+    try:
+        found = detect_channels(list(there), channels=channels)
+        convention = _motion_convention(found, there, motion_convention)
+    except ClipError as error:
+        raise ClipError(f"{file}: {error}") from error
+    if convention is None:
+        found.pop("motion", None)
+    images = {name: np.stack([there[channel] for channel in found[name]], axis=-1) for name in found}
+    return Frame(**{name: _converted(image, BUFFERS[name], convention) for name, image in images.items()})
+
+
+def _converted(image: np.ndarray, buffer: Buffer, convention: str | None) -> np.ndarray:
+    """One of their buffers as ours."""
+    if buffer.kind == "id":
+        ids = np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+        return (np.clip(np.rint(ids), 0, 2**31 - 1) - 1).astype(np.int32)
+    image = image.astype(buffer.dtype)
+    if buffer.kind == "vector" and convention is not None:
+        return convert_motion(image, convention)
+    if buffer.kind == "distance":
+        return np.where(np.isfinite(image) & (image < FAR), image, np.float32(FAR))
+    return image
 
 
 def _motion_convention(
-    found: Mapping[str, tuple[str, ...]], channels: Mapping[str, np.ndarray], stated: str | None
+    found: Mapping[str, Channels], there: Mapping[str, np.ndarray], stated: str | None
 ) -> str | None:
-    if stated is not None and stated != "none" and stated not in MOTION_CONVENTIONS:
-        raise ClipError(f"motion_convention: {_conventions()}; got {stated!r}.")
+    """The convention of a file's motion vectors; None where there are none, or none are wanted."""
     if "motion" not in found or stated == "none":
         return None
     if stated is not None:
         return stated
     layer = found["motion"][0].rpartition(".")[0]
-    four = all(f"{layer}.{component}" in channels for component in "XYZW")
+    four = all(f"{layer}.{component}" in there for component in "XYZW")
     if four and layer.rpartition(".")[2].lower() == "vector":
         return "cycles"
-    raise ClipError(f"{', '.join(found['motion'])}: state motion_convention, the file does not: {_conventions()}.")
+    raise ClipError(
+        f"{', '.join(found['motion'])}: nothing in the file says what these motion vectors mean; state "
+        f"motion_convention (jaxdn denoise --motion-convention): {_conventions()}."
+    )
 
 
 def _conventions() -> str:
@@ -206,49 +241,52 @@ def _conventions() -> str:
     return f"expected one of {words}; 'none': leave the motion out"
 
 
-def _check_like_first(file: Path, frame: Frame, first: Frame) -> None:
-    if frame.radiance.shape != first.radiance.shape:
+def _check_like_first(file: Path, frame: Frame, first: _First) -> None:
+    if frame.radiance.shape != first.shape:
         raise ClipError(
-            f"{file}: expected {first.radiance.shape[1]} x {first.radiance.shape[0]} pixels as in the first frame, "
+            f"{file}: expected {first.shape[1]} x {first.shape[0]} pixels as in the first frame, "
             f"got {frame.radiance.shape[1]} x {frame.radiance.shape[0]}."
         )
-    differing = [name for name in Frame._fields if (getattr(frame, name) is None) != (getattr(first, name) is None)]
+    differing = sorted(set(present(frame)) ^ set(first.buffers))
     if differing:
         raise ClipError(f"{file}: expected the same buffers as in the first frame, but {', '.join(differing)} differs.")
 
 
-def _components(group: Mapping[str, str], rule: _Rule) -> tuple[str, ...] | None:
-    for wanted in rule.components:
+def _name_it(buffer: str) -> str:
+    return f"name its layer: channels={{{buffer!r}: LAYER}} (jaxdn denoise --channels {buffer}=LAYER)"
+
+
+def _fitting(group: Mapping[str, str], buffer: str) -> Channels | None:
+    for wanted in _components(BUFFERS[buffer]):
         if all(component in group for component in wanted):
             return tuple(group[component] for component in wanted)
     return None
 
 
-def _named(groups: Mapping[str, Mapping[str, str]], buffer: str, rule: _Rule, layer: str) -> tuple[str, ...]:
-    channels = _components(groups.get(layer, {}), rule)
+def _named(groups: Mapping[str, Mapping[str, str]], buffer: str, layer: str) -> Channels:
+    channels = _fitting(groups.get(layer, {}), buffer)
     if channels is None:
-        raise ClipError(f"layers: no {buffer} in layer {layer!r}; there are {', '.join(map(repr, sorted(groups)))}.")
+        raise ClipError(f"channels: no {buffer} in layer {layer!r}; there are {', '.join(map(repr, sorted(groups)))}.")
     return channels
 
 
-def _detect(groups: Mapping[str, Mapping[str, str]], buffer: str, rule: _Rule) -> tuple[str, ...] | None:
-    for wanted in rule.layers:
+def _detect(groups: Mapping[str, Mapping[str, str]], buffer: str) -> Channels | None:
+    for wanted in _LAYERS[buffer]:
         fitting = {}
         for layer, group in groups.items():
             lower = layer.lower()
             if lower == wanted or (wanted and lower.endswith("." + wanted)):
-                channels = _components(group, rule)
+                channels = _fitting(group, buffer)
                 if channels:
                     fitting[layer] = channels
-        # Blender's compositor output stands beside the view layer that it was made from.
+        # Blender's compositor output stands next to the view layer that it was made from.
         rendered = {layer: channels for layer, channels in fitting.items() if not layer.startswith("Composite.")}
         fitting = rendered or fitting
         exact = {layer: channels for layer, channels in fitting.items() if layer.lower() == wanted}
         fitting = exact or fitting
         if len(set(fitting.values())) > 1:
             raise ClipError(
-                f"{buffer}: {' and '.join(map(repr, sorted(fitting)))} fit equally well; "
-                f"name one: layers={{{buffer!r}: ...}}."
+                f"{buffer}: {' and '.join(map(repr, sorted(fitting)))} fit equally well; {_name_it(buffer)}."
             )
         if fitting:
             return next(iter(fitting.values()))

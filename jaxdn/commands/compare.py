@@ -5,56 +5,19 @@ import platform
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
-from jaxdn import __version__, color, denoisers, metrics
+from jaxdn import __version__, color, metrics
+from jaxdn.candidates import Candidate
 from jaxdn.clips import read_clip
 from jaxdn.clips.noise_floor import read_noise_floor
 from jaxdn.denoiser import Denoiser
-from jaxdn.frame import Clip, Frame
+from jaxdn.frame import Clip
 from jaxdn.report import ClipResult, Results, Scores, TrainingCurve
 from jaxdn.rollout import denoise
-from jaxdn.weights import load_weights, shipped_names
-
-
-class Method(NamedTuple):
-    """One column of the table."""
-
-    label: str
-    denoiser: Denoiser | None
-    """None is the noisy image itself."""
-    params: Any
-
-
-def method_named(name: str, **options: Any) -> Method:
-    """``noisy``, a filter without weights (``svgf``), shipped weights (``ntd-large``) or a .safetensors file.
-
-    ``options`` take the place of those that the weights were saved with. Raises ValueError for a name that is none of
-    these, and for options where there are no weights.
-    """
-    if options and (name == "noisy" or name in denoisers.NAMES):
-        raise ValueError(f"{', '.join(options)}: expected a method with weights, got {name!r}; leave it out.")
-    if name == "noisy":
-        return Method(name, None, {})
-    if name in denoisers.NAMES:
-        denoiser = getattr(denoisers, name)()
-        params = denoiser.init(jax.random.key(0), Frame(radiance=np.zeros((16, 16, 3), np.float32)))
-        if not params:
-            return Method(name, denoiser, params)
-        trained = [shipped for shipped in shipped_names() if shipped.startswith(name)]
-        raise ValueError(
-            f"method {name!r}: expected its weights, one of {', '.join(trained)} or the path of a .safetensors file."
-        )
-    if not name.endswith(".safetensors") and name not in shipped_names():
-        known = ["noisy", *denoisers.NAMES, *shipped_names()]
-        raise ValueError(f"method {name!r}: expected one of {', '.join(known)} or the path of a .safetensors file.")
-    denoiser, params = load_weights(name, **options)
-    path = Path(name)
-    # A run's folder says more than the name that all weights have there.
-    return Method(path.parent.name if path.stem == "weights" else path.stem, denoiser, params)
 
 
 @jax.jit
@@ -79,7 +42,7 @@ def _clip_scores(image: jax.Array, reference: jax.Array, hidden: jax.Array) -> d
 
 
 def compare(
-    methods: Sequence[Method],
+    methods: Sequence[Candidate],
     folders: Sequence[Path],
     *,
     title: str,
@@ -98,9 +61,10 @@ def compare(
     for method in methods:
         if method.denoiser is not None:
             compiled[method.label] = _compile(method.denoiser)
+    asking = any(method.denoiser is not None and method.denoiser.samples is not None for method in methods)
     clips = []
     for count, folder in enumerate(folders):
-        clip = read_clip(folder, spp=spp)
+        clip = read_clip(folder, spp=spp, layers=asking)
         if clip.reference is None:
             raise ValueError(f"{folder}: expected a clip with a reference to compare with, got none; render one.")
         began = time.monotonic()
@@ -122,12 +86,12 @@ def _compile(denoiser: Denoiser) -> Callable[[Any, Clip], jax.Array]:
 def _compare_on(
     clip: Clip,
     folder: Path,
-    methods: Sequence[Method],
+    methods: Sequence[Candidate],
     compiled: dict[str, Callable[[Any, Clip], jax.Array]],
     spp: int,
 ) -> ClipResult:
     frames = clip.frames
-    inputs = Clip(jax.tree.map(jax.numpy.asarray, frames))
+    inputs = jax.tree.map(jax.numpy.asarray, clip._replace(reference=None))
     reference = color.tonemap(clip.reference)
     shape = (*np.shape(frames.radiance)[:3], 1)
     hidden = ~np.asarray(frames.visible, bool) if frames.visible is not None else np.zeros(shape, bool)

@@ -1,21 +1,20 @@
 """``jaxdn denoise``: a noisy clip in, denoised EXR frames out, one frame at a time."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jaxdn import color
+from jaxdn.candidates import Candidate, candidate
 from jaxdn.clips.exr import write_exr
 from jaxdn.clips.folder import frame_path, is_clip, read_frames, read_record
-from jaxdn.clips.import_exr import read_plain_frames, sequence_files
-from jaxdn.commands.compare import Method, method_named
-from jaxdn.frame import RADIANCE_MAX, Frame, only
-from jaxdn.networks import onnx
+from jaxdn.clips.import_exr import plain_frames
+from jaxdn.frame import Frame
+from jaxdn.repair import repair_image
 from jaxdn.report.images import save_png
-from jaxdn.weights import describe
+from jaxdn.rollout import Layers, stream
 
 
 class Written(NamedTuple):
@@ -24,49 +23,63 @@ class Written(NamedTuple):
     files: list[Path]
     programs: int
     """Steps that were compiled: one for each set of buffers that some frame has."""
+    repaired: int
+    """Values of frames and histories that were not usable numbers and had to be replaced."""
 
 
-def method_on(name: str, implementation: str = "auto") -> tuple[Method, str]:
-    """The method of that name on an engine, and the engine's name: "reference" (XLA) or "onnxruntime".
+def candidate_on(name: str, implementation: str = "auto") -> tuple[Candidate, str]:
+    """The candidate of that name on an engine, and the engine's name; "reference" is XLA.
 
-    ``"auto"`` is the faster engine where it can run: on a CPU, installed, for a network that computes in float32.
-    Raises ValueError for a name that is no method, and for an engine that cannot run it.
+    ``"auto"`` is the fastest engine for inference that the method has and that can run here. Raises ValueError for a
+    name that is no method, and for an engine that cannot run it.
     """
-    method = method_named(name)
+    found = candidate(name)
+    known = found.method is not None and found.method.knows("implementation")
     if implementation == "auto":
-        fits = bool(method.params) and describe(name)["options"].get("compute_dtype") != "bfloat16"
-        implementation = "onnxruntime" if fits and onnx.available() else "reference"
-    if implementation == "reference":
-        return method, implementation
-    return method_named(name, implementation=implementation), implementation
+        engine = found.engine("inference")
+        return (found, "reference") if engine is None else (candidate(name, implementation=engine), engine)
+    if implementation == "reference" and not known:
+        return found, implementation
+    return candidate(name, implementation=implementation), implementation
 
 
 def denoise_files(
     source: Path,
     out: Path,
-    method: Method,
+    method: Candidate,
     *,
     spp: int = 1,
     preview: bool = False,
     motion_convention: str | None = None,
+    channels: Mapping[str, str] | None = None,
     say: Callable[[int, int], None] = lambda done, total: None,
 ) -> Written:
     """Denoise a clip's folder, or EXR files of another renderer; returns the files written.
 
     Each output frame has the channels ``R, G, B``: the denoised radiance with the directly reflected and the emitted
     light of the clip added back (foreign files: the denoised beauty), and ``denoised.R/G/B``, the denoised part alone.
-    With ``preview`` a PNG stands beside each. A clip's frames are read, denoised and written one at a time, so that a
-    sequence of any length takes the memory of one; a file is there whole or not at all. ``say`` hears (done, total).
-    Raises ValueError for input that cannot be read or does not fit together, before the frame concerned is written.
+    Frames are read, denoised and written one at a time, so that a sequence of any length takes the memory of one; a
+    file is there whole or not at all. Raises ValueError for input that cannot be read or does not fit together, before
+    the frame concerned is written.
+
+    Args:
+      source: folder of a clip; or a folder of, or a pattern for, EXR files.
+      out: folder for the denoised frames.
+      method: what denoises.
+      spp: samples a pixel to take from a clip's layers.
+      preview: write a PNG next to each frame.
+      motion_convention: whose convention foreign motion vectors follow (:mod:`jaxdn.clips.import_exr`).
+      channels: buffer -> layer of foreign files to take it from.
+      say: called with the frames done and the frames in all.
     """
-    names, frames = _open(source, spp, motion_convention)
+    names, frames = _open(source, spp, motion_convention, channels)
     if out.resolve() in {source.resolve(), *(name.resolve().parent for name in names)}:
         raise ValueError(f"{out}: expected another folder than the input's, whose frames would be overwritten.")
-    step, programs = _stepper(method)
+    step = None if method.denoiser is None else stream(method.denoiser, method.params)
     out.mkdir(parents=True, exist_ok=True)
     written = []
-    for name, frame in zip(names, frames, strict=True):
-        image = step(frame)
+    for name, (frame, layers) in zip(names, frames, strict=True):
+        image = _light(frame.radiance) if step is None else np.asarray(step(frame, layers))
         path = out / f"{name.stem}.exr"
         beauty = image + _light(frame.direct) + _light(frame.emission)
         write_exr(path, _channels("", beauty) | _channels("denoised.", image))
@@ -74,47 +87,33 @@ def denoise_files(
             save_png(path.with_suffix(".png"), color.tonemap(beauty))
         written.append(path)
         say(len(written), len(names))
-    return Written(written, len(programs))
+    return Written(written, 0 if step is None else len(step.programs), 0 if step is None else step.repaired)
 
 
-def _open(source: Path, spp: int, motion_convention: str | None) -> tuple[list[Path], Iterator[Frame]]:
-    """The files, and their frames, read when asked for."""
+def _open(
+    source: Path, spp: int, motion_convention: str | None, channels: Mapping[str, str] | None
+) -> tuple[list[Path], Iterator[tuple[Frame, Layers]]]:
+    """The files, and their frames with a clip's independent noisy layers, read when asked for."""
     if is_clip(source):
         names = [frame_path(source, index) for index in range(read_record(source)["frames"])]
-        return names, (stored.frame for stored in read_frames(source, spp=spp))
+        return names, ((stored.frame, _powers(stored.layers)) for stored in read_frames(source, spp=spp))
     if spp != 1:
         raise ValueError(f"{source}: expected spp 1, got {spp}; only rendered clips have several sample counts.")
-    names = sequence_files(source)
-    return names, iter(read_plain_frames(source, motion_convention=motion_convention))
+    names, frames = plain_frames(source, motion_convention=motion_convention, channels=channels)
+    return names, ((frame, None) for frame in frames)
 
 
-def _stepper(method: Method) -> tuple[Callable[[Frame], np.ndarray], set[tuple[str, ...]]]:
-    """A function from one frame to the next denoised one, and the sets of buffers that it was compiled for so far."""
-    denoiser = method.denoiser
-    programs: set[tuple[str, ...]] = set()
-    if denoiser is None:
-        return lambda frame: _light(frame.radiance), programs
-    run = jax.jit(denoiser.step, donate_argnums=1)
-    state: Any = None
-
-    def step(frame: Frame) -> np.ndarray:
-        nonlocal state
-        inputs = only(frame, denoiser.reads)
-        programs.add(tuple(name for name, buffer in inputs._asdict().items() if buffer is not None))
-        if state is None:
-            state = jax.jit(denoiser.start)(method.params, inputs)
-        state, image = run(method.params, state, inputs)
-        return np.asarray(image)
-
-    return step, programs
+def _powers(layers: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
+    """The layers of 1, 2, 4, ... samples, up to the first that is missing."""
+    count = 0
+    while 1 << count in layers:
+        count += 1
+    return {1 << bit: layers[1 << bit] for bit in range(count)}
 
 
 def _light(radiance: np.ndarray | None) -> Any:
     """Radiance fit to be added: not finite or negative becomes 0, an absent part is 0."""
-    if radiance is None:
-        return 0.0
-    good = np.isfinite(radiance) & (np.asarray(radiance) >= 0)
-    return np.minimum(np.where(good, radiance, 0.0), RADIANCE_MAX).astype(np.float32)
+    return 0.0 if radiance is None else np.asarray(repair_image(radiance), np.float32)
 
 
 def _channels(layer: str, image: np.ndarray) -> dict[str, np.ndarray]:

@@ -7,35 +7,41 @@ from typing import NoReturn
 
 from rich.console import Console
 
+from jaxdn.render.errors import RenderError
+
+EXTRAS: dict[str, tuple[str, ...]] = {
+    "render": ("mitsuba", "drjit"),
+    "train": ("optax", "orbax", "grain", "matplotlib"),
+    "onnx": ("onnxruntime", "onnx"),
+    "bench": ("torch", "pyoidn"),
+}
+"""Extra of pyproject.toml -> the packages that it brings, by the names they are imported by."""
+
 
 @contextmanager
-def told_plainly() -> Iterator[None]:
+def plain_errors() -> Iterator[None]:
     """Turn what a user can mend (wrong input, missing or unwritable file) into one message and exit code 2.
 
     Anything else is a mistake of ours and keeps its traceback. Ctrl-C ends with 130, as shells expect.
     """
     try:
         yield
-    except ValueError as error:
-        _tell(str(error))
+    except (ValueError, RenderError) as error:
+        _end(str(error))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        _tell(f"{where}{error.strerror or error}")
+        _end(f"{where}{error.strerror or error}")
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        extra = "render" if package in ("mitsuba", "drjit") else "train"
-        _tell(f"this needs the package {package!r}: pip install 'jaxdn[{extra}]'.")
-    except RuntimeError as error:
-        from jaxdn.render.clip import RenderError
-
-        if not isinstance(error, RenderError):
+        extra = next((extra for extra, packages in EXTRAS.items() if package in packages), None)
+        if extra is None:
             raise
-        _tell(str(error))
+        _end(f"this needs the package {package!r}: pip install 'jaxdn[{extra}]'.")
     except KeyboardInterrupt:
         Console(stderr=True).print("jaxdn: interrupted; what is finished is kept.", highlight=False)
         sys.exit(130)
 
 
-def _tell(message: str) -> NoReturn:
+def _end(message: str) -> NoReturn:
     Console(stderr=True, style="red").print(f"jaxdn: {message}", markup=False, highlight=False, soft_wrap=True)
     sys.exit(2)

@@ -11,48 +11,25 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from jaxdn import denoisers
-from jaxdn.clips.frames import LAYOUT
-from jaxdn.commands.compare import method_named
+from jaxdn.candidates import candidate
+from jaxdn.commands.render import Planned, plan_clip
 from jaxdn.denoiser import Denoiser
-from jaxdn.effects import EFFECTS, Effects, Plan, chosen, inspect, plan
-from jaxdn.frame import Frame
+from jaxdn.effects import EFFECTS, Plan, everything, inspect, plan
+from jaxdn.frame import BUFFERS
+from jaxdn.methods.table import methods
+from jaxdn.render.opening import open_scene
 
-_BYTES = {"half": 2, "float": 4, "ids": 4, "bool": 2}
+EVERYTHING = plan(everything(1))
+"""What is rendered and stored without a plan."""
 
 
 def denoiser_named(name: str) -> Denoiser | None:
-    """A denoiser to plan for: a factory's name, shipped weights or a file; its weights do not matter here."""
-    return getattr(denoisers, name)() if name in denoisers.NAMES else method_named(name).denoiser
+    """A denoiser to plan for: a method, shipped weights or a file; None is the noisy image, which nobody denoises.
 
-
-def plan_clip(
-    scene: Any,
-    *,
-    effects: str = "auto",
-    denoiser: Denoiser | None = None,
-    width: int,
-    height: int,
-    frames: int,
-    max_depth: int | None = None,
-) -> tuple[Effects, Plan] | None:
-    """The effects to render an animated scene for, and the plan; None is to render everything (``"all"``).
-
-    ``effects`` is ``"auto"``, ``"all"``, or names joined by commas. With ``"auto"`` the path length is measured unless
-    ``max_depth`` is given. Raises ValueError for a name that is no effect.
+    The weights do not matter here, so a method that learns needs none. Raises ValueError for any other name.
     """
-    if effects == "all":
-        return None
-    if effects != "auto":
-        found = chosen([name.strip() for name in effects.split(",") if name.strip()], frames)
-        return found, plan(found, denoiser, max_depth=max_depth)
-    from jaxdn.render.depth import measure_depth
-
-    found = inspect(scene, width=width, height=height, frames=frames)
-    if max_depth is not None or "indirect" not in found or "media" in found:
-        return found, plan(found, denoiser, max_depth=max_depth)
-    depth = measure_depth(scene)
-    return found, plan(found, denoiser, max_depth=depth.max_depth, bound=depth.bound, remaining=depth.remaining)
+    known = methods()
+    return known[name].factory() if name in known else candidate(name).denoiser
 
 
 def inspect_to_terminal(
@@ -68,55 +45,73 @@ def inspect_to_terminal(
     """Print the table, or with ``as_json`` nothing but one JSON object, for a scene, a family or a finished clip."""
     reader = None if denoiser is None else denoiser_named(denoiser)
     with _nothing_else_on_stdout():
-        if Path(source).is_dir() or source.endswith(".exr"):
-            found = inspect(source, animation, frames=frames)
-            made = plan(found, reader)
-        else:
-            from jaxdn.render.scene_facts import open_scene
-
-            scene = open_scene(source, animation)
-            count = scene.frames if frames is None else frames
-            planned = plan_clip(scene, denoiser=reader, width=width, height=height, frames=count)
-            assert planned is not None  # only "all" has no plan
-            found, made = planned
+        planned = _planned(source, animation, reader, width=width, height=height, frames=frames)
     if as_json:
-        record = {"effects": list(found.names), "plan": told(made, reader), "uncertain": sorted(found.uncertain)}
+        found = planned.effects
+        record = {"effects": list(found), "plan": plan_record(planned, reader), "uncertain": sorted(found.uncertain)}
         print(json.dumps(record, indent=1))
         return
-    _show(source, found, made, reader, denoiser)
+    _show(source, planned, reader, denoiser)
 
 
-def told(made: Plan, reader: Denoiser | None) -> dict[str, Any]:
-    """A plan as JSON, with what follows from it."""
-    everything = len(Frame._fields) - 1
+def _planned(
+    source: str, animation: Path | None, reader: Denoiser | None, *, width: int, height: int, frames: int | None
+) -> Planned:
+    """What is found in a scene or a finished clip, and what would be rendered for it."""
+    if Path(source).is_dir() or source.endswith(".exr"):
+        found = inspect(source, animation, frames=frames)
+        return Planned(found, plan(found, reader))
+    scene = open_scene(source, animation)
+    count = scene.frames if frames is None else frames
+    planned = plan_clip(scene, denoiser=reader, width=width, height=height, frames=count)
+    assert planned is not None  # only "all" has no plan
+    return planned
+
+
+def plan_record(planned: Planned, reader: Denoiser | None) -> dict[str, Any]:
+    """A plan as JSON, with how its path length was measured, and with what follows from it."""
+    made, depth = planned.plan, planned.depth
     return {
         **made.record(),
+        "bound": None if depth is None else depth.bound,
+        "remaining": None if depth is None else round(depth.remaining, 4),
+        "motion": motion(made),
         "buffers": list(made.buffers),
         "channels": channels(made.buffers),
         "programs": made.programs(None if reader is None else reader.reads),
-        "buffers_left_out": everything - len(made.buffers),
-        "frames_with_noise_alone": sum(held != index for index, held in enumerate(made.held)),
+        "buffers_left_out": len(left_out(made)),
+        "frames_with_noise_alone": noise_alone(made),
         "bytes_a_pixel": bytes_a_pixel(made),
-        "bytes_a_pixel_of_all": bytes_a_pixel(None),
+        "bytes_a_pixel_of_all": bytes_a_pixel(EVERYTHING),
     }
+
+
+def motion(made: Plan) -> str:
+    """Which motion vectors are rendered: ``none``, ``traditional`` or ``dual``."""
+    return "dual" if "dual_motion" in made.buffers else "traditional" if "motion" in made.buffers else "none"
+
+
+def left_out(made: Plan) -> list[str]:
+    """The buffers that are rendered without a plan, and not by this one."""
+    return [name for name in EVERYTHING.buffers if name not in made.buffers]
+
+
+def noise_alone(made: Plan) -> int:
+    """How many frames share everything but their noise with an earlier one."""
+    return sum(held != index for index, held in enumerate(made.held))
 
 
 def channels(buffers: tuple[str, ...]) -> list[str]:
     """The EXR channels of some buffers."""
-    return [f"{name}.{letter}" for name in buffers for letter in LAYOUT[name].channels]
+    return [f"{name}.{letter}" for name in buffers for letter in BUFFERS[name].letters]
 
 
-def bytes_a_pixel(made: Plan | None) -> float:
+def bytes_a_pixel(made: Plan) -> float:
     """Mean bytes a pixel and frame before compression, one noisy layer and a reference with its half included."""
-
-    def size(names: tuple[str, ...]) -> int:
-        return sum(_BYTES[LAYOUT[name].kind] * len(LAYOUT[name].channels) for name in names)
-
-    light = 3 * _BYTES["half"]
-    if made is None:
-        return float(3 * light + size(tuple(LAYOUT)))
-    whole = [light if held != index else 3 * light + size(made.frames[index]) for index, held in enumerate(made.held)]
-    return round(sum(whole) / len(whole), 2)
+    light = BUFFERS["radiance"].bytes
+    whole = [3 * light + sum(BUFFERS[name].bytes for name in names) for names in made.frames]
+    stored = [light if held != index else whole[index] for index, held in enumerate(made.held)]
+    return round(sum(stored) / len(stored), 2)
 
 
 @contextmanager
@@ -133,7 +128,8 @@ def _nothing_else_on_stdout() -> Iterator[None]:
         os.close(kept)
 
 
-def _show(source: str, found: Effects, made: Plan, reader: Denoiser | None, name: str | None) -> None:
+def _show(source: str, planned: Planned, reader: Denoiser | None, name: str | None) -> None:
+    found, made, depth = planned
     console = Console()
     table = Table(title=f"{source}: {len(found)} of {len(EFFECTS)} effects, {len(found.frames)} frames")
     for column in ("effect", "there", "frames", "why"):
@@ -144,25 +140,19 @@ def _show(source: str, found: Effects, made: Plan, reader: Denoiser | None, name
         where = _ranges([index for index, present in enumerate(found.frames) if effect.name in present])
         table.add_row(effect.name, there, where, why, style=None if there else "dim")
     console.print(table)
-    left = [each for each in Frame._fields if each not in ("radiance", *made.buffers)]
-    noise_alone = sum(held != index for index, held in enumerate(made.held))
     measured = ""
-    if made.bound is not None and made.remaining is not None:
-        limit = "" if made.remaining <= made.bound else ", the scene's own limit"
-        measured = f"{limit}: longer ones would add {made.remaining:.1%} of the light (bound {made.bound:.0%})"
+    if depth is not None:
+        limit = "" if depth.remaining <= depth.bound else ", the scene's own limit"
+        measured = f"{limit}: longer ones would add {depth.remaining:.1%} of the light (bound {depth.bound:.0%})"
     console.print(f"integrator    {made.integrator}, paths of depth {made.max_depth}{measured}")
-    console.print(f"motion        {made.motion}")
-    console.print(f"demodulation  {made.demodulation}")
-    console.print(f"lobes apart   {'yes' if made.lobes_apart else 'no'}")
-    console.print(f"gradients     {'yes' if made.gradient_samples else 'no'}")
+    console.print(f"motion        {motion(made)}")
     console.print(f"buffers       {', '.join(made.buffers)}")
-    console.print(f"left out      {', '.join(left) or 'nothing'}")
+    console.print(f"left out      {', '.join(left_out(made)) or 'nothing'}")
     for_whom = "any denoiser" if name is None else name
     console.print(f"programs      {made.programs(None if reader is None else reader.reads)} compiled for {for_whom}")
-    console.print(f"rendered once {noise_alone} of {len(made.held)} frames hold the noise alone")
-    console.print(
-        f"on disk       {bytes_a_pixel(made):g} of {bytes_a_pixel(None):g} bytes a pixel and frame, uncompressed"
-    )
+    console.print(f"rendered once {noise_alone(made)} of {len(made.held)} frames hold the noise alone")
+    sizes = f"{bytes_a_pixel(made):g} of {bytes_a_pixel(EVERYTHING):g} bytes a pixel and frame"
+    console.print(f"on disk       {sizes}, uncompressed")
 
 
 def _ranges(indices: list[int]) -> str:

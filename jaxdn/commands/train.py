@@ -1,275 +1,68 @@
-"""``jaxdn train``: the loop around the train step, with data, validation, progress and checkpoints."""
+"""``jaxdn train``: a method that learns, trained on rendered clips."""
 
-import json
-import math
-import os
-import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
-import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-from jaxdn import color, metrics
-from jaxdn.checkpoint import Checkpoints
-from jaxdn.clips import read_clip
-from jaxdn.denoiser import Denoiser
-from jaxdn.frame import Clip
-from jaxdn.learning.step import TrainState, initial_state, make_train_step
-from jaxdn.ops import onednn
+from jaxdn.clips import find_clips, training_batches
+from jaxdn.commands.fit import fit, load_validation
+from jaxdn.methods.table import Method
 from jaxdn.recipe import Recipe
-from jaxdn.rollout import denoise
+from jaxdn.weights import save_weights
 
 
-def training_engine(implementation: str = "auto") -> str:
-    """What convolves while training: "onednn" where it can run, else "reference" (XLA alone); or what was named."""
-    if implementation == "auto":
-        return "onednn" if onednn.available() else "reference"
-    return implementation
-
-
-class Curve(NamedTuple):
-    """What a run logged: one entry per logged step, and one per validation."""
-
-    step: list[int]
-    loss: list[float]
-    validation_step: list[int]
-    validation_psnr: list[float]
-
-
-class Log:
-    """``log.jsonl`` of a run: one strict JSON object a line, appended as it happens."""
-
-    def __init__(self, path: Path, *, keep_until: int):
-        """Open the log; entries after step ``keep_until`` belong to updates that were lost, and go."""
-        kept = [entry for entry in read_log(path) if entry["step"] <= keep_until]
-        beside = path.with_name(path.name + ".part")
-        beside.write_text("".join(json.dumps(entry) + "\n" for entry in kept))
-        os.replace(beside, path)
-        self._file = path.open("a")
-
-    def write(self, **entry: Any) -> None:
-        """Append one entry and let it reach the file; what is not finite is null, which strict JSON has a word for."""
-        entry = {key: value if math.isfinite(value) else None for key, value in entry.items()}
-        self._file.write(json.dumps(entry, allow_nan=False) + "\n")
-        self._file.flush()
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-
-
-def read_log(path: Path) -> list[dict[str, Any]]:
-    """The entries of a log; a last line torn by a crash is left out, a missing file is an empty log."""
-    entries = []
-    for line in path.read_text().splitlines() if path.is_file() else []:
-        try:
-            entries.append(json.loads(line))
-        except ValueError:
-            break
-    return entries
-
-
-def read_curve(folder: Path) -> Curve:
-    """The loss and validation curves of a run's folder; not a number where the log has null."""
-
-    def number(value: float | None) -> float:
-        return float("nan") if value is None else value
-
-    entries = read_log(folder / "log.jsonl")
-    losses = [entry for entry in entries if "loss" in entry]
-    checks = [entry for entry in entries if "validation_psnr" in entry]
-    return Curve(
-        [entry["step"] for entry in losses],
-        [number(entry["loss"]) for entry in losses],
-        [entry["step"] for entry in checks],
-        [number(entry["validation_psnr"]) for entry in checks],
-    )
-
-
-def make_validation(denoiser: Denoiser, clips: Sequence[Clip]) -> Callable[[Any], float]:
-    """A function of the parameters: the mean over the clips of the PSNR of all their frames, tone-mapped, in dB.
-
-    Compiled once for clips of one size. Not a number without clips.
-    """
-
-    @jax.jit
-    def score(params: Any, clip: Clip) -> jax.Array:
-        return metrics.psnr(color.tonemap(denoise(denoiser, params, clip)), color.tonemap(clip.reference))
-
-    return lambda params: float(np.mean([float(score(params, clip)) for clip in clips])) if clips else float("nan")
-
-
-def fit(
-    denoiser: Denoiser,
+def train(
+    method: Method,
     recipe: Recipe,
-    batches: Iterator[Clip],
-    folder: Path,
+    clips: Sequence[Path],
+    out: Path,
     *,
-    label: str,
-    validation: Sequence[Clip] = (),
-    log_every: int = 20,
-    validate_every: int = 100,
-    checkpoint_every: int = 100,
-) -> TrainState:
-    """Train to ``recipe.steps`` updates, continuing from the newest checkpoint in ``folder`` as if never stopped.
+    options: Mapping[str, Any],
+    validation: Sequence[Path] = (),
+    spp: int = 1,
+    implementation: str = "auto",
+    label: str | None = None,
+    record: Mapping[str, Any] | None = None,
+) -> Path:
+    """Train a method to the end (or find it trained) and return the path of its weights.
 
-    ``batches`` is a Grain iterator (it has ``get_state`` and ``set_state``): its position is kept in every checkpoint.
-    Interrupted (Ctrl-C), the state is written before KeyboardInterrupt goes on. The log is ``folder/log.jsonl``.
-    Raises ValueError, saying what to change, when none of many updates in a row was of any effect.
+    Run again, it continues from the newest checkpoint in ``out``. Raises ValueError for what a user can mend: options
+    that the method does not have, clips that do not fit, an engine that cannot run here.
+
+    Args:
+      method: a row of the table of methods.
+      recipe: objective, optimiser, batches.
+      clips: folders of clips, or of folders of clips, to train on.
+      out: the run's folder: checkpoints, log.jsonl, recipe.json, and in the end weights.safetensors with its JSON.
+      options: the method's, kept with the weights.
+      validation: folders of whole clips held out.
+      spp: samples a pixel of the noisy input.
+      implementation: the engine that trains; "auto" is the fastest that the method has and that runs here.
+      label: the run's name in what is printed; default: that of its folder.
+      record: what else the weights' JSON should say.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    _same_recipe(folder / "recipe.json", recipe)
-    checkpoints = Checkpoints(folder / "checkpoints")
-    first_position = batches.get_state()  # type: ignore[attr-defined]
-    state = initial_state(denoiser, recipe, next(batches))
-    batches.set_state(first_position)  # type: ignore[attr-defined]
-    found = checkpoints.restore(state)
-    if found is not None:
-        state, position = found
-        batches.set_state(position)  # type: ignore[attr-defined]
-    step = int(state.step)
-    log = Log(folder / "log.jsonl", keep_until=step)
-    train_step = make_train_step(denoiser, recipe)
-    validate = make_validation(denoiser, validation)
-    # A write of the state while it is being replaced would keep neither: the position belongs to finished updates only.
-    position = batches.get_state()  # type: ignore[attr-defined]
-    saved = step
-    watch = _Divergence(label, recipe, step, int(state.skipped))
-    with _Progress(label, recipe, step) as progress:
-        try:
-            while step < recipe.steps:
-                batch = next(batches)
-                state, report = train_step(state, batch)
-                step, position = step + 1, batches.get_state()  # type: ignore[attr-defined]
-                if step % log_every == 0 or step == recipe.steps:
-                    loss, skipped = float(report.loss), int(state.skipped)
-                    log.write(step=step, loss=loss, last_frame_psnr=float(report.validation_psnr))
-                    progress.advance(step, loss=loss, skipped=skipped)
-                    watch.look(step, skipped=skipped, norm=float(report.gradient_norm))
-                if validation and (step % validate_every == 0 or step == recipe.steps):
-                    psnr = validate(state.params)
-                    log.write(step=step, validation_psnr=psnr)
-                    progress.validated(psnr)
-                if step % checkpoint_every == 0 or step == recipe.steps:
-                    checkpoints.save(state, position)
-                    saved = step
-        except KeyboardInterrupt:
-            if saved < step:
-                checkpoints.save(state, position)
-            progress.say(f"{label}: stopped after {step} of {recipe.steps} steps; the same command continues there.")
-            raise
-        finally:
-            checkpoints.close()
-            log.close()
-    return state
-
-
-def load_validation(folders: Sequence[Path], *, spp: int = 1) -> list[Clip]:
-    """Whole held-out clips, as they are validated on."""
-    return [read_clip(folder, spp=spp) for folder in folders]
-
-
-def _same_recipe(path: Path, recipe: Recipe) -> None:
-    """Write the recipe beside a new run; raise ValueError where an old run was made by another one."""
-    wanted = recipe._asdict()
-    if path.is_file():
-        there = json.loads(path.read_text())
-        differing = {key: (there.get(key), value) for key, value in wanted.items() if there.get(key) != value}
-        if differing:
-            told = ", ".join(f"{key} {old!r} -> {new!r}" for key, (old, new) in differing.items())
-            raise ValueError(
-                f"{path}: expected the recipe that this run was started with, got {told}; give the new run another "
-                "name, or delete the folder to start over."
-            )
-        return
-    beside = path.with_name(path.name + ".part")
-    beside.write_text(json.dumps(wanted, indent=1) + "\n")
-    os.replace(beside, path)
-
-
-class _Divergence:
-    """Raises where training goes on without learning: for 100 updates, or half of all, none was of any effect."""
-
-    def __init__(self, label: str, recipe: Recipe, step: int, skipped: int):
-        self._label, self._recipe = label, recipe
-        self._patience = max(1, min(100, recipe.steps // 2))
-        self._learned = self._seen = step
-        self._skipped = skipped
-
-    def look(self, step: int, *, skipped: int, norm: float) -> None:
-        """Take in that of ``step`` updates ``skipped`` were not finite, and the norm of the newest gradient.
-
-        Weights that have grown beyond all measure may still give finite images, from which no gradient comes back.
-        """
-        if skipped - self._skipped < step - self._seen and norm != 0:
-            self._learned = step
-        self._seen, self._skipped = step, skipped
-        if step - self._learned >= self._patience:
-            raise ValueError(
-                f"{self._label}: nothing was learned in the updates {self._learned + 1} to {step} ({skipped} so far "
-                f"were not finite, the newest gradient's norm is {norm:g}); start again under another name with a "
-                f"learning rate below {self._recipe.learning_rate:g}, and look for clips that are black."
-            )
-
-
-class _Progress:
-    """A bar with loss, validation PSNR, frames/s and time left; plain lines where nobody watches."""
-
-    def __init__(self, label: str, recipe: Recipe, start: int):
-        self._label, self._recipe, self._first = label, recipe, start
-        self._validation = float("nan")
-        self._console = Console(stderr=False)
-        self._began: float | None = None
-        self._printed = 0.0
-        self._bar = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.completed}/{task.total} steps  {task.fields[told]}"),
-            TimeRemainingColumn(),
-            console=self._console,
-            disable=not sys.stdout.isatty(),
-        )
-        self._task = self._bar.add_task(label, total=recipe.steps, completed=start, told="compiling ...")
-
-    def __enter__(self) -> "_Progress":
-        self._bar.start()
-        if self._first >= self._recipe.steps:
-            self.say(f"{self._label}: all {self._recipe.steps} steps are there already")
-        elif self._bar.disable:
-            self.say(f"{self._label}: step {self._first} of {self._recipe.steps}, compiling ...")
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def say(self, line: str) -> None:
-        """One line above the bar."""
-        self._console.print(line, highlight=False, markup=False)
-
-    def validated(self, psnr: float) -> None:
-        """Remember the newest validation PSNR."""
-        self._validation = psnr
-
-    def advance(self, step: int, *, loss: float, skipped: int) -> None:
-        """Show where training stands after ``step`` updates."""
-        now = time.monotonic()
-        if self._began is None:  # the first report comes after the compilation: count speed from there
-            self._began, self._first = now, step
-        rate = (step - self._first) / max(now - self._began, 1e-9)
-        told = f"loss {loss:.4f}"
-        if self._validation == self._validation:
-            told += f"  validation {self._validation:.2f} dB"
-        if rate > 0:
-            told += f"  {rate * self._recipe.batch * self._recipe.frames:.0f} frames/s"
-        if skipped:
-            told += f"  {skipped} skipped (gradient not finite)"
-        self._bar.update(self._task, completed=step, told=told)
-        if self._bar.disable and (now - self._printed > 15 or step == self._recipe.steps):
-            left = f"  {(self._recipe.steps - step) / rate:.0f} s left" if rate > 0 else ""
-            self.say(f"{self._label}: step {step}/{self._recipe.steps}  {told}{left}")
-            self._printed = now
+    label = out.name if label is None else label
+    engine = method.engine("training", options) if implementation == "auto" else implementation
+    if engine not in (None, "reference"):
+        denoiser = method.factory(**{**options, "implementation": engine})
+        print(f"{label}: convolutions run on {engine}", flush=True)
+    else:
+        denoiser = method.factory(**options)
+        print(f"{label}: everything runs on XLA", flush=True)
+    batches = training_batches(
+        clips,
+        buffers=denoiser.reads,
+        batch=recipe.batch,
+        crop=recipe.crop,
+        frames=recipe.frames,
+        seed=recipe.seed,
+        spp=spp,
+        layers=denoiser.samples is not None,
+    )
+    folders = [folder for place in validation for folder in find_clips(place)]
+    held_out = load_validation(denoiser, folders, spp=spp)
+    state = fit(denoiser, recipe, batches, out, label=label, validation=held_out)
+    about = {"recipe": recipe.record(), "skipped": int(state.skipped), **(record or {})}
+    return save_weights(
+        out / "weights.safetensors", state.params, factory=method.name, options=dict(options), record=about
+    )

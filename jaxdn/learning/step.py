@@ -89,8 +89,9 @@ def make_train_step(denoiser: Denoiser, recipe: Recipe) -> Callable[[TrainState,
 
     def batch_loss(params: Params, batch: Clip, progress: jax.Array) -> tuple[jax.Array, jax.Array]:
         def one(clip: Clip) -> tuple[jax.Array, jax.Array]:
-            settings = {"progress": progress, "rematerialize": recipe.rematerialize}
-            return clip_loss(denoiser, params, clip, recipe.objective, **settings)
+            return clip_loss(
+                denoiser, params, clip, recipe.objective, progress=progress, rematerialize=recipe.rematerialize
+            )
 
         loss, psnr = jax.vmap(one)(batch)
         return jnp.mean(loss), jnp.mean(psnr)

@@ -36,6 +36,7 @@ READS = frozenset({"normal", "depth", "previous_depth", "motion", "ids"})
 _TAPS = stencil(2, kernel=B3_SPLINE)
 _POSITIVE = Range(0, without_low=True)
 _SHARE = Range(0, 1, without_low=True)
+_Planes = tuple[jax.Array, jax.Array, jax.Array]
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ def _filter(
     """The a-trous cascade: the image [3, H, W] and what is fed back."""
     levels = options.levels
 
-    def filter_level(carry: tuple[jax.Array, ...], level: jax.Array) -> tuple[tuple[jax.Array, ...], None]:
+    def filter_level(carry: _Planes, level: jax.Array) -> tuple[_Planes, None]:
         color, variance, feedback = carry
         deviation = jnp.sqrt(jnp.maximum(blur_variance(variance), 1e-10))
         light = luminance_weight(luminance(color), deviation, sigma=options.sigma_luminance)

@@ -47,11 +47,6 @@ class Method:
         """Whether it has weights."""
         return bool(self.recipes)
 
-    @property
-    def recipe(self) -> Recipe:
-        """How it is usually trained. Raises ValueError for a filter."""
-        return self.recipe_named(None)
-
     def recipe_named(self, name: str | None) -> Recipe:
         """A recipe; None is the usual one. Raises ValueError, naming those there are."""
         if not self.recipes:
@@ -60,10 +55,13 @@ class Method:
             raise ValueError(f"{self.name}: expected a recipe out of {', '.join(self.recipes)}, got {name!r}.")
         return next(iter(self.recipes.values())) if name is None else self.recipes[name]
 
-    @property
-    def lightest(self) -> Mapping[str, Any]:
-        """The options of its fastest variant."""
-        return list(self.variants.values())[-1] if self.variants else _NOTHING
+    def variant_named(self, name: str | None) -> Mapping[str, Any]:
+        """The options of a variant; None is the fastest. Raises ValueError, naming those there are."""
+        if name is None:
+            return list(self.variants.values())[-1] if self.variants else _NOTHING
+        if name not in self.variants:
+            raise ValueError(f"{self.name}: expected a variant out of {', '.join(self.variants)}, got {name!r}.")
+        return self.variants[name]
 
     def knows(self, option: str) -> bool:
         """Whether it has an option of that name."""

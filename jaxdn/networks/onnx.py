@@ -134,7 +134,7 @@ def head_shape(params: dict[str, Any], shape: Sequence[int], depth: int) -> tupl
     return shape[0], shape[2] >> depth, shape[3] >> depth, params[f"head_{depth}"]["bias"].shape[0]
 
 
-class Engine:
+class Session:
     """One shape's session, made for the weights it was last called with.
 
     The engine lays weights out anew for its blocks, so they belong to the session; that they are those of the call is
@@ -195,7 +195,7 @@ def engine(plain: Apply, *, heads: int, slope: float, used: Sequence[slice] | No
         shape = (groups[0].shape[0], channels + -channels % BLOCK, *groups[0].shape[1:3])
         weights, tree = jax.tree.flatten(params)
         results = [jax.ShapeDtypeStruct(head_shape(params, shape, depth), jnp.float32) for depth in range(heads)]
-        session = Engine(
+        session = Session(
             shape, len(groups), lambda weights: model(jax.tree.unflatten(tree, weights), shape, used, heads, slope)
         )
         # The groups go in as they are: joined by XLA they would be written to fresh memory first.

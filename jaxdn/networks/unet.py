@@ -38,7 +38,7 @@ Part = tuple[jax.Array, Sequence[slice] | None]
 """An input of a convolution and the slices of the kernel's input channels that it consists of (None: all of them)."""
 
 
-class Engine(NamedTuple):
+class Convolver(NamedTuple):
     """What runs the convolutions."""
 
     convolve: Callable[[jax.Array, jax.Array], jax.Array]
@@ -46,8 +46,8 @@ class Engine(NamedTuple):
     """Outputs are computed in multiples of this."""
 
 
-XLA = Engine(convolve, 16)  # 51 outputs take XLA:CPU 1.4 times as long as 64
-ONEDNN = Engine(functools.partial(convolve, implementation="onednn"), 1)
+XLA = Convolver(convolve, 16)  # 51 outputs take XLA:CPU 1.4 times as long as 64
+ONEDNN = Convolver(functools.partial(convolve, implementation="onednn"), 1)
 
 
 class Convolution(nnx.Module):
@@ -57,16 +57,16 @@ class Convolution(nnx.Module):
         self.kernel = nnx.Param(jnp.zeros((3, 3, inputs, outputs), jnp.float32))
         self.bias = nnx.Param(jnp.zeros((outputs,), jnp.float32))
 
-    def __call__(self, engine: Engine, *parts: Part) -> jax.Array:
+    def __call__(self, convolver: Convolver, *parts: Part) -> jax.Array:
         kernel, dtype = self.kernel[...], parts[0][0].dtype
         outputs = kernel.shape[-1]
-        kernel = jnp.pad(kernel, ((0, 0), (0, 0), (0, 0), (0, -outputs % engine.multiple))).astype(dtype)
+        kernel = jnp.pad(kernel, ((0, 0), (0, 0), (0, 0), (0, -outputs % convolver.multiple))).astype(dtype)
 
         def share(used: Sequence[slice] | None) -> jax.Array:
             return kernel if used is None else jnp.concatenate([kernel[:, :, channels] for channels in used], axis=2)
 
         # A sum of convolutions is the convolution of the parts side by side, and joining them first costs more.
-        total = functools.reduce(jnp.add, [engine.convolve(x, share(used)) for x, used in parts])
+        total = functools.reduce(jnp.add, [convolver.convolve(x, share(used)) for x, used in parts])
         return total[..., :outputs] + jnp.reshape(self.bias[...].astype(dtype), (1, 1, 1, -1))
 
 
@@ -78,9 +78,9 @@ class Level(nnx.Module):
         for index, (before, after) in enumerate(zip((inputs, *widths), widths, strict=False)):
             setattr(self, f"convolution_{index}", Convolution(before, after))
 
-    def __call__(self, engine: Engine, *parts: Part) -> jax.Array:
+    def __call__(self, convolver: Convolver, *parts: Part) -> jax.Array:
         for index in range(self.count):
-            x = getattr(self, f"convolution_{index}")(engine, *parts)
+            x = getattr(self, f"convolution_{index}")(convolver, *parts)
             x = jnp.where(x >= 0, x, NEGATIVE_SLOPE * x)
             parts = ((x, None),)
         return x
@@ -114,21 +114,21 @@ class UNet(nnx.Module):
         for level, outputs in enumerate(heads):
             setattr(self, f"head_{level}", Convolution(widths[level][-1], outputs))
 
-    def __call__(self, engine: Engine, features: jax.Array, used: Sequence[slice] | None) -> tuple[jax.Array, ...]:
+    def __call__(self, convolver: Convolver, features: jax.Array, used: Sequence[slice] | None) -> tuple[jax.Array, ...]:
         part: Part = (features, used)
         skips: list[jax.Array] = []
         for level in range(LEVELS):
             if level:
                 part = (pool(skips[-1]), None)
-            skips.append(getattr(self, f"encoder_{level}")(engine, part))
+            skips.append(getattr(self, f"encoder_{level}")(convolver, part))
         x = skips.pop()
         outputs: list[jax.Array] = []
         for level in reversed(range(LEVELS - 1)):
             below = x.shape[-1]
             parts = (enlarge(x), [slice(0, below)]), (skips[level], [slice(below, None)])
-            x = getattr(self, f"decoder_{level}")(engine, *parts)
+            x = getattr(self, f"decoder_{level}")(convolver, *parts)
             if level < self.heads:
-                outputs.insert(0, getattr(self, f"head_{level}")(engine, (x, None)))
+                outputs.insert(0, getattr(self, f"head_{level}")(convolver, (x, None)))
         return tuple(outputs)
 
 
@@ -154,21 +154,21 @@ def xavier_uniform(key: jax.Array, shapes: dict[str, Any]) -> dict[str, Any]:
 
 
 @register("unet", "reference")
-def reference(network: Callable[[Engine], onnx.Apply], heads: int, used: Sequence[slice] | None) -> onnx.Apply:
+def reference(network: Callable[[Convolver], onnx.Apply], heads: int, used: Sequence[slice] | None) -> onnx.Apply:
     """The network as XLA compiles it."""
     return network(XLA)
 
 
 @register("unet", "onednn", requires=onednn.check_available)
 def convolved_by_onednn(
-    network: Callable[[Engine], onnx.Apply], heads: int, used: Sequence[slice] | None
+    network: Callable[[Convolver], onnx.Apply], heads: int, used: Sequence[slice] | None
 ) -> onnx.Apply:
     """XLA, but for the convolutions and their gradients: for training on CPUs."""
     return network(ONEDNN)
 
 
 @register("unet", "onnxruntime", requires=onnx.check_available)
-def run_by_onnxruntime(network: Callable[[Engine], onnx.Apply], heads: int, used: Sequence[slice] | None) -> onnx.Apply:
+def run_by_onnxruntime(network: Callable[[Convolver], onnx.Apply], heads: int, used: Sequence[slice] | None) -> onnx.Apply:
     """The whole network outside of XLA, for inference; the gradient is XLA's."""
     return onnx.engine(network(XLA), heads=heads, slope=NEGATIVE_SLOPE, used=used)
 
@@ -221,8 +221,8 @@ def unet(
             start += channels
         parts = used if len(used) < len(groups) else None
 
-        def network(engine: Engine) -> onnx.Apply:
-            return lambda params, present: nnx.merge(graph, params)(engine, jnp.concatenate(present, axis=-1), parts)
+        def network(convolver: Convolver) -> onnx.Apply:
+            return lambda params, present: nnx.merge(graph, params)(convolver, jnp.concatenate(present, axis=-1), parts)
 
         return run(network, len(heads), parts)(params, present)
 

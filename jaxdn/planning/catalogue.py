@@ -1,13 +1,17 @@
-"""The effects that a scene may have: how each is found, what it takes to simulate it, and what its absence equals.
+"""The effects that a scene may have: how each is found, and what it takes to simulate it.
 
 An effect is data. The planner knows none of them by name: a later method that reads a new buffer adds it to the effects
-that produce it, or adds an effect, and everything else follows.
+that produce it, or adds an effect, and everything else follows. What the absence of an effect equals is the neutral
+value of its buffers (:data:`jaxdn.frame.BUFFERS`).
 """
 
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from jaxdn.planning.facts import Facts, Moment
+
+DIRECT = 2
+"""Path length, in Mitsuba's count, of light that one surface reflects: 1 is emission, 3 one more reflection."""
 
 
 class Effect(NamedTuple):
@@ -20,10 +24,10 @@ class Effect(NamedTuple):
     """Why it is there in one frame; an empty string where it is not."""
     buffers: frozenset[str] = frozenset()
     """What it makes worth storing: buffers of a Frame."""
-    rays: str = ""
-    """What it asks of the renderer."""
-    neutral: str = ""
-    """What leaving its buffers out is equal to."""
+    depth: int = DIRECT
+    """The shortest paths that show it. From :data:`DIRECT` + 1 on there is indirect light to denoise."""
+    integrator: str = "path"
+    """Mitsuba's integrator that simulates it."""
     in_time: bool = False
     """It is about two frames: the first frame of a clip takes it from the second."""
 
@@ -33,9 +37,9 @@ def _list(names: Iterable[str]) -> str:
     return ", ".join(ordered[:3]) + (f" and {len(ordered) - 3} more" if len(ordered) > 3 else "")
 
 
-def _surfaces(facts: Facts, lobe: str, told: str) -> str:
+def _surfaces(facts: Facts, lobe: str, what: str) -> str:
     names = [surface.name for surface in facts.surfaces if lobe in surface.lobes]
-    return f"{_list(names)}: {told}" if names else ""
+    return f"{_list(names)}: {what}" if names else ""
 
 
 def _camera_motion(facts: Facts, moment: Moment) -> str:
@@ -79,8 +83,8 @@ def _moving_shadow(facts: Facts, moment: Moment) -> str:
     if not (moment.moving and facts.lights and _reflecting(facts)):
         return ""
     unseen = moment.moving - moment.seen
-    told = f"{_list(moment.moving)} moves through light"
-    return f"{told} ({_list(unseen)} off screen: its shadow may fall into view)" if unseen else told
+    reason = f"{_list(moment.moving)} moves through light"
+    return f"{reason} ({_list(unseen)} off screen: its shadow may fall into view)" if unseen else reason
 
 
 def _changing_light(facts: Facts, moment: Moment) -> str:
@@ -106,58 +110,34 @@ def _emission(facts: Facts, moment: Moment) -> str:
     return f"{_list(moment.shining)} is seen by the camera" if moment.shining else ""
 
 
+_MOTION = frozenset({"motion", "previous_depth"})
 _SURFACE = frozenset({"roughness"})
 
 EFFECTS: tuple[Effect, ...] = (
-    Effect(
-        "camera-motion",
-        "The camera moves, turns or zooms.",
-        _camera_motion,
-        frozenset({"motion", "previous_depth"}),
-        "the previous frame's camera",
-        "motion 0",
-        in_time=True,
-    ),
-    Effect(
-        "object-motion",
-        "Something on screen moves.",
-        _object_motion,
-        frozenset({"motion", "previous_depth"}),
-        "the previous frame's poses",
-        "motion 0",
-        in_time=True,
-    ),
+    Effect("camera-motion", "The camera moves, turns or zooms.", _camera_motion, _MOTION, in_time=True),
+    Effect("object-motion", "Something on screen moves.", _object_motion, _MOTION, in_time=True),
     Effect(
         "disocclusion",
         "Something comes into view that was hidden in the frame before.",
         _disocclusion,
         frozenset({"dual_motion", "visible"}),
-        "the previous frame's G-buffer",
-        "dual motion equal to motion, all visible",
         in_time=True,
     ),
-    Effect("indirect", "Light arrives after more than one reflection.", _indirect, rays="paths of depth 3 and more"),
-    Effect("glossy", "A surface reflects sharper than a diffuse one.", _glossy, _SURFACE, "", "roughness 1"),
-    Effect("mirror", "A surface reflects like a mirror.", _mirror, _SURFACE, "", "roughness 1"),
-    Effect("transmission", "Light passes through a surface.", _transmission, _SURFACE, "longer paths", "roughness 1"),
+    Effect("indirect", "Light arrives after more than one reflection.", _indirect, depth=DIRECT + 1),
+    Effect("glossy", "A surface reflects sharper than a diffuse one.", _glossy, _SURFACE),
+    Effect("mirror", "A surface reflects like a mirror.", _mirror, _SURFACE),
+    Effect("transmission", "Light passes through a surface.", _transmission, _SURFACE),
     Effect(
         "moving-shadow",
         "Something that moves blocks or reflects light; it need not be on screen itself.",
         _moving_shadow,
-        rays="a reference of its own for every frame",
         in_time=True,
     ),
-    Effect(
-        "changing-light",
-        "A light moves, or becomes brighter or darker.",
-        _changing_light,
-        rays="a reference of its own for every frame",
-        in_time=True,
-    ),
+    Effect("changing-light", "A light moves, or becomes brighter or darker.", _changing_light, in_time=True),
     Effect("texture", "Diffuse reflectance varies over a surface: dividing by the albedo pays.", _texture),
-    Effect("environment", "Light comes from all around the scene.", _environment, rays="those that leave the scene"),
-    Effect("media", "Light is scattered between surfaces: fog, smoke.", _media, rays="a volumetric integrator"),
-    Effect("emission", "A light is seen by the camera.", _emission, frozenset({"emission"}), "", "emission 0"),
+    Effect("environment", "Light comes from all around the scene.", _environment),
+    Effect("media", "Light is scattered between surfaces: fog, smoke.", _media, integrator="volpath"),
+    Effect("emission", "A light is seen by the camera.", _emission, frozenset({"emission"})),
 )
 """All effects, in the order in which they are listed."""
 

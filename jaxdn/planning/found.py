@@ -1,9 +1,7 @@
 """Which effects a scene has, frame by frame, and why."""
 
-import importlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from jaxdn.planning.catalogue import EFFECTS, NAMES
 from jaxdn.planning.facts import Facts
@@ -84,40 +82,3 @@ def chosen(names: Iterable[str], frames: int) -> Effects:
 def everything(frames: int) -> Effects:
     """Every effect in every frame: what a renderer does that looks at nothing."""
     return chosen(NAMES, frames)
-
-
-def inspect(
-    scene: Any, animation: Any = None, *, width: int = 128, height: int = 128, frames: int | None = None
-) -> Effects:
-    """The effects that a scene, or a finished clip, has.
-
-    Args:
-      scene: a Mitsuba scene file, the name of a family, a folder of a clip or of EXR files of any renderer, an
-        :class:`jaxdn.render.AnimatedScene`, a loaded ``mi.Scene`` (``optimize=False``), or :class:`Facts`.
-      animation: animation file (or what it says, as a dict) for a scene file or a loaded scene.
-      width: of the picture; the view decides what is on screen.
-      height: of the picture.
-      frames: how many to look at; default: all that the scene's animation, or the clip, has.
-
-    What cannot be decided counts as present and is told in ``uncertain``. A scene takes milliseconds beyond loading it,
-    a clip has to be read. Raises ValueError for what is none of these, or cannot be read.
-    """
-    if frames is not None and frames < 1:
-        raise ValueError(f"frames: expected at least 1, got {frames}.")
-    if isinstance(scene, Facts):
-        return find(scene._replace(moments=scene.moments[:frames]))
-    # The one look upwards: who calls for facts of a scene needs the rooms that can read one.
-    if _is_footage(scene):
-        facts = importlib.import_module("jaxdn.clips.evidence").read_facts(scene, animation)
-        return find(facts._replace(moments=facts.moments[:frames]))
-    reader = importlib.import_module("jaxdn.render.scene_facts")
-    return find(reader.read_facts(scene, animation, width=width, height=height, frames=frames))
-
-
-def _is_footage(scene: Any) -> bool:
-    """A folder of frames, or a pattern for EXR files."""
-    from pathlib import Path
-
-    if not isinstance(scene, str | Path):
-        return False
-    return Path(scene).is_dir() or str(scene).endswith(".exr")

@@ -9,7 +9,7 @@ from typing import Any
 _HOMES = {
     "AnimatedScene": "scene",
     "Camera": "scene",
-    "scene_from_record": "scene",
+    "scene_from_record": "opening",
     "choose_variant": "variant",
     "use_variant": "variant",
     "ClipJob": "farm",

@@ -1,6 +1,6 @@
 """Animation files: keys for the camera, keys for shapes, and shapes to insert into a scene that stands still.
 
-One JSON object beside the scene file; every part may be left out:
+One JSON object next to the scene file; every part may be left out:
 
     {"frames": 16,
      "camera": [{"frame": 0, "origin": [0, 1, 5], "target": [0, 1, 0], "fov": 40}, {"frame": 15, ...}],

@@ -10,26 +10,23 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.clips import ClipError, read_frame, write_frame
-from jaxdn.clips.files import read_json, write_json
+from jaxdn.clips.folder import begin_record, begun_record, finish_record, frame_path
 from jaxdn.frame import Frame
 from jaxdn.motion import dual_motion
-from jaxdn.planning.plan import Plan
+from jaxdn.planning.plan import Plan, entries
+from jaxdn.render.errors import RenderError
 from jaxdn.render.gbuffer import check_scene, gbuffer
 from jaxdn.render.geometry import View, motion_between
 from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.seeds import NOISY, REFERENCE
 from jaxdn.render.variant import use_variant
-from jaxdn.render.wavefront import Light, no_light
+from jaxdn.render.wavefront import Accumulated, no_light
 
-FORMAT = 1
-_MOTION = frozenset({"motion", "previous_depth", "dual_motion", "visible"})
+_SURFACE = ("albedo", "normal", "depth", "roughness", "ids")
 _DISOCCLUSION = frozenset({"dual_motion", "visible"})
+_MOTION = frozenset({"motion", "previous_depth"}) | _DISOCCLUSION
 _FREE = ("frames", "cameras", "versions", "bad_samples")
 """Entries of a record that may change when rendering goes on."""
-
-
-class RenderError(RuntimeError):
-    """A frame that could not be rendered; the message names the clip, the frame and the reason."""
 
 
 class Rendered(NamedTuple):
@@ -90,7 +87,7 @@ def render_frame(
     dark = plan is not None and plan.integrator == "none"
     noise_only = plan is not None and not plan.indirect
 
-    def light(stream: int, first: int, count: int) -> Light:
+    def light(stream: int, first: int, count: int) -> Accumulated:
         if dark or (noise_only and stream == NOISY and reference_spp):
             return no_light((height, width))
         return accumulate(built, seed=seed, frame=frame, stream=stream, first=first, count=count, max_depth=depth)
@@ -110,7 +107,7 @@ def render_frame(
     images = {count: _single(part.indirect / count) for count, part in noisy.items()}
     found: dict[str, Any] = {"direct": _single(total.direct / samples), "emission": _single(total.emitted / samples)}
     if view is not None:
-        found |= {name: getattr(view.gbuffer, name) for name in ("albedo", "normal", "depth", "roughness", "ids")}
+        found |= {name: getattr(view.gbuffer, name) for name in _SURFACE}
         if wanted & _MOTION:
             found |= _motion(view, previous, disocclusion=bool(wanted & _DISOCCLUSION))
     buffers = {name: buffer for name, buffer in found.items() if name in wanted}
@@ -139,13 +136,13 @@ def render_clip(
     plan: Plan | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Path:
-    """Render the frames 0 ... ``frames`` - 1 into ``folder``: ``clip.json`` and one ``frame_0000.exr`` each.
+    """Render the frames 0 ... ``frames`` - 1 into ``folder``: one ``frame_0000.exr`` each, and then ``clip.json``.
 
     Frames that are already there and whole are kept, so that an interrupted rendering goes on where it stopped; the
-    folder's record has to have been made with the same settings (ClipError otherwise). ``progress`` is called with the
-    number of every frame that is finished or found. A ``plan`` for these frames is obeyed and kept in the record.
-    Returns the folder. Raises RenderError, naming the clip and the
-    frame, if a frame cannot be rendered or written.
+    folder has to have been begun with the same settings (ClipError otherwise). It is a clip when all frames are there,
+    and not before (:func:`jaxdn.clips.folder.begin_record`). ``progress`` is called with the number of every frame that
+    is finished or found. A ``plan`` for these frames is obeyed and kept in the record. Returns the folder. Raises
+    RenderError, naming the clip and the frame, if a frame cannot be rendered or written.
     """
     folder = Path(folder)
     frames = scene.frames if frames is None else frames
@@ -156,7 +153,6 @@ def render_clip(
         raise ValueError(f"plan: expected one for {frames} frames, got one for {len(plan.frames)}.")
     chosen = use_variant(variant)
     record: dict[str, Any] = {
-        "format": FORMAT,
         "name": scene.name,
         "frames": frames,
         "width": width,
@@ -173,50 +169,43 @@ def render_clip(
         "versions": _versions(),
         "bad_samples": 0,
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    if (folder / "clip.json").exists():
-        before = read_json(folder / "clip.json")
+    before = begun_record(folder)
+    if before is not None:
         _check_settings(folder, record, before)
         record["bad_samples"] = before.get("bad_samples", 0)
-    write_json(folder / "clip.json", record)
-
+    begin_record(record, folder)
+    options: dict[str, Any] = {"width": width, "height": height, "layers": layers, "reference_spp": reference_spp}
+    options |= {"max_depth": max_depth, "seed": seed, "variant": chosen, "plan": plan}
     previous: View | None = None
     for frame in range(frames):
-        path = folder / f"frame_{frame:04d}.exr"
+        path = frame_path(folder, frame)
         if _is_whole(path):
             previous = None
         else:
             try:
-                rendered = render_frame(
-                    scene,
-                    frame,
-                    width=width,
-                    height=height,
-                    layers=layers,
-                    reference_spp=reference_spp,
-                    max_depth=max_depth,
-                    seed=seed,
-                    variant=chosen,
-                    previous=previous,
-                    plan=plan,
-                )
-                write_frame(
-                    path,
-                    rendered.frame,
-                    layers=rendered.layers,
-                    reference=rendered.reference,
-                    reference_half=rendered.reference_half,
-                )
+                rendered = render_frame(scene, frame, previous=previous, **options)
+                _write(path, rendered)
             except Exception as error:
                 reason = f"{type(error).__name__}: {error}"
                 raise RenderError(f"clip {scene.name!r} in {folder}, frame {frame}: {reason}") from error
             previous = rendered.view
             if rendered.bad_samples:
                 record["bad_samples"] += rendered.bad_samples
-                write_json(folder / "clip.json", record)
+                begin_record(record, folder)
         if progress is not None:
             progress(frame)
+    finish_record(record, folder)
     return folder
+
+
+def _write(path: Path, rendered: Rendered) -> None:
+    write_frame(
+        path,
+        rendered.frame,
+        layers=rendered.layers,
+        reference=rendered.reference,
+        reference_half=rendered.reference_half,
+    )
 
 
 def _path_length(scene: AnimatedScene, max_depth: int | None, plan: Plan | None) -> int:
@@ -226,7 +215,7 @@ def _path_length(scene: AnimatedScene, max_depth: int | None, plan: Plan | None)
     return max_depth or (plan.max_depth if plan else None) or scene.max_depth
 
 
-def tracer(variant: str) -> tuple[Callable[..., Light], bool]:
+def tracer(variant: str) -> tuple[Callable[..., Accumulated], bool]:
     """The tracer of a variant, and whether it spreads its samples over the pixel."""
     if variant.startswith("scalar"):
         from jaxdn.render.exact import accumulate as exact
@@ -284,9 +273,9 @@ def _versions() -> dict[str, str]:
     }
 
 
-def _check_settings(folder: Path, wanted: Mapping[str, Any], found: Any) -> None:
+def _check_settings(folder: Path, wanted: Mapping[str, Any], found: Mapping[str, Any]) -> None:
     """Raise ClipError if the frames in a folder were rendered with other settings."""
-    found = found if isinstance(found, dict) else {}
+    found = {**found, "plan": entries(found.get("plan"))}
     # Compared as JSON gives it back: a tuple has become a list there.
     differing = [key for key in wanted if key not in _FREE and _plain(found.get(key)) != _plain(wanted[key])]
     cameras = zip(found.get("cameras", []), wanted["cameras"], strict=False)

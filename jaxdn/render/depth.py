@@ -35,7 +35,7 @@ class PathDepth(NamedTuple):
 def measure_depth(scene: AnimatedScene, *, bound: float = BOUND) -> PathDepth:
     """The shortest path length that leaves out at most ``bound`` of the reflected light, measured in the first frame.
 
-    Light that the camera sees directly does not count: beside a bright window everything else would be negligible.
+    Light that the camera sees directly does not count: next to a bright window everything else would be negligible.
     There are 16 samples for each of 24 x 24 pixels; all depths follow the same paths, so that their differences are
     exact. Never longer than the scene's own ``max_depth``, and never so short that there is no indirect light. What
     remains after depth D is taken as a geometric series with the ratio of the last two bounces measured, or of the last

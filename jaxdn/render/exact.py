@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.seeds import pass_seed
-from jaxdn.render.wavefront import BRIGHTEST, Light, no_light
+from jaxdn.render.wavefront import BRIGHTEST, Accumulated, no_light
 
 _NO_ROULETTE = 1000
 
@@ -26,7 +26,9 @@ def _integrators(max_depth: int) -> list[Any]:
     ]
 
 
-def accumulate(scene: Any, *, seed: int, frame: int, stream: int, first: int, count: int, max_depth: int) -> Light:
+def accumulate(
+    scene: Any, *, seed: int, frame: int, stream: int, first: int, count: int, max_depth: int
+) -> Accumulated:
     """The sums of the passes ``first`` to ``first + count`` of one stream; see :func:`wavefront.accumulate`."""
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     integrators = _integrators(max_depth)
@@ -42,5 +44,5 @@ def accumulate(scene: Any, *, seed: int, frame: int, stream: int, first: int, co
         whole, two, one = (np.where(finite, image, 0.0) for image in images)
         # The film adds in float32: a last-digit difference of two equal sums must not become a negative light.
         direct, indirect = np.maximum(two - one, 0.0), np.maximum(whole - two, 0.0)
-        total = total.plus(Light(one, direct, indirect, int(np.sum(~finite))))
+        total = total.plus(Accumulated(one, direct, indirect, int(np.sum(~finite))))
     return total

@@ -14,8 +14,10 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxdn.clips.folder import frame_path, is_clip, read_record
-from jaxdn.render.scene import scene_from_record
+from jaxdn.clips.folder import begun_record, frame_path, is_clip, read_record
+from jaxdn.planning.plan import entries, plan_from_record
+from jaxdn.render.errors import RenderError
+from jaxdn.render.opening import scene_from_record
 from jaxdn.render.variant import choose_variant
 
 _THREADS = 2
@@ -36,8 +38,9 @@ class ClipJob(NamedTuple):
     max_depth: int | None = None
     seed: int = 0
     variant: str | None = None
+    """None: the one that the clip in the folder was begun with, or where there is none, the fastest that works here."""
     plan: dict[str, Any] | None = None
-    """The record of a :class:`jaxdn.effects.Plan`; None renders everything."""
+    """The record of a :class:`jaxdn.planning.plan.Plan`; None renders everything."""
 
 
 class _Worker(NamedTuple):
@@ -60,17 +63,18 @@ def render_clips(
     the processes and keeps every finished frame; calling again goes on. A clip that fails does not stop the others:
     at the end RenderError names each failed clip, the frame it failed at, and why.
     """
-    from jaxdn.render.clip import RenderError
-
-    waiting = list(jobs)
+    waiting = [_as_begun(job) for job in jobs]
     folders = [job.folder for job in waiting]
     if len({os.path.abspath(folder) for folder in folders}) != len(folders):
         raise ValueError("render_clips: expected a folder of its own for every clip.")
     total = sum(job.frames for job in waiting)
     waiting = [job for job in waiting if not _finished(job)]
     limit = max(1, min(workers or os.cpu_count() or 1, len(waiting)))
-    for variant in {job.variant for job in waiting}:
-        choose_variant(variant)  # probe once, here: the processes inherit the result
+    for job in waiting:
+        try:
+            choose_variant(job.variant)  # probed once, here: the processes inherit the result
+        except ValueError as error:
+            raise ValueError(f"clip in {job.folder}: {error}") from error
 
     done = total - sum(job.frames for job in waiting)
     running: list[_Worker] = []
@@ -102,6 +106,12 @@ def render_clips(
     return [Path(folder) for folder in folders]
 
 
+def _as_begun(job: ClipJob) -> ClipJob:
+    """The job with a variant: a clip is finished, and found finished, with the one that it was begun with."""
+    begun = begun_record(job.folder) if job.variant is None else None
+    return job if begun is None else job._replace(variant=begun.get("variant"))
+
+
 def _finished(job: ClipJob) -> bool:
     """Whether a clip is there with all its frames, as it was asked for: it takes no process to find that out."""
     if not is_clip(job.folder):
@@ -111,7 +121,7 @@ def _finished(job: ClipJob) -> bool:
     wanted |= {"layers": sorted(job.layers), "reference_spp": job.reference_spp, "scene": job.scene}
     chosen = {"max_depth": job.max_depth, "variant": job.variant}
     # A clip from before there were plans has no such entry, and everything in it.
-    if record.get("plan") != job.plan:
+    if entries(record.get("plan")) != entries(job.plan):
         return False
     wanted |= {key: value for key, value in chosen.items() if value is not None}
     # A frame's file has its name from the moment it is whole.
@@ -135,7 +145,6 @@ def _work(job: ClipJob, messages: Connection, threads: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business, it ends this process
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     try:
-        from jaxdn.effects import plan_from_record
         from jaxdn.render.clip import render_clip
         from jaxdn.render.variant import use_variant
 
@@ -205,7 +214,7 @@ class _Bar:
         self._bar = Progress("rendering frames", *columns)
         self._bar.disable = not self._bar.console.is_terminal
         self._task = self._bar.add_task("frames", total=total)
-        self._told = -1
+        self._tenths = -1
 
     def __enter__(self) -> Callable[[int, int], None]:
         self._bar.start()
@@ -220,6 +229,6 @@ class _Bar:
     def _say(self, done: int, total: int) -> None:
         """A line for each tenth where nobody watches a bar move."""
         self._show(done, total)
-        if 10 * done // max(total, 1) > self._told:
-            self._told = 10 * done // max(total, 1)
+        if 10 * done // max(total, 1) > self._tenths:
+            self._tenths = 10 * done // max(total, 1)
             print(f"rendered {done} of {total} frames", flush=True)

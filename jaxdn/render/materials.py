@@ -17,7 +17,7 @@ class Material(NamedTuple):
     """One BSDF with everything nested in it."""
 
     lobes: frozenset[str]
-    """As in :class:`jaxdn.effects.Surface`."""
+    """As in :class:`jaxdn.planning.facts.Surface`."""
     textured: bool = False
     unsure: Mapping[str, str] = {}
     """Effect -> why it could not be decided."""
@@ -71,7 +71,7 @@ def _parameter(bsdf: Any, name: str, default: float) -> Range:
 
 def _join(parts: list[Material]) -> Material:
     lobes = frozenset().union(*(part.lobes for part in parts))
-    unsure = {effect: told for part in parts for effect, told in part.unsure.items()}
+    unsure = {effect: reason for part in parts for effect, reason in part.unsure.items()}
     return Material(lobes, any(part.textured for part in parts), unsure)
 
 
@@ -99,8 +99,8 @@ def _rough(bsdf: Any, *, squared: bool) -> Material:
         found = Range(low, high, any(one.varies for one in ranges), all(one.known for one in ranges))
         name = "alpha"
     if not found.known:
-        told = f"{bsdf.class_name()}: what its {name} texture holds cannot be read"
-        return Material(frozenset({"glossy"}), unsure={"glossy": told})
+        reason = f"{bsdf.class_name()}: what its {name} texture holds cannot be read"
+        return Material(frozenset({"glossy"}), unsure={"glossy": reason})
     return Material(frozenset({"glossy"})) if found.low < 1 else NOTHING
 
 
@@ -201,5 +201,5 @@ def material_of(bsdf: Any) -> Material:
         "transmission": flags & int(known.Transmission),
     }
     present = frozenset(lobe for lobe, bits in lobes.items() if bits)
-    told = f"{kind}: taken by its flags, as nothing else is known of it"
-    return Material(present, textured=True, unsure=dict.fromkeys(sorted(present - {"diffuse"} | {"texture"}), told))
+    reason = f"{kind}: taken by its flags, as nothing else is known of it"
+    return Material(present, textured=True, unsure=dict.fromkeys(sorted(present - {"diffuse"} | {"texture"}), reason))

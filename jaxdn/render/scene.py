@@ -5,7 +5,6 @@ animations (the tracers, the motion vectors, the clip writer) sees only the prot
 or a loader for a file format is one new class.
 """
 
-import importlib
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -30,7 +29,7 @@ class AnimatedScene(Protocol):
     frames: int
     """The suggested number of frames."""
     record: dict[str, Any]
-    """Everything needed to build it again, as JSON: :func:`scene_from_record` turns it back into a scene."""
+    """All it takes to build it again, as JSON: :func:`jaxdn.render.scene_from_record` turns it back into a scene."""
     max_depth: int
     """Path length in Mitsuba's count: 1 is emission, 2 adds direct light, 3 one indirect bounce."""
 
@@ -53,23 +52,3 @@ class AnimatedScene(Protocol):
 def brightness(scene: AnimatedScene, frame: float) -> Mapping[str, float]:
     """Light -> factor on its radiance, of scenes that have a method of this name; in others no light changes."""
     return getattr(scene, "brightness", lambda frame: {})(frame)
-
-
-def scene_from_record(record: Mapping[str, Any]) -> AnimatedScene:
-    """Build the scene that a clip's record describes: ``{"family": name, "seed": int, ...}``, or a scene file's.
-
-    Keys besides ``family`` become the keyword arguments of the family's function; ``{"file": ..., "animation": ...}``
-    is a scene file in motion. Raises ValueError for a record that names neither.
-    """
-    if "file" in record:
-        return importlib.import_module("jaxdn.render.scene_file").SceneFile.from_record(record)
-    if "family" not in record:
-        raise ValueError(
-            f"scene record: expected a 'family' or a 'file', got {sorted(record)}; see jaxdn.render.families."
-        )
-    families = importlib.import_module("jaxdn.render.families").FAMILIES
-    name = record["family"]
-    if name not in families:
-        raise ValueError(f"scene record: unknown family {name!r}; expected one of {', '.join(sorted(families))}.")
-    options = {key: value for key, value in record.items() if key != "family"}
-    return families[name](**options)

@@ -5,14 +5,12 @@ The scene is built once, for its first frame; what happens later is in its poses
 
 from collections.abc import Mapping, Sequence
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxdn.planning.facts import Facts, Light, Moment, Surface
-from jaxdn.render.animation import CameraKeys, RigidKeys, check_animation, read_animation
-from jaxdn.render.scene import AnimatedScene, Camera, brightness, scene_from_record
+from jaxdn.render.scene import AnimatedScene, brightness
 from jaxdn.render.variant import use_variant
 from jaxdn.render.visibility import corners, fills_view, may_be_seen, moved
 
@@ -20,121 +18,17 @@ _LOOK = 16
 """Height of the picture that is looked at, in pixels."""
 
 
-def read_facts(
-    scene: Any, animation: Any = None, *, width: int = 128, height: int = 128, frames: int | None = None
-) -> Facts:
-    """Facts about a scene file, a family's name, an animated scene, a loaded ``mi.Scene`` or a scene as a dict.
-
-    Raises ValueError for anything else, and for files that cannot be read.
-    """
-    return facts_of(open_scene(scene, animation), width=width, height=height, frames=frames)
-
-
-def open_scene(scene: Any, animation: Any = None) -> AnimatedScene:
-    """What :func:`read_facts` takes, as an animated scene."""
-    from jaxdn.render.families import FAMILIES
-
-    if isinstance(scene, str | Path):
-        if str(scene) in FAMILIES:
-            return scene_from_record({"family": str(scene), "seed": 0})
-        if Path(scene).suffix == ".xml":
-            from jaxdn.render.scene_file import SceneFile
-
-            if isinstance(animation, Mapping):
-                return SceneFile.from_record({"file": str(scene), "animation": dict(animation)})
-            return SceneFile(scene, animation)
-        raise ValueError(
-            f"scene {str(scene)!r}: expected a Mitsuba scene (.xml), a folder of frames, or a family "
-            f"({', '.join(sorted(FAMILIES))})."
-        )
-    if isinstance(scene, Mapping):
-        use_variant()
-        import mitsuba as mi
-
-        return LoadedScene(mi.load_dict(dict(scene), optimize=False), animation)
-    if hasattr(scene, "shapes") and hasattr(scene, "sensors"):
-        return LoadedScene(scene, animation)
-    if not isinstance(scene, AnimatedScene):
-        raise ValueError(f"scene: expected a scene file, a family, an mi.Scene or an AnimatedScene, got {type(scene)}.")
-    return scene
-
-
-class LoadedScene:
-    """A scene that is loaded already, as an animated one to look at; its animation moves nothing in it."""
-
-    name = "scene"
-    max_depth = 8
-
-    def __init__(self, scene: Any, animation: Any = None) -> None:
-        keys = read_animation(Path(animation)) if isinstance(animation, str | Path) else dict(animation or {})
-        check_animation(keys, [shape.id() for shape in scene.shapes()], has_camera=bool(scene.sensors()))
-        if "inserted" in keys or "lights" in keys:
-            raise ValueError("animation: inserted shapes and lights need a scene file, this scene is loaded already.")
-        self.frames = int(keys.get("frames", 1))
-        self.record: dict[str, Any] = {}
-        self._scene = scene
-        self._camera = CameraKeys(keys["camera"]) if "camera" in keys else None
-        self._motions = {
-            name: RigidKeys(motion["keys"], np.array(motion.get("pivot", (0, 0, 0)), float))
-            for name, motion in keys.get("shapes", {}).items()
-        }
-
-    def build(self, frame: float, width: int, height: int) -> Any:
-        """The scene as it was given."""
-        return self._scene
-
-    def camera(self, frame: float) -> Camera:
-        """The camera of one frame."""
-        import mitsuba as mi
-
-        sensor = self._scene.sensors()[0]
-        rest = Camera(
-            np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4),
-            float(np.ravel(np.array(mi.traverse(sensor)["x_fov"]))[0]),
-        )
-        if self._camera is None:
-            return rest
-        fov = self._camera.fov(frame)
-        return Camera(self._camera(frame), rest.x_fov if fov is None else fov)
-
-    def pose(self, frame: float) -> dict[str, np.ndarray]:
-        """Shape id -> [4, 4], where the keys have moved it."""
-        return {name: motion(frame) for name, motion in self._motions.items()}
-
-
 def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | None = None) -> Facts:
-    """Facts about the first ``frames`` frames of an animated scene."""
+    """Facts about the first ``frames`` frames (default: all) of an animated scene, seen at ``width`` x ``height``."""
     use_variant()
     # Mitsuba's names exist once a variant is chosen.
     from jaxdn.render.gbuffer import gbuffer, shape_names
-    from jaxdn.render.materials import NOTHING, material_of
-    from jaxdn.render.plugins import children, shape_groups
 
     # A small picture of the same shape: enough to see whether rays leave the scene.
     built = scene.build(0, max(1, round(_LOOK * width / height)), _LOOK)
     shapes = dict(zip(shape_names(built), built.shapes(), strict=True))
-    grouped = [part for group in shape_groups(built) for _, part in children(group) if hasattr(part, "bsdf")]
-
-    surfaces: list[Surface] = []
-    uncertain: dict[str, str] = {}
-    for name, shape in shapes.items():
-        members = grouped if shape.class_name() == "Instance" else [shape]
-        materials = [NOTHING if part.bsdf() is None else material_of(part.bsdf()) for part in members]
-        for material in materials:
-            uncertain |= {effect: f"{name}: {told}" for effect, told in material.unsure.items()}
-        if shape.class_name() == "Instance" and not members:
-            told = f"{name}: what an instance shows could not be read"
-            uncertain |= dict.fromkeys(("glossy", "mirror", "transmission", "texture"), told)
-        lobes = frozenset().union(*(material.lobes for material in materials))
-        textured = any(material.textured for material in materials)
-        surfaces.append(Surface(name, lobes, textured, bool(shape.is_medium_transition())))
-
-    lights: list[Light] = []
-    by_id = {shape.id(): name for name, shape in shapes.items()}
-    for index, emitter in enumerate(built.emitters()):
-        owner = emitter.get_shape()
-        name = by_id[owner.id()] if owner is not None else emitter.id() or f"light_{index}"
-        lights.append(Light(name, bool(emitter.is_environment())))
+    surfaces, uncertain = _surfaces(built, shapes)
+    lights = _lights(built, shapes)
     around = frozenset(light.name for light in lights if light.environment)
     if around and not np.any(gbuffer(built).ids < 0):
         uncertain["emission"] = "the environment is not seen in a small picture of frame 0, but may be later"
@@ -151,6 +45,39 @@ def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | Non
         max_depth=scene.max_depth,
         uncertain=uncertain,
     )
+
+
+def _surfaces(built: Any, shapes: Mapping[str, Any]) -> tuple[list[Surface], dict[str, str]]:
+    """The surfaces of a scene, and effect -> why their materials do not decide it."""
+    from jaxdn.render.materials import NOTHING, material_of
+    from jaxdn.render.plugins import children, shape_groups
+
+    grouped = [part for group in shape_groups(built) for _, part in children(group) if hasattr(part, "bsdf")]
+    surfaces: list[Surface] = []
+    uncertain: dict[str, str] = {}
+    for name, shape in shapes.items():
+        members = grouped if shape.class_name() == "Instance" else [shape]
+        materials = [NOTHING if part.bsdf() is None else material_of(part.bsdf()) for part in members]
+        for material in materials:
+            uncertain |= {effect: f"{name}: {reason}" for effect, reason in material.unsure.items()}
+        if shape.class_name() == "Instance" and not members:
+            reason = f"{name}: what an instance shows could not be read"
+            uncertain |= dict.fromkeys(("glossy", "mirror", "transmission", "texture"), reason)
+        lobes = frozenset().union(*(material.lobes for material in materials))
+        textured = any(material.textured for material in materials)
+        surfaces.append(Surface(name, lobes, textured, bool(shape.is_medium_transition())))
+    return surfaces, uncertain
+
+
+def _lights(built: Any, shapes: Mapping[str, Any]) -> list[Light]:
+    """The lights of a scene; one that is a shape has the shape's name."""
+    lights: list[Light] = []
+    by_id = {shape.id(): name for name, shape in shapes.items()}
+    for index, emitter in enumerate(built.emitters()):
+        owner = emitter.get_shape()
+        name = by_id[owner.id()] if owner is not None else emitter.id() or f"light_{index}"
+        lights.append(Light(name, bool(emitter.is_environment())))
+    return lights
 
 
 class _Stage:

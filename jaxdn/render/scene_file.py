@@ -1,7 +1,7 @@
-"""Mitsuba scene files set in motion: any scene XML with, beside it, an animation file of keys.
+"""Mitsuba scene files set in motion: any scene XML, with an animation file of keys next to it.
 
 Mitsuba's own loader does the loading: what stands still is loaded once; for every frame an edited part of the XML (a
-new camera, the shapes that move with a matrix appended to their transform, inserted shapes) is loaded beside it.
+new camera, the shapes that move with a matrix appended to their transform, inserted shapes) is loaded in addition.
 Scenes of the 0.6 format stay of that format, so that Mitsuba upgrades them as it would the file.
 """
 
@@ -31,9 +31,9 @@ _TEXTURES = ("bitmap", "checkerboard", "mesh_attribute", "volume")
 
 
 class SceneFile:
-    """A Mitsuba 3 scene file as an animated scene; see :mod:`jaxdn.render.animation` for what the JSON beside it says.
+    """A Mitsuba 3 scene file as an animated scene; see :mod:`jaxdn.render.animation` for what the JSON says.
 
-    Without ``animation_path`` the file ``<scene>.json`` beside the scene is used if there is one, and a scene without
+    Without ``animation_path`` the file ``<scene>.json`` next to the scene is used if there is one, and a scene without
     an animation is a still. Shapes without an id get ``shape_<n>``, counted from 0 in the order of the file, and a dot
     in an id becomes an underscore. The camera is the file's first sensor, which must be a perspective one; its
     horizontal field of view is that of the file's own film and stays so at every image size. Raises ValueError for
@@ -42,9 +42,9 @@ class SceneFile:
 
     def __init__(self, path: Path | str, animation_path: Path | str | None = None) -> None:
         path = Path(path)
-        beside = path.with_suffix(".json")
-        if animation_path is None and beside.is_file():
-            animation_path = beside
+        own = path.with_suffix(".json")
+        if animation_path is None and own.is_file():
+            animation_path = own
         if animation_path is not None and not Path(animation_path).is_file():
             raise ValueError(f"animation {animation_path}: expected a file, found none.")
         self._open(path, {} if animation_path is None else read_animation(Path(animation_path)))
@@ -112,7 +112,7 @@ class SceneFile:
         if self._still is None or self._still[0] != variant:
             rests = _kept(self._tree, lambda element: element.get("id") not in {*self._motions, *self._lights})
             still = _load(rests)
-            # A group is handed on for those who look at the scene: its instances do not tell what is in it.
+            # Groups are kept for those who look at the scene: its instances do not tell what is in it.
             self._still = variant, [*still.shapes(), *shape_groups(still), *_lamps(still)]
         moving = _load(self.describe(frame, width, height))
         fresh = [*moving.shapes(), *shape_groups(moving), *_lamps(moving)]
@@ -210,7 +210,7 @@ def _absolute_files(root: ET.Element, path: Path) -> None:
             continue
         found = [folder / name for folder in folders if (folder / name).is_file()]
         if not found:
-            raise ValueError(f"scene {path}: it uses the file {name!r}, which is not there; put it beside the scene.")
+            raise ValueError(f"scene {path}: it uses the file {name!r}, which is not there; put it next to the scene.")
         element.set("value", str(found[0].resolve()))
 
 

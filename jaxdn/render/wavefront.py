@@ -20,8 +20,8 @@ BRIGHTEST = 1e30
 """A sample as bright as this is an overflow, and a sum of a few more would be."""
 
 
-class Light(NamedTuple):
-    """Sums over samples of the three parts of radiance, each [H, W, 3] float64."""
+class Accumulated(NamedTuple):
+    """Light as sums over samples of the three parts of radiance, each [H, W, 3] float64."""
 
     emitted: np.ndarray
     direct: np.ndarray
@@ -29,9 +29,9 @@ class Light(NamedTuple):
     bad: int
     """Number of samples that were not finite (or beyond ``BRIGHTEST``); they count as black."""
 
-    def plus(self, other: "Light") -> "Light":
+    def plus(self, other: "Accumulated") -> "Accumulated":
         """The sums over both sets of samples."""
-        return Light(
+        return Accumulated(
             self.emitted + other.emitted,
             self.direct + other.direct,
             self.indirect + other.indirect,
@@ -39,10 +39,10 @@ class Light(NamedTuple):
         )
 
 
-def no_light(shape: tuple[int, ...]) -> Light:
+def no_light(shape: tuple[int, ...]) -> Accumulated:
     """The sums over no samples."""
     emitted, direct, indirect = np.zeros((3, *shape, 3))
-    return Light(emitted, direct, indirect, 0)
+    return Accumulated(emitted, direct, indirect, 0)
 
 
 def generator(pixel: Any, sample: Any, key: tuple[int, int]) -> Any:
@@ -125,7 +125,7 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
 
 def _chunk(
     scene: Any, first_pixel: int, pixels: int, first: int, count: int, key: tuple[int, int], depth: int
-) -> Light:
+) -> Accumulated:
     """The sums of ``count`` samples of a run of pixels, flat [pixels, 3]."""
     sensor = scene.sensors()[0]
     width = dr.opaque(mi.UInt32, int(sensor.film().crop_size()[0]))
@@ -146,7 +146,7 @@ def _chunk(
     sums = [[dr.block_sum(part[channel], count) for channel in range(3)] for part in parts]
     dr.eval(sums)
     images = [np.stack([np.array(channel, np.float64) for channel in part], axis=-1) for part in sums]
-    return Light(images[0], images[1], images[2], int(dr.sum(bad)[0]))
+    return Accumulated(images[0], images[1], images[2], int(dr.sum(bad)[0]))
 
 
 def accumulate(
@@ -159,7 +159,7 @@ def accumulate(
     count: int,
     max_depth: int,
     max_lanes: int = MAX_LANES,
-) -> Light:
+) -> Accumulated:
     """The sums of the samples ``first`` to ``first + count`` of one stream over the scene's film."""
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     key = frame_key(seed, frame, stream)
@@ -173,4 +173,4 @@ def accumulate(
             total = total.plus(_chunk(scene, start, size, first + done, min(batch, count - done), key, max_depth))
         runs.append(total)
     images = [np.concatenate([run[part] for run in runs]).reshape(height, width, 3) for part in range(3)]
-    return Light(images[0], images[1], images[2], sum(run.bad for run in runs))
+    return Accumulated(images[0], images[1], images[2], sum(run.bad for run in runs))

@@ -3,12 +3,13 @@
 import base64
 import io
 import os
-import uuid
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
+
+from jaxdn.files import write_whole
 
 NOT_FINITE = (1.0, 0.0, 1.0)
 """NaN and infinite pixels are painted magenta, so that a broken image does not pass for a black one."""
@@ -20,10 +21,10 @@ ERROR_COLORS = ((0, 0, 4), (48, 12, 92), (130, 31, 108), (206, 66, 68), (246, 14
 def save_png(path: str | os.PathLike[str], image: Any) -> None:
     """Write a display-encoded image [H, W, 3] or [H, W] in 0..1 as an 8-bit PNG.
 
-    Values outside 0..1 are clamped, pixels that are not finite are painted magenta. The file is written beside its
-    place and then renamed: no reader ever meets half a picture. Raises ValueError for another shape.
+    Values outside 0..1 are clamped, pixels that are not finite are painted magenta. No reader ever meets half
+    a picture (:func:`jaxdn.files.write_whole`). Raises ValueError for another shape.
     """
-    write_atomically({Path(path): encode_png(image)})
+    write_whole({Path(path): encode_png(image)})
 
 
 def encode_png(image: Any) -> bytes:
@@ -99,21 +100,6 @@ def worst_crop(errors: list[np.ndarray], disoccluded: Any, *, size: int = 40) ->
 def data_address(png: bytes) -> str:
     """The PNG as a ``data:`` address, which needs no file and no server."""
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
-
-
-def write_atomically(contents: dict[Path, bytes]) -> None:
-    """Write all files beside their places, then rename them; on an error none is replaced and no rest is left."""
-    written: dict[Path, Path] = {}
-    try:
-        for path, content in contents.items():
-            beside = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.part")
-            written[path] = beside
-            beside.write_bytes(content)
-        for path, beside in written.items():
-            os.replace(beside, path)
-    finally:
-        for beside in written.values():
-            beside.unlink(missing_ok=True)
 
 
 def _encode(picture: Image.Image) -> bytes:

@@ -4,7 +4,7 @@ import json
 import os
 from pathlib import Path
 
-from jaxdn.report.images import write_atomically
+from jaxdn.files import write_whole
 from jaxdn.report.page import page
 from jaxdn.report.results import Results, check_results, metrics
 
@@ -14,16 +14,16 @@ def write_report(results: Results, folder: str | os.PathLike[str]) -> Path:
 
     ``metrics.json`` is strict JSON with every number of the results and no image: NaN (not measured, or nothing to
     measure on) is ``null``, infinities are the strings ``"inf"`` and ``"-inf"``. ``report.html`` is one file that needs
-    neither a server nor a network. Both are written beside their places and then renamed, the page last; the folder is
-    made where it is missing. Raises ValueError where the results contradict themselves (a method without scores, images
-    of different sizes), before anything is written.
+    neither a server nor a network. Both are renamed into their places when they are whole, the page last; the folder
+    is made where it is missing. Raises ValueError where the results contradict themselves (a method without scores,
+    images of different sizes), before anything is written.
     """
     check_results(results)
     numbers = json.dumps(metrics(results), indent=1, allow_nan=False, ensure_ascii=False)
     document = page(results)
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
-    write_atomically(
+    write_whole(
         {
             target / "metrics.json": (numbers + "\n").encode("utf-8", "replace"),
             target / "report.html": document.encode("utf-8", "replace"),

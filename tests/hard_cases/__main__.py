@@ -3,8 +3,8 @@
 python -m tests.hard_cases                # runs/hard-cases/table.html and table.json
 
 What is done lies in ``runs/hard-cases/parts``, one file for each function: interrupted, it goes on from there, as long
-as neither the package nor the cases have changed. Compiled programs are kept beside them, so that a run after a mend
-compiles only what the mend has changed.
+as neither the package nor the cases have changed. Compiled programs are kept there too, so that the run after a fix
+compiles only what the fix has changed.
 """
 
 import hashlib
@@ -19,7 +19,8 @@ import jax
 import numpy as np
 
 from jaxdn import color
-from jaxdn.report.images import data_address, encode_png, write_atomically
+from jaxdn.files import write_whole
+from jaxdn.report.images import data_address, encode_png
 from tests.hard_cases import laws
 from tests.hard_cases.cases import CASES
 from tests.hard_cases.inputs import good
@@ -50,7 +51,7 @@ def part(name: str, state: str, make: Callable[[], dict[str, Any]]) -> dict[str,
     made = {"state": state, **make()}
     made["seconds"] = time.monotonic() - began
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically({path: json.dumps(made).encode()})
+    write_whole({path: json.dumps(made)})
     return made
 
 
@@ -99,14 +100,14 @@ def main() -> int:
         pictures |= {(case, subject.name): address for case, address in made["pictures"].items()}
         seconds += made["seconds"]
         red = sum(row.verdict == "red" for row in found)
-        told = f"{red} of {len(found)} red" if red else f"{len(found)} cells without red"
-        print(f"[{number}/{len(subjects)}] {subject.name}: {told}, {made['seconds']:.0f} s", flush=True)
+        verdict = f"{red} of {len(found)} red" if red else f"{len(found)} cells without red"
+        print(f"[{number}/{len(subjects)}] {subject.name}: {verdict}, {made['seconds']:.0f} s", flush=True)
     made = part("laws", state, lambda: {"laws": list(laws.measured())})
     seconds += made["seconds"]
     page = write_page(table, FOLDER, laws=[laws.Law(*law) for law in made["laws"]], pictures=pictures)
     red = [row for row in table if row.verdict == "red"]
     for row in red:
-        print(f"red: {row.subject}, {row.case}, {row.precision}, {row.direction}: {row.told}")
+        print(f"red: {row.subject}, {row.case}, {row.precision}, {row.direction}: {row.reason}")
     print(f"{len(table)} cells, {len(red)} red, {seconds / 60:.0f} min: {page}")
     return 1 if red else 0
 

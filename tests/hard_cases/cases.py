@@ -10,8 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdn.frame import FAR, Frame
-from tests.hard_cases.inputs import WIDTH, Inputs, dotted, filled, good, replaced
+from jaxdn.frame import BUFFERS, FAR, Frame, Kind
+from jaxdn.methods.table import methods
+from tests.hard_cases.inputs import BY_HAND, WIDTH, Inputs, dotted, filled, good, replaced
+
+WITHOUT_NAN: tuple[Kind, ...] = ("flag", "id")
+"""Kinds that hold neither NaN nor infinity."""
+WITH_SIGN: tuple[Kind, ...] = ("signed", "direction", "vector")
+"""Kinds in which nothing is wrong with a negative value."""
 
 
 class Case(NamedTuple):
@@ -91,32 +97,35 @@ def radiance_negative(inputs: Inputs) -> Inputs:
     return dotted(inputs, "radiance", -3.0)
 
 
-@case("every buffer has some pixels that are not a number")
-def everything_not_a_number(inputs: Inputs) -> Inputs:
-    for name in ("radiance", "albedo", "normal", "depth", "roughness", "motion", "dual_motion", "previous_depth"):
-        inputs = dotted(inputs, name, np.nan)
+def _breakable() -> list[str]:
+    """The buffers that can hold broken values, of those in the scene and those that a method of the package reads."""
+    read = set(BY_HAND)
+    for method in methods().values():
+        for options in ({}, *method.variants.values()):
+            read |= method.factory(**options).reads
+    return [name for name, buffer in BUFFERS.items() if name in read and buffer.kind not in WITHOUT_NAN]
+
+
+def _everything(value: float, inputs: Inputs) -> Inputs:
+    for name in _BREAKABLE:
+        inputs = dotted(inputs, name, value)
     return inputs
 
 
-@case("every buffer has some pixels at infinity")
-def everything_infinite(inputs: Inputs) -> Inputs:
-    for name in ("radiance", "albedo", "normal", "depth", "roughness", "motion", "dual_motion", "previous_depth"):
-        inputs = dotted(inputs, name, np.inf)
+def _broken(buffer: str, values: tuple[float, ...], inputs: Inputs) -> Inputs:
+    for every, value in zip((7, 11), values, strict=False):
+        inputs = dotted(inputs, buffer, value, every=every)
     return inputs
 
 
-def _broken(buffer: str, value: tuple[float, ...], inputs: Inputs) -> Inputs:
-    for every, one in zip((7, 11), value, strict=False):
-        inputs = dotted(inputs, buffer, one, every=every)
-    return inputs
-
-
-_SIGNED = {"normal", "motion", "dual_motion"}
-for _buffer in (name for name in Frame._fields[1:] if name not in ("visible", "ids")):
-    for _told, _value in (("not a number", (np.nan,)), ("infinite", (np.inf, -np.inf)), ("negative", (-3.0,))):
-        if _told != "negative" or _buffer not in _SIGNED:
-            _name = f"{_buffer.replace('_', ' ')} {_told}"
-            CASES[_name] = Case(_name, f"one buffer alone is broken: {_name}", partial(_broken, _buffer, _value))
+_BREAKABLE = _breakable()
+case("every buffer has some pixels that are not a number", name="everything not a number")(partial(_everything, np.nan))
+case("every buffer has some pixels at infinity", name="everything infinite")(partial(_everything, np.inf))
+for _buffer in _BREAKABLE[1:]:  # radiance has its own above
+    for _what, _values in (("not a number", (np.nan,)), ("infinite", (np.inf, -np.inf)), ("negative", (-3.0,))):
+        if _what != "negative" or BUFFERS[_buffer].kind not in WITH_SIGN:
+            _name = f"{_buffer.replace('_', ' ')} {_what}"
+            case(f"one buffer alone is broken: {_name}", name=_name)(partial(_broken, _buffer, _values))
 
 
 @case("the light is off")

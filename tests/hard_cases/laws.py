@@ -1,16 +1,18 @@
 """How far the learned networks are from what a filter obeys by construction: flips, channels, brightness."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-import jaxdn
-from jaxdn.frame import Clip, Frame
+from jaxdn.candidates import candidate, filters
+from jaxdn.frame import BUFFERS, Buffer, Clip, Frame
 from jaxdn.weights import shipped_names
 from tests.hard_cases.inputs import good
+from tests.hard_cases.subjects import denoised
 
 FRAMES, HEIGHT, WIDTH = 8, 64, 96
 """Multiples of 16: padding at one side is not what is asked here."""
@@ -27,34 +29,39 @@ class Law(NamedTuple):
     """RMS of (denoised clip - reference) over the same: what the difference is to be compared with."""
 
 
+def _changed(clip: Clip, change: Callable[[Buffer, np.ndarray], np.ndarray]) -> Clip:
+    """The clip with ``change(buffer, values)`` of all its buffers; the reference is light, as ``radiance`` is."""
+    frames = {name: change(BUFFERS[name], np.asarray(values)) for name, values in clip.frames._asdict().items()}
+    return Clip(Frame(**frames), change(BUFFERS["radiance"], np.asarray(clip.reference)))
+
+
 def _flipped(axis: int, sign: tuple[float, float]) -> Callable[[Clip], Clip]:
     """Mirror every buffer along x (axis -2) or y (axis -3); vectors across it change their sign, normals do not.
 
     World-space normals belong to the scene, which a camera may see in a mirror.
     """
 
-    def change(clip: Clip) -> Clip:
-        frames = clip.frames._asdict()
-        for name in ("motion", "dual_motion"):
-            frames[name] = frames[name] * np.asarray(sign, np.float32)
-        return jax.tree.map(lambda buffer: np.flip(np.asarray(buffer), axis), Clip(Frame(**frames), clip.reference))
+    def flip(buffer: Buffer, values: np.ndarray) -> np.ndarray:
+        return np.flip(values * np.asarray(sign, np.float32) if buffer.kind == "vector" else values, axis)
 
-    return change
+    return lambda clip: _changed(clip, flip)
 
 
 def _brighter(factor: float) -> Callable[[Clip], Clip]:
-    def change(clip: Clip) -> Clip:
-        frames = clip.frames
-        light = {name: factor * getattr(frames, name) for name in ("radiance", "direct", "emission")}
-        return Clip(frames._replace(**light), factor * clip.reference)
-
-    return change
+    """All light times ``factor``."""
+    return lambda clip: _changed(
+        clip, lambda buffer, values: factor * values if buffer.kind in ("light", "signed") else values
+    )
 
 
 def _permuted(clip: Clip) -> Clip:
-    frames = clip.frames
-    colors = {name: getattr(frames, name)[..., [1, 2, 0]] for name in ("radiance", "albedo", "direct", "emission")}
-    return Clip(frames._replace(**colors), clip.reference[..., [1, 2, 0]])
+    """Red, green and blue take each other's place in everything that has a colour."""
+
+    def permute(buffer: Buffer, values: np.ndarray) -> np.ndarray:
+        colored = buffer.channels == 3 and buffer.kind in ("light", "fraction")
+        return values[..., [1, 2, 0]] if colored else values
+
+    return _changed(clip, permute)
 
 
 CHANGES: dict[str, Callable[[Clip], Clip]] = {
@@ -69,19 +76,16 @@ CHANGES: dict[str, Callable[[Clip], Clip]] = {
 
 
 def measured() -> Iterator[Law]:
-    """Every law for every network that has shipped weights, and for a filter beside them."""
+    """Every law for every network that has shipped weights, and for the filters to compare with."""
     clip = good(frames=FRAMES, height=HEIGHT, width=WIDTH).clip
-    methods: dict[str, tuple[jaxdn.Denoiser, Any]] = {name: jaxdn.load_weights(name) for name in shipped_names()}
-    methods["svgf"] = (jaxdn.denoisers.svgf(), {})
-    for method, (denoiser, params) in methods.items():
-        run = jax.jit(lambda clip, denoiser=denoiser, params=params: jaxdn.denoise(denoiser, params, clip))
+    for name in (*shipped_names(), *filters()):
+        one = candidate(name)
+        run = jax.jit(partial(denoised, one.denoiser, one.params))
         plain = np.asarray(run(clip))
         for law, change in CHANGES.items():
             expected = change(Clip(clip.frames, plain)).reference
             size = _rms(expected)
-            yield Law(
-                law, method, _rms(run(change(clip)) - expected) / size, _rms(plain - clip.reference) / _rms(plain)
-            )
+            yield Law(law, name, _rms(run(change(clip)) - expected) / size, _rms(plain - clip.reference) / _rms(plain))
 
 
 def _rms(values: Any) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 
-from jaxdn.report.images import write_atomically
+from jaxdn.files import write_whole
 from tests.hard_cases.cases import CASES
 from tests.hard_cases.laws import Law
 from tests.hard_cases.table import DIRECTIONS, PRECISIONS, Row
@@ -51,7 +51,7 @@ def write_page(
     body = f"""<h1>Hard cases</h1>
 <p>{len(cases)} cases, {sum(map(len, kinds.values()))} functions, {len(table)} cells: <span class="green key">
 {counts["green"]} green</span> <span class="red key">{counts["red"]} red</span> <span class="input key">
-{counts["input"]} hand on</span> what was no number in the input, or has no finite true value (the PSNR of identical
+{counts["input"]} pass on</span> what was no number in the input, or has no finite true value (the PSNR of identical
 images), as a pure function may and a denoiser may not. Compiled by jax {jax.__version__} for {jax.default_backend()}.
 </p>
 <p>Green is finite, inside its bounds, and close to the same function in double precision. Numbers are the largest
@@ -63,16 +63,12 @@ a cell for all that was found; click it for the case{" and its pictures" if pict
     page = folder / "table.html"
     document = f'<!doctype html><meta charset="utf-8"><title>Hard cases</title><style>{_STYLE}</style>{body}\n'
     record = {"rows": [row._asdict() for row in table], "laws": [law._asdict() for law in laws]}
-    write_atomically({page: document.encode(), folder / "table.json": _json(record).encode()})
+    write_whole({page: document, folder / "table.json": json.dumps(record, indent=0, default=str) + "\n"})
     return page
 
 
 def _kinds(table: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(row.kind for row in table))
-
-
-def _json(record: object) -> str:
-    return json.dumps(record, indent=0, default=str) + "\n"
 
 
 def _anchor(case: str, subject: str | None = None) -> str:
@@ -88,9 +84,9 @@ def _number(error: float | None) -> str:
     return "–" if error is None else "0" if error == 0 else f"{error:.0e}".replace("e-0", "e-")
 
 
-def _told(row: Row) -> str:
+def _described(row: Row) -> str:
     error = "nothing to compare" if row.error is None else f"error {row.error:.1e}"
-    return f"{row.precision}, {row.direction}: {row.told or 'finite'}, {error}, largest {row.largest:.3g}"
+    return f"{row.precision}, {row.direction}: {row.reason or 'finite'}, {error}, largest {row.largest:.3g}"
 
 
 def _table(
@@ -131,13 +127,14 @@ def _cell(found: Sequence[Row], place: str) -> str:
     shown = [_number(row.error) for row in found if len(found) == 1 or row.direction == "forward"]
     shown = shown or [_number(None)]
     numbers = shown[0] + "".join(f"<small>{number}</small>" for number in shown[1:] if number != shown[0])
-    told = html.escape("\n".join(map(_told, found)), quote=True)
-    return f'<td class="{verdict}" title="{told}"><a href="#{place}">{numbers}</a></td>'
+    described = html.escape("\n".join(map(_described, found)), quote=True)
+    return f'<td class="{verdict}" title="{described}"><a href="#{place}">{numbers}</a></td>'
 
 
 def _list(title: str, found: Iterable[Row]) -> str:
     lines = (
-        f'<li><a href="#{_anchor(row.case)}">{html.escape(f"{row.subject}, {row.case}")}</a>: {html.escape(_told(row))}'
+        f'<li><a href="#{_anchor(row.case)}">{html.escape(f"{row.subject}, {row.case}")}</a>: '
+        f"{html.escape(_described(row))}"
         for row in found
     )
     return f"<h2>{title}</h2><ul>{''.join(lines)}</ul>"
@@ -165,6 +162,6 @@ def _laws(laws: Sequence[Law]) -> str:
     )
     return f"""<h2>Laws of the learned networks</h2><p>A filter that is right commutes with each of these changes of its
 input; a network has only learned to. How far it fails: root mean square of the difference between the denoised change
-and the changed denoised clip, relative to the clip's own root mean square, and beside it how far the denoised clip is
-from its reference in the same measure. A filter without weights is there to compare.</p><table><thead><tr><th>change
+and the changed denoised clip, relative to the clip's own root mean square; and how far the denoised clip is from its
+reference in the same measure. A filter without weights is there to compare.</p><table><thead><tr><th>change
 </th><th>method</th><th>difference</th><th>error</th><th>ratio</th></tr></thead><tbody>{body}</tbody></table>"""

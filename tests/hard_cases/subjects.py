@@ -1,6 +1,5 @@
 """What the hard cases are put to: every registered denoiser and every public operation, as functions of the inputs."""
 
-import inspect
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,8 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdn
-from jaxdn import color, kernels, losses, metrics, numerics, warping
-from jaxdn.frame import RADIANCE_MAX, Frame
+from jaxdn import color, losses, metrics, numerics, scales
+from jaxdn.frame import RADIANCE_MAX, Clip, Frame
+from jaxdn.methods.table import methods
+from jaxdn.motion import on_screen
+from jaxdn.ops.softmax_filter import softmax_filter
 from jaxdn.repair import repair
 from tests.hard_cases.inputs import HEIGHT, WIDTH, Inputs
 
@@ -28,7 +30,7 @@ class Subject(NamedTuple):
     """(params, inputs) -> array."""
     params: Any = ()
     repairs: bool = False
-    """It has to make something usable of anything; the others may hand on what is no number in their input."""
+    """It has to make something usable of anything; the others may pass on what is no number in their input."""
     bounds: tuple[float, float] = (-np.inf, np.inf)
     truth: Callable[[Any, Inputs], Any] | None = None
     """The same without its reduced precision inside, for the comparison in double; None: ``run`` itself."""
@@ -38,17 +40,18 @@ class Subject(NamedTuple):
 
 
 def denoiser_subjects() -> list[Subject]:
-    """Every denoiser by its factory, and in each precision that it knows; a network with the weights it starts from."""
+    """Every method that is registered now, in its lightest variant and each precision that it knows.
+
+    A network has the weights that training starts from.
+    """
     subjects = []
-    for name in jaxdn.denoisers.NAMES:
-        factory = getattr(jaxdn.denoisers, name)
-        knows = inspect.signature(factory).parameters
-        options = {"size": "small"} if "size" in knows else {}
-        denoiser = factory(**options)
+    for name, method in methods().items():
+        options = method.variant_named(None)
+        denoiser = method.factory(**options)
         params = denoiser.init(jax.random.key(0), Frame(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
         usual = Subject(
             name,
-            partial(_denoised, denoiser),
+            _on_clips(denoiser),
             params,
             repairs=True,
             bounds=(0.0, RADIANCE_MAX),
@@ -56,14 +59,21 @@ def denoiser_subjects() -> list[Subject]:
             kind="denoiser",
         )
         subjects.append(usual)
-        if "compute_dtype" in knows:
-            half = factory(**options, compute_dtype="bfloat16")
-            subjects.append(usual._replace(name=f"{name} bfloat16", run=partial(_denoised, half), truth=usual.run))
+        if method.knows("compute_dtype"):
+            half = method.factory(**{**options, "compute_dtype": "bfloat16"})
+            subjects.append(usual._replace(name=f"{name} bfloat16", run=_on_clips(half), truth=usual.run))
     return subjects
 
 
-def _denoised(denoiser: jaxdn.Denoiser, params: Any, inputs: Inputs) -> jax.Array:
-    return jaxdn.denoise(denoiser, params, inputs.clip)
+def _on_clips(denoiser: jaxdn.Denoiser) -> Callable[[Any, Inputs], jax.Array]:
+    return lambda params, inputs: denoised(denoiser, params, inputs.clip)
+
+
+def denoised(denoiser: jaxdn.Denoiser, params: Any, clip: Clip) -> jax.Array:
+    """The denoised clip; whoever asks for samples gets the radiance, broken or not, for each number of them."""
+    if denoiser.samples is not None:
+        clip = clip._replace(layers=dict.fromkeys((1, 2, 4, 8), clip.frames.radiance))
+    return jaxdn.denoise(denoiser, params, clip)
 
 
 def _images(inputs: Inputs) -> tuple[jax.Array, jax.Array]:
@@ -88,7 +98,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         return jaxdn.apply_kernels(inputs.clip.frames.radiance[-1], jaxdn.normalize_kernels(inputs.logits))
 
     def filtered_by_logits(inputs: Inputs) -> jax.Array:
-        return kernels.softmax_filter(inputs.clip.frames.radiance[-1:], inputs.logits)[0]
+        return softmax_filter(inputs.clip.frames.radiance[-1:], inputs.logits)[0]
 
     def even(inputs: Inputs) -> jax.Array:
         """As the error for odd sizes says."""
@@ -114,15 +124,15 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
 
     return {
         **{f"warp, {border}": partial(warped, border=border) for border in _BORDERS},
-        "on_screen": lambda inputs: jax.vmap(warping.on_screen)(inputs.clip.frames.motion).astype(jnp.float32),
+        "on_screen": lambda inputs: jax.vmap(on_screen)(inputs.clip.frames.motion).astype(jnp.float32),
         "dual_motion": dual,
         "occlusion_mask": masks,
         "normalize_kernels": lambda inputs: jaxdn.normalize_kernels(inputs.logits),
         "apply_kernels": filtered,
         "softmax_filter": filtered_by_logits,
         "compose_scales": composed,
-        "downsample": lambda inputs: kernels.downsample(even(inputs)),
-        "upsample": lambda inputs: kernels.upsample(inputs.clip.frames.radiance[-1]),
+        "downsample": lambda inputs: scales.downsample(even(inputs)),
+        "upsample": lambda inputs: scales.upsample(inputs.clip.frames.radiance[-1]),
         "color.compress": of_light(color.compress),
         "color.expand": lambda inputs: color.expand(jnp.minimum(inputs.clip.frames.radiance, 2.0)),
         "color.luminance": of_light(color.luminance),
@@ -142,7 +152,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
 
 
 def operation_subjects() -> list[Subject]:
-    """Every public operation, and the frame's repair, which every denoiser begins with."""
+    """Every public operation, and the repair of a frame, which every denoiser begins with."""
     pure = [
         Subject(name, lambda params, inputs, run=run: run(inputs), pictured=name in _PICTURED)
         for name, run in _operations().items()
@@ -151,7 +161,7 @@ def operation_subjects() -> list[Subject]:
     def repaired(params: Any, inputs: Inputs) -> jax.Array:
         return repair(inputs.clip.frames)[0].radiance
 
-    mended = Subject("frame.repair", repaired, repairs=True, bounds=(0.0, RADIANCE_MAX), pictured=True)
+    mended = Subject("repair", repaired, repairs=True, bounds=(0.0, RADIANCE_MAX), pictured=True)
     return [*pure, mended]
 
 

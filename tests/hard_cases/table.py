@@ -39,8 +39,9 @@ class Row(NamedTuple):
     error: float | None
     """Against double precision, where that is finite; None where there is nothing to compare."""
     verdict: str
-    """``green``, ``red``, or ``input`` where a pure function hands on what was no number before."""
-    told: str
+    """``green``, ``red``, or ``input`` where a pure function passes on what was no number before."""
+    reason: str
+    """Of a verdict that is not green."""
 
 
 def rows(
@@ -76,7 +77,7 @@ def rows(
 
 
 def _cast(inputs: Inputs, precision: str) -> Inputs:
-    """Half-precision inputs are what a file or a GPU hands over."""
+    """Half-precision inputs are what a file or a GPU gives."""
     if precision == "float32":
         return inputs
 
@@ -128,21 +129,21 @@ def _judge(case: str, subject: Subject, precision: str, direction: str, result: 
 
     # What double precision cannot make finite either comes from the input, or from the true value (an infinite PSNR).
     excused = np.zeros_like(finite) if subject.repairs else ~representable
-    verdict, told = "green", ""
+    verdict, reason = "green", ""
     if not np.all(finite | excused):
-        verdict, told = "red", f"{int(np.sum(~finite & ~excused))} values are not finite"
+        verdict, reason = "red", f"{int(np.sum(~finite & ~excused))} values are not finite"
     elif direction == "gradient" and largest > STEEPEST and subject.repairs:
-        verdict, told = "red", f"a gradient of {largest:.1e}"
+        verdict, reason = "red", f"a gradient of {largest:.1e}"
     elif direction == "forward" and lowest < subject.bounds[0] - 1e-6:
-        verdict, told = "red", f"{lowest:.3g} is below {subject.bounds[0]:g}"
+        verdict, reason = "red", f"{lowest:.3g} is below {subject.bounds[0]:g}"
     elif direction == "forward" and largest > subject.bounds[1]:
-        verdict, told = "red", f"{largest:.3g} is above {subject.bounds[1]:g}"
+        verdict, reason = "red", f"{largest:.3g} is above {subject.bounds[1]:g}"
     elif direction == "forward" and error is not None and error > bound:
-        verdict, told = "red", f"relative error {error:.1e}"
+        verdict, reason = "red", f"relative error {error:.1e}"
     elif not np.all(finite):
-        verdict, told = "input", "not finite in double precision either"
+        verdict, reason = "input", "not finite in double precision either"
     return Row(
-        case, subject.name, subject.kind, precision, direction, bool(np.all(finite)), largest, error, verdict, told
+        case, subject.name, subject.kind, precision, direction, bool(np.all(finite)), largest, error, verdict, reason
     )
 
 

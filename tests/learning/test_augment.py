@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxdn.clips.augment import transform_clip, transform_image, transform_motion
-from jaxdn.frame import Clip, Frame
+from jaxdn.frame import BUFFERS, Clip, Frame, present
 
 SYMMETRIES = list(itertools.product([False, True], range(4)))
 
@@ -60,20 +60,26 @@ def test_the_eight_are_different_and_make_a_group(rng: np.random.Generator) -> N
 
 
 def test_a_clip_is_transformed_in_every_buffer(rng: np.random.Generator) -> None:
-    frames = Frame(
-        radiance=rng.random((2, 4, 6, 3)),
-        normal=rng.random((2, 4, 6, 3)),
-        motion=rng.random((2, 4, 6, 2)),
-        dual_motion=rng.random((2, 4, 6, 2)),
-        ids=rng.integers(-1, 4, (2, 4, 6, 1)),
-    )
-    clip = transform_clip(Clip(frames, frames.radiance + 1), flip=True, turns=1)
+    frames = Frame(**{name: rng.random((2, 4, 6, row.channels)) for name, row in BUFFERS.items() if name != "albedo"})
+    layers = {1: frames.radiance + 2, 2: frames.radiance + 3}
+    clip = transform_clip(Clip(frames, frames.radiance + 1, layers), flip=True, turns=1)
     assert clip.frames.albedo is None
     np.testing.assert_array_equal(clip.reference, clip.frames.radiance + 1)
+    for samples, offset in ((1, 2), (2, 3)):
+        np.testing.assert_array_equal(clip.layers[samples], clip.frames.radiance + offset)
     # Pixel (x, y) of a picture 6 wide goes to 5 - x by the flip, and then (x, y) -> (y, 5 - x) by the turn: (y, x).
-    np.testing.assert_array_equal(clip.frames.radiance[:, 5, 1], frames.radiance[:, 1, 5])
-    np.testing.assert_array_equal(clip.frames.normal[:, 5, 1], frames.normal[:, 1, 5])  # world space: unchanged
-    np.testing.assert_array_equal(clip.frames.ids[:, 5, 1], frames.ids[:, 1, 5])
-    for name in ("motion", "dual_motion"):
-        before, after = getattr(frames, name), getattr(clip.frames, name)
-        np.testing.assert_array_equal(after[:, 5, 1], before[:, 1, 5, ::-1])
+    for name in ("radiance", *present(frames)):
+        before, after = getattr(frames, name)[:, 1, 5], getattr(clip.frames, name)[:, 5, 1]
+        turned = before[..., ::-1] if BUFFERS[name].kind == "vector" else before  # normals are in world space
+        np.testing.assert_array_equal(after, turned, err_msg=name)
+
+
+def test_vectors_that_are_not_motion_are_turned_too(rng: np.random.Generator) -> None:
+    """Where a shadow or a reflection came from lies in the image plane; a gradient of luminance does not."""
+    plane = rng.random((1, 4, 4, 2))
+    frames = Frame(rng.random((1, 4, 4, 3)), shadow_motion=plane, glossy_motion=plane, luminance_gradient=plane)
+    found = transform_clip(Clip(frames), flip=False, turns=2).frames
+    back = plane[:, ::-1, ::-1]
+    np.testing.assert_array_equal(found.shadow_motion, -back)
+    np.testing.assert_array_equal(found.glossy_motion, -back)
+    np.testing.assert_array_equal(found.luminance_gradient, back)

@@ -10,7 +10,7 @@ import pytest
 from jaxdn import clips
 from jaxdn.clips import ClipError, training_batches
 from jaxdn.clips.cache import open_cached, read_window
-from jaxdn.frame import Clip, Frame
+from jaxdn.frame import BUFFERS, Clip, Frame
 
 HEIGHT, WIDTH = 12, 15
 
@@ -33,7 +33,7 @@ def folder(tmp_path: Path, rng: np.random.Generator) -> Path:
             frame = Frame(radiance=image[t], motion=motion, depth=image[t, ..., 2:])
             layers = {1: image[t], 2: image[t] + 4}
             clips.write_frame(clips.frame_path(home, t), frame, layers=layers, reference=image[t])
-        clips.write_record({"frames": count, "width": WIDTH, "height": HEIGHT, "layers": [1, 2]}, home)
+        clips.finish_record({"frames": count, "width": WIDTH, "height": HEIGHT, "layers": [1, 2]}, home)
     return tmp_path / "clips"
 
 
@@ -127,6 +127,75 @@ def test_the_cache_holds_the_clip_and_follows_it(folder: Path) -> None:
     np.testing.assert_array_equal(read_window(open_cached(home), everything).reference, coordinates(2, 9))
     assert len(os.listdir(folder / ".cache")) == 1
     assert os.listdir(folder / ".cache") != kept
+
+
+def test_every_buffer_of_the_table_comes_back_from_the_cache(tmp_path: Path, rng: np.random.Generator) -> None:
+    shape = (2, 5, 7)
+    frames = Frame(**{name: 1e5 * rng.random((*shape, row.channels), np.float32) for name, row in BUFFERS.items()})
+    frames = frames._replace(ids=rng.integers(-1, 10**6, (*shape, 1)), visible=rng.random((*shape, 1)) > 0.5)
+    clips.write_clip(Clip(frames, frames.radiance), tmp_path / "all")
+    expected = clips.read_clip(tmp_path / "all")
+    window = (slice(1, 2), slice(0, 4), slice(2, 7))
+    found = read_window(open_cached(tmp_path / "all"), window)
+    for name, row in BUFFERS.items():
+        assert getattr(found.frames, name).dtype == row.dtype, name
+        np.testing.assert_array_equal(getattr(found.frames, name), getattr(expected.frames, name)[window], err_msg=name)
+
+
+def test_independent_layers_come_cropped_and_turned_with_the_rest(folder: Path) -> None:
+    expected = clips.read_clip(folder / "clip0", layers=True)
+    assert sorted(expected.layers) == [1, 2]
+    np.testing.assert_array_equal(expected.layers[2], coordinates(4, 0) + 4)
+    assert clips.read_clip(folder / "clip0").layers is None
+    window = (slice(1, 3), slice(2, 5), slice(0, 9))
+    found = read_window(open_cached(folder / "clip0"), window, layers=True)
+    assert equal(found, jax.tree.map(lambda image: image[window], expected))
+    assert read_window(open_cached(folder / "clip0"), window).layers is None
+    batch = next(training_batches(folder, batch=16, crop=6, frames=2, seed=3, spp=3, layers=True))
+    assert {count: layer.shape for count, layer in batch.layers.items()} == dict.fromkeys((1, 2), (16, 2, 6, 6, 3))
+    np.testing.assert_array_equal(batch.layers[1], batch.reference)
+    np.testing.assert_array_equal(batch.layers[2], batch.reference + 4)
+    assert next(training_batches(folder, batch=1, crop=6, frames=2, seed=3)).layers is None
+
+
+def test_batches_have_the_layers_that_every_clip_has(tmp_path: Path) -> None:
+    image = np.ones((4, 4, 3), np.float32)
+
+    def write(name: str, *counts: int) -> None:
+        (tmp_path / name).mkdir(exist_ok=True)
+        frame = Frame(radiance=image)
+        clips.write_frame(
+            tmp_path / name / "frame_0000.exr", frame, layers=dict.fromkeys(counts, image), reference=image
+        )
+        clips.finish_record({"frames": 1, "width": 4, "height": 4, "layers": list(counts)}, tmp_path / name)
+
+    def given() -> set[int]:
+        stream = training_batches(tmp_path, batch=2, crop=4, frames=1, seed=0, spp=4, layers=True)
+        return set(next(stream).layers)
+
+    write("a", 1, 2, 4, 16)
+    write("b", 1, 2, 4)
+    assert given() == {1, 2, 4}  # 16 without 8 makes no number of samples
+    write("b", 1, 4)
+    assert given() == {1}
+    write("b", 4)
+    with pytest.raises(ClipError, match=r"b: expected independent noisy layers of 1, 2, 4, .* got 4; .*--layers"):
+        given()
+    with pytest.raises(ClipError, match=r"b: expected independent noisy layers"):
+        clips.read_clip(tmp_path / "b", spp=4, layers=True)
+
+
+def test_an_interrupted_clip_is_left_out_and_named(folder: Path) -> None:
+    record = clips.read_record(folder / "clip1")
+    clips.begin_record(record, folder / "clip1")
+    with pytest.warns(UserWarning, match="clip1: rendering this clip was interrupted.*left out"):
+        assert clips.find_clips(folder) == [folder / "clip0", folder / "clip2"]
+    with pytest.raises(ClipError, match="clip1: rendering this clip was interrupted; run the same command again"):
+        clips.find_clips(folder / "clip1")
+    for name in ("clip0", "clip2"):
+        clips.begin_record(clips.read_record(folder / name), folder / name)
+    with pytest.raises(ClipError, match="clip0: rendering this clip was interrupted"):
+        clips.find_clips(folder)
 
 
 def test_a_clip_that_cannot_be_read_leaves_no_cache(folder: Path) -> None:

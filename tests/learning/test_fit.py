@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from jaxdn.clips import training_batches, write_clip
-from jaxdn.commands.train import fit, read_curve, read_log, training_engine
+from jaxdn.commands.fit import fit
+from jaxdn.commands.log import read_curve, read_log
 from jaxdn.denoisers import ntd
-from jaxdn.recipe import Recipe
+from jaxdn.methods.table import method_named
 from tests.learning.test_training import TINY, make_clip
 
-RECIPE = Recipe(steps=6, batch=2, crop=16, frames=4)
+METHOD = method_named("ntd")
+RECIPE = METHOD.recipe_named(None)._replace(steps=6, batch=2, crop=16, frames=4)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +58,7 @@ run = partial(run_on, None)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", dict.fromkeys(("reference", training_engine())))
+@pytest.mark.parametrize("engine", dict.fromkeys(("reference", METHOD.engine("training") or "reference")))
 def test_interrupted_training_ends_in_bit_identical_weights(engine, clips, tmp_path):
     run = partial(run_on, engine)
     whole = run(clips, tmp_path / "whole", checkpoint_every=100)
@@ -75,7 +77,7 @@ def test_a_finished_run_is_not_trained_again(clips, tmp_path):
 
 
 def test_another_recipe_in_the_same_folder_is_refused(clips, tmp_path):
-    (tmp_path / "recipe.json").write_text(json.dumps({**RECIPE._asdict(), "learning_rate": 7.0}))
+    (tmp_path / "recipe.json").write_text(json.dumps({**RECIPE.record(), "learning_rate": 7.0}))
     with pytest.raises(ValueError, match=r"learning_rate 7.0 -> 0.001"):
         run(clips, tmp_path)
 

@@ -1,5 +1,7 @@
 """Training: the loss, the step, two phases, bad data, and a run that is stopped and goes on as if it never was."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,13 +10,14 @@ import pytest
 from jaxdn import color, losses
 from jaxdn.denoisers import ntd
 from jaxdn.frame import Clip, Frame
-from jaxdn.learning.step import PARITY, clip_loss, initial_state, make_train_step
+from jaxdn.learning.step import clip_loss, initial_state, make_train_step
+from jaxdn.methods.table import method_named
 from jaxdn.motion import occlusion_mask
-from jaxdn.recipe import Recipe
+from jaxdn.rollout import denoise
 from tests.plainly import jit_plainly
 
 TINY = ((4,), (4,), (4,), (4,), (4,))
-RECIPE = Recipe(steps=8, batch=2, crop=16, frames=4)
+RECIPE = method_named("ntd").recipe_named(None)._replace(steps=8, batch=2, crop=16, frames=4)
 
 
 def make_clip(seed, *, frames=4, size=16):
@@ -59,16 +62,14 @@ def state(denoiser):
 
 def test_the_loss_is_the_papers_sum_on_all_frames_but_the_last(denoiser, state):
     clip = make_clip(0)
-    from jaxdn.rollout import denoise
-
     images = denoise(denoiser, state.params, clip)
     masks = jax.vmap(occlusion_mask)(clip.frames.motion, clip.frames.dual_motion)[:3]
     ours, wanted = color.compress(images[:3]), color.compress(clip.reference[:3])
     without = losses.spatial(ours, wanted) + losses.temporal(ours, wanted)
     joined = losses.occlusion(ours, wanted, masks)
     assert joined > 0
-    for weight in (0.0, 1.0):
-        loss, _ = clip_loss(denoiser, state.params, clip, occlusion=weight)
+    for progress, weight in ((0.0, 0.0), (0.49, 0.0), (0.5, 1.0), (1.0, 1.0)):
+        loss, _ = clip_loss(denoiser, state.params, clip, RECIPE.objective, progress=progress)
         np.testing.assert_allclose(loss, without + weight * joined, rtol=1e-5)
 
 
@@ -77,7 +78,7 @@ def test_the_last_frame_gives_no_gradient(denoiser, state):
     clip = make_clip(0)
     changed = clip._replace(reference=clip.reference.copy())
     changed.reference[-1] *= 3.0
-    gradient = jit_plainly(jax.grad(lambda params, clip: clip_loss(denoiser, params, clip)[0]))
+    gradient = jit_plainly(jax.grad(lambda params, clip: clip_loss(denoiser, params, clip, RECIPE.objective)[0]))
     for one, other in zip(
         jax.tree.leaves(gradient(state.params, clip)), jax.tree.leaves(gradient(state.params, changed)), strict=True
     ):
@@ -103,9 +104,10 @@ def test_rematerialised_gradients_are_the_same(denoiser, state):
     clip = make_clip(3)
 
     def gradient(rematerialize):
-        return jit_plainly(jax.grad(lambda p: clip_loss(denoiser, p, clip, rematerialize=rematerialize)[0]))(
-            state.params
-        )
+        def loss(params):
+            return clip_loss(denoiser, params, clip, RECIPE.objective, rematerialize=rematerialize)[0]
+
+        return jit_plainly(jax.grad(loss))(state.params)
 
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(False), gradient(True))
 
@@ -169,12 +171,21 @@ def test_a_gradient_that_is_not_finite_changes_nothing(denoiser, step, state):
 def test_nothing_moves_nothing_is_disoccluded(denoiser, state):
     clip = make_clip(0)
     still = clip._replace(frames=clip.frames._replace(motion=None, dual_motion=None))
-    with_occlusion, _ = clip_loss(denoiser, state.params, still, occlusion=1.0)
-    without, _ = clip_loss(denoiser, state.params, still, occlusion=0.0)
+    with_occlusion, _ = clip_loss(denoiser, state.params, still, RECIPE.objective, progress=1.0)
+    without, _ = clip_loss(denoiser, state.params, still, RECIPE.objective, progress=0.0)
     assert with_occlusion == without
 
 
 def test_the_papers_recipe_is_constant_adam():
-    assert PARITY.learning_rate == 1e-4
-    assert not PARITY.decay
-    assert PARITY.clip_norm == 0
+    parity = method_named("ntd").recipe_named("parity")
+    assert parity.learning_rate == 1e-4
+    assert not parity.decay
+    assert parity.clip_norm == 0
+    assert parity.objective.name == RECIPE.objective.name  # the loss is the paper's own in both
+
+
+def test_a_recipe_is_kept_as_json():
+    kept = json.loads(json.dumps(RECIPE.record(), allow_nan=False))
+    assert set(kept) == set(RECIPE._fields)
+    assert kept["objective"] == "indirect illumination"
+    assert kept["steps"] == 8

@@ -10,19 +10,31 @@ import pytest
 
 from experiments.stability import kills
 from jaxdn.checkpoint import Checkpoints
-from jaxdn.commands.train import Log, fit, read_curve
+from jaxdn.commands.fit import fit
+from jaxdn.commands.log import Log, read_curve
 from jaxdn.denoiser import Denoiser
 from jaxdn.frame import RADIANCE_MAX
-from jaxdn.learning.step import clean, initial_state
-from tests import test_fit
+from jaxdn.learning.step import clip_loss, initial_state
+from jaxdn.repair import repair_image
+from tests.learning import test_fit
 from tests.learning.test_checkpoint import torn
+from tests.learning.test_training import make_clip
 
 clips = test_fit.clips
 
 
 def test_a_reference_is_bounded_as_what_it_is_compared_with():
     bad = jnp.asarray([np.nan, np.inf, -np.inf, -1.0, 1e30, 0.25], jnp.float32)
-    np.testing.assert_array_equal(clean(bad), [0, 0, 0, 0, RADIANCE_MAX, 0.25])
+    safe = repair_image(bad)
+    np.testing.assert_array_equal(safe, [0, 0, 0, 0, RADIANCE_MAX, 0.25])
+    clip = make_clip(0)
+    reference = clip.reference.copy()
+    reference.reshape(-1)[: bad.size] = bad
+    mended = clip._replace(reference=np.asarray(repair_image(reference)))
+    params, objective = {"gain": jnp.full((), 0.1)}, test_fit.RECIPE.objective
+    losses = [clip_loss(brighter(), params, each, objective)[0] for each in (clip._replace(reference=reference), mended)]
+    assert np.isfinite(losses[0])
+    assert losses[0] == losses[1]
 
 
 def brighter():
@@ -42,7 +54,8 @@ def run(clips, folder, recipe=test_fit.RECIPE, source=None, every=2):
     return fit(brighter(), recipe, batches, folder, label="t", log_every=1, checkpoint_every=every)
 
 
-@pytest.mark.parametrize(("rate", "kept"), [(1e30, 1), (np.inf, 0)])
+@pytest.mark.filterwarnings("ignore:overflow encountered in cast")  # 1e39 is infinite in single precision
+@pytest.mark.parametrize(("rate", "kept"), [(1e30, 1), (1e39, 0)])
 def test_a_rate_that_explodes_ends_with_what_to_change_and_finite_weights(clips, tmp_path, rate, kept):
     recipe = test_fit.RECIPE._replace(learning_rate=rate, decay=False)
     told = rf"nothing was learned in the updates {kept + 1} to {kept + 3}.*learning rate"
@@ -54,6 +67,12 @@ def test_a_rate_that_explodes_ends_with_what_to_change_and_finite_weights(clips,
         initial_state(brighter(), recipe, next(test_fit.batches(clips)))
     )
     assert np.isfinite(kept_state.params["gain"])
+
+
+def test_a_rate_that_no_json_can_keep_is_refused_before_anything_is_written(clips, tmp_path):
+    with pytest.raises(ValueError, match=r"recipe\.json"):
+        run(clips, tmp_path, test_fit.RECIPE._replace(learning_rate=np.inf))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_log_is_strict_json_whatever_the_loss(tmp_path):

@@ -52,12 +52,16 @@ def test_truncated_weights(saved):
 
 
 @pytest.mark.parametrize(
-    ("content", "told"), [(None, "beside it"), ("{", "beside it"), ('{"factory": "evil", "options": {}}', "'evil'")]
+    ("content", "told"), [
+        (None, "in the same folder"),
+        ("{", "in the same folder"),
+        ('{"factory": "evil", "options": {}}', "'evil'"),
+    ]
 )
 def test_bad_description(saved, content, told):
     path, _ = saved
-    beside = path.with_suffix(".json")
-    beside.unlink() if content is None else beside.write_text(content)
+    description = path.with_suffix(".json")
+    description.unlink() if content is None else description.write_text(content)
     with pytest.raises(ValueError, match=told):
         jaxdn.load_weights(path)
 

@@ -284,7 +284,7 @@ def test_a_mirror_commutes_with_svgf(seed, way):
 @settings(max_examples=8)
 @given(seed=seeds, power=st.integers(1, 12))
 def test_svgf_of_brighter_light_is_a_brighter_image(seed, power):
-    # Its two constants, 1e-10 beside the variance and 1e-4 beside the reach over edges, are in units of light.
+    # Its two constants, 1e-10 for the variance and 1e-4 for the reach over edges, are in units of light.
     frames = scene(seed)
     factor = np.float32(2.0**power)
     brighter = filtered(frames._replace(radiance=factor * frames.radiance)) / factor

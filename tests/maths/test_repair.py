@@ -1,11 +1,13 @@
-"""The repair of a frame: normals of any length, and the count of what was replaced."""
+"""The repair of a frame, by the kind of each buffer, and the count of what was replaced."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from jaxdn.frame import FAR, RADIANCE_MAX, Frame
+from jaxdn.frame import BUFFERS, FAR, RADIANCE_MAX, Frame
 from jaxdn.repair import repair
 
 repaired = jax.jit(repair)
@@ -66,3 +68,143 @@ def test_the_count_is_of_one_type_in_double_precision_too(x64):
     assert found.depth.dtype == jnp.float64
     assert count.dtype == jnp.int32
     assert count == 16
+
+
+SPECIAL = (np.nan, np.inf, -np.inf, -0.0, 0.0, 1e-37, -1e-37, 1.0, -1.0, 0.5, 1.5, 7e4, -7e4, 1e9, 2e9, 3e38, -3e38)
+NEUTRAL_ONE = {"albedo", "roughness", "reflectance"}
+"""Fractions that are 1 where nobody knows them; the others are 0."""
+BOUNDS = {
+    "light": (0, RADIANCE_MAX),
+    "signed": (-RADIANCE_MAX, RADIANCE_MAX),
+    "fraction": (0, 1),
+    "count": (0, np.inf),
+    "direction": (-1, 1),
+    "distance": (0, 1e9),
+}
+
+
+def numpy_repair(values, name):
+    """In float64: what comes out, and how many values had to be replaced."""
+    values, kind = np.asarray(values, np.float64), BUFFERS[name].kind
+    finite = np.isfinite(values)
+    if kind == "vector":
+        known = finite.all(axis=-1, keepdims=True)
+        return np.where(known, values, np.nan), np.sum(~known)
+    if kind == "direction":
+        length = np.linalg.norm(np.where(finite, values, 0), axis=-1, keepdims=True)
+        usable = finite.all(axis=-1, keepdims=True) & (np.abs(values).max(axis=-1, keepdims=True) > 1e-6)
+        return np.where(usable, values, 0) / np.where(usable, length, 1), np.sum(~finite)
+    low, high = BOUNDS[kind]
+    unknown = ~finite | ((values < 0) & (kind in ("light", "count", "distance")))
+    # The one that is infinite and still means something: a distance that is beyond all others.
+    instead = np.where(values == np.inf, 1e9 if kind == "distance" else 0, 0) + (kind == "fraction") * (
+        name in NEUTRAL_ONE
+    )
+    right = finite & (values >= low) & (values <= high)
+    return np.clip(np.where(unknown, instead, values), low, high), np.sum(~right)
+
+
+def spoilt(seed, name, dtype=np.float32):
+    """Values of all sizes with special ones in between."""
+    rng = np.random.default_rng([seed, *name.encode()])
+    shape = (6, 5, BUFFERS[name].channels)
+    values = rng.normal(size=shape) * 10.0 ** rng.integers(-3, 6, shape)
+    with np.errstate(over="ignore", under="ignore"):
+        return np.where(rng.random(shape) < 0.4, rng.choice(SPECIAL, shape), values).astype(dtype)
+
+
+def repaired_alone(name, values):
+    """One buffer repaired, and the count; radiance is sound unless it is the one."""
+    given = frame(6) if name == "radiance" else Frame(np.full((6, 5, 3), 0.5, np.float32))
+    found, count = repaired(given._replace(**{name: values}))
+    return np.asarray(getattr(found, name)), int(count)
+
+
+NUMBERS = [name for name, buffer in BUFFERS.items() if buffer.kind not in ("flag", "id")]
+
+
+def test_every_kind_is_tried():
+    assert {BUFFERS[name].kind for name in NUMBERS} == {*BOUNDS, "vector"}
+    assert {"luminance_gradient", "sample_count", "specular_reflectance"} <= set(NUMBERS)
+    fractions = {name for name in NUMBERS if BUFFERS[name].kind == "fraction"}
+    assert fractions - NEUTRAL_ONE == {"specular_reflectance"}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@given(seed=st.integers(0, 2**16))
+def test_repair_is_the_numpy_one(name, seed):
+    values = spoilt(seed, name)
+    found, count = repaired_alone(name, values)
+    expected, replaced = numpy_repair(values, name)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 if BUFFERS[name].kind == "direction" else 1e-37)
+    assert count == replaced
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+@given(seed=st.integers(0, 2**16))
+def test_what_is_repaired_is_in_bounds_and_stays_as_it_is(name, seed):
+    """Nothing is left to count, but vectors that are not finite: they say for good that there is no history."""
+    kind = BUFFERS[name].kind
+    found, count = repaired_alone(name, spoilt(seed, name))
+    again, recount = repaired_alone(name, found)
+    if kind == "direction":
+        np.testing.assert_allclose(again, found, atol=2e-7)
+        length = np.linalg.norm(found.astype(np.float64), axis=-1)
+        np.testing.assert_allclose(length[length > 0], 1, rtol=1e-6)
+    else:
+        np.testing.assert_array_equal(again, found)
+    if kind == "vector":
+        broken = np.isnan(found)
+        assert (broken[..., 0] == broken[..., 1]).all()
+        assert recount == count == broken[..., 0].sum()
+        return
+    low, high = BOUNDS[kind]
+    assert np.isfinite(found).all()
+    assert (found >= low - 1e-6 * (kind == "direction")).all()
+    assert (found <= high + 1e-6 * (kind == "direction")).all()
+    assert recount == 0
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_what_is_sound_stays_bit_for_bit_and_is_not_counted(name, rng):
+    kind, shape = BUFFERS[name].kind, (6, 5, BUFFERS[name].channels)
+    if kind == "direction":
+        values = rng.choice([0.0, 1.0, -1.0], (6, 5, 1)) * np.array([[[0.0, 1.0, 0.0]]])
+    else:
+        low = {"signed": -5, "vector": -5}.get(kind, 0)
+        values = rng.uniform(low, 1 if kind == "fraction" else 5, shape)
+        values[0, 0] = BOUNDS.get(kind, (0, 0))[0]
+    found, count = repaired_alone(name, values.astype(np.float32))
+    np.testing.assert_array_equal(found, values.astype(np.float32))
+    assert count == 0
+
+
+@pytest.mark.parametrize("dtype", [np.float16, jnp.bfloat16, np.int32])
+@pytest.mark.parametrize("name", ["radiance", "luminance_gradient", "sample_count", "albedo"])
+def test_narrow_numbers_are_widened(name, dtype, rng):
+    values = rng.integers(0, 2, (6, 5, BUFFERS[name].channels)).astype(dtype)
+    found, count = repaired_alone(name, values)
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, values.astype(np.float32))
+    assert count == 0
+
+
+def test_flags_and_ids_are_as_they_were(rng):
+    ids, visible = rng.integers(-5, 2**24, (4, 4, 1)).astype(np.int32), rng.random((4, 4, 1)) < 0.5
+    found, count = repaired(frame(ids=ids, visible=visible))
+    np.testing.assert_array_equal(found.ids, ids)
+    np.testing.assert_array_equal(found.visible, visible)
+    assert (found.ids.dtype, found.visible.dtype, int(count)) == (jnp.int32, jnp.bool_, 0)
+
+
+def test_gradients_through_the_repair_are_finite_and_zero_where_it_replaced():
+    for name in NUMBERS:
+        values = jnp.asarray(spoilt(0, name))
+        sound = Frame(jnp.full((6, 5, 3), 0.5))
+
+        def total(values, name=name, sound=sound):
+            return jnp.nansum(getattr(repair(sound._replace(**{name: values}))[0], name))
+
+        slope = np.asarray(jax.jit(jax.grad(total))(values))
+        assert np.isfinite(slope).all(), name
+        assert not slope[~np.isfinite(values)].any(), name

@@ -1,6 +1,6 @@
 """Thousands of frames: the recurrent state stays bounded, does not drift, and forgets one poisoned frame.
 
-python -m pytest tests/test_long_runs.py -m slow -s        # prints the curves' figures
+python -m pytest tests/methods/test_long_runs.py -m slow -s        # prints the curves' figures
 """
 
 import functools
@@ -11,20 +11,21 @@ import numpy as np
 import pytest
 from jax import lax
 
-import jaxdn
+from jaxdn.candidates import candidate, filters
 from jaxdn.frame import RADIANCE_MAX, Frame
+from jaxdn.methods.table import methods
+from jaxdn.weights import shipped_names
 
 SIZE = 32
 LONG, SHORT = 2000, 240
-METHODS = ["svgf", "ntd-small"]
-FORGETS = {"svgf": 120, "ntd-small": 80}
-"""Frames after which a poisoned frame has to be forgotten, to 1 % of the clean run."""
+LIGHTEST = [list(method.variants)[-1] for method in methods().values() if method.variants]
+METHODS = [*filters(), *(name for name in LIGHTEST if name in shipped_names())]
+FORGETS = {"ntd-small": 80}
+"""Frames after which a poisoned frame has to be forgotten, to 1 % of the clean run; 120 for all others."""
 
 
-def method(name):
-    if name in jaxdn.denoisers.NAMES:
-        return getattr(jaxdn.denoisers, name)(), {}
-    return jaxdn.load_weights(name)
+def test_filters_and_the_lightest_weights_are_put_to_the_test():
+    assert {"svgf", "ntd-small"} <= set(METHODS)
 
 
 def wall():
@@ -44,7 +45,7 @@ def wall():
 @functools.cache
 def compiled(name, frames):
     """A run of so many frames over a wall, before which the camera slides there and back for ever."""
-    denoiser, params = method(name)
+    _, denoiser, params, *_ = candidate(name)
     base = jax.tree.map(jnp.asarray, wall())
 
     def body(settings, state, index):
@@ -99,7 +100,7 @@ def test_one_poisoned_frame_is_forgotten(name, poison):
     recovered = int(bad.max()) + 1 - at if bad.size else 0
     print(f"{name}: {poison:g} forgotten to 1 % after {recovered} frames")
     assert np.array_equal(spoilt[3][:at], clean[3][:at])
-    assert recovered <= FORGETS[name]
+    assert recovered <= FORGETS.get(name, 120)
 
 
 @pytest.mark.slow

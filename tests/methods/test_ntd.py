@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.denoiser import Denoiser
+from jaxdn.denoiser import Denoiser, Recurrent
 from jaxdn.frame import FAR, Frame, frame_at
-from jaxdn.methods.ntd import State, depth_feature, ntd
+from jaxdn.methods.ntd import depth_feature, ntd
 from jaxdn.rollout import unroll
 from tests.plainly import jit_plainly
 
@@ -108,7 +108,7 @@ def test_data_flow_with_known_heads(options: dict[str, Any], rng: np.random.Gene
     assert [len(head) for head in heads] == ([52, 26, 25] if fine else [51, 26, 26])
     for level, head in enumerate(heads):
         params[f"head_{level}"]["bias"] = jnp.asarray(head, jnp.float32)
-    state = State(jnp.asarray(history, jnp.float32), jnp.asarray(3), jnp.asarray(0))
+    state = Recurrent(jnp.asarray(history, jnp.float32), jnp.asarray(3), jnp.asarray(0))
     after, image = jax.jit(denoiser.step)(params, state, frame)
 
     pyramid = options.get("pyramid", "mean")
@@ -122,7 +122,7 @@ def test_data_flow_with_known_heads(options: dict[str, Any], rng: np.random.Gene
     current = sigmoid(heads[0][50])
     wanted = np.maximum(current * coarse + (1 - current) * temporal, 0)
     np.testing.assert_allclose(image, wanted, atol=1e-5)
-    np.testing.assert_array_equal(after.history, image)
+    np.testing.assert_array_equal(after.core, image)
     assert after.age == 4
 
 
@@ -144,7 +144,7 @@ def test_alpha_weighs_the_current_frame_and_missing_history_is_not_used(
     step = jax.jit(denoiser.step)
 
     def image(logit: float, level: float) -> np.ndarray:
-        state = State(jnp.full((16, 16, 3), level), jnp.asarray(1), jnp.asarray(0))
+        state = Recurrent(jnp.full((16, 16, 3), level), jnp.asarray(1), jnp.asarray(0))
         return np.asarray(step(blending(params, logit), state, frame)[1])
 
     # A history of 1000 against a noise of about 1: where it is used, it shows.
@@ -238,7 +238,7 @@ def test_first_frame_uses_no_history_and_no_motion(
     step = jax.jit(denoiser.step)
     start = denoiser.start(params, frame)
     _, image = step(params, start, frame)
-    poisoned = start._replace(history=jnp.full_like(start.history, jnp.nan))
+    poisoned = start._replace(core=jnp.full_like(start.core, jnp.nan))
     elsewhere = frame._replace(motion=3 * frame.motion, dual_motion=jnp.full_like(frame.motion, 7.3))
     np.testing.assert_array_equal(step(params, poisoned, elsewhere)[1], image)
 
@@ -264,10 +264,10 @@ def test_poison_stays_finite_and_is_counted(rng: np.random.Generator, key: jax.A
     state, image = step(params, denoiser.start(params, broken), broken)
     assert state.repaired == 3
     assert np.all(np.isfinite(image))
-    state = state._replace(history=state.history.at[2, 2].set(jnp.nan).at[3, 3].set(jnp.inf))
+    state = state._replace(core=state.core.at[2, 2].set(jnp.nan).at[3, 3].set(jnp.inf))
     state, image = step(params, state, first)
     assert np.all(np.isfinite(image))
-    assert np.all(np.isfinite(state.history))
+    assert np.all(np.isfinite(state.core))
     assert image.max() <= 65504
 
 

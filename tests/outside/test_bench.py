@@ -18,7 +18,7 @@ PROBE = roofline.Probe(lambda: time.sleep(1e-3), 1e7, lambda: time.sleep(1e-3), 
 KEYS = ["work", "implementation", "median_ms", "min_ms", "max_ms", "peak_mib", "against", "ratio"]
 
 
-def test_calls_are_timed_in_turns():
+def test_calls_are_timed_interleaved():
     order = []
     timings = measure({name: lambda name=name: order.append(name) for name in "ab"}, rounds=3)
     assert order == list("ab" * 4)

@@ -5,17 +5,29 @@ import math
 import re
 import subprocess
 import sys
+from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.speed.chart.breakdown import WHOLE, breakdown, subjects
 from experiments.speed.chart.energy import find_meter
-from experiments.speed.chart.methods import methods
 from experiments.speed.chart.page import page
 from experiments.speed.chart.render_cost import Cost, fit
 from experiments.speed.chart.scores import MEASURES
 from experiments.speed.chart.store import Store, point_key
 from experiments.speed.chart.summary import RENDERER, Point, equal_quality, equal_samples, front_table, pareto, points
+from experiments.speed.chart.way import way
+from experiments.speed.chart.ways import chosen, left_out, registered, ways
+from experiments.speed.works import scene
+from jaxdn.candidates import Candidate, untrained
+from jaxdn.denoiser import Core, recurrent
+from jaxdn.frame import Clip, frame_at
+from jaxdn.methods import table
+from jaxdn.methods.table import method, method_named, methods
+from jaxdn.networks.engines import ENGINES
+from jaxdn.rollout import denoise
 
 SIZE, OWN = "1280x720", "64x64"
 PSNR = MEASURES[0]
@@ -84,10 +96,10 @@ def test_the_front_is_what_nothing_else_beats(rng):
         point(f"m{index}", 1, float(psnr), float(ms)) for index, (psnr, ms) in enumerate(rng.uniform(1, 40, (60, 2)))
     ]
     front = pareto(cloud, PSNR, SIZE, render=True)
-    for candidate in cloud:
-        time, psnr = candidate.milliseconds(SIZE, render=True), candidate.errors["psnr"]
+    for each in cloud:
+        time, psnr = each.milliseconds(SIZE, render=True), each.errors["psnr"]
         beaten = any(other.milliseconds(SIZE, render=True) <= time and other.errors["psnr"] > psnr for other in cloud)
-        assert (candidate in front) == (not beaten)
+        assert (each in front) == (not beaten)
     assert [each.milliseconds(SIZE, render=True) for each in front] == sorted(
         each.milliseconds(SIZE, render=True) for each in front
     )
@@ -157,16 +169,99 @@ def test_energy_counters_wrap(tmp_path):
     assert find_meter(tmp_path).joules(lambda: (zone / "energy_uj").write_text("1500000\n")) == pytest.approx(2.5)
 
 
-def test_every_registered_method_is_there_with_its_variants():
-    listed = methods()
-    found = {method.name: method for method in listed}
+@pytest.fixture(scope="module")
+def denoisers():
+    return chosen()
+
+
+def test_every_registered_method_is_there_with_its_variants(denoisers):
+    listed = ways(denoisers)
+    found = {each.name: each for each in listed}
     assert len(found) == len(listed)
     for name in ("svgf", "ntd-large", "ntd-small"):
         assert found[name].images is not None
         assert f"{name}, not demodulated" in found
+        assert found[f"{name}, effects all"].images is not None
         assert found[f"{name}, still scene"].images is None
+        assert found[name].guides == "motion"
     assert "ntd-large, bfloat16" in found
+    assert ("ntd-large, onnxruntime" in found) == ENGINES["onnxruntime"].available()
     assert found["ntd tiny"].images is None
+    assert {each.method.name for each in denoisers} == set(methods())
+
+
+def test_quickly_the_fastest_of_each_method_is_measured():
+    found = [each.name for each in ways(chosen(quick=True), quick=True)]
+    assert {"svgf", "ntd-small"} <= set(found)
+    assert "ntd-large" not in found
+    assert not [name for name in found if "," in name]
+
+
+def entered(monkeypatch, factory, name, **columns):
+    """A method in the table for the length of a test."""
+    monkeypatch.setattr(table, "_METHODS", dict(table._METHODS))
+    factory.__name__ = name
+    return method(NoOptions, title=name, **columns)(factory)
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """None."""
+
+
+def mean_of_two(samples=None):
+    """A denoiser that averages with the frame before, times a gain."""
+
+    def step(params, state, frame, first):
+        image = params["gain"] * jnp.where(first, frame.radiance, 0.5 * (frame.radiance + state))
+        return image, image, 0
+
+    def init(key, frame):
+        return {"gain": jnp.ones(())}
+
+    return recurrent(Core(lambda params, frame: frame.radiance, step, frozenset(), init, samples))
+
+
+def test_a_newcomer_without_weights_is_timed_alone(monkeypatch):
+    recipe = method_named("ntd").recipe_named(None)
+    entered(monkeypatch, lambda options: mean_of_two(), "newcomer", recipes={"usual": recipe})
+    denoisers = [each for each in chosen() if each.label == "newcomer"]
+    found = {each.name: each for each in registered(denoisers)}
+    assert set(found) == {"newcomer", "newcomer, effects all", "newcomer, still scene"}
+    assert all(each.images is None and each.guides == "none" for each in found.values())
+    frame = frame_at(scene.clip(1, 16, 32).frames, 0)
+    np.testing.assert_array_equal(found["newcomer"].timed(frame)(), frame.radiance)
+    assert list(subjects(denoisers)) == []
+
+
+def test_images_are_those_of_a_clip_that_begins_anew():
+    """The same frames twice through one way: nothing of the first run is left in the second."""
+    denoiser = mean_of_two()
+    frames = scene.clip(3, 16, 32).frames
+    images = way(Candidate("newcomer", denoiser, {"gain": jnp.ones(())})).images
+    found = images(frames)
+    np.testing.assert_allclose(found, denoise(denoiser, {"gain": 1.0}, Clip(frames)), rtol=1e-6)
+    np.testing.assert_array_equal(images(frames), found)
+
+
+def test_what_asks_for_samples_is_left_out_in_a_sentence(monkeypatch):
+    def samples(params, state, frame):
+        return jnp.ones_like(frame.radiance[..., :1])
+
+    entered(monkeypatch, lambda options: mean_of_two(samples), "sampler")
+    assert not [each for each in chosen() if each.label == "sampler"]
+    assert [sentence for sentence in left_out() if sentence.startswith("sampler asks the renderer for samples")]
+
+
+def test_steps_with_known_parts_are_taken_apart(denoisers):
+    names = [subject.name for subject in subjects(denoisers, quick=True)]
+    assert names == ["ntd-large, reference", "ntd-small, reference"]
+    tiny = {"size": ((4,), (4,), (5,), (5,), (6,))}
+    assert not list(subjects([untrained(method_named("ntd"), **tiny, domain="compressed")]))
+    subject = next(subjects([untrained(method_named("ntd"), **tiny)]))
+    parts = breakdown(subject, frame_at(scene.clip(2, 16, 32).frames, 1), rounds=2)
+    assert list(parts)[-1] == WHOLE
+    assert len(parts) == 5
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -10,31 +11,26 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.clips import ClipError
+from jaxdn.clips.evidence import read_facts
 from jaxdn.clips.exr import to_half
 from jaxdn.clips.import_exr import convert_motion
-from jaxdn.frame import FAR, Clip, Frame
+from jaxdn.frame import BUFFERS, FAR, Clip, Frame
 
-HALF = ("radiance", "albedo", "normal", "roughness", "direct", "emission")
+HALF = tuple(name for name, row in BUFFERS.items() if row.stored == "half")
+
+
+def make_buffer(rng: np.random.Generator, name: str, height: int, width: int) -> np.ndarray:
+    """Random numbers as the kind of a buffer has them; too large for half precision where single is stored."""
+    row = BUFFERS[name]
+    image = rng.random((height, width, row.channels), np.float32)
+    if row.stored in ("flag", "id"):
+        return image > 0.5 if row.stored == "flag" else (9 * image - 1).astype(np.int32)
+    scale, offset = {"light": (10, 0), "direction": (2, -1), "fraction": (1, 0)}.get(row.kind, (2e5, -1e5))
+    return np.float32(scale) * image + np.float32(offset)
 
 
 def make_frame(rng: np.random.Generator, height: int, width: int) -> Frame:
-    def light(channels: int = 3) -> np.ndarray:
-        return rng.random((height, width, channels), np.float32)
-
-    return Frame(
-        radiance=10 * light(),
-        albedo=light(),
-        normal=2 * light() - 1,
-        depth=light(1) * 100,
-        roughness=light(1),
-        motion=50 * light(2) - 25,
-        dual_motion=50 * light(2) - 25,
-        visible=light(1) > 0.5,
-        previous_depth=light(1) * 100,
-        ids=rng.integers(-1, 9, (height, width, 1), np.int32),
-        direct=light(),
-        emission=light(),
-    )
+    return Frame(**{name: make_buffer(rng, name, height, width) for name in BUFFERS})
 
 
 def make_clip(rng: np.random.Generator, count: int = 3, height: int = 5, width: int = 7) -> Clip:
@@ -55,7 +51,22 @@ def test_every_buffer_comes_back(tmp_path: Path, rng: np.random.Generator, size:
         np.testing.assert_array_equal(found, expected, err_msg=name)
     np.testing.assert_array_equal(stored.reference, frame.direct.astype(np.float16))
     np.testing.assert_array_equal(stored.reference_half, frame.emission.astype(np.float16))
-    assert [file.name for file in tmp_path.iterdir()] == ["a.exr"]  # nothing is left beside it
+    assert [file.name for file in tmp_path.iterdir()] == ["a.exr"]  # and nothing else is left
+
+
+def test_the_channels_of_the_first_version_are_what_they_were(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Clips that were written before there was a table of buffers stay readable, and their readers too."""
+    half = [*rgb("albedo"), *rgb("normal", "XYZ"), "roughness.Y", "visible.Y", *rgb("direct"), *rgb("emission")]
+    half += [*rgb("noisy_1spp"), *rgb("reference")]
+    single = ["depth.Z", "previous_depth.Z", *rgb("motion", "XY"), *rgb("dual_motion", "XY")]
+    types = dict.fromkeys(half, np.float16) | dict.fromkeys(single, np.float32) | {"ids.Y": np.uint32}
+    names = {name.partition(".")[0] for name in types} & set(BUFFERS)
+    frame = make_frame(rng, 3, 4)
+    first = Frame(frame.radiance, **{name: getattr(frame, name) for name in names})
+    clips.write_frame(tmp_path / "a.exr", first, reference=frame.direct)
+    found = clips.read_exr(tmp_path / "a.exr")
+    assert {name: pixels.dtype for name, pixels in found.items()} == types
+    np.testing.assert_array_equal(found["ids.Y"], frame.ids[..., 0] + 1)
 
 
 def test_absent_buffers_stay_absent(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -237,7 +248,7 @@ def test_broken_clips_are_refused_with_the_reason(tmp_path: Path, rng: np.random
         (folder / "clip.json").write_text(text)
         with pytest.raises(ClipError, match=r"clip\.json: "):
             clips.read_clip(folder)
-    clips.write_record(record, folder)
+    clips.finish_record(record, folder)
     clips.write_frame(folder / "frame_0002.exr", make_frame(rng, 6, 7))
     with pytest.raises(ClipError, match=r"frame_0002\.exr: expected 7 x 5 pixels as clip\.json says, got 7 x 6"):
         clips.read_clip(folder)
@@ -255,9 +266,69 @@ def test_broken_clips_are_refused_with_the_reason(tmp_path: Path, rng: np.random
 
 def test_a_record_that_is_no_json_is_refused(tmp_path: Path, rng: np.random.Generator) -> None:
     for value in (float("nan"), np.zeros(3), {1, 2}):
-        with pytest.raises(ClipError, match="cannot be written as JSON"):
+        with pytest.raises(ValueError, match="cannot be written as JSON"):
             clips.write_clip(make_clip(rng, 1), tmp_path / "c", record={"value": value})
         assert not clips.is_clip(tmp_path / "c")
+
+
+def test_a_refused_record_leaves_the_clip_that_is_there(tmp_path: Path, rng: np.random.Generator) -> None:
+    clips.write_clip(make_clip(rng, 2), tmp_path / "c")
+    with pytest.raises(ValueError, match="cannot be written as JSON"):
+        clips.write_clip(make_clip(rng, 1), tmp_path / "c", record={"value": float("nan")})
+    assert clips.read_clip(tmp_path / "c").frames.radiance.shape[0] == 2
+
+
+def test_a_clip_counts_as_one_when_its_last_frame_is_written(tmp_path: Path, rng: np.random.Generator) -> None:
+    folder = tmp_path / "made" / "c"
+    record = {"frames": 1, "width": 7, "height": 5, "layers": [1], "seed": 4}
+    assert clips.begun_record(folder) is None
+    clips.begin_record(record, folder)
+    clips.write_frame(clips.frame_path(folder, 0), make_frame(rng, 5, 7))
+    assert not clips.is_clip(folder)
+    assert clips.begun_record(folder) == {"format": 1, **record}
+    for read in (clips.read_clip, clips.read_record, read_facts):
+        with pytest.raises(ClipError, match="c: rendering this clip was interrupted; run the same command again"):
+            read(folder)
+    clips.finish_record(record, folder)
+    assert clips.read_record(folder) == clips.begun_record(folder) == {"format": 1, **record}
+    assert sorted(file.name for file in folder.iterdir()) == ["clip.json", "frame_0000.exr"]
+    # More frames are added: until they are there it is no clip.
+    clips.begin_record({**record, "frames": 2}, folder)
+    assert not clips.is_clip(folder)
+    assert clips.begun_record(folder)["frames"] == 2
+    # A rendering that was ended between the two steps of the end has a finished clip.
+    clips.finish_record(record, folder)
+    (folder / "clip.unfinished.json").write_text("{")
+    assert clips.is_clip(folder)
+    assert clips.begun_record(folder)["frames"] == 1
+    (folder / "clip.json").unlink()
+    with pytest.raises(ClipError, match=r"clip\.unfinished\.json: not readable"):
+        clips.begun_record(folder)
+
+
+def test_a_record_that_is_refused_changes_nothing(tmp_path: Path, rng: np.random.Generator) -> None:
+    clips.write_clip(make_clip(rng, 1), tmp_path / "c")
+    before = {file.name: file.read_bytes() for file in (tmp_path / "c").iterdir()}
+    record = clips.read_record(tmp_path / "c")
+    for begin_or_finish in (clips.begin_record, clips.finish_record):
+        with pytest.raises(ClipError, match="frames: expected"):
+            begin_or_finish({**record, "frames": 0}, tmp_path / "c")
+        with pytest.raises(ValueError, match="cannot be written as JSON"):
+            begin_or_finish({**record, "seed": float("inf")}, tmp_path / "c")
+        assert {file.name: file.read_bytes() for file in (tmp_path / "c").iterdir()} == before
+
+
+def test_a_clip_whose_writing_is_interrupted_is_none(tmp_path: Path, rng: np.random.Generator, monkeypatch) -> None:
+    clips.write_clip(make_clip(rng, 2), tmp_path / "c")
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxdn.clips.folder.write_frame", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        clips.write_clip(make_clip(rng, 3), tmp_path / "c")
+    assert not clips.is_clip(tmp_path / "c")
+    assert clips.begun_record(tmp_path / "c")["frames"] == 3
 
 
 def write_plain(path: Path, names: list[str], rng: np.random.Generator, size: tuple[int, int] = (4, 6)) -> None:
@@ -306,19 +377,21 @@ def test_channels_that_fit_twice_or_not_at_all_are_asked_about() -> None:
     twice = [*rgb("Left.Combined"), *rgb("Right.Combined")]
     with pytest.raises(ClipError, match=r"'Left\.Combined' and 'Right\.Combined' fit equally well"):
         clips.detect_channels(twice)
-    assert clips.detect_channels(twice, layers={"radiance": "Right.Combined"})["radiance"][0] == "Right.Combined.R"
-    with pytest.raises(ClipError, match="no radiance among the channels"):
+    with pytest.raises(ClipError, match=r"channels=\{'radiance': LAYER\} \(jaxdn denoise --channels radiance=LAYER\)"):
+        clips.detect_channels(twice)
+    assert clips.detect_channels(twice, channels={"radiance": "Right.Combined"})["radiance"][0] == "Right.Combined.R"
+    with pytest.raises(ClipError, match=r"no radiance among the channels.*--channels radiance=LAYER"):
         clips.detect_channels(["specular.R", "specular.G", "specular.B"])
     with pytest.raises(ClipError, match="no radiance in layer 'Left'"):
-        clips.detect_channels(twice, layers={"radiance": "Left"})
-    with pytest.raises(ClipError, match="layers: expected names among"):
-        clips.detect_channels(twice, layers={"colour": "Left.Combined"})
+        clips.detect_channels(twice, channels={"radiance": "Left"})
+    with pytest.raises(ClipError, match="channels: expected buffers among"):
+        clips.detect_channels(twice, channels={"colour": "Left.Combined"})
 
 
 def test_foreign_motion_needs_a_convention(tmp_path: Path, rng: np.random.Generator) -> None:
     write_plain(tmp_path / "shot_0008.exr", [*rgb(""), "motion.X", "motion.Y"], rng)
     write_plain(tmp_path / "shot_0009.exr", [*rgb(""), "motion.X", "motion.Y"], rng)
-    with pytest.raises(ClipError, match=r"state motion_convention.*'previous-current'.*'cycles'"):
+    with pytest.raises(ClipError, match=r"motion_convention \(jaxdn denoise --motion-convention\).*'cycles'"):
         clips.read_clip(tmp_path)
     with pytest.raises(ClipError, match="got 'sideways'"):
         clips.read_clip(tmp_path, motion_convention="sideways")
@@ -363,6 +436,43 @@ def test_blender_sequences_need_nothing_said(tmp_path: Path, rng: np.random.Gene
     assert clips.read_clip(tmp_path).frames.ids is None
 
 
+@pytest.mark.parametrize("shown", [0, 1])
+def test_ids_are_kept_if_the_first_frame_has_some(tmp_path: Path, rng: np.random.Generator, shown: int) -> None:
+    for index in range(2):
+        ids = np.full((4, 6), index == shown, np.float32)
+        light = {name: rng.random((4, 6), np.float32) for name in "RGB"}
+        clips.write_exr(tmp_path / f"a{index}.exr", {**light, "ids.Y": ids})
+    found = clips.read_clip(tmp_path).frames.ids
+    if shown == 1:
+        assert found is None
+    else:
+        np.testing.assert_array_equal(found[:, 0, 0, 0], [0, -1])
+
+
+def test_foreign_frames_are_read_one_at_a_time(tmp_path: Path, rng: np.random.Generator, monkeypatch) -> None:
+    for index in range(5):
+        write_plain(tmp_path / f"a{index}.exr", [*rgb(""), *rgb("Albedo"), *rgb("motion", "XY")], rng)
+    read: list[Path] = []
+
+    def counted(path: Path) -> dict[str, np.ndarray]:
+        read.append(path)
+        return clips.read_exr(path)
+
+    monkeypatch.setattr("jaxdn.clips.import_exr.read_exr", counted)
+    files, frames = clips.plain_frames(tmp_path, motion_convention="uv", channels={"albedo": "Albedo"})
+    assert [file.name for file in files] == [f"a{index}.exr" for index in range(5)]
+    assert not read
+    alive: list[weakref.ref] = []
+    for count, frame in enumerate(frames, start=1):
+        assert read == files[:count]
+        alive.append(weakref.ref(frame.radiance))
+        del frame
+        # The frame that was given last, and no other; the first leaves its size and the names of its buffers.
+        assert sum(reference() is not None for reference in alive) <= 1
+    assert len(read) == 5
+    assert len(read_facts(tmp_path).moments) == 5  # which way vectors point does not matter for whether anything moves
+
+
 def test_foreign_sequences_that_do_not_make_one_clip(tmp_path: Path, rng: np.random.Generator) -> None:
     write_plain(tmp_path / "a_01.exr", rgb(""), rng)
     write_plain(tmp_path / "a_03.exr", rgb(""), rng)
@@ -379,6 +489,8 @@ def test_foreign_sequences_that_do_not_make_one_clip(tmp_path: Path, rng: np.ran
         clips.read_clip(tmp_path)
     with pytest.raises(ClipError, match="expected spp 1, got 2"):
         clips.read_clip(tmp_path, spp=2)
+    with pytest.raises(ClipError, match=r"expected independent noisy layers .* got none"):
+        clips.read_clip(tmp_path / "a_01.exr", layers=True)
     write_plain(tmp_path / "beauty.exr", rgb(""), rng)
     with pytest.raises(ClipError, match="ends in a frame number"):
         clips.read_clip(tmp_path)

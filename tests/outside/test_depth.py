@@ -3,7 +3,7 @@
 import pytest
 
 from jaxdn.render.depth import measure_depth
-from jaxdn.render.scene_facts import open_scene
+from jaxdn.render.opening import open_scene
 
 
 def furnace(reflectance, max_depth=30):
@@ -36,7 +36,7 @@ def test_a_wider_bound_is_a_shorter_path():
     assert [measure_depth(furnace(0.5), bound=bound).max_depth for bound in (0.3, 0.1, 0.03, 0.01)] == [3, 5, 8, 8]
 
 
-def test_the_scene_limits_the_length_and_what_is_missing_is_told():
+def test_the_scene_limits_the_length_and_what_is_missing_is_known():
     found = measure_depth(furnace(0.8, max_depth=5), bound=0.01)
     assert found.max_depth == 5
     assert found.remaining == pytest.approx(0.8**4, rel=0.25)

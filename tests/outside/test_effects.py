@@ -1,9 +1,11 @@
 """Effects are found exactly, planned as data, and what a scene lacks is neither rendered nor stored nor compiled."""
 
+import ast
 import dataclasses
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +13,12 @@ import pytest
 import jaxdn
 from experiments.speed.small_rooms import CASES, FRAMES
 from jaxdn import effects
-from jaxdn.effects import EFFECTS, Facts, Light, Moment, Surface
-from jaxdn.frame import Frame
+from jaxdn.commands import inspect as command
+from jaxdn.effects import EFFECTS, Effect, Effects, Facts, Light, Moment, Surface
+from jaxdn.frame import BUFFERS, Frame
 
 SIZE = {"width": 24, "height": 16}
+PLANNING = Path(effects.__file__).parent / "planning"
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -78,33 +82,73 @@ def test_what_is_uncertain_counts_as_present():
 
 
 def test_a_new_effect_needs_no_change_of_the_planner(monkeypatch):
-    # A later method reads a buffer that moving shadows produce: the planner takes it from the data.
-    taught = tuple(
-        effect._replace(buffers=effect.buffers | {"ids", "gradient"}) if effect.name == "moving-shadow" else effect
-        for effect in EFFECTS
+    # A later method reads a buffer that an effect produces; the planner takes that, and what it costs, from the data.
+    glow = Effect(
+        "fluorescence",
+        "Light comes back in another colour.",
+        lambda facts, moment: "",
+        frozenset({"luminance_gradient"}),
+        depth=3,
+        integrator="spectral",
     )
-    monkeypatch.setattr(effects.planning, "EFFECTS", taught)
-    found = effects.chosen(["moving-shadow"], 2)
-    reader = jaxdn.denoisers.svgf()._replace(reads=frozenset({"gradient"}))
-    assert effects.plan(found, reader).gradient_samples
-    assert not effects.plan(found, jaxdn.denoisers.svgf()).gradient_samples
+    monkeypatch.setattr("jaxdn.planning.plan.EFFECTS", (*EFFECTS, glow))
+    found = Effects(("fluorescence",), {}, {}, (frozenset({"fluorescence"}),), (0,), max_depth=9)
+    reader = jaxdn.denoisers.svgf()._replace(reads=frozenset({"luminance_gradient"}))
+    made = effects.plan(found, reader)
+    assert (made.buffers, made.indirect, made.max_depth, made.integrator) == (
+        ("direct", "luminance_gradient"), True, 9, "spectral"
+    )  # fmt: skip
+    assert "luminance_gradient" not in effects.plan(found, jaxdn.denoisers.svgf()).buffers
+
+
+def test_the_planner_names_no_effect():
+    names = {effect.name for effect in EFFECTS}
+    for file in ("plan.py", "found.py"):
+        tree = ast.parse((PLANNING / file).read_text())
+        texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
+        # "emission" is an effect, and a buffer that is added to every image.
+        assert texts & names <= {"emission"}, file
+
+
+def test_planning_looks_at_nothing_above_it():
+    code = (
+        "import sys; import jaxdn.planning.plan, jaxdn.planning.found; "
+        "print([name for name in sys.modules if name.startswith(('jaxdn.clips', 'jaxdn.render'))])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    rooms = [*PLANNING.glob("*.py"), PLANNING.parent / "effects.py", *(PLANNING.parent / "render").rglob("*.py")]
+    for path in rooms:
+        if path.name != "__init__.py":  # the front doors load their names when they are asked for
+            assert 'import_module("jaxdn' not in path.read_text(), path
 
 
 def test_a_plan_is_what_the_scene_has_and_the_denoiser_reads():
     found = effects.chosen(["camera-motion", "disocclusion", "glossy", "indirect"], 3)
     svgf, ntd = jaxdn.denoisers.svgf(), jaxdn.denoisers.ntd(size="small")
-    assert effects.plan(found, svgf).motion == "traditional"
-    assert effects.plan(found, ntd).motion == "dual"
+    assert command.motion(effects.plan(found, svgf)) == "traditional"
+    assert command.motion(effects.plan(found, ntd)) == "dual"
     assert "roughness" not in effects.plan(found, svgf).buffers
     assert "roughness" in effects.plan(found).buffers
     assert set(effects.plan(found, ntd).buffers) <= ntd.reads | {"direct", "emission"}
 
 
 def test_a_plan_survives_its_record():
-    made = effects.plan(effects.chosen(["glossy", "indirect"], 3), max_depth=5, bound=0.01, remaining=0.002)
+    made = effects.plan(effects.chosen(["glossy", "indirect"], 3), max_depth=5)
     assert effects.plan_from_record(json.loads(json.dumps(made.record()))) == made
-    with pytest.raises(ValueError, match="expected the entries"):
+    with pytest.raises(ValueError, match=r"expected the entries .* missing: .*held"):
         effects.plan_from_record({"integrator": "path"})
+
+
+def test_a_plan_of_an_earlier_version_is_read():
+    made = effects.plan(effects.chosen(["glossy", "indirect"], 3), max_depth=5)
+    earlier = {"bound": 0.01, "remaining": 0.002, "motion": "none", "lobes_apart": False, "gradient_samples": False}
+    assert effects.plan_from_record(made.record() | earlier | {"demodulation": "none"}) == made
+
+
+def test_every_entry_of_a_plan_is_obeyed():
+    # What is only for people to read follows from these, and is said by `jaxdn inspect`.
+    assert set(effects.Plan._fields) == {"integrator", "max_depth", "indirect", "effects", "frames", "held"}
 
 
 def test_unknown_effects_are_refused_with_those_there_are():
@@ -123,7 +167,24 @@ def test_every_effect_says_what_it_is():
     for effect in EFFECTS:
         assert effect.sentence.endswith(".")
         assert effect.buffers <= set(Frame._fields)
-        assert bool(effect.neutral) == bool(effect.buffers)
+
+
+def test_what_is_left_out_is_counted_against_what_is_rendered_without_a_plan():
+    nothing = effects.plan(effects.chosen([], 1))
+    assert command.bytes_a_pixel(command.EVERYTHING) == 74
+    assert set(command.left_out(nothing)) == {name for effect in EFFECTS for name in effect.buffers}
+    assert command.bytes_a_pixel(nothing) == 18 + sum(BUFFERS[name].bytes for name in nothing.buffers)
+    assert command.channels(("normal", "ids")) == ["normal.X", "normal.Y", "normal.Z", "ids.Y"]
+
+
+@pytest.mark.parametrize("name", ["svgf", "ntd", "ntd-small"])
+def test_a_plan_is_made_for_a_method_with_or_without_weights(name):
+    assert command.denoiser_named(name).reads
+
+
+def test_a_method_that_there_is_not_is_refused():
+    with pytest.raises(ValueError, match="magic"):
+        command.denoiser_named("magic")
 
 
 def test_json_is_all_that_is_printed(tmp_path):
@@ -138,6 +199,8 @@ def test_json_is_all_that_is_printed(tmp_path):
     assert set(said) == {"effects", "plan", "uncertain"}
     assert set(said["effects"]) == {"indirect", "glossy"}
     assert said["plan"]["motion"] == "none"
+    assert 0 < said["plan"]["remaining"] < 1
+    assert len(said["plan"]["buffers"]) + said["plan"]["buffers_left_out"] == 11
     assert said["uncertain"] == []
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from jaxdn.render.families import FAMILIES, family_scene, shapes, textures
 from jaxdn.render.families.staging import Stage, look_at, rod, shuttle, turn
-from jaxdn.render.scene import AnimatedScene, scene_from_record
+from jaxdn.render.opening import scene_from_record
+from jaxdn.render.scene import AnimatedScene
 
 NAMES = sorted(FAMILIES)
 SEEDS = (0, 1, 7)
@@ -126,7 +127,7 @@ def test_about_a_third_of_the_lamps_shine_upwards() -> None:
     assert {"up", "down", "window"} == set(lamps)
 
 
-def test_wrong_names_are_told_what_there_is() -> None:
+def test_wrong_names_raise_with_what_there_is() -> None:
     with pytest.raises(ValueError, match="expected one of"):
         family_scene("vegetables", 0)
     with pytest.raises(ValueError, match="lamp"):

@@ -14,10 +14,10 @@ def source(tmp_path_factory):
 
 @pytest.mark.parametrize("kind", ["exr", *(pytest.param(kind, marks=pytest.mark.slow) for kind in fuzz.KINDS[1:])])
 def test_broken_files_are_refused_and_nothing_else(kind, source):
-    told = fuzz.run_kind(kind, 0, 150, source)
-    assert told.bad == []
-    assert told.read + told.refused == told.inputs == 150
-    assert told.refused > 20
+    counts = fuzz.run_kind(kind, 0, 150, source)
+    assert counts.bad == []
+    assert counts.read + counts.refused == counts.inputs == 150
+    assert counts.refused > 20
 
 
 def test_inputs_are_the_same_in_every_run():

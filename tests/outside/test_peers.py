@@ -10,10 +10,12 @@ from experiments.speed.works import scene
 from jaxdn.denoisers import ntd
 from jaxdn.frame import Clip, frame_at
 from jaxdn.learning.step import clip_loss, initial_state
+from jaxdn.methods.table import method_named
 from jaxdn.ops.warp import warp
-from jaxdn.recipe import Recipe
+from jaxdn.rollout import stream
 
 TINY = ((4,), (4,), (5,), (5,), (6,))
+RECIPE = method_named("ntd").recipe_named(None)._replace(decay=False)
 
 
 def skip_without(package: str) -> None:
@@ -45,11 +47,11 @@ def test_pytorch_gives_the_same_images(key, x64):
     params = lively(denoiser.init(key, frame_at(frames, 0)), key)
     forms = (pytorch.apply_kernels_loop, pytorch.apply_kernels_unfold)
     theirs = [pytorch.NTD(TINY, params, apply_kernels=form).double().eval() for form in forms]
-    state, run = denoiser.start(params, frame_at(frames, 0)), jax.jit(denoiser.step)
+    ours = stream(denoiser, params)
     others = [pytorch.start(pytorch.tensors(frame_at(frames, 0))["radiance"][None]) for _ in forms]
     for index in range(3):
         frame = frame_at(frames, index)
-        state, image = run(params, state, frame)
+        image = ours(frame)
         buffers = {name: buffer[None] for name, buffer in pytorch.tensors(frame).items()}
         for number, step in enumerate(theirs):
             with torch.inference_mode():
@@ -64,15 +66,15 @@ def test_pytorch_has_the_same_loss_and_gradients(key, x64):
 
     clips = [scene.clip(3, 16, 16, seed=seed) for seed in range(2)]
     batch: Clip = double(jax.tree.map(lambda *leaves: np.stack(leaves), *clips))
-    denoiser, recipe = ntd(size=TINY), Recipe(decay=False)
-    params = lively(initial_state(denoiser, recipe, batch).params, key)
+    denoiser = ntd(size=TINY)
+    params = lively(initial_state(denoiser, RECIPE, batch).params, key)
 
     def batch_loss(params):
-        loss, psnr = jax.vmap(lambda clip: clip_loss(denoiser, params, clip))(batch)
+        loss, psnr = jax.vmap(lambda clip: clip_loss(denoiser, params, clip, RECIPE.objective))(batch)
         return jnp.mean(loss), jnp.mean(psnr)
 
     (loss, _), gradient = jax.jit(jax.value_and_grad(batch_loss, has_aux=True))(params)
-    trainer = Trainer(TINY, params, recipe)
+    trainer = Trainer(TINY, params, RECIPE)
     trainer.step.double()
     theirs, _ = peer_loss(trainer.step, *batch_tensors(batch))
     theirs.backward()
@@ -90,12 +92,10 @@ def test_pytorch_trains():
     skip_without("torch")
     from experiments.speed.works import train_steps
 
-    call = train_steps.pytorch("small", train_steps.batch_of(16, RECIPE), RECIPE, compiled=False)
+    recipe = RECIPE._replace(batch=1, frames=2)
+    call = train_steps.pytorch("small", train_steps.batch_of(16, recipe), recipe, compiled=False)
     first, *_, last = [call() for _ in range(4)]
     assert last < first
-
-
-RECIPE = Recipe(decay=False, batch=1, frames=2)
 
 
 def test_pytorch_warps_off_screen_as_jaxdn_does(rng):

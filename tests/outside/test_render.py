@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -12,10 +13,15 @@ import numpy as np
 import pytest
 from render_scenes import HEIGHT, PIXEL, SQUARE_Z, WIDTH, Stage, fast_variants, shift
 
+from jaxdn import effects
 from jaxdn.clips import ClipError, read_frame
+from jaxdn.clips.folder import begun_record, is_clip, read_record
+from jaxdn.frame import present
 from jaxdn.render import farm
-from jaxdn.render.clip import Rendered, RenderError, render_clip, render_frame
-from jaxdn.render.scene import AnimatedScene, scene_from_record
+from jaxdn.render.clip import Rendered, render_clip, render_frame
+from jaxdn.render.errors import RenderError
+from jaxdn.render.opening import scene_from_record
+from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.seeds import NOISY, REFERENCE, frame_key, pass_seed, tea
 from jaxdn.render.variant import choose_variant, llvm_candidates, use_variant
 
@@ -129,9 +135,9 @@ def test_half_of_the_reference_tells_its_noise(variant: str) -> None:
     assert found.reference is not None
     assert found.reference_half is not None
     assert truth is not None
-    told = np.mean((found.reference - found.reference_half) ** 2)
+    estimated = np.mean((found.reference - found.reference_half) ** 2)
     real = np.mean((found.reference - truth) ** 2)
-    assert 0.3 < told / real < 1.5
+    assert 0.3 < estimated / real < 1.5
 
 
 def same(first: Rendered, second: Rendered) -> bool:
@@ -180,7 +186,9 @@ def test_a_clip_is_written_and_goes_on_where_it_was_interrupted(variant: str, tm
     with pytest.raises(KeyboardInterrupt):
         render_clip(sliding(), tmp_path / "parts", progress=interrupt, **options)
     parts = tmp_path / "parts"
-    assert sorted(path.name for path in parts.iterdir()) == ["clip.json", "frame_0000.exr", "frame_0001.exr"]
+    names = ["clip.unfinished.json", "frame_0000.exr", "frame_0001.exr"]
+    assert sorted(path.name for path in parts.iterdir()) == names
+    assert not is_clip(parts)
     # A frame that was cut off is rendered again, one that is whole is not.
     damaged = (parts / "frame_0001.exr").read_bytes()
     (parts / "frame_0001.exr").write_bytes(damaged[: len(damaged) // 2])
@@ -188,6 +196,8 @@ def test_a_clip_is_written_and_goes_on_where_it_was_interrupted(variant: str, tm
     seen: list[int] = []
     render_clip(sliding(), parts, progress=seen.append, **options)
     assert seen == [0, 1, 2]
+    assert is_clip(parts)
+    assert not (parts / "clip.unfinished.json").exists()
     assert (parts / "frame_0000.exr").stat().st_mtime_ns == stamp
     for index in range(3):
         name = f"frame_{index:04d}.exr"
@@ -201,6 +211,74 @@ def test_a_clip_is_written_and_goes_on_where_it_was_interrupted(variant: str, tm
     assert len(record["cameras"]) == 3
     assert record["jittered"] is (variant == "scalar_rgb")
     assert record["bad_samples"] == 0
+
+
+KILLED = """
+import os, signal, sys
+sys.path.insert(0, sys.argv[2])
+from render_scenes import HEIGHT, WIDTH, Stage
+from jaxdn.render.clip import render_clip
+def kill(frame):
+    if frame == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+size = {"width": WIDTH, "height": HEIGHT}
+render_clip(Stage(), sys.argv[1], frames=3, reference_spp=2, variant="scalar_rgb", progress=kill, **size)
+"""
+
+
+def test_a_killed_rendering_leaves_no_clip_and_goes_on(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"frames": 3, "reference_spp": 2, "variant": "scalar_rgb", **SIZE}
+    parts = tmp_path / "parts"
+    done = subprocess.run([sys.executable, "-c", KILLED, str(parts), str(Path(__file__).parent)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert (parts / "frame_0001.exr").exists()
+    assert not is_clip(parts)
+    with pytest.raises(ClipError):
+        read_record(parts)
+    render_clip(Stage(), parts, **options)
+    assert is_clip(parts)
+    whole = render_clip(Stage(), tmp_path / "whole", **options)
+    assert read_record(parts) == read_record(whole)
+    for index in range(3):
+        name = f"frame_{index:04d}.exr"
+        assert (parts / name).read_bytes() == (whole / name).read_bytes()
+
+
+def test_a_finished_clip_that_gets_more_frames_is_unfinished_until_it_has_them(tmp_path: Path) -> None:
+    options: dict[str, Any] = {"variant": "scalar_rgb", **SIZE}
+    render_clip(Stage(), tmp_path, frames=1, **options)
+    assert is_clip(tmp_path)
+
+    def interrupt(frame: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render_clip(Stage(), tmp_path, frames=2, progress=interrupt, **options)
+    assert not is_clip(tmp_path)
+    render_clip(Stage(), tmp_path, frames=2, **options)
+    assert read_record(tmp_path)["frames"] == 2
+
+
+def test_without_a_plan_every_buffer_of_every_effect_is_rendered() -> None:
+    frame = render_frame(Stage(), 0, variant="scalar_rgb", **SIZE).frame
+    assert set(present(frame)) == set(effects.plan(effects.everything(1)).buffers)
+
+
+def test_a_clip_with_the_plan_of_an_earlier_version_goes_on(tmp_path: Path) -> None:
+    scene = {"family": "fruit", "seed": 0}
+    plan = effects.plan(effects.chosen(["indirect"], 2))
+    options: dict[str, Any] = {"frames": 2, "variant": "scalar_rgb", **SIZE}
+    render_clip(scene_from_record(scene), tmp_path, plan=plan, **options)
+    record = json.loads((tmp_path / "clip.json").read_text())
+    record["plan"] |= {"motion": "none", "lobes_apart": False, "gradient_samples": False, "demodulation": "none"}
+    (tmp_path / "clip.json").write_text(json.dumps(record))
+    job = farm.ClipJob(scene, str(tmp_path), WIDTH, HEIGHT, 2, plan=plan.record())
+    assert farm._finished(job)
+    (tmp_path / "frame_0001.exr").unlink()
+    assert not farm._finished(job)
+    render_clip(scene_from_record(scene), tmp_path, plan=plan, **options)
+    assert farm._finished(job)
+    assert farm._finished(job._replace(seed=1)) is False
 
 
 def test_other_settings_in_the_same_folder_raise(tmp_path: Path) -> None:
@@ -223,6 +301,7 @@ def test_a_scene_that_breaks_is_named_with_its_frame(tmp_path: Path) -> None:
     with pytest.raises(RenderError, match=r"'stage'.*frame 1: ArithmeticError: no square today"):
         render_clip(Stage(square=breaks), tmp_path, frames=2, variant="scalar_rgb", **SIZE)
     assert (tmp_path / "frame_0000.exr").exists()
+    assert not is_clip(tmp_path)
 
 
 UNSUPPORTED: dict[str, dict[str, Any]] = {
@@ -351,6 +430,46 @@ def test_a_worker_that_dies_is_reported_with_its_clip(tmp_path: Path) -> None:
     assert "SIGKILL" in failure
 
 
+def begin(folder: Path, scene: dict[str, Any], variant: str) -> None:
+    """Render the first of two frames and stop."""
+
+    def interrupt(frame: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render_clip(scene_from_record(scene), folder, frames=2, variant=variant, progress=interrupt, **SIZE)
+
+
+def test_a_job_goes_on_with_the_variant_that_its_clip_was_begun_with(tmp_path: Path) -> None:
+    scene = {"family": "fruit", "seed": 0}
+    begin(tmp_path, scene, "scalar_rgb")
+    job = farm.ClipJob(scene, str(tmp_path), WIDTH, HEIGHT, 2)
+    assert farm._as_begun(job).variant == "scalar_rgb"
+    assert farm._as_begun(job._replace(variant="llvm_ad_rgb")).variant == "llvm_ad_rgb"
+    assert farm._as_begun(job._replace(folder=str(tmp_path / "new"))).variant is None
+
+
+def test_a_clip_begun_with_a_variant_that_does_not_run_here_is_named(tmp_path: Path) -> None:
+    scene = {"family": "fruit", "seed": 0}
+    begin(tmp_path, scene, "scalar_rgb")
+    file = tmp_path / "clip.unfinished.json"
+    file.write_text(file.read_text().replace("scalar_rgb", "vulkan_rgb"))
+    job = farm.ClipJob(scene, str(tmp_path), WIDTH, HEIGHT, 2)
+    with pytest.raises(ValueError, match=rf"{tmp_path.name}.*vulkan_rgb"):
+        farm.render_clips([job], progress=False)
+
+
+@pytest.mark.slow
+def test_an_interrupted_clip_is_finished_with_the_variant_it_was_begun_with(tmp_path: Path) -> None:
+    scene = {"family": "fruit", "seed": 0}
+    begin(tmp_path, scene, "scalar_rgb")
+    farm.render_clips([farm.ClipJob(scene, str(tmp_path), WIDTH, HEIGHT, 2)], progress=False)
+    assert is_clip(tmp_path)
+    record = begun_record(tmp_path)
+    assert record is not None
+    assert record["variant"] == "scalar_rgb"
+
+
 @pytest.mark.slow
 def test_clips_are_rendered_side_by_side_and_failures_do_not_stop_the_others(tmp_path: Path) -> None:
     good = farm.ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "good"), WIDTH, HEIGHT, 2)
@@ -360,6 +479,8 @@ def test_clips_are_rendered_side_by_side_and_failures_do_not_stop_the_others(tmp
         farm.render_clips([bad, good], workers=2, progress=lambda done, total: steps.append((done, total)))
     assert steps[-1] == (2, 4)
     assert len(list((tmp_path / "good").glob("frame_*.exr"))) == 2
+    assert is_clip(tmp_path / "good")
+    assert not is_clip(tmp_path / "bad")
     with pytest.raises(ValueError, match="folder of its own"):
         farm.render_clips([good, good], progress=False)
 

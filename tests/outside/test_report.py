@@ -277,15 +277,6 @@ def test_save_png_rounds_clamps_and_paints_broken_pixels(tmp_path):
         save_png(tmp_path / "b.png", np.zeros((2, 2, 4)))
 
 
-def test_a_write_that_fails_replaces_nothing_and_leaves_nothing(tmp_path):
-    write_report(synthetic(clips=1), tmp_path)
-    before = (tmp_path / "report.html").read_bytes()
-    with pytest.raises(TypeError):
-        pictures.write_atomically({tmp_path / "report.html": b"new", tmp_path / "other": "not bytes"})
-    assert (tmp_path / "report.html").read_bytes() == before
-    assert {path.name for path in tmp_path.iterdir()} == {"metrics.json", "report.html"}
-
-
 def test_error_map_and_its_scale():
     error = pictures.error_map(np.full((2, 2, 3), (0.1, 0.2, 0.6)), np.zeros((2, 2, 3)))
     np.testing.assert_allclose(error, 0.3)

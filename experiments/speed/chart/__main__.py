@@ -1,7 +1,7 @@
 """`make chart`: error against time per frame of every way to an image, measured on this machine.
 
     python -m experiments.speed.chart                          # everything, about 20 minutes on two cores
-    python -m experiments.speed.chart --quick                  # a few methods on one tiny clip: a minute
+    python -m experiments.speed.chart --quick                  # the fastest of each method, one tiny clip: a minute
     python -m experiments.speed.chart --clips my/clip other    # your own clips (with layers and a reference)
 
 Writes ``runs/chart/chart.json`` (raw measurements) and ``runs/chart/chart.html`` (a page that needs no network). What
@@ -25,32 +25,32 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedCo
 
 from experiments.speed import peers
 from experiments.speed.chart import footage, summary
-from experiments.speed.chart.breakdown import breakdown
+from experiments.speed.chart.breakdown import breakdown, subjects
 from experiments.speed.chart.energy import NOT_MEASURABLE, Meter, find_meter
 from experiments.speed.chart.footage import Footage, Sizes
-from experiments.speed.chart.methods import DENOISED_SPP, Method, left_out, methods
 from experiments.speed.chart.page import write_page
 from experiments.speed.chart.render_cost import measure_cost
 from experiments.speed.chart.scores import MEASURES, picture, score
 from experiments.speed.chart.store import Store, point_key
 from experiments.speed.chart.summary import RENDERER
+from experiments.speed.chart.way import DENOISED_SPP, Way
+from experiments.speed.chart.ways import chosen, left_out, ways
 from experiments.speed.timing import measure, peak_mib
 from experiments.speed.works import scene
 from jaxdn.commands.compare import describe_machine
-from jaxdn.commands.errors import told_plainly
+from jaxdn.commands.errors import plain_errors
 from jaxdn.frame import Frame, frame_at, written_out
-from jaxdn.networks import LARGE, SMALL, onnx
 from jaxdn.render import scene_from_record, use_variant
 from jaxdn.report import save_png
-from jaxdn.weights import SHIPPED, load_weights
+from jaxdn.weights import SHIPPED
 
 
 @dataclass
 class Settings:
-    """Measure error and time of every method on the same clips; write runs/chart/chart.html."""
+    """Measure error and time of every way to an image on the same clips; write runs/chart/chart.html."""
 
     quick: bool = False
-    """A few methods on one tiny clip, to see that everything works."""
+    """The fastest weights of each method on one tiny clip, to see that everything works."""
     clips: tuple[Path, ...] = ()
     """Folders of your own clips, with noisy layers and a reference; default: two of the scene families."""
     out: Path | None = None
@@ -62,9 +62,9 @@ class Run:
 
     def __init__(self, sizes: Sizes, clips: Sequence[Footage], folder: Path, console: Console) -> None:
         self.sizes, self.clips, self.folder, self.console = sizes, clips, folder, console
-        wanted = sizes.methods
-        self.methods = [each for each in methods() if wanted is None or each.name in wanted]
-        self.labels = {each.name: (each.family, each.variant, each.guides) for each in self.methods}
+        self.denoisers = chosen(quick=sizes.quick)
+        self.ways = ways(self.denoisers, quick=sizes.quick)
+        self.labels = {each.name: (each.family, each.variant, each.guides) for each in self.ways}
         self.labels[RENDERER] = (RENDERER, "plain", "none")
         self.layers = footage.common_layers(clips)
         self.meter: Meter | None = find_meter()
@@ -99,8 +99,8 @@ class Run:
     def errors(self) -> None:
         """Score the renderer and every denoised point on every clip, and keep the picture that the page shows."""
         spps = {RENDERER: self.layers}
-        scored = {RENDERER: None, **{each.name: each for each in self.methods if each.images is not None}}
-        spps |= {each.name: [spp for spp in DENOISED_SPP if spp in self.layers] for each in self.methods}
+        scored = {RENDERER: None, **{each.name: each.images for each in self.ways if each.images is not None}}
+        spps |= {name: [spp for spp in DENOISED_SPP if spp in self.layers] for name in scored if name != RENDERER}
         todo = [
             (name, spp)
             for name in scored
@@ -115,8 +115,9 @@ class Run:
             for name, spp in todo:
                 key, found = point_key(name, spp), {}
                 for clip in self.clips:
-                    frames, method = clip.frames._replace(radiance=clip.noisy[spp]), scored[name]
-                    images = clip.noisy[spp] if method is None else method.images(frames)  # type: ignore[misc]
+                    denoise = scored[name]
+                    noisy = clip.frames._replace(radiance=clip.noisy[spp])
+                    images = noisy.radiance if denoise is None else denoise(noisy)
                     found[clip.name] = score(images, clip)
                     save_png(self._picture(key, clip), picture(images[clip.shown]))
                 self.store.put("errors", key, found)
@@ -142,26 +143,26 @@ class Run:
                         try:
                             animated = scene_from_record(clip.record.get("scene") or {})
                         except ValueError as error:
-                            self.say(f"{clip.name}: what rendering it costs cannot be told: {error}")
+                            self.say(f"{clip.name}: what rendering it costs cannot be measured: {error}")
                             continue
                         costs[clip.name] = measure_cost(animated, height, width, self.meter)
                         self.store.put("render", size, costs)
                     done(f"{clip.name} at {size}")
 
     def times(self) -> None:
-        """Time every method, the methods of a group in turns, at both sizes."""
+        """Time every way, those of a group interleaved, at both sizes."""
         own = jax.tree.map(np.asarray, frame_at(self.clips[0].frames, self.clips[0].shown))
         present = [name for name in Frame._fields if getattr(own, name) is not None]
         height, width = self.sizes.timed
         made = written_out(frame_at(scene.clip(2, height, width).frames, 1), present)
         frames = {self.timed_size: made, self.own_size: own}
-        groups: dict[str, list[Method]] = {}
-        for method in self.methods:
-            if not all(size in self.store.data["times"].get(method.name, {}) for size in self._sizes_of(method)):
-                groups.setdefault(method.group, []).append(method)
+        groups: dict[str, list[Way]] = {}
+        for way in self.ways:
+            if not all(size in self.store.data["times"].get(way.name, {}) for size in self._sizes_of(way)):
+                groups.setdefault(way.group, []).append(way)
         with self.counted("times", len(groups)) as done:
             for group, members in groups.items():
-                found: dict[str, dict[str, Any]] = {method.name: {} for method in members}
+                found: dict[str, dict[str, Any]] = {way.name: {} for way in members}
                 for size, frame in frames.items():
                     for name, timing in self._timed(members, frame, size).items():
                         found[name][size] = timing
@@ -170,12 +171,11 @@ class Run:
                         self.store.put("times", name, sizes)
                 done(group)
 
-    def _sizes_of(self, method: Method) -> tuple[str, ...]:
-        """PyTorch compiles for each size anew, and a small one tells nothing that the timed one does not."""
-        return (self.timed_size,) if method.family == "PyTorch" else (self.timed_size, self.own_size)
+    def _sizes_of(self, way: Way) -> tuple[str, ...]:
+        return (self.timed_size, self.own_size) if way.small else (self.timed_size,)
 
-    def _timed(self, members: Sequence[Method], frame: Frame, size: str) -> dict[str, dict[str, Any]]:
-        calls = {method.name: method.timed(frame) for method in members if size in self._sizes_of(method)}
+    def _timed(self, members: Sequence[Way], frame: Frame, size: str) -> dict[str, dict[str, Any]]:
+        calls = {way.name: way.timed(frame) for way in members if size in self._sizes_of(way)}
         # Small frames vary more, and cost nothing.
         rounds = self.sizes.rounds if size == self.timed_size else 7 * self.sizes.rounds
         found: dict[str, dict[str, Any]] = {}
@@ -187,23 +187,15 @@ class Run:
         return found
 
     def breakdowns(self) -> None:
-        """Where the time of one frame of ``ntd`` goes."""
+        """Where the time of one frame goes, of those denoisers whose parts are known."""
         height, width = self.sizes.timed
         frame = jax.tree.map(jnp.asarray, frame_at(scene.clip(2, height, width).frames, 1))
-        engines = ["reference", *(["onnxruntime"] if onnx.available() else [])]
-        widths = {"large": LARGE, "small": SMALL}
-        if self.sizes.methods is not None:
-            engines, widths = engines[:1], {"small": SMALL}
-        for size in widths:
-            for engine in engines:
-                name = f"ntd-{size}, {engine}"
-                if self.store.has("breakdown", name):
-                    continue
-                denoiser, params = load_weights(f"ntd-{size}", implementation=engine)
-                parts = breakdown(widths[size], denoiser, params, frame, engine, rounds=self.sizes.rounds)
-                self.store.put("breakdown", name, parts)
-                told = ", ".join(f"{part} {timing.median_ms:.0f} ms" for part, timing in parts.items())
-                self.say(f"one frame of {name}: {told}")
+        for subject in subjects(self.denoisers, quick=self.sizes.quick):
+            if not self.store.has("breakdown", subject.name):
+                parts = breakdown(subject, frame, rounds=self.sizes.rounds)
+                self.store.put("breakdown", subject.name, parts)
+                figures = ", ".join(f"{part} {timing.median_ms:.0f} ms" for part, timing in parts.items())
+                self.say(f"one frame of {subject.name}: {figures}")
 
 
 def _digest(path: Path) -> str:
@@ -241,5 +233,5 @@ def main(settings: Settings) -> None:
 
 
 if __name__ == "__main__":
-    with told_plainly():
+    with plain_errors():
         main(tyro.cli(Settings, description=Settings.__doc__))

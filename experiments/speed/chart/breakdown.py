@@ -3,8 +3,9 @@
 A step compiled as a whole shares memory between its parts, so the parts together may take longer than it does.
 """
 
-from collections.abc import Callable
-from typing import Any
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +13,18 @@ import jax.numpy as jnp
 from experiments.speed.timing import Call, Timing, measure
 from experiments.speed.works import steps
 from jaxdn import color
+from jaxdn.candidates import Candidate
 from jaxdn.denoiser import Denoiser
 from jaxdn.frame import Frame
-from jaxdn.methods.ntd import SMALLEST_ALBEDO, TAPS, depth_feature
+from jaxdn.methods.demodulated import SMALLEST_ALBEDO
+from jaxdn.methods.ntd import TAPS, depth_feature
 from jaxdn.motion import on_screen
 from jaxdn.networks import MULTIPLE, Widths
+from jaxdn.networks.engines import ENGINES
 from jaxdn.networks.unet import unet
 from jaxdn.ops.softmax_filter import softmax_filter
 from jaxdn.ops.warp import warp
+from jaxdn.options import make
 from jaxdn.repair import repair, repair_image
 from jaxdn.scales import compose_scales, downsample
 
@@ -28,6 +33,37 @@ HEADS = (2 * TAPS + 1, TAPS + 1, TAPS + 1)
 
 REPROJECTION, NETWORK, FILTERING, BLENDING = "reprojection", "features and kernels", "applying kernels", "blending"
 WHOLE = "whole step"
+
+
+class Subject(NamedTuple):
+    """A step that can be taken apart."""
+
+    name: str
+    """Weights and engine."""
+    widths: Widths
+    denoiser: Denoiser
+    params: Any
+    engine: str
+
+
+def subjects(denoisers: Sequence[Candidate], *, quick: bool = False) -> Iterator[Subject]:
+    """Those whose step has the parts below, in plain XLA and in each engine that runs here (``quick``: XLA alone).
+
+    These are weights of ``ntd`` whose options are the defaults but for the network's size: others change the parts.
+    """
+    method = steps.METHOD
+    fitting = [ENGINES[name] for name in method.engines if ENGINES[name].purpose == "inference"]
+    engines = ["reference", *(each.name for each in fitting if each.available() and not quick)]
+    for each in denoisers:
+        if each.method != method:
+            continue
+        options: Any = make(method.options, each.options, method=method.name)
+        if dataclasses.replace(options, size=method.options().size) != method.options():
+            continue
+        widths = steps.WIDTHS.get(options.size, options.size)
+        for engine in engines:
+            denoiser = method.factory(**each.options, implementation=engine)
+            yield Subject(f"{each.label}, {engine}", widths, denoiser, each.params, engine)
 
 
 def reproject(history: jax.Array, frame: Frame, noisy: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -57,14 +93,13 @@ def blend(
     return jnp.maximum(current * composed + (1.0 - current) * temporal, 0.0) * colors
 
 
-def breakdown(
-    widths: Widths, denoiser: Denoiser, params: Any, frame: Frame, implementation: str | None, *, rounds: int
-) -> dict[str, Timing]:
-    """The four parts and the whole step, timed in turns, for a frame whose sides are multiples of 16."""
+def breakdown(subject: Subject, frame: Frame, *, rounds: int) -> dict[str, Timing]:
+    """The four parts and the whole step, timed interleaved, for a frame whose sides are multiples of 16."""
     height, width = frame.radiance.shape[:2]
     if height % MULTIPLE or width % MULTIPLE:
         raise ValueError(f"frame: expected sides that are multiples of {MULTIPLE}, got {height} x {width}.")
-    network = unet(GROUPS, HEADS, widths=widths, implementation=implementation)
+    params = subject.params
+    network = unet(GROUPS, HEADS, widths=subject.widths, implementation=subject.engine)
 
     def predict(params: Any, frame: Frame, noisy: jax.Array, recalled: jax.Array, lost: jax.Array) -> Any:
         frame, _ = repair(frame)
@@ -90,7 +125,7 @@ def breakdown(
         NETWORK: _waiting(predict_jit, params, frame, noisy, recalled, lost),
         FILTERING: _waiting(apply_jit, noisy, recalled, heads),
         BLENDING: _waiting(jax.jit(blend), filtered, heads, lost, colors),
-        WHOLE: steps.recurrent(denoiser, params, frame),
+        WHOLE: steps.recurrent(subject.denoiser, params, frame),
     }
     return measure(calls, rounds=rounds)
 

@@ -10,7 +10,7 @@ from jaxdn import effects
 from jaxdn.clips import ClipError, read_clip, read_record
 from jaxdn.clips.noise_floor import read_noise_floor
 from jaxdn.frame import Frame
-from jaxdn.render import ClipJob, choose_variant, render_clips
+from jaxdn.render import ClipJob, render_clips
 
 
 class Sizes(NamedTuple):
@@ -27,8 +27,8 @@ class Sizes(NamedTuple):
     timed: tuple[int, int]
     """Height and width of the frame that is timed."""
     rounds: int
-    methods: tuple[str, ...] | None = None
-    """Names of the methods to measure; None is all of them."""
+    quick: bool = False
+    """Only the plain form of each method's fastest weights is measured."""
 
     @property
     def layers(self) -> tuple[int, ...]:
@@ -37,7 +37,7 @@ class Sizes(NamedTuple):
 
 
 FULL = Sizes((("pinkroom", 400), ("mobile", 400)), 64, 6, 1024, 2048, (720, 1280), rounds=3)
-QUICK = Sizes((("mobile", 400),), 32, 5, 16, 32, (48, 64), rounds=2, methods=("svgf", "ntd-small", "oidn high"))
+QUICK = Sizes((("mobile", 400),), 32, 5, 16, 32, (48, 64), rounds=2, quick=True)
 SCORED = 4
 """Frames at a clip's end that are scored: recurrent methods have a history by then."""
 
@@ -64,7 +64,6 @@ class Footage(NamedTuple):
 def render(sizes: Sizes, folder: Path) -> list[Path]:
     """Render the clips into ``folder``, or find them there; returns their folders."""
     places = [folder / f"{family}-{seed}" for family, seed in sizes.scenes]
-    variants = [_variant(place) for place in places]
     jobs = [
         ClipJob(
             {"family": family, "seed": seed},
@@ -75,16 +74,10 @@ def render(sizes: Sizes, folder: Path) -> list[Path]:
             layers=sizes.layers,
             reference_spp=sizes.reference_spp,
             seed=seed,
-            variant=variant,
         )
-        for (family, seed), place, variant in zip(sizes.scenes, places, variants, strict=True)
+        for (family, seed), place in zip(sizes.scenes, places, strict=True)
     ]
     return render_clips(jobs)
-
-
-def _variant(place: Path) -> str:
-    """The variant that a clip was begun with: it is finished, and used again, with the same one."""
-    return read_record(place)["variant"] if (place / "clip.json").is_file() else choose_variant().variant
 
 
 def read(folder: Path) -> Footage:

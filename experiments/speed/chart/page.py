@@ -13,11 +13,11 @@ import numpy as np
 from PIL import Image
 
 from experiments.speed.chart.breakdown import WHOLE
-from experiments.speed.chart.methods import ALL
 from experiments.speed.chart.scores import MEASURES
-from experiments.speed.chart.summary import RENDERER, Equal, Point, pareto, render_cost, told
+from experiments.speed.chart.summary import RENDERER, Equal, Point, in_words, pareto, render_cost
+from experiments.speed.chart.way import ALL
+from jaxdn.files import write_whole
 from jaxdn.report import images
-from jaxdn.report.images import write_atomically
 from jaxdn.report.results import json_ready
 
 Pictures = dict[str, dict[str, np.ndarray]]
@@ -34,7 +34,7 @@ def write_page(
     """Write ``folder/chart.html``; ``sizes`` are the timed size and the clips' own. Returns its path."""
     path = Path(folder) / "chart.html"
     document = page(data, points, equals, sizes, read_pictures(Path(folder), data, points))
-    write_atomically({path: document.encode("utf-8", "replace")})
+    write_whole({path: document.encode("utf-8", "replace")})
     return path
 
 
@@ -125,7 +125,7 @@ def _for_script(
     timings = data["times"].get(point.method, {})
     return {
         **point._asdict(),
-        "equal": None if equal is None else told(equal, most),
+        "equal": None if equal is None else in_words(equal, most),
         "spread": {size: [timing["min_ms"], timing["max_ms"]] for size, timing in timings.items()},
         # At the clips' own size the program was compiled while scoring.
         "compile": {size: timing["first_ms"] for size, timing in timings.items() if size == timed},
@@ -149,7 +149,7 @@ def _top(data: Mapping[str, Any], sizes: tuple[str, str]) -> str:
     said = [
         f"Errors are means over the last {data['settings']['scored frames']} frames of {escape(clips)}, "
         f"{sizes[1]} pixels: small images. All but relative MSE are taken on sRGB values, cut at 1.",
-        f"Time is for one frame of {sizes[0]} (median of repeats, methods in turns), or of the clips' own size. "
+        f"Time is for one frame of {sizes[0]} (median of repeats, methods interleaved), or of the clips' own size. "
         "Rendering beyond four samples a pixel is extrapolated: its time is a line in the number of samples.",
         "Marks at the bottom of the plot have no error: untrained widths, the same network in PyTorch, and the time "
         "of a frame in which nothing moves. They stand at the time of a frame with 1 sample a pixel.",
@@ -178,7 +178,7 @@ def _front(data: Mapping[str, Any], points: Sequence[Point], equals: Mapping[str
                 number(point.denoise_ms.get(size, math.nan)),
                 number(point.errors["psnr"], 2),
                 number(point.errors["temporal_psnr"], 2),
-                "" if equal is None else told(equal, most),
+                "" if equal is None else in_words(equal, most),
             ]
         )
     head = ["Method", "spp", f"ms / frame, {size}", "of it denoising", "PSNR dB", "temporal PSNR dB", "bare renderer"]
@@ -215,7 +215,7 @@ def _table(
         row += [
             number(point.errors.get(measure.field, math.nan), 4 if measure.better < 0 else 2) for measure in MEASURES
         ]
-        row += ["" if equal is None else told(equal, most), number(point.render_ms.get(sizes[0], math.nan))]
+        row += ["" if equal is None else in_words(equal, most), number(point.render_ms.get(sizes[0], math.nan))]
         row += [number(point.denoise_ms.get(sizes[0], math.nan)), spread]
         row += [number(point.denoise_ms.get(sizes[1], math.nan), 1)]
         row += [number(timing.get("first_ms", math.nan) / 1e3, 1), number(timing.get("peak_mib"))]
@@ -283,7 +283,7 @@ def _making(data: Mapping[str, Any]) -> str:
     rows = "".join(f'<tr><th scope="row">{escape(str(k))}</th><td>{escape(str(v))}</td></tr>' for k, v in facts.items())
     return (
         f'<section id="made"><h2>How this was made</h2><table class="facts"><tbody>{rows}</tbody></table>'
-        '<p class="note">All raw numbers lie beside this page in <code>chart.json</code>.</p></section>'
+        '<p class="note">All raw numbers lie next to this page in <code>chart.json</code>.</p></section>'
     )
 
 

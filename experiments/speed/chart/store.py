@@ -7,7 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from jaxdn.clips.files import read_json, write_json
+from jaxdn.clips.files import read_json
+from jaxdn.files import write_json
 from jaxdn.report.results import json_ready
 
 PARTS = ("clips", "errors", "times", "render", "breakdown", "left_out")
@@ -36,7 +37,7 @@ class Store:
                 os.replace(path, path.with_name("chart.before.json"))
 
     def put(self, part: str, key: str, value: Any) -> None:
-        """Keep one measurement and write the file anew, beside its place and then renamed."""
+        """Keep one measurement and write the file anew."""
         self.data[part][key] = json_ready(value)
         write_json(self.path, self.data)
 

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.speed.chart.methods import ALL
 from experiments.speed.chart.render_cost import Cost, mean_cost
 from experiments.speed.chart.scores import MEASURES, Measure
+from experiments.speed.chart.way import ALL
 
 RENDERER = "renderer"
 
@@ -156,14 +156,14 @@ def front_table(front: Sequence[Point], equals: Mapping[str, Equal], size: str, 
                 f"{point.denoise_ms[size]:.0f}",
                 f"{point.errors['psnr']:.2f}",
                 f"{point.errors['temporal_psnr']:.2f}",
-                "" if equal is None else told(equal, most),
+                "" if equal is None else in_words(equal, most),
             ]
         )
     return text_table(rows)
 
 
-def told(equal: Equal, most: int) -> str:
-    """An equal-quality figure in words."""
+def in_words(equal: Equal, most: int) -> str:
+    """An equal-quality figure in words; ``most`` samples were rendered."""
     if math.isinf(equal.spp):
         return f"> {most} spp"
     if equal.spp == 0:

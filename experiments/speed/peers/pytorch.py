@@ -19,7 +19,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from jaxdn.frame import FAR, RADIANCE_MAX, Frame
-from jaxdn.methods.ntd import SMALLEST_ALBEDO, TAPS
+from jaxdn.methods.demodulated import SMALLEST_ALBEDO
+from jaxdn.methods.ntd import TAPS
 from jaxdn.networks import LEVELS, Widths
 from jaxdn.networks.unet import NEGATIVE_SLOPE
 
@@ -32,7 +33,7 @@ BUFFERS = ("radiance", "albedo", "normal", "depth", "motion", "dual_motion")
 
 
 class State(NamedTuple):
-    """What one frame hands to the next."""
+    """What one frame leaves to the next."""
 
     history: Tensor
     """[B, 3, H, W] the last output, divided by albedo."""

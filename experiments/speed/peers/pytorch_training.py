@@ -1,4 +1,4 @@
-"""The train step in PyTorch: the loss of ``jaxdn.learning.step``, back-propagation through time, the same Adam.
+"""The train step in PyTorch: the loss that ``ntd`` has, back-propagation through time, the same Adam.
 
 A clip's last frame is for validation as in jaxdn; because the loss does not reach it, autograd leaves it out.
 """
@@ -33,7 +33,7 @@ def batch_tensors(batch: Clip) -> tuple[dict[str, Tensor], Tensor]:
 def clip_loss(
     step: NTD, frames: dict[str, Tensor], reference: Tensor, *, occlusion: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """Mean loss of a batch of clips [T, B, C, H, W], and the PSNR of their last frames (``jaxdn.learning.step``)."""
+    """Mean loss of a batch of clips [T, B, C, H, W] (``jaxdn.objectives``), and the PSNR of their last frames."""
     state, images = start(frames["radiance"][0]), []
     for index in range(len(reference)):
         state, image = step(state, {name: buffer[index] for name, buffer in frames.items()})

@@ -17,20 +17,20 @@ from pathlib import Path
 from typing import Any
 
 Program = tuple[str, str]
-"""Engine, "xla" or "torch", and a program's name."""
+"""Compiler, "xla" or "torch", and a program's name."""
 
 
 def warm(programs: Sequence[Program], cache: Path, *, limit_s: float) -> dict[Program, float | None]:
     """Compile into the caches in ``cache``, a process for each core, and return the seconds that each took.
 
-    They are in each other's way a little, all of them alike.
+    They slow each other down a little, all alike.
     """
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         seconds = pool.map(lambda pair: compile_seconds(pair[0], pair[1], cache, limit_s=limit_s), programs)
         return dict(zip(programs, seconds, strict=True))
 
 
-def compile_seconds(engine: str, program: str, cache: Path, *, limit_s: float) -> float | None:
+def compile_seconds(compiler: str, program: str, cache: Path, *, limit_s: float) -> float | None:
     """Compile in a process of its own with its cache in the folder ``cache``; None if it takes longer than the limit.
 
     RuntimeError with the child's last words where it fails.
@@ -40,33 +40,32 @@ def compile_seconds(engine: str, program: str, cache: Path, *, limit_s: float) -
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "TORCHINDUCTOR_CACHE_DIR": str(cache / "torch"),
     }
-    command = [sys.executable, "-m", "experiments.speed.works.compilation", engine, program]
+    command = [sys.executable, "-m", "experiments.speed.works.compilation", compiler, program]
     try:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit_s, check=False)
     except subprocess.TimeoutExpired:
         return None
     if done.returncode:
         words = done.stderr.strip().splitlines()[-1:]
-        raise RuntimeError(f"{engine} did not compile {program}: {''.join(words)}")
+        raise RuntimeError(f"{compiler} did not compile {program}: {''.join(words)}")
     return float(done.stdout.split()[-1])
 
 
 def _xla(program: str) -> float:
     import jax
 
-    from experiments.speed.works import scene, train_steps
-    from jaxdn.denoisers import ntd
+    from experiments.speed.works import scene, steps, train_steps
     from jaxdn.frame import frame_at
     from jaxdn.learning.step import initial_state, make_train_step
 
     kind, size, detail, *remat = program.split("-")
-    denoiser, recipe = ntd(size=size), train_steps.RECIPE._replace(rematerialize=bool(remat))
+    denoiser, recipe = steps.METHOD.factory(size=size), train_steps.RECIPE._replace(rematerialize=bool(remat))
     step: Any
     arguments: tuple[Any, ...]
     if kind == "step":
         frame = frame_at(scene.clip(1, 720, 1280).frames, 0)
         params = denoiser.init(jax.random.key(0), frame)
-        step, arguments = jax.jit(denoiser.step, donate_argnums=1), (params, denoiser.start(params, frame), frame)
+        step, arguments = steps.program(denoiser), (params, denoiser.start(params, frame), frame)
     else:
         batch = train_steps.batch_of(int(detail))
         state = initial_state(denoiser, recipe, batch)
@@ -81,14 +80,13 @@ def _torch(program: str) -> float:
 
     from experiments.speed.peers import pytorch
     from experiments.speed.works import scene, steps, train_steps
-    from jaxdn.denoisers import ntd
     from jaxdn.frame import frame_at
 
     pytorch.prepare_process()
     kind, size, detail = program.split("-")
     if kind == "step":
         frame = frame_at(scene.clip(1, 720, 1280).frames, 0)
-        call = steps.pytorch(size, ntd(size=size).init(jax.random.key(0), frame), frame, compiled=True)
+        call = steps.pytorch(size, steps.METHOD.factory(size=size).init(jax.random.key(0), frame), frame, compiled=True)
     else:
         call = train_steps.pytorch(size, train_steps.batch_of(int(detail)), train_steps.RECIPE, compiled=True)
     began = time.perf_counter()
@@ -97,5 +95,5 @@ def _torch(program: str) -> float:
 
 
 if __name__ == "__main__":
-    engine, program = sys.argv[1:]
-    print({"xla": _xla, "torch": _torch}[engine](program))
+    compiler, program = sys.argv[1:]
+    print({"xla": _xla, "torch": _torch}[compiler](program))

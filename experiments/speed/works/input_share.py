@@ -1,7 +1,7 @@
 """Does training wait for its input? Real clips on disk, the real pipeline, the real train step.
 
 The step is waited for before the next batch is asked for, so that what the loop then waits is time in which nothing is
-computed. Beside it the same step on a batch that is there already: the difference is all that the input costs,
+computed. Compared with the same step on a batch that is there already: the difference is all that the input costs,
 what its threads take from the step included.
 """
 
@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from experiments.speed.timing import Timing
-from experiments.speed.works import scene
+from experiments.speed.works import scene, steps
 from jaxdn.clips import training_batches, write_clip
-from jaxdn.denoisers import ntd
 from jaxdn.learning.step import initial_state, make_train_step
 from jaxdn.recipe import Recipe
 
@@ -26,7 +25,7 @@ WINDOWS, STEPS = 3, 4
 
 def measure_input(recipe: Recipe) -> dict[str, Timing]:
     """``wait`` and ``loop`` (milliseconds a step of a training loop), and ``alone`` (the step on a batch at hand)."""
-    denoiser = ntd(size="large")  # its program has been compiled for the train steps
+    denoiser = steps.METHOD.factory(size="large")  # its program has been compiled for the train steps
     with tempfile.TemporaryDirectory() as place:
         side = recipe.crop + recipe.crop // 2
         for seed in range(2 * recipe.batch):

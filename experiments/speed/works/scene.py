@@ -8,7 +8,7 @@ from jaxdn.frame import Clip, Frame
 def clip(frames: int, height: int, width: int, *, seed: int = 0) -> Clip:
     """A clip [T, H, W, C] of a patterned wall behind which a camera pans, a square in front that moves, 1 spp noise.
 
-    Vectors have fractions of a pixel, a border of history is off-screen, and beside the square the dual vector differs
+    Vectors have fractions of a pixel, a border of history is off-screen, and next to the square the dual vector differs
     from the traditional one, as in a rendered clip.
     """
     rng = np.random.default_rng(seed)

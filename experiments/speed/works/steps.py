@@ -11,22 +11,35 @@ from experiments.speed import peers, roofline
 from experiments.speed.timing import Call
 from experiments.speed.works import Work, scene
 from jaxdn.denoiser import Denoiser
-from jaxdn.denoisers import ntd
 from jaxdn.frame import Frame, frame_at
+from jaxdn.methods.table import method_named
 from jaxdn.networks import LARGE, SMALL
+from jaxdn.networks.engines import ENGINES, Purpose
 
 HEIGHT, WIDTH = 720, 1280
 WIDTHS = {"large": LARGE, "small": SMALL}
-IMPLEMENTATIONS: dict[str, dict[str, Any]] = {
-    "xla": {},
-    "onnxruntime": {"implementation": "onnxruntime"},
-}
-"""Name in the results -> options of ``ntd``."""
+METHOD = method_named("ntd")
+"""The method whose network the peers have too."""
+
+
+def implementations(purpose: Purpose) -> dict[str, dict[str, Any]]:
+    """Name in the results -> options of the method: XLA, and its engines for this purpose."""
+    engines = [name for name in METHOD.engines if ENGINES[name].purpose == purpose]
+    return {"xla": {}, **{name: {"implementation": name} for name in engines}}
+
+
+def program(denoiser: Denoiser) -> Callable[..., Any]:
+    """The jitted step ``(params, state, frame) -> (state, image)`` whose state's memory is used again.
+
+    The step by itself and not :func:`jaxdn.rollout.stream`, as what is timed here is compiled by other processes, which
+    have to lower the same program (:mod:`experiments.speed.works.compilation`).
+    """
+    return jax.jit(denoiser.step, donate_argnums=1)
 
 
 def recurrent(denoiser: Denoiser, params: Any, frame: Frame) -> Call:
-    """A call that denoises ``frame`` once more, jitted, the state carried on and its memory donated."""
-    step = jax.jit(denoiser.step, donate_argnums=1)
+    """A call that denoises ``frame`` once more, jitted, with the state that the call before left."""
+    step = program(denoiser)
     state = [jax.tree.map(jnp.copy, denoiser.start(params, frame))]
 
     def call() -> jax.Array:
@@ -74,10 +87,10 @@ def works(*, height: int = HEIGHT, width: int = WIDTH, title: str = "720p") -> I
     lacking = peers.missing()
     frame = jax.tree.map(jnp.asarray, frame_at(scene.clip(2, height, width).frames, 1))
     for size, widths in WIDTHS.items():
-        params = ntd(size=size).init(jax.random.key(0), frame)
+        params = METHOD.factory(size=size).init(jax.random.key(0), frame)
 
         def ours(options: dict[str, Any], size: str = size, params: Any = params) -> Callable[[], Call]:
-            return lambda: recurrent(ntd(size=size, **options), params, frame)
+            return lambda: recurrent(METHOD.factory(size=size, **options), params, frame)
 
         def torch(compiled: bool, size: str = size, params: Any = params) -> Callable[[], Call]:
             return lambda: pytorch(size, params, frame, compiled=compiled)
@@ -93,7 +106,7 @@ def works(*, height: int = HEIGHT, width: int = WIDTH, title: str = "720p") -> I
             alone["oidn-high"] = lambda: open_image_denoise(frame, "high")()
         yield Work(
             f"step-{size}-{title}",
-            {name: ours(options) for name, options in IMPLEMENTATIONS.items()},
+            {name: ours(options) for name, options in implementations("inference").items()},
             others,
             roofline.step(widths, height, width),
             alone=alone,

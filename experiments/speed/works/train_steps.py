@@ -10,14 +10,13 @@ import numpy as np
 from experiments.speed import peers, roofline
 from experiments.speed.timing import Call
 from experiments.speed.works import Work, scene
-from experiments.speed.works.steps import WIDTHS
-from jaxdn.denoisers import ntd
+from experiments.speed.works.steps import METHOD, WIDTHS, implementations
 from jaxdn.frame import Clip
 from jaxdn.learning.step import initial_state, make_train_step
-from jaxdn.ops import onednn
+from jaxdn.networks.engines import ENGINES
 from jaxdn.recipe import Recipe
 
-RECIPE = Recipe(decay=False)
+RECIPE = METHOD.recipe_named(None)._replace(decay=False)
 CASES = (("large", 64), ("large", 128))
 """(size, crop in pixels). What compiles longest is compared at the first alone: rematerialised, and by PyTorch."""
 
@@ -28,9 +27,9 @@ def batch_of(size: int, recipe: Recipe = RECIPE) -> Clip:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *clips)
 
 
-def ours(size: str, batch: Clip, recipe: Recipe, *, implementation: str | None = None) -> Call:
+def ours(size: str, batch: Clip, recipe: Recipe, **options: Any) -> Call:
     """A call that makes one update; state and batch lie on the device, the old state's memory is donated."""
-    denoiser = ntd(size=size, implementation=implementation)
+    denoiser = METHOD.factory(size=size, **options)
     state = [initial_state(denoiser, recipe, batch)]
     step, there = make_train_step(denoiser, recipe), jax.tree.map(jnp.asarray, batch)
 
@@ -45,29 +44,26 @@ def pytorch(size: str, batch: Clip, recipe: Recipe, *, compiled: bool) -> Call:
     """The same in PyTorch."""
     from experiments.speed.peers.pytorch_training import Trainer, batch_tensors
 
-    params = initial_state(ntd(size=size), recipe, batch).params
+    params = initial_state(METHOD.factory(size=size), recipe, batch).params
     trainer = Trainer(WIDTHS[size], params, recipe, compiled=compiled)
     tensors = batch_tensors(batch)
     return lambda: trainer(*tensors)
 
 
 def works() -> Iterator[Work]:
-    """``train-large-64`` and so on: plain, with oneDNN's convolutions where they are installed, and rematerialised."""
+    """``train-large-64`` and so on: plain, with each engine that trains here, and rematerialised."""
     lacking = peers.missing()
     for size, crop in CASES:
         batch = batch_of(crop)
 
-        def own(
-            size: str = size, batch: Clip = batch, *, again: bool = False, engine: str | None = None
-        ) -> Callable[[], Call]:
-            return lambda: ours(size, batch, RECIPE._replace(rematerialize=again), implementation=engine)
+        def own(size: str = size, batch: Clip = batch, *, again: bool = False, **options: Any) -> Callable[[], Call]:
+            return lambda: ours(size, batch, RECIPE._replace(rematerialize=again), **options)
 
         def torch(compiled: bool, size: str = size, batch: Clip = batch) -> Callable[[], Call]:
             return lambda: pytorch(size, batch, RECIPE, compiled=compiled)
 
-        mine: dict[str, Callable[[], Call]] = {"xla": own()}
-        if onednn.available():
-            mine["onednn"] = own(engine="onednn")
+        forms = implementations("training").items()
+        mine = {name: own(**options) for name, options in forms if name not in ENGINES or ENGINES[name].available()}
         others: dict[str, Callable[[], Call]] = {}
         if "torch" not in lacking:
             others["torch-eager"] = torch(False)

@@ -1,0 +1,124 @@
+"""The ways that are compared, from the table of methods and the weights there are: new ones appear by themselves."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments.speed import peers
+from experiments.speed.chart import of_ntd
+from experiments.speed.chart.way import ALL, PLAIN, Way, all_written_out, standing_still, way
+from experiments.speed.timing import Call
+from experiments.speed.works import steps
+from jaxdn import candidates
+from jaxdn.candidates import Candidate
+from jaxdn.frame import Frame, written_out
+from jaxdn.methods.table import Method, methods
+from jaxdn.networks.engines import ENGINES
+
+
+def chosen(*, quick: bool = False) -> list[Candidate]:
+    """The denoisers to measure; ``quick``: of each method only the fastest.
+
+    Those that ask the renderer for samples are not among them, see :func:`left_out`.
+    """
+    found = [each for each in candidates.everything() if not _asks(each)]
+    if not quick:
+        return found
+    fastest = {_row(each).name: each.label for each in sorted(found, key=_place)}
+    return [each for each in found if each.label in fastest.values()]
+
+
+def registered(denoisers: Sequence[Candidate]) -> Iterator[Way]:
+    """Every denoiser in all its variants: the plain form, what its method has options for, other sets of buffers.
+
+    What has not been trained is timed with the weights that training starts from, and not scored.
+    """
+    for each in denoisers:
+        trained = each.label in candidates.all_names()
+        yield way(each, scored=trained)
+        for name, options in _alternatives(_row(each)).items():
+            yield way(_remade(each, options), name, scored=trained)
+        yield way(each, ALL, prepare=all_written_out, scored=trained)
+        yield way(each, "still scene", prepare=standing_still, scored=False)
+
+
+def _row(candidate: Candidate) -> Method:
+    assert candidate.method is not None  # only the noisy image has none, and it is not measured
+    return candidate.method
+
+
+def _asks(candidate: Candidate) -> bool:
+    return candidate.denoiser is not None and candidate.denoiser.samples is not None
+
+
+def _place(candidate: Candidate) -> int:
+    """Its place among the variants of its method, which go from the most accurate to the fastest."""
+    variants = list(_row(candidate).variants)
+    return variants.index(candidate.label) if candidate.label in variants else -1
+
+
+def _alternatives(method: Method) -> dict[str, dict[str, Any]]:
+    """Variant -> options that give the plain form's weights another step."""
+    found: dict[str, dict[str, Any]] = {}
+    for name in method.engines:
+        if ENGINES[name].purpose == "inference" and ENGINES[name].available():
+            found[name] = {"implementation": name}
+    if method.knows("compute_dtype"):
+        found["bfloat16"] = {"compute_dtype": "bfloat16"}
+    if method.knows("demodulate"):
+        found["not demodulated"] = {"demodulate": False}
+    return found
+
+
+def _remade(candidate: Candidate, changed: Mapping[str, Any]) -> Candidate:
+    """The same weights, run with other options."""
+    options = {**candidate.options, **changed}
+    return candidate._replace(denoiser=_row(candidate).factory(**options), options=options)
+
+
+def open_image_denoise() -> Iterator[Way]:
+    """Open Image Denoise with albedo and normals, in its three qualities."""
+    if "pyoidn" in peers.missing():
+        return
+    from experiments.speed.peers.oidn import oidn
+
+    # Interleaved with weights of ours: what is compared has to meet the same machine.
+    group = next(iter(candidates.shipped_names()), "Open Image Denoise")
+    for quality in ("high", "balanced", "fast"):
+
+        def images(frames: Frame, quality: str = quality) -> np.ndarray:
+            frames = written_out(frames, ("albedo", "normal"))
+            arrays = [np.asarray(buffer, np.float32) for buffer in (frames.radiance, frames.albedo, frames.normal)]
+            denoise = oidn(*arrays[0].shape[1:3], quality=quality)
+            return np.stack([denoise(*frame).copy() for frame in zip(*arrays, strict=True)])
+
+        def timed(frame: Frame, quality: str = quality) -> Call:
+            return steps.open_image_denoise(frame, quality)
+
+        variant = PLAIN if quality == "high" else quality
+        yield Way(f"oidn {quality}", "Open Image Denoise", variant, "features", timed, images, group)
+
+
+def ways(denoisers: Sequence[Candidate], *, quick: bool = False) -> list[Way]:
+    """Everything that can be run here; ``quick``: plain forms only."""
+    found = [*registered(denoisers), *open_image_denoise()]
+    if quick:
+        return [each for each in found if each.variant == PLAIN]
+    return [*found, *of_ntd.untrained(), *of_ntd.pytorch()]
+
+
+def left_out() -> list[str]:
+    """Why some rows are missing here, in sentences."""
+    sentences = list(dict.fromkeys(peers.missing().values()))
+    wanted = {name for method in methods().values() for name in method.engines}
+    for name, engine in ENGINES.items():
+        if name in wanted and engine.purpose == "inference" and not engine.available():
+            sentences.append(f"{name} is not installed or does not run where jax computes: its rows are left out.")
+    for each in candidates.everything():
+        if _asks(each):
+            sentences.append(
+                f"{each.label} asks the renderer for samples pixel by pixel, and what is compared here has the same "
+                "number in every pixel: its rows are left out."
+            )
+    return sentences

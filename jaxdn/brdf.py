@@ -1,0 +1,184 @@
+"""What a surface reflects: BRDFs pre-integrated over the incident directions, and light divided by that.
+
+The share of light from all around that a surface reflects to the viewer, its directional albedo
+``F_b = integral of f_r cos(theta_i) dw_i``, is what textures and materials contribute to an image; dividing by it leaves
+the incident light, which is what a denoiser should filter (Zhuang et al. 2021, "Real-Time Denoising Using BRDF
+Pre-Integration Factorization"). For a microfacet lobe with Schlick's Fresnel term ``F0 + (1 - F0) (1 - v.h)^5`` it is
+``F0 A + B`` with two numbers that depend on the cosine n.v and the roughness alone (Karis 2013).
+"""
+
+import functools
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdn.checks import check_image, check_option, check_same_size
+
+Lobe = Literal["ggx", "ggx-correlated", "beckmann"]
+"""GGX with Smith's separable shadowing (as Mitsuba has it), with the height-correlated one, Beckmann (separable)."""
+
+LOBES: tuple[Lobe, ...] = ("ggx", "ggx-correlated", "beckmann")
+SIZE = 128
+"""Entries of a stored table along each axis."""
+SAMPLES = 4096
+"""Half vectors a stored entry is the mean of."""
+SMALLEST_COSINE = 1 / 512
+"""Cosines below are taken for this: shading normals may face away from the viewer."""
+FLOOR = 0.04
+"""Where the divisor begins to depart from the reflectance: what a dielectric reflects at least, head-on."""
+
+_STORED = Path(__file__).parent / "shipped" / "directional-albedo.npz"
+
+
+def ggx_albedo_table(*, lobe: Lobe = "ggx", size: int = SIZE, samples: int = SAMPLES) -> np.ndarray:
+    """The table [size, size, 2] of A and B, float32, over n.v (first axis) and linear roughness r (second).
+
+    Entry (i, j) stands for ``n.v = (i + 0.5) / size`` and ``r = (j + 0.5) / size``, with alpha = r^2. Half vectors
+    (visible normals; Heitz 2018) come from a Hammersley set of ``samples`` points: the same table on every machine, up
+    to rounding. A, B >= 0 and A + B <= 1. A stored table of every lobe comes with the package (:func:`albedo_table`).
+    """
+    check_option(lobe, "lobe", LOBES)
+    centres = (np.arange(size) + 0.5) / size
+    points = _hammersley(samples)
+    table = np.empty((size, size, 2))
+    for column, roughness in enumerate(centres):
+        table[:, column] = _integrate(lobe, centres, roughness**2, points)
+    # The sampled mean of what reflects everything may exceed 1 by its error (Beckmann: 7e-6).
+    return (table / np.maximum(table.sum(-1, keepdims=True), 1.0)).astype(np.float32)
+
+
+def _hammersley(count: int) -> np.ndarray:
+    """[count, 2] low-discrepancy points in [0, 1)^2: centres of equal intervals, and radical inverses in base 2."""
+    index = np.arange(count, dtype=np.uint64)
+    inverse, scale = np.zeros(count), 0.5
+    for _ in range(32):
+        inverse += scale * (index & np.uint64(1))
+        index, scale = index >> np.uint64(1), scale / 2
+    return np.stack([(np.arange(count) + 0.5) / count, inverse], axis=-1)
+
+
+def _integrate(lobe: Lobe, cosines: np.ndarray, alpha: float, points: np.ndarray) -> np.ndarray:
+    """A and B [n, 2] for cosines [n] of the view direction, float64."""
+    view = np.stack([np.sqrt(1 - cosines**2), np.zeros_like(cosines), cosines], axis=-1)[:, None]  # [n, 1, 3]
+    if lobe == "beckmann":
+        half, weight = _beckmann_normals(view, alpha, points)
+    else:
+        half, weight = _visible_normals(view, alpha, points), None
+    aligned = np.sum(view * half, axis=-1)  # v.h
+    light = 2 * aligned[..., None] * half - view
+    above = (light[..., 2] > 0) & (aligned > 0)
+    to_light = np.where(above, light[..., 2], 1.0)
+    before, after = (_smith(lobe, cosine, alpha) for cosine in (view[..., 2], to_light))
+    if weight is None:  # visible normals: the weight is G2 / G1(v)
+        shadowing = (1 + before) / (1 + before + after) if lobe == "ggx-correlated" else 1 / (1 + after)
+    else:
+        shadowing = weight * aligned / ((1 + before) * (1 + after))
+    shadowing = np.where(above, shadowing, 0.0)
+    grazing = (1 - np.clip(aligned, 0, 1)) ** 5
+    return np.stack([np.mean(shadowing * (1 - grazing), axis=-1), np.mean(shadowing * grazing, axis=-1)], axis=-1)
+
+
+def _visible_normals(view: np.ndarray, alpha: float, points: np.ndarray) -> np.ndarray:
+    """GGX half vectors [n, s, 3] in proportion to how much of them is seen (Heitz 2018)."""
+    stretched = view * np.array([alpha, alpha, 1.0])
+    stretched /= np.linalg.norm(stretched, axis=-1, keepdims=True)
+    # An orthonormal basis about the stretched view direction, which has no y component.
+    first = np.array([0.0, 1.0, 0.0])
+    second = np.cross(stretched, first)
+    radius, angle = np.sqrt(points[:, 0]), 2 * np.pi * points[:, 1]
+    x, y = radius * np.cos(angle), radius * np.sin(angle)
+    share = 0.5 * (1 + stretched[..., 2])
+    y = (1 - share) * np.sqrt(1 - x**2) + share * y
+    z = np.sqrt(np.maximum(0, 1 - x**2 - y**2))
+    normal = x[..., None] * first + y[..., None] * second + z[..., None] * stretched
+    half = normal * np.array([alpha, alpha, 1.0])
+    half[..., 2] = np.maximum(half[..., 2], 1e-9)
+    return half / np.linalg.norm(half, axis=-1, keepdims=True)
+
+
+def _beckmann_normals(view: np.ndarray, alpha: float, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Beckmann half vectors [1, s, 3] in proportion to D n.h, and the rest of the estimator, 1 / (n.h n.v) [n, s]."""
+    slope = alpha**2 * -np.log1p(-points[:, 0])  # tan^2
+    cosine = 1 / np.sqrt(1 + slope)
+    sine, angle = np.sqrt(np.maximum(0, 1 - cosine**2)), 2 * np.pi * points[:, 1]
+    half = np.stack([sine * np.cos(angle), sine * np.sin(angle), cosine], axis=-1)[None]
+    return half, 1 / (cosine[None] * view[..., 2])
+
+
+def _smith(lobe: Lobe, cosine: np.ndarray, alpha: float) -> np.ndarray:
+    """Smith's Lambda: masking is 1 / (1 + Lambda). Beckmann's by the fit of Walter et al. 2007, as Mitsuba has it."""
+    tangent = np.sqrt(np.maximum(0, 1 - cosine**2)) / cosine
+    if lobe != "beckmann":
+        return 0.5 * (np.sqrt(1 + (alpha * tangent) ** 2) - 1)
+    a = 1 / np.maximum(alpha * tangent, 1e-12)
+    fit = np.where(a < 1.6, (3.535 * a + 2.181 * a**2) / (1 + 2.276 * a + 2.577 * a**2), 1.0)
+    return 1 / fit - 1
+
+
+@functools.cache
+def albedo_table(lobe: Lobe = "ggx") -> np.ndarray:
+    """The stored table [128, 128, 2] of a lobe: what :func:`ggx_albedo_table` makes."""
+    check_option(lobe, "lobe", LOBES)
+    with np.load(_STORED, allow_pickle=False) as stored:
+        return stored[lobe]
+
+
+def directional_albedo(
+    albedo: jax.Array, specular: jax.Array, roughness: jax.Array, cosine: jax.Array, *, lobe: Lobe = "ggx"
+) -> jax.Array:
+    """``albedo + specular A + B`` [H, W, 3]: what a diffuse surface with a microfacet lobe reflects of light all around.
+
+    Differentiable in all four. Roughness and cosines are clamped to what the table covers. Raises ValueError for shapes
+    that do not fit.
+
+    Args:
+      albedo: [H, W, 3] reflectance of the diffuse part.
+      specular: [H, W, 3] F0, the specular reflectance head-on.
+      roughness: [H, W, 1] linear roughness r in [0, 1], alpha = r^2.
+      cosine: [H, W, 1] n.v, of the shading normal and the direction to the viewer.
+      lobe: which microfacet model.
+    """
+    for name, image, channels in (("albedo", albedo, 3), ("specular", specular, 3)):
+        check_image(image, name, channels=channels)
+    for name, image in (("roughness", roughness), ("cosine", cosine)):
+        check_image(image, name, channels=1)
+        check_same_size(albedo, image, ("albedo", name))
+    check_same_size(albedo, specular, ("albedo", "specular"))
+    found = _look_up(jnp.asarray(albedo_table(lobe)), jnp.maximum(cosine, SMALLEST_COSINE), roughness)
+    return albedo + specular * found[..., :1] + found[..., 1:]
+
+
+def _look_up(table: jax.Array, cosine: jax.Array, roughness: jax.Array) -> jax.Array:
+    """A and B [H, W, 2], bilinear between the centres of the entries, constant beyond the outermost."""
+    size = table.shape[0]
+    y, x = (jnp.clip(value[..., 0] * size - 0.5, 0.0, size - 1.0) for value in (cosine, roughness))
+    top, left = (jnp.clip(jnp.floor(at), 0, size - 2).astype(jnp.int32) for at in (y, x))
+    down, right = (y - top)[..., None], (x - left)[..., None]
+    table = table.astype(y.dtype)
+    upper = (1 - right) * table[top, left] + right * table[top, left + 1]
+    lower = (1 - right) * table[top + 1, left] + right * table[top + 1, left + 1]
+    return (1 - down) * upper + down * lower
+
+
+def divisor(reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
+    """What light is divided by: ``sqrt(reflectance^2 + floor^2)``, which is the reflectance where that is not small.
+
+    Smooth everywhere: two neighbours whose reflectances are alike are divided by what is alike, however dark they are.
+    A switch (1 below a threshold) makes of 0.009 and 0.011 a factor of 90 in what is filtered.
+    """
+    return jnp.sqrt(reflectance * reflectance + floor * floor)
+
+
+def demodulate(radiance: jax.Array, reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
+    """Radiance [H, W, 3] divided by what the surface reflects; finite for any reflectance >= 0."""
+    check_same_size(radiance, reflectance, ("radiance", "reflectance"))
+    return radiance / divisor(reflectance, floor=floor)
+
+
+def remodulate(light: jax.Array, reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
+    """The inverse of :func:`demodulate` with the same reflectance, up to rounding."""
+    check_same_size(light, reflectance, ("light", "reflectance"))
+    return light * divisor(reflectance, floor=floor)

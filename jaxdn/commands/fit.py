@@ -1,0 +1,206 @@
+"""The loop around the train step: data, validation, progress and checkpoints."""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from jaxdn import color, metrics
+from jaxdn.checkpoint import Checkpoints
+from jaxdn.clips import read_clip
+from jaxdn.commands.log import Log
+from jaxdn.denoiser import Denoiser
+from jaxdn.files import write_json
+from jaxdn.frame import Clip
+from jaxdn.learning.step import TrainState, initial_state, make_train_step
+from jaxdn.recipe import Recipe
+from jaxdn.rollout import denoise
+
+
+def make_validation(denoiser: Denoiser, clips: Sequence[Clip]) -> Callable[[Any], float]:
+    """A function of the parameters: the mean over the clips of the PSNR of all their frames, tone-mapped, in dB.
+
+    Compiled once for clips of one size. Not a number without clips.
+    """
+
+    @jax.jit
+    def score(params: Any, clip: Clip) -> jax.Array:
+        return metrics.psnr(color.tonemap(denoise(denoiser, params, clip)), color.tonemap(clip.reference))
+
+    return lambda params: float(np.mean([float(score(params, clip)) for clip in clips])) if clips else float("nan")
+
+
+def fit(
+    denoiser: Denoiser,
+    recipe: Recipe,
+    batches: Iterator[Clip],
+    folder: Path,
+    *,
+    label: str,
+    validation: Sequence[Clip] = (),
+    log_every: int = 20,
+    validate_every: int = 100,
+    checkpoint_every: int = 100,
+) -> TrainState:
+    """Train to ``recipe.steps`` updates, continuing from the newest checkpoint in ``folder`` as if never stopped.
+
+    ``batches`` is a Grain iterator (it has ``get_state`` and ``set_state``): its position is kept in every checkpoint.
+    Interrupted (Ctrl-C), the state is written before KeyboardInterrupt goes on. The log is ``folder/log.jsonl``.
+    Raises ValueError, saying what to change, when none of many updates in a row was of any effect.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    _same_recipe(folder / "recipe.json", recipe)
+    checkpoints = Checkpoints(folder / "checkpoints")
+    first_position = batches.get_state()  # type: ignore[attr-defined]
+    state = initial_state(denoiser, recipe, next(batches))
+    batches.set_state(first_position)  # type: ignore[attr-defined]
+    found = checkpoints.restore(state)
+    if found is not None:
+        state, position = found
+        batches.set_state(position)  # type: ignore[attr-defined]
+    step = int(state.step)
+    log = Log(folder / "log.jsonl", keep_until=step)
+    train_step = make_train_step(denoiser, recipe)
+    validate = make_validation(denoiser, validation)
+    # A write of the state while it is being replaced would keep neither: the position belongs to finished updates only.
+    position = batches.get_state()  # type: ignore[attr-defined]
+    saved = step
+    watch = _Divergence(label, recipe, step, int(state.skipped))
+    with _Progress(label, recipe, step) as progress:
+        try:
+            while step < recipe.steps:
+                batch = next(batches)
+                state, report = train_step(state, batch)
+                step, position = step + 1, batches.get_state()  # type: ignore[attr-defined]
+                if step % log_every == 0 or step == recipe.steps:
+                    loss, skipped = float(report.loss), int(state.skipped)
+                    log.write(step=step, loss=loss, last_frame_psnr=float(report.validation_psnr))
+                    progress.advance(step, loss=loss, skipped=skipped)
+                    watch.look(step, skipped=skipped, norm=float(report.gradient_norm))
+                if validation and (step % validate_every == 0 or step == recipe.steps):
+                    psnr = validate(state.params)
+                    log.write(step=step, validation_psnr=psnr)
+                    progress.validated(psnr)
+                if step % checkpoint_every == 0 or step == recipe.steps:
+                    checkpoints.save(state, position)
+                    saved = step
+        except KeyboardInterrupt:
+            if saved < step:
+                checkpoints.save(state, position)
+            progress.say(f"{label}: stopped after {step} of {recipe.steps} steps; the same command continues there.")
+            raise
+        finally:
+            checkpoints.close()
+            log.close()
+    return state
+
+
+def load_validation(denoiser: Denoiser, folders: Sequence[Path], *, spp: int = 1) -> list[Clip]:
+    """Whole held-out clips, as they are validated on."""
+    return [read_clip(folder, spp=spp, layers=denoiser.samples is not None) for folder in folders]
+
+
+def _same_recipe(path: Path, recipe: Recipe) -> None:
+    """Write the recipe of a new run; raise ValueError where an old run was made by another one."""
+    wanted = recipe.record()
+    if path.is_file():
+        there = json.loads(path.read_text())
+        differing = {key: (there.get(key), value) for key, value in wanted.items() if there.get(key) != value}
+        if differing:
+            changes = ", ".join(f"{key} {old!r} -> {new!r}" for key, (old, new) in differing.items())
+            raise ValueError(
+                f"{path}: expected the recipe that this run was started with, got {changes}; give the new run another "
+                "name, or delete the folder to start over."
+            )
+        return
+    write_json(path, wanted)
+
+
+class _Divergence:
+    """Raises where training goes on without learning: for 100 updates, or half of all, none was of any effect."""
+
+    def __init__(self, label: str, recipe: Recipe, step: int, skipped: int):
+        self._label, self._recipe = label, recipe
+        self._patience = max(1, min(100, recipe.steps // 2))
+        self._learned = self._seen = step
+        self._skipped = skipped
+
+    def look(self, step: int, *, skipped: int, norm: float) -> None:
+        """Take in that of ``step`` updates ``skipped`` were not finite, and the norm of the newest gradient.
+
+        Weights that have grown beyond all measure may still give finite images, from which no gradient comes back.
+        """
+        if skipped - self._skipped < step - self._seen and norm != 0:
+            self._learned = step
+        self._seen, self._skipped = step, skipped
+        if step - self._learned >= self._patience:
+            raise ValueError(
+                f"{self._label}: nothing was learned in the updates {self._learned + 1} to {step} ({skipped} so far "
+                f"were not finite, the newest gradient's norm is {norm:g}); start again under another name with a "
+                f"learning rate below {self._recipe.learning_rate:g}, and look for clips that are black."
+            )
+
+
+class _Progress:
+    """A bar with loss, validation PSNR, frames/s and time left; plain lines where nobody watches."""
+
+    def __init__(self, label: str, recipe: Recipe, start: int):
+        self._label, self._recipe, self._first = label, recipe, start
+        self._validation = float("nan")
+        self._console = Console(stderr=False)
+        self._began: float | None = None
+        self._printed = 0.0
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed}/{task.total} steps  {task.fields[state]}"),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not sys.stdout.isatty(),
+        )
+        self._task = self._bar.add_task(label, total=recipe.steps, completed=start, state="compiling ...")
+
+    def __enter__(self) -> "_Progress":
+        self._bar.start()
+        if self._first >= self._recipe.steps:
+            self.say(f"{self._label}: all {self._recipe.steps} steps are there already")
+        elif self._bar.disable:
+            self.say(f"{self._label}: step {self._first} of {self._recipe.steps}, compiling ...")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def say(self, line: str) -> None:
+        """One line above the bar."""
+        self._console.print(line, highlight=False, markup=False)
+
+    def validated(self, psnr: float) -> None:
+        """Remember the newest validation PSNR."""
+        self._validation = psnr
+
+    def advance(self, step: int, *, loss: float, skipped: int) -> None:
+        """Show where training stands after ``step`` updates."""
+        now = time.monotonic()
+        if self._began is None:  # the first report comes after the compilation: count speed from there
+            self._began, self._first = now, step
+        rate = (step - self._first) / max(now - self._began, 1e-9)
+        state = f"loss {loss:.4f}"
+        if self._validation == self._validation:
+            state += f"  validation {self._validation:.2f} dB"
+        if rate > 0:
+            state += f"  {rate * self._recipe.batch * self._recipe.frames:.0f} frames/s"
+        if skipped:
+            state += f"  {skipped} skipped (gradient not finite)"
+        self._bar.update(self._task, completed=step, state=state)
+        if self._bar.disable and (now - self._printed > 15 or step == self._recipe.steps):
+            left = f"  {(self._recipe.steps - step) / rate:.0f} s left" if rate > 0 else ""
+            self.say(f"{self._label}: step {step}/{self._recipe.steps}  {state}{left}")
+            self._printed = now

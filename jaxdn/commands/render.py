@@ -1,0 +1,126 @@
+"""``jaxdn render``: animated clips by Mitsuba, with what their scenes call for and nothing else."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jaxdn.denoiser import Denoiser
+from jaxdn.effects import Effects, Plan, chosen, inspect, plan
+from jaxdn.render.depth import PathDepth, measure_depth
+from jaxdn.render.families import FAMILIES
+from jaxdn.render.farm import ClipJob, render_clips
+from jaxdn.render.opening import scene_from_record
+from jaxdn.render.scene import AnimatedScene
+from jaxdn.render.scene_file import SceneFile
+from jaxdn.render.variant import choose_variant
+
+
+class Planned(NamedTuple):
+    """What was found in a scene, and what follows from it."""
+
+    effects: Effects
+    plan: Plan
+    depth: PathDepth | None = None
+    """How the plan's path length was measured; None where it was not."""
+
+
+def plan_clip(
+    scene: AnimatedScene,
+    *,
+    effects: str = "auto",
+    denoiser: Denoiser | None = None,
+    width: int,
+    height: int,
+    frames: int,
+    max_depth: int | None = None,
+) -> Planned | None:
+    """The effects to render an animated scene for, and the plan; None is to render everything (``"all"``).
+
+    ``effects`` is ``"auto"``, ``"all"``, or names joined by commas. With ``"auto"`` the path length is measured unless
+    ``max_depth`` is given. Raises ValueError for a name that is no effect.
+    """
+    if effects == "all":
+        return None
+    if effects != "auto":
+        named = chosen([name.strip() for name in effects.split(",") if name.strip()], frames)
+        return Planned(named, plan(named, denoiser, max_depth=max_depth))
+    found = inspect(scene, width=width, height=height, frames=frames)
+    made = plan(found, denoiser, max_depth=max_depth)
+    # Measuring takes a path tracer, and light that longer paths may add to.
+    if max_depth is not None or not made.indirect or made.integrator != "path":
+        return Planned(found, made)
+    depth = measure_depth(scene)
+    return Planned(found, plan(found, denoiser, max_depth=depth.max_depth), depth)
+
+
+def render(
+    source: str,
+    out: Path,
+    *,
+    animation: Path | None,
+    seeds: Sequence[int],
+    width: int,
+    height: int,
+    frames: int,
+    reference_spp: int,
+    layers: Sequence[int],
+    max_depth: int | None,
+    effects: str,
+    workers: int | None,
+) -> list[Path]:
+    """Render clips into folders ``out/<scene>-<seed>``, or go on with them, and return these folders.
+
+    Args:
+      source: a family, of which each seed is another scene, or a Mitsuba scene (.xml), whose seeds differ in noise
+        alone.
+      out: the folder for the clips.
+      animation: animation file for a scene file; default: the one next to it.
+      seeds: one clip each.
+      width: in pixels.
+      height: in pixels.
+      frames: how many.
+      reference_spp: samples a pixel of the reference; 0 for none.
+      layers: samples a pixel of the noisy layers, powers of two.
+      max_depth: path length (1 emission, 2 direct light ...); default: measured, or the scene's own.
+      effects: as in :func:`plan_clip`.
+      workers: processes; default: the cores.
+
+    Prints the variant, what each clip is rendered for, and how far rendering is. Raises ValueError for what is no scene
+    and for options out of range, RenderError, at the end, for clips that failed.
+    """
+    scenes = _scenes(source, animation, seeds)
+    choice = choose_variant()
+    print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
+    size: dict[str, Any] = {"width": width, "height": height, "frames": frames}
+    jobs = []
+    for name, scene, noises in scenes:
+        planned = plan_clip(scene, effects=effects, max_depth=max_depth, **size)
+        for seed in noises:
+            clip = f"{name}-{seed}"
+            if planned is not None:
+                found = ", ".join(planned.effects) or "no effects"
+                print(f"{clip}: {found}; paths of depth {planned.plan.max_depth}", flush=True)
+            job = ClipJob(
+                scene.record,
+                str(out / clip),
+                **size,
+                layers=tuple(layers),
+                reference_spp=reference_spp,
+                max_depth=max_depth,
+                seed=seed,
+                plan=None if planned is None else planned.plan.record(),
+            )
+            jobs.append(job)
+    return render_clips(jobs, workers=workers)
+
+
+def _scenes(
+    source: str, animation: Path | None, seeds: Sequence[int]
+) -> Iterable[tuple[str, AnimatedScene, list[int]]]:
+    """Every scene once: its name, the scene, and the seeds of the noise that it is rendered with."""
+    if source in FAMILIES:  # made one at a time: there may be hundreds
+        return ((source, scene_from_record({"family": source, "seed": seed}), [seed]) for seed in seeds)
+    if source.endswith(".xml"):
+        scene = SceneFile(Path(source), animation)
+        return [(scene.name, scene, list(seeds))]
+    raise ValueError(f"scene {source!r}: expected a family ({', '.join(sorted(FAMILIES))}) or a Mitsuba scene (.xml).")

@@ -1,0 +1,5 @@
+"""The error that rendering raises; this module imports no renderer, so that whoever handles errors needs none."""
+
+
+class RenderError(RuntimeError):
+    """A frame that could not be rendered; the message names the clip, the frame and the reason."""

@@ -1,0 +1,116 @@
+"""What training minimises, against NumPy in float64."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdn.frame import Clip, Frame
+from jaxdn.methods.table import methods
+from jaxdn.objectives import disocclusions, indirect_illumination
+
+SHAPE = (5, 6, 7)
+OBJECTIVE = indirect_illumination()
+
+
+@pytest.fixture
+def images(rng):
+    """Denoised frames with blacks and fireflies."""
+    light = rng.exponential(size=(*SHAPE, 3)) * 10.0 ** rng.integers(-4, 3, (*SHAPE, 3))
+    return jnp.asarray(np.where(rng.random((*SHAPE, 3)) < 0.1, 0, light), jnp.float32)
+
+
+@pytest.fixture
+def clip(rng):
+    """Vectors of which a third differ by more than half a pixel from the dual ones."""
+    motion = rng.normal(size=(*SHAPE, 2)).astype(np.float32)
+    dual = motion + 5 * (rng.random((*SHAPE, 1)) < 0.3).astype(np.float32)
+    frames = Frame(jnp.ones((*SHAPE, 3)), motion=jnp.asarray(motion), dual_motion=jnp.asarray(dual))
+    return Clip(frames, jnp.asarray(rng.exponential(size=(*SHAPE, 3)), jnp.float32))
+
+
+def numpy_compress(x):
+    u = np.log1p(np.asarray(x, np.float64))
+    toe = 1e-4
+    return np.where(u <= toe, toe ** (1 / 2.2) / toe * u, u ** (1 / 2.2))
+
+
+def numpy_objective(images, clip, *, occlusion):
+    """Spatial, temporal and motion-occlusion terms of all frames but the last, each a mean over its elements."""
+    trained = max(1, len(images) - 1)
+    error = numpy_compress(images[:trained]) - numpy_compress(clip.reference[:trained])
+    total = np.abs(error).mean()
+    if trained > 1:
+        total += np.mean([np.abs(error[t] - error[t - 1]) for t in range(1, trained)])
+    if occlusion:
+        apart = np.asarray(clip.frames.dual_motion, np.float64) - np.asarray(clip.frames.motion, np.float64)
+        masks = (np.linalg.norm(apart, axis=-1, keepdims=True) > 0.5).astype(float)
+        lately = [
+            sum(weight * masks[t - age if t >= age else t] for age, weight in enumerate((1.0, 0.8, 0.6)))
+            for t in range(trained)
+        ]
+        total += np.abs(error * np.stack(lately)).mean()
+    return total
+
+
+@pytest.mark.parametrize(("progress", "joined"), [(0.0, False), (0.499, False), (0.5, True), (1.0, True)])
+def test_it_is_the_papers_sum_and_the_occlusion_term_joins_in_the_second_half(progress, joined, images, clip):
+    found = jax.jit(OBJECTIVE.loss)(images, clip, jnp.asarray(progress))
+    expected = numpy_objective(images, clip, occlusion=joined)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    other = numpy_objective(images, clip, occlusion=not joined)
+    assert abs(other - expected) > 0.05 * expected  # the two could not be taken for one another
+
+
+@pytest.mark.parametrize("progress", [0.0, 1.0])
+def test_without_occlusion_it_never_joins(progress, images, clip):
+    found = indirect_illumination(occlusion=False).loss(images, clip, jnp.asarray(progress))
+    np.testing.assert_allclose(found, numpy_objective(images, clip, occlusion=False), rtol=1e-5)
+
+
+def test_the_two_have_names_of_their_own():
+    assert OBJECTIVE.name != indirect_illumination(occlusion=False).name
+
+
+def test_the_last_frame_gives_no_gradient_and_all_others_do(images, clip):
+    slope = np.asarray(jax.jit(jax.grad(OBJECTIVE.loss))(images, clip, jnp.asarray(1.0)))
+    assert np.isfinite(slope).all()
+    np.testing.assert_array_equal(slope[-1], 0)
+    assert all(np.abs(slope[index]).max() > 0 for index in range(len(slope) - 1))
+    spoilt = clip._replace(reference=clip.reference.at[-1].multiply(7.0))
+    np.testing.assert_array_equal(jax.grad(OBJECTIVE.loss)(images, spoilt, jnp.asarray(1.0)), slope)
+
+
+def test_a_clip_of_one_frame_is_trained_on(images, clip):
+    one = jax.tree.map(lambda buffer: buffer[:1], clip)
+    found, slope = jax.value_and_grad(OBJECTIVE.loss)(images[:1], one, jnp.asarray(1.0))
+    np.testing.assert_allclose(found, numpy_objective(images[:1], one, occlusion=True), rtol=1e-5)
+    assert np.abs(slope).max() > 0
+
+
+def test_a_denoised_clip_that_is_its_reference_costs_nothing(clip):
+    found, slope = jax.value_and_grad(OBJECTIVE.loss)(clip.reference, clip, jnp.asarray(1.0))
+    assert found == 0
+    np.testing.assert_array_equal(slope, 0)
+
+
+@pytest.mark.parametrize("absent", [("motion",), ("dual_motion",), ("motion", "dual_motion")])
+def test_without_vectors_nothing_is_disoccluded(absent, images, clip):
+    still = clip._replace(frames=clip.frames._replace(**dict.fromkeys(absent)))
+    np.testing.assert_array_equal(disocclusions(still.frames), np.zeros((*SHAPE, 1)))
+    found = OBJECTIVE.loss(images, still, jnp.asarray(1.0))
+    np.testing.assert_allclose(found, numpy_objective(images, clip, occlusion=False), rtol=1e-5)
+
+
+def test_both_halves_of_training_are_one_program(images, clip):
+    loss = jax.jit(OBJECTIVE.loss)
+    for progress in (0.0, 0.25, 0.5, 1.0):
+        loss(images, clip, jnp.asarray(progress))
+    assert loss._cache_size() == 1
+
+
+@pytest.mark.parametrize("name", [name for name, method in methods().items() if method.learns])
+def test_every_learned_method_says_what_it_minimises(name):
+    for recipe in methods()[name].recipes.values():
+        assert recipe.objective.name
+        assert recipe.record()["objective"] == recipe.objective.name

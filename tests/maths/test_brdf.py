@@ -1,0 +1,146 @@
+"""Directional albedo against brute-force integration of the BRDF, and light divided by what a surface reflects."""
+
+import hypothesis
+import hypothesis.extra.numpy as arrays
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import strategies
+from jax.test_util import check_grads
+
+from jaxdn import brdf
+
+CHECK = [  # cosine, roughness, (A, B) separable, (A, B) height-correlated
+    (0.3, 0.3, (0.8095, 0.1358), (0.8099, 0.1359)),
+    (0.6, 0.6, (0.775, 0.008), (0.778, 0.008)),
+    (0.1, 0.1, (0.416, 0.578), (0.416, 0.578)),
+    (0.95, 0.9, (0.426, 0.000), (0.427, 0.000)),
+    (0.1, 0.9, (0.618, 0.021), (0.767, 0.032)),
+    (0.5, 0.5, (0.833, 0.022), (0.835, 0.022)),
+]
+
+
+def looked_up(lobe, cosine, roughness):
+    """A and B from the stored table, by way of the public function."""
+    one = jnp.ones((1, 1, 1))
+
+    def of(specular):
+        zero = jnp.zeros((1, 1, 3))
+        return brdf.directional_albedo(zero, zero + specular, roughness * one, cosine * one, lobe=lobe)[0, 0, 0]
+
+    return float(of(1.0) - of(0.0)), float(of(0.0))
+
+
+@pytest.mark.parametrize(("cosine", "roughness", "separable", "correlated"), CHECK)
+def test_the_table_has_the_known_values(cosine, roughness, separable, correlated):
+    np.testing.assert_allclose(looked_up("ggx", cosine, roughness), separable, atol=0.004)
+    np.testing.assert_allclose(looked_up("ggx-correlated", cosine, roughness), correlated, atol=0.004)
+
+
+def integrated(lobe, cosine, roughness, schlick):
+    """Integral of D G F / (4 n.l n.v) n.l over light directions by the midpoint rule, written from the equations."""
+    alpha = roughness**2
+    count = 1500
+    mu = (np.arange(count) + 0.5) / count
+    phi = (np.arange(count) + 0.5) / count * 2 * np.pi
+    mu, phi = np.meshgrid(mu, phi, indexing="ij")
+    light = np.stack([np.sqrt(1 - mu**2) * np.cos(phi), np.sqrt(1 - mu**2) * np.sin(phi), mu], -1)
+    view = np.array([np.sqrt(1 - cosine**2), 0, cosine])
+    half = light + view
+    half /= np.linalg.norm(half, axis=-1, keepdims=True)
+    nh, vh = half[..., 2], half @ view
+    if lobe == "beckmann":
+        distribution = np.exp((nh**2 - 1) / (nh**2 * alpha**2)) / (np.pi * alpha**2 * nh**4)
+    else:
+        distribution = alpha**2 / (np.pi * (nh**2 * (alpha**2 - 1) + 1) ** 2)
+
+    def masking(c):
+        if lobe == "beckmann":
+            a = c / (alpha * np.sqrt(1 - c**2))
+            fit = (3.535 * a + 2.181 * a**2) / (1 + 2.276 * a + 2.577 * a**2)
+            return np.where(a < 1.6, fit, 1.0)
+        return 2 * c / (c + np.sqrt(alpha**2 + (1 - alpha**2) * c**2))
+
+    shadowing = masking(mu) * masking(np.full_like(mu, cosine))
+    if lobe == "ggx-correlated":
+        shadowing = 1 / (1 / masking(mu) + 1 / masking(np.full_like(mu, cosine)) - 1)
+    term = (1 - vh) ** 5 if schlick else 1 - (1 - vh) ** 5
+    return np.sum(distribution * shadowing * term / (4 * cosine)) * 2 * np.pi / count**2
+
+
+@pytest.mark.parametrize("lobe", brdf.LOBES)
+@pytest.mark.parametrize(("cosine", "roughness"), [(0.3, 0.5), (0.8, 0.7), (0.55, 0.95), (0.9, 0.4)])
+def test_the_table_is_the_integral_of_the_brdf(lobe, cosine, roughness):
+    expected = [integrated(lobe, cosine, roughness, schlick) for schlick in (False, True)]
+    np.testing.assert_allclose(looked_up(lobe, cosine, roughness), expected, atol=0.003)
+
+
+@pytest.mark.parametrize("lobe", brdf.LOBES)
+def test_the_table_loses_light_and_makes_none(lobe):
+    table = brdf.albedo_table(lobe)
+    assert table.shape == (brdf.SIZE, brdf.SIZE, 2)
+    assert table.dtype == np.float32
+    assert np.all(table >= 0)
+    assert np.all(table.sum(-1) <= 1 + 1e-6)
+    np.testing.assert_allclose(table[8:, 0].sum(-1), 1, atol=2e-3)  # a mirror reflects everything
+
+
+def test_the_stored_tables_are_what_the_function_makes():
+    for lobe in brdf.LOBES:
+        small = brdf.ggx_albedo_table(lobe=lobe, size=8, samples=brdf.SAMPLES)
+        centres = (np.arange(8) + 0.5) / 8
+        found = np.array([[looked_up(lobe, c, r) for r in centres] for c in centres])
+        np.testing.assert_allclose(found, small, atol=0.003)
+        again = brdf.ggx_albedo_table(lobe=lobe, size=8, samples=brdf.SAMPLES)
+        np.testing.assert_array_equal(small, again)
+
+
+def test_gradients_of_the_directional_albedo(x64, rng):
+    arguments = [rng.uniform(0.05, 0.9, (3, 4, c)) for c in (3, 3, 1, 1)]
+    check_grads(brdf.directional_albedo, arguments, order=1, modes=["rev"], eps=1e-7, atol=1e-4, rtol=1e-4)
+
+
+def test_out_of_range_is_clamped_and_finite():
+    one = jnp.ones((1, 1, 1))
+    color = jnp.full((1, 1, 3), 0.5)
+    for roughness in (-1.0, 0.0, 2.0):
+        for cosine in (-1.0, 0.0, 1e-9, 1.0, 5.0):
+            found = brdf.directional_albedo(color, color, roughness * one, cosine * one)
+            assert jnp.isfinite(found).all()
+            assert (found >= 0.5).all()
+            assert (found <= 1.5).all()
+
+
+@hypothesis.given(
+    arrays.arrays(np.float32, (2, 3, 3), elements=strategies.floats(0, 6e4, width=32)),
+    arrays.arrays(np.float32, (2, 3, 3), elements=strategies.floats(0, 1, width=32)),
+)
+def test_dividing_and_multiplying_again_changes_nothing(radiance, reflectance):
+    light = brdf.demodulate(radiance, reflectance)
+    assert jnp.isfinite(light).all()
+    np.testing.assert_allclose(brdf.remodulate(light, reflectance), radiance, rtol=1e-6, atol=1e-30)
+
+
+@hypothesis.given(strategies.floats(0, 1), strategies.floats(1e-6, 1e-3))
+def test_no_threshold_tells_alike_neighbours_apart(reflectance, difference):
+    near = jnp.asarray([reflectance, reflectance + difference])
+    first, second = np.asarray(brdf.divisor(near))
+    assert abs(second / first - 1) <= difference / brdf.FLOOR * 1.01 + 1e-6
+
+
+def test_slopes_stay_finite_at_no_reflectance():
+    slope = jax.grad(lambda reflectance: brdf.demodulate(jnp.ones((1, 1, 3)), reflectance).sum())(jnp.zeros((1, 1, 3)))
+    assert jnp.isfinite(slope).all()
+
+
+def test_wrong_shapes_raise():
+    color, one = jnp.ones((2, 2, 3)), jnp.ones((2, 2, 1))
+    with pytest.raises(ValueError, match="specular"):
+        brdf.directional_albedo(color, one, one, one)
+    with pytest.raises(ValueError, match="same size"):
+        brdf.directional_albedo(color, color, one[:1], one)
+    with pytest.raises(ValueError, match="lobe"):
+        brdf.directional_albedo(color, color, one, one, lobe="phong")
+    with pytest.raises(ValueError, match="same size"):
+        brdf.demodulate(color, color[:1])

@@ -1,0 +1,82 @@
+"""``jaxdn render``: scenes are opened and planned once, and the clips are what was asked for."""
+
+import pytest
+
+from experiments.speed.small_rooms import CASES
+from jaxdn.clips.folder import is_clip, read_record
+from jaxdn.commands import render as command
+
+OPTIONS = {
+    "animation": None,
+    "width": 24,
+    "height": 16,
+    "frames": 2,
+    "reference_spp": 2,
+    "layers": [1],
+    "max_depth": None,
+    "effects": "auto",
+    "workers": 1,
+}
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """What is opened and planned, and the jobs that would be rendered."""
+    seen = {"opened": 0, "planned": 0, "jobs": []}
+
+    def count(name, what):
+        function = getattr(command, name)
+
+        def counting(*arguments, **options):
+            seen[what] += 1
+            return function(*arguments, **options)
+
+        monkeypatch.setattr(command, name, counting)
+
+    count("SceneFile", "opened")
+    count("scene_from_record", "opened")
+    count("inspect", "planned")
+    monkeypatch.setattr(command, "render_clips", lambda jobs, workers: seen["jobs"].extend(jobs) or [])
+    return seen
+
+
+def test_a_scene_file_is_opened_and_planned_once_for_all_seeds(counted, tmp_path, capsys):
+    path = CASES["moving: ball"].write(tmp_path)
+    command.render(str(path), tmp_path / "out", seeds=[3, 5, 8], **OPTIONS)
+    assert (counted["opened"], counted["planned"]) == (1, 1)
+    jobs = counted["jobs"]
+    name = tmp_path.name
+    assert [job.seed for job in jobs] == [3, 5, 8]
+    assert [job.folder for job in jobs] == [str(tmp_path / "out" / f"{name}-{seed}") for seed in (3, 5, 8)]
+    assert all(job.plan == jobs[0].plan for job in jobs)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("rendering with Mitsuba's ")
+    found = "object-motion, disocclusion, indirect, moving-shadow; paths of depth 6"
+    assert lines[1:] == [f"{name}-{seed}: {found}" for seed in (3, 5, 8)]
+
+
+def test_every_seed_of_a_family_is_a_scene_of_its_own(counted, tmp_path):
+    command.render("fruit", tmp_path, seeds=[0, 1], **OPTIONS)
+    assert (counted["opened"], counted["planned"]) == (2, 2)
+    assert [job.scene for job in counted["jobs"]] == [{"family": "fruit", "seed": seed} for seed in (0, 1)]
+
+
+@pytest.mark.parametrize(("effects", "planned"), [("all", False), ("indirect, glossy", True)])
+def test_effects_that_were_chosen_are_not_looked_for(counted, tmp_path, effects, planned):
+    command.render("fruit", tmp_path, seeds=[0], **{**OPTIONS, "effects": effects})
+    assert counted["planned"] == 0
+    assert (counted["jobs"][0].plan is not None) == planned
+
+
+def test_what_is_no_scene_is_refused_before_anything_is_tried(tmp_path, capsys):
+    with pytest.raises(ValueError, match=r"'castle': expected a family \(dash, .*\) or a Mitsuba scene"):
+        command.render("castle", tmp_path, seeds=[0], **OPTIONS)
+    assert capsys.readouterr().out == ""
+
+
+@pytest.mark.slow
+def test_clips_are_rendered(tmp_path):
+    path = CASES["static grey box"].write(tmp_path)
+    folders = command.render(str(path), tmp_path / "out", seeds=[0, 1], **{**OPTIONS, "workers": 2})
+    assert all(is_clip(folder) for folder in folders)
+    assert [read_record(folder)["seed"] for folder in folders] == [0, 1]
