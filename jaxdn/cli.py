@@ -102,8 +102,9 @@ class Train:
     steps: int | None = None
     batch: int | None = None
     crop: int | None = None
+    frames: int | None = None
     learning_rate: float | None = None
-    """These four, and the next two: default as in the recipe."""
+    """These five, and the next two: default as in the recipe."""
     rematerialize: bool | None = None
     """A quarter of the memory for 1.1 to 1.4 of the time."""
     seed: int | None = None

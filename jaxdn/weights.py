@@ -29,7 +29,7 @@ def flatten(params: dict[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
     flat: dict[str, np.ndarray] = {}
     for key, value in params.items():
         name = f"{prefix}/{key}" if prefix else str(key)
-        flat.update(flatten(value, name) if isinstance(value, dict) else {name: np.ascontiguousarray(value)})
+        flat.update(flatten(value, name) if isinstance(value, dict) else {name: np.asarray(value, order="C")})
     return flat
 
 

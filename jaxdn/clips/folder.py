@@ -218,14 +218,14 @@ def open_frames(
     reference.
     """
     if is_clip(path):
-        files = [frame_path(path, index) for index in range(read_record(path)["frames"])]
-        return files, read_frames(path, spp=spp)
+        frames = read_frames(path, spp=spp)  # finds out first whether there are as many as the record claims
+        return [frame_path(path, index) for index in range(read_record(path)["frames"])], frames
     if _looks_unfinished(path):
         raise _unfinished(Path(path))
     if spp != 1:
         raise ClipError(f"{path}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
-    files, frames = plain_frames(path, motion_convention=motion_convention, channels=channels)
-    return files, (StoredFrame(frame, {}, None, None) for frame in frames)
+    files, plain = plain_frames(path, motion_convention=motion_convention, channels=channels)
+    return files, (StoredFrame(frame, {}, None, None) for frame in plain)
 
 
 def read_clip(

@@ -81,5 +81,5 @@ def test_an_animation_nested_without_end_is_refused(tmp_path):
 def test_a_description_of_weights_nested_without_end_is_refused(tmp_path):
     (tmp_path / "weights.safetensors").write_bytes(b"")
     (tmp_path / "weights.json").write_text(DEEP)
-    with pytest.raises(ValueError, match=r"expected weights\.json beside it"):
+    with pytest.raises(ValueError, match=r"expected weights\.json in the same folder"):
         load_weights(tmp_path / "weights.safetensors")
