@@ -1,5 +1,6 @@
 """Stepping through a clip: as one scan, which is what training and notebooks want, or frame by frame as they come."""
 
+import functools
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
@@ -67,6 +68,17 @@ def denoise(denoiser: Denoiser, params: Params, clip: Clip) -> jax.Array:
     return unroll(denoiser, params, clip.frames, clip.layers)
 
 
+# Jitted once for all streams: a denoiser that goes through many clips is compiled once.
+@functools.partial(jax.jit, static_argnums=0)
+def _start(denoiser: Denoiser, params: Params, frame: Frame) -> State:
+    return denoiser.start(params, frame)
+
+
+@functools.partial(jax.jit, static_argnums=0, donate_argnums=2)
+def _step(denoiser: Denoiser, params: Params, state: State, frame: Frame, layers: Layers) -> tuple[State, jax.Array]:
+    return denoiser.step(params, state, sampled(denoiser, params, state, frame, layers))
+
+
 class Stream:
     """Frames in, images out, one at a time: the recurrent state is kept between calls. Made by :func:`stream`.
 
@@ -75,14 +87,9 @@ class Stream:
 
     def __init__(self, denoiser: Denoiser, params: Params) -> None:
         self._denoiser, self._params = denoiser, params
-        self._start = jax.jit(denoiser.start)
-        self._step = jax.jit(self._one, donate_argnums=1)
         self._state: Any = None
         self.programs: set[tuple[str, ...]] = set()
         """The sets of buffers, besides radiance, that a step was compiled for."""
-
-    def _one(self, params: Params, state: State, frame: Frame, layers: Layers) -> tuple[State, jax.Array]:
-        return self._denoiser.step(params, state, sampled(self._denoiser, params, state, frame, layers))
 
     def __call__(self, frame: Frame, layers: Layers = None) -> jax.Array:
         """Denoise the next frame [H, W, C]; returns [H, W, 3]."""
@@ -90,8 +97,8 @@ class Stream:
         self.programs.add(present(frame))
         if self._state is None:
             # Copied: what is donated to the step must not lie in one place twice.
-            self._state = jax.tree.map(jnp.copy, self._start(self._params, frame))
-        self._state, image = self._step(self._params, self._state, frame, layers)
+            self._state = jax.tree.map(jnp.copy, _start(self._denoiser, self._params, frame))
+        self._state, image = _step(self._denoiser, self._params, self._state, frame, layers)
         return image
 
     def each(self, frames: Iterable[Frame]) -> Iterator[jax.Array]:

@@ -9,8 +9,8 @@ import numpy as np
 from jaxdn import color
 from jaxdn.candidates import Candidate, candidate
 from jaxdn.clips.exr import write_exr
-from jaxdn.clips.folder import frame_path, is_clip, read_frames, read_record
-from jaxdn.clips.import_exr import plain_frames
+from jaxdn.clips.folder import open_frames
+from jaxdn.clips.frames import StoredFrame, doubling_layers
 from jaxdn.frame import Frame
 from jaxdn.repair import repair_image
 from jaxdn.report.images import save_png
@@ -72,7 +72,8 @@ def denoise_files(
       channels: buffer -> layer of foreign files to take it from.
       say: called with the frames done and the frames in all.
     """
-    names, frames = _open(source, spp, motion_convention, channels)
+    asks = method.denoiser is not None and method.denoiser.samples is not None
+    names, frames = _open(source, asks, spp, motion_convention, channels)
     if out.resolve() in {source.resolve(), *(name.resolve().parent for name in names)}:
         raise ValueError(f"{out}: expected another folder than the input's, whose frames would be overwritten.")
     step = None if method.denoiser is None else stream(method.denoiser, method.params)
@@ -91,24 +92,15 @@ def denoise_files(
 
 
 def _open(
-    source: Path, spp: int, motion_convention: str | None, channels: Mapping[str, str] | None
+    source: Path, asks: bool, spp: int, motion_convention: str | None, channels: Mapping[str, str] | None
 ) -> tuple[list[Path], Iterator[tuple[Frame, Layers]]]:
-    """The files, and their frames with a clip's independent noisy layers, read when asked for."""
-    if is_clip(source):
-        names = [frame_path(source, index) for index in range(read_record(source)["frames"])]
-        return names, ((stored.frame, _powers(stored.layers)) for stored in read_frames(source, spp=spp))
-    if spp != 1:
-        raise ValueError(f"{source}: expected spp 1, got {spp}; only rendered clips have several sample counts.")
-    names, frames = plain_frames(source, motion_convention=motion_convention, channels=channels)
-    return names, ((frame, None) for frame in frames)
+    """The files and their frames, read when needed; with independent noisy layers for a method that asks for samples."""
+    names, frames = open_frames(source, spp=spp, motion_convention=motion_convention, channels=channels)
 
+    def layers(stored: StoredFrame) -> Layers:
+        return {count: stored.layers[count] for count in doubling_layers(stored.layers, source)} if asks else None
 
-def _powers(layers: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
-    """The layers of 1, 2, 4, ... samples, up to the first that is missing."""
-    count = 0
-    while 1 << count in layers:
-        count += 1
-    return {1 << bit: layers[1 << bit] for bit in range(count)}
+    return names, ((stored.frame, layers(stored)) for stored in frames)
 
 
 def _light(radiance: np.ndarray | None) -> Any:

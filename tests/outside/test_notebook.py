@@ -6,7 +6,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-NOTEBOOK = Path(__file__).parents[1] / "notebooks" / "pieces.ipynb"
+NOTEBOOK = Path(__file__).parents[2] / "notebooks" / "pieces.ipynb"
 
 
 @pytest.mark.slow

@@ -259,7 +259,7 @@ def _costs(data: Mapping[str, Any], sizes: tuple[str, str]) -> str:
 
 
 def _breakdown(data: Mapping[str, Any], size: str) -> str:
-    """One frame of ntd in the paper's parts."""
+    """One frame in parts, of the denoisers that can be taken apart."""
     rows, head = [], ["ms"]
     for name, parts in data["breakdown"].items():
         head = ["ms", *parts]
@@ -270,7 +270,7 @@ def _breakdown(data: Mapping[str, Any], size: str) -> str:
         ]
         rows.append([escape(name), *cells])
     return (
-        f'<section id="breakdown"><h2>One {size} frame of ntd in parts</h2><p class="note">Each part is a program of '
+        f'<section id="breakdown"><h2>One {size} frame in parts</h2><p class="note">Each part is a program of '
         "its own; the whole step is one, and shares memory between its parts.</p>"
         f"{_rows(head, rows)}</section>"
         if rows

@@ -1,0 +1,77 @@
+"""Does the memory of `jaxdn denoise` grow with the number of frames? Peak memory for a short and a long sequence.
+
+    python -m experiments.stability.memory --frames 2 60     # 1280 x 720, runs/memory.json
+
+Frames are foreign EXR files (beauty, albedo, normal, depth, motion) without a ``clip.json``. Each sequence is denoised
+by the command line in a process of its own, whose largest resident set is taken. Unix alone.
+"""
+
+import os
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from jaxdn.clips import write_exr
+from jaxdn.commands.errors import plain_errors
+from jaxdn.files import write_json
+
+
+@dataclass
+class Settings:
+    """Denoise sequences of several lengths and compare their peak memory."""
+
+    frames: tuple[int, ...] = (2, 60)
+    width: int = 1280
+    height: int = 720
+    method: str = "ntd-small"
+    out: Path = Path("runs/memory.json")
+
+
+def write_sequence(folder: Path, frames: int, height: int, width: int) -> None:
+    """Noise with every buffer that the networks read; all frames are the same file under other names."""
+    rng = np.random.default_rng(0)
+    layers = {"": "RGB", "albedo.": "RGB", "normal.": "XYZ", "motion.": "XY", "depth.": "Z"}
+    channels = {
+        f"{layer}{letter}": rng.uniform(0.1, 0.9, (height, width)).astype(np.float32)
+        for layer, letters in layers.items()
+        for letter in letters
+    }
+    folder.mkdir()
+    first = folder / "frame_0001.exr"
+    write_exr(first, channels)
+    for index in range(2, frames + 1):
+        os.link(first, folder / f"frame_{index:04d}.exr")
+
+
+def peak_mib(source: Path, out: Path, method: str) -> float:
+    """The largest resident set of one `jaxdn denoise`, in MiB. Raises RuntimeError where it fails."""
+    command = [sys.executable, "-m", "jaxdn.cli", "denoise", str(source), "-o", str(out), "--method", method]
+    command += ["--motion-convention", "previous-current"]
+    child = os.posix_spawn(sys.executable, command, os.environ)
+    _, status, usage = os.wait4(child, 0)
+    if status:
+        raise RuntimeError(f"jaxdn denoise of {source} ended with status {status}")
+    return usage.ru_maxrss / (1024 if sys.platform != "darwin" else 1024**2)
+
+
+def main(settings: Settings) -> None:
+    """Measure, print, keep."""
+    found: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as place:
+        for count in settings.frames:
+            source = Path(place) / f"frames-{count}"
+            write_sequence(source, count, settings.height, settings.width)
+            found[str(count)] = peak_mib(source, Path(place) / f"out-{count}", settings.method)
+            print(f"{count} frames: {found[str(count)]:.0f} MiB", flush=True)
+    sizes = {"width": settings.width, "height": settings.height, "method": settings.method}
+    settings.out.parent.mkdir(parents=True, exist_ok=True)
+    write_json(settings.out, {**sizes, "peak MiB": found})
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Settings, description=Settings.__doc__))
