@@ -94,7 +94,7 @@ def denoise_files(
 def _open(
     source: Path, asks: bool, spp: int, motion_convention: str | None, channels: Mapping[str, str] | None
 ) -> tuple[list[Path], Iterator[tuple[Frame, Layers]]]:
-    """The files and their frames, read when needed; with independent noisy layers for a method that asks for samples."""
+    """The files and their frames, read when needed; with independent layers for a method that asks for samples."""
     names, frames = open_frames(source, spp=spp, motion_convention=motion_convention, channels=channels)
 
     def layers(stored: StoredFrame) -> Layers:

@@ -9,7 +9,7 @@ from jaxdn.effects import Effects, Plan, chosen, inspect, plan
 from jaxdn.render.depth import PathDepth, measure_depth
 from jaxdn.render.families import FAMILIES
 from jaxdn.render.farm import ClipJob, render_clips
-from jaxdn.render.opening import scene_from_record
+from jaxdn.render.opening import family_scene
 from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.scene_file import SceneFile
 from jaxdn.render.variant import choose_variant
@@ -119,7 +119,7 @@ def _scenes(
 ) -> Iterable[tuple[str, AnimatedScene, list[int]]]:
     """Every scene once: its name, the scene, and the seeds of the noise that it is rendered with."""
     if source in FAMILIES:  # made one at a time: there may be hundreds
-        return ((source, scene_from_record({"family": source, "seed": seed}), [seed]) for seed in seeds)
+        return ((source, family_scene(source, seed, animation), [seed]) for seed in seeds)
     if source.endswith(".xml"):
         scene = SceneFile(Path(source), animation)
         return [(scene.name, scene, list(seeds))]

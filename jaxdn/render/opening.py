@@ -30,6 +30,15 @@ def scene_from_record(record: Mapping[str, Any]) -> AnimatedScene:
     return FAMILIES[name](**options)
 
 
+def family_scene(name: str, seed: int, animation: Any = None) -> AnimatedScene:
+    """A scene of a family. Raises ValueError for an animation, which belongs to scene files: families move already."""
+    if animation is not None:
+        raise ValueError(
+            f"animation {animation}: expected none for the family {name!r}, which moves already; leave it out."
+        )
+    return scene_from_record({"family": name, "seed": seed})
+
+
 def open_scene(scene: Any, animation: Any = None) -> AnimatedScene:
     """A scene file, a family's name (its seed 0), a loaded ``mi.Scene``, or a scene as Mitsuba's dict, as a scene.
 
@@ -53,7 +62,7 @@ def open_scene(scene: Any, animation: Any = None) -> AnimatedScene:
 def _named(scene: str | Path, animation: Any) -> AnimatedScene:
     """The scene of a family's name or a file's path."""
     if str(scene) in FAMILIES:
-        return scene_from_record({"family": str(scene), "seed": 0})
+        return family_scene(str(scene), 0, animation)
     if Path(scene).suffix != ".xml":
         raise ValueError(
             f"scene {str(scene)!r}: expected a Mitsuba scene (.xml), a folder of frames, or a family "

@@ -34,7 +34,7 @@ def counted(monkeypatch):
         monkeypatch.setattr(command, name, counting)
 
     count("SceneFile", "opened")
-    count("scene_from_record", "opened")
+    count("family_scene", "opened")
     count("inspect", "planned")
     monkeypatch.setattr(command, "render_clips", lambda jobs, workers: seen["jobs"].extend(jobs) or [])
     return seen
@@ -72,6 +72,12 @@ def test_what_is_no_scene_is_refused_before_anything_is_tried(tmp_path, capsys):
     with pytest.raises(ValueError, match=r"'castle': expected a family \(dash, .*\) or a Mitsuba scene"):
         command.render("castle", tmp_path, seeds=[0], **OPTIONS)
     assert capsys.readouterr().out == ""
+
+
+def test_an_animation_of_a_family_is_refused_and_not_ignored(tmp_path):
+    with pytest.raises(ValueError, match="expected none for the family 'fruit'"):
+        command.render("fruit", tmp_path / "out", seeds=[0], **{**OPTIONS, "animation": tmp_path / "walk.json"})
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
