@@ -7,10 +7,10 @@ export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 
 .PHONY: help setup train test test-slow bench chart hard-cases lint format docs weights clean
 
-help:  ## what can be made
+help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
-setup: .venv/ready  ## .venv with the exact versions of constraints.txt (uv where it is found, else pip)
+setup: .venv/ready  ## .venv with the exact versions of constraints.txt (uses uv if it is installed, else pip)
 
 .venv/ready: pyproject.toml constraints.txt
 	@echo "Setting up .venv (Python packages of constraints.txt; a minute or two) ..."
@@ -27,7 +27,7 @@ setup: .venv/ready  ## .venv with the exact versions of constraints.txt (uv wher
 train: setup  ## the main job: render clips, train the denoiser and its ablations, evaluate, write a report
 	$(BIN)/python -m experiments.papers.ablation $(SETTINGS)
 
-weights: setup  ## the recipe of the shipped weights: hours, resumable
+weights: setup  ## train the shipped weights again (hours; resumable)
 	$(BIN)/python -m experiments.papers.ablation --preset full --ship $(SETTINGS)
 
 test: setup  ## the tests (minutes)
@@ -36,13 +36,13 @@ test: setup  ## the tests (minutes)
 test-slow: setup  ## the slow tests: real training runs, the notebook, real processes
 	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m slow $(SETTINGS)
 
-hard-cases: setup  ## every hard case, operation, denoiser and precision: runs/hard-cases/table.html
+hard-cases: setup  ## run every operation and denoiser on every hard case: runs/hard-cases/table.html
 	$(BIN)/python -m tests.hard_cases
 
-# What people use today, to compare with. Only a CPU build of PyTorch is taken, from wherever pip is told to look, else
+# Common alternatives to compare with. Only a CPU build of PyTorch is installed, from pip's configured index or else
 # through uv from PyTorch's own index: the default build brings gigabytes of CUDA packages.
 .venv/tools: .venv/ready
-	@echo "Adding what people use today (PyTorch's CPU build, Open Image Denoise) to compare with ..."
+	@echo "Adding PyTorch's CPU build and Open Image Denoise to compare with ..."
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip >/dev/null
 	@$(BIN)/python -m pip install --quiet -c constraints.txt pyoidn || \
 		echo "Open Image Denoise (pyoidn) could not be installed: its rows will be left out"
@@ -51,10 +51,10 @@ hard-cases: setup  ## every hard case, operation, denoiser and precision: runs/h
 		echo "no CPU build of PyTorch could be installed: its rows will be left out"
 	@touch $@
 
-bench: .venv/tools  ## time operations, steps and training against PyTorch and Open Image Denoise: runs/bench.json
+bench: .venv/tools  ## time operations, steps and training, compared with PyTorch and Open Image Denoise: runs/bench.json
 	$(BIN)/python -m experiments.speed.bench $(SETTINGS)
 
-chart: .venv/tools  ## error against time of every way to an image: runs/chart/chart.html
+chart: .venv/tools  ## error against time for every way to make an image: runs/chart/chart.html
 	$(BIN)/python -m experiments.speed.chart $(SETTINGS)
 
 lint: setup  ## ruff and the type checker
@@ -62,14 +62,14 @@ lint: setup  ## ruff and the type checker
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: setup  ## let ruff order and format the code
+format: setup  ## sort imports and format the code with ruff
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-docs: setup  ## the reference pages, from the docstrings, into site/
+docs: setup  ## build the reference pages from the docstrings into site/
 	@if command -v uv >/dev/null 2>&1; then uv pip install --quiet --python $(BIN)/python -c constraints.txt --group docs; \
 	else $(BIN)/python -m pip install --quiet -c constraints.txt --group docs; fi
 	$(BIN)/python -m mkdocs build --strict
 
-clean:  ## forget the environment and what was rendered and trained
+clean:  ## delete the environment and everything rendered and trained
 	rm -rf .venv runs data site

@@ -15,6 +15,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     for name, method in methods().items():
         parts.append(f"## {name}: {method.title}\n")
         if method.learns:
-            parts.append(f"Learns. Variants: {', '.join(method.variants) or 'none'}; recipes: {', '.join(method.recipes)}.\n")
+            variants, recipes = ", ".join(method.variants) or "none", ", ".join(method.recipes)
+            parts.append(f"Learns. Variants: {variants}; recipes: {recipes}.\n")
         parts.append(f"::: {method.factory.__module__}\n")
     return markdown.replace(PLACE, "\n".join(parts))

@@ -1,7 +1,7 @@
 """jaxdn removes Monte Carlo noise from path-traced animations, in JAX.
 
-Every name below is loaded on first use, so that a notebook that only wants :func:`warp` needs jax and numpy alone:
-Mitsuba, OpenEXR, Orbax and Grain are imported by the rooms that use them, and by nothing else.
+Every name below is loaded on first use, so that a notebook that only uses :func:`warp` needs only jax and numpy:
+Mitsuba, OpenEXR, Orbax and Grain are imported only by the subpackages that use them.
 """
 
 import importlib
@@ -25,7 +25,7 @@ _HOMES = {
     "read_clip": "clips",
     "write_clip": "clips",
 }
-_ROOMS = ("color", "losses", "metrics", "denoisers", "effects")
+_ROOMS = ("brdf", "color", "losses", "metrics", "denoisers", "effects")
 
 __all__ = [*_HOMES, *_ROOMS, "__version__"]
 

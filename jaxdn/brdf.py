@@ -1,8 +1,8 @@
 """What a surface reflects: BRDFs pre-integrated over the incident directions, and light divided by that.
 
 The share of light from all around that a surface reflects to the viewer, its directional albedo
-``F_b = integral of f_r cos(theta_i) dw_i``, is what textures and materials contribute to an image; dividing by it leaves
-the incident light, which is what a denoiser should filter (Zhuang et al. 2021, "Real-Time Denoising Using BRDF
+``F_b = integral of f_r cos(theta_i) dw_i``, is what textures and materials contribute to an image; dividing by it
+leaves the incident light, which is what a denoiser should filter (Zhuang et al. 2021, "Real-Time Denoising Using BRDF
 Pre-Integration Factorization"). For a microfacet lobe with Schlick's Fresnel term ``F0 + (1 - F0) (1 - v.h)^5`` it is
 ``F0 A + B`` with two numbers that depend on the cosine n.v and the roughness alone (Karis 2013).
 """
@@ -129,7 +129,7 @@ def albedo_table(lobe: Lobe = "ggx") -> np.ndarray:
 def directional_albedo(
     albedo: jax.Array, specular: jax.Array, roughness: jax.Array, cosine: jax.Array, *, lobe: Lobe = "ggx"
 ) -> jax.Array:
-    """``albedo + specular A + B`` [H, W, 3]: what a diffuse surface with a microfacet lobe reflects of light all around.
+    """``albedo + specular A + B`` [H, W, 3]: what a diffuse surface with a microfacet lobe reflects of uniform light.
 
     Differentiable in all four. Roughness and cosines are clamped to what the table covers. Raises ValueError for shapes
     that do not fit.

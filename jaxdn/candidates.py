@@ -1,6 +1,6 @@
-"""What can denoise something here and now: filters, shipped weights, weights in a file, the noisy image itself.
+"""Denoisers that are ready to run: filters, shipped weights, weights in a file, and the noisy image itself.
 
-Everything that takes the name of a method (command line, comparisons, chart, long runs, hard cases) takes it from here.
+The command line, comparisons, the chart, long runs and the hard cases look up names of methods here.
 """
 
 from collections.abc import Iterator, Mapping
@@ -24,14 +24,14 @@ class Candidate(NamedTuple):
     """A denoiser that is ready to run."""
 
     label: str
-    """Its name in tables."""
+    """The name in tables."""
     denoiser: Denoiser | None
     """None is the noisy image itself."""
     params: Params
     method: Method | None = None
     """Its row in the table of methods."""
     options: Mapping[str, Any] = {}
-    """What its factory was given."""
+    """The options given to its factory."""
 
     def engine(self, purpose: Purpose = "inference") -> str | None:
         """The engine that runs it fastest here (:meth:`jaxdn.methods.table.Method.engine`); None is XLA."""
@@ -41,8 +41,8 @@ class Candidate(NamedTuple):
 def candidate(name: str, **options: Any) -> Candidate:
     """``noisy``, a filter (``svgf``), shipped weights (``ntd-large``) or the path of a .safetensors file.
 
-    ``options`` go to the factory, in place of those that weights were saved with. Raises ValueError for a name that is
-    none of these, for a method that learns without its weights, and for options that the method does not have.
+    ``options`` are passed to the factory and replace those that the weights were saved with. Raises ValueError for any
+    other name, for a learned method without weights, and for options that the method does not have.
     """
     if name == NOISY:
         if options:
@@ -65,13 +65,13 @@ def candidate(name: str, **options: Any) -> Candidate:
     denoiser, params = load_weights(name, **options)
     description = describe(name)
     path = Path(name)
-    # A run's folder says more than the name that all weights have there.
+    # A run's folder is a better label than the file name, which is the same for all runs.
     label = path.parent.name if path.stem == "weights" else path.stem
     return Candidate(label, denoiser, params, method_named(description["factory"]), description["options"] | options)
 
 
 def untrained(method: Method, **options: Any) -> Candidate:
-    """A method that learns, in its lightest variant, with the weights that training starts from."""
+    """A learned method in its smallest variant, with initial weights."""
     given = {**method.variant_named(None), **options}
     denoiser = method.factory(**given)
     return Candidate(method.name, denoiser, denoiser.init(jax.random.key(0), _smallest()), method, given)
@@ -88,7 +88,7 @@ def all_names() -> list[str]:
 
 
 def everything() -> Iterator[Candidate]:
-    """Filters, shipped weights, and methods that learn and have no weights here, as they are before training."""
+    """Filters, shipped weights, and learned methods without shipped weights, with initial weights."""
     yield from (candidate(name) for name in all_names() if name != NOISY)
     trained = {describe(name)["factory"] for name in shipped_names()}
     yield from (untrained(method) for name, method in methods().items() if method.learns and name not in trained)

@@ -1,4 +1,4 @@
-"""The command line: ``jaxdn inspect | render | train | denoise | compare``; every verb has ``--help`` with examples."""
+"""The command line: ``jaxdn inspect | render | train | denoise | compare``; every command has ``--help``."""
 
 import sys
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ _PATH = tyro.conf.Positional[Path]
 
 @dataclass
 class Inspect:
-    """Say which effects a scene has and why, what will be rendered for them, and what that saves.
+    """List the effects of a scene and why it has them, what will be rendered for them, and what that saves.
 
     For example:
 
@@ -29,20 +29,20 @@ class Inspect:
     animation: Path | None = None
     """Animation file for a scene file."""
     denoiser: str | None = None
-    """Plan for this denoiser (svgf, ntd-large ...); default: for whatever any denoiser may read."""
+    """Plan for this denoiser (svgf, ntd-large ...); default: for every buffer that a denoiser may read."""
     width: int = 128
     height: int = 128
     frames: int | None = None
-    """How many frames to look at; default: all that the animation has."""
+    """Number of frames to inspect; default: all of the animation."""
     json: bool = False
-    """Print one JSON object and nothing else: {"effects": [...], "plan": {...}, "uncertain": [...]}."""
+    """Print only one JSON object: {"effects": [...], "plan": {...}, "uncertain": [...]}."""
 
 
 @dataclass
 class Render:
     """Render animated clips with Mitsuba: noisy indirect light, references, G-buffers and motion vectors.
 
-    Run the same command again to continue what was interrupted.
+    Run the same command again to resume an interrupted rendering.
 
     For example:
 
@@ -54,29 +54,29 @@ class Render:
     scene: tyro.conf.Positional[str]
     """A family (fruit, robot, pinkroom, mobile, edge, dash) or the path of a Mitsuba scene (.xml)."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Folder that gets one folder per clip."""
+    """Output folder; it gets one folder per clip."""
     animation: Path | None = None
     """Animation file (JSON: camera keys, rigid keys, inserted shapes) for a scene file."""
     seeds: list[int] = field(default_factory=lambda: [0])
-    """One clip of the family for each seed; for a scene file, the seed of the noise."""
+    """One clip of the family for each seed; for a scene file, the seeds of the noise."""
     width: int = 128
     height: int = 128
     frames: int = 10
     reference_spp: int = 256
-    """Samples a pixel of the reference; 0 for none."""
+    """Samples per pixel of the reference; 0 for none."""
     layers: list[int] = field(default_factory=lambda: [1])
-    """Independent noisy layers, in samples a pixel (powers of two)."""
+    """Independent noisy layers, in samples per pixel (powers of two)."""
     max_depth: int | None = None
-    """Path length (1 emission, 2 direct, 3 one bounce of indirect light ...); default: what the scene asks for."""
+    """Path length (1 emission, 2 direct, 3 one bounce of indirect light ...); default: as the scene needs."""
     effects: str = "auto"
-    """auto: what the scene calls for (see `jaxdn inspect`); all: everything; or effects by name, joined by commas."""
+    """auto: the effects that the scene has (see `jaxdn inspect`); all: every effect; or names separated by commas."""
     workers: int | None = None
-    """Processes; default: the cores."""
+    """Number of processes; default: the number of cores."""
 
 
 @dataclass
 class Train:
-    """Train a method that learns on rendered clips; run it again to continue.
+    """Train a learned method on rendered clips; run it again to resume.
 
     For example:
 
@@ -88,30 +88,35 @@ class Train:
     clips: _PATH
     """Folder of clips to train on."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """The run's folder: checkpoints, log, and in the end weights.safetensors with its JSON."""
+    """The run's folder: checkpoints, log, and finally weights.safetensors with its JSON."""
     validation: Path | None = None
-    """Folder of whole clips held out for validation."""
+    """Folder of held-out clips for validation, used whole."""
     method: str = "ntd"
-    """What to train; an unknown name lists the methods there are."""
+    """Method to train; an unknown name lists the available ones."""
     variant: str | None = None
     """One of the method's variants (ntd-large, ntd-small); default: the fastest."""
     set: list[str] = field(default_factory=list)
-    """Options of the method as option=value, such as motion=traditional preset=parity; an unknown one lists them."""
+    """Options of the method as option=value, such as motion=traditional preset=parity; an unknown name lists them."""
     recipe: str | None = None
     """One of the method's recipes (for ntd: usual, without-occlusion, parity); default: the usual one."""
     steps: int | None = None
+    """Parameter updates; default, as for the next six options: as in the recipe."""
     batch: int | None = None
+    """Clips per update."""
     crop: int | None = None
+    """Width and height of the crops that are trained on, in pixels."""
     frames: int | None = None
+    """Consecutive frames of a clip per update."""
     learning_rate: float | None = None
-    """These five, and the next two: default as in the recipe."""
+    """Peak learning rate."""
     rematerialize: bool | None = None
-    """A quarter of the memory for 1.1 to 1.4 of the time."""
+    """Recompute in the backward pass: a quarter of the memory for 1.1 to 1.4 times the time."""
     seed: int | None = None
+    """Seed of the initial weights and of the data's order."""
     spp: int = 1
-    """Samples a pixel of the noisy input."""
+    """Samples per pixel of the noisy input."""
     implementation: str = "auto"
-    """What convolves: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest that runs here."""
+    """Engine for convolutions: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest available."""
 
 
 @dataclass
@@ -132,20 +137,20 @@ class Denoise:
     method: str = "ntd-large"
     """Shipped weights (ntd-large, ntd-small), a filter (svgf), or the path of a .safetensors file."""
     spp: int = 1
-    """Samples a pixel to take from the clip's layers."""
+    """Samples per pixel to take from the clip's layers."""
     preview: bool = False
     """Write a PNG next to every EXR."""
     motion_convention: str | None = None
-    """For foreign files with motion vectors: whose convention they follow; an unknown one lists those known."""
+    """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
     channels: list[str] = field(default_factory=list)
-    """For foreign files: buffer=layer, where the layer of a buffer is not found by its name."""
+    """For files of other renderers: buffer=layer, if the layer of a buffer is not found by its name."""
     implementation: str = "auto"
-    """What runs a network: reference (XLA), onnxruntime (CPU; the extra onnx); auto: the fastest that runs here."""
+    """Engine for the network: reference (XLA), onnxruntime (CPU; the extra onnx); auto: the fastest available."""
 
 
 @dataclass
 class Compare:
-    """Score methods on clips with references; writes metrics.json and report.html, and says who wins.
+    """Score methods on clips with references; writes metrics.json and report.html, and prints a table.
 
     For example:
 
@@ -159,6 +164,7 @@ class Compare:
     methods: list[str] = field(default_factory=list)
     """noisy, filters, shipped weights or .safetensors files; default: all that come with the package."""
     spp: int = 1
+    """Samples per pixel to take from the clips' layers."""
 
 
 def _inspect(options: Inspect) -> None:
@@ -256,8 +262,14 @@ def _compare(options: Compare) -> None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Parse the command line and run one verb; what a user can mend ends with one message and exit code 2."""
-    verbs: dict[type, Any] = {Inspect: _inspect, Render: _render, Train: _train, Denoise: _denoise, Compare: _compare}
+    """Parse the command line and run one command; errors a user can fix end with one message and exit code 2."""
+    run: dict[type, Any] = {
+        Inspect: _inspect,
+        Render: _render,
+        Train: _train,
+        Denoise: _denoise,
+        Compare: _compare,
+    }
     options = tyro.cli(
         Inspect | Render | Train | Denoise | Compare,
         prog="jaxdn",
@@ -265,7 +277,7 @@ def main(arguments: list[str] | None = None) -> None:
         args=arguments,
     )
     with plain_errors():
-        verbs[type(options)](options)
+        run[type(options)](options)
 
 
 if __name__ == "__main__":

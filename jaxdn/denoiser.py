@@ -1,9 +1,9 @@
-"""What a denoiser is, and the ritual that all of them share.
+"""What a denoiser is, and the processing that all of them share.
 
-:class:`Denoiser` is the one interface that training, evaluation, the planner, the chart and the command line know. A
-method is written as a :class:`Core`, which sees nothing but sound frames; :func:`recurrent` makes a denoiser of it and
-does for all methods, once, what each would otherwise repeat: shapes are checked, frames repaired and counted, the age
-of the state is kept, and no image leaves with a value that is negative or beyond what a file holds.
+:class:`Denoiser` is the one interface that training, evaluation, the planner, the chart and the command line use. A
+method is written as a :class:`Core`, which gets only valid frames. :func:`recurrent` turns it into a denoiser and adds
+what every method needs: it checks shapes, repairs frames and counts repaired values, keeps the age of the state, and
+clamps the image to values from 0 to the largest that a file holds.
 """
 
 import dataclasses
@@ -20,13 +20,13 @@ from jaxdn.repair import repair
 Params = Any
 """Nested dicts of arrays; ``{}`` for a filter without weights."""
 State = Any
-"""What one frame leaves to the next: a flat pytree of few, large arrays."""
+"""What is carried from one frame to the next: a flat pytree of few, large arrays."""
 Step = Callable[[Params, State, Frame], tuple[State, jax.Array]]
 """(params, state, frame) -> (state, image [H, W, 3] >= 0)."""
 
 
 class Denoiser(NamedTuple):
-    """The one interface; a clip is a scan over ``step``. The functions are pure, and not jitted."""
+    """The interface of every denoiser; a clip is a scan over ``step``. The functions are pure and not jitted."""
 
     init: Callable[[jax.Array, Frame], Params]
     """(key, frame) -> params."""
@@ -34,15 +34,15 @@ class Denoiser(NamedTuple):
     """(params, frame) -> state before the first frame."""
     step: Step
     reads: frozenset[str]
-    """Names of the Frame buffers, besides ``radiance``, that it can make use of."""
+    """Names of the Frame buffers, in addition to ``radiance``, that it can use."""
     samples: Callable[[Params, State, Frame], jax.Array] | None = None
-    """(params, state, frame) -> [H, W, 1] samples a pixel that it asks the renderer for before ``step`` (rounded to
-    whole numbers). The frame's radiance is then what has been rendered beforehand, and in ``step`` the mean of the
-    samples asked for, with ``sample_count``. None: it takes the radiance as it comes."""
+    """(params, state, frame) -> [H, W, 1] samples per pixel that it requests from the renderer before ``step`` (rounded
+    to whole numbers). Here the frame's radiance is what has been rendered before; in ``step`` it is the mean of the
+    requested samples, with ``sample_count``. None: no request, the radiance is used as it is."""
 
 
 class Core(NamedTuple):
-    """A method without the ritual. Frames hold what it reads, repaired; there is no need to look for broken values."""
+    """A method without the shared processing. Frames hold only what it reads, already repaired."""
 
     start: Callable[[Params, Frame], State]
     """(params, frame) -> its own state."""
@@ -60,7 +60,7 @@ class Recurrent(NamedTuple):
     core: State
     """The method's own."""
     age: jax.Array
-    """int32, frames seen; at 0 there is no history."""
+    """int32, frames processed; at 0 there is no history."""
     repaired: jax.Array
     """int32, values of frames and histories that had to be replaced so far."""
 
@@ -80,7 +80,7 @@ class Ritual:
 
 
 def recurrent(core: Core) -> Denoiser:
-    """The denoiser of a core. Its functions raise ValueError for shapes that do not fit, never for pixel contents."""
+    """The denoiser of a core. Its functions raise ValueError for wrong shapes, never for pixel values."""
 
     def start(params: Params, frame: Frame) -> Recurrent:
         frame, _ = repair(checked(frame, core.reads))
@@ -89,16 +89,16 @@ def recurrent(core: Core) -> Denoiser:
 
     samples = None
     if core.samples is not None:
-        asked = core.samples
+        core_samples = core.samples
 
         def samples(params: Params, state: Recurrent, frame: Frame) -> jax.Array:
-            return asked(params, state.core, repair(checked(frame, core.reads))[0])
+            return core_samples(params, state.core, repair(checked(frame, core.reads))[0])
 
     return Denoiser(core.init, start, Ritual(core), core.reads, samples)
 
 
 def checked(frame: Frame, reads: frozenset[str]) -> Frame:
-    """What a denoiser reads of a frame. Raises ValueError unless that is [H, W, C], all of one size."""
+    """The buffers of a frame that a denoiser reads. Raises ValueError unless they are [H, W, C], all of one size."""
     frame = only(frame, reads)
     check_image(frame.radiance, "frame.radiance", channels=3)
     for name, buffer in frame._asdict().items():

@@ -1,7 +1,7 @@
 """The factories of all methods, by name: ``jaxdn.denoisers.ntd(size="small")`` returns a :class:`jaxdn.Denoiser`.
 
-What there is comes from the table (:mod:`jaxdn.methods.table`); :data:`NAMES` lists it. ``demodulated`` wraps any
-denoiser. The methods themselves live in :mod:`jaxdn.methods`, a file each.
+The factories come from the table of methods (:mod:`jaxdn.methods.table`); :data:`NAMES` lists them. ``demodulated``
+wraps any denoiser. The methods are implemented in :mod:`jaxdn.methods`, one file each.
 """
 
 from typing import Any

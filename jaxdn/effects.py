@@ -1,8 +1,8 @@
-"""Simulate only the effects a scene calls for: what it has, what that takes, and what may be left out.
+"""Simulate only the effects that a scene has: find them, and plan what they need and what may be left out.
 
 ``inspect`` finds the effects of a scene or a finished clip, ``plan`` intersects them with what a denoiser reads, and
-the renderer obeys the plan. What is left out is ``None`` in a :class:`jaxdn.Frame`, and leaves no trace in the compiled
-step: that is equal to its neutral value, at a lower cost.
+the renderer follows the plan. What is left out is ``None`` in a :class:`jaxdn.Frame` and not in the compiled step: the
+result is that of the neutral value, at a lower cost.
 """
 
 from pathlib import Path
@@ -34,12 +34,12 @@ def inspect(
         :class:`jaxdn.render.AnimatedScene`, a loaded ``mi.Scene`` (``optimize=False``), a scene as Mitsuba's dict, or
         :class:`Facts`.
       animation: animation file (or its contents, as a dict) for a scene file or a loaded scene.
-      width: of the picture; the view decides what is on screen.
-      height: of the picture.
-      frames: how many to look at; default: all that the scene's animation, or the clip, has.
+      width: of the image in pixels; with ``height`` it decides what is on screen.
+      height: of the image in pixels.
+      frames: number of frames to inspect; default: all of the scene's animation, or of the clip.
 
-    What cannot be decided counts as present and is listed in ``uncertain``. A scene takes milliseconds beyond loading
-    it, a clip has to be read. Raises ValueError for anything else, and for what cannot be read.
+    An undecidable effect counts as present and is listed in ``uncertain``. A scene takes milliseconds besides loading;
+    a clip has to be read. Raises ValueError for any other ``scene``, and for files that cannot be read.
     """
     if frames is not None and frames < 1:
         raise ValueError(f"frames: expected at least 1, got {frames}.")

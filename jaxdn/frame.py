@@ -1,9 +1,9 @@
-"""The vocabulary: what a renderer gives for one frame, what a clip is, and the one table of all buffers.
+"""Frames and clips: the buffers that a renderer gives for one frame, and the one table of all buffers.
 
 ``None`` is the neutral element: a buffer that is ``None`` means *this effect is absent*, and every consumer treats it
-exactly as the neutral value written out (no motion is zero motion, no albedo is white, no roughness is 1, no normal and
-no depth is 0). Because ``None`` is part of the pytree's structure, jit specialises on it and an absent effect leaves no
-trace in the compiled program.
+exactly as the explicit neutral value (no motion is zero motion, no albedo is white, no roughness is 1, no normal and
+no depth is 0). Because ``None`` is part of the pytree's structure, jit specialises on it, and an absent effect adds
+nothing to the compiled program.
 
 A buffer is declared once, as a field of :class:`Frame` annotated with its :class:`Buffer`. Repair, files, caches,
 augmentation, byte counts and the hard cases of the tests all follow from :data:`BUFFERS`.
@@ -26,7 +26,7 @@ Array = Any
 """A jax or NumPy array, or None where the effect is absent."""
 
 Kind = Literal["light", "signed", "fraction", "direction", "distance", "vector", "count", "flag", "id"]
-"""What the numbers of a buffer are, which decides how they are repaired, stored and transformed:
+"""The kind of values in a buffer; it decides how they are repaired, stored and transformed:
 
 * ``light``: radiance >= 0; ``signed``: a difference of radiances, of either sign;
 * ``fraction``: in [0, 1]; ``count``: a number of samples >= 0;
@@ -38,16 +38,16 @@ _DTYPES = {"flag": np.dtype(bool), "id": np.dtype(np.int32)}
 
 
 class Buffer(NamedTuple):
-    """One row of the table: all that the rest of the house has to know about a buffer."""
+    """One row of the table: everything that the other modules need to know about a buffer."""
 
     channels: int
     kind: Kind
     neutral: float | str = 0.0
-    """What ``None`` stands for: a number, or the name of a buffer declared before this one, whose values it takes."""
+    """The meaning of ``None``: a number, or the name of a buffer declared before this one, whose values it takes."""
 
     @property
     def stored(self) -> Literal["half", "single", "flag", "id"]:
-        """How it lies in files: float16, float32, bool (as float16) or an integer (as uint32, one up)."""
+        """Its format in files: float16, float32, bool (as float16) or an integer (as uint32, plus one)."""
         return _STORED.get(self.kind, "single")  # type: ignore[return-value]
 
     @property
@@ -64,15 +64,15 @@ class Buffer(NamedTuple):
 
     @property
     def bytes(self) -> int:
-        """Bytes a pixel in files, before compression."""
+        """Bytes per pixel in files, before compression."""
         return self.channels * {"half": 2, "flag": 2, "single": 4, "id": 4}[self.stored]
 
 
 class Frame(NamedTuple):
     """What a renderer gives for one frame; every buffer is ``[H, W, C]`` and all but ``radiance`` may be ``None``.
 
-    What a renderer makes at another size than the frame's (A-SVGF's one sample in 3x3 pixels) is stored scattered at
-    full size, with its neutral value elsewhere.
+    A buffer that a renderer makes at a lower resolution (A-SVGF's one sample in 3x3 pixels) is scattered to full size,
+    with its neutral value elsewhere.
     """
 
     radiance: Annotated[Array, Buffer(3, "light")]
@@ -88,7 +88,7 @@ class Frame(NamedTuple):
     motion: Annotated[Array, Buffer(2, "vector")] = None
     """[H, W, 2] (x, y) px, y down, previous minus current; not finite where there is no history; neutral: 0."""
     dual_motion: Annotated[Array, Buffer(2, "vector", "motion")] = None
-    """[H, W, 2] px, as ``motion`` but disoccluded pixels take their occluder's; neutral: ``motion``."""
+    """[H, W, 2] px, as ``motion`` but disoccluded pixels take over their occluder's; neutral: ``motion``."""
     visible: Annotated[Array, Buffer(1, "flag", 1.0)] = None
     """[H, W, 1] bool, the point was seen in the previous frame; neutral: true."""
     previous_depth: Annotated[Array, Buffer(1, "distance", "depth")] = None
@@ -100,15 +100,15 @@ class Frame(NamedTuple):
     emission: Annotated[Array, Buffer(3, "light")] = None
     """[H, W, 3] light emitted towards the camera; neutral: 0."""
     specular: Annotated[Array, Buffer(3, "light")] = None
-    """[H, W, 3] the part of ``radiance`` that a specular lobe reflected last; the rest is diffuse; neutral: 0."""
+    """[H, W, 3] the part of ``radiance`` whose last reflection was specular; the rest is diffuse; neutral: 0."""
     reflectance: Annotated[Array, Buffer(3, "fraction", "albedo")] = None
-    """[H, W, 3] share of light from all around that the surface reflects to the camera; neutral: ``albedo``."""
+    """[H, W, 3] share of uniform incident light that the surface reflects to the camera; neutral: ``albedo``."""
     specular_reflectance: Annotated[Array, Buffer(3, "fraction")] = None
     """[H, W, 3] the specular lobes' part of ``reflectance``; neutral: 0."""
     hit_distance: Annotated[Array, Buffer(1, "distance")] = None
-    """[H, W, 1] length of the path's segment after the first hit, diffuse samples; 0 (neutral) is unknown."""
+    """[H, W, 1] length of the path's segment after the first hit, diffuse samples; 0 (neutral) means unknown."""
     specular_hit_distance: Annotated[Array, Buffer(1, "distance")] = None
-    """[H, W, 1] the same of specular samples; 0 (neutral) is unknown."""
+    """[H, W, 1] the same for specular samples; 0 (neutral) means unknown."""
     sample_count: Annotated[Array, Buffer(1, "count", 1.0)] = None
     """[H, W, 1] samples that ``radiance`` is the mean of; neutral: 1."""
     luminance_gradient: Annotated[Array, Buffer(2, "signed")] = None
@@ -133,24 +133,24 @@ GUIDES: tuple[str, ...] = Frame._fields[1:]
 
 
 class Clip(NamedTuple):
-    """Consecutive frames and, where it is known, what their ``radiance`` converges to."""
+    """Consecutive frames and, where known, what their ``radiance`` converges to."""
 
     frames: Frame
-    """A Frame whose buffers have ``T`` in front."""
+    """A Frame whose buffers have a leading axis ``T``."""
     reference: Array = None
     """[T, H, W, 3] the noise-free radiance."""
     layers: dict[int, Array] | None = None
-    """Samples a pixel (powers of two) -> [T, H, W, 3] independent noisy radiance, for a denoiser that asks for samples
+    """Samples per pixel (powers of two) -> [T, H, W, 3] independent noisy radiance, for denoisers that request samples
     (:attr:`jaxdn.Denoiser.samples`)."""
 
 
 def frame_at(frames: Frame, index: int | jax.Array) -> Frame:
-    """The frame at one index of a clip's frames (the leading axis of every buffer that is there)."""
+    """The frame at one index of a clip's frames (the leading axis of every buffer that is present)."""
     return jax.tree.map(lambda buffer: buffer[index], frames)
 
 
 def present(frame: Frame) -> tuple[str, ...]:
-    """The names of the buffers that are there besides ``radiance``, in the order of the table."""
+    """The names of the buffers that are present, except ``radiance``, in the order of the table."""
     return tuple(name for name in GUIDES if getattr(frame, name) is not None)
 
 
@@ -163,14 +163,14 @@ def only(frame: Frame, reads: frozenset[str]) -> Frame:
 def written_out(frame: Frame, names: Iterable[str]) -> Frame:
     """The same frame (or a clip's frames) with the neutral value in place of every ``None`` among ``names``.
 
-    What comes out gives the same image, at a higher cost: for where frames with and without an effect have to be
-    stacked. NumPy arrays in, NumPy arrays out.
+    The result gives the same image at a higher cost; it is needed where frames with and without an effect are stacked.
+    NumPy arrays in, NumPy arrays out.
     """
     wanted = set(names)
     light = frame.radiance
     numbers = np if isinstance(light, np.ndarray) else jnp
     filled = frame._asdict()
-    for name in GUIDES:  # in this order: what a neutral value is taken from comes first
+    for name in GUIDES:  # in this order: a buffer that gives another's neutral value comes first
         if name in wanted and filled[name] is None:
             filled[name] = _neutral(name, filled, light, numbers)
     return Frame(**filled)

@@ -1,6 +1,6 @@
-"""What training minimises: L1 distances of whole clips [T, H, W, C], each one scalar.
+"""Training losses: L1 distances of whole clips [T, H, W, C], each one scalar.
 
-The images are compared as they are: compress them first (``color.compress``). ``denoised`` and ``reference`` have the
+The images are not transformed here: compress them first (``color.compress``). ``denoised`` and ``reference`` have the
 same shape; other shapes raise ValueError. Every loss has a finite gradient everywhere (0 where the two agree).
 """
 
@@ -30,7 +30,7 @@ def temporal(denoised: jax.Array, reference: jax.Array) -> jax.Array:
 
 
 def gradient(denoised: jax.Array, reference: jax.Array, *, operator: str = "difference") -> jax.Array:
-    """Mean absolute difference of the image gradients: edges count, levels do not.
+    """Mean absolute difference of the image gradients; constant offsets do not count.
 
     ``operator="difference"``: forward differences in x and in y, inside the image; the mean is over both together (0
     for an image of one pixel). ``operator="hfen"``: responses of a Laplacian of Gaussian with sigma 1.5 px on 15 x 15
@@ -41,7 +41,7 @@ def gradient(denoised: jax.Array, reference: jax.Array, *, operator: str = "diff
     check_option(operator, "operator", ("difference", "hfen"))
     error = _difference(denoised, reference)
     if operator == "hfen":
-        # Its 225 taps cancel: in bfloat16 nothing but their rounding would be left of a smooth error.
+        # Its 225 taps cancel: for a smooth error, bfloat16 would leave only rounding errors.
         exact = error.astype(jnp.promote_types(error.dtype, jnp.float32))
         return jnp.mean(absolute(_laplacian_of_gaussian(exact))).astype(error.dtype)
     horizontal = error[:, :, 1:] - error[:, :, :-1]
@@ -56,7 +56,7 @@ def occlusion(
     *,
     weights: tuple[float, ...] = (1.0, 0.8, 0.6),
 ) -> jax.Array:
-    """Mean over all elements of ``|(denoised - reference) S|``: errors where something was disoccluded lately.
+    """Mean over all elements of ``|(denoised - reference) S|``: errors where something was disoccluded recently.
 
     ``S_i = sum_k weights[k] M_{i-k}`` with ``masks`` M [T, H, W, 1] in {0, 1} (``jaxdn.occlusion_mask`` of each frame),
     taken at the same pixel. A mask before the first frame is replaced by frame i's own M_i. S is not clipped, it
@@ -94,9 +94,9 @@ _LOG_SIGMA = 1.5
 
 
 def _laplacian_taps() -> tuple[np.ndarray, np.ndarray]:
-    """[15, 3] taps in x and in y; the sum over the three products is the Laplacian of Gaussian less its mean.
+    """[15, 3] taps in x and in y; the sum of the three products is the Laplacian of Gaussian minus its mean.
 
-    LoG = g''(x) g(y) + g(x) g''(y), and a constant, the mean of its 225 taps, is a product of two constants.
+    LoG = g''(x) g(y) + g(x) g''(y); the third product is the constant mean of its 225 taps.
     """
     x = np.arange(-_LOG_RADIUS, _LOG_RADIUS + 1.0)
     g = np.exp(-0.5 * (x / _LOG_SIGMA) ** 2) / (np.sqrt(2 * np.pi) * _LOG_SIGMA)
@@ -109,7 +109,7 @@ def _laplacian_taps() -> tuple[np.ndarray, np.ndarray]:
 def _laplacian_of_gaussian(images: jax.Array) -> jax.Array:
     across, down = _laplacian_taps()
     frames, height, width, channels = images.shape
-    # Channels move beside the frames, so that the last axis can hold the three products.
+    # Channels are merged into the frames' axis, so that the last axis can hold the three products.
     planes = jnp.moveaxis(images, -1, 1).reshape(frames * channels, height, width, 1)
     rows = correlate(pad_edge(planes, _LOG_RADIUS, axis=-2), across, axis=-2)
     return jnp.sum(correlate(pad_edge(rows, _LOG_RADIUS, axis=-3), down, axis=-3), axis=-1)

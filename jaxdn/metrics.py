@@ -1,15 +1,14 @@
-"""How far an image or a clip is from its reference: one number each.
+"""Error metrics of an image or a clip against its reference, one number each.
 
-``image`` and ``reference`` are [H, W, C], or clips [T, H, W, C], of the same shape and as the metric is to see them:
-tone-map first (``color.tonemap``), all but ``relative_mse`` (and state the operator beside the number). ``mask``
-[H, W, 1] or [T, H, W, 1] restricts a metric to the pixels where it is above 0 (or true); what lies outside has no
-influence, whatever it is (SSIM and FLIP look at the neighbourhood of the pixels inside). Masked out altogether, images
-count as identical.
+``image`` and ``reference`` are [H, W, C], or clips [T, H, W, C], of the same shape. Tone-map them first
+(``color.tonemap``), except for ``relative_mse``, and state the operator with the number. ``mask`` [H, W, 1] or
+[T, H, W, 1] restricts a metric to the pixels where it is above 0 (or true); pixels outside have no influence (SSIM and
+FLIP use the neighbourhood of the pixels inside). Completely masked images count as identical.
 
-A non-finite pixel makes a number non-finite: a metric that passed over it would flatter. For finite images no metric is
-NaN, and all gradients are finite.
+A non-finite pixel makes the result non-finite: ignoring it would report too good a value. For finite images no metric
+is NaN, and all gradients are finite.
 
-On averages: MSE, L1, relative MSE, SSIM and FLIP are means over all pixels of all frames together. PSNR is the mean of
+Averages: MSE, L1, relative MSE, SSIM and FLIP are means over all pixels of all frames together. PSNR is the mean of
 the frames' PSNRs, so one perfect frame makes it infinite: ``average="mse"`` gives the PSNR of the mean MSE instead.
 """
 
@@ -41,14 +40,14 @@ def l1(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = None)
 def relative_mse(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = None) -> jax.Array:
     """Mean of ``(image - reference)^2 / (reference^2 + 0.01)`` on linear radiance; 0 for an empty mask.
 
-    Rousselle et al. 2011, eq. 10; they and others differ in the constant.
+    Rousselle et al. 2011, eq. 10; the constant varies in the literature.
     """
     image, reference, inside = _prepare(image, reference, mask)
-    # Divided before it is squared: the square of a firefly in the reference overflows, the ratio does not. An error
-    # near the largest number does so as well, and its derivative with it: it counts as a 64th of that number.
+    # Divided before squaring: the square of a firefly in the reference overflows, the ratio does not. Errors are limited
+    # to 1/64 of the largest number: larger ones, and their derivatives, would overflow as well.
     scale = safe_norm(jnp.stack([reference, jnp.full_like(reference, 0.1)], axis=-1))[..., 0]
-    most = float(jnp.finfo(image.dtype).max) / 64
-    return _mean((jnp.clip(image - reference, -most, most) / scale) ** 2, inside)
+    limit = float(jnp.finfo(image.dtype).max) / 64
+    return _mean((jnp.clip(image - reference, -limit, limit) / scale) ** 2, inside)
 
 
 def psnr(
@@ -61,9 +60,14 @@ def psnr(
 ) -> jax.Array:
     """Peak signal-to-noise ratio in dB, ``10 log10(peak^2 / MSE)``; of a clip, the mean of its frames' PSNRs.
 
-    Infinite where the two are identical, for a frame and so for its clip, with derivative 0. Frames whose mask is empty
-    are left out of the mean; with all of them empty it is infinite. ``average="mse"``: the PSNR of the mean MSE.
-    ``peak=255`` on images in [0, 1] is the convention of Zeng et al. 2021, table 2: 48.13 dB more.
+    Infinite where the two are identical, for a frame and so for its clip, with derivative 0.
+
+    Args:
+      image: [H, W, C] or a clip [T, H, W, C].
+      reference: of the same shape.
+      mask: see the module. Frames with an empty mask are left out of the mean; if all are empty it is infinite.
+      peak: largest value. 255 on images in [0, 1] is the convention of Zeng et al. 2021, table 2: 48.13 dB more.
+      average: ``"frames"``, or ``"mse"`` for the PSNR of the mean MSE.
     """
     check_option(average, "average", ("frames", "mse"))
     image, reference, inside = _prepare(image, reference, mask)
@@ -78,12 +82,18 @@ def temporal_psnr(
     peak: float = 1.0,
     average: str = "frames",
 ) -> jax.Array:
-    """PSNR of the frame-to-frame differences of two clips [T, H, W, C]: flicker, whatever the constant error.
+    """PSNR of the frame-to-frame differences of two clips: measures flicker, independent of a constant error.
 
-    ``x_i - x_{i-1}`` against ``y_i - y_{i-1}`` at the same pixel, negative differences kept, peak 1 although they span
-    [-1, 1]; the mean of T - 1 PSNRs (Hasselgren et al. 2020, sec. 3). ``mask`` is that of the later frame; the earlier
-    one counts where the later does. Infinite for two clips that change alike, and for clips of one frame. Options as in
-    ``psnr``.
+    Compares ``x_i - x_{i-1}`` with ``y_i - y_{i-1}`` at the same pixel, with sign, peak 1 although they span [-1, 1];
+    the mean of T - 1 PSNRs (Hasselgren et al. 2020, "Neural Temporal Adaptive Sampling and Denoising", sec. 3).
+    Infinite for two clips with equal differences, and for clips of one frame.
+
+    Args:
+      image: a clip [T, H, W, C].
+      reference: of the same shape.
+      mask: [T, H, W, 1]; a difference counts where the mask of its later frame is set.
+      peak: as in ``psnr``.
+      average: as in ``psnr``.
     """
     check_option(average, "average", ("frames", "mse"))
     check_image(image, "image", rank=4)
@@ -95,11 +105,10 @@ def temporal_psnr(
 
 
 def ssim(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = None) -> jax.Array:
-    """Structural similarity, at most 1: the mean of its map over pixels and channels, each channel by itself.
+    """Structural similarity, at most 1: the mean of its map over pixels and channels, each channel separately.
 
     11 x 11 Gaussian window of sigma 1.5, population covariance, K1 = 0.01, K2 = 0.03, data range 1 (Wang et al. 2004).
-    The map is taken only where the window fits into the image, so a border of 5 pixels does not count, masked or not;
-    an image smaller than the window uses the largest odd window that fits. 1 for an empty mask.
+    The map is computed only where the window fits into the image, so a border of 5 pixels never counts; an image smaller than the window uses the largest odd window that fits. 1 for an empty mask.
     """
     image, reference = _pair(image, reference)
     inside = _inside(image, mask)
@@ -111,7 +120,7 @@ def ssim(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = Non
         return correlate(correlate(x, taps, axis=-2), taps, axis=-3)
 
     x, y = window_mean(image), window_mean(reference)
-    # Variances of what is left after the middle grey: the same numbers, with half the digits lost to cancellation.
+    # Variances after subtracting 0.5: the same values, with half the digits lost to cancellation.
     a, b = image - 0.5, reference - 0.5
     xx = window_mean(a * a) - (x - 0.5) ** 2
     yy = window_mean(b * b) - (y - 0.5) ** 2
@@ -140,7 +149,7 @@ def flip(
 
 
 def _pair(image: jax.Array, reference: jax.Array, *, channels: int | None = None) -> tuple[jax.Array, jax.Array]:
-    """Both images checked, in float32 or better: half precision neither holds small squares nor counts pixels."""
+    """Both images checked, in float32 or better: small squares and pixel counts do not fit into half precision."""
     rank = 4 if jnp.ndim(image) == 4 else 3
     check_image(image, "image", rank=rank, channels=channels)
     check_image(reference, "reference", rank=rank, channels=image.shape[-1])
@@ -150,7 +159,7 @@ def _pair(image: jax.Array, reference: jax.Array, *, channels: int | None = None
 
 
 def _inside(image: jax.Array, mask: jax.Array | None) -> jax.Array | None:
-    """[..., H, W, 1] bool, or None for all of it."""
+    """[..., H, W, 1] bool, or None for the whole image."""
     if mask is None:
         return None
     if jnp.shape(mask) != (*image.shape[:-1], 1):

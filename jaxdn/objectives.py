@@ -1,8 +1,8 @@
-"""What training minimises, as values: ``(images, clip, progress) -> loss``.
+"""Training objectives as functions ``(images, clip, progress) -> loss``.
 
 ``images`` [T, H, W, 3] are a clip's denoised frames in linear radiance, ``clip`` has the frames and a reference without
-broken values, and ``progress`` in [0, 1] is the share of the updates that lie behind (traced, so that all phases of
-training run in one compiled program).
+invalid values, and ``progress`` in [0, 1] is the fraction of updates done (traced, so that all phases of training run
+in one compiled program).
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ Loss = Callable[[jax.Array, Clip, jax.Array], jax.Array]
 
 
 class Objective(NamedTuple):
-    """A loss and the name under which a run's record keeps it."""
+    """A loss and its name in the record of a run."""
 
     name: str
     loss: Loss
@@ -28,9 +28,9 @@ class Objective(NamedTuple):
 def indirect_illumination(*, occlusion: bool = True) -> Objective:
     """``spatial + temporal + motion-occlusion`` on compressed radiance (Zeng et al. 2021, eq. 5 and 6).
 
-    Over all frames but the last, which gives no gradient and is left for validation; a clip of one frame is trained on.
-    Radiance is compressed by ``log(1 + x)^(1/2.2)``: in linear radiance one firefly would outweigh a frame. The
-    motion-occlusion loss joins in the second half of training (C in the paper; ``occlusion=False`` is A and B).
+    All frames except the last are used, which is left for validation; a clip of one frame is trained on. Radiance is
+    compressed by ``log(1 + x)^(1/2.2)``: in linear radiance one firefly would outweigh a frame. The motion-occlusion
+    loss is added in the second half of training (C in the paper; ``occlusion=False`` is A and B).
     """
 
     def loss(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:
@@ -48,7 +48,7 @@ def indirect_illumination(*, occlusion: bool = True) -> Objective:
 def disocclusions(frames: Frame) -> jax.Array:
     """The masks ``[T, H, W, 1]`` of the occlusion loss: where the dual vector differs from the traditional one.
 
-    No vectors, or no dual vectors: nothing is disoccluded, and the mask is zero.
+    Without motion vectors or without dual ones, nothing is disoccluded and the mask is zero.
     """
     if frames.motion is None or frames.dual_motion is None:
         return jnp.zeros_like(frames.radiance[..., :1])

@@ -1,7 +1,7 @@
 """The options of a method: one frozen dataclass, read by its factory, the command line and the docs.
 
-A field's annotation is all that is declared: ``Literal`` for a choice, ``Annotated[float, Range(...)]`` for a number,
-``bool``, ``None`` and unions of these, nested tuples of numbers. What is given is checked here and nowhere else.
+Only a field's annotation is declared: ``Literal`` for a choice, ``Annotated[float, Range(...)]`` for a number,
+``bool``, ``None`` and unions of these, nested tuples of numbers. Given values are checked here and nowhere else.
 """
 
 import dataclasses
@@ -14,12 +14,12 @@ T = TypeVar("T")
 
 
 class Range(NamedTuple):
-    """The numbers that an option may be, from ``low`` to ``high``."""
+    """The allowed values of an option, from ``low`` to ``high``."""
 
     low: float = -float("inf")
     high: float = float("inf")
     without_low: bool = False
-    """``low`` itself is not one of them."""
+    """``low`` itself is excluded."""
 
     def __contains__(self, value: object) -> bool:
         inside = isinstance(value, int | float) and self.low <= value <= self.high
@@ -34,8 +34,8 @@ class Range(NamedTuple):
 def make(cls: type[T], given: Mapping[str, Any], *, method: str, base: T | None = None) -> T:
     """The options ``cls`` with the ``given`` values in place of those of ``base`` (default: the declared defaults).
 
-    Lists become tuples, as JSON has no others. Raises ValueError, naming what there is, for an option that does not
-    exist or a value that it cannot have.
+    Lists become tuples, as JSON has only lists. Raises ValueError, naming what is allowed, for an unknown option or an
+    invalid value.
     """
     hints = get_type_hints(cls, include_extras=True)
     unknown = [name for name in given if name not in hints]
@@ -44,12 +44,12 @@ def make(cls: type[T], given: Mapping[str, Any], *, method: str, base: T | None 
     values = {name: _tuples(value) for name, value in given.items()}
     for name, value in values.items():
         if not _fits(value, hints[name]):
-            raise ValueError(f"{method} {name}: expected {_told(hints[name])}, got {value!r}.")
+            raise ValueError(f"{method} {name}: expected {_expected(hints[name])}, got {value!r}.")
     return cls(**values) if base is None else dataclasses.replace(base, **values)  # type: ignore[type-var]
 
 
 def parse(assignments: Sequence[str], *, option: str = "--set") -> dict[str, Any]:
-    """``["size=small", "levels=3"]`` as a dict: values are JSON where they can be read as such, else words.
+    """``["size=small", "levels=3"]`` as a dict: values are parsed as JSON if possible, else taken as strings.
 
     Raises ValueError, naming the command line's ``option``, for what is not ``name=value``.
     """
@@ -66,10 +66,10 @@ def parse(assignments: Sequence[str], *, option: str = "--set") -> dict[str, Any
 
 
 def describe(cls: type) -> str:
-    """One line an option: its name, what it may be, and its default."""
+    """One line per option: its name, its allowed values, and its default."""
     hints = get_type_hints(cls, include_extras=True)
     fields = dataclasses.fields(cls)
-    return "\n".join(f"* ``{each.name}``: {_told(hints[each.name])}; default {each.default!r}" for each in fields)
+    return "\n".join(f"* ``{each.name}``: {_expected(hints[each.name])}; default {each.default!r}" for each in fields)
 
 
 def _tuples(value: Any) -> Any:
@@ -93,15 +93,15 @@ def _fits(value: Any, hint: Any) -> bool:
     return isinstance(value, NoneType if hint is None else hint)
 
 
-def _told(hint: Any) -> str:
+def _expected(hint: Any) -> str:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        return " ".join([_told(arguments[0]), *(str(rule) for rule in arguments[1:] if isinstance(rule, Range))])
+        return " ".join([_expected(arguments[0]), *(str(rule) for rule in arguments[1:] if isinstance(rule, Range))])
     if origin in (Union, UnionType):
-        return " or ".join(_told(one) for one in arguments)
+        return " or ".join(_expected(one) for one in arguments)
     if origin is Literal:
         return "one of " + ", ".join(map(repr, arguments)) if len(arguments) > 1 else repr(arguments[0])
     if origin is tuple:
-        return f"a tuple of {_told(arguments[0])}"
-    names = {float: "a number", int: "a whole number", bool: "True or False", NoneType: "None", str: "a word"}
+        return f"a tuple of {_expected(arguments[0])}"
+    names = {float: "a number", int: "a whole number", bool: "True or False", NoneType: "None", str: "a string"}
     return names.get(hint, str(hint))

@@ -14,13 +14,13 @@ from jaxdn.frame import Clip, Frame, frame_at, only, present
 from jaxdn.sampling import from_layers
 
 Layers = Mapping[int, Any] | None
-"""Samples a pixel -> independent noisy radiance; see :class:`jaxdn.Clip`."""
+"""Samples per pixel -> independent noisy radiance; see :class:`jaxdn.Clip`."""
 
 
 def sampled(denoiser: Denoiser, params: Params, state: State, frame: Frame, layers: Layers) -> Frame:
-    """The frame with the samples that the denoiser asks for, served from stored layers; as it is if it asks for none.
+    """The frame with the samples that the denoiser requests, taken from stored layers; unchanged without a request.
 
-    Raises ValueError where it asks and there are no layers.
+    Raises ValueError for a request without layers.
     """
     if denoiser.samples is None:
         return only(frame, denoiser.reads)
@@ -53,8 +53,8 @@ def unroll(
 def denoise(denoiser: Denoiser, params: Params, clip: Clip) -> jax.Array:
     """Denoise a clip; returns linear radiance ``[T, H, W, 3]``, >= 0.
 
-    ``clip.frames`` are T frames of linear radiance with whatever other buffers the renderer gave; those that
-    ``denoiser.reads`` does not name are left out of the program. Pure and not jitted: wrap it in ``jax.jit`` with the
+    ``clip.frames`` are T frames of linear radiance and any other buffers; those that ``denoiser.reads`` does not name
+    are left out of the program. Pure and not jitted: wrap it in ``jax.jit`` with the
     denoiser closed over. Raises ValueError when the radiance is not ``[T, H, W, 3]`` or a buffer's size differs.
     """
     radiance = clip.frames.radiance
@@ -68,7 +68,7 @@ def denoise(denoiser: Denoiser, params: Params, clip: Clip) -> jax.Array:
     return unroll(denoiser, params, clip.frames, clip.layers)
 
 
-# Jitted once for all streams: a denoiser that goes through many clips is compiled once.
+# Jitted once for all streams: a denoiser that is used on many clips is compiled once.
 @functools.partial(jax.jit, static_argnums=0)
 def _start(denoiser: Denoiser, params: Params, frame: Frame) -> State:
     return denoiser.start(params, frame)
@@ -82,27 +82,27 @@ def _step(denoiser: Denoiser, params: Params, state: State, frame: Frame, layers
 class Stream:
     """Frames in, images out, one at a time: the recurrent state is kept between calls. Made by :func:`stream`.
 
-    A step is compiled for each set of buffers that some frame has, and its state's memory is used again.
+    A step is compiled for each distinct set of buffers; the memory of the state is reused.
     """
 
     def __init__(self, denoiser: Denoiser, params: Params) -> None:
         self._denoiser, self._params = denoiser, params
-        self._state: Any = None
+        self._state: State = None
         self.programs: set[tuple[str, ...]] = set()
-        """The sets of buffers, besides radiance, that a step was compiled for."""
+        """The sets of buffers, without radiance, that a step was compiled for."""
 
     def __call__(self, frame: Frame, layers: Layers = None) -> jax.Array:
         """Denoise the next frame [H, W, C]; returns [H, W, 3]."""
         frame = only(frame, self._denoiser.reads)
         self.programs.add(present(frame))
         if self._state is None:
-            # Copied: what is donated to the step must not lie in one place twice.
+            # Copied: two donated arrays must not share memory.
             self._state = jax.tree.map(jnp.copy, _start(self._denoiser, self._params, frame))
         self._state, image = _step(self._denoiser, self._params, self._state, frame, layers)
         return image
 
     def each(self, frames: Iterable[Frame]) -> Iterator[jax.Array]:
-        """The image of every frame, made when it is asked for."""
+        """The image of every frame, computed lazily."""
         return (self(frame) for frame in frames)
 
     @property
@@ -114,6 +114,6 @@ class Stream:
 def stream(denoiser: Denoiser, params: Params) -> Stream:
     """A function from each frame of a sequence to its denoised image; memory is that of one frame.
 
-    The one way of stepping that the command line, the chart and notebooks share; gives the images of :func:`denoise`.
+    Used by the command line, the chart and notebooks; gives the same images as :func:`denoise`.
     """
     return Stream(denoiser, params)

@@ -1,4 +1,4 @@
-"""Weights travel as safetensors plus a small JSON that names the denoiser's factory and its options; no pickle."""
+"""Weights as safetensors plus a small JSON that names the denoiser's factory and its options; no pickle."""
 
 import json
 from pathlib import Path
@@ -10,21 +10,21 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
-from jaxdn.denoiser import Denoiser
+from jaxdn.denoiser import Denoiser, Params
 from jaxdn.files import write_whole
 from jaxdn.frame import Frame
 from jaxdn.methods.table import method_named
 
 SHIPPED = Path(__file__).parent / "shipped"
-"""Where the weights lie that come with the package."""
+"""Folder of the weights that come with the package."""
 
 
 def shipped_names() -> list[str]:
-    """The names that :func:`load_weights` knows."""
+    """The names that :func:`load_weights` accepts."""
     return sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 
 
-def flatten(params: dict[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
+def flatten(params: Params, prefix: str = "") -> dict[str, np.ndarray]:
     """A nested dict of arrays as one level, keys joined by ``/``."""
     flat: dict[str, np.ndarray] = {}
     for key, value in params.items():
@@ -33,7 +33,7 @@ def flatten(params: dict[str, Any], prefix: str = "") -> dict[str, np.ndarray]:
     return flat
 
 
-def unflatten(flat: dict[str, np.ndarray]) -> dict[str, Any]:
+def unflatten(flat: dict[str, np.ndarray]) -> Params:
     """The inverse of :func:`flatten`, with jax arrays as leaves."""
     params: dict[str, Any] = {}
     for name, value in flat.items():
@@ -46,12 +46,18 @@ def unflatten(flat: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def save_weights(
-    path: Path | str, params: dict[str, Any], *, factory: str, options: dict[str, Any], record: dict[str, Any]
+    path: Path | str, params: Params, *, factory: str, options: dict[str, Any], record: dict[str, Any]
 ) -> Path:
     """Write ``path`` (.safetensors) and the JSON file of the same name; returns the path of the weights.
 
-    ``factory`` is a name in ``jaxdn.denoisers`` and ``options`` its keyword arguments; ``record`` says how the weights
-    came to be (data, recipe, scores). Each file is whole or not there.
+    No file is ever left incomplete.
+
+    Args:
+      path: its suffix is replaced by ``.safetensors``; its folder is created if it is missing.
+      params: what to save.
+      factory: a name in ``jaxdn.denoisers``.
+      options: keyword arguments of the factory.
+      record: how the weights were made (data, recipe, scores); further entries of the JSON.
     """
     path = Path(path).with_suffix(".safetensors")
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -60,12 +66,12 @@ def save_weights(
     return path
 
 
-def load_weights(name_or_path: str | Path, **options_instead: Any) -> tuple[Denoiser, dict[str, Any]]:
+def load_weights(name_or_path: str | Path, **options_instead: Any) -> tuple[Denoiser, Params]:
     """A denoiser and its parameters, by a shipped name (``"ntd-large"``) or the path of a .safetensors file.
 
-    The factory and its options are read from the JSON file of the same name; ``options_instead`` take their place, such
-    as ``implementation="onnxruntime"`` or ``compute_dtype="bfloat16"``. Raises ValueError where nothing of that name
-    exists, a file cannot be read, the JSON names an unknown factory or option, or the weights are not those of the
+    The factory and its options are read from the JSON file of the same name; ``options_instead`` replace them, such
+    as ``implementation="onnxruntime"`` or ``compute_dtype="bfloat16"``. Raises ValueError if no weights of that name
+    exist, a file cannot be read, the JSON names an unknown factory or option, or the weights are not those of the
     denoiser that it describes.
     """
     path = weights_path(name_or_path)
@@ -89,7 +95,7 @@ def load_weights(name_or_path: str | Path, **options_instead: Any) -> tuple[Deno
 
 
 def weights_path(name_or_path: str | Path) -> Path:
-    """The .safetensors file of a shipped name, or the path itself. Raises ValueError where there is no such file."""
+    """The .safetensors file of a shipped name, or the path itself. Raises ValueError if there is no such file."""
     path = SHIPPED / f"{name_or_path}.safetensors"
     if not path.is_file():
         path = Path(name_or_path)
@@ -104,7 +110,7 @@ def weights_path(name_or_path: str | Path) -> Path:
 def describe(name_or_path: str | Path) -> dict[str, Any]:
     """The JSON of weights: ``factory``, ``options``, and how they were trained.
 
-    Raises ValueError where it cannot be read, or names a method that is not in the table.
+    Raises ValueError if it cannot be read or names an unknown method.
     """
     file = weights_path(name_or_path).with_suffix(".json")
     try:
@@ -123,7 +129,7 @@ def describe(name_or_path: str | Path) -> dict[str, Any]:
 
 
 def _check_params(flat: dict[str, np.ndarray], denoiser: Denoiser, path: Path) -> None:
-    """Raise ValueError unless the arrays are what the denoiser is initialised with, in name, shape and type."""
+    """Raise ValueError unless the arrays have the names, shapes and types of the denoiser's initial parameters."""
     frame = Frame(jax.ShapeDtypeStruct((16, 16, 3), jnp.float32))
     wanted = _shapes(jax.eval_shape(denoiser.init, jax.random.key(0), frame))
     found = {name: (array.shape, array.dtype) for name, array in flat.items()}

@@ -1,1 +1,1 @@
-"""One file a verb of the command line; each is also a function that a script can call."""
+"""The commands of the command line, one file each; each is also a function that a script can call."""

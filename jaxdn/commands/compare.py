@@ -1,4 +1,4 @@
-"""``jaxdn compare``: every method on the same clips, scored, timed and laid side by side in one report."""
+"""``jaxdn compare``: every method on the same clips, scored, timed and shown next to each other in one report."""
 
 import os
 import platform
@@ -14,7 +14,7 @@ from jaxdn import __version__, color, metrics
 from jaxdn.candidates import Candidate
 from jaxdn.clips import read_clip
 from jaxdn.clips.noise_floor import read_noise_floor
-from jaxdn.denoiser import Denoiser
+from jaxdn.denoiser import Denoiser, Params
 from jaxdn.frame import Clip
 from jaxdn.report import ClipResult, Results, Scores, TrainingCurve
 from jaxdn.rollout import denoise
@@ -55,16 +55,25 @@ def compare(
 
     Images are tone-mapped (sRGB, clipped to [0, 1]) before they are scored. Disoccluded pixels are those whose point
     was hidden in the previous frame (``visible`` is false). Milliseconds are the median of three runs of the compiled
-    clip, divided by its frames; compilation is not in them. Raises ValueError for a clip without a reference.
+    clip, divided by its frames, without compilation. Raises ValueError for a clip without a reference.
+
+    Args:
+      methods: what to compare.
+      folders: the clips, each with a reference.
+      title: of the report.
+      settings: shown in the report.
+      training: label of a method -> its training curve, for the report.
+      spp: samples per pixel to take from the clips' layers.
+      say: prints one line per clip.
     """
-    compiled: dict[str, Callable[[Any, Clip], jax.Array]] = {}
+    compiled: dict[str, Callable[[Params, Clip], jax.Array]] = {}
     for method in methods:
         if method.denoiser is not None:
             compiled[method.label] = _compile(method.denoiser)
-    asking = any(method.denoiser is not None and method.denoiser.samples is not None for method in methods)
+    needs_layers = any(method.denoiser is not None and method.denoiser.samples is not None for method in methods)
     clips = []
     for count, folder in enumerate(folders):
-        clip = read_clip(folder, spp=spp, layers=asking)
+        clip = read_clip(folder, spp=spp, layers=needs_layers)
         if clip.reference is None:
             raise ValueError(f"{folder}: expected a clip with a reference to compare with, got none; render one.")
         began = time.monotonic()
@@ -79,7 +88,7 @@ def compare(
     return Results(title, settings, describe_machine(), labels, clips, training or {})
 
 
-def _compile(denoiser: Denoiser) -> Callable[[Any, Clip], jax.Array]:
+def _compile(denoiser: Denoiser) -> Callable[[Params, Clip], jax.Array]:
     return jax.jit(lambda params, clip: denoise(denoiser, params, clip))
 
 
@@ -87,7 +96,7 @@ def _compare_on(
     clip: Clip,
     folder: Path,
     methods: Sequence[Candidate],
-    compiled: dict[str, Callable[[Any, Clip], jax.Array]],
+    compiled: dict[str, Callable[[Params, Clip], jax.Array]],
     spp: int,
 ) -> ClipResult:
     frames = clip.frames
@@ -95,7 +104,7 @@ def _compare_on(
     reference = color.tonemap(clip.reference)
     shape = (*np.shape(frames.radiance)[:3], 1)
     hidden = ~np.asarray(frames.visible, bool) if frames.visible is not None else np.zeros(shape, bool)
-    # At a clip's first frame nobody has a history: what "was hidden before" means nothing there.
+    # At a clip's first frame no method has a history, so no pixel counts as disoccluded.
     hidden = np.concatenate([np.zeros_like(hidden[:1]), hidden[1:]])
     shown = int(np.argmax(hidden.sum((1, 2, 3)))) if hidden.any() else shape[0] - 1
     scores, per_frame = {}, {}
@@ -118,20 +127,22 @@ def _compare_on(
 
 
 def _as_scores(found: dict[str, np.ndarray], hidden: np.ndarray, milliseconds: float, spp: int) -> Scores:
-    anything = bool(hidden.any())
+    any_hidden = bool(hidden.any())
     with np.errstate(divide="ignore"):
         hidden_psnr = float(-10.0 * np.log10(found["disoccluded_mse"]))
     return Scores(
         **{name: float(found[name]) for name in ("psnr", "ssim", "l1", "mse", "temporal_psnr", "flip")},
-        disoccluded_l1=float(found["disoccluded_l1"]) if anything else float("nan"),
-        disoccluded_psnr=hidden_psnr if anything else float("nan"),
+        disoccluded_l1=float(found["disoccluded_l1"]) if any_hidden else float("nan"),
+        disoccluded_psnr=hidden_psnr if any_hidden else float("nan"),
         ms_per_frame=milliseconds,
         spp=float(spp),
     )
 
 
-def _timed(run: Callable[[Any, Clip], jax.Array], params: Any, clip: Clip, frames: int) -> tuple[jax.Array, float]:
-    """The denoised clip and the median milliseconds a frame of three runs after a first one that compiles."""
+def _timed(
+    run: Callable[[Params, Clip], jax.Array], params: Params, clip: Clip, frames: int
+) -> tuple[jax.Array, float]:
+    """The denoised clip and the median milliseconds per frame of three runs after a first one that compiles."""
     denoised = jax.block_until_ready(run(params, clip))
     seconds = []
     for _ in range(3):
@@ -142,7 +153,7 @@ def _timed(run: Callable[[Any, Clip], jax.Array], params: Any, clip: Clip, frame
 
 
 def describe_machine() -> dict[str, Any]:
-    """What made a measurement: processor, cores, device, versions."""
+    """The machine of a measurement: processor, cores, device, versions."""
     return {
         "processor": _processor(),
         "cores": _cores(),

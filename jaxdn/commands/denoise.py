@@ -22,16 +22,16 @@ class Written(NamedTuple):
 
     files: list[Path]
     programs: int
-    """Steps that were compiled: one for each set of buffers that some frame has."""
+    """Steps that were compiled: one for each distinct set of buffers among the frames."""
     repaired: int
-    """Values of frames and histories that were not usable numbers and had to be replaced."""
+    """Invalid values (NaN, infinite, negative ...) of frames and histories that were replaced."""
 
 
 def candidate_on(name: str, implementation: str = "auto") -> tuple[Candidate, str]:
     """The candidate of that name on an engine, and the engine's name; "reference" is XLA.
 
     ``"auto"`` is the fastest engine for inference that the method has and that can run here. Raises ValueError for a
-    name that is no method, and for an engine that cannot run it.
+    name that is not a method, and for an engine that cannot run it.
     """
     found = candidate(name)
     known = found.method is not None and found.method.knows("implementation")
@@ -57,23 +57,23 @@ def denoise_files(
     """Denoise a clip's folder, or EXR files of another renderer; returns the files written.
 
     Each output frame has the channels ``R, G, B``: the denoised radiance with the directly reflected and the emitted
-    light of the clip added back (foreign files: the denoised beauty), and ``denoised.R/G/B``, the denoised part alone.
-    Frames are read, denoised and written one at a time, so that a sequence of any length takes the memory of one; a
-    file is there whole or not at all. Raises ValueError for input that cannot be read or does not fit together, before
+    light of the clip added back (files of other renderers: the denoised beauty), and ``denoised.R/G/B``, the denoised
+    part alone. Frames are read, denoised and written one at a time, so that a sequence of any length takes the memory
+    of one. Files are never left incomplete. Raises ValueError for input that cannot be read or is inconsistent, before
     the frame concerned is written.
 
     Args:
       source: folder of a clip; or a folder of, or a pattern for, EXR files.
       out: folder for the denoised frames.
-      method: what denoises.
-      spp: samples a pixel to take from a clip's layers.
+      method: the denoiser.
+      spp: samples per pixel to take from a clip's layers.
       preview: write a PNG next to each frame.
-      motion_convention: whose convention foreign motion vectors follow (:mod:`jaxdn.clips.import_exr`).
-      channels: buffer -> layer of foreign files to take it from.
-      say: called with the frames done and the frames in all.
+      motion_convention: that of motion vectors in files of other renderers (:mod:`jaxdn.clips.import_exr`).
+      channels: buffer -> layer to take it from in files of other renderers.
+      say: called with the number of frames done and the total.
     """
-    asks = method.denoiser is not None and method.denoiser.samples is not None
-    names, frames = _open(source, asks, spp, motion_convention, channels)
+    needs_layers = method.denoiser is not None and method.denoiser.samples is not None
+    names, frames = _open(source, needs_layers, spp, motion_convention, channels)
     if out.resolve() in {source.resolve(), *(name.resolve().parent for name in names)}:
         raise ValueError(f"{out}: expected another folder than the input's, whose frames would be overwritten.")
     step = None if method.denoiser is None else stream(method.denoiser, method.params)
@@ -92,19 +92,21 @@ def denoise_files(
 
 
 def _open(
-    source: Path, asks: bool, spp: int, motion_convention: str | None, channels: Mapping[str, str] | None
+    source: Path, needs_layers: bool, spp: int, motion_convention: str | None, channels: Mapping[str, str] | None
 ) -> tuple[list[Path], Iterator[tuple[Frame, Layers]]]:
     """The files and their frames, read when needed; with independent layers for a method that asks for samples."""
     names, frames = open_frames(source, spp=spp, motion_convention=motion_convention, channels=channels)
 
     def layers(stored: StoredFrame) -> Layers:
-        return {count: stored.layers[count] for count in doubling_layers(stored.layers, source)} if asks else None
+        return (
+            {count: stored.layers[count] for count in doubling_layers(stored.layers, source)} if needs_layers else None
+        )
 
     return names, ((stored.frame, layers(stored)) for stored in frames)
 
 
 def _light(radiance: np.ndarray | None) -> Any:
-    """Radiance fit to be added: not finite or negative becomes 0, an absent part is 0."""
+    """Radiance that can be added: non-finite or negative values become 0, an absent part is 0."""
     return 0.0 if radiance is None else np.asarray(repair_image(radiance), np.float32)
 
 

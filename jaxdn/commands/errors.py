@@ -1,4 +1,4 @@
-"""Errors that a person at a terminal can act on: one message, exit code 2, no traceback."""
+"""Errors that a user at a terminal can act on: one message, exit code 2, no traceback."""
 
 import sys
 from collections.abc import Iterator
@@ -15,14 +15,14 @@ EXTRAS: dict[str, tuple[str, ...]] = {
     "onnx": ("onnxruntime", "onnx"),
     "bench": ("torch", "pyoidn"),
 }
-"""Extra of pyproject.toml -> the packages that it brings, by the names they are imported by."""
+"""Extra of pyproject.toml -> the packages that it installs, by their import names."""
 
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """Turn what a user can mend (wrong input, missing or unwritable file) into one message and exit code 2.
+    """Turn errors that a user can fix (wrong input, missing or unwritable file) into one message and exit code 2.
 
-    Anything else is a mistake of ours and keeps its traceback. Ctrl-C ends with 130, as shells expect.
+    Anything else is a bug and keeps its traceback. Ctrl-C ends with exit code 130, as shells expect.
     """
     try:
         yield

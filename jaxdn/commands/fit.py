@@ -5,7 +5,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -16,7 +15,7 @@ from jaxdn import color, metrics
 from jaxdn.checkpoint import Checkpoints
 from jaxdn.clips import read_clip
 from jaxdn.commands.log import Log
-from jaxdn.denoiser import Denoiser
+from jaxdn.denoiser import Denoiser, Params
 from jaxdn.files import write_json
 from jaxdn.frame import Clip
 from jaxdn.learning.step import TrainState, initial_state, make_train_step
@@ -24,14 +23,14 @@ from jaxdn.recipe import Recipe
 from jaxdn.rollout import denoise
 
 
-def make_validation(denoiser: Denoiser, clips: Sequence[Clip]) -> Callable[[Any], float]:
+def make_validation(denoiser: Denoiser, clips: Sequence[Clip]) -> Callable[[Params], float]:
     """A function of the parameters: the mean over the clips of the PSNR of all their frames, tone-mapped, in dB.
 
-    Compiled once for clips of one size. Not a number without clips.
+    Compiled once for clips of one size. NaN without clips.
     """
 
     @jax.jit
-    def score(params: Any, clip: Clip) -> jax.Array:
+    def score(params: Params, clip: Clip) -> jax.Array:
         return metrics.psnr(color.tonemap(denoise(denoiser, params, clip)), color.tonemap(clip.reference))
 
     return lambda params: float(np.mean([float(score(params, clip)) for clip in clips])) if clips else float("nan")
@@ -49,11 +48,21 @@ def fit(
     validate_every: int = 100,
     checkpoint_every: int = 100,
 ) -> TrainState:
-    """Train to ``recipe.steps`` updates, continuing from the newest checkpoint in ``folder`` as if never stopped.
+    """Train to ``recipe.steps`` updates, resuming from the newest checkpoint in ``folder`` to the same result.
 
-    ``batches`` is a Grain iterator (it has ``get_state`` and ``set_state``): its position is kept in every checkpoint.
-    Interrupted (Ctrl-C), the state is written before KeyboardInterrupt goes on. The log is ``folder/log.jsonl``.
-    Raises ValueError, saying what to change, when none of many updates in a row was of any effect.
+    On Ctrl-C the state is saved before KeyboardInterrupt is raised again. Raises ValueError, with what to change, after
+    many updates in a row that changed nothing.
+
+    Args:
+      denoiser: what to train.
+      recipe: objective, optimiser, number of updates.
+      batches: a Grain iterator (with ``get_state`` and ``set_state``); every checkpoint keeps its position.
+      folder: gets recipe.json, log.jsonl and the checkpoints.
+      label: the run's name in messages.
+      validation: held-out clips.
+      log_every: updates between two log entries.
+      validate_every: updates between two validations.
+      checkpoint_every: updates between two checkpoints.
     """
     folder.mkdir(parents=True, exist_ok=True)
     _same_recipe(folder / "recipe.json", recipe)
@@ -69,7 +78,7 @@ def fit(
     log = Log(folder / "log.jsonl", keep_until=step)
     train_step = make_train_step(denoiser, recipe)
     validate = make_validation(denoiser, validation)
-    # A write of the state while it is being replaced would keep neither: the position belongs to finished updates only.
+    # An interrupt may come between the batch and its update: this position always belongs to finished updates.
     position = batches.get_state()  # type: ignore[attr-defined]
     saved = step
     watch = _Divergence(label, recipe, step, int(state.skipped))
@@ -103,12 +112,12 @@ def fit(
 
 
 def load_validation(denoiser: Denoiser, folders: Sequence[Path], *, spp: int = 1) -> list[Clip]:
-    """Whole held-out clips, as they are validated on."""
+    """Held-out clips, read whole, for validation."""
     return [read_clip(folder, spp=spp, layers=denoiser.samples is not None) for folder in folders]
 
 
 def _same_recipe(path: Path, recipe: Recipe) -> None:
-    """Write the recipe of a new run; raise ValueError where an old run was made by another one."""
+    """Write the recipe of a new run; raise ValueError if an existing run has another one."""
     wanted = recipe.record()
     if path.is_file():
         there = json.loads(path.read_text())
@@ -124,7 +133,7 @@ def _same_recipe(path: Path, recipe: Recipe) -> None:
 
 
 class _Divergence:
-    """Raises where training goes on without learning: for 100 updates, or half of all, none was of any effect."""
+    """Raises ValueError when training no longer learns: for 100 updates, or half of all, none changed the weights."""
 
     def __init__(self, label: str, recipe: Recipe, step: int, skipped: int):
         self._label, self._recipe = label, recipe
@@ -133,9 +142,9 @@ class _Divergence:
         self._skipped = skipped
 
     def look(self, step: int, *, skipped: int, norm: float) -> None:
-        """Take in that of ``step`` updates ``skipped`` were not finite, and the norm of the newest gradient.
+        """Check training after ``step`` updates, ``skipped`` of them not finite, by the newest gradient's norm.
 
-        Weights that have grown beyond all measure may still give finite images, from which no gradient comes back.
+        Weights that have grown extremely large may still give finite images, but with a gradient of zero.
         """
         if skipped - self._skipped < step - self._seen and norm != 0:
             self._learned = step
@@ -149,7 +158,7 @@ class _Divergence:
 
 
 class _Progress:
-    """A bar with loss, validation PSNR, frames/s and time left; plain lines where nobody watches."""
+    """A bar with loss, validation PSNR, frames/s and time left; plain lines without a terminal."""
 
     def __init__(self, label: str, recipe: Recipe, start: int):
         self._label, self._recipe, self._first = label, recipe, start
@@ -179,17 +188,17 @@ class _Progress:
         self._bar.stop()
 
     def say(self, line: str) -> None:
-        """One line above the bar."""
+        """Print one line above the bar."""
         self._console.print(line, highlight=False, markup=False)
 
     def validated(self, psnr: float) -> None:
-        """Remember the newest validation PSNR."""
+        """Keep the newest validation PSNR."""
         self._validation = psnr
 
     def advance(self, step: int, *, loss: float, skipped: int) -> None:
-        """Show where training stands after ``step`` updates."""
+        """Show the progress after ``step`` updates."""
         now = time.monotonic()
-        if self._began is None:  # the first report comes after the compilation: count speed from there
+        if self._began is None:  # the first report comes after the compilation: measure speed from there
             self._began, self._first = now, step
         rate = (step - self._first) / max(now - self._began, 1e-9)
         state = f"loss {loss:.4f}"

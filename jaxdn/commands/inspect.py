@@ -20,13 +20,13 @@ from jaxdn.methods.table import methods
 from jaxdn.render.opening import open_scene
 
 EVERYTHING = plan(everything(1))
-"""What is rendered and stored without a plan."""
+"""The plan that corresponds to rendering everything."""
 
 
 def denoiser_named(name: str) -> Denoiser | None:
-    """A denoiser to plan for: a method, shipped weights or a file; None is the noisy image, which nobody denoises.
+    """A denoiser to plan for: a method, shipped weights or a file; None for the noisy image, which is not denoised.
 
-    The weights do not matter here, so a method that learns needs none. Raises ValueError for any other name.
+    The weights do not matter here, so a learned method needs none. Raises ValueError for any other name.
     """
     known = methods()
     return known[name].factory() if name in known else candidate(name).denoiser
@@ -42,7 +42,17 @@ def inspect_to_terminal(
     frames: int | None,
     as_json: bool,
 ) -> None:
-    """Print the table, or with ``as_json`` nothing but one JSON object, for a scene, a family or a finished clip."""
+    """Print the table of effects and the plan for a scene, a family or a finished clip.
+
+    Args:
+      source: a Mitsuba scene (.xml), a family, or a finished clip.
+      animation: animation file for a scene file.
+      denoiser: name of the denoiser to plan for; None: for every buffer that a denoiser may read.
+      width: in pixels.
+      height: in pixels.
+      frames: number of frames to inspect; None: all.
+      as_json: print only one JSON object.
+    """
     reader = None if denoiser is None else denoiser_named(denoiser)
     with _nothing_else_on_stdout():
         planned = _planned(source, animation, reader, width=width, height=height, frames=frames)
@@ -57,7 +67,7 @@ def inspect_to_terminal(
 def _planned(
     source: str, animation: Path | None, reader: Denoiser | None, *, width: int, height: int, frames: int | None
 ) -> Planned:
-    """What is found in a scene or a finished clip, and what would be rendered for it."""
+    """The effects of a scene or a finished clip, and what would be rendered for them."""
     if Path(source).is_dir() or source.endswith(".exr"):
         found = inspect(source, animation, frames=frames)
         return Planned(found, plan(found, reader))
@@ -69,7 +79,7 @@ def _planned(
 
 
 def plan_record(planned: Planned, reader: Denoiser | None) -> dict[str, Any]:
-    """A plan as JSON, with how its path length was measured, and with what follows from it."""
+    """A plan as JSON, with how its path length was measured, and with derived figures."""
     made, depth = planned.plan, planned.depth
     return {
         **made.record(),
@@ -92,12 +102,12 @@ def motion(made: Plan) -> str:
 
 
 def left_out(made: Plan) -> list[str]:
-    """The buffers that are rendered without a plan, and not by this one."""
+    """The buffers that this plan leaves out."""
     return [name for name in EVERYTHING.buffers if name not in made.buffers]
 
 
 def noise_alone(made: Plan) -> int:
-    """How many frames share everything but their noise with an earlier one."""
+    """How many frames share everything except the noise with an earlier one."""
     return sum(held != index for index, held in enumerate(made.held))
 
 
@@ -107,7 +117,7 @@ def channels(buffers: tuple[str, ...]) -> list[str]:
 
 
 def bytes_a_pixel(made: Plan) -> float:
-    """Mean bytes a pixel and frame before compression, one noisy layer and a reference with its half included."""
+    """Mean bytes per pixel and frame before compression, including one noisy layer, the reference and its half."""
     light = BUFFERS["radiance"].bytes
     whole = [3 * light + sum(BUFFERS[name].bytes for name in names) for names in made.frames]
     stored = [light if held != index else whole[index] for index, held in enumerate(made.held)]
@@ -116,7 +126,7 @@ def bytes_a_pixel(made: Plan) -> float:
 
 @contextmanager
 def _nothing_else_on_stdout() -> Iterator[None]:
-    """Send what others print to standard error, the renderer's own threads and C++ included."""
+    """Redirect everything printed, also by the renderer's threads and C++ code, to standard error."""
     sys.stdout.flush()
     kept = os.dup(1)
     os.dup2(2, 1)
@@ -148,10 +158,10 @@ def _show(source: str, planned: Planned, reader: Denoiser | None, name: str | No
     console.print(f"motion        {motion(made)}")
     console.print(f"buffers       {', '.join(made.buffers)}")
     console.print(f"left out      {', '.join(left_out(made)) or 'nothing'}")
-    for_whom = "any denoiser" if name is None else name
-    console.print(f"programs      {made.programs(None if reader is None else reader.reads)} compiled for {for_whom}")
-    console.print(f"rendered once {noise_alone(made)} of {len(made.held)} frames hold the noise alone")
-    sizes = f"{bytes_a_pixel(made):g} of {bytes_a_pixel(EVERYTHING):g} bytes a pixel and frame"
+    reader_name = "any denoiser" if name is None else name
+    console.print(f"programs      {made.programs(None if reader is None else reader.reads)} compiled for {reader_name}")
+    console.print(f"rendered once {noise_alone(made)} of {len(made.held)} frames store only their noise")
+    sizes = f"{bytes_a_pixel(made):g} of {bytes_a_pixel(EVERYTHING):g} bytes per pixel and frame"
     console.print(f"on disk       {sizes}, uncompressed")
 
 

@@ -18,16 +18,16 @@ class Curve(NamedTuple):
 
 
 class Log:
-    """``log.jsonl`` of a run: one strict JSON object a line, appended as it happens."""
+    """``log.jsonl`` of a run: one strict JSON object per line, written immediately."""
 
     def __init__(self, path: Path, *, keep_until: int):
-        """Open the log; entries after step ``keep_until`` belong to updates that were lost, and go."""
+        """Open the log; entries after step ``keep_until`` belong to lost updates and are removed."""
         kept = [entry for entry in read_log(path) if entry["step"] <= keep_until]
         write_whole({path: "".join(json.dumps(entry) + "\n" for entry in kept)})
         self._file = path.open("a")
 
     def write(self, **entry: Any) -> None:
-        """Append one entry and let it reach the file; what is not finite is null, which strict JSON has a word for."""
+        """Append one entry and flush it; non-finite values are written as null, as strict JSON has no NaN."""
         entry = {key: value if math.isfinite(value) else None for key, value in entry.items()}
         self._file.write(json.dumps(entry, allow_nan=False) + "\n")
         self._file.flush()
@@ -38,7 +38,7 @@ class Log:
 
 
 def read_log(path: Path) -> list[dict[str, Any]]:
-    """The entries of a log; a last line torn by a crash is left out, a missing file is an empty log."""
+    """The entries of a log; a last line left incomplete by a crash is ignored, a missing file is an empty log."""
     entries = []
     for line in path.read_text().splitlines() if path.is_file() else []:
         try:
@@ -49,7 +49,7 @@ def read_log(path: Path) -> list[dict[str, Any]]:
 
 
 def read_curve(folder: Path) -> Curve:
-    """The loss and validation curves of a run's folder; not a number where the log has null."""
+    """The loss and validation curves of a run's folder; NaN where the log has null."""
 
     def number(value: float | None) -> float:
         return float("nan") if value is None else value

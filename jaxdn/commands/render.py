@@ -1,4 +1,4 @@
-"""``jaxdn render``: animated clips by Mitsuba, with what their scenes call for and nothing else."""
+"""``jaxdn render``: animated clips by Mitsuba, with only the effects that their scenes have."""
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -16,12 +16,12 @@ from jaxdn.render.variant import choose_variant
 
 
 class Planned(NamedTuple):
-    """What was found in a scene, and what follows from it."""
+    """The effects found in a scene, and the plan derived from them."""
 
     effects: Effects
     plan: Plan
     depth: PathDepth | None = None
-    """How the plan's path length was measured; None where it was not."""
+    """How the plan's path length was measured; None if it was not."""
 
 
 def plan_clip(
@@ -34,10 +34,18 @@ def plan_clip(
     frames: int,
     max_depth: int | None = None,
 ) -> Planned | None:
-    """The effects to render an animated scene for, and the plan; None is to render everything (``"all"``).
+    """The effects to render an animated scene for, and the plan; None means to render everything (``"all"``).
 
-    ``effects`` is ``"auto"``, ``"all"``, or names joined by commas. With ``"auto"`` the path length is measured unless
-    ``max_depth`` is given. Raises ValueError for a name that is no effect.
+    Raises ValueError for a name that is not an effect.
+
+    Args:
+      scene: what is rendered.
+      effects: ``"auto"``, ``"all"``, or names separated by commas.
+      denoiser: plan for the buffers that it reads; None: for every buffer that a denoiser may read.
+      width: in pixels.
+      height: in pixels.
+      frames: number of frames.
+      max_depth: path length; by default, with ``"auto"``, it is measured.
     """
     if effects == "all":
         return None
@@ -46,7 +54,7 @@ def plan_clip(
         return Planned(named, plan(named, denoiser, max_depth=max_depth))
     found = inspect(scene, width=width, height=height, frames=frames)
     made = plan(found, denoiser, max_depth=max_depth)
-    # Measuring takes a path tracer, and light that longer paths may add to.
+    # Measuring needs a path tracer, and indirect light that longer paths may add.
     if max_depth is not None or not made.indirect or made.integrator != "path":
         return Planned(found, made)
     depth = measure_depth(scene)
@@ -68,25 +76,25 @@ def render(
     effects: str,
     workers: int | None,
 ) -> list[Path]:
-    """Render clips into folders ``out/<scene>-<seed>``, or go on with them, and return these folders.
+    """Render clips into folders ``out/<scene>-<seed>``, or resume them, and return these folders.
 
     Args:
-      source: a family, of which each seed is another scene, or a Mitsuba scene (.xml), whose seeds differ in noise
-        alone.
+      source: a family, for which each seed gives another scene, or a Mitsuba scene (.xml), whose seeds differ only
+        in noise.
       out: the folder for the clips.
       animation: animation file for a scene file; default: the one next to it.
       seeds: one clip each.
       width: in pixels.
       height: in pixels.
-      frames: how many.
-      reference_spp: samples a pixel of the reference; 0 for none.
-      layers: samples a pixel of the noisy layers, powers of two.
+      frames: number of frames.
+      reference_spp: samples per pixel of the reference; 0 for none.
+      layers: samples per pixel of the noisy layers, powers of two.
       max_depth: path length (1 emission, 2 direct light ...); default: measured, or the scene's own.
       effects: as in :func:`plan_clip`.
-      workers: processes; default: the cores.
+      workers: number of processes; default: the number of cores.
 
-    Prints the variant, what each clip is rendered for, and how far rendering is. Raises ValueError for what is no scene
-    and for options out of range, RenderError, at the end, for clips that failed.
+    Prints the Mitsuba variant, each clip's effects, and the progress. Raises ValueError for a source that is not a
+    scene and for options out of range, and RenderError, at the end, for clips that failed.
     """
     scenes = _scenes(source, animation, seeds)
     choice = choose_variant()
@@ -117,8 +125,8 @@ def render(
 def _scenes(
     source: str, animation: Path | None, seeds: Sequence[int]
 ) -> Iterable[tuple[str, AnimatedScene, list[int]]]:
-    """Every scene once: its name, the scene, and the seeds of the noise that it is rendered with."""
-    if source in FAMILIES:  # made one at a time: there may be hundreds
+    """Every scene once: its name, the scene, and the noise seeds to render it with."""
+    if source in FAMILIES:  # built one at a time: there may be hundreds
         return ((source, family_scene(source, seed, animation), [seed]) for seed in seeds)
     if source.endswith(".xml"):
         scene = SceneFile(Path(source), animation)

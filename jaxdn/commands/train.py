@@ -1,4 +1,4 @@
-"""``jaxdn train``: a method that learns, trained on rendered clips."""
+"""``jaxdn train``: a learned method, trained on rendered clips."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,22 +24,22 @@ def train(
     label: str | None = None,
     record: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Train a method to the end (or find it trained) and return the path of its weights.
+    """Train a method to the end, unless it is trained already, and return the path of its weights.
 
-    Run again, it continues from the newest checkpoint in ``out``. Raises ValueError for what a user can mend: options
-    that the method does not have, clips that do not fit, an engine that cannot run here.
+    A second call resumes from the newest checkpoint in ``out``. Raises ValueError for options that the method does not
+    have, unsuitable clips, and an engine that cannot run here.
 
     Args:
       method: a row of the table of methods.
       recipe: objective, optimiser, batches.
       clips: folders of clips, or of folders of clips, to train on.
-      out: the run's folder: checkpoints, log.jsonl, recipe.json, and in the end weights.safetensors with its JSON.
-      options: the method's, kept with the weights.
-      validation: folders of whole clips held out.
-      spp: samples a pixel of the noisy input.
-      implementation: the engine that trains; "auto" is the fastest that the method has and that runs here.
-      label: the run's name in what is printed; default: that of its folder.
-      record: what else the weights' JSON should say.
+      out: the run's folder: checkpoints, log.jsonl, recipe.json, and finally weights.safetensors with its JSON.
+      options: the method's, stored with the weights.
+      validation: folders of held-out clips, used whole.
+      spp: samples per pixel of the noisy input.
+      implementation: the engine for training; "auto" is the method's fastest that is available here.
+      label: the run's name in messages; default: that of its folder.
+      record: further entries of the weights' JSON.
     """
     label = out.name if label is None else label
     engine = method.engine("training", options) if implementation == "auto" else implementation

@@ -1,4 +1,4 @@
-"""One update of training: a clip's loss, its gradient through all frames, and what makes of it new weights."""
+"""One training update: a clip's loss, its gradient through all frames, and the optimiser's step."""
 
 import functools
 import math
@@ -25,17 +25,17 @@ class TrainState(NamedTuple):
     params: Params
     optimizer: Any
     step: jax.Array
-    """int32, updates tried so far."""
+    """int32, updates attempted so far."""
     skipped: jax.Array
-    """int32, updates left out because their gradient was not finite."""
+    """int32, updates skipped because they were not finite."""
 
 
 class Report(NamedTuple):
-    """What one step says of itself (scalars)."""
+    """The figures of one update (scalars)."""
 
     loss: jax.Array
     validation_psnr: jax.Array
-    """PSNR of the clips' last frame, tone-mapped; no gradient comes from it."""
+    """PSNR of the clips' last frame, tone-mapped; it has no gradient."""
     gradient_norm: jax.Array
 
 
@@ -48,7 +48,7 @@ def optimizer(recipe: Recipe) -> optax.GradientTransformation:
             0.0, recipe.learning_rate, warmup, max(recipe.steps, warmup + 1), 0.01 * recipe.learning_rate
         )
     limit = optax.clip_by_global_norm(recipe.clip_norm) if recipe.clip_norm > 0 else optax.identity()
-    # All weights as one vector: a program for each of 54 arrays takes XLA a fifth of the whole step's compilation.
+    # All weights as one vector: separate code for 54 arrays takes XLA a fifth of the whole step's compilation time.
     return optax.flatten(optax.chain(limit, optax.adam(rate)))
 
 
@@ -63,7 +63,14 @@ def clip_loss(
 ) -> tuple[jax.Array, jax.Array]:
     """The objective's loss of one clip, and the PSNR of its last frame, tone-mapped.
 
-    Broken values of the reference (not finite, negative) are 0, and it is clamped to what a denoiser may return.
+    Args:
+      denoiser: what is trained.
+      params: its parameters.
+      clip: frames and reference. Invalid values of the reference (not finite, negative) count as 0, and it is clamped
+        to the largest radiance that a denoiser returns.
+      objective: the loss.
+      progress: fraction of the updates done.
+      rematerialize: recompute each step in the backward pass, see :func:`jaxdn.rollout.unroll`.
     """
     clip = clip._replace(reference=repair_image(clip.reference))
     images = unroll(denoiser, params, clip.frames, clip.layers, rematerialize=rematerialize)
@@ -73,7 +80,7 @@ def clip_loss(
 
 
 def initial_state(denoiser: Denoiser, recipe: Recipe, batch: Clip) -> TrainState:
-    """Parameters drawn with the recipe's seed and an optimiser that has seen nothing; ``batch`` gives the shapes."""
+    """Parameters drawn with the recipe's seed and a new optimiser state; ``batch`` gives the shapes."""
     frame = jax.tree.map(lambda buffer: buffer[0, 0], batch.frames)
     params = denoiser.init(jax.random.key(recipe.seed), frame)
     return TrainState(params, optimizer(recipe).init(params), jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
@@ -82,8 +89,8 @@ def initial_state(denoiser: Denoiser, recipe: Recipe, batch: Clip) -> TrainState
 def make_train_step(denoiser: Denoiser, recipe: Recipe) -> Callable[[TrainState, Clip], tuple[TrainState, Report]]:
     """The jitted update ``(state, batch of clips) -> (state, report)``; the old state's memory is donated.
 
-    An update that is not finite, or whose loss is not, changes no weight: the state stays as it was and ``skipped``
-    counts it.
+    An update that is not finite, or whose loss is not, is skipped: weights and optimiser stay as they were, and
+    ``skipped`` counts it.
     """
     update_rule = optimizer(recipe)
 
@@ -102,7 +109,7 @@ def make_train_step(denoiser: Denoiser, recipe: Recipe) -> Callable[[TrainState,
         norm = optax.tree.norm(gradient)
         updates, optimizer_state = update_rule.update(gradient, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)
-        # A finite gradient times too high a learning rate is no finite weight: what would be kept is what is tested.
+        # With too high a learning rate a finite gradient may give a non-finite weight: the new values are tested.
         kept = jax.tree.leaves((params, optimizer_state))
         finite = [jnp.isfinite(norm), jnp.isfinite(loss), *(jnp.isfinite(x).all() for x in kept)]
         usable = functools.reduce(jnp.logical_and, finite)

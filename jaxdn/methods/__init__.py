@@ -1,1 +1,1 @@
-"""The systems, a file each, and the table of them; use them through :mod:`jaxdn.denoisers`."""
+"""The denoising methods, one file each, and the table of them; use them through :mod:`jaxdn.denoisers`."""

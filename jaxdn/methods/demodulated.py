@@ -1,4 +1,4 @@
-"""A denoiser that works on light divided by what the surface reflects, as a wrapper of any other."""
+"""Demodulation: a wrapper that makes any denoiser filter radiance divided by the albedo."""
 
 from typing import Literal
 
@@ -10,18 +10,18 @@ from jaxdn.denoiser import Core, Denoiser, Params, Ritual, State, recurrent
 from jaxdn.frame import RADIANCE_MAX, Frame
 
 SMALLEST_ALBEDO = 0.01
-"""Albedo below this is not divided by."""
+"""Radiance is not divided by an albedo below this."""
 
 Demodulation = Literal["albedo", "none"]
 
 
 def demodulated(denoiser: Denoiser, *, by: Demodulation = "albedo") -> Denoiser:
-    """The same denoiser fed with radiance divided by the albedo, its image multiplied by the same again.
+    """The denoiser applied to radiance divided by the albedo, with its image multiplied by the same albedo.
 
-    Textures then are not in what is filtered, and cannot be blurred. Its state, history included, is demodulated too.
-    ``by="none"`` returns the denoiser as it is; where frames have no albedo, nothing is divided. Parameters are those
+    Textures are thus removed before filtering and cannot be blurred. The state, including the history, is demodulated
+    too. ``by="none"`` returns the denoiser unchanged; frames without albedo are not divided. The parameters are those
     of the denoiser. Raises ValueError for another ``by``, and for a denoiser that :func:`jaxdn.denoiser.recurrent` did
-    not make, as broken values have to be repaired before the division.
+    not make, because invalid values have to be repaired before the division.
     """
     check_option(by, "by", ("albedo", "none"))
     if by == "none":
@@ -42,12 +42,12 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation = "albedo") -> Denoiser:
         assert core.samples is not None
         return core.samples(params, state, _divided(frame)[0])
 
-    asks = None if core.samples is None else samples
-    return recurrent(Core(start, step, core.reads | {"albedo"}, core.init, asks))
+    requests = None if core.samples is None else samples
+    return recurrent(Core(start, step, core.reads | {"albedo"}, core.init, requests))
 
 
 def _divided(frame: Frame) -> tuple[Frame, jax.Array | None]:
-    """The frame with demodulated radiance, and what it was divided by."""
+    """The frame with demodulated radiance, and the divisor."""
     if frame.albedo is None:
         return frame, None
     divisor = jnp.where(frame.albedo > SMALLEST_ALBEDO, frame.albedo, 1.0)

@@ -1,7 +1,7 @@
 """Neural temporal denoising for indirect illumination (``ntd``).
 
 A U-Net predicts, for every pixel, 5x5 softmax kernels for the noisy image at three scales, one 5x5 kernel for the
-previous output warped by *dual* motion vectors, and how to blend them. What the paper leaves open is an option here;
+previous output warped by *dual* motion vectors, and how to blend them. Details that the paper leaves open are options;
 ``preset="parity"`` takes the exact paper settings.
 
 Yan Zeng, Lu Wang, Yanning Xu, Xiangxu Meng, "Neural Temporal Denoising for Indirect Illumination", 2021 ("Zeng et al.
@@ -10,7 +10,7 @@ Information", 2021.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -34,52 +34,52 @@ TAPS = 25
 
 @dataclass(frozen=True)
 class Options:
-    """What the paper leaves open; the first choice is the default."""
+    """Details that the paper leaves open; the first choice is the default."""
 
     size: Literal["large", "small"] | Widths = "large"
-    """The U-Net's widths, by name or as such (see :func:`jaxdn.networks.unet.unet`)."""
+    """The U-Net's widths, by name or as tuples (see :func:`jaxdn.networks.unet.unet`)."""
     motion: Literal["dual", "traditional"] = "dual"
-    """Vectors that warp the history: ``dual_motion``, or ``motion`` where there is none; or always ``motion``."""
+    """Vectors that warp the history: ``dual_motion`` (``motion`` if it is absent), or always ``motion``."""
     alpha_at: Literal["coarse", "fine"] = "coarse"
-    """The blending weight of two scales inside U, or outside of it, a weight for each fine pixel."""
+    """The blending weight of two scales: inside U, at the coarse scale; or outside it, for each fine pixel."""
     down: Literal["mean", "max"] = "mean"
-    """D of a 2x2 block; the maximum (the paper's) biases dark."""
+    """D on each 2x2 block; the maximum (as in the paper) darkens."""
     up: Literal["bilinear", "nearest"] = "bilinear"
-    """U."""
+    """The upsampling U."""
     pyramid: Literal["mean", "max"] = "mean"
-    """How the noisy image is downsampled."""
+    """Downsampling of the noisy image to the coarser scales."""
     domain: Literal["linear", "compressed"] = "linear"
-    """What kernels work on: radiance, or compressed radiance (robust to fireflies, biased dark)."""
+    """Kernels filter radiance, or compressed radiance (robust to fireflies, but it darkens)."""
     depth_scale: Literal["geometric", "unit"] = "geometric"
-    """See :func:`depth_feature`."""
+    """Scaling of the depth feature, see :func:`depth_feature`."""
     border: Literal["clamp", "zeros"] = "clamp"
-    """Of the warp."""
+    """Border of the warp."""
     first_frame: Literal["none", "noisy"] = "none"
-    """No history at age 0 and alpha^t = 1, or the first frame's own noise as history."""
+    """At age 0: no history and alpha^t = 1, or the first frame's noisy image as history."""
     missing_history: Literal["current", "blend"] = "current"
-    """Off-screen or without a vector: the noisy pixel as history, alpha^t = 1, and one more channel that tells the
-    network; or left to the network."""
+    """Off-screen or without a vector: the noisy pixel as history, alpha^t = 1, and a mask of these pixels as an
+    additional input channel; or no special treatment."""
     demodulate: bool = True
     """Filter radiance divided by albedo."""
     truncate: bool = False
-    """No gradient flows through the history."""
+    """Stop the gradient at the history."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
-    """Of the U-Net alone; None is the images' dtype."""
+    """Precision of the U-Net only; None is the images' dtype."""
     implementation: Literal["reference", "onnxruntime", "onednn"] | None = None
-    """Of the U-Net: XLA, or on CPUs ONNX Runtime (inference; the extra ``onnx``) or oneDNN (training; the extra
+    """Engine of the U-Net: XLA, or on CPUs ONNX Runtime (inference; the extra ``onnx``) or oneDNN (training; the extra
     ``onednn``). None is XLA."""
 
 
 PARITY = Options(
     down="max", depth_scale="unit", border="zeros", first_frame="noisy", missing_history="blend", demodulate=False
 )
-"""The exact paper settings: D is max-pooling (eq. 4), warped taps outside are 0, the first history is noise."""
+"""The exact paper settings: D is max-pooling (eq. 4), taps outside the image are 0, the first history is noisy."""
 
 
 def depth_feature(depth: jax.Array, *, scale: str = "geometric") -> jax.Array:
-    """Depth as ``z / (z + g)`` in [0, 1); g is the geometric mean of what is not background, or 1 with ``"unit"``.
+    """Depth as ``z / (z + g)`` in [0, 1); g is the geometric mean over surfaces, or 1 with ``"unit"``.
 
-    ``depth`` [H, W, 1] >= 0; 0 (the neutral value) gives 0. With the geometric mean the feature does not change with
+    ``depth`` [H, W, 1] >= 0; 0 (the neutral value) gives 0. The geometric mean makes the feature independent of
     the scene's unit of length.
     """
     if scale == "unit":
@@ -93,7 +93,7 @@ def depth_feature(depth: jax.Array, *, scale: str = "geometric") -> jax.Array:
 def _recall(
     options: Options, state: jax.Array, frame: Frame, first: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The warped history, where there is none (bool [H, W, 1]), and how many of its values were broken."""
+    """The warped history, where it is missing (bool [H, W, 1]), and how many of its values were invalid."""
     noisy = frame.radiance
     absent = first if options.first_frame == "none" else jnp.zeros_like(first)
     absent = jnp.broadcast_to(absent, (*noisy.shape[:2], 1))
@@ -115,7 +115,15 @@ def _recall(
 def _blend(
     options: Options, heads: list[jax.Array], noisy: jax.Array, recalled: jax.Array, absent: jax.Array
 ) -> jax.Array:
-    """Kernels applied and composed, in whatever domain the images are in."""
+    """The kernels applied, and the scales and the history blended, in the domain of the images.
+
+    Args:
+      options: of the method.
+      heads: logits at full, half and quarter resolution.
+      noisy: [H, W, 3], in the domain that kernels work on.
+      recalled: [H, W, 3] the warped history, in the same domain.
+      absent: bool [H, W, 1], there is no history.
+    """
     full, half, quarter = heads
     scales = [noisy]
     for _ in range(2):
@@ -158,10 +166,11 @@ def ntd(options: Options) -> Denoiser:
     """
     flagged = options.missing_history == "current"
     groups = (3, 3, 3, 1, 3, 1) if flagged else (3, 3, 3, 1, 3)
-    # full: two kernels and alpha^t; half, quarter: one kernel. An alpha lives at one end of each of the two seams.
+    # full: two kernels and alpha^t; half, quarter: one kernel each. Each of the two blends has one alpha, at its finer
+    # or coarser scale.
     fine = options.alpha_at == "fine"
     heads = (2 * TAPS + 2, TAPS + 1, TAPS) if fine else (2 * TAPS + 1, TAPS + 1, TAPS + 1)
-    # Flax is loaded when a network is built: a filter without weights needs jax and numpy alone.
+    # Flax is imported only when a network is built: filters without weights need only jax and numpy.
     from jaxdn.networks.unet import unet
 
     sizes = {"large": LARGE, "small": SMALL}
@@ -169,7 +178,7 @@ def ntd(options: Options) -> Denoiser:
     network = unet(groups, heads, widths=widths, implementation=options.implementation)
     reads = frozenset({"albedo", "normal", "depth", "motion", *(["dual_motion"] if options.motion == "dual" else [])})
 
-    def init(key: jax.Array, frame: Frame) -> dict[str, Any]:
+    def init(key: jax.Array, frame: Frame) -> Params:
         return network.init(key)
 
     def start(params: Params, frame: Frame) -> jax.Array:

@@ -1,12 +1,12 @@
-"""Spatiotemporal variance-guided filtering (``svgf``), the reference point of real-time denoising.
+"""Spatiotemporal variance-guided filtering (``svgf``), the common baseline of real-time denoising.
 
-Each frame: divide by the albedo, fetch the history with every tap tested, blend colour and the moments of luminance
-into it, estimate the variance per pixel (from time, or from a 7x7 neighbourhood while the history is short), then five
-a-trous levels whose reach over luminance edges is set by that variance, and multiply by the albedo again.
+For each frame: divide by the albedo, fetch the history with a test of every tap, blend colour and the moments of
+luminance into it, estimate the variance per pixel (temporally, or from a 7x7 neighbourhood while the history is short),
+apply five a-trous levels whose luminance edge-stopping depends on that variance, and multiply by the albedo.
 
-What is kept as colour history is the image after the first level (``feedback_level``), demodulated, not the image
-shown: feeding the whole cascade back would blur more with every frame. This is the algorithm's own rule and the one
-difference from the learned denoisers here, which keep the image they show.
+The colour history is the demodulated image after the first level (``feedback_level``), not the output image: feeding
+the whole cascade back would blur more with every frame. The paper prescribes this; the learned denoisers here keep
+their output image instead.
 
 Christoph Schied et al., "Spatiotemporal Variance-Guided Filtering: Real-Time Reconstruction for Path-Traced Global
 Illumination", 2017.
@@ -41,30 +41,30 @@ _Planes = tuple[jax.Array, jax.Array, jax.Array]
 
 @dataclass(frozen=True)
 class Options:
-    """Its parameters, with the defaults of the paper where it gives them."""
+    """The parameters, with the paper's defaults where it gives them."""
 
     alpha: Annotated[float, _SHARE] = 0.2
-    """Least share of the new frame in colour, ``max(alpha, 1 / N)`` at history length N."""
+    """Minimum weight of the new frame in colour; the weight is ``max(alpha, 1 / N)`` at history length N."""
     alpha_moments: Annotated[float, _SHARE] = 0.2
-    """The same in the moments of luminance."""
+    """The same for the moments of luminance."""
     sigma_depth: Annotated[float, _POSITIVE] = 1.0
-    """Reach over differences in depth."""
+    """Edge-stopping parameter for differences in depth."""
     sigma_normal: Annotated[float, Range(0)] = 128.0
     """Exponent of the cosine of normals."""
     sigma_luminance: Annotated[float, _POSITIVE] = 4.0
-    """Reach over differences in luminance, in standard deviations."""
+    """Edge-stopping parameter for differences in luminance, in standard deviations."""
     levels: Annotated[int, Range(0, 10)] = 5
     """Levels of the a-trous filter."""
     feedback_level: Annotated[int, Range(0, 10)] = 1
-    """The level whose image becomes the colour history; 0 is what time alone has blended."""
+    """The level whose image becomes the colour history; 0 is the temporally blended image."""
     history_max: Annotated[int, Range(1)] = 32
-    """Longest history length N in frames."""
+    """Maximum history length N in frames."""
     short_history: Annotated[int, Range(0)] = 4
-    """At N below this the variance is that of the 7x7 neighbourhood."""
+    """For N below this the variance is estimated from the 7x7 neighbourhood."""
     depth_tolerance: Annotated[float, Range(0)] = 0.02
-    """Relative difference from the expected depth that a tap of the history may have, besides its slope."""
+    """Allowed relative difference of a history tap from the expected depth, in addition to the slope term."""
     normal_threshold: float = 0.9
-    """The cosine of normals that a tap of the history has to exceed."""
+    """A history tap is accepted above this cosine of normals."""
     demodulate: bool = True
     """Filter radiance divided by albedo."""
 
@@ -77,20 +77,19 @@ class Options:
 
 
 class SvgfState(NamedTuple):
-    """What one frame leaves to the next."""
+    """What is carried from one frame to the next."""
 
     history: jax.Array
     """[H, W, 6] demodulated colour, first and second moment of its luminance, history length in frames."""
     guides: jax.Array
-    """[H, W, 0..5] depth, normal and ids of the previous frame, those that the frames have."""
+    """[H, W, 0..5] depth, normal and ids of the previous frame, as far as present."""
 
 
 @method(Options, title="Spatiotemporal variance-guided filtering (Schied et al. 2017)")
 def svgf(options: Options) -> Denoiser:
     """SVGF, a filter without weights (``params`` is ``{}``).
 
-    Reads albedo, normal, depth, previous_depth, motion and ids; a buffer that is ``None`` takes its test or weight with
-    it. Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for options out of range
+    Reads albedo, normal, depth, previous_depth, motion and ids; without a buffer, its test or weight is left out. Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for options out of range
     and radiance that is not [H, W, 3].
     """
 
@@ -131,7 +130,7 @@ def svgf(options: Options) -> Denoiser:
 def _recall(
     options: Options, state: SvgfState, frame: Frame, first: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The fetched history [6, H, W], 0 where there is none; this frame's guides; the count of broken pixels."""
+    """The fetched history [6, H, W], 0 where missing; this frame's guides; the number of invalid history pixels."""
     guides, place = pack_guides(frame.depth, frame.normal, frame.ids, frame.radiance)
     tolerances = {"depth_tolerance": options.depth_tolerance, "normal_threshold": options.normal_threshold}
     accept = same_surface(frame, guides, place, **tolerances, first=6)
@@ -151,7 +150,16 @@ def _filter(
     hit: jax.Array | None,
     weights: list[Weight],
 ) -> tuple[jax.Array, jax.Array]:
-    """The a-trous cascade: the image [3, H, W] and what is fed back."""
+    """The a-trous cascade: the image [3, H, W] and the colour history [3, H, W].
+
+    Args:
+      options: of the method.
+      color: [3, H, W].
+      variance: [H, W] of its luminance.
+      feedback: [3, H, W] the colour history if no level replaces it.
+      hit: [H, W] bool, a surface is seen; None: everywhere.
+      weights: edge-stopping weights, without that of luminance.
+    """
     levels = options.levels
 
     def filter_level(carry: _Planes, level: jax.Array) -> tuple[_Planes, None]:

@@ -114,7 +114,9 @@ class UNet(nnx.Module):
         for level, outputs in enumerate(heads):
             setattr(self, f"head_{level}", Convolution(widths[level][-1], outputs))
 
-    def __call__(self, convolver: Convolver, features: jax.Array, used: Sequence[slice] | None) -> tuple[jax.Array, ...]:
+    def __call__(
+        self, convolver: Convolver, features: jax.Array, used: Sequence[slice] | None
+    ) -> tuple[jax.Array, ...]:
         part: Part = (features, used)
         skips: list[jax.Array] = []
         for level in range(LEVELS):
@@ -168,7 +170,9 @@ def convolved_by_onednn(
 
 
 @register("unet", "onnxruntime", requires=onnx.check_available)
-def run_by_onnxruntime(network: Callable[[Convolver], onnx.Apply], heads: int, used: Sequence[slice] | None) -> onnx.Apply:
+def run_by_onnxruntime(
+    network: Callable[[Convolver], onnx.Apply], heads: int, used: Sequence[slice] | None
+) -> onnx.Apply:
     """The whole network outside of XLA, for inference; the gradient is XLA's."""
     return onnx.engine(network(XLA), heads=heads, slope=NEGATIVE_SLOPE, used=used)
 

@@ -32,7 +32,9 @@ def test_a_reference_is_bounded_as_what_it_is_compared_with():
     reference.reshape(-1)[: bad.size] = bad
     mended = clip._replace(reference=np.asarray(repair_image(reference)))
     params, objective = {"gain": jnp.full((), 0.1)}, test_fit.RECIPE.objective
-    losses = [clip_loss(brighter(), params, each, objective)[0] for each in (clip._replace(reference=reference), mended)]
+    losses = [
+        clip_loss(brighter(), params, each, objective)[0] for each in (clip._replace(reference=reference), mended)
+    ]
     assert np.isfinite(losses[0])
     assert losses[0] == losses[1]
 

@@ -52,11 +52,12 @@ def test_truncated_weights(saved):
 
 
 @pytest.mark.parametrize(
-    ("content", "told"), [
+    ("content", "told"),
+    [
         (None, "in the same folder"),
         ("{", "in the same folder"),
         ('{"factory": "evil", "options": {}}', "'evil'"),
-    ]
+    ],
 )
 def test_bad_description(saved, content, told):
     path, _ = saved

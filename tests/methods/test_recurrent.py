@@ -1,5 +1,4 @@
-"""The ritual of all denoisers on toy cores: checks, repairs, age and bounds; light divided by albedo; samples asked for.
-"""
+"""The ritual of all denoisers, on toy cores; light divided by the albedo; samples that are asked for."""
 
 import jax
 import jax.numpy as jnp

@@ -233,9 +233,7 @@ def test_static_history_counts_up_and_is_the_mean_while_it_does(rng):
 def test_variance_of_white_noise_after_one_level():
     """All weights open: the 5x5 B3 kernel leaves (70/256)^2 = 0.0747681 of the variance, and the mean."""
     values = jnp.ones((3, 15, 17))
-    mean, variance = edge_average(
-        values, None, [], stencil(2, kernel=B3_SPLINE), variance=jnp.full((15, 17), 2.0)
-    )
+    mean, variance = edge_average(values, None, [], stencil(2, kernel=B3_SPLINE), variance=jnp.full((15, 17), 2.0))
     np.testing.assert_allclose(mean, 1.0, rtol=1e-6)
     np.testing.assert_allclose(variance[2:-2, 2:-2], 2.0 * 0.0747681, rtol=1e-5)
     assert float(variance[0, 0]) > 2.0 * 0.0747681  # half the taps at the border

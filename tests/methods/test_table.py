@@ -267,9 +267,7 @@ def engines(monkeypatch, **available):
         ("training", {"compute_dtype": None}, "onednn"),
     ],
 )
-def test_the_engine_is_the_fastest_for_the_purpose_and_none_for_half_precision(
-    purpose, options, expected, monkeypatch
-):
+def test_the_engine_is_the_fastest_for_the_purpose_and_none_for_half_precision(purpose, options, expected, monkeypatch):
     ntd, svgf = method_named("ntd"), method_named("svgf")
     engines(monkeypatch, onnxruntime=True, onednn=True)
     assert ntd.engine(purpose, options) == expected

@@ -1,5 +1,6 @@
 """The command line as a user meets it: real processes, messages instead of tracebacks, exit code 2, whole files."""
 
+import json
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -42,7 +43,24 @@ def clip(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("verb", [(), ("render",), ("train",), ("denoise",), ("compare",)])
+def write_shot(file, pixels):
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, pixels).write(str(file))
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory):
+    """EXR files of another renderer: noise on a checkered wall, whose colours lie in a layer of a name of its own."""
+    folder, rng = tmp_path_factory.mktemp("shots"), np.random.default_rng(0)
+    checks = np.where(np.indices((24, 32)).sum(axis=0) // 3 % 2 == 0, 0.9, 0.1).astype(np.float32)
+    for index in range(2):
+        pixels = {letter: (checks * rng.exponential(size=checks.shape)).astype(np.float32) for letter in "RGB"}
+        pixels |= {f"Paint.{letter}": checks for letter in "RGB"}
+        write_shot(folder / f"shot_{index:04d}.exr", pixels)
+    return folder
+
+
+@pytest.mark.parametrize("verb", [(), ("inspect",), ("render",), ("train",), ("denoise",), ("compare",)])
 def test_help_says_what_to_type(verb):
     done = jaxdn(*verb, "--help")
     assert done.returncode == 0
@@ -67,21 +85,58 @@ def test_denoise_plain_exr_files_with_the_shipped_network(tmp_path):
     for index in range(2):
         pixels = {letter: rng.exponential(size=(33, 57)).astype(np.float32) for letter in "RGB"}
         pixels["R"][3, 4], pixels["G"][5, 6], pixels["B"][7, 8] = np.nan, np.inf, -3.0
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        OpenEXR.File(header, pixels).write(str(tmp_path / f"shot_{index:04d}.exr"))
+        write_shot(tmp_path / f"shot_{index:04d}.exr", pixels)
     engines = ["reference", *(["onnxruntime"] if find_spec("onnxruntime") else [])]
     reds = []
     for engine in engines:
         out = tmp_path / engine
         done = jaxdn("denoise", tmp_path / "shot_*.exr", "-o", out, "--method", "ntd-small", "--implementation", engine)
         assert done.returncode == 0, done.stderr
-        assert engine in done.stdout
+        assert f"({engine}, 1 program compiled)" in done.stdout
+        assert "6 values were not usable numbers" in done.stdout
         with OpenEXR.File(str(out / "shot_0001.exr"), separate_channels=True) as file:
             reds.append(file.channels()["R"].pixels)
     assert reds[0].shape == (33, 57)
     assert np.isfinite(reds[0]).all()
     assert reds[0].std() < 0.7  # exponential noise has a standard deviation of 1
     np.testing.assert_allclose(reds[0], reds[-1], rtol=2e-3, atol=2e-3)  # stored in half precision
+
+
+def test_a_layer_named_on_the_command_line_is_the_buffer(shot, tmp_path):
+    """Divided by its colours the wall is plain, and its checks are not blurred; found by nobody they would be."""
+    checks = np.where(np.indices((24, 32)).sum(axis=0) // 3 % 2 == 0, 0.9, 0.1)
+    errors = []
+    for name, options in (("without", ()), ("with", ("--channels", "albedo=Paint"))):
+        done = jaxdn("denoise", shot, "-o", tmp_path / name, "--method", "svgf", *options)
+        assert done.returncode == 0, done.stderr
+        with OpenEXR.File(str(tmp_path / name / "shot_0001.exr"), separate_channels=True) as file:
+            errors.append(np.abs(file.channels()["G"].pixels - checks).mean())
+    assert errors[1] < 0.5 * errors[0]
+
+
+@pytest.mark.slow
+def test_train_denoise_and_compare_with_weights_of_ones_own(tmp_path):
+    write_clip(make_clip(0, frames=10, size=20), tmp_path / "clips" / "square")
+    few = ("--steps", "2", "--batch", "1", "--crop", "16")
+    options = ("--variant", "ntd-small", "--set", "size=[[4], [4], [4], [4], [4]]", "motion=traditional")
+    train = ("train", tmp_path / "clips", "-o", tmp_path / "mine", *options, "--recipe", "without-occlusion", *few)
+    done = jaxdn(*train)
+    assert done.returncode == 0, done.stderr
+    weights = tmp_path / "mine" / "weights.safetensors"
+    assert str(weights) in done.stdout
+    kept = json.loads(weights.with_suffix(".json").read_text())
+    assert kept["factory"] == "ntd"
+    assert kept["options"] == {"size": [[4]] * 5, "motion": "traditional"}
+    assert kept["recipe"]["objective"] == "indirect illumination without occlusion"
+    assert kept["recipe"]["steps"] == 2
+    again = jaxdn(*train)
+    assert "all 2 steps are there already" in again.stdout
+    done = jaxdn("denoise", tmp_path / "clips" / "square", "-o", tmp_path / "out", "--method", weights)
+    assert done.returncode == 0, done.stderr
+    assert len(list((tmp_path / "out").glob("*.exr"))) == 10
+    done = jaxdn("compare", tmp_path / "clips", "-o", tmp_path / "report", "--methods", "noisy", weights)
+    assert done.returncode == 0, done.stderr
+    assert "mine" in done.stdout
 
 
 def test_compare_ends_with_a_report(clip, tmp_path):
@@ -96,22 +151,43 @@ def test_compare_ends_with_a_report(clip, tmp_path):
     ("arguments", "told"),
     [
         (("denoise", "nowhere", "-o", "out"), "nowhere"),
-        (("denoise", "CLIP", "-o", "out", "--method", "magic"), "expected one of noisy, ntd, svgf"),
+        (("denoise", "CLIP", "-o", "out", "--method", "magic"), "expected one of noisy, svgf, ntd-large, ntd-small"),
         (("denoise", "CLIP", "-o", "out", "--method", "ntd"), "expected its weights"),
         (("denoise", "CLIP", "-o", "CLIP", "--method", "svgf"), "another folder"),
         (("denoise", "CLIP", "-o", "out", "--method", "svgf", "--spp", "2"), "2 samples a pixel are not available"),
         (("denoise", "CLIP", "-o", "out", "--wrong"), "--wrong"),
-        (("denoise", "CLIP", "-o", "out", "--method", "svgf", "--implementation", "onnxruntime"), "with weights"),
-        (("compare", "nowhere", "-o", "out", "--methods", "noisy"), "no clip.json"),
+        (("denoise", "CLIP", "-o", "out", "--method", "svgf", "--implementation", "onnxruntime"), "'implementation'"),
+        (("compare", "nowhere", "-o", "out", "--methods", "noisy"), "nowhere: there is no such folder"),
+        (("compare", ".", "-o", "out", "--methods", "noisy"), "expected a clip (a folder with clip.json)"),
+        (("compare", "CLIP", "-o", "out", "--methods", "noisy", "magic"), "expected one of noisy, svgf"),
+        (("denoise", "SHOT", "-o", "out", "--method", "svgf", "--channels", "radiance"), "expected name=value"),
+        (
+            ("denoise", "SHOT", "-o", "out", "--method", "svgf", "--channels", "light=R"),
+            "expected buffers among radiance",
+        ),
+        (
+            ("denoise", "SHOT", "-o", "out", "--method", "svgf", "--channels", "albedo=Dyes"),
+            "no albedo in layer 'Dyes'",
+        ),
+        (("denoise", "SHOT", "-o", "out", "--method", "svgf", "--motion-convention", "maya"), "'cycles'"),
+        (("denoise", "SHOT", "-o", "out", "--method", "svgf", "--spp", "2"), "expected spp 1, got 2"),
         (("render", "castle", "-o", "out"), "fruit"),
         (("render", "none.xml", "-o", "out"), "none.xml"),
         (("train", "CLIP", "-o", "out", "--steps", "1"), "expected at least 10 frames, got 3"),
+        (("train", "CLIP", "-o", "out", "--method", "magic"), "expected one of ntd, svgf"),
+        (("train", "CLIP", "-o", "out", "--method", "svgf"), "expected a method that learns"),
+        (("train", "CLIP", "-o", "out", "--variant", "ntd-huge"), "expected a variant out of ntd-large, ntd-small"),
+        (("train", "CLIP", "-o", "out", "--recipe", "wild"), "out of usual, without-occlusion, parity, got 'wild'"),
+        (("train", "CLIP", "-o", "out", "--set", "motoin=dual"), "expected options out of size, motion,"),
+        (("train", "CLIP", "-o", "out", "--set", "motion=wild"), "motion: expected one of 'dual', 'traditional'"),
+        (("train", "CLIP", "-o", "out", "--set", "motion"), "--set 'motion': expected name=value"),
     ],
 )
-def test_mistakes_are_told_plainly(clip, tmp_path, monkeypatch, arguments, told):
+def test_mistakes_are_told_plainly(clip, shot, tmp_path, monkeypatch, arguments, told):
     monkeypatch.chdir(tmp_path)
-    assert told in fails(*(clip if word == "CLIP" else word for word in arguments))
-    assert not list(tmp_path.rglob("*.part"))
+    places = {"CLIP": clip, "SHOT": shot}
+    assert told in fails(*(places.get(word, word) for word in arguments))
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]  # nothing half written, hidden or not
 
 
 def test_a_truncated_frame_names_the_file(clip, tmp_path):
