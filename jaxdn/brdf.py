@@ -1,10 +1,10 @@
-"""What a surface reflects: BRDFs pre-integrated over the incident directions, and light divided by that.
+"""Directional albedo: BRDFs pre-integrated over the incident directions, and demodulation by it.
 
-The share of light from all around that a surface reflects to the viewer, its directional albedo
-``F_b = integral of f_r cos(theta_i) dw_i``, is what textures and materials contribute to an image; dividing by it
-leaves the incident light, which is what a denoiser should filter (Zhuang et al. 2021, "Real-Time Denoising Using BRDF
+The directional albedo ``F_b = integral of f_r cos(theta_i) dw_i`` is the share of uniform incident light that a surface
+reflects to the viewer, and the contribution of textures and materials to an image. Dividing by it leaves the incident
+light, which is what a denoiser should filter (Zhuang et al. 2021, "Real-Time Denoising Using BRDF
 Pre-Integration Factorization"). For a microfacet lobe with Schlick's Fresnel term ``F0 + (1 - F0) (1 - v.h)^5`` it is
-``F0 A + B`` with two numbers that depend on the cosine n.v and the roughness alone (Karis 2013).
+``F0 A + B`` with two numbers that depend only on the cosine n.v and the roughness (Karis 2013).
 """
 
 import functools
@@ -18,17 +18,18 @@ import numpy as np
 from jaxdn.checks import check_image, check_option, check_same_size
 
 Lobe = Literal["ggx", "ggx-correlated", "beckmann"]
-"""GGX with Smith's separable shadowing (as Mitsuba has it), with the height-correlated one, Beckmann (separable)."""
+"""GGX with Smith's separable shadowing (as in Mitsuba) or the height-correlated one, Beckmann (separable)."""
 
 LOBES: tuple[Lobe, ...] = ("ggx", "ggx-correlated", "beckmann")
 SIZE = 128
 """Entries of a stored table along each axis."""
 SAMPLES = 4096
-"""Half vectors a stored entry is the mean of."""
+"""Half vectors averaged for a stored entry."""
 SMALLEST_COSINE = 1 / 512
-"""Cosines below are taken for this: shading normals may face away from the viewer."""
+"""Smaller cosines are replaced by this: shading normals may face away from the viewer."""
 FLOOR = 0.04
-"""Where the divisor begins to depart from the reflectance: what a dielectric reflects at least, head-on."""
+"""The divisor differs from the reflectance near and below this, the least reflectance of a dielectric at normal
+incidence."""
 
 _STORED = Path(__file__).parent / "shipped" / "directional-albedo.npz"
 
@@ -46,7 +47,7 @@ def ggx_albedo_table(*, lobe: Lobe = "ggx", size: int = SIZE, samples: int = SAM
     table = np.empty((size, size, 2))
     for column, roughness in enumerate(centres):
         table[:, column] = _integrate(lobe, centres, roughness**2, points)
-    # The sampled mean of what reflects everything may exceed 1 by its error (Beckmann: 7e-6).
+    # The sampled mean of a full reflector may exceed 1 by its error (Beckmann: 7e-6).
     return (table / np.maximum(table.sum(-1, keepdims=True), 1.0)).astype(np.float32)
 
 
@@ -82,7 +83,7 @@ def _integrate(lobe: Lobe, cosines: np.ndarray, alpha: float, points: np.ndarray
 
 
 def _visible_normals(view: np.ndarray, alpha: float, points: np.ndarray) -> np.ndarray:
-    """GGX half vectors [n, s, 3] in proportion to how much of them is seen (Heitz 2018)."""
+    """GGX half vectors [n, s, 3], sampled in proportion to their visible area (Heitz 2018)."""
     stretched = view * np.array([alpha, alpha, 1.0])
     stretched /= np.linalg.norm(stretched, axis=-1, keepdims=True)
     # An orthonormal basis about the stretched view direction, which has no y component.
@@ -109,7 +110,7 @@ def _beckmann_normals(view: np.ndarray, alpha: float, points: np.ndarray) -> tup
 
 
 def _smith(lobe: Lobe, cosine: np.ndarray, alpha: float) -> np.ndarray:
-    """Smith's Lambda: masking is 1 / (1 + Lambda). Beckmann's by the fit of Walter et al. 2007, as Mitsuba has it."""
+    """Smith's Lambda: masking is 1 / (1 + Lambda). Beckmann's by the fit of Walter et al. 2007, as in Mitsuba."""
     tangent = np.sqrt(np.maximum(0, 1 - cosine**2)) / cosine
     if lobe != "beckmann":
         return 0.5 * (np.sqrt(1 + (alpha * tangent) ** 2) - 1)
@@ -120,7 +121,7 @@ def _smith(lobe: Lobe, cosine: np.ndarray, alpha: float) -> np.ndarray:
 
 @functools.cache
 def albedo_table(lobe: Lobe = "ggx") -> np.ndarray:
-    """The stored table [128, 128, 2] of a lobe: what :func:`ggx_albedo_table` makes."""
+    """The stored table [128, 128, 2] of a lobe, made by :func:`ggx_albedo_table`."""
     check_option(lobe, "lobe", LOBES)
     with np.load(_STORED, allow_pickle=False) as stored:
         return stored[lobe]
@@ -129,17 +130,17 @@ def albedo_table(lobe: Lobe = "ggx") -> np.ndarray:
 def directional_albedo(
     albedo: jax.Array, specular: jax.Array, roughness: jax.Array, cosine: jax.Array, *, lobe: Lobe = "ggx"
 ) -> jax.Array:
-    """``albedo + specular A + B`` [H, W, 3]: what a diffuse surface with a microfacet lobe reflects of uniform light.
+    """``albedo + specular A + B`` [H, W, 3]: reflectance of a diffuse surface with a microfacet lobe in uniform light.
 
-    Differentiable in all four. Roughness and cosines are clamped to what the table covers. Raises ValueError for shapes
-    that do not fit.
+    Differentiable in all four. Roughness and cosines are clamped to the range of the table. Raises ValueError for
+    inconsistent shapes.
 
     Args:
       albedo: [H, W, 3] reflectance of the diffuse part.
-      specular: [H, W, 3] F0, the specular reflectance head-on.
+      specular: [H, W, 3] F0, the specular reflectance at normal incidence.
       roughness: [H, W, 1] linear roughness r in [0, 1], alpha = r^2.
       cosine: [H, W, 1] n.v, of the shading normal and the direction to the viewer.
-      lobe: which microfacet model.
+      lobe: the microfacet model.
     """
     for name, image, channels in (("albedo", albedo, 3), ("specular", specular, 3)):
         check_image(image, name, channels=channels)
@@ -164,16 +165,16 @@ def _look_up(table: jax.Array, cosine: jax.Array, roughness: jax.Array) -> jax.A
 
 
 def divisor(reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
-    """What light is divided by: ``sqrt(reflectance^2 + floor^2)``, which is the reflectance where that is not small.
+    """The divisor ``sqrt(reflectance^2 + floor^2)``, close to the reflectance where that is not small.
 
-    Smooth everywhere: two neighbours whose reflectances are alike are divided by what is alike, however dark they are.
-    A switch (1 below a threshold) makes of 0.009 and 0.011 a factor of 90 in what is filtered.
+    It is smooth everywhere: neighbours of similar reflectance have similar divisors, however dark they are. With a
+    threshold (1 below it), reflectances of 0.009 and 0.011 would differ by a factor of 90 after the division.
     """
     return jnp.sqrt(reflectance * reflectance + floor * floor)
 
 
 def demodulate(radiance: jax.Array, reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
-    """Radiance [H, W, 3] divided by what the surface reflects; finite for any reflectance >= 0."""
+    """Radiance [H, W, 3] divided by the surface's reflectance; finite for any reflectance >= 0."""
     check_same_size(radiance, reflectance, ("radiance", "reflectance"))
     return radiance / divisor(reflectance, floor=floor)
 

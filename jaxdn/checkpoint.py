@@ -1,4 +1,4 @@
-"""Checkpoints of a training run (Orbax): parameters, optimiser and the position in the data, all or nothing."""
+"""Checkpoints of a training run (Orbax): parameters, optimiser and the position in the data, always complete."""
 
 import hashlib
 import json
@@ -14,15 +14,15 @@ import orbax.checkpoint as ocp
 from jaxdn.learning.step import TrainState
 
 _DIGEST = "sha256"
-"""Where the digest lies in what is stored with the state; checkpoints of earlier versions have none."""
+"""Key of the digest in the data stored with the state; checkpoints of earlier versions have none."""
 
 
 class Checkpoints:
     """The checkpoints of one run in one folder; the newest two are kept.
 
-    Orbax writes each under a temporary name and renames it when it is whole: a run killed while writing continues from
-    the one before. Each holds a digest of its own values, so that damage which still parses is noticed too. Saving
-    happens in the background; :meth:`close` waits for it.
+    Orbax writes each under a temporary name and renames it when it is complete: a run killed while writing resumes from
+    the one before. Each contains a digest of its values, which also detects damaged files that can still be parsed.
+    Saving is asynchronous; :meth:`close` waits for it.
     """
 
     def __init__(self, folder: Path):
@@ -31,25 +31,25 @@ class Checkpoints:
         self._manager = ocp.CheckpointManager(self._folder, options=options)
 
     def save(self, state: TrainState, data: dict[str, Any]) -> None:
-        """Keep the state after ``state.step`` updates with the data iterator's own state (JSON)."""
-        # Copies: on a CPU an array may be written from where it lies, and the next update takes over its memory.
+        """Save the state after ``state.step`` updates with the data iterator's state (JSON)."""
+        # Copies: on a CPU an array may be written from its own memory, which the next update reuses.
         values = jax.tree.map(np.array, state._asdict())
         position = {**data, _DIGEST: digest(values, data)}
         arguments = ocp.args.Composite(state=ocp.args.StandardSave(values), data=ocp.args.JsonSave(position))
         self._manager.save(int(state.step), args=arguments, force=True)
 
     def restore(self, like: TrainState) -> tuple[TrainState, dict[str, Any]] | None:
-        """The newest checkpoint as a state shaped ``like`` this one, and the data's position; None where there is none.
+        """The newest checkpoint as a state shaped ``like`` this one, and the data's position; None if there is none.
 
-        A checkpoint that cannot be read (torn by a crash of the machine, or damaged) is moved out of the way, into
-        ``damaged-<step>`` next to the folder, with a UserWarning, and the one before it is taken. Raises ValueError
-        when none of them can be read as this network's.
+        A checkpoint that cannot be read (incomplete after a crash of the machine, or damaged) is moved to
+        ``damaged-<step>`` next to the folder, with a UserWarning, and the one before it is used. Raises ValueError
+        if none of them can be read as this network's.
         """
         failed: dict[int, Exception] = {}
         for step in sorted(self._manager.all_steps(), reverse=True):
             try:
                 found = self._read(step, like)
-            except Exception as error:  # what a damaged byte leads to in Orbax has no common base
+            except Exception as error:  # the errors that damaged bytes cause in Orbax have no common base class
                 failed[step] = error
                 continue
             for damaged, reason in failed.items():

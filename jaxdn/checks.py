@@ -1,4 +1,4 @@
-"""Errors at the public edge: what was expected, what came, what to do. Nothing here looks at pixel contents."""
+"""Argument checks of public functions: what was expected, what was given, what to do. Pixel values are not checked."""
 
 from typing import Any
 

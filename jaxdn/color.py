@@ -1,4 +1,4 @@
-"""Curves from linear radiance to what networks, losses, metrics and eyes compare, and the luminance."""
+"""Transfer curves of linear radiance for networks, losses, metrics and display, and the luminance."""
 
 import functools
 import math
@@ -11,32 +11,33 @@ from jaxdn.frame import RADIANCE_MAX
 
 _GAMMA = 2.2
 _TOE = 1e-4
-"""log(1 + x) below which ``compress`` is a straight line: its power has an infinite slope at 0."""
+"""Below this log(1 + x), ``compress`` is a straight line, as the power has an infinite slope at 0."""
 _TOE_VALUE = _TOE ** (1 / _GAMMA)
 _TOE_SLOPE = _TOE_VALUE / _TOE
 """About 152."""
 _TOP = 64.0
-"""``expand`` saturates at the largest finite number over this, so that its slope there is finite too."""
+"""``expand`` saturates at the largest finite number divided by this, so that its slope stays finite too."""
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of linear Rec.709 red, green and blue (ITU-R BT.709)."""
 
 OPERATORS = ("srgb", "aces", "reinhard", "compress")
-"""What ``tonemap`` knows."""
+"""The operators of ``tonemap``."""
 
 
 def compress(x: jax.Array) -> jax.Array:
-    """Squeeze radiance for networks and losses: ``log(1 + x)^(1 / 2.2)``, elementwise.
+    """Compress radiance for networks and losses: ``log(1 + x)^(1 / 2.2)``, elementwise.
 
     Below log(1 + x) = 1e-4 it is the line ``152 log(1 + x)`` through the origin that meets the curve there: continuous,
     increasing, slope 152 at 0 instead of infinity. Odd: ``compress(-x) = -compress(x)``, so that a negative prediction
     still has a gradient. Value and slope are finite for every float; infinity counts as the largest finite number
     (7.7 in float32). NaN stays NaN.
 
-    Hasselgren et al. 2020, sec. 2.1; the toe and the odd continuation are ours.
+    Hasselgren et al. 2020, "Neural Temporal Adaptive Sampling and Denoising", sec. 2.1; the toe and the odd
+    continuation are ours.
     """
     x = _floating(x)
-    size = jnp.where(x >= 0, x, -x)  # not abs: with a derivative of 0 at 0 a black pixel would never learn
+    size = jnp.where(x >= 0, x, -x)  # not abs: its derivative of 0 at 0 would stop learning at black pixels
     u = jnp.log1p(jnp.minimum(size, float(jnp.finfo(x.dtype).max)))
     toe = u <= _TOE
     y = jnp.where(toe, _TOE_SLOPE * u, _power(jnp.where(toe, 1.0, u), 1 / _GAMMA))
@@ -59,16 +60,16 @@ def expand(y: jax.Array) -> jax.Array:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def _power(x: jax.Array, exponent: float) -> jax.Array:
-    """``x^exponent`` for x > 0 as ``exp(exponent log x)``, of which XLA:CPU makes vector code: a seventh of the time.
+    """``x^exponent`` for x > 0 as ``exp(exponent log x)``, which XLA:CPU vectorises: a seventh of the time.
 
-    Its relative error is ``|exponent log x|`` roundings, at most ten for what this module gives it.
+    Its relative error is ``|exponent log x|`` roundings, at most ten for the arguments in this module.
     """
     return jnp.exp(exponent * jnp.log(x))
 
 
 @_power.defjvp
 def _power_slope(exponent: float, primals: tuple[jax.Array], tangents: tuple[jax.Array]) -> tuple[jax.Array, jax.Array]:
-    """``exponent x^(exponent - 1)`` at once: the chain's own x^exponent / x overflows where expand saturates."""
+    """``exponent x^(exponent - 1)`` directly: x^exponent / x of the chain rule overflows where expand saturates."""
     (x,), (tangent,) = primals, tangents
     return _power(x, exponent), exponent * _power(x, exponent - 1) * tangent
 
@@ -83,14 +84,14 @@ def luminance(image: jax.Array) -> jax.Array:
 
 
 def tonemap(image: jax.Array, *, operator: str = "srgb") -> jax.Array:
-    """Linear radiance [..., 3] to display-encoded values in [0, 1] of the same shape, for metrics and for looking at.
+    """Linear radiance [..., 3] to display-encoded values in [0, 1] of the same shape, for metrics and for display.
 
     Radiance is first clamped to [0, 65504]; a NaN stays NaN. ``operator``:
 
-    * ``"srgb"``: cut at 1, then the sRGB curve (IEC 61966-2-1).
-    * ``"aces"``: ``x (2.51 x + 0.03) / (x (2.43 x + 0.59) + 0.14)``, cut at 1, then the sRGB curve
+    * ``"srgb"``: clipped at 1, then the sRGB curve (IEC 61966-2-1).
+    * ``"aces"``: ``x (2.51 x + 0.03) / (x (2.43 x + 0.59) + 0.14)``, clipped at 1, then the sRGB curve
       (Narkowicz 2015, "ACES filmic tone mapping curve", without its optional exposure of 0.6).
-    * ``"reinhard"``: ``x / (1 + luminance(x))``, cut at 1, then the sRGB curve (Reinhard et al. 2002, eq. 3).
+    * ``"reinhard"``: ``x / (1 + luminance(x))``, clipped at 1, then the sRGB curve (Reinhard et al. 2002, eq. 3).
     * ``"compress"``: ``compress(x) / compress(65504)``: the domain in which the networks are trained.
     """
     check_option(operator, "operator", OPERATORS)
@@ -98,7 +99,7 @@ def tonemap(image: jax.Array, *, operator: str = "srgb") -> jax.Array:
     if operator == "compress":
         return compress(x) / (math.log1p(RADIANCE_MAX) ** (1 / _GAMMA))
     if operator == "aces":
-        x = x / (1.0 + x)  # the same quotient with both sides over (1 + x)^2: squares of half-precision overflow
+        x = x / (1.0 + x)  # numerator and denominator divided by (1 + x)^2: half-precision squares overflow
         rest = 1.0 - x
         x = x * (2.51 * x + 0.03 * rest) / (x * (2.43 * x + 0.59 * rest) + 0.14 * rest * rest)
     elif operator == "reinhard":

@@ -48,7 +48,7 @@ class Core(NamedTuple):
     """(params, frame) -> its own state."""
     step: Callable[[Params, State, Frame, jax.Array], tuple[State, jax.Array, jax.Array | int]]
     """(params, state, frame, first) -> (state, image [H, W, 3], values of the history that had to be replaced).
-    ``first`` is a bool scalar: there is no history yet, whatever the state and the motion say."""
+    ``first`` is a bool scalar: there is no history yet, regardless of state and motion."""
     reads: frozenset[str]
     init: Callable[[jax.Array, Frame], Params] = lambda key, frame: {}
     samples: Callable[[Params, State, Frame], jax.Array] | None = None

@@ -1,4 +1,4 @@
-"""Files that are either whole or not there: the one place that writes."""
+"""Writing files so that they are either complete or absent: the one place that writes."""
 
 import json
 import os
@@ -13,8 +13,8 @@ from typing import Any
 def whole(path: str | Path) -> Iterator[Path]:
     """Give a temporary path next to ``path``; rename it to ``path`` if the block succeeds, remove it if it does not.
 
-    Readers therefore see the old file or the new one, never half of one, whatever interrupts the writer (Ctrl-C, a full
-    disk, a kill: the last leaves a hidden ``.tmp`` file, never a broken one). The data is on disk before the rename.
+    Readers therefore see the old file or the new one, never an incomplete one, however the writer is interrupted
+    (Ctrl-C, a full disk, a kill: the last leaves a hidden ``.tmp`` file). The data is on disk before the rename.
     Raises FileNotFoundError if the folder is missing, and OSError as the system reports it.
     """
     with _renamed([Path(path)]) as (temporary,):
@@ -25,7 +25,7 @@ def write_whole(contents: Mapping[Path, bytes | str]) -> None:
     """Write files, text as UTF-8, and rename them in this order when all are on disk.
 
     On an error while writing none is replaced and nothing is left behind. Raises as :func:`whole` does, TypeError for
-    contents that are neither bytes nor text, and ValueError for text that UTF-8 has no bytes for.
+    contents that are neither bytes nor text, and ValueError for text that UTF-8 cannot encode.
     """
     with _renamed(list(contents)) as temporaries:
         for temporary, content in zip(temporaries, contents.values(), strict=True):
@@ -33,9 +33,9 @@ def write_whole(contents: Mapping[Path, bytes | str]) -> None:
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Write strict JSON (no NaN, no Infinity), indented, whole or not at all.
+    """Write strict JSON (no NaN, no Infinity), indented, complete or not at all.
 
-    Raises ValueError, naming the file, if ``value`` holds something that JSON has no word for, and as :func:`whole`
+    Raises ValueError, naming the file, if ``value`` holds something that JSON cannot represent, and as :func:`whole`
     does.
     """
     try:
@@ -53,7 +53,7 @@ def _renamed(paths: Sequence[Path]) -> Iterator[list[Path]]:
     for path in paths:
         if not path.parent.is_dir():
             raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; create it first.")
-    # Two processes, or two threads of one, may write the same file: each needs its own.
+    # Two processes, or two threads of one, may write the same file: each needs its own temporary file.
     temporaries = [path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.tmp") for path in paths]
     try:
         yield temporaries
@@ -67,7 +67,7 @@ def _renamed(paths: Sequence[Path]) -> Iterator[list[Path]]:
 
 
 def _sync(path: Path) -> None:
-    """Wait until the disk has a file: a full or failing one may only say so here."""
+    """Wait until a file is on disk: a full or failing disk may report its error only here."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,8 +1,8 @@
-"""FLIP: the difference a viewer sees when flipping between two images, pixel by pixel.
+"""FLIP: the difference, pixel by pixel, that a viewer sees when flipping between two images.
 
 Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström, Fairchild 2020, "FLIP: A Difference Evaluator for Alternating
 Images" (equation and section numbers below are that paper's), in the separable form of the authors' own evaluator
-1.3 and later: the spatial filters are products of one-dimensional ones and pixels beyond the border repeat the edge.
+1.3 and later: the spatial filters are products of one-dimensional ones, and pixels beyond the border repeat the edge.
 """
 
 import math
@@ -26,7 +26,7 @@ _WHITE = _TO_XYZ.sum(axis=1)
 """D65, what linear (1, 1, 1) maps to."""
 _FROM_XYZ = np.linalg.inv(_TO_XYZ)
 _TO_OPPONENT = np.array([[0, 116, 0], [500, -500, 0], [0, 200, -200]]) / _WHITE
-"""XYZ to YCxCz, less the 16 taken off Y (sec. 4.1.1)."""
+"""XYZ to YCxCz, without subtracting 16 from Y (sec. 4.1.1)."""
 
 _COLOR_EXPONENT, _FEATURE_EXPONENT = 0.7, 0.5
 _KNEE, _KNEE_VALUE = 0.4, 0.95
@@ -35,10 +35,10 @@ _FEATURE_WIDTH = 0.082
 
 
 def flip_map(image: jax.Array, reference: jax.Array, *, pixels_per_degree: float = PIXELS_PER_DEGREE) -> jax.Array:
-    """LDR-FLIP error of every pixel, in [0, 1], 0 where nothing is to be seen.
+    """LDR-FLIP error of every pixel, in [0, 1], 0 where no difference is visible.
 
-    ``image`` and ``reference`` [..., H, W, 3] display-encoded sRGB in [0, 1] (``color.tonemap``), cut to that range;
-    returns [..., H, W, 1]. Symmetric. A NaN pixel makes its neighbourhood NaN. Gradients are finite for finite images.
+    ``image`` and ``reference`` [..., H, W, 3] display-encoded sRGB (``color.tonemap``), clipped to [0, 1]; returns
+    [..., H, W, 1]. Symmetric. A NaN pixel makes its neighbourhood NaN. Gradients are finite for finite images.
     """
     both = jnp.stack([image, reference])
     opponent = _linear_map(srgb_decode(jnp.clip(both, 0.0, 1.0)), _TO_OPPONENT @ _TO_XYZ)
@@ -60,7 +60,7 @@ def _color_difference(opponent: jax.Array, pixels_per_degree: float) -> jax.Arra
     lab = _hunt(_lab(_linear_map(linear, _TO_XYZ / _WHITE[:, None])))
     distance = _hyab(lab[0], lab[1])
 
-    # The largest distance there is, green to blue, maps to 1 (sec. 4.1.4).
+    # The largest possible distance, green to blue, maps to 1 (sec. 4.1.4).
     largest = _largest_distance() ** _COLOR_EXPONENT
     knee = _KNEE * largest
     x = safe_power(distance, _COLOR_EXPONENT)
@@ -109,13 +109,13 @@ def _feature_taps(pixels_per_degree: float) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def _linear_map(image: jax.Array, matrix: np.ndarray) -> jax.Array:
-    """``matrix`` times the colour of every pixel, written out: a device may compute dot products in lower precision."""
+    """``matrix`` times the colour of every pixel, as explicit sums: devices may compute dot products less precisely."""
     columns = matrix.T.reshape((3,) + (1,) * (image.ndim - 1) + (3,)).astype(image.dtype)
     return image[..., 0:1] * columns[0] + image[..., 1:2] * columns[1] + image[..., 2:3] * columns[2]
 
 
 def _lab(relative: jax.Array) -> jax.Array:
-    """CIELAB of XYZ over white."""
+    """CIELAB of XYZ divided by white."""
     delta = 6 / 29
     toe = relative <= delta**3
     root = jnp.where(toe, relative / (3 * delta**2) + 4 / 29, jnp.where(toe, 1.0, relative) ** (1 / 3))
@@ -124,7 +124,7 @@ def _lab(relative: jax.Array) -> jax.Array:
 
 
 def _hunt(lab: jax.Array) -> jax.Array:
-    """Colours look less colourful in the dark: a and b times L / 100 (sec. 4.1.2)."""
+    """Hunt effect, dark colours look less colourful: a and b times L / 100 (sec. 4.1.2)."""
     return jnp.concatenate([lab[..., 0:1], 0.01 * lab[..., 0:1] * lab[..., 1:3]], axis=-1)
 
 

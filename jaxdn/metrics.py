@@ -43,8 +43,8 @@ def relative_mse(image: jax.Array, reference: jax.Array, *, mask: jax.Array | No
     Rousselle et al. 2011, eq. 10; the constant varies in the literature.
     """
     image, reference, inside = _prepare(image, reference, mask)
-    # Divided before squaring: the square of a firefly in the reference overflows, the ratio does not. Errors are limited
-    # to 1/64 of the largest number: larger ones, and their derivatives, would overflow as well.
+    # Divided before squaring: the square of a firefly in the reference overflows, the ratio does not. Errors are
+    # limited to 1/64 of the largest number: larger ones, and their derivatives, would overflow as well.
     scale = safe_norm(jnp.stack([reference, jnp.full_like(reference, 0.1)], axis=-1))[..., 0]
     limit = float(jnp.finfo(image.dtype).max) / 64
     return _mean((jnp.clip(image - reference, -limit, limit) / scale) ** 2, inside)
@@ -108,7 +108,8 @@ def ssim(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = Non
     """Structural similarity, at most 1: the mean of its map over pixels and channels, each channel separately.
 
     11 x 11 Gaussian window of sigma 1.5, population covariance, K1 = 0.01, K2 = 0.03, data range 1 (Wang et al. 2004).
-    The map is computed only where the window fits into the image, so a border of 5 pixels never counts; an image smaller than the window uses the largest odd window that fits. 1 for an empty mask.
+    The map is computed only where the window fits into the image, so a border of 5 pixels never counts; an image
+    smaller than the window uses the largest odd window that fits. 1 for an empty mask.
     """
     image, reference = _pair(image, reference)
     inside = _inside(image, mask)

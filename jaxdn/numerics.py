@@ -1,9 +1,9 @@
 """Powers and lengths whose values and derivatives stay finite.
 
-The true derivative of each is infinite or undefined at 0, and one such pixel would make the gradient of a whole clip
-NaN. Each function here says which finite derivative it takes instead. *Tiny* below is the smallest normal number of the
-dtype (1.2e-38 in float32); an infinite argument counts as the largest finite one. NaN stays NaN: hiding it is the
-business of ``frame.repair`` alone.
+Their true derivatives are infinite or undefined at 0, and one such pixel would make the gradient of a whole clip NaN.
+Each function states which finite derivative it has instead. *Tiny* below is the smallest normal number of the
+dtype (1.2e-38 in float32); an infinite argument counts as the largest finite one. NaN stays NaN: only
+``repair.repair`` replaces it.
 """
 
 from functools import partial
@@ -26,7 +26,7 @@ def _finite(x: jax.Array) -> jax.Array:
 
 
 def absolute(x: jax.Array) -> jax.Array:
-    """``|x|`` with derivative 0 at 0: where prediction and target agree, an L1 loss pulls neither way.
+    """``|x|`` with derivative 0 at 0: where prediction and target agree, an L1 loss has no gradient.
 
     ``jnp.abs`` has derivative 1 there (or 0, depending on the version of jax).
     """
@@ -46,8 +46,8 @@ def safe_power(x: jax.Array, exponent: jax.Array | float) -> jax.Array:
 def safe_norm(x: jax.Array, *, axis: int = -1) -> jax.Array:
     """Euclidean length over ``axis``, which is kept with size 1; 0 with derivative 0 for a vector shorter than tiny.
 
-    Scaled by the largest component, so that neither tiny nor huge components vanish in their squares. A length beyond
-    the largest finite number saturates there, and its derivative stays the unit vector.
+    Scaled by the largest component, so that squares of tiny and huge components neither underflow nor overflow.
+    A length beyond the largest finite number saturates there, and its derivative stays the unit vector.
     """
     return _norm(_finite(x), axis)
 
@@ -68,9 +68,9 @@ def _norm_jvp(axis: int, primals: tuple[jax.Array], tangents: tuple[jax.Array]) 
 
 
 def _scaled(x: jax.Array, axis: int) -> tuple[jax.Array, jax.Array]:
-    """``x`` over its largest component, and that component; 1 and 0 for a vector of zeros.
+    """``x`` divided by its largest component, and that component; 1 and 0 for a vector of zeros.
 
-    The scale stops at 1/8 of the largest number: XLA may multiply by its reciprocal, which must not be subnormal.
+    The scale is at most 1/8 of the largest number: XLA may multiply by its reciprocal, which must not be subnormal.
     """
     scale = jax.lax.stop_gradient(jnp.minimum(jnp.max(jnp.abs(x), axis=axis, keepdims=True), _largest(x) / 8))
     zero = scale < _tiny(x)

@@ -1,6 +1,6 @@
-"""Frames and histories made safe to compute on: what every denoiser begins with.
+"""Repair of frames and histories, the first step of every denoiser.
 
-What is done depends on the kind of a buffer alone (:data:`jaxdn.frame.BUFFERS`).
+The repair depends only on the kind of a buffer (:data:`jaxdn.frame.BUFFERS`).
 """
 
 from collections.abc import Callable
@@ -11,14 +11,14 @@ import jax.numpy as jnp
 from jaxdn.frame import BUFFERS, RADIANCE_MAX, Buffer, Frame
 
 FARTHEST = 1e9
-"""Distances above this are taken for this."""
+"""Larger distances are replaced by this."""
 
 Repaired = tuple[jax.Array, jax.Array]
-"""A buffer that is safe, and which of its values had to be replaced (bool)."""
+"""The repaired buffer, and which of its values were replaced (bool)."""
 
 
 def repair(frame: Frame) -> tuple[Frame, jax.Array]:
-    """Make a frame safe to compute on; returns it with the number of values that had to be replaced (int32).
+    """Replace invalid values of a frame; returns it with the number of replaced values (int32).
 
     By the kind of each buffer:
 
@@ -27,9 +27,9 @@ def repair(frame: Frame) -> tuple[Frame, jax.Array]:
     * direction: not finite or shorter than 1e-6 -> 0, else unit length;
     * distance: NaN or negative -> 0, above 1e9 -> 1e9; count: not finite or negative -> 0;
     * vector: not finite -> NaN in both components, which means *no history there* (0 would be a legal vector);
-    * flag, id: as they are.
+    * flag, id: unchanged.
 
-    Half-precision buffers are widened to float32. Never raises on contents.
+    Half-precision buffers are widened to float32. Never raises because of values.
     """
     replaced: dict[tuple[int, ...], jax.Array] = {}
     safe = {}
@@ -41,10 +41,10 @@ def repair(frame: Frame) -> tuple[Frame, jax.Array]:
         safe[name], bad = _REPAIRS[buffer.kind](
             jnp.asarray(values, jnp.promote_types(values.dtype, jnp.float32)), buffer
         )
-        # Summed up to one array for each shape: every reduction to a number is a pass over memory of its own.
+        # Summed to one array per shape first: every reduction to a scalar is a separate pass over memory.
         flags = jnp.asarray(bad, jnp.int32)
         replaced[flags.shape] = replaced[flags.shape] + flags if flags.shape in replaced else flags
-    # Where double precision is enabled a sum of int32 is int64, which no scan takes back as the int32 it began with.
+    # With double precision enabled a sum of int32 is int64, which does not match the int32 carry of a scan.
     counts = jnp.stack([jnp.sum(flags, dtype=jnp.int32) for flags in replaced.values()])
     return frame._replace(**safe), jnp.sum(counts, dtype=jnp.int32)
 
@@ -71,7 +71,7 @@ def _count(values: jax.Array, buffer: Buffer) -> Repaired:
 
 
 def _direction(values: jax.Array, buffer: Buffer) -> Repaired:
-    # Written out for three components: XLA:CPU takes four times as long for reductions over so short an axis.
+    # Explicit for three components: XLA:CPU takes four times as long for reductions over such a short axis.
     sizes = [jnp.abs(values[..., i : i + 1]) for i in range(3)]
     largest = jnp.maximum(jnp.maximum(sizes[0], sizes[1]), sizes[2])
     usable = jnp.isfinite(largest) & (largest > 1e-6)
@@ -104,7 +104,7 @@ _REPAIRS: dict[str, Callable[[jax.Array, Buffer], Repaired]] = {
 
 
 def repair_image(image: jax.typing.ArrayLike) -> jax.Array:
-    """An image that cannot poison anything: not finite or negative -> 0, at most ``RADIANCE_MAX``."""
+    """An image without invalid values: not finite or negative -> 0, at most ``RADIANCE_MAX``."""
     image = jnp.asarray(image)
     bad = ~(jnp.isfinite(image) & (image >= 0))
     return jnp.minimum(jnp.where(bad, 0.0, image), RADIANCE_MAX)

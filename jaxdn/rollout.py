@@ -21,6 +21,13 @@ def sampled(denoiser: Denoiser, params: Params, state: State, frame: Frame, laye
     """The frame with the samples that the denoiser requests, taken from stored layers; unchanged without a request.
 
     Raises ValueError for a request without layers.
+
+    Args:
+      denoiser: what requests samples.
+      params: its parameters.
+      state: before this frame.
+      frame: [H, W, C], with the radiance rendered before.
+      layers: samples per pixel -> independent radiance [H, W, 3].
     """
     if denoiser.samples is None:
         return only(frame, denoiser.reads)
@@ -33,11 +40,18 @@ def sampled(denoiser: Denoiser, params: Params, state: State, frame: Frame, laye
 def unroll(
     denoiser: Denoiser, params: Params, frames: Frame, layers: Layers = None, *, rematerialize: bool = False
 ) -> jax.Array:
-    """Denoise consecutive frames ``[T, H, W, C]`` with one recurrent state; returns images ``[T, H, W, 3]``.
+    """Denoise consecutive frames with one recurrent state; returns images ``[T, H, W, 3]``.
 
-    ``start`` sees the first frame once, then ``step`` is scanned over all T frames. With ``rematerialize`` the backward
-    pass recomputes each step from its carried state, so that memory grows by one frame's state per frame and not by one
-    network's activations (about a quarter of the memory for 1.1 to 1.4 times the time; Chen et al. 2016).
+    ``start`` gets the first frame, then ``step`` is scanned over all T frames.
+
+    Args:
+      denoiser: what denoises.
+      params: its parameters.
+      frames: a Frame of buffers ``[T, H, W, C]``.
+      layers: samples per pixel -> ``[T, H, W, 3]``, for a denoiser that requests samples.
+      rematerialize: recompute each step from its carried state in the backward pass, so that memory grows by one
+        frame's state per frame instead of one network's activations (about a quarter of the memory for 1.1 to 1.4
+        times the time; Chen et al. 2016, "Training Deep Nets with Sublinear Memory Cost").
     """
     frames = only(frames, denoiser.reads)
     layers = layers if denoiser.samples is not None else None

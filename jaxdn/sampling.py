@@ -1,7 +1,8 @@
-"""Images of any number of samples a pixel, put together from stored independent layers.
+"""Images with any number of samples per pixel, combined from stored independent layers.
 
-A renderer that ran once for 1, 2, 4, ... samples has run for every number up to their sum: n samples are the layers of
-n's binary digits, each weighted with its own number (Hasselgren et al. 2020, sec. 2.2).
+Layers of 1, 2, 4, ... samples give every number of samples up to their sum: n samples are the layers of n's binary
+digits, each weighted by its number of samples (Hasselgren et al. 2020, "Neural Temporal Adaptive Sampling and
+Denoising", sec. 2.2).
 """
 
 from collections.abc import Mapping
@@ -11,10 +12,10 @@ import jax.numpy as jnp
 
 
 def from_layers(layers: Mapping[int, jax.Array], counts: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The image [H, W, 3] with ``counts`` [H, W, 1] samples a pixel, and the counts that it really has.
+    """The image [H, W, 3] with ``counts`` [H, W, 1] samples per pixel, and the actual counts.
 
     ``layers`` maps powers of two to independent images [H, W, 3] of that many samples. Counts are rounded and clamped
-    to what the layers add up to; a pixel of no samples is 0. No gradient flows into the counts. Raises ValueError
+    to the layers' sum; a pixel without samples is 0. No gradient flows into the counts. Raises ValueError
     unless the layers are 1, 2, 4, ... without a gap.
     """
     expected = [1 << bit for bit in range(len(layers))]

@@ -1,4 +1,4 @@
-"""Images at several scales: halving, doubling, and putting filtered scales together."""
+"""Images at several scales: halving, doubling, and composing filtered scales."""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ def upsample(image: jax.Array, *, up: str = "bilinear") -> jax.Array:
     """Double [H, W, C] to [2H, 2W, C]: bilinear with half-pixel centres and edge clamp, or nearest.
 
     Bilinear at twice the size has two weights only, 0.75 of the pixel that holds the sample and 0.25 of its neighbour,
-    so each axis is two shifted sums interleaved (what ``jax.image.resize`` does as matrix products).
+    so each axis is two interleaved shifted sums (``jax.image.resize`` uses matrix products).
     """
     check_image(image, "image")
     check_option(up, "up", ("bilinear", "nearest"))
@@ -48,16 +48,22 @@ def _double(image: jax.Array, axis: int) -> jax.Array:
 def compose_scales(
     fine: jax.Array, coarse: jax.Array, alpha: jax.Array, *, down: str = "mean", up: str = "bilinear"
 ) -> jax.Array:
-    """Replace the low frequencies of ``fine`` [H, W, C] by ``coarse`` [H/2, W/2, C] where ``alpha`` in [0, 1] says so.
+    """Replace the low frequencies of ``fine`` [H, W, C] by ``coarse`` [H/2, W/2, C] with weight ``alpha`` in [0, 1].
 
     With D the 2x2 ``down``-sampling and U the ``up``-sampling of this module:
 
     - alpha [H/2, W/2, 1] (Zeng et al. 2021, eq. 4): ``fine - U(alpha * D(fine)) + U(alpha * coarse)``
     - alpha [H, W, 1] (Hasselgren et al. 2020, eq. 3): ``fine - alpha * U(D(fine)) + alpha * U(coarse)``
 
-    The mean passes constant images unchanged; the maximum (the paper's own) darkens positive images where alpha > 0.
-    The result, of fine's shape, is not clamped and may be negative. U is linear, so both forms upsample once.
-    Raises ValueError for odd sizes (pad by edge to a multiple of 16 and crop) and for other shapes.
+    The result, of fine's shape, is not clamped and may be negative. U is linear, so both forms upsample once. Raises
+    ValueError for odd sizes (pad by edge to a multiple of 16 and crop) and for other shapes.
+
+    Args:
+      fine: [H, W, C].
+      coarse: [H/2, W/2, C].
+      alpha: [H/2, W/2, 1] or [H, W, 1].
+      down: ``"mean"`` keeps constant images unchanged; ``"max"`` (the paper's) darkens positive ones where alpha > 0.
+      up: ``"bilinear"`` or ``"nearest"``.
     """
     for name, array, channels in (("fine", fine, None), ("coarse", coarse, None), ("alpha", alpha, 1)):
         check_image(array, name, channels=channels)

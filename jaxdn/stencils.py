@@ -1,6 +1,6 @@
-"""One-dimensional stencils over images: what SSIM, FLIP and the HFEN loss filter with.
+"""One-dimensional stencils over images, used by SSIM, FLIP and the HFEN loss.
 
-A separable filter is two calls, one for each axis. Written as shifted multiply-adds, which XLA fuses into one pass.
+A separable filter is two calls, one per axis, each a sum of shifted products, which XLA fuses into one pass.
 """
 
 import jax
@@ -9,7 +9,7 @@ import numpy as np
 
 
 def correlate(image: jax.Array, taps: np.ndarray, *, axis: int) -> jax.Array:
-    """Correlate one spatial axis with ``taps``, where they fit entirely: the axis shrinks by K - 1.
+    """Correlate one spatial axis with ``taps``, only where they fit entirely: the axis shrinks by K - 1.
 
     ``image`` [..., H, W, C]; ``axis`` -3 (y) or -2 (x); ``taps`` [K, C'], one filter for each channel, where C or C'
     may be 1. To keep the size, pad first: ``pad_edge``.

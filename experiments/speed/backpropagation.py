@@ -1,8 +1,8 @@
-"""What back-propagation through time costs: memory and time of a train step for clips of 2, 5 and 10 frames.
+"""The cost of back-propagation through time: memory and time of a train step for clips of 2, 5 and 10 frames.
 
     python -m experiments.speed.backpropagation [--size large]
 
-Rematerialisation earns its keep if memory grows by one frame's state per frame, and not by one network's activations.
+Rematerialisation works if memory grows by one frame's state per frame, not by one network's activations.
 """
 
 import time
@@ -29,7 +29,7 @@ class Settings:
 
 
 def random_batch(settings: Settings, frames: int) -> Clip:
-    """Noise in the shape of a training batch: costs do not depend on contents."""
+    """Noise in the shape of a training batch: costs do not depend on values."""
     rng = np.random.default_rng(0)
 
     def noise(channels: int) -> np.ndarray:
@@ -45,7 +45,7 @@ def main(settings: Settings) -> None:
     method = method_named("ntd")
     usual = method.recipe_named(None)._replace(batch=settings.batch, crop=settings.crop)
     print(f"ntd {settings.size}, batch {settings.batch}, {settings.crop} px, on {jax.devices()[0].device_kind}")
-    print(f"{'frames':>6} {'rematerialised':>15} {'temporary MiB':>14} {'ms a step':>10} {'compile s':>10}")
+    print(f"{'frames':>6} {'rematerialised':>15} {'temporary MiB':>14} {'ms / step':>10} {'compile s':>10}")
     for rematerialize in (False, True):
         before = None
         for frames in (2, 5, 10):
@@ -64,7 +64,7 @@ def main(settings: Settings) -> None:
                 state, report = step(state, batch)
                 jax.block_until_ready(report)
                 seconds.append(time.perf_counter() - began)
-            growth = "" if before is None else f"  (+{(memory - before[1]) / (frames - before[0]):.2f} MiB a frame)"
+            growth = "" if before is None else f"  (+{(memory - before[1]) / (frames - before[0]):.2f} MiB per frame)"
             print(
                 f"{frames:6} {rematerialize!s:>15} {memory:14.1f} {1e3 * float(np.median(seconds)):10.0f} "
                 f"{compiled:10.1f}{growth}",

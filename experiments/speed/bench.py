@@ -1,12 +1,12 @@
-"""`make bench`: what jaxdn costs on this machine, against its roofline, PyTorch and Open Image Denoise.
+"""`make bench`: the speed of jaxdn on this machine, compared with its roofline, PyTorch and Open Image Denoise.
 
     python -m experiments.speed.bench                  # everything, less than 20 minutes on two cores
     python -m experiments.speed.bench --only steps     # one group
 
 Writes ``runs/bench.json``, a list of rows ``{"work", "implementation", "median_ms", "min_ms", "max_ms", "peak_mib",
-"against", "ratio"}`` with ``ratio`` = own median over that of ``against``, and prints a table. What is compared is
-measured interleaved in one process. The peers are optional (`make bench` installs them); rows are left out with a word
-where one cannot be had.
+"against", "ratio"}`` with ``ratio`` = own median over that of ``against``, and prints a table. Compared programs are
+measured interleaved in one process. The peers are optional (`make bench` installs them); the rows of a missing one are
+left out with a message.
 """
 
 import os
@@ -33,19 +33,19 @@ from jaxdn.files import write_json
 Row = dict[str, Any]
 
 BUDGET_S = {"steps": 180, "operations": 180, "train": 240, "input": 90, "compile": 60}
-"""Seconds for each group, in the order in which they run: a work begins only while its group has time left. What is
-compiled beforehand does not count; on two cores it takes about as long as all of this."""
+"""Seconds for each group, in the order in which they run: a work starts only while its group has time left. Compiling
+in advance does not count; on two cores it takes about as long as all of this."""
 ONE_WORK_S = {"steps": 45, "operations": 6, "train": 60}
 """Seconds for the rounds of one work; at least two rounds are run."""
 COMPILED = ("step-large-720p", "train-large-64")
 """The programs whose compile time is measured."""
 COMPILE_S = 240
-"""A compilation is given up after so many seconds."""
+"""A compilation is stopped after so many seconds."""
 
 
 @dataclass
 class Settings:
-    """Time jaxdn against its roofline, PyTorch and Open Image Denoise; write runs/bench.json."""
+    """Time jaxdn, compared with its roofline, PyTorch and Open Image Denoise; write runs/bench.json."""
 
     only: Literal["all", "steps", "operations", "train", "compile", "input"] = "all"
     """Run one group of works."""
@@ -53,20 +53,29 @@ class Settings:
 
 
 class Report:
-    """The rows so far, in a file that is whole after every work."""
+    """The rows so far, in a file that is complete after every work."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.rows = path, []  # type: Path, list[Row]
         path.parent.mkdir(parents=True, exist_ok=True)
 
     def add(self, rows: Sequence[Row]) -> None:
-        """Keep the rows and write the file anew."""
+        """Add the rows and rewrite the file."""
         self.rows.extend(rows)
         write_json(self.path, self.rows)
 
 
 def row(work: str, name: str, timing: Timing, peak: float | None, against: str, other_ms: float) -> Row:
-    """One row of the results."""
+    """One row of the results.
+
+    Args:
+      work: its name.
+      name: of the implementation.
+      timing: of the implementation.
+      peak: memory in MiB; None if not measured.
+      against: name of the implementation that it is compared with.
+      other_ms: median of that one.
+    """
     return {
         "work": work,
         "implementation": name,
@@ -86,7 +95,15 @@ def compare(
     others: Sequence[str],
     ideal_ms: float,
 ) -> list[Row]:
-    """Everything against the roofline, and what is not among the ``others`` against each of them."""
+    """Rows of one work: everything compared with the roofline, and ours with each of the ``others``.
+
+    Args:
+      work: its name.
+      timings: name -> timing of every implementation.
+      peaks: name -> memory in MiB.
+      others: names of the peers.
+      ideal_ms: the roofline's time.
+    """
     rows = []
     for name, timing in timings.items():
         for other in [] if name in others else others:
@@ -96,7 +113,7 @@ def compare(
 
 
 def run(work: Work, probe: Probe, *, budget_s: float, say: Callable[[str], None]) -> list[Row]:
-    """Build what the work compares, time it interleaved with the ceilings, then take each peak."""
+    """Build the programs of a work, time them interleaved with the ceilings, then measure their peak memory."""
     calls: dict[str, Call] = {}
     for name, build in {**work.ours, **work.peers}.items():
         try:
@@ -108,7 +125,7 @@ def run(work: Work, probe: Probe, *, budget_s: float, say: Callable[[str], None]
     reached = probe.ceilings(*(timings.pop(name).median_ms for name in ceilings))
     first = ", ".join(f"{name} {timing.first_ms / 1e3:.1f} s" for name, timing in timings.items())
     say(
-        f"{work.name}: first calls, which compile: {first}; then {next(iter(timings.values())).rounds} rounds; "
+        f"{work.name}: first calls (with compilation): {first}; then {next(iter(timings.values())).rounds} rounds; "
         f"{reached.copy_gb_s:.1f} GB/s copied, {reached.matmul_gflop_s:.0f} GFLOP/s in matrix products"
     )
     peaks = {name: peak_mib(work.alone.get(name, call)) for name, call in calls.items()}
@@ -119,7 +136,7 @@ def run(work: Work, probe: Probe, *, budget_s: float, say: Callable[[str], None]
 def compile_rows(
     program: str, cache: Path, taken: dict[compilation.Program, float | None], *, say: Callable[[str], None]
 ) -> list[Row]:
-    """Compile time of one program: cold (``taken``, or now), again from the cache, and PyTorch's."""
+    """Compile time of one program: cold (from ``taken`` or measured now), from the cache, and PyTorch's."""
     work, seconds = f"compile-{program}", {}
     compilers = ["xla"] if "torch-compiled" in peers.missing() else ["xla", "torch"]
     for pair in [(compiler, program) for compiler in compilers]:
@@ -133,7 +150,7 @@ def compile_rows(
         if value is not None:
             timings[name] = Timing(1e3 * value, 1e3 * value, 1e3 * value, 1e3 * value, 1)
         elif name.split("-")[0] in compilers:
-            say(f"{work}: {name} did not end within {COMPILE_S} s, its rows are left out")
+            say(f"{work}: {name} did not finish within {COMPILE_S} s; its rows are left out")
     pairs = (("xla-cold", "torch-compiled"), ("xla-cached", "xla-cold"), ("torch-compiled", "xla-cold"))
     return [
         row(work, name, timings[name], None, against, timings[against].median_ms)
@@ -143,7 +160,7 @@ def compile_rows(
 
 
 def input_rows() -> list[Row]:
-    """The share of its time that training waits for a batch, and what the input costs in all."""
+    """The share of time that training waits for a batch, and the total cost of the input."""
     timings = input_share.measure_input(train_steps.RECIPE)
     wait, loop, alone = (timings[name] for name in ("wait", "loop", "alone"))
     return [
@@ -179,15 +196,15 @@ def compiled(
     *,
     say: Callable[[str], None],
 ) -> Iterator[Work]:
-    """The works, once the programs that take long to compile are in the caches, made by a process for each core.
+    """The works, after the programs that take long to compile are compiled into the caches, one process per core.
 
-    Compilers use one core, and PyTorch's has to be given up after a while, which only another process can be. What
-    each took goes to ``taken``.
+    Compilers use one core, and PyTorch's may have to be stopped, which needs a separate process. The seconds that each
+    took are stored in ``taken``.
     """
     listed = list(works())
     programs: list[compilation.Program] = [("torch", work.name) for work in listed if "torch-compiled" in work.peers]
     for work in listed:
-        # Programs that call an engine are compiled where they run: another process does not find them in jax's cache.
+        # Programs that call an engine are compiled where they run, as jax's cache does not share them.
         programs += [("xla", work.name + name.removeprefix("xla")) for name in work.ours if name.startswith("xla")]
     say(f"compiling {', '.join(sorted({name for _, name in programs}))} ...")
     taken |= compilation.warm(programs, cache, limit_s=COMPILE_S)
@@ -233,7 +250,7 @@ def main(settings: Settings) -> None:
     say(f"{os.cpu_count()} cores, jax {jax.__version__} on {jax.default_backend()}, huge pages {pages}")
     probe = roofline.probe()
     with tempfile.TemporaryDirectory() as place:
-        # What several groups use is compiled once.
+        # Programs that several groups use are compiled once.
         jax.config.update("jax_compilation_cache_dir", str(Path(place) / "jax"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(Path(place) / "torch")
@@ -245,7 +262,7 @@ def main(settings: Settings) -> None:
             started = time.monotonic()
             while call is not None:
                 if time.monotonic() - started > BUDGET_S[group]:
-                    say(f"{group}: its {BUDGET_S[group]} s are spent, the works that are left are left out")
+                    say(f"{group}: its {BUDGET_S[group]} s are used up; the remaining works are left out")
                     break
                 with console.status(f"{group} ..."):
                     rows = call()
@@ -254,7 +271,7 @@ def main(settings: Settings) -> None:
                     say(f"{each['work']}: {each['implementation']} {each['ratio']:.2f} of {each['against']}")
                 call = next(calls, None)
     console.print(table(report.rows))
-    print(f"raw numbers: {settings.out}  ({time.monotonic() - began:.0f} s in all)")
+    print(f"raw numbers: {settings.out}  ({time.monotonic() - began:.0f} s in total)")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""What leaving out absent effects saves: rendering, disk, denoising and memory, ``auto`` against ``all``.
+"""Savings from leaving out absent effects: rendering, disk, denoising and memory, ``auto`` compared with ``all``.
 
-    python -m experiments.speed.effects            # a minute or two a scene on two cores
+    python -m experiments.speed.effects            # a minute or two per scene on two cores
     python -m experiments.speed.effects --quick    # fewer samples, three scenes
 
 For each scene of :mod:`experiments.speed.small_rooms` that is listed here the same clip is rendered both ways and
-denoised frame by frame, each program once a round. What is printed are ratios auto / all of one run;
-``runs/effects.json`` has the raw numbers too. Path length is measured for ``auto`` and the scene's own for ``all``; the
-column ``same depth`` is the rendering time of ``auto`` at the scene's own path length, which separates the two savings.
+denoised frame by frame, each program once per round. It prints the ratios auto / all of one run; ``runs/effects.json``
+has the raw numbers too. The path length is measured for ``auto`` and the scene's own for ``all``; the column ``same
+depth`` is the rendering time of ``auto`` at the scene's own path length, which separates the two savings.
 """
 
 import functools
@@ -29,6 +29,7 @@ from experiments.speed.small_rooms import CASES, FRAMES, Case
 from jaxdn import effects
 from jaxdn.clips import read_frames
 from jaxdn.commands.errors import plain_errors
+from jaxdn.denoiser import Params
 from jaxdn.effects import Plan
 from jaxdn.frame import Frame, only
 from jaxdn.render import use_variant
@@ -63,7 +64,7 @@ class Settings:
 
 
 def medians(programs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Median seconds of each program; every round runs each of them once, so that all meet the same machine."""
+    """Median seconds of each program; the programs run interleaved, so that all have the same machine conditions."""
     times: dict[str, list[float]] = {name: [] for name in programs}
     for _ in range(rounds):
         for name, program in programs.items():
@@ -117,12 +118,12 @@ def render(case: Case, settings: Settings, folder: Path) -> tuple[dict[str, Any]
     return figures, {name: clips[name][0] for name in ("all", "auto")}
 
 
-def denoise(denoiser: jaxdn.Denoiser, params: Any, clips: dict[str, Path]) -> dict[str, Any]:
-    """Steady-state milliseconds a frame, bytes and operations of the step, with everything and by plan."""
+def denoise(denoiser: jaxdn.Denoiser, params: Params, clips: dict[str, Path]) -> dict[str, Any]:
+    """Steady-state milliseconds per frame, bytes and operations of the step, with everything and by plan."""
     runs: dict[str, Callable[[], Any]] = {}
     figures: dict[str, Any] = {"bytes": {}, "operations": {}}
     for name, clip in clips.items():
-        # The last frame: what moves has begun to move by then, and has not come to rest.
+        # The last frame: moving objects have started by then and not yet come to rest.
         frame = [jax.tree.map(jax.numpy.asarray, stored.frame) for stored in read_frames(clip)][-1]
         used: Frame = only(frame, denoiser.reads)
         state = denoiser.start(params, used)
@@ -171,7 +172,7 @@ def ratio(pair: dict[str, float], name: str = "auto") -> str:
 
 
 def show(results: dict[str, Any]) -> None:
-    """One row a scene, ratios auto / all."""
+    """One row per scene, ratios auto / all."""
     table = Table(title="auto / all")
     kinds = ("time", "memory", "operations")
     titles = ["scene", "depth", "render", "same depth", "inspection", "disk"]
@@ -179,14 +180,14 @@ def show(results: dict[str, Any]) -> None:
         table.add_column(title, overflow="fold")
     for name, figures in results.items():
         seconds = figures["render seconds"]
-        looked = (figures["inspection seconds"] + figures["depth seconds"]) / seconds["all"]
+        inspection = (figures["inspection seconds"] + figures["depth seconds"]) / seconds["all"]
         row = [
             name,
             f"{figures['depth']['auto']}/{figures['depth']['all']}",
             ratio(seconds),
             ratio(seconds, "same depth"),
         ]
-        row += [f"{looked:.3f}", ratio(figures["bytes"])]
+        row += [f"{inspection:.3f}", ratio(figures["bytes"])]
         for method in ("svgf", "ntd small"):
             row += [ratio(figures[method][kind]) for kind in ("milliseconds", "bytes", "operations")]
         table.add_row(*row)

@@ -1,9 +1,9 @@
-"""The least time that a work can take here: its operations and bytes over what this machine reaches.
+"""The roofline: a lower bound for the time of a work, from its operations and bytes and the machine's peak rates.
 
 The ceilings are measured interleaved with the work. Operations and bytes are counted from the shapes, not from a
 compiled program: every convolution reads its input once, writes its output once and does ``2 * 9 * Ci * Co`` operations
-a pixel. Nothing stays in a cache from one convolution to the next, and nothing else is counted that could be fused
-into one of them.
+per pixel. Nothing stays in a cache from one convolution to the next; other work that could be fused into one is not
+counted.
 """
 
 import os
@@ -24,23 +24,23 @@ FLOAT = 4
 
 
 class Cost(NamedTuple):
-    """What one pass over memory costs at least."""
+    """The minimum cost of one pass over memory."""
 
     operations: float
     bytes: float
 
 
 class Ceilings(NamedTuple):
-    """What the machine reaches."""
+    """The rates that the machine reaches."""
 
     copy_gb_s: float
-    """Bytes read plus bytes written, in 1e9 a second."""
+    """Bytes read plus bytes written, in 1e9 per second."""
     matmul_gflop_s: float
-    """float32, multiplication and addition counted apart."""
+    """float32; a multiplication and an addition count as two."""
 
 
 class Probe(NamedTuple):
-    """Calls that reach the ceilings, to be timed interleaved with the work: a shared machine's ceilings move."""
+    """Calls that reach the ceilings, to be timed interleaved with the work: a shared machine's speed varies."""
 
     copy: Call
     bytes: float
@@ -48,19 +48,19 @@ class Probe(NamedTuple):
     operations: float
 
     def ceilings(self, copy_ms: float, matmul_ms: float) -> Ceilings:
-        """From what the two calls took."""
+        """The ceilings from the times of the two calls."""
         return Ceilings(self.bytes / copy_ms / 1e6, self.operations / matmul_ms / 1e6)
 
 
 def probe() -> Probe:
-    """Copying, and the fastest float32 matrix product at hand, on jax's default device."""
+    """Copying, and the fastest available float32 matrix product, on jax's default device."""
     cpu = jax.default_backend() == "cpu"
     size = 1536 if cpu else 8192
     a = np.random.default_rng(0).standard_normal((size, size), np.float32)
     on_device = jnp.asarray(a)
     product = jax.jit(lambda a: jnp.dot(a, a, precision="highest"))
     matmul: Call = lambda: product(on_device).block_until_ready()  # noqa: E731
-    if cpu:  # NumPy's library is sometimes the faster one
+    if cpu:  # NumPy's library is sometimes faster
         by_numpy: Call = lambda: a @ a  # noqa: E731
         times = measure({"jax": matmul, "numpy": by_numpy}, rounds=5)
         matmul = matmul if times["jax"].median_ms < times["numpy"].median_ms else by_numpy
@@ -69,7 +69,7 @@ def probe() -> Probe:
 
 
 def _copy_by_threads() -> tuple[Call, float]:
-    """A copy of 128 MiB, a share for each core, and the bytes it moves."""
+    """A copy of 128 MiB, divided among the cores, and the bytes it moves."""
     cores = os.cpu_count() or 1
     source, target = (np.ones((cores, (32 << 20) // cores), np.float32) for _ in range(2))
     pool = ThreadPoolExecutor(cores)
@@ -88,7 +88,7 @@ def _copy_on_device() -> tuple[Call, float]:
 
 
 def milliseconds(costs: Sequence[Cost], ceilings: Ceilings) -> float:
-    """The roofline of passes one after another: each takes the longer of its operations and its bytes."""
+    """The roofline of consecutive passes: each takes the longer of its operations' and its bytes' time."""
     seconds = [
         max(cost.operations / (1e9 * ceilings.matmul_gflop_s), cost.bytes / (1e9 * ceilings.copy_gb_s))
         for cost in costs
@@ -97,7 +97,15 @@ def milliseconds(costs: Sequence[Cost], ceilings: Ceilings) -> float:
 
 
 def convolution(count: int, height: int, width: int, inputs: int, outputs: int) -> Cost:
-    """A 3x3 convolution of [count, height, width, inputs]; its gradient by image or by kernel costs the same."""
+    """A 3x3 convolution of [count, height, width, inputs]; its gradient by image or by kernel costs the same.
+
+    Args:
+      count: number of images.
+      height: of an image.
+      width: of an image.
+      inputs: channels in.
+      outputs: channels out.
+    """
     pixels = count * height * width
     weights = 9 * inputs * outputs
     return Cost(2.0 * pixels * weights, FLOAT * (pixels * (inputs + outputs) + weights))
@@ -119,7 +127,7 @@ def kernel_application(height: int, width: int, *, gradient: bool = False) -> Co
 def bilinear_warp(height: int, width: int, *, gradient: bool = False) -> Cost:
     """A bilinear fetch of RGB: image and vectors are read once, the result is written.
 
-    With ``gradient`` (by the image alone): the result's gradient and the vectors read, the image's gradient written.
+    With ``gradient`` (only by the image): the result's gradient and the vectors read, the image's gradient written.
     """
     pixels = height * width
     once = Cost(pixels * 24.0, FLOAT * pixels * 8.0)
@@ -129,7 +137,16 @@ def bilinear_warp(height: int, width: int, *, gradient: bool = False) -> Cost:
 def network(
     widths: Widths, height: int, width: int, *, count: int = 1, features: int = 14, heads: Sequence[int] = (51, 26, 26)
 ) -> list[Cost]:
-    """The convolutions of the U-Net, of ``count`` images."""
+    """The convolutions of the U-Net.
+
+    Args:
+      widths: of the U-Net.
+      height: of an image.
+      width: of an image.
+      count: number of images.
+      features: input channels.
+      heads: output channels at full, half and quarter resolution.
+    """
     costs, inputs = [], features
 
     def level_of(n: int, inputs: int, channels: Sequence[int]) -> int:
@@ -155,6 +172,6 @@ def step(widths: Widths, height: int, width: int) -> list[Cost]:
 
 def train_step(widths: Widths, size: int, *, batch: int, frames: int) -> list[Cost]:
     """One update on ``batch`` clips of ``frames`` frames: three times the convolutions (forward and two gradients) for
-    all frames but the last, which is only looked at."""
+    all frames except the last, which has only the forward pass."""
     convolutions = network(widths, size, size, count=batch)
     return convolutions * (3 * (frames - 1) + 1)

@@ -1,7 +1,7 @@
 """Small scenes, each with the effects that it has: from a static grey box to a room in which everything moves.
 
-A scene is a box of six walls, a lamp, whatever is put inside, and an animation. Materials and animations are the
-building blocks, so that random scenes can be drawn from them too.
+A scene is a box of six walls, a lamp, its contents, and an animation. It is built from materials and animations, so
+that random scenes can be drawn from them too.
 """
 
 import json
@@ -85,7 +85,7 @@ MATERIALS: dict[str, tuple[str, set[str]]] = {
     "bumpy": (bsdf("bumpmap", BUMPS + bsdf("diffuse")), set()),
     "cut-out": (bsdf("mask", number("opacity", 0.5) + bsdf("diffuse")), {"transmission"}),
 }
-"""Name -> XML and the effects that the material brings."""
+"""Name -> XML and the effects of the material."""
 
 # The camera stands at z = 3.5 and looks along -z; the lamp is behind it, or in view under the ceiling.
 STILL: dict[str, Any] = {}
@@ -121,7 +121,7 @@ ANIMATIONS: dict[str, tuple[dict[str, Any], set[str]]] = {
         OBJECT | CAMERA | {"changing-light"},
     ),
 }
-"""Name -> animation of the room and the effects that it brings."""
+"""Name -> animation of the room and its effects."""
 
 
 def rectangle(name: str, transform: str, material: str = GREY, emitter: str = "") -> str:
@@ -183,9 +183,9 @@ class Case(NamedTuple):
 
 def room(material: str = "grey", animation: str = "still", *, lamp: str = BEHIND) -> Case:
     """A closed room with a ball of some material in view."""
-    xml, brought = MATERIALS[material]
-    keys, moved = ANIMATIONS[animation]
-    effects = LIT | brought | moved | ({"emission"} if lamp == SEEN else set())
+    xml, material_effects = MATERIALS[material]
+    keys, animation_effects = ANIMATIONS[animation]
+    effects = LIT | material_effects | animation_effects | ({"emission"} if lamp == SEEN else set())
     return Case(box() + lamp + ball(xml) + FAR_BALL, keys, effects)
 
 
@@ -206,7 +206,7 @@ MEDIUM = (
     '<bsdf type="null"/><medium name="interior" type="homogeneous"><rgb name="sigma_t" value="1"/>'
     '<rgb name="albedo" value="0.5"/></medium></shape>'
 )
-# One flat picture fills the view: whatever the camera does, nothing can come out from behind anything.
+# One flat picture fills the view: however the camera moves, nothing can be disoccluded.
 PICTURE = rectangle(
     "picture", '<scale value="40"/><translate z="-2"/>', bsdf("twosided", bsdf("diffuse", checker("reflectance")))
 )
@@ -243,4 +243,4 @@ CASES: dict[str, Case] = {
         LIT | OBJECT | CAMERA | {"changing-light", "emission", "texture", "mirror", "transmission", "glossy"},
     ),
 }
-"""Name -> scene: what is here and nothing else is found."""
+"""Name -> scene with exactly the effects that have to be found."""

@@ -1,7 +1,7 @@
-"""How long calls take compared with each other, and how much memory one takes.
+"""Relative timing of calls, and the memory of one call.
 
-A machine that others use is fast one minute and slow the next: what is compared is measured interleaved, in one
-process, and read as ratios of medians.
+The speed of a shared machine varies from one minute to the next: compared calls are measured interleaved in one
+process, and results are ratios of medians.
 """
 
 import ctypes
@@ -15,35 +15,35 @@ from typing import Any, NamedTuple
 import numpy as np
 
 Call = Callable[[], Any]
-"""Something to time; it returns when its work is done (``jax.block_until_ready`` inside)."""
+"""A call to time; it returns when its work is done (``jax.block_until_ready`` inside)."""
 
 PAUSE_S = 0.01
-"""Between two calls: threads of the one before may still spin for work."""
+"""Pause between two calls: threads of the previous one may still be spinning."""
 
 
 class Timing(NamedTuple):
-    """What one call took, in milliseconds."""
+    """The times of one call, in milliseconds."""
 
     median_ms: float
     min_ms: float
     max_ms: float
     first_ms: float
-    """The first call, which compiles; it is not among the others."""
+    """The first call, with compilation; not part of the others."""
     rounds: int
 
 
 def measure(calls: Mapping[str, Call], *, rounds: int = 7, budget_s: float = 60.0) -> dict[str, Timing]:
     """Time calls interleaved: each once to compile, then ``rounds`` times, or until ``budget_s`` is spent.
 
-    There are at least two rounds, and all are whole: every call is timed equally often. The budget counts from the end
-    of the first calls.
+    There are at least two rounds, and all are complete: every call is timed equally often. The budget counts from the
+    end of the first calls.
     """
     first, samples = {}, {name: [] for name in calls}  # type: dict[str, float], dict[str, list[float]]
     for name, call in calls.items():
         first[name] = _milliseconds(call)
     began = time.perf_counter()
     for done in range(rounds):
-        # The next round takes about as long as the mean one so far.
+        # The next round is expected to take the mean time of a round so far.
         spent = time.perf_counter() - began
         if done >= 2 and spent * (done + 1) / done > budget_s:
             break
@@ -63,18 +63,18 @@ def _milliseconds(call: Call) -> float:
 
 
 def peak_mib(call: Call) -> float | None:
-    """Growth of the process's resident memory at the call's peak, in MiB; None where the system does not tell (Linux).
+    """Growth of the process's resident memory at the call's peak, in MiB; None where the system does not report it
+    (only Linux does).
 
-    What the caller holds already (arguments, weights) is not in it; what comes back is. Call once before, so that
-    compilation is not in it either. Memory that an engine keeps between calls is not counted: give a call that builds
-    the engine too.
+    It includes the results but not what the caller holds already (arguments, weights). Call once before, to exclude
+    compilation. Memory that an engine keeps between calls is not counted: pass a call that also builds the engine.
     """
     if sys.platform != "linux":
         return None
     gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)  # what the allocator keeps would hide the growth
+    ctypes.CDLL(None).malloc_trim(0)  # memory kept by the allocator would hide the growth
     try:
-        Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from here
+        Path("/proc/self/clear_refs").write_text("5")  # reset the peak
     except OSError:  # some sandboxes forbid it
         return None
     before = _status("VmRSS")

@@ -99,6 +99,15 @@ def _compare_on(
     compiled: dict[str, Callable[[Params, Clip], jax.Array]],
     spp: int,
 ) -> ClipResult:
+    """The scores and images of one clip.
+
+    Args:
+      clip: with a reference.
+      folder: of the clip.
+      methods: what to compare.
+      compiled: label of a method -> its compiled function.
+      spp: samples per pixel of the clip's radiance.
+    """
     frames = clip.frames
     inputs = jax.tree.map(jax.numpy.asarray, clip._replace(reference=None))
     reference = color.tonemap(clip.reference)

@@ -94,7 +94,15 @@ def denoise_files(
 def _open(
     source: Path, needs_layers: bool, spp: int, motion_convention: str | None, channels: Mapping[str, str] | None
 ) -> tuple[list[Path], Iterator[tuple[Frame, Layers]]]:
-    """The files and their frames, read when needed; with independent layers for a method that asks for samples."""
+    """The files and their frames, read when needed.
+
+    Args:
+      source: folder of a clip, or a folder of, or a pattern for, EXR files.
+      needs_layers: give independent layers, for a method that requests samples.
+      spp: samples per pixel to take from a clip's layers.
+      motion_convention: as in :func:`denoise_files`.
+      channels: as in :func:`denoise_files`.
+    """
     names, frames = open_frames(source, spp=spp, motion_convention=motion_convention, channels=channels)
 
     def layers(stored: StoredFrame) -> Layers:

@@ -1,1 +1,1 @@
-"""The pieces that classical temporal filters are made of: history, moments, variance, spatial averages."""
+"""The parts of classical temporal filters: history, moments, variance, spatial averages."""

@@ -15,9 +15,15 @@ def luminance(planes: jax.Array) -> jax.Array:
 def accumulate(past: jax.Array, now: jax.Array, *, alpha: float, alpha_moments: float, history_max: int) -> jax.Array:
     """The history [6, H, W] with colour ``now`` [3, H, W] blended in (Schied et al. 2017, sec. 4.1 and 4.2).
 
-    Planes are colour, the first and second moment of its luminance, and the history length N in frames; ``past`` is 0
-    where there is none. The new frame has the share ``max(alpha, 1 / N)`` in colour, likewise in moments, at a length N
-    of at most ``history_max``: without a history it is the new frame alone.
+    Planes are colour, the first and second moment of its luminance, and the history length N in frames. The new frame
+    has the weight ``max(alpha, 1 / N)``: without a history, the result is the new frame.
+
+    Args:
+      past: the history [6, H, W], 0 where there is none.
+      now: colour of the new frame [3, H, W].
+      alpha: minimum weight of the new frame in colour.
+      alpha_moments: minimum weight of the new frame in the moments.
+      history_max: maximum of N.
     """
     level = luminance(now)
     length = jnp.minimum(past[5] + 1.0, history_max)

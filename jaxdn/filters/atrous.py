@@ -1,11 +1,11 @@
 """Edge-stopped averages over a sparse stencil: the a-trous wavelet filter and its relatives.
 
-The weight of a tap q at pixel p is its share h of the stencil times edge-stopping weights that the caller chooses
-(Dammertz et al. 2010; Schied et al. 2017).
+The weight of a tap q at pixel p is its stencil weight h times edge-stopping weights that the caller chooses (Dammertz
+et al., "Edge-Avoiding A-Trous Wavelet Transform for fast Global Illumination Filtering", 2010; Schied et al. 2017).
 
-Arrays here are planar, ``[C, H, W]``: the stencil then runs along contiguous rows and vectorises. Taps are a scan over
-strips of rows, in which the weight of one tap is made while the tap before it is added up: written as a plain sum,
-XLA:CPU computes every weight again for each channel that uses it, which takes twice the time. The strips fit the cache.
+Arrays here are planar, ``[C, H, W]``: the stencil then runs along contiguous rows and vectorises. For each
+strip of rows, a scan over the taps computes the weight of one tap while it adds up the tap before: written as a plain
+sum, XLA:CPU recomputes every weight for each channel, which takes twice the time. The strips fit into the cache.
 """
 
 import functools
@@ -21,7 +21,7 @@ from jaxdn.filters.weights import Offset, Weight
 B3_SPLINE = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
 _STRIP_PIXELS = 16384
 _NO_WEIGHT = 1e-10
-"""Taps that weigh less together count as none: the cube of their sum, in the variance's gradient, would be 0."""
+"""Smaller sums of weights count as no tap: their cube, in the variance's gradient, would underflow to 0."""
 
 
 def stencil(radius: int, *, kernel: np.ndarray | None = None) -> np.ndarray:
@@ -46,24 +46,24 @@ def edge_average(
     variance: jax.Array | None = None,
     needed: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Weighted mean of ``values`` [C, H, W] over ``taps``, and the variance that this mean has.
+    """Weighted mean of ``values`` [C, H, W] over ``taps``, and the variance of this mean.
 
-    Taps outside the image or without a surface weigh nothing; the centre weighs h exactly; a pixel without any tap, or
-    with taps that weigh less than 1e-10 together, gives 0.
+    Taps outside the image or without a surface have weight 0, the centre has exactly h. A pixel without taps, or whose
+    weights sum to less than 1e-10, gives 0.
 
     Args:
       values: planes to average.
       hit: [H, W] bool, a surface is seen; other pixels are never taps. None: everywhere.
       weights: edge-stopping weights, see :mod:`jaxdn.filters.weights`.
       taps: rows of (dy, dx, h), see :func:`stencil`.
-      step: spreads the taps; it may be traced, so that all levels share one compiled loop, up to ``step_max``.
+      step: spacing of the taps; it may be traced, so that all levels share one compiled loop, up to ``step_max``.
       step_max: the largest ``step``.
       variance: [H, W], becomes ``sum w^2 variance / (sum w)^2``.
       needed: [H, W] bool, strips of the image without a needed pixel are skipped and come back as 0.
     """
     _, height, width = values.shape
     dtype = values.dtype
-    # One strip elsewhere than on the CPU: a cache to stay in is the CPU's concern.
+    # Strips are for the CPU's cache only; other devices take one strip.
     rows = height if jax.default_backend() != "cpu" else min(height, max(8, _STRIP_PIXELS // width))
     strips = -(-height // rows)
     spare = strips * rows - height
@@ -76,13 +76,13 @@ def edge_average(
     def centred(plane: jax.Array) -> jax.Array:
         return jnp.pad(plane, ((0, spare), (0, 0)))
 
-    # Masked pixels enter as zeros in the sums and in the sum of weights alike.
+    # Masked pixels enter as zeros in the sums and in the sum of weights.
     means = [around(plane * inside) for plane in values] + [around(inside)]
     spread = None if variance is None else around(variance * inside)
     there = [[around(plane) for plane in one.there] for one in weights]
     centre = [[centred(plane) for plane in one.here] for one in weights]
     offsets = step * jnp.asarray(taps[:, :2], jnp.int32) + jnp.array([reach_y, reach_x], jnp.int32)[None]
-    # Per tap: dx, dy and its length, each for step 1, and h.
+    # Per tap: dx, dy and its length, all for step 1, and h.
     length = np.hypot(taps[:, 0], taps[:, 1])
     numbers = jnp.asarray(np.stack([taps[:, 1], taps[:, 0], length, taps[:, 2]], axis=1), dtype)
     numbers = numbers * jnp.where(jnp.arange(4) < 3, jnp.asarray(step, dtype), 1.0)[None]
@@ -97,14 +97,14 @@ def edge_average(
         def weigh(offset: jax.Array, number: jax.Array) -> jax.Array:
             tap = Offset(number[0], number[1], number[2])
             factor = jnp.full((rows, width), number[3])
-            looked = [
+            samples = [
                 ([shifted(plane, offset) for plane in a], [here(plane) for plane in b])
                 for a, b in zip(there, centre, strict=True)
             ]
-            exponents = [one.exponent(*at, tap) for one, at in zip(weights, looked, strict=True) if one.exponent]
+            exponents = [one.exponent(*at, tap) for one, at in zip(weights, samples, strict=True) if one.exponent]
             if exponents:
                 factor = factor * jnp.exp(-functools.reduce(jnp.add, exponents))
-            for one, at in zip(weights, looked, strict=True):
+            for one, at in zip(weights, samples, strict=True):
                 if one.factor:
                     factor = factor * one.factor(*at, tap)
             return factor
@@ -120,7 +120,7 @@ def edge_average(
             sums, ready, offset = carry
             return (add(sums, ready, offset), weigh(*tap), tap[0]), None
 
-        # The centre waits to be added with its weight h before the first tap's weight is made.
+        # The centre's weight h is ready before the first tap's weight is computed.
         nothing = jnp.zeros((rows, width), dtype)
         sums = ([nothing] * len(means), None if spread is None else nothing)
         begin = (sums, jnp.full((rows, width), taps[0, 2], dtype), offsets[0])

@@ -1,4 +1,4 @@
-"""What tells one surface from another: depth, its slopes, normals and ids, packed as the next frame needs them."""
+"""Guides that distinguish surfaces: depth and its slopes, normals and ids, packed for the next frame."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from jaxdn.frame import FAR
 
 
 class Guides(NamedTuple):
-    """Where the layers of packed guides ``[H, W, G]`` lie; ``None`` is a buffer that is absent."""
+    """Channel positions in packed guides ``[H, W, G]``; ``None`` for an absent buffer."""
 
     depth: int | None
     normal: slice | None
@@ -19,7 +19,7 @@ class Guides(NamedTuple):
 def pack_guides(
     depth: jax.Array | None, normal: jax.Array | None, ids: jax.Array | None, like: jax.Array
 ) -> tuple[jax.Array, Guides]:
-    """Put what is there of depth, normal and ids into one array ``[H, W, 0..5]`` of the dtype of ``like``.
+    """Pack depth, normal and ids, as far as present, into one array ``[H, W, 0..5]`` of the dtype of ``like``.
 
     Ids are stored as floating-point numbers, exact up to 2**24 objects in float32.
     """
@@ -37,7 +37,7 @@ def pack_guides(
 
 
 def hit_mask(depth: jax.Array | None, ids: jax.Array | None) -> jax.Array | None:
-    """[H, W] bool: the camera ray met a surface; ``None`` (everywhere) where neither buffer can tell."""
+    """[H, W] bool: the camera ray hit a surface; ``None`` (everywhere) without either buffer."""
     known = []
     if depth is not None:
         known.append(depth[..., 0] < FAR)
@@ -47,7 +47,7 @@ def hit_mask(depth: jax.Array | None, ids: jax.Array | None) -> jax.Array | None
 
 
 def cosine(first: jax.Array, second: jax.Array) -> jax.Array:
-    """[..., 3] normals -> [...] cosine, where the zero normal of *no surface* is orthogonal to all but itself."""
+    """[..., 3] normals -> [...] cosine, where the zero normal of *no surface* is orthogonal to all except itself."""
     both_absent = jnp.all(first == 0, axis=-1) & jnp.all(second == 0, axis=-1)
     return jnp.where(both_absent, 1.0, jnp.sum(first * second, axis=-1))
 
@@ -55,8 +55,8 @@ def cosine(first: jax.Array, second: jax.Array) -> jax.Array:
 def depth_slopes(depth: jax.Array, ids: jax.Array | None) -> tuple[jax.Array, jax.Array]:
     """Screen-space slope of depth ``[H, W, 1]`` along x and y, each ``[H, W]``, per pixel.
 
-    Of the forward and the backward difference, restricted to the same object, the smaller in magnitude; 0 where neither
-    exists. A silhouette thus does not pass for a steep surface.
+    The slope is the smaller in magnitude of the forward and the backward difference within the same object, and 0 where
+    neither exists. A silhouette thus does not count as a steep surface.
     """
     z = depth[..., 0]
     identity = None if ids is None else ids[..., 0]

@@ -1,8 +1,8 @@
-"""History fetched by motion, every tap tested on its own: what SVGF and its descendants do instead of a plain warp.
+"""Reprojection of the history with a test of every tap, as SVGF and later filters do instead of a plain warp.
 
-A plain bilinear warp mixes whatever lies under the four taps. Here each tap is accepted or rejected (same object,
-expected depth, same orientation), the accepted ones are renormalised, and where none is left the 3x3 neighbourhood of
-the target is tried (Schied et al. 2017).
+A plain bilinear warp mixes all four taps. Here each tap is accepted or rejected (same object, expected depth, same
+orientation) and the accepted ones are renormalised; where none is accepted, the 3x3 neighbourhood of the target is
+tried (Schied et al. 2017).
 """
 
 from collections.abc import Callable
@@ -16,17 +16,24 @@ from jaxdn.filters.guides import Guides, cosine, depth_slopes
 from jaxdn.frame import Frame
 
 WEIGHT_MIN = 0.01
-"""Least sum of accepted bilinear weights that counts as history."""
+"""Minimum sum of accepted bilinear weights that counts as history."""
 
 
 def same_surface(
     frame: Frame, guides: jax.Array, place: Guides, *, depth_tolerance: float, normal_threshold: float, first: int
 ) -> Callable[[jax.Array], jax.Array]:
-    """The test of one tap for :func:`reproject`: does it show the surface that is seen now?
+    """The test of one tap for :func:`reproject`: does it show the same surface as the current pixel?
 
-    ``guides`` and ``place`` are the frame's own (:func:`jaxdn.filters.guides.pack_guides`); a tap has its guides from
-    layer ``first`` on. It passes where ids agree, ``|z - z_expected| <= depth_tolerance z_expected + 2 (|dz/dx| +
-    |dz/dy|)`` and the cosine of the normals exceeds ``normal_threshold``; what the frame lacks is not tested.
+    A tap passes where ids agree, ``|z - z_expected| <= depth_tolerance z_expected + 2 (|dz/dx| + |dz/dy|)`` and the
+    cosine of the normals exceeds ``normal_threshold``; absent buffers are not tested.
+
+    Args:
+      frame: the current frame.
+      guides: its packed guides (:func:`jaxdn.filters.guides.pack_guides`).
+      place: the channel positions in ``guides``.
+      depth_tolerance: relative to the expected depth.
+      normal_threshold: of the cosine.
+      first: the channel of a tap at which its guides begin.
     """
     if frame.depth is not None:
         expected = (frame.depth if frame.previous_depth is None else frame.previous_depth)[..., 0]
@@ -56,8 +63,8 @@ def reproject(
 
     ``accept`` gets one tap for every pixel, [H, W, C], and returns [H, W] bool. Taps outside the image count as
     rejected, rejected values are never multiplied (they may be NaN), and no gradient flows into the motion. Returns the
-    renormalised mean [H, W, C], 0 where there is none, and [H, W] bool: there is one. Motion that is not finite means
-    none; no motion (``None``) is zero motion without a gather.
+    renormalised mean [H, W, C], 0 where there is no history, and [H, W] bool, where there is one. Non-finite motion
+    means no history; no motion (``None``) is zero motion without a gather.
     """
     height, width, channels = packed.shape
     dtype = packed.dtype
@@ -115,5 +122,5 @@ def reproject(
         around = total / jnp.where(found, count, 1.0)[..., None]
         return jnp.where(found[..., None], around, mean), valid | found
 
-    # A still camera rejects nothing: then the nine fetches are skipped.
+    # With a static camera no tap is rejected, and the nine fetches are skipped.
     return lax.cond(jnp.all(valid | ~known), lambda mean, valid: (mean, valid), second_chance, mean, valid)

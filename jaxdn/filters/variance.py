@@ -1,4 +1,4 @@
-"""How noisy the luminance of a pixel is: from its history, or from its neighbours while the history is short."""
+"""Variance of a pixel's luminance: from its history, or from its neighbours while the history is short."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ from jaxdn.filters.weights import Weight
 def estimate_variance(
     history: jax.Array, hit: jax.Array | None, weights: Sequence[Weight], *, short_history: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Colour [3, H, W] and the variance [H, W] of its luminance, from a history as of ``accumulate``.
+    """Colour [3, H, W] and the variance [H, W] of its luminance, from a history of ``accumulate``.
 
     Where the length N is less than ``short_history``, both are those of the edge-stopped 7x7 neighbourhood, and the
     variance is multiplied by ``short_history / N`` (Schied et al. 2017, sec. 4.2).

@@ -1,7 +1,7 @@
-"""Edge-stopping weights: how much a tap of a spatial filter counts, by what is seen there and at the centre.
+"""Edge-stopping weights: the weight of a filter tap, from the guides at the tap and at the centre.
 
-A filter takes any number of them; each is an exponent (those of all weights are added up, and ``exp(-sum)`` is taken
-once) or a factor. All are planar, ``[n, H, W]``, as the filters are.
+A filter takes any number of them. Each is an exponent (the exponents of all weights are summed, and ``exp(-sum)`` is
+computed once) or a factor. All arrays are planar, ``[n, H, W]``, as in the filters.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ Planes = list[jax.Array]
 
 
 class Offset(NamedTuple):
-    """From the centre to the tap, in pixels (scalars, the spread of the taps included)."""
+    """From the centre to the tap, in pixels (scalars, including the spacing of the taps)."""
 
     x: jax.Array
     y: jax.Array
@@ -28,9 +28,9 @@ class Weight(NamedTuple):
     """One edge-stopping weight."""
 
     there: jax.Array
-    """[n, H, W] what is looked at in the tap's pixel."""
+    """[n, H, W] planes that are read at the tap."""
     here: jax.Array
-    """[m, H, W] what is looked at in the centre's."""
+    """[m, H, W] planes that are read at the centre."""
     exponent: Callable[[Planes, Planes, Offset], jax.Array] | None = None
     """(there, here, offset) -> e >= 0 [h, w], for a factor ``exp(-e)``."""
     factor: Callable[[Planes, Planes, Offset], jax.Array] | None = None
@@ -56,7 +56,7 @@ def depth_weight(depth: jax.Array, ids: jax.Array | None, *, sigma: float) -> We
 def normal_weight(normal: jax.Array, *, sigma: float) -> Weight:
     """``max(0, n(p) . n(q)) ** sigma`` for unit normals [H, W, 3] (Schied et al. 2017, eq. 4).
 
-    Pixels without a normal (0) are alike among themselves and orthogonal to all others.
+    Pixels without a normal (0) have weight 1 among themselves and 0 with all others.
     """
     absent = jnp.all(normal == 0, axis=-1, keepdims=True).astype(normal.dtype)
     layers = jnp.concatenate([normal, absent], axis=-1).transpose(2, 0, 1)

@@ -89,8 +89,9 @@ class SvgfState(NamedTuple):
 def svgf(options: Options) -> Denoiser:
     """SVGF, a filter without weights (``params`` is ``{}``).
 
-    Reads albedo, normal, depth, previous_depth, motion and ids; without a buffer, its test or weight is left out. Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for options out of range
-    and radiance that is not [H, W, 3].
+    Reads albedo, normal, depth, previous_depth, motion and ids; without a buffer, its test or weight is left out.
+    Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for options out of range and
+    radiance that is not [H, W, 3].
     """
 
     def start(params: Params, frame: Frame) -> SvgfState:

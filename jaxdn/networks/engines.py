@@ -1,4 +1,4 @@
-"""What can run a network besides plain XLA, and what for."""
+"""The engines that can run a network instead of plain XLA, and their purposes."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -10,13 +10,13 @@ Purpose = Literal["inference", "training"]
 
 
 class Engine(NamedTuple):
-    """A value of a network's option ``implementation``; both engines compute in float32 alone."""
+    """A value of a network's option ``implementation``; both engines compute only in float32."""
 
     name: str
     purpose: Purpose
-    """What it is faster at than XLA, and taken for when nobody names an engine."""
+    """The work at which it is faster than XLA, and for which it is the default."""
     available: Callable[[], bool]
-    """Whether it can run here: installed, and jax computes on a device that it knows."""
+    """Whether it can run here: it is installed and supports jax's device."""
 
 
 ENGINES: dict[str, Engine] = {

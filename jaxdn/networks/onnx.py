@@ -1,9 +1,9 @@
 """The U-Net run by ONNX Runtime, an inference engine for CPUs, from inside a jitted program.
 
-XLA:CPU convolves at about two thirds of what the machine can do. ONNX Runtime keeps activations in blocks of 16
+XLA:CPU's convolutions reach about two thirds of the machine's peak. ONNX Runtime keeps activations in blocks of 16
 channels from one convolution to the next; a 720p step takes 0.77 to 1.03 of XLA's time (``docs/performance.md``). It
 is an extra (``pip install jaxdn[onnx]``) and for inference only: the gradient is that of the U-Net in plain XLA,
-computed anew. Nothing of this leaves the room: ``unet(..., implementation="onnxruntime")`` is the same pure function.
+recomputed. None of this is visible outside: ``unet(..., implementation="onnxruntime")`` is the same pure function.
 """
 
 import os
@@ -20,10 +20,10 @@ from jaxdn.networks import LEVELS
 
 OPSET = 17
 BLOCK = 16
-"""Channels that the engine computes at a time; an input of another count takes a slow path (3 times the time)."""
+"""Channels that the engine computes at a time; other input counts take a slow path (3 times the time)."""
 
 Apply = Callable[[dict[str, Any], list[jax.Array]], tuple[jax.Array, ...]]
-"""(params, the feature groups that are there [N, H, W, c]) -> heads."""
+"""(params, the present feature groups [N, H, W, c]) -> heads."""
 
 
 def available() -> bool:
@@ -51,9 +51,14 @@ def model(
 ) -> bytes:
     """The U-Net with these weights as a serialised ONNX graph.
 
-    ``shape`` [N, c, H, W] is that of the input ``planes``, c a multiple of :data:`BLOCK`; ``used`` are the slices of
-    the first kernel's inputs that they consist of (None: all). Outputs ``head_0`` ... are [N, H / 2^i, W / 2^i,
-    channels].
+    Its input is ``planes``; its outputs ``head_0`` ... are [N, H / 2^i, W / 2^i, channels].
+
+    Args:
+      params: the weights.
+      shape: [N, c, H, W] of ``planes``, c a multiple of :data:`BLOCK`.
+      used: the slices of the first kernel's inputs that ``planes`` consists of; None: all.
+      heads: number of outputs.
+      slope: of the LeakyReLU for negative inputs.
     """
     from onnx import TensorProto, helper, numpy_helper
 
@@ -102,7 +107,7 @@ def model(
             "Resize", x, "", twice, mode="nearest", nearest_mode="floor", coordinate_transformation_mode="asymmetric"
         )
         layer = params[f"decoder_{depth}"]["convolution_0"]
-        # A sum of two convolutions, which the engine adds up in place, is cheaper than joining their inputs.
+        # A sum of two convolutions, which the engine adds in place, is cheaper than concatenating their inputs.
         total = node(
             "Add",
             convolution(larger, layer["kernel"][:, :, :below], None),
@@ -120,9 +125,9 @@ def model(
 
     outputs = [value(f"head_{depth}", head_shape(params, shape, depth)) for depth in range(heads)]
     graph = helper.make_graph(nodes, "unet", [value("planes", shape)], outputs, constants)
-    whole = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)])
-    whole.ir_version = 8
-    return whole.SerializeToString()
+    graph_model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)])
+    graph_model.ir_version = 8
+    return graph_model.SerializeToString()
 
 
 def _outputs(level: dict[str, Any]) -> int:
@@ -135,15 +140,15 @@ def head_shape(params: dict[str, Any], shape: Sequence[int], depth: int) -> tupl
 
 
 class Session:
-    """One shape's session, made for the weights it was last called with.
+    """The session of one shape, created for the weights of its last call.
 
-    The engine lays weights out anew for its blocks, so they belong to the session; that they are those of the call is
-    made sure of at every call (a comparison of bytes, about a millisecond), which keeps the function pure.
+    The engine rearranges weights for its blocks, so they belong to the session. Every call compares its weights with
+    those of the session (by bytes, about a millisecond), which keeps the function pure.
     """
 
     def __init__(self, shape: tuple[int, ...], groups: int, describe: Callable[[list[np.ndarray]], bytes]) -> None:
         self._groups, self._describe = groups, describe
-        self._planes = np.zeros(shape, np.float32)  # kept: fresh memory costs more than what is written into it
+        self._planes = np.zeros(shape, np.float32)  # kept: allocating new memory takes longer than writing to it
         self._weights: list[np.ndarray] = []
         self._session: Any = None
         self._lock = threading.Lock()
@@ -198,7 +203,7 @@ def engine(plain: Apply, *, heads: int, slope: float, used: Sequence[slice] | No
         session = Session(
             shape, len(groups), lambda weights: model(jax.tree.unflatten(tree, weights), shape, used, heads, slope)
         )
-        # The groups go in as they are: joined by XLA they would be written to fresh memory first.
+        # The groups are passed separately: XLA would concatenate them into newly allocated memory first.
         return tuple(buffer_callback(session, results, vmap_method="sequential")(*groups, *weights))
 
     def forward(params: dict[str, Any], groups: list[jax.Array]) -> tuple[Any, Any]:

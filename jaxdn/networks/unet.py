@@ -1,11 +1,11 @@
 """The U-Net that predicts kernels: five resolution levels, heads on the last three decoder levels.
 
-Flax NNX lives behind this door. What comes out are plain nested dicts of arrays and two pure functions, so that
-optimisers, checkpoints and users never meet one of its types.
+Flax NNX is used only inside this module. Its results are plain nested dicts of arrays and two pure functions, so that
+optimisers, checkpoints and users never see its types.
 
 Architecture (Zeng et al. 2021, sec. 4.3 and fig. 6, after Hasselgren et al. 2020): 3x3 convolutions, LeakyReLU, 2x2
-max-pooling down, nearest upsampling and skip concatenation up. The papers give no widths; :data:`LARGE` is our reading
-of "about 850,000 weights". Xavier-uniform kernels (Glorot and Bengio 2010), zero biases.
+max-pooling down, nearest upsampling and skip concatenation up. The papers give no widths; :data:`LARGE` is our choice
+for "about 850,000 weights". Xavier-uniform kernels (Glorot and Bengio 2010), zero biases.
 """
 
 import functools
@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
+from jaxdn.denoiser import Params
 from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, onnx
 from jaxdn.ops import onednn
 from jaxdn.ops.convolution import convolve
@@ -39,11 +40,11 @@ Part = tuple[jax.Array, Sequence[slice] | None]
 
 
 class Convolver(NamedTuple):
-    """What runs the convolutions."""
+    """An implementation of the convolutions."""
 
     convolve: Callable[[jax.Array, jax.Array], jax.Array]
     multiple: int
-    """Outputs are computed in multiples of this."""
+    """The number of output channels is padded to a multiple of this."""
 
 
 XLA = Convolver(convolve, 16)  # 51 outputs take XLA:CPU 1.4 times as long as 64
@@ -65,7 +66,7 @@ class Convolution(nnx.Module):
         def share(used: Sequence[slice] | None) -> jax.Array:
             return kernel if used is None else jnp.concatenate([kernel[:, :, channels] for channels in used], axis=2)
 
-        # A sum of convolutions is the convolution of the parts side by side, and joining them first costs more.
+        # A sum of convolutions equals the convolution of the concatenated parts, and concatenating costs more.
         total = functools.reduce(jnp.add, [convolver.convolve(x, share(used)) for x, used in parts])
         return total[..., :outputs] + jnp.reshape(self.bias[...].astype(dtype), (1, 1, 1, -1))
 
@@ -94,14 +95,14 @@ def pool(x: jax.Array) -> jax.Array:
 
 
 def enlarge(x: jax.Array) -> jax.Array:
-    """Every pixel four times: [N, H, W, C] -> [N, 2H, 2W, C]."""
+    """Repeat every pixel 2x2 times: [N, H, W, C] -> [N, 2H, 2W, C]."""
     n, height, width, channels = x.shape
     blocks = jnp.broadcast_to(x[:, :, None, :, None, :], (n, height, 2, width, 2, channels))
     return jnp.reshape(blocks, (n, 2 * height, 2 * width, channels))
 
 
 class UNet(nnx.Module):
-    """Encoder, decoder and three heads; called on features and the slices of the first kernel that belong to them."""
+    """Encoder, decoder and three heads; called with features and their slices of the first kernel."""
 
     def __init__(self, inputs: int, heads: Sequence[int], widths: Widths) -> None:
         self.heads = len(heads)
@@ -137,7 +138,7 @@ class UNet(nnx.Module):
 def xavier_uniform(key: jax.Array, shapes: dict[str, Any]) -> dict[str, Any]:
     """Kernels uniform within +-sqrt(6 / (fan_in + fan_out)), biases zero (Glorot and Bengio 2010).
 
-    All kernels are cut from one draw: a generator for each of them takes XLA twenty seconds to compile.
+    All kernels are slices of one draw: with a generator for each, XLA takes twenty seconds to compile.
     """
     leaves, tree = jax.tree.flatten(shapes)
     draw = jax.random.uniform(
@@ -165,7 +166,7 @@ def reference(network: Callable[[Convolver], onnx.Apply], heads: int, used: Sequ
 def convolved_by_onednn(
     network: Callable[[Convolver], onnx.Apply], heads: int, used: Sequence[slice] | None
 ) -> onnx.Apply:
-    """XLA, but for the convolutions and their gradients: for training on CPUs."""
+    """XLA with oneDNN's convolutions and their gradients: for training on CPUs."""
     return network(ONEDNN)
 
 
@@ -173,7 +174,7 @@ def convolved_by_onednn(
 def run_by_onnxruntime(
     network: Callable[[Convolver], onnx.Apply], heads: int, used: Sequence[slice] | None
 ) -> onnx.Apply:
-    """The whole network outside of XLA, for inference; the gradient is XLA's."""
+    """The whole network in ONNX Runtime, for inference; the gradient is XLA's."""
     return onnx.engine(network(XLA), heads=heads, slope=NEGATIVE_SLOPE, used=used)
 
 
@@ -183,8 +184,8 @@ def unet(
     """A U-Net as ``init(key) -> params`` and ``apply(params, features) -> heads``.
 
     ``groups`` are the channel counts of the feature groups; ``apply`` takes one array ``[N, H, W, c]`` for each, or
-    ``None`` where it is absent, which is the same as an array of zeros but without its share of the first convolution:
-    the shapes of ``params`` never depend on it. H and W are multiples of 16. ``heads`` are the channel counts at full,
+    ``None`` where it is absent, which equals an array of zeros but skips its part of the first convolution: the shapes
+    of ``params`` never depend on it. H and W are multiples of 16. ``heads`` are the channel counts at full,
     half and quarter resolution; their outputs are raw (logits). ``widths`` gives the channels of each convolution of
     each of the five levels; the decoder mirrors the first four. Computes in the features' dtype. ``implementation``:
     None or "reference" (XLA), "onnxruntime" (inference, see :mod:`jaxdn.networks.onnx`) or "onednn" (convolutions and
@@ -233,6 +234,6 @@ def unet(
     return Network(init, apply)
 
 
-def count(params: Any) -> int:
+def count(params: Params) -> int:
     """The number of weights in ``params``."""
     return sum(leaf.size for leaf in jax.tree.leaves(params))

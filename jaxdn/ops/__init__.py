@@ -1,1 +1,1 @@
-"""The few hot operations, a file each: the public function, a readable reference, faster forms of the same maths."""
+"""The performance-critical operations, one file each: the public function, a readable reference, faster versions."""

@@ -1,9 +1,9 @@
-"""3x3 convolution whose gradients stay fast inside a scan.
+"""3x3 convolution with gradients that are fast inside a scan.
 
-XLA:CPU runs plain NHWC/HWIO convolutions well, but the ones that automatic differentiation makes fall off the fast path
-inside ``lax.scan`` (28 times slower in a two-layer toy, jax 0.10). The ``"blocked"`` implementation has a VJP of its
-own: the gradient by the image is again a plain convolution, the gradient by the kernel a few matrix products. The
-``"onednn"`` implementation has another engine do all three.
+XLA:CPU runs plain NHWC/HWIO convolutions fast, but not those of automatic differentiation inside ``lax.scan`` (28 times
+slower in a test with two layers, jax 0.10). The ``"blocked"`` implementation has its own VJP: the gradient by the image
+is again a plain convolution, the gradient by the kernel a few matrix products. The ``"onednn"`` implementation runs all
+three in oneDNN.
 """
 
 import jax
@@ -16,7 +16,7 @@ from jaxdn.ops.registry import register, resolve
 
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
 _BLOCK_BYTES = 4 << 20
-"""Patches are gathered for about so much memory at a time: they stay in the cache, and a 720p frame stays small."""
+"""Patches are gathered in blocks of about this size: they stay in the cache, and a 720p frame takes little memory."""
 
 
 def convolve(x: jax.Array, kernel: jax.Array, *, implementation: str | None = None) -> jax.Array:
@@ -58,7 +58,7 @@ def _patches(image: jax.Array, first: jax.Array | int, rows: int) -> jax.Array:
 
 @custom_vmap
 def _kernel_gradient(x: jax.Array, cotangent: jax.Array) -> jax.Array:
-    """d loss / d kernel, ``sum_p x(p + offset) cotangent(p)``: patches of the thinner side, one product per strip."""
+    """d loss / d kernel, ``sum_p x(p + offset) cotangent(p)``: patches of the side with fewer channels."""
     count, height, width, inputs = x.shape
     outputs = cotangent.shape[3]
     around_output = outputs <= inputs
@@ -81,16 +81,16 @@ def _kernel_gradient(x: jax.Array, cotangent: jax.Array) -> jax.Array:
         empty = jnp.zeros((wide.shape[3], 9 * thin.shape[3]), exact)
         total, _ = lax.scan(lambda sum, index: (sum + strip(index * rows), None), empty, jnp.arange(height // rows))
     total = total.astype(x.dtype).reshape(wide.shape[3], 3, 3, thin.shape[3])
-    if around_output:  # patches of the cotangent run against the offsets of the image
+    if around_output:  # offsets of the cotangent's patches have the opposite sign
         return jnp.flip(total, (1, 2)).transpose(1, 2, 0, 3)
     return total.transpose(1, 2, 3, 0)
 
 
 @_kernel_gradient.def_vmap
 def _one_by_one(size: int, batched: tuple[bool, bool], x: jax.Array, cotangent: jax.Array) -> tuple[jax.Array, bool]:
-    """Under vmap, a plain product for each example in turn: XLA:CPU has no fast path for a batch of them.
+    """Under vmap, one plain product per example: XLA:CPU has no fast path for batched ones.
 
-    A loop and not an unrolled one: it takes about the same time and a third of the compilation.
+    The loop is not unrolled: it takes about the same time and a third of the compilation time.
     """
     x = x if batched[0] else jnp.broadcast_to(x, (size, *x.shape))
     cotangent = cotangent if batched[1] else jnp.broadcast_to(cotangent, (size, *cotangent.shape))
@@ -118,7 +118,7 @@ _by_engine.defvjp(lambda x, kernel: (onednn.forward(x, kernel), (x, kernel)), _e
 
 @register("convolution", "onednn", requires=onednn.check_available)
 def engine(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    """oneDNN for float32, value and gradients; other types, which it has no fast form of, as ``"blocked"``."""
+    """oneDNN for float32, value and gradients; ``"blocked"`` for other types, which oneDNN does not run fast."""
     if x.dtype == kernel.dtype == jnp.float32:
         return _by_engine(x, kernel)
     return _blocked(x, kernel)

@@ -1,9 +1,9 @@
-"""Filter kernels of every pixel's own: made from logits, and applied.
+"""Per-pixel filter kernels: normalised from logits, and applied.
 
 The public operations and the implementations of :func:`apply_kernels`. The automatic gradient of K*K shifted products
-keeps or rebuilds K*K shifted images and pads each kernel slice's share to full width before it adds them.
-``"recompute"`` keeps only its two arguments and makes both gradients in the shape of the forward pass: K*K shifted
-multiply-adds for the image, K*K short sums laid side by side for the kernels.
+keeps or recomputes K*K shifted images, and pads the gradient of each kernel slice to full width before adding them.
+``"recompute"`` keeps only its two arguments and computes both gradients like the forward pass: K*K shifted
+multiply-adds for the image, K*K concatenated short sums for the kernels.
 """
 
 import math
@@ -16,7 +16,8 @@ from jaxdn.ops.registry import register, resolve
 
 
 def normalize_kernels(logits: jax.Array) -> jax.Array:
-    """Softmax over the taps: [H, W, K*K] logits -> weights >= 0 that sum to 1 (Vogels et al. 2018).
+    """Softmax over the taps: [H, W, K*K] logits -> weights >= 0 that sum to 1 (Vogels et al. 2018, "Denoising with
+    Kernel Prediction and Asymmetric Loss Functions").
 
     Computed and returned in float32 at least: radiance reaches 65504, and weights rounded to 8 bits do not sum to 1.
     """
@@ -26,12 +27,12 @@ def normalize_kernels(logits: jax.Array) -> jax.Array:
 
 
 def apply_kernels(image: jax.Array, kernels: jax.Array, *, implementation: str | None = None) -> jax.Array:
-    """Filter every pixel with a kernel of its own: ``out(p) = sum_t kernels(p, t) * image(p + offset_t)``.
+    """Filter every pixel with its own kernel: ``out(p) = sum_t kernels(p, t) * image(p + offset_t)``.
 
     image: [H, W, C], any colour space. kernels: [H, W, K*K] with K odd, taps row-major from -(K//2) to K//2, x fastest.
-    Taps beyond the border take the nearest edge pixel. Kernels are used as they are, see ``normalize_kernels``.
-    Returns [H, W, C] in the wider of the two dtypes. ``implementation``: "reference" or "recompute"; None picks the
-    fastest. Raises ValueError for sizes that differ and a last axis that is not the square of an odd number.
+    Taps beyond the border take the nearest edge pixel. Kernels are not normalised, see ``normalize_kernels``.
+    Returns [H, W, C] in the wider of the two dtypes. ``implementation``: "reference" or "recompute"; None selects the
+    fastest. Raises ValueError for different sizes and a last axis that is not the square of an odd number.
     """
     check_image(image, "image")
     check_image(kernels, "kernels")

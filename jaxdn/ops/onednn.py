@@ -1,8 +1,8 @@
 """oneDNN's 3x3 convolutions and their gradients, called from inside a jitted program on CPUs.
 
-XLA:CPU has no fast form of a convolution's gradient by its kernel, and its convolutions reach two thirds of what the
-machine can do. oneDNN (Apache-2.0; the engine under PyTorch on CPUs) is an extra, ``pip install jaxdn[onednn]``: a
-shared library, spoken to through its C interface (version 3) by ctypes, so that nothing needs a compiler. It reads and
+XLA:CPU has no fast gradient of a convolution by its kernel, and its convolutions reach two thirds of the machine's
+peak. oneDNN (Apache-2.0; the engine under PyTorch on CPUs) is an extra, ``pip install jaxdn[onednn]``: a
+shared library, called through its C interface (version 3) by ctypes, so that no compiler is needed. It reads and
 writes XLA's own buffers. :mod:`jaxdn.ops.convolution` makes one differentiable operation of the three functions.
 """
 
@@ -48,7 +48,7 @@ def _path() -> Any:
 
 @functools.cache
 def _library() -> Any:
-    """The C functions; those that are called at every convolution with their types, so that ctypes checks little."""
+    """The C functions; those called at every convolution have declared types, which makes ctypes faster."""
     library = ctypes.CDLL(str(_path()))
     library.dnnl_primitive_desc_query_md.restype = c_void_p
     library.dnnl_primitive_desc_query_md.argtypes = (c_void_p, c_int, c_int)
@@ -96,22 +96,30 @@ def _made(function: str, *arguments: Any) -> c_void_p:
 
 @functools.cache
 def _engine() -> tuple[c_void_p, c_void_p]:
-    """The CPU, and a stream of work for it. Neither is ever given back: they live as long as the process."""
+    """The CPU, and a stream of work for it. Neither is ever freed: they live as long as the process."""
     engine = _made("dnnl_engine_create", _CPU, c_size_t(0))
     return engine, _made("dnnl_stream_create", engine, _IN_ORDER)
 
 
 def _images(count: int, height: int, width: int, channels: int) -> c_void_p:
-    """Describes [N, H, W, C] in memory; oneDNN's dimensions are N, C, H, W whatever the order in memory."""
+    """Describes [N, H, W, C] in memory; oneDNN's dimensions are N, C, H, W for any order in memory."""
     strides = _Dims(height * width * channels, 1, width * channels, channels)
     dims = _Dims(count, channels, height, width)
     return _made("dnnl_memory_desc_create_with_strides", 4, dims, _FLOAT32, strides)
 
 
 class _Convolution:
-    """One direction of a convolution of one shape, made once; called with addresses.
+    """One direction of a convolution of one shape, created once; called with addresses.
 
-    The library picks the layout of the kernel; it is put there, or brought back, at every call (a few microseconds).
+    The library chooses the layout of the kernel; every call converts to or from it (a few microseconds).
+
+    Args:
+      direction: "forward", "image gradient" or "kernel gradient".
+      count: images N.
+      height: of the images.
+      width: of the images.
+      inputs: channels of the convolution's input.
+      outputs: channels of its output.
     """
 
     def __init__(self, direction: str, count: int, height: int, width: int, inputs: int, outputs: int) -> None:
@@ -128,35 +136,35 @@ class _Convolution:
             "dnnl_convolution_forward_primitive_desc_create",
             *(engine, _TRAINING, _DIRECT, x, free, None, y, *window, None),
         )
-        what, asked = forward, _ASK_WEIGHTS
+        description, query = forward, _ASK_WEIGHTS
         roles = _SOURCE, _WEIGHTS, _DESTINATION
         if direction == "image gradient":
-            what = _made(
+            description = _made(
                 "dnnl_convolution_backward_data_primitive_desc_create",
                 *(engine, _DIRECT, x, free, y, *window, forward, None),
             )
             x, y, roles = y, x, (_DESTINATION_GRADIENT, _WEIGHTS, _SOURCE_GRADIENT)
         elif direction == "kernel gradient":
-            what = _made(
+            description = _made(
                 "dnnl_convolution_backward_weights_primitive_desc_create",
                 *(engine, _DIRECT, x, free, None, y, *window, forward, None),
             )
-            asked, roles = _ASK_WEIGHTS_GRADIENT, (_SOURCE, _WEIGHTS_GRADIENT, _DESTINATION_GRADIENT)
-        theirs = c_void_p(_library().dnnl_primitive_desc_query_md(what, asked, 0))
+            query, roles = _ASK_WEIGHTS_GRADIENT, (_SOURCE, _WEIGHTS_GRADIENT, _DESTINATION_GRADIENT)
+        theirs = c_void_p(_library().dnnl_primitive_desc_query_md(description, query, 0))
         backward = direction == "kernel gradient"
-        turn = _made(
+        reorder = _made(
             "dnnl_reorder_primitive_desc_create",
             *((theirs, engine, ours, engine, None) if backward else (ours, engine, theirs, engine, None)),
         )
-        # Memory without an address: it is told at every call.
+        # Memory without an address: it is set at every call.
         self._given = [_made("dnnl_memory_create", each, engine, _NO_MEMORY) for each in (x, ours, y)]
         inside = _made("dnnl_memory_create", theirs, engine, _OWN_MEMORY)
         first, kernel, last = self._given
-        convolve = self._prepared(what, (roles[0], first), (roles[1], inside), (roles[2], last))
+        convolve = self._prepared(description, (roles[0], first), (roles[1], inside), (roles[2], last))
         if backward:
-            self._work = [convolve, self._prepared(turn, (_SOURCE, inside), (_DESTINATION, kernel))]
+            self._work = [convolve, self._prepared(reorder, (_SOURCE, inside), (_DESTINATION, kernel))]
         else:
-            self._work = [self._prepared(turn, (_SOURCE, kernel), (_DESTINATION, inside)), convolve]
+            self._work = [self._prepared(reorder, (_SOURCE, kernel), (_DESTINATION, inside)), convolve]
 
     @staticmethod
     def _prepared(description: c_void_p, *arguments: tuple[int, c_void_p]) -> tuple[c_void_p, int, Any]:
@@ -172,10 +180,10 @@ class _Convolution:
 
 
 _made_once = functools.cache(_Convolution)
-"""Kept for good, as jax keeps the programs that call them: a kernel's size of memory for each."""
+"""Never freed, as jax keeps the programs that call them; each takes the memory of one kernel."""
 
 _ALONE = threading.Lock()
-"""One convolution at a time: each of them uses all cores, and they share what is prepared for their shape."""
+"""One convolution at a time: each uses all cores, and convolutions of one shape share their buffers."""
 
 
 def _address(array: np.ndarray) -> int:
@@ -191,7 +199,7 @@ def _image_gradient(context: Any, out: Any, cotangent: Any, kernel: Any) -> None
 
 
 def _with_kernel(direction: str, images: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
-    """Images of any number at once under one kernel; where vmap has brought several kernels, one after the other."""
+    """All images at once for one kernel; one call per kernel if vmap batched the kernel."""
     inputs, outputs = kernel.shape[-2:]
     if kernel.size == 9 * inputs * outputs:
         images, out = (array.reshape(1, -1, *array.shape[-3:]) for array in (images, out))
@@ -203,12 +211,12 @@ def _with_kernel(direction: str, images: np.ndarray, kernel: np.ndarray, out: np
 
 
 def _at(array: np.ndarray, index: Sequence[int]) -> np.ndarray:
-    """The example of that index; an axis that vmap did not batch has length 1."""
+    """The example at an index; an axis that vmap did not batch has length 1."""
     return array[tuple(place if size > 1 else 0 for place, size in zip(index, array.shape, strict=False))]
 
 
 def _kernel_gradient(context: Any, out: Any, x: Any, cotangent: Any) -> None:
-    """Each example of a batch has a gradient of its own: that is what vmap means, and what jax adds up afterwards."""
+    """Under vmap each example has its own gradient, which jax adds up afterwards."""
     images, gradients, cotangents = (np.asarray(array) for array in (x, out, cotangent))
     run = _made_once("kernel gradient", *images.shape[-4:], cotangents.shape[-1])
     with _ALONE:
@@ -226,11 +234,11 @@ def forward(x: jax.Array, kernel: jax.Array) -> jax.Array:
 
 
 def image_gradient(cotangent: jax.Array, kernel: jax.Array) -> jax.Array:
-    """The cotangent [N, H, W, Co] brought back to the image: [N, H, W, Ci]."""
+    """The gradient by the image [N, H, W, Ci] for the cotangent [N, H, W, Co]."""
     return _program(_image_gradient, (*cotangent.shape[:3], kernel.shape[2]), cotangent, kernel, batch="expand_dims")
 
 
 def kernel_gradient(x: jax.Array, cotangent: jax.Array) -> jax.Array:
-    """The cotangent brought back to the kernel, ``sum_p x(p + offset) cotangent(p)``: [3, 3, Ci, Co]."""
+    """The gradient by the kernel, ``sum_p x(p + offset) cotangent(p)``: [3, 3, Ci, Co]."""
     shape = (3, 3, x.shape[3], cotangent.shape[3])
     return _program(_kernel_gradient, shape, x, cotangent, batch="broadcast_all")

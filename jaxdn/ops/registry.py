@@ -1,4 +1,4 @@
-"""Which implementation of an operation runs: the fastest the platform supports, or the one that was named."""
+"""Selects the implementation of an operation: the fastest on the platform, or the named one."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -20,8 +20,8 @@ def register(
 ) -> Callable[[Any], Any]:
     """Decorator: make a function the implementation ``name`` of ``operation``.
 
-    ``preferred_on`` are the platforms (``"cpu"``, ``"gpu"``, ``"tpu"``) on which it is the one that None stands for.
-    ``requires`` raises ValueError, saying what is missing, where the implementation cannot run.
+    ``preferred_on`` are the platforms (``"cpu"``, ``"gpu"``, ``"tpu"``) on which None selects it. ``requires`` raises
+    ValueError, with what is missing, if the implementation cannot run.
     """
 
     def keep(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -39,8 +39,8 @@ def implementations(operation: str) -> tuple[str, ...]:
 def resolve(operation: str, implementation: str | None) -> Callable[..., Any]:
     """The function that runs: the named one, or with None the one preferred on jax's default platform.
 
-    Resolved while tracing, so that nothing of the choice stays in the program. A name never falls back to another:
-    ValueError where it does not exist or cannot run.
+    Resolved during tracing, so the choice costs nothing at run time. There is no fallback: ValueError for a name that
+    does not exist or cannot run.
     """
     known = _IMPLEMENTATIONS[operation]
     if implementation is None:

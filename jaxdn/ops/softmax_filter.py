@@ -1,9 +1,9 @@
-"""Kernels straight from logits: the softmax over the taps and the filter in one, strip by strip.
+"""Filtering with kernels given as logits: the softmax over the taps and the filter combined, strip by strip.
 
-A 720p frame's 25 logits a pixel are 92 MB. Softmax, then filter, then whatever uses the result: XLA:CPU writes and
-reads those megabytes at every step and, as it fuses the filter into each of its users, computes it once for each of
-them. ``"strips"`` takes some rows at a time, so that the weights never leave the cache and the result is a result. Its
-gradient keeps the arguments alone and makes the weights anew.
+The 25 logits per pixel of a 720p frame are 92 MB. For softmax, filter and each use of the result, XLA:CPU writes and
+reads them again, and it recomputes the filter for each of its users, because it fuses it into them. ``"strips"``
+processes some rows at a time, so that the weights stay in the cache and the result is computed once. Its gradient
+keeps only the arguments and recomputes the weights.
 """
 
 import functools
@@ -19,7 +19,7 @@ from jaxdn.ops.kernels import check_taps
 from jaxdn.ops.registry import register, resolve
 
 _STRIP = 1_000_000
-"""Logits in a strip, about: 15 rows of two kernels at 720p."""
+"""Approximate number of logits in a strip: 15 rows of two kernels at 720p."""
 
 
 def softmax_filter(
@@ -28,9 +28,9 @@ def softmax_filter(
     """Filter images with kernels given as logits: ``apply_kernels(image, normalize_kernels(logits))``, faster.
 
     images: [n, H, W, C], any colour space. logits: [H, W, m] with m >= n * taps; image i has the ``taps`` = K*K, K odd,
-    from ``i * taps`` on, further channels are not read: a network's head goes in as it is. Returns [n, H, W, C] in
-    float32 at least. ``implementation``: "reference" or "strips"; None picks the fastest. Raises ValueError for sizes
-    that differ, too few logits, and taps that are not the square of an odd number.
+    from ``i * taps`` on; further channels are not read, so a network's head can be passed whole. Returns [n, H, W, C]
+    in float32 at least. ``implementation``: "reference" or "strips"; None selects the fastest. Raises ValueError for
+    different sizes, too few logits, and taps that are not the square of an odd number.
     """
     images, logits = jnp.asarray(images), jnp.asarray(logits)
     check_image(logits, "logits")
@@ -55,7 +55,7 @@ def _weights(logits: jax.Array, count: int, taps: int) -> list[jax.Array]:
 
 @register("softmax_filter", "reference", preferred_on=("gpu", "tpu"))
 def reference(images: jax.Array, logits: jax.Array, taps: int) -> jax.Array:
-    """The softmax, then the filter, with the gradients that the filter's best implementation has."""
+    """The softmax, then the filter, with the gradients of the filter's default implementation."""
     kernels_of = _weights(logits, images.shape[0], taps)
     return jnp.stack([kernels.apply_kernels(image, one) for image, one in zip(images, kernels_of, strict=True)])
 
@@ -97,7 +97,7 @@ def _by_strips(images: jax.Array, logits: jax.Array, taps: int) -> jax.Array:
     extended = _extend(images, radius)
 
     def strip(index: jax.Array | int, out: jax.Array) -> jax.Array:
-        first = jnp.minimum(index * rows, height - rows)  # the last strip may compute some rows again
+        first = jnp.minimum(index * rows, height - rows)  # the last strip may recompute some rows
         part = _filtered(
             lax.dynamic_slice_in_dim(extended, first, rows + 2 * radius, 1),
             lax.dynamic_slice_in_dim(logits, first, rows, 0),
@@ -115,7 +115,8 @@ def _forward(images: jax.Array, logits: jax.Array, taps: int) -> tuple[jax.Array
 def _gradients(extended: jax.Array, logits: jax.Array, cotangents: jax.Array, taps: int) -> tuple[jax.Array, jax.Array]:
     """A strip's gradients by the extended images [n, h + 2r, w + 2r, C] and by the logits [h, w, m].
 
-    With w the softmax and d_t = <cotangent, image(p + offset_t)>, that by the logits is ``w_t (d_t - sum_s w_s d_s)``.
+    With w the softmax and d_t = <cotangent, image(p + offset_t)>, the gradient by the logits is
+    ``w_t (d_t - sum_s w_s d_s)``.
     """
     height, width = logits.shape[:2]
     radius = _radius(taps)
@@ -149,7 +150,7 @@ def _backward(taps: int, residuals: tuple[jax.Array, jax.Array], cotangent: jax.
     def strip(index: jax.Array | int, sums: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         by_images, by_logits = sums
         first = jnp.minimum(index * rows, height - rows)
-        fresh = first + jnp.arange(rows) >= index * rows  # rows that the strip before has had count once
+        fresh = first + jnp.arange(rows) >= index * rows  # rows that the previous strip has computed count only once
         part_images, part_logits = _gradients(
             lax.dynamic_slice_in_dim(extended, first, rows + 2 * radius, 1),
             lax.dynamic_slice_in_dim(logits, first, rows, 0),

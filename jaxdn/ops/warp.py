@@ -1,6 +1,6 @@
-"""Fetching history: the previous frame as this frame sees it.
+"""Backward warping: the previous frame reprojected to the current frame.
 
-The public :func:`warp` and its implementations: each fetches at array positions ``x``, ``y`` [h, w] that lie inside the
+The public :func:`warp` and its implementations: each samples at array positions ``x``, ``y`` [h, w] that lie inside the
 image (0 <= x <= W - 1, likewise y).
 """
 
@@ -14,13 +14,13 @@ from jaxdn.ops.registry import register, resolve
 
 
 def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implementation: str | None = None) -> jax.Array:
-    """Fetch ``image`` [H, W, C] bilinearly at ``p + motion(p)``: the previous frame as this frame sees it.
+    """Fetch ``image`` [H, W, C] bilinearly at ``p + motion(p)``: the previous frame reprojected to this one.
 
     ``motion`` [H, W, 2] is (x, y) in pixels, y down, previous minus current. With border ``"clamp"`` the position is
     clamped to the outermost pixel centres, with ``"zeros"`` pixels outside count as zero (as in PyTorch's grid_sample
-    with align_corners=False). Where the motion is not finite the result is 0. The gradient goes to the image; motion is
-    data and gets none. ``implementation`` is None (the fastest for this platform), ``"reference"`` or ``"pairs"``.
-    Raises ValueError for shapes that do not fit and unknown options.
+    with align_corners=False). Where the motion is not finite the result is 0. Only the image has a gradient, not the
+    motion. ``implementation`` is None (the fastest for this platform), ``"reference"`` or ``"pairs"``.
+    Raises ValueError for inconsistent shapes and unknown options.
     """
     check_image(image, "image")
     check_image(motion, "motion", channels=2)
@@ -30,7 +30,7 @@ def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implemen
     # Positions of a large image do not fit into half precision.
     motion = motion.astype(jnp.promote_types(motion.dtype, jnp.float32))
     height, width = image.shape[:2]
-    # Plane by plane: XLA:CPU takes half of the time that it takes for vectors of two.
+    # Plane by plane: XLA:CPU takes half the time that it takes for vectors of two.
     known = jnp.isfinite(motion[..., 0]) & jnp.isfinite(motion[..., 1])
     x, y = (jnp.where(known, position, 0.0) for position in targets(motion))
     if border == "zeros":
@@ -45,7 +45,7 @@ def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implemen
 
 
 def _position_dtype(image: jax.Array) -> jnp.dtype:
-    """Weights are computed in the image's precision, but never in half of it."""
+    """Weights are computed in the image's precision, but at least in float32."""
     return jnp.promote_types(image.dtype, jnp.float32)
 
 
@@ -79,7 +79,7 @@ def _fetch(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     left, top, fx, fy = _cells(x, y, height, width)
     flat = image.reshape(-1)
     start = (top * width + left) * channels
-    # Two neighbours of a row lie side by side in memory: one index fetches 2C numbers.
+    # Two neighbours of a row are contiguous in memory: one index fetches 2C numbers.
     pairs = lax.GatherDimensionNumbers(offset_dims=(x.ndim,), collapsed_slice_dims=(), start_index_map=(0,))
 
     def row(offset: int) -> jax.Array:
@@ -92,7 +92,7 @@ def _fetch(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _spread(shape: tuple[int, ...], x: jax.Array, y: jax.Array, cotangent: jax.Array) -> jax.Array:
-    """The adjoint of the fetch: every value goes back to its four pixels."""
+    """The adjoint of the fetch: every value is scattered to its four pixels."""
     height, width, channels = max(shape[0], 2), max(shape[1], 2), shape[2]
     left, top, fx, fy = _cells(x, y, height, width)
     rows = [jnp.concatenate([wy * (1 - fx) * cotangent, wy * fx * cotangent], axis=-1) for wy in (1 - fy, fy)]
@@ -114,7 +114,7 @@ def _pairs(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def _forward(image: jax.Array, x: jax.Array, y: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-    # Of the image only shape and dtype matter to the adjoint; an empty slice carries it through a scan for nothing.
+    # The adjoint needs only the image's shape and dtype; an empty slice carries them through a scan at no cost.
     return _fetch(image, x, y), (image[:, :, :, None][..., :0], x, y)
 
 

@@ -1,4 +1,4 @@
-"""Which effects a scene has and what follows from them: pure functions of plain facts.
+"""The effects of a scene and the rendering plan that follows: pure functions of plain facts.
 
-The public front is :mod:`jaxdn.effects`.
+The public interface is :mod:`jaxdn.effects`.
 """

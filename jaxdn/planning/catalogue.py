@@ -1,8 +1,8 @@
-"""The effects that a scene may have: how each is found, and what it takes to simulate it.
+"""The effects that a scene may have: how each is found, and what is needed to simulate it.
 
-An effect is data. The planner knows none of them by name: a later method that reads a new buffer adds it to the effects
-that produce it, or adds an effect, and everything else follows. What the absence of an effect equals is the neutral
-value of its buffers (:data:`jaxdn.frame.BUFFERS`).
+Effects are data, and the planner treats all alike: for a method that reads a new buffer, add the buffer to the effects
+that produce it, or add an effect. The absence of an effect equals the neutral value of its buffers
+(:data:`jaxdn.frame.BUFFERS`).
 """
 
 from collections.abc import Callable, Iterable
@@ -11,25 +11,25 @@ from typing import NamedTuple
 from jaxdn.planning.facts import Facts, Moment
 
 DIRECT = 2
-"""Path length, in Mitsuba's count, of light that one surface reflects: 1 is emission, 3 one more reflection."""
+"""Path length, in Mitsuba's count, of light reflected by one surface: 1 is emission, 3 one more reflection."""
 
 
 class Effect(NamedTuple):
-    """One thing that may happen in a scene."""
+    """One effect that a scene may have."""
 
     name: str
     sentence: str
-    """What it is, for a user."""
+    """A description for the user."""
     found: Callable[[Facts, Moment], str]
-    """Why it is there in one frame; an empty string where it is not."""
+    """(facts, moment) -> the reason why one frame has it; an empty string if it does not."""
     buffers: frozenset[str] = frozenset()
-    """What it makes worth storing: buffers of a Frame."""
+    """The buffers of a Frame that it requires."""
     depth: int = DIRECT
-    """The shortest paths that show it. From :data:`DIRECT` + 1 on there is indirect light to denoise."""
+    """The shortest path length that shows it. From :data:`DIRECT` + 1 on there is indirect light to denoise."""
     integrator: str = "path"
     """Mitsuba's integrator that simulates it."""
     in_time: bool = False
-    """It is about two frames: the first frame of a clip takes it from the second."""
+    """It concerns two frames: the first frame of a clip takes it from the second."""
 
 
 def _list(names: Iterable[str]) -> str:
@@ -64,7 +64,8 @@ def _indirect(facts: Facts, moment: Moment) -> str:
     reflecting = _reflecting(facts)
     if not (facts.lights and reflecting and facts.interreflects):
         return ""
-    return f"light of {_list(light.name for light in facts.lights)} goes on from {_list(reflecting)}"
+    lights = _list(light.name for light in facts.lights)
+    return f"light of {lights} is reflected onto other surfaces by {_list(reflecting)}"
 
 
 def _glossy(facts: Facts, moment: Moment) -> str:

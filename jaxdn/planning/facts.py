@@ -1,7 +1,7 @@
-"""Plain facts about a scene in motion, as far as they decide what has to be simulated.
+"""Plain facts about an animated scene, as far as they decide what has to be simulated.
 
-The vocabulary between those who read facts (:mod:`jaxdn.render.scene_facts` from a scene,
-:mod:`jaxdn.clips.evidence` from a finished clip) and the catalogue of effects, which knows neither Mitsuba nor files.
+The data passed from the readers of facts (:mod:`jaxdn.render.scene_facts` for a scene, :mod:`jaxdn.clips.evidence` for
+a finished clip) to the catalogue of effects, which depends neither on Mitsuba nor on files.
 """
 
 from collections.abc import Mapping
@@ -11,12 +11,12 @@ NO_NAMES: frozenset[str] = frozenset()
 
 
 class Surface(NamedTuple):
-    """One shape and what light does on it."""
+    """One shape and how it scatters light."""
 
     name: str
     lobes: frozenset[str] = frozenset({"diffuse"})
-    """Of ``diffuse``, ``glossy`` (rougher than a mirror, smoother than diffuse), ``mirror``, ``transmission``; empty
-    for what reflects nothing."""
+    """Some of ``diffuse``, ``glossy`` (rougher than a mirror, smoother than diffuse), ``mirror``, ``transmission``;
+    empty if it reflects nothing."""
     textured: bool = False
     """Its diffuse reflectance varies over the surface."""
     medium: bool = False
@@ -28,16 +28,16 @@ class Light(NamedTuple):
 
     name: str
     environment: bool = False
-    """It shines from everywhere around and is seen where the camera's rays leave the scene."""
+    """It surrounds the scene and is seen where the camera's rays leave the scene."""
 
 
 class Moment(NamedTuple):
     """What happens between one frame and the one before it; names are those of shapes and lights."""
 
     camera: bool = False
-    """The camera, or its field of view, is another one."""
+    """The camera moved, or its field of view changed."""
     moving: frozenset[str] = NO_NAMES
-    """Shapes with another pose."""
+    """Shapes whose pose changed."""
     seen: frozenset[str] = NO_NAMES
     """Those of them that may be on screen in one of the two frames."""
     reveals: bool = False
@@ -49,17 +49,17 @@ class Moment(NamedTuple):
 
 
 class Facts(NamedTuple):
-    """A scene in motion."""
+    """An animated scene."""
 
     surfaces: tuple[Surface, ...]
     lights: tuple[Light, ...]
     moments: tuple[Moment, ...]
-    """One a frame; the first one has nothing before it."""
+    """One per frame; the first has no previous frame."""
     medium: bool = False
-    """The camera itself stands in a participating medium."""
+    """The camera itself is in a participating medium."""
     interreflects: bool = True
     """Light reflected by one surface may reach another one."""
     max_depth: int | None = None
-    """Path length that the scene asks for (1 emission, 2 direct, 3 one bounce of indirect light)."""
+    """Path length that the scene specifies (1 emission, 2 direct, 3 one bounce of indirect light)."""
     uncertain: Mapping[str, str] = {}
     """Effect -> why it could not be decided; such an effect counts as present."""

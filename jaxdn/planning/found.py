@@ -11,7 +11,7 @@ IN_TIME = frozenset(effect.name for effect in EFFECTS if effect.in_time)
 
 @dataclass(frozen=True)
 class Effects:
-    """The effects of a clip. ``"glossy" in effects`` asks for one, iterating gives their names in a fixed order."""
+    """The effects of a clip. ``"glossy" in effects`` tests for one; iteration gives the names in a fixed order."""
 
     names: tuple[str, ...]
     """Effects present in some frame."""
@@ -20,14 +20,14 @@ class Effects:
     uncertain: Mapping[str, str]
     """Effect -> why it could not be decided; it counts as present."""
     frames: tuple[frozenset[str], ...]
-    """The effects of every frame. The first frame has those of the second: nothing has moved yet, but a step compiled
-    for it alone would be a second program in nearly every clip."""
+    """The effects of every frame. The first frame takes those that concern two frames from the second: nothing has
+    moved yet, but it would otherwise need a separately compiled step in nearly every clip."""
     held: tuple[int, ...]
-    """For every frame the earliest one that shows the same: nothing moved or changed since, but for the noise."""
+    """For every frame the earliest one that shows the same, except for the noise: nothing moved or changed since."""
     lit: bool = True
-    """There is light at all."""
+    """The scene has any light."""
     max_depth: int | None = None
-    """The path length that the scene itself asks for."""
+    """The path length that the scene itself specifies."""
 
     def __contains__(self, name: object) -> bool:
         return name in self.names
@@ -64,7 +64,7 @@ def find(facts: Facts) -> Effects:
 
 
 def chosen(names: Iterable[str], frames: int) -> Effects:
-    """Just the named effects, in every frame. Raises ValueError for a name that is none, listing those there are."""
+    """Only the named effects, in every frame. Raises ValueError for an unknown name, listing the known ones."""
     wanted = set(names)
     unknown = sorted(wanted - set(NAMES))
     if unknown:
@@ -72,7 +72,7 @@ def chosen(names: Iterable[str], frames: int) -> Effects:
     still = not wanted & IN_TIME
     return Effects(
         tuple(name for name in NAMES if name in wanted),
-        dict.fromkeys(wanted, "asked for"),
+        dict.fromkeys(wanted, "requested"),
         {},
         (frozenset(wanted),) * frames,
         (0,) * frames if still else tuple(range(frames)),
@@ -80,5 +80,5 @@ def chosen(names: Iterable[str], frames: int) -> Effects:
 
 
 def everything(frames: int) -> Effects:
-    """Every effect in every frame: what a renderer does that looks at nothing."""
+    """Every effect in every frame: rendering without inspection."""
     return chosen(NAMES, frames)

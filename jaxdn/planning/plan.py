@@ -1,4 +1,4 @@
-"""What to render, store and compute: what the scene has *and* the denoiser can use, and nothing else."""
+"""What to render, store and compute: only what the scene has *and* the denoiser can use."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -9,27 +9,27 @@ from jaxdn.planning.catalogue import DIRECT, EFFECTS
 from jaxdn.planning.found import Effects
 
 GEOMETRY = frozenset({"albedo", "normal", "depth", "ids"})
-"""Buffers that every scene has. A constant albedo is still one: dividing by it is what makes rooms alike."""
+"""Buffers that every scene has. A constant albedo is kept too: dividing by it makes scenes similar."""
 COMPOSED = frozenset({"direct", "emission"})
-"""Buffers that no denoiser need read: they are added to its image."""
+"""Buffers that are added to the denoised image, whether or not the denoiser reads them."""
 BOUND = 0.01
-"""Share of a picture's reflected light that may be missing when paths end."""
+"""Largest share of an image's reflected light that limited path lengths may leave out."""
 
 
 class Plan(NamedTuple):
-    """What a renderer has to do for one clip."""
+    """The work of a renderer for one clip."""
 
     integrator: str
-    """Mitsuba's (``path``, ``volpath``), or ``none`` where there is no light at all."""
+    """Mitsuba's (``path``, ``volpath``), or ``none`` for a scene without light."""
     max_depth: int | None
-    """Path length; None leaves it to the scene."""
+    """Path length; None: that of the scene."""
     indirect: bool
     """Whether there is anything to denoise."""
     effects: tuple[str, ...]
     frames: tuple[tuple[str, ...], ...]
     """The buffers of each frame's file, without ``radiance``."""
     held: tuple[int, ...]
-    """For each frame the one whose buffers and reference it shares; its own file then holds the noise alone."""
+    """For each frame the one whose buffers and reference it shares; its own file then stores only the noise."""
 
     @property
     def buffers(self) -> tuple[str, ...]:
@@ -37,11 +37,11 @@ class Plan(NamedTuple):
         return tuple(name for name in GUIDES if any(name in frame for frame in self.frames))
 
     def programs(self, reads: frozenset[str] | None = None) -> int:
-        """How many steps have to be compiled: one for each distinct set of buffers (of those in ``reads``)."""
+        """How many steps are compiled: one for each distinct set of buffers (of those in ``reads``)."""
         return len({frozenset(frame) if reads is None else frozenset(frame) & reads for frame in self.frames})
 
     def record(self) -> dict[str, Any]:
-        """The plan as JSON, for ``clip.json`` and ``--json``; :func:`plan_from_record` is the way back."""
+        """The plan as JSON, for ``clip.json`` and ``--json``; :func:`plan_from_record` is the inverse."""
         return {
             **self._asdict(),
             "effects": list(self.effects),
@@ -51,12 +51,12 @@ class Plan(NamedTuple):
 
 
 def entries(record: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """What a plan's record says today: entries that only an earlier version wrote are left out. None stays None."""
+    """The entries of a plan's record that this version uses; those of earlier versions are dropped. None stays None."""
     return None if record is None else {name: record[name] for name in Plan._fields if name in record}
 
 
 def plan_from_record(record: Mapping[str, Any]) -> Plan:
-    """The plan that :meth:`Plan.record` wrote, in this version or an earlier one. Raises ValueError for less."""
+    """The plan that :meth:`Plan.record` wrote, in this or an earlier version. Raises ValueError for missing entries."""
     missing = [name for name in Plan._fields if name not in record]
     if missing:
         raise ValueError(f"plan: expected the entries {', '.join(Plan._fields)}; these are missing: {missing}.")
@@ -66,9 +66,9 @@ def plan_from_record(record: Mapping[str, Any]) -> Plan:
 
 
 def plan(effects: Effects, denoiser: Denoiser | None = None, *, max_depth: int | None = None) -> Plan:
-    """The intersection of what a scene has and what a denoiser reads (None: whatever any denoiser may read).
+    """The intersection of the effects of a scene and the buffers that a denoiser reads (None: all buffers).
 
-    ``max_depth`` is the path length to render with, the scene's own by default
+    ``max_depth`` is the path length to render with, by default the scene's
     (:func:`jaxdn.render.depth.measure_depth` measures it).
     """
     by_name = {effect.name: effect for effect in EFFECTS}

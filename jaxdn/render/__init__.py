@@ -1,6 +1,6 @@
 """Rendering animated scenes with Mitsuba 3: noisy layers, references, G-buffers and motion vectors.
 
-The only room that imports Mitsuba, and only when something is rendered.
+The only subpackage that imports Mitsuba, and only when something is rendered.
 """
 
 import importlib

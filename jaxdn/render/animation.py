@@ -1,6 +1,6 @@
-"""Animation files: keys for the camera, keys for shapes, and shapes to insert into a scene that stands still.
+"""Animation files: keys for the camera, keys for shapes, and shapes to insert into a static scene.
 
-One JSON object next to the scene file; every part may be left out:
+One JSON object next to the scene file; every part is optional:
 
     {"frames": 16,
      "camera": [{"frame": 0, "origin": [0, 1, 5], "target": [0, 1, 0], "fov": 40}, {"frame": 15, ...}],
@@ -12,11 +12,11 @@ One JSON object next to the scene file; every part may be left out:
      "lights": {"lamp": [{"frame": 0, "scale": 1}, {"frame": 8, "scale": 0}]}}
 
 Camera keys have ``origin``, ``target``, ``up`` or a rigid camera-to-world ``matrix``, and ``fov``, the horizontal
-field of view in degrees. A shape's keys move it from where the scene file puts it: a rotation about its ``pivot``,
+field of view in degrees. A shape's keys move it from its place in the scene file: a rotation about its ``pivot``,
 then a translation. An inserted shape is a sphere, cube, cylinder (along z) or rectangle (facing +z) that fills a box of
-``size`` (one number or its extents) around the origin; its keys place it. Between keys positions run linearly,
-rotations about one axis linearly in the angle, others along the great arc; before the first and after the last key
-things rest. ``lights`` names emitters, or shapes that emit, and scales their radiance.
+``size`` (one number or its extents) around the origin; its keys place it. Between keys, positions are interpolated
+linearly, rotations about one axis linearly in the angle, other rotations spherically; before the first and after the
+last key everything rests. ``lights`` names emitters, or shapes that emit, and scales their radiance.
 """
 
 import difflib
@@ -44,7 +44,7 @@ class RigidKeys:
         self.axes = np.array([_unit(key.get("axis", (0.0, 1.0, 0.0))) for key in keys])
         self.angles = np.array([float(key.get("angle", 0.0)) for key in keys])
         self.pivot = pivot
-        # A rotation by nothing may count as one about its neighbour's axis: so that 0 to 720 degrees is two turns.
+        # A zero rotation takes the axis of its neighbour, so that 0 to 720 degrees are two full turns.
         for index in (*range(1, len(keys)), *range(len(keys) - 2, -1, -1)):
             other = index - 1 if index else min(1, len(keys) - 1)
             if self.angles[index] == 0.0 and self.angles[other] != 0.0:
@@ -90,7 +90,7 @@ class CameraKeys:
         return look_at(origin, target, up)
 
     def fov(self, frame: float) -> float | None:
-        """Horizontal field of view in degrees; None where the keys leave it to the scene file."""
+        """Horizontal field of view in degrees; None if only the scene file gives it."""
         if "fov" not in self.keys[0]:
             return None
         return float(np.interp(frame, self.frames, [key["fov"] for key in self.keys]))
@@ -104,7 +104,7 @@ def light_scale(keys: Sequence[Mapping[str, Any]], frame: float) -> float:
 
 
 def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Camera to world as Mitsuba has it: +z towards the target, +x to the left; ValueError if undefined."""
+    """Camera to world in Mitsuba's convention: +z towards the target, +x to the left; ValueError if undefined."""
     forward = target - origin
     left = np.cross(up, forward)
     if np.linalg.norm(left) <= 1e-9 * (1 + np.linalg.norm(forward)):
@@ -128,7 +128,7 @@ def rotation_matrix(axis: np.ndarray, degrees: float) -> np.ndarray:
 
 
 def slerp(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
-    """The rotation that lies at ``share`` of the great arc between two: first (first^T second)^share."""
+    """Spherical interpolation of two rotations at ``share``: first (first^T second)^share."""
     if np.array_equal(first, second):  # by its own test below, rounding may turn what stands still
         return first
     between = first.T @ second
@@ -146,7 +146,7 @@ def slerp(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
 
 
 def read_animation(path: Path) -> dict[str, Any]:
-    """The JSON object of an animation file; raises ValueError if it is none (not a number, as in NaN, is not JSON)."""
+    """The JSON object of an animation file; raises ValueError if it is not one (NaN is not JSON)."""
 
     def refuse(word: str) -> float:
         raise ValueError(f"expected finite numbers, got {word}")
@@ -159,9 +159,9 @@ def read_animation(path: Path) -> dict[str, Any]:
 
 
 def check_animation(animation: Any, shape_ids: Iterable[str], *, has_camera: bool = True) -> None:
-    """Raise ValueError with the place of the mistake unless ``animation`` fits a scene with these shapes.
+    """Raise ValueError with the place of the error unless ``animation`` fits a scene with these shapes.
 
-    Whether its lights are lights of the scene is for who loads the scene to say.
+    Whether its lights are lights of the scene is checked when the scene is loaded.
     """
     ids = list(shape_ids)
     _known(animation, _TOP, "animation")
@@ -309,7 +309,7 @@ def _numbers(value: Any, count: int, place: str) -> np.ndarray:
 
 
 def _mix(first: Any, second: Any, share: float) -> Any:
-    """From one to the other, and exactly the one where both are equal: what rests must not tremble."""
+    """Linear interpolation, exact where both are equal, so that resting objects do not jitter."""
     return first + share * (second - first)
 
 

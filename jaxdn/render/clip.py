@@ -1,4 +1,4 @@
-"""Render one frame, or a whole clip into a folder of OpenEXR frames, restartable at any point."""
+"""Render one frame, or a clip into a folder of OpenEXR frames, resumable at any point."""
 
 import importlib.metadata
 import platform
@@ -26,11 +26,11 @@ _SURFACE = ("albedo", "normal", "depth", "roughness", "ids")
 _DISOCCLUSION = frozenset({"dual_motion", "visible"})
 _MOTION = frozenset({"motion", "previous_depth"}) | _DISOCCLUSION
 _FREE = ("frames", "cameras", "versions", "bad_samples")
-"""Entries of a record that may change when rendering goes on."""
+"""Entries of a record that may change when rendering is resumed."""
 
 
 class Rendered(NamedTuple):
-    """One frame with everything a clip stores of it; NumPy arrays."""
+    """Everything that a clip stores of one frame, as NumPy arrays."""
 
     frame: Frame
     """``radiance`` is the noisy layer with the fewest samples."""
@@ -39,9 +39,9 @@ class Rendered(NamedTuple):
     reference: np.ndarray | None
     """[H, W, 3] converged indirect radiance, of samples that no noisy layer contains."""
     reference_half: np.ndarray | None
-    """[H, W, 3] the same of the first half of its samples."""
+    """[H, W, 3] the same from the first half of its samples."""
     view: View | None
-    """What the next frame's motion vectors need; None where the plan asked for no look at the scene."""
+    """Input of the next frame's motion vectors; None if the plan needs no G-buffer."""
     bad_samples: int
     """Samples that were not finite and count as black."""
 
@@ -62,16 +62,24 @@ def render_frame(
 ) -> Rendered:
     """Render one frame of an animated scene: noisy layers, a reference, G-buffers and motion vectors.
 
-    ``layers`` are numbers of samples, powers of two. ``direct`` and ``emission`` are means over the reference's
-    samples, or over the noisy ones if ``reference_spp`` is 0. ``previous`` is the ``view`` of the frame before,
-    computed if it is not given; frame 0 has none, and its motion is 0. The result depends on nothing but the
-    arguments: the same frame rendered again, alone or in another process, is the same bit for bit.
+    ``direct`` and ``emission`` are means over the reference's samples, or over the noisy ones if ``reference_spp`` is
+    0. The result depends only on the arguments: the same frame rendered again, alone or in another process, is the same
+    bit for bit. Raises ValueError for options out of range and scenes with unsupported effects.
 
-    A ``plan`` leaves out what the scene does not call for: buffers that are None then, paths longer than its
-    ``max_depth`` (one given here wins), and, in a frame that shows what an earlier one did (``plan.held``), everything
-    but the noise. What is left is the same as without a plan, bit for bit.
-
-    Raises ValueError for options out of range and scenes with effects that are not supported.
+    Args:
+      scene: to render.
+      frame: index of the frame.
+      width: in pixels.
+      height: in pixels.
+      layers: samples per pixel of the noisy layers, powers of two.
+      reference_spp: samples per pixel of the reference; 0 for none.
+      max_depth: path length; default: that of the plan, else of the scene.
+      seed: of the random numbers.
+      variant: Mitsuba's; default: the fastest that works here.
+      previous: the ``view`` of the frame before, computed if it is not given; frame 0 has none, and its motion is 0.
+      plan: what to leave out: buffers (None then), paths longer than its ``max_depth``, and, in a frame that shows the
+        same as an earlier one (``plan.held``), everything except the noise. The rest is the same as without a plan, bit
+        for bit.
     """
     _check_options(width, height, layers, reference_spp)
     accumulate, _ = tracer(use_variant(variant))
@@ -92,7 +100,7 @@ def render_frame(
             return no_light((height, width))
         return accumulate(built, seed=seed, frame=frame, stream=stream, first=first, count=count, max_depth=depth)
 
-    # Layer n always holds the samples n-1 ... 2n-2: the same image whichever other layers are asked for.
+    # Layer n always holds the samples n-1 ... 2n-2: its image does not depend on the other layers.
     noisy = {samples: light(NOISY, samples - 1, samples) for samples in sorted(layers)}
     halves = []
     if reference_spp and not repeated:
@@ -138,11 +146,24 @@ def render_clip(
 ) -> Path:
     """Render the frames 0 ... ``frames`` - 1 into ``folder``: one ``frame_0000.exr`` each, and then ``clip.json``.
 
-    Frames that are already there and whole are kept, so that an interrupted rendering goes on where it stopped; the
-    folder has to have been begun with the same settings (ClipError otherwise). It is a clip when all frames are there,
-    and not before (:func:`jaxdn.clips.folder.begin_record`). ``progress`` is called with the number of every frame that
-    is finished or found. A ``plan`` for these frames is obeyed and kept in the record. Returns the folder. Raises
-    RenderError, naming the clip and the frame, if a frame cannot be rendered or written.
+    Existing complete frames are kept, so that an interrupted rendering is resumed; the folder must have been started
+    with the same settings (ClipError otherwise). It only becomes a clip when all frames exist
+    (:func:`jaxdn.clips.folder.begin_record`). Returns the folder. Raises RenderError, naming the clip and the frame, if
+    a frame cannot be rendered or written.
+
+    Args:
+      scene: to render.
+      folder: of the clip.
+      width: in pixels.
+      height: in pixels.
+      frames: number of frames; default: that of the scene.
+      layers: as in :func:`render_frame`, like the next five.
+      reference_spp: samples per pixel of the reference; 0 for none.
+      max_depth: path length.
+      seed: of the random numbers.
+      variant: Mitsuba's.
+      plan: for these frames; it is stored in the record.
+      progress: called with the index of every frame that is finished or already exists.
     """
     folder = Path(folder)
     frames = scene.frames if frames is None else frames
@@ -209,14 +230,14 @@ def _write(path: Path, rendered: Rendered) -> None:
 
 
 def _path_length(scene: AnimatedScene, max_depth: int | None, plan: Plan | None) -> int:
-    """A user's own wins, then the plan's, then the scene's."""
+    """The given path length, else the plan's, else the scene's."""
     if max_depth is not None and max_depth < 1:
         raise ValueError(f"max_depth: expected at least 1 (emission only), got {max_depth}.")
     return max_depth or (plan.max_depth if plan else None) or scene.max_depth
 
 
 def tracer(variant: str) -> tuple[Callable[..., Accumulated], bool]:
-    """The tracer of a variant, and whether it spreads its samples over the pixel."""
+    """The tracer of a variant, and whether it distributes its samples over the pixel."""
     if variant.startswith("scalar"):
         from jaxdn.render.exact import accumulate as exact
 
@@ -232,7 +253,7 @@ def _view(scene: AnimatedScene, frame: int, built: Any) -> View:
 
 
 def _motion(view: View, previous: View | None, *, disocclusion: bool) -> dict[str, Any]:
-    """The Frame's buffers about motion; nothing has moved yet in a first frame."""
+    """The motion buffers of a Frame; in the first frame nothing has moved yet."""
     if previous is None:
         zero = np.zeros((*view.gbuffer.ids.shape[:2], 2), np.float32)
         seen = np.ones_like(view.gbuffer.ids, bool)
@@ -276,14 +297,14 @@ def _versions() -> dict[str, str]:
 def _check_settings(folder: Path, wanted: Mapping[str, Any], found: Mapping[str, Any]) -> None:
     """Raise ClipError if the frames in a folder were rendered with other settings."""
     found = {**found, "plan": entries(found.get("plan"))}
-    # Compared as JSON gives it back: a tuple has become a list there.
+    # Compared in the form read from JSON, where tuples have become lists.
     differing = [key for key in wanted if key not in _FREE and _plain(found.get(key)) != _plain(wanted[key])]
     cameras = zip(found.get("cameras", []), wanted["cameras"], strict=False)
     if any(_plain(first) != _plain(second) for first, second in cameras):
         differing.append("cameras")
     if differing:
         pairs = ((key, str(found.get(key))[:60], str(wanted[key])[:60]) for key in differing)
-        what = "; ".join(f"{key}: {there} there, {asked} wanted" for key, there, asked in pairs)
+        what = "; ".join(f"{key}: {there} there, {new} wanted" for key, there, new in pairs)
         raise ClipError(f"{folder}: was rendered with other settings ({what}); choose another folder or remove it.")
 
 

@@ -1,8 +1,8 @@
-"""How long paths have to be: measured on a few cheap samples of the scene itself.
+"""The necessary path length, measured with a few samples of the scene.
 
-A path of depth D + 1 sees all the light of depth D and one bounce more, so the sums of a few samples at growing depths
-tell what each bounce adds. From some bounce on each adds a fixed share of the one before it, and what is still missing
-is a geometric series.
+Paths of depth D + 1 collect the light of depth D and one more bounce, so the sums of a few samples at increasing depths
+give what each bounce adds. From some bounce on each adds a fixed share of the one before it, and the rest is a
+geometric series.
 """
 
 import itertools
@@ -20,14 +20,14 @@ _DEPTHS = (2, 3, 4, 5, 6, 8, 10, 13, 17, 24)
 
 
 class PathDepth(NamedTuple):
-    """The path length found, and how sure it is."""
+    """The chosen path length and its estimated error."""
 
     max_depth: int
     """Path length in Mitsuba's count: 1 is emission, 2 direct, 3 one bounce of indirect light."""
     remaining: float
     """Estimated share of the reflected light that longer paths would add."""
     bound: float
-    """The share that was allowed."""
+    """The allowed share."""
     light: dict[int, float]
     """Path length -> mean reflected radiance, as measured."""
 
@@ -35,11 +35,11 @@ class PathDepth(NamedTuple):
 def measure_depth(scene: AnimatedScene, *, bound: float = BOUND) -> PathDepth:
     """The shortest path length that leaves out at most ``bound`` of the reflected light, measured in the first frame.
 
-    Light that the camera sees directly does not count: next to a bright window everything else would be negligible.
-    There are 16 samples for each of 24 x 24 pixels; all depths follow the same paths, so that their differences are
-    exact. Never longer than the scene's own ``max_depth``, and never so short that there is no indirect light. What
-    remains after depth D is taken as a geometric series with the ratio of the last two bounces measured, or of the last
-    three if they decay slower. Raises ValueError for a bound outside (0, 1).
+    Light that the camera sees directly does not count: next to a bright window everything else would be negligible. It
+    takes 16 samples for each of 24 x 24 pixels; all depths follow the same paths, so that their differences are exact.
+    The result is at most the scene's own ``max_depth`` and always includes indirect light. The light beyond depth D is
+    estimated as a geometric series with the ratio of the last two measured bounces, or of the last three if they decay
+    slower. Raises ValueError for a bound outside (0, 1).
     """
     if not 0 < bound < 1:
         raise ValueError(f"bound: expected a share of the light between 0 and 1, got {bound!r}.")
@@ -57,7 +57,7 @@ def measure_depth(scene: AnimatedScene, *, bound: float = BOUND) -> PathDepth:
 
 
 def _gains(light: dict[int, float]) -> list[float]:
-    """What each measured depth added, per bounce."""
+    """The light added by each measured depth, per bounce."""
     depths = sorted(light)
     return [(light[b] - light[a]) / (b - a) for a, b in itertools.pairwise(depths)]
 
@@ -69,7 +69,7 @@ def _remaining(light: dict[int, float]) -> float:
     if total <= 0 or len(gains) < 2 or gains[-1] <= 0:
         return 0.0
     middles = [(a + b) / 2 for a, b in itertools.pairwise(depths)]
-    # The slower of two decays: a single bounce of few samples is noisy.
+    # The slower of two decay rates: with few samples a single bounce is noisy.
     ratios = [
         (gains[-1] / gains[-back]) ** (1 / (middles[-1] - middles[-back]))
         for back in (2, 3)
@@ -82,7 +82,7 @@ def _remaining(light: dict[int, float]) -> float:
 
 
 def _shortest(light: dict[int, float], bound: float) -> PathDepth:
-    """Of the measured depths the shortest that still keeps within the bound; the longest if none does."""
+    """The shortest measured depth within the bound; the longest if none is."""
     depths = sorted(light)
     tail = _remaining(light)
     full = light[depths[-1]] * (1 + tail)

@@ -1,4 +1,4 @@
-"""The error that rendering raises; this module imports no renderer, so that whoever handles errors needs none."""
+"""The error that rendering raises; this module imports no renderer, so that error handlers need none."""
 
 
 class RenderError(RuntimeError):

@@ -1,9 +1,9 @@
-"""The same three parts of radiance from Mitsuba's own ``path`` integrator, for the variant without vectorisation.
+"""Emitted, direct and indirect radiance from Mitsuba's own ``path`` integrator, for the scalar variant.
 
 With the same seed and one sample per pixel two ``path`` integrators of different depth follow the same paths, so that
 ``path(D) - path(2)`` is exactly the indirect light of ``path(D)``: never negative. With more than one sample the
-streams of random numbers drift apart, hence the loop over passes of one sample each. Samples are spread over the
-pixel (box filter): Mitsuba offers nothing else here.
+streams of random numbers diverge, hence the loop over passes of one sample each. Samples are distributed over the pixel
+(box filter): Mitsuba has no other option here.
 """
 
 from typing import Any
@@ -18,7 +18,7 @@ _NO_ROULETTE = 1000
 
 
 def _integrators(max_depth: int) -> list[Any]:
-    """The whole of the light, without indirect light, and emission alone."""
+    """Integrators of all light, of light without the indirect part, and of emission only."""
     # Three renderings are three times faster than one "aov" integrator around all three.
     return [
         mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": _NO_ROULETTE})
@@ -29,7 +29,17 @@ def _integrators(max_depth: int) -> list[Any]:
 def accumulate(
     scene: Any, *, seed: int, frame: int, stream: int, first: int, count: int, max_depth: int
 ) -> Accumulated:
-    """The sums of the passes ``first`` to ``first + count`` of one stream; see :func:`wavefront.accumulate`."""
+    """The sums of the passes ``first`` to ``first + count`` of one stream; see :func:`wavefront.accumulate`.
+
+    Args:
+      scene: the ``mi.Scene``.
+      seed: of the clip.
+      frame: index of the frame.
+      stream: of :mod:`jaxdn.render.seeds`.
+      first: index of the first pass.
+      count: number of passes.
+      max_depth: path length.
+    """
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     integrators = _integrators(max_depth)
     total = no_light((height, width))
@@ -42,7 +52,7 @@ def accumulate(
         ]
         finite = np.all(np.stack(images) < BRIGHTEST, axis=(0, -1), keepdims=True)[0]
         whole, two, one = (np.where(finite, image, 0.0) for image in images)
-        # The film adds in float32: a last-digit difference of two equal sums must not become a negative light.
+        # The film adds in float32: a last-digit difference of two equal sums must not become negative light.
         direct, indirect = np.maximum(two - one, 0.0), np.maximum(whole - two, 0.0)
         total = total.plus(Accumulated(one, direct, indirect, int(np.sum(~finite))))
     return total

@@ -1,7 +1,7 @@
-"""Render many clips at once, a process for each.
+"""Render many clips in parallel, one process each.
 
-Several processes of few threads are about a third faster than one process of many, and a process that dies takes one
-clip with it. Frames are whole files from the moment they have their name: whatever ends the work, it goes on there.
+Several processes with few threads are about a third faster than one process with many, and a process that dies affects
+only one clip. A frame's file gets its name when it is complete, so an interrupted rendering can always be resumed.
 """
 
 import multiprocessing
@@ -21,7 +21,7 @@ from jaxdn.render.opening import scene_from_record
 from jaxdn.render.variant import choose_variant
 
 _THREADS = 2
-"""Renderer threads of each process. With a single one Mitsuba's loader waits for ever on some scenes' textures."""
+"""Renderer threads of each process. With only one, Mitsuba's loader waits forever for some scenes' textures."""
 
 
 class ClipJob(NamedTuple):
@@ -38,7 +38,7 @@ class ClipJob(NamedTuple):
     max_depth: int | None = None
     seed: int = 0
     variant: str | None = None
-    """None: the one that the clip in the folder was begun with, or where there is none, the fastest that works here."""
+    """None: the one that the clip in the folder was started with, else the fastest that works here."""
     plan: dict[str, Any] | None = None
     """The record of a :class:`jaxdn.planning.plan.Plan`; None renders everything."""
 
@@ -48,7 +48,7 @@ class _Worker(NamedTuple):
     process: BaseProcess
     messages: Connection
     finished: list[int]
-    """Frames that it reported."""
+    """Frames that it has reported."""
 
 
 def render_clips(
@@ -59,9 +59,9 @@ def render_clips(
 ) -> list[Path]:
     """Render clips in ``workers`` processes (default: one for every core) and return their folders.
 
-    ``progress`` shows frames done of all frames and the time left, or is called with these two numbers. Ctrl-C stops
-    the processes and keeps every finished frame; calling again goes on. A clip that fails does not stop the others:
-    at the end RenderError names each failed clip, the frame it failed at, and why.
+    ``progress`` shows the frames done, the total and the time left, or is called with the first two. Ctrl-C stops the
+    processes and keeps every finished frame; another call resumes. A failed clip does not stop the others: at the end
+    RenderError names each failed clip, its frame and the reason.
     """
     waiting = [_as_begun(job) for job in jobs]
     folders = [job.folder for job in waiting]
@@ -107,31 +107,31 @@ def render_clips(
 
 
 def _as_begun(job: ClipJob) -> ClipJob:
-    """The job with a variant: a clip is finished, and found finished, with the one that it was begun with."""
+    """The job with a variant: a clip is completed, and checked for completeness, with the one it was started with."""
     begun = begun_record(job.folder) if job.variant is None else None
     return job if begun is None else job._replace(variant=begun.get("variant"))
 
 
 def _finished(job: ClipJob) -> bool:
-    """Whether a clip is there with all its frames, as it was asked for: it takes no process to find that out."""
+    """Whether the clip exists with all its frames and the wanted settings; this needs no separate process."""
     if not is_clip(job.folder):
         return False
     record = read_record(job.folder)
     wanted: dict[str, Any] = {"width": job.width, "height": job.height, "frames": job.frames, "seed": job.seed}
     wanted |= {"layers": sorted(job.layers), "reference_spp": job.reference_spp, "scene": job.scene}
     chosen = {"max_depth": job.max_depth, "variant": job.variant}
-    # A clip from before there were plans has no such entry, and everything in it.
+    # A clip from before plans existed has no such entry, and all buffers.
     if entries(record.get("plan")) != entries(job.plan):
         return False
     wanted |= {key: value for key, value in chosen.items() if value is not None}
-    # A frame's file has its name from the moment it is whole.
+    # A frame's file gets its name only when it is complete.
     return all(record.get(key) == value for key, value in wanted.items()) and all(
         frame_path(job.folder, frame).is_file() for frame in range(job.frames)
     )
 
 
 def _start(job: ClipJob, *, threads: int) -> _Worker:
-    # A forked child would inherit the renderer's and JAX's threads half-way; a spawned one starts clean.
+    # A forked child would inherit an inconsistent state of the renderer's and JAX's threads; a spawned one does not.
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_work, args=(job, sender, threads), daemon=True)
@@ -141,8 +141,8 @@ def _start(job: ClipJob, *, threads: int) -> _Worker:
 
 
 def _work(job: ClipJob, messages: Connection, threads: int) -> None:
-    """Runs in a process of its own: render one clip and report each frame."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business, it ends this process
+    """Runs in a separate process: render one clip and report each frame."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     try:
         from jaxdn.render.clip import render_clip
@@ -168,7 +168,7 @@ def _work(job: ClipJob, messages: Connection, threads: int) -> None:
 
 
 def _listen(worker: _Worker) -> tuple[int, str, bool]:
-    """What a worker has to say: frames finished since, why it failed ("" if it did not), whether it has ended."""
+    """A worker's messages: newly finished frames, the reason of a failure ("" for none), whether it has ended."""
     frames = 0
     while True:
         try:
@@ -176,7 +176,7 @@ def _listen(worker: _Worker) -> tuple[int, str, bool]:
                 return frames, "", False
             message = worker.messages.recv()
         except (EOFError, OSError):
-            # Its end of the pipe is closed and it never said why: something ended the process from outside.
+            # The pipe was closed without a message: the process was ended from outside.
             worker.process.join()
             return frames, _death(worker), True
         if isinstance(message, int):
@@ -193,7 +193,7 @@ def _death(worker: _Worker) -> str:
         cause = signal.Signals(-code).name
         cause += {"SIGKILL": " (out of memory?)", "SIGABRT": " (an LLVM that does not work?)"}.get(cause, "")
     frame = worker.finished[-1] + 1 if worker.finished else 0
-    return f"clip in {worker.job.folder}, frame {frame}: the renderer's process died: {cause}. Start again to go on."
+    return f"clip in {worker.job.folder}, frame {frame}: the renderer's process died: {cause}. Start again to resume."
 
 
 def _display(
@@ -205,7 +205,7 @@ def _display(
 
 
 class _Bar:
-    """A progress bar: frames done of all frames, time gone and time left."""
+    """A progress bar: frames done, total, elapsed and remaining time."""
 
     def __init__(self, total: int) -> None:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
@@ -227,7 +227,7 @@ class _Bar:
         self._bar.update(self._task, completed=done, total=total)
 
     def _say(self, done: int, total: int) -> None:
-        """A line for each tenth where nobody watches a bar move."""
+        """Print a line per tenth where there is no terminal for a bar."""
         self._show(done, total)
         if 10 * done // max(total, 1) > self._tenths:
             self._tenths = 10 * done // max(total, 1)

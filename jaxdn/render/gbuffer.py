@@ -1,6 +1,6 @@
-"""What the camera sees through pixel centres: albedo, normal, depth, roughness, position and shape ids.
+"""G-buffers at pixel centres: albedo, normal, depth, roughness, position and shape ids.
 
-Free of noise, because one ray through each pixel centre is all there is to it. Mitsuba's own albedo buffer is no
+They are free of noise, as there is exactly one ray through each pixel centre. Mitsuba's own albedo buffer is no
 reflectance for rough conductors and blends (it evaluates the BSDF at normal incidence), and its depth starts at the
 near plane, so these are taken from the BSDFs and positions directly.
 """
@@ -38,7 +38,7 @@ class GBuffer(NamedTuple):
 
 
 def shape_names(scene: Any) -> list[str]:
-    """The name of every shape in the scene's own order; one without a name is called after its place."""
+    """The name of every shape in the scene's order; unnamed shapes are named by their index."""
     names = [shape.id() or f"shape_{index:04d}" for index, shape in enumerate(scene.shapes())]
     if len(set(names)) != len(names):
         raise ValueError("scene: expected every shape to have an id of its own; load it with optimize=False.")
@@ -46,7 +46,7 @@ def shape_names(scene: Any) -> list[str]:
 
 
 def check_scene(scene: Any) -> None:
-    """Raise ValueError for what the tracers would otherwise leave out without a word."""
+    """Raise ValueError for effects that the tracers would otherwise silently ignore."""
     sensor = scene.sensors()[0]
     if sensor.get_medium() is not None or any(shape.is_medium_transition() for shape in scene.shapes()):
         raise ValueError("scene: participating media (fog, smoke) are not supported yet; remove them from the scene.")
@@ -68,7 +68,7 @@ def gbuffer(scene: Any) -> GBuffer:
     direction, normal, position = found["direction"], found["normal"], found["position"]
     to_world = np.array(scene.sensors()[0].world_transform().matrix, np.float64).reshape(4, 4)
     forward = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2])
-    # Distances along the ray begin at the near plane; the position does not care.
+    # Distances along the ray begin at the near plane; the position is independent of it.
     depth = (position - to_world[:3, 3]) @ forward[:, None]
     away = np.sum(normal * direction, axis=-1, keepdims=True) > 0
     return GBuffer(
@@ -97,7 +97,7 @@ def _vectorised(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict
     flags = bsdf.flags()
     diffuse = valid & mi.has_flag(flags, mi.BSDFFlags.Diffuse)
     albedo = dr.select(diffuse, mi.Color3f(bsdf.eval_diffuse_reflectance(hit, diffuse)), 0.0)
-    # "principled" reports its base colour even where all of it is metal or glass.
+    # "principled" reports its base colour even for pure metal or glass.
     for part in ("metallic", "spec_trans"):
         there = diffuse & bsdf.has_attribute(part, diffuse)
         albedo *= 1.0 - dr.select(there, bsdf.eval_attribute_1(part, hit, there), 0.0)
@@ -121,7 +121,7 @@ def _vectorised(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict
     }
     dr.eval(buffers)
     arrays = {name: np.array(buffer).T.astype(np.float64) for name, buffer in buffers.items()}
-    # Registry numbers depend on what else is alive: names are what stays.
+    # Registry numbers depend on the other existing objects; names do not.
     lookup = {0: -1}
     reinterpret: Any = dr.reinterpret_array
     for own, name in zip(scene.shapes(), names, strict=True):
@@ -155,7 +155,7 @@ def _one_by_one(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict
 
 
 def _address(shape: Any) -> str:
-    """Python wrappers of one shape come and go; its id stays."""
+    """Python wrappers of a shape are temporary; its id is not."""
     return str(shape.id())
 
 

@@ -1,4 +1,4 @@
-"""Where things were: motion vectors, visibility and previous depths from G-buffers, cameras and poses. NumPy only.
+"""Motion vectors, visibility and previous depths from G-buffers, cameras and poses. NumPy only.
 
 All in float64: a vector is the difference of two projections, each hundreds of pixels large. Pixel coordinates here
 have the centre of the first pixel at (0.5, 0.5) and y down; vectors are previous minus current, so the history of pixel
@@ -15,14 +15,14 @@ from jaxdn.render.gbuffer import GBuffer
 from jaxdn.render.scene import Camera
 
 SAME_NORMAL = 0.9
-"""Smallest cosine between the normals of what counts as the same surface."""
+"""Minimum cosine between normals of the same surface."""
 SAME_PLANE = 0.005
-"""Largest distance from the surface's plane, as a fraction of the depth."""
+"""Maximum distance from the surface's plane, as a fraction of the depth."""
 _BEHIND = 1e-6
 
 
 class View(NamedTuple):
-    """One frame as the geometry sees it."""
+    """The geometry of one frame."""
 
     gbuffer: GBuffer
     camera: Camera
@@ -30,12 +30,12 @@ class View(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """How the image moved between two frames; see :class:`jaxdn.Frame`."""
+    """The image motion between two frames; see :class:`jaxdn.Frame`."""
 
     motion: np.ndarray
     """[H, W, 2] float64 px, previous minus current; NaN where the point was behind the previous camera."""
     forward_motion: np.ndarray | None
-    """[H, W, 2] float64 px, of the previous frame's pixels: how far what they show has moved, now minus then."""
+    """[H, W, 2] float64 px, on the previous frame's pixels: their points' displacement, current minus previous."""
     visible: np.ndarray | None
     """[H, W, 1] bool, the point was seen in the previous frame."""
     previous_depth: np.ndarray
@@ -85,13 +85,13 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
     Without ``disocclusion`` the latter, and what was visible, are not computed and None.
 
     Traditional motion is ``P'(T^-1 X) - P(X)`` (X the world position, T the shape's rigid motion, P and P' the two
-    projections), and for the sky the projections of its direction: it turns with the camera and knows no translation.
+    projections), and for the sky the projections of its direction: it rotates with the camera and has no translation.
     Where neither camera nor shape moved it is exactly 0.
 
     A point counts as seen before if the *nearest* pixel of the previous frame shows the same shape, with normals within
     ``SAME_NORMAL`` and within ``SAME_PLANE`` of z of the point's plane. Where that pixel is sky while the point is not,
-    nothing can have covered it, so any of the four pixels around may prove it seen.
-    Source: Zeng et al. 2021, eq. 1 and 2. Raises ValueError if the two frames have other sizes or shapes.
+    nothing can have covered it, so a match in any of the four surrounding pixels is enough.
+    Source: Zeng et al. 2021, eq. 1 and 2. Raises ValueError if the two frames differ in size or shapes.
     """
     now, before = current.gbuffer, previous.gbuffer
     if now.names != before.names or now.ids.shape != before.ids.shape:
@@ -111,18 +111,18 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
         return Motion(motion, None, None, previous_depth)
 
     there = relative_poses(now.names, previous.pose, current.pose)[before.ids[..., 0]]
-    borrowed = _homogeneous(before)
-    moved, _ = project(np.einsum("hwij,hwj->hwi", there, borrowed), current.camera, size)
-    forward = moved - project(borrowed, previous.camera, size)[0]
+    old_surface = _homogeneous(before)
+    moved, _ = project(np.einsum("hwij,hwj->hwi", there, old_surface), current.camera, size)
+    forward = moved - project(old_surface, previous.camera, size)[0]
     forward[same_camera & _still(there)] = 0.0
 
     normals = np.einsum("hwij,hwj->hwi", back[..., :3, :3], now.normal)
     lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
     normals = normals / np.where(lengths > 0, lengths, 1.0)
-    # In float32 and from the pixel itself: the pixel looked up must be the one that the stored vector leads to.
+    # In float32 from the pixel index: this must be the same pixel as the stored vector gives.
     pixels = np.stack(np.meshgrid(np.arange(size[1]), np.arange(size[0])), axis=-1).astype(np.float32)
     landing = pixels + motion.astype(np.float32) + np.float32(0.5)
-    # The very border still belongs to the outermost pixel.
+    # The image's border belongs to the outermost pixel.
     tap = np.where(landing == [size[1], size[0]], landing - 1, np.floor(landing))
     seen, nearest = _matches(now, before, tap, old_points, normals, z)
     on_sky = (nearest == -1) & ~sky
@@ -149,7 +149,16 @@ def _homogeneous(gbuffer: GBuffer) -> np.ndarray:
 def _matches(
     now: GBuffer, before: GBuffer, tap: np.ndarray, points: np.ndarray, normals: np.ndarray, z: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the previous frame's pixel ``tap`` (column, row) shows the same point, and the id it shows (-2: none)."""
+    """Whether the previous frame's pixel ``tap`` shows the same point, and the id it shows (-2: none).
+
+    Args:
+      now: G-buffer of the current frame.
+      before: G-buffer of the previous frame.
+      tap: (column, row) in the previous frame.
+      points: the current points in the previous frame's world.
+      normals: the current normals there.
+      z: view-space depths of the points in the previous frame.
+    """
     height, width = before.ids.shape[:2]
     with np.errstate(invalid="ignore"):
         inside = (tap >= 0) & (tap <= [width - 1, height - 1])

@@ -1,4 +1,4 @@
-"""A scene that Mitsuba has loaded already, as an animated one to look at."""
+"""A scene that Mitsuba has loaded already, as an animated scene for inspection."""
 
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,9 @@ from jaxdn.render.scene import Camera
 
 
 class LoadedScene:
-    """A loaded ``mi.Scene`` (``optimize=False``) with an animation that says what moves, but moves nothing in it.
+    """A loaded ``mi.Scene`` (``optimize=False``) with an animation that is only described, not applied to it.
 
-    Good for inspection and for measuring the path length, not for rendering a clip: it has no record. ``animation`` is
+    For inspection and measuring the path length, not for rendering a clip: it has no record. ``animation`` is
     the path of an animation file or its contents. Raises ValueError for one that does not fit the scene.
     """
 
@@ -34,7 +34,7 @@ class LoadedScene:
         }
 
     def build(self, frame: float, width: int, height: int) -> Any:
-        """The scene as it was given."""
+        """The given scene, unchanged."""
         return self._scene
 
     def camera(self, frame: float) -> Camera:
@@ -52,5 +52,5 @@ class LoadedScene:
         return Camera(self._camera(frame), rest.x_fov if fov is None else fov)
 
     def pose(self, frame: float) -> dict[str, np.ndarray]:
-        """Shape id -> [4, 4], where the keys have moved it."""
+        """Shape id -> [4, 4] motion by the keys."""
         return {name: motion(frame) for name, motion in self._motions.items()}

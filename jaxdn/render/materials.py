@@ -1,7 +1,8 @@
-"""What light does on a surface, read from Mitsuba's BSDF objects: lobes, roughness, textures; nested ones too.
+"""Materials read from Mitsuba's BSDF objects, also nested ones: lobes, roughness, textures.
 
-BSDF flags alone do not tell: ``principled`` always claims a diffuse and a glossy lobe, a roughness may be textured, and
-a rough conductor of roughness 1 is no sharper than a wall. So the tree of objects is walked, and the values looked at.
+BSDF flags are not sufficient: ``principled`` always reports a diffuse and a glossy lobe, a roughness may be textured,
+and a rough conductor of roughness 1 is no sharper than a diffuse surface. So the tree of objects is traversed and its
+values are read.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,7 +25,7 @@ class Material(NamedTuple):
 
 
 class Range(NamedTuple):
-    """The values that a parameter takes over a surface."""
+    """The values of a parameter over a surface."""
 
     low: float
     high: float
@@ -44,7 +45,7 @@ def _numbers(value: Any) -> np.ndarray | None:
 
 
 def range_of(texture: Any) -> Range:
-    """The values of a texture or spectrum; unknown ones may be anything."""
+    """The values of a texture or spectrum; unknown ones may have any value."""
     parameters = mi.traverse(texture)
     data = _numbers(parameters["data"]) if "data" in parameters else None
     if data is not None:
@@ -88,7 +89,7 @@ def _diffuse(bsdf: Any, *names: str) -> Material:
 
 
 def _rough(bsdf: Any, *, squared: bool) -> Material:
-    """The glossy lobe of a microfacet BSDF, of which nothing is left at roughness 1."""
+    """The glossy lobe of a microfacet BSDF; none at roughness 1."""
     if squared:
         found = _parameter(bsdf, "roughness", 0.5)
         name = "roughness"
@@ -127,7 +128,7 @@ def _rough_plastic(bsdf: Any) -> Material:
 
 def _rough_conductor(bsdf: Any) -> Material:
     rough = _rough(bsdf, squared=False)
-    # At roughness 1 it is still a reflector, if no sharper than a diffuse one.
+    # At roughness 1 it still reflects, but no sharper than a diffuse surface.
     return rough if rough.lobes else Material(frozenset({"diffuse"}))
 
 
@@ -188,7 +189,7 @@ _CLASSES: dict[str, Callable[[Any], Material]] = {
 
 
 def material_of(bsdf: Any) -> Material:
-    """The material of a BSDF; a class that is not known here is taken by its flags, and said to be uncertain."""
+    """The material of a BSDF; an unknown class is classified by its flags and marked as uncertain."""
     kind = bsdf.class_name()
     if kind in _CLASSES:
         return _CLASSES[kind](bsdf)

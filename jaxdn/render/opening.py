@@ -1,4 +1,4 @@
-"""Where animated scenes come from: the record of a clip, a scene file, a family's name, or what Mitsuba has loaded."""
+"""Opening animated scenes: from a clip's record, a scene file, a family's name, or a scene loaded by Mitsuba."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,8 +14,8 @@ from jaxdn.render.variant import use_variant
 def scene_from_record(record: Mapping[str, Any]) -> AnimatedScene:
     """Build the scene that a clip's record describes: ``{"family": name, "seed": int, ...}``, or a scene file's.
 
-    Keys besides ``family`` become the keyword arguments of the family's function; ``{"file": ..., "animation": ...}``
-    is a scene file in motion. Raises ValueError for a record that names neither, and for an unknown family.
+    Keys other than ``family`` become the keyword arguments of the family's function; ``{"file": ..., "animation":
+    ...}`` is an animated scene file. Raises ValueError for a record that names neither, and for an unknown family.
     """
     if "file" in record:
         return SceneFile.from_record(record)
@@ -42,8 +42,8 @@ def family_scene(name: str, seed: int, animation: Any = None) -> AnimatedScene:
 def open_scene(scene: Any, animation: Any = None) -> AnimatedScene:
     """A scene file, a family's name (its seed 0), a loaded ``mi.Scene``, or a scene as Mitsuba's dict, as a scene.
 
-    ``animation`` is an animation file, or its contents, for a scene file or a loaded scene; an animated scene comes
-    back as it is. Raises ValueError for anything else, and for files that cannot be read.
+    ``animation`` is an animation file, or its contents, for a scene file or a loaded scene; an animated scene is
+    returned unchanged. Raises ValueError for anything else, and for files that cannot be read.
     """
     if isinstance(scene, str | Path):
         return _named(scene, animation)

@@ -22,5 +22,5 @@ def children(plugin: Any) -> list[tuple[str, Any]]:
 
 
 def shape_groups(scene: Any) -> list[Any]:
-    """What the instances of a scene repeat; a group is no shape of the scene itself."""
+    """The shape groups that a scene instantiates; a group is not a shape of the scene itself."""
     return [child for _, child in children(scene) if child.class_name() == "ShapeGroupPlugin"]

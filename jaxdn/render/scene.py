@@ -1,8 +1,8 @@
-"""What an animated scene is: a camera path, poses and a way to build Mitsuba's scene for one frame.
+"""The protocol of an animated scene: a camera path, poses, and Mitsuba's scene for each frame.
 
-Mitsuba 3.9 has no animation of its own, so motion is a new set of transforms for every frame. Everything that reads
-animations (the tracers, the motion vectors, the clip writer) sees only the protocol below, so a new family of scenes
-or a loader for a file format is one new class.
+Mitsuba 3.9 does not support animation, so motion is a new set of transforms for every frame. All users of animations
+(the tracers, the motion vectors, the clip writer) only use the protocol below, so a new family of scenes or a loader
+for a file format is one new class.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ import numpy as np
 
 
 class Camera(NamedTuple):
-    """A pinhole camera as Mitsuba has it: it looks along its +z axis, +x points LEFT in the image and +y up."""
+    """A pinhole camera in Mitsuba's convention: it looks along its +z axis, +x points LEFT in the image and +y up."""
 
     to_world: np.ndarray
     """[4, 4] float64 camera to world, rigid."""
@@ -22,14 +22,14 @@ class Camera(NamedTuple):
 
 @runtime_checkable
 class AnimatedScene(Protocol):
-    """A scene at every point of time; time is counted in frames (a float is allowed), the animation starts at 0."""
+    """A scene as a function of time in frames (a float is allowed); the animation starts at 0."""
 
     name: str
     """Short name for messages and records."""
     frames: int
     """The suggested number of frames."""
     record: dict[str, Any]
-    """All it takes to build it again, as JSON: :func:`jaxdn.render.scene_from_record` turns it back into a scene."""
+    """Everything needed to build it again, as JSON, with :func:`jaxdn.render.scene_from_record`."""
     max_depth: int
     """Path length in Mitsuba's count: 1 is emission, 2 adds direct light, 3 one indirect bounce."""
 
@@ -38,11 +38,11 @@ class AnimatedScene(Protocol):
         ...
 
     def camera(self, frame: float) -> Camera:
-        """The camera of one frame, the same one that ``build`` puts into the scene."""
+        """The camera of one frame, the same as in the scene from ``build``."""
         ...
 
     def pose(self, frame: float) -> Mapping[str, np.ndarray]:
-        """Shape id -> [4, 4] float64 world pose of every shape that may move; a shape that is absent stands still.
+        """Shape id -> [4, 4] float64 world pose of every shape that may move; other shapes are static.
 
         Only the ratios ``pose(i)[id] @ inv(pose(i - 1)[id])`` matter.
         """
@@ -50,5 +50,5 @@ class AnimatedScene(Protocol):
 
 
 def brightness(scene: AnimatedScene, frame: float) -> Mapping[str, float]:
-    """Light -> factor on its radiance, of scenes that have a method of this name; in others no light changes."""
+    """Light -> factor on its radiance, for scenes with a method of this name; empty for others."""
     return getattr(scene, "brightness", lambda frame: {})(frame)

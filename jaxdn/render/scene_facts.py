@@ -1,6 +1,7 @@
-"""Facts about an animated scene: what its surfaces and lights are, and what moves between which frames.
+"""Facts about an animated scene: its surfaces and lights, and what moves between which frames.
 
-The scene is built once, for its first frame; what happens later is in its poses, its camera and its lights' brightness.
+The scene is built once, for its first frame; later changes are read from its poses, its camera and its lights'
+brightness.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,16 +16,16 @@ from jaxdn.render.variant import use_variant
 from jaxdn.render.visibility import corners, fills_view, may_be_seen, moved
 
 _LOOK = 16
-"""Height of the picture that is looked at, in pixels."""
+"""Height of the inspected image, in pixels."""
 
 
 def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | None = None) -> Facts:
     """Facts about the first ``frames`` frames (default: all) of an animated scene, seen at ``width`` x ``height``."""
     use_variant()
-    # Mitsuba's names exist once a variant is chosen.
+    # Mitsuba's names exist only after a variant is chosen.
     from jaxdn.render.gbuffer import gbuffer, shape_names
 
-    # A small picture of the same shape: enough to see whether rays leave the scene.
+    # A small image of the same aspect ratio is enough to see whether rays leave the scene.
     built = scene.build(0, max(1, round(_LOOK * width / height)), _LOOK)
     shapes = dict(zip(shape_names(built), built.shapes(), strict=True))
     surfaces, uncertain = _surfaces(built, shapes)
@@ -48,7 +49,7 @@ def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | Non
 
 
 def _surfaces(built: Any, shapes: Mapping[str, Any]) -> tuple[list[Surface], dict[str, str]]:
-    """The surfaces of a scene, and effect -> why their materials do not decide it."""
+    """The surfaces of a scene, and effect -> why their materials leave it undecided."""
     from jaxdn.render.materials import NOTHING, material_of
     from jaxdn.render.plugins import children, shape_groups
 
@@ -81,7 +82,7 @@ def _lights(built: Any, shapes: Mapping[str, Any]) -> list[Light]:
 
 
 class _Stage:
-    """Where shapes are in each frame, against the view."""
+    """Places of the shapes in each frame, relative to the view."""
 
     def __init__(
         self, scene: AnimatedScene, shapes: Mapping[str, Any], size: tuple[int, int], around: frozenset[str]
@@ -98,7 +99,7 @@ class _Stage:
                 self.squares[name] = _to_world(shape)
 
     def place(self, name: str, pose: Mapping[str, np.ndarray]) -> np.ndarray:
-        """How a shape has moved since frame 0, where it was built."""
+        """The motion of a shape since frame 0, for which it was built."""
         return np.asarray(pose[name]) @ np.linalg.inv(self.rest[name]) if name in pose else np.eye(4)
 
     def on_screen(self, name: str, frame: float) -> bool:
@@ -107,7 +108,7 @@ class _Stage:
         return may_be_seen(points, self.camera(frame), self.size)
 
     def moment(self, frame: int, lights: Sequence[Light]) -> Moment:
-        """What happens between a frame and the one before it."""
+        """The changes between a frame and the one before it."""
         emitting = (light.name for light in lights if light.name in self.boxes)
         shining = self.around.union(name for name in emitting if self.on_screen(name, frame))
         if frame == 0:
@@ -126,7 +127,7 @@ class _Stage:
         return Moment(camera, moving, seen, reveals, frozenset(changing), shining)
 
     def _one_flat_view(self, frame: int) -> bool:
-        """One flat surface fills the picture now and before: nothing can come out from behind anything."""
+        """One flat surface fills the image now and before: nothing can be disoccluded."""
         there = {name for name in self.boxes for at in (frame - 1, frame) if self.on_screen(name, at)}
         if len(there) != 1 or not there <= set(self.squares):
             return False
@@ -147,7 +148,7 @@ def _to_world(shape: Any) -> np.ndarray:
 def _interreflects(
     stage: _Stage, shapes: Mapping[str, Any], surfaces: Sequence[Surface], lights: Sequence[Light]
 ) -> bool:
-    """False where a single flat reflector, or a convex one lit and seen from outside, is all there is."""
+    """False if the only reflector is flat, or convex and lit and seen from outside."""
     reflecting = [surface for surface in surfaces if surface.lobes]
     if len(reflecting) != 1 or "transmission" in reflecting[0].lobes:
         return True
@@ -155,7 +156,7 @@ def _interreflects(
     kind = shapes[name].class_name()
     if kind in ("Rectangle", "Disk"):
         return False
-    # A point light's place is not looked up, and a pose may carry the shape anywhere.
+    # A point light's position is not known here, and a pose may move the shape anywhere.
     placed = all(light.environment or light.name in shapes for light in lights)
     if kind not in ("Sphere", "Cube") or not placed or stage.rest:
         return True

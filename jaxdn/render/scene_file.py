@@ -1,8 +1,8 @@
-"""Mitsuba scene files set in motion: any scene XML, with an animation file of keys next to it.
+"""Animated Mitsuba scene files: any scene XML, with an animation file of keys next to it.
 
-Mitsuba's own loader does the loading: what stands still is loaded once; for every frame an edited part of the XML (a
-new camera, the shapes that move with a matrix appended to their transform, inserted shapes) is loaded in addition.
-Scenes of the 0.6 format stay of that format, so that Mitsuba upgrades them as it would the file.
+Mitsuba's own loader is used: static parts are loaded once; for every frame an edited part of the XML (a new camera, the
+moving shapes with a matrix appended to their transform, inserted shapes) is loaded in addition. Scenes of the 0.6
+format keep that format, so that Mitsuba upgrades them as it would the file.
 """
 
 import copy
@@ -26,18 +26,18 @@ from jaxdn.render.scene import Camera
 from jaxdn.render.variant import use_variant
 
 _DEPTH = 8
-"""Path length where the file asks for endless paths or does not say."""
+"""Path length if the file has unlimited paths or does not specify it."""
 _TEXTURES = ("bitmap", "checkerboard", "mesh_attribute", "volume")
 
 
 class SceneFile:
-    """A Mitsuba 3 scene file as an animated scene; see :mod:`jaxdn.render.animation` for what the JSON says.
+    """A Mitsuba 3 scene file as an animated scene; see :mod:`jaxdn.render.animation` for the JSON file.
 
     Without ``animation_path`` the file ``<scene>.json`` next to the scene is used if there is one, and a scene without
-    an animation is a still. Shapes without an id get ``shape_<n>``, counted from 0 in the order of the file, and a dot
+    an animation is static. Shapes without an id get ``shape_<n>``, counted from 0 in the order of the file, and a dot
     in an id becomes an underscore. The camera is the file's first sensor, which must be a perspective one; its
-    horizontal field of view is that of the file's own film and stays so at every image size. Raises ValueError for
-    files that cannot be read and animations that do not fit.
+    horizontal field of view is that of the file's own film at every image size. Raises ValueError for files
+    that cannot be read and animations that do not match the scene.
     """
 
     def __init__(self, path: Path | str, animation_path: Path | str | None = None) -> None:
@@ -51,7 +51,7 @@ class SceneFile:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> "SceneFile":
-        """The scene of a clip's record ``{"file": ..., "animation": {...}}``; the file is found from where one is."""
+        """The scene of a clip's record ``{"file": ..., "animation": {...}}``; its path may be relative."""
         scene = cls.__new__(cls)
         scene._open(Path(record["file"]), record.get("animation", {}))
         return scene
@@ -95,15 +95,15 @@ class SceneFile:
         return Camera(self._camera(frame), fov)
 
     def pose(self, frame: float) -> dict[str, np.ndarray]:
-        """Shape id -> [4, 4], where the keys have moved the shape from where the file puts it."""
+        """Shape id -> [4, 4] motion by the keys, from the shape's place in the file."""
         return {name: motion(frame) for name, motion in self._motions.items()}
 
     def brightness(self, frame: float) -> dict[str, float]:
-        """Light -> factor on its radiance, where the keys change it."""
+        """Light -> factor on its radiance, for lights with keys."""
         return {name: light_scale(keys, frame) for name, keys in self._lights.items()}
 
     def build(self, frame: float, width: int, height: int) -> Any:
-        """The ``mi.Scene`` of one frame; what does not move is loaded once and shared by all frames."""
+        """The ``mi.Scene`` of one frame; static parts are loaded once and shared by all frames."""
         import mitsuba as mi
 
         from jaxdn.render.plugins import shape_groups
@@ -112,7 +112,7 @@ class SceneFile:
         if self._still is None or self._still[0] != variant:
             rests = _kept(self._tree, lambda element: element.get("id") not in {*self._motions, *self._lights})
             still = _load(rests)
-            # Groups are kept for those who look at the scene: its instances do not tell what is in it.
+            # Groups are kept for inspection: instances do not show their contents.
             self._still = variant, [*still.shapes(), *shape_groups(still), *_lamps(still)]
         moving = _load(self.describe(frame, width, height))
         fresh = [*moving.shapes(), *shape_groups(moving), *_lamps(moving)]
@@ -122,7 +122,7 @@ class SceneFile:
         return mi.load_dict({"type": "scene", **parts}, optimize=False)
 
     def describe(self, frame: float, width: int, height: int) -> ET.Element:
-        """The XML of what one frame has for itself: camera, film and the shapes that move."""
+        """The XML of the parts that change per frame: camera, film and moving shapes."""
         poses = self.pose(frame)
         changing = {*poses, *self._lights}
         scene = copy.deepcopy(_kept(self._tree, lambda element: element.get("id") in changing))
@@ -157,13 +157,13 @@ class SceneFile:
 def _load(root: ET.Element) -> Any:
     import mitsuba as mi
 
-    if mi.variant() is None:  # whoever opens a scene need not have chosen a variant yet
+    if mi.variant() is None:  # a variant may not have been chosen yet
         use_variant()
     return mi.load_string(ET.tostring(root, encoding="unicode"), optimize=False)
 
 
 def _lamps(scene: Any) -> list[Any]:
-    """The emitters of a loaded scene that are no shapes."""
+    """The emitters of a loaded scene that are not shapes."""
     return [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
 
 
@@ -184,7 +184,7 @@ def _kept(root: ET.Element, wanted: Callable[[ET.Element], bool]) -> ET.Element:
 
 
 def _read_xml(path: Path) -> ET.Element:
-    """The scene's root with every ``<include>`` put in its place."""
+    """The scene's root with every ``<include>`` expanded."""
     try:
         root = ET.parse(path).getroot()
     except (OSError, ET.ParseError) as error:
@@ -202,7 +202,7 @@ def _read_xml(path: Path) -> ET.Element:
 
 
 def _absolute_files(root: ET.Element, path: Path) -> None:
-    """Make the names of the files that the scene uses absolute; raises ValueError for one that is not there."""
+    """Make the names of the files that the scene uses absolute; raises ValueError for a missing one."""
     folders = [path.parent, *(path.parent / element.get("value", "") for element in root.findall("path"))]
     for element in root.iter("string"):
         name = element.get("value", "")
@@ -215,7 +215,7 @@ def _absolute_files(root: ET.Element, path: Path) -> None:
 
 
 def _name_shapes(root: ET.Element) -> list[str]:
-    """The ids of the top-level shapes, after those without one have been given theirs."""
+    """The ids of the top-level shapes, after adding the missing ones."""
     taken = {element.get("id") for element in root.iter() if element.get("id")}
     for index, element in enumerate(root.findall("shape")):
         name = element.get("id") or f"shape_{index}"
@@ -247,7 +247,7 @@ def _rest_camera(root: ET.Element) -> tuple[Camera | None, float, float]:
 
 
 def _path_length(root: ET.Element) -> int:
-    """max_depth of the file's integrator, wherever it is nested."""
+    """max_depth of the file's integrator, also if nested."""
     integrator = root.find("integrator")
     if integrator is not None:
         for element in integrator.iter("integer"):
@@ -266,7 +266,7 @@ def _light(root: ET.Element, name: str) -> ET.Element | None:
 
 
 def _check_lights(root: ET.Element, keys: Mapping[str, Any], path: Path) -> None:
-    """Raise ValueError for a name that is no light of the scene, or a light whose radiance is no number."""
+    """Raise ValueError for a name that is not a light of the scene, or a light whose radiance is not a number."""
     for name in keys:
         emitter = _light(root, name)
         if emitter is None:
@@ -278,13 +278,13 @@ def _check_lights(root: ET.Element, keys: Mapping[str, Any], path: Path) -> None
 
 
 def _powers(emitter: ET.Element) -> list[ET.Element]:
-    """The elements that say how bright an emitter is."""
+    """The elements that define an emitter's brightness."""
     names = ("radiance", "intensity", "irradiance", "power")
     return [part for part in emitter if part.get("name") in names and part.tag in ("rgb", "spectrum", "float")]
 
 
 def _scale_light(emitter: ET.Element | None, factor: float) -> None:
-    assert emitter is not None  # _check_lights has found it
+    assert emitter is not None  # _check_lights has checked it
     if emitter.get("type") == "envmap":
         own = next((part for part in emitter if part.get("name") == "scale"), None)
         if own is None:

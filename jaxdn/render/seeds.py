@@ -1,4 +1,4 @@
-"""Random numbers as a function of (seed, frame, stream, pixel, sample): nothing depends on the order of rendering.
+"""Random numbers as a function of (seed, frame, stream, pixel, sample): independent of the order of rendering.
 
 A frame rendered alone, again, or in another process gets the same numbers, and the reference never shares a sample
 with the noisy layers. The mixing function is TEA (Zafar, Olano and Curtis 2010), nested so that no two inputs of the
@@ -12,7 +12,7 @@ _MASK = 0xFFFFFFFF
 
 
 def tea(first: int, second: int, rounds: int = 8) -> tuple[int, int]:
-    """A bijection of pairs of 32-bit numbers that leaves no structure of its input."""
+    """A bijection of pairs of 32-bit numbers that removes the structure of its input."""
     first, second, total = first & _MASK, second & _MASK, 0
     for _ in range(rounds):
         total = (total + 0x9E3779B9) & _MASK
@@ -32,7 +32,7 @@ def frame_key(seed: int, frame: int, stream: int) -> tuple[int, int]:
 def pass_seed(seed: int, frame: int, stream: int, index: int) -> int:
     """The seed of one whole-image pass of Mitsuba's own integrators.
 
-    Mitsuba multiplies it by the number of pixels modulo 2**32, so only its low bits count: consecutive passes have to
-    get consecutive seeds, and the streams are kept apart by a fixed distance instead of by chance.
+    Mitsuba multiplies it by the number of pixels modulo 2**32, so only its low bits count: consecutive passes need
+    consecutive seeds, and a fixed distance separates the streams.
     """
     return (tea(frame, seed)[0] + (stream << 17) + index) & _MASK

@@ -1,9 +1,9 @@
-"""Which of Mitsuba's variants to render with: the fastest one that works on this machine.
+"""Selects Mitsuba's variant for rendering: the fastest that works on this machine.
 
 ``llvm_ad_rgb`` is three to seven times faster than ``scalar_rgb`` but needs an LLVM library, and LLVM 15 and 16 pass
-drjit's own check and then abort the whole process at the first kernel with a float minimum. Nothing in Python can
-catch that, so a candidate is tried in a process of its own. What was found is kept for this process and, in the
-environment, for its children.
+drjit's own check and then abort the whole process at the first kernel with a float minimum. Python cannot
+catch that, so a candidate is tried in a separate process. The result is kept for this process and, in the environment,
+for its children.
 """
 
 import glob
@@ -44,7 +44,7 @@ _PATTERNS = (
 
 
 class Choice(NamedTuple):
-    """A variant that was seen to work, the LLVM library it needs ("" for none), and a sentence that says why."""
+    """A variant that works, the LLVM library it needs ("" for none), and the reason of the choice."""
 
     variant: str
     llvm: str
@@ -55,7 +55,7 @@ _choice: dict[str | None, Choice] = {}
 
 
 def llvm_candidates() -> list[str]:
-    """LLVM libraries worth a try, newest first; ``DRJIT_LIBLLVM_PATH`` alone if the user set it."""
+    """LLVM libraries to try, newest first; only ``DRJIT_LIBLLVM_PATH`` if the user set it."""
     if os.environ.get(_LIBRARY):
         return [os.environ[_LIBRARY]]
     versions: dict[str, int] = {}
@@ -68,7 +68,7 @@ def llvm_candidates() -> list[str]:
 
 
 def _works(variant: str, library: str = "") -> bool:
-    """Try a variant in a process of its own (a quarter of a second; LLVM 15 and 16 die there with SIGABRT)."""
+    """Try a variant in a separate process (a quarter of a second; LLVM 15 and 16 die there with SIGABRT)."""
     environment = dict(os.environ)
     if library:
         environment[_LIBRARY] = library
@@ -97,7 +97,7 @@ def _find(requested: str | None) -> Choice:
                 return Choice("llvm_ad_rgb", library, f"{library} works")
         if requested:
             raise ValueError(f"variant: {requested!r} does not run here. {advice()}")
-    return Choice("scalar_rgb", "", f"no LLVM library works here. {advice()}" if not requested else "it was asked for")
+    return Choice("scalar_rgb", "", f"no LLVM library works here. {advice()}" if not requested else "it was requested")
 
 
 def advice() -> str:
@@ -112,7 +112,7 @@ def choose_variant(requested: str | None = None) -> Choice:
     """The variant to render with: ``requested``, else ``JAXDN_VARIANT``, else the fastest that works here.
 
     A probe runs once per process and choice; child processes find its result in their environment. Raises
-    ValueError when the variant that was asked for is unknown or does not run here.
+    ValueError if the requested variant is unknown or does not run here.
     """
     requested = requested or os.environ.get(OVERRIDE) or None
     if requested is not None and requested not in VARIANTS:

@@ -1,4 +1,4 @@
-"""What may be on screen: boxes and flat surfaces against the camera's view. Conservative, and NumPy only."""
+"""Visibility tests of boxes and flat surfaces against the camera's view: conservative, NumPy only."""
 
 import itertools
 
@@ -32,9 +32,9 @@ def may_be_seen(points: np.ndarray, camera: Camera, size: tuple[int, int]) -> bo
 
 
 def fills_view(to_world: np.ndarray, camera: Camera, size: tuple[int, int]) -> bool:
-    """Whether the square [-1, 1]^2 at z = 0, placed by a [4, 4] matrix, covers the whole picture.
+    """Whether the square [-1, 1]^2 at z = 0, placed by a [4, 4] matrix, covers the whole image.
 
-    It is convex: where the four corners of the picture see it, all pixels do.
+    It is convex: if the four corners of the image see it, all pixels do.
     """
     across, up = _slopes(camera, size)
     inverse = np.linalg.inv(to_world) @ np.asarray(camera.to_world, np.float64)

@@ -1,8 +1,8 @@
-"""A path tracer for Mitsuba's vectorised variants that keeps emitted, direct and indirect light apart.
+"""A path tracer for Mitsuba's vectorised variants that separates emitted, direct and indirect light.
 
 One lane is one path through the centre of one pixel. The estimator is that of Mitsuba's ``path`` integrator (next-event
 estimation and BSDF sampling, balance heuristic; Veach 1997, sec. 9.2), so sums agree with it, but one pass gives all
-three parts, and the random numbers are a function of (pixel, sample, frame, seed) alone.
+three parts, and the random numbers depend only on (pixel, sample, frame, seed).
 """
 
 from typing import Any, NamedTuple
@@ -17,11 +17,11 @@ MAX_LANES = 1 << 20
 """Paths traced at once: about 300 bytes of memory each."""
 
 BRIGHTEST = 1e30
-"""A sample as bright as this is an overflow, and a sum of a few more would be."""
+"""Samples at least this bright are treated as overflows, as the sum of a few would overflow."""
 
 
 class Accumulated(NamedTuple):
-    """Light as sums over samples of the three parts of radiance, each [H, W, 3] float64."""
+    """Sums over samples of the three parts of radiance, each [H, W, 3] float64."""
 
     emitted: np.ndarray
     direct: np.ndarray
@@ -47,7 +47,7 @@ def no_light(shape: tuple[int, ...]) -> Accumulated:
 
 def generator(pixel: Any, sample: Any, key: tuple[int, int]) -> Any:
     """A PCG32 generator for every lane, a bijection of (pixel, sample) mixed once more with the frame's key."""
-    # Literals would be baked into the kernel and compile it again for every frame: opaque values are data.
+    # Literals would be compiled into the kernel, a new one for every frame; opaque values are data.
     mix: Any = mi.sample_tea_32
     first, second = mix(pixel, sample)
     first, second = mix(first ^ dr.opaque(mi.UInt32, key[0]), second ^ dr.opaque(mi.UInt32, key[1]))
@@ -71,7 +71,7 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
     """Follow one path per lane; returns (emitted, direct, indirect) radiance.
 
     ``max_depth`` counts as Mitsuba does: 1 is emission, 2 adds direct light, 3 one indirect bounce. No Russian
-    roulette: at these depths it does not pay.
+    roulette: it does not help at these depths.
     """
     context = mi.BSDFContext()
     emitted, direct, indirect = mi.Spectrum(0.0), mi.Spectrum(0.0), mi.Spectrum(0.0)
@@ -126,7 +126,17 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
 def _chunk(
     scene: Any, first_pixel: int, pixels: int, first: int, count: int, key: tuple[int, int], depth: int
 ) -> Accumulated:
-    """The sums of ``count`` samples of a run of pixels, flat [pixels, 3]."""
+    """The sums of ``count`` samples of consecutive pixels, flat [pixels, 3].
+
+    Args:
+      scene: the ``mi.Scene``.
+      first_pixel: index of the first pixel.
+      pixels: number of pixels.
+      first: index of the first sample.
+      count: samples per pixel.
+      key: of the stream (:func:`jaxdn.render.seeds.frame_key`).
+      depth: path length.
+    """
     sensor = scene.sensors()[0]
     width = dr.opaque(mi.UInt32, int(sensor.film().crop_size()[0]))
     lane = dr.arange(mi.UInt32, pixels * count)
@@ -137,11 +147,11 @@ def _chunk(
     row = pixel // width
     ray = camera_rays(sensor, pixel - row * width, row)
     traced: Any = trace(scene, ray, generator(pixel, sample, key), dr.opaque(mi.UInt32, depth))
-    # Light is not negative: NaN, infinities and what would overflow a sum all fail this one comparison.
+    # As light is not negative, NaN, infinities and values that could overflow a sum all fail this comparison.
     finite = dr.all(traced[0] + traced[1] + traced[2] < BRIGHTEST)
     parts = [dr.select(finite, part, 0.0) for part in traced]
     bad = dr.select(finite, mi.UInt32(0), mi.UInt32(1))
-    # One kernel: a block sum of something not yet evaluated would trace everything again, once per sum.
+    # One kernel: a block sum of unevaluated values would trace everything again for each sum.
     dr.eval(parts, bad)
     sums = [[dr.block_sum(part[channel], count) for channel in range(3)] for part in parts]
     dr.eval(sums)
@@ -160,7 +170,18 @@ def accumulate(
     max_depth: int,
     max_lanes: int = MAX_LANES,
 ) -> Accumulated:
-    """The sums of the samples ``first`` to ``first + count`` of one stream over the scene's film."""
+    """The sums of the samples ``first`` to ``first + count`` of one stream over the scene's film.
+
+    Args:
+      scene: the ``mi.Scene``.
+      seed: of the clip.
+      frame: index of the frame.
+      stream: of :mod:`jaxdn.render.seeds`.
+      first: index of the first sample.
+      count: samples per pixel.
+      max_depth: path length.
+      max_lanes: paths traced at a time.
+    """
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     key = frame_key(seed, frame, stream)
     pixels = min(width * height, max_lanes)

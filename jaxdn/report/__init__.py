@@ -1,4 +1,4 @@
-"""What a training run or a comparison ends with: numbers in ``metrics.json``, a page that opens from disk beside it."""
+"""The report of a training run or a comparison: ``metrics.json``, and next to it a page that opens from disk."""
 
 from jaxdn.report.images import save_png
 from jaxdn.report.results import ClipResult, Results, Scores, TrainingCurve, mean_scores

@@ -1,4 +1,4 @@
-"""Pictures as PNG: files for ``--preview``, data addresses for the page, error maps and where to zoom in."""
+"""Images as PNG: files for ``--preview``, data URLs for the page, error maps and zoom regions."""
 
 import base64
 import io
@@ -12,7 +12,7 @@ from PIL import Image
 from jaxdn.files import write_whole
 
 NOT_FINITE = (1.0, 0.0, 1.0)
-"""NaN and infinite pixels are painted magenta, so that a broken image does not pass for a black one."""
+"""NaN and infinite pixels are painted magenta, so that an invalid image cannot be mistaken for a black one."""
 
 ERROR_COLORS = ((0, 0, 4), (48, 12, 92), (130, 31, 108), (206, 66, 68), (246, 143, 30), (252, 215, 92), (255, 255, 235))
 """sRGB bytes at equal steps from no error to the top of the scale; monotone in lightness."""
@@ -21,8 +21,8 @@ ERROR_COLORS = ((0, 0, 4), (48, 12, 92), (130, 31, 108), (206, 66, 68), (246, 14
 def save_png(path: str | os.PathLike[str], image: Any) -> None:
     """Write a display-encoded image [H, W, 3] or [H, W] in 0..1 as an 8-bit PNG.
 
-    Values outside 0..1 are clamped, pixels that are not finite are painted magenta. No reader ever meets half
-    a picture (:func:`jaxdn.files.write_whole`). Raises ValueError for another shape.
+    Values outside 0..1 are clamped, pixels that are not finite are painted magenta. The file is never
+    incomplete (:func:`jaxdn.files.write_whole`). Raises ValueError for another shape.
     """
     write_whole({Path(path): encode_png(image)})
 
@@ -49,7 +49,7 @@ def error_map(image: Any, reference: Any) -> np.ndarray:
 def error_scale(maps: list[np.ndarray]) -> float:
     """Upper end of a colour scale shared by all maps: their 99.5th percentile, rounded up to 1, 2 or 5 times 10^n.
 
-    NaN does not count: one broken image must not turn all the others black.
+    NaN does not count: one invalid image must not make all others black.
     """
     known = [values[~np.isnan(values)] for values in maps]
     top = float(np.percentile(np.concatenate(known), 99.5)) if sum(map(len, known)) else 0.0
@@ -86,19 +86,19 @@ def worst_crop(errors: list[np.ndarray], disoccluded: Any, *, size: int = 40) ->
     rows, columns = mask.shape
     weight = np.sum(np.nan_to_num(np.asarray(errors, np.float64), nan=1.0), axis=0) if errors else np.ones(mask.shape)
     if mask.any():
-        # The smallest addend keeps the window on disoccluded pixels even where nothing is wrong with them.
+        # The small constant keeps the window on disoccluded pixels even if they have no error.
         weight = np.where(mask, weight + 1e-9, 0.0)
     width, height = min(size, columns), min(size * 3 // 4, rows)
     total = np.pad(np.cumsum(np.cumsum(weight, axis=0), axis=1), ((1, 0), (1, 0)))
     sums = total[height:, width:] - total[:-height, width:] - total[height:, :-width] + total[:-height, :-width]
-    # Of equally bad windows take the middle one, which has the fault in its centre rather than in a corner.
+    # Among windows of equal error the middle one is taken: it has the error in its centre, not in a corner.
     best = np.argwhere(sums >= sums.max() * (1 - 1e-6) - 1e-12)
     y, x = best[np.argmin(np.abs(best - best.mean(axis=0)).sum(axis=1))]
     return int(x), int(y), width, height
 
 
 def data_address(png: bytes) -> str:
-    """The PNG as a ``data:`` address, which needs no file and no server."""
+    """The PNG as a ``data:`` URL, which needs neither file nor server."""
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 

@@ -1,7 +1,7 @@
 """The page as one string: text, tables and data in HTML, style and behaviour inlined from ``page.css`` and ``page.js``.
 
-Tables and words need no script. Pictures and curves are kept as JSON inside each clip's section and are only unpacked
-when that section is opened, so a page of thirty clips opens as fast as a page of one.
+Tables and text need no script. Images and curves are stored as JSON inside each clip's section and only unpacked when
+that section is opened, so a page of thirty clips opens as fast as a page of one.
 """
 
 import json
@@ -26,12 +26,12 @@ from jaxdn.report.results import (
 from jaxdn.report.summary import COLUMNS, best_methods, floor_score, headline, is_noisy, sentences, show
 
 IMAGE_BUDGET = 27_000_000
-"""Bytes of pictures (as base64 text) in one page; clips that come after it is spent keep numbers and curves only."""
+"""Bytes of images (as base64 text) in one page; clips beyond it have only numbers and curves."""
 
 ARROWS = {1: "\N{NO-BREAK SPACE}↑", -1: "\N{NO-BREAK SPACE}↓", 0: ""}
 
 POINTS = 1000
-"""A loss curve is drawn with at most so many points, each the mean of its steps; metrics.json keeps them all."""
+"""Maximum number of points of a loss curve, each the mean of its steps; metrics.json has all of them."""
 
 
 def page(results: Results) -> str:
@@ -72,7 +72,7 @@ def page(results: Results) -> str:
         '<p class="note">Keys <kbd>1</kbd> … switch the picture of the clip in view, <kbd>E</kbd> shows its error, '
         "<kbd>D</kbd> marks disoccluded pixels. Error is the mean over channels of |method − reference| on display "
         f"values in 0..1; one colour scale for the whole page: {_scale_bar(scale)}</p>",
-        "<noscript><p>The pictures and curves need JavaScript, which this page carries with it.</p></noscript>",
+        "<noscript><p>The images and curves need JavaScript, which this page contains.</p></noscript>",
         *sections,
         "</section>",
         _training(results),
@@ -84,7 +84,7 @@ def page(results: Results) -> str:
             '<html lang="en">',
             "<head>",
             '<meta charset="utf-8">',
-            # Nothing may be fetched: the page is complete, and says so to the browser.
+            # The page is complete; this policy makes the browser block every request.
             '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
             "style-src 'unsafe-inline'; script-src 'unsafe-inline'\">",
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
@@ -120,7 +120,7 @@ def _top(results: Results) -> str:
         f'<div class="label">{escape(below)}</div></div>'
         for label, figure, below in cards
     )
-    said = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences(results))
+    findings = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences(results))
     count = f"{len(results.clips)} clip{'s' if len(results.clips) != 1 else ''}"
     links = {"scores": "Scores", "overview": "By clip", "clips": "Pictures", "training": "Training", "made": "Settings"}
     navigation = " ".join(
@@ -132,7 +132,7 @@ def _top(results: Results) -> str:
         f'<header><h1>{escape(results.title)}</h1><p class="note">{count}, {len(results.methods)} methods</p>'
         f"<nav>{navigation}</nav></header>"
         f'<section id="summary"><div class="cards">{shown}</div>'
-        f"<ul>{said}</ul></section>"
+        f"<ul>{findings}</ul></section>"
     )
 
 
@@ -170,7 +170,7 @@ def _table(scores: dict[str, Scores], methods: list[str], floor: float) -> str:
 
 
 def _overview(results: Results) -> str:
-    """One row a clip, one column a method: where each method is strong."""
+    """One row per clip, one column per method."""
     tables = []
     for column in COLUMNS[:-2]:
         head = "".join(
@@ -204,7 +204,16 @@ def _overview(results: Results) -> str:
 def _clip(
     results: Results, clip: ClipResult, maps: dict[str, np.ndarray], index: int, scale: float, budget: int
 ) -> tuple[str, int]:
-    """A clip's collapsible section, and how many bytes its pictures take."""
+    """A clip's collapsible section, and how many bytes its images take.
+
+    Args:
+      results: of the whole report.
+      clip: to show.
+      maps: method -> its error map [H, W].
+      index: of the clip.
+      scale: upper end of the error maps' colour scale.
+      budget: bytes of images that the page may still take.
+    """
     labels = [method for method in results.methods if method in clip.images]
     judged = [maps[label] for label in labels if not is_noisy(label)] or list(maps.values())
     mask = np.asarray(clip.disoccluded, bool)
@@ -253,7 +262,7 @@ def _clip(
 
 
 def _curves(clip: ClipResult) -> dict[str, dict[str, list[float]]]:
-    """metric -> method -> values with five figures: the page's order is by metric."""
+    """metric -> method -> values with five significant digits, ordered as on the page."""
     curves: dict[str, dict[str, list[float]]] = {}
     for method, metrics in clip.per_frame.items():
         for metric, values in metrics.items():
@@ -295,7 +304,7 @@ def _making(results: Results) -> str:
         parts.append(f'<div><h3>{name}</h3><table class="facts"><tbody>{rows}</tbody></table></div>')
     return (
         f'<section id="made"><h2>How this was made</h2><div class="pair">{"".join(parts)}</div>'
-        '<p class="note">All numbers of this page lie beside it in <code>metrics.json</code>.</p></section>'
+        '<p class="note">All numbers of this page are in <code>metrics.json</code> in the same folder.</p></section>'
     )
 
 

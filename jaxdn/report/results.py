@@ -1,4 +1,4 @@
-"""What was measured: the plain structure that evaluation fills and the report shows."""
+"""The results of an evaluation, as the plain structure that the report shows."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 REFERENCE = "reference"
-"""The label under which every clip keeps its reference image; no method may be called so."""
+"""The label under which every clip keeps its reference image; no method may have this name."""
 
 
 class Scores(NamedTuple):
@@ -54,7 +54,7 @@ class ClipResult(NamedTuple):
 
 
 class TrainingCurve(NamedTuple):
-    """How one network learned."""
+    """Loss and validation of one training run."""
 
     step: list[int]
     loss: list[float]
@@ -64,7 +64,7 @@ class TrainingCurve(NamedTuple):
 
 
 class Results(NamedTuple):
-    """All that a report says."""
+    """Everything in a report."""
 
     title: str
     settings: dict[str, Any]
@@ -73,11 +73,11 @@ class Results(NamedTuple):
     """Labels in the order of the page; "reference" is implicit."""
     clips: list[ClipResult]
     training: dict[str, TrainingCurve]
-    """label -> curve; empty where nothing was trained."""
+    """label -> curve; empty if nothing was trained."""
 
 
 def check_results(results: Results) -> None:
-    """Raise ValueError where the structure contradicts itself; never looks at the numbers in it."""
+    """Raise ValueError if the structure is inconsistent; the numbers are not checked."""
     methods = list(results.methods)
     if not methods or len(set(methods)) != len(methods) or REFERENCE in methods:
         raise ValueError(
@@ -113,9 +113,9 @@ def check_results(results: Results) -> None:
 def mean_scores(results: Results) -> dict[str, Scores]:
     """Mean of every score over the clips, for each method.
 
-    A clip on which a metric is NaN for every method has nothing to measure there (no disoccluded pixels, one frame
-    only) and is left out of that metric's mean. A NaN of one method where others have a number is that method's failure
-    and makes its mean NaN. dB values are averaged as dB, as the papers do.
+    A clip on which a metric is NaN for every method cannot be measured (no disoccluded pixels, only one frame) and is
+    left out of that metric's mean. A NaN of one method where others have a number is that method's failure and makes
+    its mean NaN. dB values are averaged as dB, as the papers do.
     """
     table = np.asarray([[clip.scores[method] for method in results.methods] for clip in results.clips], np.float64)
     measurable = np.any(~np.isnan(table), axis=1)
@@ -140,10 +140,10 @@ def _mean(values: np.ndarray) -> float:
 
 
 def metrics(results: Results) -> dict[str, Any]:
-    """The numbers of the results as what strict JSON can hold.
+    """The numbers of the results as values of strict JSON.
 
     NaN (not measured, or nothing to measure on) becomes ``null``; infinities become the strings ``"inf"`` and
-    ``"-inf"``, which ``float()`` reads in Python. Images stay out.
+    ``"-inf"``, which ``float()`` reads in Python. Images are left out.
     """
     return json_ready(
         {
@@ -171,7 +171,7 @@ def metrics(results: Results) -> dict[str, Any]:
 
 
 def json_ready(value: Any) -> Any:
-    """Plain Python for ``json.dumps(..., allow_nan=False)``; what JSON does not know becomes its ``str``."""
+    """Plain Python for ``json.dumps(..., allow_nan=False)``; values without a JSON form become their ``str``."""
     if value is None or isinstance(value, bool | str):
         return str(value) if isinstance(value, str) else value
     if isinstance(value, dict):

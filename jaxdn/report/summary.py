@@ -1,4 +1,4 @@
-"""The results in words and in plain text: what the page opens with and what the terminal prints."""
+"""The results as sentences and as a text table: the page's summary and the terminal's output."""
 
 import math
 import re
@@ -7,16 +7,16 @@ from typing import NamedTuple
 from jaxdn.report.results import Results, Scores, mean_noise_floor, mean_scores
 
 NEAR_FLOOR = 3.0
-"""dB; closer to the noise floor than this, half or more of the measured error is the reference's own noise."""
+"""dB; within this distance of the noise floor, half or more of the measured error is the reference's own noise."""
 
 
 class Column(NamedTuple):
-    """How one score is written."""
+    """How one score is shown."""
 
     field: str
     label: str
     better: int
-    """1 where higher is better, -1 where lower is, 0 where it is a fact and no score."""
+    """1 if higher is better, -1 if lower is, 0 if it is not a score."""
     explanation: str
 
 
@@ -35,7 +35,7 @@ COLUMNS = (
 
 
 def show(value: float, field: str) -> str:
-    """A score as text: dB with two places, small errors with three figures, an en dash for NaN."""
+    """A score as text: dB with two decimals, small errors with three significant digits, an en dash for NaN."""
     if math.isnan(value):
         return "–"
     if math.isinf(value):
@@ -57,7 +57,7 @@ def show(value: float, field: str) -> str:
 
 
 class Headline(NamedTuple):
-    """The four things a reader wants first; NaN or None where the results cannot tell."""
+    """The main findings; NaN or None where the results do not have them."""
 
     best: str | None
     best_psnr: float
@@ -65,13 +65,13 @@ class Headline(NamedTuple):
     """dB PSNR of the best method over svgf; NaN where there is no svgf or it is the best."""
     svgf: str | None
     traditional: str | None
-    """The ablation A (traditional motion vectors) that is compared."""
+    """The compared ablation A (traditional motion vectors)."""
     occlusion: str | None
     """The ablation C (dual motion vectors and occlusion loss), of the same size as A."""
     disoccluded_less: float
-    """By which fraction C's L1 error in disoccluded pixels lies below A's; negative where it lies above."""
+    """The fraction by which C's L1 error in disoccluded pixels is below A's; negative if it is above."""
     disoccluded_gain: float
-    """dB PSNR of C over A in disoccluded pixels."""
+    """PSNR of C minus that of A in disoccluded pixels, in dB."""
     floor: float
     """dB, mean noise floor of the references."""
 
@@ -95,26 +95,26 @@ def headline(results: Results) -> Headline:
 
 
 def sentences(results: Results) -> list[str]:
-    """The headline in words, plain text, one sentence or two for each finding."""
+    """The headline as plain text, one or two sentences for each finding."""
     top, clips = headline(results), results.clips
     over = f"over {len(clips)} clips" if len(clips) != 1 else f"on the clip {clips[0].name}"
-    said = []
+    found = []
     if top.best is None:
-        said.append("No method has a PSNR: nothing can be said about which is best.")
+        found.append("No method has a PSNR, so none can be called the best.")
     elif len(results.methods) == 1:
-        said.append(f"{top.best} reaches {show(top.best_psnr, 'psnr')} dB PSNR {over}.")
+        found.append(f"{top.best} reaches {show(top.best_psnr, 'psnr')} dB PSNR {over}.")
     else:
         value = show(top.best_psnr, "psnr")
         text = f"{top.best} has the highest PSNR of {len(results.methods)} methods: {value} dB {over}"
         if math.isfinite(top.gain_over_svgf):
             text += f", {show(top.gain_over_svgf, 'psnr')} dB more than {top.svgf}"
-        said.append(text + ".")
+        found.append(text + ".")
     broken = [method for method, scores in mean_scores(results).items() if math.isnan(scores.psnr)]
     if broken and top.best is not None:
-        said.append(f"Without a PSNR on at least one clip: {', '.join(broken)}.")
+        found.append(f"Without a PSNR on at least one clip: {', '.join(broken)}.")
     if top.traditional is not None and top.occlusion is not None:
         if math.isnan(top.disoccluded_less):
-            said.append("Disoccluded pixels were not scored, so A and C cannot be compared there.")
+            found.append("Disoccluded pixels were not scored, so A and C cannot be compared there.")
         else:
             means = mean_scores(results)
             a, c = (means[method].disoccluded_l1 for method in (top.traditional, top.occlusion))
@@ -125,18 +125,18 @@ def sentences(results: Results) -> list[str]:
             )
             if math.isfinite(top.disoccluded_gain):
                 text += f"; {'+' if top.disoccluded_gain >= 0 else ''}{show(top.disoccluded_gain, 'psnr')} dB PSNR"
-            said.append(text + ").")
+            found.append(text + ").")
     if math.isnan(top.floor):
-        said.append("The noise floor of the references is not known.")
+        found.append("The noise floor of the references is not known.")
     else:
         text = f"The references are noisy themselves: a perfect image would score {show(top.floor, 'psnr')} dB"
-        said.append(text + (" on average." if len(clips) != 1 else "."))
+        found.append(text + (" on average." if len(clips) != 1 else "."))
         if top.best_psnr > top.floor - NEAR_FLOOR:
-            said.append(
+            found.append(
                 f"{top.best} comes within {NEAR_FLOOR:g} dB of that floor, so its true error is smaller than it looks; "
-                "references with more samples would tell."
+                "references with more samples would show it."
             )
-    return said
+    return found
 
 
 def text_table(results: Results) -> str:
@@ -169,7 +169,7 @@ def floor_score(floor_psnr: float, field: str) -> float:
 
 
 def best_methods(scores: dict[str, Scores], column: Column) -> set[str]:
-    """The methods that are best in a column as it is written; none where the column is no score or has one method."""
+    """The best methods of a column, as rounded; none if the column is not a score or has one method."""
     values = {method: getattr(score, column.field) for method, score in scores.items()}
     known = {method: value * column.better for method, value in values.items() if not math.isnan(value)}
     if column.better == 0 or len(known) < 2:
@@ -180,7 +180,7 @@ def best_methods(scores: dict[str, Scores], column: Column) -> set[str]:
 
 
 def is_noisy(method: str) -> bool:
-    """Whether a label says that this is the input, not a method."""
+    """Whether a label is that of the noisy input, not of a method."""
     return "noisy" in method.lower()
 
 
@@ -189,14 +189,14 @@ def _difference(first: float, second: float) -> float:
 
 
 def _labelled(methods: list[str], word: str) -> str | None:
-    """The first method that is called so, or has the word in its label."""
+    """The first method with this label, or with the word in its label."""
     exact = [method for method in methods if method.lower() == word]
     within = [method for method in methods if word in re.split(r"[^a-z0-9]+", method.lower())]
     return next(iter(exact + within), None)
 
 
 def _ablation(methods: list[str]) -> tuple[str | None, str | None]:
-    """Labels of the ablations A and C: the same label but for the one letter, else the first of each."""
+    """Labels of the ablations A and C: those that differ only in this letter, else the first of each."""
 
     def lettered(letter: str) -> list[str]:
         return [method for method in methods if re.search(rf"(?<![A-Za-z0-9]){letter}(?![A-Za-z0-9])", method)]

@@ -14,9 +14,9 @@ def write_report(results: Results, folder: str | os.PathLike[str]) -> Path:
 
     ``metrics.json`` is strict JSON with every number of the results and no image: NaN (not measured, or nothing to
     measure on) is ``null``, infinities are the strings ``"inf"`` and ``"-inf"``. ``report.html`` is one file that needs
-    neither a server nor a network. Both are renamed into their places when they are whole, the page last; the folder
-    is made where it is missing. Raises ValueError where the results contradict themselves (a method without scores,
-    images of different sizes), before anything is written.
+    neither a server nor a network. Both files are renamed into place when complete, the page last; the folder is
+    created if it is missing. Raises ValueError for inconsistent results (a method without scores, images of different
+    sizes), before anything is written.
     """
     check_results(results)
     numbers = json.dumps(metrics(results), indent=1, allow_nan=False, ensure_ascii=False)

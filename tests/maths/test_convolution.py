@@ -1,5 +1,8 @@
 """The convolution and its hand-written gradient."""
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -125,3 +128,40 @@ def test_onednn_that_is_not_installed_says_what_to_install(monkeypatch):
     assert not onednn.available()
     with pytest.raises(ValueError, match=r"pip install .*jaxdn\[onednn\]"):
         convolve(*_operands(2, 3), implementation="onednn")
+
+
+MADE_AND_RUN = """
+import threading
+import numpy as np
+from jaxdn.ops import onednn
+
+rng = np.random.default_rng(0)
+for size, inputs, outputs in (((1, 1), 4, 4), ((16, 16), 14, 4), ((64, 64), 14, 32)):
+    x, y = (rng.standard_normal((1, *size, channels)).astype(np.float32) for channels in (inputs, outputs))
+    kernel = rng.standard_normal((3, 3, inputs, outputs)).astype(np.float32)
+    for direction, (first, second, out) in {
+        "forward": (x, kernel, np.zeros_like(y)),
+        "image gradient": (y, kernel, np.zeros_like(x)),
+        "kernel gradient": (x, np.zeros_like(kernel), y),
+    }.items():
+        made, found = [], out if direction != "kernel gradient" else second
+        make = lambda: made.append(onednn._Convolution(direction, 1, *size, inputs, outputs))
+        run = lambda: made[0](*(onednn._address(array) for array in (first, second, out)))
+        for task in (make, run):
+            thread = threading.Thread(target=task)
+            thread.start()
+            thread.join()
+        there = found.copy()
+        run()
+        np.testing.assert_allclose(there, found, rtol=1e-5, atol=1e-5)
+        assert np.abs(found).max() > 0.1
+print("sound")
+"""
+
+
+@needs_onednn
+def test_onednn_may_be_run_by_another_thread_than_made_it():
+    """XLA calls back from any of its threads; the library's own working memory belongs to the thread that makes."""
+    done = subprocess.run([sys.executable, "-c", MADE_AND_RUN], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr  # a write out of bounds ends the process
+    assert done.stdout.strip() == "sound"

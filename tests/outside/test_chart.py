@@ -250,7 +250,7 @@ def test_what_asks_for_samples_is_left_out_in_a_sentence(monkeypatch):
 
     entered(monkeypatch, lambda options: mean_of_two(samples), "sampler")
     assert not [each for each in chosen() if each.label == "sampler"]
-    assert [sentence for sentence in left_out() if sentence.startswith("sampler asks the renderer for samples")]
+    assert [sentence for sentence in left_out() if sentence.startswith("sampler requests samples from the renderer")]
 
 
 def test_steps_with_known_parts_are_taken_apart(denoisers):
@@ -275,5 +275,5 @@ def test_the_whole_of_it_quickly_and_again(tmp_path):
     assert {"renderer @ 1", "renderer @ 16"} <= set(raw["errors"])
     assert "bare renderer needs" in first.stdout
     again = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert "going on from what was measured before" in again.stdout
+    assert "resuming the earlier measurements" in again.stdout
     assert json.loads((tmp_path / "chart-quick" / "chart.json").read_text()) == raw

@@ -1,1 +1,1 @@
-"""`make chart`: what every way to an image costs in time, and how good the image is, on this machine."""
+"""`make chart`: time and image quality of every method on this machine."""

@@ -1,11 +1,11 @@
-"""`make chart`: error against time per frame of every way to an image, measured on this machine.
+"""`make chart`: error against time per frame for every way to make an image, measured on this machine.
 
     python -m experiments.speed.chart                          # everything, about 20 minutes on two cores
     python -m experiments.speed.chart --quick                  # the fastest of each method, one tiny clip: a minute
     python -m experiments.speed.chart --clips my/clip other    # your own clips (with layers and a reference)
 
-Writes ``runs/chart/chart.json`` (raw measurements) and ``runs/chart/chart.html`` (a page that needs no network). What
-is measured is kept after every point: interrupted, it goes on where it stopped, and repeats only what is missing.
+Writes ``runs/chart/chart.json`` (raw measurements) and ``runs/chart/chart.html`` (a page that needs no network). Every
+point is saved when it is measured: an interrupted run is resumed and measures only what is missing.
 """
 
 import hashlib
@@ -47,7 +47,7 @@ from jaxdn.weights import SHIPPED
 
 @dataclass
 class Settings:
-    """Measure error and time of every way to an image on the same clips; write runs/chart/chart.html."""
+    """Measure error and time for every way to make an image on the same clips; write runs/chart/chart.html."""
 
     quick: bool = False
     """The fastest weights of each method on one tiny clip, to see that everything works."""
@@ -58,7 +58,7 @@ class Settings:
 
 
 class Run:
-    """One run: what it measures, where it keeps it, and how it tells."""
+    """One run: the measurements, their storage and the messages."""
 
     def __init__(self, sizes: Sizes, clips: Sequence[Footage], folder: Path, console: Console) -> None:
         self.sizes, self.clips, self.folder, self.console = sizes, clips, folder, console
@@ -79,12 +79,12 @@ class Run:
         self.store = Store(folder / "chart.json", settings, describe_machine())
 
     def say(self, line: str) -> None:
-        """A line that stays."""
+        """Print a line above the progress bars."""
         self.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     @contextmanager
     def counted(self, title: str, total: int) -> Iterator[Any]:
-        """A bar where somebody watches, lines elsewhere; calls ``done(what)`` after each part."""
+        """A bar on a terminal, lines elsewhere; the caller calls ``done(what)`` after each part."""
         columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), "{task.fields[what]}")
         with Progress(title, *columns, console=self.console, disable=not self.console.is_terminal) as bar:
             task = bar.add_task(title, total=total, what="")
@@ -132,7 +132,7 @@ class Run:
         return all(self._picture(key, clip).is_file() for clip in self.clips)
 
     def render_costs(self) -> None:
-        """What rendering a frame of each clip costs, at its own size and at the timed one."""
+        """Measure the cost of rendering a frame of each clip, at its own size and at the timed one."""
         use_variant()
         sizes = {self.own_size: self.clips[0].reference.shape[1:3], self.timed_size: self.sizes.timed}
         with self.counted("rendering", len(sizes) * len(self.clips)) as done:
@@ -143,14 +143,14 @@ class Run:
                         try:
                             animated = scene_from_record(clip.record.get("scene") or {})
                         except ValueError as error:
-                            self.say(f"{clip.name}: what rendering it costs cannot be measured: {error}")
+                            self.say(f"{clip.name}: its rendering cost cannot be measured: {error}")
                             continue
                         costs[clip.name] = measure_cost(animated, height, width, self.meter)
                         self.store.put("render", size, costs)
                     done(f"{clip.name} at {size}")
 
     def times(self) -> None:
-        """Time every way, those of a group interleaved, at both sizes."""
+        """Time every method, those of a group interleaved, at both sizes."""
         own = jax.tree.map(np.asarray, frame_at(self.clips[0].frames, self.clips[0].shown))
         present = [name for name in Frame._fields if getattr(own, name) is not None]
         height, width = self.sizes.timed
@@ -176,7 +176,7 @@ class Run:
 
     def _timed(self, members: Sequence[Way], frame: Frame, size: str) -> dict[str, dict[str, Any]]:
         calls = {way.name: way.timed(frame) for way in members if size in self._sizes_of(way)}
-        # Small frames vary more, and cost nothing.
+        # Small frames vary more and take little time.
         rounds = self.sizes.rounds if size == self.timed_size else 7 * self.sizes.rounds
         found: dict[str, dict[str, Any]] = {}
         for name, timing in measure(calls, rounds=rounds, budget_s=150 if size == self.timed_size else 10).items():
@@ -210,12 +210,12 @@ def main(settings: Settings) -> None:
     folder = settings.out or Path("runs") / ("chart-quick" if settings.quick else "chart")
     places = list(settings.clips) or footage.render(sizes, Path("data") / folder.name)
     run = Run(sizes, [footage.read(place) for place in places], folder, console)
-    lacking = left_out() + ([] if run.meter else [NOT_MEASURABLE])
-    run.store.put("left_out", "here", lacking)
-    for sentence in lacking:
+    missing = left_out() + ([] if run.meter else [NOT_MEASURABLE])
+    run.store.put("left_out", "here", missing)
+    for sentence in missing:
         run.say(sentence)
     if run.store.kept:
-        run.say(f"{run.store.path}: going on from what was measured before with these settings on this machine")
+        run.say(f"{run.store.path}: resuming the earlier measurements with these settings on this machine")
     if "torch" not in peers.missing():
         from experiments.speed.peers import pytorch
 
@@ -229,7 +229,7 @@ def main(settings: Settings) -> None:
     page = write_page(folder, run.store.data, found, equals, (run.timed_size, run.own_size))
     front = summary.pareto(found, MEASURES[0], run.timed_size, render=bool(run.store.data["render"]))
     print(summary.front_table(front, equals, run.timed_size, max(run.layers)))
-    print(f"raw numbers: {run.store.path}\npage:        {page}  ({time.monotonic() - began:.0f} s in all)")
+    print(f"raw numbers: {run.store.path}\npage:        {page}  ({time.monotonic() - began:.0f} s in total)")
 
 
 if __name__ == "__main__":

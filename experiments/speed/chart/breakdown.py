@@ -1,6 +1,6 @@
-"""Where the time of one ``ntd`` frame goes, in the paper's four parts, each jitted by itself.
+"""Where the time of one ``ntd`` frame goes, in the paper's four parts, each jitted separately.
 
-A step compiled as a whole shares memory between its parts, so the parts together may take longer than it does.
+A step compiled as a whole shares memory between its parts, so the sum of the parts may take longer.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from experiments.speed.timing import Call, Timing, measure
 from experiments.speed.works import steps
 from jaxdn import color
 from jaxdn.candidates import Candidate
-from jaxdn.denoiser import Denoiser
+from jaxdn.denoiser import Denoiser, Params
 from jaxdn.frame import Frame
 from jaxdn.methods.demodulated import SMALLEST_ALBEDO
 from jaxdn.methods.ntd import TAPS, depth_feature
@@ -36,20 +36,20 @@ WHOLE = "whole step"
 
 
 class Subject(NamedTuple):
-    """A step that can be taken apart."""
+    """A step whose parts can be timed."""
 
     name: str
     """Weights and engine."""
     widths: Widths
     denoiser: Denoiser
-    params: Any
+    params: Params
     engine: str
 
 
 def subjects(denoisers: Sequence[Candidate], *, quick: bool = False) -> Iterator[Subject]:
-    """Those whose step has the parts below, in plain XLA and in each engine that runs here (``quick``: XLA alone).
+    """Denoisers whose step has the parts below, in plain XLA and in each available engine (``quick``: only XLA).
 
-    These are weights of ``ntd`` whose options are the defaults but for the network's size: others change the parts.
+    These are weights of ``ntd`` with default options except for the network's size: other options change the parts.
     """
     method = steps.METHOD
     fitting = [ENGINES[name] for name in method.engines if ENGINES[name].purpose == "inference"]
@@ -67,7 +67,7 @@ def subjects(denoisers: Sequence[Candidate], *, quick: bool = False) -> Iterator
 
 
 def reproject(history: jax.Array, frame: Frame, noisy: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The warped history, the noisy pixel where there is none, and where that is."""
+    """The warped history, with the noisy pixel where it is missing, and a mask of the missing pixels."""
     lost = ~on_screen(frame.dual_motion)
     return jnp.where(lost, noisy, repair_image(warp(history, frame.dual_motion))), lost
 
@@ -101,7 +101,7 @@ def breakdown(subject: Subject, frame: Frame, *, rounds: int) -> dict[str, Timin
     params = subject.params
     network = unet(GROUPS, HEADS, widths=subject.widths, implementation=subject.engine)
 
-    def predict(params: Any, frame: Frame, noisy: jax.Array, recalled: jax.Array, lost: jax.Array) -> Any:
+    def predict(params: Params, frame: Frame, noisy: jax.Array, recalled: jax.Array, lost: jax.Array) -> Any:
         frame, _ = repair(frame)
         features = [
             color.compress(noisy),

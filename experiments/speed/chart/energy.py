@@ -1,4 +1,4 @@
-"""Joules that the processor's packages take, where the machine tells (RAPL under Linux)."""
+"""Energy in joules of the processor's packages, where the machine reports it (RAPL under Linux)."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,25 +10,25 @@ NOT_MEASURABLE = "Energy is not measurable on this machine: it exposes no readab
 
 
 class Meter:
-    """The energy counters of all packages; what else runs on the machine is in them."""
+    """The energy counters of all packages; they include everything that runs on the machine."""
 
     def __init__(self, zones: Sequence[Path]) -> None:
         self._zones = zones
 
     def joules(self, call: Callable[[], Any]) -> float:
-        """What the packages took while ``call`` ran."""
+        """The packages' energy while ``call`` ran."""
         before = [_read(zone / "energy_uj") for zone in self._zones]
         call()
         total = 0
         for zone, start in zip(self._zones, before, strict=True):
             spent = _read(zone / "energy_uj") - start
-            # The counter starts again from 0 when it is full.
+            # The counter wraps around.
             total += spent if spent >= 0 else spent + _read(zone / "max_energy_range_uj")
         return total / 1e6
 
 
 def find_meter(folder: Path = POWERCAP) -> Meter | None:
-    """The meter of this machine; None where there is none or its counters may not be read (often only by root)."""
+    """The meter of this machine; None if it has none or its counters cannot be read (often only by root)."""
     zones = sorted(folder.glob("intel-rapl:[0-9]")) + sorted(folder.glob("intel-rapl:[0-9][0-9]"))
     try:
         for zone in zones:

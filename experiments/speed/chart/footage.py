@@ -1,4 +1,4 @@
-"""The clips of the chart: rendered with noisy layers from 1 sample a pixel up to what a user would wait for."""
+"""The clips of the chart, rendered with noisy layers from 1 sample per pixel up to the most a user would wait for."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from jaxdn.render import ClipJob, render_clips
 
 
 class Sizes(NamedTuple):
-    """What is rendered and timed."""
+    """The rendered and timed sizes."""
 
     scenes: tuple[tuple[str, int], ...]
     """(family, seed): seeds that no network was trained or validated on."""
@@ -28,11 +28,11 @@ class Sizes(NamedTuple):
     """Height and width of the frame that is timed."""
     rounds: int
     quick: bool = False
-    """Only the plain form of each method's fastest weights is measured."""
+    """Measure only the plain form of each method's fastest weights."""
 
     @property
     def layers(self) -> tuple[int, ...]:
-        """1, 2, 4 ... samples a pixel."""
+        """1, 2, 4 ... samples per pixel."""
         return tuple(2**power for power in range(self.most_samples.bit_length()))
 
 
@@ -49,20 +49,20 @@ class Footage(NamedTuple):
     folder: Path
     record: dict[str, Any]
     frames: Frame
-    """[T, H, W, C] the buffers that the effects of the clip call for; ``radiance`` is that of the smallest layer."""
+    """[T, H, W, C] the buffers that the clip's effects require; ``radiance`` is that of the smallest layer."""
     noisy: dict[int, np.ndarray]
-    """Samples a pixel -> [T, H, W, 3]."""
+    """Samples per pixel -> [T, H, W, 3]."""
     reference: np.ndarray
     hidden: np.ndarray
     """[T, H, W, 1] bool, pixels whose point was hidden one frame earlier."""
     shown: int
-    """The frame that the page shows: of the scored ones, the one with the most hidden pixels."""
+    """The frame on the page: the scored frame with the most hidden pixels."""
     noise_floor: float
     """PSNR in dB that a perfect image would have against the reference; NaN where it is not known."""
 
 
 def render(sizes: Sizes, folder: Path) -> list[Path]:
-    """Render the clips into ``folder``, or find them there; returns their folders."""
+    """Render the clips into ``folder``, unless they exist; returns their folders."""
     places = [folder / f"{family}-{seed}" for family, seed in sizes.scenes]
     jobs = [
         ClipJob(
@@ -81,7 +81,7 @@ def render(sizes: Sizes, folder: Path) -> list[Path]:
 
 
 def read(folder: Path) -> Footage:
-    """Read a clip. Raises ClipError where it has no reference or fewer frames than are scored."""
+    """Read a clip. Raises ClipError if it has no reference or too few frames to be scored."""
     record = read_record(folder)
     layers = sorted(record["layers"])
     clip = read_clip(folder, spp=layers[0])
@@ -101,7 +101,7 @@ def read(folder: Path) -> Footage:
 
 
 def common_layers(clips: Sequence[Footage]) -> list[int]:
-    """The numbers of samples that every clip has. Raises ClipError where there are none, or the sizes differ."""
+    """The numbers of samples that every clip has. Raises ClipError if there are none, or the sizes differ."""
     shared = set.intersection(*(set(clip.noisy) for clip in clips))
     shapes = {clip.reference.shape[1:3] for clip in clips}
     if not shared or len(shapes) > 1:

@@ -1,13 +1,13 @@
-"""Ways that ``ntd`` alone has: its network in PyTorch, and at widths for which there are no trained weights."""
+"""Entries that only ``ntd`` has: its network in PyTorch, and with widths without trained weights."""
 
 from collections.abc import Iterator
-from typing import Any
 
 from experiments.speed import peers
 from experiments.speed.chart.way import Way, way
 from experiments.speed.timing import Call
 from experiments.speed.works import steps
 from jaxdn import candidates
+from jaxdn.denoiser import Params
 from jaxdn.frame import Frame
 from jaxdn.networks import Widths
 from jaxdn.weights import load_weights, shipped_names
@@ -16,11 +16,11 @@ UNTRAINED: dict[str, Widths] = {
     "ntd medium": ((24, 24), (48, 48), (48, 48), (64, 64), (80, 80)),
     "ntd tiny": ((8,), (16, 16), (24, 24), (32, 32), (32, 32)),
 }
-"""Widths for which there are no trained weights: what they cost can be measured, how good they are cannot."""
+"""Widths without trained weights: their time can be measured, their quality cannot."""
 
 
 def untrained() -> Iterator[Way]:
-    """Networks of other widths with random weights: time alone."""
+    """Networks of other widths with random weights: only time."""
     for name, widths in UNTRAINED.items():
         made = way(candidates.untrained(steps.METHOD, size=widths), scored=False)
         family = "untrained widths"
@@ -28,21 +28,21 @@ def untrained() -> Iterator[Way]:
 
 
 def pytorch() -> Iterator[Way]:
-    """The network of the shipped weights in PyTorch: the same image, so time alone.
+    """The network of the shipped weights in PyTorch: the same image, so only time.
 
-    At the large size alone, as PyTorch compiles for each size anew.
+    Only at the large size, as PyTorch compiles again for each size.
     """
-    lacking = peers.missing()
+    missing = peers.missing()
     for weights, options in steps.METHOD.variants.items():
         if weights not in shipped_names():
             continue
         _, params = load_weights(weights)
         for compiled in (False, True):
-            if ("torch-compiled" if compiled else "torch") in lacking:
+            if ("torch-compiled" if compiled else "torch") in missing:
                 continue
 
             def timed(
-                frame: Frame, size: str = options["size"], params: Any = params, compiled: bool = compiled
+                frame: Frame, size: str = options["size"], params: Params = params, compiled: bool = compiled
             ) -> Call:
                 return steps.pytorch(size, params, frame, compiled=compiled)
 

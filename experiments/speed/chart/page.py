@@ -1,4 +1,4 @@
-"""The chart as one page that needs no network: a plot with the pictures behind it, and tables that need no script."""
+"""The chart as one page that needs no network: a plot linked to images, and tables that need no script."""
 
 import json
 import math
@@ -31,7 +31,15 @@ def write_page(
     equals: Mapping[str, Equal],
     sizes: tuple[str, str],
 ) -> Path:
-    """Write ``folder/chart.html``; ``sizes`` are the timed size and the clips' own. Returns its path."""
+    """Write ``folder/chart.html`` and return its path.
+
+    Args:
+      folder: with the images that were saved while scoring.
+      data: raw measurements.
+      points: of the chart.
+      equals: key of a point -> what the bare renderer needs for its quality.
+      sizes: the timed size and the clips' own.
+    """
     path = Path(folder) / "chart.html"
     document = page(data, points, equals, sizes, read_pictures(Path(folder), data, points))
     write_whole({path: document.encode("utf-8", "replace")})
@@ -39,7 +47,7 @@ def write_page(
 
 
 def read_pictures(folder: Path, data: Mapping[str, Any], points: Sequence[Point]) -> Pictures:
-    """The pictures that were kept while scoring."""
+    """The images that were saved while scoring."""
     found: Pictures = {}
     for clip in data["clips"]:
         keys = ["reference", *(point.key for point in points if point.spp)]
@@ -57,7 +65,15 @@ def page(
     sizes: tuple[str, str],
     pictures: Pictures,
 ) -> str:
-    """The whole document."""
+    """The whole document.
+
+    Args:
+      data: raw measurements.
+      points: of the chart.
+      equals: key of a point -> what the bare renderer needs for its quality.
+      sizes: the timed size and the clips' own.
+      pictures: clip -> point -> image.
+    """
     here = files("experiments.speed.chart")
     style = files("jaxdn.report").joinpath("page.css").read_text("utf-8") + here.joinpath("page.css").read_text("utf-8")
     errors = {
@@ -91,7 +107,7 @@ def page(
         '<div class="legend" id="families"></div><div class="legend" id="variants"></div>'
         '<p class="note" id="hovered" aria-live="polite">Point at a mark for its numbers, click it for its picture.</p>'
         '<div id="shown"></div>'
-        "<noscript><p>The plot and the pictures need JavaScript, which this page carries with it. The tables do not."
+        "<noscript><p>The plot and the pictures need JavaScript, which this page contains. The tables do not."
         "</p></noscript></section>",
         _front(data, points, equals, sizes[0], most),
         _table(data, points, equals, sizes, most),
@@ -103,7 +119,7 @@ def page(
         [
             "<!DOCTYPE html>",
             '<html lang="en"><head><meta charset="utf-8">',
-            # Nothing may be fetched: the page is complete, and says so to the browser.
+            # The page is complete; this policy makes the browser block every request.
             '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
             "style-src 'unsafe-inline'; script-src 'unsafe-inline'\">",
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
@@ -146,18 +162,18 @@ def _top(data: Mapping[str, Any], sizes: tuple[str, str]) -> str:
         else name
         for name, facts in data["clips"].items()
     )
-    said = [
+    notes = [
         f"Errors are means over the last {data['settings']['scored frames']} frames of {escape(clips)}, "
-        f"{sizes[1]} pixels: small images. All but relative MSE are taken on sRGB values, cut at 1.",
+        f"{sizes[1]} pixels: small images. All except relative MSE are computed on sRGB values, clipped at 1.",
         f"Time is for one frame of {sizes[0]} (median of repeats, methods interleaved), or of the clips' own size. "
-        "Rendering beyond four samples a pixel is extrapolated: its time is a line in the number of samples.",
+        "Rendering times beyond four samples per pixel are extrapolated linearly in the number of samples.",
         "Marks at the bottom of the plot have no error: untrained widths, the same network in PyTorch, and the time "
-        "of a frame in which nothing moves. They stand at the time of a frame with 1 sample a pixel.",
-        "Effects all writes out every buffer that a denoiser reads, plain only what a clip calls for: the same image, "
-        "and the same program where the clip calls for everything.",
+        "of a frame in which nothing moves. They are placed at the time of a frame with 1 sample per pixel.",
+        "Effects all has every buffer that a denoiser reads, plain only those of the clip's effects: the same image, "
+        "and the same program if the clip has all effects.",
         *(escape(sentence) for sentence in data["left_out"]["here"]),
     ]
-    sentences = "".join(f"<li>{sentence}</li>" for sentence in said)
+    sentences = "".join(f"<li>{sentence}</li>" for sentence in notes)
     return (
         "<header><h1>What accuracy costs in time</h1></header>"
         f'<section id="summary"><ul class="note">{sentences}</ul></section>'
@@ -181,7 +197,7 @@ def _front(data: Mapping[str, Any], points: Sequence[Point], equals: Mapping[str
                 "" if equal is None else in_words(equal, most),
             ]
         )
-    head = ["Method", "spp", f"ms / frame, {size}", "of it denoising", "PSNR dB", "temporal PSNR dB", "bare renderer"]
+    head = ["Method", "spp", f"ms / frame, {size}", "denoising ms", "PSNR dB", "temporal PSNR dB", "bare renderer"]
     return (
         '<section id="front"><h2>The Pareto front</h2><p class="note">No other point is better and no slower; PSNR '
         "against time with rendering. Last column: what rendering alone needs for the same PSNR.</p>"
@@ -250,7 +266,7 @@ def _costs(data: Mapping[str, Any], sizes: tuple[str, str]) -> str:
             rows.append([f"{escape(clip)}, {size}", *(number(1e3 * value, 1) for value in costs["seconds"].values())])
     if not rows:
         return ""
-    head = ["Clip and size", "building the scene", "each sample a pixel", "albedo, normals, depth", "motion vectors"]
+    head = ["Clip and size", "building the scene", "each sample per pixel", "albedo, normals, depth", "motion vectors"]
     return (
         '<section id="rendering"><h2>Rendering one frame, ms</h2><p class="note">The first two are the bare renderer. '
         "A denoiser that is not temporal needs the third too, a temporal one all four.</p>"

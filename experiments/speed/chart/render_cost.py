@@ -1,4 +1,4 @@
-"""What rendering one frame costs: a part for every sample, and parts that come once."""
+"""The cost of rendering one frame: a part per sample, and fixed parts."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -22,11 +22,11 @@ class Cost(NamedTuple):
     fixed: float
     """Building the scene."""
     sample: float
-    """One sample a pixel."""
+    """One sample per pixel."""
     features: float
     """Albedo, normals, depth."""
     motion: float
-    """Motion vectors, the dual ones and what is disoccluded."""
+    """Motion vectors, dual motion vectors and visibility."""
 
     def at(self, spp: float, guides: str = "none") -> float:
         """The cost of a frame with ``spp`` samples and the buffers that "features" or "motion" stand for."""
@@ -35,11 +35,11 @@ class Cost(NamedTuple):
 
 
 def fit(light: Mapping[int, float], features: float, motion: float) -> Cost:
-    """The cost from what frames took: ``light`` without buffers by samples, and with 1 sample and more buffers."""
+    """The cost from the times of frames: ``light`` (samples -> without buffers), and 1 sample with more buffers."""
     samples = np.asarray(sorted(light), float)
     slope, fixed = np.polyfit(samples, [light[int(spp)] for spp in samples], 1)
     slope = max(float(slope), 0.0)
-    # Noise of the measurement must not make a buffer, or the scene, cost less than nothing.
+    # Measurement noise must not make the cost of a buffer, or of the scene, negative.
     return Cost(max(float(fixed), 0.0), slope, max(features - light[1], 0.0), max(motion - features, 0.0))
 
 

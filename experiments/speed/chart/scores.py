@@ -1,4 +1,4 @@
-"""How far images are from the reference: the numbers of one point of the chart."""
+"""Errors against the reference: the numbers of one point of the chart."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ class Measure(NamedTuple):
     field: str
     label: str
     better: int
-    """1 where higher is better, -1 where lower is."""
+    """1 if higher is better, -1 if lower is."""
 
 
 MEASURES = (
@@ -43,7 +43,7 @@ def _scores(images: jax.Array, reference: jax.Array, hidden: jax.Array) -> dict[
 
 
 def score(images: np.ndarray, clip: Footage) -> dict[str, float]:
-    """Every measure over the last frames of images [T, H, W, 3], linear; all but relative MSE on sRGB, cut at 1.
+    """Every measure over the last frames of images [T, H, W, 3], linear; all except relative MSE on sRGB, clipped at 1.
 
     NaN in disoccluded pixels where the clip has none.
     """
@@ -54,5 +54,5 @@ def score(images: np.ndarray, clip: Footage) -> dict[str, float]:
 
 
 def picture(image: np.ndarray) -> np.ndarray:
-    """A linear image as it is looked at: sRGB, cut at 1."""
+    """A linear image for display: sRGB, clipped at 1."""
     return np.asarray(color.tonemap(jnp.asarray(image)))

@@ -1,4 +1,4 @@
-"""The raw measurements in one file that is whole after every point: an interrupted run goes on where it stopped."""
+"""The raw measurements in one file that is complete after every point: an interrupted run is resumed."""
 
 import hashlib
 import json
@@ -17,7 +17,7 @@ clip -> cost. breakdown: network -> part -> timing."""
 
 
 class Store:
-    """``chart.json`` and what it was measured with."""
+    """``chart.json``: the measurements, their settings and their machine."""
 
     def __init__(self, path: Path, settings: Mapping[str, Any], machine: Mapping[str, Any]) -> None:
         self.path = path
@@ -26,18 +26,18 @@ class Store:
         mark = hashlib.sha256(text.encode()).hexdigest()[:16]
         self.data: dict[str, Any] = {"fingerprint": mark, **made_with, **{part: {} for part in PARTS}}
         self.kept = False
-        """Measurements of an earlier run were found, made with the same settings on the same machine."""
+        """Measurements of an earlier run with the same settings on the same machine were found."""
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.exists():
             before = read_json(path)
             if isinstance(before, dict) and before.get("fingerprint") == mark:
                 self.data, self.kept = before, True
             else:
-                # Numbers of another machine or other settings do not mix with these, and may have taken long.
+                # Numbers of another machine or other settings cannot be combined with these, but may have taken long.
                 os.replace(path, path.with_name("chart.before.json"))
 
     def put(self, part: str, key: str, value: Any) -> None:
-        """Keep one measurement and write the file anew."""
+        """Add one measurement and rewrite the file."""
         self.data[part][key] = json_ready(value)
         write_json(self.path, self.data)
 
@@ -47,5 +47,5 @@ class Store:
 
 
 def point_key(method: str, spp: int) -> str:
-    """How a point is called in the file."""
+    """The key of a point in the file."""
     return f"{method} @ {spp}"

@@ -1,4 +1,4 @@
-"""What the raw measurements say: points, the Pareto front, and how long bare rendering takes for the same quality."""
+"""Evaluation of the raw measurements: points, the Pareto front, and the time of bare rendering for equal quality."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ RENDERER = "renderer"
 
 
 class Point(NamedTuple):
-    """One way to an image at one number of samples."""
+    """One method at one number of samples."""
 
     key: str
     method: str
@@ -25,13 +25,12 @@ class Point(NamedTuple):
     errors: Mapping[str, float]
     """Measure -> mean over clips."""
     denoise_ms: Mapping[str, float]
-    """Size -> milliseconds a frame, 0 for the renderer alone."""
+    """Size -> milliseconds per frame, 0 for the renderer alone."""
     render_ms: Mapping[str, float]
-    """Size -> milliseconds of rendering the frame that goes in (where ``spp`` is None, with one sample); empty where it
-    is not known."""
+    """Size -> milliseconds of rendering the input frame (with one sample if ``spp`` is None); empty if not known."""
 
     def milliseconds(self, size: str, *, render: bool) -> float:
-        """Per frame; NaN where it is not known."""
+        """Per frame; NaN if not known."""
         rendered = self.render_ms.get(size, math.nan) if render else 0.0
         return self.denoise_ms.get(size, math.nan) + rendered
 
@@ -40,15 +39,15 @@ class Equal(NamedTuple):
     """What the bare renderer needs for the quality of a point."""
 
     spp: float
-    """0 below one sample, infinite beyond the most that were rendered."""
+    """0 below one sample, infinite beyond the largest rendered number."""
     seconds: float
-    """Per frame at the timed size; NaN where the time of rendering is not known."""
+    """Per frame at the timed size; NaN if the time of rendering is not known."""
 
 
 def points(data: Mapping[str, Any], labels: Mapping[str, tuple[str, str, str]]) -> list[Point]:
     """The points of the raw data; ``labels``: method -> (family, variant, guides).
 
-    Methods without a label are left out: they were measured when something was installed that is not there now.
+    Methods without a label are left out: they were measured with an installation that is no longer there.
     """
     costs = {size: render_cost(data, size) for size in data["render"]}
     found = []
@@ -82,8 +81,8 @@ def render_cost(data: Mapping[str, Any], size: str, kind: str = "seconds") -> Co
 def pareto(points: Sequence[Point], measure: Measure, size: str, *, render: bool = True) -> list[Point]:
     """The points that no other one beats in both time and error, by rising time.
 
-    What writes every buffer out is left aside: its image is the plain form's, and where nothing is left out the time
-    is too, so that chance would choose between them.
+    The variant with every buffer explicit is not considered: its image is the plain form's, and often its time too, so
+    that noise would decide between them.
     """
     known = []
     for point in points:
@@ -103,13 +102,13 @@ def pareto(points: Sequence[Point], measure: Measure, size: str, *, render: bool
 
 
 def equal_samples(psnr: float, curve: Mapping[int, float]) -> float:
-    """Samples a pixel at which the renderer's ``curve`` (spp -> PSNR) reaches ``psnr``.
+    """Samples per pixel at which the renderer's ``curve`` (spp -> PSNR) reaches ``psnr``.
 
     Between two counts of samples the PSNR is linear in their logarithm. 0 below the curve's first point, infinite
     beyond its last.
     """
     samples = np.asarray(sorted(curve), float)
-    # More samples never make an image worse; where noise says so, the fewer samples count.
+    # More samples never make an image worse; where noise suggests it, the smaller number of samples counts.
     quality = np.maximum.accumulate([curve[int(spp)] for spp in samples])
     if psnr < quality[0]:
         return 0.0
@@ -145,7 +144,7 @@ def text_table(rows: Sequence[Sequence[str]]) -> str:
 
 def front_table(front: Sequence[Point], equals: Mapping[str, Equal], size: str, most: int) -> str:
     """The Pareto front for a terminal; ``most`` samples were rendered."""
-    rows = [["on the front", "spp", "ms / frame", "of it denoising", "PSNR dB", "temporal", "bare renderer needs"]]
+    rows = [["on the front", "spp", "ms / frame", "denoising ms", "PSNR dB", "temporal", "bare renderer needs"]]
     for point in front:
         equal = equals.get(point.key)
         rows.append(
@@ -163,7 +162,7 @@ def front_table(front: Sequence[Point], equals: Mapping[str, Equal], size: str, 
 
 
 def in_words(equal: Equal, most: int) -> str:
-    """An equal-quality figure in words; ``most`` samples were rendered."""
+    """An equal-quality figure as text; ``most`` samples were rendered."""
     if math.isinf(equal.spp):
         return f"> {most} spp"
     if equal.spp == 0:
@@ -172,6 +171,6 @@ def in_words(equal: Equal, most: int) -> str:
 
 
 def _mean(values: Sequence[float | None]) -> float:
-    """The mean of what is known: a clip without disoccluded pixels has no number there."""
+    """The mean of the known values: a clip without disoccluded pixels has none."""
     known = [float(value) for value in values if value is not None]
     return float(np.mean(known)) if known else math.nan

@@ -1,4 +1,4 @@
-"""One way from noisy frames to images: a column of the chart's tables, a colour and a sign in its plot."""
+"""One method of the chart, from noisy frames to images: a row of its tables, a colour and a marker in its plot."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,59 +14,59 @@ from jaxdn.frame import BUFFERS, Frame, frame_at, only, written_out
 from jaxdn.rollout import stream
 
 DENOISED_SPP = (1, 2, 4, 8)
-"""Samples a pixel of what is denoised."""
+"""Samples per pixel of the denoised images."""
 
 STILL = frozenset({"previous_depth", "visible", *(name for name, each in BUFFERS.items() if each.kind == "vector")})
-"""The buffers that a scene in which nothing moves does not have."""
+"""The buffers that a static scene does not have."""
 
 PLAIN = "plain"
 """The variant that the others differ from."""
 ALL = "effects all"
-"""The variant with every buffer written out: the image is that of the plain form, which differs in its time alone."""
+"""The variant with every buffer explicit: the image is that of the plain form, only the time differs."""
 
 _FEATURES = frozenset({"albedo", "normal", "depth"})
 
 Prepare = Callable[[Frame, frozenset[str]], Frame]
-"""(frame, what the denoiser reads) -> the frame that it gets."""
+"""(frame, the buffers that the denoiser reads) -> the frame that it gets."""
 
 
 class Way(NamedTuple):
-    """One way from noisy frames to images."""
+    """One method that makes images from noisy frames."""
 
     name: str
     family: str
-    """What it is a variant of: one colour in the plot."""
+    """The method that it is a variant of: one colour in the plot."""
     variant: str
-    """How it differs from the plain form: one sign in the plot."""
+    """How it differs from the plain form: one marker in the plot."""
     guides: str
-    """What it needs of the renderer besides light: "none", "features" (albedo, normals, depth), or "motion" too."""
+    """Renderer output that it needs besides radiance: "none", "features" (albedo, normals, depth), or also "motion"."""
     timed: Callable[[Frame], Call]
-    """A call that denoises one frame [H, W, C] once more, for timing."""
+    """A call that denoises one frame [H, W, C], for timing."""
     images: Callable[[Frame], np.ndarray] | None
-    """Frames [T, H, W, C] -> images [T, H, W, 3]; None where only the time can be measured."""
+    """Frames [T, H, W, C] -> images [T, H, W, 3]; None if only the time can be measured."""
     group: str
-    """Ways of one group are timed interleaved."""
+    """Methods of one group are timed interleaved."""
     small: bool = True
-    """Whether a small frame is timed too."""
+    """Whether it is also timed on a small frame."""
 
 
 def as_it_is(frame: Frame, reads: frozenset[str]) -> Frame:
-    """The buffers that the clip calls for."""
+    """The buffers of the clip."""
     return frame
 
 
 def all_written_out(frame: Frame, reads: frozenset[str]) -> Frame:
-    """Every buffer that is read, whatever the scene calls for: effects ``all``."""
+    """Every buffer that is read, whichever effects the scene has: effects ``all``."""
     return written_out(frame, reads)
 
 
 def standing_still(frame: Frame, reads: frozenset[str]) -> Frame:
-    """The frame of a scene in which nothing moves."""
+    """The frame of a static scene."""
     return frame._replace(**dict.fromkeys(STILL))
 
 
 def way(candidate: Candidate, variant: str = PLAIN, *, prepare: Prepare = as_it_is, scored: bool = True) -> Way:
-    """The way of a denoiser of this package. Unless ``scored``, its time alone is measured."""
+    """The chart's entry for a denoiser of this package. Unless ``scored``, only its time is measured."""
     denoiser, params = candidate.denoiser, candidate.params
     if denoiser is None:
         raise ValueError(f"{candidate.label}: expected a denoiser, got the noisy image itself.")

@@ -1,4 +1,4 @@
-"""The ways that are compared, from the table of methods and the weights there are: new ones appear by themselves."""
+"""The compared methods, from the table of methods and the available weights: new ones are included automatically."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -18,11 +18,11 @@ from jaxdn.networks.engines import ENGINES
 
 
 def chosen(*, quick: bool = False) -> list[Candidate]:
-    """The denoisers to measure; ``quick``: of each method only the fastest.
+    """The denoisers to measure; ``quick``: only the fastest of each method.
 
-    Those that ask the renderer for samples are not among them, see :func:`left_out`.
+    Those that request samples from the renderer are left out, see :func:`left_out`.
     """
-    found = [each for each in candidates.everything() if not _asks(each)]
+    found = [each for each in candidates.everything() if not _requests_samples(each)]
     if not quick:
         return found
     fastest = {_row(each).name: each.label for each in sorted(found, key=_place)}
@@ -30,9 +30,9 @@ def chosen(*, quick: bool = False) -> list[Candidate]:
 
 
 def registered(denoisers: Sequence[Candidate]) -> Iterator[Way]:
-    """Every denoiser in all its variants: the plain form, what its method has options for, other sets of buffers.
+    """Every denoiser in all its variants: the plain form, other options of its method, other sets of buffers.
 
-    What has not been trained is timed with the weights that training starts from, and not scored.
+    Untrained methods are timed with initial weights and not scored.
     """
     for each in denoisers:
         trained = each.label in candidates.all_names()
@@ -48,18 +48,18 @@ def _row(candidate: Candidate) -> Method:
     return candidate.method
 
 
-def _asks(candidate: Candidate) -> bool:
+def _requests_samples(candidate: Candidate) -> bool:
     return candidate.denoiser is not None and candidate.denoiser.samples is not None
 
 
 def _place(candidate: Candidate) -> int:
-    """Its place among the variants of its method, which go from the most accurate to the fastest."""
+    """Its index among the variants of its method, which are ordered from the most accurate to the fastest."""
     variants = list(_row(candidate).variants)
     return variants.index(candidate.label) if candidate.label in variants else -1
 
 
 def _alternatives(method: Method) -> dict[str, dict[str, Any]]:
-    """Variant -> options that give the plain form's weights another step."""
+    """Variant -> options that change the step but not the weights."""
     found: dict[str, dict[str, Any]] = {}
     for name in method.engines:
         if ENGINES[name].purpose == "inference" and ENGINES[name].available():
@@ -83,7 +83,7 @@ def open_image_denoise() -> Iterator[Way]:
         return
     from experiments.speed.peers.oidn import oidn
 
-    # Interleaved with weights of ours: what is compared has to meet the same machine.
+    # Interleaved with our weights, so that both are measured under the same machine conditions.
     group = next(iter(candidates.shipped_names()), "Open Image Denoise")
     for quality in ("high", "balanced", "fast"):
 
@@ -101,7 +101,7 @@ def open_image_denoise() -> Iterator[Way]:
 
 
 def ways(denoisers: Sequence[Candidate], *, quick: bool = False) -> list[Way]:
-    """Everything that can be run here; ``quick``: plain forms only."""
+    """Every method that can be run here; ``quick``: only plain forms."""
     found = [*registered(denoisers), *open_image_denoise()]
     if quick:
         return [each for each in found if each.variant == PLAIN]
@@ -114,11 +114,11 @@ def left_out() -> list[str]:
     wanted = {name for method in methods().values() for name in method.engines}
     for name, engine in ENGINES.items():
         if name in wanted and engine.purpose == "inference" and not engine.available():
-            sentences.append(f"{name} is not installed or does not run where jax computes: its rows are left out.")
+            sentences.append(f"{name} is not installed or does not run on jax's device: its rows are left out.")
     for each in candidates.everything():
-        if _asks(each):
+        if _requests_samples(each):
             sentences.append(
-                f"{each.label} asks the renderer for samples pixel by pixel, and what is compared here has the same "
+                f"{each.label} requests samples from the renderer per pixel, but the compared images have the same "
                 "number in every pixel: its rows are left out."
             )
     return sentences

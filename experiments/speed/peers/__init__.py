@@ -1,6 +1,6 @@
-"""What people use today, each behind one small door: PyTorch (the same network) and Open Image Denoise.
+"""The alternatives in common use, one module each: PyTorch (the same network) and Open Image Denoise.
 
-They are optional. What is not installed is left out, and :func:`missing` says so in a sentence.
+They are optional. Those not installed are left out, with a message from :func:`missing`.
 """
 
 import importlib.util
@@ -11,7 +11,7 @@ _PACKAGES = {"torch": "PyTorch", "pyoidn": "Open Image Denoise (pyoidn)"}
 
 
 def missing() -> dict[str, str]:
-    """Peer -> why its rows are left out here, in a sentence; what can be run is not in it.
+    """Peer -> a sentence why its rows are left out here; only peers that cannot be run.
 
     Peers are ``"torch"``, ``"torch-compiled"`` and ``"pyoidn"``.
     """

@@ -18,10 +18,10 @@ Filter = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 def oidn(height: int, width: int, *, quality: str = "high", threads: int | None = None) -> Filter:
     """A filter ``(image, albedo, normal) -> denoised image``, all [H, W, 3] float32 of this size, linear HDR radiance.
 
-    Albedo in [0, 1], normals in [-1, 1], both taken as noisy as they come. The result is one array that the next call
-    overwrites. ``threads``: default the machine's cores. The network is built here, once; a call copies its arguments
-    into the filter's own images and runs it. Raises ValueError for an unknown quality or another size, RuntimeError
-    with the tool's own words where it fails.
+    Albedo in [0, 1], normals in [-1, 1], both possibly noisy. The next call overwrites the result. ``threads``: by
+    default the machine's cores. The network is built once, here; a call copies its arguments into the filter's own
+    images and runs it. Raises ValueError for an unknown quality or another size, and RuntimeError with the library's
+    message if it fails.
     """
     if quality not in QUALITIES:
         raise ValueError(f"quality: expected one of {', '.join(QUALITIES)}, got {quality!r}.")

@@ -1,9 +1,9 @@
 """The recurrent ``ntd`` step in PyTorch, as a peer for speed: the same network, the same weights, the same image.
 
-Written as a PyTorch user would who cares for speed on the CPU: channels-last tensors, library operations wherever there
-is one, inference mode. Options are the defaults of :func:`jaxdn.denoisers.ntd`. Frames are taken as sound: what jaxdn
-repairs and counts in every frame (values that are not finite, normals that are not of unit length) is left out here,
-which is to PyTorch's advantage.
+Written for speed on the CPU, as a PyTorch user would: channels-last tensors, library operations wherever they exist,
+inference mode. Options are the defaults of :func:`jaxdn.denoisers.ntd`. Frames are assumed to be valid: the
+repairs that jaxdn does in every frame (non-finite values, normals not of unit length) are left out here, which is to
+PyTorch's advantage.
 
 Tensors are ``[B, C, H, W]`` in channels-last memory; height and width are multiples of 16.
 """
@@ -29,11 +29,11 @@ FEATURES = 14
 HEADS = (2 * TAPS + 1, TAPS + 1, TAPS + 1)
 
 BUFFERS = ("radiance", "albedo", "normal", "depth", "motion", "dual_motion")
-"""The buffers that a frame has here: all that the network makes use of."""
+"""The buffers of a frame here: all that the network uses."""
 
 
 class State(NamedTuple):
-    """What one frame leaves to the next."""
+    """What is carried from one frame to the next."""
 
     history: Tensor
     """[B, 3, H, W] the last output, divided by albedo."""
@@ -42,13 +42,13 @@ class State(NamedTuple):
 
 
 def prepare_process() -> None:
-    """All cores, and room for every shape that is compiled (PyTorch gives up after eight of them)."""
+    """Use all cores, and allow compiling every shape (PyTorch stops after eight by default)."""
     torch.set_num_threads(os.cpu_count() or 1)
     torch._dynamo.config.recompile_limit = 64
 
 
 def tensor(array: Any) -> Tensor:
-    """A jaxdn array [..., H, W, C] as [..., C, H, W] whose memory stays as it was, which is channels-last."""
+    """A jaxdn array [..., H, W, C] as [..., C, H, W] with unchanged memory, which is channels-last."""
     return torch.from_numpy(np.array(array)).movedim(-1, -3)
 
 
@@ -125,7 +125,7 @@ def compress(x: Tensor) -> Tensor:
 
 
 def depth_feature(depth: Tensor) -> Tensor:
-    """``z / (z + g)`` with the geometric mean g of what is not background, for each image."""
+    """``z / (z + g)`` with the geometric mean g over surfaces, for each image."""
     known = (depth > 0) & (depth < FAR)
     logarithms = torch.where(known, torch.log(torch.where(known, depth, 1.0)), 0.0)
     count = known.sum((1, 2, 3), keepdim=True).clamp(min=1)
@@ -133,7 +133,7 @@ def depth_feature(depth: Tensor) -> Tensor:
 
 
 def targets(motion: Tensor) -> tuple[Tensor, Tensor]:
-    """The array position (x, y), each [B, H, W], that each pixel's vector points at."""
+    """The array position (x, y), each [B, H, W], that each pixel's vector points to."""
     height, width = motion.shape[-2:]
     x = torch.arange(width, dtype=motion.dtype) + motion[:, 0]
     y = torch.arange(height, dtype=motion.dtype)[:, None] + motion[:, 1]
@@ -149,7 +149,7 @@ def warp(image: Tensor, motion: Tensor) -> Tensor:
 
 
 def apply_kernels_loop(image: Tensor, kernels: Tensor) -> Tensor:
-    """``sum_t kernels(p, t) image(p + offset_t)`` as 25 shifted multiply-adds: the fastest form to run and to compile.
+    """``sum_t kernels(p, t) image(p + offset_t)`` as 25 shifted multiply-adds: fastest to run and to compile.
 
     Planes, not channels-last: 0.65 of the time, and PyTorch 2.13 cannot compile the gradient of a channels-last pad.
     """
@@ -164,7 +164,7 @@ def apply_kernels_loop(image: Tensor, kernels: Tensor) -> Tensor:
 
 
 def apply_kernels_unfold(image: Tensor, kernels: Tensor) -> Tensor:
-    """The same as patches times kernels: without compilation the fastest form to train with."""
+    """The same as patches times kernels: the fastest version for training without compilation."""
     count, channels, height, width = image.shape
     patches = F.unfold(F.pad(image.contiguous(), (2, 2, 2, 2), mode="replicate"), 5)
     patches = patches.reshape(count, channels, TAPS, height, width)
@@ -181,21 +181,21 @@ def compose_scales(fine: Tensor, coarse: Tensor, alpha: Tensor) -> Tensor:
 
 
 class Prepared(NamedTuple):
-    """What the network and the kernels work on."""
+    """The input of the network and of the kernels."""
 
     noisy: Tensor
     """[B, 3, H, W] radiance divided by ``colors``."""
     colors: Tensor
     recalled: Tensor
-    """[B, 3, H, W] warped history, the noisy pixel where there is none."""
+    """[B, 3, H, W] warped history, the noisy pixel where it is missing."""
     absent: Tensor
-    """bool [B, 1, H, W]: where there is none."""
+    """bool [B, 1, H, W]: the history is missing."""
     features: Tensor
-    """[B, 14, H, W]"""
+    """[B, 14, H, W] the network's input."""
 
 
 def prepare(state: State, frame: dict[str, Tensor]) -> Prepared:
-    """Divide by albedo, warp the history, put the network's input together."""
+    """Divide by albedo, warp the history, assemble the network's input."""
     albedo, motion = frame["albedo"], frame["dual_motion"]
     colors = torch.where(albedo > SMALLEST_ALBEDO, albedo, 1.0)
     noisy = (frame["radiance"] / colors).clamp(max=RADIANCE_MAX)
@@ -221,10 +221,16 @@ def finish(filtered: list[Tensor], heads: list[Tensor], prepared: Prepared) -> t
 class NTD(nn.Module):
     """One step of the recurrent denoiser: ``(state, frame) -> (state, image)``.
 
-    ``apply_kernels`` is the form of the kernel application. ``compile_network`` and ``compile_kernels`` (softmax and
-    application) give that part to ``torch.compile``, for static shapes: symbolic ones compile once and take 2.4 times
-    as long to run. The rest runs as fast without. As one graph, each of the 25 taps would compute again what its image
-    is made from, the warp included: compiling a 720p step took more than four minutes.
+    Parts are compiled for static shapes: with symbolic ones they are compiled only once but take 2.4 times as long to
+    run. The rest runs as fast without compilation. In a single graph, each of the 25 taps would recompute its image,
+    including the warp: compiling a 720p step took more than four minutes.
+
+    Args:
+      widths: of the network.
+      params: of the jaxdn network.
+      apply_kernels: the version of the kernel application.
+      compile_network: use ``torch.compile`` for the network.
+      compile_kernels: use it for softmax and kernel application.
     """
 
     def __init__(

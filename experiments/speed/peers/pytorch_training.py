@@ -1,6 +1,6 @@
-"""The train step in PyTorch: the loss that ``ntd`` has, back-propagation through time, the same Adam.
+"""The train step in PyTorch: the loss of ``ntd``, back-propagation through time, the same Adam.
 
-A clip's last frame is for validation as in jaxdn; because the loss does not reach it, autograd leaves it out.
+A clip's last frame is for validation as in jaxdn; as it is not in the loss, autograd skips it.
 """
 
 from typing import Any
@@ -16,9 +16,9 @@ from jaxdn.networks import Widths
 from jaxdn.recipe import Recipe
 
 WEIGHTS = (1.0, 0.8, 0.6)
-"""Of the newest three disocclusion masks."""
+"""Weights of the newest three disocclusion masks."""
 THRESHOLD = 0.5
-"""Vectors that differ by more pixels than this are disoccluded."""
+"""Pixels whose two vectors differ by more than this, in pixels, are disoccluded."""
 
 
 def batch_tensors(batch: Clip) -> tuple[dict[str, Tensor], Tensor]:
@@ -56,7 +56,7 @@ def clip_loss(
 
 
 def encode(image: Tensor) -> Tensor:
-    """Linear radiance cut at 1, in sRGB code values."""
+    """Linear radiance clipped at 1, in sRGB code values."""
     image = image.clamp(0, 1)
     return torch.where(image <= 0.0031308, 12.92 * image, 1.055 * image.clamp(min=0.0031308) ** (1 / 2.4) - 0.055)
 
@@ -65,7 +65,7 @@ class Trainer:
     """Network and optimiser; a call is one update and returns its loss.
 
     Kernels are applied as patches times kernels, without compilation: with its gradient each of their sizes takes
-    PyTorch 80 s to compile on two cores. ``compiled`` is about the network.
+    PyTorch 80 s to compile on two cores. ``compiled`` concerns only the network.
     """
 
     def __init__(self, widths: Widths, params: dict[str, Any], recipe: Recipe, *, compiled: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""What is timed: one file for each kind of work, each with ours and its peers behind calls without arguments."""
+"""The timed works: one file for each kind, with ours and the peers as calls without arguments."""
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -9,7 +9,7 @@ from experiments.speed.timing import Call
 
 
 class Work(NamedTuple):
-    """One piece of work done in several ways. ``ours`` and ``peers`` make a call when asked: arrays live that long."""
+    """One work with several implementations. ``ours`` and ``peers`` build a call on demand, which holds its arrays."""
 
     name: str
     ours: dict[str, Callable[[], Call]]
@@ -17,4 +17,4 @@ class Work(NamedTuple):
     roofline: Sequence[Cost]
     rounds: int = 5
     alone: Mapping[str, Callable[[], Any]] = MappingProxyType({})
-    """What to take the peak memory of where it is not the call: an engine that keeps memory between calls."""
+    """Calls for measuring the peak memory, where they differ: for engines that keep memory between calls."""

@@ -1,10 +1,10 @@
-"""How long a program takes to compile, each time in a process of its own: cold, and from the cache on disk.
+"""The compile time of a program, each time in a separate process: cold, and from the cache on disk.
 
-    python -m experiments.speed.works.compilation xla step-large-720p     # what a child process runs: prints seconds
+    python -m experiments.speed.works.compilation xla step-large-720p     # run by a child process: prints seconds
 
 Programs are named as the works are, ``train-large-64-remat`` is the rematerialised step. Tracing, lowering and
-compilation are counted; starting Python and importing are not. PyTorch compiles when it first runs, so one run is in
-its figure.
+compilation are counted; starting Python and importing are not. PyTorch compiles on its first run, so its figure
+includes one run.
 """
 
 import os
@@ -21,9 +21,9 @@ Program = tuple[str, str]
 
 
 def warm(programs: Sequence[Program], cache: Path, *, limit_s: float) -> dict[Program, float | None]:
-    """Compile into the caches in ``cache``, a process for each core, and return the seconds that each took.
+    """Compile into the caches in ``cache``, one process per core, and return the seconds that each took.
 
-    They slow each other down a little, all alike.
+    They slow each other down a little, all equally.
     """
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         seconds = pool.map(lambda pair: compile_seconds(pair[0], pair[1], cache, limit_s=limit_s), programs)
@@ -31,9 +31,9 @@ def warm(programs: Sequence[Program], cache: Path, *, limit_s: float) -> dict[Pr
 
 
 def compile_seconds(compiler: str, program: str, cache: Path, *, limit_s: float) -> float | None:
-    """Compile in a process of its own with its cache in the folder ``cache``; None if it takes longer than the limit.
+    """Compile in a separate process with its cache in the folder ``cache``; None if it takes longer than the limit.
 
-    RuntimeError with the child's last words where it fails.
+    Raises RuntimeError with the last line of the child's error output if it fails.
     """
     environment = os.environ | {
         "JAX_COMPILATION_CACHE_DIR": str(cache / "jax"),
@@ -46,8 +46,8 @@ def compile_seconds(compiler: str, program: str, cache: Path, *, limit_s: float)
     except subprocess.TimeoutExpired:
         return None
     if done.returncode:
-        words = done.stderr.strip().splitlines()[-1:]
-        raise RuntimeError(f"{compiler} did not compile {program}: {''.join(words)}")
+        message = done.stderr.strip().splitlines()[-1:]
+        raise RuntimeError(f"{compiler} did not compile {program}: {''.join(message)}")
     return float(done.stdout.split()[-1])
 
 

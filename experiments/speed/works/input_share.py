@@ -1,8 +1,8 @@
 """Does training wait for its input? Real clips on disk, the real pipeline, the real train step.
 
-The step is waited for before the next batch is asked for, so that what the loop then waits is time in which nothing is
-computed. Compared with the same step on a batch that is there already: the difference is all that the input costs,
-what its threads take from the step included.
+The loop waits for the step before it requests the next batch, so that nothing is computed while it waits for input.
+Compared with the same step on a batch in memory, the difference is the total cost of the input, including what its
+threads take from the step.
 """
 
 import tempfile
@@ -20,11 +20,11 @@ from jaxdn.learning.step import initial_state, make_train_step
 from jaxdn.recipe import Recipe
 
 WINDOWS, STEPS = 3, 4
-"""Each figure is sampled so many times, over so many updates."""
+"""Each figure is measured this many times, over this many updates."""
 
 
 def measure_input(recipe: Recipe) -> dict[str, Timing]:
-    """``wait`` and ``loop`` (milliseconds a step of a training loop), and ``alone`` (the step on a batch at hand)."""
+    """``wait`` and ``loop`` (milliseconds per step in training), and ``alone`` (the step on a batch in memory)."""
     denoiser = steps.METHOD.factory(size="large")  # its program has been compiled for the train steps
     with tempfile.TemporaryDirectory() as place:
         side = recipe.crop + recipe.crop // 2
@@ -42,7 +42,7 @@ def measure_input(recipe: Recipe) -> dict[str, Timing]:
         state, step = initial_state(denoiser, recipe, held), make_train_step(denoiser, recipe)
 
         def window(next_batch: Callable[[], Any]) -> tuple[float, float]:
-            """Milliseconds a step that were waited, and in all."""
+            """Milliseconds per step of waiting, and in total."""
             nonlocal state
             waited, began = 0.0, time.perf_counter()
             for _ in range(STEPS):

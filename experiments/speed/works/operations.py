@@ -1,6 +1,7 @@
-"""The hot operations alone, forward and gradient: the forms that are registered, PyTorch's, and the roofline.
+"""The performance-critical operations, forward and gradient: our implementations, PyTorch's, and the roofline.
 
-The chosen form (``implementation=None``) is called ``xla``; the others, but for the reference, carry their names. An
+The default implementation (``implementation=None``) is called ``xla``; the others, except the reference, keep their
+names. An
 engine that is not installed is left out.
 """
 
@@ -27,7 +28,7 @@ Function = Callable[..., Any]
 
 
 def forms(operation: str) -> dict[str, str | None]:
-    """Name in the results -> name in the registry; what None stands for is ``xla``."""
+    """Name in the results -> name in the registry; the default is ``xla``."""
     engines = ["onednn"] if operation == "convolution" and onednn.available() else []
     ways = [name for name in implementations(operation) if name not in ("reference", "onednn")]
     others = [name for name in ways if resolve(operation, name) is not resolve(operation, None)]
@@ -49,7 +50,7 @@ def torch_calls(
 ) -> dict[str, Callable[[], Call]]:
     """``forward`` of tensors in PyTorch, eager and compiled; with ``gradient``, also back to those arguments.
 
-    ``arrays`` are [N, H, W, C] (channels-last tensors) or anything else. ``eager`` is the form that is faster there.
+    ``arrays`` are [N, H, W, C] (channels-last tensors) or anything else. ``eager`` is the version that is faster there.
     """
     lacking = peers.missing()
 
@@ -131,7 +132,7 @@ def with_gradient(function: Function, arguments: tuple[int, ...]) -> Function:
 
 
 def warp_works(height: int, width: int, title: str) -> Iterator[Work]:
-    """A bilinear fetch of RGB against ``grid_sample``, and with its gradient by the image."""
+    """A bilinear fetch of RGB compared with ``grid_sample``, and with its gradient by the image."""
     rng = np.random.default_rng(0)
     image = rng.exponential(size=(height, width, 3)).astype(np.float32)
     motion = 3 * rng.standard_normal((height // 8, width // 8, 2), np.float32)
@@ -159,7 +160,7 @@ def warp_works(height: int, width: int, title: str) -> Iterator[Work]:
 
 
 def convolution_works(shape: tuple[int, int, int, int, int]) -> Iterator[Work]:
-    """One 3x3 convolution: forward, gradient by the image, gradient by the kernel (backward passes alone)."""
+    """One 3x3 convolution: forward, gradient by the image, gradient by the kernel (only the backward passes)."""
     count, height, width, inputs, outputs = shape
     rng = np.random.default_rng(0)
     x = rng.standard_normal((count, height, width, inputs), np.float32)

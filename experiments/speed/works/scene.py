@@ -1,4 +1,4 @@
-"""Frame buffers that cost what real ones cost, made without a renderer: for timing, not for looking at."""
+"""Frame buffers with the computing cost of real ones, made without a renderer, for timing only."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from jaxdn.frame import Clip, Frame
 
 
 def clip(frames: int, height: int, width: int, *, seed: int = 0) -> Clip:
-    """A clip [T, H, W, C] of a patterned wall behind which a camera pans, a square in front that moves, 1 spp noise.
+    """A clip [T, H, W, C] of a patterned wall with a panning camera and a moving square in front, with 1 spp noise.
 
     Vectors have fractions of a pixel, a border of history is off-screen, and next to the square the dual vector differs
     from the traditional one, as in a rendered clip.

@@ -19,7 +19,7 @@ from jaxdn.networks.engines import ENGINES, Purpose
 HEIGHT, WIDTH = 720, 1280
 WIDTHS = {"large": LARGE, "small": SMALL}
 METHOD = method_named("ntd")
-"""The method whose network the peers have too."""
+"""The method whose network the peers also implement."""
 
 
 def implementations(purpose: Purpose) -> dict[str, dict[str, Any]]:
@@ -29,16 +29,16 @@ def implementations(purpose: Purpose) -> dict[str, dict[str, Any]]:
 
 
 def program(denoiser: Denoiser) -> Callable[..., Any]:
-    """The jitted step ``(params, state, frame) -> (state, image)`` whose state's memory is used again.
+    """The jitted step ``(params, state, frame) -> (state, image)`` whose state's memory is reused.
 
-    The step by itself and not :func:`jaxdn.rollout.stream`, as what is timed here is compiled by other processes, which
+    The step itself and not :func:`jaxdn.rollout.stream`, as the timed programs are compiled by other processes, which
     have to lower the same program (:mod:`experiments.speed.works.compilation`).
     """
     return jax.jit(denoiser.step, donate_argnums=1)
 
 
 def recurrent(denoiser: Denoiser, params: Any, frame: Frame) -> Call:
-    """A call that denoises ``frame`` once more, jitted, with the state that the call before left."""
+    """A call that denoises ``frame``, jitted, with the state of the previous call."""
     step = program(denoiser)
     state = [jax.tree.map(jnp.copy, denoiser.start(params, frame))]
 

@@ -18,7 +18,7 @@ from jaxdn.recipe import Recipe
 
 RECIPE = METHOD.recipe_named(None)._replace(decay=False)
 CASES = (("large", 64), ("large", 128))
-"""(size, crop in pixels). What compiles longest is compared at the first alone: rematerialised, and by PyTorch."""
+"""(size, crop in pixels). The slowest to compile, rematerialised and PyTorch's, are compared only at the first."""
 
 
 def batch_of(size: int, recipe: Recipe = RECIPE) -> Clip:
@@ -28,7 +28,7 @@ def batch_of(size: int, recipe: Recipe = RECIPE) -> Clip:
 
 
 def ours(size: str, batch: Clip, recipe: Recipe, **options: Any) -> Call:
-    """A call that makes one update; state and batch lie on the device, the old state's memory is donated."""
+    """A call that makes one update; state and batch are on the device, the old state's memory is donated."""
     denoiser = METHOD.factory(size=size, **options)
     state = [initial_state(denoiser, recipe, batch)]
     step, there = make_train_step(denoiser, recipe), jax.tree.map(jnp.asarray, batch)
@@ -51,7 +51,7 @@ def pytorch(size: str, batch: Clip, recipe: Recipe, *, compiled: bool) -> Call:
 
 
 def works() -> Iterator[Work]:
-    """``train-large-64`` and so on: plain, with each engine that trains here, and rematerialised."""
+    """``train-large-64`` and so on: plain, with each engine for training available here, and rematerialised."""
     lacking = peers.missing()
     for size, crop in CASES:
         batch = batch_of(crop)

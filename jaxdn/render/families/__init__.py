@@ -1,7 +1,7 @@
-"""Procedural animated scenes: every seed is a different scene, and the same one for ever.
+"""Procedural animated scenes: every seed gives a different scene, and always the same one.
 
-`FAMILIES` maps a family's name to its function of a seed. Clips record ``{"family": name, "seed": seed}``, so what a
-seed looks like must not change once clips have been rendered from it: add a new family rather than change an old one.
+`FAMILIES` maps a family's name to its function of a seed. Clips record ``{"family": name, "seed": seed}``, so the scene
+of a seed must not change once clips have been rendered from it: add a new family instead of changing one.
 """
 
 from collections.abc import Callable

@@ -1,7 +1,7 @@
-"""A dash from the dark into the light: fast toys cross a hall whose one half is lit and whose other half is not.
+"""From dark to light: fast toys cross a hall of which one half is lit and the other is not.
 
 A history that follows the moving object brings dark values into the light, and the ground it uncovers was lit
-differently a frame ago: the case that tests how fast a temporal filter lets go.
+differently a frame ago: this tests how fast a temporal filter discards its history.
 """
 
 import numpy as np

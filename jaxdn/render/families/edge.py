@@ -1,7 +1,7 @@
-"""Disocclusion at the image's border: a tall painted screen slides out of the picture and back in again.
+"""Disocclusion at the image's border: a tall painted screen slides out of the image and back.
 
 What it uncovers lies next to the border, where a dual motion vector may point outside the previous image: the case
-in which Zeng et al. 2021 (their fig. 11) have nothing to reuse either.
+in which Zeng et al. 2021 (their fig. 11) have no history to reuse either.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""A still life that does not keep still: fruit rolls over a laid table, a stand of oranges turns, a lemon hops."""
+"""A moving still life: fruit rolls over a laid table, a stand of oranges turns, a lemon hops."""
 
 import numpy as np
 
@@ -127,7 +127,7 @@ def _stand(stage: Stage) -> None:
 
 
 def _rolling_fruit(stage: Stage) -> None:
-    """One fruit a lane in front of the still life: two roll to and fro, the third (a lemon or an orange) hops along."""
+    """One fruit a lane in front of the still life: two roll back and forth, the third (lemon or orange) hops."""
     rng = stage.rng
     lanes = rng.permutation(np.array([0.06, 0.28, 0.47]))
     kinds = [_apple(rng), _apple(rng) if rng.random() < 0.5 else _orange(rng), _orange(rng, rng.random() < 0.6)]
@@ -153,7 +153,19 @@ def _rolling(
     beat: float,
     attitude: np.ndarray,
 ) -> Motion:
-    """To and fro along x without slipping, hopping `leap` high every `beat` frames."""
+    """Rolling back and forth along x without slipping, with hops.
+
+    Args:
+      z: place of the lane.
+      radius: of the fruit.
+      reach: half the travel.
+      centre: its middle in x.
+      period: of the travel, in frames.
+      phase: of the travel, in periods.
+      leap: height of the hops.
+      beat: frames between two hops.
+      attitude: [4, 4] the fruit's own orientation and scale.
+    """
 
     def motion(frame: float) -> np.ndarray:
         travel = reach * swing(frame, period, phase)

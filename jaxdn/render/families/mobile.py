@@ -118,7 +118,16 @@ def _mobile(stage: Stage) -> None:
 
 
 def _arm(stage: Stage, index: int, boom: Motion, end: float, rate: float, brass: Material) -> Motion:
-    """A small arm on a link below the boom's end; gives the joint on which its toys hang."""
+    """A small arm on a link below the boom's end; returns the joint from which its toys hang.
+
+    Args:
+      stage: gets the shapes.
+      index: of the arm.
+      boom: motion of the large arm.
+      end: x of the boom's end.
+      rate: of rotation, in degrees per frame.
+      brass: the material.
+    """
     drop, phase = stage.rng.uniform(0.16, 0.24), stage.rng.uniform(0, 360)
     link, bar = rod((end, 0, 0), (end, -drop, 0), 0.008), rod((-REACH, 0, 0), (REACH, 0, 0), 0.018)
 
@@ -154,7 +163,17 @@ def _toy(
     size: float,
     material: Material,
 ) -> None:
-    """A toy on a thread below a joint, slowly turning about its thread."""
+    """A toy on a thread below a joint, slowly turning about its thread.
+
+    Args:
+      stage: gets the shapes.
+      name: of the toy.
+      shape: of the toy.
+      joint: motion of the joint.
+      place: of the toy below the joint.
+      size: scale of the shape.
+      material: of the toy.
+    """
     rate, tilt = stage.rng.uniform(4, 9) * stage.rng.choice([-1, 1]), stage.rng.uniform(10, 40)
     hang = shift(*place)
     thread = rod((place[0], 0, place[2]), place, 0.007)

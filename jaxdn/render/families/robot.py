@@ -156,7 +156,16 @@ def _walk(stage: Stage) -> None:
 def _part(
     stage: Stage, name: str, shape: str | shapes.Mesh, joint: Motion, local: np.ndarray, material: Material
 ) -> None:
-    """A shape fixed to a joint that moves."""
+    """A shape fixed to a moving joint.
+
+    Args:
+      stage: gets the shape.
+      name: of the shape.
+      shape: a primitive's name or a mesh.
+      joint: motion of the joint.
+      local: [4, 4] pose relative to the joint.
+      material: of the shape.
+    """
     stage.add(name, shape, attached(joint, local), material)
 
 
@@ -171,7 +180,19 @@ def _arm(
     shell: Material,
     steel: Material,
 ) -> None:
-    """Arms swing against the legs; the elbow bends as the arm comes forwards."""
+    """One arm: arms swing opposite to the legs; the elbow bends as the arm comes forwards.
+
+    Args:
+      stage: gets the shapes.
+      name: suffix of the shapes' names.
+      side: 1 or -1 along x.
+      chest: motion of the chest.
+      stride: period of a step cycle, in frames.
+      phase: of the arm, in periods.
+      limb: mesh of upper arm and forearm.
+      shell: material of the limbs.
+      steel: material of shoulder and hand.
+    """
 
     def shoulder(frame: float) -> np.ndarray:
         return (
@@ -201,6 +222,20 @@ def _leg(
     trim: Material,
     steel: Material,
 ) -> None:
+    """One leg with its foot.
+
+    Args:
+      stage: gets the shapes.
+      name: suffix of the shapes' names.
+      side: 1 or -1 along x.
+      pelvis: motion of the pelvis.
+      stride: period of a step cycle, in frames.
+      phase: of the leg, in periods.
+      limb: mesh of thigh and shin.
+      trim: material of the limbs.
+      steel: material of the joints.
+    """
+
     def hip(frame: float) -> np.ndarray:
         return pelvis(frame) @ shift(side * 0.15, 0, 0) @ turn("x", -_stride(frame, stride, phase)[0])
 

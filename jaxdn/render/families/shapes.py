@@ -240,7 +240,7 @@ def ply_path(mesh: Mesh) -> str:
     contents = header.encode() + columns.tobytes() + faces.tobytes()
     path = Path(_folder().name) / f"{hashlib.sha256(contents).hexdigest()[:24]}.ply"
     if not path.exists():
-        # Written aside and renamed, so that a thread that looks meanwhile never reads half a mesh.
+        # Written under another name and renamed, so that another thread never reads an incomplete mesh.
         handle, part = tempfile.mkstemp(dir=path.parent)
         with os.fdopen(handle, "wb") as file:
             file.write(contents)

@@ -1,4 +1,4 @@
-"""The stage on which a family plays: transforms, materials, rooms with lamps and windows, and the scene they form.
+"""Building blocks of a family's scenes: transforms, materials, rooms with lamps and windows, and the scene itself.
 
 Metres, y up; a room is centred on x = z = 0 with its floor at y = 0, and the camera looks towards -z.
 """
@@ -79,7 +79,7 @@ def hop(frame: float, period: float, phase: float = 0.0) -> float:
 
 
 def shuttle(frame: float, period: float, phase: float = 0.0) -> float:
-    """There and back at constant speed in [-1, 1]: what rolls between two cushions does."""
+    """Back and forth at constant speed in [-1, 1], like a ball between two cushions."""
     time = (frame / period + phase) % 1.0
     return 4 * abs(time - 0.5) - 1
 
@@ -136,10 +136,17 @@ class Part(NamedTuple):
 
 
 class Stage:
-    """An animated scene that a family fills part by part; see `AnimatedScene` for what it offers to others.
+    """An animated scene that a family fills part by part; its interface is `AnimatedScene`.
 
     `rng` is seeded by the family's name and the seed: every random choice must be drawn from it while the stage is
-    filled, none later, so that a record gives the same frames for ever.
+    filled, none later, so that a record always gives the same frames.
+
+    Args:
+      name: of the family.
+      seed: of the scene.
+      frames: suggested number of frames.
+      max_depth: path length.
+      lamp: one of `LAMPS`; "mix" lets the seed choose.
     """
 
     def __init__(self, name: str, seed: int, *, frames: int = 16, max_depth: int = 5, lamp: str = "mix") -> None:
@@ -150,7 +157,7 @@ class Stage:
         if lamp != "mix":
             self.record["lamp"] = lamp
         self.rng = np.random.default_rng([int(seed), zlib.crc32(name.encode())])
-        draw = self.rng.random()  # always drawn, so that a chosen lamp leaves every other choice as it was
+        draw = self.rng.random()  # always drawn, so that a given lamp does not change the other choices
         self.lamp = lamp if lamp != "mix" else "up" if draw < 0.3 else "down" if draw < 0.65 else "window"
         self.parts: dict[str, Part] = {}
         self.bounds = np.zeros((2, 3))
@@ -159,7 +166,15 @@ class Stage:
     def add(
         self, name: str, shape: str | Mesh, pose: np.ndarray | Motion, material: Material, *, glow: Any = None
     ) -> None:
-        """Put a shape on the stage; a pose that is a function of the frame makes it one that moves."""
+        """Add a shape to the scene.
+
+        Args:
+          name: a new one.
+          shape: a primitive's name or a mesh.
+          pose: [4, 4], or a function of the frame for a moving shape.
+          material: of the shape.
+          glow: radiance that it emits.
+        """
         if name in self.parts:
             raise ValueError(f"stage {self.name}: expected a new part, got {name!r} twice; rename one of them.")
         motion: Motion = pose if callable(pose) else lambda frame: pose
@@ -220,9 +235,17 @@ def furnish_room(
     back: Material,
     ceiling: Material,
 ) -> None:
-    """Floor, ceiling and four walls of a room of half width, full height and half length `half`.
+    """Floor, ceiling and four walls of a room.
 
-    Where the stage's lamp is a window, the right wall has an opening with a cross of bars before a bright sky.
+    If the stage's lamp is a window, the right wall has an opening with a cross of bars in front of a bright sky.
+
+    Args:
+      stage: gets the shapes.
+      half: half width, full height and half length in metres.
+      floor: material.
+      wall: material of the front and side walls.
+      back: material of the back wall.
+      ceiling: material.
     """
     width, height, length = half
     stage.bounds = np.array([[-width, 0, -length], [width, height, length]])
@@ -304,14 +327,20 @@ def drifting_camera(
     reach: float = 0.25,
     period: tuple[float, float] = (45, 90),
 ) -> None:
-    """A camera on a slow closed path around `origin`, never at rest, that pans around `target` as it goes.
+    """A camera that always moves on a slow closed path around `origin` and pans around `target`.
 
-    `reach` is half the sideways travel in metres; the path rises and dollies by less.
+    Args:
+      stage: gets the camera.
+      origin: centre of the path.
+      target: centre of the pan.
+      x_fov: horizontal field of view in degrees.
+      reach: half the sideways travel in metres; the path rises and dollies by less.
+      period: range of the periods in frames.
     """
     rng = stage.rng
     times = rng.uniform(*period, 3) * rng.choice([-1, 1], 3)
     phases = rng.random(3)
-    phases[2] = phases[0] + 0.25  # rises fastest where it turns back sideways, so that it never stands still
+    phases[2] = phases[0] + 0.25  # rises fastest at the sideways turning points, so that it never rests
     times[2] = times[0]
     spans = np.array([1.0, 0.35, 0.45]) * reach * rng.uniform(0.8, 1.2, 3)
     eye, aim = np.asarray(origin, float), np.asarray(target, float)

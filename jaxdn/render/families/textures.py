@@ -47,7 +47,15 @@ def noise(rng: np.random.Generator, cells: int, *, size: int = 256, octaves: int
 
 
 def wood(rng: np.random.Generator, dark: Color, light: Color, *, planks: int = 5, size: int = 256) -> np.ndarray:
-    """Planks along u: grain bent by noise, one tone and one shift for each plank, dark joints between them."""
+    """Planks along u: grain bent by noise, one tone and one shift for each plank, dark joints between them.
+
+    Args:
+      rng: random numbers.
+      dark: colour of the grain.
+      light: colour between the grain.
+      planks: number of planks.
+      size: texels per side.
+    """
     x, y = _grid(size)
     plank = np.floor(y * planks).astype(int) % planks
     tone, offset = rng.uniform(0.8, 1.1, planks)[plank], rng.random(planks)[plank]
@@ -61,7 +69,16 @@ def wood(rng: np.random.Generator, dark: Color, light: Color, *, planks: int = 5
 def tiles(
     rng: np.random.Generator, first: Color, second: Color, *, count: int = 8, grout: float = 0.06, size: int = 256
 ) -> np.ndarray:
-    """A chequerboard of worn tiles with grout; `count` must be even to wrap."""
+    """A chequerboard of worn tiles with grout; `count` must be even to wrap.
+
+    Args:
+      rng: random numbers.
+      first: colour of half of the tiles.
+      second: colour of the others.
+      count: tiles per side; must be even to wrap.
+      grout: width of the joints, relative to a tile.
+      size: texels per side.
+    """
     x, y = _grid(size)
     column, row = (x * count).astype(int), (y * count).astype(int)
     wear = rng.uniform(0.8, 1.08, (count, count))[row, column] * (0.9 + 0.2 * noise(rng, 16, size=size))
@@ -71,7 +88,15 @@ def tiles(
 
 
 def bricks(rng: np.random.Generator, brick: Color, mortar: Color, *, rows: int = 12, size: int = 256) -> np.ndarray:
-    """A running bond; `rows` must be even to wrap."""
+    """A running bond; `rows` must be even to wrap.
+
+    Args:
+      rng: random numbers.
+      brick: colour.
+      mortar: colour.
+      rows: number of rows; must be even to wrap.
+      size: texels per side.
+    """
     x, y = _grid(size)
     row = (y * rows).astype(int)
     across = (x + 0.5 * (row % 2) / (rows // 2)) * (rows // 2)
@@ -84,7 +109,15 @@ def bricks(rng: np.random.Generator, brick: Color, mortar: Color, *, rows: int =
 def wallpaper(
     rng: np.random.Generator, ground: Color, figure: Color, *, columns: int = 6, size: int = 256
 ) -> np.ndarray:
-    """Soft stripes with a motif (dots, diamonds or rings) in every second one."""
+    """Soft stripes with a motif (dots, diamonds or rings) in every second one.
+
+    Args:
+      rng: random numbers.
+      ground: colour.
+      figure: colour of motif and stripes.
+      columns: number of stripe pairs.
+      size: texels per side.
+    """
     x, y = _grid(size)
     stripe = 0.5 + 0.5 * np.tanh(6 * np.sin(2 * np.pi * x * columns))
     dx, dy = x * columns % 1 - 0.25, y * columns % 1 - 0.5
@@ -98,14 +131,30 @@ def wallpaper(
 def stripes(
     rng: np.random.Generator, colors: list[np.ndarray], *, count: int = 9, slant: float = 0.0, size: int = 256
 ) -> np.ndarray:
-    """Bands across u that take the colours in turn; `count` should be a multiple of their number."""
+    """Bands across u that take the colours in turn; `count` should be a multiple of their number.
+
+    Args:
+      rng: random numbers.
+      colors: used cyclically.
+      count: number of bands; should be a multiple of the number of colours.
+      slant: shift of the bands in u from v = 0 to 1.
+      size: texels per side.
+    """
     x, y = _grid(size)
     band = np.floor((x + slant * y) * count).astype(int) % len(colors)
     return _finish(np.asarray(colors)[band] * (0.88 + 0.15 * noise(rng, 12, size=size))[..., None])
 
 
 def plaid(rng: np.random.Generator, ground: Color, thread: Color, accent: Color, *, count: int = 5) -> np.ndarray:
-    """Woven cloth: broad bands both ways, thin accents, and a fine weave."""
+    """Woven cloth: broad bands both ways, thin accents, and a fine weave.
+
+    Args:
+      rng: random numbers.
+      ground: colour.
+      thread: colour of the bands.
+      accent: colour of the thin lines.
+      count: bands per side.
+    """
     x, y = _grid(256)
     band = 0.5 * ((x * count % 1) < 0.45) + 0.5 * ((y * count % 1) < 0.45)
     thin = (np.abs(x * count % 1 - 0.72) < 0.035) | (np.abs(y * count % 1 - 0.72) < 0.035)
@@ -135,7 +184,15 @@ def apple_skin(rng: np.random.Generator, ripe: Color, unripe: Color) -> np.ndarr
 def speckled(
     rng: np.random.Generator, ground: Color, spot: Color, *, cells: int = 24, amount: float = 0.3
 ) -> np.ndarray:
-    """Patches and small spots: citrus peel, stone, felt, grass."""
+    """Patches and small spots: citrus peel, stone, felt, grass.
+
+    Args:
+      rng: random numbers.
+      ground: colour.
+      spot: colour of the spots.
+      cells: of the noise, per side.
+      amount: share of spots.
+    """
     spots = np.clip((noise(rng, cells, octaves=2) - (1 - amount)) * 6, 0, 1)
     return _finish(_mix(ground, spot, spots) * (0.85 + 0.25 * noise(rng, 5))[..., None])
 
