@@ -24,9 +24,10 @@ _LIBRARY = "libdnnl.so.3"
 
 # The C interface's numbers (oneapi/dnnl/dnnl_types.h).
 _CPU, _FLOAT32, _ANY_LAYOUT, _IN_ORDER, _TRAINING, _DIRECT = 1, 3, 1, 1, 64, 1
-_ASK_WEIGHTS, _ASK_WEIGHTS_GRADIENT = 131, 132
+_ASK_WEIGHTS, _ASK_WEIGHTS_GRADIENT, _ASK_SCRATCHPAD = 131, 132, 136
 _SOURCE, _DESTINATION, _WEIGHTS = 1, 17, 33
 _SOURCE_GRADIENT, _DESTINATION_GRADIENT, _WEIGHTS_GRADIENT = 129, 145, 161
+_SCRATCHPAD, _USER_SCRATCHPAD = 80, 1
 _OWN_MEMORY, _NO_MEMORY = c_void_p(-1), c_void_p(None)
 
 _Dims = c_int64 * 12
@@ -101,6 +102,18 @@ def _engine() -> tuple[c_void_p, c_void_p]:
     return engine, _made("dnnl_stream_create", engine, _IN_ORDER)
 
 
+@functools.cache
+def _attributes() -> c_void_p:
+    """Primitives get their working memory from us.
+
+    The library's own belongs to the thread that creates a primitive, and XLA calls back from any of its threads: there
+    it would be missing, and the primitive would write to address 0.
+    """
+    attributes = _made("dnnl_primitive_attr_create")
+    _call("dnnl_primitive_attr_set_scratchpad_mode", attributes, _USER_SCRATCHPAD)
+    return attributes
+
+
 def _images(count: int, height: int, width: int, channels: int) -> c_void_p:
     """Describes [N, H, W, C] in memory; oneDNN's dimensions are N, C, H, W for any order in memory."""
     strides = _Dims(height * width * channels, 1, width * channels, channels)
@@ -134,27 +147,28 @@ class _Convolution:
         window = (_ONE, _ZERO, _ONE, _ONE)  # stride, dilation, zeros before and after
         forward = _made(
             "dnnl_convolution_forward_primitive_desc_create",
-            *(engine, _TRAINING, _DIRECT, x, free, None, y, *window, None),
+            *(engine, _TRAINING, _DIRECT, x, free, None, y, *window, _attributes()),
         )
         description, query = forward, _ASK_WEIGHTS
         roles = _SOURCE, _WEIGHTS, _DESTINATION
         if direction == "image gradient":
             description = _made(
                 "dnnl_convolution_backward_data_primitive_desc_create",
-                *(engine, _DIRECT, x, free, y, *window, forward, None),
+                *(engine, _DIRECT, x, free, y, *window, forward, _attributes()),
             )
             x, y, roles = y, x, (_DESTINATION_GRADIENT, _WEIGHTS, _SOURCE_GRADIENT)
         elif direction == "kernel gradient":
             description = _made(
                 "dnnl_convolution_backward_weights_primitive_desc_create",
-                *(engine, _DIRECT, x, free, None, y, *window, forward, None),
+                *(engine, _DIRECT, x, free, None, y, *window, forward, _attributes()),
             )
             query, roles = _ASK_WEIGHTS_GRADIENT, (_SOURCE, _WEIGHTS_GRADIENT, _DESTINATION_GRADIENT)
         theirs = c_void_p(_library().dnnl_primitive_desc_query_md(description, query, 0))
         backward = direction == "kernel gradient"
         reorder = _made(
             "dnnl_reorder_primitive_desc_create",
-            *((theirs, engine, ours, engine, None) if backward else (ours, engine, theirs, engine, None)),
+            *((theirs, engine, ours, engine) if backward else (ours, engine, theirs, engine)),
+            _attributes(),
         )
         # Memory without an address: it is set at every call.
         self._given = [_made("dnnl_memory_create", each, engine, _NO_MEMORY) for each in (x, ours, y)]
@@ -169,7 +183,10 @@ class _Convolution:
     @staticmethod
     def _prepared(description: c_void_p, *arguments: tuple[int, c_void_p]) -> tuple[c_void_p, int, Any]:
         primitive = _made("dnnl_primitive_create", description)
-        return primitive, len(arguments), (_Argument * len(arguments))(*[_Argument(*each) for each in arguments])
+        needed = c_void_p(_library().dnnl_primitive_desc_query_md(description, _ASK_SCRATCHPAD, 0))
+        scratchpad = _made("dnnl_memory_create", needed, _engine()[0], _OWN_MEMORY)
+        given = [*arguments, (_SCRATCHPAD, scratchpad)]
+        return primitive, len(given), (_Argument * len(given))(*[_Argument(*each) for each in given])
 
     def __call__(self, first: int, kernel: int, last: int) -> None:
         """Addresses of x (the cotangent for the image's gradient), of the kernel or its gradient, and of y."""

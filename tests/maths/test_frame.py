@@ -31,8 +31,8 @@ def light(numbers, dtype=np.float32, shape=SIZE):
 
 def test_the_table_is_the_frames_fields():
     assert tuple(BUFFERS) == Frame._fields
-    assert tuple(BUFFERS)[0] == "radiance"
-    assert GUIDES == Frame._fields[1:]
+    assert next(iter(BUFFERS)) == "radiance"
+    assert Frame._fields[1:] == GUIDES
     assert "radiance" not in Frame._field_defaults
     assert all(default is None for default in Frame._field_defaults.values())
     assert set(Frame._field_defaults) == set(GUIDES)

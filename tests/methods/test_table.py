@@ -171,7 +171,7 @@ def test_ntds_own_preset_is_parity(rng):
 
 
 def test_a_method_without_presets_has_no_such_option():
-    with pytest.raises(ValueError, match="svgf: expected options out of .*'preset'"):
+    with pytest.raises(ValueError, match=r"svgf: expected options out of .*'preset'"):
         jaxdn.denoisers.svgf(preset="parity")
 
 
@@ -222,9 +222,8 @@ def test_the_table_finds_the_methods_of_its_room():
 def test_factories_and_modules_do_not_shadow_one_another():
     with pytest.raises(ModuleNotFoundError):
         importlib.import_module("jaxdn.denoisers.ntd")
-    from jaxdn.denoisers import ntd
-
     import jaxdn.methods.ntd as room
+    from jaxdn.denoisers import ntd
 
     assert callable(ntd)
     assert ntd is method_named("ntd").factory
