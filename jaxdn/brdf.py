@@ -1,8 +1,8 @@
 """What a surface reflects: BRDFs pre-integrated over the incident directions, and light divided by that.
 
 The share of light from all around that a surface reflects to the viewer, its directional albedo
-``F_b = integral of f_r cos(theta_i) dw_i``, is what textures and materials contribute to an image; dividing by it leaves
-the incident light, which is what a denoiser should filter (Zhuang et al. 2021, "Real-Time Denoising Using BRDF
+``F_b = integral of f_r cos(theta_i) dw_i``, is what textures and materials contribute to an image; dividing by it
+leaves the incident light, which is what a denoiser should filter (Zhuang et al. 2021, "Real-Time Denoising Using BRDF
 Pre-Integration Factorization"). For a microfacet lobe with Schlick's Fresnel term ``F0 + (1 - F0) (1 - v.h)^5`` it is
 ``F0 A + B`` with two numbers that depend on the cosine n.v and the roughness alone (Karis 2013).
 """
@@ -27,8 +27,12 @@ SAMPLES = 4096
 """Half vectors a stored entry is the mean of."""
 SMALLEST_COSINE = 1 / 512
 """Cosines below are taken for this: shading normals may face away from the viewer."""
-FLOOR = 0.04
-"""Where the divisor begins to depart from the reflectance: what a dielectric reflects at least, head-on."""
+FLOOR = 0.15
+"""What is divided by where nothing is reflected; the divisor is the reflectance itself from twice that on.
+
+Smaller ones gain 0.1 dB where the reflectance is known, and lose 0.6 dB where there is the albedo alone, of which dark
+metal has none (``python -m experiments.papers.demodulation``).
+"""
 
 _STORED = Path(__file__).parent / "shipped" / "directional-albedo.npz"
 
@@ -129,7 +133,7 @@ def albedo_table(lobe: Lobe = "ggx") -> np.ndarray:
 def directional_albedo(
     albedo: jax.Array, specular: jax.Array, roughness: jax.Array, cosine: jax.Array, *, lobe: Lobe = "ggx"
 ) -> jax.Array:
-    """``albedo + specular A + B`` [H, W, 3]: what a diffuse surface with a microfacet lobe reflects of light all around.
+    """``albedo + specular A + B`` [H, W, 3]: what a diffuse surface with a microfacet lobe reflects of light around.
 
     Differentiable in all four. Roughness and cosines are clamped to what the table covers. Raises ValueError for shapes
     that do not fit.
@@ -164,12 +168,13 @@ def _look_up(table: jax.Array, cosine: jax.Array, roughness: jax.Array) -> jax.A
 
 
 def divisor(reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
-    """What light is divided by: ``sqrt(reflectance^2 + floor^2)``, which is the reflectance where that is not small.
+    """What light is divided by: ``(reflectance^4 + floor^4)^(1/4)``, which is the reflectance where that is not small.
 
     Smooth everywhere: two neighbours whose reflectances are alike are divided by what is alike, however dark they are.
     A switch (1 below a threshold) makes of 0.009 and 0.011 a factor of 90 in what is filtered.
     """
-    return jnp.sqrt(reflectance * reflectance + floor * floor)
+    larger, smaller = jnp.maximum(reflectance, floor), jnp.minimum(reflectance, floor)
+    return larger * (1 + (smaller / larger) ** 4) ** 0.25
 
 
 def demodulate(radiance: jax.Array, reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:

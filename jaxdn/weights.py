@@ -119,7 +119,13 @@ def describe(name_or_path: str | Path) -> dict[str, Any]:
         method_named(factory)
     except ValueError as error:
         raise ValueError(f"weights {file}: factory: {error} They may come from a newer jaxdn.") from error
-    return {**description, "factory": factory, "options": options}
+    return {**description, "factory": factory, "options": _today(options)}
+
+
+def _today(options: dict[str, Any]) -> dict[str, Any]:
+    """Saved options as they are called today: whether to divide by the albedo has become what to divide by."""
+    earlier = options.get("demodulate")
+    return options | {"demodulate": "albedo" if earlier else "none"} if isinstance(earlier, bool) else options
 
 
 def _check_params(flat: dict[str, np.ndarray], denoiser: Denoiser, path: Path) -> None:

@@ -1,8 +1,8 @@
 """Spatiotemporal variance-guided filtering (``svgf``), the reference point of real-time denoising.
 
-Each frame: divide by the albedo, fetch the history with every tap tested, blend colour and the moments of luminance
-into it, estimate the variance per pixel (from time, or from a 7x7 neighbourhood while the history is short), then five
-a-trous levels whose reach over luminance edges is set by that variance, and multiply by the albedo again.
+Each frame: divide by what surfaces reflect, fetch the history with every tap tested, blend colour and the moments of
+luminance into it, estimate the variance per pixel (from time, or from a 7x7 neighbourhood while the history is short),
+then five a-trous levels whose reach over luminance edges is set by that variance, and multiply by the same again.
 
 What is kept as colour history is the image after the first level (``feedback_level``), demodulated, not the image
 shown: feeding the whole cascade back would blur more with every frame. This is the algorithm's own rule and the one
@@ -28,7 +28,7 @@ from jaxdn.filters.reprojection import reproject, same_surface
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.filters.weights import Weight, depth_weight, luminance_weight, normal_weight
 from jaxdn.frame import Frame
-from jaxdn.methods.demodulated import demodulated
+from jaxdn.methods.demodulated import Demodulation, demodulated
 from jaxdn.methods.table import method
 from jaxdn.options import Range
 
@@ -65,8 +65,8 @@ class Options:
     """Relative difference from the expected depth that a tap of the history may have, besides its slope."""
     normal_threshold: float = 0.9
     """The cosine of normals that a tap of the history has to exceed."""
-    demodulate: bool = True
-    """Filter radiance divided by albedo."""
+    demodulate: Demodulation = "brdf"
+    """What light is divided by before it is filtered."""
 
     def __post_init__(self) -> None:
         if self.feedback_level > self.levels:
@@ -89,9 +89,9 @@ class SvgfState(NamedTuple):
 def svgf(options: Options) -> Denoiser:
     """SVGF, a filter without weights (``params`` is ``{}``).
 
-    Reads albedo, normal, depth, previous_depth, motion and ids; a buffer that is ``None`` takes its test or weight with
-    it. Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for options out of range
-    and radiance that is not [H, W, 3].
+    Reads reflectance, albedo, normal, depth, previous_depth, motion and ids; a buffer that is ``None`` takes its test
+    or weight with it. Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for options
+    out of range and radiance that is not [H, W, 3].
     """
 
     def start(params: Params, frame: Frame) -> SvgfState:
@@ -125,7 +125,7 @@ def svgf(options: Options) -> Denoiser:
         return SvgfState(kept, guides), image, broken
 
     plain = recurrent(Core(start, step, READS))
-    return demodulated(plain, by="albedo" if options.demodulate else "none")
+    return demodulated(plain, by=options.demodulate)
 
 
 def _recall(
