@@ -2,11 +2,10 @@
 
 ``python -m experiments.papers.demodulation SCENE.xml ...`` renders each scene (and three small rooms) at 160x90 from a
 camera at rest, 1 sample a pixel for :data:`FRAMES` frames, and prints the PSNR of svgf's last two frames for each way
-of dividing (:func:`ways`). Errors are free of the reference's own noise: ``mean((x - a) (x - b))`` with its two halves.
+of dividing (:func:`ways`). Errors are free of the reference's own noise (:func:`jaxdn.metrics.unbiased_psnr`).
 """
 
 import functools
-import math
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -18,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.speed.small_rooms import CASES
-from jaxdn import brdf, color
+from jaxdn import brdf, color, metrics
 from jaxdn.denoisers import svgf
 from jaxdn.frame import Clip, Frame
 from jaxdn.rollout import denoise
@@ -66,10 +65,9 @@ def clip_of(path: Path) -> tuple[Clip, np.ndarray]:
     return Clip(frames, first.reference), first.reference_half
 
 
-def error(image: Any, first: Any, second: Any) -> float:
-    """PSNR in dB, without the noise of the reference's two halves."""
-    x, a, b = (np.asarray(color.tonemap(jnp.asarray(light)), np.float64) for light in (image, first, second))
-    return -10 * math.log10(max(float(np.mean((x - a) * (x - b))), 1e-9))
+def score(image: Any, first: Any, second: Any) -> float:
+    """PSNR in dB of tone-mapped light, without the noise of the reference's two halves."""
+    return float(metrics.unbiased_psnr(*(color.tonemap(jnp.asarray(light)) for light in (image, first, second))))
 
 
 def scenes(paths: list[str]) -> Iterator[tuple[str, Clip, np.ndarray]]:
@@ -90,7 +88,7 @@ def main() -> None:
         for divisor in ways().values():
             by = divisor(clip.frames)
             image = run(Clip(clip.frames._replace(radiance=clip.frames.radiance / by, albedo=None))) * by
-            row.append(np.mean([error(image[at], half, other) for at in (-2, -1)]))
+            row.append(np.mean([score(image[at], half, other) for at in (-2, -1)]))
         print(f"| {name} | {' | '.join(f'{value:.2f}' for value in row)} |", flush=True)
 
 
