@@ -30,7 +30,7 @@ SMALLEST_COSINE = 1 / 512
 FLOOR = 0.15
 """What is divided by where nothing is reflected; the divisor is the reflectance itself from twice that on.
 
-Smaller ones gain 0.1 dB where the reflectance is known, and lose 0.6 dB where there is the albedo alone, of which dark
+0.04 gains 0.1 dB where the reflectance is known, and loses 0.6 to 2.1 dB where there is the albedo alone, of which
 metal has none (``python -m experiments.papers.demodulation``).
 """
 
