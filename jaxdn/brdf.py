@@ -27,9 +27,12 @@ SAMPLES = 4096
 """Half vectors averaged for a stored entry."""
 SMALLEST_COSINE = 1 / 512
 """Smaller cosines are replaced by this: shading normals may face away from the viewer."""
-FLOOR = 0.04
-"""The divisor differs from the reflectance near and below this, the least reflectance of a dielectric at normal
-incidence."""
+FLOOR = 0.15
+"""The divisor of a surface that reflects nothing; from twice this value on, the divisor is the reflectance itself.
+
+0.04 gains 0.1 dB where the reflectance is known, and loses 0.6 to 2.1 dB where only the albedo is, which metal does not
+have (``python -m experiments.papers.demodulation``).
+"""
 
 _STORED = Path(__file__).parent / "shipped" / "directional-albedo.npz"
 
@@ -165,12 +168,13 @@ def _look_up(table: jax.Array, cosine: jax.Array, roughness: jax.Array) -> jax.A
 
 
 def divisor(reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
-    """The divisor ``sqrt(reflectance^2 + floor^2)``, close to the reflectance where that is not small.
+    """The divisor ``(reflectance^4 + floor^4)^(1/4)``, close to the reflectance where that is not small.
 
     It is smooth everywhere: neighbours of similar reflectance have similar divisors, however dark they are. With a
     threshold (1 below it), reflectances of 0.009 and 0.011 would differ by a factor of 90 after the division.
     """
-    return jnp.sqrt(reflectance * reflectance + floor * floor)
+    larger, smaller = jnp.maximum(reflectance, floor), jnp.minimum(reflectance, floor)
+    return larger * (1 + (smaller / larger) ** 4) ** 0.25
 
 
 def demodulate(radiance: jax.Array, reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:

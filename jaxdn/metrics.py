@@ -50,6 +50,35 @@ def relative_mse(image: jax.Array, reference: jax.Array, *, mask: jax.Array | No
     return _mean((jnp.clip(image - reference, -limit, limit) / scale) ** 2, inside)
 
 
+def unbiased_mse(image: jax.Array, first: jax.Array, second: jax.Array, *, mask: jax.Array | None = None) -> jax.Array:
+    """Mean of ``(image - first) (image - second)``: the squared error without the noise of the reference; 0 if empty.
+
+    ``first`` and ``second`` are independent noisy references with the same expectation r, such as the means of the two
+    halves of a reference's samples. Then the expectation is ``(image - r)^2``, as the errors of the two are
+    independent, whereas the MSE against their mean adds the variance of that mean, and stops falling there. Tone
+    mapping does not keep expectations: what it moves is the noise of a half times its curvature, far below the floor.
+    An estimate: for an image as good as the reference it may be negative.
+    """
+    image, first, inside = _prepare(image, first, mask)
+    _, second, _ = _prepare(image, second, mask)
+    return _mean((image - first) * (image - second), inside)
+
+
+def unbiased_psnr(
+    image: jax.Array,
+    first: jax.Array,
+    second: jax.Array,
+    *,
+    mask: jax.Array | None = None,
+    peak: float = 1.0,
+) -> jax.Array:
+    """``10 log10(peak^2 / MSE)`` in dB of :func:`unbiased_mse`, of a clip that of all its pixels together.
+
+    Infinite where the estimate is not above 0: the image is as good as can be told.
+    """
+    return _decibels(jnp.maximum(unbiased_mse(image, first, second, mask=mask), 0.0), peak)
+
+
 def psnr(
     image: jax.Array,
     reference: jax.Array,

@@ -49,41 +49,44 @@ BLACK = bsdf("diffuse", rgb("reflectance", "0"))
 MATERIALS: dict[str, tuple[str, set[str]]] = {
     "grey": (GREY, set()),
     "checkered": (bsdf("twosided", bsdf("diffuse", checker("reflectance"))), {"texture"}),
-    "rough metal": (bsdf("roughconductor", number("alpha", 0.3)), {"glossy"}),
-    "metal of roughness 1": (bsdf("roughconductor", number("alpha", 1.0)), set()),
-    "plastic of roughness 1": (bsdf("roughplastic", number("alpha", 1.0)), set()),
-    "textured roughness": (bsdf("roughconductor", rough_texture(0.2, 1.0)), {"glossy"}),
-    "textured roughness 1": (bsdf("roughconductor", rough_texture(1.0, 1.0)), set()),
-    "mirror": (bsdf("conductor"), {"mirror"}),
-    "smooth plastic": (bsdf("plastic"), {"mirror"}),
-    "glass": (bsdf("dielectric"), {"mirror", "transmission"}),
-    "thin glass": (bsdf("thindielectric"), {"mirror", "transmission"}),
-    "rough glass": (bsdf("roughdielectric", number("alpha", 0.2)), {"glossy", "transmission"}),
-    "principled": (bsdf("principled", number("roughness", 0.4)), {"glossy"}),
-    "principled matt": (bsdf("principled", number("roughness", 1.0)), set()),
+    "rough metal": (bsdf("roughconductor", number("alpha", 0.3)), {"specular", "glossy"}),
+    "metal of roughness 1": (bsdf("roughconductor", number("alpha", 1.0)), {"specular"}),
+    "plastic of roughness 1": (bsdf("roughplastic", number("alpha", 1.0)), {"specular"}),
+    "textured roughness": (bsdf("roughconductor", rough_texture(0.2, 1.0)), {"specular", "glossy"}),
+    "textured roughness 1": (bsdf("roughconductor", rough_texture(1.0, 1.0)), {"specular"}),
+    "mirror": (bsdf("conductor"), {"specular", "mirror"}),
+    "smooth plastic": (bsdf("plastic"), {"specular", "mirror"}),
+    "glass": (bsdf("dielectric"), {"specular", "mirror", "transmission"}),
+    "thin glass": (bsdf("thindielectric"), {"specular", "mirror", "transmission"}),
+    "rough glass": (bsdf("roughdielectric", number("alpha", 0.2)), {"specular", "glossy", "transmission"}),
+    "principled": (bsdf("principled", number("roughness", 0.4)), {"specular", "glossy"}),
+    "principled matt": (bsdf("principled", number("roughness", 1.0)), {"specular"}),
     "principled metal, textured": (
         bsdf("principled", number("metallic", 1.0) + number("roughness", 0.3) + checker("base_color")),
-        {"glossy"},
+        {"specular", "glossy"},
     ),
     "principled glass": (
         bsdf("principled", number("spec_trans", 1.0) + number("roughness", 0.3) + number("eta", 1.5)),
-        {"glossy", "transmission"},
+        {"specular", "glossy", "transmission"},
     ),
     "blend": (
         bsdf("blendbsdf", number("weight", 0.4) + bsdf("diffuse", checker("reflectance")) + bsdf("conductor")),
-        {"texture", "mirror"},
+        {"specular", "texture", "mirror"},
     ),
     "blend of one": (
         bsdf("blendbsdf", number("weight", 0.0) + bsdf("diffuse") + bsdf("conductor")),
-        set(),
+        {"specular"},  # so its flags say
     ),
-    "two sides": (bsdf("twosided", bsdf("diffuse") + bsdf("roughconductor", number("alpha", 0.2))), {"glossy"}),
+    "two sides": (
+        bsdf("twosided", bsdf("diffuse") + bsdf("roughconductor", number("alpha", 0.2))),
+        {"specular", "glossy"},
+    ),
     "deep inside": (
         bsdf("mask", number("opacity", 1.0) + bsdf("twosided", bsdf("roughplastic", number("alpha", 0.2)))),
-        {"glossy"},
+        {"specular", "glossy"},
     ),
     "bumpy": (bsdf("bumpmap", BUMPS + bsdf("diffuse")), set()),
-    "cut-out": (bsdf("mask", number("opacity", 0.5) + bsdf("diffuse")), {"transmission"}),
+    "cut-out": (bsdf("mask", number("opacity", 0.5) + bsdf("diffuse")), {"specular", "transmission"}),
 }
 """Name -> XML and the effects of the material."""
 
@@ -225,13 +228,15 @@ CASES: dict[str, Case] = {
     ),
     "only emission": Case(GLOWING, {}, {"emission"}),
     "no light": Case(box(), {}, set()),
-    "instances": Case(box() + BEHIND + INSTANCES, {}, LIT | {"mirror"}),
-    "instances that move": Case(box() + BEHIND + INSTANCES, ANIMATIONS["ball"][0], LIT | OBJECT | {"mirror"}),
+    "instances": Case(box() + BEHIND + INSTANCES, {}, LIT | {"specular", "mirror"}),
+    "instances that move": Case(
+        box() + BEHIND + INSTANCES, ANIMATIONS["ball"][0], LIT | OBJECT | {"specular", "mirror"}
+    ),
     "open to the sky": Case(box(open_front=True) + ENVIRONMENT, {}, LIT | {"environment", "emission"}),
     "a sky that cannot be seen": Case(
         box() + ENVIRONMENT, {}, LIT | {"environment", "emission"}, frozenset({"emission"})
     ),
-    "fog": Case(box() + BEHIND + MEDIUM, {}, LIT | {"media", "transmission"}),
+    "fog": Case(box() + BEHIND + MEDIUM, {}, LIT | {"media", "specular", "transmission"}),
     "one picture, camera moves": Case(PICTURE + BEHIND, {"camera": MOVES}, {"camera-motion", "texture"}),
     "a room in which everything moves": Case(
         box(wall=MATERIALS["checkered"][0])
@@ -240,7 +245,10 @@ CASES: dict[str, Case] = {
         + FAR_BALL
         + ball(MATERIALS["rough metal"][0], "metal", 'x="-1" y="0.5" z="-1"'),
         ANIMATIONS["everything"][0],
-        LIT | OBJECT | CAMERA | {"changing-light", "emission", "texture", "mirror", "transmission", "glossy"},
+        LIT
+        | OBJECT
+        | CAMERA
+        | {"changing-light", "emission", "texture", "specular", "mirror", "transmission", "glossy"},
     ),
 }
 """Name -> scene with exactly the effects that have to be found."""

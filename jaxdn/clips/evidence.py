@@ -52,7 +52,7 @@ class _Look:
         self._moments: list[Moment] = []
         self._unsure: dict[str, str] = {}
         self._lobes: set[str] = {"diffuse"}
-        self._textured = self._lit = self._sky_shines = False
+        self._textured = self._specular = self._lit = self._sky_shines = False
 
     def at(self, frame: Frame) -> None:
         """Look at the next frame."""
@@ -105,6 +105,10 @@ class _Look:
             self._lobes |= {"mirror"} if np.any(roughness == 0) else set()
         elif self._plan is None:
             self._unsure |= dict.fromkeys(("glossy", "mirror"), "there is no roughness buffer")
+        if frame.reflectance is not None:
+            self._specular |= frame.albedo is None or not np.array_equal(frame.reflectance, frame.albedo)
+        elif self._plan is None:
+            self._unsure.setdefault("specular", "there is no reflectance buffer")
         if frame.albedo is None or frame.ids is None:
             if self._plan is None:
                 self._unsure.setdefault("texture", "it takes albedo and ids to tell a texture from two shapes")
@@ -121,7 +125,7 @@ class _Look:
             hidden = {name: why for name, why in hidden.items() if name not in ("moving-shadow", "changing-light")}
         if self._sky_shines:
             hidden.pop("environment", None)
-        surface = Surface("what is seen", frozenset(self._lobes), self._textured)
+        surface = Surface("what is seen", frozenset(self._lobes), self._textured, specular=self._specular)
         lights = (Light("a light", environment=self._sky_shines),) if self._lit else ()
         return Facts((surface,), lights, tuple(self._moments), uncertain=hidden | self._unsure)
 

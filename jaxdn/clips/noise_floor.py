@@ -20,6 +20,21 @@ def noise_floor(reference: np.ndarray, reference_half: np.ndarray) -> float:
     return float(np.mean((first.astype(np.float64) - second) ** 2) / 4.0)
 
 
+def read_halves(folder: str | Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Two independent references [T, H, W, 3] of a clip, of half the samples each; None where it does not keep one.
+
+    A clip keeps its reference and the mean ``a`` of the first half of its samples; the other is ``2 * reference - a``,
+    or 0 where rounding to half precision has made that negative.
+    """
+    first, second = [], []
+    for stored in read_frames(folder, spp=read_record(folder)["layers"][0]):
+        if stored.reference is None or stored.reference_half is None:
+            return None
+        first.append(stored.reference_half)
+        second.append(np.maximum(2.0 * stored.reference - stored.reference_half, 0.0))
+    return (np.stack(first), np.stack(second)) if first else None
+
+
 def read_noise_floor(folder: str | Path) -> float:
     """The PSNR in dB that a perfect image would get against this clip's reference, averaged over frames.
 

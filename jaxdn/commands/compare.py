@@ -13,7 +13,7 @@ import numpy as np
 from jaxdn import __version__, color, metrics
 from jaxdn.candidates import Candidate
 from jaxdn.clips import read_clip
-from jaxdn.clips.noise_floor import read_noise_floor
+from jaxdn.clips.noise_floor import read_halves, read_noise_floor
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.frame import Clip
 from jaxdn.report import ClipResult, Results, Scores, TrainingCurve
@@ -118,6 +118,8 @@ def _compare_on(
     shown = int(np.argmax(hidden.sum((1, 2, 3)))) if hidden.any() else shape[0] - 1
     scores, per_frame = {}, {}
     images = {"reference": np.asarray(reference[shown])}
+    halves = read_halves(folder)
+    shown_halves = None if halves is None else tuple(color.tonemap(jax.numpy.asarray(half)) for half in halves)
     for method in methods:
         if method.denoiser is None:
             denoised, milliseconds = inputs.frames.radiance, 0.0
@@ -126,6 +128,9 @@ def _compare_on(
         image = color.tonemap(denoised)
         found = {name: np.asarray(value) for name, value in _clip_scores(image, reference, hidden * 1.0).items()}
         scores[method.label] = _as_scores(found, hidden, milliseconds, spp)
+        if shown_halves is not None:
+            unbiased = float(metrics.unbiased_psnr(image, *shown_halves))
+            scores[method.label] = scores[method.label]._replace(unbiased_psnr=unbiased)
         per_frame[method.label] = {
             "psnr": found["frame_psnr"].tolist(),
             "l1": found["frame_l1"].tolist(),

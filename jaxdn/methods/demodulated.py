@@ -5,25 +5,35 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
+from jaxdn import brdf
 from jaxdn.checks import check_option
 from jaxdn.denoiser import Core, Denoiser, Params, Ritual, State, recurrent
 from jaxdn.frame import RADIANCE_MAX, Frame
 
 SMALLEST_ALBEDO = 0.01
-"""Radiance is not divided by an albedo below this."""
+"""Radiance is not divided by an albedo below this (``by="albedo"``)."""
 
-Demodulation = Literal["albedo", "none"]
+Demodulation = Literal["albedo", "brdf", "none"]
+"""What light is divided by, see :func:`demodulated`."""
 
 
-def demodulated(denoiser: Denoiser, *, by: Demodulation = "albedo") -> Denoiser:
-    """The denoiser applied to radiance divided by the albedo, with its image multiplied by the same albedo.
+def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "albedo") -> Denoiser:
+    """The denoiser applied to radiance divided by what the surface reflects; its image is multiplied by the same again.
 
     Textures are thus removed before filtering and cannot be blurred. The state, including the history, is demodulated
-    too. ``by="none"`` returns the denoiser unchanged; frames without albedo are not divided. The parameters are those
-    of the denoiser. Raises ValueError for another ``by``, and for a denoiser that :func:`jaxdn.denoiser.recurrent` did
-    not make, because invalid values have to be repaired before the division.
+    too. ``by`` is
+
+    * ``"brdf"``: :func:`jaxdn.brdf.divisor` of the frame's ``reflectance``, of its albedo where that is absent;
+    * ``"albedo"``: the albedo where that exceeds 0.01 and 1 elsewhere, as the shipped weights were trained;
+    * ``"none"``: the denoiser is returned unchanged.
+
+    ``True`` is ``"albedo"`` and ``False`` is ``"none"``. Frames with neither buffer are not divided. The parameters are
+    those of the denoiser. Raises ValueError for another ``by``, and for a denoiser that
+    :func:`jaxdn.denoiser.recurrent` did not make, because invalid values have to be repaired before the division.
     """
-    check_option(by, "by", ("albedo", "none"))
+    if isinstance(by, bool):  # as it was before there were three choices
+        by = "albedo" if by else "none"
+    check_option(by, "by", ("albedo", "brdf", "none"))
     if by == "none":
         return denoiser
     if not isinstance(denoiser.step, Ritual):
@@ -31,24 +41,33 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation = "albedo") -> Denoiser:
     core = denoiser.step.core
 
     def start(params: Params, frame: Frame) -> State:
-        return core.start(params, _divided(frame)[0])
+        return core.start(params, _divided(frame, by)[0])
 
     def step(params: Params, state: State, frame: Frame, first: jax.Array) -> tuple[State, jax.Array, jax.Array | int]:
-        frame, divisor = _divided(frame)
+        frame, divisor = _divided(frame, by)
         state, image, lost = core.step(params, state, frame, first)
         return state, image if divisor is None else image * divisor, lost
 
     def samples(params: Params, state: State, frame: Frame) -> jax.Array:
         assert core.samples is not None
-        return core.samples(params, state, _divided(frame)[0])
+        return core.samples(params, state, _divided(frame, by)[0])
 
     requests = None if core.samples is None else samples
-    return recurrent(Core(start, step, core.reads | {"albedo"}, core.init, requests))
+    reads = {"albedo", "reflectance"} if by == "brdf" else {"albedo"}
+    return recurrent(Core(start, step, core.reads | reads, core.init, requests))
 
 
-def _divided(frame: Frame) -> tuple[Frame, jax.Array | None]:
+def _divided(frame: Frame, by: Demodulation) -> tuple[Frame, jax.Array | None]:
     """The frame with demodulated radiance, and the divisor."""
-    if frame.albedo is None:
+    divisor = _divisor(frame, by)
+    if divisor is None:
         return frame, None
-    divisor = jnp.where(frame.albedo > SMALLEST_ALBEDO, frame.albedo, 1.0)
     return frame._replace(radiance=jnp.minimum(frame.radiance / divisor, RADIANCE_MAX)), divisor
+
+
+def _divisor(frame: Frame, by: Demodulation) -> jax.Array | None:
+    if by == "brdf":
+        # The albedo is the reflectance's neutral value: the same function of either.
+        reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
+        return None if reflectance is None else brdf.divisor(reflectance)
+    return None if frame.albedo is None else jnp.where(frame.albedo > SMALLEST_ALBEDO, frame.albedo, 1.0)

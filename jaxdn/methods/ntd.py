@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxdn import color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.frame import FAR, RADIANCE_MAX, Frame
-from jaxdn.methods.demodulated import demodulated
+from jaxdn.methods.demodulated import Demodulation, demodulated
 from jaxdn.methods.table import method
 from jaxdn.motion import on_screen
 from jaxdn.networks import LARGE, SMALL, Widths, crop, pad
@@ -59,8 +59,8 @@ class Options:
     missing_history: Literal["current", "blend"] = "current"
     """Off-screen or without a vector: the noisy pixel as history, alpha^t = 1, and a mask of these pixels as an
     additional input channel; or no special treatment."""
-    demodulate: bool = True
-    """Filter radiance divided by albedo."""
+    demodulate: Demodulation | bool = "albedo"
+    """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     truncate: bool = False
     """Stop the gradient at the history."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
@@ -71,7 +71,7 @@ class Options:
 
 
 PARITY = Options(
-    down="max", depth_scale="unit", border="zeros", first_frame="noisy", missing_history="blend", demodulate=False
+    down="max", depth_scale="unit", border="zeros", first_frame="noisy", missing_history="blend", demodulate="none"
 )
 """The exact paper settings: D is max-pooling (eq. 4), taps outside the image are 0, the first history is noisy."""
 
@@ -213,4 +213,4 @@ def ntd(options: Options) -> Denoiser:
         return image, image, broken
 
     plain = recurrent(Core(start, step, reads, init))
-    return demodulated(plain, by="albedo" if options.demodulate else "none")
+    return demodulated(plain, by=options.demodulate)

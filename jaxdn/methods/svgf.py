@@ -28,7 +28,7 @@ from jaxdn.filters.reprojection import reproject, same_surface
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.filters.weights import Weight, depth_weight, luminance_weight, normal_weight
 from jaxdn.frame import Frame
-from jaxdn.methods.demodulated import demodulated
+from jaxdn.methods.demodulated import Demodulation, demodulated
 from jaxdn.methods.table import method
 from jaxdn.options import Range
 
@@ -65,8 +65,8 @@ class Options:
     """Allowed relative difference of a history tap from the expected depth, in addition to the slope term."""
     normal_threshold: float = 0.9
     """A history tap is accepted above this cosine of normals."""
-    demodulate: bool = True
-    """Filter radiance divided by albedo."""
+    demodulate: Demodulation | bool = "albedo"
+    """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
 
     def __post_init__(self) -> None:
         if self.feedback_level > self.levels:
@@ -125,7 +125,7 @@ def svgf(options: Options) -> Denoiser:
         return SvgfState(kept, guides), image, broken
 
     plain = recurrent(Core(start, step, READS))
-    return demodulated(plain, by="albedo" if options.demodulate else "none")
+    return demodulated(plain, by=options.demodulate)
 
 
 def _recall(

@@ -80,6 +80,11 @@ def _transmission(facts: Facts, moment: Moment) -> str:
     return _surfaces(facts, "transmission", "lets light through")
 
 
+def _specular(facts: Facts, moment: Moment) -> str:
+    names = [surface.name for surface in facts.surfaces if surface.specular]
+    return f"{_list(names)}: not perfectly diffuse" if names else ""
+
+
 def _moving_shadow(facts: Facts, moment: Moment) -> str:
     if not (moment.moving and facts.lights and _reflecting(facts)):
         return ""
@@ -128,6 +133,12 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("glossy", "A surface reflects sharper than a diffuse one.", _glossy, _SURFACE),
     Effect("mirror", "A surface reflects like a mirror.", _mirror, _SURFACE),
     Effect("transmission", "Light passes through a surface.", _transmission, _SURFACE),
+    Effect(
+        "specular",
+        "A surface reflects another share of the light than its albedo.",
+        _specular,
+        frozenset({"reflectance"}),
+    ),
     Effect(
         "moving-shadow",
         "Something that moves blocks or reflects light; it need not be on screen itself.",

@@ -21,6 +21,8 @@ class Surface(NamedTuple):
     """Its diffuse reflectance varies over the surface."""
     medium: bool = False
     """It bounds fog, smoke or another participating medium."""
+    specular: bool = False
+    """It is not perfectly diffuse, so that its reflectance is not its albedo: even metal of roughness 1."""
 
 
 class Light(NamedTuple):

@@ -22,7 +22,7 @@ from jaxdn.render.seeds import NOISY, REFERENCE
 from jaxdn.render.variant import use_variant
 from jaxdn.render.wavefront import Accumulated, no_light
 
-_SURFACE = ("albedo", "normal", "depth", "roughness", "ids")
+_SURFACE = ("albedo", "normal", "depth", "roughness", "reflectance", "ids")
 _DISOCCLUSION = frozenset({"dual_motion", "visible"})
 _MOTION = frozenset({"motion", "previous_depth"}) | _DISOCCLUSION
 _FREE = ("frames", "cameras", "versions", "bad_samples")
@@ -87,10 +87,10 @@ def render_frame(
     repeated = plan is not None and plan.held[frame] != frame
     wanted = frozenset(Frame._fields if plan is None else () if repeated else plan.frames[frame])
     if wanted & _MOTION and previous is None and frame > 0:
-        previous = _view(scene, frame - 1, scene.build(frame - 1, width, height))
+        previous = _view(scene, frame - 1, scene.build(frame - 1, width, height), frozenset())
     built = scene.build(frame, width, height)
     check_scene(built)
-    view = previous if repeated else _view(scene, frame, built) if wanted else None
+    view = previous if repeated else _view(scene, frame, built, wanted) if wanted else None
 
     dark = plan is not None and plan.integrator == "none"
     noise_only = plan is not None and not plan.indirect
@@ -247,9 +247,9 @@ def tracer(variant: str) -> tuple[Callable[..., Accumulated], bool]:
     return wavefront, False
 
 
-def _view(scene: AnimatedScene, frame: int, built: Any) -> View:
+def _view(scene: AnimatedScene, frame: int, built: Any, wanted: frozenset[str]) -> View:
     pose = {name: np.asarray(matrix, np.float64) for name, matrix in scene.pose(frame).items()}
-    return View(gbuffer(built), scene.camera(frame), pose)
+    return View(gbuffer(built, reflectance="reflectance" in wanted), scene.camera(frame), pose)
 
 
 def _motion(view: View, previous: View | None, *, disocclusion: bool) -> dict[str, Any]:

@@ -5,6 +5,8 @@ reflectance for rough conductors and blends (it evaluates the BSDF at normal inc
 near plane, so these are taken from the BSDFs and positions directly.
 """
 
+import functools
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.frame import FAR
+from jaxdn.render.reflectance import Reflectances
 from jaxdn.render.wavefront import camera_rays
 
 
@@ -35,6 +38,9 @@ class GBuffer(NamedTuple):
     """[H, W, 1] int32 position of the shape's name in ``names``, -1 on a miss."""
     names: tuple[str, ...]
     """The names of the scene's shapes, sorted: the same shape has the same id in every frame."""
+    reflectance: np.ndarray | None = None
+    """[H, W, 3] float32 share of light from all around that goes to the camera, in [0, 1], 1 on a miss; None where it
+    was not asked for."""
 
 
 def shape_names(scene: Any) -> list[str]:
@@ -56,13 +62,19 @@ def check_scene(scene: Any) -> None:
         raise ValueError("scene: motion blur is not supported yet; expected an instantaneous shutter.")
 
 
-def gbuffer(scene: Any) -> GBuffer:
-    """Trace one ray through the centre of every pixel of the scene's first sensor, with the current variant."""
+def gbuffer(scene: Any, *, reflectance: bool = False) -> GBuffer:
+    """Trace one ray through the centre of every pixel of the scene's first sensor, with the current variant.
+
+    With ``reflectance`` (:mod:`jaxdn.render.reflectance`) a material that cannot be averaged is warned of by the name
+    of its shape, once, and its albedo taken.
+    """
     names = shape_names(scene)
     ranks = {name: rank for rank, name in enumerate(sorted(names))}
     trace = _one_by_one if str(mi.variant()).startswith("scalar") else _vectorised
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
-    found = {name: buffer.reshape(height, width, -1) for name, buffer in trace(scene, names, ranks).items()}
+    reflectances = Reflectances(scene) if reflectance else None
+    traced = trace(scene, names, ranks, reflectances)
+    found = {name: buffer.reshape(height, width, -1) for name, buffer in traced.items()}
 
     hit = found["ids"] >= 0
     direction, normal, position = found["direction"], found["normal"], found["position"]
@@ -71,8 +83,9 @@ def gbuffer(scene: Any) -> GBuffer:
     # Distances along the ray begin at the near plane; the position is independent of it.
     depth = (position - to_world[:3, 3]) @ forward[:, None]
     away = np.sum(normal * direction, axis=-1, keepdims=True) > 0
+    albedo = np.where(hit, np.clip(np.nan_to_num(found["albedo"]), 0.0, 1.0), 1.0).astype(np.float32)
     return GBuffer(
-        albedo=np.where(hit, np.clip(np.nan_to_num(found["albedo"]), 0.0, 1.0), 1.0).astype(np.float32),
+        albedo=albedo,
         normal=np.where(hit, np.where(away, -normal, normal), 0.0).astype(np.float32),
         depth=np.where(hit, depth, FAR).astype(np.float32),
         roughness=np.where(hit, np.clip(np.nan_to_num(found["roughness"], nan=1.0), 0.0, 1.0), 1.0).astype(np.float32),
@@ -80,10 +93,28 @@ def gbuffer(scene: Any) -> GBuffer:
         direction=direction,
         ids=found["ids"].astype(np.int32),
         names=tuple(sorted(names)),
+        reflectance=_reflectance(found, albedo, sorted(names)) if reflectance else None,
     )
 
 
-def _vectorised(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict[str, np.ndarray]:
+def _reflectance(found: dict[str, np.ndarray], albedo: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """What was averaged, in [0, 1], with the albedo where that gave no number."""
+    broken = (found["ids"] >= 0) & ~np.all(np.isfinite(found["reflectance"]), axis=-1, keepdims=True)
+    for number in np.unique(found["ids"][broken]):
+        _warn(names[int(number)])
+    known = (found["ids"] >= 0) & ~broken
+    return np.where(known, np.clip(found["reflectance"], 0.0, 1.0), albedo).astype(np.float32)
+
+
+@functools.cache
+def _warn(shape: str) -> None:
+    """Once for each shape, not once for each frame."""
+    warnings.warn(f"{shape}: what its material reflects cannot be averaged; its albedo is taken.", stacklevel=2)
+
+
+def _vectorised(
+    scene: Any, names: Sequence[str], ranks: dict[str, int], reflectances: Reflectances | None
+) -> dict[str, np.ndarray]:
     """All pixels at once; flat buffers."""
     sensor = scene.sensors()[0]
     width, height = (int(size) for size in sensor.film().crop_size())
@@ -119,6 +150,8 @@ def _vectorised(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict
         "roughness": roughness,
         "shape": shape,
     }
+    if reflectances is not None:
+        buffers["reflectance"] = reflectances.of_pixels(hit, bsdf, valid, albedo)
     dr.eval(buffers)
     arrays = {name: np.array(buffer).T.astype(np.float64) for name, buffer in buffers.items()}
     # Registry numbers depend on the other existing objects; names do not.
@@ -131,13 +164,17 @@ def _vectorised(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict
     return arrays
 
 
-def _one_by_one(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict[str, np.ndarray]:
+def _one_by_one(
+    scene: Any, names: Sequence[str], ranks: dict[str, int], reflectances: Reflectances | None
+) -> dict[str, np.ndarray]:
     """The same buffers, a pixel at a time, for the variant without vectorisation."""
     sensor = scene.sensors()[0]
     width, height = (int(size) for size in sensor.film().crop_size())
     by_shape = {_address(own): ranks[name] for own, name in zip(scene.shapes(), names, strict=True)}
     sizes = {"albedo": 3, "normal": 3, "position": 3, "direction": 3, "roughness": 1}
     arrays: dict[str, np.ndarray] = {name: np.zeros((width * height, size)) for name, size in sizes.items()}
+    if reflectances is not None:
+        arrays["reflectance"] = np.zeros((width * height, 3))
     arrays["ids"] = np.full(width * height, -1)
     for pixel in range(width * height):
         row, column = divmod(pixel, width)
@@ -150,7 +187,10 @@ def _one_by_one(scene: Any, names: Sequence[str], ranks: dict[str, int]) -> dict
         arrays["ids"][pixel] = by_shape.get(_address(owner), -1)
         arrays["position"][pixel] = hit.p
         arrays["normal"][pixel] = hit.sh_frame.n
-        arrays["albedo"][pixel], arrays["roughness"][pixel] = _surface(hit)
+        albedo, arrays["roughness"][pixel] = _surface(hit)
+        arrays["albedo"][pixel] = albedo
+        if reflectances is not None:
+            arrays["reflectance"][pixel] = reflectances.of_one(hit, hit.bsdf(), albedo)
     return arrays
 
 

@@ -36,6 +36,12 @@ class Range(NamedTuple):
 NOTHING = Material(frozenset())
 
 
+def is_lambertian(bsdf: Any) -> bool:
+    """Whether a BSDF has no lobe but perfectly diffuse ones, so that it reflects just its albedo."""
+    known = mi.BSDFFlags
+    return bool(int(bsdf.flags()) & int(known.All) == int(known.DiffuseReflection))
+
+
 def _numbers(value: Any) -> np.ndarray | None:
     try:
         array = np.asarray(value, np.float64)

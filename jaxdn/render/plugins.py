@@ -1,5 +1,6 @@
 """Mitsuba's objects as a tree: a scene holds shapes, a shape a BSDF, a BSDF textures and other BSDFs."""
 
+import functools
 from typing import Any
 
 import mitsuba as mi
@@ -7,18 +8,32 @@ import mitsuba as mi
 
 def children(plugin: Any) -> list[tuple[str, Any]]:
     """The objects directly inside a plugin, by name."""
-    found: list[tuple[str, Any]] = []
+    walk = _walk(str(mi.variant()))()
+    plugin.traverse(walk)
+    return walk.found
+
+
+@functools.cache
+def _walk(variant: str) -> Any:
+    """The class of the callback for one variant, made once.
+
+    A class is part of a cycle of references, and what one made for each call would have found lived until Python next
+    looks for cycles: scenes of frames long done, whose objects still have numbers, so that kernels do not fit again.
+    """
 
     class Walk(mi.TraversalCallback):
+        def __init__(self) -> None:
+            super().__init__()
+            self.found: list[tuple[str, Any]] = []
+
         def put(self, name: str, value: Any, *_: Any) -> None:
             if isinstance(value, mi.Object):
-                found.append((name, value))
+                self.found.append((name, value))
 
         def put_object(self, name: str, obj: Any, flags: int) -> None:
-            found.append((name, obj))
+            self.found.append((name, obj))
 
-    plugin.traverse(Walk())
-    return found
+    return Walk
 
 
 def shape_groups(scene: Any) -> list[Any]:

@@ -50,7 +50,7 @@ def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | Non
 
 def _surfaces(built: Any, shapes: Mapping[str, Any]) -> tuple[list[Surface], dict[str, str]]:
     """The surfaces of a scene, and effect -> why their materials leave it undecided."""
-    from jaxdn.render.materials import NOTHING, material_of
+    from jaxdn.render.materials import NOTHING, is_lambertian, material_of
     from jaxdn.render.plugins import children, shape_groups
 
     grouped = [part for group in shape_groups(built) for _, part in children(group) if hasattr(part, "bsdf")]
@@ -63,10 +63,11 @@ def _surfaces(built: Any, shapes: Mapping[str, Any]) -> tuple[list[Surface], dic
             uncertain |= {effect: f"{name}: {reason}" for effect, reason in material.unsure.items()}
         if shape.class_name() == "Instance" and not members:
             reason = f"{name}: what an instance shows could not be read"
-            uncertain |= dict.fromkeys(("glossy", "mirror", "transmission", "texture"), reason)
+            uncertain |= dict.fromkeys(("glossy", "mirror", "transmission", "specular", "texture"), reason)
         lobes = frozenset().union(*(material.lobes for material in materials))
         textured = any(material.textured for material in materials)
-        surfaces.append(Surface(name, lobes, textured, bool(shape.is_medium_transition())))
+        specular = any(part.bsdf() is not None and not is_lambertian(part.bsdf()) for part in members)
+        surfaces.append(Surface(name, lobes, textured, bool(shape.is_medium_transition()), specular))
     return surfaces, uncertain
 
 

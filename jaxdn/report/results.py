@@ -33,6 +33,8 @@ class Scores(NamedTuple):
     """Milliseconds that the method needs per frame on the machine of the report."""
     spp: float
     """Samples per pixel of the noisy radiance it was given."""
+    unbiased_psnr: float = math.nan
+    """dB, ``psnr`` of all frames together without the reference's own noise; NaN where a clip has no half of it."""
 
 
 class ClipResult(NamedTuple):

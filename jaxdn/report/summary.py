@@ -22,6 +22,7 @@ class Column(NamedTuple):
 
 COLUMNS = (
     Column("psnr", "PSNR dB", 1, "peak 1, tone-mapped"),
+    Column("unbiased_psnr", "PSNR dB, unbiased", 1, "without the reference's own noise, all frames together"),
     Column("ssim", "SSIM", 1, "structural similarity"),
     Column("l1", "L1", -1, "mean absolute difference"),
     Column("mse", "MSE", -1, "mean squared difference"),

@@ -31,6 +31,20 @@ def test_round_trip(saved):
     assert image.shape == (16, 16, 3)
 
 
+@pytest.mark.parametrize(("earlier", "today"), [(True, "albedo"), (False, "none")])
+def test_weights_of_an_earlier_version_are_read(tmp_path, earlier, today):
+    """Whether to divide by the albedo was a yes or no; it has become what to divide by."""
+    params = ntd(size=TINY).init(jax.random.key(0), FRAME)
+    saved = save_weights(
+        tmp_path / "w", params, factory="ntd", options={"size": TINY, "demodulate": earlier}, record={}
+    )
+    frame = FRAME._replace(albedo=np.full((16, 16, 3), 0.5, np.float32))
+    images = []
+    for denoiser in (jaxdn.load_weights(saved)[0], ntd(size=TINY, demodulate=today)):
+        images.append(denoiser.step(params, denoiser.start(params, frame), frame)[1])
+    np.testing.assert_array_equal(*images)
+
+
 def test_flatten_and_back():
     nested = {"a": {"b": np.ones(2), "c": {"d": np.zeros(1)}}, "e": np.arange(3.0)}
     assert set(flatten(nested)) == {"a/b", "a/c/d", "e"}

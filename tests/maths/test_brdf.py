@@ -129,6 +129,13 @@ def test_no_threshold_tells_alike_neighbours_apart(reflectance, difference):
     assert abs(second / first - 1) <= difference / brdf.FLOOR * 1.01 + 1e-6
 
 
+@pytest.mark.parametrize("value", [0.0, 1e-30, 0.05, 0.15, 0.3, 1.0, 1e20])
+def test_the_divisor_is_the_reflectance_where_that_is_not_small(value):
+    expected = (np.float64(value) ** 4 + 0.15**4) ** 0.25
+    np.testing.assert_allclose(brdf.divisor(jnp.float32(value)), expected, rtol=1e-6)
+    assert value < 0.3 or expected / value < 1.02
+
+
 def test_slopes_stay_finite_at_no_reflectance():
     slope = jax.grad(lambda reflectance: brdf.demodulate(jnp.ones((1, 1, 3)), reflectance).sum())(jnp.zeros((1, 1, 3)))
     assert jnp.isfinite(slope).all()

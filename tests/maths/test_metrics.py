@@ -295,3 +295,52 @@ def test_relative_mse_has_a_finite_gradient_up_to_the_largest_number(extreme):
     reference = np.full((2, 2, 3), 0.01, np.float32)
     assert np.isfinite(jax.grad(metrics.relative_mse)(image, reference)).all()
     assert metrics.relative_mse(image, reference) == np.inf, "it is not flattered"
+
+
+# Without the noise of the reference.
+
+
+def halves(rng: np.random.Generator, *, error: float, noise: float, shape: tuple[int, ...]) -> list[jax.Array]:
+    """An image ``error`` off the truth (RMS), and two references whose mean has the noise ``noise`` (RMS)."""
+    truth = rng.uniform(0.3, 0.7, shape)
+    offsets = (error, noise * 2**0.5, noise * 2**0.5)
+    return [jnp.asarray(truth + size * rng.standard_normal(shape), jnp.float32) for size in offsets]
+
+
+@pytest.mark.parametrize("shape", [(180, 320, 3), (4, 90, 160, 3)])
+def test_errors_without_the_references_noise_are_the_true_ones(shape):
+    # As much noise in the reference as error in the image: the plain PSNR is 3 dB off.
+    image, first, second = halves(np.random.default_rng(1), error=0.02, noise=0.02, shape=shape)
+    true = -20 * np.log10(0.02)
+    assert true - float(psnr(image, (first + second) / 2)) > 2.9
+    assert abs(float(metrics.unbiased_psnr(image, first, second)) - true) < 0.1
+    np.testing.assert_allclose(metrics.unbiased_psnr(image, first, second, peak=255.0), true + 48.13, atol=0.1)
+
+
+def test_unbiased_mse_is_the_mean_product_inside_the_mask(rng):
+    image, first, second = halves(rng, error=0.1, noise=0.1, shape=SHAPE)
+    mask = rng.random((*SHAPE[:-1], 1)) < 0.5
+    broken = [jnp.where(mask, each, jnp.nan) for each in (image, first, second)]
+    x, a, b = (np.asarray(each, np.float64)[mask[..., 0]] for each in (image, first, second))
+    found = metrics.unbiased_mse(*broken, mask=jnp.asarray(mask))
+    np.testing.assert_allclose(found, np.mean((x - a) * (x - b)), rtol=1e-5)
+    assert float(metrics.unbiased_mse(*broken, mask=jnp.zeros(mask.shape))) == 0
+    check_grads(lambda x: metrics.unbiased_mse(x, first, second), (image,), order=1, modes=["rev"], rtol=1e-2)
+
+
+def test_two_references_that_are_one_give_the_plain_error(rng):
+    image, reference = pair(rng)
+    np.testing.assert_allclose(metrics.unbiased_mse(image, reference, reference), mse(image, reference), rtol=1e-6)
+    one = metrics.unbiased_psnr(image, reference, reference)
+    np.testing.assert_allclose(one, metrics.psnr(image, reference, average="mse"), rtol=1e-6)
+
+
+def test_an_image_that_is_as_good_as_can_be_told_is_infinitely_good():
+    image = jnp.full((4, 4, 3), 0.5)
+    assert float(metrics.unbiased_psnr(image, image + 0.1, image - 0.1)) == np.inf
+
+
+def test_a_second_reference_of_another_size_is_refused(rng):
+    image, reference = pair(rng)
+    with pytest.raises(ValueError, match="same size"):
+        metrics.unbiased_mse(image, reference, reference[:, 1:])

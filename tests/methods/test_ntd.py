@@ -20,7 +20,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "parity": {"preset": "parity"},
     "fine": {"alpha_at": "fine", "up": "nearest", "first_frame": "noisy", "truncate": True},
     "max": {"down": "max", "pyramid": "max", "depth_scale": "unit", "missing_history": "blend"},
-    "compressed": {"domain": "compressed", "motion": "traditional", "demodulate": False},
+    "compressed": {"domain": "compressed", "motion": "traditional", "demodulate": "none"},
 }
 
 
@@ -136,7 +136,7 @@ def blending(params: Any, logit: float) -> Any:
 def test_alpha_weighs_the_current_frame_and_missing_history_is_not_used(
     rng: np.random.Generator, key: jax.Array
 ) -> None:
-    denoiser = tiny(demodulate=False)
+    denoiser = tiny(demodulate="none")
     frames = random_frames(rng)
     params, frame = initial(denoiser, key, frames), frame_at(frames, 1)
     broken = frame.dual_motion.at[4, 5].set(jnp.nan).at[9, 9].set(jnp.asarray([40.0, 0.0]))
@@ -163,7 +163,8 @@ def test_constant_radiance_stays(name: str, rng: np.random.Generator, key: jax.A
     frames = frames._replace(radiance=jnp.full_like(frames.radiance, 0.7))
     if name == "parity":  # the paper's zeros beyond the border are not constant
         frames = frames._replace(motion=None, dual_motion=None)
-    if VARIANTS[name].get("demodulate", name != "parity"):  # radiance over albedo is what is constant here
+    usual = "none" if name == "parity" else "albedo"
+    if VARIANTS[name].get("demodulate", usual) != "none":  # radiance over albedo is what is constant here
         usable = jnp.where(frames.albedo > 0.01, frames.albedo, 1.0)
         frames = frames._replace(radiance=0.7 * usable)
     images = run(denoiser)(initial(denoiser, key, frames), frames)

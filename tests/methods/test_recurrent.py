@@ -1,4 +1,4 @@
-"""The ritual of all denoisers, on toy cores; light divided by the albedo; samples that are asked for."""
+"""The ritual of all denoisers on toy cores: checks, repairs, age and bounds; demodulation; requested samples."""
 
 import jax
 import jax.numpy as jnp
@@ -199,8 +199,57 @@ def test_without_albedo_or_by_none_nothing_is_divided(rng):
     state, image = denoiser.step({}, denoiser.start({}, frame), frame)
     np.testing.assert_array_equal(image, frame.radiance)
     np.testing.assert_array_equal(state.core, frame.radiance)
-    with pytest.raises(ValueError, match="'albedo', 'none', got 'normal'"):
+    with pytest.raises(ValueError, match="'albedo', 'brdf', 'none', got 'normal'"):
         demodulated(plain, by="normal")
+
+
+def test_what_is_reflected_is_divided_by_and_the_albedo_where_that_is_all_there_is(rng):
+    albedo, reflectance = (jnp.asarray(rng.uniform(0, 1, (*SIZE, 3)), jnp.float32) for _ in range(2))
+    denoiser = demodulated(recurrent(identity()), by="brdf")
+    assert denoiser.reads == {"albedo", "reflectance"}
+    buffers = ({"albedo": albedo, "reflectance": reflectance}, {"albedo": albedo}, {"reflectance": reflectance}, {})
+    for given in buffers:
+        frame = frame_of(rng, **given)
+        state, image = denoiser.step({}, denoiser.start({}, frame), frame)
+        np.testing.assert_allclose(image, frame.radiance, rtol=1e-6)
+        by = np.asarray(given.get("reflectance", given.get("albedo", 1.0)), np.float64)
+        expected = (by**4 + 0.15**4) ** 0.25 if given else by
+        np.testing.assert_allclose(state.core, np.asarray(frame.radiance, np.float64) / expected, rtol=1e-6)
+
+
+def test_no_reflectance_is_the_albedo_written_out(rng):
+    albedo = albedo_of(rng)
+    denoiser = demodulated(recurrent(identity()), by="brdf")
+    frame = frame_of(rng, albedo=albedo)
+    cores = []
+    for each in (frame, frame._replace(reflectance=albedo)):
+        state, _ = denoiser.step({}, denoiser.start({}, each), each)
+        cores.append(state.core)
+    np.testing.assert_array_equal(*cores)
+
+
+@pytest.mark.parametrize("name", ["albedo", "reflectance"])
+def test_neighbours_that_reflect_alike_are_divided_by_what_is_alike(name):
+    """A ramp of dark values through 0.01, where dividing by the albedo jumps by a factor of 100."""
+    ramp = jnp.linspace(0, 0.03, 31)[None, :, None] * jnp.ones((1, 1, 3))
+    frame = Frame(jnp.ones((1, 31, 3)), **{name: ramp})
+    largest = {}
+    for by in ("brdf", "albedo"):
+        denoiser = demodulated(recurrent(identity()), by=by)
+        state, _ = denoiser.step({}, denoiser.start({}, frame), frame)
+        light = np.asarray(state.core)[0, :, 0]
+        largest[by] = np.max(light[1:] / light[:-1])
+    assert largest["brdf"] < 1.01
+    assert name == "reflectance" or largest["albedo"] > 50
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -1.0, 0.0, 1e-40, 1e-9, 1.0, 1e9, 1e38])
+def test_any_reflectance_gives_the_radiance_back(rng, value):
+    frame = frame_of(rng)._replace(reflectance=jnp.full((*SIZE, 3), value, jnp.float32))
+    denoiser = demodulated(recurrent(identity()), by="brdf")
+    state, image = denoiser.step({}, denoiser.start({}, frame), frame)
+    assert np.all(np.isfinite(state.core))
+    np.testing.assert_allclose(image, frame.radiance, rtol=1e-6)
 
 
 def test_a_wrapped_denoiser_can_be_wrapped_again(rng):

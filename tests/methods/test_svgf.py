@@ -213,7 +213,7 @@ def test_a_constant_image_stays(rng):
 
 
 def test_static_history_counts_up_and_is_the_mean_while_it_does(rng):
-    denoiser = svgf(levels=1, feedback_level=0, history_max=6, demodulate=False)
+    denoiser = svgf(levels=1, feedback_level=0, history_max=6, demodulate="none")
     step = jax.jit(denoiser.step)
     noise = rng.gamma(0.5, 1.0, (8, 6, 7, 3)).astype(np.float32)
     state = denoiser.start({}, Frame(noise[0]))

@@ -107,10 +107,10 @@ def test_what_is_out_of_range_says_the_range():
 
 
 def test_the_command_lines_words_become_values():
-    words = ["size=small", "levels=3", "alpha=0.25", "demodulate=false", "truncate=True", "widths=[[1], [2]]"]
+    words = ["size=small", "levels=3", "alpha=0.25", "occlusion=false", "truncate=True", "widths=[[1], [2]]"]
     found = parse([*words, "compute_dtype=null", "preset=None", "a=b=c", 'name="3"', "empty="])
     assert found == {
-        **{"size": "small", "levels": 3, "alpha": 0.25, "demodulate": False, "truncate": True},
+        **{"size": "small", "levels": 3, "alpha": 0.25, "occlusion": False, "truncate": True},
         **{"widths": [[1], [2]], "compute_dtype": None, "preset": None, "a": "b=c", "name": "3", "empty": ""},
     }
     assert parse([]) == {}
@@ -143,7 +143,7 @@ def built(monkeypatch, factory_of_ntd):
         ({"preset": None}, Options()),
         ({"preset": "parity"}, PARITY),
         ({"preset": "parity", "down": "mean"}, dataclasses.replace(PARITY, down="mean")),
-        ({"preset": "parity", "demodulate": True}, dataclasses.replace(PARITY, demodulate=True)),
+        ({"preset": "parity", "demodulate": "albedo"}, dataclasses.replace(PARITY, demodulate="albedo")),
         ({"size": [[4], [4]], "truncate": True}, Options(size=((4,), (4,)), truncate=True)),
     ],
 )

@@ -163,7 +163,7 @@ def test_what_is_no_scene_is_refused(scene):
 
 
 def test_every_effect_says_what_it_is():
-    assert len({effect.name for effect in EFFECTS}) == 13
+    assert len({effect.name for effect in EFFECTS}) == 14
     for effect in EFFECTS:
         assert effect.sentence.endswith(".")
         assert effect.buffers <= set(Frame._fields)
@@ -171,7 +171,7 @@ def test_every_effect_says_what_it_is():
 
 def test_what_is_left_out_is_counted_against_what_is_rendered_without_a_plan():
     nothing = effects.plan(effects.chosen([], 1))
-    assert command.bytes_a_pixel(command.EVERYTHING) == 74
+    assert command.bytes_a_pixel(command.EVERYTHING) == 80
     assert set(command.left_out(nothing)) == {name for effect in EFFECTS for name in effect.buffers}
     assert command.bytes_a_pixel(nothing) == 18 + sum(BUFFERS[name].bytes for name in nothing.buffers)
     assert command.channels(("normal", "ids")) == ["normal.X", "normal.Y", "normal.Z", "ids.Y"]
@@ -197,10 +197,10 @@ def test_json_is_all_that_is_printed(tmp_path):
     )
     said = json.loads(done.stdout)
     assert set(said) == {"effects", "plan", "uncertain"}
-    assert set(said["effects"]) == {"indirect", "glossy"}
+    assert set(said["effects"]) == {"indirect", "glossy", "specular"}
     assert said["plan"]["motion"] == "none"
     assert 0 < said["plan"]["remaining"] < 1
-    assert len(said["plan"]["buffers"]) + said["plan"]["buffers_left_out"] == 11
+    assert len(said["plan"]["buffers"]) + said["plan"]["buffers_left_out"] == 12
     assert said["uncertain"] == []
 
 

@@ -127,7 +127,7 @@ def test_training_mixes_clips_of_different_effects(tmp_path):
 def test_a_finished_clip_is_inspected_without_its_scene(tmp_path):
     everything, auto = rendered(room("rough metal", "ball"), tmp_path)
     found = effects.inspect(auto)
-    assert set(found) == {"object-motion", "disocclusion", "indirect", "glossy", "moving-shadow"}
+    assert set(found) == {"object-motion", "disocclusion", "indirect", "glossy", "specular", "moving-shadow"}
     blind = effects.inspect(everything)
     assert set(found) <= set(blind)
     assert {"transmission", "media"} <= set(blind.uncertain)

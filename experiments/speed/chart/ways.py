@@ -67,7 +67,7 @@ def _alternatives(method: Method) -> dict[str, dict[str, Any]]:
     if method.knows("compute_dtype"):
         found["bfloat16"] = {"compute_dtype": "bfloat16"}
     if method.knows("demodulate"):
-        found["not demodulated"] = {"demodulate": False}
+        found["not demodulated"] = {"demodulate": "none"}
     return found
 
 

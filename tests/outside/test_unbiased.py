@@ -1,0 +1,56 @@
+"""``compare`` tells errors without the reference's own noise, from the halves that a clip keeps."""
+
+import numpy as np
+import pytest
+
+from jaxdn.candidates import Candidate
+from jaxdn.clips.folder import begin_record, finish_record, frame_path
+from jaxdn.clips.frames import write_frame
+from jaxdn.clips.noise_floor import read_halves
+from jaxdn.commands.compare import compare
+from jaxdn.frame import Frame
+
+SHAPE = (2, 60, 80, 3)
+ERROR = 0.02
+"""Of the image and of the reference, in linear light about 0.2, where the transfer curve is nearly straight."""
+
+
+def write(folder, *, halves):
+    """A clip of a grey wall: an image of the noise ERROR, and a reference as noisy as that."""
+    rng = np.random.default_rng(2)
+    image, first, second = (0.2 + size * rng.standard_normal(SHAPE) for size in (ERROR, ERROR * 2**0.5, ERROR * 2**0.5))
+    record = {"name": "wall", "frames": SHAPE[0], "width": SHAPE[2], "height": SHAPE[1], "layers": [1]}
+    begin_record(record, folder)
+    for index in range(SHAPE[0]):
+        half = first[index] if halves else None
+        reference = (first[index] + second[index]) / 2
+        frame = Frame(image[index].astype(np.float32))
+        write_frame(frame_path(folder, index), frame, reference=reference, reference_half=half)
+    finish_record(record, folder)
+    return first, second
+
+
+def test_the_halves_of_a_reference_are_read(tmp_path):
+    written = write(tmp_path / "clip", halves=True)
+    found = read_halves(tmp_path / "clip")
+    assert found is not None
+    for half, expected in zip(found, written, strict=True):
+        np.testing.assert_allclose(half, expected, rtol=0, atol=1e-3)  # half precision
+
+
+def test_a_clip_without_a_half_has_none(tmp_path):
+    write(tmp_path / "clip", halves=False)
+    assert read_halves(tmp_path / "clip") is None
+
+
+@pytest.mark.parametrize("halves", [True, False])
+def test_the_references_noise_is_not_in_the_score(tmp_path, halves):
+    write(tmp_path / "clip", halves=halves)
+    noisy = Candidate("noisy", None, {}, None, {})
+    results = compare([noisy], [tmp_path / "clip"], title="", settings={}, say=lambda text: None)
+    scores = results.clips[0].scores["noisy"]
+    if not halves:
+        assert np.isnan(scores.unbiased_psnr)
+        return
+    # The reference's noise is as large as the image's: half of the plain error is not the image's.
+    assert abs(scores.unbiased_psnr - scores.psnr - 10 * np.log10(2)) < 0.15
