@@ -236,7 +236,7 @@ def _denoise(options: Denoise) -> None:
             spp=options.spp,
             preview=options.preview,
             motion_convention=options.motion_convention,
-            channels=parse(options.channels, option="--channels"),
+            channels=parse(options.channels, option="--channels", words=True),
             say=lambda done, total: status.update(f"{options.method}: frame {done} of {total}"),
         )
     compiled = f"{written.programs} program{'s' * (written.programs != 1)} compiled"

@@ -48,10 +48,11 @@ def make(cls: type[T], given: Mapping[str, Any], *, method: str, base: T | None 
     return cls(**values) if base is None else dataclasses.replace(base, **values)  # type: ignore[type-var]
 
 
-def parse(assignments: Sequence[str], *, option: str = "--set") -> dict[str, Any]:
+def parse(assignments: Sequence[str], *, option: str = "--set", words: bool = False) -> dict[str, Any]:
     """``["size=small", "levels=3"]`` as a dict: values are parsed as JSON if possible, else taken as strings.
 
-    Raises ValueError, naming the command line's ``option``, for what is not ``name=value``.
+    With ``words`` every value is a string, whatever it looks like. Raises ValueError, naming the command line's
+    ``option``, for what is not ``name=value``.
     """
     parsed: dict[str, Any] = {}
     for assignment in assignments:
@@ -59,7 +60,7 @@ def parse(assignments: Sequence[str], *, option: str = "--set") -> dict[str, Any
         if not (name and sign):
             raise ValueError(f"{option} {assignment!r}: expected name=value.")
         try:
-            parsed[name] = json.loads(text)
+            parsed[name] = text if words else json.loads(text)
         except ValueError:
             parsed[name] = {"True": True, "False": False, "None": None}.get(text, text)
     return parsed

@@ -27,9 +27,10 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "albedo") -> De
     * ``"albedo"``: the albedo where that exceeds 0.01 and 1 elsewhere, as the shipped weights were trained;
     * ``"none"``: the denoiser is returned unchanged.
 
-    ``True`` is ``"albedo"`` and ``False`` is ``"none"``. Frames with neither buffer are not divided. The parameters are
-    those of the denoiser. Raises ValueError for another ``by``, and for a denoiser that
-    :func:`jaxdn.denoiser.recurrent` did not make, because invalid values have to be repaired before the division.
+    Divided radiance is clamped to 65504, as radiance itself is. ``True`` is ``"albedo"`` and ``False`` is ``"none"``.
+    Frames with neither buffer are not divided. The parameters are those of the denoiser. Raises ValueError for another
+    ``by``, and for a denoiser that :func:`jaxdn.denoiser.recurrent` did not make, because invalid values have to be
+    repaired before the division.
     """
     if isinstance(by, bool):  # as it was before there were three choices
         by = "albedo" if by else "none"

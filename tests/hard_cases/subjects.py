@@ -119,6 +119,10 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
             images = tuple(jnp.clip(image, 0.0, 1.0) for image in images)  # a tone curve that half precision holds
         return getattr(metrics, name)(*images, mask=inputs.mask if masked else None)
 
+    def unbiased(inputs: Inputs, name: str) -> jax.Array:
+        image, reference = (jnp.clip(image, 0.0, 1.0) for image in _images(inputs))
+        return getattr(metrics, name)(image, reference, reference[..., ::-1])
+
     def of_light(function: Callable[..., jax.Array], **options: Any) -> Callable[[Inputs], jax.Array]:
         return lambda inputs: function(inputs.clip.frames.radiance, **options)
 
@@ -147,6 +151,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "losses.gradient, hfen": partial(lost, loss=losses.gradient, operator="hfen"),
         "losses.occlusion": lambda inputs: lost(inputs, losses.occlusion, inputs.mask),
         **{f"metrics.{name}": partial(measured, name=name, masked=False) for name in _METRICS},
+        **{f"metrics.{name}": partial(unbiased, name=name) for name in ("unbiased_mse", "unbiased_psnr")},
         **{f"metrics.{name}, masked": partial(measured, name=name, masked=True) for name in _METRICS},
     }
 

@@ -352,3 +352,13 @@ def test_weights_of_a_network_run_on_the_engine_that_is_there(installed, engine,
         tmp_path / "half", params, factory="ntd", options={"size": TINY, "compute_dtype": "bfloat16"}, record={}
     )
     assert candidate_on(str(half))[1] == "reference"
+
+
+def test_names_of_layers_are_words_whatever_they_look_like():
+    assert parse(["albedo=3", "ids=null", "depth=[1]"], option="--channels", words=True) == {
+        "albedo": "3",
+        "ids": "null",
+        "depth": "[1]",
+    }
+    with pytest.raises(ValueError, match="--channels 'albedo'"):
+        parse(["albedo"], option="--channels", words=True)
