@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxdn import brdf
 from jaxdn.checks import check_option
 from jaxdn.denoiser import Core, Denoiser, Params, Ritual, State, recurrent
-from jaxdn.frame import RADIANCE_MAX, Frame
+from jaxdn.frame import Frame
 
 SMALLEST_ALBEDO = 0.01
 """Radiance is not divided by an albedo below this (``by="albedo"``)."""
@@ -27,10 +27,10 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "albedo") -> De
     * ``"albedo"``: the albedo where that exceeds 0.01 and 1 elsewhere, as the shipped weights were trained;
     * ``"none"``: the denoiser is returned unchanged.
 
-    Divided radiance is clamped to 65504, as radiance itself is. ``True`` is ``"albedo"`` and ``False`` is ``"none"``.
-    Frames with neither buffer are not divided. The parameters are those of the denoiser. Raises ValueError for another
-    ``by``, and for a denoiser that :func:`jaxdn.denoiser.recurrent` did not make, because invalid values have to be
-    repaired before the division.
+    Divided radiance may exceed 65504: a clamp there would make the result depend on the exposure. ``True`` is
+    ``"albedo"`` and ``False`` is ``"none"``. Frames with neither buffer are not divided. The parameters are those of
+    the denoiser. Raises ValueError for another ``by``, and for a denoiser that :func:`jaxdn.denoiser.recurrent` did not
+    make, because invalid values have to be repaired before the division.
     """
     if isinstance(by, bool):  # as it was before there were three choices
         by = "albedo" if by else "none"
@@ -63,7 +63,7 @@ def _divided(frame: Frame, by: Demodulation) -> tuple[Frame, jax.Array | None]:
     divisor = _divisor(frame, by)
     if divisor is None:
         return frame, None
-    return frame._replace(radiance=jnp.minimum(frame.radiance / divisor, RADIANCE_MAX)), divisor
+    return frame._replace(radiance=frame.radiance / divisor), divisor
 
 
 def _divisor(frame: Frame, by: Demodulation) -> jax.Array | None:

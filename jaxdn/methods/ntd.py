@@ -194,6 +194,8 @@ def ntd(options: Options) -> Denoiser:
         params: Params, state: jax.Array, frame: Frame, first: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         size = frame.radiance.shape[:2]
+        # Divided by a small albedo it may be beyond what the network has ever seen.
+        frame = frame._replace(radiance=jnp.minimum(frame.radiance, RADIANCE_MAX))
         recalled, absent, broken = _recall(options, state, frame, first)
         depth = None if frame.depth is None else pad(depth_feature(frame.depth, scale=options.depth_scale))
         albedo = None if frame.albedo is None else pad(frame.albedo - 1.0)
