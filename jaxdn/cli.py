@@ -97,6 +97,8 @@ class Train:
     """One of the method's variants (ntd-large, ntd-small); default: the fastest."""
     set: list[str] = field(default_factory=list)
     """Options of the method as option=value, such as motion=traditional preset=parity; an unknown name lists them."""
+    start: str | None = None
+    """Shipped weights or a .safetensors file to continue from; default: new weights."""
     recipe: str | None = None
     """One of the method's recipes (for ntd: usual, without-occlusion, parity); default: the usual one."""
     steps: int | None = None
@@ -215,6 +217,7 @@ def _train(options: Train) -> None:
         [options.clips],
         options.out,
         options={**method.variant_named(options.variant), **parse(options.set)},
+        start=options.start,
         validation=[options.validation] if options.validation else [],
         spp=options.spp,
         implementation=options.implementation,

@@ -66,7 +66,7 @@ class Recurrent(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Ritual:
+class RecurrentStep:
     """The ``step`` of a denoiser that :func:`recurrent` made; wrappers such as ``demodulated`` take its ``core``."""
 
     core: Core
@@ -94,7 +94,7 @@ def recurrent(core: Core) -> Denoiser:
         def samples(params: Params, state: Recurrent, frame: Frame) -> jax.Array:
             return core_samples(params, state.core, repair(checked(frame, core.reads))[0])
 
-    return Denoiser(core.init, start, Ritual(core), core.reads, samples)
+    return Denoiser(core.init, start, RecurrentStep(core), core.reads, samples)
 
 
 def checked(frame: Frame, reads: frozenset[str]) -> Frame:

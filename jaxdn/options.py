@@ -6,6 +6,7 @@ Only a field's annotation is declared: ``Literal`` for a choice, ``Annotated[flo
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping, Sequence
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -14,7 +15,7 @@ T = TypeVar("T")
 
 
 class Range(NamedTuple):
-    """The allowed values of an option, from ``low`` to ``high``."""
+    """The allowed values of an option: finite numbers from ``low`` to ``high``."""
 
     low: float = -float("inf")
     high: float = float("inf")
@@ -22,7 +23,7 @@ class Range(NamedTuple):
     """``low`` itself is excluded."""
 
     def __contains__(self, value: object) -> bool:
-        inside = isinstance(value, int | float) and self.low <= value <= self.high
+        inside = isinstance(value, int | float) and math.isfinite(value) and self.low <= value <= self.high
         return inside and not (self.without_low and value == self.low)
 
     def __str__(self) -> str:
@@ -42,10 +43,15 @@ def make(cls: type[T], given: Mapping[str, Any], *, method: str, base: T | None 
     if unknown:
         raise ValueError(f"{method}: expected options out of {', '.join(hints)}, got {', '.join(map(repr, unknown))}.")
     values = {name: _tuples(value) for name, value in given.items()}
+    check(values, hints, of=method)
+    return cls(**values) if base is None else dataclasses.replace(base, **values)  # type: ignore[type-var]
+
+
+def check(values: Mapping[str, Any], hints: Mapping[str, Any], *, of: str) -> None:
+    """Raise ValueError, naming what is allowed, unless every value fits the annotation of its name in ``hints``."""
     for name, value in values.items():
         if not _fits(value, hints[name]):
-            raise ValueError(f"{method} {name}: expected {_expected(hints[name])}, got {value!r}.")
-    return cls(**values) if base is None else dataclasses.replace(base, **values)  # type: ignore[type-var]
+            raise ValueError(f"{of} {name}: expected {_expected(hints[name])}, got {value!r}.")
 
 
 def parse(assignments: Sequence[str], *, option: str = "--set", words: bool = False) -> dict[str, Any]:

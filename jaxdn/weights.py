@@ -94,6 +94,33 @@ def load_weights(name_or_path: str | Path, **options_instead: Any) -> tuple[Deno
     return denoiser, unflatten(flat)
 
 
+def starting_params(name_or_path: str | Path, denoiser: Denoiser) -> Params:
+    """Parameters to continue training ``denoiser`` from: those of shipped weights or of a file.
+
+    The denoiser may see more than the one that the weights were trained for: where a kernel has more input channels
+    than the stored one, the last ones are zero, so that its first images are those of the stored weights. Raises
+    ValueError as :func:`load_weights` does, and for weights of another network.
+    """
+    path = weights_path(name_or_path)
+    _, params = load_weights(path)
+    frame = Frame(jax.ShapeDtypeStruct((16, 16, 3), jnp.float32))
+    wanted = _shapes(jax.eval_shape(denoiser.init, jax.random.key(0), frame))
+    found, grown = flatten(params), {}
+    for name, (shape, _) in wanted.items():
+        stored = found.get(name)
+        fits = stored is not None and len(stored.shape) == len(shape)
+        more = [new - old for old, new in zip(stored.shape, shape, strict=True)] if fits else []
+        inputs = len(shape) - 2  # kernels are [height, width, inputs, outputs]
+        if not fits or any(extra != 0 and (axis != inputs or extra < 0) for axis, extra in enumerate(more)):
+            raise ValueError(
+                f"weights {path}: expected a network that training can continue from, but {name} is "
+                f"{None if stored is None else stored.shape} there and {shape} in the denoiser to train; choose the "
+                "same variant and options."
+            )
+        grown[name] = np.pad(stored, [(0, extra) for extra in more])
+    return unflatten(grown)
+
+
 def weights_path(name_or_path: str | Path) -> Path:
     """The .safetensors file of a shipped name, or the path itself. Raises ValueError if there is no such file."""
     path = SHIPPED / f"{name_or_path}.safetensors"

@@ -5,8 +5,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -21,6 +23,14 @@ from jaxdn.frame import Clip
 from jaxdn.learning.step import TrainState, initial_state, make_train_step
 from jaxdn.recipe import Recipe
 from jaxdn.rollout import denoise
+
+
+class Start(NamedTuple):
+    """What training begins with instead of new parameters."""
+
+    name: str
+    """Of the weights, for the record."""
+    params: Params
 
 
 def make_validation(denoiser: Denoiser, clips: Sequence[Clip]) -> Callable[[Params], float]:
@@ -43,6 +53,7 @@ def fit(
     folder: Path,
     *,
     label: str,
+    start: Start | None = None,
     validation: Sequence[Clip] = (),
     log_every: int = 20,
     validate_every: int = 100,
@@ -50,8 +61,8 @@ def fit(
 ) -> TrainState:
     """Train to ``recipe.steps`` updates, resuming from the newest checkpoint in ``folder`` to the same result.
 
-    On Ctrl-C the state is saved before KeyboardInterrupt is raised again. Raises ValueError, with what to change, after
-    many updates in a row that changed nothing.
+    On Ctrl-C the state is saved before KeyboardInterrupt is raised again. Raises ValueError for a recipe with impossible
+    values, and, with what to change, after many updates in a row that changed nothing.
 
     Args:
       denoiser: what to train.
@@ -59,17 +70,21 @@ def fit(
       batches: a Grain iterator (with ``get_state`` and ``set_state``); every checkpoint keeps its position.
       folder: gets recipe.json, log.jsonl and the checkpoints.
       label: the run's name in messages.
+      start: what to begin with; None draws parameters with the recipe's seed.
       validation: held-out clips.
       log_every: updates between two log entries.
       validate_every: updates between two validations.
       checkpoint_every: updates between two checkpoints.
     """
+    recipe.check()
     folder.mkdir(parents=True, exist_ok=True)
-    _same_recipe(folder / "recipe.json", recipe)
+    _same_recipe(folder / "recipe.json", recipe, None if start is None else start.name)
     checkpoints = Checkpoints(folder / "checkpoints")
     first_position = batches.get_state()  # type: ignore[attr-defined]
     state = initial_state(denoiser, recipe, next(batches))
     batches.set_state(first_position)  # type: ignore[attr-defined]
+    if start is not None:
+        state = state._replace(params=jax.tree.map(jnp.array, start.params))
     found = checkpoints.restore(state)
     if found is not None:
         state, position = found
@@ -116,9 +131,9 @@ def load_validation(denoiser: Denoiser, folders: Sequence[Path], *, spp: int = 1
     return [read_clip(folder, spp=spp, layers=denoiser.samples is not None) for folder in folders]
 
 
-def _same_recipe(path: Path, recipe: Recipe) -> None:
+def _same_recipe(path: Path, recipe: Recipe, start: str | None) -> None:
     """Write the recipe of a new run; raise ValueError if an existing run has another one."""
-    wanted = recipe.record()
+    wanted = {**recipe.record(), "start": start}
     if path.is_file():
         there = json.loads(path.read_text())
         differing = {key: (there.get(key), value) for key, value in wanted.items() if there.get(key) != value}

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxdn.clips import find_clips, training_batches
-from jaxdn.commands.fit import fit, load_validation
+from jaxdn.commands.fit import Start, fit, load_validation
 from jaxdn.methods.table import Method
 from jaxdn.recipe import Recipe
-from jaxdn.weights import save_weights
+from jaxdn.weights import save_weights, starting_params
 
 
 def train(
@@ -18,6 +18,7 @@ def train(
     out: Path,
     *,
     options: Mapping[str, Any],
+    start: str | Path | None = None,
     validation: Sequence[Path] = (),
     spp: int = 1,
     implementation: str = "auto",
@@ -35,6 +36,8 @@ def train(
       clips: folders of clips, or of folders of clips, to train on.
       out: the run's folder: checkpoints, log.jsonl, recipe.json, and finally weights.safetensors with its JSON.
       options: the method's, stored with the weights.
+      start: shipped weights or a .safetensors file to continue from (:func:`jaxdn.weights.starting_params`); None:
+        new ones.
       validation: folders of held-out clips, used whole.
       spp: samples per pixel of the noisy input.
       implementation: the engine for training; "auto" is the method's fastest that is available here.
@@ -61,8 +64,10 @@ def train(
     )
     folders = [folder for place in validation for folder in find_clips(place)]
     held_out = load_validation(denoiser, folders, spp=spp)
-    state = fit(denoiser, recipe, batches, out, label=label, validation=held_out)
-    about = {"recipe": recipe.record(), "skipped": int(state.skipped), **(record or {})}
+    first = None if start is None else Start(str(start), starting_params(start, denoiser))
+    state = fit(denoiser, recipe, batches, out, label=label, start=first, validation=held_out)
+    begun = {} if first is None else {"start": first.name}
+    about = {"recipe": recipe.record(), "skipped": int(state.skipped), **begun, **(record or {})}
     return save_weights(
         out / "weights.safetensors", state.params, factory=method.name, options=dict(options), record=about
     )

@@ -1,39 +1,48 @@
-"""Guides that distinguish surfaces: depth and its slopes, normals and ids, packed for the next frame."""
+"""Guides that distinguish surfaces: depth and its slopes, normals and ids."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxdn.frame import FAR
+from jaxdn.frame import FAR, Frame
 
 
 class Guides(NamedTuple):
-    """Channel positions in packed guides ``[H, W, G]``; ``None`` for an absent buffer."""
+    """The guides of one frame, to be kept for the next one; ``None`` for an absent buffer."""
 
-    depth: int | None
-    normal: slice | None
-    ids: int | None
+    depth: jax.Array | None
+    """[H, W, 1]."""
+    normal: jax.Array | None
+    """[H, W, 3]."""
+    ids: jax.Array | None
+    """[H, W, 1] in a floating-point dtype: exact up to 2**24 objects in float32."""
 
 
-def pack_guides(
-    depth: jax.Array | None, normal: jax.Array | None, ids: jax.Array | None, like: jax.Array
-) -> tuple[jax.Array, Guides]:
-    """Pack depth, normal and ids, as far as present, into one array ``[H, W, 0..5]`` of the dtype of ``like``.
+def guides_of(frame: Frame) -> Guides:
+    """The guides of a frame, ids in the dtype of its radiance, so that they can be packed with colour."""
+    return Guides(frame.depth, frame.normal, None if frame.ids is None else frame.ids.astype(frame.radiance.dtype))
 
-    Ids are stored as floating-point numbers, exact up to 2**24 objects in float32.
-    """
-    layers: list[jax.Array] = []
-    width = 0
-    places: list[int | None] = []
-    for buffer in (depth, normal, ids):
-        places.append(None if buffer is None else width)
-        if buffer is not None:
-            layers.append(buffer.astype(like.dtype))
-            width += buffer.shape[-1]
-    packed = jnp.concatenate(layers, axis=-1) if layers else jnp.zeros((*like.shape[:2], 0), like.dtype)
-    at_normal = None if places[1] is None else slice(places[1], places[1] + 3)
-    return packed, Guides(places[0], at_normal, places[2])
+
+def shared(guides: Guides, other: Guides) -> Guides:
+    """Of ``guides`` those that both have: only these can be compared."""
+    return Guides(*(one if two is not None else None for one, two in zip(guides, other, strict=True)))
+
+
+def pack(history: jax.Array, guides: Guides) -> jax.Array:
+    """[H, W, C] and the guides that are present, as one array [H, W, C + 0..5] that a warp fetches at once."""
+    return jnp.concatenate([history, *(each for each in guides if each is not None)], axis=-1)
+
+
+def unpack(packed: jax.Array, like: Guides) -> tuple[jax.Array, Guides]:
+    """What :func:`pack` packed, where ``like`` are guides with the same buffers present."""
+    widths = [0 if each is None else each.shape[-1] for each in like]
+    at = packed.shape[-1] - sum(widths)
+    history, found = packed[..., :at], []
+    for each, width in zip(like, widths, strict=True):
+        found.append(None if each is None else packed[..., at : at + width])
+        at += width
+    return history, Guides(*found)
 
 
 def hit_mask(depth: jax.Array | None, ids: jax.Array | None) -> jax.Array | None:

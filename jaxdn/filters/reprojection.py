@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.filters.guides import Guides, cosine, depth_slopes
+from jaxdn.filters.guides import Guides, cosine, depth_slopes, guides_of, shared
 from jaxdn.frame import Frame
 
 WEIGHT_MIN = 0.01
@@ -20,35 +20,35 @@ WEIGHT_MIN = 0.01
 
 
 def same_surface(
-    frame: Frame, guides: jax.Array, place: Guides, *, depth_tolerance: float, normal_threshold: float, first: int
-) -> Callable[[jax.Array], jax.Array]:
-    """The test of one tap for :func:`reproject`: does it show the same surface as the current pixel?
+    frame: Frame, before: Guides, *, depth_tolerance: float, normal_threshold: float
+) -> Callable[[Guides], jax.Array]:
+    """The test of one tap of the previous frame: does it show the same surface as the current pixel?
 
     A tap passes where ids agree, ``|z - z_expected| <= depth_tolerance z_expected + 2 (|dz/dx| + |dz/dy|)`` and the
-    cosine of the normals exceeds ``normal_threshold``; absent buffers are not tested.
+    cosine of the normals exceeds ``normal_threshold``; what one of the two frames lacks is not tested. The result maps
+    the guides at a tap, [H, W, C] for every pixel, to bool [H, W].
 
     Args:
       frame: the current frame.
-      guides: its packed guides (:func:`jaxdn.filters.guides.pack_guides`).
-      place: the channel positions in ``guides``.
+      before: the guides of the previous frame.
       depth_tolerance: relative to the expected depth.
       normal_threshold: of the cosine.
-      first: the channel of a tap at which its guides begin.
     """
-    if frame.depth is not None:
-        expected = (frame.depth if frame.previous_depth is None else frame.previous_depth)[..., 0]
-        slope_x, slope_y = depth_slopes(frame.depth, frame.ids)
+    now = guides_of(frame)
+    tested = shared(now, before)
+    if tested.depth is not None:
+        expected = (tested.depth if frame.previous_depth is None else frame.previous_depth)[..., 0]
+        slope_x, slope_y = depth_slopes(tested.depth, frame.ids)
         tolerance = depth_tolerance * expected + 2 * (jnp.abs(slope_x) + jnp.abs(slope_y))
 
-    def accept(tap: jax.Array) -> jax.Array:
-        before = tap[..., first:]
-        accepted = jnp.ones(before.shape[:2], bool)
-        if place.depth is not None:
-            accepted &= jnp.abs(before[..., place.depth] - expected) <= tolerance
-        if place.normal is not None:
-            accepted &= cosine(before[..., place.normal], guides[..., place.normal]) > normal_threshold
-        if place.ids is not None:
-            accepted &= before[..., place.ids] == guides[..., place.ids]
+    def accept(tap: Guides) -> jax.Array:
+        accepted = jnp.ones(frame.radiance.shape[:2], bool)
+        if tap.depth is not None:
+            accepted &= jnp.abs(tap.depth[..., 0] - expected) <= tolerance
+        if tap.normal is not None:
+            accepted &= cosine(tap.normal, tested.normal) > normal_threshold
+        if tap.ids is not None:
+            accepted &= tap.ids[..., 0] == tested.ids[..., 0]
         return accepted
 
     return accept

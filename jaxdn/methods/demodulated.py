@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxdn import brdf
 from jaxdn.checks import check_option
-from jaxdn.denoiser import Core, Denoiser, Params, Ritual, State, recurrent
+from jaxdn.denoiser import Core, Denoiser, Params, RecurrentStep, State, recurrent
 from jaxdn.frame import Frame
 
 SMALLEST_ALBEDO = 0.01
@@ -37,7 +37,7 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "albedo") -> De
     check_option(by, "by", ("albedo", "brdf", "none"))
     if by == "none":
         return denoiser
-    if not isinstance(denoiser.step, Ritual):
+    if not isinstance(denoiser.step, RecurrentStep):
         raise ValueError("demodulated: expected a denoiser made by jaxdn.denoiser.recurrent, got another; make it so.")
     core = denoiser.step.core
 

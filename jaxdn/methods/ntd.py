@@ -59,6 +59,9 @@ class Options:
     missing_history: Literal["current", "blend"] = "current"
     """Off-screen or without a vector: the noisy pixel as history, alpha^t = 1, and a mask of these pixels as an
     additional input channel; or no special treatment."""
+    guides: Literal["geometry", "materials"] = "geometry"
+    """Buffers that the network sees: albedo, normal and depth, as in the paper; or ``reflectance`` and ``roughness``
+    too."""
     demodulate: Demodulation | bool = "albedo"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     truncate: bool = False
@@ -164,8 +167,9 @@ def ntd(options: Options) -> Denoiser:
     The paper trains with Adam at a constant 1e-4 for 200 epochs of 142 clips (the recipe "parity"). Raises ValueError
     for an unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
     """
-    flagged = options.missing_history == "current"
-    groups = (3, 3, 3, 1, 3, 1) if flagged else (3, 3, 3, 1, 3)
+    flagged, materials = options.missing_history == "current", options.guides == "materials"
+    # What is optional comes last: weights trained without it can be continued with it.
+    groups = (3, 3, 3, 1, 3, *([1] if flagged else []), *([3, 1] if materials else []))
     # full: two kernels and alpha^t; half, quarter: one kernel each. Each of the two blends has one alpha, at its finer
     # or coarser scale.
     fine = options.alpha_at == "fine"
@@ -176,7 +180,9 @@ def ntd(options: Options) -> Denoiser:
     sizes = {"large": LARGE, "small": SMALL}
     widths = sizes[options.size] if isinstance(options.size, str) else options.size
     network = unet(groups, heads, widths=widths, implementation=options.implementation)
-    reads = frozenset({"albedo", "normal", "depth", "motion", *(["dual_motion"] if options.motion == "dual" else [])})
+    reads = frozenset({"albedo", "normal", "depth", "motion"})
+    reads |= {"dual_motion"} if options.motion == "dual" else set()
+    reads |= {"reflectance", "roughness"} if materials else set()
 
     def init(key: jax.Array, frame: Frame) -> Params:
         return network.init(key)
@@ -205,6 +211,9 @@ def ntd(options: Options) -> Denoiser:
         features = [squeezed, albedo, normal, depth, squeezed_history]
         if flagged:
             features.append(absent.astype(noisy.dtype))
+        if materials:
+            reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
+            features += [None if guide is None else pad(guide - 1.0) for guide in (reflectance, frame.roughness)]
         predicted = predict(params, features, noisy.dtype)
 
         if options.domain == "compressed":

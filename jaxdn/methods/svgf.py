@@ -23,7 +23,7 @@ from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.accumulation import accumulate, luminance
 from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
 from jaxdn.filters.blur import blur_variance
-from jaxdn.filters.guides import hit_mask, pack_guides
+from jaxdn.filters.guides import Guides, guides_of, hit_mask, pack, shared, unpack
 from jaxdn.filters.reprojection import reproject, same_surface
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.filters.weights import Weight, depth_weight, luminance_weight, normal_weight
@@ -81,8 +81,8 @@ class SvgfState(NamedTuple):
 
     history: jax.Array
     """[H, W, 6] demodulated colour, first and second moment of its luminance, history length in frames."""
-    guides: jax.Array
-    """[H, W, 0..5] depth, normal and ids of the previous frame, as far as present."""
+    guides: Guides
+    """Depth, normal and ids of the previous frame, as far as present."""
 
 
 @method(Options, title="Spatiotemporal variance-guided filtering (Schied et al. 2017)")
@@ -95,13 +95,13 @@ def svgf(options: Options) -> Denoiser:
     """
 
     def start(params: Params, frame: Frame) -> SvgfState:
-        guides, _ = pack_guides(frame.depth, frame.normal, frame.ids, frame.radiance)
-        return SvgfState(jnp.zeros((*frame.radiance.shape[:2], 6), guides.dtype), jnp.zeros_like(guides))
+        nothing = jnp.zeros((*frame.radiance.shape[:2], 6), frame.radiance.dtype)
+        return SvgfState(nothing, jax.tree.map(jnp.zeros_like, guides_of(frame)))
 
     def step(
         params: Params, state: SvgfState, frame: Frame, first: jax.Array
     ) -> tuple[SvgfState, jax.Array, jax.Array]:
-        past, guides, broken = _recall(options, state, frame, first)
+        past, broken = _recall(options, state, frame, first)
         history = accumulate(
             past,
             frame.radiance.transpose(2, 0, 1),
@@ -122,25 +122,25 @@ def svgf(options: Options) -> Denoiser:
         if hit is not None:
             image = jnp.where(hit[..., None], image, frame.radiance)
         kept = jnp.concatenate([feedback, history[3:]]).transpose(1, 2, 0)
-        return SvgfState(kept, guides), image, broken
+        return SvgfState(kept, guides_of(frame)), image, broken
 
     plain = recurrent(Core(start, step, READS))
     return demodulated(plain, by=options.demodulate)
 
 
-def _recall(
-    options: Options, state: SvgfState, frame: Frame, first: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The fetched history [6, H, W], 0 where missing; this frame's guides; the number of invalid history pixels."""
-    guides, place = pack_guides(frame.depth, frame.normal, frame.ids, frame.radiance)
+def _recall(options: Options, state: SvgfState, frame: Frame, first: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The fetched history [6, H, W], 0 where missing; the number of invalid history pixels."""
+    # Guides may come and go within a clip.
+    before = shared(state.guides, guides_of(frame))
     tolerances = {"depth_tolerance": options.depth_tolerance, "normal_threshold": options.normal_threshold}
-    accept = same_surface(frame, guides, place, **tolerances, first=6)
-    packed = jnp.concatenate([state.history, state.guides], axis=-1)
-    past, valid = reproject(packed, frame.motion, lambda tap: accept(tap) & ~first)
-    past = past[..., :6]
+    accept = same_surface(frame, before, **tolerances)
+    packed, valid = reproject(
+        pack(state.history, before), frame.motion, lambda tap: accept(unpack(tap, before)[1]) & ~first
+    )
+    past, _ = unpack(packed, before)
     sound = jnp.all(jnp.isfinite(past) & (past >= 0), axis=-1)
     broken = jnp.sum(valid & ~sound, dtype=jnp.int32)
-    return jnp.where((valid & sound)[..., None], past, 0.0).transpose(2, 0, 1), guides, broken
+    return jnp.where((valid & sound)[..., None], past, 0.0).transpose(2, 0, 1), broken
 
 
 def _filter(

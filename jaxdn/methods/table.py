@@ -1,7 +1,7 @@
 """The one table of methods: what each denoising system is called, what its options are, how it is trained and run.
 
-A new method is one new file in this room. It declares its options as a frozen dataclass and decorates the function that
-makes a denoiser of them with :func:`method`; the command line, training, comparisons, chart, benchmark, hard cases and
+A new method is one new file in this package. It declares its options as a frozen dataclass and decorates the function
+that makes a denoiser of them with :func:`method`; the command line, training, comparisons, chart, benchmark, hard cases and
 documentation read the table and know no method by name.
 """
 
@@ -107,8 +107,8 @@ def method(
         factory.__name__ = factory.__qualname__ = name
         factory.__module__ = build.__module__
         lines = [f"* ``preset``: None or one of {', '.join(map(repr, presets))}"] if presets else []
-        told = "\n".join([*lines, declared.describe(options)])
-        factory.__doc__ = f"{inspect.cleandoc(build.__doc__ or title)}\n\nOptions:\n\n{told}"
+        listed = "\n".join([*lines, declared.describe(options)])
+        factory.__doc__ = f"{inspect.cleandoc(build.__doc__ or title)}\n\nOptions:\n\n{listed}"
         keyword = inspect.Parameter.KEYWORD_ONLY
         signature = [
             inspect.Parameter(each.name, keyword, default=each.default, annotation=each.type)
@@ -124,9 +124,9 @@ def method(
 
 
 def methods() -> dict[str, Method]:
-    """All methods by name, in alphabetical order: those of this room, and what others have entered."""
-    room = importlib.import_module(__package__)
-    for module in pkgutil.iter_modules(room.__path__):
+    """All methods by name, in alphabetical order: those of this package, and those that other modules have entered."""
+    package = importlib.import_module(__package__)
+    for module in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"{__package__}.{module.name}")
     return dict(sorted(_METHODS.items()))
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxdn.clips import training_batches, write_clip
-from jaxdn.commands.fit import fit
+from jaxdn.commands.fit import Start, fit
 from jaxdn.commands.log import read_curve, read_log
 from jaxdn.denoisers import ntd
 from jaxdn.methods.table import method_named
@@ -85,3 +85,14 @@ def test_another_recipe_in_the_same_folder_is_refused(clips, tmp_path):
 def test_a_torn_log_line_is_left_out(tmp_path):
     (tmp_path / "log.jsonl").write_text('{"step": 1, "loss": 2.0}\n{"step": 2, "lo')
     assert read_log(tmp_path / "log.jsonl") == [{"step": 1, "loss": 2.0}]
+
+
+def test_training_begins_with_given_weights_and_refuses_others_for_the_same_run(clips, tmp_path):
+    one = run(clips, tmp_path / "one")
+    # The warm-up's first update has a learning rate of zero.
+    short = RECIPE._replace(steps=1)
+    again = partial(fit, ntd(size=TINY), short, folder=tmp_path / "two", label="t")
+    state = again(batches(clips), start=Start("one", one.params))
+    jax.tree.map(np.testing.assert_array_equal, state.params, one.params)
+    with pytest.raises(ValueError, match="start 'one' -> 'another'"):
+        again(batches(clips), start=Start("another", one.params))

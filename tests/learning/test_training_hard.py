@@ -71,9 +71,19 @@ def test_a_rate_that_explodes_ends_with_what_to_change_and_finite_weights(clips,
     assert np.isfinite(kept_state.params["gain"])
 
 
-def test_a_rate_that_no_json_can_keep_is_refused_before_anything_is_written(clips, tmp_path):
-    with pytest.raises(ValueError, match=r"recipe\.json"):
-        run(clips, tmp_path, test_fit.RECIPE._replace(learning_rate=np.inf))
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("learning_rate", value) for value in (np.inf, np.nan, 0.0, -1e-3, "fast")),
+        *((name, value) for name in ("steps", "batch", "crop", "frames") for value in (0, -1, 2.5)),
+        *(("clip_norm", value) for value in (-1.0, np.inf)),
+        ("seed", -1),
+        ("decay", 1),
+    ],
+)
+def test_an_impossible_recipe_is_refused_by_name_before_anything_is_written(clips, tmp_path, name, value):
+    with pytest.raises(ValueError, match=rf"^recipe {name}: expected .*, got "):
+        run(clips, tmp_path, test_fit.RECIPE._replace(**{name: value}))
     assert not list(tmp_path.iterdir())
 
 

@@ -9,7 +9,7 @@ import pytest
 import jaxdn
 from jaxdn.denoisers import ntd
 from jaxdn.frame import Frame
-from jaxdn.weights import flatten, save_weights, shipped_names, unflatten
+from jaxdn.weights import flatten, save_weights, shipped_names, starting_params, unflatten
 
 TINY = ((4,), (4,), (4,), (4,), (4,))
 FRAME = Frame(radiance=np.ones((16, 16, 3), np.float32))
@@ -43,6 +43,31 @@ def test_weights_of_an_earlier_version_are_read(tmp_path, earlier, today):
     for denoiser in (jaxdn.load_weights(saved)[0], ntd(size=TINY, demodulate=today)):
         images.append(denoiser.step(params, denoiser.start(params, frame), frame)[1])
     np.testing.assert_array_equal(*images)
+
+
+def test_training_continues_from_weights_that_see_less(saved, rng):
+    """New guides begin with weights of zero: the first image is that of the old weights, whatever the guides show."""
+    path, params = saved
+    old, more = jaxdn.load_weights(path)[0], ntd(size=TINY, guides="materials")
+    grown = starting_params(path, more)
+    frame = FRAME._replace(
+        radiance=rng.exponential(size=(16, 16, 3)).astype(np.float32),
+        albedo=rng.uniform(0.2, 1, (16, 16, 3)).astype(np.float32),
+        reflectance=rng.uniform(0.2, 1, (16, 16, 3)).astype(np.float32),
+        roughness=rng.uniform(size=(16, 16, 1)).astype(np.float32),
+    )
+    images = [
+        denoiser.step(weights, denoiser.start(weights, frame), frame)[1]
+        for denoiser, weights in ((old, params), (more, grown))
+    ]
+    np.testing.assert_allclose(images[1], images[0], rtol=1e-5)
+    jax.tree.map(np.testing.assert_array_equal, starting_params(path, old), params)
+
+
+@pytest.mark.parametrize("options", [{"size": ((8,), (4,), (4,), (4,), (4,))}, {"size": TINY, "alpha_at": "fine"}])
+def test_weights_of_another_network_are_no_start(saved, options):
+    with pytest.raises(ValueError, match=r"expected a network that training can continue from, but .* is \("):
+        starting_params(saved[0], ntd(**options))
 
 
 def test_flatten_and_back():

@@ -1,11 +1,11 @@
-"""The ritual of all denoisers on toy cores: checks, repairs, age and bounds; demodulation; requested samples."""
+"""The processing that all denoisers share, on toy cores: checks, repairs, age and bounds; demodulation; requested samples."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.denoiser import Core, Denoiser, Recurrent, Ritual, recurrent
+from jaxdn.denoiser import Core, Denoiser, Recurrent, RecurrentStep, recurrent
 from jaxdn.frame import RADIANCE_MAX, Clip, Frame, frame_at, present
 from jaxdn.methods.demodulated import demodulated
 from jaxdn.rollout import denoise, stream, unroll
@@ -34,7 +34,7 @@ def identity(**others):
 def test_first_is_told_once_and_age_counts_frames(rng):
     core = core_of(lambda params, state, frame, first: (first, frame.radiance, 0), start=lambda params, frame: False)
     denoiser, frame = recurrent(core), frame_of(rng)
-    assert isinstance(denoiser.step, Ritual)
+    assert isinstance(denoiser.step, RecurrentStep)
     assert denoiser.step.core is core
     state = denoiser.start({}, frame)
     assert isinstance(state, Recurrent)

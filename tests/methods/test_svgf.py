@@ -459,3 +459,17 @@ def test_a_pixel_without_a_surface_among_strangers_spoils_no_gradient(rng):
     value, slopes = jax.value_and_grad(spread, (0, 1))(values, level)
     assert jnp.isfinite(value)
     assert all(jnp.isfinite(slope).all() for slope in slopes)
+
+
+def test_guides_that_come_and_go_are_not_tested_against_other_guides(rng):
+    """Depth and normals (4 layers) in one frame, normals and ids (4 layers too) in the next: normals are shared."""
+    frame = moving_frames(rng, 1)[0]._replace(motion=None, previous_depth=None, depth=None, ids=None)
+    near = np.full((HEIGHT, WIDTH, 1), 2.0, np.float32)
+    frames = [frame._replace(depth=near), frame._replace(ids=np.full((HEIGHT, WIDTH, 1), 7, np.int32)), frame]
+    denoiser, lengths = svgf(demodulate="none"), []
+    state = denoiser.start({}, frames[0])
+    for each in frames:
+        state, _ = denoiser.step({}, state, each)
+        lengths.append(state.core.history[..., 5])
+    np.testing.assert_array_equal(lengths[1], 2)  # every pixel has found its history
+    np.testing.assert_array_equal(lengths[2], 3)

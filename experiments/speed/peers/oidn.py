@@ -3,8 +3,13 @@
 import os
 from collections.abc import Callable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pyoidn
+
+from jaxdn.denoiser import Denoiser, Params, State
+from jaxdn.frame import Frame, written_out
 
 QUALITIES = {
     "high": pyoidn.OIDN_QUALITY_HIGH,
@@ -54,3 +59,26 @@ def _check(device: pyoidn.Device) -> None:
     error = device.get_error()
     if error is not None:
         raise RuntimeError(f"Open Image Denoise: {error}")
+
+
+def frame_by_frame(quality: str = "high") -> Denoiser:
+    """Open Image Denoise as a denoiser of the one interface, without a history, so that comparisons can run it.
+
+    Reads albedo and normals; a missing one is its neutral value. The image stays on the CPU.
+    """
+
+    def start(params: Params, frame: Frame) -> tuple[()]:
+        return ()
+
+    def step(params: Params, state: State, frame: Frame) -> tuple[State, jax.Array]:
+        whole = written_out(frame, ("albedo", "normal"))
+        height, width = frame.radiance.shape[:2]
+        run = oidn(height, width, quality=quality)
+
+        def filtered(*images: jax.Array) -> np.ndarray:
+            return run(*(np.asarray(image, np.float32) for image in images)).copy()
+
+        like = jax.ShapeDtypeStruct((height, width, 3), jnp.float32)
+        return state, jax.pure_callback(filtered, like, whole.radiance, whole.albedo, whole.normal)
+
+    return Denoiser(lambda key, frame: {}, start, step, frozenset({"albedo", "normal"}))

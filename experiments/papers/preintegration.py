@@ -1,0 +1,80 @@
+"""Zhuang et al. 2021: denoisers that divide light by the albedo, by the pre-integrated BRDF, or by nothing.
+
+    python -m experiments.papers.preintegration CLIP ... [--weights A.safetensors B.safetensors]
+
+Every filter of the table of methods that demodulates is run with each choice on clips that have the buffer
+``reflectance`` (``experiments.papers.rooms`` renders some), and next to it the given weights, those that are shipped,
+and Open Image Denoise frame by frame where it is installed. Writes ``runs/preintegration/report.html``, and every
+method's image of every clip as ``pictures/CLIP/METHOD.png``, to be looked at at 100 %.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, get_args
+
+import numpy as np
+import tyro
+
+from experiments.speed import peers
+from jaxdn.candidates import NOISY, Candidate, candidate, filters
+from jaxdn.clips import find_clips
+from jaxdn.commands.compare import compare
+from jaxdn.commands.errors import plain_errors
+from jaxdn.methods.demodulated import Demodulation
+from jaxdn.methods.table import method_named
+from jaxdn.report import Results, text_table, write_report
+from jaxdn.report.images import save_png
+from jaxdn.weights import shipped_names
+
+
+@dataclass
+class Settings:
+    """Compare ways to demodulate on clips that have the buffer `reflectance`."""
+
+    clips: Annotated[list[Path], tyro.conf.Positional]
+    """Clips, or folders of clips."""
+    weights: list[str] = field(default_factory=list)
+    """Files of weights to compare in addition to those that are shipped."""
+    out: Path = Path("runs/preintegration")
+    """Folder for the report and the pictures."""
+
+
+def contestants(weights: list[str]) -> Iterator[Candidate]:
+    """The noisy image, every filter in every way, weights as they were trained, and Open Image Denoise."""
+    yield candidate(NOISY)
+    for name in filters():
+        if method_named(name).knows("demodulate"):
+            for by in get_args(Demodulation):
+                yield candidate(name, demodulate=by)._replace(label=f"{name}, {by}")
+    for name in (*shipped_names(), *weights):
+        yield candidate(name)
+    if "pyoidn" not in peers.missing():
+        from experiments.speed.peers.oidn import frame_by_frame
+
+        yield Candidate("Open Image Denoise", frame_by_frame(), {})
+
+
+def save_pictures(results: Results, folder: Path) -> None:
+    """Each method's image of the frame that the report shows, and the reference's."""
+    for clip in results.clips:
+        place = folder / clip.name
+        place.mkdir(parents=True, exist_ok=True)
+        for label, image in clip.images.items():
+            save_png(place / f"{label.replace(', ', '-').replace(' ', '-')}.png", np.asarray(image))
+
+
+def main(settings: Settings) -> None:
+    """Compare, report, save the pictures."""
+    folders = [folder for place in settings.clips for folder in find_clips(place)]
+    title = "Divided by the albedo, by the pre-integrated BRDF, by nothing"
+    results = compare(list(contestants(settings.weights)), folders, title=title, settings={"clips": len(folders)})
+    page = write_report(results, settings.out)
+    save_pictures(results, settings.out / "pictures")
+    print(text_table(results))
+    print(f"report: {page}")
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Settings, description=Settings.__doc__))
