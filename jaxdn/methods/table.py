@@ -1,8 +1,8 @@
 """The one table of methods: what each denoising system is called, what its options are, how it is trained and run.
 
 A new method is one new file in this package. It declares its options as a frozen dataclass and decorates the function
-that makes a denoiser of them with :func:`method`; the command line, training, comparisons, chart, benchmark, hard cases and
-documentation read the table and know no method by name.
+that makes a denoiser of them with :func:`method`; the command line, training, comparisons, chart, benchmark, hard
+cases and documentation read the table and know no method by name.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""The processing that all denoisers share, on toy cores: checks, repairs, age and bounds; demodulation; requested samples."""
+"""The processing that all denoisers share, on toy cores: checks, repairs, age, bounds; demodulation; samples."""
 
 import jax
 import jax.numpy as jnp
