@@ -1,9 +1,9 @@
 """The table on real rooms that no network was trained on, with a moving camera and an inserted moving object.
 
-    python -m experiments.papers.rooms SCENES [--runs runs/full]
+    python -m experiments.papers.rooms SCENES ... [--runs runs/full]
 
-SCENES is a folder with Benedikt Bitterli's scenes for Mitsuba (``living-room/scene.xml``, ``staircase2``,
-``cornell_box_picture``); their animations are the files in ``experiments/papers/rooms/``. Writes
+SCENES are folders with Benedikt Bitterli's scenes for Mitsuba (``living-room/scene.xml``, ``staircase2``, ``kitchen``
+...); their animations are the files in ``experiments/papers/rooms/``. Writes clips to ``data/rooms`` and
 ``runs/rooms/report.html``.
 """
 
@@ -28,23 +28,28 @@ ANIMATIONS = Path(__file__).parent / "rooms"
 class Settings:
     """Render the rooms, compare the methods on them, write a report."""
 
-    scenes: Annotated[Path, tyro.conf.Positional]
-    """Folder of the rooms: one folder with a scene.xml each."""
+    scenes: Annotated[list[Path], tyro.conf.Positional]
+    """Folders of rooms: one folder with a scene.xml each."""
     runs: Path | None = None
     """Folder of the ablation's runs, which are compared in place of the shipped weights."""
     width: int = 128
     height: int = 72
     frames: int = 8
+    layers: tuple[int, ...] = (1,)
+    """Independent noisy layers, in samples per pixel; the report is on the one with the fewest."""
     reference_spp: int = 128
+    workers: int | None = None
+    """Number of rendering processes; default: the number of cores."""
 
 
 def jobs(settings: Settings) -> list[ClipJob]:
     """What to render: every room whose scene is there. Raises ValueError if none is."""
     found = []
     for animation in sorted(ANIMATIONS.glob("*.json")):
-        path = settings.scenes / animation.stem / "scene.xml"
-        if not path.is_file():
-            print(f"{path} is not there: this room is left out")
+        scene = Path(animation.stem) / "scene.xml"
+        path = next((folder / scene for folder in settings.scenes if (folder / scene).is_file()), None)
+        if path is None:
+            print(f"{scene} does not exist in any of the folders: this room is left out")
             continue
         found.append(
             ClipJob(
@@ -53,12 +58,14 @@ def jobs(settings: Settings) -> list[ClipJob]:
                 width=settings.width,
                 height=settings.height,
                 frames=settings.frames,
+                layers=settings.layers,
                 reference_spp=settings.reference_spp,
             )
         )
     if not found:
         names = ", ".join(path.stem for path in sorted(ANIMATIONS.glob("*.json")))
-        raise ValueError(f"{settings.scenes}: expected folders out of {names} with a scene.xml each, found none.")
+        places = ", ".join(map(str, settings.scenes))
+        raise ValueError(f"{places}: expected folders out of {names} with a scene.xml each, found none.")
     return found
 
 
@@ -76,7 +83,7 @@ def main(settings: Settings) -> None:
     choice = choose_variant()
     print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
     try:
-        render_clips(rooms)
+        render_clips(rooms, workers=settings.workers)
     except RenderError as error:  # a room with something that is not supported is left out of the table, not hidden
         print(error)
     folders = [Path(job.folder) for job in rooms if len(list(Path(job.folder).glob("*.exr"))) == settings.frames]
