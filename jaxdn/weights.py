@@ -107,15 +107,15 @@ def starting_params(name_or_path: str | Path, denoiser: Denoiser) -> Params:
     wanted = _shapes(jax.eval_shape(denoiser.init, jax.random.key(0), frame))
     found, grown = flatten(params), {}
     for name, (shape, _) in wanted.items():
-        stored = found.get(name)
-        fits = stored is not None and len(stored.shape) == len(shape)
-        more = [new - old for old, new in zip(stored.shape, shape, strict=True)] if fits else []
+        stored = found.get(name, np.zeros(()))
         inputs = len(shape) - 2  # kernels are [height, width, inputs, outputs]
-        if not fits or any(extra != 0 and (axis != inputs or extra < 0) for axis, extra in enumerate(more)):
+        more = [new - old for old, new in zip(stored.shape, shape, strict=False)]
+        growing = all(extra == 0 or (axis == inputs and extra > 0) for axis, extra in enumerate(more))
+        if name not in found or len(stored.shape) != len(shape) or not growing:
             raise ValueError(
                 f"weights {path}: expected a network that training can continue from, but {name} is "
-                f"{None if stored is None else stored.shape} there and {shape} in the denoiser to train; choose the "
-                "same variant and options."
+                f"{stored.shape if name in found else 'missing'} there and {shape} in the denoiser to train; choose "
+                "the same variant and options."
             )
         grown[name] = np.pad(stored, [(0, extra) for extra in more])
     return unflatten(grown)
@@ -137,6 +137,7 @@ def weights_path(name_or_path: str | Path) -> Path:
 def describe(name_or_path: str | Path) -> dict[str, Any]:
     """The JSON of weights: ``factory``, ``options``, and how they were trained.
 
+    An option that an earlier version did not record has the value that it had then (``Method.earlier``).
     Raises ValueError if it cannot be read or names an unknown method.
     """
     file = weights_path(name_or_path).with_suffix(".json")
@@ -149,7 +150,7 @@ def describe(name_or_path: str | Path) -> dict[str, Any]:
             f"'options', got {error!r}; copy both files together."
         ) from error
     try:
-        method_named(factory)
+        options = {**method_named(factory).earlier, **options}
     except ValueError as error:
         raise ValueError(f"weights {file}: factory: {error} They may come from a newer jaxdn.") from error
     return {**description, "factory": factory, "options": options}

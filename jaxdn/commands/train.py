@@ -1,5 +1,6 @@
 """``jaxdn train``: a learned method, trained on rendered clips."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,7 +36,7 @@ def train(
       recipe: objective, optimiser, batches.
       clips: folders of clips, or of folders of clips, to train on.
       out: the run's folder: checkpoints, log.jsonl, recipe.json, and finally weights.safetensors with its JSON.
-      options: the method's, stored with the weights.
+      options: the method's; they are stored with the weights, and so are the defaults of all others.
       start: shipped weights or a .safetensors file to continue from (:func:`jaxdn.weights.starting_params`); None:
         new ones.
       validation: folders of held-out clips, used whole.
@@ -68,6 +69,11 @@ def train(
     state = fit(denoiser, recipe, batches, out, label=label, start=first, validation=held_out)
     begun = {} if first is None else {"start": first.name}
     about = {"recipe": recipe.record(), "skipped": int(state.skipped), **begun, **(record or {})}
+    given = dataclasses.asdict(method.made(options))
     return save_weights(
-        out / "weights.safetensors", state.params, factory=method.name, options=dict(options), record=about
+        out / "weights.safetensors",
+        state.params,
+        factory=method.name,
+        options=given,
+        record=about,
     )

@@ -45,9 +45,9 @@ def same_surface(
         accepted = jnp.ones(frame.radiance.shape[:2], bool)
         if tap.depth is not None:
             accepted &= jnp.abs(tap.depth[..., 0] - expected) <= tolerance
-        if tap.normal is not None:
+        if tap.normal is not None and tested.normal is not None:
             accepted &= cosine(tap.normal, tested.normal) > normal_threshold
-        if tap.ids is not None:
+        if tap.ids is not None and tested.ids is not None:
             accepted &= tap.ids[..., 0] == tested.ids[..., 0]
         return accepted
 

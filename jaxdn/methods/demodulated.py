@@ -1,4 +1,4 @@
-"""Demodulation: a wrapper that makes any denoiser filter radiance divided by the albedo."""
+"""Demodulation: a wrapper that makes any denoiser filter radiance divided by what the surface reflects."""
 
 from typing import Literal
 
@@ -13,18 +13,19 @@ from jaxdn.frame import Frame
 SMALLEST_ALBEDO = 0.01
 """Radiance is not divided by an albedo below this (``by="albedo"``)."""
 
-Demodulation = Literal["albedo", "brdf", "none"]
+Demodulation = Literal["brdf", "albedo", "none"]
 """What light is divided by, see :func:`demodulated`."""
 
 
-def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "albedo") -> Denoiser:
+def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "brdf") -> Denoiser:
     """The denoiser applied to radiance divided by what the surface reflects; its image is multiplied by the same again.
 
     Textures are thus removed before filtering and cannot be blurred. The state, including the history, is demodulated
     too. ``by`` is
 
     * ``"brdf"``: :func:`jaxdn.brdf.divisor` of the frame's ``reflectance``, of its albedo where that is absent;
-    * ``"albedo"``: the albedo where that exceeds 0.01 and 1 elsewhere, as the shipped weights were trained;
+    * ``"albedo"``: the albedo where that exceeds 0.01 and 1 elsewhere, as in earlier versions: on dark and on glossy
+      surfaces the divided light of neighbours may differ by a factor of 100, and colours appear that are not there;
     * ``"none"``: the denoiser is returned unchanged.
 
     Divided radiance may exceed 65504: a clamp there would make the result depend on the exposure. ``True`` is
@@ -34,7 +35,7 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "albedo") -> De
     """
     if isinstance(by, bool):  # as it was before there were three choices
         by = "albedo" if by else "none"
-    check_option(by, "by", ("albedo", "brdf", "none"))
+    check_option(by, "by", ("brdf", "albedo", "none"))
     if by == "none":
         return denoiser
     if not isinstance(denoiser.step, RecurrentStep):

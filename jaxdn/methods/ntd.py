@@ -62,7 +62,7 @@ class Options:
     guides: Literal["geometry", "materials"] = "geometry"
     """Buffers that the network sees: albedo, normal and depth, as in the paper; or ``reflectance`` and ``roughness``
     too."""
-    demodulate: Demodulation | bool = "albedo"
+    demodulate: Demodulation | bool = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     truncate: bool = False
     """Stop the gradient at the history."""
@@ -156,6 +156,7 @@ def _blend(
     },
     variants={"ntd-large": {"size": "large"}, "ntd-small": {"size": "small"}},
     engines=("onnxruntime", "onednn"),
+    earlier={"demodulate": "albedo"},
 )
 def ntd(options: Options) -> Denoiser:
     """The neural temporal denoiser.

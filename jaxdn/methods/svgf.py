@@ -1,8 +1,8 @@
 """Spatiotemporal variance-guided filtering (``svgf``), the common baseline of real-time denoising.
 
-For each frame: divide by the albedo, fetch the history with a test of every tap, blend colour and the moments of
-luminance into it, estimate the variance per pixel (temporally, or from a 7x7 neighbourhood while the history is short),
-apply five a-trous levels whose luminance edge-stopping depends on that variance, and multiply by the albedo.
+For each frame: divide by what surfaces reflect, fetch the history with a test of every tap, blend colour and the
+moments of luminance into it, estimate the variance per pixel (temporally, or from a 7x7 neighbourhood while the history
+is short), apply five a-trous levels whose luminance edge-stopping depends on that variance, and multiply again.
 
 The colour history is the demodulated image after the first level (``feedback_level``), not the output image: feeding
 the whole cascade back would blur more with every frame. The paper prescribes this; the learned denoisers here keep
@@ -65,7 +65,7 @@ class Options:
     """Allowed relative difference of a history tap from the expected depth, in addition to the slope term."""
     normal_threshold: float = 0.9
     """A history tap is accepted above this cosine of normals."""
-    demodulate: Demodulation | bool = "albedo"
+    demodulate: Demodulation | bool = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
 
     def __post_init__(self) -> None:
@@ -89,7 +89,8 @@ class SvgfState(NamedTuple):
 def svgf(options: Options) -> Denoiser:
     """SVGF, a filter without weights (``params`` is ``{}``).
 
-    Reads albedo, normal, depth, previous_depth, motion and ids; without a buffer, its test or weight is left out.
+    Reads reflectance, albedo, normal, depth, previous_depth, motion and ids; without a buffer, its test or weight is
+    left out.
     Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for options out of range and
     radiance that is not [H, W, 3].
     """

@@ -41,6 +41,8 @@ class Method:
     """Names of weights that are or may be shipped -> options, from the most accurate to the fastest."""
     engines: tuple[str, ...]
     """Values of its option ``implementation`` besides XLA: names in :data:`jaxdn.networks.engines.ENGINES`."""
+    earlier: Mapping[str, Any]
+    """Options that weights without a record of them were trained with, where the default is another today."""
 
     @property
     def learns(self) -> bool:
@@ -62,6 +64,18 @@ class Method:
         if name not in self.variants:
             raise ValueError(f"{self.name}: expected a variant out of {', '.join(self.variants)}, got {name!r}.")
         return self.variants[name]
+
+    def made(self, given: Mapping[str, Any]) -> Any:
+        """The checked options, an instance of :attr:`options`, from ``given`` ones, among them ``preset``.
+
+        Raises ValueError for an unknown option, preset or value.
+        """
+        given, base = dict(given), None
+        if self.presets and (chosen := given.pop("preset", None)) is not None:
+            if chosen not in self.presets:
+                raise ValueError(f"{self.name} preset: expected one of {', '.join(self.presets)}, got {chosen!r}.")
+            base = self.presets[chosen]
+        return declared.make(self.options, given, method=self.name, base=base)
 
     def knows(self, option: str) -> bool:
         """Whether it has an option of that name."""
@@ -86,6 +100,7 @@ def method(
     recipes: Mapping[str, Recipe] = _NOTHING,
     variants: Mapping[str, Mapping[str, Any]] = _NOTHING,
     engines: tuple[str, ...] = (),
+    earlier: Mapping[str, Any] = _NOTHING,
 ) -> Callable[[Callable[[Any], Denoiser]], Callable[..., Denoiser]]:
     """Decorator: enter ``build(options) -> Denoiser`` in the table and make it a factory ``(**options) -> Denoiser``.
 
@@ -97,12 +112,7 @@ def method(
         name = build.__name__
 
         def factory(**given: Any) -> Denoiser:
-            base = None
-            if presets and (chosen := given.pop("preset", None)) is not None:
-                if chosen not in presets:
-                    raise ValueError(f"{name} preset: expected one of {', '.join(presets)}, got {chosen!r}.")
-                base = presets[chosen]
-            return build(declared.make(options, given, method=name, base=base))
+            return build(row.made(given))
 
         factory.__name__ = factory.__qualname__ = name
         factory.__module__ = build.__module__
@@ -117,7 +127,8 @@ def method(
         if presets:
             signature.append(inspect.Parameter("preset", keyword, default=None, annotation=str | None))
         factory.__signature__ = inspect.Signature(signature, return_annotation=Denoiser)  # type: ignore[attr-defined]
-        _METHODS[name] = Method(name, title, factory, options, presets, recipes, variants, engines)
+        row = Method(name, title, factory, options, presets, recipes, variants, engines, earlier)
+        _METHODS[name] = row
         return factory
 
     return enter

@@ -31,14 +31,20 @@ def test_round_trip(saved):
     assert image.shape == (16, 16, 3)
 
 
-@pytest.mark.parametrize(("earlier", "today"), [(True, "albedo"), (False, "none")])
+@pytest.mark.parametrize(
+    ("earlier", "today"),
+    [
+        ({"demodulate": True}, "albedo"),
+        ({"demodulate": False}, "none"),
+        ({}, "albedo"),
+        ({"demodulate": "brdf"}, "brdf"),
+    ],
+)
 def test_weights_of_an_earlier_version_are_read(tmp_path, earlier, today):
-    """Whether to divide by the albedo was a yes or no; it has become what to divide by."""
+    """Whether to divide by the albedo was a yes or no, yes unless it was given; it has become what to divide by."""
     params = ntd(size=TINY).init(jax.random.key(0), FRAME)
-    saved = save_weights(
-        tmp_path / "w", params, factory="ntd", options={"size": TINY, "demodulate": earlier}, record={}
-    )
-    frame = FRAME._replace(albedo=np.full((16, 16, 3), 0.5, np.float32))
+    saved = save_weights(tmp_path / "w", params, factory="ntd", options={"size": TINY, **earlier}, record={})
+    frame = FRAME._replace(albedo=np.full((16, 16, 3), 0.1, np.float32))
     images = []
     for denoiser in (jaxdn.load_weights(saved)[0], ntd(size=TINY, demodulate=today)):
         images.append(denoiser.step(params, denoiser.start(params, frame), frame)[1])

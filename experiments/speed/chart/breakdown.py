@@ -12,11 +12,10 @@ import jax.numpy as jnp
 
 from experiments.speed.timing import Call, Timing, measure
 from experiments.speed.works import steps
-from jaxdn import color
+from jaxdn import brdf, color
 from jaxdn.candidates import Candidate
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.frame import Frame
-from jaxdn.methods.demodulated import SMALLEST_ALBEDO
 from jaxdn.methods.ntd import TAPS, depth_feature
 from jaxdn.motion import on_screen
 from jaxdn.networks import MULTIPLE, Widths
@@ -113,7 +112,7 @@ def breakdown(subject: Subject, frame: Frame, *, rounds: int) -> dict[str, Timin
         ]
         return tuple(head[0] for head in network.apply(params, [feature[None] for feature in features]))
 
-    colors = jnp.where(frame.albedo > SMALLEST_ALBEDO, frame.albedo, 1.0)
+    colors = brdf.divisor(frame.albedo if frame.reflectance is None else frame.reflectance)
     noisy = frame.radiance / colors
     reproject_jit, predict_jit = jax.jit(reproject), jax.jit(predict)
     recalled, lost = reproject_jit(noisy, frame, noisy)

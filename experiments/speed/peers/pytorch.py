@@ -18,8 +18,8 @@ import torch._dynamo
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from jaxdn.brdf import FLOOR
 from jaxdn.frame import FAR, RADIANCE_MAX, Frame
-from jaxdn.methods.demodulated import SMALLEST_ALBEDO
 from jaxdn.methods.ntd import TAPS
 from jaxdn.networks import LEVELS, Widths
 from jaxdn.networks.unet import NEGATIVE_SLOPE
@@ -197,7 +197,7 @@ class Prepared(NamedTuple):
 def prepare(state: State, frame: dict[str, Tensor]) -> Prepared:
     """Divide by albedo, warp the history, assemble the network's input."""
     albedo, motion = frame["albedo"], frame["dual_motion"]
-    colors = torch.where(albedo > SMALLEST_ALBEDO, albedo, 1.0)
+    colors = (albedo**4 + FLOOR**4) ** 0.25  # :func:`jaxdn.brdf.divisor` of frames without reflectance
     noisy = (frame["radiance"] / colors).clamp(max=RADIANCE_MAX)
     height, width = noisy.shape[-2:]
     x, y = targets(motion)
