@@ -54,7 +54,7 @@ def test_weights_of_an_earlier_version_are_read(tmp_path, earlier, today):
 def test_training_continues_from_weights_that_see_less(saved, rng):
     """New guides begin with weights of zero: the first image is that of the old weights, whatever the guides show."""
     path, params = saved
-    old, more = jaxdn.load_weights(path)[0], ntd(size=TINY, guides="materials")
+    old, more = jaxdn.load_weights(path)[0], ntd(size=TINY, guides="materials", demodulate="albedo")
     grown = starting_params(path, more)
     frame = FRAME._replace(
         radiance=rng.exponential(size=(16, 16, 3)).astype(np.float32),
