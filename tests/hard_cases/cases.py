@@ -169,6 +169,36 @@ def albedo_tiny(inputs: Inputs) -> Inputs:
     return filled(inputs, "albedo", 1e-5)
 
 
+@case("a black hole in the scene: it reflects nothing at all")
+def reflectance_zero(inputs: Inputs) -> Inputs:
+    return filled(filled(inputs, "albedo", 0.0), "reflectance", 0.0)
+
+
+@case("soot: reflectances around the smallest that half precision holds")
+def reflectance_tiny(inputs: Inputs) -> Inputs:
+    return dotted(filled(inputs, "reflectance", 1e-7), "reflectance", 1e-5)
+
+
+@case("a material that gains energy: more is reflected than arrives")
+def reflectance_huge(inputs: Inputs) -> Inputs:
+    return filled(inputs, "reflectance", 1e4)
+
+
+@case("a picture painted in pure colours: in two of three channels nothing is reflected")
+def saturated_primaries(inputs: Inputs) -> Inputs:
+    columns = np.arange(inputs.clip.frames.albedo.shape[2])
+    texture = np.broadcast_to(np.eye(3, dtype=np.float32)[columns % 3], inputs.clip.frames.albedo.shape)
+    return replaced(inputs, albedo=texture, reflectance=texture, radiance=texture * inputs.clip.frames.radiance)
+
+
+@case("a floor seen at a grazing angle: shading normals across the line of sight, and some away from it")
+def grazing_cosines(inputs: Inputs) -> Inputs:
+    normal = np.zeros_like(inputs.clip.frames.normal)
+    cosine = np.linspace(-0.02, 0.02, normal.shape[2], dtype=np.float32)
+    normal[..., 1], normal[..., 2] = np.sqrt(1 - cosine**2), cosine
+    return filled(replaced(inputs, normal=normal), "reflectance", 1.0)
+
+
 @case("a polished mirror")
 def roughness_zero(inputs: Inputs) -> Inputs:
     return filled(inputs, "roughness", 0.0)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdn
-from jaxdn import color, losses, metrics, numerics, scales
+from jaxdn import brdf, color, losses, metrics, numerics, scales
 from jaxdn.frame import RADIANCE_MAX, Clip, Frame
 from jaxdn.methods.table import methods
 from jaxdn.motion import on_screen
@@ -40,7 +40,7 @@ class Subject(NamedTuple):
 
 
 def denoiser_subjects() -> list[Subject]:
-    """Every method that is registered now, in its lightest variant and each precision that it knows.
+    """Every method that is registered now, in its lightest variant, each precision and both ways to divide light.
 
     A network has the weights that training starts from.
     """
@@ -62,6 +62,9 @@ def denoiser_subjects() -> list[Subject]:
         if method.knows("compute_dtype"):
             half = method.factory(**{**options, "compute_dtype": "bfloat16"})
             subjects.append(usual._replace(name=f"{name} bfloat16", run=_on_clips(half), truth=usual.run))
+        if method.knows("demodulate"):
+            plain = method.factory(**{**options, "demodulate": "albedo"})
+            subjects.append(usual._replace(name=f"{name} by albedo", run=_on_clips(plain)))
     return subjects
 
 
@@ -123,6 +126,14 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         image, reference = (jnp.clip(image, 0.0, 1.0) for image in _images(inputs))
         return getattr(metrics, name)(image, reference, reference[..., ::-1])
 
+    def reflected(inputs: Inputs) -> jax.Array:
+        frames = inputs.clip.frames
+        cosine = frames.normal[..., 2:]
+        return jax.vmap(brdf.directional_albedo)(frames.albedo, frames.albedo[..., ::-1], frames.roughness, cosine)
+
+    def divided(inputs: Inputs, way: Callable[..., jax.Array]) -> jax.Array:
+        return way(inputs.clip.frames.radiance, inputs.clip.frames.reflectance)
+
     def of_light(function: Callable[..., jax.Array], **options: Any) -> Callable[[Inputs], jax.Array]:
         return lambda inputs: function(inputs.clip.frames.radiance, **options)
 
@@ -137,6 +148,10 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "compose_scales": composed,
         "downsample": lambda inputs: scales.downsample(even(inputs)),
         "upsample": lambda inputs: scales.upsample(inputs.clip.frames.radiance[-1]),
+        "brdf.directional_albedo": reflected,
+        "brdf.divisor": lambda inputs: brdf.divisor(inputs.clip.frames.reflectance),
+        "brdf.demodulate": partial(divided, way=brdf.demodulate),
+        "brdf.remodulate": partial(divided, way=brdf.remodulate),
         "color.compress": of_light(color.compress),
         "color.expand": lambda inputs: color.expand(jnp.minimum(inputs.clip.frames.radiance, 2.0)),
         "color.luminance": of_light(color.luminance),
