@@ -121,7 +121,7 @@ def test_a_material_that_cannot_be_averaged_is_named_once_and_its_albedo_used(fa
 
     monkeypatch.setattr(reflectance, "_KNOWN", frozenset())
     monkeypatch.setattr(reflectance, "_samples", lambda bsdf: False)
-    with pytest.warns(UserWarning, match="ball: what its material reflects cannot be averaged"):
+    with pytest.warns(UserWarning, match="ball: the reflectance of its material cannot be averaged"):
         there = found("roughplastic")
     np.testing.assert_array_equal(there.reflectance, there.albedo)
     with warnings.catch_warnings():

@@ -481,7 +481,7 @@ def test_clips_are_rendered_in_parallel_and_failures_do_not_stop_the_others(tmp_
     assert len(list((tmp_path / "good").glob("frame_*.exr"))) == 2
     assert is_clip(tmp_path / "good")
     assert not is_clip(tmp_path / "bad")
-    with pytest.raises(ValueError, match="folder of its own"):
+    with pytest.raises(ValueError, match="a different folder for every clip"):
         farm.render_clips([good, good], progress=False)
 
 

@@ -242,7 +242,7 @@ def test_a_pose_that_appears_or_disappears_raises(start: dict[str, np.ndarray], 
 
 def test_shapes_that_appear_or_disappear_raise() -> None:
     camera = Camera(np.eye(4), 90.0)
-    with pytest.raises(ValueError, match="come or go"):
+    with pytest.raises(ValueError, match="none may appear or disappear"):
         motion_between(View(flat([0]), camera, {}), View(flat([0])._replace(names=("a",)), camera, {}))
 
 
