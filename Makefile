@@ -1,8 +1,8 @@
-# Everything a user needs, from a bare clone: Python >= 3.11 and make. `make train` and `make test` set themselves up.
+# All targets work from a fresh clone with Python >= 3.11 and make; they create .venv first if they need it.
 PYTHON ?= python3
 BIN := .venv/bin
 SETTINGS ?=
-# Huge pages for large buffers (glibc; ignored elsewhere): a train step takes 0.87 of its time.
+# Huge pages for large buffers (glibc; ignored elsewhere): a train step takes 0.87 of the time.
 export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 
 .PHONY: help setup train test test-slow bench chart hard-cases lint format docs weights clean
@@ -24,7 +24,7 @@ setup: .venv/ready  ## .venv with the exact versions of constraints.txt (uses uv
 	fi
 	@touch $@
 
-train: setup  ## the main job: render clips, train the denoiser and its ablations, evaluate, write a report
+train: setup  ## render clips, train the denoiser and its ablations, evaluate, write a report
 	$(BIN)/python -m experiments.papers.ablation $(SETTINGS)
 
 weights: setup  ## train the shipped weights again (hours; resumable)

@@ -1,1 +1,1 @@
-"""What reproduces the papers: one file for each table or figure; run with ``python -m experiments.NAME``."""
+"""Experiments on papers, stability and speed, one file each; run with ``python -m experiments.GROUP.NAME``."""

@@ -1,4 +1,4 @@
-"""Stepping through a clip: as one scan, which is what training and notebooks want, or frame by frame as they come."""
+"""Stepping through a clip: as one scan, for training and notebooks, or frame by frame."""
 
 import functools
 from collections.abc import Iterable, Iterator, Mapping
@@ -32,7 +32,7 @@ def sampled(denoiser: Denoiser, params: Params, state: State, frame: Frame, laye
     if denoiser.samples is None:
         return only(frame, denoiser.reads)
     if layers is None:
-        raise ValueError("layers: expected independent noisy layers, as this denoiser asks for samples, got None.")
+        raise ValueError("layers: expected independent noisy layers, as this denoiser requests samples, got None.")
     radiance, counts = from_layers(layers, denoiser.samples(params, state, only(frame, denoiser.reads)))
     return only(frame._replace(radiance=radiance, sample_count=counts), denoiser.reads)
 

@@ -1,4 +1,4 @@
-"""What every test runs under: strict broadcasting, full float32 precision, fixed seeds, a compilation cache.
+"""The settings of every test: strict broadcasting, full float32 precision, fixed seeds, a compilation cache.
 
 Markers: ``slow`` (more than 10 s), ``browser`` (needs Chromium through Playwright).
 """
@@ -26,7 +26,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
     # [3] against [H, W, 3] has to be written out: silent broadcasting hides a swapped axis.
     jax.config.update("jax_numpy_rank_promotion", "raise")
-    # NVIDIA devices compute float32 products as TF32 unless told otherwise; the references here are float64.
+    # NVIDIA devices compute float32 products as TF32 by default; the references here are float64.
     jax.config.update("jax_default_matmul_precision", "highest")
     # Most of a test's time is compilation, and most of it is the same as in the last run.
     jax.config.update("jax_compilation_cache_dir", str(config.rootpath / ".pytest_cache" / "jax"))
@@ -35,13 +35,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def rng() -> np.random.Generator:
-    """A NumPy generator that starts afresh for each test."""
+    """A NumPy generator with the same seed for each test."""
     return np.random.default_rng(20210629)
 
 
 @pytest.fixture
 def key() -> jax.Array:
-    """A JAX key that starts afresh for each test."""
+    """The same JAX key for each test."""
     return jax.random.key(20210629)
 
 

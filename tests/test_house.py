@@ -1,4 +1,4 @@
-"""The house stands: imports point down, the core needs jax and numpy alone, public names are where they should be."""
+"""The structure: imports point down, the core needs only jax and numpy, public names are where they should be."""
 
 import ast
 import inspect
@@ -26,7 +26,7 @@ MATHS = (
     "ops",
     "brdf",
 )
-FLOORS = {
+LAYERS = {
     **dict.fromkeys((*MATHS, "ops", "losses", "metrics", "flip", "sampling", "objectives", "recipe"), 1),
     **dict.fromkeys(("filters", "networks"), 2),
     **dict.fromkeys(("methods", "denoisers"), 3),
@@ -67,7 +67,7 @@ def _imported_by_name(path: Path) -> list[ast.expr]:
     return [call.args[0] for name, call in names if name == "import_module"]
 
 
-def _room(path: Path) -> str:
+def _package(path: Path) -> str:
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
 
@@ -76,30 +76,30 @@ MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_imports_point_down(path):
-    floor = FLOORS[_room(path)]
+    layer = LAYERS[_package(path)]
     for name in _imports(path):
         top, _, rest = name.partition(".")
         if top == "jaxdn":
-            room = rest.partition(".")[0]
-            if room in FLOORS:
-                assert FLOORS[room] <= floor, f"{path} (floor {floor}) imports {name} (floor {FLOORS[room]})"
+            package = rest.partition(".")[0]
+            if package in LAYERS:
+                assert LAYERS[package] <= layer, f"{path} (layer {layer}) imports {name} (layer {LAYERS[package]})"
         elif top in OUTSIDE:
-            assert _room(path) in OUTSIDE[top], f"{path} imports {top}"
+            assert _package(path) in OUTSIDE[top], f"{path} imports {top}"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_nothing_is_imported_by_name_but_from_a_rooms_own_door(path):
-    """An import that no import statement shows would get around the test above."""
+def test_packages_import_by_name_only_from_themselves(path):
+    """An import without an import statement would bypass the test above."""
     for argument in _imported_by_name(path):
         written = ast.unparse(argument)
-        room = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts[:2])
-        own = written.startswith(("__package__", "f'{__package__}", f"f'{room}.", f"'{room}."))
+        package = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts[:2])
+        own = written.startswith(("__package__", "f'{__package__}", f"f'{package}.", f"'{package}."))
         outside = isinstance(argument, ast.Constant) and not str(argument.value).startswith("jaxdn")
         assert own or outside, f"{path} imports {written}; write an import statement"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_a_module_is_one_idea(path):
+def test_a_module_is_short_and_has_a_docstring(path):
     assert len(path.read_text().splitlines()) <= 450
     assert ast.get_docstring(ast.parse(path.read_text())), "the first line says what the module is"
 
@@ -129,7 +129,7 @@ print("alone")
 """
 
 
-def test_the_maths_needs_jax_and_numpy_alone():
+def test_the_maths_needs_only_jax_and_numpy():
     done = subprocess.run([sys.executable, "-c", ONLY_JAX], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "alone", done.stderr
 
@@ -141,7 +141,7 @@ def test_importing_the_package_loads_nothing():
 
 
 @pytest.mark.parametrize("name", [name for name in jaxdn.__all__ if name != "__version__"])
-def test_public_names_exist_and_say_what_they_are(name):
+def test_public_names_exist_and_have_docstrings(name):
     assert inspect.getdoc(getattr(jaxdn, name))
 
 

@@ -1,4 +1,4 @@
-"""A new method is one new file, a new buffer one declaration: everything else finds them with nothing else edited."""
+"""A new method is one new file, a new buffer one declaration: everything else finds them without further edits."""
 
 import importlib.util
 import json
@@ -112,7 +112,7 @@ def test_a_new_method_is_trained_denoises_and_is_compared(toy, clips, tmp_path, 
     assert "gain" in capsys.readouterr().err
 
 
-def test_a_new_method_has_its_row_of_the_hard_cases_and_its_place_in_the_chart(toy):
+def test_a_new_method_appears_in_the_hard_cases_and_the_chart(toy):
     subject = next(subject for subject in denoiser_subjects() if subject.name == "toy")
     cases = [CASES["radiance not a number"], CASES["every pixel off screen"]]
     table_rows = list(rows(cases, [subject]))

@@ -1,4 +1,4 @@
-"""Table 2 and the ablation of Zeng et al. 2021: noisy, filters, and ntd as A, B and C, on clips none was trained on.
+"""Table 2 and the ablation of Zeng et al. 2021: noisy, filters, and ntd as A, B and C, on clips not used in training.
 
 A warps the history with traditional motion vectors, B with dual ones, C adds the motion-occlusion loss in the second
 half of training; all three share the network, the data, the seed and the number of steps.
@@ -6,8 +6,7 @@ half of training; all three share the network, the data, the seed and the number
     python -m experiments.papers.ablation                  # `make train`: a demonstration, about a quarter of an hour
     python -m experiments.papers.ablation --preset full    # `make weights`: the shipped weights, the README's table
 
-Everything is kept under ``data/`` and ``runs/``: what was rendered or trained is used again, and what was interrupted
-continues where it stopped.
+Everything is kept under ``data/`` and ``runs/``: finished clips and runs are reused, interrupted ones are resumed.
 """
 
 import time
@@ -32,14 +31,14 @@ from jaxdn.weights import SHIPPED
 FAMILIES = ("fruit", "robot", "pinkroom", "mobile")
 FAILURES = ("edge", "dash")
 METHOD = "ntd"
-"""The method that the ablation is of."""
+"""The method under ablation."""
 
 
 class ClipSet(NamedTuple):
     """Clips rendered with the same settings."""
 
     clips: tuple[tuple[str, int], ...]
-    """(family, seed) of each."""
+    """(family, seed) of each clip."""
     size: int
     """Width and height in pixels."""
     frames: int
@@ -52,7 +51,7 @@ class Run(NamedTuple):
 
     label: str
     options: Mapping[str, Any]
-    """The method's."""
+    """Options of the method."""
     recipe: str
     """The name of one of the method's recipes."""
     steps: int
@@ -118,23 +117,23 @@ PRESETS = {
 }
 
 SHIPPED_RUNS = {"C large": "ntd-large", "C": "ntd-small"}
-"""The runs of the full preset whose weights come with the package, and their names there."""
+"""The runs of the full preset whose weights are shipped with the package, and their names there."""
 
 
 @dataclass
 class Settings:
-    """Render clips, train the denoiser and its ablations, evaluate them on clips never seen, write a report."""
+    """Render clips, train the denoiser and its ablations, evaluate them on held-out clips, write a report."""
 
     preset: Literal["demo", "full"] = "demo"
     """demo: SMALL networks and a dozen small clips, to see that it learns. full: the shipped weights."""
     name: str | None = None
     """Folder under runs/ for weights, logs and the report; default: the preset's name."""
     only: Literal["all", "render", "train", "report"] = "all"
-    """Do one part of the work alone (on what the parts before it left)."""
+    """Run only one stage, with the results of the earlier stages."""
     runs: tuple[str, ...] = ()
     """Labels of the runs to train; default: all of the preset."""
     workers: int | None = None
-    """Processes that render; default: the cores."""
+    """Number of rendering processes; default: the number of cores."""
     ship: bool = False
     """Put the weights of the full preset into the package."""
 
@@ -157,12 +156,12 @@ def jobs(clips: ClipSet, folder: Path) -> list[ClipJob]:
 
 
 def folders(clips: ClipSet, folder: Path) -> list[Path]:
-    """Where a set's clips lie."""
+    """The folders of a set's clips."""
     return [folder / f"{family}-{seed}" for family, seed in clips.clips]
 
 
 def render(preset: Preset, data: Path, workers: int | None) -> dict[str, Any]:
-    """Render all clips of a preset, or find them rendered; returns what the report says of the renderer."""
+    """Render the missing clips of a preset; returns the report's entry for the renderer."""
     choice = choose_variant()
     print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
     parts = [(preset.train, "train"), (preset.validation, "validation"), *((each, "test") for each in preset.tests)]
@@ -171,7 +170,7 @@ def render(preset: Preset, data: Path, workers: int | None) -> dict[str, Any]:
 
 
 def train_run(run: Run, preset: Preset, data: Path, folder: Path) -> Path:
-    """Train one network to the end (or find it trained); returns the path of its weights."""
+    """Train one network to the end, unless it is trained already; returns the path of its weights."""
     method = method_named(METHOD)
     origin = {"trained_on": f"{len(preset.train.clips)} clips of {', '.join(FAMILIES)}", "run": run.label}
     return train(
@@ -200,7 +199,7 @@ def evaluate(preset: Preset, settings: Settings, data: Path, folder: Path, machi
     facts = {
         "preset": settings.preset,
         "training clips": len(preset.train.clips),
-        "test clips (never seen)": len(tests),
+        "test clips (held out)": len(tests),
         "training steps": ", ".join(f"{run.label} {run.steps}" for run in preset.runs),
         **{key.replace("_", " "): value for key, value in recipe.items() if key not in ("steps", "objective")},
     }

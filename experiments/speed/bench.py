@@ -33,14 +33,14 @@ from jaxdn.files import write_json
 Row = dict[str, Any]
 
 BUDGET_S = {"steps": 180, "operations": 180, "train": 240, "input": 90, "compile": 60}
-"""Seconds for each group, in the order in which they run: a work starts only while its group has time left. Compiling
-in advance does not count; on two cores it takes about as long as all of this."""
+"""Seconds for each group, in the order in which they run: a workload starts only while its group has time left.
+Compiling in advance does not count; on two cores it takes about as long as all of this."""
 ONE_WORK_S = {"steps": 45, "operations": 6, "train": 60}
-"""Seconds for the rounds of one work; at least two rounds are run."""
+"""Seconds for the rounds of one workload; at least two rounds are run."""
 COMPILED = ("step-large-720p", "train-large-64")
 """The programs whose compile time is measured."""
 COMPILE_S = 240
-"""A compilation is stopped after so many seconds."""
+"""Time limit of one compilation, in seconds."""
 
 
 @dataclass
@@ -48,12 +48,12 @@ class Settings:
     """Time jaxdn, compared with its roofline, PyTorch and Open Image Denoise; write runs/bench.json."""
 
     only: Literal["all", "steps", "operations", "train", "compile", "input"] = "all"
-    """Run one group of works."""
+    """Run one group of workloads."""
     out: Path = Path("runs/bench.json")
 
 
 class Report:
-    """The rows so far, in a file that is complete after every work."""
+    """The rows so far, in a file that is complete after every workload."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.rows = path, []  # type: Path, list[Row]
@@ -95,7 +95,7 @@ def compare(
     others: Sequence[str],
     ideal_ms: float,
 ) -> list[Row]:
-    """Rows of one work: everything compared with the roofline, and ours with each of the ``others``.
+    """Rows of one workload: everything compared with the roofline, and ours with each of the ``others``.
 
     Args:
       work: its name.
@@ -113,7 +113,7 @@ def compare(
 
 
 def run(work: Work, probe: Probe, *, budget_s: float, say: Callable[[str], None]) -> list[Row]:
-    """Build the programs of a work, time them interleaved with the ceilings, then measure their peak memory."""
+    """Build the programs of a workload, time them interleaved with the ceilings, then measure their peak memory."""
     calls: dict[str, Call] = {}
     for name, build in {**work.ours, **work.peers}.items():
         try:
@@ -170,7 +170,7 @@ def input_rows() -> list[Row]:
 
 
 def table(rows: Sequence[Row]) -> Table:
-    """One line for each work and implementation, a column for each peer."""
+    """One line for each workload and implementation, a column for each peer."""
     against = list(dict.fromkeys(row["against"] for row in rows))
     shown = Table(title="ratios: own median over the peer's (below 1 is faster)")
     for title in ("work", "implementation", "median ms", "min - max ms", "peak MiB", *against):
@@ -196,7 +196,7 @@ def compiled(
     *,
     say: Callable[[str], None],
 ) -> Iterator[Work]:
-    """The works, after the programs that take long to compile are compiled into the caches, one process per core.
+    """The workloads, after the programs that take long to compile are compiled into the caches, one process per core.
 
     Compilers use one core, and PyTorch's may have to be stopped, which needs a separate process. The seconds that each
     took are stored in ``taken``.
@@ -216,7 +216,7 @@ def compiled(
 
 
 def groups(cache: Path, probe: Probe, say: Callable[[str], None]) -> dict[str, Iterator[Callable[[], list[Row]]]]:
-    """Group -> its works as calls that return rows."""
+    """Group -> its workloads as calls that return rows."""
 
     def timed(group: str, works: Iterator[Work]) -> Iterator[Callable[[], list[Row]]]:
         for work in works:
@@ -233,7 +233,7 @@ def groups(cache: Path, probe: Probe, say: Callable[[str], None]) -> dict[str, I
 
 
 def main(settings: Settings) -> None:
-    """Run the groups, write the file after each work, print the table."""
+    """Run the groups, write the file after each workload, print the table."""
     began = time.monotonic()
     console, report = Console(width=max(Console().width, 160)), Report(settings.out)
 
@@ -262,7 +262,7 @@ def main(settings: Settings) -> None:
             started = time.monotonic()
             while call is not None:
                 if time.monotonic() - started > BUDGET_S[group]:
-                    say(f"{group}: its {BUDGET_S[group]} s are used up; the remaining works are left out")
+                    say(f"{group}: its {BUDGET_S[group]} s are used up; the remaining workloads are left out")
                     break
                 with console.status(f"{group} ..."):
                     rows = call()

@@ -123,7 +123,7 @@ def denoise(denoiser: jaxdn.Denoiser, params: Params, clips: dict[str, Path]) ->
     runs: dict[str, Callable[[], Any]] = {}
     figures: dict[str, Any] = {"bytes": {}, "operations": {}}
     for name, clip in clips.items():
-        # The last frame: moving objects have started by then and not yet come to rest.
+        # The last frame: moving objects have started by then and have not stopped yet.
         frame = [jax.tree.map(jax.numpy.asarray, stored.frame) for stored in read_frames(clip)][-1]
         used: Frame = only(frame, denoiser.reads)
         state = denoiser.start(params, used)

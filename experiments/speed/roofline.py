@@ -1,8 +1,8 @@
-"""The roofline: a lower bound for the time of a work, from its operations and bytes and the machine's peak rates.
+"""The roofline: a lower bound for the time of a workload, from its operations and bytes and the machine's peak rates.
 
-The ceilings are measured interleaved with the work. Operations and bytes are counted from the shapes, not from a
+The ceilings are measured interleaved with the workload. Operations and bytes are counted from the shapes, not from a
 compiled program: every convolution reads its input once, writes its output once and does ``2 * 9 * Ci * Co`` operations
-per pixel. Nothing stays in a cache from one convolution to the next; other work that could be fused into one is not
+per pixel. Nothing stays in a cache from one convolution to the next; operations that could be fused into one are not
 counted.
 """
 
@@ -40,7 +40,7 @@ class Ceilings(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """Calls that reach the ceilings, to be timed interleaved with the work: a shared machine's speed varies."""
+    """Calls that reach the ceilings, to be timed interleaved with the workload: a shared machine's speed varies."""
 
     copy: Call
     bytes: float

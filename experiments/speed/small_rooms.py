@@ -163,7 +163,7 @@ SENSOR = (
     '<lookat origin="0,1,3.5" target="0,1,0" up="0,1,0"/></transform></sensor>'
 )
 FAR_BALL = ball(GREY, "behind", 'x="0" y="0.5" z="6"')
-"""It is outside of the box, behind the camera."""
+"""It is outside the box, behind the camera."""
 INTEGRATOR = '<integrator type="path"><integer name="max_depth" value="6"/></integrator>'
 
 

@@ -1,12 +1,11 @@
-"""Broken files: only documented errors, never a crash, a hang, a huge allocation or a file where none was asked for.
+"""Broken files must raise only documented errors: no crash, no hang, no huge allocation, no unexpected file.
 
     python -m experiments.stability.fuzz --inputs 100000      # some minutes; counts in runs/fuzz.json
     python -m experiments.stability.fuzz --only exr --first 4711 --inputs 1
 
 Input n of a kind is the same in every run (:mod:`experiments.stability.fuzz_inputs`), so ``--first`` repeats a single
-one. A run that was interrupted continues from the counts it left; without that file it starts over. Reading happens in
-processes of their own with a limit on memory and on time, so that whatever dies is reported with the number of the
-input that killed it.
+one. An interrupted run resumes from its saved counts; without that file it starts over. Files are read in separate
+processes with limits on memory and time, so that a crash is reported with the number of the input that caused it.
 """
 
 import contextlib
@@ -32,45 +31,45 @@ from jaxdn.commands.errors import plain_errors
 from jaxdn.files import write_json
 
 DOCUMENTED = (ValueError, OSError)
-"""What a broken file may raise: ClipError is a ValueError; a file of nothing may not open."""
+"""The errors that a broken file may raise: ClipError is a ValueError; an empty file may not open."""
 SECONDS = 20
-"""Of a processor, for one input; and thirty times as long by the clock, as a machine may stand still."""
+"""CPU time for one input; the limit of wall time is thirty times as long, as a machine may stall."""
 MEMORY = 1 << 30
-"""Bytes that reading a file of some kilobytes may take beyond what the process has already."""
+"""Bytes that reading a file of a few kilobytes may allocate."""
 
 
 @dataclass
 class Settings:
-    """Feed broken files to everything that reads files."""
+    """Feed broken files to every reader of files."""
 
     inputs: int = 100_000
-    """How many in all, shared between the kinds."""
+    """Total number of inputs, divided among the kinds."""
     only: Literal["all", "exr", "foreign", "record", "animation", "weights", "description"] = "all"
     first: int = 0
     """Number of the first input of each kind."""
     batch: int = 5000
-    """Inputs for each process."""
+    """Inputs per process."""
     out: Path = Path("runs/fuzz.json")
-    """Where the counts go, after every batch."""
+    """File for the counts, written after every batch."""
 
 
 class Counts(NamedTuple):
-    """What became of inputs."""
+    """Outcomes of inputs."""
 
     read: int
     refused: int
-    """With a documented error."""
+    """Inputs that raised a documented error."""
     bad: list[tuple[int, str]]
     """The number of each input that was not handled, and what happened."""
 
     @property
     def inputs(self) -> int:
-        """How many there were."""
+        """Total number of inputs."""
         return self.read + self.refused + len(self.bad)
 
 
 def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
-    """For each kind a function that writes the bytes where they belong and reads them as a user would."""
+    """For each kind a function that writes the bytes to the expected path and reads them as a user would."""
     from jaxdn.clips import read_clip, read_frame
     from jaxdn.clips.cache import open_cached
     from jaxdn.clips.evidence import read_facts
@@ -100,7 +99,7 @@ def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
         read_clip(clip)
         read_facts(clip)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a reference that is not finite is warned of, and taken as 0
+            warnings.simplefilter("ignore")  # a non-finite reference gives a warning and counts as 0
             open_cached(clip, cache=folder / "cache")
 
     return {
@@ -114,7 +113,7 @@ def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
 
 
 def child(kind: str, first: int, count: int, source: Path) -> None:
-    """Read a run of inputs; a line for each that says what became of it."""
+    """Read consecutive inputs; prints one line with the outcome of each."""
     faulthandler.enable()
     good = [file.read_bytes() for file in sorted((source / "good" / kind).iterdir())]
     with tempfile.TemporaryDirectory() as place:
@@ -155,13 +154,13 @@ def _address_space() -> int:
 
 
 def _listing(folder: Path) -> set[Path]:
-    """Every file under a folder but those of the cache that reading a clip for training makes."""
+    """Every file under a folder except those of the training cache."""
     found = {path.relative_to(folder) for path in folder.rglob("*")}
     return {path for path in found if path.parts[:2] != ("in", "cache")}
 
 
 def prepare(source: Path) -> Path:
-    """Write the good files where the processes that read find them; returns the folder."""
+    """Write the valid files into the folder of the reading processes; returns it."""
     (source / "in").mkdir(parents=True)
     for kind, files in good_files(source / "in").items():
         (source / "good" / kind).mkdir(parents=True)
@@ -171,9 +170,9 @@ def prepare(source: Path) -> Path:
 
 
 def run_kind(kind: str, first: int, count: int, source: Path, *, repeat: bool = True) -> Counts:
-    """Feed inputs of one kind; a process that dies loses its own input, not the ones after.
+    """Feed inputs of one kind; a process that dies affects only its current input.
 
-    With ``repeat`` that input gets a second chance: a machine that stood still for a while is no hang.
+    With ``repeat`` that input is tried a second time: a stalled machine is not a hang.
     """
     found, bad = {"read": 0, "refused": 0}, []
     done = first

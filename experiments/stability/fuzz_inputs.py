@@ -1,8 +1,8 @@
-"""Good files of every kind that is read, and ten thousand ways each of being broken; input n is the same in every run.
+"""Valid files of every kind that is read, and broken versions of them; input n is the same in every run.
 
-Half of the inputs are broken blindly: bits flipped, bytes cut, doubled, or replaced by numbers that are often badly
-handled. The other half keep their form, which is what gets past the first check: JSON that parses with a value, a name
-or a nesting that nobody expects (for safetensors, the JSON in its head), EXR with a wrong number in its header.
+Half of the inputs are corrupted at random: bits flipped, bytes cut, doubled, or replaced by numbers that are often
+handled wrongly. The other half stay well-formed, to get past the first check: JSON that parses, with an unexpected
+value, name or nesting (for safetensors, in the JSON header), EXR with a wrong number in its header.
 """
 
 import copy
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 KINDS = ("exr", "foreign", "record", "animation", "weights", "description")
-"""Frames of ours, frames of other renderers, clip.json, animation files, safetensors, the JSON that goes with them."""
+"""Frames of ours, frames of other renderers, clip.json, animation files, safetensors and their JSON."""
 _WORDS = (b"-1", b"0", b"1e999", b"NaN", b"99999999999999999999", b"null", b'"x"', b"[]", b"{}", b"true", b"-0.0")
 _INTEGERS = (0, 1, 2**31 - 1, 2**32 - 1, 2**24, 65536)
 _DEEP = "<deep>"  # becomes brackets in brackets, which json.dumps could not write
@@ -26,7 +26,7 @@ _VALUES: tuple[Any, ...] = (
 
 
 def good_files(folder: Path) -> dict[str, list[bytes]]:
-    """Whole files of each kind, also written where a reader expects them: ``clip/``, ``weights.safetensors`` ..."""
+    """Valid files of each kind, also written where a reader expects them: ``clip/``, ``weights.safetensors`` ..."""
     import jax
 
     from jaxdn.clips import write_clip
@@ -103,7 +103,7 @@ def _exr_files(folder: Path, channels: dict[str, np.ndarray]) -> list[bytes]:
 
 
 def broken(kind: str, good: list[bytes], number: int) -> bytes:
-    """Input ``number`` of a kind: one of its good files with one to eight things wrong."""
+    """Input ``number`` of a kind: one of its valid files with one to eight faults."""
     draw = random.Random(f"{kind} {number}")
     data = draw.choice(good)
     if draw.random() < 0.5:
@@ -118,7 +118,7 @@ def broken(kind: str, good: list[bytes], number: int) -> bytes:
 
 
 def blindly(good: bytes, draw: random.Random) -> bytes:
-    """Bits and bytes changed without regard to what they mean."""
+    """Bits and bytes changed regardless of their meaning."""
     data = bytearray(good)
     for _ in range(draw.choice((1, 1, 1, 2, 3, 5, 8))):
         at, length = draw.randrange(len(data) + 1), draw.randint(1, 16)
@@ -141,7 +141,7 @@ def blindly(good: bytes, draw: random.Random) -> bytes:
 
 
 def _header(good: bytes, draw: random.Random) -> bytes:
-    """An EXR file with a wrong number in the value of one of its header's attributes, or one of its letters wrong."""
+    """An EXR file with a wrong number or a wrong character in one of its header's attributes."""
     data = bytearray(good)
     attributes = ["dataWindow", "displayWindow", "channels", "compression", "lineOrder", "tiles", "type", "name"]
     at = data.find(draw.choice(attributes).encode() + b"\0")
@@ -161,7 +161,7 @@ def _header(good: bytes, draw: random.Random) -> bytes:
 
 
 def _json(good: bytes, draw: random.Random) -> bytes:
-    """JSON that parses, with one to three places in it that hold what nobody expects."""
+    """JSON that parses, with unexpected contents in one to three places."""
     root = [json.loads(good)]
     for _ in range(draw.choice((1, 1, 2, 3))):
         places = _places(root)
@@ -171,7 +171,7 @@ def _json(good: bytes, draw: random.Random) -> bytes:
             holder[key] = copy.deepcopy(draw.choice(_VALUES))
         elif how == 3:
             other, name = draw.choice(places)
-            holder[key] = copy.deepcopy(other[name])  # nothing may hold itself
+            holder[key] = copy.deepcopy(other[name])  # no container may contain itself
         elif how == 4 and isinstance(holder, dict):
             holder[draw.choice(("frame", "x", "", "../x", "keys", "size", "__metadata__"))] = holder.pop(key)
         elif holder is not root:

@@ -1,10 +1,10 @@
-"""Training that is killed (SIGKILL) at random moments ends in the same weights, bit for bit.
+"""Training that is killed (SIGKILL) at random moments ends with the same weights, bit for bit.
 
     python -m experiments.stability.kills --kills 60      # counts in runs/kills.json
 
-A tiny network is trained once in peace, and then by processes that are killed again and again: while they start and
-compile, between two steps, and while a checkpoint is being written. Started once more each time, training must lose
-nothing but the steps since its last checkpoint, and end with the weights, and the log, of the undisturbed run.
+A tiny network is trained once without interruption, and then by processes that are killed repeatedly: while they start
+and compile, between two steps, and while a checkpoint is being written. After each restart, training may lose only the
+steps since its last checkpoint, and must end with the weights and the log of the uninterrupted run.
 """
 
 import random
@@ -35,11 +35,11 @@ class Sizes(NamedTuple):
 
 @dataclass
 class Settings:
-    """Kill a training run at random moments and see what is left."""
+    """Kill a training run at random moments and check its result."""
 
     kills: int = 60
     seed: int = 0
-    """Decides the moments."""
+    """Seed of the moments."""
     out: Path = Path("runs/kills.json")
 
 
@@ -56,7 +56,7 @@ def make_clips(folder: Path) -> None:
 
 
 def train(clips: Path, folder: Path, sizes: Sizes) -> None:
-    """Train to the end, from wherever the folder stands, and write the weights."""
+    """Train to the end, resuming from the folder, and write the weights."""
     import jax
 
     from jaxdn.clips import training_batches
@@ -78,7 +78,7 @@ def train(clips: Path, folder: Path, sizes: Sizes) -> None:
 
 
 def start(clips: Path, folder: Path, sizes: Sizes) -> subprocess.Popen[str]:
-    """The training as a process of its own."""
+    """Training in a separate process."""
     command = [sys.executable, "-m", "experiments.stability.kills", "--child"]
     arguments = map(str, (clips, folder, *sizes))
     return subprocess.Popen([*command, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -102,7 +102,7 @@ def writing(folder: Path) -> bool:
 
 
 def wait(until: Callable[[], bool], process: subprocess.Popen[str]) -> bool:
-    """Look every millisecond; False if the process ended first."""
+    """Poll every millisecond; False if the process ended first."""
     while process.poll() is None:
         if until():
             return True
@@ -110,8 +110,8 @@ def wait(until: Callable[[], bool], process: subprocess.Popen[str]) -> bool:
     return False
 
 
-def shoot(process: subprocess.Popen[str], folder: Path, draw: random.Random) -> str | None:
-    """Kill at a random moment, of one of three sorts; None if the process was faster."""
+def kill(process: subprocess.Popen[str], folder: Path, draw: random.Random) -> str | None:
+    """Kill at a random moment of one of three kinds; None if the process ended first."""
     sort = draw.choice(("starting", "training", "training", "writing", "writing"))
     if sort == "starting":
         moment = time.monotonic() + draw.uniform(0.0, 8.0)
@@ -131,24 +131,24 @@ def shoot(process: subprocess.Popen[str], folder: Path, draw: random.Random) -> 
 
 
 def main(settings: Settings) -> int:
-    """Train in peace, train under fire, compare."""
+    """Train without and with kills, and compare."""
     draw, sizes = random.Random(settings.seed), Sizes()
     counts: dict[str, Any] = {"kills": 0, "while writing a checkpoint": 0, "runs": 0, "equal": 0, "each": []}
     with tempfile.TemporaryDirectory() as place:
-        clips, calm = Path(place) / "clips", Path(place) / "calm"
+        clips, whole = Path(place) / "clips", Path(place) / "whole"
         make_clips(clips)
         began = time.monotonic()
-        said, _ = start(clips, calm, sizes).communicate()
-        if not (calm / "weights.safetensors").is_file():
+        said, _ = start(clips, whole, sizes).communicate()
+        if not (whole / "weights.safetensors").is_file():
             print(said)
             return 1
-        print(f"undisturbed: {sizes.steps} steps in {time.monotonic() - began:.0f} s", flush=True)
+        print(f"uninterrupted: {sizes.steps} steps in {time.monotonic() - began:.0f} s", flush=True)
         while counts["kills"] < settings.kills:
-            shot = Path(place) / f"shot-{counts['runs']}"
-            if not _under_fire(clips, shot, sizes, draw, counts, settings.kills):
+            killed = Path(place) / f"killed-{counts['runs']}"
+            if not _killed_run(clips, killed, sizes, draw, counts, settings.kills):
                 return 1
             counts["runs"] += 1
-            counts["equal"] += same(calm, shot)
+            counts["equal"] += same(whole, killed)
             lost = [each["lost"] for each in counts["each"]]
             mean = round(float(np.mean(lost)), 2)
             counts |= {"most steps lost": max(lost), "mean steps lost": mean, **sizes._asdict()}
@@ -157,26 +157,26 @@ def main(settings: Settings) -> int:
             print(
                 f"{counts['kills']} kills, {counts['while writing a checkpoint']} of them while a checkpoint was being "
                 f"written, at most {max(lost)} steps lost; {counts['equal']} of {counts['runs']} runs ended in the "
-                f"undisturbed weights and log ({time.monotonic() - began:.0f} s)",
+                f"uninterrupted weights and log ({time.monotonic() - began:.0f} s)",
                 flush=True,
             )
-    # Saving is asynchronous: the newest checkpoint may still have been on its way, and one more interval is lost.
+    # Saving is asynchronous: the newest checkpoint may not have been complete yet, so one more interval may be lost.
     return int(counts["equal"] < counts["runs"] or counts["most steps lost"] > 2 * sizes.checkpoint_every)
 
 
-def _under_fire(
+def _killed_run(
     clips: Path, folder: Path, sizes: Sizes, draw: random.Random, counts: dict[str, Any], kills: int
 ) -> bool:
-    """One run to its end, killed as often as there are kills left; False if it could not go on."""
+    """One run to its end, killed until no kills are left; False if it could not resume."""
     while True:
         process = start(clips, folder, sizes)
         before = logged(folder)
-        sort = shoot(process, folder, draw) if counts["kills"] < kills else None
+        sort = kill(process, folder, draw) if counts["kills"] < kills else None
         if sort is None:
             said, _ = process.communicate()
             if process.returncode == 0:
                 return True
-            print(f"after {counts['kills']} kills the run did not go on:\n{said}")
+            print(f"after {counts['kills']} kills the run did not resume:\n{said}")
             return False
         seen, kept, torn = logged(folder), newest(folder), sort != "starting" and writing(folder)
         counts["kills"] += 1

@@ -1,10 +1,10 @@
-"""Thousands of frames: does the recurrent state of each denoiser stay bounded, drift, or keep what poisoned it?
+"""Thousands of frames: is each denoiser's recurrent state bounded, does it drift, and does it forget invalid frames?
 
     python -m experiments.stability.long_runs      # curves.json and curves.png in runs/long-runs/
 
-Three runs of 2,000 frames for each subject: a camera that rests; a clip played forwards and backwards, over and over;
-and the same with one frame in the middle in which every value is NaN or 1e30. Per frame: the largest magnitude in the
-state, the error of the output against the noise-free image, and, for a poisoned run, how far it is from the clean one.
+Three runs of 2,000 frames for each subject: a static camera; a clip played back and forth; and the same with one
+*poisoned* frame in the middle, in which every value is NaN or 1e30. Per frame: the largest magnitude in the state, the
+error of the output against the noise-free image, and, for a poisoned run, its distance from the clean one.
 """
 
 import functools
@@ -29,18 +29,18 @@ from jaxdn.frame import Frame
 from jaxdn.rollout import sampled
 
 SIZE, TURN = 48, 16
-"""Pixels of a side, and frames after which the clip runs the other way."""
+"""Width and height in pixels, and frames after which the clip is reversed."""
 POISONS = {"NaN": float("nan"), "1e30": 1e30}
 LAYERS = (1, 2, 4, 8)
-"""Samples of the noise that whoever asks for samples is served."""
+"""Samples per pixel of the layers, for denoisers that request samples."""
 
 
 @dataclass
 class Settings:
-    """Denoise for thousands of frames and keep curves."""
+    """Denoise thousands of frames and record curves."""
 
     subjects: tuple[str, ...] = field(default_factory=lambda: tuple(name for name in all_names() if name != NOISY))
-    """Filters, and names or paths of weights; default: all that come with the package."""
+    """Filters, and names or paths of weights; default: all that are shipped."""
     frames: int = 2000
     out: Path = Path("runs/long-runs")
 
@@ -49,7 +49,7 @@ class Curves(NamedTuple):
     """One value per frame of one run."""
 
     state: np.ndarray
-    """Largest magnitude in the recurrent state, its counters aside."""
+    """Largest magnitude in the recurrent state, except its counters."""
     error: np.ndarray
     """Mean absolute error against the noise-free image, relative to its mean."""
     healthy: np.ndarray
@@ -59,7 +59,7 @@ class Curves(NamedTuple):
 
 
 def _world(columns: jax.Array, rows: jax.Array) -> Frame:
-    """A textured wall before which stands a nearer, brighter square, noise-free."""
+    """A textured wall behind a nearer, brighter square, noise-free."""
     inside = ((columns > 20) & (columns < 34) & (rows > 14) & (rows < 30))[..., None]
     texture = jnp.stack([0.5 + 0.3 * jnp.sin(columns / 3), 0.5 + 0 * rows, 0.6 + 0.2 * jnp.cos(rows / 5)], axis=-1)
     albedo = jnp.where(inside, 0.8, texture)
@@ -106,30 +106,30 @@ def compiled(denoiser: Denoiser, params: Any, frames: int) -> Callable[[Any], An
     return jax.jit(run)
 
 
-def recovery(clean: Curves, spoilt: Curves, at: int) -> int:
+def recovery(clean: Curves, poisoned: Curves, at: int) -> int:
     """Frames from the poisoned one until the output stays within 1 % of the clean run's mean level."""
-    bad = np.flatnonzero(distance(clean, spoilt) > 0.01)
+    bad = np.flatnonzero(distance(clean, poisoned) > 0.01)
     return int(bad.max()) + 1 - at if bad.size else 0
 
 
-def distance(clean: Curves, spoilt: Curves) -> np.ndarray:
+def distance(clean: Curves, poisoned: Curves) -> np.ndarray:
     """Per frame the largest difference of the samples, relative to the clean run's mean."""
-    apart = np.abs(spoilt.sample - clean.sample).max(axis=(1, 2, 3))
+    apart = np.abs(poisoned.sample - clean.sample).max(axis=(1, 2, 3))
     return np.asarray(apart / np.abs(clean.sample).mean(axis=(1, 2, 3)))
 
 
 def examine(name: str, frames: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """All runs of one subject: what they came to, and their curves."""
+    """All runs of one subject: their results and curves."""
     subject = candidate(name)
     if subject.denoiser is None:
-        raise ValueError(f"subject {name!r}: expected something that denoises, got the noisy image itself.")
+        raise ValueError(f"subject {name!r}: expected a denoiser, got the noisy image itself.")
     run = compiled(subject.denoiser, subject.params, frames)
     at = frames // 2
 
     def curves(speed: float, poison: float = 0.0, poisoned: int = -1) -> Curves:
         return Curves(*map(np.asarray, run((jnp.float32(speed), jnp.float32(poison), jnp.int32(poisoned)))))
 
-    runs = {"static": curves(0.0), "to and fro": curves(0.7)}
+    runs = {"static": curves(0.0), "back and forth": curves(0.7)}
     runs |= {label: curves(0.7, poison, at) for label, poison in POISONS.items()}
     outcome: dict[str, Any] = {}
     lines: dict[str, np.ndarray] = {}
@@ -139,8 +139,8 @@ def examine(name: str, frames: int) -> tuple[dict[str, Any], dict[str, np.ndarra
         outcome[label] |= {"largest state": float(found.state.max()), "healthy": bool(found.healthy.all())}
         lines |= {f"{label}, state": found.state, f"{label}, error": found.error}
     for label in POISONS:
-        outcome[label]["frames to within 1 %"] = recovery(runs["to and fro"], runs[label], at)
-        lines[f"{label}, distance"] = distance(runs["to and fro"], runs[label])
+        outcome[label]["frames to within 1 %"] = recovery(runs["back and forth"], runs[label], at)
+        lines[f"{label}, distance"] = distance(runs["back and forth"], runs[label])
     return outcome, lines
 
 
@@ -153,7 +153,7 @@ def draw(curves: dict[str, dict[str, np.ndarray]], path: Path) -> None:
 
     figure, axes = plt.subplots(len(curves), 3, figsize=(15, 3.2 * len(curves)), squeeze=False, layout="constrained")
     for row, (name, lines) in zip(axes, curves.items(), strict=True):
-        for label in ("static", "to and fro"):
+        for label in ("static", "back and forth"):
             row[0].plot(lines[f"{label}, state"], label=label, linewidth=0.8)
             row[1].plot(lines[f"{label}, error"], label=label, linewidth=0.8)
         for label in POISONS:
@@ -169,7 +169,7 @@ def draw(curves: dict[str, dict[str, np.ndarray]], path: Path) -> None:
 
 
 def main(settings: Settings) -> None:
-    """Run all subjects, write curves.json and curves.png, print what they came to."""
+    """Run all subjects, write curves.json and curves.png, print the results."""
     settings.out.mkdir(parents=True, exist_ok=True)
     outcomes: dict[str, Any] = {}
     curves: dict[str, dict[str, np.ndarray]] = {}

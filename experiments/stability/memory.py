@@ -2,8 +2,8 @@
 
     python -m experiments.stability.memory --frames 2 60     # 1280 x 720, runs/memory.json
 
-Frames are foreign EXR files (beauty, albedo, normal, depth, motion) without a ``clip.json``. Each sequence is denoised
-by the command line in a process of its own, whose largest resident set is taken. Unix alone.
+Frames are another renderer's EXR files (beauty, albedo, normal, depth, motion). The command line denoises each sequence
+in a separate process, whose peak resident set is measured. Unix only.
 """
 
 import os
@@ -48,7 +48,7 @@ def write_sequence(folder: Path, frames: int, height: int, width: int) -> None:
 
 
 def peak_mib(source: Path, out: Path, method: str) -> float:
-    """The largest resident set of one `jaxdn denoise`, in MiB. Raises RuntimeError where it fails."""
+    """The peak resident set of one `jaxdn denoise`, in MiB. Raises RuntimeError where it fails."""
     command = [sys.executable, "-m", "jaxdn.cli", "denoise", str(source), "-o", str(out), "--method", method]
     command += ["--motion-convention", "previous-current"]
     child = os.posix_spawn(sys.executable, command, os.environ)
@@ -59,7 +59,7 @@ def peak_mib(source: Path, out: Path, method: str) -> float:
 
 
 def main(settings: Settings) -> None:
-    """Measure, print, keep."""
+    """Measure, print, save."""
     found: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as place:
         for count in settings.frames:

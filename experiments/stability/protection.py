@@ -1,11 +1,11 @@
-"""What protection costs: the same step with and without the repair of frames and histories, at 1280 x 720.
+"""The cost of repair: the same step with and without the repair of frames and histories, at 1280 x 720.
 
     python -m experiments.stability.protection      # runs/protection.json
 
-Both programs run in one process, interleaved, so that whatever else the machine does falls on both; each pair gives a
-ratio and the median of the ratios counts, of wall time and of the processors' time, which others disturb less. What is
-taken away is every ``repair`` and ``repair_image`` of :mod:`jaxdn.repair` that a denoiser calls. The safe powers and
-lengths of :mod:`jaxdn.numerics` are part of both: without them there is no gradient to speak of.
+Both programs run interleaved in one process, so that other load affects both. The result is the median of the ratios of
+all pairs, for wall time and for CPU time, which other load affects less. The program without repair lacks every
+``repair`` and ``repair_image`` of :mod:`jaxdn.repair` that a denoiser calls. The safe powers and lengths of
+:mod:`jaxdn.numerics` are part of both: without them gradients would not be finite.
 """
 
 import contextlib
@@ -45,7 +45,7 @@ Subject = tuple[Method, Mapping[str, Any]]
 
 
 def subjects() -> dict[str, Subject]:
-    """Filters by name, as they are by default, and each variant of the methods that learn."""
+    """Filters with their default options, and each variant of the learned methods, by name."""
     found: dict[str, Subject] = {}
     for name, method in methods().items():
         found |= {variant: (method, options) for variant, options in (method.variants or {name: {}}).items()}
@@ -54,7 +54,7 @@ def subjects() -> dict[str, Subject]:
 
 @dataclass
 class Settings:
-    """Time a step with and without its protection."""
+    """Time a step with and without repair."""
 
     subjects: tuple[str, ...] = field(default_factory=lambda: tuple(subjects()))
     pairs: int = 15
@@ -64,7 +64,7 @@ class Settings:
 
 
 def frame_of(reads: Collection[str], height: int, width: int) -> Frame:
-    """A noisy frame with every buffer in ``reads``, and nothing wrong in it."""
+    """A valid noisy frame with every buffer in ``reads``."""
     rng = np.random.default_rng(0)
 
     def drawn(buffer: Buffer) -> np.ndarray:
@@ -79,7 +79,7 @@ def frame_of(reads: Collection[str], height: int, width: int) -> Frame:
 
 @contextlib.contextmanager
 def unprotected() -> Iterator[None]:
-    """While this lasts, denoisers are traced without repair."""
+    """Inside this context denoisers are traced without repair."""
     kept = {"repair": repair, "repair_image": repair_image}
     neutral: dict[str, Callable[..., Any]] = {
         "repair": lambda frame: (frame, jnp.zeros((), jnp.int32)),
@@ -97,12 +97,12 @@ def unprotected() -> Iterator[None]:
 
 
 def stepper(subject: Subject, height: int, width: int) -> Callable[[], None]:
-    """A function that takes one step further, compiled under whatever protection there is now."""
+    """A function that runs the next step, compiled with repair unless inside :func:`unprotected`."""
     method, options = subject
-    denoiser = method.factory(**options)  # a new one each time: jax would take the trace of an old one
+    denoiser = method.factory(**options)  # a new one each time: jax would reuse an old trace
     frame = jax.tree.map(jnp.asarray, frame_of(denoiser.reads, height, width))
     params = denoiser.init(jax.random.key(0), frame)
-    states = [jax.tree.map(jnp.copy, denoiser.start(params, frame))]  # what is donated must not be given twice
+    states = [jax.tree.map(jnp.copy, denoiser.start(params, frame))]  # a buffer cannot be donated twice
     step = jax.jit(denoiser.step, donate_argnums=1).lower(params, states[0], frame).compile()
 
     def run() -> None:
@@ -113,7 +113,7 @@ def stepper(subject: Subject, height: int, width: int) -> Callable[[], None]:
 
 
 def seconds(run: Callable[[], None]) -> tuple[float, float]:
-    """Wall time of one call, and processor time of all its threads."""
+    """Wall time of one call, and CPU time of all its threads."""
     wall, busy = time.perf_counter(), time.process_time()
     run()
     return time.perf_counter() - wall, time.process_time() - busy
@@ -127,27 +127,27 @@ def measure(subject: Subject, pairs: int, *, height: int, width: int) -> dict[st
     for run in (with_it, without):
         run()
         run()
-    times = np.array([  # [pairs, (with, without), (wall, processors)]
+    times = np.array([  # [pairs, (with, without), (wall, CPU)]
         [seconds(with_it), seconds(without)] if pair % 2 else [seconds(without), seconds(with_it)][::-1]
         for pair in range(pairs)
     ])  # fmt: skip
-    ratios = times[:, 0] / times[:, 1]  # [pairs, (wall, processors)]
+    ratios = times[:, 0] / times[:, 1]  # [pairs, (wall, CPU)]
     (protected, busy), (bare, _) = np.median(times, axis=0)
     low, middle, high = np.percentile(ratios, (25, 50, 75), axis=0).round(4).tolist()
     return {
         "ms protected": round(1e3 * float(protected), 2),
         "ms without": round(1e3 * float(bare), 2),
-        "ms of processors": round(1e3 * float(busy), 2),
+        "ms of CPU time": round(1e3 * float(busy), 2),
         "ratio": middle[0],
         "ratio, quartiles": [low[0], high[0]],
-        "ratio of processor time": middle[1],
-        "ratio of processor time, quartiles": [low[1], high[1]],
+        "ratio of CPU time": middle[1],
+        "ratio of CPU time, quartiles": [low[1], high[1]],
         "pairs": pairs,
     }
 
 
 def main(settings: Settings) -> None:
-    """Measure all subjects and write what they cost."""
+    """Measure all subjects and write the results."""
     size = {"height": settings.height, "width": settings.width}
     known = subjects()
     unknown = [name for name in settings.subjects if name not in known]

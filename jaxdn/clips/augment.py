@@ -1,4 +1,4 @@
-"""The eight symmetries of a square, applied to a clip: what makes many clips out of one.
+"""The eight symmetries of a square, applied to a clip: data augmentation.
 
 A symmetry moves pixels *and* turns the vectors that live in the image plane, which are the buffers of the kind
 "vector" (:data:`jaxdn.frame.BUFFERS`): flipping the image left to right negates their x component, a quarter turn
@@ -36,7 +36,7 @@ def transform_motion(motion: np.ndarray, *, flip: bool, turns: int) -> np.ndarra
 
 
 def transform_clip(clip: Clip, *, flip: bool, turns: int) -> Clip:
-    """Every buffer of a clip, its reference and its layers under one symmetry; what is ``None`` stays so."""
+    """Every buffer of a clip, its reference and its layers under one symmetry; ``None`` stays ``None``."""
 
     def moved(images: Any) -> Any:
         return jax.tree.map(lambda image: transform_image(image, flip=flip, turns=turns), images)

@@ -1,4 +1,4 @@
-"""Clips as memory maps: what training reads instead of decoding EXR files for every crop.
+"""Clips as memory maps, so that training need not decode EXR files for every crop.
 
 ``<folder>/.cache/<clip>.<stamp>/`` holds one ``.npy`` file per buffer of a clip, in the precision it has in the EXR
 files. The stamp is made of the names, sizes and times of those files, so that a clip that changes gets a new cache; the
@@ -26,13 +26,13 @@ from jaxdn.clips.record import is_planned
 from jaxdn.files import write_json
 from jaxdn.frame import BUFFERS, GUIDES, Buffer, Clip, Frame, present, written_out
 
-_VERSION = 1  # of what the cache holds; another number leaves old caches behind
+_VERSION = 1  # of the cache's layout; caches of other versions are not used
 _LIGHT = BUFFERS["radiance"]
-"""How noisy layers and references are held."""
+"""How noisy layers and references are stored."""
 
 
 class CachedClip(NamedTuple):
-    """One clip, ready for random access; files are opened by :func:`read_window` and not before.
+    """One clip, ready for random access; files are opened only by :func:`read_window`.
 
     A memory map holds a file handle for as long as it lives, and a few hundred clips of a dozen buffers would need more
     of them than a process may have.
@@ -45,7 +45,7 @@ class CachedClip(NamedTuple):
     shape: tuple[int, int, int]
     """Frames, height, width."""
     arrays: frozenset[str]
-    """What is stored: names of buffers, ``reference`` and ``noisy_<n>spp``."""
+    """The stored arrays: names of buffers, ``reference`` and ``noisy_<n>spp``."""
     layers: tuple[int, ...]
     """The sample counts of the noisy layers."""
     planned: bool = False
@@ -53,12 +53,12 @@ class CachedClip(NamedTuple):
 
     @property
     def buffers(self) -> frozenset[str]:
-        """Names of the Frame buffers that there are, but for ``radiance``."""
+        """Names of the Frame buffers that are present, except ``radiance``."""
         return self.arrays & frozenset(GUIDES)
 
 
 def open_cached(path: str | Path, *, cache: str | Path | None = None) -> CachedClip:
-    """Open a clip through its cache (default: ``.cache`` next to the clip's folder), which is made if need be.
+    """Open a clip through its cache (default: ``.cache`` next to the clip's folder), which is created if it is missing.
 
     Reference values that are not finite or negative are 0 in the cache, and a UserWarning names the clip and how many
     there are; noisy images stay as they are, as denoisers repair their own input. Raises ClipError as
@@ -75,7 +75,7 @@ def open_cached(path: str | Path, *, cache: str | Path | None = None) -> CachedC
     if facts["bad_reference_values"]:
         warnings.warn(
             f"{path}: {facts['bad_reference_values']} values of the reference are not finite or negative; "
-            "they are taken as 0.",
+            "they count as 0.",
             stacklevel=2,
         )
     shape = (record["frames"], record["height"], record["width"])
@@ -90,9 +90,9 @@ def read_window(
     buffers: Collection[str] | None = None,
     layers: bool = False,
 ) -> Clip:
-    """The part ``window`` (frames, rows, columns) of a clip as a Clip of plain arrays with ``spp`` samples a pixel.
+    """The part ``window`` (frames, rows, columns) of a clip as a Clip of plain arrays with ``spp`` samples per pixel.
 
-    Buffers come out with the dtypes of :attr:`jaxdn.frame.Buffer.dtype`. ``buffers`` names the ones to read (default:
+    Buffers have the dtypes of :attr:`jaxdn.frame.Buffer.dtype`. ``buffers`` names the ones to read (default:
     all there are); of a clip that was rendered by a plan, those that it lacks are written out. With ``layers`` the
     clip's independent noisy layers of 1, 2, 4, ... samples are read too (``Clip.layers``).
     """
@@ -168,7 +168,7 @@ def _uniform(path: Path, record: Mapping[str, Any]) -> Iterator[StoredFrame]:
 
 
 def _images(stored: StoredFrame) -> Iterator[tuple[str, np.ndarray, Buffer]]:
-    """Everything to hold of a frame: the array's name, the array, and how it is stored."""
+    """Everything to store of a frame: the array's name, the array, and how it is stored."""
     for samples, image in stored.layers.items():
         yield _noisy(samples), image, _LIGHT
     for name in present(stored.frame):

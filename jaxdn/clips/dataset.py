@@ -1,9 +1,9 @@
 """Training data: an endless, shuffled, augmented, resumable stream of batches from a folder of clips.
 
 Every element is one clip's random window of consecutive frames, one random crop of it (the same over all its frames, so
-that history stays meaningful) under one of the eight symmetries of a square. What comes is decided by ``seed`` and the
-position in the stream alone: two streams with the same arguments are equal, and one restored from
-``get_state()`` goes on exactly where the other was.
+that history stays meaningful) under one of the eight symmetries of a square. It depends only on ``seed`` and the
+position in the stream: two streams with the same arguments are equal, and one restored from ``get_state()`` resumes
+exactly where the other was.
 """
 
 from collections.abc import Sequence
@@ -42,14 +42,14 @@ def training_batches(
       crop: side of the square crop, or (height, width), in pixels.
       frames: consecutive frames of each element.
       seed: decides the order, windows, crops and symmetries; from 0 to 2^32 - 1.
-      spp: samples a pixel of the noisy radiance; of several numbers, each element takes one at random.
+      spp: samples per pixel of the noisy radiance; of several numbers, each element takes one at random.
       buffers: Frame buffers to read, usually ``denoiser.reads`` (default: all that the clips have).
-      layers: give the independent noisy layers of 1, 2, 4, ... samples that every clip has too (``Clip.layers``), for a
-        denoiser that asks for samples.
+      layers: add the independent noisy layers of 1, 2, 4, ... samples that every clip has (``Clip.layers``), for a
+        denoiser that requests samples.
       augment: flips and quarter turns (no odd turns for a crop that is not square).
-      threads: batches made ahead, each by its own thread; 0 makes them when asked for.
+      threads: batches prepared in advance, each by its own thread; 0 prepares them when requested.
 
-    Its ``get_state()`` is a small dict for a checkpoint, to be given to ``set_state`` of an equal iterator.
+    Its ``get_state()`` is a small dict for a checkpoint, to be passed to ``set_state`` of an equal iterator.
 
     Raises ClipError, naming the clip, for clips that are broken, shorter than ``frames``, smaller than ``crop``,
     without reference, ``spp`` or ``layers``, or that do not all have the same buffers. Warns, naming the clip, of a
@@ -71,7 +71,7 @@ def training_batches(
     for source in sources:
         _check(source, (frames, height, width), counts)
     names = _common_buffers(sources, buffers)
-    # Each clip's are a beginning of 1, 2, 4, ...: the fewest are what all of them have.
+    # Each clip has the first layers of 1, 2, 4, ...: the clip with the fewest decides.
     common = min((doubling_layers(source.layers, source.path) for source in sources), key=len) if layers else []
 
     def element(index: int, rng: np.random.Generator) -> Clip:
@@ -92,7 +92,7 @@ def training_batches(
     indices = [index for index, source in enumerate(sources) for _ in range(source.shape[0] // frames)]
     # `repeat` before `random_map`: its generator is seeded by the position in the endless stream.
     stream = grain.MapDataset.source(indices).seed(seed).shuffle().repeat(None).random_map(element)
-    # Nothing ever remains of an endless stream, but rounding its length up overflows for batches of one.
+    # An endless stream has no incomplete last batch, but rounding its length up overflows for batches of one.
     batches = stream.batch(batch, drop_remainder=True, batch_fn=_stack)
     # Grain's own default is to keep 500 elements ready, which are batches here.
     options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=threads)
@@ -105,7 +105,7 @@ def _stack(clips: Sequence[Clip]) -> Clip:
 
 def _check(clip: CachedClip, sizes: tuple[int, int, int], counts: Sequence[int]) -> None:
     if clip.shape[0] < sizes[0]:
-        raise ClipError(f"{clip.path}: expected at least {sizes[0]} frames, got {clip.shape[0]}; ask for fewer frames.")
+        raise ClipError(f"{clip.path}: expected at least {sizes[0]} frames, got {clip.shape[0]}; use fewer frames.")
     if clip.shape[1] < sizes[1] or clip.shape[2] < sizes[2]:
         raise ClipError(
             f"{clip.path}: expected at least {sizes[2]} x {sizes[1]} pixels for the crop, got {clip.shape[2]} x "

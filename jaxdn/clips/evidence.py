@@ -1,7 +1,7 @@
-"""Facts about a finished clip, from what its buffers show: for when the scene itself is not at hand.
+"""Facts about a finished clip from its buffers, for clips whose scene is not available.
 
-Buffers show less than a scene does. Where they cannot decide, the effect is uncertain, and counts as present; a clip
-that was rendered by a plan says in its record what it was rendered for.
+Buffers show less than a scene does. Where they cannot decide, the effect is uncertain and counts as present. The record
+of a clip that was rendered by a plan lists the effects that it was rendered for.
 """
 
 from collections.abc import Mapping
@@ -20,10 +20,10 @@ _HIDDEN = {
     "transmission": "a buffer of the first surface does not show what lies behind it",
     "media": "no buffer shows a medium",
     "environment": "light from all around need not be seen by the camera",
-    "moving-shadow": "what casts a shadow need not be on screen",
+    "moving-shadow": "an object that casts a shadow need not be on screen",
     "changing-light": "noise hides small changes of light",
 }
-"""What no buffer can rule out."""
+"""Effects that no buffer can rule out."""
 
 
 def read_facts(path: str | Path, animation: Any = None) -> Facts:
@@ -75,16 +75,16 @@ class _Look:
         if index == 0:
             return Moment()
         if frame.dual_motion is not None:
-            # Not a number is equal to itself here: no vector in both is no difference.
+            # NaN equals NaN here: where both have no vector there is no difference.
             reveals = not np.array_equal(np.asarray(frame.dual_motion), np.asarray(frame.motion), equal_nan=True)
         else:
             reveals = moved and self._plan is None
             if reveals:
-                self._unsure.setdefault("disocclusion", "there are no dual motion vectors to tell")
+                self._unsure.setdefault("disocclusion", "there are no dual motion vectors")
         if self._cameras is None:
             camera, objects = moved, moved
             if moved:
-                why = "the vectors do not say whether the camera moves or what it sees"
+                why = "the vectors do not distinguish camera motion from object motion"
                 self._unsure |= dict.fromkeys(("camera-motion", "object-motion"), why)
         else:
             camera = self._cameras[index] != self._cameras[index - 1]
@@ -95,7 +95,7 @@ class _Look:
         return Moment(camera=camera, moving=movers, seen=movers, reveals=reveals)
 
     def _had(self, effect: str) -> bool:
-        """Whether the clip was rendered for an effect; without a plan nothing is known against it."""
+        """Whether the clip was rendered for an effect; without a plan this is assumed."""
         return self._plan is None or effect in self._plan["effects"]
 
     def _surface(self, frame: Frame) -> None:
@@ -111,13 +111,13 @@ class _Look:
             self._unsure.setdefault("specular", "there is no reflectance buffer")
         if frame.albedo is None or frame.ids is None:
             if self._plan is None:
-                self._unsure.setdefault("texture", "it takes albedo and ids to tell a texture from two shapes")
+                self._unsure.setdefault("texture", "albedo and ids are needed to distinguish a texture from two shapes")
         elif not self._textured:
             albedo, ids = np.asarray(frame.albedo), np.asarray(frame.ids)[..., 0]
             self._textured = any(np.any(np.ptp(albedo[ids == shape], axis=0) > 0) for shape in np.unique(ids[ids >= 0]))
 
     def facts(self) -> Facts:
-        """What all frames together show."""
+        """The facts that all frames together show."""
         hidden = {name: why for name, why in _HIDDEN.items() if self._had(name)}
         if self._plan is None and not self._lit:
             hidden = {}
@@ -135,7 +135,7 @@ def _some(buffer: Any) -> bool:
 
 
 def _sky(frame: Frame) -> np.ndarray | None:
-    """[H, W] bool, the camera's ray left the scene; None where no buffer tells."""
+    """[H, W] bool, the camera ray left the scene; None where no buffer shows it."""
     if frame.ids is not None:
         return np.asarray(np.asarray(frame.ids)[..., 0] < 0)
     return None if frame.depth is None else np.asarray(np.asarray(frame.depth)[..., 0] >= FAR)

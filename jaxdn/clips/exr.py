@@ -1,8 +1,8 @@
 """One OpenEXR file: named 2-D channels in, named 2-D channels out.
 
-The Python bindings accept much that they then write or read wrongly, so all traffic goes through here: they write
-non-contiguous arrays scrambled, turn ``[H, W, 1]`` into R, G, B, overflow float16 to infinity, do not notice that the
-disk is full while a file is small, and announce a truncated file with a printed warning instead of an error.
+All EXR files are read and written here, because the Python bindings fail silently: they scramble non-contiguous arrays,
+turn ``[H, W, 1]`` into R, G, B, overflow float16 to infinity, do not notice a full disk while a file is small, and
+print a warning instead of raising an error for a truncated file.
 """
 
 import errno
@@ -19,12 +19,12 @@ HALF_MAX = 65504.0
 """The largest float16."""
 
 _NAME_LIMIT = 255  # longer channel names are cut off silently
-_SIDE_LIMIT = 1 << 16  # a header that claims more is taken for a broken one, before anything is allocated for it
+_SIDE_LIMIT = 1 << 16  # a larger size in a header counts as damaged, before memory is allocated for it
 _STORABLE = (np.float16, np.float32, np.uint32)
 
 
 def to_half(values: np.ndarray) -> np.ndarray:
-    """float16, finite values clamped to +-65504 instead of overflowing; NaN and infinities stay what they are."""
+    """float16, finite values clamped to +-65504 instead of overflowing; NaN and infinities stay unchanged."""
     values = np.asarray(values)
     clamped = np.clip(values, -HALF_MAX, HALF_MAX)
     with np.errstate(invalid="ignore", over="ignore"):
@@ -34,8 +34,8 @@ def to_half(values: np.ndarray) -> np.ndarray:
 def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
     """Write 2-D channels (float16, float32 or uint32, all of one size) as one ZIP-compressed scanline file.
 
-    The file is written under a temporary name, read back, and then renamed: it is whole or not there. Raises ValueError
-    for channels that OpenEXR cannot hold and OSError (``errno.ENOSPC`` for a full disk) if the file cannot be written.
+    The file is written under a temporary name, read back, and then renamed: it is complete or absent. Raises ValueError
+    for channels that OpenEXR cannot store and OSError (``errno.ENOSPC`` for a full disk) if the file cannot be written.
     """
     path = Path(path)
     prepared = {name: _storable(path, name, pixels) for name, pixels in channels.items()}
@@ -49,21 +49,21 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
         except RuntimeError as error:
             code = errno.ENOSPC if "No space left" in str(error) else errno.EIO
             raise OSError(code, f"could not write the frame ({error})", str(path)) from error
-        # A disk that fills up within the last buffer goes unnoticed by the writer: look at what is really there.
+        # The writer does not notice a disk that fills up within the last buffer: check what was written.
         try:
             found = read_exr(temporary)
         except ClipError as error:
-            raise OSError(errno.ENOSPC, "the file came out incomplete; is the disk full?", str(path)) from error
+            raise OSError(errno.ENOSPC, "the file is incomplete after writing; is the disk full?", str(path)) from error
         if found.keys() != prepared.keys():
-            raise OSError(errno.EIO, "the file came out without some of its channels", str(path))
+            raise OSError(errno.EIO, "the file lacks some of its channels after writing", str(path))
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     """All channels of a file by their full names, 2-D, in the precision they are stored in.
 
     Of a file with several parts, each channel is named ``part.channel`` unless it already begins with its part's name.
-    Subsampled channels are left out. Raises ClipError, naming the file and the reason, if the file is missing, is no
-    OpenEXR file, is truncated or damaged, or holds deep data.
+    Subsampled channels are left out. Raises ClipError, naming the file and the reason, if the file is missing, not an
+    OpenEXR file, truncated or damaged, or has deep data.
     """
     path = Path(path)
     if not path.is_file():
@@ -83,7 +83,7 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
                         continue
                     pixels = channel.pixels
                     if not isinstance(pixels, np.ndarray) or pixels.ndim != 2 or pixels.dtype == object:
-                        raise ClipError(f"{path}: channel {name} is no flat image; deep data cannot be read.")
+                        raise ClipError(f"{path}: channel {name} is not a flat image; deep data cannot be read.")
                     found[_full_name(part.header, name, len(parts))] = pixels
     except ClipError:
         raise

@@ -1,4 +1,4 @@
-"""The error that everything about clips raises, and JSON files read with it."""
+"""The error of everything about clips, and JSON files read with it."""
 
 import json
 from pathlib import Path

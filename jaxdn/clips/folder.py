@@ -1,8 +1,8 @@
 """A clip as a folder: ``clip.json`` and ``frame_0000.exr``, ``frame_0001.exr`` ... in it.
 
-``clip.json`` is the clip's record: how it was made and what it holds. It is written last. While frames are being
-written the folder has ``clip.unfinished.json`` instead, by which an interrupted rendering goes on; such a folder is no
-clip yet.
+``clip.json`` is the clip's record: how it was made and what it contains. It is written last. While frames are being
+written the folder has ``clip.unfinished.json`` instead, from which an interrupted rendering is resumed; such a folder
+is not a clip yet.
 """
 
 import itertools
@@ -27,7 +27,7 @@ _UNFINISHED = "clip.unfinished.json"
 
 
 def frame_path(folder: str | Path, index: int) -> Path:
-    """Where frame ``index`` of a clip lies."""
+    """The path of frame ``index`` of a clip."""
     return Path(folder) / f"frame_{index:04d}.exr"
 
 
@@ -37,16 +37,17 @@ def is_clip(path: str | Path) -> bool:
 
 
 def begin_record(record: Mapping[str, Any], folder: str | Path) -> None:
-    """Say in a clip's folder, which is made if need be, what is about to be written into it.
+    """Start or extend a clip in a folder, which is created if it is missing, with the record of its future contents.
 
-    Writes ``record`` as ``clip.unfinished.json`` and takes ``clip.json`` away: a finished clip that gets more frames is
-    unfinished until :func:`finish_record`. To be called again when an entry changes in between. Raises ClipError if an
-    entry is missing or wrong and ValueError if one is no JSON, with the folder as it was; OSError if the disk refuses.
+    Writes ``record`` as ``clip.unfinished.json`` and removes ``clip.json``: a finished clip that gets more frames is
+    unfinished until :func:`finish_record`. Call it again when an entry changes in between. Raises ClipError if an
+    entry is missing or wrong and ValueError if one is not JSON, without changing the folder; OSError if it cannot be
+    written.
     """
     folder = Path(folder)
     record = checked({"format": FORMAT, **record}, folder / _UNFINISHED)
     folder.mkdir(parents=True, exist_ok=True)
-    # In this order: whatever interrupts it, there is a record, and until the second step it is the finished clip's.
+    # In this order there is always a record, however this is interrupted; until the second step, the finished clip's.
     write_json(folder / _UNFINISHED, record)
     (folder / _RECORD).unlink(missing_ok=True)
 
@@ -62,11 +63,11 @@ def finish_record(record: Mapping[str, Any], folder: str | Path) -> None:
 
 
 def begun_record(folder: str | Path) -> dict[str, Any] | None:
-    """The record of a clip that is finished or was interrupted; None where none was begun.
+    """The record of a clip that is finished or was interrupted; None where there is none.
 
     Raises ClipError if the record is broken or of another version.
     """
-    for file in (Path(folder) / _RECORD, Path(folder) / _UNFINISHED):  # where both are there, the clip is finished
+    for file in (Path(folder) / _RECORD, Path(folder) / _UNFINISHED):  # where both exist, the clip is finished
         if file.is_file():
             return checked(read_json(file), file)
     return None
@@ -111,12 +112,12 @@ def find_clips(path: str | Path) -> list[Path]:
 
 
 def write_clip(clip: Clip, path: str | Path, *, record: Mapping[str, Any] | None = None, spp: int = 1) -> None:
-    """Write a clip into the folder ``path``, which is made if need be; a clip that is there already is replaced.
+    """Write a clip into the folder ``path``, which is created if it is missing; an existing clip is replaced.
 
     The clip's radiance becomes its one noisy layer of ``spp`` samples a pixel. ``record`` is stored as ``clip.json``
-    with the entries that the frames decide (format, frames, width, height, layers) filled in. Light, fractions and
+    with the entries that follow from the frames (format, frames, width, height, layers) filled in. Light, fractions and
     directions keep half precision (:attr:`jaxdn.frame.Buffer.stored`). Raises ValueError for shapes that do not fit
-    each other or a record that is no JSON, before anything is written; OSError if the disk refuses.
+    each other or a record that is not JSON, before anything is written; OSError if a file cannot be written.
     """
     folder = Path(path)
     if np.ndim(clip.frames.radiance) != 4:
@@ -142,9 +143,8 @@ def write_clip(clip: Clip, path: str | Path, *, record: Mapping[str, Any] | None
 def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
     """The frames of a clip one by one, for clips that do not fit into memory. Raises as :func:`read_clip` does.
 
-    A clip that was rendered by a plan may have frames with other buffers than their neighbours (an object that starts
-    to move): what a frame lacks is ``None`` in it. A frame that shows what an earlier one did has its buffers and its
-    reference from there.
+    Frames of a clip that was rendered by a plan may have different buffers (an object starts to move): absent ones are
+    ``None``. A frame that shows the same as an earlier one takes its buffers and its reference from there.
     """
     folder = Path(path)
     record = read_record(folder)
@@ -212,13 +212,13 @@ def open_frames(
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
 ) -> tuple[list[Path], Iterator[StoredFrame]]:
-    """The files of a clip, or of another renderer's sequence, and their frames, each read when it is asked for.
+    """The files of a clip, or of another renderer's sequence, and their frames, each read when it is requested.
 
     Takes what :func:`read_clip` takes and raises as it does. The frames of another renderer have no ``layers`` and no
     reference.
     """
     if is_clip(path):
-        frames = read_frames(path, spp=spp)  # finds out first whether there are as many as the record claims
+        frames = read_frames(path, spp=spp)  # first checks that all frames of the record exist
         return [frame_path(path, index) for index in range(read_record(path)["frames"])], frames
     if _looks_unfinished(path):
         raise _unfinished(Path(path))
@@ -238,7 +238,7 @@ def read_clip(
 ) -> Clip:
     """Read a clip as NumPy arrays, with the dtypes of :attr:`jaxdn.frame.Buffer.dtype`.
 
-    A buffer that some frames have and others lack is written out in those (:func:`jaxdn.frame.written_out`).
+    A buffer that only some frames have is written out in the others (:func:`jaxdn.frame.written_out`).
 
     ``path`` is the folder of a clip, of which ``spp`` samples a pixel are read, and with ``layers`` the independent
     noisy layers of 1, 2, 4, ... samples too (``Clip.layers``); or a folder of, or a glob pattern for, the EXR files of
@@ -262,7 +262,7 @@ def read_clip(
 
 
 def _unfinished(folder: Path) -> ClipError:
-    """What is wrong with a folder that is no clip."""
+    """Why a folder is not a clip."""
     if (folder / _UNFINISHED).is_file():
         return ClipError(f"{folder}: rendering this clip was interrupted; run the same command again to finish it.")
     return ClipError(f"{folder}: there is no {_RECORD} in it; the clip was not finished. Render it again.")
@@ -274,7 +274,7 @@ def _looks_unfinished(path: str | Path) -> bool:
 
 
 def _names(stored: StoredFrame, *, planned: bool) -> set[str]:
-    """What all frames of a clip have to have; the buffers are the plan's own business."""
+    """What all frames of a clip must have; with a plan, buffers may differ."""
     light = {f"noisy_{samples}spp" for samples in stored.layers}
     light |= set() if stored.reference is None else {"reference"}
     return light if planned else light | set(present(stored.frame))

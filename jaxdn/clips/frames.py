@@ -2,7 +2,7 @@
 
 Noisy radiance is stored as *independent* layers of 1, 2, 4, ... samples a pixel, so that one rendering gives every
 sample count up to their sum: ``n`` samples are ``sum(2^k * layer_k) / n`` over the bits of ``n`` (Hasselgren et al.
-2020, sec. 2.2). A buffer that is ``None`` has no channels in the file, and comes back as ``None``. How a buffer is
+2020, sec. 2.2). A buffer that is ``None`` has no channels in the file, and is read as ``None``. How a buffer is
 stored follows from its row in :data:`jaxdn.frame.BUFFERS`.
 """
 
@@ -17,20 +17,20 @@ from jaxdn.clips.files import ClipError
 from jaxdn.frame import BUFFERS, GUIDES, Buffer, Frame
 
 _LIGHT = BUFFERS["radiance"]
-"""How noisy layers and references lie in the file; the radiance itself is made of the layers."""
+"""How noisy layers and references are stored; the radiance itself is combined from the layers."""
 
 
 class StoredFrame(NamedTuple):
     """What :func:`read_frame` finds: NumPy arrays with the dtypes of :attr:`jaxdn.frame.Buffer.dtype`."""
 
     frame: Frame
-    """Its radiance has the number of samples that was asked for."""
+    """Its radiance has the requested number of samples."""
     layers: dict[int, np.ndarray]
     """Every independent noisy image [H, W, 3] by its number of samples."""
     reference: np.ndarray | None
     """[H, W, 3] the converged radiance."""
     reference_half: np.ndarray | None
-    """[H, W, 3] the mean of the first half of the reference's samples: what the reference's own noise is."""
+    """[H, W, 3] the mean of the first half of the reference's samples, to measure the reference's noise."""
 
 
 def write_frame(
@@ -41,7 +41,7 @@ def write_frame(
     reference: Any = None,
     reference_half: Any = None,
 ) -> None:
-    """Write one frame, whole or not at all.
+    """Write one frame, completely or not at all.
 
     ``layers`` maps numbers of samples (1, 2, 4, ...) to independent noisy images [H, W, 3]; ``frame.radiance`` is
     not stored then. Without ``layers``, ``frame.radiance`` becomes the layer of one sample. Each buffer is stored as
@@ -101,7 +101,7 @@ def stored_layers(channels: Iterable[str]) -> list[int]:
 
 
 def doubling_layers(available: Iterable[int], where: str | Path) -> list[int]:
-    """The layers of 1, 2, 4, ... samples up to the first that is missing: what any number of samples is made of.
+    """The layers of 1, 2, 4, ... samples up to the first that is missing: any number of samples is combined from these.
 
     Raises ClipError if there is none of 1 sample.
     """
@@ -121,7 +121,7 @@ def combine(layers: Mapping[int, np.ndarray]) -> np.ndarray:
     """The float32 mean of independent images, each weighted with its number of samples."""
     if len(layers) == 1:
         return np.asarray(next(iter(layers.values())), np.float32)
-    with np.errstate(invalid="ignore"):  # Inf - Inf: what is broken in a layer stays visible in the sum
+    with np.errstate(invalid="ignore"):  # Inf - Inf: invalid values of a layer stay visible in the sum
         total = sum(np.float32(samples) * image.astype(np.float32) for samples, image in layers.items())
         return np.asarray(total / np.float32(sum(layers)), np.float32)
 
@@ -141,7 +141,7 @@ def layers_for(spp: int, available: Iterable[int], where: str | Path) -> list[in
         layers = ", ".join(map(str, available)) or "none"
         raise ClipError(
             f"{where}: {spp} samples a pixel are not available; there are independent layers of {layers} samples a "
-            "pixel: ask for one of these or, of powers of two, for their sums."
+            "pixel: request one of these or, of powers of two, a sum of them."
         )
     return chosen
 

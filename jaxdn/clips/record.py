@@ -1,4 +1,4 @@
-"""What a clip's record (``clip.json``) has to say, and what follows from it."""
+"""The contents of a clip's record (``clip.json``), and what follows from them."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +12,7 @@ FORMAT = 1
 
 
 def checked(record: Any, file: Path) -> dict[str, Any]:
-    """The record itself, if it is a sound one; raises ClipError, naming ``file`` and the entry, if it is not."""
+    """The record itself, if it is valid; raises ClipError, naming ``file`` and the entry, if it is not."""
     if not isinstance(record, dict):
         raise ClipError(f"{file}: expected a JSON object, got {type(record).__name__}.")
     if record.get("format") != FORMAT:
@@ -34,7 +34,7 @@ def checked(record: Any, file: Path) -> dict[str, Any]:
 
 
 def is_planned(record: Mapping[str, Any]) -> bool:
-    """Whether a clip was rendered by a plan: what it lacks is an absent effect, not something forgotten."""
+    """Whether a clip was rendered by a plan: a missing buffer is an absent effect, not an omission."""
     return record.get("plan") is not None
 
 
@@ -44,13 +44,13 @@ def held_frames(record: Mapping[str, Any]) -> list[int]:
 
 
 def _check_plan(plan: Any, count: int, file: Path) -> None:
-    """Raise ClipError unless a plan is None or says what each frame holds, whose it is, and for which effects."""
+    """Raise ClipError unless a plan is None or lists each frame's buffers, whose they are, and the effects."""
     if plan is None:
         return
     held = plan.get("held") if isinstance(plan, Mapping) else None
     frames = plan.get("frames") if isinstance(plan, Mapping) else None
-    sound = isinstance(held, list) and isinstance(frames, list) and len(held) == len(frames) == count
-    if not sound or not all(type(at) is int and 0 <= at <= index for index, at in enumerate(held or [])):
+    valid = isinstance(held, list) and isinstance(frames, list) and len(held) == len(frames) == count
+    if not valid or not all(type(at) is int and 0 <= at <= index for index, at in enumerate(held or [])):
         raise ClipError(f"{file}: plan: expected what each of {count} frames holds; render it again.")
     effects = plan.get("effects")
     if not isinstance(effects, list) or not all(isinstance(name, str) for name in effects):

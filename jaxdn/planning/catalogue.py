@@ -1,7 +1,7 @@
 """The effects that a scene may have: how each is found, and what is needed to simulate it.
 
-Effects are data, and the planner treats all alike: for a method that reads a new buffer, add the buffer to the effects
-that produce it, or add an effect. The absence of an effect equals the neutral value of its buffers
+Effects are data, and the planner treats all of them equally: for a method that reads a new buffer, add the buffer to
+the effects that produce it, or add an effect. The absence of an effect equals the neutral value of its buffers
 (:data:`jaxdn.frame.BUFFERS`).
 """
 
@@ -135,7 +135,7 @@ EFFECTS: tuple[Effect, ...] = (
     Effect("transmission", "Light passes through a surface.", _transmission, _SURFACE),
     Effect(
         "specular",
-        "A surface reflects another share of the light than its albedo.",
+        "A surface's reflectance differs from its albedo.",
         _specular,
         frozenset({"reflectance"}),
     ),

@@ -16,7 +16,7 @@ field of view in degrees. A shape's keys move it from its place in the scene fil
 then a translation. An inserted shape is a sphere, cube, cylinder (along z) or rectangle (facing +z) that fills a box of
 ``size`` (one number or its extents) around the origin; its keys place it. Between keys, positions are interpolated
 linearly, rotations about one axis linearly in the angle, other rotations spherically; before the first and after the
-last key everything rests. ``lights`` names emitters, or shapes that emit, and scales their radiance.
+last key nothing moves. ``lights`` names emitters, or shapes that emit, and scales their radiance.
 """
 
 import difflib
@@ -129,7 +129,7 @@ def rotation_matrix(axis: np.ndarray, degrees: float) -> np.ndarray:
 
 def slerp(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
     """Spherical interpolation of two rotations at ``share``: first (first^T second)^share."""
-    if np.array_equal(first, second):  # by its own test below, rounding may turn what stands still
+    if np.array_equal(first, second):  # exact: rounding must not turn a static shape
         return first
     between = first.T @ second
     cosine = np.clip((np.trace(between) - 1) / 2, -1.0, 1.0)
@@ -299,9 +299,9 @@ def _known(value: Any, names: Sequence[str], place: str) -> None:
 
 
 def _numbers(value: Any, count: int, place: str) -> np.ndarray:
-    sound = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == count
+    valid = isinstance(value, Sequence) and not isinstance(value, str) and len(value) == count
     # Compared and not asked whether it is finite: a whole number may be larger than any float.
-    if not sound or not all(
+    if not valid or not all(
         isinstance(x, int | float) and not isinstance(x, bool) and abs(x) <= sys.float_info.max for x in value
     ):
         raise ValueError(f"{place}: expected {count} finite number{'s' * (count > 1)}, got {value!r}.")

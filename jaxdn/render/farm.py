@@ -66,7 +66,7 @@ def render_clips(
     waiting = [_as_begun(job) for job in jobs]
     folders = [job.folder for job in waiting]
     if len({os.path.abspath(folder) for folder in folders}) != len(folders):
-        raise ValueError("render_clips: expected a folder of its own for every clip.")
+        raise ValueError("render_clips: expected a different folder for every clip.")
     total = sum(job.frames for job in waiting)
     waiting = [job for job in waiting if not _finished(job)]
     limit = max(1, min(workers or os.cpu_count() or 1, len(waiting)))

@@ -39,15 +39,15 @@ class GBuffer(NamedTuple):
     names: tuple[str, ...]
     """The names of the scene's shapes, sorted: the same shape has the same id in every frame."""
     reflectance: np.ndarray | None = None
-    """[H, W, 3] float32 share of light from all around that goes to the camera, in [0, 1], 1 on a miss; None where it
-    was not asked for."""
+    """[H, W, 3] float32 share of uniform incident light that is reflected to the camera, in [0, 1], 1 on a miss; None
+    if it was not requested."""
 
 
 def shape_names(scene: Any) -> list[str]:
     """The name of every shape in the scene's order; unnamed shapes are named by their index."""
     names = [shape.id() or f"shape_{index:04d}" for index, shape in enumerate(scene.shapes())]
     if len(set(names)) != len(names):
-        raise ValueError("scene: expected every shape to have an id of its own; load it with optimize=False.")
+        raise ValueError("scene: expected every shape to have a unique id; load it with optimize=False.")
     return names
 
 
@@ -65,8 +65,8 @@ def check_scene(scene: Any) -> None:
 def gbuffer(scene: Any, *, reflectance: bool = False) -> GBuffer:
     """Trace one ray through the centre of every pixel of the scene's first sensor, with the current variant.
 
-    With ``reflectance`` (:mod:`jaxdn.render.reflectance`) a material that cannot be averaged is warned of by the name
-    of its shape, once, and its albedo taken.
+    With ``reflectance`` (:mod:`jaxdn.render.reflectance`) a material that cannot be averaged gives one warning with the
+    name of its shape, and its albedo is used.
     """
     names = shape_names(scene)
     ranks = {name: rank for rank, name in enumerate(sorted(names))}
@@ -98,7 +98,7 @@ def gbuffer(scene: Any, *, reflectance: bool = False) -> GBuffer:
 
 
 def _reflectance(found: dict[str, np.ndarray], albedo: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """What was averaged, in [0, 1], with the albedo where that gave no number."""
+    """The averaged reflectance in [0, 1], and the albedo where that is NaN."""
     broken = (found["ids"] >= 0) & ~np.all(np.isfinite(found["reflectance"]), axis=-1, keepdims=True)
     for number in np.unique(found["ids"][broken]):
         _warn(names[int(number)])
@@ -108,8 +108,8 @@ def _reflectance(found: dict[str, np.ndarray], albedo: np.ndarray, names: Sequen
 
 @functools.cache
 def _warn(shape: str) -> None:
-    """Once for each shape, not once for each frame."""
-    warnings.warn(f"{shape}: what its material reflects cannot be averaged; its albedo is taken.", stacklevel=2)
+    """Warn once for each shape, not for each frame."""
+    warnings.warn(f"{shape}: the reflectance of its material cannot be averaged; its albedo is used.", stacklevel=2)
 
 
 def _vectorised(

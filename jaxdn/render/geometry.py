@@ -95,7 +95,7 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
     """
     now, before = current.gbuffer, previous.gbuffer
     if now.names != before.names or now.ids.shape != before.ids.shape:
-        raise ValueError("motion: expected two frames of one size with the same shapes; shapes may not come or go.")
+        raise ValueError("motion: expected two frames of one size with the same shapes; none may appear or disappear.")
     size = now.ids.shape[:2]
     back = relative_poses(now.names, current.pose, previous.pose)[now.ids[..., 0]]
     same_camera = _same(current.camera, previous.camera)

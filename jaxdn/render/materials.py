@@ -106,7 +106,7 @@ def _rough(bsdf: Any, *, squared: bool) -> Material:
         found = Range(low, high, any(one.varies for one in ranges), all(one.known for one in ranges))
         name = "alpha"
     if not found.known:
-        reason = f"{bsdf.class_name()}: what its {name} texture holds cannot be read"
+        reason = f"{bsdf.class_name()}: the values of its {name} texture cannot be read"
         return Material(frozenset({"glossy"}), unsure={"glossy": reason})
     return Material(frozenset({"glossy"})) if found.low < 1 else NOTHING
 
@@ -208,5 +208,5 @@ def material_of(bsdf: Any) -> Material:
         "transmission": flags & int(known.Transmission),
     }
     present = frozenset(lobe for lobe, bits in lobes.items() if bits)
-    reason = f"{kind}: taken by its flags, as nothing else is known of it"
+    reason = f"{kind}: classified only by its flags, as the class is unknown"
     return Material(present, textured=True, unsure=dict.fromkeys(sorted(present - {"diffuse"} | {"texture"}), reason))

@@ -17,8 +17,8 @@ def children(plugin: Any) -> list[tuple[str, Any]]:
 def _walk(variant: str) -> Any:
     """The class of the callback for one variant, made once.
 
-    A class is part of a cycle of references, and what one made for each call would have found lived until Python next
-    looks for cycles: scenes of frames long done, whose objects still have numbers, so that kernels do not fit again.
+    A class is part of a reference cycle. With one class per call, the objects that it found would live until the next
+    garbage collection: scenes of finished frames, whose registered objects would cause kernels to be compiled again.
     """
 
     class Walk(mi.TraversalCallback):

@@ -1,18 +1,18 @@
-"""What the surface in every pixel reflects: the share F_b of light from all around that it sends to the camera.
+"""The reflectance of the surface in every pixel: the share F_b of uniform incident light that it reflects.
 
 ``F_b(w_o) = integral of f_r(w_i, w_o) cos(theta_i) dw_i`` is the mean of the weights f cos / pdf that ``bsdf.sample``
-gives (Zhuang et al. 2021, eq. 5), so it comes from the very BSDF that the renderer samples, and agrees with it. Three
-ways, by what a material needs:
+gives (Zhuang et al. 2021, eq. 5), so it agrees with the renderer, which samples the same BSDF. It is found in one of
+three ways, depending on the material:
 
-* a diffuse one: the albedo, which is its F_b;
-* one that is the same all over the surface: a table over the cosine, made once for each material that is met;
+* diffuse: the albedo, which is its F_b;
+* constant over the surface: a table over the cosine, computed once per material;
 * any other (textures, bumps, blends by a texture): the mean of a few samples in every pixel, at the camera ray's hit.
 
-The samples are fixed low-discrepancy points, the same in every pixel and frame: no noise, and nothing that flickers.
+The samples are fixed low-discrepancy points, the same in every pixel and frame: no noise and no flicker.
 
-What passes through a surface counts as reflected. Its radiance is scaled by 1 / eta^2 on the way in and back on the
-way out, which is no loss: without that factor clear glass reflects 1, and nothing is divided. Of a mask, what passes
-through counts as 1: ``opacity * F_b + 1 - opacity``.
+Transmitted light counts as reflected. Its radiance is scaled by 1 / eta^2 on the way in and back on the way out, which
+is not a loss: without that factor clear glass has F_b = 1, so its radiance is not divided. For a mask, the light that
+passes through counts as 1: ``opacity * F_b + 1 - opacity``.
 """
 
 import functools
@@ -31,9 +31,9 @@ COSINES = 64
 TABLE_SAMPLES = 2048
 """Samples that an entry is the mean of."""
 PIXEL_SAMPLES = 32
-"""Samples of a pixel whose material differs from place to place."""
+"""Samples per pixel of a material that varies over the surface."""
 _KEPT = 1024
-"""Tables kept, of 1.5 KiB each: an animated scene is built anew for every frame, with the same materials."""
+"""Tables kept, of 1.5 KiB each: an animated scene is rebuilt for every frame, with the same materials."""
 
 _TABLED, _ALBEDO, _NEITHER, _AVERAGED = 0, -1, -2, -3
 """The ways. A material with a table is numbered from 0 upwards by it, one that is averaged from -3 downwards."""
@@ -53,7 +53,7 @@ class Reflectances:
         tables: list[np.ndarray] = []
         self._averaged: list[Any] = []
         self._numbers: dict[int, int] = {}
-        # The wrappers are kept, so that Mitsuba hands out the same ones again and they can be told apart.
+        # The wrappers are kept, so that Mitsuba returns the same ones again and their ids identify the materials.
         self._materials = list(_materials(scene))
         for material in self._materials:
             number = _way(material)
@@ -67,7 +67,7 @@ class Reflectances:
         self._tables = np.stack(tables) if tables else np.ones((1, 2 * COSINES, 3), np.float32)
 
     def of_pixels(self, hit: Any, bsdf: Any, active: Any, albedo: Any) -> Any:
-        """F_b of all hits at once, for the vectorised variants; not a number where a material cannot be averaged."""
+        """F_b of all hits at once, for the vectorised variants; NaN where a material cannot be averaged."""
         numbers = {int(_identity(mi.BSDFPtr(one))[0]): self._numbers[id(one)] for one in self._materials}
         by_identity = np.full(max(numbers, default=0) + 1, _NEITHER, np.int32)
         by_identity[list(numbers)] = list(numbers.values())
@@ -108,7 +108,7 @@ def _materials(scene: Any) -> Iterator[Any]:
 
 
 def _identity(bsdf: Any) -> Any:
-    """The number by which a vectorised variant knows a BSDF; 0 is none."""
+    """The number that a vectorised variant assigns to a BSDF; 0 is none."""
     reinterpret: Any = dr.reinterpret_array
     return reinterpret(mi.UInt32, bsdf)
 
@@ -118,7 +118,7 @@ def _way(bsdf: Any) -> int:
     if is_lambertian(bsdf):
         return _ALBEDO
     parts = list(_tree(bsdf))
-    # What is not known here may have no samples: it is tried, as an error in the tracer would end the whole frame.
+    # An unknown class may not support sampling: it is tested, as an error in the tracer would end the whole frame.
     if any(part.class_name() not in _KNOWN for part in parts if isinstance(part, mi.BSDF)) and not _samples(bsdf):
         return _NEITHER
     uniform = all(
@@ -168,7 +168,7 @@ def _places(cosine: Any, numbers: Any) -> tuple[Any, Any]:
 
 @functools.cache
 def _points_array(count: int) -> np.ndarray:
-    """[count, 3] low-discrepancy points in (0, 1)^3 (Hammersley): which lobe, and where in it; count: a power of 2."""
+    """[count, 3] low-discrepancy points in (0, 1)^3 (Hammersley): lobe, and direction in it; count: a power of 2."""
     index = np.arange(count)
 
     def inverse(base: int) -> np.ndarray:
@@ -216,7 +216,7 @@ _made: dict[str, np.ndarray] = {}
 
 
 def _table(bsdf: Any) -> np.ndarray:
-    """[2 * COSINES, 3] F_b of a material that is the same everywhere, from within and from without."""
+    """[2 * COSINES, 3] F_b of a material that is constant over the surface, from inside and from outside."""
     content = _content(bsdf)
     if content not in _made:
         if len(_made) >= _KEPT:
@@ -228,7 +228,7 @@ def _table(bsdf: Any) -> np.ndarray:
 
 
 def _content(bsdf: Any) -> str:
-    """All that a material is, as text: its name for it says the same of the same material in the next frame's scene."""
+    """All parameters of a material as text: equal for the same material in the next frame's scene."""
     parameters = mi.traverse(bsdf)
     exact = (np.asarray(parameters[name], np.float64).tobytes().hex() for name in parameters.keys())  # noqa: SIM118
     return "|".join([str(mi.variant()), str(bsdf), *exact])
@@ -244,7 +244,7 @@ def _table_at_once(bsdf: Any, cosines: np.ndarray) -> np.ndarray:
     lobe, x, y = (dr.gather(mi.Float, points, sample + axis) for axis in range(3))
     hit = _seen_from(dr.safe_sqrt(1 - dr.square(cosine)), cosine)
     sampled, weight = bsdf.sample(mi.BSDFContext(), hit, lobe, mi.Point2f(x, y), True)
-    # Of a weight that is the same for all (thin glass) there is one value, and not one a lane.
+    # A weight that is the same for all lanes (thin glass) has only one value.
     weight = mi.Color3f(weight * dr.square(sampled.eta)) + mi.Color3f(dr.zeros(mi.Float, dr.width(lane)))
     dr.eval(weight)
     return np.array(weight, np.float64).T.reshape(len(cosines), TABLE_SAMPLES, 3).mean(axis=1)

@@ -32,7 +32,7 @@ def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | Non
     lights = _lights(built, shapes)
     around = frozenset(light.name for light in lights if light.environment)
     if around and not np.any(gbuffer(built).ids < 0):
-        uncertain["emission"] = "the environment is not seen in a small picture of frame 0, but may be later"
+        uncertain["emission"] = "the environment is not seen in a small image of frame 0, but may be later"
         around = frozenset()
 
     stage = _Stage(scene, shapes, (height, width), around)
@@ -62,7 +62,7 @@ def _surfaces(built: Any, shapes: Mapping[str, Any]) -> tuple[list[Surface], dic
         for material in materials:
             uncertain |= {effect: f"{name}: {reason}" for effect, reason in material.unsure.items()}
         if shape.class_name() == "Instance" and not members:
-            reason = f"{name}: what an instance shows could not be read"
+            reason = f"{name}: the contents of an instance could not be read"
             uncertain |= dict.fromkeys(("glossy", "mirror", "transmission", "specular", "texture"), reason)
         lobes = frozenset().union(*(material.lobes for material in materials))
         textured = any(material.textured for material in materials)

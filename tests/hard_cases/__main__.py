@@ -1,10 +1,10 @@
-"""Everything, and the page: what ``make hard-cases`` runs.
+"""Run all hard cases and write the page: ``make hard-cases``.
 
 python -m tests.hard_cases                # runs/hard-cases/table.html and table.json
 
-What is done lies in ``runs/hard-cases/parts``, one file for each function: interrupted, it goes on from there, as long
-as neither the package nor the cases have changed. Compiled programs are kept there too, so that the run after a fix
-compiles only what the fix has changed.
+Results are stored in ``runs/hard-cases/parts``, one file for each function; an interrupted run is resumed from them, as
+long as neither the package nor the cases have changed. Compiled programs are cached there too, so that a run after a
+fix compiles only what the fix has changed.
 """
 
 import hashlib
@@ -32,7 +32,7 @@ FOLDER = Path("runs/hard-cases")
 
 
 def fingerprint() -> str:
-    """Changes with the package, the cases, jax and the device: results of another state are not taken over."""
+    """Changes with the package, the cases, jax and the device: results of another state are not reused."""
     here = Path(__file__).parent
     package = (here.parent.parent / "jaxdn").rglob("*.py")
     sources = sorted([*(path for path in here.glob("*.py") if path.name != "page.py"), *package])
@@ -41,7 +41,7 @@ def fingerprint() -> str:
 
 
 def part(name: str, state: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """The result of ``make()``, from its file where that is of the same state; else made, and written there."""
+    """The result of ``make()``, read from its file if that has the same state, else computed and written."""
     path = FOLDER / "parts" / f"{name.replace(' ', '-').replace(',', '')}.json"
     if path.is_file():
         known = json.loads(path.read_text())
@@ -56,12 +56,12 @@ def part(name: str, state: str, make: Callable[[], dict[str, Any]]) -> dict[str,
 
 
 def picture(image: np.ndarray, exposure: float) -> str:
-    """The data address of linear radiance [H, W, 3], exposed and encoded for a display; magenta is no number."""
+    """The data address of linear radiance [H, W, 3], exposed and encoded for a display; magenta is NaN."""
     return data_address(encode_png(np.asarray(color.tonemap(np.asarray(image, np.float32) * exposure))))
 
 
 def exposure_of(case: str) -> float:
-    """What brings the median of a case's reference to a middle grey, so that moonlight and noon can both be seen."""
+    """The exposure that maps the median of a case's reference to middle grey, so that dark and bright cases show."""
     middle = float(np.median(CASES[case].make(good()).clip.reference))
     return 0.3 / middle if middle > 0 else 1.0
 
@@ -75,7 +75,7 @@ def of_subject(subject: Subject) -> dict[str, Any]:
 
 
 def given_pictures() -> dict[tuple[str, str], str]:
-    """What goes in: the last noisy frame of each case, and its reference."""
+    """The inputs: the last noisy frame of each case, and its reference."""
     shown = {}
     for name, case in CASES.items():
         clip = case.make(good()).clip

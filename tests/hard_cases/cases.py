@@ -1,4 +1,4 @@
-"""What goes wrong in practice, as inputs: each case is one function of a clip in which nothing is wrong.
+"""Faults that occur in practice, as inputs: each case is one function of a valid clip.
 
 All cases have the same buffers, and all but the last four the same shapes, so that one compiled program serves
 them. A new case is one more function here.
@@ -15,9 +15,9 @@ from jaxdn.methods.table import methods
 from tests.hard_cases.inputs import BY_HAND, WIDTH, Inputs, dotted, filled, good, replaced
 
 WITHOUT_NAN: tuple[Kind, ...] = ("flag", "id")
-"""Kinds that hold neither NaN nor infinity."""
+"""Kinds that have neither NaN nor infinity."""
 WITH_SIGN: tuple[Kind, ...] = ("signed", "direction", "vector")
-"""Kinds in which nothing is wrong with a negative value."""
+"""Kinds for which negative values are valid."""
 
 
 class Case(NamedTuple):
@@ -25,7 +25,7 @@ class Case(NamedTuple):
 
     name: str
     sentence: str
-    """Where it happens in practice."""
+    """Where it occurs in practice."""
     make: Callable[[Inputs], Inputs]
 
 
@@ -35,7 +35,7 @@ CASES: dict[str, Case] = {}
 def case(
     sentence: str, *, name: str | None = None
 ) -> Callable[[Callable[[Inputs], Inputs]], Callable[[Inputs], Inputs]]:
-    """Decorator: make a function of good inputs a case, under its own name unless another is given."""
+    """Decorator: make a function of valid inputs a case, under its own name unless another is given."""
 
     def keep(make: Callable[[Inputs], Inputs]) -> Callable[[Inputs], Inputs]:
         known = name or make.__name__.replace("_", " ")
@@ -45,7 +45,7 @@ def case(
     return keep
 
 
-@case("nothing is wrong: what the others are compared with")
+@case("valid inputs, to compare the others with")
 def control(inputs: Inputs) -> Inputs:
     return inputs
 
@@ -60,17 +60,17 @@ def fireflies_of_1e2(inputs: Inputs) -> Inputs:
     return dotted(inputs, "radiance", 1e2)
 
 
-@case("the brightest that a half-precision file holds")
+@case("the largest value of a half-precision file")
 def fireflies_of_65504(inputs: Inputs) -> Inputs:
     return dotted(inputs, "radiance", 65504.0)
 
 
-@case("beyond what a half-precision file holds")
+@case("beyond the largest value of a half-precision file")
 def fireflies_beyond_half_precision(inputs: Inputs) -> Inputs:
     return dotted(inputs, "radiance", 1e30)
 
 
-@case("an overflow that was clipped: the largest number there is")
+@case("an overflow that was clipped: the largest finite number")
 def fireflies_of_the_largest_number(inputs: Inputs) -> Inputs:
     return dotted(inputs, "radiance", np.finfo(np.float32).max)
 
@@ -92,13 +92,13 @@ def radiance_infinite(inputs: Inputs) -> Inputs:
     return dotted(dotted(inputs, "radiance", np.inf), "radiance", -np.inf, every=11)
 
 
-@case("a filter with negative lobes was in the renderer")
+@case("the renderer's pixel filter has negative lobes")
 def radiance_negative(inputs: Inputs) -> Inputs:
     return dotted(inputs, "radiance", -3.0)
 
 
 def _breakable() -> list[str]:
-    """The buffers that can hold broken values, of those in the scene and those that a method of the package reads."""
+    """The buffers that can have invalid values, of those in the scene and those that a method of the package reads."""
     read = set(BY_HAND)
     for method in methods().values():
         for options in ({}, *method.variants.values()):
@@ -140,14 +140,14 @@ def constant(inputs: Inputs) -> Inputs:
     return inputs._replace(clip=inputs.clip._replace(reference=np.full_like(inputs.clip.reference, 0.5)))
 
 
-@case("a converged still image shown again and again: no change from frame to frame")
+@case("a converged still image, repeated: no change from frame to frame")
 def identical_frames(inputs: Inputs) -> Inputs:
     first = {name: np.broadcast_to(buffer[:1], buffer.shape) for name, buffer in inputs.clip.frames._asdict().items()}
     still = inputs.clip._replace(reference=np.broadcast_to(inputs.clip.reference[:1], inputs.clip.reference.shape))
     return replaced(inputs._replace(clip=still), **first)
 
 
-@case("the first sample that ever hit anything")
+@case("only one sample has hit a light so far")
 def one_bright_pixel(inputs: Inputs) -> Inputs:
     radiance = np.zeros_like(inputs.clip.frames.radiance)
     radiance[:, 5, 7] = 6e4
@@ -227,7 +227,7 @@ def normals_at_right_angles(inputs: Inputs) -> Inputs:
     return replaced(inputs, normal=normal)
 
 
-@case("a transformation with a scale nobody meant: lengths near the largest number, and near the smallest")
+@case("a wrong scale in a transformation: lengths near the largest and the smallest number")
 def normals_of_extreme_length(inputs: Inputs) -> Inputs:
     normal = 3e38 * inputs.clip.frames.normal
     normal[:, ::2] = 2e-38 * inputs.clip.frames.normal[:, ::2]
@@ -252,7 +252,7 @@ def depth_far(inputs: Inputs) -> Inputs:
 
 
 @case(
-    "an insect on the lens before a mountain, through a hole in the mesh, under an infinite sky",
+    "an object at the lens, a mountain, a hole in the mesh and an infinite sky",
     name="depth of 0, 1e-6, 1e6 and infinity in one frame",
 )
 def depth_of_all_kinds(inputs: Inputs) -> Inputs:
@@ -282,18 +282,18 @@ def every_pixel_off_screen(inputs: Inputs) -> Inputs:
     return filled(filled(inputs, "motion", 1e4), "dual_motion", 1e4)
 
 
-@case("a vector that no integer holds")
+@case("a vector too large for any integer")
 def motion_of_1e30(inputs: Inputs) -> Inputs:
     return filled(filled(inputs, "motion", 1e30), "dual_motion", -1e30)
 
 
-@case("a new object fills the picture: nothing was seen before")
+@case("a new object fills the image: nothing was visible before")
 def every_pixel_disoccluded(inputs: Inputs) -> Inputs:
     inputs = replaced(inputs, visible=np.zeros_like(inputs.clip.frames.visible))
     return filled(inputs, "dual_motion", 3.0)
 
 
-@case("another room from one frame to the next, and motion says nothing of it")
+@case("a cut to another scene, which the motion vectors do not show")
 def cut(inputs: Inputs) -> Inputs:
     other = good(7).clip.frames
     frames = {}
@@ -304,7 +304,7 @@ def cut(inputs: Inputs) -> Inputs:
     return replaced(inputs, **frames)
 
 
-@case("somebody switches the light off")
+@case("the light is switched off")
 def light_switched_off(inputs: Inputs) -> Inputs:
     radiance = np.array(inputs.clip.frames.radiance)
     radiance[1:] = 0
@@ -338,46 +338,46 @@ def brightness_made_small(inputs: Inputs) -> Inputs:
     return replaced(inputs, radiance=1e-3 * inputs.clip.frames.radiance)
 
 
-@case("a network that was trained too fast")
+@case("a network trained with too high a learning rate")
 def logits_of_1e4(inputs: Inputs) -> Inputs:
     return inputs._replace(logits=1e4 * np.sign(inputs.logits), blend=1e4 * np.sign(inputs.blend))
 
 
-@case("a network that has learned nothing: all taps alike")
+@case("an untrained network: all taps equal")
 def logits_all_equal(inputs: Inputs) -> Inputs:
     return inputs._replace(logits=np.full_like(inputs.logits, 3.0), blend=np.zeros_like(inputs.blend))
 
 
-@case("a network that keeps its input")
+@case("a network that returns its input")
 def logits_one_hot(inputs: Inputs) -> Inputs:
     logits = np.full_like(inputs.logits, -1e4)
     logits[..., 12] = 0
     return inputs._replace(logits=logits)
 
 
-@case("a network one of whose weights has become no number")
+@case("a network with a NaN among its weights")
 def logits_with_one_that_is_not_a_number(inputs: Inputs) -> Inputs:
     logits = np.array(inputs.logits)
     logits[..., 3] = np.nan
     return inputs._replace(logits=logits)
 
 
-@case("a metric of what was disoccluded, where nothing was")
+@case("a metric over disoccluded pixels when there are none")
 def mask_of_nothing(inputs: Inputs) -> Inputs:
     return inputs._replace(mask=np.zeros_like(inputs.mask))
 
 
-@case("a metric of what was disoccluded, right after a cut")
+@case("a metric over disoccluded pixels right after a cut")
 def mask_of_everything(inputs: Inputs) -> Inputs:
     return inputs._replace(mask=np.ones_like(inputs.mask))
 
 
-@case("numbers too small to be normal")
+@case("numbers below the smallest normal one")
 def subnormal_radiance(inputs: Inputs) -> Inputs:
     return filled(inputs, "radiance", 1e-40)
 
 
-@case("a probe, or a test that somebody reduced to the utmost")
+@case("a probe, or a minimal test")
 def size_1x1(inputs: Inputs) -> Inputs:
     return good(height=1, width=1)
 
@@ -392,6 +392,6 @@ def size_3x3_and_two_frames(inputs: Inputs) -> Inputs:
     return good(frames=2, height=3, width=3)
 
 
-@case("a crop by hand: no power of two divides it")
+@case("a crop by hand: not divisible by a power of two")
 def size_17x31(inputs: Inputs) -> Inputs:
     return good(height=17, width=31)

@@ -1,4 +1,4 @@
-"""What denoisers and operations are given: a clip in which nothing is wrong, and the ways to spoil one buffer of it."""
+"""The inputs of denoisers and operations: a valid clip, and ways to corrupt one of its buffers."""
 
 from typing import Any, NamedTuple
 
@@ -11,11 +11,11 @@ BY_HAND = frozenset({
     *("radiance", "albedo", "normal", "depth", "roughness", "motion", "dual_motion", "visible", "previous_depth"),
     *("ids", "direct", "emission"),
 })  # fmt: skip
-"""The buffers that show the wall and the square; all others are drawn by their kind."""
+"""The buffers that show the wall and the square; all others are random values of their kind."""
 
 
 class Inputs(NamedTuple):
-    """What denoisers and operations are given."""
+    """The inputs of denoisers and operations."""
 
     clip: Clip
     logits: np.ndarray
@@ -23,13 +23,13 @@ class Inputs(NamedTuple):
     blend: np.ndarray
     """[H / 2, W / 2, 1] of a composition, before the sigmoid; rounded up where the size is odd."""
     mask: np.ndarray
-    """[T, H, W, 1] in {0, 1}: the pixels that a metric or the occlusion loss is about."""
+    """[T, H, W, 1] in {0, 1}: the pixels of a metric or of the occlusion loss."""
 
 
 def good(seed: int = 0, *, frames: int = FRAMES, height: int = HEIGHT, width: int = WIDTH) -> Inputs:
-    """A wall, and a square that moves over it by 1.5 px a frame: noisy, with every buffer, and nothing wrong.
+    """A wall, and a square that moves over it by 1.5 px a frame: noisy, valid, with every buffer.
 
-    The buffers that are not :data:`BY_HAND` have values that are sound for their kind, and nothing to do with the wall.
+    The buffers that are not :data:`BY_HAND` have random values that are valid for their kind.
     """
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[:height, :width].astype(np.float32)
@@ -67,7 +67,7 @@ def good(seed: int = 0, *, frames: int = FRAMES, height: int = HEIGHT, width: in
 
 
 def _drawn(name: str, buffer: Buffer, shape: tuple[int, ...], seed: int) -> np.ndarray:
-    """Random values [*shape, C] that nothing is wrong with; a buffer's own whichever others there are."""
+    """Valid random values [*shape, C], which depend only on the buffer."""
     rng = np.random.default_rng([seed, *name.encode()])
     shape = (*shape, buffer.channels)
     match buffer.kind:
@@ -96,7 +96,7 @@ def replaced(inputs: Inputs, **buffers: Any) -> Inputs:
 
 
 def filled(inputs: Inputs, name: str, value: Any) -> Inputs:
-    """One value in all of a buffer."""
+    """One value in every pixel of a buffer."""
     buffer = getattr(inputs.clip.frames, name)
     return replaced(inputs, **{name: np.full_like(buffer, value)})
 

@@ -1,4 +1,4 @@
-"""How far the learned networks are from what a filter obeys by construction: flips, channels, brightness."""
+"""How far learned networks deviate from invariances of filters: flips, channels, brightness."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -15,18 +15,18 @@ from tests.hard_cases.inputs import good
 from tests.hard_cases.subjects import denoised
 
 FRAMES, HEIGHT, WIDTH = 8, 64, 96
-"""Multiples of 16: padding at one side is not what is asked here."""
+"""Multiples of 16: padding at one side is not tested here."""
 
 
 class Law(NamedTuple):
-    """One change of the input, and how far a method is from changing its output alike."""
+    """One transformation of the input, and how far a method is from transforming its output equally."""
 
     law: str
     method: str
     difference: float
     """RMS of (denoised change - changed denoised clip) over the RMS of the latter."""
     error: float
-    """RMS of (denoised clip - reference) over the same: what the difference is to be compared with."""
+    """RMS of (denoised clip - reference) over the same, to compare the difference with."""
 
 
 def _changed(clip: Clip, change: Callable[[Buffer, np.ndarray], np.ndarray]) -> Clip:
@@ -38,7 +38,7 @@ def _changed(clip: Clip, change: Callable[[Buffer, np.ndarray], np.ndarray]) -> 
 def _flipped(axis: int, sign: tuple[float, float]) -> Callable[[Clip], Clip]:
     """Mirror every buffer along x (axis -2) or y (axis -3); vectors across it change their sign, normals do not.
 
-    World-space normals belong to the scene, which a camera may see in a mirror.
+    World-space normals stay: a flipped image shows a mirrored scene in mirrored axes.
     """
 
     def flip(buffer: Buffer, values: np.ndarray) -> np.ndarray:
@@ -55,7 +55,7 @@ def _brighter(factor: float) -> Callable[[Clip], Clip]:
 
 
 def _permuted(clip: Clip) -> Clip:
-    """Red, green and blue take each other's place in everything that has a colour."""
+    """Red, green and blue permuted in every buffer that has colours."""
 
     def permute(buffer: Buffer, values: np.ndarray) -> np.ndarray:
         colored = buffer.channels == 3 and buffer.kind in ("light", "fraction")

@@ -1,4 +1,4 @@
-"""The page: every case against every denoiser and operation, the worst of each cell, with what it looks like."""
+"""The page: every case against every denoiser and operation, the worst result of each cell, with pictures."""
 
 import html
 import json
@@ -51,13 +51,13 @@ def write_page(
     body = f"""<h1>Hard cases</h1>
 <p>{len(cases)} cases, {sum(map(len, kinds.values()))} functions, {len(table)} cells: <span class="green key">
 {counts["green"]} green</span> <span class="red key">{counts["red"]} red</span> <span class="input key">
-{counts["input"]} pass on</span> what was no number in the input, or has no finite true value (the PSNR of identical
+{counts["input"]} pass on</span> NaN or infinity of the input, or have no finite true value (the PSNR of identical
 images), as a pure function may and a denoiser may not. Compiled by jax {jax.__version__} for {jax.default_backend()}.
 </p>
-<p>Green is finite, inside its bounds, and close to the same function in double precision. Numbers are the largest
+<p>Green is finite, within its bounds, and close to the same function in double precision. Numbers are the largest
 difference from it, relative to the largest value (small ones: bfloat16 inputs); – is
 where infinity in the input leaves nothing to compare. Point at
-a cell for all that was found; click it for the case{" and its pictures" if pictures else ""}.</p>
+a cell for all its results; click it for the case{" and its pictures" if pictures else ""}.</p>
 {_list("Red", red) if red else ""}{tables}{_laws(laws) if laws else ""}
 <h2>Cases</h2>{"".join(_section(case, cells, pictures) for case in cases)}"""
     page = folder / "table.html"
@@ -160,8 +160,8 @@ def _laws(laws: Sequence[Law]) -> str:
         f"<td>{law.error:.1e}</td><td>{law.difference / law.error:.2f}</td></tr>\n"
         for law in laws
     )
-    return f"""<h2>Laws of the learned networks</h2><p>A filter that is right commutes with each of these changes of its
-input; a network has only learned to. How far it fails: root mean square of the difference between the denoised change
+    return f"""<h2>Invariances of the learned networks</h2><p>A filter commutes with each of these changes of its
+input; a network has only learned to. Its deviation: root mean square of the difference between the denoised change
 and the changed denoised clip, relative to the clip's own root mean square; and how far the denoised clip is from its
-reference in the same measure. A filter without weights is there to compare.</p><table><thead><tr><th>change
+reference in the same measure. A filter without weights is included for comparison.</p><table><thead><tr><th>change
 </th><th>method</th><th>difference</th><th>error</th><th>ratio</th></tr></thead><tbody>{body}</tbody></table>"""

@@ -1,4 +1,4 @@
-"""What the hard cases are put to: every registered denoiser and every public operation, as functions of the inputs."""
+"""The subjects of the hard cases: every registered denoiser and every public operation, as functions of the inputs."""
 
 from collections.abc import Callable
 from functools import partial
@@ -23,24 +23,24 @@ _PICTURED = {*(f"warp, {border}" for border in _BORDERS), "apply_kernels", "soft
 
 
 class Subject(NamedTuple):
-    """A function of inputs, and what has to hold of its result."""
+    """A function of inputs, and the conditions on its result."""
 
     name: str
     run: Callable[[Any, Inputs], Any]
     """(params, inputs) -> array."""
     params: Any = ()
     repairs: bool = False
-    """It has to make something usable of anything; the others may pass on what is no number in their input."""
+    """Its result must always be finite; the others may pass on NaN or infinity of their input."""
     bounds: tuple[float, float] = (-np.inf, np.inf)
     truth: Callable[[Any, Inputs], Any] | None = None
     """The same without its reduced precision inside, for the comparison in double; None: ``run`` itself."""
     pictured: bool = False
-    """What comes out is worth looking at."""
+    """Its result is shown as a picture."""
     kind: str = "operation"
 
 
 def denoiser_subjects() -> list[Subject]:
-    """Every method that is registered now, in its lightest variant, each precision and both ways to divide light.
+    """Every registered method, in its smallest variant, each precision and both ways to divide light.
 
     A network has the weights that training starts from.
     """
@@ -73,7 +73,7 @@ def _on_clips(denoiser: jaxdn.Denoiser) -> Callable[[Any, Inputs], jax.Array]:
 
 
 def denoised(denoiser: jaxdn.Denoiser, params: Any, clip: Clip) -> jax.Array:
-    """The denoised clip; whoever asks for samples gets the radiance, broken or not, for each number of them."""
+    """The denoised clip; if samples are requested, every layer is the radiance."""
     if denoiser.samples is not None:
         clip = clip._replace(layers=dict.fromkeys((1, 2, 4, 8), clip.frames.radiance))
     return jaxdn.denoise(denoiser, params, clip)
@@ -172,7 +172,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
 
 
 def operation_subjects() -> list[Subject]:
-    """Every public operation, and the repair of a frame, which every denoiser begins with."""
+    """Every public operation, and the repair of a frame, the first step of every denoiser."""
     pure = [
         Subject(name, lambda params, inputs, run=run: run(inputs), pictured=name in _PICTURED)
         for name, run in _operations().items()
@@ -186,10 +186,9 @@ def operation_subjects() -> list[Subject]:
 
 
 def gradient_of(run: Callable[[Any, Inputs], Any]) -> Callable[[Any, Inputs], Any]:
-    """The gradient of a weighted mean of what ``run`` gives, by its parameters, the radiance and the logits.
+    """The gradient of a weighted mean of the result of ``run``, by its parameters, the radiance and the logits.
 
-    The weights differ from value to value, up to 1 and of both signs: of weights that sum to 1 a plain mean has no
-    gradient at all.
+    The weights vary from -1 to 1: the plain mean of normalised kernels, for one, has a gradient of zero.
     """
 
     def mean(params: Any, radiance: Any, logits: Any, inputs: Inputs) -> jax.Array:

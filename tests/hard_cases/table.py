@@ -1,4 +1,4 @@
-"""The crossing of cases, subjects, precisions and directions, and what came of each: one row a cell."""
+"""All combinations of cases, subjects, precisions and directions with their results: one row per cell."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -16,10 +16,10 @@ DIRECTIONS = ("forward", "gradient")
 ERROR_BOUND = {"single": 2e-3, "half": 0.1}
 """Largest error against the same function in double precision on the same inputs, relative to its largest value.
 
-``half`` is for what comes out in bfloat16, or was computed in it on purpose.
+``half`` is for results in bfloat16, or deliberately computed in it.
 """
 STEEPEST = 1e9
-"""A gradient beyond this is as good as infinite to an optimiser."""
+"""A gradient beyond this counts as infinite."""
 
 _MOST, _LEAST = float(np.finfo(np.float32).max), float(np.finfo(np.float32).tiny)
 
@@ -35,13 +35,13 @@ class Row(NamedTuple):
     direction: str
     finite: bool
     largest: float
-    """Largest magnitude that came out."""
+    """Largest magnitude of the result."""
     error: float | None
     """Against double precision, where that is finite; None where there is nothing to compare."""
     verdict: str
-    """``green``, ``red``, or ``input`` where a pure function passes on what was no number before."""
+    """``green``, ``red``, or ``input`` where a pure function passes on NaN or infinity."""
     reason: str
-    """Of a verdict that is not green."""
+    """The reason of a verdict that is not green."""
 
 
 def rows(
@@ -62,7 +62,7 @@ def rows(
             forward = direction == "forward"
             exact = subject.truth or subject.run
             run = jax.jit(subject.run if forward else gradient_of(subject.run))
-            # The comparison is run once for each case: made quickly rather than quick, in a third of the time.
+            # The comparison runs once for each case: compiled without optimisation, in a third of the time.
             double = jax.jit(
                 exact if forward else gradient_of(exact), compiler_options={"xla_backend_optimization_level": 0}
             )
@@ -77,7 +77,7 @@ def rows(
 
 
 def _cast(inputs: Inputs, precision: str) -> Inputs:
-    """Half-precision inputs are what a file or a GPU gives."""
+    """Half-precision inputs, as a file or a GPU gives them."""
     if precision == "float32":
         return inputs
 
@@ -121,13 +121,13 @@ def _judge(case: str, subject: Subject, precision: str, direction: str, result: 
         # Below the smallest normal number XLA:CPU rounds to 0, as most hardware does.
         scale = max(float(np.max(np.abs(truth[both]), initial=0.0)), 1e3 * _LEAST)
         size = min(1.0, float(np.max(np.abs(_leaves(inputs.clip.frames.radiance)), initial=0.0)))
-        if scale < 1e-9 * size:  # 0 because its terms cancel: met to the rounding of what cancels
+        if scale < 1e-9 * size:  # 0 because its terms cancel: equal up to the rounding of the terms
             scale = 1e-4 * size
         error = float(np.max(np.abs(found[both] - truth[both]), initial=0.0)) / scale
     reduced = subject.truth is not None or jax.tree.leaves(result)[0].dtype == jnp.bfloat16
     bound = ERROR_BOUND["half" if reduced else "single"]
 
-    # What double precision cannot make finite either comes from the input, or from the true value (an infinite PSNR).
+    # Not finite in double precision either: it comes from the input or is the true value (an infinite PSNR).
     excused = np.zeros_like(finite) if subject.repairs else ~representable
     verdict, reason = "green", ""
     if not np.all(finite | excused):
@@ -148,7 +148,7 @@ def _judge(case: str, subject: Subject, precision: str, direction: str, result: 
 
 
 def _infinite(inputs: Inputs) -> bool:
-    """Whether there is an infinity in anything that an operation is given."""
+    """Whether any input of an operation has an infinity."""
     frames = inputs.clip.frames
     read = (frames.radiance, frames.motion, frames.dual_motion, frames.normal, inputs.clip.reference, inputs.logits)
     return any(bool(np.any(np.isinf(np.asarray(array).astype(np.float64)))) for array in read)

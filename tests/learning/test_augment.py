@@ -1,4 +1,4 @@
-"""The symmetries: a transformed clip is the clip of the transformed world."""
+"""The symmetries: a transformed clip is the clip of the transformed scene."""
 
 import itertools
 
@@ -67,7 +67,7 @@ def test_a_clip_is_transformed_in_every_buffer(rng: np.random.Generator) -> None
     np.testing.assert_array_equal(clip.reference, clip.frames.radiance + 1)
     for samples, offset in ((1, 2), (2, 3)):
         np.testing.assert_array_equal(clip.layers[samples], clip.frames.radiance + offset)
-    # Pixel (x, y) of a picture 6 wide goes to 5 - x by the flip, and then (x, y) -> (y, 5 - x) by the turn: (y, x).
+    # Pixel (x, y) of an image 6 wide goes to 5 - x by the flip, and then (x, y) -> (y, 5 - x) by the turn: (y, x).
     for name in ("radiance", *present(frames)):
         before, after = getattr(frames, name)[:, 1, 5], getattr(clip.frames, name)[:, 5, 1]
         turned = before[..., ::-1] if BUFFERS[name].kind == "vector" else before  # normals are in world space
@@ -75,7 +75,7 @@ def test_a_clip_is_transformed_in_every_buffer(rng: np.random.Generator) -> None
 
 
 def test_vectors_that_are_not_motion_are_turned_too(rng: np.random.Generator) -> None:
-    """Where a shadow or a reflection came from lies in the image plane; a gradient of luminance does not."""
+    """Vectors of shadows and reflections lie in the image plane; a gradient of luminance does not."""
     plane = rng.random((1, 4, 4, 2))
     frames = Frame(rng.random((1, 4, 4, 3)), shadow_motion=plane, glossy_motion=plane, luminance_gradient=plane)
     found = transform_clip(Clip(frames), flip=False, turns=2).frames

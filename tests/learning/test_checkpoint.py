@@ -1,4 +1,4 @@
-"""Checkpoints with every file of theirs torn, emptied, lost or with one bit wrong: the one before is taken, or told."""
+"""Checkpoints with any file truncated, emptied, deleted or with a flipped bit: the previous one is restored."""
 
 import shutil
 
@@ -54,7 +54,7 @@ def damaged_copies(whole, place, how):
 
 @pytest.mark.filterwarnings("ignore:checkpoint", "ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("how", ["torn", "empty", "lost", "flipped"])
-def test_whatever_happened_to_a_file_what_comes_back_is_what_was_written(whole, tmp_path, how):
+def test_a_damaged_file_never_restores_other_values(whole, tmp_path, how):
     steps = []
     for file, folder in damaged_copies(whole, tmp_path, how):
         found = restored(folder)
@@ -64,7 +64,7 @@ def test_whatever_happened_to_a_file_what_comes_back_is_what_was_written(whole, 
         assert found[1] == {"position": step}, file
         assert (folder.parent / "damaged-6").is_dir() == (step == 3)
         steps.append(step)
-    assert set(steps) == {3, 6}, "some files are spare, others are not"
+    assert set(steps) == {3, 6}, "some files are redundant, others are not"
 
 
 def torn(whole, folder, *steps):
@@ -76,7 +76,7 @@ def torn(whole, folder, *steps):
     return folder
 
 
-def test_a_torn_checkpoint_is_told_and_the_next_one_takes_its_place(whole, tmp_path):
+def test_a_truncated_checkpoint_gives_a_warning_and_the_previous_one_is_restored(whole, tmp_path):
     folder = torn(whole, tmp_path / "checkpoints", 6)
     kept = Checkpoints(folder)
     with pytest.warns(UserWarning, match=r"6 is damaged .* moved to .*damaged-6; .* after 3 updates"):
@@ -89,7 +89,7 @@ def test_a_torn_checkpoint_is_told_and_the_next_one_takes_its_place(whole, tmp_p
     assert position == {"position": 6}
 
 
-def test_where_no_checkpoint_can_be_read_it_says_so_and_keeps_them(whole, tmp_path):
+def test_unreadable_checkpoints_raise_and_are_kept(whole, tmp_path):
     folder = torn(whole, tmp_path / "checkpoints", 3, 6)
     with pytest.raises(ValueError, match=r"none of the checkpoints \(3, 6\).*delete the folder"):
         restored(folder)

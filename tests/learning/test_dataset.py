@@ -1,4 +1,4 @@
-"""The stream of training batches: what is in it, that it repeats, that it resumes, and what it refuses."""
+"""The stream of training batches: contents, reproducibility, resuming, and refused input."""
 
 import os
 from pathlib import Path
@@ -16,7 +16,7 @@ HEIGHT, WIDTH = 12, 15
 
 
 def coordinates(count: int, clip: int) -> np.ndarray:
-    """A clip that says of every value where it came from: (clip, frame, row * 16 + column), exact in half precision."""
+    """A clip whose values are their own coordinates: (clip, frame, row * 16 + column), exact in half precision."""
     t, y, x = np.mgrid[:count, :HEIGHT, :WIDTH].astype(np.float32)
     return np.stack([np.full_like(t, clip), t, y * 16 + x], axis=-1)
 
@@ -63,7 +63,7 @@ def test_elements_are_windows_of_one_clip(folder: Path) -> None:
     assert len(starts) > 20
 
 
-def test_augmented_elements_are_symmetries_and_motion_goes_along(folder: Path) -> None:
+def test_augmented_elements_are_symmetries_of_image_and_motion(folder: Path) -> None:
     batch = next(training_batches(folder, batch=24, crop=6, frames=2, seed=3))
     shapes = set()
     for element in batch.reference[..., 2]:
@@ -85,7 +85,7 @@ def test_equal_arguments_give_equal_streams_and_seeds_differ(folder: Path) -> No
 
 
 @pytest.mark.parametrize("threads", [0, 2])
-def test_a_restored_stream_goes_on_where_it_was(folder: Path, threads: int) -> None:
+def test_a_restored_stream_resumes_where_it_was(folder: Path, threads: int) -> None:
     def stream() -> clips.training_batches:
         return training_batches(folder, batch=2, crop=5, frames=2, seed=7, threads=threads)
 
@@ -142,7 +142,7 @@ def test_every_buffer_of_the_table_comes_back_from_the_cache(tmp_path: Path, rng
         np.testing.assert_array_equal(getattr(found.frames, name), getattr(expected.frames, name)[window], err_msg=name)
 
 
-def test_independent_layers_come_cropped_and_turned_with_the_rest(folder: Path) -> None:
+def test_independent_layers_are_cropped_and_turned_with_the_rest(folder: Path) -> None:
     expected = clips.read_clip(folder / "clip0", layers=True)
     assert sorted(expected.layers) == [1, 2]
     np.testing.assert_array_equal(expected.layers[2], coordinates(4, 0) + 4)
@@ -175,7 +175,7 @@ def test_batches_have_the_layers_that_every_clip_has(tmp_path: Path) -> None:
 
     write("a", 1, 2, 4, 16)
     write("b", 1, 2, 4)
-    assert given() == {1, 2, 4}  # 16 without 8 makes no number of samples
+    assert given() == {1, 2, 4}  # 16 is not usable without 8
     write("b", 1, 4)
     assert given() == {1}
     write("b", 4)
@@ -225,7 +225,7 @@ def test_a_broken_reference_is_zeroed_and_named_while_noise_is_kept(tmp_path: Pa
     np.testing.assert_array_equal(batch.reference[1 - bad], image)
 
 
-def test_what_does_not_fit_is_refused_by_name(folder: Path, tmp_path: Path) -> None:
+def test_unsuitable_clips_and_arguments_are_refused_by_name(folder: Path, tmp_path: Path) -> None:
     def refused(match: str, **changes: object) -> None:
         options = {"batch": 1, "crop": 4, "frames": 2, "seed": 0, **changes}
         with pytest.raises(ValueError, match=match):

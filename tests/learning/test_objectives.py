@@ -1,4 +1,4 @@
-"""What training minimises, against NumPy in float64."""
+"""Training objectives against NumPy in float64."""
 
 import jax
 import jax.numpy as jnp
@@ -54,21 +54,21 @@ def numpy_objective(images, clip, *, occlusion):
 
 
 @pytest.mark.parametrize(("progress", "joined"), [(0.0, False), (0.499, False), (0.5, True), (1.0, True)])
-def test_it_is_the_papers_sum_and_the_occlusion_term_joins_in_the_second_half(progress, joined, images, clip):
+def test_it_is_the_papers_sum_and_the_occlusion_term_is_added_in_the_second_half(progress, joined, images, clip):
     found = jax.jit(OBJECTIVE.loss)(images, clip, jnp.asarray(progress))
     expected = numpy_objective(images, clip, occlusion=joined)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
     other = numpy_objective(images, clip, occlusion=not joined)
-    assert abs(other - expected) > 0.05 * expected  # the two could not be taken for one another
+    assert abs(other - expected) > 0.05 * expected  # the two differ clearly
 
 
 @pytest.mark.parametrize("progress", [0.0, 1.0])
-def test_without_occlusion_it_never_joins(progress, images, clip):
+def test_without_occlusion_the_term_is_never_added(progress, images, clip):
     found = indirect_illumination(occlusion=False).loss(images, clip, jnp.asarray(progress))
     np.testing.assert_allclose(found, numpy_objective(images, clip, occlusion=False), rtol=1e-5)
 
 
-def test_the_two_have_names_of_their_own():
+def test_the_two_objectives_have_different_names():
     assert OBJECTIVE.name != indirect_illumination(occlusion=False).name
 
 
@@ -77,8 +77,8 @@ def test_the_last_frame_gives_no_gradient_and_all_others_do(images, clip):
     assert np.isfinite(slope).all()
     np.testing.assert_array_equal(slope[-1], 0)
     assert all(np.abs(slope[index]).max() > 0 for index in range(len(slope) - 1))
-    spoilt = clip._replace(reference=clip.reference.at[-1].multiply(7.0))
-    np.testing.assert_array_equal(jax.grad(OBJECTIVE.loss)(images, spoilt, jnp.asarray(1.0)), slope)
+    changed = clip._replace(reference=clip.reference.at[-1].multiply(7.0))
+    np.testing.assert_array_equal(jax.grad(OBJECTIVE.loss)(images, changed, jnp.asarray(1.0)), slope)
 
 
 def test_a_clip_of_one_frame_is_trained_on(images, clip):
@@ -110,7 +110,7 @@ def test_both_halves_of_training_are_one_program(images, clip):
 
 
 @pytest.mark.parametrize("name", [name for name, method in methods().items() if method.learns])
-def test_every_learned_method_says_what_it_minimises(name):
+def test_every_learned_method_names_its_objective(name):
     for recipe in methods()[name].recipes.values():
         assert recipe.objective.name
         assert recipe.record()["objective"] == recipe.objective.name

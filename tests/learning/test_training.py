@@ -1,4 +1,4 @@
-"""Training: the loss, the step, two phases, bad data, and a run that is stopped and goes on as if it never was."""
+"""Training: the loss, the step, its two phases, invalid data, and recipes."""
 
 import json
 
@@ -21,7 +21,7 @@ RECIPE = method_named("ntd").recipe_named(None)._replace(steps=8, batch=2, crop=
 
 
 def make_clip(seed, *, frames=4, size=16):
-    """A moving ramp under noise, with a strip that the dual vectors call disoccluded."""
+    """A noisy moving ramp, with a strip that is disoccluded according to the dual vectors."""
     rng = np.random.default_rng(seed)
     ramp = np.linspace(0.1, 1.0, size, dtype=np.float32)[None, None, :, None] * np.ones((frames, size, size, 3))
     reference = (ramp + 0.1 * np.arange(frames)[:, None, None, None]).astype(np.float32)
@@ -93,7 +93,7 @@ def test_a_step_learns_and_compiles_once_over_both_phases(step, state):
         reports.append(report)
     assert step._cache_size() == 1
     assert reports[3].loss < reports[0].loss
-    # The occlusion loss joins at half of the steps: the same weights would have cost less without it.
+    # The occlusion loss is added after half of the steps, which raises the loss.
     assert reports[4].loss > reports[3].loss
     assert int(state.skipped) == 0
     assert int(state.step) == RECIPE.steps
@@ -112,7 +112,7 @@ def test_rematerialised_gradients_are_the_same(denoiser, state):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(False), gradient(True))
 
 
-def sound(state):
+def valid(state):
     return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.params, state.optimizer)))
 
 
@@ -120,34 +120,34 @@ POISONS = [np.nan, np.inf, -np.inf, 1e30, -1e30, 1e38]
 
 
 @pytest.mark.parametrize("buffer", ["radiance", "albedo", "normal", "depth", "motion", "dual_motion", "reference"])
-def test_a_poisoned_buffer_never_makes_a_bad_weight_and_learning_goes_on(step, state, buffer):
+def test_a_poisoned_buffer_never_makes_an_invalid_weight_and_training_continues(step, state, buffer):
     batch = batch_of(make_clip(0), make_clip(1))
     before = jax.tree.map(np.array, state.params)
     for poison in POISONS:
         if buffer == "reference":
-            spoilt = batch._replace(reference=batch.reference.at[:, 1, 3:9].set(poison))
+            poisoned = batch._replace(reference=batch.reference.at[:, 1, 3:9].set(poison))
         else:
             values = getattr(batch.frames, buffer).at[:, 1, 3:9].set(poison)
-            spoilt = batch._replace(frames=batch.frames._replace(**{buffer: values}))
-        state, report = step(state, spoilt)
+            poisoned = batch._replace(frames=batch.frames._replace(**{buffer: values}))
+        state, report = step(state, poisoned)
         assert np.isfinite(report.loss), poison
-        assert sound(state), poison
+        assert valid(state), poison
     assert int(state.skipped) == 0
     changed = [np.any(new != old) for new, old in zip(*map(jax.tree.leaves, (state.params, before)), strict=True)]
     assert any(changed)
 
 
-def test_a_black_batch_is_one_like_any_other(step, state):
+def test_a_black_batch_is_trained_on(step, state):
     batch = batch_of(make_clip(0), make_clip(1))
     black = jax.tree.map(jnp.zeros_like, batch)
     state, _ = step(state, black)
     state, report = step(state, black)
     assert np.isfinite(report.loss)
     assert np.isfinite(report.gradient_norm)
-    assert sound(state)
+    assert valid(state)
     assert int(state.skipped) == 0
     state, _ = step(state, batch)
-    assert sound(state)
+    assert valid(state)
 
 
 def test_a_gradient_that_is_not_finite_changes_nothing(denoiser, step, state):
@@ -168,7 +168,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing(denoiser, step, state):
     )
 
 
-def test_nothing_moves_nothing_is_disoccluded(denoiser, state):
+def test_without_motion_nothing_is_disoccluded(denoiser, state):
     clip = make_clip(0)
     still = clip._replace(frames=clip.frames._replace(motion=None, dual_motion=None))
     with_occlusion, _ = clip_loss(denoiser, state.params, still, RECIPE.objective, progress=1.0)

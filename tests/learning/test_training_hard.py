@@ -1,4 +1,4 @@
-"""Training when things go wrong: bad clips, a rate that explodes, a torn checkpoint, a process that is killed."""
+"""Training under faults: invalid clips, a diverging learning rate, a truncated checkpoint, a killed process."""
 
 import json
 import time
@@ -23,7 +23,7 @@ from tests.learning.test_training import make_clip
 clips = test_fit.clips
 
 
-def test_a_reference_is_bounded_as_what_it_is_compared_with():
+def test_a_reference_is_bounded_like_the_denoised_image():
     bad = jnp.asarray([np.nan, np.inf, -np.inf, -1.0, 1e30, 0.25], jnp.float32)
     safe = repair_image(bad)
     np.testing.assert_array_equal(safe, [0, 0, 0, 0, RADIANCE_MAX, 0.25])
@@ -40,7 +40,7 @@ def test_a_reference_is_bounded_as_what_it_is_compared_with():
 
 
 def brighter():
-    """A denoiser of one weight, which compiles in a moment: radiance times 1 + gain^2."""
+    """A denoiser with one weight, which compiles quickly: radiance times 1 + gain^2."""
 
     def step(params, state, frame):
         return state + 1, frame.radiance * (1 + params["gain"] ** 2)
@@ -58,12 +58,12 @@ def run(clips, folder, recipe=test_fit.RECIPE, source=None, every=2):
 
 @pytest.mark.filterwarnings("ignore:overflow encountered in cast")  # 1e39 is infinite in single precision
 @pytest.mark.parametrize(("rate", "kept"), [(1e30, 1), (1e39, 0)])
-def test_a_rate_that_explodes_ends_with_what_to_change_and_finite_weights(clips, tmp_path, rate, kept):
+def test_a_diverging_learning_rate_ends_with_advice_and_finite_weights(clips, tmp_path, rate, kept):
     recipe = test_fit.RECIPE._replace(learning_rate=rate, decay=False)
     told = rf"nothing was learned in the updates {kept + 1} to {kept + 3}.*learning rate"
     with pytest.raises(ValueError, match=told):
         run(clips, tmp_path, recipe, every=1)
-    with pytest.raises(ValueError, match="learning rate"):  # nor does it go on when it is started again
+    with pytest.raises(ValueError, match="learning rate"):  # a restart does not continue either
         run(clips, tmp_path, recipe, every=1)
     kept_state, _ = Checkpoints(tmp_path / "checkpoints").restore(
         initial_state(brighter(), recipe, next(test_fit.batches(clips)))
@@ -97,7 +97,7 @@ def test_a_log_is_strict_json_whatever_the_loss(tmp_path):
     np.testing.assert_array_equal(read_curve(tmp_path).loss, [np.nan, 0.5])
 
 
-def test_with_the_newest_checkpoint_torn_it_continues_from_the_one_before_to_the_same_weights(clips, tmp_path):
+def test_with_the_newest_checkpoint_truncated_it_continues_from_the_previous_one_to_the_same_weights(clips, tmp_path):
     whole = run(clips, tmp_path / "whole", every=100)
     stopping = test_fit.Stopping(test_fit.batches(clips), 5)
     with pytest.raises(KeyboardInterrupt):
@@ -123,6 +123,6 @@ def test_a_killed_process_loses_only_the_steps_since_its_last_checkpoint(tmp_pat
     process.communicate()
     seen, kept = kills.logged(tmp_path / "shot"), kills.newest(tmp_path / "shot")
     assert 23 <= seen < 60
-    assert seen - kept <= 2 * sizes.checkpoint_every  # one may have been on its way to the disk
+    assert seen - kept <= 2 * sizes.checkpoint_every  # one may not have been complete yet
     said, _ = kills.start(tmp_path / "clips", tmp_path / "shot", sizes).communicate()
     assert kills.same(tmp_path / "calm", tmp_path / "shot"), said

@@ -228,7 +228,7 @@ def test_keeps_the_dtype(case, name, dtype, rng):
 
 
 @pytest.mark.parametrize("op", ["warp", "apply_kernels", "softmax_filter", "convolution", "unet"])
-def test_a_name_is_that_one_or_an_error(op):
+def test_a_named_implementation_runs_or_raises(op):
     assert len(implementations(op)) > 1
     assert "reference" in runnable(op)
     assert set(implementations(op)) - set(runnable(op)) <= {"onednn", "onnxruntime"}  # engines are extras

@@ -1,4 +1,4 @@
-"""Directional albedo against brute-force integration of the BRDF, and light divided by what a surface reflects."""
+"""Directional albedo against brute-force integration of the BRDF, and demodulation by the reflectance."""
 
 import hypothesis
 import hypothesis.extra.numpy as arrays
@@ -22,7 +22,7 @@ CHECK = [  # cosine, roughness, (A, B) separable, (A, B) height-correlated
 
 
 def looked_up(lobe, cosine, roughness):
-    """A and B from the stored table, by way of the public function."""
+    """A and B from the stored table, through the public function."""
     one = jnp.ones((1, 1, 1))
 
     def of(specular):
@@ -77,7 +77,7 @@ def test_the_table_is_the_integral_of_the_brdf(lobe, cosine, roughness):
 
 
 @pytest.mark.parametrize("lobe", brdf.LOBES)
-def test_the_table_loses_light_and_makes_none(lobe):
+def test_the_table_adds_no_energy(lobe):
     table = brdf.albedo_table(lobe)
     assert table.shape == (brdf.SIZE, brdf.SIZE, 2)
     assert table.dtype == np.float32
@@ -123,7 +123,7 @@ def test_dividing_and_multiplying_again_changes_nothing(radiance, reflectance):
 
 
 @hypothesis.given(strategies.floats(0, 1), strategies.floats(1e-6, 1e-3))
-def test_no_threshold_tells_alike_neighbours_apart(reflectance, difference):
+def test_similar_neighbours_have_similar_divisors(reflectance, difference):
     near = jnp.asarray([reflectance, reflectance + difference])
     first, second = np.asarray(brdf.divisor(near))
     assert abs(second / first - 1) <= difference / brdf.FLOOR * 1.01 + 1e-6
@@ -136,7 +136,7 @@ def test_the_divisor_is_the_reflectance_where_that_is_not_small(value):
     assert value < 0.3 or expected / value < 1.02
 
 
-def test_slopes_stay_finite_at_no_reflectance():
+def test_slopes_are_finite_at_zero_reflectance():
     slope = jax.grad(lambda reflectance: brdf.demodulate(jnp.ones((1, 1, 3)), reflectance).sum())(jnp.zeros((1, 1, 3)))
     assert jnp.isfinite(slope).all()
 

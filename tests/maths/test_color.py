@@ -39,7 +39,7 @@ def test_compress_is_the_formula() -> None:
     np.testing.assert_allclose(compress(x), compress_reference(x), rtol=2e-6, atol=1e-30)
 
 
-def test_compress_is_continuous_at_the_toe_and_152_steep_below() -> None:
+def test_compress_is_continuous_at_the_toe_with_slope_152_below() -> None:
     below, above = np.float32(TOE * (1 - 1e-6)), np.float32(TOE * (1 + 1e-6))
     assert 0 <= compress(above) - compress(below) < 1e-6
     np.testing.assert_allclose(jax.grad(compress)(0.0), 151.99, rtol=1e-4)
@@ -102,7 +102,7 @@ def test_luminance(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(color.luminance(jnp.ones(3)), [1.0], rtol=1e-6)
 
 
-def test_luminance_wants_three_channels() -> None:
+def test_luminance_needs_three_channels() -> None:
     with pytest.raises(ValueError, match="3 channels"):
         color.luminance(jnp.ones((4, 4, 1)))
 
@@ -138,7 +138,7 @@ def test_tonemap_is_finite_for_every_float(operator: str) -> None:
     assert np.all(np.isnan(tonemap(jnp.full(3, jnp.nan), operator=operator)))
 
 
-def test_tonemap_defaults_to_srgb_and_names_what_it_knows() -> None:
+def test_tonemap_defaults_to_srgb_and_names_its_operators() -> None:
     np.testing.assert_allclose(tonemap(jnp.full(3, 0.2158605)), 0.5019, atol=1e-4)  # code value 128
     with pytest.raises(ValueError, match="reinhard"):
         tonemap(jnp.ones(3), operator="filmic")

@@ -86,7 +86,7 @@ def _agree(function, cotangent, x, kernel):
 @pytest.mark.parametrize("size", [(6, 7), (1, 1), (1, 9), (17, 31)])
 @pytest.mark.parametrize(("count", "inputs", "outputs"), [(1, 14, 32), (3, 32, 51), (2, 3, 2)])
 def test_onednn_in_single_precision(size, count, inputs, outputs):
-    """What the shared contract cannot see, as it computes in double precision."""
+    """The shared contract test computes in double precision, which oneDNN does not."""
     rng = np.random.default_rng(inputs)
     x, cotangent = (rng.standard_normal((count, *size, channels)) for channels in (inputs, outputs))
     _agree(lambda convolve: convolve, cotangent, x, rng.standard_normal((3, 3, inputs, outputs)))
@@ -112,15 +112,15 @@ def test_onednn_under_vmap(batch, over_images, over_kernels):
 
 
 @needs_onednn
-def test_onednn_keeps_what_is_no_number_beside_its_pixel():
-    """A Winograd form, which is never asked for, would spread it over its tile."""
+def test_onednn_keeps_nan_within_its_3x3_neighbourhood():
+    """A Winograd algorithm, which is never requested, would spread it over its tile."""
     rng = np.random.default_rng(0)
     x, kernel = rng.standard_normal((1, 12, 12, 16)).astype(np.float32), rng.standard_normal((3, 3, 16, 16))
     x[0, 5, 6, 0] = np.nan
     out = convolve(jnp.asarray(x), jnp.asarray(kernel, jnp.float32), implementation="onednn")
-    spoilt = np.zeros((12, 12), bool)
-    spoilt[4:7, 5:8] = True
-    np.testing.assert_array_equal(np.isnan(out[0]).any(axis=-1), spoilt)
+    reached = np.zeros((12, 12), bool)
+    reached[4:7, 5:8] = True
+    np.testing.assert_array_equal(np.isnan(out[0]).any(axis=-1), reached)
 
 
 def test_onednn_that_is_not_installed_says_what_to_install(monkeypatch):
@@ -155,13 +155,13 @@ for size, inputs, outputs in (((1, 1), 4, 4), ((16, 16), 14, 4), ((64, 64), 14, 
         run()
         np.testing.assert_allclose(there, found, rtol=1e-5, atol=1e-5)
         assert np.abs(found).max() > 0.1
-print("sound")
+print("equal")
 """
 
 
 @needs_onednn
-def test_onednn_may_be_run_by_another_thread_than_made_it():
-    """XLA calls back from any of its threads; the library's own working memory belongs to the thread that makes."""
+def test_onednn_runs_on_another_thread_than_the_creating_one():
+    """XLA calls back from any of its threads; the library's own working memory belongs to the creating thread."""
     done = subprocess.run([sys.executable, "-c", MADE_AND_RUN], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr  # a write out of bounds ends the process
-    assert done.stdout.strip() == "sound"
+    assert done.stdout.strip() == "equal"

@@ -1,4 +1,4 @@
-"""The one table of buffers: it is the Frame's fields, and what None stands for is what it says."""
+"""The table of buffers: it has the Frame's fields, and None equals the documented neutral value."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ CHAINS = {
     "glossy_motion": "motion",
 }
 ENDS = {"albedo": 1, "roughness": 1, "visible": 1, "sample_count": 1, "reflectance": 1, "ids": -1}
-"""What None stands for in the end where it is not 0, from the docstrings of the fields."""
+"""The neutral values that are not 0, from the docstrings of the fields."""
 
 
 def values_of(name, rng, shape=SIZE):
@@ -80,14 +80,14 @@ def test_a_neutral_value_follows_its_chain(name, source, numbers, rng):
     frame = written_out(Frame(light(numbers), **{source: there}), [name])
     np.testing.assert_array_equal(getattr(frame, name), there)
     assert set(present(frame)) == {name, source}
-    # Where the source is absent as well, both are what the source stands for.
+    # Where the source is absent too, both are the source's neutral value.
     both = written_out(Frame(light(numbers)), [name, source])
     np.testing.assert_array_equal(getattr(both, name), ENDS.get(source, 0))
     np.testing.assert_array_equal(getattr(both, name), getattr(both, source))
 
 
 @pytest.mark.parametrize("numbers", NUMBERS)
-def test_all_of_them_at_once_and_nothing_that_is_there_changes(numbers, rng):
+def test_all_absent_buffers_are_written_out_and_present_ones_stay(numbers, rng):
     there = {name: numbers.asarray(values_of(name, rng)) for name in ("motion", "ids", "normal")}
     frame = written_out(Frame(light(numbers), **there), GUIDES)
     assert present(frame) == GUIDES
@@ -98,14 +98,14 @@ def test_all_of_them_at_once_and_nothing_that_is_there_changes(numbers, rng):
 
 
 @pytest.mark.parametrize("numbers", NUMBERS)
-def test_a_clips_frames_are_written_out_with_their_time(numbers):
+def test_a_clips_frames_are_written_out_with_their_time_axis(numbers):
     frames = written_out(Frame(light(numbers, shape=(3, *SIZE))), ["albedo", "ids", "motion"])
     assert frames.albedo.shape == (3, *SIZE, 3)
     assert frames.ids.shape == (3, *SIZE, 1)
     assert frame_at(frames, 1).motion.shape == (*SIZE, 2)
 
 
-def test_what_is_written_out_has_the_radiances_precision_but_for_flags_and_ids():
+def test_written_out_buffers_have_the_radiances_precision_except_flags_and_ids():
     frame = written_out(Frame(light(np, np.float16)), GUIDES)
     for name in GUIDES:
         kind = BUFFERS[name].kind

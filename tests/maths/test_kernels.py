@@ -44,7 +44,7 @@ def test_softmax_filter_is_normalizing_and_applying(rng):
         ((1, 6, 5, 3), (6, 5, 25), 24, "K odd"),
     ],
 )
-def test_softmax_filter_says_what_does_not_fit(images, logits, taps, message):
+def test_softmax_filter_names_wrong_shapes(images, logits, taps, message):
     with pytest.raises(ValueError, match=message):
         softmax_filter(np.zeros(images), np.zeros(logits), taps=taps)
 

@@ -1,9 +1,9 @@
-"""Laws that hold whatever the pixels are: mirrors, bounds, channels, brightness, and what history is for.
+"""Invariances for any pixel values: mirrors, bounds, channels, brightness, and less variance with a longer history.
 
 Images here are whole numbers and motion is in sixty-fourths of a pixel, so that every product and sum of a warp, a
-kernel application or a mean is exact in single precision: where a law is exact the test asks for every bit. What needs
-powers or divisions (softmax, SSIM, FLIP, filters) is held to its rounding. The laws of the learned networks, which have
-only learned them, are measured by ``make hard-cases``.
+kernel application or a mean is exact in single precision: exact invariances are tested bit for bit, those with powers
+or divisions (softmax, SSIM, FLIP, filters) up to rounding. Learned networks obey them only approximately, which
+``make hard-cases`` measures.
 """
 
 from functools import partial
@@ -32,7 +32,7 @@ def image(rng, *, channels=3, frames=()):
 
 
 def vectors(rng):
-    """Odd sixty-fourths: never halfway between two pixels, where the nearest one is a matter of taste."""
+    """Odd sixty-fourths: never halfway between two pixels, where the nearest one is ambiguous."""
     return ((2 * rng.integers(-300, 300, (H, W, 2)) + 1) / 64).astype(np.float32)
 
 
@@ -48,7 +48,7 @@ def mirrored(array, way):
 
 
 def turned(motion, way):
-    """A field of vectors in a mirror: the pixels change places, and the component across the mirror its sign."""
+    """A mirrored field of vectors: the pixels move, and the component across the mirror changes its sign."""
     return mirrored(motion, way) * np.asarray(AXES[way][1], np.float32)
 
 
@@ -175,7 +175,7 @@ def test_a_warp_and_a_change_of_size_keep_an_image_inside_its_bounds(seed):
 
 
 @given(seed=seeds)
-def test_another_channel_never_changes_the_others(seed):
+def test_channels_do_not_influence_each_other(seed):
     rng = np.random.default_rng(seed)
     light, motion = rng.exponential(size=(H, W, 4)).astype(np.float32), vectors(rng)
     kernels = np.asarray(normalize_kernels(rng.standard_normal((H, W, 9)).astype(np.float32)))
@@ -247,7 +247,7 @@ def test_brighter_light_is_a_larger_error(seed, power):
 FRAMES, SIZE = 24, 16
 svgf = jaxdn.denoisers.svgf()
 filtered = jax.jit(lambda frames: jaxdn.denoise(svgf, {}, Clip(frames)))
-blending = jaxdn.denoisers.svgf(levels=0, feedback_level=0, short_history=1)  # time alone, no neighbourhood
+blending = jaxdn.denoisers.svgf(levels=0, feedback_level=0, short_history=1)  # temporal filtering only
 blended = jax.jit(lambda frames: jaxdn.denoise(blending, {}, Clip(frames)))
 
 
@@ -284,7 +284,7 @@ def test_a_mirror_commutes_with_svgf(seed, way):
 @settings(max_examples=8)
 @given(seed=seeds, power=st.integers(1, 12))
 def test_svgf_of_brighter_light_is_a_brighter_image(seed, power):
-    # Its two constants, 1e-10 for the variance and 1e-4 for the reach over edges, are in units of light.
+    # Its two constants, 1e-10 for the variance and 1e-4 for edge-stopping, are in units of light.
     frames = scene(seed)
     factor = np.float32(2.0**power)
     brighter = filtered(frames._replace(radiance=factor * frames.radiance)) / factor
@@ -294,7 +294,7 @@ def test_svgf_of_brighter_light_is_a_brighter_image(seed, power):
 @pytest.mark.slow
 @settings(max_examples=8)
 @given(seed=seeds)
-def test_svgf_stays_inside_what_it_has_been_shown(seed):
+def test_svgf_stays_within_the_range_of_its_input(seed):
     frames = scene(seed)._replace(albedo=None)
     shown = np.maximum.accumulate(frames.radiance.max(axis=(1, 2)))[:, None, None]
     least = np.minimum.accumulate(frames.radiance.min(axis=(1, 2)))[:, None, None]
@@ -307,11 +307,11 @@ def test_svgf_stays_inside_what_it_has_been_shown(seed):
 @settings(max_examples=8)
 @given(seed=seeds)
 def test_on_a_static_scene_the_variance_of_svgf_falls_with_history(seed):
-    # Uniform noise: of 256 pixels with long tails, the variance itself would be too uncertain to follow.
+    # Uniform noise: of 256 pixels with long tails, the variance itself would be too noisy to compare.
     noise = np.random.default_rng(seed).uniform(0, 2, (FRAMES, SIZE, SIZE, 1)).astype(np.float32)
     frames = Frame(np.broadcast_to(noise, (FRAMES, SIZE, SIZE, 3)))
     variance = np.asarray(blended(frames))[..., 0].var(axis=(1, 2))
-    # What time alone does: on a blank wall the whole filter averages nearly all away at once.
+    # Temporal filtering only: on a blank wall the spatial filter would remove nearly all variance at once.
     # 1 / N while the history is a mean, alpha / (2 - alpha) = 1 / 9 once it is a moving average.
     np.testing.assert_allclose(variance[:5] / variance[0], 1 / np.arange(1, 6), rtol=0.5)
     assert np.all(np.diff(variance[:4]) < 0)

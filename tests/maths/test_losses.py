@@ -54,7 +54,7 @@ def test_temporal(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(temporal(x, y), expected, rtol=1e-6)
 
 
-def test_temporal_is_blind_to_a_constant_error_and_zero_for_one_frame(rng: np.random.Generator) -> None:
+def test_temporal_ignores_a_constant_error_and_is_zero_for_one_frame(rng: np.random.Generator) -> None:
     x, _ = pair(rng)
     np.testing.assert_allclose(temporal(x + 0.25, x), 0, atol=1e-7)
     value, slope = jax.value_and_grad(temporal)(x[:1], x[:1] + 1)
@@ -84,7 +84,7 @@ def test_hfen_cancels_in_bfloat16_too() -> None:
 
 
 @pytest.mark.parametrize("operator", ["difference", "hfen"])
-def test_gradient_is_blind_to_a_level(operator: str, rng: np.random.Generator) -> None:
+def test_gradient_ignores_a_constant_offset(operator: str, rng: np.random.Generator) -> None:
     x, _ = pair(rng)
     np.testing.assert_allclose(gradient(x + 0.5, x, operator=operator), 0, atol=1e-6)
 

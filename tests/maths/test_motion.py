@@ -32,7 +32,7 @@ def _square(position, speed, side=8, snap=True):
 @pytest.mark.parametrize("snap", [True, False])
 @pytest.mark.parametrize("speed", [(3, 0), (-2, 0), (0, 4), (3, -2)])
 def test_square_in_front_of_a_plane(speed, snap):
-    """Uncovered pixels borrow exactly the square's motion; the mask is exactly the trailing strip."""
+    """Uncovered pixels take over exactly the square's motion; the mask is exactly the trailing strip."""
     motion, forward, visible, uncovered = _square((8, 8), speed, snap=snap)
     dual = dual_motion(motion, forward, visible=visible)
     np.testing.assert_array_equal(dual[uncovered], np.broadcast_to(-np.float32(speed), (uncovered.sum(), 2)))
@@ -94,7 +94,7 @@ def test_static_scene_is_exactly_zero():
     np.testing.assert_array_equal(occlusion_mask(still, dual), 0.0)
 
 
-def test_vectors_that_are_not_finite_give_no_mask_and_spread_nowhere():
+def test_non_finite_vectors_give_no_mask_and_do_not_spread():
     motion, forward, _, _ = _square((8, 8), (3, 0))
     clean = np.asarray(occlusion_mask(motion, dual_motion(motion, forward)))
     motion[0, 0], motion[10, 6], motion[10, 10, 1] = np.nan, np.inf, -np.inf
@@ -104,7 +104,7 @@ def test_vectors_that_are_not_finite_give_no_mask_and_spread_nowhere():
     broken = ~np.all(np.isfinite(motion), axis=-1)
     assert not mask[broken].any()
     np.testing.assert_array_equal(mask[~broken], clean[~broken])
-    # What is unknown about the previous frame leaves the pixel without a mask as well.
+    # Non-finite vectors of the previous frame give no mask either.
     forward[10, 6] = np.nan
     assert occlusion_mask(motion, dual_motion(motion, forward))[10, 6, 0] == 0
 
@@ -124,7 +124,7 @@ def test_batches_and_compiles_as_it_is():
         np.testing.assert_array_equal(dual[index], dual_motion(case[0], case[1], visible=case[2]))
 
 
-def test_errors_say_what_came():
+def test_errors_say_what_was_given():
     motion = jnp.zeros((4, 5, 2))
     with pytest.raises(ValueError, match="same size"):
         dual_motion(motion, motion[:-1])

@@ -1,4 +1,4 @@
-"""Powers and lengths: equal to the truth where it can be represented, finite with finite slopes everywhere else."""
+"""Powers and lengths: accurate where the true value can be represented, finite with finite slopes elsewhere."""
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ def normal_and_finite(x: np.ndarray) -> np.ndarray:
     return (x >= np.finfo(np.float32).tiny) & np.isfinite(x)
 
 
-def test_the_sweep_is_of_every_magnitude() -> None:
+def test_the_sweep_covers_every_magnitude() -> None:
     x = magnitudes()
     assert np.all(np.diff(x) > 0)
     assert x[0] == 0
@@ -40,12 +40,12 @@ def test_the_sweep_is_of_every_magnitude() -> None:
 
 
 @pytest.mark.parametrize("exponent", [0.0, 1 / 2.2, 0.5, 0.7, 1.0])
-def test_power_is_true_where_normal_and_finite_everywhere(exponent: float) -> None:
+def test_power_is_accurate_where_normal_and_finite_everywhere(exponent: float) -> None:
     x = magnitudes()
     value, slope = (np.asarray(found) for found in power_and_slope(x, exponent))
     assert np.all(np.isfinite(value))
     assert np.all(np.isfinite(slope))
-    # An ulp up and down is what a power may waver by.
+    # A power may be off by one ulp.
     assert np.all(value[1:] >= value[:-1] * (1 - 3e-7))
     normal, wide = normal_and_finite(x), x[normal_and_finite(x)].astype(np.float64)
     np.testing.assert_allclose(value[normal], wide**exponent, rtol=2e-5)
@@ -69,7 +69,7 @@ def test_power_has_a_finite_derivative_by_its_exponent() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("other", ["zero", "same", "small"])
-def test_norm_is_true_where_normal_and_finite_everywhere(other: str, sign: float) -> None:
+def test_norm_is_accurate_where_normal_and_finite_everywhere(other: str, sign: float) -> None:
     x = sign * magnitudes()
     beside = {"zero": np.zeros_like(x), "same": x, "small": x * np.float32(2.0**-20)}[other]
     vectors = np.stack([x, beside, np.zeros_like(x)], axis=-1).astype(np.float32)
@@ -91,13 +91,13 @@ def test_nan_stays_nan() -> None:
     assert np.isnan(length(jnp.asarray([1.0, jnp.nan])))
 
 
-def test_absolute_pulls_neither_way_at_zero() -> None:
+def test_absolute_has_derivative_zero_at_zero() -> None:
     value, slope = jax.jit(jax.vmap(jax.value_and_grad(absolute)))(jnp.asarray([-2.0, -0.0, 0.0, 3.0]))
     np.testing.assert_array_equal(value, [2, 0, 0, 3])
     np.testing.assert_array_equal(slope, [-1, 0, 0, 1])
 
 
-def test_absolute_is_the_size_of_every_number() -> None:
+def test_absolute_is_the_magnitude_of_every_number() -> None:
     x = np.concatenate([-magnitudes()[::-1], magnitudes()])
     value, slope = (np.asarray(found) for found in jax.jit(jax.vmap(jax.value_and_grad(absolute)))(x))
     normal = (np.abs(x) >= np.finfo(np.float32).tiny) | (x == 0)

@@ -30,7 +30,7 @@ def test_normals_of_every_length_become_unit_and_keep_their_direction():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_normal_with_something_that_is_no_number_is_no_normal(bad):
+def test_a_normal_with_a_non_finite_component_becomes_zero(bad):
     normal = np.broadcast_to(np.float32([0, 0, 1]), (4, 4, 3)).copy()
     normal[1, 2, 0] = bad
     found, count = repaired(frame(normal=normal))
@@ -39,7 +39,7 @@ def test_a_normal_with_something_that_is_no_number_is_no_normal(bad):
     assert count == 1
 
 
-def test_every_buffer_that_had_to_be_changed_is_counted():
+def test_every_repaired_buffer_is_counted():
     rng = np.random.default_rng(0)
     shape = (6, 5)
     buffers = {
@@ -72,7 +72,7 @@ def test_the_count_is_of_one_type_in_double_precision_too(x64):
 
 SPECIAL = (np.nan, np.inf, -np.inf, -0.0, 0.0, 1e-37, -1e-37, 1.0, -1.0, 0.5, 1.5, 7e4, -7e4, 1e9, 2e9, 3e38, -3e38)
 NEUTRAL_ONE = {"albedo", "roughness", "reflectance"}
-"""Fractions that are 1 where nobody knows them; the others are 0."""
+"""Fractions whose neutral value is 1; the others have 0."""
 BOUNDS = {
     "light": (0, RADIANCE_MAX),
     "signed": (-RADIANCE_MAX, RADIANCE_MAX),
@@ -84,7 +84,7 @@ BOUNDS = {
 
 
 def numpy_repair(values, name):
-    """In float64: what comes out, and how many values had to be replaced."""
+    """In float64: the result, and how many values were replaced."""
     values, kind = np.asarray(values, np.float64), BUFFERS[name].kind
     finite = np.isfinite(values)
     if kind == "vector":
@@ -96,7 +96,7 @@ def numpy_repair(values, name):
         return np.where(usable, values, 0) / np.where(usable, length, 1), np.sum(~finite)
     low, high = BOUNDS[kind]
     unknown = ~finite | ((values < 0) & (kind in ("light", "count", "distance")))
-    # The one that is infinite and still means something: a distance that is beyond all others.
+    # Only an infinite distance has a meaning: it is beyond all others.
     instead = np.where(values == np.inf, 1e9 if kind == "distance" else 0, 0) + (kind == "fraction") * (
         name in NEUTRAL_ONE
     )
@@ -104,8 +104,8 @@ def numpy_repair(values, name):
     return np.clip(np.where(unknown, instead, values), low, high), np.sum(~right)
 
 
-def spoilt(seed, name, dtype=np.float32):
-    """Values of all sizes with special ones in between."""
+def partly_broken(seed, name, dtype=np.float32):
+    """Values of all magnitudes with special ones in between."""
     rng = np.random.default_rng([seed, *name.encode()])
     shape = (6, 5, BUFFERS[name].channels)
     values = rng.normal(size=shape) * 10.0 ** rng.integers(-3, 6, shape)
@@ -114,7 +114,7 @@ def spoilt(seed, name, dtype=np.float32):
 
 
 def repaired_alone(name, values):
-    """One buffer repaired, and the count; radiance is sound unless it is the one."""
+    """One buffer repaired, and the count; radiance is valid unless it is that buffer."""
     given = frame(6) if name == "radiance" else Frame(np.full((6, 5, 3), 0.5, np.float32))
     found, count = repaired(given._replace(**{name: values}))
     return np.asarray(getattr(found, name)), int(count)
@@ -123,7 +123,7 @@ def repaired_alone(name, values):
 NUMBERS = [name for name, buffer in BUFFERS.items() if buffer.kind not in ("flag", "id")]
 
 
-def test_every_kind_is_tried():
+def test_every_kind_is_tested():
     assert {BUFFERS[name].kind for name in NUMBERS} == {*BOUNDS, "vector"}
     assert {"luminance_gradient", "sample_count", "specular_reflectance"} <= set(NUMBERS)
     fractions = {name for name in NUMBERS if BUFFERS[name].kind == "fraction"}
@@ -133,7 +133,7 @@ def test_every_kind_is_tried():
 @pytest.mark.parametrize("name", NUMBERS)
 @given(seed=st.integers(0, 2**16))
 def test_repair_is_the_numpy_one(name, seed):
-    values = spoilt(seed, name)
+    values = partly_broken(seed, name)
     found, count = repaired_alone(name, values)
     expected, replaced = numpy_repair(values, name)
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 if BUFFERS[name].kind == "direction" else 1e-37)
@@ -142,10 +142,10 @@ def test_repair_is_the_numpy_one(name, seed):
 
 @pytest.mark.parametrize("name", NUMBERS)
 @given(seed=st.integers(0, 2**16))
-def test_what_is_repaired_is_in_bounds_and_stays_as_it_is(name, seed):
-    """Nothing is left to count, but vectors that are not finite: they say for good that there is no history."""
+def test_repaired_values_are_in_bounds_and_stable(name, seed):
+    """A second repair counts nothing, except non-finite vectors: they stay and mean that there is no history."""
     kind = BUFFERS[name].kind
-    found, count = repaired_alone(name, spoilt(seed, name))
+    found, count = repaired_alone(name, partly_broken(seed, name))
     again, recount = repaired_alone(name, found)
     if kind == "direction":
         np.testing.assert_allclose(again, found, atol=2e-7)
@@ -166,7 +166,7 @@ def test_what_is_repaired_is_in_bounds_and_stays_as_it_is(name, seed):
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_what_is_sound_stays_bit_for_bit_and_is_not_counted(name, rng):
+def test_valid_values_stay_bit_for_bit_and_are_not_counted(name, rng):
     kind, shape = BUFFERS[name].kind, (6, 5, BUFFERS[name].channels)
     if kind == "direction":
         values = rng.choice([0.0, 1.0, -1.0], (6, 5, 1)) * np.array([[[0.0, 1.0, 0.0]]])
@@ -189,7 +189,7 @@ def test_narrow_numbers_are_widened(name, dtype, rng):
     assert count == 0
 
 
-def test_flags_and_ids_are_as_they_were(rng):
+def test_flags_and_ids_stay_unchanged(rng):
     ids, visible = rng.integers(-5, 2**24, (4, 4, 1)).astype(np.int32), rng.random((4, 4, 1)) < 0.5
     found, count = repaired(frame(ids=ids, visible=visible))
     np.testing.assert_array_equal(found.ids, ids)
@@ -199,11 +199,11 @@ def test_flags_and_ids_are_as_they_were(rng):
 
 def test_gradients_through_the_repair_are_finite_and_zero_where_it_replaced():
     for name in NUMBERS:
-        values = jnp.asarray(spoilt(0, name))
-        sound = Frame(jnp.full((6, 5, 3), 0.5))
+        values = jnp.asarray(partly_broken(0, name))
+        valid = Frame(jnp.full((6, 5, 3), 0.5))
 
-        def total(values, name=name, sound=sound):
-            return jnp.nansum(getattr(repair(sound._replace(**{name: values}))[0], name))
+        def total(values, name=name, valid=valid):
+            return jnp.nansum(getattr(repair(valid._replace(**{name: values}))[0], name))
 
         slope = np.asarray(jax.jit(jax.grad(total))(values))
         assert np.isfinite(slope).all(), name

@@ -1,4 +1,4 @@
-"""Images of any number of samples a pixel out of layers of 1, 2, 4, ... of them."""
+"""Images with any number of samples per pixel from layers of 1, 2, 4, ... samples."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ def drawn(rng, bits):
 
 
 def numpy_from_layers(layers, counts):
-    """Pixel by pixel and bit by bit, in float64."""
+    """Pixel by pixel and binary digit by binary digit, in float64."""
     image = np.zeros((*SIZE, 3))
     for row, column in np.ndindex(SIZE):
         count = int(counts[row, column, 0])
@@ -56,14 +56,14 @@ def test_every_pixel_has_its_own_number(rng):
         *((7.4, 7), (8.0, 7), (1e30, 7), (np.nan, 0), (-np.inf, 0)),
     ],
 )
-def test_counts_are_rounded_and_clamped_to_what_there_is(asked, had, rng):
+def test_counts_are_rounded_and_clamped_to_the_available_samples(asked, had, rng):
     layers = drawn(rng, 3)
     image, taken = from_layers(single(layers), jnp.full((*SIZE, 1), asked, jnp.float32))
     np.testing.assert_array_equal(taken, had)
     np.testing.assert_allclose(image, numpy_from_layers(layers, np.full((*SIZE, 1), had)), rtol=1e-6)
 
 
-def test_no_sample_is_black_and_a_layer_that_is_not_taken_may_be_anything(rng):
+def test_no_sample_is_black_and_an_unused_layer_may_be_anything(rng):
     layers = single(drawn(rng, 2))
     layers[2] = jnp.full_like(layers[2], jnp.nan)
     counts = jnp.zeros((*SIZE, 1)).at[1, 1].set(1.0)
@@ -101,7 +101,7 @@ def test_no_gradient_flows_into_the_counts_and_into_layers_their_share(rng):
         np.testing.assert_allclose(slope, np.broadcast_to(share, slope.shape), rtol=1e-6)
 
 
-def test_the_mean_over_many_noises_is_the_noise_free_image():
+def test_the_mean_over_many_noise_realisations_is_the_noise_free_image():
     """Layers of n samples have the variance 1 / n; every number of samples then has the variance 1 / number."""
     rng = np.random.default_rng(0)
     shape = (200, 200, 3)

@@ -1,4 +1,4 @@
-"""Warping: analytic answers, borders, vectors that point nowhere."""
+"""Warping: analytic results, borders, non-finite vectors."""
 
 import jax
 import jax.numpy as jnp
@@ -47,7 +47,7 @@ def test_no_motion_returns_the_image_itself(rng):
 
 @pytest.mark.parametrize("border", ["clamp", "zeros"])
 def test_vectors_that_are_not_finite_fetch_nothing(border):
-    """Neither a value nor a gradient, and none of it reaches the neighbours."""
+    """Neither a value nor a gradient, and the neighbours are not affected."""
     motion = np.zeros((3, 4, 2), np.float32)
     motion[0, 0, 0], motion[1, 1, 1], motion[2, 2] = np.nan, np.inf, -np.inf
     motion[2, 3] = 1e30
@@ -85,7 +85,7 @@ def test_on_screen_is_half_a_pixel_beyond_the_outermost_centres():
         assert not seen[row, column, 0]
 
 
-def test_errors_say_what_came():
+def test_errors_say_what_was_given():
     image, motion = jnp.zeros((4, 5, 3)), jnp.zeros((4, 5, 2))
     with pytest.raises(ValueError, match=r"motion.*2 channels"):
         warp(image, image)

@@ -1,4 +1,4 @@
-"""The part of the table of hard cases that CI checks; `make hard-cases` makes all of it, with the page."""
+"""The part of the table of hard cases that CI checks; `make hard-cases` runs all of it and writes the page."""
 
 import inspect
 import json
@@ -36,7 +36,7 @@ SMALLEST = [CASES["size 1x1"], CASES["size 3x3 and two frames"]]
 LONG_TO_COMPILE = ("metrics.flip", "metrics.ssim", "losses.gradient, hfen")
 OPERATIONS = [one for one in operation_subjects() if not one.name.startswith(LONG_TO_COMPILE)]
 INNER = {"targets", "check_taps", "offsets", "albedo_table", "ggx_albedo_table"}
-"""What operations share, which is tried through them, and tables that no image goes into."""
+"""Helpers of operations, which are tested through them, and tables that take no image."""
 PLAIN = [one for one in OPERATIONS if not one.name.endswith(", masked")]
 
 
@@ -73,18 +73,18 @@ def test_denoisers_withstand_every_case(subject):
     assert_green(subject)
 
 
-def test_every_denoiser_and_every_public_operation_is_put_to_the_test():
+def test_every_denoiser_and_every_public_operation_is_tested():
     assert {subject.name.split()[0] for subject in denoiser_subjects()} == set(methods())
     inside = {one for operation in ("warp", "apply_kernels", "softmax_filter") for one in implementations(operation)}
     tried = {subject.name.split(",")[0].split(".")[-1] for subject in operation_subjects()}
     for module in (brdf, color, losses, metrics, motion, numerics, scales, kernels, softmax_filter, warp):
         functions = inspect.getmembers(module, inspect.isfunction)
         public = {name for name, one in functions if one.__module__ == module.__name__ and name[0] != "_"}
-        assert public - inside - INNER <= tried, f"{module.__name__} has functions that no hard case is put to"
+        assert public - inside - INNER <= tried, f"{module.__name__} has functions that no hard case tests"
 
 
-def test_the_table_would_show_what_is_wrong(tmp_path):
-    # A filter that divides by its input is red where there is a zero, or no number, and only there.
+def test_the_table_shows_errors(tmp_path):
+    # A filter that divides by its input is red only where there is a zero or NaN.
     careless = Subject("careless", lambda params, inputs: 1.0 / inputs.clip.frames.radiance, repairs=True)
     chosen = [CASES[name] for name in ("control", "black", "radiance not a number", "size 1x1")]
     table = list(rows(chosen, [careless], precisions=("float32",), directions=("forward",)))
@@ -122,7 +122,7 @@ def test_cells_are_linked_to_their_case_and_its_picture(tmp_path):
     assert record["laws"] == [{"law": "mirrored", "method": "ntd", "difference": 0.02, "error": 0.1}]
 
 
-def test_an_interrupted_run_goes_on_where_it_was(tmp_path, monkeypatch):
+def test_an_interrupted_run_resumes_where_it_was(tmp_path, monkeypatch):
     monkeypatch.setattr(whole, "FOLDER", tmp_path)
     made = []
 
@@ -132,7 +132,7 @@ def test_an_interrupted_run_goes_on_where_it_was(tmp_path, monkeypatch):
 
     assert whole.part("warp, clamp", "now", make)["rows"] == [1]
     assert whole.part("warp, clamp", "now", make)["rows"] == [1]
-    assert whole.part("warp, clamp", "later", make)["rows"] == [2], "of another state nothing is taken over"
+    assert whole.part("warp, clamp", "later", make)["rows"] == [2], "results of another state are not reused"
 
 
 def test_cases_have_a_sentence_and_share_their_shapes():
@@ -140,7 +140,7 @@ def test_cases_have_a_sentence_and_share_their_shapes():
     assert all(len(made.sentence) > 4 for made in CASES.values())
 
 
-def test_changes_of_the_laws_undo_themselves():
+def test_mirroring_twice_is_the_identity():
     clip = good().clip
     for name, change in CHANGES.items():
         if name.startswith("mirrored"):
@@ -149,32 +149,32 @@ def test_changes_of_the_laws_undo_themselves():
 
 @dataclass(frozen=True)
 class Options:
-    """Of a method that is in no file of the package."""
+    """Options of a method outside the package."""
 
     size: Literal["large", "small"] = "large"
     compute_dtype: Literal["float32", "bfloat16"] | None = None
 
 
-def test_a_method_entered_while_python_runs_has_its_rows(monkeypatch):
+def test_a_method_registered_at_run_time_has_its_rows(monkeypatch):
     monkeypatch.setattr(methods_table, "_METHODS", dict(methods()))
 
     @method(
-        Options, title="A share of what is seen", recipes={"usual": Recipe(None)}, variants={"small": {"size": "small"}}
+        Options, title="A share of the radiance", recipes={"usual": Recipe(None)}, variants={"small": {"size": "small"}}
     )
     def newcomer(options):
         def step(params, state, frame, first):
-            assert frame.hit_distance is not None, "a buffer that no method of the package reads is there as well"
+            assert frame.hit_distance is not None, "a buffer that no method of the package reads is present too"
             near = frame.radiance / (1.0 + frame.hit_distance)
             return state, params["share"].astype(options.compute_dtype or near.dtype).astype(near.dtype) * near, 0
 
-        def asked(params, state, frame):
+        def requested(params, state, frame):
             return jnp.full_like(frame.radiance[..., :1], 3.0)
 
         def init(key, frame):
             return {"share": jnp.full((), 0.3 if options.size == "small" else np.nan)}
 
         reads = frozenset({"hit_distance", "sample_count"})
-        return recurrent(Core(lambda params, frame: (), step, reads, init, asked))
+        return recurrent(Core(lambda params, frame: (), step, reads, init, requested))
 
     found = {subject.name: subject for subject in denoiser_subjects()}
     assert {"newcomer", "newcomer bfloat16"} == {name for name in found if name.startswith("newcomer")}

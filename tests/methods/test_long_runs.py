@@ -1,4 +1,4 @@
-"""Thousands of frames: the recurrent state stays bounded, does not drift, and forgets one poisoned frame.
+"""Thousands of frames: the recurrent state stays bounded, does not drift, and forgets one invalid (poisoned) frame.
 
 python -m pytest tests/methods/test_long_runs.py -m slow -s        # prints the curves' figures
 """
@@ -24,7 +24,7 @@ FORGETS = {"ntd-small": 80}
 """Frames after which a poisoned frame has to be forgotten, to 1 % of the clean run; 120 for all others."""
 
 
-def test_filters_and_the_lightest_weights_are_put_to_the_test():
+def test_filters_and_the_lightest_weights_are_tested():
     assert {"svgf", "ntd-small"} <= set(METHODS)
 
 
@@ -44,7 +44,7 @@ def wall():
 
 @functools.cache
 def compiled(name, frames):
-    """A run of so many frames over a wall, before which the camera slides there and back for ever."""
+    """A run of that many frames of a wall, while the camera slides back and forth."""
     _, denoiser, params, *_ = candidate(name)
     base = jax.tree.map(jnp.asarray, wall())
 
@@ -75,7 +75,7 @@ def run(name, frames, *, speed=0.7, poison=0.0, at=-1, dark=10**6):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("speed", [0.0, 0.7])
-def test_two_thousand_frames_neither_explode_nor_drift(name, speed):
+def test_two_thousand_frames_neither_diverge_nor_drift(name, speed):
     mean, top, healthy, _ = run(name, LONG, speed=speed)
     assert healthy.all()
     assert top.max() <= RADIANCE_MAX
@@ -93,19 +93,19 @@ def test_two_thousand_frames_neither_explode_nor_drift(name, speed):
 def test_one_poisoned_frame_is_forgotten(name, poison):
     at = 60
     clean = run(name, SHORT)
-    spoilt = run(name, SHORT, poison=poison, at=at)
-    assert spoilt[2].all(), "neither state nor image ever holds what is not a number"
-    difference = np.abs(spoilt[3] - clean[3]).max(axis=(1, 2, 3)) / np.abs(clean[3]).mean(axis=(1, 2, 3))
+    poisoned = run(name, SHORT, poison=poison, at=at)
+    assert poisoned[2].all(), "state and image are always finite"
+    difference = np.abs(poisoned[3] - clean[3]).max(axis=(1, 2, 3)) / np.abs(clean[3]).mean(axis=(1, 2, 3))
     bad = np.flatnonzero(difference > 0.01)
     recovered = int(bad.max()) + 1 - at if bad.size else 0
     print(f"{name}: {poison:g} forgotten to 1 % after {recovered} frames")
-    assert np.array_equal(spoilt[3][:at], clean[3][:at])
+    assert np.array_equal(poisoned[3][:at], clean[3][:at])
     assert recovered <= FORGETS.get(name, 120)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
-def test_a_light_switched_off_does_not_linger(name):
+def test_a_light_switched_off_fades(name):
     mean, _, healthy, _ = run(name, SHORT, dark=100)
     assert healthy.all()
     gone = int(np.flatnonzero(mean[100:] < 0.01 * mean[50:100].mean())[0])

@@ -29,7 +29,7 @@ def tiny(**options: Any) -> Denoiser:
 
 
 def random_frames(rng: np.random.Generator, size: tuple[int, int] = (16, 16), count: int = 2) -> Frame:
-    """Whole buffers of a clip; vectors of a pixel or two."""
+    """All buffers of a clip; vectors of a pixel or two."""
     shape = (count, *size)
 
     def buffer(values: np.ndarray) -> jax.Array:
@@ -47,7 +47,7 @@ def random_frames(rng: np.random.Generator, size: tuple[int, int] = (16, 16), co
 
 
 def initial(denoiser: Denoiser, key: jax.Array, frames: Frame) -> Any:
-    """Parameters whose biases matter too."""
+    """Parameters with non-zero biases."""
     params = denoiser.init(key, frame_at(frames, 0))
     return jax.tree.map(lambda leaf: 1.5 * leaf + 0.1 * jax.random.normal(key, leaf.shape), params)
 
@@ -56,7 +56,7 @@ def run(denoiser: Denoiser) -> Callable[[Any, Frame], jax.Array]:
     return jax.jit(lambda params, frames: unroll(denoiser, params, frames))
 
 
-# What a frame goes through, in NumPy.
+# The processing of a frame, in NumPy.
 
 
 def box(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
@@ -96,7 +96,7 @@ def sigmoid(logit: float) -> float:
     ids=["default", "fine", "parity"],
 )
 def test_data_flow_with_known_heads(options: dict[str, Any], rng: np.random.Generator) -> None:
-    """Zero weights and chosen biases: the heads are constants, and the image can be worked out by hand."""
+    """Zero weights and chosen biases: the heads are constants, and the image can be computed by hand."""
     denoiser = tiny(**options)
     fine = options.get("alpha_at") == "fine"
     down = "max" if options else "mean"
@@ -157,7 +157,7 @@ def test_alpha_weighs_the_current_frame_and_missing_history_is_not_used(
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_constant_radiance_stays(name: str, rng: np.random.Generator, key: jax.Array) -> None:
-    """Softmax kernels, means and maxima keep a constant, the border ring included, whatever the network says."""
+    """Softmax kernels, means and maxima keep a constant, including the border, whatever the network predicts."""
     denoiser = tiny(**VARIANTS[name])
     frames = random_frames(rng, (19, 21))
     frames = frames._replace(radiance=jnp.full_like(frames.radiance, 0.7))
@@ -366,7 +366,7 @@ def test_half_precision_is_close(rng: np.random.Generator, key: jax.Array) -> No
     assert np.abs(images - wanted).max() > 0
 
 
-def test_depth_feature_is_free_of_units(rng: np.random.Generator) -> None:
+def test_depth_feature_is_independent_of_units(rng: np.random.Generator) -> None:
     depth = jnp.asarray(rng.uniform(0.5, 40, size=(6, 7, 1)), jnp.float32).at[0, 0].set(FAR)
     feature = depth_feature(depth)
     middle = np.exp(np.mean(np.log(np.delete(np.asarray(depth, np.float64).ravel(), 0))))

@@ -1,4 +1,4 @@
-"""The processing that all denoisers share, on toy cores: checks, repairs, age, bounds; demodulation; samples."""
+"""The processing that all denoisers share, on toy cores: checks, repair, age, bounds, demodulation, samples."""
 
 from functools import partial
 
@@ -26,7 +26,7 @@ def core_of(step, *, reads=(), start=lambda params, frame: jnp.zeros(()), **othe
 
 
 def identity(**others):
-    """Its image is its frame; its state is what it saw last."""
+    """Its image and its state are the frame's radiance."""
     return core_of(
         lambda params, state, frame, first: (frame.radiance, frame.radiance, 0),
         start=lambda params, frame: jnp.zeros_like(frame.radiance),
@@ -34,7 +34,7 @@ def identity(**others):
     )
 
 
-def test_first_is_told_once_and_age_counts_frames(rng):
+def test_first_is_passed_once_and_age_counts_frames(rng):
     core = core_of(lambda params, state, frame, first: (first, frame.radiance, 0), start=lambda params, frame: False)
     denoiser, frame = recurrent(core), frame_of(rng)
     assert isinstance(denoiser.step, RecurrentStep)
@@ -49,7 +49,7 @@ def test_first_is_told_once_and_age_counts_frames(rng):
     assert state.age.dtype == state.repaired.dtype == jnp.int32
 
 
-def test_first_is_told_under_scan_as_well(rng):
+def test_first_is_passed_under_scan_too(rng):
     step = lambda params, state, frame, first: (state, jnp.where(first, 1.0, 2.0) + 0 * frame.radiance, 0)  # noqa: E731
     frames = jax.tree.map(lambda *buffers: jnp.stack(buffers), *[frame_of(rng) for _ in range(3)])
     images = jax.jit(lambda frames: unroll(recurrent(core_of(step)), {}, frames))(frames)
@@ -72,7 +72,7 @@ def test_the_core_sees_repaired_buffers_and_only_those_that_it_reads(rng):
     np.testing.assert_array_equal(seen[0].albedo, 1)
     np.testing.assert_array_equal(seen[0].depth, 0)
     np.testing.assert_array_equal(seen[0].radiance[0, 0], [0, 0, RADIANCE_MAX])
-    # What is not read is not counted either: 3 of the radiance, and every value of albedo and depth.
+    # Buffers that are not read are not counted: 3 values of the radiance, all of albedo and depth.
     assert int(state.repaired) == 3 + 24 * 3 + 24
 
 
@@ -95,7 +95,7 @@ def test_repairs_of_frames_and_of_the_history_add_up(lost, rng):
         assert int(state.repaired) == expected
 
 
-def test_no_image_leaves_with_a_value_out_of_bounds(rng):
+def test_images_are_clamped_to_their_bounds(rng):
     given = np.array([-1e30, -1.0, -0.0, 0.0, 0.5, RADIANCE_MAX, 1e5, np.inf], np.float32)
     values = jnp.asarray(rng.choice(given, (*SIZE, 3)))
     denoiser, frame = recurrent(core_of(lambda params, state, frame, first: (state, values, 0))), frame_of(rng)
@@ -103,7 +103,7 @@ def test_no_image_leaves_with_a_value_out_of_bounds(rng):
     np.testing.assert_array_equal(image, np.clip(values, 0, RADIANCE_MAX))
     assert float(image.min()) == 0
     assert float(image.max()) == RADIANCE_MAX
-    assert int(state.repaired) == 0  # a method's own overshoot is nobody's broken value
+    assert int(state.repaired) == 0  # a method's own overshoot is not a repaired value
 
 
 def test_the_state_is_the_cores_own_and_is_not_clamped(rng):
@@ -148,11 +148,11 @@ def test_a_buffer_that_is_not_read_may_have_any_shape(rng):
     np.testing.assert_array_equal(image, frame.radiance)
 
 
-# Light divided by the albedo.
+# Radiance divided by the albedo.
 
 
 def albedo_of(rng):
-    """Of all sizes, with blacks, and values just at what is not divided by."""
+    """Albedos of all magnitudes, with zeros and values at the threshold of division."""
     values = rng.uniform(0.011, 1, (*SIZE, 3))
     values[0] = rng.choice([0.0, 0.01, 0.005, 1.0], values[0].shape)
     return jnp.asarray(values, jnp.float32)
@@ -164,7 +164,7 @@ def test_demodulating_an_identity_gives_the_radiance_back(rng):
     assert denoiser.reads == {"albedo"}
     state, image = denoiser.step({}, denoiser.start({}, frame), frame)
     np.testing.assert_allclose(image, frame.radiance, rtol=1e-6, atol=0)
-    # What the core saw, and keeps, is demodulated: divided where there is something to divide by.
+    # The core's input and state are demodulated: divided where the albedo exceeds the threshold.
     albedo = np.asarray(frame.albedo, np.float64)
     expected = np.asarray(frame.radiance, np.float64) / np.where(albedo > np.float32(0.01), albedo, 1)
     np.testing.assert_allclose(state.core, expected, rtol=1e-6)
@@ -172,7 +172,7 @@ def test_demodulating_an_identity_gives_the_radiance_back(rng):
     assert int(state.repaired) == 0
 
 
-def test_demodulated_start_sees_divided_light_too(rng):
+def test_demodulated_start_gets_divided_radiance_too(rng):
     frame = frame_of(rng, albedo=jnp.full((*SIZE, 3), 0.5))
     core = identity()._replace(start=lambda params, frame: frame.radiance)
     np.testing.assert_allclose(
@@ -190,8 +190,8 @@ def test_values_are_repaired_and_counted_once_before_they_are_divided(rng):
     np.testing.assert_allclose(image, frame.radiance.at[2, 3, 1].set(0), rtol=1e-6)
 
 
-def test_divided_light_is_not_clamped_and_the_image_is(rng):
-    """A clamp of what was divided would make the image depend on the exposure."""
+def test_divided_radiance_is_not_clamped_and_the_image_is(rng):
+    """A clamp of the divided radiance would make the image depend on the exposure."""
     frame = Frame(jnp.full((*SIZE, 3), 60000.0), albedo=jnp.full((*SIZE, 3), 0.02))
     denoiser = demodulated(recurrent(identity()), by="albedo")
     state, image = denoiser.step({}, denoiser.start({}, frame), frame)
@@ -210,7 +210,7 @@ def test_without_albedo_or_by_none_nothing_is_divided(rng):
         demodulated(plain, by="normal")
 
 
-def test_what_is_reflected_is_divided_by_and_the_albedo_where_that_is_all_there_is(rng):
+def test_radiance_is_divided_by_the_reflectance_or_else_by_the_albedo(rng):
     albedo, reflectance = (jnp.asarray(rng.uniform(0, 1, (*SIZE, 3)), jnp.float32) for _ in range(2))
     denoiser = demodulated(recurrent(identity()))
     assert denoiser.reads == {"albedo", "reflectance"}
@@ -236,7 +236,7 @@ def test_no_reflectance_is_the_albedo_written_out(rng):
 
 
 @pytest.mark.parametrize("name", ["albedo", "reflectance"])
-def test_neighbours_that_reflect_alike_are_divided_by_what_is_alike(name):
+def test_similar_reflectances_have_similar_divisors(name):
     """A ramp of dark values through 0.01, where dividing by the albedo jumps by a factor of 100."""
     ramp = jnp.linspace(0, 0.03, 31)[None, :, None] * jnp.ones((1, 1, 3))
     frame = Frame(jnp.ones((1, 31, 3)), **{name: ramp})
@@ -260,7 +260,7 @@ def test_any_reflectance_gives_the_radiance_back(rng, value):
 
 
 def test_a_wrapped_denoiser_can_be_wrapped_again(rng):
-    """Twice demodulated is divided twice, as its core is that of the first wrapper."""
+    """Demodulated twice is divided twice, as its core is that of the first wrapper."""
     frame = frame_of(rng, albedo=jnp.full((*SIZE, 3), 0.5))
     twice = BY_ALBEDO(BY_ALBEDO(recurrent(identity())))
     state, image = twice.step({}, twice.start({}, frame), frame)
@@ -268,7 +268,7 @@ def test_a_wrapped_denoiser_can_be_wrapped_again(rng):
     np.testing.assert_allclose(image, frame.radiance, rtol=1e-6)
 
 
-def test_a_denoiser_that_is_not_made_by_recurrent_is_refused():
+def test_a_denoiser_not_made_by_recurrent_is_refused():
     def step(params, state, frame):
         return state, frame.radiance
 
@@ -278,11 +278,11 @@ def test_a_denoiser_that_is_not_made_by_recurrent_is_refused():
     assert demodulated(bare, by="none") is bare
 
 
-# Samples asked for.
+# Requested samples.
 
 
 def adaptive(wrap=lambda denoiser: denoiser):
-    """Asks for more samples where what was rendered beforehand is brighter, up to a learned number."""
+    """Requests more samples where the radiance rendered before is brighter, up to a learned number."""
 
     def samples(params, state, frame):
         return params["most"] * frame.radiance[..., :1] / (1 + frame.radiance[..., :1])
@@ -300,7 +300,7 @@ def adaptive(wrap=lambda denoiser: denoiser):
 
 
 def layered(rng, count=3):
-    """A clip with layers of 1, 2 and 4 samples, and what the renderer gave beforehand."""
+    """A clip with layers of 1, 2 and 4 samples, and the radiance rendered before."""
     shape = (count, *SIZE, 3)
     layers = {1 << bit: jnp.asarray(rng.exponential(size=shape), jnp.float32) for bit in range(3)}
     beforehand = jnp.asarray(rng.exponential(2.0, size=shape), jnp.float32)
@@ -312,8 +312,8 @@ WRAPS = [lambda denoiser: denoiser, BY_ALBEDO]
 
 
 @pytest.mark.parametrize("wrap", WRAPS, ids=["plain", "demodulated"])
-def test_samples_asked_for_are_served_from_the_layers(wrap, rng):
-    """A loop in NumPy that asks, takes the bits of that many samples, and steps."""
+def test_requested_samples_come_from_the_layers(wrap, rng):
+    """A loop in NumPy that requests samples, combines the layers, and steps."""
     denoiser, clip = adaptive(wrap), layered(rng)
     params = denoiser.init(jax.random.key(0), frame_at(clip.frames, 0))
     images = denoise(denoiser, params, clip)
@@ -333,7 +333,7 @@ def test_samples_asked_for_are_served_from_the_layers(wrap, rng):
 
 
 @pytest.mark.parametrize("wrap", WRAPS, ids=["plain", "demodulated"])
-def test_a_stream_serves_samples_as_a_clip_does(wrap, rng):
+def test_a_stream_gives_samples_as_a_clip_does(wrap, rng):
     denoiser, clip = adaptive(wrap), layered(rng)
     params = denoiser.init(jax.random.key(0), frame_at(clip.frames, 0))
     images, one = denoise(denoiser, params, clip), stream(denoiser, params)
@@ -343,7 +343,7 @@ def test_a_stream_serves_samples_as_a_clip_does(wrap, rng):
     assert len(one.programs) == 1
 
 
-def test_the_step_is_told_how_many_samples_it_really_got(rng):
+def test_the_step_gets_the_actual_number_of_samples(rng):
     told = []
 
     def step(params, state, frame, first):
@@ -361,7 +361,7 @@ def test_the_step_is_told_how_many_samples_it_really_got(rng):
 
 
 @pytest.mark.parametrize("rematerialize", [False, True])
-def test_gradients_through_a_denoiser_that_asks_are_finite(rematerialize, rng):
+def test_gradients_through_a_denoiser_that_requests_samples_are_finite(rematerialize, rng):
     denoiser, clip = adaptive(), layered(rng)
     params = denoiser.init(jax.random.key(0), frame_at(clip.frames, 0))
 
@@ -375,7 +375,7 @@ def test_gradients_through_a_denoiser_that_asks_are_finite(rematerialize, rng):
     assert slope["most"] == 0  # the number of samples is rounded, and from_layers says so with a gradient of 0
 
 
-def test_a_denoiser_that_asks_without_layers_raises(rng):
+def test_a_request_without_layers_raises(rng):
     denoiser, clip = adaptive(), layered(rng)
     params, frame = denoiser.init(jax.random.key(0), None), frame_at(clip.frames, 0)
     with pytest.raises(ValueError, match="layers: expected independent noisy layers"):
@@ -386,7 +386,7 @@ def test_a_denoiser_that_asks_without_layers_raises(rng):
         stream(denoiser, params)(frame)
 
 
-def test_layers_that_nobody_asks_for_leave_no_trace(rng):
+def test_layers_without_a_request_leave_no_operation(rng):
     clip = layered(rng)
     denoiser = recurrent(identity())
     assert denoiser.samples is None

@@ -1,4 +1,4 @@
-"""Frame by frame as they come: the images of a whole clip, a program for each set of buffers, and what was repaired."""
+"""Streams: the images of the whole clip frame by frame, one program per set of buffers, and the repaired values."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ METHODS = {"svgf": lambda: svgf(levels=2), "ntd": lambda: ntd(size=TINY)}
 
 @pytest.fixture(scope="module")
 def clip():
-    """A wall with a square that moves over it, every buffer there."""
+    """A wall with a square that moves over it, with every buffer."""
     return good(frames=COUNT).clip._replace(reference=None)
 
 
@@ -40,14 +40,14 @@ def test_a_stream_gives_the_images_of_the_whole_clip(method, clip, numbers):
     denoiser, params, expected = method
     one = stream(denoiser, params)
     images = [one(frame) for frame in frames_of(clip, numbers)]
-    # Looked at when all are there: a state that takes over the memory of an image would have spoilt it by now.
+    # Compared at the end: a state that reuses the memory of an image would have overwritten it by now.
     for image, wanted in zip(images, expected, strict=True):
         np.testing.assert_allclose(image, wanted, rtol=2e-4, atol=1e-5)
     assert one.programs == {tuple(name for name in Frame._fields[1:] if name in denoiser.reads)}
     assert one.repaired == 0
 
 
-def test_every_stream_begins_anew_and_leaves_its_frames_and_parameters_alone(method, clip):
+def test_every_stream_starts_without_history_and_keeps_its_arguments_unchanged(method, clip):
     denoiser, params, expected = method
     frames = frames_of(clip, jnp)
     before = jax.tree.map(np.array, (params, frames))
@@ -57,7 +57,7 @@ def test_every_stream_begins_anew_and_leaves_its_frames_and_parameters_alone(met
     jax.tree.map(np.testing.assert_array_equal, (params, frames), before)
 
 
-def test_each_takes_a_frame_when_its_image_is_asked_for(method, clip):
+def test_each_takes_a_frame_when_its_image_is_requested(method, clip):
     denoiser, params, expected = method
     taken = []
 
@@ -73,8 +73,8 @@ def test_each_takes_a_frame_when_its_image_is_asked_for(method, clip):
     assert len(list(images)) == COUNT - 1
 
 
-def test_a_program_is_made_for_each_set_of_buffers_that_is_read(clip):
-    """What is not read is no other set; a set that comes again is compiled once."""
+def test_a_program_is_compiled_for_each_set_of_buffers_that_is_read(clip):
+    """Only buffers that are read make a set; a repeated set is compiled once."""
     traced = []
 
     def step(params, state, frame, first):
@@ -92,7 +92,7 @@ def test_a_program_is_made_for_each_set_of_buffers_that_is_read(clip):
 
 
 def test_buffers_that_come_and_go_are_their_neutral_values(method, clip):
-    """Still frames without vectors among frames with them, as a renderer writes them that finds nothing moving."""
+    """Frames without vectors among frames with them, as a renderer writes them where nothing moves."""
     denoiser, params, _ = method
     still = jax.tree.map(lambda buffer: buffer, clip.frames)
     vectors = np.array(still.motion)
@@ -137,7 +137,7 @@ def test_a_denoiser_without_a_count_has_repaired_nothing(clip):
         np.testing.assert_allclose(image, index * clip.frames.radiance[index], rtol=1e-6)
 
 
-def test_a_clip_of_sizes_that_differ_is_refused(method, clip):
+def test_a_clip_with_different_sizes_is_refused(method, clip):
     denoiser, params, _ = method
     shorter = clip._replace(frames=clip.frames._replace(albedo=clip.frames.albedo[:, 1:]))
     with pytest.raises(ValueError, match=r"clip\.frames\.albedo: expected \[T, H, W\]"):

@@ -1,4 +1,4 @@
-"""The table of methods and their options: what a factory takes, refuses and says of itself."""
+"""The table of methods and their options: what a factory accepts, refuses and documents."""
 
 import dataclasses
 import importlib
@@ -40,7 +40,7 @@ class Toys:
     either: Literal["small"] | tuple[int, ...] = "small"
 
 
-# What is accepted and what is not.
+# Accepted and refused values.
 
 
 @pytest.mark.parametrize(
@@ -106,7 +106,7 @@ def test_what_is_out_of_range_says_the_range():
         make(Toys, {"way": "left"}, method="toy")
 
 
-def test_the_command_lines_words_become_values():
+def test_command_line_words_become_values():
     words = ["size=small", "levels=3", "alpha=0.25", "occlusion=false", "truncate=True", "widths=[[1], [2]]"]
     found = parse([*words, "compute_dtype=null", "preset=None", "a=b=c", 'name="3"', "empty="])
     assert found == {
@@ -123,7 +123,7 @@ def test_the_command_lines_words_become_values():
 
 
 def built(monkeypatch, factory_of_ntd):
-    """The options that a factory builds of what it is given."""
+    """The options that a factory builds from its arguments."""
     seen = []
     monkeypatch.setattr(table, "_METHODS", dict(table._METHODS))
 
@@ -208,7 +208,7 @@ def test_every_default_preset_and_variant_is_one_that_its_factory_takes(row):
 # The table.
 
 
-def test_the_table_finds_the_methods_of_its_room():
+def test_the_table_finds_the_methods_of_its_package():
     found = methods()
     assert {"ntd", "svgf"} <= set(found)
     assert list(found) == sorted(found)
@@ -275,7 +275,7 @@ def test_the_engine_is_the_fastest_for_the_purpose_and_none_for_half_precision(p
     assert ntd.engine(purpose, options) is None
 
 
-# A method of somebody else's.
+# A method from outside the package.
 
 
 @dataclass(frozen=True)
@@ -305,7 +305,7 @@ def toy(monkeypatch):
     return toy
 
 
-def test_a_method_that_is_entered_is_found_everywhere(toy):
+def test_a_registered_method_is_found_everywhere(toy):
     row = method_named("toy")
     assert row.learns
     assert row.factory is toy
@@ -316,8 +316,8 @@ def test_a_method_that_is_entered_is_found_everywhere(toy):
     assert row.variant_named(None) == {}
 
 
-def test_a_learned_method_of_ones_own_can_be_denoised_with(toy, tmp_path, monkeypatch, rng):
-    """Where ONNX Runtime is installed, `jaxdn denoise` must not ask a method for it that does not know it."""
+def test_a_custom_learned_method_can_denoise(toy, tmp_path, monkeypatch, rng):
+    """Where ONNX Runtime is installed, `jaxdn denoise` must not pass it to a method without this option."""
     engines(monkeypatch, onnxruntime=True, onednn=True)
     frame = Frame(jnp.asarray(rng.exponential(size=(4, 5, 3)), jnp.float32))
     params = {"gain": jnp.asarray([[[0.5, 1.0, 2.0]]], jnp.float32)}
@@ -338,7 +338,7 @@ def test_a_learned_method_needs_weights(toy):
 
 
 @pytest.mark.parametrize(("installed", "engine"), [(True, "onnxruntime"), (False, "reference")])
-def test_weights_of_a_network_run_on_the_engine_that_is_there(installed, engine, monkeypatch, tmp_path):
+def test_weights_of_a_network_run_on_the_available_engine(installed, engine, monkeypatch, tmp_path):
     if installed and not ENGINES["onnxruntime"].available():
         pytest.skip("onnxruntime is not installed")
     engines(monkeypatch, onnxruntime=installed, onednn=True)
@@ -354,7 +354,7 @@ def test_weights_of_a_network_run_on_the_engine_that_is_there(installed, engine,
     assert candidate_on(str(half))[1] == "reference"
 
 
-def test_names_of_layers_are_words_whatever_they_look_like():
+def test_layer_names_are_always_strings():
     assert parse(["albedo=3", "ids=null", "depth=[1]"], option="--channels", words=True) == {
         "albedo": "3",
         "ids": "null",

@@ -1,4 +1,4 @@
-"""The U-Net against a NumPy one, and its promises: plain dicts, fixed shapes, absent groups that cost nothing."""
+"""The U-Net against a NumPy one, and its guarantees: plain dicts, fixed shapes, absent groups at a lower cost."""
 
 from collections.abc import Callable
 
@@ -109,7 +109,7 @@ def test_parameters_are_plain_and_xavier(key: jax.Array) -> None:
     assert not np.array_equal(params["head_0"]["kernel"], other["head_0"]["kernel"])
 
 
-def test_nothing_but_the_network_room_imports_flax() -> None:
+def test_only_the_networks_package_imports_flax() -> None:
     import pathlib
 
     import jaxdn
@@ -158,7 +158,7 @@ def test_an_engine_runs_the_same_network(
 
 
 def test_onnxruntime_follows_the_weights_under_scan_and_vmap(rng: np.random.Generator, key: jax.Array) -> None:
-    """The engine keeps weights laid out for itself; other weights in the next call give the other image."""
+    """The engine keeps weights in its own layout; new weights in the next call give the new image."""
     pytest.importorskip("onnxruntime")
     plain, engine = (unet((3, 2), (5, 3, 2), widths=TINY, implementation=name) for name in (None, "onnxruntime"))
     inputs = [jnp.stack([group, 2 * group]) for group in features(rng, (3, 2))]
@@ -175,7 +175,7 @@ def test_onnxruntime_follows_the_weights_under_scan_and_vmap(rng: np.random.Gene
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), got, wanted)
 
 
-def test_onnxruntime_takes_float32_alone(rng: np.random.Generator, key: jax.Array) -> None:
+def test_onnxruntime_takes_only_float32(rng: np.random.Generator, key: jax.Array) -> None:
     pytest.importorskip("onnxruntime")
     network = unet((3, 2), (5, 3, 2), widths=TINY, implementation="onnxruntime")
     inputs = [group.astype(jnp.bfloat16) for group in features(rng, (3, 2))]

@@ -69,8 +69,7 @@ class Stage:
         import mitsuba as mi
 
         place = mi.ScalarTransform4f
-        # Three pixels in each direction; the light stands behind the camera and below it there is a floor, so that
-        # light gets round corners.
+        # Three pixels in each direction; the light is behind the camera with a floor below it, for indirect light.
         small = np.diag([3 * PIXEL, 3 * PIXEL, 1.0, 1.0])
         scene: dict[str, Any] = {
             "type": "scene",

@@ -1,4 +1,4 @@
-"""Timing and the benchmark's rows, on works that take milliseconds."""
+"""Timing and the benchmark's rows, on workloads that take milliseconds."""
 
 import json
 import time
@@ -26,7 +26,7 @@ def test_calls_are_timed_interleaved():
     assert timings["a"].min_ms <= timings["a"].median_ms <= timings["a"].max_ms
 
 
-def test_the_first_call_is_apart_and_the_budget_ends_the_rounds():
+def test_the_first_call_is_separate_and_the_budget_ends_the_rounds():
     naps = iter([0.2] + [0.03] * 100)
     timing = measure({"nap": lambda: time.sleep(next(naps))}, rounds=100, budget_s=0.3)["nap"]
     assert timing.first_ms > 190
@@ -40,11 +40,11 @@ def test_peak_memory_is_what_a_call_touches():
 
     peak = peak_mib(allocate)
     if peak is None:
-        pytest.skip("this system does not tell the peak of resident memory")
+        pytest.skip("this system does not report the peak of resident memory")
     assert 60 < peak < 90  # 64 MiB
 
 
-def test_rows_of_a_real_work(tmp_path, monkeypatch):
+def test_rows_of_a_real_workload(tmp_path, monkeypatch):
     lacking = {"torch-compiled": "not compiled in a fast test", **peers.missing()}
     monkeypatch.setattr(peers, "missing", lambda: lacking)
     work = next(operations.warp_works(24, 32, "24p"))
@@ -67,7 +67,7 @@ def test_rows_of_a_real_work(tmp_path, monkeypatch):
     assert bench.table(rows).row_count == len(medians) - 1
 
 
-def test_every_ours_meets_every_peer():
+def test_every_implementation_is_compared_with_every_peer():
     timings = {name: Timing(ms, ms, ms, ms, 1) for name, ms in (("xla", 2.0), ("xla-remat", 3.0), ("torch-eager", 4.0))}
     rows = bench.compare("train", timings, dict.fromkeys(timings, 1.0), ["torch-eager"], 0.5)
     found = {(row["implementation"], row["against"]): row["ratio"] for row in rows}
@@ -80,7 +80,7 @@ def test_every_ours_meets_every_peer():
     }
 
 
-def test_what_cannot_run_here_is_left_out_with_a_word():
+def test_what_cannot_run_here_is_left_out_with_a_message():
     def refuse():
         raise ValueError("there is no such engine")
 

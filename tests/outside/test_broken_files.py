@@ -1,4 +1,4 @@
-"""Broken files that the fuzzer found and that were not refused as they should be."""
+"""Regression tests for broken files that the fuzzer found."""
 
 import json
 import time
@@ -54,7 +54,7 @@ def test_a_record_that_claims_endless_frames_is_refused_at_once(clip, read):
         ["frames"],
     ],
 )
-def test_a_plan_that_makes_no_sense_is_refused(clip, read, plan):
+def test_an_invalid_plan_is_refused(clip, read, plan):
     rewrite(clip, plan=plan)
     with pytest.raises(ClipError, match="plan: expected"):
         read(clip)
@@ -67,7 +67,7 @@ def test_a_record_with_fewer_cameras_than_frames_is_refused(clip):
 
 
 @pytest.mark.parametrize("number", [10**400, -(10**400)])
-def test_a_number_beyond_every_float_is_refused(number):
+def test_a_number_too_large_for_a_float_is_refused(number):
     with pytest.raises(ValueError, match="finite"):
         check_animation({"lights": {"lamp": [{"frame": 0, "scale": number}]}}, [])
 

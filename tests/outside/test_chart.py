@@ -1,4 +1,4 @@
-"""The chart: going on after an interruption, the Pareto front, equal quality, the page; the whole of it is slow."""
+"""The chart: resuming after an interruption, the Pareto front, equal quality, the page; the whole chart is slow."""
 
 import json
 import math
@@ -45,7 +45,7 @@ def scores(psnr):
 
 @pytest.fixture
 def data():
-    """Raw measurements as a run leaves them."""
+    """Raw measurements as a run stores them."""
     errors = {point_key(RENDERER, spp): {"room": scores(20 + 3 * math.log2(spp))} for spp in (1, 2, 4, 8)}
     errors |= {point_key("filter", spp): {"room": scores(24.5 + 3 * math.log2(spp))} for spp in (1, 2)}
     cost = {"seconds": {"fixed": 0.1, "sample": 0.5, "features": 0.05, "motion": 0.2}}
@@ -69,7 +69,7 @@ LABELS = {
 }
 
 
-def test_the_file_is_whole_after_every_point_and_goes_on(tmp_path):
+def test_the_file_is_complete_after_every_point_and_resumes(tmp_path):
     path = tmp_path / "runs" / "chart.json"
     store = Store(path, {"frames": 4}, {"cores": 2})
     assert not store.kept
@@ -82,7 +82,7 @@ def test_the_file_is_whole_after_every_point_and_goes_on(tmp_path):
     assert [each.name for each in path.parent.iterdir()] == ["chart.json"]
 
 
-def test_other_settings_or_another_machine_start_afresh_and_keep_the_old(tmp_path):
+def test_other_settings_or_another_machine_start_over_and_keep_the_old_file(tmp_path):
     path = tmp_path / "chart.json"
     Store(path, {"frames": 4}, {"cores": 2}).put("errors", "a @ 1", {})
     other = Store(path, {"frames": 4}, {"cores": 64})
@@ -91,7 +91,7 @@ def test_other_settings_or_another_machine_start_afresh_and_keep_the_old(tmp_pat
     assert "a @ 1" in json.loads((tmp_path / "chart.before.json").read_text())["errors"]
 
 
-def test_the_front_is_what_nothing_else_beats(rng):
+def test_the_front_has_the_points_that_nothing_else_beats(rng):
     cloud = [
         point(f"m{index}", 1, float(psnr), float(ms)) for index, (psnr, ms) in enumerate(rng.uniform(1, 40, (60, 2)))
     ]
@@ -120,7 +120,7 @@ def test_a_dip_in_the_curve_counts_for_fewer_samples():
     assert equal_samples(25, {1: 20.0, 2: 26.0, 4: 24.0, 8: 30.0}) == pytest.approx(2 ** (5 / 6))
 
 
-def test_equal_quality_tells_samples_and_seconds(data):
+def test_equal_quality_gives_samples_and_seconds(data):
     found = points(data, LABELS)
     equals = equal_quality(found, Cost(0.1, 0.5, 0.05, 0.2))
     assert equals["filter @ 1"].spp == pytest.approx(2**1.5)
@@ -130,7 +130,7 @@ def test_equal_quality_tells_samples_and_seconds(data):
     assert "3 spp, 1.5 s" in text
 
 
-def test_points_add_what_the_renderer_has_to_give(data):
+def test_points_include_the_time_of_rendering_their_input(data):
     by_key = {each.key: each for each in points(data, LABELS)}
     assert by_key["renderer @ 4"].milliseconds(SIZE, render=True) == pytest.approx(2100)
     assert by_key["filter @ 2"].milliseconds(SIZE, render=True) == pytest.approx(30 + 1350)
@@ -190,7 +190,7 @@ def test_every_registered_method_is_there_with_its_variants(denoisers):
     assert {each.method.name for each in denoisers} == set(methods())
 
 
-def test_quickly_the_fastest_of_each_method_is_measured():
+def test_quick_measures_the_fastest_of_each_method():
     found = [each.name for each in ways(chosen(quick=True), quick=True)]
     assert {"svgf", "ntd-small"} <= set(found)
     assert "ntd-large" not in found
@@ -198,7 +198,7 @@ def test_quickly_the_fastest_of_each_method_is_measured():
 
 
 def entered(monkeypatch, factory, name, **columns):
-    """A method in the table for the length of a test."""
+    """A method in the table during one test."""
     monkeypatch.setattr(table, "_METHODS", dict(table._METHODS))
     factory.__name__ = name
     return method(NoOptions, title=name, **columns)(factory)
@@ -222,7 +222,7 @@ def mean_of_two(samples=None):
     return recurrent(Core(lambda params, frame: frame.radiance, step, frozenset(), init, samples))
 
 
-def test_a_newcomer_without_weights_is_timed_alone(monkeypatch):
+def test_a_new_method_without_weights_is_only_timed(monkeypatch):
     recipe = method_named("ntd").recipe_named(None)
     entered(monkeypatch, lambda options: mean_of_two(), "newcomer", recipes={"usual": recipe})
     denoisers = [each for each in chosen() if each.label == "newcomer"]
@@ -234,8 +234,8 @@ def test_a_newcomer_without_weights_is_timed_alone(monkeypatch):
     assert list(subjects(denoisers)) == []
 
 
-def test_images_are_those_of_a_clip_that_begins_anew():
-    """The same frames twice through one way: nothing of the first run is left in the second."""
+def test_images_are_those_of_a_clip_without_history():
+    """The same frames twice: nothing of the first run is left in the second."""
     denoiser = mean_of_two()
     frames = scene.clip(3, 16, 32).frames
     images = way(Candidate("newcomer", denoiser, {"gain": jnp.ones(())})).images
@@ -244,7 +244,7 @@ def test_images_are_those_of_a_clip_that_begins_anew():
     np.testing.assert_array_equal(images(frames), found)
 
 
-def test_what_asks_for_samples_is_left_out_in_a_sentence(monkeypatch):
+def test_methods_that_request_samples_are_left_out_with_a_message(monkeypatch):
     def samples(params, state, frame):
         return jnp.ones_like(frame.radiance[..., :1])
 
@@ -253,7 +253,7 @@ def test_what_asks_for_samples_is_left_out_in_a_sentence(monkeypatch):
     assert [sentence for sentence in left_out() if sentence.startswith("sampler requests samples from the renderer")]
 
 
-def test_steps_with_known_parts_are_taken_apart(denoisers):
+def test_steps_with_known_parts_are_broken_down(denoisers):
     names = [subject.name for subject in subjects(denoisers, quick=True)]
     assert names == ["ntd-large, reference", "ntd-small, reference"]
     tiny = {"size": ((4,), (4,), (5,), (5,), (6,))}
@@ -265,7 +265,7 @@ def test_steps_with_known_parts_are_taken_apart(denoisers):
 
 
 @pytest.mark.slow
-def test_the_whole_of_it_quickly_and_again(tmp_path):
+def test_the_whole_quick_chart_and_resuming_it(tmp_path):
     pytest.importorskip("mitsuba")
     command = [sys.executable, "-m", "experiments.speed.chart", "--quick", "--out", str(tmp_path / "chart-quick")]
     first = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: real processes, messages instead of tracebacks, exit code 2, whole files."""
+"""The command line in real processes: messages instead of tracebacks, exit code 2, complete files."""
 
 import json
 import subprocess
@@ -25,7 +25,7 @@ def jaxdn(*arguments, timeout=300):
 
 
 def fails(*arguments):
-    """Run a command that a user got wrong; returns what it says."""
+    """Run a command with a user error; returns its message."""
     done = jaxdn(*arguments)
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stdout + done.stderr
@@ -50,7 +50,7 @@ def write_shot(file, pixels):
 
 @pytest.fixture(scope="module")
 def shot(tmp_path_factory):
-    """EXR files of another renderer: noise on a checkered wall, whose colours lie in a layer of a name of its own."""
+    """EXR files of another renderer: noise on a checkered wall, whose colours are in a layer with an unknown name."""
     folder, rng = tmp_path_factory.mktemp("shots"), np.random.default_rng(0)
     checks = np.where(np.indices((24, 32)).sum(axis=0) // 3 % 2 == 0, 0.9, 0.1).astype(np.float32)
     for index in range(2):
@@ -61,7 +61,7 @@ def shot(tmp_path_factory):
 
 
 @pytest.mark.parametrize("verb", [(), ("inspect",), ("render",), ("train",), ("denoise",), ("compare",)])
-def test_help_says_what_to_type(verb):
+def test_help_shows_examples(verb):
     done = jaxdn(*verb, "--help")
     assert done.returncode == 0
     assert "jaxdn" in done.stdout
@@ -103,7 +103,7 @@ def test_denoise_plain_exr_files_with_the_shipped_network(tmp_path):
 
 
 def test_a_layer_named_on_the_command_line_is_the_buffer(shot, tmp_path):
-    """Divided by its colours the wall is plain, and its checks are not blurred; found by nobody they would be."""
+    """Divided by its colours the wall is uniform, and its checks are not blurred; without the layer they would be."""
     checks = np.where(np.indices((24, 32)).sum(axis=0) // 3 % 2 == 0, 0.9, 0.1)
     errors = []
     for name, options in (("without", ()), ("with", ("--channels", "albedo=Paint"))):
@@ -115,7 +115,7 @@ def test_a_layer_named_on_the_command_line_is_the_buffer(shot, tmp_path):
 
 
 @pytest.mark.slow
-def test_train_denoise_and_compare_with_weights_of_ones_own(tmp_path):
+def test_train_denoise_and_compare_with_new_weights(tmp_path):
     write_clip(make_clip(0, frames=10, size=20), tmp_path / "clips" / "square")
     few = ("--steps", "2", "--batch", "1", "--crop", "16")
     options = ("--variant", "ntd-small", "--set", "size=[[4], [4], [4], [4], [4]]", "motion=traditional")
@@ -183,11 +183,11 @@ def test_compare_ends_with_a_report(clip, tmp_path):
         (("train", "CLIP", "-o", "out", "--set", "motion"), "--set 'motion': expected name=value"),
     ],
 )
-def test_mistakes_are_told_plainly(clip, shot, tmp_path, monkeypatch, arguments, told):
+def test_user_errors_give_plain_messages(clip, shot, tmp_path, monkeypatch, arguments, told):
     monkeypatch.chdir(tmp_path)
     places = {"CLIP": clip, "SHOT": shot}
     assert told in fails(*(places.get(word, word) for word in arguments))
-    assert not [path for path in tmp_path.rglob("*") if path.is_file()]  # nothing half written, hidden or not
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]  # no incomplete file, hidden or not
 
 
 def test_a_truncated_frame_names_the_file(clip, tmp_path):

@@ -1,4 +1,4 @@
-"""Clips on disk: round trips, and what is said about files that are broken, missing or foreign."""
+"""Clips on disk: round trips, and errors about broken and missing files and those of other renderers."""
 
 import json
 import subprocess
@@ -20,7 +20,7 @@ HALF = tuple(name for name, row in BUFFERS.items() if row.stored == "half")
 
 
 def make_buffer(rng: np.random.Generator, name: str, height: int, width: int) -> np.ndarray:
-    """Random numbers as the kind of a buffer has them; too large for half precision where single is stored."""
+    """Random values of a buffer's kind; too large for half precision where single is stored."""
     row = BUFFERS[name]
     image = rng.random((height, width, row.channels), np.float32)
     if row.stored in ("flag", "id"):
@@ -40,7 +40,7 @@ def make_clip(rng: np.random.Generator, count: int = 3, height: int = 5, width: 
 
 
 @pytest.mark.parametrize("size", [(1, 1), (33, 57), (1, 40)])
-def test_every_buffer_comes_back(tmp_path: Path, rng: np.random.Generator, size: tuple[int, int]) -> None:
+def test_every_buffer_round_trips(tmp_path: Path, rng: np.random.Generator, size: tuple[int, int]) -> None:
     frame = make_frame(rng, *size)
     clips.write_frame(tmp_path / "a.exr", frame, reference=frame.direct, reference_half=frame.emission)
     stored = clips.read_frame(tmp_path / "a.exr")
@@ -54,8 +54,8 @@ def test_every_buffer_comes_back(tmp_path: Path, rng: np.random.Generator, size:
     assert [file.name for file in tmp_path.iterdir()] == ["a.exr"]  # and nothing else is left
 
 
-def test_the_channels_of_the_first_version_are_what_they_were(tmp_path: Path, rng: np.random.Generator) -> None:
-    """Clips that were written before there was a table of buffers stay readable, and their readers too."""
+def test_the_channels_of_the_first_version_stay_unchanged(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Clips from before there was a table of buffers stay readable, and new clips by old readers."""
     half = [*rgb("albedo"), *rgb("normal", "XYZ"), "roughness.Y", "visible.Y", *rgb("direct"), *rgb("emission")]
     half += [*rgb("noisy_1spp"), *rgb("reference")]
     single = ["depth.Z", "previous_depth.Z", *rgb("motion", "XY"), *rgb("dual_motion", "XY")]
@@ -77,7 +77,7 @@ def test_absent_buffers_stay_absent(tmp_path: Path, rng: np.random.Generator) ->
     assert stored.reference_half is None
 
 
-def test_views_that_are_not_contiguous_are_written_as_they_look(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_non_contiguous_views_are_written_correctly(tmp_path: Path, rng: np.random.Generator) -> None:
     image = rng.random((9, 6), np.float32)
     channels = {"turned": np.rot90(image).T, "fortran": np.asfortranarray(image), "mirrored": image[::-1, ::-1]}
     clips.write_exr(tmp_path / "a.exr", channels)
@@ -96,7 +96,7 @@ def test_views_that_are_not_contiguous_are_written_as_they_look(tmp_path: Path, 
         np.zeros(4, np.float32),
     ],
 )
-def test_channels_that_openexr_would_garble_are_refused(tmp_path: Path, pixels: np.ndarray) -> None:
+def test_channels_that_openexr_would_corrupt_are_refused(tmp_path: Path, pixels: np.ndarray) -> None:
     with pytest.raises(ValueError, match=r"a\.exr: channel x: expected"):
         clips.write_exr(tmp_path / "a.exr", {"x": pixels})
     assert not list(tmp_path.iterdir())
@@ -148,7 +148,7 @@ def test_every_truncation_is_noticed(tmp_path: Path, rng: np.random.Generator) -
             clips.read_frame(file)
 
 
-def test_damaged_bytes_never_escape_as_anything_but_a_clip_error(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_damaged_bytes_only_raise_clip_errors(tmp_path: Path, rng: np.random.Generator) -> None:
     file = tmp_path / "a.exr"
     clips.write_frame(file, make_frame(rng, 9, 9))
     whole = np.frombuffer(file.read_bytes(), np.uint8)
@@ -189,7 +189,7 @@ for limit, side in ((300, 2), (600, 4), (20000, 99)):
 """
 
 
-def test_a_full_disk_leaves_the_old_frame_and_nothing_else(tmp_path: Path) -> None:
+def test_a_full_disk_leaves_only_the_old_frame(tmp_path: Path) -> None:
     """Small files too: the EXR library itself does not notice when a disk fills up within its last buffer."""
     (tmp_path / "a.exr").write_bytes(b"the old frame")
     command = [sys.executable, "-c", FULL_DISK, str(tmp_path)]
@@ -201,7 +201,7 @@ def test_a_full_disk_leaves_the_old_frame_and_nothing_else(tmp_path: Path) -> No
     assert (tmp_path / "a.exr").read_bytes() == b"the old frame"
 
 
-def test_a_clip_comes_back_with_its_record(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_a_clip_round_trips_with_its_record(tmp_path: Path, rng: np.random.Generator) -> None:
     clip = make_clip(rng)
     clips.write_clip(clip, tmp_path / "c", record={"seed": 5, "scene": {"family": "fruit"}, "layers": [1, 2]}, spp=4)
     record = clips.read_record(tmp_path / "c")
@@ -212,7 +212,7 @@ def test_a_clip_comes_back_with_its_record(tmp_path: Path, rng: np.random.Genera
         expected = buffer.astype(np.float16).astype(np.float32) if name in HALF else buffer
         np.testing.assert_array_equal(getattr(found.frames, name), expected, err_msg=name)
     np.testing.assert_array_equal(found.reference, clip.reference.astype(np.float16))
-    # What has half precision already is written and read without any change.
+    # Half-precision values are written and read without any change.
     clips.write_clip(found, tmp_path / "d", spp=4)
     again = clips.read_clip(tmp_path / "d", spp=4)
     np.testing.assert_array_equal(again.frames.radiance, found.frames.radiance)
@@ -264,14 +264,14 @@ def test_broken_clips_are_refused_with_the_reason(tmp_path: Path, rng: np.random
         clips.read_clip(tmp_path / "nowhere")
 
 
-def test_a_record_that_is_no_json_is_refused(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_a_record_that_is_not_json_is_refused(tmp_path: Path, rng: np.random.Generator) -> None:
     for value in (float("nan"), np.zeros(3), {1, 2}):
         with pytest.raises(ValueError, match="cannot be written as JSON"):
             clips.write_clip(make_clip(rng, 1), tmp_path / "c", record={"value": value})
         assert not clips.is_clip(tmp_path / "c")
 
 
-def test_a_refused_record_leaves_the_clip_that_is_there(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_a_refused_record_leaves_the_existing_clip(tmp_path: Path, rng: np.random.Generator) -> None:
     clips.write_clip(make_clip(rng, 2), tmp_path / "c")
     with pytest.raises(ValueError, match="cannot be written as JSON"):
         clips.write_clip(make_clip(rng, 1), tmp_path / "c", record={"value": float("nan")})
@@ -292,11 +292,11 @@ def test_a_clip_counts_as_one_when_its_last_frame_is_written(tmp_path: Path, rng
     clips.finish_record(record, folder)
     assert clips.read_record(folder) == clips.begun_record(folder) == {"format": 1, **record}
     assert sorted(file.name for file in folder.iterdir()) == ["clip.json", "frame_0000.exr"]
-    # More frames are added: until they are there it is no clip.
+    # More frames are added: until they exist it is not a clip.
     clips.begin_record({**record, "frames": 2}, folder)
     assert not clips.is_clip(folder)
     assert clips.begun_record(folder)["frames"] == 2
-    # A rendering that was ended between the two steps of the end has a finished clip.
+    # A rendering interrupted between the last two steps has a finished clip.
     clips.finish_record(record, folder)
     (folder / "clip.unfinished.json").write_text("{")
     assert clips.is_clip(folder)
@@ -318,7 +318,7 @@ def test_a_record_that_is_refused_changes_nothing(tmp_path: Path, rng: np.random
         assert {file.name: file.read_bytes() for file in (tmp_path / "c").iterdir()} == before
 
 
-def test_a_clip_whose_writing_is_interrupted_is_none(tmp_path: Path, rng: np.random.Generator, monkeypatch) -> None:
+def test_an_interrupted_clip_is_not_a_clip(tmp_path: Path, rng: np.random.Generator, monkeypatch) -> None:
     clips.write_clip(make_clip(rng, 2), tmp_path / "c")
 
     def interrupted(*_: object, **__: object) -> None:
@@ -373,7 +373,7 @@ def test_channels_are_found_by_their_names(names: list[str], expected: dict[str,
     assert {buffer: found[0] for buffer, found in clips.detect_channels(names).items()} == expected
 
 
-def test_channels_that_fit_twice_or_not_at_all_are_asked_about() -> None:
+def test_ambiguous_or_missing_channels_are_refused() -> None:
     twice = [*rgb("Left.Combined"), *rgb("Right.Combined")]
     with pytest.raises(ClipError, match=r"'Left\.Combined' and 'Right\.Combined' fit equally well"):
         clips.detect_channels(twice)
@@ -420,7 +420,7 @@ def test_every_convention_means_the_same_movement() -> None:
         np.testing.assert_allclose(convert_motion(motion, convention)[4, 7], (3, 2), rtol=1e-6, err_msg=convention)
 
 
-def test_blender_sequences_need_nothing_said(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_blender_sequences_need_no_options(tmp_path: Path, rng: np.random.Generator) -> None:
     names = [*BLENDER, "ViewLayer.IndexOB.X"]
     write_plain(tmp_path / "a1.exr", names, rng)
     channels = clips.read_exr(tmp_path / "a1.exr")
@@ -467,13 +467,13 @@ def test_foreign_frames_are_read_one_at_a_time(tmp_path: Path, rng: np.random.Ge
         assert read == files[:count]
         alive.append(weakref.ref(frame.radiance))
         del frame
-        # The frame that was given last, and no other; the first leaves its size and the names of its buffers.
+        # Only the latest frame is in memory; of the first one, its size and the names of its buffers.
         assert sum(reference() is not None for reference in alive) <= 1
     assert len(read) == 5
-    assert len(read_facts(tmp_path).moments) == 5  # which way vectors point does not matter for whether anything moves
+    assert len(read_facts(tmp_path).moments) == 5  # whether anything moves does not depend on the convention
 
 
-def test_foreign_sequences_that_do_not_make_one_clip(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_foreign_sequences_that_are_not_one_clip_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:
     write_plain(tmp_path / "a_01.exr", rgb(""), rng)
     write_plain(tmp_path / "a_03.exr", rgb(""), rng)
     with pytest.raises(ClipError, match="missing between 1 and 3: 2"):

@@ -1,4 +1,4 @@
-"""The path length that is measured is the one that theory asks for."""
+"""The measured path length is the theoretical one."""
 
 import pytest
 

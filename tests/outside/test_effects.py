@@ -1,4 +1,4 @@
-"""Effects are found exactly, planned as data, and what a scene lacks is neither rendered nor stored nor compiled."""
+"""Effects are found exactly, planned as data, and absent effects are neither rendered nor stored nor compiled."""
 
 import ast
 import dataclasses
@@ -22,7 +22,7 @@ PLANNING = Path(effects.__file__).parent / "planning"
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_just_the_effects_that_a_scene_has_are_found(name, tmp_path):
+def test_exactly_the_effects_of_a_scene_are_found(name, tmp_path):
     case = CASES[name]
     found = effects.inspect(case.write(tmp_path), **SIZE)
     assert set(found) == case.effects, found.why
@@ -63,7 +63,7 @@ def test_a_loaded_scene_is_inspected_with_its_animation(tmp_path):
     assert set(effects.inspect(scene, **SIZE)) == {"indirect"}
 
 
-def test_an_animation_that_rests_does_not_tremble(tmp_path):
+def test_a_constant_animation_has_constant_poses(tmp_path):
     from jaxdn.render.scene_file import SceneFile
 
     scene = SceneFile(CASES["moving: nothing moves"].write(tmp_path))
@@ -74,15 +74,15 @@ def test_an_animation_that_rests_does_not_tremble(tmp_path):
 
 
 def test_what_is_uncertain_counts_as_present():
-    facts = Facts((Surface("wall"),), (Light("lamp"),), (Moment(),), uncertain={"glossy": "who knows"})
+    facts = Facts((Surface("wall"),), (Light("lamp"),), (Moment(),), uncertain={"glossy": "not readable"})
     found = effects.inspect(facts)
     assert "glossy" in found
-    assert found.uncertain["glossy"] == "who knows"
+    assert found.uncertain["glossy"] == "not readable"
     assert "roughness" in effects.plan(found).buffers
 
 
 def test_a_new_effect_needs_no_change_of_the_planner(monkeypatch):
-    # A later method reads a buffer that an effect produces; the planner takes that, and what it costs, from the data.
+    # A later method reads a buffer that an effect produces; the planner finds both in the data.
     glow = Effect(
         "fluorescence",
         "Light comes back in another colour.",
@@ -110,7 +110,7 @@ def test_the_planner_names_no_effect():
         assert texts & names <= {"emission"}, file
 
 
-def test_planning_looks_at_nothing_above_it():
+def test_planning_imports_no_upper_layer():
     code = (
         "import sys; import jaxdn.planning.plan, jaxdn.planning.found; "
         "print([name for name in sys.modules if name.startswith(('jaxdn.clips', 'jaxdn.render'))])"
@@ -119,7 +119,7 @@ def test_planning_looks_at_nothing_above_it():
     assert done.stdout.strip() == "[]"
     rooms = [*PLANNING.glob("*.py"), PLANNING.parent / "effects.py", *(PLANNING.parent / "render").rglob("*.py")]
     for path in rooms:
-        if path.name != "__init__.py":  # the front doors load their names when they are asked for
+        if path.name != "__init__.py":  # the packages load their names on first use
             assert 'import_module("jaxdn' not in path.read_text(), path
 
 
@@ -133,7 +133,7 @@ def test_a_plan_is_what_the_scene_has_and_the_denoiser_reads():
     assert set(effects.plan(found, ntd).buffers) <= ntd.reads | {"direct", "emission"}
 
 
-def test_a_plan_survives_its_record():
+def test_a_plan_round_trips_through_its_record():
     made = effects.plan(effects.chosen(["glossy", "indirect"], 3), max_depth=5)
     assert effects.plan_from_record(json.loads(json.dumps(made.record()))) == made
     with pytest.raises(ValueError, match=r"expected the entries .* missing: .*held"):
@@ -146,30 +146,30 @@ def test_a_plan_of_an_earlier_version_is_read():
     assert effects.plan_from_record(made.record() | earlier | {"demodulation": "none"}) == made
 
 
-def test_every_entry_of_a_plan_is_obeyed():
-    # What is only for people to read follows from these, and is said by `jaxdn inspect`.
+def test_every_entry_of_a_plan_is_used():
+    # What is only for readers follows from these, and is printed by `jaxdn inspect`.
     assert set(effects.Plan._fields) == {"integrator", "max_depth", "indirect", "effects", "frames", "held"}
 
 
-def test_unknown_effects_are_refused_with_those_there_are():
+def test_unknown_effects_raise_with_the_known_ones():
     with pytest.raises(ValueError, match=r"unknown 'fog'; expected auto, all or camera-motion, .*media"):
         effects.chosen(["fog"], 1)
 
 
 @pytest.mark.parametrize("scene", ["nowhere", "nowhere.xml", 7])
-def test_what_is_no_scene_is_refused(scene):
+def test_an_invalid_scene_is_refused(scene):
     with pytest.raises(ValueError, match="scene"):
         effects.inspect(scene)
 
 
-def test_every_effect_says_what_it_is():
+def test_every_effect_has_a_description():
     assert len({effect.name for effect in EFFECTS}) == 14
     for effect in EFFECTS:
         assert effect.sentence.endswith(".")
         assert effect.buffers <= set(Frame._fields)
 
 
-def test_what_is_left_out_is_counted_against_what_is_rendered_without_a_plan():
+def test_left_out_buffers_are_relative_to_rendering_without_a_plan():
     nothing = effects.plan(effects.chosen([], 1))
     assert command.bytes_a_pixel(command.EVERYTHING) == 80
     assert set(command.left_out(nothing)) == {name for effect in EFFECTS for name in effect.buffers}
@@ -182,12 +182,12 @@ def test_a_plan_is_made_for_a_method_with_or_without_weights(name):
     assert command.denoiser_named(name).reads
 
 
-def test_a_method_that_there_is_not_is_refused():
+def test_an_unknown_method_is_refused():
     with pytest.raises(ValueError, match="magic"):
         command.denoiser_named("magic")
 
 
-def test_json_is_all_that_is_printed(tmp_path):
+def test_only_json_is_printed(tmp_path):
     path = CASES["a ball: textured roughness"].write(tmp_path)
     done = subprocess.run(
         [sys.executable, "-m", "jaxdn.cli", "inspect", str(path), "--json", "--denoiser", "svgf"],
@@ -204,7 +204,7 @@ def test_json_is_all_that_is_printed(tmp_path):
     assert said["uncertain"] == []
 
 
-def test_a_mistake_ends_with_one_message(tmp_path):
+def test_a_user_error_ends_with_one_message(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "jaxdn.cli", "inspect", str(tmp_path / "none.xml"), "--json"],
         capture_output=True,

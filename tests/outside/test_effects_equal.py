@@ -1,4 +1,4 @@
-"""Leaving an absent effect out gives what simulating it gives: buffers, denoised images, and less of everything."""
+"""Leaving out an absent effect gives the same buffers and denoised images as simulating it, at a lower cost."""
 
 import contextlib
 import functools
@@ -23,7 +23,7 @@ WIDTH, HEIGHT, FRAMES = 24, 16, 4
 
 
 def rendered(case, folder):
-    """The same clip with everything, and with what the scene calls for."""
+    """The same clip with every effect, and with only those of the scene."""
     folder.mkdir(parents=True, exist_ok=True)
     scene = SceneFile(case.write(folder))
     found = effects.inspect(scene, width=WIDTH, height=HEIGHT)
@@ -34,14 +34,14 @@ def rendered(case, folder):
 
 @functools.cache
 def compiled(name):
-    """A denoiser as a function of clips, compiled once for every set of buffers that comes."""
+    """A denoiser as a function of clips, compiled once for every distinct set of buffers."""
     denoiser = getattr(jaxdn.denoisers, name)(**({"size": "small"} if name == "ntd" else {}))
     params = denoiser.init(jax.random.key(0), Frame(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
     return jax.jit(lambda clip: jaxdn.denoise(denoiser, params, clip))
 
 
 def assert_the_same(everything, auto):
-    """Every buffer that is there is equal, every one that is not was neutral, and so the images are equal."""
+    """Present buffers are equal, absent ones were neutral, and so the images are equal."""
     whole, lean = read_clip(everything), read_clip(auto)
     rendered_without_a_plan = present(whole.frames)
     assert set(present(lean.frames)) <= set(rendered_without_a_plan)
@@ -73,12 +73,12 @@ def test_what_is_left_out_was_neutral_everywhere(name, tmp_path):
 @pytest.mark.slow
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.sampled_from(sorted(MATERIALS)), st.sampled_from(sorted(ANIMATIONS)), st.sampled_from([BEHIND, SEEN]))
-def test_what_is_left_out_was_neutral_in_any_room(tmp_path_factory, material, animation, lamp):
+def test_what_is_left_out_was_neutral_in_random_rooms(tmp_path_factory, material, animation, lamp):
     case = room(material, animation, lamp=lamp)
     assert_the_same(*rendered(case, tmp_path_factory.mktemp("room")))
 
 
-def test_a_frame_that_shows_the_same_holds_the_noise_alone(tmp_path):
+def test_a_frame_that_shows_the_same_stores_only_the_noise(tmp_path):
     everything, auto = rendered(CASES["moving: ball, later"], tmp_path)
     stored = [read_frame(frame_path(auto, index)) for index in range(FRAMES)]
     assert [frame.reference is not None for frame in stored] == [True, False, True, True]
@@ -90,7 +90,7 @@ def test_a_frame_that_shows_the_same_holds_the_noise_alone(tmp_path):
     assert sizes[1] < sizes[0]
 
 
-def test_an_interrupted_plan_goes_on_bit_for_bit(tmp_path):
+def test_an_interrupted_plan_resumes_bit_for_bit(tmp_path):
     _, auto = rendered(CASES["moving: ball, later"], tmp_path)
     before = [frame_path(auto, index).read_bytes() for index in range(FRAMES)]
     for index in (1, 2):

@@ -1,4 +1,4 @@
-"""What a scene lacks leaves no operation in the compiled step: read off the lowered text, not off a clock."""
+"""Absent effects leave no operation in the compiled step: tested on the lowered program, not by timing."""
 
 import re
 
@@ -71,7 +71,7 @@ def test_every_effect_adds_operations_or_nothing(name):
 
 
 @pytest.mark.parametrize("name", jaxdn.denoisers.NAMES)
-def test_an_effect_that_nobody_reads_changes_nothing(name):
+def test_an_effect_that_is_not_read_changes_nothing(name):
     denoiser = getattr(jaxdn.denoisers, name)()
     unread = [effect.name for effect in effects.EFFECTS if not effect.buffers & denoiser.reads]
     assert lowered_step(denoiser, frame_for(*unread)) == lowered_step(denoiser, frame_for())

@@ -34,7 +34,7 @@ def _render(mi: Any, scene: Stage, frame: int, *, max_depth: int | None = None, 
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_seed_is_a_scene_for_ever_and_another_seed_another_one(mitsuba: Any, name: str) -> None:
+def test_a_seed_always_gives_the_same_scene_and_another_seed_another(mitsuba: Any, name: str) -> None:
     first, again, other = (_render(mitsuba, family_scene(name, seed), 5) for seed in (3, 3, 4))
     assert first.shape == (16, 24, 3)
     assert np.isfinite(first).all()
@@ -57,7 +57,7 @@ def test_indirect_light_is_well_exposed_whatever_the_lamp(mitsuba: Any, name: st
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_pose_names_exists_moves_rigidly_and_the_rest_stands_still(mitsuba: Any, name: str) -> None:
+def test_posed_shapes_exist_and_move_rigidly_and_others_are_static(mitsuba: Any, name: str) -> None:
     scene = family_scene(name, 5)
     ids = {shape.id() for shape in scene.build(0, 24, 16).shapes()}
     assert ids == set(scene.parts)
@@ -96,11 +96,11 @@ def test_everything_stays_in_the_room_for_120_frames(name: str) -> None:
                 assert inside.min() > -1e-6, (seed, frame, part)
         steps = np.linalg.norm(np.diff(eyes, axis=0), axis=1)
         assert steps.min() > 5e-4, "the camera always moves a little"
-        assert steps.max() < 0.1, "and never leaps"
+        assert steps.max() < 0.1, "and never jumps"
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_things_are_seen_to_move_and_never_jump(name: str) -> None:
+def test_objects_move_visibly_and_never_jump(name: str) -> None:
     """The centre of every moving part shifts by less than half a metre a frame, the fastest by more than 2 cm."""
     for seed in SEEDS[:2]:
         scene = family_scene(name, seed)
@@ -127,7 +127,7 @@ def test_about_a_third_of_the_lamps_shine_upwards() -> None:
     assert {"up", "down", "window"} == set(lamps)
 
 
-def test_wrong_names_raise_with_what_there_is() -> None:
+def test_wrong_names_raise_with_the_known_ones() -> None:
     with pytest.raises(ValueError, match="expected one of"):
         family_scene("vegetables", 0)
     with pytest.raises(ValueError, match="lamp"):

@@ -1,4 +1,4 @@
-"""Whatever interrupts a writer: a file is the old one or the new one, and nothing else is left in its folder."""
+"""However a writer is interrupted, a file is the old one or the new one, and no other file is left in its folder."""
 
 import json
 import os
@@ -26,7 +26,7 @@ def folder(tmp_path: Path) -> Path:
 OLD = {"a": "old", "b": "old"}
 
 
-def test_a_file_appears_when_it_is_whole(folder: Path) -> None:
+def test_a_file_appears_when_it_is_complete(folder: Path) -> None:
     with whole(folder / "a") as temporary:
         temporary.write_text("new")
         assert (folder / "a").read_text() == "old"
@@ -36,7 +36,7 @@ def test_a_file_appears_when_it_is_whole(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [ValueError, OSError, KeyboardInterrupt, SystemExit])
-def test_a_writer_that_stops_leaves_the_old_file_and_nothing_else(folder: Path, error: type[BaseException]) -> None:
+def test_a_writer_that_stops_leaves_only_the_old_file(folder: Path, error: type[BaseException]) -> None:
     def write() -> None:
         with whole(folder / "a") as temporary:
             temporary.write_text("half of the n")
@@ -54,7 +54,7 @@ def test_a_writer_that_wrote_nothing_is_an_error(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["fsync", "replace"])
-def test_a_disk_that_refuses_late_leaves_the_old_file(folder: Path, monkeypatch, name: str) -> None:
+def test_a_late_disk_error_leaves_the_old_file(folder: Path, monkeypatch, name: str) -> None:
     def refuse(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
@@ -64,7 +64,7 @@ def test_a_disk_that_refuses_late_leaves_the_old_file(folder: Path, monkeypatch,
     assert contents(folder) == OLD
 
 
-def test_a_disk_that_refuses_one_of_several_files_replaces_none(folder: Path, monkeypatch) -> None:
+def test_a_disk_error_for_one_of_several_files_replaces_none(folder: Path, monkeypatch) -> None:
     synced: list[int] = []
     sync = os.fsync
 
@@ -120,7 +120,7 @@ def test_threads_do_not_write_into_each_others_file(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_text() in texts
 
 
-def test_json_comes_back(tmp_path: Path) -> None:
+def test_json_round_trips(tmp_path: Path) -> None:
     write_json(tmp_path / "a.json", {"é": [1, 2.5, None, True]})
     text = (tmp_path / "a.json").read_text(encoding="utf-8")
     assert json.loads(text) == {"é": [1, 2.5, None, True]}
@@ -128,7 +128,7 @@ def test_json_comes_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), {1, 2}, b"x", object()])
-def test_what_json_has_no_word_for_is_refused_by_name(folder: Path, value: object) -> None:
+def test_values_without_a_json_form_are_refused_by_name(folder: Path, value: object) -> None:
     with pytest.raises(ValueError, match=r"a: cannot be written as JSON .*finite numbers"):
         write_json(folder / "a", {"value": value})
     assert contents(folder) == OLD

@@ -8,7 +8,7 @@ from experiments.stability.memory import peak_mib, write_sequence
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="peak memory of a child is asked for the way Unix has it")
+@pytest.mark.skipif(sys.platform == "win32", reason="the peak memory of a child process is only available on Unix")
 def test_memory_does_not_grow_with_the_frames_of_a_foreign_sequence(tmp_path):
     height, width, short, long = 270, 480, 2, 50
     peaks = {}

@@ -1,4 +1,4 @@
-"""The notebook runs from top to bottom in a real kernel; its own asserts hold what it says."""
+"""The notebook runs from top to bottom in a real kernel; its asserts check its claims."""
 
 from pathlib import Path
 

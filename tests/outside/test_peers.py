@@ -28,7 +28,7 @@ def double(tree):
 
 
 def lively(params, key):
-    """Parameters whose biases matter too."""
+    """Parameters with non-zero biases."""
     return jax.tree.map(lambda leaf: 1.5 * leaf + 0.1 * jax.random.normal(key, leaf.shape), params)
 
 
@@ -134,7 +134,7 @@ def test_open_image_denoise_says_what_it_expects():
         oidn(16, 16)(wrong, wrong, wrong)
 
 
-def test_what_is_missing_is_said(monkeypatch):
+def test_missing_peers_are_reported(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert set(peers.missing()) == {"torch", "torch-compiled", "pyoidn"}
     assert "make bench" in peers.missing()["torch"]

@@ -1,4 +1,4 @@
-"""What the renderer says surfaces reflect, against Monte Carlo averages, white furnaces and albedos."""
+"""The renderer's reflectance, against Monte Carlo averages, white furnaces and albedos."""
 
 import warnings
 
@@ -60,18 +60,18 @@ def test_reflectance_is_the_mean_of_independent_samples(fast, name):
 @needs_fast
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "mask"])
 def test_a_white_furnace_divided_by_the_reflectance_is_white(fast, name):
-    # The furnace's noise at 1024 samples is 0.01 to 0.02. What has got into rough glass loses some on its way out.
+    # The furnace's noise at 1024 samples is 0.01 to 0.02. Light inside rough glass is partly lost on its way out.
     most = 0.06 if name in AVERAGED or name == "roughdielectric" else 0.03
     assert paper.measure(paper.materials()[name]).furnace < most
 
 
 @pytest.mark.parametrize("name", ["diffuse", "diffuse, textured"])
-def test_of_a_diffuse_surface_it_is_the_albedo_bit_for_bit(fast, name):
+def test_a_diffuse_surface_has_its_albedo_bit_for_bit(fast, name):
     there = found(name)
     np.testing.assert_array_equal(there.reflectance, there.albedo)
 
 
-def test_of_a_diffuse_surface_it_is_the_albedo_in_the_slow_variant(scalar):
+def test_a_diffuse_surface_has_its_albedo_in_the_slow_variant(scalar):
     there = found("diffuse, textured")
     np.testing.assert_array_equal(there.reflectance, there.albedo)
 
@@ -88,13 +88,13 @@ def test_both_variants_find_the_same(name):
     assert np.mean(np.abs(images[0] - images[1])) < 0.005
 
 
-def test_it_is_a_share_of_light_and_1_where_nothing_is_hit(fast):
+def test_it_is_a_fraction_and_1_where_nothing_is_hit(fast):
     there = found("principled, clearcoat")  # a few percent more than all light: the BSDF's own flaw
     assert 0 <= there.reflectance.min() <= there.reflectance.max() <= 1
     assert np.all(there.reflectance[there.ids[..., 0] < 0] == 1)
 
 
-def test_it_knows_no_seed(fast, tmp_path):
+def test_it_does_not_depend_on_the_seed(fast, tmp_path):
     scene = open_scene(CASES["a ball: textured roughness"].write(tmp_path))
     frames = [render_frame(scene, 0, width=24, height=16, seed=seed).frame for seed in (0, 1)]
     assert not np.array_equal(frames[0].radiance, frames[1].radiance)
@@ -116,12 +116,12 @@ def test_a_table_is_made_once_for_a_material_and_again_for_another(fast, monkeyp
     assert len(made) == 3
 
 
-def test_a_material_that_cannot_be_averaged_is_named_once_and_its_albedo_taken(fast, monkeypatch):
+def test_a_material_that_cannot_be_averaged_is_named_once_and_its_albedo_used(fast, monkeypatch):
     from jaxdn.render import reflectance
 
     monkeypatch.setattr(reflectance, "_KNOWN", frozenset())
     monkeypatch.setattr(reflectance, "_samples", lambda bsdf: False)
-    with pytest.warns(UserWarning, match="ball: what its material reflects cannot be averaged"):
+    with pytest.warns(UserWarning, match="ball: the reflectance of its material cannot be averaged"):
         there = found("roughplastic")
     np.testing.assert_array_equal(there.reflectance, there.albedo)
     with warnings.catch_warnings():
@@ -129,7 +129,7 @@ def test_a_material_that_cannot_be_averaged_is_named_once_and_its_albedo_taken(f
         found("roughplastic")
 
 
-def test_what_cannot_be_sampled_is_noticed(fast):
+def test_a_material_that_cannot_be_sampled_is_detected(fast):
     import mitsuba as mi
 
     from jaxdn.render.reflectance import _samples

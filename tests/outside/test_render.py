@@ -1,4 +1,4 @@
-"""The tracers against Mitsuba's own path integrator, and clips that survive whatever ends their rendering."""
+"""The tracers against Mitsuba's own path integrator, and clips whose rendering is interrupted."""
 
 import json
 import os
@@ -36,7 +36,7 @@ def variant(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture(scope="module")
 def converged() -> dict[str, Rendered]:
-    """One frame by every variant, with as many samples as a test can wait for."""
+    """One frame by every variant, with as many samples as a test has time for."""
     return {
         name: render_frame(Stage(), 0, reference_spp=SAMPLES, seed=1, variant=name, **SIZE) for name in fast_variants()
     }
@@ -96,7 +96,7 @@ def test_light_that_is_not_finite_counts_as_black(variant: str) -> None:
     for image in (found.frame.radiance, found.frame.direct, found.frame.emission, found.reference):
         assert image is not None
         assert np.isfinite(image).all()
-    # Mitsuba's own film drops such samples before anybody can count them.
+    # Mitsuba's own film drops such samples before they can be counted.
     assert variant == "scalar_rgb" or found.bad_samples > 0
 
 
@@ -128,7 +128,7 @@ def test_the_reference_shares_no_sample_with_the_noise(variant: str) -> None:
     assert not np.array_equal(found.reference, found.reference_half)
 
 
-def test_half_of_the_reference_tells_its_noise(variant: str) -> None:
+def test_half_of_the_reference_measures_its_noise(variant: str) -> None:
     """The difference of reference and half has half the variance of the half itself: as large as the reference's."""
     found = render_frame(Stage(), 0, reference_spp=64, seed=3, variant=variant, **SIZE)
     truth = render_frame(Stage(), 0, reference_spp=256 if variant != "scalar_rgb" else 128, seed=4, **SIZE).reference
@@ -146,7 +146,7 @@ def same(first: Rendered, second: Rendered) -> bool:
     return all(np.array_equal(one, other) for one, other in pairs if one is not None)
 
 
-def test_a_frame_depends_on_its_arguments_alone(variant: str) -> None:
+def test_a_frame_depends_only_on_its_arguments(variant: str) -> None:
     """Rendered after its predecessor, alone, or with other layers: the same bit for bit."""
     scene = sliding()
     options: dict[str, Any] = {"reference_spp": 2, "variant": variant, **SIZE}
@@ -175,7 +175,7 @@ def test_motion_in_a_frame_is_that_of_the_geometry(variant: str) -> None:
     assert (difference > 0.5).sum() == 12
 
 
-def test_a_clip_is_written_and_goes_on_where_it_was_interrupted(variant: str, tmp_path: Path) -> None:
+def test_a_clip_is_written_and_resumes_where_it_was_interrupted(variant: str, tmp_path: Path) -> None:
     options: dict[str, Any] = {"frames": 3, "layers": (1, 2), "reference_spp": 2, "variant": variant, **SIZE}
     whole = render_clip(sliding(), tmp_path / "whole", **options)
 
@@ -189,7 +189,7 @@ def test_a_clip_is_written_and_goes_on_where_it_was_interrupted(variant: str, tm
     names = ["clip.unfinished.json", "frame_0000.exr", "frame_0001.exr"]
     assert sorted(path.name for path in parts.iterdir()) == names
     assert not is_clip(parts)
-    # A frame that was cut off is rendered again, one that is whole is not.
+    # A truncated frame is rendered again, a complete one is not.
     damaged = (parts / "frame_0001.exr").read_bytes()
     (parts / "frame_0001.exr").write_bytes(damaged[: len(damaged) // 2])
     stamp = (parts / "frame_0000.exr").stat().st_mtime_ns
@@ -226,7 +226,7 @@ render_clip(Stage(), sys.argv[1], frames=3, reference_spp=2, variant="scalar_rgb
 """
 
 
-def test_a_killed_rendering_leaves_no_clip_and_goes_on(tmp_path: Path) -> None:
+def test_a_killed_rendering_leaves_no_clip_and_resumes(tmp_path: Path) -> None:
     options: dict[str, Any] = {"frames": 3, "reference_spp": 2, "variant": "scalar_rgb", **SIZE}
     parts = tmp_path / "parts"
     done = subprocess.run([sys.executable, "-c", KILLED, str(parts), str(Path(__file__).parent)], check=False)
@@ -264,7 +264,7 @@ def test_without_a_plan_every_buffer_of_every_effect_is_rendered() -> None:
     assert set(present(frame)) == set(effects.plan(effects.everything(1)).buffers)
 
 
-def test_a_clip_with_the_plan_of_an_earlier_version_goes_on(tmp_path: Path) -> None:
+def test_a_clip_with_the_plan_of_an_earlier_version_resumes(tmp_path: Path) -> None:
     scene = {"family": "fruit", "seed": 0}
     plan = effects.plan(effects.chosen(["indirect"], 2))
     options: dict[str, Any] = {"frames": 2, "variant": "scalar_rgb", **SIZE}
@@ -288,17 +288,17 @@ def test_other_settings_in_the_same_folder_raise(tmp_path: Path) -> None:
         render_clip(Stage(), tmp_path, seed=5, **options)
     with pytest.raises(ClipError, match="cameras"):
         render_clip(Stage(camera=lambda frame: shift(0.1, 0, 0)), tmp_path, **options)
-    render_clip(Stage(), tmp_path, **{**options, "frames": 2})  # more of the same is no other setting
+    render_clip(Stage(), tmp_path, **{**options, "frames": 2})  # more frames with the same settings are allowed
     assert (tmp_path / "frame_0001.exr").exists()
 
 
-def test_a_scene_that_breaks_is_named_with_its_frame(tmp_path: Path) -> None:
+def test_a_scene_that_fails_is_named_with_its_frame(tmp_path: Path) -> None:
     def breaks(frame: float) -> np.ndarray:
         if frame == 1:
-            raise ArithmeticError("no square today")
+            raise ArithmeticError("no pose here")
         return shift(0, 0, SQUARE_Z)
 
-    with pytest.raises(RenderError, match=r"'stage'.*frame 1: ArithmeticError: no square today"):
+    with pytest.raises(RenderError, match=r"'stage'.*frame 1: ArithmeticError: no pose here"):
         render_clip(Stage(square=breaks), tmp_path, frames=2, variant="scalar_rgb", **SIZE)
     assert (tmp_path / "frame_0000.exr").exists()
     assert not is_clip(tmp_path)
@@ -319,7 +319,7 @@ UNSUPPORTED: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("effect", UNSUPPORTED)
-def test_effects_that_would_be_left_out_raise(variant: str, effect: str) -> None:
+def test_unsupported_effects_raise(variant: str, effect: str) -> None:
     extra = UNSUPPORTED[effect]
     if "sensor" in extra:
         film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
@@ -364,7 +364,7 @@ def test_the_kernel_is_not_compiled_again_for_another_frame() -> None:
         render_frame(sliding(), frame, layers=(4,), reference_spp=8, seed=seed, variant=fast, **SIZE)
         return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
 
-    # Objects are numbered as they come; two frames are what it takes for the numbers to settle.
+    # Objects are numbered in the order of creation; the numbers are constant after two frames.
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     try:
         known = kernels(1, 0) | kernels(2, 0)
@@ -377,7 +377,7 @@ def test_seeds_are_all_different() -> None:
     keys = {frame_key(seed, frame, stream) for seed in range(8) for frame in range(64) for stream in (0, 1)}
     assert len(keys) == 8 * 64 * 2
     assert len({tea(first, second) for first in range(64) for second in range(64)}) == 64 * 64
-    # What Mitsuba makes of it at 128 x 128 keeps the low 18 bits only.
+    # At 128 x 128 Mitsuba uses only its low 18 bits.
     passes = {pass_seed(3, 7, stream, index) % 2**18 for stream in (NOISY, REFERENCE) for index in range(4096)}
     assert len(passes) == 2 * 4096
 
@@ -440,7 +440,7 @@ def begin(folder: Path, scene: dict[str, Any], variant: str) -> None:
         render_clip(scene_from_record(scene), folder, frames=2, variant=variant, progress=interrupt, **SIZE)
 
 
-def test_a_job_goes_on_with_the_variant_that_its_clip_was_begun_with(tmp_path: Path) -> None:
+def test_a_job_keeps_the_variant_that_its_clip_was_started_with(tmp_path: Path) -> None:
     scene = {"family": "fruit", "seed": 0}
     begin(tmp_path, scene, "scalar_rgb")
     job = farm.ClipJob(scene, str(tmp_path), WIDTH, HEIGHT, 2)
@@ -449,7 +449,7 @@ def test_a_job_goes_on_with_the_variant_that_its_clip_was_begun_with(tmp_path: P
     assert farm._as_begun(job._replace(folder=str(tmp_path / "new"))).variant is None
 
 
-def test_a_clip_begun_with_a_variant_that_does_not_run_here_is_named(tmp_path: Path) -> None:
+def test_a_clip_started_with_a_variant_that_does_not_run_here_is_named(tmp_path: Path) -> None:
     scene = {"family": "fruit", "seed": 0}
     begin(tmp_path, scene, "scalar_rgb")
     file = tmp_path / "clip.unfinished.json"
@@ -460,7 +460,7 @@ def test_a_clip_begun_with_a_variant_that_does_not_run_here_is_named(tmp_path: P
 
 
 @pytest.mark.slow
-def test_an_interrupted_clip_is_finished_with_the_variant_it_was_begun_with(tmp_path: Path) -> None:
+def test_an_interrupted_clip_is_finished_with_the_variant_it_was_started_with(tmp_path: Path) -> None:
     scene = {"family": "fruit", "seed": 0}
     begin(tmp_path, scene, "scalar_rgb")
     farm.render_clips([farm.ClipJob(scene, str(tmp_path), WIDTH, HEIGHT, 2)], progress=False)
@@ -471,7 +471,7 @@ def test_an_interrupted_clip_is_finished_with_the_variant_it_was_begun_with(tmp_
 
 
 @pytest.mark.slow
-def test_clips_are_rendered_side_by_side_and_failures_do_not_stop_the_others(tmp_path: Path) -> None:
+def test_clips_are_rendered_in_parallel_and_failures_do_not_stop_the_others(tmp_path: Path) -> None:
     good = farm.ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "good"), WIDTH, HEIGHT, 2)
     bad = farm.ClipJob({"family": "nothing"}, str(tmp_path / "bad"), WIDTH, HEIGHT, 2)
     steps: list[tuple[int, int]] = []
@@ -481,12 +481,12 @@ def test_clips_are_rendered_side_by_side_and_failures_do_not_stop_the_others(tmp
     assert len(list((tmp_path / "good").glob("frame_*.exr"))) == 2
     assert is_clip(tmp_path / "good")
     assert not is_clip(tmp_path / "bad")
-    with pytest.raises(ValueError, match="folder of its own"):
+    with pytest.raises(ValueError, match="a different folder for every clip"):
         farm.render_clips([good, good], progress=False)
 
 
 @pytest.mark.slow
-def test_a_finished_clip_takes_no_process(tmp_path, monkeypatch):
+def test_a_finished_clip_needs_no_process(tmp_path, monkeypatch):
     from jaxdn.render import ClipJob, farm
 
     job = ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "c"), 16, 12, 2, reference_spp=2, variant="scalar_rgb")

@@ -1,4 +1,4 @@
-"""``jaxdn render``: scenes are opened and planned once, and the clips are what was asked for."""
+"""``jaxdn render``: scenes are opened and planned once, and the clips match the options."""
 
 import pytest
 
@@ -21,7 +21,7 @@ OPTIONS = {
 
 @pytest.fixture
 def counted(monkeypatch):
-    """What is opened and planned, and the jobs that would be rendered."""
+    """The opened and planned scenes, and the jobs that would be rendered."""
     seen = {"opened": 0, "planned": 0, "jobs": []}
 
     def count(name, what):
@@ -55,20 +55,20 @@ def test_a_scene_file_is_opened_and_planned_once_for_all_seeds(counted, tmp_path
     assert lines[1:] == [f"{name}-{seed}: {found}" for seed in (3, 5, 8)]
 
 
-def test_every_seed_of_a_family_is_a_scene_of_its_own(counted, tmp_path):
+def test_every_seed_of_a_family_is_a_different_scene(counted, tmp_path):
     command.render("fruit", tmp_path, seeds=[0, 1], **OPTIONS)
     assert (counted["opened"], counted["planned"]) == (2, 2)
     assert [job.scene for job in counted["jobs"]] == [{"family": "fruit", "seed": seed} for seed in (0, 1)]
 
 
 @pytest.mark.parametrize(("effects", "planned"), [("all", False), ("indirect, glossy", True)])
-def test_effects_that_were_chosen_are_not_looked_for(counted, tmp_path, effects, planned):
+def test_chosen_effects_are_not_inspected(counted, tmp_path, effects, planned):
     command.render("fruit", tmp_path, seeds=[0], **{**OPTIONS, "effects": effects})
     assert counted["planned"] == 0
     assert (counted["jobs"][0].plan is not None) == planned
 
 
-def test_what_is_no_scene_is_refused_before_anything_is_tried(tmp_path, capsys):
+def test_an_invalid_scene_is_refused_at_once(tmp_path, capsys):
     with pytest.raises(ValueError, match=r"'castle': expected a family \(dash, .*\) or a Mitsuba scene"):
         command.render("castle", tmp_path, seeds=[0], **OPTIONS)
     assert capsys.readouterr().out == ""

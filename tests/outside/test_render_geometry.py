@@ -71,7 +71,7 @@ def test_projection_is_mitsubas_own(variant: str) -> None:
     np.testing.assert_allclose(pixels, expected, atol=1e-3)
 
 
-def test_depth_is_along_the_axis_and_knows_no_near_plane(variant: str) -> None:
+def test_depth_is_along_the_axis_and_ignores_the_near_plane(variant: str) -> None:
     found = view(Stage(), 0).gbuffer
     wall = found.ids[..., 0] == found.names.index("wall")
     square = found.ids[..., 0] == found.names.index("square")
@@ -82,7 +82,7 @@ def test_depth_is_along_the_axis_and_knows_no_near_plane(variant: str) -> None:
 
 
 def test_a_scene_that_stands_still_has_motion_of_exactly_zero(variant: str) -> None:
-    """Two scenes built separately, with a camera that is not at a round place."""
+    """Two scenes built separately, with a camera at a position that is not round."""
     stage = Stage(camera=lambda frame: tilted(0.7), square=lambda frame: shift(0.1, 0.2, SQUARE_Z) @ turn(20))
     current, _, motion = moved(stage)
     assert np.all(motion.motion == 0)
@@ -110,7 +110,7 @@ def test_a_square_that_slides_over_a_wall_uncovers_exactly_what_it_covered(varia
     np.testing.assert_array_equal(~motion.visible[..., 0], uncovered)
     np.testing.assert_allclose(motion.motion[now], [[-right, -down]] * 36, atol=1e-4)
     assert np.all(motion.motion[~now] == 0)
-    # The uncovered pixel borrows its occluder's vector, and lands beside it.
+    # The uncovered pixel takes over its occluder's vector, which points next to the occluder.
     np.testing.assert_allclose(vectors[uncovered], [[-right, -down]] * uncovered.sum(), atol=1e-4)
     target = np.rint(CENTRES - 0.5 + vectors).astype(int)[uncovered]
     assert not before[target[:, 1], target[:, 0]].any()
@@ -137,7 +137,7 @@ def test_a_camera_that_moves_finds_every_point_again(variant: str) -> None:
         np.testing.assert_allclose(motion.previous_depth[..., 0][seen], height - origin[2], rtol=1e-4)
 
 
-def test_the_sky_turns_with_the_camera_and_knows_no_distance(variant: str) -> None:
+def test_the_sky_turns_with_the_camera_and_has_no_parallax(variant: str) -> None:
     current, _, motion = moved(Stage(wall=False, camera=lambda frame: shift(0.5 * frame, 0, 0)))
     sky = current.gbuffer.ids[..., 0] < 0
     assert sky.any()
@@ -196,7 +196,7 @@ def test_a_point_whose_nearest_pixel_was_sky_may_be_proven_seen_by_a_neighbour()
 
 
 def test_a_neighbour_proves_nothing_where_another_surface_covered_the_point() -> None:
-    """Only the nearest pixel counts there, or the rim of every disocclusion would be lost."""
+    """Only the nearest pixel counts there, or the edge of every disocclusion would be missed."""
     covered = flat_motion([1, 1, 1, 1, 0, 0, 0, 0], [1, 1, 1, 1, 0, 0, 0, 0], 0.6)
     assert not covered.visible[0, 4, 0]
     assert covered.visible[0, 5:, 0].all()
@@ -235,14 +235,14 @@ def test_off_screen_points_were_not_seen() -> None:
 @pytest.mark.parametrize(
     ("start", "end"), [({"a": np.eye(4)}, {}), ({}, {"a": np.eye(4)})], ids=["loses its pose", "gains one"]
 )
-def test_a_pose_that_comes_or_goes_raises(start: dict[str, np.ndarray], end: dict[str, np.ndarray]) -> None:
+def test_a_pose_that_appears_or_disappears_raises(start: dict[str, np.ndarray], end: dict[str, np.ndarray]) -> None:
     with pytest.raises(ValueError, match="'a'"):
         relative_poses(("a",), start, end)
 
 
-def test_shapes_that_come_or_go_raise() -> None:
+def test_shapes_that_appear_or_disappear_raise() -> None:
     camera = Camera(np.eye(4), 90.0)
-    with pytest.raises(ValueError, match="come or go"):
+    with pytest.raises(ValueError, match="none may appear or disappear"):
         motion_between(View(flat([0]), camera, {}), View(flat([0])._replace(names=("a",)), camera, {}))
 
 

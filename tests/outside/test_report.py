@@ -200,7 +200,7 @@ def test_headline_compares_c_with_the_a_of_its_size():
     assert "of that floor" not in said
 
 
-def test_headline_says_a_loss_as_a_loss_and_a_floor_that_is_near():
+def test_headline_reports_a_loss_and_a_near_noise_floor():
     said = " ".join(sentences(scored(svgf=(39, 0.1, 20), A=(38, 0.05, 25), C=(37, 0.06, 24))))
     assert "svgf has the highest PSNR" in said
     assert "more than svgf" not in said
@@ -258,7 +258,7 @@ def test_scores_are_written_with_sensible_figures(value, field, text):
         (lambda r: r._replace(training={"x": TrainingCurve([1], [], [], [])}), "one value for each step"),
     ],
 )
-def test_contradictions_are_refused_before_anything_is_written(tmp_path, change, message):
+def test_inconsistent_results_are_refused_before_anything_is_written(tmp_path, change, message):
     with pytest.raises(ValueError, match=message):
         write_report(change(synthetic(clips=1)), tmp_path / "run")
     assert not (tmp_path / "run").exists()
@@ -362,7 +362,7 @@ def test_the_page_is_one_closed_document_that_fetches_nothing(tmp_path):
     assert "default-src 'none'" in text
 
 
-def test_everything_from_outside_is_escaped(tmp_path):
+def test_all_input_is_escaped(tmp_path):
     plain = outline(write_report(synthetic(clips=1), tmp_path).read_text())
     results = synthetic(clips=1)
     clip = results.clips[0]
@@ -557,7 +557,7 @@ def test_tables_have_all_methods_and_the_floor(visit):
 
 
 @pytest.mark.browser
-def test_curves_answer_the_pointer_the_keyboard_and_their_legend(visit):
+def test_curves_respond_to_pointer_keyboard_and_legend(visit):
     tab = visit(synthetic(clips=1, frames=120))
     chart = tab.locator("#clip-0 .curves .chart").first
     assert chart.locator("path.line").count() == 4  # the input is hidden until asked for

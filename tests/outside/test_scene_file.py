@@ -1,4 +1,4 @@
-"""Scene files in motion: what the keys say is what Mitsuba renders, and mistakes are named where they are."""
+"""Animated scene files: Mitsuba renders what the keys describe, and errors name their place."""
 
 import json
 import subprocess
@@ -117,7 +117,7 @@ def test_shapes_move_as_keyed(folder):
     np.testing.assert_allclose(scene.pose(2)["Box"][:3, :3], rotation_matrix(np.array([0, 0, 1]), 45), atol=1e-12)
     column, row = pixel_of(scene, 0, (-1, 1, 1.5))
     assert shape_at(scene, 4, round(column), round(row)) == "Wall"
-    # Beyond the keys things rest.
+    # Outside the keys nothing moves.
     np.testing.assert_array_equal(scene.pose(9)["Box"], scene.pose(4)["Box"])
 
 
@@ -169,7 +169,7 @@ def test_the_record_builds_the_same_scene(folder, monkeypatch):
     np.testing.assert_array_equal(*images)
 
 
-def test_an_animation_beside_the_scene_is_found(folder):
+def test_an_animation_next_to_the_scene_is_found(folder):
     (folder / "scene.json").write_text(json.dumps({"frames": 7}))
     assert SceneFile(folder / "scene.xml").frames == 7
 
@@ -181,7 +181,7 @@ def test_turns_longer_than_half_a_circle():
 
 
 @pytest.mark.parametrize("angle", [1e-7, 30.0, 179.999, 180.0])
-def test_slerp_goes_evenly_along_one_axis(angle):
+def test_slerp_turns_evenly_about_one_axis(angle):
     axis = np.array([2.0, -1.0, 2.0]) / 3
     first = rotation_matrix(np.array([1.0, 0.0, 0.0]), 70)
     second = first @ rotation_matrix(axis, angle)
@@ -214,7 +214,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("animation", "words"), WRONG.values(), ids=WRONG)
-def test_mistakes_are_named(folder, animation, words):
+def test_user_errors_are_named(folder, animation, words):
     with pytest.raises(ValueError, match=words):
         animated(folder, animation)
 
@@ -231,7 +231,7 @@ def test_numbers_must_be_finite(folder):
             SceneFile(folder / "scene.xml", path)
 
 
-def test_files_that_are_not_there(folder, tmp_path):
+def test_missing_files(folder, tmp_path):
     with pytest.raises(ValueError, match="could not read"):
         SceneFile(folder / "nowhere.xml")
     with pytest.raises(ValueError, match="found none"):

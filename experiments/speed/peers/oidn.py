@@ -62,7 +62,7 @@ def _check(device: pyoidn.Device) -> None:
 
 
 def frame_by_frame(quality: str = "high") -> Denoiser:
-    """Open Image Denoise as a denoiser of the one interface, without a history, so that comparisons can run it.
+    """Open Image Denoise with the denoiser interface, without a history, so that comparisons can run it.
 
     Reads albedo and normals; a missing one is its neutral value. The image stays on the CPU.
     """

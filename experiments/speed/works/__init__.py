@@ -1,4 +1,4 @@
-"""The timed works: one file for each kind, with ours and the peers as calls without arguments."""
+"""The timed workloads: one file for each kind, with ours and the peers as calls without arguments."""
 
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -9,7 +9,7 @@ from experiments.speed.timing import Call
 
 
 class Work(NamedTuple):
-    """One work with several implementations. ``ours`` and ``peers`` build a call on demand, which holds its arrays."""
+    """One workload with several implementations; ``ours`` and ``peers`` build calls, with their arrays, on demand."""
 
     name: str
     ours: dict[str, Callable[[], Call]]

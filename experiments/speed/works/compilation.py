@@ -2,7 +2,7 @@
 
     python -m experiments.speed.works.compilation xla step-large-720p     # run by a child process: prints seconds
 
-Programs are named as the works are, ``train-large-64-remat`` is the rematerialised step. Tracing, lowering and
+Programs are named like the workloads; ``train-large-64-remat`` is the rematerialised step. Tracing, lowering and
 compilation are counted; starting Python and importing are not. PyTorch compiles on its first run, so its figure
 includes one run.
 """

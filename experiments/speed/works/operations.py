@@ -1,8 +1,7 @@
 """The performance-critical operations, forward and gradient: our implementations, PyTorch's, and the roofline.
 
 The default implementation (``implementation=None``) is called ``xla``; the others, except the reference, keep their
-names. An
-engine that is not installed is left out.
+names. An engine that is not installed is left out.
 """
 
 from collections.abc import Callable, Iterator
