@@ -135,8 +135,8 @@ def directional_albedo(
 ) -> jax.Array:
     """``albedo + specular A + B`` [H, W, 3]: reflectance of a diffuse surface with a microfacet lobe in uniform light.
 
-    Differentiable in all four. Roughness and cosines are clamped to the range of the table. Raises ValueError for
-    inconsistent shapes.
+    Differentiable in all four. F0, roughness and cosines are clamped to the range that they can have. Raises ValueError
+    for inconsistent shapes.
 
     Args:
       albedo: [H, W, 3] reflectance of the diffuse part.
@@ -152,7 +152,7 @@ def directional_albedo(
         check_same_size(albedo, image, ("albedo", name))
     check_same_size(albedo, specular, ("albedo", "specular"))
     found = _look_up(jnp.asarray(albedo_table(lobe)), jnp.maximum(cosine, SMALLEST_COSINE), roughness)
-    return albedo + specular * found[..., :1] + found[..., 1:]
+    return albedo + jnp.clip(specular, 0.0, 1.0) * found[..., :1] + found[..., 1:]
 
 
 def _look_up(table: jax.Array, cosine: jax.Array, roughness: jax.Array) -> jax.Array:

@@ -8,11 +8,11 @@ import pytest
 from experiments.speed import peers
 from experiments.speed.works import scene
 from jaxdn.denoisers import ntd
-from jaxdn.frame import Clip, frame_at
+from jaxdn.frame import Clip, Frame, frame_at
 from jaxdn.learning.step import clip_loss, initial_state
 from jaxdn.methods.table import method_named
 from jaxdn.ops.warp import warp
-from jaxdn.rollout import stream
+from jaxdn.rollout import denoise, stream
 
 TINY = ((4,), (4,), (5,), (5,), (6,))
 RECIPE = method_named("ntd").recipe_named(None)._replace(decay=False)
@@ -143,3 +143,17 @@ def test_missing_peers_are_reported(monkeypatch):
     monkeypatch.setattr("platform.system", lambda: "Linux")
     assert set(peers.missing()) == {"torch-compiled"}
     assert "g++" in peers.missing()["torch-compiled"]
+
+
+def test_open_image_denoise_runs_a_clip_as_any_denoiser_does(rng):
+    skip_without("pyoidn")
+    from experiments.speed.peers.oidn import frame_by_frame, oidn
+
+    frames = Frame(
+        rng.exponential(size=(2, 32, 48, 3)).astype(np.float32),
+        albedo=rng.uniform(0.2, 0.9, (2, 32, 48, 3)).astype(np.float32),
+    )
+    images = jax.jit(lambda clip: denoise(frame_by_frame(), {}, clip))(Clip(frames))
+    run, no_normal = oidn(32, 48), np.zeros((32, 48, 3), np.float32)
+    for index in range(2):
+        np.testing.assert_array_equal(images[index], run(frames.radiance[index], frames.albedo[index], no_normal))
