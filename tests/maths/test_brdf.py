@@ -110,6 +110,10 @@ def test_out_of_range_is_clamped_and_finite():
             assert jnp.isfinite(found).all()
             assert (found >= 0.5).all()
             assert (found <= 1.5).all()
+            beyond = brdf.directional_albedo(color, 6 * color, roughness * one, cosine * one)
+            np.testing.assert_array_equal(
+                beyond, brdf.directional_albedo(color, 2 * color, roughness * one, cosine * one)
+            )
 
 
 @hypothesis.given(
