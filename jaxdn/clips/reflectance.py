@@ -10,6 +10,7 @@ alone: nothing is guessed.
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.brdf import directional_albedo
@@ -80,7 +81,8 @@ def with_reflectance(
 
 def _lobe(color: np.ndarray, roughness: np.ndarray, cosine: np.ndarray) -> np.ndarray:
     """The lobe's directional albedo [H, W, 3]; 0 where there is no lobe (F0 of 0) or no surface (no normal)."""
-    lobe = directional_albedo(np.zeros_like(color), color, roughness, np.maximum(cosine, 0.0))
+    given = (jnp.asarray(each) for each in (np.zeros_like(color), color, roughness, np.maximum(cosine, 0.0)))
+    lobe = directional_albedo(*given)
     nothing = np.isnan(cosine) | np.all(color == 0, axis=-1, keepdims=True)
     return np.where(nothing, np.float32(0), np.asarray(lobe, np.float32))
 
