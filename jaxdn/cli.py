@@ -145,7 +145,7 @@ class Denoise:
     motion_convention: str | None = None
     """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
     channels: list[str] = field(default_factory=list)
-    """For files of other renderers: buffer=layer, if the layer of a buffer is not found by its name."""
+    """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out."""
     implementation: str = "auto"
     """Engine for the network: reference (XLA), onnxruntime (CPU; the extra onnx); auto: the fastest available."""
 
@@ -241,6 +241,7 @@ def _denoise(options: Denoise) -> None:
             motion_convention=options.motion_convention,
             channels=parse(options.channels, option="--channels", words=True),
             say=lambda done, total: status.update(f"{options.method}: frame {done} of {total}"),
+            tell=print,
         )
     compiled = f"{written.programs} program{'s' * (written.programs != 1)} compiled"
     print(f"{len(written.files)} frames denoised by {options.method} in {options.out} ({engine}, {compiled})")

@@ -67,7 +67,7 @@ def clip_of(path: Path) -> tuple[Clip, np.ndarray]:
 
 def score(image: Any, first: Any, second: Any) -> float:
     """PSNR in dB of tone-mapped light, without the noise of the reference's two halves."""
-    return float(metrics.unbiased_psnr(*(color.tonemap(jnp.asarray(light)) for light in (image, first, second))))
+    return float(metrics.unbiased_psnr(color.tonemap(jnp.asarray(image)), *color.tonemap_halves(first, second)))
 
 
 def scenes(paths: list[str]) -> Iterator[tuple[str, Clip, np.ndarray]]:

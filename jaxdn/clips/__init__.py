@@ -25,8 +25,8 @@ from jaxdn.clips.frames import StoredFrame as StoredFrame
 from jaxdn.clips.frames import read_frame as read_frame
 from jaxdn.clips.frames import write_frame as write_frame
 from jaxdn.clips.import_exr import MOTION_CONVENTIONS as MOTION_CONVENTIONS
-from jaxdn.clips.import_exr import detect_channels as detect_channels
 from jaxdn.clips.import_exr import plain_frames as plain_frames
+from jaxdn.clips.layers import detect_channels as detect_channels
 
 
 def __getattr__(name: str) -> Any:

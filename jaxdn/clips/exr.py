@@ -8,6 +8,7 @@ print a warning instead of raising an error for a truncated file.
 import errno
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -92,6 +93,15 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     if not found:
         raise ClipError(f"{path}: the file has no channels.")
     return found
+
+
+def read_header(path: str | Path) -> dict[str, Any]:
+    """The attributes of a file's first part, such as ``worldToCamera``. Raises ClipError if it is not readable."""
+    try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            return dict(file.parts[0].header)
+    except (RuntimeError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise ClipError(f"{path}: not readable as OpenEXR ({error}); write the frame again.") from error
 
 
 def write_image(path: str | Path, image: np.ndarray) -> None:

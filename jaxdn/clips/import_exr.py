@@ -1,21 +1,23 @@
-"""EXR sequences of other renderers: which channel is what, and which way their motion vectors point.
+"""EXR sequences of other renderers: their files, frames, and which way their motion vectors point.
 
-Channels are found by the names that Blender Cycles, pbrt, Arnold, RenderMan, Mitsuba, Corona and Open Image Denoise's
-tools use, a view layer's name in front or not. Motion vectors differ in direction, unit and axes from one program to
-the next, and nothing in the file says which: unless the layer is Cycles' own four-component ``Vector``, the caller
-says so.
+Channels are found by their names (:mod:`jaxdn.clips.layers`). Motion vectors differ in direction, unit and axes from
+one program to the next, and nothing in the file says which: unless the layer is Cycles' own four-component ``Vector``,
+the caller says so. What surfaces reflect is derived where the file brings the parts of it
+(:mod:`jaxdn.clips.reflectance`).
 """
 
 import glob
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxdn.clips.exr import read_exr
+from jaxdn.clips.exr import read_exr, read_header
 from jaxdn.clips.files import ClipError
+from jaxdn.clips.layers import Channels, detect_channels, layer_of, unpaired_specular
+from jaxdn.clips.reflectance import check_fraction, with_reflectance
 from jaxdn.frame import BUFFERS, FAR, Buffer, Frame, present
 
 MOTION_CONVENTIONS: dict[str, str] = {
@@ -27,76 +29,6 @@ MOTION_CONVENTIONS: dict[str, str] = {
     "rows-columns": "pixels, previous minus current, (row, column) order (Noisebase)",
 }
 """What ``motion_convention`` may be, in words."""
-
-_LAYERS: dict[str, tuple[str, ...]] = {
-    "radiance": ("noisy image", "", "beauty", "rgba", "combined", "color", "ci"),
-    "albedo": (
-        "albedo",
-        "denoising albedo",
-        "diffuse_albedo",
-        "diffuse_albedo_noice",
-        "visiblediffuse",
-        "diffcol",
-        "diffuse",
-    ),
-    "normal": (
-        "denoising normal",
-        "normal",
-        "normals",
-        "sh_normal",
-        "n",
-        "ns",
-        "n_noice",
-        "visiblenormals",
-        "optixnormals",
-    ),
-    "depth": ("depth", "denoising depth", "z"),
-    "motion": ("vector", "motionvector", "motion", "mvec", "backward"),
-    "ids": ("ids", "indexob", "shape_index", "object_id", "id"),
-}
-"""The buffers that other renderers have a name for, with the names of their layers: lower case, the first that is
-there is taken."""
-
-Channels = tuple[str, ...]
-"""The full names of the channels that make up one buffer, in order."""
-
-
-def _components(buffer: Buffer) -> tuple[Channels, ...]:
-    """What the channels of such a buffer may be called within their layer, lower case; the first that fits is taken."""
-    color = (("r", "g", "b"), ("red", "green", "blue"))
-    if buffer.channels == 3:
-        return (("x", "y", "z"), *color) if buffer.kind == "direction" else color
-    if buffer.channels == 2:
-        return (("x", "y"), ("r", "g"), ("u", "v"))
-    if buffer.kind == "distance":
-        return (("z",), ("v",), ("y",), ("",))
-    return (("z",), ("y",), ("v",), ("x",), ("r",), ("i",), ("",))
-
-
-def detect_channels(names: Sequence[str], *, channels: Mapping[str, str] | None = None) -> dict[str, Channels]:
-    """Which channels make up which buffer, by their names; buffers without channels are left out.
-
-    ``channels`` names the layer of a buffer outright, for example ``{"radiance": "ViewLayer.Combined"}``. Raises
-    ClipError if two layers fit a buffer equally well, if a named layer is not there, or if there is no radiance.
-    """
-    groups: dict[str, dict[str, str]] = {}
-    for name in names:
-        layer, _, component = name.rpartition(".")
-        groups.setdefault(layer, {})[component.lower()] = name
-        if not layer:
-            groups.setdefault(name, {})[""] = name  # a channel that is a layer of its own, such as "Z"
-    stated = channels or {}
-    unknown = set(stated) - set(_LAYERS)
-    if unknown:
-        raise ClipError(f"channels: expected buffers among {', '.join(_LAYERS)}, got {', '.join(sorted(unknown))}.")
-    found = {}
-    for buffer in _LAYERS:
-        fitting = _named(groups, buffer, stated[buffer]) if buffer in stated else _detect(groups, buffer)
-        if fitting:
-            found[buffer] = fitting
-    if "radiance" not in found:
-        raise ClipError(f"no radiance among the channels {', '.join(sorted(names))}; {_name_it('radiance')}.")
-    return found
 
 
 def convert_motion(motion: np.ndarray, convention: str) -> np.ndarray:
@@ -150,15 +82,20 @@ def sequence_files(path: str | Path) -> list[Path]:
 
 
 def plain_frames(
-    path: str | Path, *, motion_convention: str | None = None, channels: Mapping[str, str] | None = None
+    path: str | Path,
+    *,
+    motion_convention: str | None = None,
+    channels: Mapping[str, str] | None = None,
+    tell: Callable[[str], None] = lambda line: None,
 ) -> tuple[list[Path], Iterator[Frame]]:
     """The files of another renderer's sequence, and their frames, each read when it is asked for.
 
     All frames have the size and the buffers of the first. ``motion_convention`` says what the motion vectors mean (a
     key of ``MOTION_CONVENTIONS``) and is needed as soon as there are any that are not Cycles' ``Vector``; ``"none"``
-    leaves them out. ``channels``: see :func:`detect_channels`. Depth is taken for view-space z (far or infinite becomes
-    ``FAR``); ids count from 1 with 0 for nothing, and are left out of all frames if they say nothing in the first.
-    Normals are expected in world space.
+    leaves them out. ``channels``: see :func:`jaxdn.clips.layers.detect_channels`. ``tell`` is called with lines about
+    what is read and derived from which layer, when the first frame is. Depth is taken for view-space z (far or infinite
+    becomes ``FAR``); ids count from 1 with 0 for nothing, and are left out of all frames if they say nothing in the
+    first. Normals are expected in world space, roughness linear (GGX alpha is its square).
 
     Raises ClipError at once where the files are no sequence, and, naming the file, when a frame is asked for that
     cannot be read or differs from the first.
@@ -166,16 +103,21 @@ def plain_frames(
     if motion_convention not in (None, "none", *MOTION_CONVENTIONS):
         raise ClipError(f"motion_convention: {_conventions()}; got {motion_convention!r}.")
     files = sequence_files(path)
-    return files, _frames(files, motion_convention, channels)
+    return files, _frames(files, motion_convention, channels, tell)
 
 
 def _frames(
-    files: Sequence[Path], motion_convention: str | None, channels: Mapping[str, str] | None
+    files: Sequence[Path],
+    motion_convention: str | None,
+    channels: Mapping[str, str] | None,
+    tell: Callable[[str], None],
 ) -> Iterator[Frame]:
     first: _First | None = None
     for file in files:
-        frame = _read(file, motion_convention, channels)
+        frame, lines = _read(file, motion_convention, channels)
         if first is None:
+            for line in lines:
+                tell(line)
             # Renderers write zeros where nobody asked for ids. Whether all frames do is not known before the last one.
             silent = frame.ids is not None and bool(np.all(frame.ids < 0))
             first = _First(frame.radiance.shape, present(frame), silent)
@@ -192,17 +134,29 @@ class _First(NamedTuple):
     """Its ids say nothing."""
 
 
-def _read(file: Path, motion_convention: str | None, channels: Mapping[str, str] | None) -> Frame:
+def _read(file: Path, motion_convention: str | None, channels: Mapping[str, str] | None) -> tuple[Frame, list[str]]:
+    """One frame, and in words what it was read and derived from."""
     there = read_exr(file)
     try:
         found = detect_channels(list(there), channels=channels)
         convention = _motion_convention(found, there, motion_convention)
+        if convention is None:
+            found.pop("motion", None)
+        images = {name: np.stack([there[channel] for channel in found[name]], axis=-1) for name in found}
+        buffers = {name: _converted(image, BUFFERS[name], convention) for name, image in images.items()}
+        for name in {"roughness", "specular_reflectance"} & set(found):
+            buffers[name] = check_fraction(name, layer_of(found[name]), buffers[name])
+        frame, derived = with_reflectance(Frame(**buffers), found, there, lambda: read_header(file))
     except ClipError as error:
         raise ClipError(f"{file}: {error}") from error
-    if convention is None:
-        found.pop("motion", None)
-    images = {name: np.stack([there[channel] for channel in found[name]], axis=-1) for name in found}
-    return Frame(**{name: _converted(image, BUFFERS[name], convention) for name, image in images.items()})
+    lines = ["read: " + ", ".join(f"{name} from {layer_of(found[name])!r}" for name in found)]
+    unpaired = None if "specular_reflectance" in (channels or {}) else unpaired_specular(list(there), found)
+    if unpaired is not None:
+        lines.append(
+            f"not used: {unpaired!r}, as the albedo may have this part in it already; if yours is the diffuse part "
+            f"alone, name it: --channels specular_reflectance={unpaired}"
+        )
+    return frame, lines if derived is None else [*lines, derived]
 
 
 def _converted(image: np.ndarray, buffer: Buffer, convention: str | None) -> np.ndarray:
@@ -250,44 +204,3 @@ def _check_like_first(file: Path, frame: Frame, first: _First) -> None:
     differing = sorted(set(present(frame)) ^ set(first.buffers))
     if differing:
         raise ClipError(f"{file}: expected the same buffers as in the first frame, but {', '.join(differing)} differs.")
-
-
-def _name_it(buffer: str) -> str:
-    return f"name its layer: channels={{{buffer!r}: LAYER}} (jaxdn denoise --channels {buffer}=LAYER)"
-
-
-def _fitting(group: Mapping[str, str], buffer: str) -> Channels | None:
-    for wanted in _components(BUFFERS[buffer]):
-        if all(component in group for component in wanted):
-            return tuple(group[component] for component in wanted)
-    return None
-
-
-def _named(groups: Mapping[str, Mapping[str, str]], buffer: str, layer: str) -> Channels:
-    channels = _fitting(groups.get(layer, {}), buffer)
-    if channels is None:
-        raise ClipError(f"channels: no {buffer} in layer {layer!r}; there are {', '.join(map(repr, sorted(groups)))}.")
-    return channels
-
-
-def _detect(groups: Mapping[str, Mapping[str, str]], buffer: str) -> Channels | None:
-    for wanted in _LAYERS[buffer]:
-        fitting = {}
-        for layer, group in groups.items():
-            lower = layer.lower()
-            if lower == wanted or (wanted and lower.endswith("." + wanted)):
-                channels = _fitting(group, buffer)
-                if channels:
-                    fitting[layer] = channels
-        # Blender's compositor output stands next to the view layer that it was made from.
-        rendered = {layer: channels for layer, channels in fitting.items() if not layer.startswith("Composite.")}
-        fitting = rendered or fitting
-        exact = {layer: channels for layer, channels in fitting.items() if layer.lower() == wanted}
-        fitting = exact or fitting
-        if len(set(fitting.values())) > 1:
-            raise ClipError(
-                f"{buffer}: {' and '.join(map(repr, sorted(fitting)))} fit equally well; {_name_it(buffer)}."
-            )
-        if fitting:
-            return next(iter(fitting.values()))
-    return None

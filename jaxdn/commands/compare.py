@@ -17,28 +17,48 @@ from jaxdn.clips.noise_floor import read_halves, read_noise_floor
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.frame import Clip
 from jaxdn.report import ClipResult, Results, Scores, TrainingCurve
+from jaxdn.report.results import headline_psnr
 from jaxdn.rollout import denoise
+
+Halves = tuple[jax.Array, jax.Array]
 
 
 @jax.jit
-def _clip_scores(image: jax.Array, reference: jax.Array, hidden: jax.Array) -> dict[str, jax.Array]:
-    """Every score of a tone-mapped clip, and the curves over its frames."""
-    frame_l1 = jax.vmap(metrics.l1)(image, reference)
-    frame_psnr = jax.vmap(metrics.psnr)(image, reference)
-    masked_l1 = jax.vmap(lambda a, b, m: metrics.l1(a, b, mask=m))(image, reference, hidden)
-    return {
-        "psnr": metrics.psnr(image, reference),
-        "ssim": metrics.ssim(image, reference),
-        "l1": metrics.l1(image, reference),
-        "mse": metrics.mse(image, reference),
-        "temporal_psnr": metrics.temporal_psnr(image, reference),
-        "flip": metrics.flip(image, reference),
-        "disoccluded_l1": metrics.l1(image, reference, mask=hidden),
-        "disoccluded_mse": metrics.mse(image, reference, mask=hidden),
-        "frame_psnr": frame_psnr,
-        "frame_l1": frame_l1,
-        "frame_disoccluded_l1": masked_l1,
+def _clip_scores(
+    denoised: jax.Array, reference: jax.Array, hidden: jax.Array, halves: Halves | None
+) -> dict[str, jax.Array]:
+    """Every score of a linear clip, and the curves over its frames; those without the noise of the reference too.
+
+    Args:
+      denoised: [T, H, W, 3].
+      reference: [T, H, W, 3].
+      hidden: [T, H, W, 1], above 0 where a point was hidden one frame earlier.
+      halves: two independent references of half the samples each, where the clip has them.
+    """
+    image, wanted = color.tonemap(denoised), color.tonemap(reference)
+    found = {
+        "psnr": metrics.psnr(image, wanted),
+        "ssim": metrics.ssim(image, wanted),
+        "l1": metrics.l1(image, wanted),
+        "mse": metrics.mse(image, wanted),
+        "temporal_psnr": metrics.temporal_psnr(image, wanted),
+        "relative_mse": metrics.relative_mse(denoised, reference),
+        "flip": metrics.flip(image, wanted),
+        "disoccluded_l1": metrics.l1(image, wanted, mask=hidden),
+        "disoccluded_mse": metrics.mse(image, wanted, mask=hidden),
+        "frame_psnr": jax.vmap(metrics.psnr)(image, wanted),
+        "frame_l1": jax.vmap(metrics.l1)(image, wanted),
+        "frame_disoccluded_l1": jax.vmap(lambda a, b, m: metrics.l1(a, b, mask=m))(image, wanted, hidden),
     }
+    if halves is not None:
+        shown = color.tonemap_halves(*halves)
+        found |= {
+            "unbiased_psnr": metrics.unbiased_psnr(image, *shown),
+            "unbiased_temporal_psnr": metrics.unbiased_temporal_psnr(image, *shown),
+            "unbiased_mse": metrics.unbiased_mse(image, *shown),
+            "unbiased_relative_mse": metrics.unbiased_relative_mse(denoised, *halves),
+        }
+    return found
 
 
 def compare(
@@ -53,9 +73,11 @@ def compare(
 ) -> Results:
     """Denoise every clip by every method and score it against the clip's reference.
 
-    Images are tone-mapped (sRGB, clipped to [0, 1]) before they are scored. Disoccluded pixels are those whose point
-    was hidden in the previous frame (``visible`` is false). Milliseconds are the median of three runs of the compiled
-    clip, divided by its frames, without compilation. Raises ValueError for a clip without a reference.
+    Images are tone-mapped (sRGB, clipped to [0, 1]) before they are scored, except for relative MSE. Where a clip keeps
+    one half of the samples of its reference, PSNR, temporal PSNR, MSE and relative MSE are given without the noise of
+    the reference too (:func:`jaxdn.metrics.unbiased_mse`). Disoccluded pixels are those whose point was hidden in the
+    previous frame (``visible`` is false). Milliseconds are the median of three runs of the compiled clip, divided by
+    its frames, without compilation. Raises ValueError for a clip without a reference.
 
     Args:
       methods: what to compare.
@@ -78,9 +100,11 @@ def compare(
             raise ValueError(f"{folder}: expected a clip with a reference to compare with, got none; render one.")
         began = time.monotonic()
         result = _compare_on(clip, folder, methods, compiled, spp)
-        psnr = "  ".join(f"{label} {scores.psnr:.2f}" for label, scores in result.scores.items())
+        field = headline_psnr([result.scores])
+        psnr = "  ".join(f"{label} {getattr(scores, field):.2f}" for label, scores in result.scores.items())
+        free = "" if field == "psnr" else " without the reference's noise"
         say(
-            f"[{count + 1}/{len(folders)}] {result.name}: PSNR {psnr} dB (reference good to "
+            f"[{count + 1}/{len(folders)}] {result.name}: PSNR{free} {psnr} dB (reference good to "
             f"{result.noise_floor_psnr:.1f} dB)  {time.monotonic() - began:.0f} s"
         )
         clips.append(result)
@@ -110,33 +134,29 @@ def _compare_on(
     """
     frames = clip.frames
     inputs = jax.tree.map(jax.numpy.asarray, clip._replace(reference=None))
-    reference = color.tonemap(clip.reference)
+    reference = jax.numpy.asarray(clip.reference)
     shape = (*np.shape(frames.radiance)[:3], 1)
     hidden = ~np.asarray(frames.visible, bool) if frames.visible is not None else np.zeros(shape, bool)
     # At a clip's first frame no method has a history, so no pixel counts as disoccluded.
     hidden = np.concatenate([np.zeros_like(hidden[:1]), hidden[1:]])
     shown = int(np.argmax(hidden.sum((1, 2, 3)))) if hidden.any() else shape[0] - 1
     scores, per_frame = {}, {}
-    images = {"reference": np.asarray(reference[shown])}
+    images = {"reference": np.asarray(color.tonemap(reference[shown]))}
     halves = read_halves(folder)
-    shown_halves = None if halves is None else tuple(color.tonemap(jax.numpy.asarray(half)) for half in halves)
     for method in methods:
         if method.denoiser is None:
             denoised, milliseconds = inputs.frames.radiance, 0.0
         else:
             denoised, milliseconds = _timed(compiled[method.label], method.params, inputs, shape[0])
-        image = color.tonemap(denoised)
-        found = {name: np.asarray(value) for name, value in _clip_scores(image, reference, hidden * 1.0).items()}
+        scored = _clip_scores(denoised, reference, hidden * 1.0, halves)
+        found = {name: np.asarray(value) for name, value in scored.items()}
         scores[method.label] = _as_scores(found, hidden, milliseconds, spp)
-        if shown_halves is not None:
-            unbiased = float(metrics.unbiased_psnr(image, *shown_halves))
-            scores[method.label] = scores[method.label]._replace(unbiased_psnr=unbiased)
         per_frame[method.label] = {
             "psnr": found["frame_psnr"].tolist(),
             "l1": found["frame_l1"].tolist(),
             "disoccluded_l1": np.where(hidden.any((1, 2, 3)), found["frame_disoccluded_l1"], np.nan).tolist(),
         }
-        images[method.label] = np.asarray(image[shown])
+        images[method.label] = np.asarray(color.tonemap(denoised[shown]))
     return ClipResult(folder.name, read_noise_floor(folder), scores, per_frame, shown, images, hidden[shown, ..., 0])
 
 
@@ -145,7 +165,7 @@ def _as_scores(found: dict[str, np.ndarray], hidden: np.ndarray, milliseconds: f
     with np.errstate(divide="ignore"):
         hidden_psnr = float(-10.0 * np.log10(found["disoccluded_mse"]))
     return Scores(
-        **{name: float(found[name]) for name in ("psnr", "ssim", "l1", "mse", "temporal_psnr", "flip")},
+        **{name: float(found[name]) for name in Scores._fields if name in found and name != "disoccluded_l1"},
         disoccluded_l1=float(found["disoccluded_l1"]) if any_hidden else float("nan"),
         disoccluded_psnr=hidden_psnr if any_hidden else float("nan"),
         ms_per_frame=milliseconds,

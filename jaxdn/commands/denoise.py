@@ -53,6 +53,7 @@ def denoise_files(
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
     say: Callable[[int, int], None] = lambda done, total: None,
+    tell: Callable[[str], None] = lambda line: None,
 ) -> Written:
     """Denoise a clip's folder, or EXR files of another renderer; returns the files written.
 
@@ -71,9 +72,10 @@ def denoise_files(
       motion_convention: that of motion vectors in files of other renderers (:mod:`jaxdn.clips.import_exr`).
       channels: buffer -> layer to take it from in files of other renderers.
       say: called with the number of frames done and the total.
+      tell: called with lines about what is read and derived from files of other renderers.
     """
     needs_layers = method.denoiser is not None and method.denoiser.samples is not None
-    names, frames = _open(source, needs_layers, spp, motion_convention, channels)
+    names, frames = _open(source, needs_layers, spp, motion_convention, channels, tell)
     if out.resolve() in {source.resolve(), *(name.resolve().parent for name in names)}:
         raise ValueError(f"{out}: expected another folder than the input's, whose frames would be overwritten.")
     step = None if method.denoiser is None else stream(method.denoiser, method.params)
@@ -92,7 +94,12 @@ def denoise_files(
 
 
 def _open(
-    source: Path, needs_layers: bool, spp: int, motion_convention: str | None, channels: Mapping[str, str] | None
+    source: Path,
+    needs_layers: bool,
+    spp: int,
+    motion_convention: str | None,
+    channels: Mapping[str, str] | None,
+    tell: Callable[[str], None],
 ) -> tuple[list[Path], Iterator[tuple[Frame, Layers]]]:
     """The files and their frames, read when needed.
 
@@ -102,8 +109,9 @@ def _open(
       spp: samples per pixel to take from a clip's layers.
       motion_convention: as in :func:`denoise_files`.
       channels: as in :func:`denoise_files`.
+      tell: as in :func:`denoise_files`.
     """
-    names, frames = open_frames(source, spp=spp, motion_convention=motion_convention, channels=channels)
+    names, frames = open_frames(source, spp=spp, motion_convention=motion_convention, channels=channels, tell=tell)
 
     def layers(stored: StoredFrame) -> Layers:
         return (

@@ -6,6 +6,7 @@ that section is opened, so a page of thirty clips opens as fast as a page of one
 
 import json
 import math
+from collections.abc import Sequence
 from html import escape
 from importlib.resources import files
 from typing import Any
@@ -23,7 +24,7 @@ from jaxdn.report.results import (
     mean_noise_floor,
     mean_scores,
 )
-from jaxdn.report.summary import COLUMNS, best_methods, floor_score, headline, is_noisy, sentences, show
+from jaxdn.report.summary import Column, best_methods, columns, floor_score, headline, is_noisy, sentences, show
 
 IMAGE_BUDGET = 27_000_000
 """Bytes of images (as base64 text) in one page; clips beyond it have only numbers and curves."""
@@ -105,9 +106,10 @@ def page(results: Results) -> str:
 
 def _top(results: Results) -> str:
     top = headline(results)
+    free = "" if top.field == "psnr" else ", unbiased"
     cards = []
     if top.best is not None:
-        cards.append(("Best PSNR", f"{show(top.best_psnr, 'psnr')} dB", top.best))
+        cards.append((f"Best PSNR{free}", f"{show(top.best_psnr, 'psnr')} dB", top.best))
     if math.isfinite(top.gain_over_svgf):
         cards.append((f"Gain over {top.svgf}", _signed(top.gain_over_svgf) + " dB", f"PSNR of {top.best}"))
     if math.isfinite(top.disoccluded_less):
@@ -137,31 +139,33 @@ def _top(results: Results) -> str:
 
 
 def _means(results: Results) -> str:
-    explained = "; ".join(f"<b>{column.label}</b>: {column.explanation}" for column in COLUMNS)
+    shown = columns(results)
+    explained = "; ".join(f"<b>{column.label}</b>: {column.explanation}" for column in shown)
     return (
         '<section id="scores"><h2>Scores, mean over all clips</h2>'
-        f"{_table(mean_scores(results), results.methods, mean_noise_floor(results))}"
+        f"{_table(mean_scores(results), shown, results.methods, mean_noise_floor(results))}"
         f'<p class="note">Arrows point to better, the best of a column is bold. {explained}. '
-        "The last row is what a perfect image would score against references that are noisy themselves. "
+        "The last row is what a perfect image would score against references that are noisy themselves; unbiased "
+        "scores do not have that noise in them, and are the ones to compare by. "
         "– means not measured, or nothing to measure on.</p></section>"
     )
 
 
-def _table(scores: dict[str, Scores], methods: list[str], floor: float) -> str:
+def _table(scores: dict[str, Scores], shown: Sequence[Column], methods: list[str], floor: float) -> str:
     """Methods down, metrics across, the noise floor as the last row."""
     head = "".join(
         f'<th scope="col" title="{escape(column.explanation)}">{column.label}{ARROWS[column.better]}</th>'
-        for column in COLUMNS
+        for column in shown
     )
-    best = {column.field: best_methods(scores, column) for column in COLUMNS}
+    best = {column.field: best_methods(scores, column) for column in shown}
     rows = []
     for number, method in enumerate(methods):
         cells = "".join(
             _cell(getattr(scores[method], column.field), column.field, best=method in best[column.field])
-            for column in COLUMNS
+            for column in shown
         )
         rows.append(f'<tr><th scope="row">{_swatch(number, method)}{escape(method)}</th>{cells}</tr>')
-    cells = "".join(f"<td>{show(floor_score(floor, column.field), column.field)}</td>" for column in COLUMNS)
+    cells = "".join(f"<td>{show(floor_score(floor, column.field), column.field)}</td>" for column in shown)
     rows.append(f'<tr class="floor"><th scope="row">noise floor</th>{cells}</tr>')
     return (
         f'<div class="scroll"><table><thead><tr><th scope="col">Method</th>{head}</tr></thead>'
@@ -172,7 +176,8 @@ def _table(scores: dict[str, Scores], methods: list[str], floor: float) -> str:
 def _overview(results: Results) -> str:
     """One row per clip, one column per method."""
     tables = []
-    for column in COLUMNS[:-2]:
+    shown = columns(results)[:-2]
+    for column in shown:
         head = "".join(
             f'<th scope="col">{_swatch(number, method)}{escape(method)}</th>'
             for number, method in enumerate(results.methods)
@@ -186,13 +191,13 @@ def _overview(results: Results) -> str:
             )
             cells += f'<td class="floor">{show(floor_score(clip.noise_floor_psnr, column.field), column.field)}</td>'
             rows.append(f'<tr><th scope="row"><a href="#clip-{index}">{escape(clip.name)}</a></th>{cells}</tr>')
-        hidden = "" if column.field == "psnr" else " hidden"
+        hidden = "" if column is shown[0] else " hidden"
         tables.append(
             f'<div class="scroll" data-metric="{column.field}"{hidden}><table><thead><tr><th scope="col">Clip</th>'
             f'{head}<th scope="col">noise floor</th></tr></thead><tbody>{"".join(rows)}</tbody></table></div>'
         )
     options = "".join(
-        f'<option value="{column.field}">{column.label}{ARROWS[column.better]}</option>' for column in COLUMNS[:-2]
+        f'<option value="{column.field}">{column.label}{ARROWS[column.better]}</option>' for column in shown
     )
     return (
         '<section id="overview"><h2>Clip by clip</h2>'
@@ -247,15 +252,17 @@ def _clip(
             '<p class="note">No pictures: this page would become too large to open comfortably. '
             "Report fewer clips, or smaller ones, to see them.</p>"
         )
-    top = headline(results).best
-    gist = "" if top is None else f"{escape(top)} {show(clip.scores[top].psnr, 'psnr')} dB, "
+    top = headline(results)
+    gist = ""
+    if top.best is not None:
+        gist = f"{escape(top.best)} {show(getattr(clip.scores[top.best], top.field), top.field)} dB, "
     opened = " open" if index == 0 else ""
     return (
         f'<details class="clip" id="clip-{index}"{opened}><summary><span class="name">'
         f'{escape(clip.name)}</span> <span class="note">{gist}'
         f"floor {show(clip.noise_floor_psnr, 'psnr')} dB</span></summary>"
         f'{notice}<div class="views"></div><h3>Scores on this clip</h3>'
-        f"{_table(clip.scores, results.methods, clip.noise_floor_psnr)}"
+        f"{_table(clip.scores, columns(results), results.methods, clip.noise_floor_psnr)}"
         '<div class="curves"></div>'
         f"{_json_script(data)}</details>"
     ), spent

@@ -1,7 +1,7 @@
 """The results of an evaluation, as the plain structure that the report shows."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,8 +33,16 @@ class Scores(NamedTuple):
     """Milliseconds that the method needs per frame on the machine of the report."""
     spp: float
     """Samples per pixel of the noisy radiance it was given."""
+    relative_mse: float = math.nan
+    """Squared difference over (reference^2 + 0.01), of linear radiance; NaN where it was not measured."""
     unbiased_psnr: float = math.nan
     """dB, ``psnr`` of all frames together without the reference's own noise; NaN where a clip has no half of it."""
+    unbiased_temporal_psnr: float = math.nan
+    """dB, ``temporal_psnr`` of all differences together, likewise."""
+    unbiased_mse: float = math.nan
+    """``mse``, likewise; below 0 where the image is as good as can be told."""
+    unbiased_relative_mse: float = math.nan
+    """``relative_mse``, likewise."""
 
 
 class ClipResult(NamedTuple):
@@ -126,6 +134,16 @@ def mean_scores(results: Results) -> dict[str, Scores]:
         columns = zip(table[:, index].T, measurable.T, strict=True)
         means[method] = Scores(*[_mean(values[counts]) for values, counts in columns])
     return means
+
+
+def headline_psnr(clips: Iterable[Mapping[str, Scores]]) -> str:
+    """The PSNR that methods are to be judged by: ``unbiased_psnr`` where every clip has it, else ``psnr``.
+
+    ``clips``: the scores of each clip, by method. The plain one has the noise of the reference in it, so it depends on
+    the samples of the reference and saturates where methods are good.
+    """
+    known = all(any(not math.isnan(scores.unbiased_psnr) for scores in clip.values()) for clip in clips)
+    return "unbiased_psnr" if known else "psnr"
 
 
 def mean_noise_floor(results: Results) -> float:

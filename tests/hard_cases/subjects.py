@@ -19,6 +19,7 @@ from tests.hard_cases.inputs import HEIGHT, WIDTH, Inputs
 
 _BORDERS = ("clamp", "zeros")
 _METRICS = ("psnr", "temporal_psnr", "ssim", "l1", "mse", "flip", "relative_mse")
+_UNBIASED = ("unbiased_mse", "unbiased_psnr", "unbiased_temporal_psnr", "unbiased_relative_mse")
 _PICTURED = {*(f"warp, {border}" for border in _BORDERS), "apply_kernels", "softmax_filter", "compose_scales"}
 
 
@@ -123,7 +124,9 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         return getattr(metrics, name)(*images, mask=inputs.mask if masked else None)
 
     def unbiased(inputs: Inputs, name: str) -> jax.Array:
-        image, reference = (jnp.clip(image, 0.0, 1.0) for image in _images(inputs))
+        image, reference = _images(inputs)
+        if name != "unbiased_relative_mse":
+            image, reference = jnp.clip(image, 0.0, 1.0), jnp.clip(reference, 0.0, 1.0)
         return getattr(metrics, name)(image, reference, reference[..., ::-1])
 
     def reflected(inputs: Inputs) -> jax.Array:
@@ -156,6 +159,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "color.expand": lambda inputs: color.expand(jnp.minimum(inputs.clip.frames.radiance, 2.0)),
         "color.luminance": of_light(color.luminance),
         **{f"color.tonemap, {one}": of_light(color.tonemap, operator=one) for one in color.OPERATORS},
+        "color.tonemap_halves": lambda inputs: jnp.stack(color.tonemap_halves(*_images(inputs))),
         "color.srgb_encode": lambda inputs: color.srgb_encode(jnp.clip(inputs.clip.frames.radiance, 0.0, 1.0)),
         "color.srgb_decode": lambda inputs: color.srgb_decode(jnp.clip(inputs.clip.frames.radiance, 0.0, 1.0)),
         "numerics.absolute": of_light(numerics.absolute),
@@ -166,7 +170,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "losses.gradient, hfen": partial(lost, loss=losses.gradient, operator="hfen"),
         "losses.occlusion": lambda inputs: lost(inputs, losses.occlusion, inputs.mask),
         **{f"metrics.{name}": partial(measured, name=name, masked=False) for name in _METRICS},
-        **{f"metrics.{name}": partial(unbiased, name=name) for name in ("unbiased_mse", "unbiased_psnr")},
+        **{f"metrics.{name}": partial(unbiased, name=name) for name in _UNBIASED},
         **{f"metrics.{name}, masked": partial(measured, name=name, masked=True) for name in _METRICS},
     }
 

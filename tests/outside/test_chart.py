@@ -13,11 +13,21 @@ import pytest
 
 from experiments.speed.chart.breakdown import WHOLE, breakdown, subjects
 from experiments.speed.chart.energy import find_meter
+from experiments.speed.chart.footage import Footage
 from experiments.speed.chart.page import page
 from experiments.speed.chart.render_cost import Cost, fit
-from experiments.speed.chart.scores import MEASURES
+from experiments.speed.chart.scores import MEASURES, score
 from experiments.speed.chart.store import Store, point_key
-from experiments.speed.chart.summary import RENDERER, Point, equal_quality, equal_samples, front_table, pareto, points
+from experiments.speed.chart.summary import (
+    RENDERER,
+    Point,
+    equal_quality,
+    equal_samples,
+    front_table,
+    headline,
+    pareto,
+    points,
+)
 from experiments.speed.chart.way import way
 from experiments.speed.chart.ways import chosen, left_out, registered, ways
 from experiments.speed.works import scene
@@ -126,8 +136,37 @@ def test_equal_quality_gives_samples_and_seconds(data):
     assert equals["filter @ 1"].spp == pytest.approx(2**1.5)
     assert equals["filter @ 1"].seconds == pytest.approx(0.1 + 0.5 * 2**1.5)
     assert set(equals) == {"filter @ 1", "filter @ 2"}
-    text = front_table(pareto(found, PSNR, SIZE), equals, SIZE, 8)
+    text = front_table(pareto(found, PSNR, SIZE), equals, SIZE, 8, headline(found))
     assert "3 spp, 1.5 s" in text
+
+
+def test_the_chart_is_read_without_the_noise_of_the_references_where_every_clip_tells(data):
+    found = points(data, LABELS)
+    assert [each.field for each in headline(found)] == ["unbiased_psnr", "unbiased_temporal_psnr"]
+    data["errors"]["filter @ 1"]["room"]["unbiased_psnr"] = None  # NaN, as it is stored
+    found = points(data, LABELS)
+    assert [each.field for each in headline(found)] == ["psnr", "temporal_psnr"]
+    # A reference of 45 dB: the renderer saturates there in plain PSNR, not without that noise.
+    for spp in (1, 2, 4, 8):
+        data["errors"][point_key(RENDERER, spp)]["room"]["psnr"] = 25.0
+    data["errors"]["filter @ 1"]["room"]["unbiased_psnr"] = 24.5
+    equals = equal_quality(points(data, LABELS), None)
+    assert equals["filter @ 1"].spp == pytest.approx(2**1.5)
+
+
+def test_a_clip_without_halves_has_no_unbiased_errors(rng):
+    clip = rng.exponential(0.3, (6, 8, 9, 3)).astype(np.float32)
+    noise = [(clip * rng.gamma(50, 1 / 50, clip.shape)).astype(np.float32) for _ in range(2)]
+    footage = Footage("", None, {}, None, {}, (noise[0] + noise[1]) / 2, None, np.zeros((6, 8, 9, 1), bool), 3, 30.0)
+    plain, known = score(clip, footage), score(clip, footage._replace(halves=tuple(noise)))
+    unbiased = [measure.field for measure in MEASURES if measure.field.startswith("unbiased")]
+    assert len(unbiased) == 4
+    assert all(math.isnan(plain[field]) for field in unbiased)
+    assert plain["psnr"] == known["psnr"]
+    assert known["unbiased_psnr"] > plain["psnr"] + 3
+    assert known["unbiased_mse"] < plain["mse"] / 2
+    assert known["unbiased_relative_mse"] < plain["relative_mse"] / 2
+    assert known["unbiased_temporal_psnr"] > plain["temporal_psnr"] + 3
 
 
 def test_points_include_the_time_of_rendering_their_input(data):

@@ -9,6 +9,8 @@ from jaxdn.clips.frames import write_frame
 from jaxdn.clips.noise_floor import read_halves
 from jaxdn.commands.compare import compare
 from jaxdn.frame import Frame
+from jaxdn.report import sentences, text_table, write_report
+from jaxdn.report.summary import headline
 
 SHAPE = (2, 60, 80, 3)
 ERROR = 0.02
@@ -54,3 +56,20 @@ def test_the_references_noise_is_not_in_the_score(tmp_path, halves):
         return
     # The reference's noise is as large as the image's: half of the plain error is not the image's.
     assert abs(scores.unbiased_psnr - scores.psnr - 10 * np.log10(2)) < 0.15
+    assert abs(scores.unbiased_temporal_psnr - scores.temporal_psnr - 10 * np.log10(2)) < 0.3
+    assert abs(scores.unbiased_mse / scores.mse - 0.5) < 0.02
+    assert abs(scores.unbiased_relative_mse / scores.relative_mse - 0.5) < 0.05
+
+
+@pytest.mark.parametrize("halves", [True, False])
+def test_the_report_says_which_score_to_read(tmp_path, halves):
+    write(tmp_path / "clip", halves=halves)
+    said = []
+    noisy = Candidate("noisy", None, {}, None, {})
+    results = compare([noisy], [tmp_path / "clip"], title="", settings={}, say=said.append)
+    assert headline(results).field == ("unbiased_psnr" if halves else "psnr")
+    assert ("without the reference's noise" in said[0]) == halves
+    assert ("Compare by the unbiased columns" in " ".join(sentences(results))) == halves
+    assert ("unbiased" in text_table(results)) == halves
+    page = write_report(results, tmp_path / "report").read_text()
+    assert ("Temporal PSNR dB, unbiased" in page) == halves

@@ -74,6 +74,7 @@ class Run:
             "clips": {clip.name: clip.record for clip in clips},
             "sizes": sizes._asdict(),
             "scored frames": footage.SCORED,
+            "measures": [measure.field for measure in MEASURES],
             "weights": {path.name: _digest(path) for path in sorted(SHIPPED.glob("*.safetensors"))},
         }
         self.store = Store(folder / "chart.json", settings, describe_machine())
@@ -227,8 +228,9 @@ def main(settings: Settings) -> None:
     found = summary.points(run.store.data, run.labels)
     equals = summary.equal_quality(found, summary.render_cost(run.store.data, run.timed_size))
     page = write_page(folder, run.store.data, found, equals, (run.timed_size, run.own_size))
-    front = summary.pareto(found, MEASURES[0], run.timed_size, render=bool(run.store.data["render"]))
-    print(summary.front_table(front, equals, run.timed_size, max(run.layers)))
+    quality = summary.headline(found)
+    front = summary.pareto(found, quality[0], run.timed_size, render=bool(run.store.data["render"]))
+    print(summary.front_table(front, equals, run.timed_size, max(run.layers), quality))
     print(f"raw numbers: {run.store.path}\npage:        {page}  ({time.monotonic() - began:.0f} s in total)")
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxdn import effects
 from jaxdn.clips import ClipError, read_clip, read_record
-from jaxdn.clips.noise_floor import read_noise_floor
+from jaxdn.clips.noise_floor import read_halves, read_noise_floor
 from jaxdn.frame import Frame
 from jaxdn.render import ClipJob, render_clips
 
@@ -53,6 +53,8 @@ class Footage(NamedTuple):
     noisy: dict[int, np.ndarray]
     """Samples per pixel -> [T, H, W, 3]."""
     reference: np.ndarray
+    halves: tuple[np.ndarray, np.ndarray] | None
+    """Two independent references of half the samples each, where the clip keeps them."""
     hidden: np.ndarray
     """[T, H, W, 1] bool, pixels whose point was hidden one frame earlier."""
     shown: int
@@ -96,8 +98,9 @@ def read(folder: Path) -> Footage:
     shown = count - SCORED + int(np.argmax(hidden[-SCORED:].sum((1, 2, 3))))
     planned = effects.plan(effects.inspect(folder)).buffers
     frames = clip.frames._replace(**{name: None for name in Frame._fields[1:] if name not in planned})
-    floor = read_noise_floor(folder)
-    return Footage(folder.name, folder, record, frames, noisy, np.asarray(clip.reference), hidden, shown, floor)
+    floor, halves = read_noise_floor(folder), read_halves(folder)
+    reference = np.asarray(clip.reference)
+    return Footage(folder.name, folder, record, frames, noisy, reference, halves, hidden, shown, floor)
 
 
 def common_layers(clips: Sequence[Footage]) -> list[int]:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from experiments.speed.chart.breakdown import WHOLE
 from experiments.speed.chart.scores import MEASURES
-from experiments.speed.chart.summary import RENDERER, Equal, Point, in_words, pareto, render_cost
+from experiments.speed.chart.summary import RENDERER, Equal, Point, headline, in_words, pareto, render_cost
 from experiments.speed.chart.way import ALL
 from jaxdn.files import write_whole
 from jaxdn.report import images
@@ -84,7 +84,7 @@ def page(
     scale = images.error_scale(denoised or [np.zeros((1, 1))])
     most = max((point.spp or 0 for point in points if point.method == RENDERER), default=0)
     content = {
-        "measures": [measure._asdict() for measure in MEASURES],
+        "measures": [each._asdict() for each in sorted(MEASURES, key=lambda each: each != headline(points)[0])],
         "sizes": sizes,
         "families": list(dict.fromkeys(point.family for point in points)),
         "variants": list(dict.fromkeys(point.variant for point in points)),
@@ -165,6 +165,8 @@ def _top(data: Mapping[str, Any], sizes: tuple[str, str]) -> str:
     notes = [
         f"Errors are means over the last {data['settings']['scored frames']} frames of {escape(clips)}, "
         f"{sizes[1]} pixels: small images. All except relative MSE are computed on sRGB values, clipped at 1.",
+        "Unbiased errors do not have the noise of the references in them: read those, where the clips keep the halves "
+        "of their references. The plain ones saturate at that noise.",
         f"Time is for one frame of {sizes[0]} (median of repeats, methods interleaved), or of the clips' own size. "
         "Rendering times beyond four samples per pixel are extrapolated linearly in the number of samples.",
         "Marks at the bottom of the plot have no error: untrained widths, the same network in PyTorch, and the time "
@@ -183,7 +185,8 @@ def _top(data: Mapping[str, Any], sizes: tuple[str, str]) -> str:
 def _front(data: Mapping[str, Any], points: Sequence[Point], equals: Mapping[str, Equal], size: str, most: int) -> str:
     """The Pareto front in PSNR, rendering included where it was timed."""
     rows = []
-    front = pareto(points, MEASURES[0], size, render=bool(data["render"]))
+    quality = headline(points)
+    front = pareto(points, quality[0], size, render=bool(data["render"]))
     for point in front:
         equal = equals.get(point.key)
         rows.append(
@@ -192,12 +195,11 @@ def _front(data: Mapping[str, Any], points: Sequence[Point], equals: Mapping[str
                 str(point.spp),
                 number(point.milliseconds(size, render=bool(data["render"]))),
                 number(point.denoise_ms.get(size, math.nan)),
-                number(point.errors["psnr"], 2),
-                number(point.errors["temporal_psnr"], 2),
+                *(number(point.errors[measure.field], 2) for measure in quality),
                 "" if equal is None else in_words(equal, most),
             ]
         )
-    head = ["Method", "spp", f"ms / frame, {size}", "denoising ms", "PSNR dB", "temporal PSNR dB", "bare renderer"]
+    head = ["Method", "spp", f"ms / frame, {size}", "denoising ms", *(each.label for each in quality), "bare renderer"]
     return (
         '<section id="front"><h2>The Pareto front</h2><p class="note">No other point is better and no slower; PSNR '
         "against time with rendering. Last column: what rendering alone needs for the same PSNR.</p>"

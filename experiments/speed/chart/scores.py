@@ -19,38 +19,59 @@ class Measure(NamedTuple):
     """1 if higher is better, -1 if lower is."""
 
 
+# The first is the one to read and the default of the page, unless the clips keep halves: see summary.headline.
 MEASURES = (
     Measure("psnr", "PSNR dB", 1),
     Measure("temporal_psnr", "temporal PSNR dB", 1),
     Measure("relative_mse", "relative MSE", -1),
+    Measure("mse", "MSE", -1),
     Measure("flip", "FLIP", -1),
     Measure("disoccluded_psnr", "PSNR dB, disoccluded pixels", 1),
     Measure("disoccluded_l1", "L1, disoccluded pixels", -1),
+    Measure("unbiased_psnr", "PSNR dB, unbiased", 1),
+    Measure("unbiased_temporal_psnr", "temporal PSNR dB, unbiased", 1),
+    Measure("unbiased_mse", "MSE, unbiased", -1),
+    Measure("unbiased_relative_mse", "relative MSE, unbiased", -1),
 )
 
 
 @jax.jit
-def _scores(images: jax.Array, reference: jax.Array, hidden: jax.Array) -> dict[str, jax.Array]:
+def _scores(
+    images: jax.Array, reference: jax.Array, hidden: jax.Array, halves: tuple[jax.Array, jax.Array] | None
+) -> dict[str, jax.Array]:
     shown, wanted = color.tonemap(images), color.tonemap(reference)
-    return {
+    found = {
         "psnr": metrics.psnr(shown, wanted),
         "temporal_psnr": metrics.temporal_psnr(shown, wanted),
         "relative_mse": metrics.relative_mse(images, reference),
+        "mse": metrics.mse(shown, wanted),
         "flip": metrics.flip(shown, wanted),
         "disoccluded_psnr": metrics.psnr(shown, wanted, mask=hidden, average="mse"),
         "disoccluded_l1": metrics.l1(shown, wanted, mask=hidden),
     }
+    if halves is not None:
+        ends = color.tonemap_halves(*halves)
+        found |= {
+            "unbiased_psnr": metrics.unbiased_psnr(shown, *ends),
+            "unbiased_temporal_psnr": metrics.unbiased_temporal_psnr(shown, *ends),
+            "unbiased_mse": metrics.unbiased_mse(shown, *ends),
+            "unbiased_relative_mse": metrics.unbiased_relative_mse(images, *halves),
+        }
+    return found
 
 
 def score(images: np.ndarray, clip: Footage) -> dict[str, float]:
     """Every measure over the last frames of images [T, H, W, 3], linear; all except relative MSE on sRGB, clipped at 1.
 
-    NaN in disoccluded pixels where the clip has none.
+    NaN in disoccluded pixels where the clip has none, and without the noise of the reference where it keeps no half.
     """
     hidden = clip.hidden[-SCORED:]
-    found = _scores(jnp.asarray(images[-SCORED:]), jnp.asarray(clip.reference[-SCORED:]), jnp.asarray(hidden))
+    halves = None if clip.halves is None else tuple(jnp.asarray(half[-SCORED:]) for half in clip.halves)
+    given = (jnp.asarray(each[-SCORED:]) for each in (images, clip.reference, hidden))
+    found = _scores(*given, halves)
     nothing = () if hidden.any() else ("disoccluded_psnr", "disoccluded_l1")
-    return {name: float("nan") if name in nothing else float(value) for name, value in found.items()}
+    known = {name: float(value) for name, value in found.items() if name not in nothing}
+    return {measure.field: known.get(measure.field, float("nan")) for measure in MEASURES}
 
 
 def picture(image: np.ndarray) -> np.ndarray:

@@ -35,6 +35,19 @@ class Point(NamedTuple):
         return self.denoise_ms.get(size, math.nan) + rendered
 
 
+def headline(points: Sequence[Point]) -> tuple[Measure, Measure]:
+    """PSNR and temporal PSNR as the chart is to be read: without the noise of the references wherever that is known.
+
+    The plain ones saturate at the noise of the reference: there, twice the samples no longer look better.
+    """
+    by_field = {measure.field: measure for measure in MEASURES}
+    fields = ("unbiased_psnr", "unbiased_temporal_psnr")
+    scored = [point for point in points if point.spp]
+    if any(math.isnan(point.errors.get(field, math.nan)) for point in scored for field in fields):
+        fields = ("psnr", "temporal_psnr")
+    return by_field[fields[0]], by_field[fields[1]]
+
+
 class Equal(NamedTuple):
     """What the bare renderer needs for the quality of a point."""
 
@@ -122,12 +135,14 @@ def equal_samples(psnr: float, curve: Mapping[int, float]) -> float:
 
 
 def equal_quality(points: Sequence[Point], cost: Cost | None) -> dict[str, Equal]:
-    """Key of each denoised point -> what the bare renderer needs for its PSNR."""
-    curve = {point.spp: point.errors["psnr"] for point in points if point.method == RENDERER and point.spp}
+    """Key of each denoised point -> what the bare renderer needs for its PSNR, that of :func:`headline`."""
+    field = headline(points)[0].field
+    known = [point for point in points if point.spp and math.isfinite(point.errors[field])]
+    curve = {point.spp: point.errors[field] for point in known if point.method == RENDERER and point.spp}
     found = {}
-    for point in points:
-        if point.method != RENDERER and point.spp and curve:
-            spp = equal_samples(point.errors["psnr"], curve)
+    for point in known:
+        if point.method != RENDERER and curve:
+            spp = equal_samples(point.errors[field], curve)
             found[point.key] = Equal(spp, cost.at(spp) if cost else math.nan)
     return found
 
@@ -142,9 +157,12 @@ def text_table(rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("  ".join(line).rstrip() for line in lines)
 
 
-def front_table(front: Sequence[Point], equals: Mapping[str, Equal], size: str, most: int) -> str:
-    """The Pareto front for a terminal; ``most`` samples were rendered."""
-    rows = [["on the front", "spp", "ms / frame", "denoising ms", "PSNR dB", "temporal", "bare renderer needs"]]
+def front_table(
+    front: Sequence[Point], equals: Mapping[str, Equal], size: str, most: int, quality: Sequence[Measure]
+) -> str:
+    """The Pareto front for a terminal; ``most`` samples were rendered, ``quality`` is shown."""
+    labels = [measure.label for measure in quality]
+    rows = [["on the front", "spp", "ms / frame", "denoising ms", *labels, "bare renderer needs"]]
     for point in front:
         equal = equals.get(point.key)
         rows.append(
@@ -153,8 +171,7 @@ def front_table(front: Sequence[Point], equals: Mapping[str, Equal], size: str, 
                 str(point.spp),
                 f"{point.milliseconds(size, render=bool(point.render_ms)):.0f}",
                 f"{point.denoise_ms[size]:.0f}",
-                f"{point.errors['psnr']:.2f}",
-                f"{point.errors['temporal_psnr']:.2f}",
+                *(f"{point.errors[measure.field]:.2f}" for measure in quality),
                 "" if equal is None else in_words(equal, most),
             ]
         )
