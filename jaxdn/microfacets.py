@@ -165,7 +165,9 @@ def masking(slopes: jax.Array, angle: jax.Array) -> jax.Array:
 def _masking(slopes: jax.Array, tangent: jax.Array) -> jax.Array:
     cells = slopes.shape[0]
     facets = jnp.asarray(np.tan(angles(cells)), slopes.dtype)
-    inverse = _projected_area(jnp.tensordot(tangent, facets, axes=0)) @ (slopes * jnp.asarray(_slope_area(cells), slopes.dtype))
+    inverse = _projected_area(jnp.tensordot(tangent, facets, axes=0)) @ (
+        slopes * jnp.asarray(_slope_area(cells), slopes.dtype)
+    )
     return 1 / jnp.maximum(inverse, 1.0)
 
 

@@ -1,5 +1,7 @@
 """Glints against the binomial distribution, the smooth lobe, and the counting rule written in plain integers."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,33 +11,40 @@ from scipy import stats
 
 from jaxdn import glints, microfacets
 
-glint_distribution = jax.jit(glints.glint_distribution, static_argnames=("lobe", "flakes", "bins"))
-flake_normals = jax.jit(glints.flake_normals, static_argnums=0, static_argnames=("lobe", "flakes", "bins"))
+OPTIONS = ("lobe", "flakes", "bins")
+LEVEL = 6
+glint_distribution = jax.jit(glints.glint_distribution, static_argnames=OPTIONS)
+flake_normals = jax.jit(glints.flake_normals, static_argnums=0, static_argnames=OPTIONS)
+
+
+@partial(jax.jit, static_argnames=OPTIONS)
+def ratio(half, position, width, rough, **options):
+    """[H, W] glints divided by the smooth distribution."""
+    smooth = microfacets.distribution(half, rough, lobe=options.get("lobe", "ggx"))
+    return (glints.glint_distribution(half, position, width, rough, **options) / smooth)[..., 0]
 
 
 def cells(level, tile=(0, 0)):
     """[n, n, 2] centres of the cells of a level of the quadtree."""
     count = 2**level
-    centres = (jnp.arange(count) + 0.5) / count
-    return jnp.stack(jnp.meshgrid(centres + tile[0], centres + tile[1]), -1)
+    centres = (np.arange(count) + 0.5) / count
+    return np.stack(np.meshgrid(centres + tile[0], centres + tile[1]), -1).astype(np.float32)
 
 
 def everywhere(shape, value):
-    return jnp.broadcast_to(jnp.asarray(value, jnp.float32), (*shape, len(value)))
+    return np.broadcast_to(np.float32(value), (*shape, len(value)))
 
 
-def relative(level, half=(0.1, 0.2, 0.9), *, tile=(0, 0), footprint=None, roughness=0.5, **options):
-    """Glints divided by the smooth distribution [n, n] in the cells of a level."""
-    position = cells(level, tile)
-    shape = position.shape[:2]
-    half, rough = everywhere(shape, half), everywhere(shape, [roughness])
+def relative(level, half=(0.1, 0.2, 0.9), *, tile=(0, 0), footprint=None, **options):
+    """Count over expected count [n, n] in the cells of a level: one program for all of them, up to the finest."""
+    shape = (2**LEVEL, 2**LEVEL)
     width = everywhere(shape, [2.0**-level if footprint is None else footprint])
-    found = glint_distribution(half, position, width, rough, **options)
-    return np.asarray(found / microfacets.distribution(half, rough, lobe=options.get("lobe", "ggx")))[..., 0]
+    found = ratio(everywhere(shape, half), cells(LEVEL, tile), width, everywhere(shape, [0.5]), **options)
+    step = 2 ** (LEVEL - level)
+    return np.asarray(found, np.float64)[::step, ::step]
 
 
-@pytest.mark.parametrize("lobe", microfacets.LOBES)
-@pytest.mark.parametrize("flakes", [1, 31, 32, 33, 256])
+@pytest.mark.parametrize(("lobe", "flakes"), [("ggx", 1), ("ggx", 32), ("ggx", 33), ("ggx", 256), ("beckmann", 256)])
 def test_the_mean_over_the_cells_is_the_smooth_distribution(lobe, flakes):
     for level in (0, 1, 4, 6):
         found = relative(level, lobe=lobe, flakes=flakes)
@@ -50,19 +59,15 @@ def test_counts_of_four_cells_add_up_to_their_parents():
         np.testing.assert_allclose(children.reshape(size, 2, size, 2).mean((1, 3)), parent, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("level", "flakes"), [(1, 16), (3, 40), (3, 200), (5, 256)])
+@pytest.mark.parametrize(("level", "flakes"), [(1, 33), (2, 256), (4, 256)])
 def test_counts_are_binomial(level, flakes):
-    """One cell of many tiles, and many cells of one tile in several directions."""
+    """One cell of each of 4096 tiles."""
     share = 4.0**-level
-    drawn = np.concatenate(
-        [relative(level, half, tile=(7, -3), flakes=flakes).ravel() for half in ((0, 0, 1), (0.3, 0, 1), (-0.2, 0.4, 1))]
-    )
-    counts = np.round(drawn * flakes * share)
-    assert counts.mean() == pytest.approx(flakes * share)
-    tiles = jnp.stack(jnp.meshgrid(jnp.arange(-30, 30), jnp.arange(5, 65)), -1) + 0.01
-    half, rough = everywhere((60, 60), (0.1, 0.2, 0.9)), everywhere((60, 60), [0.5])
-    found = glint_distribution(half, tiles, everywhere((60, 60), [2.0**-level]), rough, flakes=flakes)
-    counts = np.round(np.asarray(found / microfacets.distribution(half, rough)).ravel() * flakes * share)
+    tiles = np.stack(np.meshgrid(np.arange(-32, 32), np.arange(5, 69)), -1).astype(np.float32) + np.float32(0.01)
+    shape = tiles.shape[:2]
+    width = everywhere(shape, [2.0**-level])
+    found = ratio(everywhere(shape, (0.1, 0.2, 0.9)), tiles, width, everywhere(shape, [0.5]), flakes=flakes)
+    counts = np.round(np.asarray(found).ravel() * flakes * share)
     edges = np.unique(stats.binom.ppf([0, 0.1, 0.3, 0.5, 0.7, 0.9], flakes, share))
     observed = np.histogram(counts, [-np.inf, *(edges + 0.5), np.inf])[0]
     below = np.concatenate([stats.binom.cdf(edges, flakes, share), [1.0]])
@@ -113,7 +118,7 @@ def counted(seed, tile, direction, cell, level, flakes):
 
 def test_the_counting_rule_in_plain_integers():
     """The flakes of a seed are the same on every machine: a scene's textures are made of them."""
-    level, flakes, middle = 3, 50, 7 * 15 + 7
+    level, flakes, middle = 3, 33, 7 * 15 + 7
     for seed, tile in ((0, (0, 0)), (123456789, (-2, 5))):
         found = relative(level, (0, 0, 1), tile=tile, seed=seed, flakes=flakes) * flakes / 4**level
         expected = [[counted(seed, tile, middle, (x, y), level, flakes) for x in range(8)] for y in range(8)]
@@ -171,8 +176,7 @@ def test_the_normal_map_shows_the_flakes_that_are_counted(lobe):
     normals = flake_normals(size, jnp.float32(rough), **options)
     position, shape = cells(5), (size, size)
     here, width = everywhere(shape, [rough]), everywhere(shape, [1 / size])
-    found = glint_distribution(normals, position, width, here, **options)
-    counts = np.asarray(found / microfacets.distribution(normals, here, lobe=lobe))[..., 0] * 20 / size**2
+    counts = np.asarray(ratio(normals, position, width, here, **options)) * 20 / size**2
     occupied = np.asarray(normals)[..., 2] < 1
     assert 0.7 < occupied.mean() < 0.9  # exp(-20 81 / 32^2) of them have none
     assert np.all(np.round(counts[occupied]) >= 1)
@@ -181,7 +185,7 @@ def test_the_normal_map_shows_the_flakes_that_are_counted(lobe):
     # Nor does a texel without a flake reflect in any other direction.
     rng = np.random.default_rng(0)
     for _ in range(20):
-        half = jnp.asarray(rng.normal(0, 0.3, (*shape, 3)) + [0, 0, 1], jnp.float32)
+        half = np.float32(rng.normal(0, 0.3, (*shape, 3)) + [0, 0, 1])
         assert np.all(np.asarray(glint_distribution(half, position, width, here, **options))[~occupied] == 0)
 
 
@@ -195,7 +199,7 @@ def test_no_case_gives_anything_but_numbers(lobe):
     width = width[..., None]
     for roughness in (0.0, 0.3, 1.0):
         rough = jnp.full((len(grid), 1, 1), roughness)
-        for flakes in (1, 256):
+        for flakes in (1, 33):
             found = glint_distribution(half, position, width, rough, lobe=lobe, flakes=flakes)
             assert np.isfinite(found).all()
             assert np.all(np.asarray(found) >= 0)
@@ -233,7 +237,7 @@ def test_wrong_shapes_and_numbers_raise():
     half, position, one = jnp.ones((2, 3, 3)), jnp.ones((2, 3, 2)), jnp.ones((2, 3, 1))
     with pytest.raises(ValueError, match="position"):
         glints.glint_distribution(half, one, one, one)
-    with pytest.raises(ValueError, match="footprint.*same size"):
+    with pytest.raises(ValueError, match=r"footprint.*same size"):
         glints.glint_distribution(half, position, one[:1], one)
     with pytest.raises(ValueError, match="lobe"):
         glints.glint_distribution(half, position, one, one, lobe="phong")

@@ -61,7 +61,9 @@ def test_alpha_has_the_known_values(lobe, alpha, separable, expected):
 
 
 @pytest.mark.parametrize("separable", [False, True])
-@pytest.mark.parametrize(("lobe", "alpha"), [("ggx", 0.1), ("ggx", 0.3), ("ggx", 0.7), ("beckmann", 0.2), ("beckmann", 0.6)])
+@pytest.mark.parametrize(
+    ("lobe", "alpha"), [("ggx", 0.1), ("ggx", 0.3), ("ggx", 0.7), ("beckmann", 0.2), ("beckmann", 0.6)]
+)
 def test_the_whole_density_comes_back_from_its_own_kind_of_masking(lobe, alpha, separable):
     data = single(backscatter(lobe, alpha, separable=separable))
     slopes = microfacets.extract_distribution(data, shadowing="separable" if separable else "correlated")
@@ -184,7 +186,9 @@ def torrance_sparrow(lobe, alpha, difference, f0, *, separable):
 def test_the_fresnel_term_comes_back(lobe, alpha, separable):
     difference, f0 = np.linspace(0, 1.4, 15), np.array([0.04, 0.5, 0.95])
     shadowing = "separable" if separable else "correlated"
-    slopes = microfacets.extract_distribution(single(backscatter(lobe, alpha, separable=separable)), shadowing=shadowing)
+    slopes = microfacets.extract_distribution(
+        single(backscatter(lobe, alpha, separable=separable)), shadowing=shadowing
+    )
     brdf = torrance_sparrow(lobe, alpha, difference, f0, separable=separable)
     found = microfacets.extract_fresnel(single(brdf), single(difference), slopes, shadowing=shadowing)
     assert found.shape == (15, 3)
@@ -261,7 +265,7 @@ def test_gradients(x64, rng):
 
 def test_wrong_shapes_and_options_raise():
     curve, image = jnp.ones(8), jnp.ones((2, 8, 3))
-    with pytest.raises(ValueError, match="backscatter.*jax.vmap"):
+    with pytest.raises(ValueError, match=r"backscatter.*jax.vmap"):
         microfacets.extract_distribution(image)
     with pytest.raises(ValueError, match="backscatter"):
         microfacets.extract_distribution(jnp.ones(8, jnp.int32))
