@@ -77,6 +77,9 @@ def alpha_of(roughness: jax.Array) -> jax.Array:
 def cosine_and_sine(half: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Of the angle between half vectors [..., 3] of any length and z: each [..., 1]. A zero vector has cosine 0."""
     half = half.astype(jnp.promote_types(half.dtype, jnp.float32))
+    # In proportion to the largest component, so that the square of a length, in the derivative, does not underflow.
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(half), axis=-1, keepdims=True))
+    half = half / jnp.where(largest == 0, 1.0, largest)
     length = safe_norm(half)
     unit = half / jnp.where(length == 0, 1.0, length)
     return unit[..., 2:], safe_norm(unit[..., :2])

@@ -148,7 +148,7 @@ def test_black_and_diffuse_surfaces():
     assert np.isfinite(microfacets.fit_alpha(black, lobe="beckmann")).all()
     np.testing.assert_array_equal(microfacets.masking(black, jnp.linspace(0, 1.5, 4)), 1)
     diffuse = microfacets.extract_distribution(jnp.full(CELLS, 0.5 / np.pi))
-    assert float(microfacets.fit_alpha(diffuse, lobe="ggx").alpha) > 0.6, "very broad"
+    assert float(microfacets.fit_alpha(diffuse, lobe="ggx").alpha) > 0.5, "of cos^6 alone it would be 0.5"
 
 
 def test_angles_are_dense_at_the_normal_and_never_at_the_horizon():

@@ -201,9 +201,7 @@ def test_each_flake_of_glitter_reflects_in_its_own_direction(mitsuba: Any) -> No
         hit.sh_frame = mitsuba.Frame3f([1, 0, 0], [0, 1, 0], [0, 0, 1])
         hit.dp_du, hit.dp_dv = mitsuba.Vector3f(1, 0, 0), mitsuba.Vector3f(0, 1, 0)
         hit.wi = mitsuba.Vector3f(0, 0, 1)
-        hit.uv = mitsuba.Point2f(
-            (column + 0.5) / size / material.repeat[0], (1 - (row + 0.5) / size) / material.repeat[1]
-        )
+        hit.uv = mitsuba.Point2f((column + 0.5) / size / material.repeat[0], (row + 0.5) / size / material.repeat[1])
         return float(np.mean(np.array(bsdf.eval(mitsuba.BSDFContext(), hit, mitsuba.Vector3f(*map(float, light))))))
 
     own, others = [], []
@@ -214,15 +212,15 @@ def test_each_flake_of_glitter_reflects_in_its_own_direction(mitsuba: Any) -> No
             own.append(value(row, column, light))
             others.append(value(row, (column + 1) % size, light))
     assert len(own) > 20
-    assert min(own) > 2
-    assert np.median(others) < 0.1 * np.median(own)
+    assert min(own) > 20
+    assert np.median(others) < 0.01 * np.median(own)
 
 
 def test_glitter_is_the_still_life_with_other_materials() -> None:
     scene, again = family_scene("glitter", 3), family_scene("glitter", 3)
     flakes = {name: part.material.normals for name, part in scene.parts.items() if part.material.normals is not None}
     assert len(flakes) == 8
-    assert set(scene.parts) >= set(family_scene("fruit", 3, lamp=scene.lamp).parts) - {"wall_right", "sky"}
+    assert set(scene.parts) == set(family_scene("fruit", 3, lamp=scene.lamp).parts)
     first, second, *_ = flakes.values()
     assert not np.array_equal(first, second)
     for name, normals in flakes.items():
