@@ -25,6 +25,8 @@ MATHS = (
     "scales",
     "ops",
     "brdf",
+    "microfacets",
+    "glints",
 )
 LAYERS = {
     **dict.fromkeys((*MATHS, "ops", "losses", "metrics", "flip", "sampling", "objectives", "recipe"), 1),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdn
-from jaxdn import brdf, color, losses, metrics, numerics, scales
+from jaxdn import brdf, color, glints, losses, metrics, microfacets, numerics, scales
 from jaxdn.frame import RADIANCE_MAX, Clip, Frame
 from jaxdn.methods.table import methods
 from jaxdn.motion import on_screen
@@ -140,6 +140,31 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
     def of_light(function: Callable[..., jax.Array], **options: Any) -> Callable[[Inputs], jax.Array]:
         return lambda inputs: function(inputs.clip.frames.radiance, **options)
 
+    def curve(inputs: Inputs) -> jax.Array:
+        """The first row of the last frame, as if it were measured; at least one value."""
+        return color.luminance(inputs.clip.frames.radiance[-1, 0])[:, 0]
+
+    def extracted(inputs: Inputs, shadowing: microfacets.Shadowing = "correlated") -> jax.Array:
+        return microfacets.extract_distribution(curve(inputs), shadowing=shadowing)
+
+    def fresnel(inputs: Inputs) -> jax.Array:
+        image = inputs.clip.frames.radiance[-1]
+        return microfacets.extract_fresnel(image, jnp.linspace(0.0, 1.5, image.shape[0]), extracted(inputs))
+
+    def masked(inputs: Inputs) -> jax.Array:
+        return microfacets.masking(extracted(inputs), inputs.clip.frames.depth[-1])
+
+    def lobe(inputs: Inputs, lobe: microfacets.Lobe) -> jax.Array:
+        return microfacets.distribution(inputs.clip.frames.normal[-1], inputs.clip.frames.roughness[-1], lobe=lobe)
+
+    def glint(inputs: Inputs, lobe: microfacets.Lobe) -> jax.Array:
+        frames = inputs.clip.frames
+        place, footprint = frames.motion[-1], frames.depth[-1] / 100
+        return glints.glint_distribution(frames.normal[-1], place, footprint, frames.roughness[-1], lobe=lobe)
+
+    def flakes(inputs: Inputs) -> jax.Array:
+        return glints.flake_normals(8, inputs.clip.frames.roughness[-1, 0, 0, 0], flakes=32, bins=3)
+
     return {
         **{f"warp, {border}": partial(warped, border=border) for border in _BORDERS},
         "on_screen": lambda inputs: jax.vmap(on_screen)(inputs.clip.frames.motion).astype(jnp.float32),
@@ -162,6 +187,19 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "color.tonemap_halves": lambda inputs: jnp.stack(color.tonemap_halves(*_images(inputs))),
         "color.srgb_encode": lambda inputs: color.srgb_encode(jnp.clip(inputs.clip.frames.radiance, 0.0, 1.0)),
         "color.srgb_decode": lambda inputs: color.srgb_decode(jnp.clip(inputs.clip.frames.radiance, 0.0, 1.0)),
+        "microfacets.extract_distribution": extracted,
+        "microfacets.extract_distribution, separable": partial(extracted, shadowing="separable"),
+        "microfacets.masking": masked,
+        "microfacets.extract_fresnel": fresnel,
+        **{
+            f"microfacets.fit_alpha, {one}": lambda inputs, one=one: jnp.stack(
+                microfacets.fit_alpha(extracted(inputs), lobe=one)
+            )
+            for one in microfacets.LOBES
+        },
+        **{f"microfacets.distribution, {one}": partial(lobe, lobe=one) for one in microfacets.LOBES},
+        **{f"glints.glint_distribution, {one}": partial(glint, lobe=one) for one in microfacets.LOBES},
+        "glints.flake_normals": flakes,
         "numerics.absolute": of_light(numerics.absolute),
         "numerics.safe_norm": lambda inputs: numerics.safe_norm(inputs.clip.frames.normal),
         "numerics.safe_norm of light": of_light(numerics.safe_norm),

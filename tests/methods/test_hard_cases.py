@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn import brdf, color, losses, metrics, motion, numerics, scales
+from jaxdn import brdf, color, glints, losses, metrics, microfacets, motion, numerics, scales
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.methods import table as methods_table
 from jaxdn.methods.table import method, methods
@@ -35,7 +35,10 @@ SAME_SIZE = [case for case in CASES.values() if shapes(case) == CONTROL]
 SMALLEST = [CASES["size 1x1"], CASES["size 3x3 and two frames"]]
 LONG_TO_COMPILE = ("metrics.flip", "metrics.ssim", "losses.gradient, hfen")
 OPERATIONS = [one for one in operation_subjects() if not one.name.startswith(LONG_TO_COMPILE)]
-INNER = {"targets", "check_taps", "offsets", "albedo_table", "ggx_albedo_table"}
+INNER = {
+    *("targets", "check_taps", "offsets", "angles", "alpha_of", "cosine_and_sine"),
+    *("albedo_table", "ggx_albedo_table"),
+}  # fmt: skip
 """Helpers of operations, which are tested through them, and tables that take no image."""
 PLAIN = [one for one in OPERATIONS if not one.name.endswith(", masked")]
 
@@ -77,7 +80,11 @@ def test_every_denoiser_and_every_public_operation_is_tested():
     assert {subject.name.split()[0] for subject in denoiser_subjects()} == set(methods())
     inside = {one for operation in ("warp", "apply_kernels", "softmax_filter") for one in implementations(operation)}
     tried = {subject.name.split(",")[0].split(".")[-1] for subject in operation_subjects()}
-    for module in (brdf, color, losses, metrics, motion, numerics, scales, kernels, softmax_filter, warp):
+    modules = (
+        *(brdf, color, glints, losses, metrics, microfacets, motion, numerics, scales),
+        *(kernels, softmax_filter, warp),
+    )
+    for module in modules:
         functions = inspect.getmembers(module, inspect.isfunction)
         public = {name for name, one in functions if one.__module__ == module.__name__ and name[0] != "_"}
         assert public - inside - INNER <= tried, f"{module.__name__} has functions that no hard case tests"

@@ -189,6 +189,46 @@ def test_textures_are_reflectances_that_wrap(rng: np.random.Generator) -> None:
     assert np.abs(field[0] - field[-1]).max() < 0.1, "the last row continues in the first"
 
 
+def test_each_flake_of_glitter_reflects_in_its_own_direction(mitsuba: Any) -> None:
+    """A texel lit from where its normal says is bright to a viewer above it; its neighbours, lit so, are not."""
+    material = family_scene("glitter", 3).parts["vase"].material
+    assert material.normals is not None
+    bsdf, size = mitsuba.load_dict(material.describe()), len(material.normals)
+
+    def value(row: int, column: int, light: np.ndarray) -> float:
+        hit = mitsuba.SurfaceInteraction3f()
+        hit.n = mitsuba.Normal3f(0, 0, 1)
+        hit.sh_frame = mitsuba.Frame3f([1, 0, 0], [0, 1, 0], [0, 0, 1])
+        hit.dp_du, hit.dp_dv = mitsuba.Vector3f(1, 0, 0), mitsuba.Vector3f(0, 1, 0)
+        hit.wi = mitsuba.Vector3f(0, 0, 1)
+        hit.uv = mitsuba.Point2f((column + 0.5) / size / material.repeat[0], (row + 0.5) / size / material.repeat[1])
+        return float(np.mean(np.array(bsdf.eval(mitsuba.BSDFContext(), hit, mitsuba.Vector3f(*map(float, light))))))
+
+    own, others = [], []
+    for row, column in np.random.default_rng(0).integers(0, size, (200, 2)):
+        x, y, z = np.asarray(material.normals[row, column], float)
+        if 0.9 < z < 0.999:
+            light = np.array([2 * x * z, 2 * y * z, 2 * z * z - 1])  # mirrored at the normal
+            own.append(value(row, column, light))
+            others.append(value(row, (column + 1) % size, light))
+    assert len(own) > 20
+    assert min(own) > 20
+    assert np.median(others) < 0.01 * np.median(own)
+
+
+def test_glitter_is_the_still_life_with_other_materials() -> None:
+    scene, again = family_scene("glitter", 3), family_scene("glitter", 3)
+    flakes = {name: part.material.normals for name, part in scene.parts.items() if part.material.normals is not None}
+    assert len(flakes) == 8
+    assert set(scene.parts) == set(family_scene("fruit", 3, lamp=scene.lamp).parts)
+    first, second, *_ = flakes.values()
+    assert not np.array_equal(first, second)
+    for name, normals in flakes.items():
+        np.testing.assert_array_equal(normals, again.parts[name].material.normals)
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-6)
+        assert 0.5 < np.mean(normals[..., 2] < 1) < 0.7, "exp(-0.88) of the texels have no flake"
+
+
 def test_transforms() -> None:
     np.testing.assert_allclose(turn("y", 90) @ [0, 0, 1, 1], [1, 0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(turn("x", 90) @ [0, 1, 0, 1], [0, 0, 1, 1], atol=1e-12)

@@ -10,6 +10,7 @@ from typing import Any
 from jaxdn.render.families.dash import dash
 from jaxdn.render.families.edge import edge
 from jaxdn.render.families.fruit import fruit
+from jaxdn.render.families.glitter import glitter
 from jaxdn.render.families.mobile import mobile
 from jaxdn.render.families.pinkroom import pinkroom
 from jaxdn.render.families.robot import robot
@@ -22,6 +23,7 @@ FAMILIES: dict[str, Callable[..., Stage]] = {
     "mobile": mobile,
     "edge": edge,
     "dash": dash,
+    "glitter": glitter,
 }
 
 

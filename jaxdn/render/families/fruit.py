@@ -31,6 +31,12 @@ CLOTH = 0.006  # how far the cloth's surface lies above it
 def fruit(seed: int, *, lamp: str = "mix") -> Stage:
     """Apples, an orange and a lemon roll on a table with a cloth, a turning fruit stand, a pear, a vase and books."""
     stage = Stage("fruit", seed, lamp=lamp)
+    moving_still_life(stage)
+    return stage
+
+
+def moving_still_life(stage: Stage) -> None:
+    """Fill a stage with all of it: room, lamp, table, fruit and camera."""
     rng = stage.rng
     hue = rng.random()
     floor = glossy(textures.wood(rng, textures.hsv(0.07, 0.6, 0.5), textures.hsv(0.09, 0.5, 0.8)), 0.4, repeat=(2, 2))
@@ -44,7 +50,6 @@ def fruit(seed: int, *, lamp: str = "mix") -> Stage:
     _rolling_fruit(stage)
     side = rng.uniform(-0.35, 0.35)
     drifting_camera(stage, (side, 1.38, 1.62), (0.1 * side, 0.86, -0.1), x_fov=54, reach=0.24)
-    return stage
 
 
 def _table(stage: Stage) -> None:

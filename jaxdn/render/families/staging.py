@@ -85,32 +85,38 @@ def shuttle(frame: float, period: float, phase: float = 0.0) -> float:
 
 
 class Material(NamedTuple):
-    """A surface: one colour [3] or a texture [n,n,3], repeated over uv; without roughness it is purely diffuse."""
+    """A surface: one colour [3] or a texture [n,n,3], repeated over uv; without roughness it is purely diffuse.
+
+    `normals` [n,n,3] are those of flakes in it, one for each texel, in the frame of the surface.
+    """
 
     color: np.ndarray
     roughness: float | None = None
     metallic: float = 0.0
     specular: float = 0.5
     repeat: tuple[float, float] = (1.0, 1.0)
+    normals: np.ndarray | None = None
 
     def describe(self) -> dict[str, Any]:
         """The dictionary of a Mitsuba BSDF, seen from both sides."""
-        import mitsuba as mi
-
         if self.color.ndim == 1:
             color: dict[str, Any] = {"type": "rgb", "value": [float(value) for value in np.clip(self.color, 0, 0.95)]}
         else:
-            to_uv = mi.ScalarTransform4f(scale(self.repeat[0], self.repeat[1], 1.0))
-            color = {
-                "type": "bitmap",
-                "bitmap": mi.Bitmap(np.ascontiguousarray(self.color)),
-                "raw": True,
-                "to_uv": to_uv,
-            }
+            color = self._bitmap(self.color)
         if self.roughness is None:
             return {"type": "twosided", "nested": {"type": "diffuse", "reflectance": color}}
         gloss = {"roughness": float(self.roughness), "metallic": float(self.metallic), "specular": float(self.specular)}
-        return {"type": "twosided", "nested": {"type": "principled", "base_color": color, **gloss}}
+        nested: dict[str, Any] = {"type": "principled", "base_color": color, **gloss}
+        if self.normals is not None:
+            flakes = self._bitmap(0.5 + 0.5 * self.normals) | {"filter_type": "nearest"}
+            nested = {"type": "normalmap", "normalmap": flakes, "nested": nested}
+        return {"type": "twosided", "nested": nested}
+
+    def _bitmap(self, values: np.ndarray) -> dict[str, Any]:
+        import mitsuba as mi
+
+        to_uv = mi.ScalarTransform4f(scale(self.repeat[0], self.repeat[1], 1.0))
+        return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(values)), "raw": True, "to_uv": to_uv}
 
 
 def matte(color: Any, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Material:
