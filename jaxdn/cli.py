@@ -241,7 +241,7 @@ def _denoise(options: Denoise) -> None:
             motion_convention=options.motion_convention,
             channels=parse(options.channels, option="--channels", words=True),
             say=lambda done, total: status.update(f"{options.method}: frame {done} of {total}"),
-            tell=print,
+            log=print,
         )
     compiled = f"{written.programs} program{'s' * (written.programs != 1)} compiled"
     print(f"{len(written.files)} frames denoised by {options.method} in {options.out} ({engine}, {compiled})")

@@ -211,11 +211,11 @@ def open_frames(
     spp: int = 1,
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
-    tell: Callable[[str], None] = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
 ) -> tuple[list[Path], Iterator[StoredFrame]]:
     """The files of a clip, or of another renderer's sequence, and their frames, each read when it is requested.
 
-    Takes what :func:`read_clip` takes and raises as it does; ``tell`` as in
+    Takes what :func:`read_clip` takes and raises as it does; ``log`` as in
     :func:`jaxdn.clips.import_exr.plain_frames`. The frames of another renderer have no ``layers`` and no reference.
     """
     if is_clip(path):
@@ -225,7 +225,7 @@ def open_frames(
         raise _unfinished(Path(path))
     if spp != 1:
         raise ClipError(f"{path}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
-    files, plain = plain_frames(path, motion_convention=motion_convention, channels=channels, tell=tell)
+    files, plain = plain_frames(path, motion_convention=motion_convention, channels=channels, log=log)
     return files, (StoredFrame(frame, {}, None, None) for frame in plain)
 
 

@@ -86,13 +86,13 @@ def plain_frames(
     *,
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
-    tell: Callable[[str], None] = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
 ) -> tuple[list[Path], Iterator[Frame]]:
     """The files of another renderer's sequence, and their frames, each read when it is asked for.
 
     All frames have the size and the buffers of the first. ``motion_convention`` says what the motion vectors mean (a
     key of ``MOTION_CONVENTIONS``) and is needed as soon as there are any that are not Cycles' ``Vector``; ``"none"``
-    leaves them out. ``channels``: see :func:`jaxdn.clips.layers.detect_channels`. ``tell`` is called with lines about
+    leaves them out. ``channels``: see :func:`jaxdn.clips.layers.detect_channels`. ``log`` is called with lines about
     what is read and derived from which layer, when the first frame is. Depth is taken for view-space z (far or infinite
     becomes ``FAR``); ids count from 1 with 0 for nothing, and are left out of all frames if they say nothing in the
     first. Normals are expected in world space, roughness linear (GGX alpha is its square).
@@ -103,21 +103,21 @@ def plain_frames(
     if motion_convention not in (None, "none", *MOTION_CONVENTIONS):
         raise ClipError(f"motion_convention: {_conventions()}; got {motion_convention!r}.")
     files = sequence_files(path)
-    return files, _frames(files, motion_convention, channels, tell)
+    return files, _frames(files, motion_convention, channels, log)
 
 
 def _frames(
     files: Sequence[Path],
     motion_convention: str | None,
     channels: Mapping[str, str] | None,
-    tell: Callable[[str], None],
+    log: Callable[[str], None],
 ) -> Iterator[Frame]:
     first: _First | None = None
     for file in files:
         frame, lines = _read(file, motion_convention, channels)
         if first is None:
             for line in lines:
-                tell(line)
+                log(line)
             # Renderers write zeros where nobody asked for ids. Whether all frames do is not known before the last one.
             silent = frame.ids is not None and bool(np.all(frame.ids < 0))
             first = _First(frame.radiance.shape, present(frame), silent)

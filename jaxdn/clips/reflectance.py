@@ -102,7 +102,7 @@ def _cosine(
     places = find(groups, _WORLD_POSITIONS, _POINT)
     world = frame.normal is not None and not _is_one_of(layer_of(found["normal"]), _CAMERA_NORMALS)
     if not places or not world:
-        return None, "there are no normals and positions of one space to tell it"
+        return None, "there are no normals and positions of one space to find it"
     eye = _camera_place(header().get("worldToCamera"))
     if eye is None:
         return None, "the header has no worldToCamera with the place of the camera"
@@ -118,7 +118,7 @@ def _between(normal: np.ndarray, view: np.ndarray) -> np.ndarray:
 
 
 def _camera_place(matrix: Any) -> np.ndarray | None:
-    """Where the camera is, from a header's ``worldToCamera``; None where that is missing or does not tell.
+    """Where the camera is, from a header's ``worldToCamera``; None where that is missing or not usable.
 
     OpenEXR multiplies row vectors, so that the translation is the last row; some programs write the transpose.
     """

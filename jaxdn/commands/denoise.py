@@ -53,7 +53,7 @@ def denoise_files(
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
     say: Callable[[int, int], None] = lambda done, total: None,
-    tell: Callable[[str], None] = lambda line: None,
+    log: Callable[[str], None] = lambda line: None,
 ) -> Written:
     """Denoise a clip's folder, or EXR files of another renderer; returns the files written.
 
@@ -72,10 +72,10 @@ def denoise_files(
       motion_convention: that of motion vectors in files of other renderers (:mod:`jaxdn.clips.import_exr`).
       channels: buffer -> layer to take it from in files of other renderers.
       say: called with the number of frames done and the total.
-      tell: called with lines about what is read and derived from files of other renderers.
+      log: called with lines about what is read and derived from files of other renderers.
     """
     needs_layers = method.denoiser is not None and method.denoiser.samples is not None
-    names, frames = _open(source, needs_layers, spp, motion_convention, channels, tell)
+    names, frames = _open(source, needs_layers, spp, motion_convention, channels, log)
     if out.resolve() in {source.resolve(), *(name.resolve().parent for name in names)}:
         raise ValueError(f"{out}: expected another folder than the input's, whose frames would be overwritten.")
     step = None if method.denoiser is None else stream(method.denoiser, method.params)
@@ -99,7 +99,7 @@ def _open(
     spp: int,
     motion_convention: str | None,
     channels: Mapping[str, str] | None,
-    tell: Callable[[str], None],
+    log: Callable[[str], None],
 ) -> tuple[list[Path], Iterator[tuple[Frame, Layers]]]:
     """The files and their frames, read when needed.
 
@@ -109,9 +109,9 @@ def _open(
       spp: samples per pixel to take from a clip's layers.
       motion_convention: as in :func:`denoise_files`.
       channels: as in :func:`denoise_files`.
-      tell: as in :func:`denoise_files`.
+      log: as in :func:`denoise_files`.
     """
-    names, frames = open_frames(source, spp=spp, motion_convention=motion_convention, channels=channels, tell=tell)
+    names, frames = open_frames(source, spp=spp, motion_convention=motion_convention, channels=channels, log=log)
 
     def layers(stored: StoredFrame) -> Layers:
         return (

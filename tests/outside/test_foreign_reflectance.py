@@ -30,7 +30,7 @@ def write(path: Path, *layers: dict[str, np.ndarray], **header: object) -> Path:
 
 def read(path: Path, **options: object) -> tuple[object, list[str]]:
     lines: list[str] = []
-    _, frames = clips.plain_frames(path, tell=lines.append, **options)
+    _, frames = clips.plain_frames(path, log=lines.append, **options)
     return next(frames), lines
 
 
@@ -164,7 +164,7 @@ def test_what_is_missing_is_not_guessed(tmp_path, scene):
         "depends on the roughness, which is not there": [each for each in whole if "roughness.R" not in each],
     }
     # Cycles' denoising normals are in camera space, its positions are not.
-    cases["no normals and positions of one space to tell"] = [
+    cases["no normals and positions of one space to find"] = [
         *whole[:-2], layer("ViewLayer.Denoising Normal", scene["normal"], "XYZ"), place,
     ]  # fmt: skip
     for index, (reason, layers) in enumerate(cases.items()):
