@@ -169,7 +169,7 @@ def _ones(node: jax.Array, count: jax.Array, most: int) -> jax.Array:
     return jnp.sum(jax.lax.population_count(bits & mask).astype(jnp.int32), axis=0, dtype=jnp.int32)
 
 
-def _hash(node: jax.Array, index: jax.Array | np.uint32) -> jax.Array:
+def _hash(node: jax.Array, index: jax.Array | np.ndarray | np.uint32) -> jax.Array:
     """The hash of a node's child, uint32; two rounds of MurmurHash3's finaliser (Appleby 2011)."""
     return _mix(node ^ _mix(jnp.asarray(index, jnp.uint32) + np.uint32(0x9E3779B9)))
 
