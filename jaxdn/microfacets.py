@@ -77,12 +77,20 @@ def alpha_of(roughness: jax.Array) -> jax.Array:
 def cosine_and_sine(half: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Of the angle between half vectors [..., 3] of any length and z: each [..., 1]. A zero vector has cosine 0."""
     half = half.astype(jnp.promote_types(half.dtype, jnp.float32))
-    # In proportion to the largest component, so that the square of a length, in the derivative, does not underflow.
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(half), axis=-1, keepdims=True))
-    half = half / jnp.where(largest == 0, 1.0, largest)
+    half = half / _size(half)  # the square of a length, in the derivative, would underflow
     length = safe_norm(half)
     unit = half / jnp.where(length == 0, 1.0, length)
     return unit[..., 2:], safe_norm(unit[..., :2])
+
+
+def _size(values: jax.Array) -> jax.Array:
+    """The largest magnitude over the last axis, as a constant to divide by; 1 where all are 0.
+
+    At most an eighth of the largest number: XLA may multiply by its reciprocal, which must not be subnormal.
+    """
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(values), axis=-1, keepdims=True))
+    limits = jnp.finfo(values.dtype)
+    return jnp.where(largest < limits.tiny, 1.0, jnp.minimum(largest, float(limits.max) / 8))
 
 
 def _density(cosine: jax.Array, sine: jax.Array, alpha: jax.Array, lobe: Lobe) -> jax.Array:
@@ -144,9 +152,9 @@ def extract_distribution(backscatter: jax.Array, *, shadowing: Shadowing = "corr
     _check_curve(backscatter, "backscatter")
     check_option(shadowing, "shadowing", SHADOWINGS)
     measured = _measured(backscatter)
-    largest = jax.lax.stop_gradient(jnp.max(measured))  # the result is the same for every scale
     cells = measured.shape[0]
-    weight = measured / jnp.where(largest == 0, 1.0, largest) * jnp.asarray(np.cos(angles(cells)) ** 6, measured.dtype)
+    # The result is the same for every scale.
+    weight = measured / _size(measured) * jnp.asarray(np.cos(angles(cells)) ** 6, measured.dtype)
     operator = _operator(cells, measured.dtype)
     power = 1 if shadowing == "correlated" else 2
     slopes = _normalised(jnp.ones_like(measured))
