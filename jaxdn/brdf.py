@@ -168,13 +168,15 @@ def _look_up(table: jax.Array, cosine: jax.Array, roughness: jax.Array) -> jax.A
 
 
 def divisor(reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
-    """The divisor ``(reflectance^4 + floor^4)^(1/4)``, close to the reflectance where that is not small.
+    """The divisor ``((reflectance^4 + floor^4) / (1 + floor^4))^(1/4)``: the reflectance itself where it is not small.
+
+    For white, the neutral value of the buffer, it is 1.
 
     It is smooth everywhere: neighbours of similar reflectance have similar divisors, however dark they are. With a
     threshold (1 below it), reflectances of 0.009 and 0.011 would differ by a factor of 90 after the division.
     """
     larger, smaller = jnp.maximum(reflectance, floor), jnp.minimum(reflectance, floor)
-    return larger * (1 + (smaller / larger) ** 4) ** 0.25
+    return larger * (1 + (smaller / larger) ** 4) ** 0.25 / (1 + floor**4) ** 0.25
 
 
 def demodulate(radiance: jax.Array, reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:

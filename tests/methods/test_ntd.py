@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxdn import brdf
 from jaxdn.denoiser import Denoiser, Recurrent
 from jaxdn.frame import FAR, Frame, frame_at
 from jaxdn.methods.ntd import depth_feature, ntd
@@ -163,10 +164,9 @@ def test_constant_radiance_stays(name: str, rng: np.random.Generator, key: jax.A
     frames = frames._replace(radiance=jnp.full_like(frames.radiance, 0.7))
     if name == "parity":  # the paper's zeros beyond the border are not constant
         frames = frames._replace(motion=None, dual_motion=None)
-    usual = "none" if name == "parity" else "albedo"
-    if VARIANTS[name].get("demodulate", usual) != "none":  # radiance over albedo is what is constant here
-        usable = jnp.where(frames.albedo > 0.01, frames.albedo, 1.0)
-        frames = frames._replace(radiance=0.7 * usable)
+    usual = "none" if name == "parity" else "brdf"
+    if VARIANTS[name].get("demodulate", usual) != "none":  # divided radiance is what is constant here
+        frames = frames._replace(radiance=0.7 * brdf.divisor(frames.albedo))
     images = run(denoiser)(initial(denoiser, key, frames), frames)
     np.testing.assert_allclose(images, frames.radiance, rtol=3e-5)
 
@@ -220,8 +220,8 @@ def test_without_motion_nothing_is_gathered(rng: np.random.Generator, key: jax.A
 def test_dual_motion_falls_back_and_traditional_ignores_it(rng: np.random.Generator, key: jax.Array) -> None:
     frames = random_frames(rng)
     dual, traditional = tiny(), tiny(motion="traditional")
-    assert dual.reads == {"albedo", "normal", "depth", "motion", "dual_motion"}
-    assert traditional.reads == {"albedo", "normal", "depth", "motion"}
+    assert dual.reads == {"albedo", "reflectance", "normal", "depth", "motion", "dual_motion"}
+    assert traditional.reads == dual.reads - {"dual_motion"}
     params = initial(dual, key, frames)
     with_dual = run(dual)(params, frames)
     fallen_back = run(dual)(params, frames._replace(dual_motion=None))

@@ -220,7 +220,7 @@ def test_radiance_is_divided_by_the_reflectance_or_else_by_the_albedo(rng):
         state, image = denoiser.step({}, denoiser.start({}, frame), frame)
         np.testing.assert_allclose(image, frame.radiance, rtol=1e-6)
         by = np.asarray(given.get("reflectance", given.get("albedo", 1.0)), np.float64)
-        expected = (by**4 + 0.15**4) ** 0.25 if given else by
+        expected = ((by**4 + 0.15**4) / (1 + 0.15**4)) ** 0.25 if given else by
         np.testing.assert_allclose(state.core, np.asarray(frame.radiance, np.float64) / expected, rtol=1e-6)
 
 

@@ -61,7 +61,7 @@ def subjects(denoisers: Sequence[Candidate], *, quick: bool = False) -> Iterator
             continue
         widths = steps.WIDTHS.get(options.size, options.size)
         for engine in engines:
-            denoiser = method.factory(**each.options, implementation=engine)
+            denoiser = method.factory(**{**each.options, "implementation": engine})
             yield Subject(f"{each.label}, {engine}", widths, denoiser, each.params, engine)
 
 

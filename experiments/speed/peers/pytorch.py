@@ -197,7 +197,9 @@ class Prepared(NamedTuple):
 def prepare(state: State, frame: dict[str, Tensor]) -> Prepared:
     """Divide by albedo, warp the history, assemble the network's input."""
     albedo, motion = frame["albedo"], frame["dual_motion"]
-    colors = (albedo**4 + FLOOR**4) ** 0.25  # :func:`jaxdn.brdf.divisor` of frames without reflectance
+    colors = (
+        (albedo**4 + FLOOR**4) / (1 + FLOOR**4)
+    ) ** 0.25  # :func:`jaxdn.brdf.divisor` of frames without reflectance
     noisy = (frame["radiance"] / colors).clamp(max=RADIANCE_MAX)
     height, width = noisy.shape[-2:]
     x, y = targets(motion)
