@@ -9,7 +9,7 @@ from jaxdn.frame import BUFFERS, Buffer, Clip, Frame
 FRAMES, HEIGHT, WIDTH = 3, 16, 24
 BY_HAND = frozenset({
     *("radiance", "albedo", "normal", "depth", "roughness", "motion", "dual_motion", "visible", "previous_depth"),
-    *("ids", "direct", "emission"),
+    *("ids", "direct", "emission", "reflectance"),
 })  # fmt: skip
 """The buffers that show the wall and the square; all others are random values of their kind."""
 
@@ -48,6 +48,7 @@ def good(seed: int = 0, *, frames: int = FRAMES, height: int = HEIGHT, width: in
     by_hand = {
         "radiance": (reference * rng.exponential(size=(*shape, 1))).astype(np.float32),
         "albedo": np.where(inside, [0.3, 0.6, 0.9], 0.7).astype(np.float32),
+        "reflectance": np.where(inside, [0.4, 0.65, 0.9], 0.72).astype(np.float32),
         "normal": normal,
         "depth": np.where(inside, 2.0, 5.0 + columns[None, ..., None] / 50).astype(np.float32),
         "roughness": np.where(inside, 0.3, 1.0).astype(np.float32),
