@@ -169,8 +169,9 @@ def masking(slopes: jax.Array, angle: jax.Array) -> jax.Array:
     ``1 / G1(o) = integral of p(h) max(0, 1 + tan(o) tan(h) cos phi) over all slopes`` (Dupuy et al. 2015).
     """
     _check_curve(slopes, "slopes")
+    angle = jnp.asarray(angle, slopes.dtype)
     # At pi / 2 nothing is seen, and the tangent has no value.
-    return _masking(slopes, (jnp.sin(angle) / jnp.maximum(jnp.cos(angle), 1e-6)).astype(slopes.dtype))
+    return _masking(slopes, jnp.sin(angle) / jnp.maximum(jnp.cos(angle), 1e-6))
 
 
 def _masking(slopes: jax.Array, tangent: jax.Array) -> jax.Array:
@@ -243,7 +244,7 @@ def extract_fresnel(
         )
     measured = _measured(brdf)
     half_cosine = jnp.asarray(np.cos(angles(slopes.shape[0])), slopes.dtype)
-    cosine = jnp.maximum(jnp.cos(difference).astype(slopes.dtype)[:, None] * half_cosine[None], 1e-6)
+    cosine = jnp.maximum(jnp.cos(difference.astype(slopes.dtype))[:, None] * half_cosine[None], 1e-6)
     single = _masking(slopes, safe_power(1 - cosine**2, 0.5) / cosine)
     both = single / (2 - single) if shadowing == "correlated" else single**2
     full = (slopes / half_cosine**4)[None] * both / (4 * cosine**2)

@@ -141,8 +141,8 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         return lambda inputs: function(inputs.clip.frames.radiance, **options)
 
     def curve(inputs: Inputs) -> jax.Array:
-        """The first row of the last frame, as if it were measured; at least one value."""
-        return color.luminance(inputs.clip.frames.radiance[-1, 0])[:, 0]
+        """The green channel of the last frame's first row, as if it were measured; at least one value."""
+        return inputs.clip.frames.radiance[-1, 0, :, 1]
 
     def extracted(inputs: Inputs, shadowing: microfacets.Shadowing = "correlated") -> jax.Array:
         return microfacets.extract_distribution(curve(inputs), shadowing=shadowing)
@@ -159,7 +159,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
 
     def glint(inputs: Inputs, lobe: microfacets.Lobe) -> jax.Array:
         frames = inputs.clip.frames
-        place, footprint = frames.motion[-1], frames.depth[-1] / 100
+        place, footprint = frames.motion[-1], frames.depth[-1] / 128  # exact in bfloat16 too
         return glints.glint_distribution(frames.normal[-1], place, footprint, frames.roughness[-1], lobe=lobe)
 
     def flakes(inputs: Inputs) -> jax.Array:
