@@ -103,8 +103,7 @@ def starting_params(name_or_path: str | Path, denoiser: Denoiser) -> Params:
     """
     path = weights_path(name_or_path)
     _, params = load_weights(path)
-    frame = Frame(jax.ShapeDtypeStruct((16, 16, 3), jnp.float32))
-    wanted = _shapes(jax.eval_shape(denoiser.init, jax.random.key(0), frame))
+    wanted = _initial_shapes(denoiser)
     found, grown = flatten(params), {}
     for name, (shape, _) in wanted.items():
         stored = found.get(name, np.zeros(()))
@@ -150,7 +149,9 @@ def describe(name_or_path: str | Path) -> dict[str, Any]:
             f"'options', got {error!r}; copy both files together."
         ) from error
     try:
-        options = {**method_named(factory).earlier, **options}
+        method = method_named(factory)
+        if "preset" not in options:  # a preset gives every option, in earlier versions too
+            options = {**method.earlier, **options}
     except ValueError as error:
         raise ValueError(f"weights {file}: factory: {error} They may come from a newer jaxdn.") from error
     return {**description, "factory": factory, "options": options}
@@ -158,8 +159,7 @@ def describe(name_or_path: str | Path) -> dict[str, Any]:
 
 def _check_params(flat: dict[str, np.ndarray], denoiser: Denoiser, path: Path) -> None:
     """Raise ValueError unless the arrays have the names, shapes and types of the denoiser's initial parameters."""
-    frame = Frame(jax.ShapeDtypeStruct((16, 16, 3), jnp.float32))
-    wanted = _shapes(jax.eval_shape(denoiser.init, jax.random.key(0), frame))
+    wanted = _initial_shapes(denoiser)
     found = {name: (array.shape, array.dtype) for name, array in flat.items()}
     if found != wanted:
         differing = sorted(name for name in {*found, *wanted} if found.get(name) != wanted.get(name))
@@ -168,6 +168,12 @@ def _check_params(flat: dict[str, np.ndarray], denoiser: Denoiser, path: Path) -
             f"weights {path}: expected the weights that its JSON describes, but {len(differing)} of them differ, such "
             f"as {first}: expected {wanted.get(first)}, got {found.get(first)}; copy both files together."
         )
+
+
+def _initial_shapes(denoiser: Denoiser) -> dict[str, tuple[tuple[int, ...], Any]]:
+    """Name -> shape and type of the denoiser's initial parameters."""
+    frame = Frame(jax.ShapeDtypeStruct((16, 16, 3), jnp.float32))
+    return _shapes(jax.eval_shape(denoiser.init, jax.random.key(0), frame))
 
 
 def _shapes(tree: dict[str, Any], prefix: str = "") -> dict[str, tuple[tuple[int, ...], Any]]:

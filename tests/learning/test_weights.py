@@ -51,6 +51,15 @@ def test_weights_of_an_earlier_version_are_read(tmp_path, earlier, today):
     np.testing.assert_array_equal(*images)
 
 
+def test_a_preset_of_an_earlier_version_keeps_what_it_divides_by(tmp_path):
+    """The exact paper settings divide by nothing, whatever the default was and is."""
+    options = {"size": TINY, "preset": "parity"}
+    params = ntd(**options).init(jax.random.key(0), FRAME)
+    saved = save_weights(tmp_path / "w", params, factory="ntd", options=options, record={})
+    assert jaxdn.load_weights(saved)[0].reads == ntd(**options).reads
+    assert "demodulate" not in jaxdn.weights.describe(saved)["options"]
+
+
 def test_training_continues_from_weights_that_see_less(saved, rng):
     """New guides begin with weights of zero: the first image is that of the old weights, whatever the guides show."""
     path, params = saved
