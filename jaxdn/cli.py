@@ -66,6 +66,8 @@ class Render:
     """Samples per pixel of the reference; 0 for none."""
     layers: list[int] = field(default_factory=lambda: [1])
     """Independent noisy layers, in samples per pixel (powers of two)."""
+    draws: int = 0
+    """Further noisy images of one sample each, of indirect and of direct light: training draws from them."""
     max_depth: int | None = None
     """Path length (1 emission, 2 direct, 3 one bounce of indirect light ...); default: as the scene needs."""
     effects: str = "auto"
@@ -196,6 +198,7 @@ def _render(options: Render) -> None:
         frames=options.frames,
         reference_spp=options.reference_spp,
         layers=options.layers,
+        draws=options.draws,
         max_depth=options.max_depth,
         effects=options.effects,
         workers=options.workers,

@@ -31,6 +31,8 @@ class StoredFrame(NamedTuple):
     """[H, W, 3] the converged radiance."""
     reference_half: np.ndarray | None
     """[H, W, 3] the mean of the first half of the reference's samples, to measure the reference's noise."""
+    draws: np.ndarray | None = None
+    """[n, H, W, 6] n independent samples of indirect (first three channels) and direct light, for training."""
 
 
 def write_frame(
@@ -40,11 +42,13 @@ def write_frame(
     layers: Mapping[int, Any] | None = None,
     reference: Any = None,
     reference_half: Any = None,
+    draws: Any = None,
 ) -> None:
     """Write one frame, completely or not at all.
 
     ``layers`` maps numbers of samples (1, 2, 4, ...) to independent noisy images [H, W, 3]; ``frame.radiance`` is
-    not stored then. Without ``layers``, ``frame.radiance`` becomes the layer of one sample. Each buffer is stored as
+    not stored then. Without ``layers``, ``frame.radiance`` becomes the layer of one sample. ``draws`` [n, H, W, 6] are
+    further samples of indirect and direct light, one each. Each buffer is stored as
     :attr:`jaxdn.frame.Buffer.stored` says: light, fractions and directions in half precision (finite values beyond
     65504 are clamped; NaN and infinities are kept), distances and vectors in single precision. Raises ValueError for
     shapes that do not fit each other, OSError if the file cannot be written.
@@ -56,6 +60,8 @@ def write_frame(
         raise ValueError(f"{path}: layers: expected whole numbers of samples, got {list(layers)}.")
     images = {f"noisy_{samples}spp": (image, _LIGHT) for samples, image in sorted(layers.items())}
     images |= {"reference": (reference, _LIGHT), "reference_half": (reference_half, _LIGHT)}
+    for index, draw in enumerate(() if draws is None else draws):
+        images |= {name: (draw[..., part], _LIGHT) for name, part in _draw_names(index).items()}
     images |= {name: (getattr(frame, name), BUFFERS[name]) for name in GUIDES}
     size = np.shape(next(iter(layers.values())))[:2]
     channels: dict[str, np.ndarray] = {}
@@ -86,7 +92,21 @@ def read_frame(path: str | Path, *, spp: int = 1) -> StoredFrame:
         layers,
         _optional(path, channels, "reference", _LIGHT),
         _optional(path, channels, "reference_half", _LIGHT),
+        _read_draws(path, channels),
     )
+
+
+def _draw_names(index: int) -> dict[str, slice]:
+    """The layers of one draw: indirect and direct light, and their channels in the array."""
+    return {f"draw_{index}": slice(0, 3), f"draw_{index}_direct": slice(3, 6)}
+
+
+def _read_draws(path: str | Path, channels: Mapping[str, np.ndarray]) -> np.ndarray | None:
+    draws: list[np.ndarray] = []
+    while f"draw_{len(draws)}.R" in channels:
+        parts = [_required(path, channels, name, _LIGHT) for name in _draw_names(len(draws))]
+        draws.append(np.concatenate(parts, axis=-1))
+    return np.stack(draws) if draws else None
 
 
 def stored_layers(channels: Iterable[str]) -> list[int]:

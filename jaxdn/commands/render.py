@@ -72,6 +72,7 @@ def render(
     frames: int,
     reference_spp: int,
     layers: Sequence[int],
+    draws: int = 0,
     max_depth: int | None,
     effects: str,
     workers: int | None,
@@ -89,6 +90,7 @@ def render(
       frames: number of frames.
       reference_spp: samples per pixel of the reference; 0 for none.
       layers: samples per pixel of the noisy layers, powers of two.
+      draws: further images of one sample each, for training.
       max_depth: path length (1 emission, 2 direct light ...); default: measured, or the scene's own.
       effects: as in :func:`plan_clip`.
       workers: number of processes; default: the number of cores.
@@ -113,6 +115,7 @@ def render(
                 str(out / clip),
                 **size,
                 layers=tuple(layers),
+                draws=draws,
                 reference_spp=reference_spp,
                 max_depth=max_depth,
                 seed=seed,

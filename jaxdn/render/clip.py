@@ -18,7 +18,7 @@ from jaxdn.render.errors import RenderError
 from jaxdn.render.gbuffer import check_scene, gbuffer
 from jaxdn.render.geometry import View, motion_between
 from jaxdn.render.scene import AnimatedScene
-from jaxdn.render.seeds import NOISY, REFERENCE
+from jaxdn.render.seeds import DRAWS, NOISY, REFERENCE
 from jaxdn.render.variant import use_variant
 from jaxdn.render.wavefront import Accumulated, no_light
 
@@ -40,6 +40,8 @@ class Rendered(NamedTuple):
     """[H, W, 3] converged indirect radiance, of samples that no noisy layer contains."""
     reference_half: np.ndarray | None
     """[H, W, 3] the same from the first half of its samples."""
+    draws: np.ndarray | None
+    """[n, H, W, 6] independent single samples of indirect and direct light."""
     view: View | None
     """Input of the next frame's motion vectors; None if the plan needs no G-buffer."""
     bad_samples: int
@@ -57,6 +59,7 @@ def render_frame(
     max_depth: int | None = None,
     seed: int = 0,
     variant: str | None = None,
+    draws: int = 0,
     previous: View | None = None,
     plan: Plan | None = None,
 ) -> Rendered:
@@ -76,12 +79,13 @@ def render_frame(
       max_depth: path length; default: that of the plan, else of the scene.
       seed: of the random numbers.
       variant: Mitsuba's; default: the fastest that works here.
+      draws: further images of one sample each, for training on noise that rarely repeats.
       previous: the ``view`` of the frame before, computed if it is not given; frame 0 has none, and its motion is 0.
       plan: what to leave out: buffers (None then), paths longer than its ``max_depth``, and, in a frame that shows the
         same as an earlier one (``plan.held``), everything except the noise. The rest is the same as without a plan, bit
         for bit.
     """
-    _check_options(width, height, layers, reference_spp)
+    _check_options(width, height, layers, reference_spp, draws)
     accumulate, _ = tracer(use_variant(variant))
     depth = _path_length(scene, max_depth, plan)
     repeated = plan is not None and plan.held[frame] != frame
@@ -111,6 +115,7 @@ def render_frame(
     for part in sums[1:]:
         total = total.plus(part)
     samples = reference_spp or sum(layers)
+    singles = [light(DRAWS, index, 1) for index in range(draws)]
 
     images = {count: _single(part.indirect / count) for count, part in noisy.items()}
     found: dict[str, Any] = {"direct": _single(total.direct / samples), "emission": _single(total.emitted / samples)}
@@ -124,8 +129,9 @@ def render_frame(
         layers=images,
         reference=_single(total.indirect / samples) if halves else None,
         reference_half=_single(halves[0].indirect / ((reference_spp + 1) // 2)) if halves else None,
+        draws=np.stack([_single(np.concatenate([one.indirect, one.direct], -1)) for one in singles]) if draws else None,
         view=view,
-        bad_samples=sum(part.bad for part in (*noisy.values(), *halves)),
+        bad_samples=sum(part.bad for part in (*noisy.values(), *halves, *singles)),
     )
 
 
@@ -141,6 +147,7 @@ def render_clip(
     max_depth: int | None = None,
     seed: int = 0,
     variant: str | None = None,
+    draws: int = 0,
     plan: Plan | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Path:
@@ -157,11 +164,12 @@ def render_clip(
       width: in pixels.
       height: in pixels.
       frames: number of frames; default: that of the scene.
-      layers: as in :func:`render_frame`, like the next five.
+      layers: as in :func:`render_frame`, like the next six.
       reference_spp: samples per pixel of the reference; 0 for none.
       max_depth: path length.
       seed: of the random numbers.
       variant: Mitsuba's.
+      draws: further images of one sample each.
       plan: for these frames; it is stored in the record.
       progress: called with the index of every frame that is finished or already exists.
     """
@@ -169,7 +177,7 @@ def render_clip(
     frames = scene.frames if frames is None else frames
     if frames < 1:
         raise ValueError(f"frames: expected at least 1, got {frames}.")
-    _check_options(width, height, layers, reference_spp)
+    _check_options(width, height, layers, reference_spp, draws)
     if plan is not None and len(plan.frames) != frames:
         raise ValueError(f"plan: expected one for {frames} frames, got one for {len(plan.frames)}.")
     chosen = use_variant(variant)
@@ -180,6 +188,7 @@ def render_clip(
         "height": height,
         "layers": sorted(layers),
         "reference_spp": reference_spp,
+        "draws": draws,
         "variant": chosen,
         "max_depth": _path_length(scene, max_depth, plan),
         "plan": None if plan is None else plan.record(),
@@ -196,7 +205,7 @@ def render_clip(
         record["bad_samples"] = before.get("bad_samples", 0)
     begin_record(record, folder)
     options: dict[str, Any] = {"width": width, "height": height, "layers": layers, "reference_spp": reference_spp}
-    options |= {"max_depth": max_depth, "seed": seed, "variant": chosen, "plan": plan}
+    options |= {"max_depth": max_depth, "seed": seed, "variant": chosen, "draws": draws, "plan": plan}
     previous: View | None = None
     for frame in range(frames):
         path = frame_path(folder, frame)
@@ -226,6 +235,7 @@ def _write(path: Path, rendered: Rendered) -> None:
         layers=rendered.layers,
         reference=rendered.reference,
         reference_half=rendered.reference_half,
+        draws=rendered.draws,
     )
 
 
@@ -272,7 +282,7 @@ def _single(image: np.ndarray) -> np.ndarray:
     return image.astype(np.float32)
 
 
-def _check_options(width: int, height: int, layers: Sequence[int], reference_spp: int) -> None:
+def _check_options(width: int, height: int, layers: Sequence[int], reference_spp: int, draws: int) -> None:
     if width < 1 or height < 1:
         raise ValueError(f"width and height: expected at least 1, got {width} x {height}.")
     powers = all(isinstance(samples, int) and samples >= 1 and samples & (samples - 1) == 0 for samples in layers)
@@ -280,6 +290,8 @@ def _check_options(width: int, height: int, layers: Sequence[int], reference_spp
         raise ValueError(f"layers: expected different powers of two, such as (1, 2, 4), got {tuple(layers)}.")
     if reference_spp < 0 or reference_spp == 1:
         raise ValueError(f"reference_spp: expected 0 (no reference) or at least 2, got {reference_spp}.")
+    if draws < 0:
+        raise ValueError(f"draws: expected 0 or more images of one sample each, got {draws}.")
 
 
 def _camera_record(scene: AnimatedScene, frame: int) -> dict[str, Any]:
@@ -296,7 +308,7 @@ def _versions() -> dict[str, str]:
 
 def _check_settings(folder: Path, wanted: Mapping[str, Any], found: Mapping[str, Any]) -> None:
     """Raise ClipError if the frames in a folder were rendered with other settings."""
-    found = {**found, "plan": entries(found.get("plan"))}
+    found = {**found, "plan": entries(found.get("plan")), "draws": found.get("draws", 0)}
     # Compared in the form read from JSON, where tuples have become lists.
     differing = [key for key in wanted if key not in _FREE and _plain(found.get(key)) != _plain(wanted[key])]
     cameras = zip(found.get("cameras", []), wanted["cameras"], strict=False)

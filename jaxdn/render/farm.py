@@ -37,6 +37,7 @@ class ClipJob(NamedTuple):
     reference_spp: int = 0
     max_depth: int | None = None
     seed: int = 0
+    draws: int = 0
     variant: str | None = None
     """None: the one that the clip in the folder was started with, else the fastest that works here."""
     plan: dict[str, Any] | None = None
@@ -121,7 +122,7 @@ def _finished(job: ClipJob) -> bool:
     wanted |= {"layers": sorted(job.layers), "reference_spp": job.reference_spp, "scene": job.scene}
     chosen = {"max_depth": job.max_depth, "variant": job.variant}
     # A clip from before plans existed has no such entry, and all buffers.
-    if entries(record.get("plan")) != entries(job.plan):
+    if entries(record.get("plan")) != entries(job.plan) or record.get("draws", 0) != job.draws:
         return False
     wanted |= {key: value for key, value in chosen.items() if value is not None}
     # A frame's file gets its name only when it is complete.

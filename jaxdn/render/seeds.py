@@ -5,8 +5,9 @@ with the noisy layers. The mixing function is TEA (Zafar, Olano and Curtis 2010)
 same level collide.
 """
 
-NOISY, REFERENCE, DEPTH = 0, 1, 2
-"""The independent streams of a frame: noisy layers, reference, and the few samples that measure the path length."""
+NOISY, REFERENCE, DEPTH, DRAWS = range(4)
+"""The independent streams of a frame: noisy layers, reference, the few samples that measure the path length, and the
+single samples that training draws from."""
 
 _MASK = 0xFFFFFFFF
 
