@@ -29,7 +29,7 @@ MATHS = (
     "glints",
 )
 LAYERS = {
-    **dict.fromkeys((*MATHS, "ops", "losses", "metrics", "flip", "sampling", "objectives", "recipe"), 1),
+    **dict.fromkeys((*MATHS, "ops", "losses", "metrics", "flip", "sampling", "objectives", "recipe", "variation"), 1),
     **dict.fromkeys(("filters", "networks"), 2),
     **dict.fromkeys(("methods", "denoisers"), 3),
     **dict.fromkeys(("rollout", "learning", "planning"), 4),

@@ -26,7 +26,7 @@ from jaxdn.clips.record import is_planned
 from jaxdn.files import write_json
 from jaxdn.frame import BUFFERS, GUIDES, Buffer, Clip, Frame, present, written_out
 
-_VERSION = 1  # of the cache's layout; caches of other versions are not used
+_VERSION = 2  # of the cache's layout; caches of other versions are not used
 _LIGHT = BUFFERS["radiance"]
 """How noisy layers and references are stored."""
 
@@ -45,9 +45,13 @@ class CachedClip(NamedTuple):
     shape: tuple[int, int, int]
     """Frames, height, width."""
     arrays: frozenset[str]
-    """The stored arrays: names of buffers, ``reference`` and ``noisy_<n>spp``."""
+    """The stored arrays: names of buffers, ``reference``, ``reference_half``, ``draws`` and ``noisy_<n>spp``."""
     layers: tuple[int, ...]
     """The sample counts of the noisy layers."""
+    draws: int = 0
+    """The number of single samples."""
+    reference_spp: int = 0
+    """Samples per pixel of the reference; 0 if it is not known."""
     planned: bool = False
     """Whether a buffer that is missing is an absent effect, equal to its neutral value."""
 
@@ -55,6 +59,11 @@ class CachedClip(NamedTuple):
     def buffers(self) -> frozenset[str]:
         """Names of the Frame buffers that are present, except ``radiance``."""
         return self.arrays & frozenset(GUIDES)
+
+    @property
+    def half_spp(self) -> int:
+        """Samples per pixel of the reference's first half; 0 without one."""
+        return (self.reference_spp + 1) // 2 if "reference_half" in self.arrays else 0
 
 
 def open_cached(path: str | Path, *, cache: str | Path | None = None) -> CachedClip:
@@ -79,7 +88,8 @@ def open_cached(path: str | Path, *, cache: str | Path | None = None) -> CachedC
             stacklevel=2,
         )
     shape = (record["frames"], record["height"], record["width"])
-    return CachedClip(path, home, shape, frozenset(facts["arrays"]), tuple(facts["layers"]), is_planned(record))
+    counts = facts["draws"], int(record.get("reference_spp", 0))
+    return CachedClip(path, home, shape, frozenset(facts["arrays"]), tuple(facts["layers"]), *counts, is_planned(record))
 
 
 def read_window(
@@ -97,19 +107,26 @@ def read_window(
     clip's independent noisy layers of 1, 2, 4, ... samples are read too (``Clip.layers``).
     """
     asked = clip.buffers if buffers is None else set(buffers) & set(GUIDES)
-
-    def read(name: str, buffer: Buffer = _LIGHT) -> np.ndarray:
-        part = np.load(clip.home / f"{name}.npy", mmap_mode="r", allow_pickle=False)[window]
-        return np.array(part, buffer.dtype)
-
-    chosen = layers_for(spp, clip.layers, clip.path)
-    radiance = combine({samples: read(_noisy(samples)) for samples in chosen})
-    frames = Frame(radiance=radiance, **{name: read(name, BUFFERS[name]) for name in clip.buffers & asked})
+    guides = {name: read_array(clip, name, window) for name in clip.buffers & asked}
+    frames = Frame(radiance=read_layers(clip, window, spp), **guides)
+    counts = doubling_layers(clip.layers, clip.path) if layers else ()
     return Clip(
         written_out(frames, asked) if clip.planned else frames,
-        read("reference") if "reference" in clip.arrays else None,
-        {samples: read(_noisy(samples)) for samples in doubling_layers(clip.layers, clip.path)} if layers else None,
+        read_array(clip, "reference", window) if "reference" in clip.arrays else None,
+        {samples: read_array(clip, _noisy(samples), window) for samples in counts} if layers else None,
     )
+
+
+def read_layers(clip: CachedClip, window: tuple[slice, ...], spp: int) -> np.ndarray:
+    """Noisy radiance of ``spp`` samples a pixel, combined from the layers."""
+    chosen = layers_for(spp, clip.layers, clip.path)
+    return combine({samples: read_array(clip, _noisy(samples), window) for samples in chosen})
+
+
+def read_array(clip: CachedClip, name: str, window: tuple[Any, ...]) -> np.ndarray:
+    """The part ``window`` of one stored array, in the dtype of its buffer."""
+    part = np.load(clip.home / f"{name}.npy", mmap_mode="r", allow_pickle=False)[window]
+    return np.array(part, BUFFERS.get(name, _LIGHT).dtype)
 
 
 def _stamp(path: Path, count: int) -> str:
@@ -141,13 +158,13 @@ def _build(path: Path, home: Path) -> None:
 def _fill(path: Path, folder: Path) -> dict[str, object]:
     record = read_record(path)
     maps: dict[str, np.memmap] = {}
-    bad, layers = 0, []
+    bad, layers, draws = 0, [], 0
     for index, stored in enumerate(_uniform(path, record)):
-        layers = sorted(stored.layers)
+        layers, draws = sorted(stored.layers), 0 if stored.draws is None else len(stored.draws)
         for name, image, buffer in _images(stored):
-            if name == "reference":
+            if name in ("reference", "reference_half"):
                 wrong = ~(np.isfinite(image) & (image >= 0))
-                bad += int(wrong.sum())
+                bad += int(wrong.sum()) if name == "reference" else 0
                 image = np.where(wrong, np.float32(0), image)
             if buffer.stored == "half":
                 image = to_half(image)
@@ -157,7 +174,7 @@ def _fill(path: Path, folder: Path) -> dict[str, object]:
             maps[name][index] = image
     for array in maps.values():
         array.flush()
-    return {"arrays": sorted(maps), "layers": layers, "bad_reference_values": bad}
+    return {"arrays": sorted(maps), "layers": layers, "draws": draws, "bad_reference_values": bad}
 
 
 def _uniform(path: Path, record: Mapping[str, Any]) -> Iterator[StoredFrame]:
@@ -173,8 +190,10 @@ def _images(stored: StoredFrame) -> Iterator[tuple[str, np.ndarray, Buffer]]:
         yield _noisy(samples), image, _LIGHT
     for name in present(stored.frame):
         yield name, np.asarray(getattr(stored.frame, name)), BUFFERS[name]
-    if stored.reference is not None:
-        yield "reference", stored.reference, _LIGHT
+    for name in ("reference", "reference_half", "draws"):
+        image = getattr(stored, name)
+        if image is not None:
+            yield name, image, _LIGHT
 
 
 def _noisy(samples: int) -> str:

@@ -15,10 +15,12 @@ import numpy as np
 
 from jaxdn.clips.augment import transform_clip
 from jaxdn.clips.cache import CachedClip, open_cached, read_window
+from jaxdn.clips.draws import check_samples, draw_light
 from jaxdn.clips.files import ClipError
 from jaxdn.clips.folder import find_clips
-from jaxdn.clips.frames import doubling_layers, layers_for
+from jaxdn.clips.frames import doubling_layers
 from jaxdn.frame import Clip
+from jaxdn.variation import STILL, Variation, varied
 
 
 def training_batches(
@@ -32,6 +34,7 @@ def training_batches(
     buffers: Sequence[str] | frozenset[str] | None = None,
     layers: bool = False,
     augment: bool = True,
+    variation: Variation = STILL,
     threads: int = 1,
 ) -> grain.DatasetIterator[Clip]:
     """An endless iterator over batches: a Clip of numpy arrays ``[B, T, H, W, C]``, reference included.
@@ -42,11 +45,13 @@ def training_batches(
       crop: side of the square crop, or (height, width), in pixels.
       frames: consecutive frames of each element.
       seed: decides the order, windows, crops and symmetries; from 0 to 2^32 - 1.
-      spp: samples per pixel of the noisy radiance; of several numbers, each element takes one at random.
+      spp: samples per pixel of the noisy radiance (:func:`jaxdn.clips.draws.draw_light`); of several numbers, each
+        element takes one at random.
       buffers: Frame buffers to read, usually ``denoiser.reads`` (default: all that the clips have).
       layers: add the independent noisy layers of 1, 2, 4, ... samples that every clip has (``Clip.layers``), for a
         denoiser that requests samples.
       augment: flips and quarter turns (no odd turns for a crop that is not square).
+      variation: of light, normals and the buffers that are there.
       threads: batches prepared in advance, each by its own thread; 0 prepares them when requested.
 
     Its ``get_state()`` is a small dict for a checkpoint, to be passed to ``set_state`` of an equal iterator.
@@ -79,13 +84,15 @@ def training_batches(
         starts = [int(rng.integers(0, has - wants + 1)) for has, wants in zip(source.shape, sizes, strict=True)]
         window = tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))
         samples = counts[int(rng.integers(len(counts)))]
-        clip = read_window(source, window, spp=samples, buffers=names, layers=layers)
+        clip = read_window(source, window, spp=source.layers[0], buffers=names, layers=layers)
         if clip.layers is not None:
             clip = clip._replace(layers={count: clip.layers[count] for count in common})
-        if not augment:
-            return clip
-        turns = int(rng.integers(4)) if height == width else 2 * int(rng.integers(2))
-        return transform_clip(clip, flip=bool(rng.integers(2)), turns=turns)
+        light = draw_light(source, window, samples, rng, beauty=bool(rng.random() < variation.beauty))
+        clip = clip._replace(frames=clip.frames._replace(radiance=light.noisy), reference=light.reference)
+        if augment:
+            turns = int(rng.integers(4)) if height == width else 2 * int(rng.integers(2))
+            clip = transform_clip(clip, flip=bool(rng.integers(2)), turns=turns)
+        return clip if variation == STILL else varied(clip, variation, rng)
 
     sizes = (frames, height, width)
     # A clip of 30 frames is worth three of 10: the same number of frames is seen of every clip in proportion.
@@ -114,7 +121,7 @@ def _check(clip: CachedClip, sizes: tuple[int, int, int], counts: Sequence[int])
     if "reference" not in clip.arrays:
         raise ClipError(f"{clip.path}: there is no reference to train towards; render the clip with one.")
     for count in counts:
-        layers_for(count, clip.layers, clip.path)
+        check_samples(clip, count)
 
 
 def _common_buffers(clips: Sequence[CachedClip], wanted: Sequence[str] | frozenset[str] | None) -> frozenset[str]:

@@ -195,7 +195,7 @@ def _all_there(folder: Path, count: int) -> None:
 def _from(stored: StoredFrame, source: StoredFrame) -> StoredFrame:
     """The noise of one frame with everything else of another."""
     frame = source.frame._replace(radiance=stored.frame.radiance)
-    return StoredFrame(frame, stored.layers, source.reference, source.reference_half)
+    return stored._replace(frame=frame, reference=source.reference, reference_half=source.reference_half)
 
 
 def _checked_buffers(stored: StoredFrame, wanted: set[str], file: Path) -> StoredFrame:
@@ -277,7 +277,8 @@ def _looks_unfinished(path: str | Path) -> bool:
 def _names(stored: StoredFrame, *, planned: bool) -> set[str]:
     """What all frames of a clip must have; with a plan, buffers may differ."""
     light = {f"noisy_{samples}spp" for samples in stored.layers}
-    light |= set() if stored.reference is None else {"reference"}
+    light |= {name for name in ("reference", "reference_half") if getattr(stored, name) is not None}
+    light |= set() if stored.draws is None else {f"{len(stored.draws)} draws"}
     return light if planned else light | set(present(stored.frame))
 
 

@@ -1,0 +1,95 @@
+"""Variations of training clips that leave light transport true: what the world does not prescribe, a network must not
+learn.
+
+Light scales with the lamps, channels do not know each other, the axes of the world point anywhere, and a renderer may
+not write every buffer. Each element of a training stream is varied anew; the eight symmetries of the image come before
+(:mod:`jaxdn.clips.augment`).
+"""
+
+from typing import Annotated, Any, NamedTuple, get_type_hints
+
+import numpy as np
+
+from jaxdn.frame import BUFFERS, Clip, present, written_out
+from jaxdn.options import Range, check
+
+
+class Variation(NamedTuple):
+    """How far an element may be varied; ``STILL`` is no variation."""
+
+    exposure: Annotated[float, Range(1)] = 8.0
+    """All light times a factor from 1 / exposure to exposure (uniform in its logarithm), one per clip."""
+    tint: Annotated[float, Range(1)] = 1.5
+    """Each channel of light times a factor from 1 / tint to tint."""
+    channels: bool = True
+    """Red, green and blue in any order, in light and in reflectances alike."""
+    rotation: bool = True
+    """The world's normals under one random rotation."""
+    missing: Annotated[float, Range(0, 1)] = 0.05
+    """Probability of each group of buffers (:data:`GROUPS`) to be absent."""
+    beauty: Annotated[float, Range(0, 1)] = 0.25
+    """Share of elements with all light in place of indirect light, of clips that have single samples of both."""
+
+    def check(self) -> None:
+        """Raise ValueError, naming the field and what is allowed, for a value out of range."""
+        check(self._asdict(), get_type_hints(Variation, include_extras=True), of="variation")
+
+
+STILL = Variation(1.0, 1.0, False, False, 0.0, 0.0)
+
+GROUPS = (
+    ("albedo", "reflectance", "specular_reflectance"),
+    ("normal",),
+    ("depth", "previous_depth"),
+    ("roughness",),
+    ("motion", "dual_motion"),
+)
+"""Buffers that a renderer writes together or not at all."""
+
+
+def varied(clip: Clip, variation: Variation, rng: np.random.Generator) -> Clip:
+    """The clip (NumPy arrays ``[T, H, W, C]``) with everything but ``beauty`` drawn from ``rng``.
+
+    All its frames are varied alike. An absent buffer has its neutral value, which denoisers treat as they treat
+    ``None``, so that elements of one batch can be stacked.
+    """
+    # Everything is drawn, whatever is varied: one variation must not change the numbers of the next.
+    brighter, tints = rng.uniform(-1, 1), rng.uniform(-1, 1, 3)
+    order, rotation = rng.permutation(3), _rotation(rng.standard_normal(4))
+    absent = rng.random(len(GROUPS)) < variation.missing
+    gain = (variation.exposure**brighter * variation.tint**tints).astype(np.float32)
+    order = order if variation.channels else np.arange(3)
+
+    def light(image: np.ndarray) -> np.ndarray:
+        return image[..., order] * gain
+
+    changed: dict[str, Any] = {}
+    for name in ("radiance", *present(clip.frames)):
+        buffer, image = BUFFERS[name], getattr(clip.frames, name)
+        if buffer.kind == "light":
+            changed[name] = light(image)
+        elif buffer.kind == "fraction" and buffer.channels == 3:
+            changed[name] = image[..., order]
+        elif buffer.kind == "direction" and variation.rotation:
+            changed[name] = image @ rotation
+    dropped = {name for group, gone in zip(GROUPS, absent, strict=True) if gone for name in group}
+    dropped &= set(present(clip.frames))
+    frames = clip.frames._replace(**changed)._replace(**dict.fromkeys(dropped))
+    return Clip(
+        written_out(frames, dropped),
+        None if clip.reference is None else light(clip.reference),
+        None if clip.layers is None else {count: light(image) for count, image in clip.layers.items()},
+    )
+
+
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    """[3, 3] float32 rotation; four normal numbers give one that is uniform among all (Shoemake 1992)."""
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ],
+        np.float32,
+    )
