@@ -104,7 +104,7 @@ class Train:
     recipe: str | None = None
     """One of the method's recipes (for ntd: usual, without-occlusion, parity); default: the usual one."""
     steps: int | None = None
-    """Parameter updates; default, as for the next six options: as in the recipe."""
+    """Parameter updates; default, as for the next seven options: as in the recipe."""
     batch: int | None = None
     """Clips per update."""
     crop: int | None = None
@@ -117,8 +117,10 @@ class Train:
     """Recompute in the backward pass: a quarter of the memory for 1.1 to 1.4 times the time."""
     seed: int | None = None
     """Seed of the initial weights and of the data's order."""
-    spp: int = 1
-    """Samples per pixel of the noisy input."""
+    spp: list[int] | None = None
+    """Samples per pixel of the noisy input; of several numbers, each clip of a batch has one at random."""
+    time_limit: float | None = None
+    """Minutes after which training stops and writes its weights; the same command goes on from there."""
     implementation: str = "auto"
     """Engine for convolutions: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest available."""
 
@@ -213,6 +215,7 @@ def _train(options: Train) -> None:
     method = method_named(options.method)
     recipe = method.recipe_named(options.recipe)
     changed = {name: getattr(options, name) for name in recipe._fields if hasattr(options, name)}
+    changed["spp"] = None if options.spp is None else tuple(options.spp)
     recipe = recipe._replace(**{name: value for name, value in changed.items() if value is not None})
     path = train(
         method,
@@ -222,8 +225,8 @@ def _train(options: Train) -> None:
         options={**method.variant_named(options.variant), **parse(options.set)},
         start=options.start,
         validation=[options.validation] if options.validation else [],
-        spp=options.spp,
         implementation=options.implementation,
+        time_limit=None if options.time_limit is None else 60 * options.time_limit,
     )
     print(f"{path}: denoise with `jaxdn denoise CLIP -o OUT --method {path}`")
 

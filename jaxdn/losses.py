@@ -1,24 +1,41 @@
-"""Training losses: L1 distances of whole clips [T, H, W, C], each one scalar.
+"""Training losses: distances of whole clips [T, H, W, C], each one scalar: L1, or with ``squared`` the mean square.
 
-The images are not transformed here: compress them first (``color.compress``). ``denoised`` and ``reference`` have the
-same shape; other shapes raise ValueError. Every loss has a finite gradient everywhere (0 where the two agree).
+L1 is robust, but what minimises it is the median of the targets: with noisy targets, or noisy inputs, images get too
+dark. What minimises the mean square is their mean, whatever noise they have (Lehtinen et al. 2018, "Noise2Noise").
+
+The images are not transformed here: compress them first (``color.compress``), or see ``unbiased``. ``denoised`` and
+``reference`` have the same shape; other shapes raise ValueError. Every loss has a finite gradient everywhere (0 where
+the two agree).
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdn import color
 from jaxdn.checks import check_image, check_option, check_same_size
 from jaxdn.numerics import absolute
 from jaxdn.stencils import correlate, pad_edge
 
 
-def spatial(denoised: jax.Array, reference: jax.Array) -> jax.Array:
+def unbiased(denoised: jax.Array, reference: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The pair (denoised, reference) as compressed near the denoised image: both times ``compress'(denoised)``.
+
+    The slope has no gradient of its own, so that the target appears only linearly: squared, the difference is to first
+    order that of the compressed images, but noise in the target, which compression would turn into a bias, averages
+    out. For linear radiance.
+    """
+    point = jax.lax.stop_gradient(denoised)
+    _, slope = jax.jvp(color.compress, (point,), (jnp.ones_like(point),))
+    return denoised * slope, reference * slope
+
+
+def spatial(denoised: jax.Array, reference: jax.Array, *, squared: bool = False) -> jax.Array:
     """Mean of ``|denoised - reference|`` over all elements (Zeng et al. 2021, eq. 6, first term)."""
-    return jnp.mean(absolute(_difference(denoised, reference)))
+    return _mean_size(_difference(denoised, reference), squared=squared)
 
 
-def temporal(denoised: jax.Array, reference: jax.Array) -> jax.Array:
+def temporal(denoised: jax.Array, reference: jax.Array, *, squared: bool = False) -> jax.Array:
     """Mean of ``|(I_i - I_{i-1}) - (R_i - R_{i-1})|`` over the T - 1 differences of frames; 0 for a clip of one frame.
 
     Frames are compared at the same pixel, not along the motion (Zeng et al. 2021, eq. 6, second term; Chaitanya et al.
@@ -26,7 +43,7 @@ def temporal(denoised: jax.Array, reference: jax.Array) -> jax.Array:
     """
     error = _difference(denoised, reference)
     # The error of the differences is the difference of the errors.
-    return _mean_size(error[1:] - error[:-1])
+    return _mean_size(error[1:] - error[:-1], squared=squared)
 
 
 def gradient(denoised: jax.Array, reference: jax.Array, *, operator: str = "difference") -> jax.Array:
@@ -55,6 +72,7 @@ def occlusion(
     masks: jax.Array,
     *,
     weights: tuple[float, ...] = (1.0, 0.8, 0.6),
+    squared: bool = False,
 ) -> jax.Array:
     """Mean over all elements of ``|(denoised - reference) S|``: errors where something was disoccluded recently.
 
@@ -73,7 +91,7 @@ def occlusion(
     for age, weight in enumerate(weights):
         missing = min(age, frames)
         total = total + weight * jnp.concatenate([masks[:missing], masks[: frames - missing]])
-    return jnp.mean(absolute(error * total))
+    return _mean_size(error * total, squared=squared)
 
 
 def _difference(denoised: jax.Array, reference: jax.Array) -> jax.Array:
@@ -83,10 +101,10 @@ def _difference(denoised: jax.Array, reference: jax.Array) -> jax.Array:
     return denoised - reference
 
 
-def _mean_size(*parts: jax.Array) -> jax.Array:
-    """Mean of the absolute values of all parts together; 0 when they are all empty."""
-    count = sum(part.size for part in parts)
-    return sum((jnp.sum(absolute(part)) for part in parts), start=jnp.zeros((), parts[0].dtype)) / max(count, 1)
+def _mean_size(*parts: jax.Array, squared: bool = False) -> jax.Array:
+    """Mean of the absolute values, or squares, of all parts together; 0 when they are all empty."""
+    count, size = sum(part.size for part in parts), jnp.square if squared else absolute
+    return sum((jnp.sum(size(part)) for part in parts), start=jnp.zeros((), parts[0].dtype)) / max(count, 1)
 
 
 _LOG_RADIUS = 7

@@ -23,6 +23,8 @@ class Objective(NamedTuple):
 
     name: str
     loss: Loss
+    reads: frozenset[str] = frozenset()
+    """Buffers that the loss needs, whatever the denoiser reads."""
 
 
 def indirect_illumination(*, occlusion: bool = True) -> Objective:
@@ -42,7 +44,44 @@ def indirect_illumination(*, occlusion: bool = True) -> Objective:
         share = jnp.where(progress >= 0.5, 1.0, 0.0)
         return total + share * losses.occlusion(denoised, wanted, disocclusions(clip.frames)[trained])
 
-    return Objective("indirect illumination" if occlusion else "indirect illumination without occlusion", loss)
+    reads = frozenset({"motion", "dual_motion"} if occlusion else ())
+    return Objective("indirect illumination" if occlusion else "indirect illumination without occlusion", loss, reads)
+
+
+def unbiased_illumination(*, hidden: float = 1.0, squared_from: float = 0.6) -> Objective:
+    """The same three terms, with the mean square in the last part of training, and for all frames.
+
+    Until ``squared_from`` of the updates are done, the terms are L1 on compressed radiance, which is robust while the
+    weights are far from good; then they are squares that the noise of the target does not bias
+    (:func:`jaxdn.losses.unbiased`), so that images end as bright as they should be. The occlusion term has the weight
+    ``hidden`` from the first update on, and its mask is where the previous frame did not see the point
+    (``Frame.visible``): dual vectors that differ mark a quarter of these pixels.
+    """
+
+    def loss(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:
+        masks = hidden_pixels(clip.frames)
+
+        def terms(pair: tuple[jax.Array, jax.Array], squared: bool) -> jax.Array:
+            total = losses.spatial(*pair, squared=squared) + losses.temporal(*pair, squared=squared)
+            return total + hidden * losses.occlusion(*pair, masks, squared=squared) if hidden else total
+
+        robust = terms((color.compress(images), color.compress(clip.reference)), False)
+        mean = _SQUARES * terms(losses.unbiased(images, clip.reference), True)
+        return jnp.where(progress >= squared_from, mean, robust)
+
+    reads = frozenset({"visible"} if hidden else ())
+    return Objective(f"unbiased illumination, hidden {hidden:g}, squares from {squared_from:g}", loss, reads)
+
+
+_SQUARES = 8.0
+"""Makes the gradient of squares about as large as that of absolute values at usual errors, 0.06 when compressed."""
+
+
+def hidden_pixels(frames: Frame) -> jax.Array:
+    """1 where the previous frame did not see the point, else 0, [T, H, W, 1]; 0 without ``visible``."""
+    if frames.visible is None:
+        return jnp.zeros_like(frames.radiance[..., :1])
+    return 1.0 - frames.visible.astype(frames.radiance.dtype)
 
 
 def disocclusions(frames: Frame) -> jax.Array:

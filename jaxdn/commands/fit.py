@@ -1,6 +1,7 @@
 """The loop around the train step: data, validation, progress and checkpoints."""
 
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +21,7 @@ from jaxdn.commands.log import Log
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.files import write_json
 from jaxdn.frame import Clip
-from jaxdn.learning.step import TrainState, initial_state, make_train_step
+from jaxdn.learning.step import TrainState, begun, initial_state, make_train_step
 from jaxdn.recipe import Recipe
 from jaxdn.rollout import denoise
 
@@ -58,10 +59,11 @@ def fit(
     log_every: int = 20,
     validate_every: int = 100,
     checkpoint_every: int = 100,
+    time_limit: float | None = None,
 ) -> TrainState:
     """Train to ``recipe.steps`` updates, resuming from the newest checkpoint in ``folder`` to the same result.
 
-    On Ctrl-C the state is saved before KeyboardInterrupt is raised again. Raises ValueError for impossible values in
+    On Ctrl-C the state is saved before KeyboardInterrupt is raised again, and at the time limit before it is returned. Raises ValueError for impossible values in
     the recipe, and, with what to change, after many updates in a row that changed nothing.
 
     Args:
@@ -75,8 +77,10 @@ def fit(
       log_every: updates between two log entries.
       validate_every: updates between two validations.
       checkpoint_every: updates between two checkpoints.
+      time_limit: seconds after which no further update begins, counted from the call; None: no limit.
     """
     recipe.check()
+    end = math.inf if time_limit is None else time.monotonic() + time_limit
     folder.mkdir(parents=True, exist_ok=True)
     _same_recipe(folder / "recipe.json", recipe, None if start is None else start.name)
     checkpoints = Checkpoints(folder / "checkpoints")
@@ -84,7 +88,7 @@ def fit(
     state = initial_state(denoiser, recipe, next(batches))
     batches.set_state(first_position)  # type: ignore[attr-defined]
     if start is not None:
-        state = state._replace(params=jax.tree.map(jnp.array, start.params))
+        state = begun(jax.tree.map(jnp.array, start.params), recipe)
     found = checkpoints.restore(state)
     if found is not None:
         state, position = found
@@ -99,7 +103,7 @@ def fit(
     watch = _Divergence(label, recipe, step, int(state.skipped))
     with _Progress(label, recipe, step) as progress:
         try:
-            while step < recipe.steps:
+            while step < recipe.steps and time.monotonic() < end:
                 batch = next(batches)
                 state, report = train_step(state, batch)
                 step, position = step + 1, batches.get_state()  # type: ignore[attr-defined]
@@ -109,7 +113,7 @@ def fit(
                     progress.advance(step, loss=loss, skipped=skipped)
                     watch.look(step, skipped=skipped, norm=float(report.gradient_norm))
                 if validation and (step % validate_every == 0 or step == recipe.steps):
-                    psnr = validate(state.params)
+                    psnr = validate(state.average)
                     log.write(step=step, validation_psnr=psnr)
                     progress.validated(psnr)
                 if step % checkpoint_every == 0 or step == recipe.steps:
@@ -120,6 +124,11 @@ def fit(
                 checkpoints.save(state, position)
             progress.say(f"{label}: stopped after {step} of {recipe.steps} steps; the same command continues there.")
             raise
+        else:
+            if saved < step:
+                checkpoints.save(state, position)
+            if step < recipe.steps:
+                progress.say(f"{label}: time is over after {step} of {recipe.steps} steps; the same command goes on.")
         finally:
             checkpoints.close()
             log.close()

@@ -21,14 +21,14 @@ def train(
     options: Mapping[str, Any],
     start: str | Path | None = None,
     validation: Sequence[Path] = (),
-    spp: int = 1,
     implementation: str = "auto",
+    time_limit: float | None = None,
     label: str | None = None,
     record: Mapping[str, Any] | None = None,
 ) -> Path:
     """Train a method to the end, unless it is trained already, and return the path of its weights.
 
-    A second call resumes from the newest checkpoint in ``out``. Raises ValueError for options that the method does not
+    The weights are the running mean that the recipe asks for. A second call resumes from the newest checkpoint in ``out``. Raises ValueError for options that the method does not
     have, unsuitable clips, and an engine that cannot run here.
 
     Args:
@@ -40,11 +40,13 @@ def train(
       start: shipped weights or a .safetensors file to continue from (:func:`jaxdn.weights.starting_params`); None:
         new ones.
       validation: folders of held-out clips, used whole.
-      spp: samples per pixel of the noisy input.
       implementation: the engine for training; "auto" is the method's fastest that is available here.
+      time_limit: seconds after which training stops; the weights of that moment are written all the same.
       label: the run's name in messages; default: that of its folder.
       record: further entries of the weights' JSON.
     """
+    if time_limit is not None and not time_limit > 0:
+        raise ValueError(f"time limit: expected more than 0, got {time_limit:g} s; leave it out for no limit.")
     label = out.name if label is None else label
     engine = method.engine("training", options) if implementation == "auto" else implementation
     if engine not in (None, "reference"):
@@ -55,24 +57,25 @@ def train(
         print(f"{label}: everything runs on XLA", flush=True)
     batches = training_batches(
         clips,
-        buffers=denoiser.reads,
+        buffers=denoiser.reads | recipe.objective.reads,
         batch=recipe.batch,
         crop=recipe.crop,
         frames=recipe.frames,
         seed=recipe.seed,
-        spp=spp,
+        spp=recipe.spp,
         layers=denoiser.samples is not None,
+        variation=recipe.variation,
     )
     folders = [folder for place in validation for folder in find_clips(place)]
-    held_out = load_validation(denoiser, folders, spp=spp)
+    held_out = load_validation(denoiser, folders, spp=min(recipe.spp))
     first = None if start is None else Start(str(start), starting_params(start, denoiser))
-    state = fit(denoiser, recipe, batches, out, label=label, start=first, validation=held_out)
+    state = fit(denoiser, recipe, batches, out, label=label, start=first, validation=held_out, time_limit=time_limit)
     begun = {} if first is None else {"start": first.name}
-    about = {"recipe": recipe.record(), "skipped": int(state.skipped), **begun, **(record or {})}
+    about = {"recipe": recipe.record(), "updates": int(state.step), "skipped": int(state.skipped), **begun, **(record or {})}
     given = dataclasses.asdict(method.made(options))
     return save_weights(
         out / "weights.safetensors",
-        state.params,
+        state.average,
         factory=method.name,
         options=given,
         record=about,

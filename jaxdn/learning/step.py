@@ -23,6 +23,8 @@ class TrainState(NamedTuple):
     """Everything that an update changes."""
 
     params: Params
+    average: Params
+    """The running mean of the parameters, which is what training is for (Polyak and Juditsky 1992)."""
     optimizer: Any
     step: jax.Array
     """int32, updates attempted so far."""
@@ -83,7 +85,13 @@ def initial_state(denoiser: Denoiser, recipe: Recipe, batch: Clip) -> TrainState
     """Parameters drawn with the recipe's seed and a new optimiser state; ``batch`` gives the shapes."""
     frame = jax.tree.map(lambda buffer: buffer[0, 0], batch.frames)
     params = denoiser.init(jax.random.key(recipe.seed), frame)
-    return TrainState(params, optimizer(recipe).init(params), jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+    return begun(params, recipe)
+
+
+def begun(params: Params, recipe: Recipe) -> TrainState:
+    """The state before the first update of given parameters."""
+    zero = jnp.zeros((), jnp.int32)
+    return TrainState(params, jax.tree.map(jnp.copy, params), optimizer(recipe).init(params), zero, jnp.copy(zero))
 
 
 def make_train_step(denoiser: Denoiser, recipe: Recipe) -> Callable[[TrainState, Clip], tuple[TrainState, Report]]:
@@ -109,14 +117,15 @@ def make_train_step(denoiser: Denoiser, recipe: Recipe) -> Callable[[TrainState,
         norm = optax.tree.norm(gradient)
         updates, optimizer_state = update_rule.update(gradient, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)
+        kept_share = jnp.minimum(recipe.average, (1.0 + state.step) / (10.0 + state.step))
+        average = optax.incremental_update(params, state.average, 1.0 - kept_share if recipe.average else 1.0)
         # With too high a learning rate a finite gradient may give a non-finite weight: the new values are tested.
-        kept = jax.tree.leaves((params, optimizer_state))
+        kept = jax.tree.leaves((params, average, optimizer_state))
         finite = [jnp.isfinite(norm), jnp.isfinite(loss), *(jnp.isfinite(x).all() for x in kept)]
         usable = functools.reduce(jnp.logical_and, finite)
-        params, optimizer_state = jax.tree.map(
-            lambda new, old: jnp.where(usable, new, old), (params, optimizer_state), (state.params, state.optimizer)
-        )
+        new, old = (params, average, optimizer_state), (state.params, state.average, state.optimizer)
+        chosen = jax.tree.map(lambda new, old: jnp.where(usable, new, old), new, old)
         skipped = state.skipped + jnp.where(usable, 0, 1)
-        return TrainState(params, optimizer_state, state.step + 1, skipped), Report(loss, psnr, norm)
+        return TrainState(*chosen, state.step + 1, skipped), Report(loss, psnr, norm)
 
     return jax.jit(train_step, donate_argnums=0, compiler_options=training_options())

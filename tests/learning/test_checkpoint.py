@@ -13,7 +13,7 @@ from jaxdn.learning.step import TrainState
 
 def state(step, *, width=3000):
     params = {"a": {"w": jnp.arange(float(width)) * step, "b": jnp.ones(3)}}
-    return TrainState(params, {"m": jnp.full(7, float(step))}, jnp.int32(step), jnp.int32(0))
+    return TrainState(params, params, {"m": jnp.full(7, float(step))}, jnp.int32(step), jnp.int32(0))
 
 
 @pytest.fixture(scope="module")
