@@ -75,6 +75,29 @@ def _power_slope(exponent: float, primals: tuple[jax.Array], tangents: tuple[jax
     return _power(x, exponent), exponent * _power(x, exponent - 1) * tangent
 
 
+def exposure(radiance: jax.Array) -> jax.Array:
+    """The factor (a scalar) that makes an image [H, W, 3] of linear radiance as bright as a photograph: 0.18 in the mean.
+
+    ``0.18 / exp(mean(log L))`` over the mean luminances L of blocks of 16x16 pixels that are not black; 1 for a black
+    image. Means of blocks first: of single noisy pixels the logarithm is mostly noise. Twice the light halves the
+    factor, so that what is computed from ``exposure(x) * x`` does not depend on the unit of radiance. No gradient.
+    """
+    light = luminance(jax.lax.stop_gradient(radiance))[..., 0]
+    height, width = light.shape
+    block = [min(16, size) for size in (height, width)]
+    # Rows and columns beyond the last whole block have no say.
+    rows, columns = (size // side for size, side in zip((height, width), block, strict=True))
+    light = light[: rows * block[0], : columns * block[1]]
+    means = light.reshape(rows, block[0], columns, block[1]).mean((1, 3))
+    lit = (means > 0) & (means < jnp.inf)
+    logs = jnp.where(lit, jnp.log(jnp.where(lit, means, 1.0)), 0.0)
+    count = jnp.sum(lit, dtype=light.dtype)
+    return jnp.where(count > 0, _MIDDLE_GREY * jnp.exp(-jnp.sum(logs) / jnp.maximum(count, 1)), 1.0)
+
+
+_MIDDLE_GREY = 0.18
+
+
 def luminance(image: jax.Array) -> jax.Array:
     """Rec.709 luminance ``0.2126 R + 0.7152 G + 0.0722 B`` of linear radiance [..., 3], as [..., 1]."""
     image = _floating(image)

@@ -15,6 +15,7 @@ from jaxdn.clips.files import ClipError
 from jaxdn.clips.frames import layers_for
 
 Window = tuple[slice, ...]
+_BEAUTY = ("direct", "emission")
 
 
 class Light(NamedTuple):
@@ -63,5 +64,3 @@ def draw_light(
         return Light(half, np.maximum(other, 0.0, dtype=np.float32))
     return Light(read_layers(clip, window, spp), read_array(clip, "reference", window))
 
-
-_BEAUTY = ("direct", "emission")

@@ -147,3 +147,24 @@ def test_tonemap_defaults_to_srgb_and_names_its_operators() -> None:
 @given(st.floats(0, 1, width=32))
 def test_srgb_round_trip(x: float) -> None:
     np.testing.assert_allclose(round_trip(jnp.float32(x)), x, rtol=2e-5, atol=1e-7)
+
+
+def exposure_reference(image: np.ndarray) -> float:
+    light = np.asarray(image, np.float64) @ np.array([0.2126, 0.7152, 0.0722])
+    means = [light[y : y + 16, x : x + 16].mean() for y in range(0, 32, 16) for x in range(0, 48, 16)]
+    return 0.18 / np.exp(np.mean([np.log(mean) for mean in means if mean > 0]))
+
+
+def test_exposure(rng: np.random.Generator) -> None:
+    image = rng.exponential(size=(32, 48, 3)).astype(np.float32)
+    image[:16, :16] = 0
+    find = jax.jit(color.exposure)
+    np.testing.assert_allclose(find(image), exposure_reference(image), rtol=1e-5)
+    # Rows and columns beyond the last whole block do not count.
+    np.testing.assert_allclose(find(jnp.pad(image, ((0, 5), (0, 7), (0, 0)))), find(image), rtol=1e-6)
+    for factor in (2.0**-20, 3.0, 2.0**12):
+        np.testing.assert_allclose(factor * find(factor * image), find(image), rtol=1e-5)
+    np.testing.assert_allclose(find(np.full((3, 5, 3), 0.36, np.float32)), 0.5, rtol=1e-6)  # less than a block
+    assert find(np.zeros((8, 8, 3), np.float32)) == 1
+    assert np.isfinite(find(np.full((32, 32, 3), 65504, np.float32)))
+    assert not np.any(jax.grad(lambda x: color.exposure(x))(jnp.asarray(image)))

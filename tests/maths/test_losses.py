@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxdn import losses
+from jaxdn import color, losses
 
 SHAPE = (4, 5, 7, 3)
 
@@ -169,3 +169,41 @@ def test_shapes_are_checked(rng: np.random.Generator) -> None:
         gradient(x, y, operator="sobel")
     with pytest.raises(ValueError, match="masks"):
         occlusion(x, y, masks(rng)[:2])
+
+
+def test_squared_losses_are_means_of_squares(rng: np.random.Generator) -> None:
+    (x, y), m = pair(rng), masks(rng)
+    error = x.astype(np.float64) - y
+    np.testing.assert_allclose(losses.spatial(x, y, squared=True), np.mean(error**2), rtol=1e-5)
+    np.testing.assert_allclose(losses.temporal(x, y, squared=True), np.mean(np.diff(error, axis=0) ** 2), rtol=1e-5)
+    found = losses.occlusion(x, y, m, weights=(1.0,), squared=True)
+    np.testing.assert_allclose(found, np.mean((error * m) ** 2), rtol=1e-5)
+
+
+def test_squares_of_the_unbiased_pair_seek_the_mean_of_noisy_targets_and_l1_does_not(rng: np.random.Generator) -> None:
+    """One pixel value learned from many noisy targets of mean 1: gradient descent on both losses."""
+    targets = rng.exponential(size=(4000, 1, 1, 3)).astype(np.float32)
+
+    def by_squares(x: jax.Array) -> jax.Array:
+        image = jnp.full(targets.shape, 1.0) * x
+        return losses.spatial(*losses.unbiased(image, targets), squared=True)
+
+    def by_l1(x: jax.Array) -> jax.Array:
+        return losses.spatial(color.compress(jnp.full(targets.shape, 1.0) * x), color.compress(jnp.asarray(targets)))
+
+    found = {}
+    for loss in (by_squares, by_l1):
+        slope, x = jax.jit(jax.grad(loss)), jnp.float32(0.5)
+        for _ in range(1500):
+            x = x - 0.1 * slope(x)
+        found[loss.__name__] = float(x)
+    np.testing.assert_allclose(found["by_squares"], targets.mean(), rtol=0.01)
+    np.testing.assert_allclose(found["by_l1"], np.median(targets), rtol=0.05)  # 0.69: a third too dark
+
+
+def test_the_unbiased_pair_is_the_compressed_pair_to_first_order(rng: np.random.Generator) -> None:
+    x = np.exp(rng.normal(0, 2, SHAPE)).astype(np.float32)
+    y = (x * (1 + 1e-3 * rng.standard_normal(SHAPE))).astype(np.float32)
+    first, second = losses.unbiased(jnp.asarray(x), jnp.asarray(y))
+    wanted = np.asarray(color.compress(x), np.float64) - np.asarray(color.compress(y), np.float64)
+    np.testing.assert_allclose(first - second, wanted, rtol=2e-2, atol=2e-5)

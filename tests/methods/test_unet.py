@@ -5,6 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from jaxdn.networks import LARGE, LEVELS, SMALL, onnx
@@ -93,8 +94,9 @@ def test_an_absent_group_is_zeros_at_a_lower_cost(rng: np.random.Generator, key:
     assert flops[0] < flops[1]
 
 
-def test_parameters_are_plain_and_xavier(key: jax.Array) -> None:
-    params = unet(GROUPS, HEADS, widths=SMALL).init(key)
+@pytest.mark.parametrize("scheme", ["he", "xavier"])
+def test_parameters_are_plain_and_uniform_within_the_limits_of_the_scheme(key: jax.Array, scheme: str) -> None:
+    params = unet(GROUPS, HEADS, widths=SMALL, initialization=scheme).init(key)
     assert type(params) is dict
     assert all(type(level) is dict for level in params.values())
     for path, leaf in jax.tree.leaves_with_path(params):
@@ -102,11 +104,34 @@ def test_parameters_are_plain_and_xavier(key: jax.Array) -> None:
         if path[-1].key == "bias":
             assert not np.any(leaf)
         else:
-            limit = np.sqrt(6 / (9 * (leaf.shape[2] + leaf.shape[3])))
+            he = 0.1 * np.sqrt(3 / (9 * leaf.shape[2])) if "head" in path[0].key else np.sqrt(6 / (9 * leaf.shape[2]))
+            limit = he if scheme == "he" else np.sqrt(6 / (9 * (leaf.shape[2] + leaf.shape[3])))
             assert np.abs(leaf).max() <= limit
             np.testing.assert_allclose(np.std(leaf), limit / np.sqrt(3), rtol=0.1)
     other = unet(GROUPS, HEADS, widths=SMALL).init(jax.random.key(1))
     assert not np.array_equal(params["head_0"]["kernel"], other["head_0"]["kernel"])
+
+
+def test_every_level_begins_to_learn_at_the_same_pace(key: jax.Array, rng: np.random.Generator) -> None:
+    """With Xavier's limits the deepest levels get a hundredth of the gradient of the others, relative to their weights."""
+    network, inputs = unet(GROUPS, HEADS, widths=SMALL), features(rng, GROUPS)
+    wanted = [rng.standard_normal(np.shape(head)).astype(np.float32) for head in network.apply(network.init(key), inputs)]
+
+    @jax.jit
+    def slope(params: dict) -> dict:
+        def error(params: dict) -> jax.Array:
+            found = network.apply(params, inputs)
+            return sum(jnp.mean((head - other) ** 2) for head, other in zip(found, wanted, strict=True))
+
+        return jax.grad(error)(params)
+
+    def spread(scheme: str) -> float:
+        params = unet(GROUPS, HEADS, widths=SMALL, initialization=scheme).init(key)
+        sizes = {name: float(optax.tree.norm(part) / optax.tree.norm(params[name])) for name, part in slope(params).items()}
+        levels = [size for name, size in sizes.items() if "head" not in name]
+        return max(levels) / min(levels)
+
+    assert 4 * spread("he") < spread("xavier")
 
 
 def test_only_the_networks_package_imports_flax() -> None:

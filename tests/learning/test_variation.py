@@ -1,0 +1,106 @@
+"""Variations of clips: each leaves light transport true, and nothing else changes."""
+
+import numpy as np
+import pytest
+
+from jaxdn.frame import Clip, Frame
+from jaxdn.variation import GROUPS, STILL, Variation, varied
+
+SHAPE = (2, 4, 5)
+
+
+@pytest.fixture
+def clip(rng: np.random.Generator) -> Clip:
+    normal = rng.standard_normal((*SHAPE, 3)).astype(np.float32)
+    frames = Frame(
+        radiance=rng.exponential(size=(*SHAPE, 3)).astype(np.float32),
+        albedo=rng.random((*SHAPE, 3), np.float32),
+        reflectance=rng.random((*SHAPE, 3), np.float32),
+        normal=normal / np.linalg.norm(normal, axis=-1, keepdims=True),
+        depth=rng.uniform(1, 9, (*SHAPE, 1)).astype(np.float32),
+        roughness=rng.random((*SHAPE, 1), np.float32),
+        motion=rng.standard_normal((*SHAPE, 2)).astype(np.float32),
+        dual_motion=rng.standard_normal((*SHAPE, 2)).astype(np.float32),
+        visible=rng.random((*SHAPE, 1)) > 0.2,
+        direct=rng.exponential(size=(*SHAPE, 3)).astype(np.float32),
+    )
+    reference = rng.exponential(size=(*SHAPE, 3)).astype(np.float32)
+    return Clip(frames, reference, {1: frames.radiance, 2: reference})
+
+
+def one(variation: Variation, clip: Clip, seed: int = 0) -> Clip:
+    return varied(clip, variation, np.random.default_rng(seed))
+
+
+def unchanged(found: Clip, clip: Clip, *names: str) -> None:
+    for name in names:
+        np.testing.assert_array_equal(getattr(found.frames, name), getattr(clip.frames, name), err_msg=name)
+
+
+def test_exposure_and_tint_scale_all_light_by_the_same_factors_within_their_ranges(clip: Clip) -> None:
+    factors = []
+    for seed in range(40):
+        found = one(STILL._replace(exposure=64.0, tint=1.5), clip, seed)
+        gain = found.reference[0, 0, 0] / clip.reference[0, 0, 0]
+        for image, before in (
+            (found.reference, clip.reference),
+            (found.frames.radiance, clip.frames.radiance),
+            (found.frames.direct, clip.frames.direct),
+            (found.layers[2], clip.layers[2]),
+        ):
+            np.testing.assert_allclose(image, before * gain, rtol=1e-5)
+        unchanged(found, clip, "albedo", "normal", "depth", "motion", "visible", "roughness")
+        factors.append(gain)
+    factors = np.log2(factors)
+    assert np.abs(factors).max() <= 6 + np.log2(1.5) + 1e-4
+    assert np.abs(factors).max() > 5  # the range is used
+    assert 0.1 < np.ptp(factors, axis=1).max() <= 2 * np.log2(1.5) + 1e-4
+
+
+def test_channels_are_exchanged_in_light_and_reflectance_alike(clip: Clip) -> None:
+    orders = set()
+    for seed in range(40):
+        found = one(STILL._replace(channels=True), clip, seed)
+        order = [int(np.argmin(np.abs(clip.reference[0, 0, 0] - value))) for value in found.reference[0, 0, 0]]
+        orders.add(tuple(order))
+        np.testing.assert_array_equal(found.reference, clip.reference[..., order])
+        for name in ("radiance", "albedo", "reflectance", "direct"):
+            np.testing.assert_array_equal(getattr(found.frames, name), getattr(clip.frames, name)[..., order])
+        unchanged(found, clip, "normal", "depth", "motion")
+    assert len(orders) == 6
+
+
+def test_normals_turn_rigidly_and_nothing_else_does(clip: Clip) -> None:
+    found = one(STILL._replace(rotation=True), clip)
+    before, after = (frames.normal.reshape(-1, 3) for frames in (clip.frames, found.frames))
+    np.testing.assert_allclose(after @ after.T, before @ before.T, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.det(after[:3]), np.linalg.det(before[:3]), atol=1e-5)  # no mirror image
+    assert np.abs(after - before).max() > 0.5
+    unchanged(found, clip, "radiance", "albedo", "depth", "motion", "dual_motion")
+
+
+def test_absent_buffers_have_their_neutral_values_in_whole_groups(clip: Clip) -> None:
+    found = one(STILL._replace(missing=1.0), clip)
+    np.testing.assert_array_equal(found.frames.albedo, 1.0)
+    np.testing.assert_array_equal(found.frames.reflectance, 1.0)
+    np.testing.assert_array_equal(found.frames.roughness, 1.0)
+    for name in ("normal", "depth", "motion", "dual_motion"):
+        np.testing.assert_array_equal(getattr(found.frames, name), 0.0)
+    assert found.frames.previous_depth is None  # what was not there does not appear
+    unchanged(found, clip, "radiance", "visible", "direct")
+    half = [one(STILL._replace(missing=0.5), clip, seed).frames for seed in range(40)]
+    gone = np.array([[np.array_equal(f.albedo, np.ones_like(f.albedo)), not f.normal.any()] for f in half])
+    assert {(bool(a), bool(n)) for a, n in gone} == {(False, False), (False, True), (True, False), (True, True)}
+
+
+def test_without_variation_nothing_changes(clip: Clip) -> None:
+    found = one(STILL, clip)
+    np.testing.assert_array_equal(found.reference, clip.reference)
+    unchanged(found, clip, *(name for name in Frame._fields if getattr(clip.frames, name) is not None))
+
+
+def test_values_out_of_range_are_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="variation exposure: expected a number >= 1, got 0.5"):
+        Variation(exposure=0.5).check()
+    Variation().check()
+    assert {name for group in GROUPS for name in group} <= set(Frame._fields)
