@@ -50,15 +50,19 @@ def _clip_scores(
         "frame_l1": jax.vmap(metrics.l1)(image, wanted),
         "frame_disoccluded_l1": jax.vmap(lambda a, b, m: metrics.l1(a, b, mask=m))(image, wanted, hidden),
     }
-    if halves is not None:
-        shown = color.tonemap_halves(*halves)
-        found |= {
-            "unbiased_psnr": metrics.unbiased_psnr(image, *shown),
-            "unbiased_temporal_psnr": metrics.unbiased_temporal_psnr(image, *shown),
-            "unbiased_mse": metrics.unbiased_mse(image, *shown),
-            "unbiased_relative_mse": metrics.unbiased_relative_mse(denoised, *halves),
-        }
-    return found
+    return found if halves is None else found | unbiased_scores(denoised, hidden, halves)
+
+
+def unbiased_scores(denoised: jax.Array, hidden: jax.Array, halves: Halves) -> dict[str, jax.Array]:
+    """The scores of a linear clip without the noise of the reference; the arguments are those of ``_clip_scores``."""
+    image, shown = color.tonemap(denoised), color.tonemap_halves(*halves)
+    return {
+        "unbiased_psnr": metrics.unbiased_psnr(image, *shown),
+        "unbiased_temporal_psnr": metrics.unbiased_temporal_psnr(image, *shown),
+        "unbiased_mse": metrics.unbiased_mse(image, *shown),
+        "unbiased_disoccluded_mse": metrics.unbiased_mse(image, *shown, mask=hidden),
+        "unbiased_relative_mse": metrics.unbiased_relative_mse(denoised, *halves),
+    }
 
 
 def compare(
@@ -164,9 +168,9 @@ def _as_scores(found: dict[str, np.ndarray], hidden: np.ndarray, milliseconds: f
     any_hidden = bool(hidden.any())
     with np.errstate(divide="ignore"):
         hidden_psnr = float(-10.0 * np.log10(found["disoccluded_mse"]))
+    nothing = () if any_hidden else ("disoccluded_l1", "unbiased_disoccluded_mse")
     return Scores(
-        **{name: float(found[name]) for name in Scores._fields if name in found and name != "disoccluded_l1"},
-        disoccluded_l1=float(found["disoccluded_l1"]) if any_hidden else float("nan"),
+        **{name: float("nan") if name in nothing else float(found[name]) for name in Scores._fields if name in found},
         disoccluded_psnr=hidden_psnr if any_hidden else float("nan"),
         ms_per_frame=milliseconds,
         spp=float(spp),

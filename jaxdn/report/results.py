@@ -41,6 +41,8 @@ class Scores(NamedTuple):
     """dB, ``temporal_psnr`` of all differences together, likewise."""
     unbiased_mse: float = math.nan
     """``mse``, likewise; below 0 where the image is as good as can be told."""
+    unbiased_disoccluded_mse: float = math.nan
+    """``unbiased_mse`` on pixels that were hidden one frame earlier."""
     unbiased_relative_mse: float = math.nan
     """``relative_mse``, likewise."""
 

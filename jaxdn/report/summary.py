@@ -27,6 +27,7 @@ COLUMNS = (
     Column("l1", "L1", -1, "mean absolute difference"),
     Column("unbiased_mse", "MSE, unbiased", -1, "without the noise of the reference"),
     Column("mse", "MSE", -1, "mean squared difference"),
+    Column("unbiased_disoccluded_mse", "MSE, disoccluded, unbiased", -1, "without the noise of the reference"),
     Column("unbiased_relative_mse", "Relative MSE, unbiased", -1, "without the noise of the reference"),
     Column("relative_mse", "Relative MSE", -1, "squared difference over (reference² + 0.01), of linear radiance"),
     Column("unbiased_temporal_psnr", "Temporal PSNR dB, unbiased", 1, "without the noise of the reference"),

@@ -8,6 +8,7 @@ import numpy as np
 
 from experiments.speed.chart.footage import SCORED, Footage
 from jaxdn import color, metrics
+from jaxdn.commands.compare import unbiased_scores
 
 
 class Measure(NamedTuple):
@@ -49,15 +50,7 @@ def _scores(
         "disoccluded_psnr": metrics.psnr(shown, wanted, mask=hidden, average="mse"),
         "disoccluded_l1": metrics.l1(shown, wanted, mask=hidden),
     }
-    if halves is not None:
-        ends = color.tonemap_halves(*halves)
-        found |= {
-            "unbiased_psnr": metrics.unbiased_psnr(shown, *ends),
-            "unbiased_temporal_psnr": metrics.unbiased_temporal_psnr(shown, *ends),
-            "unbiased_mse": metrics.unbiased_mse(shown, *ends),
-            "unbiased_relative_mse": metrics.unbiased_relative_mse(images, *halves),
-        }
-    return found
+    return found if halves is None else found | unbiased_scores(images, hidden, halves)
 
 
 def score(images: np.ndarray, clip: Footage) -> dict[str, float]:
