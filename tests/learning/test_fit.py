@@ -96,3 +96,12 @@ def test_training_begins_with_given_weights_and_refuses_others_for_the_same_run(
     jax.tree.map(np.testing.assert_array_equal, state.params, one.params)
     with pytest.raises(ValueError, match="start 'one' -> 'another'"):
         again(batches(clips), start=Start("another", one.params))
+
+
+def test_training_stops_at_its_time_limit_and_goes_on_from_there(clips, tmp_path, capsys):
+    stopped = run(clips, tmp_path / "limited", time_limit=1e-9)
+    assert int(stopped.step) == 0
+    assert "time is over after 0 of 6 steps" in capsys.readouterr().out
+    whole, continued = run(clips, tmp_path / "whole"), run(clips, tmp_path / "limited")
+    assert int(continued.step) == 6
+    jax.tree.map(np.testing.assert_array_equal, whole.average, continued.average)

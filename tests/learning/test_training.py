@@ -13,6 +13,7 @@ from jaxdn.frame import Clip, Frame
 from jaxdn.learning.step import clip_loss, initial_state, make_train_step
 from jaxdn.methods.table import method_named
 from jaxdn.motion import occlusion_mask
+from jaxdn.objectives import unbiased_illumination
 from jaxdn.rollout import denoise
 from tests.plainly import jit_plainly
 
@@ -189,3 +190,41 @@ def test_a_recipe_is_kept_as_json():
     assert set(kept) == set(RECIPE._fields)
     assert kept["objective"] == "indirect illumination"
     assert kept["steps"] == 8
+
+
+def test_the_running_mean_follows_the_weights(denoiser):
+    recipe = RECIPE._replace(average=0.5, decay=False)
+    step = make_train_step(denoiser, recipe)
+    batch = batch_of(make_clip(0), make_clip(1))
+    state = initial_state(denoiser, recipe, batch)
+    wanted = jax.tree.map(np.array, state.params)
+    for count in range(8):
+        state, _ = step(state, batch)
+        share = min(0.5, (1 + count) / (10 + count))  # less of the mean so far while it is young
+        wanted = jax.tree.map(lambda mean, new, share=share: share * mean + (1 - share) * new, wanted, state.params)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), state.average, wanted)
+    assert any(np.any(a != b) for a, b in zip(*map(jax.tree.leaves, (state.average, state.params)), strict=True))
+    newest = make_train_step(denoiser, recipe._replace(average=0.0))
+    state, _ = newest(state, batch)
+    jax.tree.map(np.testing.assert_array_equal, state.average, state.params)
+
+
+def test_hidden_pixels_weigh_more_and_squares_come_late():
+    clip = make_clip(0)
+    visible = np.ones((4, 16, 16, 1), bool)
+    visible[1:, 4:8, 4:6] = False
+    seen = clip._replace(frames=clip.frames._replace(visible=visible))
+    images = jnp.asarray(clip.reference * 1.1)
+    objective = unbiased_illumination(hidden=2.0, squared_from=0.5)
+    assert objective.reads == {"visible"}
+    ours, wanted = color.compress(images), color.compress(clip.reference)
+    masks = 1.0 - visible
+    robust = losses.spatial(ours, wanted) + losses.temporal(ours, wanted) + 2 * losses.occlusion(ours, wanted, masks)
+    np.testing.assert_allclose(objective.loss(images, seen, jnp.asarray(0.4)), robust, rtol=1e-5)
+    pair = losses.unbiased(images, jnp.asarray(clip.reference))
+    squares = losses.spatial(*pair, squared=True) + losses.temporal(*pair, squared=True)
+    squares += 2 * losses.occlusion(*pair, masks, squared=True)
+    np.testing.assert_allclose(objective.loss(images, seen, jnp.asarray(0.5)), 8 * squares, rtol=1e-5)
+    # Without the buffer nothing is hidden.
+    plain = losses.spatial(ours, wanted) + losses.temporal(ours, wanted)
+    np.testing.assert_allclose(objective.loss(images, clip, jnp.asarray(0.0)), plain, rtol=1e-5)
