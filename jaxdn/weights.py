@@ -98,13 +98,19 @@ def starting_params(name_or_path: str | Path, denoiser: Denoiser) -> Params:
     """Parameters to continue training ``denoiser`` from: those of shipped weights or of a file.
 
     The denoiser may see more than the one that the weights were trained for: where a kernel has more input channels
-    than the stored one, the last ones are zero, so that its first images are those of the stored weights. Raises
-    ValueError as :func:`load_weights` does, and for weights of another network.
+    than the stored one, the last ones are zero, so that its first images are those of the stored weights. Arrays beside
+    the network's layers that the stored weights lack, such as the precisions of guided kernels, have the values that
+    training starts from, and the first images differ. Raises ValueError as :func:`load_weights` does, and for weights
+    of another network.
     """
     path = weights_path(name_or_path)
     _, params = load_weights(path)
     wanted = _initial_shapes(denoiser)
     found, grown = flatten(params), {}
+    beside = {name for name in wanted if name not in found and not name.endswith(("/kernel", "/bias"))}
+    if beside:
+        initial = flatten(denoiser.init(jax.random.key(0), Frame(np.zeros((16, 16, 3), np.float32))))
+        found |= {name: initial[name] for name in beside}
     for name, (shape, _) in wanted.items():
         stored = found.get(name, np.zeros(()))
         inputs = len(shape) - 2  # kernels are [height, width, inputs, outputs]

@@ -4,6 +4,9 @@ A U-Net predicts, for every pixel, 5x5 softmax kernels for the noisy image at th
 previous output warped by *dual* motion vectors, and how to blend them. Details that the paper leaves open are options;
 ``preset="parity"`` takes the exact paper settings.
 
+Beyond the paper, the kernels are guided: what the buffers show of two surfaces is compared before the network's logits,
+so that it need not learn where edges are (:func:`jaxdn.ops.softmax_filter.softmax_filter`).
+
 Yan Zeng, Lu Wang, Yanning Xu, Xiangxu Meng, "Neural Temporal Denoising for Indirect Illumination", 2021 ("Zeng et al.
 2021" here). Dual motion vectors: Zheng Zeng et al., "Temporally Reliable Motion Vectors for Better Use of Temporal
 Information", 2021.
@@ -17,6 +20,7 @@ import jax.numpy as jnp
 
 from jaxdn import color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.filters.guides import hit_mask
 from jaxdn.frame import FAR, RADIANCE_MAX, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated
 from jaxdn.methods.table import method
@@ -30,6 +34,10 @@ from jaxdn.repair import repair_image
 from jaxdn.scales import compose_scales, downsample
 
 TAPS = 25
+SCALES = 3
+"""Full, half and quarter resolution."""
+PRECISIONS = {"albedo": (3, 3.0), "normal": (3, 3.0), "depth": (1, 6.0), "reflectance": (3, 3.0), "roughness": (1, 3.0)}
+"""Guide of the kernels -> its channels, and the logarithm of its precision at the start of training."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +70,11 @@ class Options:
     guides: Literal["geometry", "materials"] = "geometry"
     """Buffers that the network sees: albedo, normal and depth, as in the paper; or ``reflectance`` and ``roughness``
     too."""
+    kernels: Literal["guided", "plain"] = "guided"
+    """The network's logits plus a cross-bilateral prior, see :func:`guided_features`; or these logits alone, as in the
+    paper."""
+    background: Literal["pass", "filter"] = "pass"
+    """Pixels without a surface (depth at ``FAR``) keep their radiance, which has no noise, or are filtered."""
     demodulate: Demodulation | bool = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     truncate: bool = False
@@ -74,7 +87,14 @@ class Options:
 
 
 PARITY = Options(
-    down="max", depth_scale="unit", border="zeros", first_frame="noisy", missing_history="blend", demodulate="none"
+    down="max",
+    depth_scale="unit",
+    border="zeros",
+    first_frame="noisy",
+    missing_history="blend",
+    kernels="plain",
+    background="filter",
+    demodulate="none",
 )
 """The exact paper settings: D is max-pooling (eq. 4), taps outside the image are 0, the first history is noisy."""
 
@@ -91,6 +111,46 @@ def depth_feature(depth: jax.Array, *, scale: str = "geometric") -> jax.Array:
     logarithms = jnp.where(known, jnp.log(jnp.where(known, depth, 1.0)), 0.0)
     middle = jnp.exp(jnp.sum(logarithms) / jnp.maximum(jnp.sum(known, dtype=depth.dtype), 1.0))
     return depth / (depth + middle)
+
+
+def initial_precisions(guides: Literal["geometry", "materials"]) -> Params:
+    """Name of a guide -> [3, C] the logarithms of its precisions at each scale, before training."""
+    names = ("albedo", "normal", "depth", *(("reflectance", "roughness") if guides == "materials" else ()))
+    return {name: jnp.full((SCALES, PRECISIONS[name][0]), PRECISIONS[name][1], jnp.float32) for name in names}
+
+
+def guided_features(precisions: Params, guides: dict[str, jax.Array | None]) -> list[jax.Array | None]:
+    """The features that guide the kernels at full, half and quarter resolution; None without any guide.
+
+    With g the guides (at coarser scales their means over blocks) and a the learned log precisions, the logit of the
+    tap at q of pixel p gets ``- sum_c exp(a_c) (g_c(p) - g_c(q))^2``: the features are ``exp(a_c / 2) g_c``. Absent
+    guides are left out, as constant ones would change nothing.
+
+    Args:
+      precisions: name -> [3, C], see :func:`initial_precisions`.
+      guides: name -> [H, W, C] or None; H and W are multiples of 4.
+    """
+    present = {name: guides[name] for name in precisions if guides[name] is not None}
+    if not present:
+        return [None] * SCALES
+    together = jnp.concatenate(list(present.values()), axis=-1)
+    logarithms = jnp.concatenate([precisions[name] for name in present], axis=-1).astype(together.dtype)
+    features: list[jax.Array | None] = []
+    for scale in range(SCALES):
+        if scale:
+            together = downsample(together)
+        features.append(together * jnp.exp(0.5 * logarithms[scale])[None, None])
+    return features
+
+
+def _guides(options: Options, frame: Frame) -> dict[str, jax.Array | None]:
+    """The guides as the network and the prior see them, padded; 0 is the neutral value, None where one is absent."""
+    reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
+    depth = None if frame.depth is None else depth_feature(frame.depth, scale=options.depth_scale)
+    fractions = {"albedo": frame.albedo, "reflectance": reflectance, "roughness": frame.roughness}
+    guides = {name: None if guide is None else guide - 1.0 for name, guide in fractions.items()}
+    guides |= {"normal": frame.normal, "depth": depth}
+    return {name: None if guide is None else pad(guide) for name, guide in guides.items()}
 
 
 def _recall(
@@ -116,27 +176,32 @@ def _recall(
 
 
 def _blend(
-    options: Options, heads: list[jax.Array], noisy: jax.Array, recalled: jax.Array, absent: jax.Array
+    options: Options,
+    heads: list[jax.Array],
+    guiding: list[jax.Array | None],
+    noisy: jax.Array,
+    recalled: jax.Array,
+    absent: jax.Array,
 ) -> jax.Array:
     """The kernels applied, and the scales and the history blended, in the domain of the images.
 
     Args:
       options: of the method.
       heads: logits at full, half and quarter resolution.
+      guiding: features of the prior at the same resolutions; None for plain kernels.
       noisy: [H, W, 3], in the domain that kernels work on.
       recalled: [H, W, 3] the warped history, in the same domain.
       absent: bool [H, W, 1], there is no history.
     """
     full, half, quarter = heads
     scales = [noisy]
-    for _ in range(2):
+    for _ in range(SCALES - 1):
         scales.append(downsample(scales[-1], down=options.pyramid))
     fine = options.alpha_at == "fine"
     seams = (full[..., 2 * TAPS + 1 :], half[..., TAPS:]) if fine else (half[..., TAPS:], quarter[..., TAPS:])
-    coarsest, middle = (
-        softmax_filter(image[None], head)[0] for image, head in ((scales[2], quarter), (scales[1], half))
-    )
-    finest, temporal = softmax_filter(jnp.stack([noisy, recalled]), full)
+    coarsest = softmax_filter(scales[2][None], quarter, features=guiding[2])[0]
+    middle = softmax_filter(scales[1][None], half, features=guiding[1])[0]
+    finest, temporal = softmax_filter(jnp.stack([noisy, recalled]), full, features=guiding[0])
     composed = coarsest
     for image, seam in ((middle, seams[1]), (finest, seams[0])):
         composed = compose_scales(image, composed, jax.nn.sigmoid(seam), down=options.down, up=options.up)
@@ -156,7 +221,7 @@ def _blend(
     },
     variants={"ntd-large": {"size": "large"}, "ntd-small": {"size": "small"}},
     engines=("onnxruntime", "onednn"),
-    earlier={"demodulate": "albedo"},
+    earlier={"demodulate": "albedo", "kernels": "plain", "background": "filter"},
 )
 def ntd(options: Options) -> Denoiser:
     """The neural temporal denoiser.
@@ -164,6 +229,9 @@ def ntd(options: Options) -> Denoiser:
     With x the noisy radiance, i^s its 5x5 kernel-filtered versions at scales s = 1, 1/2, 1/4 and t the kernel-filtered
     warped history, ``o^c = i^1/4``, ``o^f = i^f - U(alpha D(i^f)) + U(alpha o^c)`` for the two finer scales, and the
     output is ``alpha^t o^1 + (1 - alpha^t) t`` (Zeng et al. 2021, eq. 1 and 4): alpha^t weighs the *current* frame.
+
+    Guided kernels have learned precisions in ``params["guide"]`` beside the network's weights. Training may continue
+    from weights with plain kernels (``jaxdn train --start``); the first image then differs by the prior.
 
     The paper trains with Adam at a constant 1e-4 for 200 epochs of 142 clips (the recipe "parity"). Raises ValueError
     for an unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
@@ -185,8 +253,11 @@ def ntd(options: Options) -> Denoiser:
     reads |= {"dual_motion"} if options.motion == "dual" else set()
     reads |= {"reflectance", "roughness"} if materials else set()
 
+    guided = options.kernels == "guided"
+
     def init(key: jax.Array, frame: Frame) -> Params:
-        return network.init(key)
+        params = network.init(key)
+        return {**params, "guide": initial_precisions(options.guides)} if guided else params
 
     def start(params: Params, frame: Frame) -> jax.Array:
         return jnp.zeros_like(frame.radiance)
@@ -195,7 +266,8 @@ def ntd(options: Options) -> Denoiser:
         """The heads [H, W, c] for feature groups [H, W, c]."""
         inner = jnp.dtype(jnp.bfloat16) if options.compute_dtype == "bfloat16" else dtype
         batch = [None if group is None else group[None].astype(inner) for group in features]
-        return [head[0].astype(dtype) for head in network.apply(params, batch)]
+        weights = {name: part for name, part in params.items() if name != "guide"}
+        return [head[0].astype(dtype) for head in network.apply(weights, batch)]
 
     def step(
         params: Params, state: jax.Array, frame: Frame, first: jax.Array
@@ -204,24 +276,26 @@ def ntd(options: Options) -> Denoiser:
         # Divided by a small albedo it may be beyond what the network has ever seen.
         frame = frame._replace(radiance=jnp.minimum(frame.radiance, RADIANCE_MAX))
         recalled, absent, broken = _recall(options, state, frame, first)
-        depth = None if frame.depth is None else pad(depth_feature(frame.depth, scale=options.depth_scale))
-        albedo = None if frame.albedo is None else pad(frame.albedo - 1.0)
-        normal = None if frame.normal is None else pad(frame.normal)
+        seen = _guides(options, frame)
         noisy, recalled, absent = (pad(image) for image in (frame.radiance, recalled, absent))
         squeezed, squeezed_history = color.compress(noisy), color.compress(recalled)
-        features = [squeezed, albedo, normal, depth, squeezed_history]
+        features = [squeezed, seen["albedo"], seen["normal"], seen["depth"], squeezed_history]
         if flagged:
             features.append(absent.astype(noisy.dtype))
         if materials:
-            reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
-            features += [None if guide is None else pad(guide - 1.0) for guide in (reflectance, frame.roughness)]
+            features += [seen["reflectance"], seen["roughness"]]
         predicted = predict(params, features, noisy.dtype)
+        guiding = guided_features(params["guide"], seen) if guided else [None] * SCALES
 
         if options.domain == "compressed":
-            image = color.expand(jnp.maximum(_blend(options, predicted, squeezed, squeezed_history, absent), 0.0))
+            blended = _blend(options, predicted, guiding, squeezed, squeezed_history, absent)
+            image = color.expand(jnp.maximum(blended, 0.0))
         else:
-            image = _blend(options, predicted, noisy, recalled, absent)
+            image = _blend(options, predicted, guiding, noisy, recalled, absent)
         image = jnp.clip(crop(image, size), 0.0, RADIANCE_MAX)
+        hit = hit_mask(frame.depth, None) if options.background == "pass" else None
+        if hit is not None:
+            image = jnp.where(hit[..., None], image, frame.radiance)
         return image, image, broken
 
     plain = recurrent(Core(start, step, reads, init))

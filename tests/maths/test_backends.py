@@ -48,10 +48,25 @@ def numpy_apply_kernels(image, kernels):
     return out
 
 
-def numpy_softmax_filter(images, logits, taps):
+def numpy_prior(features, taps):
+    """The squared distance of every pixel to each of its taps, in loops."""
+    height, width, _ = features.shape
+    size = int(np.sqrt(taps))
+    out = np.zeros((height, width, taps))
+    for row in range(height):
+        for column in range(width):
+            for tap in range(taps):
+                i = min(max(row + tap // size - size // 2, 0), height - 1)
+                j = min(max(column + tap % size - size // 2, 0), width - 1)
+                out[row, column, tap] = np.sum((features[row, column] - features[i, j]) ** 2)
+    return out
+
+
+def numpy_softmax_filter(images, logits, features, taps):
     filtered = []
+    prior = 0.0 if features is None else numpy_prior(features, taps)
     for index, image in enumerate(images):
-        own = logits[..., index * taps : (index + 1) * taps]
+        own = logits[..., index * taps : (index + 1) * taps] - prior
         weights = np.exp(own - own.max(axis=-1, keepdims=True))
         filtered.append(numpy_apply_kernels(image, weights / weights.sum(axis=-1, keepdims=True)))
     return np.stack(filtered)
@@ -102,7 +117,20 @@ def _case(op, size, rng):
             lambda implementation, images, logits: softmax_filter(
                 images, logits, taps=taps, implementation=implementation
             ),
-            lambda images, logits: numpy_softmax_filter(images, logits, taps),
+            lambda images, logits: numpy_softmax_filter(images, logits, None, taps),
+        )
+    if op.startswith("guided_filter"):
+        taps, count, spare, channels = map(int, op.removeprefix("guided_filter_").split("_"))
+        return (
+            (
+                rng.standard_normal((count, *size, 3)),
+                3 * rng.standard_normal((*size, count * taps + spare)),
+                rng.standard_normal((*size, channels)),
+            ),
+            lambda implementation, images, logits, features: softmax_filter(
+                images, logits, features=features, taps=taps, implementation=implementation
+            ),
+            lambda images, logits, features: numpy_softmax_filter(images, logits, features, taps),
         )
     inputs, outputs = map(int, op.removeprefix("convolution_").split("_"))
     return (
@@ -149,7 +177,10 @@ CASES = [
 
 FILTERS = [
     (case, name)
-    for case in ("softmax_filter_25_1_0", "softmax_filter_9_2_1")
+    for case in (
+        *("softmax_filter_25_1_0", "softmax_filter_9_2_1"),
+        *("guided_filter_25_2_1_7", "guided_filter_9_1_0_1", "guided_filter_1_1_0_2"),
+    )
     for name in implementations("softmax_filter")
 ]
 """Not linear in its logits, so that its gradient has a test of its own."""
@@ -238,15 +269,20 @@ def test_a_named_implementation_runs_or_raises(op):
 
 
 @pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("guided", [False, True])
 @pytest.mark.parametrize("height", [5, 7, 8])
-def test_strips_of_any_number_of_rows_are_the_whole_image(height, rng, monkeypatch):
+def test_strips_of_any_number_of_rows_are_the_whole_image(height, guided, rng, monkeypatch):
     """Two rows a strip: heights that they divide and others, whose last strip computes a row again."""
     monkeypatch.setattr("jaxdn.ops.softmax_filter._STRIP", 2 * 6 * 51)
     images, logits = rng.standard_normal((2, height, 6, 3)), rng.standard_normal((height, 6, 51))
+    features = rng.standard_normal((height, 6, 7)) if guided else None
     cotangent = rng.standard_normal(images.shape)
 
     def both(implementation):
-        value, pull = jax.vjp(lambda *at: softmax_filter(*at, implementation=implementation), images, logits)
+        def filtered(images, logits, features):
+            return softmax_filter(images, logits, features=features, implementation=implementation)
+
+        value, pull = jax.vjp(filtered, images, logits, features)
         return value, pull(cotangent)
 
     jax.tree.map(

@@ -36,6 +36,64 @@ def test_softmax_filter_is_normalizing_and_applying(rng):
     np.testing.assert_allclose(softmax_filter(images, head), expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize("implementation", ["reference", "strips"])
+@pytest.mark.parametrize("size", [(4, 3), (1, 1), (1, 6)])
+@pytest.mark.usefixtures("x64")
+def test_gradients_of_guided_kernels(size, implementation, rng):
+    images, logits, features = (
+        jnp.asarray(rng.standard_normal(shape)) for shape in ((2, *size, 2), (*size, 19), (*size, 3))
+    )
+
+    def filtered(images, logits, features):
+        filtered = softmax_filter(images, logits, features=features, taps=9, implementation=implementation)
+        return jnp.tanh(filtered)
+
+    check_grads(jax.jit(filtered), (images, logits, features), order=1, modes=["rev"])
+
+
+@pytest.mark.parametrize("implementation", ["reference", "strips"])
+def test_constant_features_change_nothing(implementation, rng):
+    images, logits = rng.random((2, 6, 5, 3)).astype(np.float32), rng.standard_normal((6, 5, 51)).astype(np.float32)
+    run = jax.jit(softmax_filter, static_argnames="implementation")
+    guided = run(images, logits, features=jnp.full((6, 5, 7), 1e4), implementation=implementation)
+    np.testing.assert_allclose(guided, run(images, logits, implementation=implementation), rtol=1e-6)
+
+
+@pytest.mark.parametrize("implementation", ["reference", "strips"])
+@pytest.mark.parametrize("step", [4.0, 20.0, 1e4, 1e25])
+def test_no_light_crosses_a_step_of_the_features(step, implementation, rng):
+    """An image of 1 on one side and 0 on the other: what crosses is the sum of the weights across the edge."""
+    side = (np.arange(8) >= 3).astype(np.float32)[None, :, None]
+    image = np.broadcast_to(side, (6, 8, 3))[None]
+    logits, features = rng.standard_normal((6, 8, 25)).astype(np.float32), step * np.broadcast_to(side, (6, 8, 2))
+
+    @jax.jit
+    def crossing(logits, features):
+        filtered = softmax_filter(image, logits, features=features, implementation=implementation)
+        return jnp.max(jnp.abs(filtered - image))
+
+    assert crossing(logits, jnp.zeros_like(features)) > 0.1
+    assert crossing(logits, features) < 1e-6
+    slopes = jax.jit(jax.grad(crossing, (0, 1)))(logits, jnp.asarray(features))
+    assert all(np.all(np.isfinite(slope)) for slope in slopes)
+
+
+@pytest.mark.parametrize("implementation", ["reference", "strips"])
+def test_large_features_keep_their_small_differences(implementation, rng):
+    """Features around 20 differ by 0.1: the weights are those of the differences alone."""
+    images, logits = rng.random((1, 6, 5, 3)).astype(np.float32), rng.standard_normal((6, 5, 25)).astype(np.float32)
+    small = (rng.integers(0, 8, (6, 5, 3)) / 64).astype(np.float32)
+    near, far = (
+        softmax_filter(images, logits, features=each, implementation=implementation) for each in (small, 20 + small)
+    )
+    np.testing.assert_allclose(far, near, rtol=1e-5)
+
+
+def test_features_of_another_size_raise():
+    with pytest.raises(ValueError, match="logits and features: expected the same size"):
+        softmax_filter(jnp.zeros((1, 6, 5, 3)), jnp.zeros((6, 5, 25)), features=jnp.zeros((5, 6, 7)))
+
+
 @pytest.mark.parametrize(
     ("images", "logits", "taps", "message"),
     [
