@@ -75,6 +75,11 @@ class Options:
     paper."""
     background: Literal["pass", "filter"] = "pass"
     """Pixels without a surface (depth at ``FAR``) keep their radiance, which has no noise, or are filtered."""
+    exposure: Literal["measured", "given"] = "measured"
+    """The network sees radiance times :func:`jaxdn.color.exposure` of each frame, so that twice the light gives twice the
+    image; or radiance as it is given."""
+    initialization: Literal["he", "xavier"] = "he"
+    """Of the U-Net's weights, see :func:`jaxdn.networks.unet.initial`."""
     demodulate: Demodulation | bool = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     truncate: bool = False
@@ -94,6 +99,8 @@ PARITY = Options(
     missing_history="blend",
     kernels="plain",
     background="filter",
+    exposure="given",
+    initialization="xavier",
     demodulate="none",
 )
 """The exact paper settings: D is max-pooling (eq. 4), taps outside the image are 0, the first history is noisy."""
@@ -221,7 +228,13 @@ def _blend(
     },
     variants={"ntd-large": {"size": "large"}, "ntd-small": {"size": "small"}},
     engines=("onnxruntime", "onednn"),
-    earlier={"demodulate": "albedo", "kernels": "plain", "background": "filter"},
+    earlier={
+        "demodulate": "albedo",
+        "kernels": "plain",
+        "background": "filter",
+        "exposure": "given",
+        "initialization": "xavier",
+    },
 )
 def ntd(options: Options) -> Denoiser:
     """The neural temporal denoiser.
@@ -248,7 +261,8 @@ def ntd(options: Options) -> Denoiser:
 
     sizes = {"large": LARGE, "small": SMALL}
     widths = sizes[options.size] if isinstance(options.size, str) else options.size
-    network = unet(groups, heads, widths=widths, implementation=options.implementation)
+    settings = {"initialization": options.initialization, "implementation": options.implementation}
+    network = unet(groups, heads, widths=widths, **settings)
     reads = frozenset({"albedo", "normal", "depth", "motion"})
     reads |= {"dual_motion"} if options.motion == "dual" else set()
     reads |= {"reflectance", "roughness"} if materials else set()
@@ -278,7 +292,8 @@ def ntd(options: Options) -> Denoiser:
         recalled, absent, broken = _recall(options, state, frame, first)
         seen = _guides(options, frame)
         noisy, recalled, absent = (pad(image) for image in (frame.radiance, recalled, absent))
-        squeezed, squeezed_history = color.compress(noisy), color.compress(recalled)
+        gain = color.exposure(frame.radiance) if options.exposure == "measured" else 1.0
+        squeezed, squeezed_history = color.compress(gain * noisy), color.compress(gain * recalled)
         features = [squeezed, seen["albedo"], seen["normal"], seen["depth"], squeezed_history]
         if flagged:
             features.append(absent.astype(noisy.dtype))
@@ -289,7 +304,7 @@ def ntd(options: Options) -> Denoiser:
 
         if options.domain == "compressed":
             blended = _blend(options, predicted, guiding, squeezed, squeezed_history, absent)
-            image = color.expand(jnp.maximum(blended, 0.0))
+            image = color.expand(jnp.maximum(blended, 0.0)) / gain
         else:
             image = _blend(options, predicted, guiding, noisy, recalled, absent)
         image = jnp.clip(crop(image, size), 0.0, RADIANCE_MAX)
