@@ -137,7 +137,7 @@ def guided_features(precisions: Params, guides: dict[str, jax.Array | None]) -> 
       precisions: name -> [3, C], see :func:`initial_precisions`.
       guides: name -> [H, W, C] or None; H and W are multiples of 4.
     """
-    present = {name: guides[name] for name in precisions if guides[name] is not None}
+    present = {name: guide for name in precisions if (guide := guides[name]) is not None}
     if not present:
         return [None] * SCALES
     together = jnp.concatenate(list(present.values()), axis=-1)
@@ -300,7 +300,7 @@ def ntd(options: Options) -> Denoiser:
         if materials:
             features += [seen["reflectance"], seen["roughness"]]
         predicted = predict(params, features, noisy.dtype)
-        guiding = guided_features(params["guide"], seen) if guided else [None] * SCALES
+        guiding = guided_features(params["guide"] if guided else {}, seen)
 
         if options.domain == "compressed":
             blended = _blend(options, predicted, guiding, squeezed, squeezed_history, absent)

@@ -120,7 +120,7 @@ def _strip_of(planes: Planes, first: jax.Array, rows: int) -> Planes:
 
 def _strip_weights(logits: jax.Array, count: int, taps: int, planes: Planes) -> list[jax.Array]:
     """Each image's kernels [h, w, taps] in a strip."""
-    prior = affinity.by_taps(planes, *logits.shape[:2], taps) if planes else None
+    prior = affinity.by_taps(planes, logits.shape[0], logits.shape[1], taps) if planes else None
     return _weights(logits, count, taps, prior)
 
 

@@ -20,7 +20,10 @@ from tests.hard_cases.inputs import HEIGHT, WIDTH, Inputs
 _BORDERS = ("clamp", "zeros")
 _METRICS = ("psnr", "temporal_psnr", "ssim", "l1", "mse", "flip", "relative_mse")
 _UNBIASED = ("unbiased_mse", "unbiased_psnr", "unbiased_temporal_psnr", "unbiased_relative_mse")
-_PICTURED = {*(f"warp, {border}" for border in _BORDERS), "apply_kernels", "softmax_filter", "compose_scales"}
+_PICTURED = {*(f"warp, {border}" for border in _BORDERS), "apply_kernels", "compose_scales"} | {
+    "softmax_filter",
+    "softmax_filter, guided",
+}
 
 
 class Subject(NamedTuple):
@@ -41,7 +44,7 @@ class Subject(NamedTuple):
 
 
 def denoiser_subjects() -> list[Subject]:
-    """Every registered method, in its smallest variant, each precision and both ways to divide light.
+    """Every registered method, in its smallest variant, each precision, both ways to divide light and to filter it.
 
     A network has the weights that training starts from.
     """
@@ -66,6 +69,10 @@ def denoiser_subjects() -> list[Subject]:
         if method.knows("demodulate"):
             plain = method.factory(**{**options, "demodulate": "albedo"})
             subjects.append(usual._replace(name=f"{name} by albedo", run=_on_clips(plain)))
+        if method.knows("kernels"):
+            alone = method.factory(**{**options, "kernels": "plain", "background": "filter"})
+            weights = {part: layers for part, layers in params.items() if part != "guide"}
+            subjects.append(usual._replace(name=f"{name} unguided", run=_on_clips(alone), params=weights))
     return subjects
 
 
@@ -103,6 +110,11 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
 
     def filtered_by_logits(inputs: Inputs) -> jax.Array:
         return softmax_filter(inputs.clip.frames.radiance[-1:], inputs.logits)[0]
+
+    def guided_by_features(inputs: Inputs) -> jax.Array:
+        frame = repair(jax.tree.map(lambda buffer: buffer[-1], inputs.clip.frames))[0]
+        features = 20 * jnp.concatenate([frame.albedo, frame.normal], axis=-1)
+        return softmax_filter(frame.radiance[None], inputs.logits, features=features)[0]
 
     def even(inputs: Inputs) -> jax.Array:
         """As the error for odd sizes says."""
@@ -173,6 +185,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "normalize_kernels": lambda inputs: jaxdn.normalize_kernels(inputs.logits),
         "apply_kernels": filtered,
         "softmax_filter": filtered_by_logits,
+        "softmax_filter, guided": guided_by_features,
         "compose_scales": composed,
         "downsample": lambda inputs: scales.downsample(even(inputs)),
         "upsample": lambda inputs: scales.upsample(inputs.clip.frames.radiance[-1]),

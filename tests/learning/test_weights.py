@@ -8,17 +8,20 @@ import pytest
 
 import jaxdn
 from jaxdn.denoisers import ntd
-from jaxdn.frame import Frame
+from jaxdn.frame import FAR, Frame
 from jaxdn.weights import flatten, save_weights, shipped_names, starting_params, unflatten
 
 TINY = ((4,), (4,), (4,), (4,), (4,))
+GUIDED = {"kernels": "guided", "background": "pass"}
 FRAME = Frame(radiance=np.ones((16, 16, 3), np.float32))
 
 
 @pytest.fixture
 def saved(tmp_path):
     params = ntd(size=TINY).init(jax.random.key(0), FRAME)
-    path = save_weights(tmp_path / "w", params, factory="ntd", options={"size": TINY}, record={"note": "test"})
+    path = save_weights(
+        tmp_path / "w", params, factory="ntd", options={"size": TINY, **GUIDED}, record={"note": "test"}
+    )
     return path, params
 
 
@@ -42,11 +45,11 @@ def test_round_trip(saved):
 )
 def test_weights_of_an_earlier_version_are_read(tmp_path, earlier, today):
     """Whether to divide by the albedo was a yes or no, yes unless it was given; it has become what to divide by."""
-    params = ntd(size=TINY).init(jax.random.key(0), FRAME)
+    params = ntd(size=TINY, kernels="plain").init(jax.random.key(0), FRAME)
     saved = save_weights(tmp_path / "w", params, factory="ntd", options={"size": TINY, **earlier}, record={})
     frame = FRAME._replace(albedo=np.full((16, 16, 3), 0.1, np.float32))
     images = []
-    for denoiser in (jaxdn.load_weights(saved)[0], ntd(size=TINY, demodulate=today)):
+    for denoiser in (jaxdn.load_weights(saved)[0], ntd(size=TINY, kernels="plain", demodulate=today)):
         images.append(denoiser.step(params, denoiser.start(params, frame), frame)[1])
     np.testing.assert_array_equal(*images)
 
@@ -60,10 +63,47 @@ def test_a_preset_of_an_earlier_version_keeps_what_it_divides_by(tmp_path):
     assert "demodulate" not in jaxdn.weights.describe(saved)["options"]
 
 
-def test_training_continues_from_weights_that_see_less(saved, rng):
+def test_guided_kernels_continue_from_plain_ones(tmp_path):
+    """The precisions start from their initial values, here and where the kernels see more guides than before."""
+    options = {"size": TINY, "kernels": "plain"}
+    params = ntd(**options).init(jax.random.key(0), FRAME)
+    assert "guide" not in params
+    path = save_weights(tmp_path / "plain", params, factory="ntd", options=options, record={})
+    guided = starting_params(path, ntd(size=TINY))
+    np.testing.assert_array_equal(guided["guide"]["depth"], np.full((3, 1), 6.0))
+    jax.tree.map(np.testing.assert_array_equal, {n: guided[n] for n in params}, params)
+    assert set(guided) == {*params, "guide"}
+
+    guided["guide"]["depth"] = guided["guide"]["depth"] - 1
+    path = save_weights(tmp_path / "guided", guided, factory="ntd", options={"size": TINY, **GUIDED}, record={})
+    more = starting_params(path, ntd(size=TINY, guides="materials"))["guide"]
+    np.testing.assert_array_equal(more["depth"], np.full((3, 1), 5.0))
+    np.testing.assert_array_equal(more["reflectance"], np.full((3, 3), 3.0))
+    with pytest.raises(ValueError, match="convolution_1/bias is missing there"):
+        starting_params(path, ntd(size=((4, 4), *TINY[1:])))
+
+
+def test_weights_without_a_record_of_guides_have_plain_kernels_and_filter_the_background(tmp_path, rng):
+    params = ntd(size=TINY, kernels="plain").init(jax.random.key(0), FRAME)
+    depth = np.full((16, 16, 1), 3.0, np.float32)
+    depth[:, 8:] = FAR
+    frame = FRAME._replace(radiance=rng.exponential(size=(16, 16, 3)).astype(np.float32), depth=depth)
+    explicit = {"kernels": "plain", "background": "filter"}
+    images = []
+    for number, options in enumerate(({"demodulate": "brdf"}, {"demodulate": "brdf", **explicit})):
+        path = save_weights(tmp_path / str(number), params, factory="ntd", options={"size": TINY, **options}, record={})
+        denoiser, loaded = jaxdn.load_weights(path)
+        images.append(denoiser.step(loaded, denoiser.start(loaded, frame), frame)[1])
+    np.testing.assert_array_equal(*images)
+    assert np.abs(images[0] - frame.radiance)[:, 8:].max() > 0.01
+
+
+def test_training_continues_from_weights_that_see_less(tmp_path, rng):
     """New guides begin with weights of zero: the first image is that of the old weights, whatever the guides show."""
-    path, params = saved
-    old, more = jaxdn.load_weights(path)[0], ntd(size=TINY, guides="materials", demodulate="albedo")
+    options = {"size": TINY, "kernels": "plain", "demodulate": "albedo"}
+    params = ntd(**options).init(jax.random.key(0), FRAME)
+    path = save_weights(tmp_path / "w", params, factory="ntd", options=options, record={})
+    old, more = jaxdn.load_weights(path)[0], ntd(**options, guides="materials")
     grown = starting_params(path, more)
     frame = FRAME._replace(
         radiance=rng.exponential(size=(16, 16, 3)).astype(np.float32),

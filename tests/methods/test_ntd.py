@@ -10,8 +10,9 @@ import pytest
 
 from jaxdn import brdf
 from jaxdn.denoiser import Denoiser, Recurrent
-from jaxdn.frame import FAR, Frame, frame_at
-from jaxdn.methods.ntd import depth_feature, ntd
+from jaxdn.frame import FAR, Frame, frame_at, only
+from jaxdn.methods.ntd import depth_feature, guided_features, ntd
+from jaxdn.weights import load_weights
 from jaxdn.rollout import unroll
 from tests.plainly import jit_plainly
 
@@ -21,6 +22,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "parity": {"preset": "parity"},
     "fine": {"alpha_at": "fine", "up": "nearest", "first_frame": "noisy", "truncate": True},
     "max": {"down": "max", "pyramid": "max", "depth_scale": "unit", "missing_history": "blend"},
+    "plain": {"kernels": "plain", "background": "filter"},
+    "materials": {"guides": "materials"},
     "compressed": {"domain": "compressed", "motion": "traditional", "demodulate": "none"},
 }
 
@@ -366,6 +369,89 @@ def test_half_precision_is_close(rng: np.random.Generator, key: jax.Array) -> No
     assert np.abs(images - wanted).max() > 0
 
 
+@pytest.mark.parametrize("guides", ["geometry", "materials"])
+def test_parameters_of_the_guides(guides: str, rng: np.random.Generator, key: jax.Array) -> None:
+    """One logarithm for each scale and channel, the same whatever buffers the frame has; none for plain kernels."""
+    frame = frame_at(random_frames(rng), 0)
+    options = {"guides": guides}
+    params, plain = tiny(**options).init(key, frame), tiny(**options, kernels="plain").init(key, frame)
+    channels = {"albedo": 3, "normal": 3, "depth": 1} | ({"reflectance": 3, "roughness": 1} if "m" in guides else {})
+    assert {name: leaf.shape for name, leaf in params["guide"].items()} == {n: (3, c) for n, c in channels.items()}
+    assert set(params) - set(plain) == {"guide"}
+    assert np.all(params["guide"]["depth"] == 6.0)
+    bare = tiny(**options).init(key, Frame(frame.radiance))
+    jax.tree.map(np.testing.assert_array_equal, bare, params)
+
+
+def test_features_of_the_guides_are_scaled_means(rng: np.random.Generator) -> None:
+    albedo, depth = rng.random((8, 16, 3)), rng.random((8, 16, 1))
+    precisions = {"albedo": rng.normal(size=(3, 3)), "normal": np.zeros((3, 3)), "depth": rng.normal(size=(3, 1))}
+    features = guided_features(
+        jax.tree.map(jnp.asarray, precisions), {"albedo": jnp.asarray(albedo), "normal": None, "depth": depth}
+    )
+    means = albedo, half(albedo), half(half(albedo))
+    distances = depth, half(depth), half(half(depth))
+    for scale in range(3):
+        wanted = [np.exp(precisions["albedo"][scale] / 2) * means[scale]]
+        wanted.append(np.exp(precisions["depth"][scale] / 2) * distances[scale])
+        np.testing.assert_allclose(features[scale], np.concatenate(wanted, axis=-1), rtol=1e-5)
+    assert guided_features(precisions, dict.fromkeys(precisions)) == [None] * 3
+
+
+def test_guided_kernels_keep_two_surfaces_apart(rng: np.random.Generator) -> None:
+    """Dark and bright walls at a right angle, equal noise, a network that predicts nothing: the mean of each stays."""
+    right = (np.arange(64) >= 32).astype(np.float32)[None, :, None]
+    normal = np.concatenate([1 - right, right, 0 * right], axis=-1)
+    light = 1 + 9 * right + rng.normal(0, 0.5, (64, 64, 3)).astype(np.float32)
+    frame = Frame(
+        jnp.asarray(np.maximum(light, 0)),
+        normal=jnp.asarray(np.broadcast_to(normal, (64, 64, 3))),
+        depth=jnp.full((64, 64, 1), 3.0),
+    )
+    errors = {}
+    for kernels in ("guided", "plain"):
+        denoiser = tiny(kernels=kernels)
+        params = denoiser.init(jax.random.key(0), frame)
+        params = {
+            name: part if name == "guide" else jax.tree.map(jnp.zeros_like, part) for name, part in params.items()
+        }
+        _, image = jax.jit(denoiser.step)(params, denoiser.start(params, frame), frame)
+        errors[kernels] = np.abs(np.asarray(image) - (1 + 9 * right))[:, 16:48].max()
+    assert errors["guided"] < 0.5
+    assert errors["plain"] > 1.5
+
+
+def test_the_background_passes_through(rng: np.random.Generator, key: jax.Array) -> None:
+    """Also in the second frame, when surfaces have moved over it, and in the history."""
+    frames = random_frames(rng)
+    sky = rng.random((2, 16, 16, 1)) < 0.3
+    frames = frames._replace(depth=jnp.where(sky, FAR, frames.depth))
+    denoiser, filtering = tiny(), tiny(background="filter")
+    params = initial(denoiser, key, frames)
+    images, others = np.asarray(run(denoiser)(params, frames)), np.asarray(run(filtering)(params, frames))
+    np.testing.assert_allclose(*(np.where(sky, each, 0) for each in (images, frames.radiance)), rtol=1e-6)
+    assert np.abs(others - images)[np.broadcast_to(sky, images.shape)].max() > 0.1
+    np.testing.assert_allclose(np.where(sky, 0, others)[0], np.where(sky, 0, images)[0], rtol=1e-6)
+    assert denoiser.reads == filtering.reads
+    first = frame_at(frames, 0)
+    state, _ = jax.jit(denoiser.step)(params, denoiser.start(params, first), first)
+    divided = first.radiance / brdf.divisor(first.albedo)
+    np.testing.assert_allclose(*(np.where(sky[0], each, 0) for each in (state.core, divided)), rtol=1e-6)
+    without = frames._replace(depth=None)
+    np.testing.assert_array_equal(run(denoiser)(params, without), run(filtering)(params, without))
+
+
+@pytest.mark.parametrize("name", ["ntd-small", "ntd-large"])
+def test_shipped_weights_keep_their_images(name: str, rng: np.random.Generator) -> None:
+    """They were trained with plain kernels that filter the background too, and their files do not say so."""
+    denoiser, params = load_weights(name)
+    explicit = ntd(size=name.removeprefix("ntd-"), kernels="plain", background="filter")
+    assert "guide" not in params
+    frames = random_frames(rng, (32, 32))
+    frames = only(frames._replace(depth=frames.depth.at[:, :8].set(FAR)), denoiser.reads)
+    np.testing.assert_array_equal(run(denoiser)(params, frames), run(explicit)(params, frames))
+
+
 def test_depth_feature_is_independent_of_units(rng: np.random.Generator) -> None:
     depth = jnp.asarray(rng.uniform(0.5, 40, size=(6, 7, 1)), jnp.float32).at[0, 0].set(FAR)
     feature = depth_feature(depth)
@@ -383,7 +469,7 @@ def test_depth_feature_is_independent_of_units(rng: np.random.Generator) -> None
     [
         *({name: "nonsense"} for name in ("size", "motion", "preset", "alpha_at", "down", "up", "pyramid", "domain")),
         *({name: "nonsense"} for name in ("depth_scale", "border", "first_frame", "missing_history")),
-        *({name: "nonsense"} for name in ("demodulate", "truncate", "compute_dtype")),
+        *({name: "nonsense"} for name in ("demodulate", "truncate", "compute_dtype", "kernels", "background")),
     ],
     ids=lambda options: next(iter(options)),
 )

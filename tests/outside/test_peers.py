@@ -32,6 +32,10 @@ def lively(params, key):
     return jax.tree.map(lambda leaf: 1.5 * leaf + 0.1 * jax.random.normal(key, leaf.shape), params)
 
 
+PLAIN = {"kernels": "plain", "background": "filter"}
+"""The version written in PyTorch is that of the shipped weights."""
+
+
 def relative(a, b):
     return np.linalg.norm(np.asarray(a) - np.asarray(b)) / np.linalg.norm(np.asarray(b))
 
@@ -43,7 +47,7 @@ def test_pytorch_gives_the_same_images(key, x64):
     from experiments.speed.peers import pytorch
 
     frames = double(scene.clip(3, 16, 32).frames)
-    denoiser = ntd(size=TINY)
+    denoiser = ntd(size=TINY, **PLAIN)
     params = lively(denoiser.init(key, frame_at(frames, 0)), key)
     forms = (pytorch.apply_kernels_loop, pytorch.apply_kernels_unfold)
     theirs = [pytorch.NTD(TINY, params, apply_kernels=form).double().eval() for form in forms]
@@ -66,7 +70,7 @@ def test_pytorch_has_the_same_loss_and_gradients(key, x64):
 
     clips = [scene.clip(3, 16, 16, seed=seed) for seed in range(2)]
     batch: Clip = double(jax.tree.map(lambda *leaves: np.stack(leaves), *clips))
-    denoiser = ntd(size=TINY)
+    denoiser = ntd(size=TINY, **PLAIN)
     params = lively(initial_state(denoiser, RECIPE, batch).params, key)
 
     def batch_loss(params):
