@@ -12,8 +12,8 @@ from jaxdn import brdf
 from jaxdn.denoiser import Denoiser, Recurrent
 from jaxdn.frame import FAR, Frame, frame_at, only
 from jaxdn.methods.ntd import depth_feature, guided_features, ntd
-from jaxdn.weights import load_weights
 from jaxdn.rollout import unroll
+from jaxdn.weights import load_weights
 from tests.plainly import jit_plainly
 
 TINY = ((4,), (4,), (5,), (5,), (6,))

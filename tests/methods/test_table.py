@@ -154,7 +154,7 @@ def test_presets_are_what_the_given_options_override(given, expected, monkeypatc
 def test_ntds_own_preset_is_parity(rng):
     """Not the spy's: with the options of PARITY written out it computes the same, and with others it does not."""
     frame = Frame(jnp.asarray(rng.exponential(size=(16, 16, 3)), jnp.float32), depth=jnp.full((16, 16, 1), 4.0))
-    names = ("down", "depth_scale", "border", "first_frame", "missing_history", "demodulate")
+    names = ("down", "depth_scale", "border", "first_frame", "missing_history", "kernels", "background", "demodulate")
     written = {name: getattr(PARITY, name) for name in names}
     assert dataclasses.replace(Options(), **written) == PARITY
     ntd = jaxdn.denoisers.ntd

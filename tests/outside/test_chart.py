@@ -296,8 +296,9 @@ def test_steps_with_known_parts_are_broken_down(denoisers):
     names = [subject.name for subject in subjects(denoisers, quick=True)]
     assert names == ["ntd-large, reference", "ntd-small, reference"]
     tiny = {"size": ((4,), (4,), (5,), (5,), (6,))}
-    assert not list(subjects([untrained(method_named("ntd"), **tiny, domain="compressed")]))
-    subject = next(subjects([untrained(method_named("ntd"), **tiny)]))
+    plain = {**tiny, "kernels": "plain", "background": "filter"}
+    assert not list(subjects([untrained(method_named("ntd"), **plain, domain="compressed")]))
+    subject = next(subjects([untrained(method_named("ntd"), **plain)]))
     parts = breakdown(subject, frame_at(scene.clip(2, 16, 32).frames, 1), rounds=2)
     assert list(parts)[-1] == WHOLE
     assert len(parts) == 5
