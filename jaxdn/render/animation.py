@@ -9,14 +9,17 @@ One JSON object next to the scene file; every part is optional:
                                                      "axis": [0, 1, 0], "angle": 90}]}},
      "inserted": [{"id": "ball", "type": "sphere", "size": 0.4, "color": [0.8, 0.2, 0.1], "roughness": 0.3,
                    "keys": [{"frame": 0, "translation": [0, 0.2, 1]}, ...]}],
-     "lights": {"lamp": [{"frame": 0, "scale": 1}, {"frame": 8, "scale": 0}]}}
+     "lights": {"lamp": [{"frame": 0, "scale": 1}, {"frame": 8, "scale": 0}]},
+     "materials": {"Oak": {"hue": 120, "saturation": 1.5, "tint": [1, 0.8, 0.6], "roughness": 0.3}}}
 
 Camera keys have ``origin``, ``target``, ``up`` or a rigid camera-to-world ``matrix``, and ``fov``, the horizontal
 field of view in degrees. A shape's keys move it from its place in the scene file: a rotation about its ``pivot``,
 then a translation. An inserted shape is a sphere, cube, cylinder (along z) or rectangle (facing +z) that fills a box of
 ``size`` (one number or its extents) around the origin; its keys place it. Between keys, positions are interpolated
 linearly, rotations about one axis linearly in the angle, other rotations spherically; before the first and after the
-last key nothing moves. ``lights`` names emitters, or shapes that emit, and scales their radiance.
+last key nothing moves. ``lights`` names emitters, or shapes that emit, and scales their radiance: by one number, or by
+three for red, green and blue. ``materials`` names BSDFs, or shapes whose BSDF has no id, and changes their colours and
+roughness for the whole clip (:func:`jaxdn.render.repaint.repaint` has the formula).
 """
 
 import difflib
@@ -29,9 +32,10 @@ from typing import Any
 import numpy as np
 
 PRIMITIVES = ("sphere", "cube", "cylinder", "rectangle")
-_TOP = ("frames", "camera", "shapes", "inserted", "lights")
+_TOP = ("frames", "camera", "shapes", "inserted", "lights", "materials")
 _LOOK = ("origin", "target", "up")
 _RIGID = ("frame", "translation", "axis", "angle")
+_MATERIAL = ("hue", "saturation", "tint", "roughness")
 _INSERTED = ("id", "type", "size", "color", "roughness", "metallic", "bsdf", "emission", "keys")
 
 
@@ -96,11 +100,12 @@ class CameraKeys:
         return float(np.interp(frame, self.frames, [key["fov"] for key in self.keys]))
 
 
-def light_scale(keys: Sequence[Mapping[str, Any]], frame: float) -> float:
-    """The factor on a light's radiance at one time."""
-    frames, scales = [key["frame"] for key in keys], [float(key["scale"]) for key in keys]
-    first, second, share = _between(np.array(frames, float), frame)
-    return float(_mix(scales[first], scales[second], share))
+def light_scale(keys: Sequence[Mapping[str, Any]], frame: float) -> float | tuple[float, ...]:
+    """The factor on a light's radiance at one time: a number, or three if they differ."""
+    scales = [np.broadcast_to(np.array(key["scale"], float), 3) for key in keys]
+    first, second, share = _between(np.array([key["frame"] for key in keys], float), frame)
+    red, green, blue = (float(value) for value in _mix(scales[first], scales[second], share))
+    return red if red == green == blue else (red, green, blue)
 
 
 def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
@@ -202,8 +207,25 @@ def check_animation(animation: Any, shape_ids: Iterable[str], *, has_camera: boo
         for index, key in enumerate(keys):
             at = f"animation lights {name!r}[{index}]"
             _known(key, ("frame", "scale"), at)
-            if _numbers([key.get("scale")], 1, f"{at} scale")[0] < 0:
-                raise ValueError(f"{at} scale: expected a factor >= 0, got {key['scale']!r}.")
+            scale = key.get("scale")
+            colored = isinstance(scale, Sequence)
+            if (_numbers(scale if colored else [scale], 3 if colored else 1, f"{at} scale") < 0).any():
+                raise ValueError(f"{at} scale: expected a factor >= 0, got {scale!r}.")
+    _check_materials(animation.get("materials", {}))
+
+
+def _check_materials(materials: Any) -> None:
+    if not isinstance(materials, Mapping):
+        raise ValueError(f"animation materials: expected an object of material to changes, got {materials!r}.")
+    for name, changes in materials.items():
+        place = f"animation materials {name!r}"
+        _known(changes, _MATERIAL, place)
+        for key, value in changes.items():
+            values = _numbers(value if key == "tint" else [value], 3 if key == "tint" else 1, f"{place} {key}")
+            if key != "hue" and (values < 0).any():
+                raise ValueError(f"{place} {key}: expected no number below 0, got {value!r}.")
+            if key in ("tint", "roughness") and (values > 1).any():
+                raise ValueError(f"{place} {key}: expected no number above 1, got {value!r}.")
 
 
 def _check_camera(keys: Any, has_camera: bool) -> None:

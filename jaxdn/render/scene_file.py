@@ -6,6 +6,7 @@ format keep that format, so that Mitsuba upgrades them as it would the file.
 """
 
 import copy
+import difflib
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
@@ -81,6 +82,8 @@ class SceneFile:
             self._motions[name] = RigidKeys(shape.get("keys", [{"frame": 0}]), np.zeros(3))
         self._lights = animation.get("lights", {})
         _check_lights(self._tree, self._lights, path)
+        self._materials = animation.get("materials", {})
+        _check_materials(self._tree, self._materials, path)
         self._still: tuple[str, list[Any]] | None = None
 
     def camera(self, frame: float) -> Camera:
@@ -98,8 +101,8 @@ class SceneFile:
         """Shape id -> [4, 4] motion by the keys, from the shape's place in the file."""
         return {name: motion(frame) for name, motion in self._motions.items()}
 
-    def brightness(self, frame: float) -> dict[str, float]:
-        """Light -> factor on its radiance, for lights with keys."""
+    def brightness(self, frame: float) -> dict[str, float | tuple[float, ...]]:
+        """Light -> factor on its radiance, one or three for red, green and blue, for lights with keys."""
         return {name: light_scale(keys, frame) for name, keys in self._lights.items()}
 
     def build(self, frame: float, width: int, height: int) -> Any:
@@ -107,14 +110,17 @@ class SceneFile:
         import mitsuba as mi
 
         from jaxdn.render.plugins import shape_groups
+        from jaxdn.render.repaint import repaint
 
         variant = str(mi.variant())
         if self._still is None or self._still[0] != variant:
             rests = _kept(self._tree, lambda element: element.get("id") not in {*self._motions, *self._lights})
             still = _load(rests)
+            repaint(still, self._materials)
             # Groups are kept for inspection: instances do not show their contents.
             self._still = variant, [*still.shapes(), *shape_groups(still), *_lamps(still)]
         moving = _load(self.describe(frame, width, height))
+        repaint(moving, self._materials)
         fresh = [*moving.shapes(), *shape_groups(moving), *_lamps(moving)]
         parts = {part.id(): part for part in [*self._still[1], *fresh]}
         parts |= {"animation_sensor": moving.sensors()[0], "animation_integrator": moving.integrator()}
@@ -127,7 +133,7 @@ class SceneFile:
         changing = {*poses, *self._lights}
         scene = copy.deepcopy(_kept(self._tree, lambda element: element.get("id") in changing))
         for name, factor in self.brightness(frame).items():
-            _scale_light(_light(scene, name), factor)
+            _scale_light(_light(scene, name), np.broadcast_to(factor, 3))
         for element in scene.findall("shape"):
             if element.get("id") not in poses:
                 continue
@@ -215,13 +221,16 @@ def _absolute_files(root: ET.Element, path: Path) -> None:
 
 
 def _name_shapes(root: ET.Element) -> list[str]:
-    """The ids of the top-level shapes, after adding the missing ones."""
+    """The ids of the top-level shapes, after adding the missing ones, also those of emitters."""
     taken = {element.get("id") for element in root.iter() if element.get("id")}
     for index, element in enumerate(root.findall("shape")):
         name = element.get("id") or f"shape_{index}"
         while element.get("id") is None and name in taken:
             name += "_"
         element.set("id", name if element.get("type") == "shapegroup" else name.replace(".", "_"))
+    for index, element in enumerate(root.findall("emitter")):
+        if element.get("id") is None and f"light_{index}" not in taken:
+            element.set("id", f"light_{index}")
     return [element.get("id", "") for element in root.findall("shape") if element.get("type") != "shapegroup"]
 
 
@@ -275,6 +284,21 @@ def _check_lights(root: ET.Element, keys: Mapping[str, Any], path: Path) -> None
             raise ValueError(f"animation lights: the scene {path} has no light {name!r}; it has {lights}.")
         if not _powers(emitter) and emitter.get("type") != "envmap":
             raise ValueError(f"animation lights: {name!r} has no colour or number to scale; give it one in the scene.")
+        colored = any(np.ptp(np.broadcast_to(key["scale"], 3)) > 0 for key in keys[name])
+        if colored and (not _powers(emitter) or any(part.tag != "rgb" for part in _powers(emitter))):
+            raise ValueError(
+                f"animation lights: {name!r} is not given in red, green and blue; expected one number as its scale."
+            )
+
+
+def _check_materials(root: ET.Element, materials: Mapping[str, Any], path: Path) -> None:
+    """Raise ValueError for a name that is neither a BSDF of the scene nor a shape with one of its own."""
+    inline = [shape.get("id", "") for shape in root.findall("shape") if shape.find("bsdf") is not None]
+    names = [element.get("id", "") for element in root.iter("bsdf") if element.get("id")] + inline
+    for name in materials:
+        if name not in names:
+            near = ", ".join(difflib.get_close_matches(name, names, 5, 0.4) or names[:8]) or "none"
+            raise ValueError(f"animation materials: the scene {path} has no material {name!r}; near: {near}.")
 
 
 def _powers(emitter: ET.Element) -> list[ET.Element]:
@@ -283,18 +307,23 @@ def _powers(emitter: ET.Element) -> list[ET.Element]:
     return [part for part in emitter if part.get("name") in names and part.tag in ("rgb", "spectrum", "float")]
 
 
-def _scale_light(emitter: ET.Element | None, factor: float) -> None:
+def _scale_light(emitter: ET.Element | None, factors: np.ndarray) -> None:
+    """Multiply an emitter's brightness by three factors, which are equal for one that is not red, green and blue."""
     assert emitter is not None  # _check_lights has checked it
     if emitter.get("type") == "envmap":
         own = next((part for part in emitter if part.get("name") == "scale"), None)
         if own is None:
             own = ET.SubElement(emitter, "float", name="scale", value="1")
-        own.set("value", repr(float(own.get("value", "1")) * factor))
+        own.set("value", repr(float(own.get("value", "1")) * float(factors[0])))
     for part in _powers(emitter):
         numbers = part.get("value", "0").replace(",", " ").split()
+        if part.tag == "rgb":
+            values = np.broadcast_to([float(number) for number in numbers], 3) * factors
+            part.set("value", " ".join(repr(float(value)) for value in values))
+            continue
         # "wavelength:value" pairs of a spectrum scale in their values.
         pairs = [number.rpartition(":") for number in numbers]
-        part.set("value", " ".join(f"{head}{colon}{float(value) * factor!r}" for head, colon, value in pairs))
+        part.set("value", " ".join(f"{head}{colon}{float(value) * float(factors[0])!r}" for head, colon, value in pairs))
 
 
 def _transform(shape: ET.Element) -> ET.Element | None:
