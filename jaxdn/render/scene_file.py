@@ -61,7 +61,7 @@ class SceneFile:
         self._tree = _read_xml(path)
         _absolute_files(self._tree, path)
         self._shapes = _name_shapes(self._tree)
-        self._rest, self._near, self._far = _rest_camera(self._tree)
+        self._rest, self.near, self._far = _rest_camera(self._tree)
         check_animation(animation, self._shapes, has_camera=self._rest is not None)
         if self._rest is None and "camera" not in animation:
             raise ValueError(
@@ -146,7 +146,7 @@ class SceneFile:
         ET.SubElement(scene, "integrator", type="path").append(_value("max_depth", self.max_depth))
         camera = self.camera(frame)
         sensor = ET.SubElement(scene, "sensor", type="perspective")
-        for key, value in {"fov": camera.x_fov, "near_clip": self._near, "far_clip": self._far}.items():
+        for key, value in {"fov": camera.x_fov, "near_clip": self.near, "far_clip": self._far}.items():
             sensor.append(_value(key, float(value)))
         sensor.append(_value("fov_axis", "x"))
         to_world = ET.SubElement(sensor, "transform", name="to_world")

@@ -1,0 +1,304 @@
+"""Tours: any scene file, animated by a seed, as training data from furnished rooms.
+
+A tour is an ordinary animation (:mod:`jaxdn.render.animation`): a camera on a collision-free path, things of the room
+that move and things thrown in, changed materials, and changed lights. Its record holds the animation in full, so that
+the scene is built again without the search that found it.
+"""
+
+import functools
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+import numpy as np
+
+from jaxdn.render.animation import CameraKeys, rotation_matrix
+from jaxdn.render.free_space import FreeSpace
+from jaxdn.render.gbuffer import shape_names
+from jaxdn.render.repaint import changeable, named_materials
+from jaxdn.render.scene import Camera
+from jaxdn.render.scene_file import SceneFile
+from jaxdn.render.tour_things import focal, moved_shapes, thrown_things
+
+_ATTEMPTS = 16
+_VIEWS = 48
+"""Views that are compared for one attempt."""
+_SIDE, _SAMPLES = 24, 16
+"""Size of the images that measure a view's light, and their samples per pixel."""
+_DARK = 0.03
+"""A frame that is darker than this share of the tour's brightest is rejected."""
+
+
+class _Plan(NamedTuple):
+    """A tour before its light is measured."""
+
+    animation: dict[str, Any]
+    level: float
+    """Wanted mean radiance."""
+
+
+def tour(path: Path | str, seed: int, frames: int) -> SceneFile:
+    """The tour of a scene file for one seed, ``frames`` long; the same arguments always give the same tour.
+
+    Speeds are in pixels per frame at an image width of 128. The camera mostly moves by 0.2 to 3, sometimes by up to 30
+    (it pans) or hardly at all; things by 0.3 to 30. Fields of view are 35 to 80 degrees. The mean radiance of the
+    image is drawn from 0.01 to 0.8. Raises ValueError for files that cannot be read or rendered, for a scene without
+    free space around its camera, and for one in which no tour is found.
+    """
+    if frames < 1:
+        raise ValueError(f"tour frames: expected at least 1, got {frames}.")
+    path = Path(path)
+    space = _space(os.path.abspath(path), path.stat().st_mtime if path.is_file() else 0.0)
+    reason = ""
+    for attempt in range(_ATTEMPTS):
+        rng = np.random.default_rng([seed, attempt])
+        plan = _plan(space, rng, frames)
+        if plan is None:
+            reason = "no view shows enough"
+            continue
+        scene = SceneFile.from_record({"file": str(path), "animation": plan.animation})
+        levels, reason = _verdict(space, scene, frames)
+        if not reason:
+            factor = float(np.clip(plan.level / max(np.median(levels), 1e-9), 1e-4, 1e4))
+            animation = _brighter(plan.animation, factor)
+            return SceneFile.from_record({"file": str(path), "animation": animation})
+    raise ValueError(
+        f"tour of {space.file.name}, seed {seed}: expected a view that shows the room, found none in {_ATTEMPTS} "
+        f"attempts (the last: {reason}); leave this seed out."
+    )
+
+
+@functools.lru_cache(maxsize=1)
+def _space(path: str, changed: float) -> FreeSpace:
+    """The free space of a file, for all seeds."""
+    return FreeSpace(SceneFile.from_record({"file": path}))
+
+
+def _plan(space: FreeSpace, rng: np.random.Generator, frames: int) -> _Plan | None:
+    """An animation of the room; None if none of the views is good."""
+    view = _view(space, rng)
+    if view is None:
+        return None
+    keys = _camera_keys(space, view, rng, frames)
+    path = CameraKeys(keys)
+    cameras = [Camera(path(frame), view.x_fov) for frame in range(frames)]
+    level = float(10 ** (rng.uniform(-2, -1.2) if rng.random() < 0.25 else rng.uniform(-1.2, -0.1)))
+    images = _light_images(space, cameras[frames // 2])
+    if sum(_level(image) for image in images.values()) <= 0:
+        return None
+    lights = _light_keys(images, rng, frames, level)
+    moved = moved_shapes(space, cameras, rng, int(rng.integers(0, 5)), keep=set(lights))
+    animation: dict[str, Any] = {"frames": frames, "camera": keys}
+    parts = {
+        "shapes": moved,
+        "inserted": thrown_things(space, cameras, rng, int(rng.integers(1, 7)), level),
+        "lights": lights,
+        "materials": _materials(space, rng),
+    }
+    return _Plan(animation | {name: part for name, part in parts.items() if part}, level)
+
+
+def _view(space: FreeSpace, rng: np.random.Generator) -> Camera | None:
+    """The best of some random views: many things, near and far ones, none too close; None if all are poor."""
+    cameras = []
+    for spot in space.spots[rng.integers(len(space.spots), size=_VIEWS)]:
+        pitch, turn = np.radians(rng.uniform(-30, 12)), rng.uniform(0, 360)
+        ahead = np.roll(space.up, 1) * np.cos(pitch) + space.up * np.sin(pitch)
+        forward = rotation_matrix(space.up, turn) @ ahead
+        cameras.append(Camera(_looking(space, spot, forward), float(rng.uniform(35, 80))))
+    views = space.judge(cameras)
+    good = (views.empty < 0.35) & (views.close < 0.3) & (views.largest < 0.7)
+    good &= (views.shapes >= min(4, len(space.scene.shapes()))) & (views.spread > 0.4)
+    good &= views.nearest > 1.5 * space.clear
+    # Noise in the score, so that the richest corner of a room is not in every tour.
+    score = np.log(views.shapes + 1.0) + views.spread - views.largest - views.empty + rng.normal(0, 0.4, _VIEWS)
+    return cameras[int(np.argmax(np.where(good, score, -np.inf)))] if good.any() else None
+
+
+def _looking(space: FreeSpace, origin: np.ndarray, forward: np.ndarray) -> np.ndarray:
+    """[4, 4] camera to world, upright."""
+    key = {"frame": 0, "origin": origin, "target": origin + forward, "up": space.up}
+    return CameraKeys([key])(0)
+
+
+def _camera_keys(space: FreeSpace, view: Camera, rng: np.random.Generator, frames: int) -> list[dict[str, Any]]:
+    """Camera keys of a path that begins at a view: nearly still, slow, fast, or panning."""
+    style = rng.choice(["still", "slow", "fast", "pan"], p=[0.15, 0.5, 0.15, 0.2])
+    low, high = {"still": (0.02, 0.2), "slow": (0.2, 3), "fast": (2, 8), "pan": (4, 30)}[str(style)]
+    speed = float(np.exp(rng.uniform(np.log(low), np.log(high)))) / focal(view)
+    middle = float(space.judge([view]).middle[0])
+    if style == "pan":
+        return _panning(space, view, rng, frames, float(np.degrees(speed)), middle)
+    origin, forward = view.to_world[:3, 3], view.to_world[:3, 2]
+    # Moving ahead changes the image less than moving sideways.
+    step = view.to_world[:3, :3] @ (rng.normal(size=3) * (1, 0.4, 1.2))
+    step = step / np.linalg.norm(step) * min(speed * middle * max(frames - 1, 1), 1.5 * space.reach)
+    corners = int(rng.integers(1, 4))
+    for _ in range(8):
+        bends = [rotation_matrix(space.up, angle) for angle in np.cumsum(rng.uniform(-45, 45, corners))]
+        places = np.cumsum([origin, *(bend @ step / corners for bend in bends)], axis=0)
+        if space.is_free_way(places):
+            break
+        step = 0.6 * step
+    else:
+        places = np.repeat(origin[None], corners + 1, axis=0)
+    # At 1 the camera looks ahead all the time, at 0 at one place.
+    follow = rng.uniform(0, 1)
+    targets = origin + middle * forward + follow * (places - origin)
+    times = np.linspace(0, max(frames - 1, 1), corners + 1)
+    return [_camera_key(space, view, *key) for key in zip(times, places, targets, strict=True)]
+
+
+def _panning(
+    space: FreeSpace, view: Camera, rng: np.random.Generator, frames: int, rate: float, middle: float
+) -> list[dict[str, Any]]:
+    """A key for every frame of a camera that turns by ``rate`` degrees a frame, to and fro between two angles."""
+    widest = rng.uniform(40, 140)
+    start = rng.uniform(-0.5, 0.5) * widest
+    sign = rng.choice([-1, 1])
+    phases = np.mod(start + widest / 2 + rate * np.arange(max(frames, 2)), 2 * widest)
+    angles = sign * (widest / 2 - np.abs(phases - widest) + widest / 2)
+    origin, forward = view.to_world[:3, 3], view.to_world[:3, 2]
+    turned = [rotation_matrix(space.up, angle - angles[0]) @ forward for angle in angles]
+    return [_camera_key(space, view, at, origin, origin + middle * one) for at, one in enumerate(turned)]
+
+
+def _camera_key(
+    space: FreeSpace, view: Camera, at: float, origin: np.ndarray, target: np.ndarray
+) -> dict[str, Any]:
+    key = {"frame": float(at), "origin": origin.tolist(), "target": target.tolist(), "up": space.up.tolist()}
+    return {**key, "fov": view.x_fov}
+
+
+def _light_images(space: FreeSpace, camera: Camera) -> dict[str, np.ndarray]:
+    """Name -> [side, side] luminance that each light alone gives the view."""
+    sensor = mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": camera.x_fov,
+            "near_clip": space.near,
+            "to_world": mi.ScalarTransform4f(camera.to_world),
+            "sampler": {"type": "independent"},
+            "film": {"type": "hdrfilm", "width": _SIDE, "height": _SIDE, "rfilter": {"type": "box"}},
+        }
+    )
+    integrator = mi.load_dict({"type": "path", "max_depth": min(space.file.max_depth, 8)})
+    emitters = [mi.traverse(emitter) for emitter in space.scene.emitters()]
+    keys = [[key for key in one.keys() if key.endswith((".value", ".data", "scale"))] for one in emitters]
+    own = [{key: one[key] for key in names} for one, names in zip(emitters, keys, strict=True)]
+    images = {}
+    for shining, emitter in enumerate(space.scene.emitters()):
+        for index, (one, values) in enumerate(zip(emitters, own, strict=True)):
+            for key, value in values.items():
+                one[key] = value if index == shining else 0 * value
+            one.update()
+        image = mi.render(space.scene, sensor=sensor, integrator=integrator, spp=_SAMPLES, seed=0)
+        name = emitter.get_shape().id() if emitter.get_shape() is not None else emitter.id()
+        images[name] = np.nan_to_num(np.array(image, np.float64))[..., :3].mean(axis=-1)
+    for one, values in zip(emitters, own, strict=True):
+        for key, value in values.items():
+            one[key] = value
+        one.update()
+    return images
+
+
+def _level(image: np.ndarray) -> float:
+    """Mean of the darker 90 % of an image's pixels, so that a visible lamp does not count."""
+    values = np.sort(image.ravel())
+    return float(values[: max(1, int(0.9 * len(values)))].mean())
+
+
+def _light_keys(
+    images: Mapping[str, np.ndarray], rng: np.random.Generator, frames: int, level: float
+) -> dict[str, list[dict[str, Any]]]:
+    """An animation's "lights": tints, lights that are off, and one that is switched or dims in the clip."""
+    names = sorted(images)
+    gains = {name: float(np.exp(rng.normal(0, 0.6))) for name in names}
+    for name in names:
+        left = sum(gains[other] * _level(images[other]) for other in names if other != name)
+        if rng.random() < 0.2 and left > 0.1 * gains[name] * _level(images[name]):
+            gains[name] = 0.0
+    factor = level / max(_level(sum((gains[name] * images[name] for name in names), np.zeros(1))), 1e-9)
+    tint = {name: _tint(rng) for name in names}
+    keys = {name: [{"frame": 0.0, "scale": (factor * gains[name] * tint[name]).tolist()}] for name in names}
+    lit = [name for name in names if gains[name] > 0]
+    if frames > 2 and rng.random() < 0.4:
+        name = str(rng.choice(lit))
+        rest = sum(gains[other] * _level(images[other]) for other in lit if other != name)
+        # Without other light it dims and is not switched off.
+        least = 0.0 if rest > 0.1 * gains[name] * _level(images[name]) else rng.uniform(0.1, 0.4)
+        at = int(rng.integers(1, frames - 1)) if frames > 3 else 1
+        over = 1 if rng.random() < 0.6 else int(rng.integers(1, frames - at + 1))
+        ends = [keys[name][0]["scale"], (least * np.array(keys[name][0]["scale"])).tolist()]
+        if rng.random() < 0.5:
+            ends.reverse()
+        keys[name] = [
+            {"frame": float(when), "scale": scale} for when, scale in zip((at - 1, at - 1 + over), ends, strict=True)
+        ]
+    return keys
+
+
+def _tint(rng: np.random.Generator) -> np.ndarray:
+    """[3] factors from warm to cold light, now and then a colour; their mean is 1."""
+    warm = rng.normal(0, 0.25)
+    tint = np.exp([warm, 0.0, -warm])
+    if rng.random() < 0.15:
+        tint = tint * rng.uniform(0.15, 1.0, 3)
+    return tint / tint.mean()
+
+
+def _materials(space: FreeSpace, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
+    """An animation's "materials": other hues, saturations, tints and roughnesses for a random share of them."""
+    share = rng.choice([0.15, 0.5, 0.9])
+    changes: dict[str, dict[str, Any]] = {}
+    for name, bsdf in sorted(dict(named_materials(space.scene)).items()):
+        colored, rough = changeable(bsdf)
+        change: dict[str, Any] = {}
+        if colored and rng.random() < share:
+            change["hue"] = float(rng.uniform(-180, 180))
+            change["saturation"] = float(rng.uniform(0.7, 2.5))
+            if rng.random() < 0.4:  # what is grey has no hue to turn
+                change["tint"] = (1 - rng.uniform(0.2, 1) * (1 - rng.uniform(0.1, 1.0, 3))).tolist()
+        if rough and rng.random() < 0.5 * share:
+            change["roughness"] = float(rng.uniform(0.1, 0.8))
+        if change:
+            changes[name] = change
+    return changes
+
+
+def _verdict(space: FreeSpace, scene: SceneFile, frames: int) -> tuple[list[float], str]:
+    """Levels of light in the first, middle and last frame, and why the tour is no good ("" if it is)."""
+    levels, thrown = [], False
+    for frame in sorted({0, frames // 2, frames - 1}):
+        built = scene.build(frame, _SIDE, _SIDE)
+        camera = scene.camera(frame)
+        seen = space.judge([camera], built)
+        if seen.empty[0] > 0.7 or seen.close[0] > 0.6 or seen.largest[0] > 0.9:
+            return [], "a wall, the outside or a thing fills the view"
+        if seen.nearest[0] < 1.3 * space.near:
+            return [], "the near clip cuts a thing"
+        image = np.array(mi.render(built, spp=_SAMPLES, seed=frame), np.float64)
+        levels.append(_level(np.nan_to_num(image)[..., :3].mean(axis=-1)))
+        thrown = thrown or _shows_thrown(space, built, camera)
+    if min(levels) <= _DARK * max(levels):
+        return levels, "a frame is black"
+    return levels, "" if thrown else "nothing thrown in is seen"
+
+
+def _shows_thrown(space: FreeSpace, built: Any, camera: Camera) -> bool:
+    from jaxdn.render.free_space import cast, view_rays
+
+    seen = cast(built, camera.to_world[:3, 3], view_rays(camera, 48)).shape
+    names = shape_names(built)
+    return any(names[int(index)].startswith("thrown_") for index in np.unique(seen[seen >= 0]))
+
+
+def _brighter(animation: Mapping[str, Any], factor: float) -> dict[str, Any]:
+    """The animation with all of the room's lights scaled."""
+
+    def scaled(keys: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+        return [{**key, "scale": [factor * value for value in key["scale"]]} for key in keys]
+
+    return {**animation, "lights": {name: scaled(keys) for name, keys in animation["lights"].items()}}
