@@ -49,6 +49,8 @@ class Render:
     jaxdn render fruit --seeds 0 1 2 -o data/train
 
     jaxdn render kitchen/scene.xml --animation kitchen.json -o data/kitchen
+
+    jaxdn render kitchen/scene.xml --tour --seeds 0-49 -o data/train
     """
 
     scene: tyro.conf.Positional[str]
@@ -57,8 +59,10 @@ class Render:
     """Output folder; it gets one folder per clip."""
     animation: Path | None = None
     """Animation file (JSON: camera keys, rigid keys, inserted shapes) for a scene file."""
-    seeds: list[int] = field(default_factory=lambda: [0])
-    """One clip of the family for each seed; for a scene file, the seeds of the noise."""
+    tour: bool = False
+    """Make an animation of the scene file for each seed: camera path, moving things, materials and lights."""
+    seeds: list[str] = field(default_factory=lambda: ["0"])
+    """One clip of the family, or tour of the scene, for each seed, such as 3 or 0-49; else the seeds of the noise."""
     width: int = 128
     height: int = 128
     frames: int = 10
@@ -194,7 +198,8 @@ def _render(options: Render) -> None:
         options.scene,
         options.out,
         animation=options.animation,
-        seeds=options.seeds,
+        tours=options.tour,
+        seeds=_numbers(options.seeds),
         width=options.width,
         height=options.height,
         frames=options.frames,
@@ -205,6 +210,19 @@ def _render(options: Render) -> None:
         effects=options.effects,
         workers=options.workers,
     )
+
+
+def _numbers(words: list[str]) -> list[int]:
+    """The whole numbers of words such as 3 and 0-49, whose ends count. Raises ValueError for anything else."""
+    numbers: list[int] = []
+    for word in words:
+        first, _, last = word.partition("-")
+        if not first.isdecimal() or not (last or first).isdecimal() or word.endswith("-"):
+            raise ValueError(f"--seeds: expected whole numbers >= 0 or ranges such as 0-49, got {word!r}.")
+        if last and int(last) < int(first):
+            raise ValueError(f"--seeds: expected a range from low to high, got {word!r}; swap its ends.")
+        numbers += range(int(first), int(last or first) + 1)
+    return numbers
 
 
 def _train(options: Train) -> None:

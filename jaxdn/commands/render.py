@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxdn.clips.folder import begun_record
 from jaxdn.denoiser import Denoiser
 from jaxdn.effects import Effects, Plan, chosen, inspect, plan
 from jaxdn.render.depth import PathDepth, measure_depth
@@ -12,7 +13,7 @@ from jaxdn.render.farm import ClipJob, render_clips
 from jaxdn.render.opening import family_scene
 from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.scene_file import SceneFile
-from jaxdn.render.variant import choose_variant
+from jaxdn.render.variant import choose_variant, use_variant
 
 
 class Planned(NamedTuple):
@@ -66,6 +67,7 @@ def render(
     out: Path,
     *,
     animation: Path | None,
+    tours: bool = False,
     seeds: Sequence[int],
     width: int,
     height: int,
@@ -81,9 +83,10 @@ def render(
 
     Args:
       source: a family, for which each seed gives another scene, or a Mitsuba scene (.xml), whose seeds differ only
-        in noise.
+        in noise unless ``tours`` is set.
       out: the folder for the clips.
       animation: animation file for a scene file; default: the one next to it.
+      tours: every seed gives another tour of the scene file (:func:`jaxdn.render.rooms.tour`) instead of its animation.
       seeds: one clip each.
       width: in pixels.
       height: in pixels.
@@ -98,7 +101,7 @@ def render(
     Prints the Mitsuba variant, each clip's effects, and the progress. Raises ValueError for a source that is not a
     scene and for options out of range, and RenderError, at the end, for clips that failed.
     """
-    scenes = _scenes(source, animation, seeds)
+    scenes = _tours(source, animation, seeds, frames, out) if tours else _scenes(source, animation, seeds)
     choice = choose_variant()
     print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
     size: dict[str, Any] = {"width": width, "height": height, "frames": frames}
@@ -135,3 +138,30 @@ def _scenes(
         scene = SceneFile(Path(source), animation)
         return [(scene.name, scene, list(seeds))]
     raise ValueError(f"scene {source!r}: expected a family ({', '.join(sorted(FAMILIES))}) or a Mitsuba scene (.xml).")
+
+
+def _tours(
+    source: str, animation: Path | None, seeds: Sequence[int], frames: int, out: Path
+) -> Iterable[tuple[str, AnimatedScene, list[int]]]:
+    """The same of a scene's tours; a tour that a folder's record describes already is not searched again."""
+    if not source.endswith(".xml"):
+        raise ValueError(f"tour of {source!r}: expected a Mitsuba scene (.xml); leave --tour out for a family.")
+    if animation is not None:
+        raise ValueError(
+            f"animation {animation}: expected none with --tour, which makes its own; leave one of them out."
+        )
+    if not Path(source).is_file():
+        raise ValueError(f"scene {source}: expected a Mitsuba scene (.xml), found no file.")
+    use_variant()
+    # Its names of Mitsuba exist only after a variant is chosen.
+    from jaxdn.render.rooms import tour
+
+    def scene(seed: int) -> SceneFile:
+        record = begun_record(out / f"{SceneFile.name_of(source)}-{seed}") or {}
+        made = record.get("scene", {})
+        same_file = "file" in made and Path(made["file"]).resolve() == Path(source).resolve()
+        if same_file and "inserted" in made.get("animation", {}) and record["frames"] == frames:
+            return SceneFile.from_record(made)
+        return tour(source, seed, frames)
+
+    return ((one.name, one, [seed]) for seed, one in ((seed, scene(seed)) for seed in seeds))

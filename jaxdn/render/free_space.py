@@ -1,5 +1,6 @@
 """The free space of a scene, found by rays: where a camera may be, what it sees there, and how far things can move."""
 
+import itertools
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -153,7 +154,7 @@ class FreeSpace:
     def is_free_way(self, points: np.ndarray) -> bool:
         """Whether a camera can move along the polyline through points [N, 3]: every part of it is clear."""
         steps = [points[:1]]
-        for first, second in zip(points[:-1], points[1:], strict=True):
+        for first, second in itertools.pairwise(points):
             length = float(np.linalg.norm(second - first))
             share = np.linspace(0, 1, 2 + int(2 * length / self.clear))[1:, None]
             steps.append(first + share * (second - first))

@@ -47,7 +47,7 @@ def named_materials(scene: Any) -> list[tuple[str, Any]]:
 def changeable(bsdf: Any) -> tuple[bool, bool]:
     """Whether a BSDF has colours, and a roughness, that can be changed."""
     parameters = mi.traverse(bsdf)
-    return any(_is_color(key, parameters[key]) for key in parameters.keys()), bool(_rough_keys(parameters))
+    return any(_is_color(key, value) for key, value in parameters), bool(_rough_keys(parameters))
 
 
 def _change(bsdf: Any, name: str, changes: Mapping[str, Any]) -> None:
@@ -103,9 +103,8 @@ def _is_color(key: str, value: Any) -> bool:
 
 def _rough_keys(parameters: Any) -> list[str]:
     """The keys of constant alphas and roughnesses."""
-    names = [key.removesuffix(".value").rpartition(".")[2] for key in parameters.keys()]
     return [
         key
-        for key, name in zip(parameters.keys(), names, strict=True)
-        if name in ("alpha", "alpha_u", "alpha_v", "roughness") and not key.endswith(".data")
+        for key in list(parameters.keys())
+        if key.removesuffix(".value").rpartition(".")[2] in ("alpha", "alpha_u", "alpha_v", "roughness")
     ]

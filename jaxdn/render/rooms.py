@@ -15,12 +15,13 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.animation import CameraKeys, rotation_matrix
-from jaxdn.render.free_space import FreeSpace
+from jaxdn.render.free_space import FreeSpace, cast, view_rays
 from jaxdn.render.gbuffer import shape_names
 from jaxdn.render.repaint import changeable, named_materials
 from jaxdn.render.scene import Camera
 from jaxdn.render.scene_file import SceneFile
 from jaxdn.render.tour_things import focal, moved_shapes, thrown_things
+from jaxdn.render.variant import use_variant
 
 _ATTEMPTS = 16
 _VIEWS = 48
@@ -49,12 +50,14 @@ def tour(path: Path | str, seed: int, frames: int) -> SceneFile:
     """
     if frames < 1:
         raise ValueError(f"tour frames: expected at least 1, got {frames}.")
+    if seed < 0:
+        raise ValueError(f"tour seed: expected at least 0, got {seed}.")
     path = Path(path)
-    space = _space(os.path.abspath(path), path.stat().st_mtime if path.is_file() else 0.0)
+    space = _space(os.path.abspath(path), path.stat().st_mtime if path.is_file() else 0.0, use_variant())
     reason = ""
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([seed, attempt])
-        plan = _plan(space, rng, frames)
+        plan = _plan(space, rng, frames, ease=attempt / _ATTEMPTS)
         if plan is None:
             reason = "no view shows enough"
             continue
@@ -71,14 +74,14 @@ def tour(path: Path | str, seed: int, frames: int) -> SceneFile:
 
 
 @functools.lru_cache(maxsize=1)
-def _space(path: str, changed: float) -> FreeSpace:
-    """The free space of a file, for all seeds."""
+def _space(path: str, changed: float, variant: str) -> FreeSpace:
+    """The free space of a file as it is now, for all seeds."""
     return FreeSpace(SceneFile.from_record({"file": path}))
 
 
-def _plan(space: FreeSpace, rng: np.random.Generator, frames: int) -> _Plan | None:
-    """An animation of the room; None if none of the views is good."""
-    view = _view(space, rng)
+def _plan(space: FreeSpace, rng: np.random.Generator, frames: int, *, ease: float) -> _Plan | None:
+    """An animation of the room; None if none of the views is good enough; ``ease`` in [0, 1) asks for less."""
+    view = _view(space, rng, ease)
     if view is None:
         return None
     keys = _camera_keys(space, view, rng, frames)
@@ -100,7 +103,7 @@ def _plan(space: FreeSpace, rng: np.random.Generator, frames: int) -> _Plan | No
     return _Plan(animation | {name: part for name, part in parts.items() if part}, level)
 
 
-def _view(space: FreeSpace, rng: np.random.Generator) -> Camera | None:
+def _view(space: FreeSpace, rng: np.random.Generator, ease: float) -> Camera | None:
     """The best of some random views: many things, near and far ones, none too close; None if all are poor."""
     cameras = []
     for spot in space.spots[rng.integers(len(space.spots), size=_VIEWS)]:
@@ -109,9 +112,8 @@ def _view(space: FreeSpace, rng: np.random.Generator) -> Camera | None:
         forward = rotation_matrix(space.up, turn) @ ahead
         cameras.append(Camera(_looking(space, spot, forward), float(rng.uniform(35, 80))))
     views = space.judge(cameras)
-    good = (views.empty < 0.35) & (views.close < 0.3) & (views.largest < 0.7)
-    good &= (views.shapes >= min(4, len(space.scene.shapes()))) & (views.spread > 0.4)
-    good &= views.nearest > 1.5 * space.clear
+    good = (views.empty < 0.35 + 0.25 * ease) & (views.close < 0.3 + 0.2 * ease) & (views.largest < 0.7 + 0.3 * ease)
+    good &= (views.shapes >= 4 - 3 * ease) & (views.spread > 0.4 - 0.2 * ease) & (views.nearest > 1.5 * space.clear)
     # Noise in the score, so that the richest corner of a room is not in every tour.
     score = np.log(views.shapes + 1.0) + views.spread - views.largest - views.empty + rng.normal(0, 0.4, _VIEWS)
     return cameras[int(np.argmax(np.where(good, score, -np.inf)))] if good.any() else None
@@ -165,9 +167,7 @@ def _panning(
     return [_camera_key(space, view, at, origin, origin + middle * one) for at, one in enumerate(turned)]
 
 
-def _camera_key(
-    space: FreeSpace, view: Camera, at: float, origin: np.ndarray, target: np.ndarray
-) -> dict[str, Any]:
+def _camera_key(space: FreeSpace, view: Camera, at: float, origin: np.ndarray, target: np.ndarray) -> dict[str, Any]:
     key = {"frame": float(at), "origin": origin.tolist(), "target": target.tolist(), "up": space.up.tolist()}
     return {**key, "fov": view.x_fov}
 
@@ -186,17 +186,18 @@ def _light_images(space: FreeSpace, camera: Camera) -> dict[str, np.ndarray]:
     )
     integrator = mi.load_dict({"type": "path", "max_depth": min(space.file.max_depth, 8)})
     emitters = [mi.traverse(emitter) for emitter in space.scene.emitters()]
-    keys = [[key for key in one.keys() if key.endswith((".value", ".data", "scale"))] for one in emitters]
-    own = [{key: one[key] for key in names} for one, names in zip(emitters, keys, strict=True)]
+    keys = [[key for key, _ in one if key.endswith((".value", ".data", "scale"))] for one in emitters]
+    # Copies: an assignment below changes the value in place.
+    own = [{key: type(one[key])(one[key]) for key in names} for one, names in zip(emitters, keys, strict=True)]
     images = {}
     for shining, emitter in enumerate(space.scene.emitters()):
         for index, (one, values) in enumerate(zip(emitters, own, strict=True)):
             for key, value in values.items():
                 one[key] = value if index == shining else 0 * value
             one.update()
-        image = mi.render(space.scene, sensor=sensor, integrator=integrator, spp=_SAMPLES, seed=0)
+        image = mi.render(space.scene, sensor=sensor, integrator=integrator, spp=_SAMPLES, seed=mi.UInt32(0))
         name = emitter.get_shape().id() if emitter.get_shape() is not None else emitter.id()
-        images[name] = np.nan_to_num(np.array(image, np.float64))[..., :3].mean(axis=-1)
+        images[name] = _luminance(image)
     for one, values in zip(emitters, own, strict=True):
         for key, value in values.items():
             one[key] = value
@@ -272,27 +273,38 @@ def _verdict(space: FreeSpace, scene: SceneFile, frames: int) -> tuple[list[floa
     """Levels of light in the first, middle and last frame, and why the tour is no good ("" if it is)."""
     levels, thrown = [], False
     for frame in sorted({0, frames // 2, frames - 1}):
-        built = scene.build(frame, _SIDE, _SIDE)
-        camera = scene.camera(frame)
-        seen = space.judge([camera], built)
-        if seen.empty[0] > 0.7 or seen.close[0] > 0.6 or seen.largest[0] > 0.9:
-            return [], "a wall, the outside or a thing fills the view"
-        if seen.nearest[0] < 1.3 * space.near:
-            return [], "the near clip cuts a thing"
-        image = np.array(mi.render(built, spp=_SAMPLES, seed=frame), np.float64)
-        levels.append(_level(np.nan_to_num(image)[..., :3].mean(axis=-1)))
-        thrown = thrown or _shows_thrown(space, built, camera)
+        level, reason, seen = _glance(space, scene, frame)
+        if reason:
+            return [], reason
+        levels.append(level)
+        thrown = thrown or seen
     if min(levels) <= _DARK * max(levels):
         return levels, "a frame is black"
     return levels, "" if thrown else "nothing thrown in is seen"
 
 
-def _shows_thrown(space: FreeSpace, built: Any, camera: Camera) -> bool:
-    from jaxdn.render.free_space import cast, view_rays
+def _glance(space: FreeSpace, scene: SceneFile, frame: int) -> tuple[float, str, bool]:
+    """One frame: its level of light, why it is no good ("" if it is), and whether a thing that was thrown in is seen.
 
+    Its scene is freed on return: beside a second one, the next would need new kernels.
+    """
+    built = scene.build(frame, _SIDE, _SIDE)
+    camera = scene.camera(frame)
+    view = space.judge([camera], built)
+    if view.empty[0] > 0.7 or view.close[0] > 0.6 or view.spread[0] < 0.12:
+        return 0.0, "a wall, the outside or a thing fills the view", False
+    if view.nearest[0] < 1.3 * space.near:
+        return 0.0, "the near clip cuts a thing", False
+    level = _level(_luminance(mi.render(built, spp=_SAMPLES, seed=mi.UInt32(frame))))
     seen = cast(built, camera.to_world[:3, 3], view_rays(camera, 48)).shape
     names = shape_names(built)
-    return any(names[int(index)].startswith("thrown_") for index in np.unique(seen[seen >= 0]))
+    thrown = any(names[int(index)].startswith("thrown_") for index in np.unique(seen[seen >= 0]))
+    return level, "", thrown
+
+
+def _luminance(image: Any) -> np.ndarray:
+    """[H, W] mean of the colours of a rendered image."""
+    return np.nan_to_num(np.array(image, np.float64))[..., :3].mean(axis=-1)
 
 
 def _brighter(animation: Mapping[str, Any], factor: float) -> dict[str, Any]:

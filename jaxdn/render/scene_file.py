@@ -57,6 +57,12 @@ class SceneFile:
         scene._open(Path(record["file"]), record.get("animation", {}))
         return scene
 
+    @staticmethod
+    def name_of(path: Path | str) -> str:
+        """The name of a scene file: that of its folder for ``scene.xml``, else its own."""
+        path = Path(path)
+        return path.parent.name if path.stem == "scene" and path.parent.name else path.stem
+
     def _open(self, path: Path, animation: dict[str, Any]) -> None:
         self._tree = _read_xml(path)
         _absolute_files(self._tree, path)
@@ -67,7 +73,7 @@ class SceneFile:
             raise ValueError(
                 f"scene {path}: expected a perspective sensor or an animation with camera keys, got neither."
             )
-        self.name = path.parent.name if path.stem == "scene" and path.parent.name else path.stem
+        self.name = self.name_of(path)
         self.frames = int(animation.get("frames", 1))
         self.max_depth = _path_length(self._tree)
         near = os.path.relpath(path)
@@ -323,7 +329,9 @@ def _scale_light(emitter: ET.Element | None, factors: np.ndarray) -> None:
             continue
         # "wavelength:value" pairs of a spectrum scale in their values.
         pairs = [number.rpartition(":") for number in numbers]
-        part.set("value", " ".join(f"{head}{colon}{float(value) * float(factors[0])!r}" for head, colon, value in pairs))
+        part.set(
+            "value", " ".join(f"{head}{colon}{float(value) * float(factors[0])!r}" for head, colon, value in pairs)
+        )
 
 
 def _transform(shape: ET.Element) -> ET.Element | None:
