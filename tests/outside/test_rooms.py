@@ -1,5 +1,6 @@
 """Tours of rooms: the camera stays clear, things are seen, speeds are bounded, and the record is the whole scene."""
 
+import itertools
 import json
 
 import numpy as np
@@ -14,7 +15,7 @@ from jaxdn.render.variant import choose_variant
 mi = pytest.importorskip("mitsuba")
 
 FRAMES = 6
-SEEDS = range(4)
+SEEDS = range(3)
 
 
 def box(place, size, name, bsdf="grey"):
@@ -47,8 +48,8 @@ def room(camera=(0, 1.5, 2.5), fog=""):
   {"".join(walls + crates)}
   <shape type="sphere" id="ball"><point name="center" x="1" y="0.4" z="-1"/><float name="radius" value="0.4"/>
     <bsdf type="roughconductor"><float name="alpha" value="0.2"/></bsdf>{fog}</shape>
-  <shape type="rectangle" id="lamp"><transform name="to_world"><rotate x="1" angle="90"/><translate y="2.98"/></transform>
-    <emitter type="area"><rgb name="radiance" value="5, 5, 4"/></emitter></shape>
+  <shape type="rectangle" id="lamp"><transform name="to_world"><rotate x="1" angle="90"/><translate y="2.98"/>
+    </transform><emitter type="area"><rgb name="radiance" value="5, 5, 4"/></emitter></shape>
   <shape type="sphere" id="bulb"><point name="center" x="-1.5" y="0.7" z="-1.5"/><float name="radius" value="0.1"/>
     <emitter type="area"><rgb name="radiance" value="20, 10, 5"/></emitter></shape>
 </scene>"""
@@ -79,14 +80,6 @@ def tours(folder):
     return [tour(folder / "scene.xml", seed, FRAMES) for seed in SEEDS]
 
 
-def free(scene, origin, count=400):
-    """Distance of the nearest surface in random directions, by Mitsuba alone."""
-    directions = np.random.default_rng(7).normal(size=(count, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    distances = [scene.ray_intersect(mi.Ray3f(origin.tolist(), one.tolist())).t for one in directions]
-    return min(float(np.ravel(np.array(distance))[0]) for distance in distances)
-
-
 def test_a_seed_always_gives_the_same_tour_and_another_seed_another(tours, folder):
     from jaxdn.render.rooms import tour
 
@@ -98,16 +91,22 @@ def test_a_seed_always_gives_the_same_tour_and_another_seed_another(tours, folde
 
 def test_cameras_keep_clear_of_everything(tours, folder):
     empty = SceneFile(folder / "scene.xml").build(0, 4, 4)
+    directions = np.random.default_rng(7).normal(size=(40, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     for scene in tours:
-        for frame in np.linspace(0, FRAMES - 1, 2 * FRAMES - 1)[::3]:
-            assert free(empty, scene.camera(frame).to_world[:3, 3], 60) > 0.05
-            assert 35 <= scene.camera(frame).x_fov <= 80
+        assert 35 <= scene.camera(0).x_fov <= 80
+        for frame in np.linspace(0, FRAMES - 1, 5):
+            place = scene.camera(frame).to_world[:3, 3]
+            assert np.all(np.abs(place - [0, 1.5, 0]) < [2.95, 1.45, 2.95])
+            for direction in directions:
+                near = mi.Ray3f(place.tolist(), direction.tolist(), 0.05, 0.0, [])  # of length 0.05
+                assert not np.any(empty.ray_test(near))
 
 
 def test_cameras_move_within_bounds(tours):
     for scene in tours:
         cameras = [scene.camera(frame) for frame in range(FRAMES)]
-        for first, second in zip(cameras, cameras[1:], strict=False):
+        for first, second in itertools.pairwise(cameras):
             turn = np.degrees(np.arccos(np.clip(first.to_world[:3, 2] @ second.to_world[:3, 2], -1, 1)))
             focal = 64 / np.tan(np.radians(first.x_fov / 2))
             assert focal * np.radians(turn) < 45
@@ -128,9 +127,9 @@ def test_things_thrown_in_are_seen_and_those_of_the_room_are_not_its_lights(tour
 
 
 def test_the_record_rebuilds_the_scene_bit_for_bit(tours):
-    record = json.loads(json.dumps(tours[2].record))
+    record = json.loads(json.dumps(tours[1].record))
     images = [
-        np.array(mi.render(scene.build(1, 12, 12), spp=2, seed=3)) for scene in (tours[2], scene_from_record(record))
+        np.array(mi.render(scene.build(1, 12, 12), spp=2, seed=3)) for scene in (tours[1], scene_from_record(record))
     ]
     assert images[0].max() > 0
     np.testing.assert_array_equal(*images)
@@ -203,14 +202,27 @@ def test_motion_to_and_fro_has_its_speed_and_passes_its_place():
     np.testing.assert_allclose(inner, 0.7)
 
 
-def test_the_command_renders_tours_and_does_not_search_again(folder, tmp_path, monkeypatch):
+def test_the_command_renders_tours_and_does_not_search_again(tours, folder, tmp_path, monkeypatch):
     from jaxdn.cli import main
     from jaxdn.render import rooms
 
-    words = ["render", str(folder / "scene.xml"), "--tour", "--seeds", "1-2", "-o", str(tmp_path), "--frames", "2"]
-    words += ["--width", "16", "--height", "12", "--reference-spp", "2", "--workers", "1", "--max-depth", "3"]
+    # Searching has tests above; what counts here is that every seed has its own tour.
+    monkeypatch.setattr(rooms, "tour", lambda path, seed, frames: tours[seed])
+
+    words = [
+        "render",
+        str(folder / "scene.xml"),
+        "--tour",
+        "--seeds",
+        "0-1",
+        "-o",
+        str(tmp_path),
+        "--frames",
+        str(FRAMES),
+    ]
+    words += ["--width", "16", "--height", "12", "--reference-spp", "2", "--workers", "1", "--effects", "indirect"]
     main(words)
-    clips = [tmp_path / f"{folder.name}-{seed}" for seed in (1, 2)]
+    clips = [tmp_path / f"{folder.name}-{seed}" for seed in (0, 1)]
     assert all(is_clip(clip) for clip in clips)
     records = [read_record(clip)["scene"] for clip in clips]
     assert records[0] != records[1]
