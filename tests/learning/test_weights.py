@@ -12,16 +12,15 @@ from jaxdn.frame import FAR, Frame
 from jaxdn.weights import flatten, save_weights, shipped_names, starting_params, unflatten
 
 TINY = ((4,), (4,), (4,), (4,), (4,))
-GUIDED = {"kernels": "guided", "background": "pass"}
+
+SAVED = {"size": TINY, "kernels": "guided", "background": "pass"}
 FRAME = Frame(radiance=np.ones((16, 16, 3), np.float32))
 
 
 @pytest.fixture
 def saved(tmp_path):
     params = ntd(size=TINY).init(jax.random.key(0), FRAME)
-    path = save_weights(
-        tmp_path / "w", params, factory="ntd", options={"size": TINY, **GUIDED}, record={"note": "test"}
-    )
+    path = save_weights(tmp_path / "w", params, factory="ntd", options=SAVED, record={"note": "test"})
     return path, params
 
 
@@ -75,7 +74,7 @@ def test_guided_kernels_continue_from_plain_ones(tmp_path):
     assert set(guided) == {*params, "guide"}
 
     guided["guide"]["depth"] = guided["guide"]["depth"] - 1
-    path = save_weights(tmp_path / "guided", guided, factory="ntd", options={"size": TINY, **GUIDED}, record={})
+    path = save_weights(tmp_path / "guided", guided, factory="ntd", options=SAVED, record={})
     more = starting_params(path, ntd(size=TINY, guides="materials"))["guide"]
     np.testing.assert_array_equal(more["depth"], np.full((3, 1), 5.0))
     np.testing.assert_array_equal(more["reflectance"], np.full((3, 3), 3.0))
