@@ -375,7 +375,9 @@ def test_parameters_of_the_guides(guides: str, rng: np.random.Generator, key: ja
     frame = frame_at(random_frames(rng), 0)
     options = {"guides": guides}
     params, plain = tiny(**options).init(key, frame), tiny(**options, kernels="plain").init(key, frame)
-    channels = {"albedo": 3, "normal": 3, "depth": 1} | ({"reflectance": 3, "roughness": 1} if "m" in guides else {})
+    channels = {"albedo": 3, "normal": 3, "depth": 1} | (
+        {"reflectance": 3, "roughness": 1} if guides == "materials" else {}
+    )
     assert {name: leaf.shape for name, leaf in params["guide"].items()} == {n: (3, c) for n, c in channels.items()}
     assert set(params) - set(plain) == {"guide"}
     assert np.all(params["guide"]["depth"] == 6.0)
