@@ -15,21 +15,20 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.animation import CameraKeys, rotation_matrix
-from jaxdn.render.free_space import FreeSpace, cast, view_rays
-from jaxdn.render.gbuffer import shape_names
+from jaxdn.render.free_space import FreeSpace
 from jaxdn.render.repaint import changeable, named_materials
 from jaxdn.render.scene import Camera
 from jaxdn.render.scene_file import SceneFile
 from jaxdn.render.tour_things import focal, moved_shapes, thrown_things
 from jaxdn.render.variant import use_variant
 
-_ATTEMPTS = 16
+_ATTEMPTS = 32
 _VIEWS = 48
 """Views that are compared for one attempt."""
 _SIDE, _SAMPLES = 24, 16
 """Size of the images that measure a view's light, and their samples per pixel."""
 _DARK = 0.03
-"""A frame that is darker than this share of the tour's brightest is rejected."""
+"""A view that is darker than this share of the path's middle is rejected."""
 
 
 class _Plan(NamedTuple):
@@ -54,22 +53,18 @@ def tour(path: Path | str, seed: int, frames: int) -> SceneFile:
         raise ValueError(f"tour seed: expected at least 0, got {seed}.")
     path = Path(path)
     space = _space(os.path.abspath(path), path.stat().st_mtime if path.is_file() else 0.0, use_variant())
-    reason = ""
     for attempt in range(_ATTEMPTS):
-        rng = np.random.default_rng([seed, attempt])
-        plan = _plan(space, rng, frames, ease=attempt / _ATTEMPTS)
+        plan = _plan(space, np.random.default_rng([seed, attempt]), frames, ease=attempt / _ATTEMPTS)
         if plan is None:
-            reason = "no view shows enough"
             continue
-        scene = SceneFile.from_record({"file": str(path), "animation": plan.animation})
-        levels, reason = _verdict(space, scene, frames)
-        if not reason:
-            factor = float(np.clip(plan.level / max(np.median(levels), 1e-9), 1e-4, 1e4))
-            animation = _brighter(plan.animation, factor)
+        # What was changed and thrown in lights the room differently than its own lights were measured to.
+        level = _measured(SceneFile.from_record({"file": str(path), "animation": plan.animation}), frames // 2)
+        if level > 0:
+            animation = _brighter(plan.animation, plan.level / level)
             return SceneFile.from_record({"file": str(path), "animation": animation})
     raise ValueError(
-        f"tour of {space.file.name}, seed {seed}: expected a view that shows the room, found none in {_ATTEMPTS} "
-        f"attempts (the last: {reason}); leave this seed out."
+        f"tour of {space.file.name}, seed {seed}: expected a lit view that shows the room, found none in {_ATTEMPTS} "
+        f"attempts; leave this seed out."
     )
 
 
@@ -88,15 +83,22 @@ def _plan(space: FreeSpace, rng: np.random.Generator, frames: int, *, ease: floa
     path = CameraKeys(keys)
     cameras = [Camera(path(frame), view.x_fov) for frame in range(frames)]
     level = float(10 ** (rng.uniform(-2, -1.2) if rng.random() < 0.25 else rng.uniform(-1.2, -0.1)))
-    images = _light_images(space, cameras[frames // 2])
-    if sum(_level(image) for image in images.values()) <= 0:
+    seen = [cameras[frame] for frame in sorted({0, frames // 2, frames - 1})]
+    if not _shows_enough(space, seen, ease):
         return None
-    lights = _light_keys(images, rng, frames, level)
+    images = _light_images(space, cameras[frames // 2])
+    total = _level(sum(images.values(), np.zeros(1)))
+    if total <= 0 or min(_level(_image(space, camera)) for camera in seen) < _DARK * total:
+        return None
+    lights = _light_keys(space, images, rng, frames, level)
     moved = moved_shapes(space, cameras, rng, int(rng.integers(0, 5)), keep=set(lights))
     animation: dict[str, Any] = {"frames": frames, "camera": keys}
+    thrown = thrown_things(space, cameras, rng, int(rng.integers(1, 7)), level)
+    if not thrown:
+        return None
     parts = {
         "shapes": moved,
-        "inserted": thrown_things(space, cameras, rng, int(rng.integers(1, 7)), level),
+        "inserted": thrown,
         "lights": lights,
         "materials": _materials(space, rng),
     }
@@ -117,6 +119,13 @@ def _view(space: FreeSpace, rng: np.random.Generator, ease: float) -> Camera | N
     # Noise in the score, so that the richest corner of a room is not in every tour.
     score = np.log(views.shapes + 1.0) + views.spread - views.largest - views.empty + rng.normal(0, 0.4, _VIEWS)
     return cameras[int(np.argmax(np.where(good, score, -np.inf)))] if good.any() else None
+
+
+def _shows_enough(space: FreeSpace, cameras: Sequence[Camera], ease: float) -> bool:
+    """Whether the views along a path show things of the room, and not only a wall or the outside."""
+    views = space.judge(list(cameras))
+    good = (views.empty < 0.7) & (views.close < 0.5) & (views.spread > 0.25 - 0.15 * ease)
+    return bool((good & (views.shapes >= 4 - 3 * ease) & (views.nearest > 1.3 * space.near)).all())
 
 
 def _looking(space: FreeSpace, origin: np.ndarray, forward: np.ndarray) -> np.ndarray:
@@ -157,14 +166,19 @@ def _panning(
     space: FreeSpace, view: Camera, rng: np.random.Generator, frames: int, rate: float, middle: float
 ) -> list[dict[str, Any]]:
     """A key for every frame of a camera that turns by ``rate`` degrees a frame, to and fro between two angles."""
-    widest = rng.uniform(40, 140)
-    start = rng.uniform(-0.5, 0.5) * widest
-    sign = rng.choice([-1, 1])
-    phases = np.mod(start + widest / 2 + rate * np.arange(max(frames, 2)), 2 * widest)
-    angles = sign * (widest / 2 - np.abs(phases - widest) + widest / 2)
     origin, forward = view.to_world[:3, 3], view.to_world[:3, 2]
-    turned = [rotation_matrix(space.up, angle - angles[0]) @ forward for angle in angles]
-    return [_camera_key(space, view, at, origin, origin + middle * one) for at, one in enumerate(turned)]
+    best: list[np.ndarray] = []
+    most = -1.0
+    for _ in range(6):  # the arc that shows most even where it shows least
+        widest, start, sign = rng.uniform(30, 140), rng.random(), rng.choice([-1, 1])
+        phases = np.mod(start * widest + rate * np.arange(max(frames, 2)), 2 * widest)
+        angles = sign * (widest - np.abs(phases - widest))
+        turned = [rotation_matrix(space.up, angle - angles[0]) @ forward for angle in angles]
+        views = space.judge([Camera(_looking(space, origin, one), view.x_fov) for one in turned])
+        shown = float((views.shapes * np.minimum(views.spread, 1)).min())
+        if shown > most:
+            best, most = turned, shown
+    return [_camera_key(space, view, at, origin, origin + middle * one) for at, one in enumerate(best)]
 
 
 def _camera_key(space: FreeSpace, view: Camera, at: float, origin: np.ndarray, target: np.ndarray) -> dict[str, Any]:
@@ -172,36 +186,41 @@ def _camera_key(space: FreeSpace, view: Camera, at: float, origin: np.ndarray, t
     return {**key, "fov": view.x_fov}
 
 
+def _image(space: FreeSpace, camera: Camera) -> np.ndarray:
+    """[side, side] luminance of a view of the room."""
+    sensor = {
+        "type": "perspective",
+        "fov": camera.x_fov,
+        "near_clip": space.near,
+        "to_world": mi.ScalarTransform4f(camera.to_world),
+        "sampler": {"type": "independent"},
+        "film": {"type": "hdrfilm", "width": _SIDE, "height": _SIDE, "rfilter": {"type": "box"}},
+    }
+    integrator = mi.load_dict({"type": "path", "max_depth": min(space.file.max_depth, 8)})
+    return _luminance(
+        mi.render(space.scene, sensor=mi.load_dict(sensor), integrator=integrator, spp=_SAMPLES, seed=mi.UInt32(0))
+    )
+
+
 def _light_images(space: FreeSpace, camera: Camera) -> dict[str, np.ndarray]:
     """Name -> [side, side] luminance that each light alone gives the view."""
-    sensor = mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": camera.x_fov,
-            "near_clip": space.near,
-            "to_world": mi.ScalarTransform4f(camera.to_world),
-            "sampler": {"type": "independent"},
-            "film": {"type": "hdrfilm", "width": _SIDE, "height": _SIDE, "rfilter": {"type": "box"}},
-        }
-    )
-    integrator = mi.load_dict({"type": "path", "max_depth": min(space.file.max_depth, 8)})
     emitters = [mi.traverse(emitter) for emitter in space.scene.emitters()]
     keys = [[key for key, _ in one if key.endswith((".value", ".data", "scale"))] for one in emitters]
     # Copies: an assignment below changes the value in place.
     own = [{key: type(one[key])(one[key]) for key in names} for one, names in zip(emitters, keys, strict=True)]
-    images = {}
-    for shining, emitter in enumerate(space.scene.emitters()):
+
+    def shine(wanted: set[int]) -> None:
         for index, (one, values) in enumerate(zip(emitters, own, strict=True)):
             for key, value in values.items():
-                one[key] = value if index == shining else 0 * value
+                one[key] = value if index in wanted else 0 * value
             one.update()
-        image = mi.render(space.scene, sensor=sensor, integrator=integrator, spp=_SAMPLES, seed=mi.UInt32(0))
+
+    images = {}
+    for shining, emitter in enumerate(space.scene.emitters()):
+        shine({shining})
         name = emitter.get_shape().id() if emitter.get_shape() is not None else emitter.id()
-        images[name] = _luminance(image)
-    for one, values in zip(emitters, own, strict=True):
-        for key, value in values.items():
-            one[key] = value
-        one.update()
+        images[name] = _image(space, camera)
+    shine(set(range(len(emitters))))
     return images
 
 
@@ -212,20 +231,21 @@ def _level(image: np.ndarray) -> float:
 
 
 def _light_keys(
-    images: Mapping[str, np.ndarray], rng: np.random.Generator, frames: int, level: float
+    space: FreeSpace, images: Mapping[str, np.ndarray], rng: np.random.Generator, frames: int, level: float
 ) -> dict[str, list[dict[str, Any]]]:
     """An animation's "lights": tints, lights that are off, and one that is switched or dims in the clip."""
-    names = sorted(images)
+    colored = space.file.lights()
+    names = sorted(set(images) & set(colored))
     gains = {name: float(np.exp(rng.normal(0, 0.6))) for name in names}
     for name in names:
         left = sum(gains[other] * _level(images[other]) for other in names if other != name)
         if rng.random() < 0.2 and left > 0.1 * gains[name] * _level(images[name]):
             gains[name] = 0.0
     factor = level / max(_level(sum((gains[name] * images[name] for name in names), np.zeros(1))), 1e-9)
-    tint = {name: _tint(rng) for name in names}
+    tint = {name: _tint(rng) if colored[name] else np.ones(3) for name in names}
     keys = {name: [{"frame": 0.0, "scale": (factor * gains[name] * tint[name]).tolist()}] for name in names}
     lit = [name for name in names if gains[name] > 0]
-    if frames > 2 and rng.random() < 0.4:
+    if lit and frames > 2 and rng.random() < 0.4:
         name = str(rng.choice(lit))
         rest = sum(gains[other] * _level(images[other]) for other in lit if other != name)
         # Without other light it dims and is not switched off.
@@ -269,37 +289,9 @@ def _materials(space: FreeSpace, rng: np.random.Generator) -> dict[str, dict[str
     return changes
 
 
-def _verdict(space: FreeSpace, scene: SceneFile, frames: int) -> tuple[list[float], str]:
-    """Levels of light in the first, middle and last frame, and why the tour is no good ("" if it is)."""
-    levels, thrown = [], False
-    for frame in sorted({0, frames // 2, frames - 1}):
-        level, reason, seen = _glance(space, scene, frame)
-        if reason:
-            return [], reason
-        levels.append(level)
-        thrown = thrown or seen
-    if min(levels) <= _DARK * max(levels):
-        return levels, "a frame is black"
-    return levels, "" if thrown else "nothing thrown in is seen"
-
-
-def _glance(space: FreeSpace, scene: SceneFile, frame: int) -> tuple[float, str, bool]:
-    """One frame: its level of light, why it is no good ("" if it is), and whether a thing that was thrown in is seen.
-
-    Its scene is freed on return: beside a second one, the next would need new kernels.
-    """
-    built = scene.build(frame, _SIDE, _SIDE)
-    camera = scene.camera(frame)
-    view = space.judge([camera], built)
-    if view.empty[0] > 0.7 or view.close[0] > 0.6 or view.spread[0] < 0.12:
-        return 0.0, "a wall, the outside or a thing fills the view", False
-    if view.nearest[0] < 1.3 * space.near:
-        return 0.0, "the near clip cuts a thing", False
-    level = _level(_luminance(mi.render(built, spp=_SAMPLES, seed=mi.UInt32(frame))))
-    seen = cast(built, camera.to_world[:3, 3], view_rays(camera, 48)).shape
-    names = shape_names(built)
-    thrown = any(names[int(index)].startswith("thrown_") for index in np.unique(seen[seen >= 0]))
-    return level, "", thrown
+def _measured(scene: SceneFile, frame: int) -> float:
+    """The level of light of one frame."""
+    return _level(_luminance(mi.render(scene.build(frame, _SIDE, _SIDE), spp=_SAMPLES, seed=mi.UInt32(frame))))
 
 
 def _luminance(image: Any) -> np.ndarray:
@@ -313,4 +305,4 @@ def _brighter(animation: Mapping[str, Any], factor: float) -> dict[str, Any]:
     def scaled(keys: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         return [{**key, "scale": [factor * value for value in key["scale"]]} for key in keys]
 
-    return {**animation, "lights": {name: scaled(keys) for name, keys in animation["lights"].items()}}
+    return {**animation, "lights": {name: scaled(keys) for name, keys in animation.get("lights", {}).items()}}

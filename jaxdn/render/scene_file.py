@@ -111,6 +111,12 @@ class SceneFile:
         """Light -> factor on its radiance, one or three for red, green and blue, for lights with keys."""
         return {name: light_scale(keys, frame) for name, keys in self._lights.items()}
 
+    def lights(self) -> dict[str, bool]:
+        """The lights whose radiance keys can scale -> whether they can scale red, green and blue by themselves."""
+        found = {element.get("id", ""): _light(self._tree, element.get("id", "")) for element in self._tree}
+        known = {name: _powers(light) for name, light in found.items() if name and light is not None}
+        return {name: all(part.tag == "rgb" for part in parts) for name, parts in known.items() if parts}
+
     def build(self, frame: float, width: int, height: int) -> Any:
         """The ``mi.Scene`` of one frame; static parts are loaded once and shared by all frames."""
         import mitsuba as mi

@@ -64,7 +64,8 @@ def _own_motion(
     best = int(np.argmax(ways))
     speed = _between(rng, 0.3, 10) * _depth(cameras[0], center) / focal(cameras[0])
     path = _bounce(0.0, max(ways[best], 0.2 * radius), speed, 0.0, last)
-    return [{"frame": at, "translation": (x * sideways[best]).tolist()} for at, x in path]
+    keys = [{"frame": at, "translation": (x * sideways[best]).tolist()} for at, x in path]
+    return keys if _apart(space, cameras, keys, radius, center) else [{"frame": 0}]
 
 
 def thrown_things(
@@ -236,10 +237,12 @@ def _bounce(low: float, high: float, speed: float, at: float, last: int) -> list
     return list(zip(times.tolist(), positions.tolist(), strict=True))
 
 
-def _apart(space: FreeSpace, cameras: Sequence[Camera], keys: Sequence[dict[str, Any]], radius: float) -> bool:
-    """Whether a thing of this radius stays off every camera."""
+def _apart(
+    space: FreeSpace, cameras: Sequence[Camera], keys: Sequence[dict[str, Any]], radius: float, center: Any = 0.0
+) -> bool:
+    """Whether a thing of this radius, whose ``center`` the keys move, stays off every camera."""
     frames = [key["frame"] for key in keys]
-    places = np.array([key["translation"] for key in keys])
+    places = center + np.array([key["translation"] for key in keys])
     path = np.stack([np.interp(np.arange(len(cameras)), frames, places[:, axis]) for axis in range(3)], axis=-1)
     away = np.linalg.norm(path - np.array([camera.to_world[:3, 3] for camera in cameras]), axis=1)
     return bool(away.min() > radius + max(2 * space.near, 0.5 * space.clear))

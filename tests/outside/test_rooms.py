@@ -119,7 +119,7 @@ def test_things_thrown_in_are_seen_and_those_of_the_room_are_not_its_lights(tour
     for scene in tours:
         inserted = {shape["id"] for shape in scene.record["animation"]["inserted"]}
         seen = set()
-        for frame in (0, FRAMES // 2, FRAMES - 1):
+        for frame in range(FRAMES):
             found = gbuffer(scene.build(frame, 48, 48))
             seen |= {found.names[index] for index in np.unique(found.ids) if index >= 0}
         assert seen & inserted
@@ -260,7 +260,7 @@ def test_a_scene_without_free_space_or_with_fog_is_refused(folder, tmp_path):
     (tmp_path / "wood.png").write_bytes((folder / "wood.png").read_bytes())
     path = tmp_path / "scene.xml"
     path.write_text(room(camera=(0, 1000, 2000)))
-    with pytest.raises(ValueError, match=r"expected free space around the scene's camera, found none .*; move the"):
+    with pytest.raises(ValueError, match=r"expected free space around the scene's camera, found none"):
         tour(path, 0, 2)
     path.write_text(room(fog='<medium type="homogeneous" name="interior"/>'))
     with pytest.raises(ValueError, match="participating media"):
