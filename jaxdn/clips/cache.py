@@ -12,7 +12,7 @@ import os
 import shutil
 import tempfile
 import warnings
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,11 +75,8 @@ def open_cached(path: str | Path, *, cache: str | Path | None = None) -> CachedC
     """
     path = Path(path)
     record = read_record(path)
-    root = path.parent / ".cache" if cache is None else Path(cache)
-    home = root / f"{path.name}.{_stamp(path, record['frames'])}"
-    if not home.is_dir():
-        _build(path, home)
-        _forget(root, path.name, home)
+    frames = (frame_path(path, index) for index in range(record["frames"]))  # the record may claim any number
+    home = kept(path, cache, itertools.chain([path / "clip.json"], frames), lambda folder: _fill(path, folder))
     facts = read_json(home / "facts.json")
     if facts["bad_reference_values"]:
         warnings.warn(
@@ -129,10 +126,25 @@ def read_array(clip: CachedClip, name: str, window: tuple[Any, ...]) -> np.ndarr
     return np.array(part, BUFFERS.get(name, _LIGHT).dtype)
 
 
-def _stamp(path: Path, count: int) -> str:
+def kept(
+    path: Path, cache: str | Path | None, files: Iterable[Path], fill: Callable[[Path], Mapping[str, Any]]
+) -> Path:
+    """The folder ``<cache>/<name of path>.<stamp of files>`` (default: ``.cache`` next to ``path``).
+
+    Where it is missing, ``fill`` is called with a temporary folder and returns the contents of its ``facts.json``; the
+    folder gets its name when it is complete. Raises ClipError for a missing file, OSError if it cannot be written.
+    """
+    root = path.parent / ".cache" if cache is None else Path(cache)
+    home = root / f"{path.name}.{_stamp(files)}"
+    if not home.is_dir():
+        _build(path.name, home, fill)
+        _forget(root, path.name, home)
+    return home
+
+
+def _stamp(files: Iterable[Path]) -> str:
     digest = hashlib.sha256(f"{_VERSION}".encode())
-    frames = (frame_path(path, index) for index in range(count))  # one by one: the record may claim any number
-    for file in itertools.chain([path / "clip.json"], frames):
+    for file in files:
         try:
             facts = file.stat()
         except OSError as error:
@@ -141,11 +153,11 @@ def _stamp(path: Path, count: int) -> str:
     return digest.hexdigest()[:16]
 
 
-def _build(path: Path, home: Path) -> None:
+def _build(name: str, home: Path, fill: Callable[[Path], Mapping[str, Any]]) -> None:
     home.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=home.parent))
+    temporary = Path(tempfile.mkdtemp(prefix=f".{name}.", dir=home.parent))
     try:
-        write_json(temporary / "facts.json", _fill(path, temporary))
+        write_json(temporary / "facts.json", fill(temporary))
         try:
             os.rename(temporary, home)
         except OSError:

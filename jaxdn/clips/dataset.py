@@ -1,4 +1,4 @@
-"""Training data: an endless, shuffled, augmented, resumable stream of batches from a folder of clips.
+"""Training data: an endless, shuffled, augmented, resumable stream of batches from folders of clips or packed sets.
 
 Every element is one clip's random window of consecutive frames, one random crop of it (the same over all its frames, so
 that history stays meaningful) under one of the eight symmetries of a square. It depends only on ``seed`` and the
@@ -14,11 +14,11 @@ import jax
 import numpy as np
 
 from jaxdn.clips.augment import transform_clip
-from jaxdn.clips.cache import CachedClip, open_cached, read_window
+from jaxdn.clips.cache import CachedClip, read_window
 from jaxdn.clips.draws import check_samples, draw_light
 from jaxdn.clips.files import ClipError
-from jaxdn.clips.folder import find_clips
 from jaxdn.clips.frames import doubling_layers
+from jaxdn.clips.pack import open_clips
 from jaxdn.frame import Clip
 from jaxdn.variation import STILL, Variation, varied
 
@@ -40,7 +40,7 @@ def training_batches(
     """An endless iterator over batches: a Clip of numpy arrays ``[B, T, H, W, C]``, reference included.
 
     Args:
-      clips: a folder of clips, one clip, or a list of either.
+      clips: a folder of clips, one clip, a packed set (:mod:`jaxdn.clips.pack`), or a list of these.
       batch: elements of a batch.
       crop: side of the square crop, or (height, width), in pixels.
       frames: consecutive frames of each element.
@@ -70,7 +70,7 @@ def training_batches(
     if not counts:
         raise ValueError("spp: expected at least one number of samples, got none.")
     folders = [clips] if isinstance(clips, str | Path) else clips
-    sources = [open_cached(path) for folder in folders for path in find_clips(folder)]
+    sources = [source for folder in folders for source in open_clips(folder)]
     if not sources:
         raise ClipError("clips: expected at least one folder, got none.")
     for source in sources:

@@ -53,7 +53,7 @@ def draw_light(
         chosen = np.sort(rng.permutation(clip.draws)[:spp])
         samples = read_array(clip, "draws", (window[0], chosen, *window[1:])).astype(np.float32).mean(axis=1)
         reference = read_array(clip, "reference", window)
-        if not beauty:
+        if not beauty or samples.shape[-1] == 3:  # a packed set may have indirect light alone
             return Light(samples[..., :3], reference)
         direct, emission = (read_array(clip, name, window) if name in clip.arrays else 0.0 for name in _BEAUTY)
         return Light(samples[..., :3] + samples[..., 3:] + emission, reference + direct + emission)
