@@ -1,4 +1,4 @@
-"""The command line: ``jaxdn inspect | render | train | denoise | compare``; every command has ``--help``."""
+"""The command line: ``jaxdn inspect | render | pack | train | denoise | compare``; every command has ``--help``."""
 
 import sys
 from dataclasses import dataclass, field
@@ -81,6 +81,37 @@ class Render:
 
 
 @dataclass
+class Pack:
+    """Pack random windows of rendered clips into one compact file, to train on a machine that clips are too large for.
+
+    For example:
+
+    jaxdn pack data/train -o train.pack --mib 50 --crop 64 --draws 2
+
+    jaxdn train train.pack -o runs/mine
+    """
+
+    clips: tyro.conf.Positional[list[Path]]
+    """Folders of clips."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The file to write."""
+    mib: float
+    """Largest size of the file in MiB."""
+    crop: int = 64
+    """Width and height of the windows, in pixels; training may crop them further."""
+    frames: int = 10
+    """Consecutive frames of a window; of a shorter clip all."""
+    draws: int = 2
+    """Single samples to store of each window; 0: the layer of one sample instead."""
+    buffers: list[str] | None = None
+    """Buffers to store; default: those that every variant of ntd is trained with."""
+    indirect_only: bool = False
+    """Leave out direct and emitted light: smaller, but nothing can be trained on all light."""
+    seed: int = 0
+    """Of the choice of windows."""
+
+
+@dataclass
 class Train:
     """Train a learned method on rendered clips; run it again to resume.
 
@@ -91,12 +122,12 @@ class Train:
     jaxdn train data/train -o runs/traditional --variant ntd-large --set motion=traditional
     """
 
-    clips: _PATH
-    """Folder of clips to train on."""
+    clips: tyro.conf.Positional[list[Path]]
+    """Folders of clips, or files of `jaxdn pack`, to train on."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The run's folder: checkpoints, log, and finally weights.safetensors with its JSON."""
     validation: Path | None = None
-    """Folder of held-out clips for validation, used whole."""
+    """Folder of held-out clips, or a file of `jaxdn pack`, for validation, used whole."""
     method: str = "ntd"
     """Method to train; an unknown name lists the available ones."""
     variant: str | None = None
@@ -225,6 +256,29 @@ def _numbers(words: list[str]) -> list[int]:
     return numbers
 
 
+def _pack(options: Pack) -> None:
+    from jaxdn.clips.pack import USUAL, Packing
+    from jaxdn.commands.pack import pack
+
+    packing = Packing(
+        crop=options.crop,
+        frames=options.frames,
+        draws=options.draws,
+        buffers=USUAL if options.buffers is None else tuple(options.buffers),
+        direct=not options.indirect_only,
+        seed=options.seed,
+    )
+    with Console(stderr=True).status("reading ...") as status:
+        packed = pack(
+            options.clips,
+            options.out,
+            packing,
+            mib=options.mib,
+            say=lambda windows, size: status.update(f"{windows} windows, {size / 2**20:.1f} MiB"),
+        )
+    print(f"{options.out}: {packed.windows} windows of {packed.clips} clips, {packed.size / 2**20:.1f} MiB")
+
+
 def _train(options: Train) -> None:
     from jaxdn.commands.train import train
     from jaxdn.methods.table import method_named
@@ -238,7 +292,7 @@ def _train(options: Train) -> None:
     path = train(
         method,
         recipe,
-        [options.clips],
+        options.clips,
         options.out,
         options={**method.variant_named(options.variant), **parse(options.set)},
         start=options.start,
@@ -294,12 +348,13 @@ def main(arguments: list[str] | None = None) -> None:
     run: dict[type, Any] = {
         Inspect: _inspect,
         Render: _render,
+        Pack: _pack,
         Train: _train,
         Denoise: _denoise,
         Compare: _compare,
     }
     options = tyro.cli(
-        Inspect | Render | Train | Denoise | Compare,
+        Inspect | Render | Pack | Train | Denoise | Compare,
         prog="jaxdn",
         description="Remove Monte Carlo noise from path-traced animations.",
         args=arguments,

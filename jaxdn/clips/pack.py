@@ -75,7 +75,7 @@ def write_pack(
     clips: Sequence[CachedClip],
     *,
     size: int,
-    packing: Packing = Packing(),
+    packing: Packing,
     say: Callable[[int, int], None] = lambda windows, size: None,
 ) -> Packed:
     """Pack random windows of clips into a file of at most ``size`` bytes, of every clip one before of any a second.

@@ -16,7 +16,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from jaxdn import color, metrics
 from jaxdn.checkpoint import Checkpoints
-from jaxdn.clips import read_clip
+from jaxdn.clips import find_clips, read_clip
+from jaxdn.clips.cache import read_window
+from jaxdn.clips.pack import open_pack
 from jaxdn.commands.log import Log
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.files import write_json
@@ -135,9 +137,19 @@ def fit(
     return state
 
 
-def load_validation(denoiser: Denoiser, folders: Sequence[Path], *, spp: int = 1) -> list[Clip]:
-    """Held-out clips, read whole, for validation."""
-    return [read_clip(folder, spp=spp, layers=denoiser.samples is not None) for folder in folders]
+def load_validation(denoiser: Denoiser, places: Sequence[Path], *, spp: int = 1) -> list[Clip]:
+    """Held-out clips of folders, and windows of packed sets, each read whole, for validation."""
+    layers, everything = denoiser.samples is not None, (slice(None),) * 3
+    clips: list[Clip] = []
+    for place in places:
+        if place.is_file():
+            windows = open_pack(place)
+            clips += [
+                read_window(window, everything, spp=spp, buffers=denoiser.reads, layers=layers) for window in windows
+            ]
+        else:
+            clips += [read_clip(folder, spp=spp, layers=layers) for folder in find_clips(place)]
+    return clips
 
 
 def _same_recipe(path: Path, recipe: Recipe, start: str | None) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxdn.clips import find_clips, training_batches
+from jaxdn.clips import training_batches
 from jaxdn.commands.fit import Start, fit, load_validation
 from jaxdn.methods.table import Method
 from jaxdn.recipe import Recipe
@@ -34,12 +34,12 @@ def train(
     Args:
       method: a row of the table of methods.
       recipe: objective, optimiser, batches.
-      clips: folders of clips, or of folders of clips, to train on.
+      clips: folders of clips, or packed sets, to train on.
       out: the run's folder: checkpoints, log.jsonl, recipe.json, and finally weights.safetensors with its JSON.
       options: the method's; they are stored with the weights, and so are the defaults of all others.
       start: shipped weights or a .safetensors file to continue from (:func:`jaxdn.weights.starting_params`); None:
         new ones.
-      validation: folders of held-out clips, used whole.
+      validation: folders of held-out clips, or packed sets, used whole.
       implementation: the engine for training; "auto" is the method's fastest that is available here.
       time_limit: seconds after which training stops; the weights of that moment are written all the same.
       label: the run's name in messages; default: that of its folder.
@@ -66,8 +66,7 @@ def train(
         layers=denoiser.samples is not None,
         variation=recipe.variation,
     )
-    folders = [folder for place in validation for folder in find_clips(place)]
-    held_out = load_validation(denoiser, folders, spp=min(recipe.spp))
+    held_out = load_validation(denoiser, validation, spp=min(recipe.spp))
     first = None if start is None else Start(str(start), starting_params(start, denoiser))
     state = fit(denoiser, recipe, batches, out, label=label, start=first, validation=held_out, time_limit=time_limit)
     begun = {} if first is None else {"start": first.name}
