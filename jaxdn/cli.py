@@ -107,6 +107,8 @@ class Pack:
     """Buffers to store; default: those that every variant of ntd is trained with."""
     indirect_only: bool = False
     """Leave out direct and emitted light: smaller, but nothing can be trained on all light."""
+    without_half: bool = False
+    """Leave out the reference's first half: a quarter smaller, but no inputs of half the reference's samples."""
     seed: int = 0
     """Of the choice of windows."""
 
@@ -266,6 +268,7 @@ def _pack(options: Pack) -> None:
         draws=options.draws,
         buffers=USUAL if options.buffers is None else tuple(options.buffers),
         direct=not options.indirect_only,
+        half=not options.without_half,
         seed=options.seed,
     )
     with Console(stderr=True).status("reading ...") as status:

@@ -46,6 +46,8 @@ class Packing(NamedTuple):
     buffers: tuple[str, ...] = USUAL
     direct: bool = True
     """With the direct light of the single samples, and the buffers ``direct`` and ``emission``."""
+    half: bool = True
+    """With the reference's first half, for training on inputs of half its samples."""
     seed: int = 0
     """Of the windows."""
 
@@ -178,7 +180,7 @@ def _stored(
 ) -> Stored:
     """Everything to store of a window."""
     wanted = set(packing.buffers) | ({"direct", "emission"} if packing.direct and packing.draws else set())
-    wanted |= {"reference", "reference_half"} | (set() if packing.draws else {_NOISY})
+    wanted |= {"reference"} | ({"reference_half"} if packing.half else set()) | (set() if packing.draws else {_NOISY})
     codes: dict[str, np.ndarray] = {}
     for name in (*GUIDES, "reference", "reference_half", _NOISY):  # in this order: neutral buffers come first
         if name in wanted & clip.arrays:
