@@ -68,7 +68,7 @@ def decode_fraction(codes: np.ndarray) -> np.ndarray:
 def encode_direction(values: np.ndarray) -> np.ndarray:
     """uint16 codes [..., 2] of directions [..., 3]: points of an octahedron unfolded to a square, in 1023 steps a side.
 
-    The error is below 0.2 degrees, and 0 for the axes; the length becomes 1. The zero vector, and with it what is not
+    The error is below 0.26 degrees, and 0 for the axes; the length becomes 1. The zero vector, and with it what is not
     finite, has a code of its own. Cigolle et al. 2014, "A Survey of Efficient Representations for Independent Unit
     Vectors".
     """
