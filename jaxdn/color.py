@@ -76,7 +76,7 @@ def _power_slope(exponent: float, primals: tuple[jax.Array], tangents: tuple[jax
 
 
 def exposure(radiance: jax.Array) -> jax.Array:
-    """The factor (a scalar) that makes an image [H, W, 3] of linear radiance as bright as a photograph: 0.18 in the mean.
+    """The factor (a scalar) that makes linear radiance [H, W, 3] as bright as a photograph: 0.18 in the mean.
 
     ``0.18 / exp(mean(log L))`` over the mean luminances L of blocks of 16x16 pixels that are not black; 1 for a black
     image. Means of blocks first: of single noisy pixels the logarithm is mostly noise. Twice the light halves the

@@ -86,7 +86,9 @@ def open_cached(path: str | Path, *, cache: str | Path | None = None) -> CachedC
         )
     shape = (record["frames"], record["height"], record["width"])
     counts = facts["draws"], int(record.get("reference_spp", 0))
-    return CachedClip(path, home, shape, frozenset(facts["arrays"]), tuple(facts["layers"]), *counts, is_planned(record))
+    return CachedClip(
+        path, home, shape, frozenset(facts["arrays"]), tuple(facts["layers"]), *counts, is_planned(record)
+    )
 
 
 def read_window(

@@ -2,8 +2,8 @@
 
 A clip has at most one image of each sample count in its layers, but may have many single samples (``draws``), of
 indirect and of direct light. ``n`` samples a pixel are the mean of ``n`` of them, chosen at random, so that a crop
-rarely has the same noise twice. More samples come from the layers, and as many as half of the reference's from its first
-half, whose target is then the other half: independent, and nearly clean.
+rarely has the same noise twice. More samples come from the layers, and as many as half of the reference's from its
+first half, whose target is then the other half: independent, and nearly clean.
 """
 
 from typing import NamedTuple
@@ -33,12 +33,12 @@ def check_samples(clip: CachedClip, spp: int) -> None:
         layers_for(spp, clip.layers, clip.path)
     except ClipError as error:
         half = f", or {clip.half_spp} (half of the reference)" if clip.half_spp else ""
-        raise ClipError(f"{error} Its single samples give 1 to {clip.draws}{half}." if clip.draws else str(error)) from error
+        raise ClipError(
+            f"{error} Its single samples give 1 to {clip.draws}{half}." if clip.draws else str(error)
+        ) from error
 
 
-def draw_light(
-    clip: CachedClip, window: Window, spp: int, rng: np.random.Generator, *, beauty: bool = False
-) -> Light:
+def draw_light(clip: CachedClip, window: Window, spp: int, rng: np.random.Generator, *, beauty: bool = False) -> Light:
     """Light of ``spp`` samples a pixel in a window (frames, rows, columns) of a clip.
 
     Args:
@@ -63,4 +63,3 @@ def draw_light(
         other = (both * shares[1] - half * shares[0]) / (shares[1] - shares[0])
         return Light(half, np.maximum(other, 0.0, dtype=np.float32))
     return Light(read_layers(clip, window, spp), read_array(clip, "reference", window))
-

@@ -65,8 +65,9 @@ def fit(
 ) -> TrainState:
     """Train to ``recipe.steps`` updates, resuming from the newest checkpoint in ``folder`` to the same result.
 
-    On Ctrl-C the state is saved before KeyboardInterrupt is raised again, and at the time limit before it is returned. Raises ValueError for impossible values in
-    the recipe, and, with what to change, after many updates in a row that changed nothing.
+    On Ctrl-C the state is saved before KeyboardInterrupt is raised again, and at the time limit before it is returned.
+    Raises ValueError for impossible values in the recipe, and, with what to change, after many updates in a row that
+    changed nothing.
 
     Args:
       denoiser: what to train.

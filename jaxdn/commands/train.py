@@ -28,8 +28,9 @@ def train(
 ) -> Path:
     """Train a method to the end, unless it is trained already, and return the path of its weights.
 
-    The weights are the running mean that the recipe asks for. A second call resumes from the newest checkpoint in ``out``. Raises ValueError for options that the method does not
-    have, unsuitable clips, and an engine that cannot run here.
+    The weights are the running mean that the recipe asks for. A second call resumes from the newest checkpoint in
+    ``out``. Raises ValueError for options that the method does not have, unsuitable clips, and an engine that cannot
+    run here.
 
     Args:
       method: a row of the table of methods.
@@ -70,7 +71,13 @@ def train(
     first = None if start is None else Start(str(start), starting_params(start, denoiser))
     state = fit(denoiser, recipe, batches, out, label=label, start=first, validation=held_out, time_limit=time_limit)
     begun = {} if first is None else {"start": first.name}
-    about = {"recipe": recipe.record(), "updates": int(state.step), "skipped": int(state.skipped), **begun, **(record or {})}
+    about = {
+        "recipe": recipe.record(),
+        "updates": int(state.step),
+        "skipped": int(state.skipped),
+        **begun,
+        **(record or {}),
+    }
     given = dataclasses.asdict(method.made(options))
     return save_weights(
         out / "weights.safetensors",

@@ -123,9 +123,12 @@ def make_train_step(denoiser: Denoiser, recipe: Recipe) -> Callable[[TrainState,
         kept = jax.tree.leaves((params, average, optimizer_state))
         finite = [jnp.isfinite(norm), jnp.isfinite(loss), *(jnp.isfinite(x).all() for x in kept)]
         usable = functools.reduce(jnp.logical_and, finite)
-        new, old = (params, average, optimizer_state), (state.params, state.average, state.optimizer)
-        chosen = jax.tree.map(lambda new, old: jnp.where(usable, new, old), new, old)
+        params, average, optimizer_state = jax.tree.map(
+            lambda new, old: jnp.where(usable, new, old),
+            (params, average, optimizer_state),
+            (state.params, state.average, state.optimizer),
+        )
         skipped = state.skipped + jnp.where(usable, 0, 1)
-        return TrainState(*chosen, state.step + 1, skipped), Report(loss, psnr, norm)
+        return TrainState(params, average, optimizer_state, state.step + 1, skipped), Report(loss, psnr, norm)
 
     return jax.jit(train_step, donate_argnums=0, compiler_options=training_options())

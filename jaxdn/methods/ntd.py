@@ -76,8 +76,8 @@ class Options:
     background: Literal["pass", "filter"] = "pass"
     """Pixels without a surface (depth at ``FAR``) keep their radiance, which has no noise, or are filtered."""
     exposure: Literal["measured", "given"] = "measured"
-    """The network sees radiance times :func:`jaxdn.color.exposure` of each frame, so that twice the light gives twice the
-    image; or radiance as it is given."""
+    """The network sees radiance times :func:`jaxdn.color.exposure` of each frame, so that twice the light gives twice
+    the image; or radiance as it is given."""
     initialization: Literal["he", "xavier"] = "he"
     """Of the U-Net's weights, see :func:`jaxdn.networks.unet.initial`."""
     demodulate: Demodulation | bool = "brdf"
@@ -261,8 +261,8 @@ def ntd(options: Options) -> Denoiser:
 
     sizes = {"large": LARGE, "small": SMALL}
     widths = sizes[options.size] if isinstance(options.size, str) else options.size
-    settings = {"initialization": options.initialization, "implementation": options.implementation}
-    network = unet(groups, heads, widths=widths, **settings)
+    scheme, engine = options.initialization, options.implementation
+    network = unet(groups, heads, widths=widths, initialization=scheme, implementation=engine)
     reads = frozenset({"albedo", "normal", "depth", "motion"})
     reads |= {"dual_motion"} if options.motion == "dual" else set()
     reads |= {"reflectance", "roughness"} if materials else set()

@@ -139,8 +139,8 @@ class UNet(nnx.Module):
 def initial(key: jax.Array, shapes: dict[str, Any], *, scheme: str) -> dict[str, Any]:
     """Kernels uniform within +-limit, biases zero.
 
-    ``scheme``: with "he" the limit is ``sqrt(6 / fan_in)``, so that signals keep their size through the rectifiers (He et
-    al. 2015), and a tenth of ``sqrt(3 / fan_in)`` in the heads, so that every kernel begins nearly flat; with "xavier"
+    ``scheme``: with "he" the limit is ``sqrt(6 / fan_in)``, so that signals keep their size through the rectifiers (He
+    et al. 2015), and a tenth of ``sqrt(3 / fan_in)`` in the heads, so that every kernel begins nearly flat; with "xavier"
     it is ``sqrt(6 / (fan_in + fan_out))`` (Glorot and Bengio 2010), with which each convolution halves the signal's
     variance: the deep levels begin with gradients two orders of magnitude smaller and hardly learn.
 
@@ -203,10 +203,11 @@ def unet(
     ``None`` where it is absent, which equals an array of zeros but skips its part of the first convolution: the shapes
     of ``params`` never depend on it. H and W are multiples of 16. ``heads`` are the channel counts at full,
     half and quarter resolution; their outputs are raw (logits). ``widths`` gives the channels of each convolution of
-    each of the five levels; the decoder mirrors the first four. ``initialization``: see :func:`initial`. Computes in the features' dtype. ``implementation``:
-    None or "reference" (XLA), "onnxruntime" (inference, see :mod:`jaxdn.networks.onnx`) or "onednn" (convolutions and
-    their gradients, see :mod:`jaxdn.ops.onednn`). Raises ValueError when ``widths`` is not five non-empty levels
-    of positive integers, the features do not fit, or the implementation cannot run here.
+    each of the five levels; the decoder mirrors the first four. ``initialization``: see :func:`initial`. Computes in
+    the features' dtype. ``implementation``: None or "reference" (XLA), "onnxruntime" (inference, see
+    :mod:`jaxdn.networks.onnx`) or "onednn" (convolutions and their gradients, see :mod:`jaxdn.ops.onednn`). Raises
+    ValueError when ``widths`` is not five non-empty levels of positive integers, the features do not fit, or the
+    implementation cannot run here.
     """
     run = resolve("unet", implementation)
     widths = tuple(tuple(level) for level in widths)

@@ -100,7 +100,7 @@ def test_without_variation_nothing_changes(clip: Clip) -> None:
 
 
 def test_values_out_of_range_are_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="variation exposure: expected a number >= 1, got 0.5"):
+    with pytest.raises(ValueError, match=r"variation exposure: expected a number >= 1, got 0\.5"):
         Variation(exposure=0.5).check()
     Variation().check()
     assert {name for group in GROUPS for name in group} <= set(Frame._fields)

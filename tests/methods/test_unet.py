@@ -113,9 +113,11 @@ def test_parameters_are_plain_and_uniform_within_the_limits_of_the_scheme(key: j
 
 
 def test_every_level_begins_to_learn_at_the_same_pace(key: jax.Array, rng: np.random.Generator) -> None:
-    """With Xavier's limits the deepest levels get a hundredth of the gradient of the others, relative to their weights."""
+    """With Xavier's limits the deepest levels get a hundredth of the others' gradient, relative to their weights."""
     network, inputs = unet(GROUPS, HEADS, widths=SMALL), features(rng, GROUPS)
-    wanted = [rng.standard_normal(np.shape(head)).astype(np.float32) for head in network.apply(network.init(key), inputs)]
+    wanted = [
+        rng.standard_normal(np.shape(head)).astype(np.float32) for head in network.apply(network.init(key), inputs)
+    ]
 
     @jax.jit
     def slope(params: dict) -> dict:
@@ -127,7 +129,9 @@ def test_every_level_begins_to_learn_at_the_same_pace(key: jax.Array, rng: np.ra
 
     def spread(scheme: str) -> float:
         params = unet(GROUPS, HEADS, widths=SMALL, initialization=scheme).init(key)
-        sizes = {name: float(optax.tree.norm(part) / optax.tree.norm(params[name])) for name, part in slope(params).items()}
+        sizes = {
+            name: float(optax.tree.norm(part) / optax.tree.norm(params[name])) for name, part in slope(params).items()
+        }
         levels = [size for name, size in sizes.items() if "head" not in name]
         return max(levels) / min(levels)
 
