@@ -140,9 +140,9 @@ def initial(key: jax.Array, shapes: dict[str, Any], *, scheme: str) -> dict[str,
     """Kernels uniform within +-limit, biases zero.
 
     ``scheme``: with "he" the limit is ``sqrt(6 / fan_in)``, so that signals keep their size through the rectifiers (He
-    et al. 2015), and a tenth of ``sqrt(3 / fan_in)`` in the heads, so that every kernel begins nearly flat; with "xavier"
-    it is ``sqrt(6 / (fan_in + fan_out))`` (Glorot and Bengio 2010), with which each convolution halves the signal's
-    variance: the deep levels begin with gradients two orders of magnitude smaller and hardly learn.
+    et al. 2015), and a tenth of ``sqrt(3 / fan_in)`` in the heads, so that every kernel begins nearly flat; with
+    "xavier" it is ``sqrt(6 / (fan_in + fan_out))`` (Glorot and Bengio 2010), with which each convolution halves the
+    signal's variance: the deep levels begin with gradients two orders of magnitude smaller and hardly learn.
 
     All kernels are slices of one draw: with a generator for each, XLA takes twenty seconds to compile.
     """
