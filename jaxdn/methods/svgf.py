@@ -41,7 +41,7 @@ _Planes = tuple[jax.Array, jax.Array, jax.Array]
 
 @dataclass(frozen=True)
 class Options:
-    """The parameters, with the paper's defaults where it gives them."""
+    """The parameters, with the paper's defaults where it gives them, except for ``sigma_normal``."""
 
     alpha: Annotated[float, _SHARE] = 0.2
     """Minimum weight of the new frame in colour; the weight is ``max(alpha, 1 / N)`` at history length N."""
@@ -49,8 +49,9 @@ class Options:
     """The same for the moments of luminance."""
     sigma_depth: Annotated[float, _POSITIVE] = 1.0
     """Edge-stopping parameter for differences in depth."""
-    sigma_normal: Annotated[float, Range(0)] = 128.0
-    """Exponent of the cosine of normals."""
+    sigma_normal: Annotated[float, Range(0)] = 16.0
+    """Exponent of the cosine of normals. The paper's 128 (``preset="paper"``) keeps light of one curved or bumpy surface
+    apart: at 1 sample per pixel 16 has 1.6 dB more on held-out clips."""
     sigma_luminance: Annotated[float, _POSITIVE] = 4.0
     """Edge-stopping parameter for differences in luminance, in standard deviations."""
     levels: Annotated[int, Range(0, 10)] = 5
@@ -85,7 +86,11 @@ class SvgfState(NamedTuple):
     """Depth, normal and ids of the previous frame, as far as present."""
 
 
-@method(Options, title="Spatiotemporal variance-guided filtering (Schied et al. 2017)")
+@method(
+    Options,
+    title="Spatiotemporal variance-guided filtering (Schied et al. 2017)",
+    presets={"paper": Options(sigma_normal=128.0)},
+)
 def svgf(options: Options) -> Denoiser:
     """SVGF, a filter without weights (``params`` is ``{}``).
 

@@ -13,7 +13,7 @@ from jaxdn.methods.svgf import svgf
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 HEIGHT, WIDTH = 10, 12
-DENOISER = svgf(levels=3)
+DENOISER = svgf(preset="paper", levels=3)
 STEP = jax.jit(DENOISER.step)
 
 
