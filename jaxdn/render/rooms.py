@@ -109,7 +109,7 @@ def _view(space: FreeSpace, rng: np.random.Generator, ease: float) -> Camera | N
     """The best of some random views: many things, near and far ones, none too close; None if all are poor."""
     cameras = []
     for spot in space.spots[rng.integers(len(space.spots), size=_VIEWS)]:
-        pitch, turn = np.radians(rng.uniform(-30, 12)), rng.uniform(0, 360)
+        pitch, turn = np.radians(rng.uniform(-35, 8)), rng.uniform(0, 360)
         ahead = np.roll(space.up, 1) * np.cos(pitch) + space.up * np.sin(pitch)
         forward = rotation_matrix(space.up, turn) @ ahead
         cameras.append(Camera(_looking(space, spot, forward), float(rng.uniform(35, 80))))
