@@ -20,6 +20,26 @@ def downsample(image: jax.Array, *, down: str = "mean") -> jax.Array:
     return jnp.maximum(jnp.maximum(corners[0], corners[1]), jnp.maximum(corners[2], corners[3]))
 
 
+def fill(image: jax.Array, known: jax.Array) -> jax.Array:
+    """[H, W, C] with the mean of the known pixels of the same 2x2 block, else 4x4 block, where a pixel is not known.
+
+    ``known`` [H, W, 1] is bool. Blocks without a known pixel are 0. Means of the result thus hold nothing of what was
+    there. Sizes that are not multiples of 4 raise ValueError.
+    """
+    check_image(image, "image")
+    image = jnp.asarray(image)
+    weight = jnp.asarray(known, image.dtype)
+    total, means = jnp.where(known, image, 0.0), []
+    for level in (1, 2):
+        total, weight = downsample(total), downsample(weight)
+        mean = total / jnp.where(weight > 0, weight, 1.0)
+        for _ in range(level):
+            mean = upsample(mean, up="nearest")
+        means.append((mean, weight))
+    near = upsample(means[0][1], up="nearest") > 0
+    return jnp.where(known, image, jnp.where(near, means[0][0], means[1][0]))
+
+
 def upsample(image: jax.Array, *, up: str = "bilinear") -> jax.Array:
     """Double [H, W, C] to [2H, 2W, C]: bilinear with half-pixel centres and edge clamp, or nearest.
 

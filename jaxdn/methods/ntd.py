@@ -31,7 +31,7 @@ from jaxdn.ops.softmax_filter import softmax_filter
 from jaxdn.ops.warp import warp
 from jaxdn.recipe import Recipe
 from jaxdn.repair import repair_image
-from jaxdn.scales import compose_scales, downsample
+from jaxdn.scales import compose_scales, downsample, fill
 
 TAPS = 25
 SCALES = 3
@@ -74,7 +74,8 @@ class Options:
     """The network's logits plus a cross-bilateral prior, see :func:`guided_features`; or these logits alone, as in the
     paper."""
     background: Literal["pass", "filter"] = "pass"
-    """Pixels without a surface (depth at ``FAR``) keep their radiance, which has no noise, or are filtered."""
+    """Pixels without a surface (depth at ``FAR``) keep their radiance, which has no noise, and surfaces get none of it:
+    for the filters these pixels hold the light of surfaces next to them. Or they are filtered as all others."""
     exposure: Literal["measured", "given"] = "measured"
     """The network sees radiance times :func:`jaxdn.color.exposure` of each frame, so that twice the light gives twice
     the image; or radiance as it is given."""
@@ -292,7 +293,10 @@ def ntd(options: Options) -> Denoiser:
         recalled, absent, broken = _recall(options, state, frame, first)
         seen = _guides(options, frame)
         noisy, recalled, absent = (pad(image) for image in (frame.radiance, recalled, absent))
-        gain = color.exposure(frame.radiance) if options.exposure == "measured" else 1.0
+        hit = hit_mask(frame.depth, None) if options.background == "pass" else None
+        if hit is not None:
+            noisy, recalled = (fill(image, pad(hit[..., None])) for image in (noisy, recalled))
+        gain = color.exposure(noisy) if options.exposure == "measured" else 1.0
         squeezed, squeezed_history = color.compress(gain * noisy), color.compress(gain * recalled)
         features = [squeezed, seen["albedo"], seen["normal"], seen["depth"], squeezed_history]
         if flagged:
@@ -308,10 +312,8 @@ def ntd(options: Options) -> Denoiser:
         else:
             image = _blend(options, predicted, guiding, noisy, recalled, absent)
         image = jnp.clip(crop(image, size), 0.0, RADIANCE_MAX)
-        hit = hit_mask(frame.depth, None) if options.background == "pass" else None
-        if hit is not None:
-            image = jnp.where(hit[..., None], image, frame.radiance)
-        return image, image, broken
+        shown = image if hit is None else jnp.where(hit[..., None], image, frame.radiance)
+        return image, shown, broken
 
     plain = recurrent(Core(start, step, reads, init))
     return demodulated(plain, by=options.demodulate)

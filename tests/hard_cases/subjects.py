@@ -177,6 +177,10 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
     def flakes(inputs: Inputs) -> jax.Array:
         return glints.flake_normals(8, inputs.clip.frames.roughness[-1, 0, 0, 0], flakes=32, bins=3)
 
+    def filled(inputs: Inputs) -> jax.Array:
+        image = inputs.clip.frames.radiance[-1][:16, :16]
+        return scales.fill(image, inputs.clip.frames.visible[-1][:16, :16])
+
     return {
         **{f"warp, {border}": partial(warped, border=border) for border in _BORDERS},
         "on_screen": lambda inputs: jax.vmap(on_screen)(inputs.clip.frames.motion).astype(jnp.float32),
@@ -188,6 +192,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "softmax_filter, guided": guided_by_features,
         "compose_scales": composed,
         "downsample": lambda inputs: scales.downsample(even(inputs)),
+        "fill": filled,
         "upsample": lambda inputs: scales.upsample(inputs.clip.frames.radiance[-1]),
         "brdf.directional_albedo": reflected,
         "brdf.divisor": lambda inputs: brdf.divisor(inputs.clip.frames.reflectance),

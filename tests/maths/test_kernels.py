@@ -10,7 +10,7 @@ from jax.test_util import check_grads
 
 from jaxdn.ops.kernels import apply_kernels, normalize_kernels
 from jaxdn.ops.softmax_filter import softmax_filter
-from jaxdn.scales import compose_scales, downsample, upsample
+from jaxdn.scales import compose_scales, downsample, fill, upsample
 
 SCALES = [(down, up) for down in ("mean", "max") for up in ("bilinear", "nearest")]
 
@@ -201,3 +201,27 @@ def test_errors_say_what_to_do():
         compose_scales(image, image, image[..., :1])
     with pytest.raises(ValueError, match=r"alpha.*\(4, 6\) or \(2, 3\), got \(3, 6\)"):
         compose_scales(image, image[:2, :3], image[:3, :, :1])
+
+
+def test_fill_takes_the_mean_of_known_neighbours(rng: np.random.Generator) -> None:
+    image = rng.random((8, 12, 3)).astype(np.float32)
+    known = rng.random((8, 12, 1)) < 0.3
+    known[:4, :4] = False  # a block without any
+    known[4:6, 4:6] = False
+    known[6, 4] = True  # known only in the 4x4 block
+    found = np.asarray(jax.jit(fill)(np.where(known, image, np.nan), known))
+    for y, x in np.ndindex(8, 12):
+        if known[y, x, 0]:
+            expected = image[y, x]
+        else:
+            means = []
+            for size in (2, 4):
+                block = np.s_[y // size * size : y // size * size + size, x // size * size : x // size * size + size]
+                inside = known[block][..., 0]
+                means += [image[block][inside].astype(np.float64).mean(0)] if inside.any() else []
+            expected = means[0] if means else 0.0
+        np.testing.assert_allclose(found[y, x], expected, rtol=1e-5)
+    slope = jax.grad(lambda x: jnp.sum(fill(x, known) ** 2))(jnp.asarray(image))
+    np.testing.assert_array_equal(np.where(known, 0, slope), 0)  # what is not known has no say
+    with pytest.raises(ValueError, match="even"):
+        fill(np.zeros((6, 8, 3), np.float32), np.ones((6, 8, 1), bool))
