@@ -50,8 +50,8 @@ class Options:
     sigma_depth: Annotated[float, _POSITIVE] = 1.0
     """Edge-stopping parameter for differences in depth."""
     sigma_normal: Annotated[float, Range(0)] = 16.0
-    """Exponent of the cosine of normals. The paper's 128 (``preset="paper"``) keeps light of one curved or bumpy surface
-    apart: at 1 sample per pixel 16 has 1.6 dB more on held-out clips."""
+    """Exponent of the cosine of normals. The paper's 128 (``preset="paper"``) keeps light of one curved or bumpy
+    surface apart: at 1 sample per pixel 16 has 1.6 dB more on held-out clips."""
     sigma_luminance: Annotated[float, _POSITIVE] = 4.0
     """Edge-stopping parameter for differences in luminance, in standard deviations."""
     levels: Annotated[int, Range(0, 10)] = 5

@@ -10,9 +10,10 @@ import numpy as np
 
 import jaxdn
 from jaxdn import brdf, color, glints, losses, metrics, microfacets, numerics, scales
-from jaxdn.frame import RADIANCE_MAX, Clip, Frame
+from jaxdn.frame import FAR, RADIANCE_MAX, Clip, Frame
 from jaxdn.methods.table import methods
 from jaxdn.motion import on_screen
+from jaxdn.networks import pad
 from jaxdn.ops.softmax_filter import softmax_filter
 from jaxdn.repair import repair
 from tests.hard_cases.inputs import HEIGHT, WIDTH, Inputs
@@ -178,8 +179,9 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         return glints.flake_normals(8, inputs.clip.frames.roughness[-1, 0, 0, 0], flakes=32, bins=3)
 
     def filled(inputs: Inputs) -> jax.Array:
-        image = inputs.clip.frames.radiance[-1][:16, :16]
-        return scales.fill(image, inputs.clip.frames.visible[-1][:16, :16])
+        frames = inputs.clip.frames
+        known = frames.depth[-1] < FAR
+        return scales.fill(pad(frames.radiance[-1]), pad(known))
 
     return {
         **{f"warp, {border}": partial(warped, border=border) for border in _BORDERS},
