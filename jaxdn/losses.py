@@ -23,9 +23,10 @@ def unbiased(denoised: jax.Array, reference: jax.Array) -> tuple[jax.Array, jax.
 
     The slope has no gradient of its own, so that the target appears only linearly: squared, the difference is to first
     order that of the compressed images, but noise in the target, which compression would turn into a bias, averages
-    out. For linear radiance.
+    out. For linear radiance. Below 0.02 the slope stays that at 0.02: at black it is 152, and a single bright sample in
+    a target would outweigh all else.
     """
-    point = jax.lax.stop_gradient(denoised)
+    point = jnp.maximum(jax.lax.stop_gradient(denoised), 0.02)
     _, slope = jax.jvp(color.compress, (point,), (jnp.ones_like(point),))
     return denoised * slope, reference * slope
 

@@ -10,14 +10,17 @@ from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import numpy as np
 
-from jaxdn.frame import BUFFERS, Clip, present, written_out
+from jaxdn.frame import BUFFERS, RADIANCE_MAX, Clip, present, written_out
 from jaxdn.options import Range, check
 
 
 class Variation(NamedTuple):
     """How far an element may be varied; ``STILL`` is no variation."""
 
-    exposure: Annotated[float, Range(1)] = 8.0
+    level: bool = True
+    """All light is first brought to the same brightness, 0.18 in the geometric mean over the reference's blocks of 16x16
+    pixels (by a factor of 1000 at most): else a loss hardly sees dark rooms."""
+    exposure: Annotated[float, Range(1)] = 4.0
     """All light times a factor from 1 / exposure to exposure (uniform in its logarithm), one per clip."""
     tint: Annotated[float, Range(1)] = 1.5
     """Each channel of light times a factor from 1 / tint to tint."""
@@ -35,7 +38,7 @@ class Variation(NamedTuple):
         check(self._asdict(), get_type_hints(Variation, include_extras=True), of="variation")
 
 
-STILL = Variation(1.0, 1.0, False, False, 0.0, 0.0)
+STILL = Variation(False, 1.0, 1.0, False, False, 0.0, 0.0)
 
 GROUPS = (
     ("albedo", "reflectance", "specular_reflectance"),
@@ -57,7 +60,8 @@ def varied(clip: Clip, variation: Variation, rng: np.random.Generator) -> Clip:
     brighter, tints = rng.uniform(-1, 1), rng.uniform(-1, 1, 3)
     order, rotation = rng.permutation(3), _rotation(rng.standard_normal(4))
     absent = rng.random(len(GROUPS)) < variation.missing
-    gain = (variation.exposure**brighter * variation.tint**tints).astype(np.float32)
+    level = _leveling(clip.reference) if variation.level and clip.reference is not None else 1.0
+    gain = (level * variation.exposure**brighter * variation.tint**tints).astype(np.float32)
     order = order if variation.channels else np.arange(3)
 
     def light(image: np.ndarray) -> np.ndarray:
@@ -80,6 +84,16 @@ def varied(clip: Clip, variation: Variation, rng: np.random.Generator) -> Clip:
         None if clip.reference is None else light(clip.reference),
         None if clip.layers is None else {count: light(image) for count, image in clip.layers.items()},
     )
+
+
+def _leveling(reference: np.ndarray) -> float:
+    """The factor that makes light [T, H, W, 3] as bright as all others."""
+    light = np.clip(reference, 0.0, RADIANCE_MAX).mean((0, 3), dtype=np.float64)
+    means = [
+        light[y : y + 16, x : x + 16].mean() for y in range(0, len(light), 16) for x in range(0, len(light[0]), 16)
+    ]
+    lit = [mean for mean in means if mean > 0]
+    return float(np.clip(0.18 / np.exp(np.mean(np.log(lit))), 1e-3, 1e3)) if lit else 1.0
 
 
 def _rotation(quaternion: np.ndarray) -> np.ndarray:

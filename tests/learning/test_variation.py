@@ -104,3 +104,16 @@ def test_values_out_of_range_are_refused_by_name() -> None:
         Variation(exposure=0.5).check()
     Variation().check()
     assert {name for group in GROUPS for name in group} <= set(Frame._fields)
+
+
+def test_every_clip_gets_the_same_brightness(clip: Clip, rng: np.random.Generator) -> None:
+    wide = rng.exponential(size=(2, 32, 48, 3)).astype(np.float32)
+    wide[:, :16, :16] = 0  # black blocks have no say
+    for factor in (1e-2, 1.0, 30.0):
+        given = Clip(Frame(radiance=factor * wide), factor * wide)
+        found = one(STILL._replace(level=True), given)
+        means = found.reference.mean((0, 3)).reshape(2, 16, 3, 16).mean((1, 3)).ravel()[1:]
+        np.testing.assert_allclose(np.exp(np.mean(np.log(means))), 0.18, rtol=1e-4)
+        np.testing.assert_allclose(found.frames.radiance, found.reference, rtol=1e-6)
+    black = Clip(Frame(radiance=0 * wide), 0 * wide)
+    assert not one(STILL._replace(level=True), black).reference.any()
