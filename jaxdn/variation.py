@@ -18,8 +18,8 @@ class Variation(NamedTuple):
     """How far an element may be varied; ``STILL`` is no variation."""
 
     level: bool = True
-    """All light is first brought to the same brightness, 0.18 in the geometric mean over the reference's blocks of 16x16
-    pixels (by a factor of 1000 at most): else a loss hardly sees dark rooms."""
+    """All light is first brought to the same brightness, 0.18 in the geometric mean over the reference's blocks of
+    16x16 pixels (by a factor of 1000 at most): else a loss hardly sees dark rooms."""
     exposure: Annotated[float, Range(1)] = 4.0
     """All light times a factor from 1 / exposure to exposure (uniform in its logarithm), one per clip."""
     tint: Annotated[float, Range(1)] = 1.5
