@@ -12,6 +12,7 @@ from jaxdn.render.families.edge import edge
 from jaxdn.render.families.fruit import fruit
 from jaxdn.render.families.glitter import glitter
 from jaxdn.render.families.mobile import mobile
+from jaxdn.render.families.parlour import parlour
 from jaxdn.render.families.pinkroom import pinkroom
 from jaxdn.render.families.robot import robot
 from jaxdn.render.families.staging import Stage
@@ -24,6 +25,7 @@ FAMILIES: dict[str, Callable[..., Stage]] = {
     "edge": edge,
     "dash": dash,
     "glitter": glitter,
+    "parlour": parlour,
 }
 
 

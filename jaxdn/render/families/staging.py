@@ -87,7 +87,8 @@ def shuttle(frame: float, period: float, phase: float = 0.0) -> float:
 class Material(NamedTuple):
     """A surface: one colour [3] or a texture [n,n,3], repeated over uv; without roughness it is purely diffuse.
 
-    `normals` [n,n,3] are those of flakes in it, one for each texel, in the frame of the surface.
+    `normals` [n,n,3] are those of flakes in it, one for each texel, in the frame of the surface. `glass` is Mitsuba's
+    name of a kind of glass, which lets light of the colour through; roughness and the rest do not apply to it.
     """
 
     color: np.ndarray
@@ -96,27 +97,32 @@ class Material(NamedTuple):
     specular: float = 0.5
     repeat: tuple[float, float] = (1.0, 1.0)
     normals: np.ndarray | None = None
+    glass: str | None = None
 
     def describe(self) -> dict[str, Any]:
-        """The dictionary of a Mitsuba BSDF, seen from both sides."""
+        """The dictionary of a Mitsuba BSDF; all but glass look the same from both sides."""
         if self.color.ndim == 1:
             color: dict[str, Any] = {"type": "rgb", "value": [float(value) for value in np.clip(self.color, 0, 0.95)]}
         else:
-            color = self._bitmap(self.color)
+            color = _bitmap(self.color, self.repeat)
+        if self.glass is not None:
+            return {"type": self.glass, "specular_transmittance": color}
         if self.roughness is None:
             return {"type": "twosided", "nested": {"type": "diffuse", "reflectance": color}}
         gloss = {"roughness": float(self.roughness), "metallic": float(self.metallic), "specular": float(self.specular)}
         nested: dict[str, Any] = {"type": "principled", "base_color": color, **gloss}
         if self.normals is not None:
-            flakes = self._bitmap(0.5 + 0.5 * self.normals) | {"filter_type": "nearest"}
+            flakes = _bitmap(0.5 + 0.5 * self.normals, self.repeat) | {"filter_type": "nearest"}
             nested = {"type": "normalmap", "normalmap": flakes, "nested": nested}
         return {"type": "twosided", "nested": nested}
 
-    def _bitmap(self, values: np.ndarray) -> dict[str, Any]:
-        import mitsuba as mi
 
-        to_uv = mi.ScalarTransform4f(scale(self.repeat[0], self.repeat[1], 1.0))
-        return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(values)), "raw": True, "to_uv": to_uv}
+def _bitmap(values: np.ndarray, repeat: tuple[float, float] = (1.0, 1.0)) -> dict[str, Any]:
+    """The dictionary of a texture [n,n,3] of linear values."""
+    import mitsuba as mi
+
+    to_uv = mi.ScalarTransform4f(scale(repeat[0], repeat[1], 1.0))
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(values)), "raw": True, "to_uv": to_uv}
 
 
 def matte(color: Any, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Material:
@@ -131,14 +137,23 @@ def metal(color: Any, roughness: float = 0.25) -> Material:
     return Material(np.asarray(color), roughness, metallic=1.0)
 
 
+def glass(color: Any, *, thin: bool = False) -> Material:
+    """Clear glass: of a solid body, or of a `thin` wall that is a single sheet."""
+    return Material(np.asarray(color), glass="thindielectric" if thin else "dielectric")
+
+
 class Part(NamedTuple):
-    """One shape of a stage: a primitive's name or a mesh, where it stands at a frame, and what it is made of."""
+    """One shape of a stage: a primitive's name or a mesh, where it stands at a frame, what it is made of and emits.
+
+    `glow` is a radiance [3] or a texture of it [n,n,3]; `dimmer` gives the factor on it at a frame.
+    """
 
     shape: str | Mesh
     pose: Motion
     moves: bool
     material: Material
     glow: np.ndarray | None
+    dimmer: Callable[[float], float] | None = None
 
 
 class Stage:
@@ -170,7 +185,14 @@ class Stage:
         self.view: Callable[[float], Camera] = lambda frame: Camera(np.eye(4), 60.0)
 
     def add(
-        self, name: str, shape: str | Mesh, pose: np.ndarray | Motion, material: Material, *, glow: Any = None
+        self,
+        name: str,
+        shape: str | Mesh,
+        pose: np.ndarray | Motion,
+        material: Material,
+        *,
+        glow: Any = None,
+        dimmer: Callable[[float], float] | None = None,
     ) -> None:
         """Add a shape to the scene.
 
@@ -179,19 +201,24 @@ class Stage:
           shape: a primitive's name or a mesh.
           pose: [4, 4], or a function of the frame for a moving shape.
           material: of the shape.
-          glow: radiance that it emits.
+          glow: radiance [3] that it emits, or a texture of it [n, n, 3].
+          dimmer: factor on the radiance at a frame.
         """
         if name in self.parts:
             raise ValueError(f"stage {self.name}: expected a new part, got {name!r} twice; rename one of them.")
         motion: Motion = pose if callable(pose) else lambda frame: pose
         radiance = None if glow is None else np.asarray(glow, float)
-        self.parts[name] = Part(shape, motion, callable(pose), material, radiance)
+        self.parts[name] = Part(shape, motion, callable(pose), material, radiance, dimmer)
 
     def camera(self, frame: float) -> Camera:
         return self.view(frame)
 
     def pose(self, frame: float) -> dict[str, np.ndarray]:
         return {name: part.pose(frame) for name, part in self.parts.items() if part.moves}
+
+    def brightness(self, frame: float) -> dict[str, float]:
+        """Light -> factor on its radiance, for lights that change."""
+        return {name: part.dimmer(frame) for name, part in self.parts.items() if part.dimmer is not None}
 
     def build(self, frame: float, width: int, height: int) -> Any:
         import mitsuba as mi
@@ -202,7 +229,7 @@ class Stage:
         """Mitsuba's dictionary of one frame; the shapes' keys are the ids that `pose` uses."""
         import mitsuba as mi
 
-        camera = self.camera(frame)
+        camera, factors = self.camera(frame), self.brightness(frame)
         film: dict[str, Any] = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
         film |= {"pixel_format": "rgb", "component_format": "float32"}
         sensor: dict[str, Any] = {
@@ -222,10 +249,17 @@ class Stage:
                 shape = {"type": part.shape}
             shape |= {"to_world": mi.ScalarTransform4f(part.pose(frame)), "bsdf": part.material.describe()}
             if part.glow is not None:
-                radiance = {"type": "rgb", "value": [float(value) for value in part.glow]}
-                shape["emitter"] = {"type": "area", "radiance": radiance}
+                shape["emitter"] = {"type": "area", "radiance": _radiance(part.glow, factors.get(name))}
             scene[name] = shape
         return scene
+
+
+def _radiance(glow: np.ndarray, factor: float | None) -> dict[str, Any]:
+    """The dictionary of an emitted colour [3] or texture [n,n,3]."""
+    emitted = glow if factor is None else factor * glow
+    if emitted.ndim == 1:
+        return {"type": "rgb", "value": [float(value) for value in emitted]}
+    return _bitmap(emitted.astype(np.float32))
 
 
 LAMPS = ("mix", "up", "down", "window")
