@@ -16,6 +16,9 @@ TINY = ((4,), (4,), (4,), (4,), (4,))
 SAVED = {"size": TINY, "kernels": "guided", "background": "pass"}
 FRAME = Frame(radiance=np.ones((16, 16, 3), np.float32))
 
+EARLIER = {"kernels": "plain", "background": "filter", "exposure": "given"}
+"""What weights without a record of these options were trained with."""
+
 
 @pytest.fixture
 def saved(tmp_path):
@@ -48,7 +51,7 @@ def test_weights_of_an_earlier_version_are_read(tmp_path, earlier, today):
     saved = save_weights(tmp_path / "w", params, factory="ntd", options={"size": TINY, **earlier}, record={})
     frame = FRAME._replace(albedo=np.full((16, 16, 3), 0.1, np.float32))
     images = []
-    for denoiser in (jaxdn.load_weights(saved)[0], ntd(size=TINY, kernels="plain", demodulate=today)):
+    for denoiser in (jaxdn.load_weights(saved)[0], ntd(size=TINY, **EARLIER, demodulate=today)):
         images.append(denoiser.step(params, denoiser.start(params, frame), frame)[1])
     np.testing.assert_array_equal(*images)
 
@@ -87,9 +90,8 @@ def test_weights_without_a_record_of_guides_have_plain_kernels_and_filter_the_ba
     depth = np.full((16, 16, 1), 3.0, np.float32)
     depth[:, 8:] = FAR
     frame = FRAME._replace(radiance=rng.exponential(size=(16, 16, 3)).astype(np.float32), depth=depth)
-    explicit = {"kernels": "plain", "background": "filter"}
     images = []
-    for number, options in enumerate(({"demodulate": "brdf"}, {"demodulate": "brdf", **explicit})):
+    for number, options in enumerate(({"demodulate": "brdf"}, {"demodulate": "brdf", **EARLIER})):
         path = save_weights(tmp_path / str(number), params, factory="ntd", options={"size": TINY, **options}, record={})
         denoiser, loaded = jaxdn.load_weights(path)
         images.append(denoiser.step(loaded, denoiser.start(loaded, frame), frame)[1])
@@ -99,7 +101,7 @@ def test_weights_without_a_record_of_guides_have_plain_kernels_and_filter_the_ba
 
 def test_training_continues_from_weights_that_see_less(tmp_path, rng):
     """New guides begin with weights of zero: the first image is that of the old weights, whatever the guides show."""
-    options = {"size": TINY, "kernels": "plain", "demodulate": "albedo"}
+    options = {"size": TINY, **EARLIER, "demodulate": "albedo"}
     params = ntd(**options).init(jax.random.key(0), FRAME)
     path = save_weights(tmp_path / "w", params, factory="ntd", options=options, record={})
     old, more = jaxdn.load_weights(path)[0], ntd(**options, guides="materials")
