@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdn.render.families import FAMILIES
+from jaxdn.render.later import Later
 from jaxdn.render.loaded import LoadedScene
 from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.scene_file import SceneFile
@@ -15,8 +16,13 @@ def scene_from_record(record: Mapping[str, Any]) -> AnimatedScene:
     """Build the scene that a clip's record describes: ``{"family": name, "seed": int, ...}``, or a scene file's.
 
     Keys other than ``family`` become the keyword arguments of the family's function; ``{"file": ..., "animation":
-    ...}`` is an animated scene file. Raises ValueError for a record that names neither, and for an unknown family.
+    ...}`` is an animated scene file. With ``"start": frame`` it is the later part of either that begins there. Raises
+    ValueError for a record that names neither, and for an unknown family.
     """
+    if "start" in record:
+        return Later(
+            scene_from_record({key: value for key, value in record.items() if key != "start"}), record["start"]
+        )
     if "file" in record:
         return SceneFile.from_record(record)
     if "family" not in record:

@@ -304,3 +304,32 @@ def test_transforms() -> None:
     np.testing.assert_allclose(placed @ [0, 1, 0, 1], [2, 4, 5, 1], atol=1e-12)
     assert np.linalg.det(placed) == pytest.approx(0.01 * 3)
     assert [shuttle(frame, 8) for frame in (0, 2, 4, 8)] == [1, 0, -1, 1]
+
+
+@pytest.mark.parametrize("name", ["pinkroom", "parlour"])
+def test_a_later_part_is_the_same_scene_from_there_on(name: str) -> None:
+    whole, later = (scene_from_record({"family": name, "seed": 2, **start}) for start in ({}, {"start": 7}))
+    assert later.record == {"family": name, "seed": 2, "start": 7}
+    assert isinstance(later, AnimatedScene)
+    for frame in (0, 2.5):
+        np.testing.assert_array_equal(later.camera(frame).to_world, whole.camera(7 + frame).to_world)
+        poses, wanted = later.pose(frame), whole.pose(7 + frame)
+        assert poses.keys() == wanted.keys()
+        assert all(np.array_equal(poses[shape], wanted[shape]) for shape in poses)
+        assert brightness(later, frame) == brightness(whole, 7 + frame)
+    assert any(np.any(later.pose(0)[shape] != whole.pose(0)[shape]) for shape in whole.pose(0))
+    with pytest.raises(ValueError, match="start: expected a frame"):
+        scene_from_record({"family": name, "seed": 2, "start": -1})
+
+
+def test_a_later_part_is_rendered_with_its_motion(mitsuba: Any) -> None:
+    """Also in its first frame nothing has moved, as in every clip."""
+    from jaxdn.render.clip import render_frame
+
+    whole, later = (scene_from_record({"family": "dash", "seed": 2, **start}) for start in ({}, {"start": 3}))
+    size: Any = {"width": 12, "height": 8, "variant": "scalar_rgb"}
+    wanted, found = render_frame(whole, 4, **size).frame, render_frame(later, 1, **size).frame
+    for buffer in ("depth", "normal", "albedo", "motion", "visible"):
+        np.testing.assert_array_equal(getattr(found, buffer), getattr(wanted, buffer), err_msg=buffer)
+    assert np.abs(found.motion).max() > 0.5
+    assert not render_frame(later, 0, **size).frame.motion.any()
