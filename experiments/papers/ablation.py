@@ -186,10 +186,8 @@ def render(preset: Preset, data: Path, workers: int | None) -> dict[str, Any]:
 def train_run(run: Run, preset: Preset, data: Path, folder: Path) -> Path:
     """Train one network to the end, unless it is trained already; returns the path of its weights."""
     method = method_named(METHOD)
-    origin = {
-        "trained_on": f"{len(preset.train.clips)} clips of {', '.join(dict.fromkeys(family for family, _, _ in preset.train.clips))}",
-        "run": run.label,
-    }
+    families = ", ".join(dict.fromkeys(family for family, _, _ in preset.train.clips))
+    origin = {"trained_on": f"{len(preset.train.clips)} clips of {families}", "run": run.label}
     return train(
         method,
         preset.recipe(method, run),

@@ -207,3 +207,7 @@ def test_the_unbiased_pair_is_the_compressed_pair_to_first_order(rng: np.random.
     first, second = losses.unbiased(jnp.asarray(x), jnp.asarray(y))
     wanted = np.asarray(color.compress(x), np.float64) - np.asarray(color.compress(y), np.float64)
     np.testing.assert_allclose(first - second, wanted, rtol=2e-2, atol=2e-5)
+    # One firefly in the target weighs as much as some hundred pixels, not as the whole image.
+    image, firefly = jnp.full(SHAPE, 0.2), jnp.full(SHAPE, 0.3).at[0, 0, 0].set(60000.0)
+    gap = np.subtract(*losses.unbiased(image, firefly))
+    assert 10 < np.square(gap).max() / np.square(gap[-1, -1, -1]).max() < 1000
