@@ -54,7 +54,7 @@ class Render:
     """
 
     scene: tyro.conf.Positional[str]
-    """A family (fruit, robot, pinkroom, mobile, edge, dash, parlour) or the path of a Mitsuba scene (.xml)."""
+    """A family (fruit, robot, pinkroom, mobile, edge, dash, glitter, parlour) or the path of a Mitsuba scene (.xml)."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Output folder; it gets one folder per clip."""
     animation: Path | None = None

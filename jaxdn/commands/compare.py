@@ -5,7 +5,7 @@ import platform
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -20,7 +20,29 @@ from jaxdn.report import ClipResult, Results, Scores, TrainingCurve
 from jaxdn.report.results import headline_psnr
 from jaxdn.rollout import denoise
 
-Halves = tuple[jax.Array, jax.Array]
+Halves = tuple[Any, Any]
+
+
+class Footage(NamedTuple):
+    """A clip to score images by."""
+
+    clip: Clip
+    """With a reference."""
+    halves: Halves | None
+    """Two independent references [T, H, W, 3] of half the samples each; None if they are not known."""
+    noise_floor: float
+    """dB, the PSNR of a perfect image against the reference; not a number without halves."""
+
+
+def read_footage(folder: Path, *, spp: int = 1, layers: bool = False) -> Footage:
+    """A clip of a folder with ``spp`` samples a pixel. Raises ValueError for one without a reference.
+
+    ``layers`` reads the independent noisy layers too, for denoisers that request samples.
+    """
+    clip = read_clip(folder, spp=spp, layers=layers)
+    if clip.reference is None:
+        raise ValueError(f"{folder}: expected a clip with a reference to compare with, got none; render one.")
+    return Footage(clip, read_halves(folder), read_noise_floor(folder))
 
 
 @jax.jit
@@ -73,6 +95,7 @@ def compare(
     settings: dict[str, Any],
     training: dict[str, TrainingCurve] | None = None,
     spp: int = 1,
+    read: Callable[..., Footage] = read_footage,
     say: Callable[[str], None] = print,
 ) -> Results:
     """Denoise every clip by every method and score it against the clip's reference.
@@ -90,6 +113,7 @@ def compare(
       settings: shown in the report.
       training: label of a method -> its training curve, for the report.
       spp: samples per pixel to take from the clips' layers.
+      read: (folder, spp, layers) -> what to score by.
       say: prints one line per clip.
     """
     compiled: dict[str, Callable[[Params, Clip], jax.Array]] = {}
@@ -99,11 +123,9 @@ def compare(
     needs_layers = any(method.denoiser is not None and method.denoiser.samples is not None for method in methods)
     clips = []
     for count, folder in enumerate(folders):
-        clip = read_clip(folder, spp=spp, layers=needs_layers)
-        if clip.reference is None:
-            raise ValueError(f"{folder}: expected a clip with a reference to compare with, got none; render one.")
+        footage = read(folder, spp=spp, layers=needs_layers)
         began = time.monotonic()
-        result = _compare_on(clip, folder, methods, compiled, spp)
+        result = _compare_on(footage, folder.name, methods, compiled, spp)
         field = headline_psnr([result.scores])
         psnr = "  ".join(f"{label} {getattr(scores, field):.2f}" for label, scores in result.scores.items())
         free = "" if field == "psnr" else " without the reference's noise"
@@ -121,8 +143,8 @@ def _compile(denoiser: Denoiser) -> Callable[[Params, Clip], jax.Array]:
 
 
 def _compare_on(
-    clip: Clip,
-    folder: Path,
+    footage: Footage,
+    name: str,
     methods: Sequence[Candidate],
     compiled: dict[str, Callable[[Params, Clip], jax.Array]],
     spp: int,
@@ -130,12 +152,13 @@ def _compare_on(
     """The scores and images of one clip.
 
     Args:
-      clip: with a reference.
-      folder: of the clip.
+      footage: the clip and its references.
+      name: of the clip.
       methods: what to compare.
       compiled: label of a method -> its compiled function.
       spp: samples per pixel of the clip's radiance.
     """
+    clip, halves = footage.clip, footage.halves
     frames = clip.frames
     inputs = jax.tree.map(jax.numpy.asarray, clip._replace(reference=None))
     reference = jax.numpy.asarray(clip.reference)
@@ -146,7 +169,6 @@ def _compare_on(
     shown = int(np.argmax(hidden.sum((1, 2, 3)))) if hidden.any() else shape[0] - 1
     scores, per_frame = {}, {}
     images = {"reference": np.asarray(color.tonemap(reference[shown]))}
-    halves = read_halves(folder)
     for method in methods:
         if method.denoiser is None:
             denoised, milliseconds = inputs.frames.radiance, 0.0
@@ -161,7 +183,7 @@ def _compare_on(
             "disoccluded_l1": np.where(hidden.any((1, 2, 3)), found["frame_disoccluded_l1"], np.nan).tolist(),
         }
         images[method.label] = np.asarray(color.tonemap(denoised[shown]))
-    return ClipResult(folder.name, read_noise_floor(folder), scores, per_frame, shown, images, hidden[shown, ..., 0])
+    return ClipResult(name, footage.noise_floor, scores, per_frame, shown, images, hidden[shown, ..., 0])
 
 
 def _as_scores(found: dict[str, np.ndarray], hidden: np.ndarray, milliseconds: float, spp: int) -> Scores:

@@ -1,0 +1,131 @@
+"""The results of every method: at several sample counts, of indirect light and of frames as other renderers give them.
+
+    python -m experiments.papers.results CLIP ... --spp 1 4 16 [--weights A.safetensors ...]
+
+Filters, shipped and given weights, and Open Image Denoise frame by frame where it is installed, on clips with a
+reference and both its halves, rendered with as many single samples as the largest sample count of the other views
+(``--draws``). For every view and count: a table, ``runs/results/VIEW-SPP/report.html``, and every method's image of
+every clip as ``pictures/CLIP/METHOD.png``, to be looked at at 100 %.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from experiments.papers.preintegration import save_pictures
+from experiments.speed import peers
+from jaxdn.candidates import NOISY, Candidate, candidate, filters
+from jaxdn.clips import find_clips
+from jaxdn.clips.folder import read_frames
+from jaxdn.commands.compare import Footage, compare, read_footage
+from jaxdn.commands.errors import plain_errors
+from jaxdn.report import Results, write_report
+from jaxdn.report.results import mean_scores
+from jaxdn.weights import shipped_names
+
+Read = Callable[..., Footage]
+
+
+def beauty(folder: Path, *, spp: int, layers: bool = False) -> Footage:
+    """All light in place of indirect light: direct light as noisy, and emitted light, as in other renderers' frames.
+
+    Raises ValueError for a clip with fewer than ``spp`` single samples.
+    """
+    footage, light, rest = read_footage(folder, layers=layers), [], []
+    for stored in read_frames(folder):
+        if stored.draws is None or len(stored.draws) < spp:
+            raise ValueError(f"{folder}: expected at least {spp} single samples; render the clip with --draws {spp}.")
+        emission = 0.0 if stored.frame.emission is None else stored.frame.emission
+        direct = 0.0 if stored.frame.direct is None else stored.frame.direct
+        light.append((stored.draws[:spp, ..., :3] + stored.draws[:spp, ..., 3:]).mean(0) + emission)
+        rest.append(direct + emission)
+    added = np.stack(rest)
+    frames = footage.clip.frames._replace(radiance=np.stack(light).astype(np.float32))
+    clip = footage.clip._replace(frames=frames, reference=footage.clip.reference + added)
+    # Both halves have the same direct light: its own noise, which is small, stays in the errors.
+    halves = None if footage.halves is None else tuple(half + added for half in footage.halves)
+    return footage._replace(clip=clip, halves=halves)
+
+
+def without(read: Read, *names: str) -> Read:
+    """The same without some buffers."""
+
+    def reader(folder: Path, *, spp: int, layers: bool = False) -> Footage:
+        footage = read(folder, spp=spp, layers=layers)
+        frames = footage.clip.frames._replace(**dict.fromkeys(names))
+        return footage._replace(clip=footage.clip._replace(frames=frames))
+
+    return reader
+
+
+VIEWS: dict[str, Read] = {
+    "indirect": read_footage,
+    "beauty": beauty,
+    "beauty-without-depth": without(beauty, "depth", "previous_depth", "ids", "roughness", "reflectance"),
+    "beauty-without-motion": without(beauty, "motion", "dual_motion", "previous_depth", "ids", "reflectance"),
+}
+"""Name -> how clips are read: as they are, and as three kinds of foreign frames."""
+
+
+@dataclass
+class Settings:
+    """Compare every method at several sample counts and views."""
+
+    clips: Annotated[list[Path], tyro.conf.Positional]
+    """Clips, or folders of clips."""
+    spp: list[int] = field(default_factory=lambda: [1])
+    """Samples per pixel."""
+    views: list[str] = field(default_factory=lambda: list(VIEWS))
+    """Some of: indirect, beauty, beauty-without-depth, beauty-without-motion."""
+    weights: list[str] = field(default_factory=list)
+    """Files of weights to compare in addition to those that are shipped."""
+    out: Path = Path("runs/results")
+    """Folder for the reports and the pictures."""
+
+
+def contestants(weights: list[str]) -> Iterator[Candidate]:
+    """The noisy image, filters, weights, and Open Image Denoise."""
+    for name in (NOISY, *filters(), *shipped_names(), *weights):
+        yield candidate(name)
+    if "pyoidn" not in peers.missing():
+        from experiments.speed.peers.oidn import frame_by_frame
+
+        yield Candidate("Open Image Denoise", frame_by_frame(), {})
+
+
+def table(results: Results) -> str:
+    """One line per method, in the form of Markdown: means over the clips, without the noise of the references."""
+    lines = ["| method | PSNR | temporal PSNR | FLIP | L1 | hidden pixels, PSNR |", "|---|---|---|---|---|---|"]
+    for label, one in mean_scores(results).items():
+        with np.errstate(divide="ignore", invalid="ignore"):
+            hidden = -10 * np.log10(one.unbiased_disoccluded_mse)
+        lines.append(
+            f"| {label} | {one.unbiased_psnr:.2f} | {one.unbiased_temporal_psnr:.2f} | {one.flip:.3f} | {one.l1:.4f} "
+            f"| {hidden:.2f} |"
+        )
+    return "\n".join(lines)
+
+
+def main(settings: Settings) -> None:
+    """Compare, report, save the pictures."""
+    unknown = [name for name in settings.views if name not in VIEWS]
+    if unknown:
+        raise ValueError(f"--views: expected some of {', '.join(VIEWS)}, got {', '.join(unknown)}.")
+    folders = [folder for place in settings.clips for folder in find_clips(place)]
+    methods = list(contestants(settings.weights))
+    for view in settings.views:
+        for spp in settings.spp:
+            out, title = settings.out / f"{view}-{spp}", f"{view.replace('-', ' ')}, {spp} samples per pixel"
+            results = compare(methods, folders, title=title, settings={"spp": spp}, spp=spp, read=VIEWS[view])
+            write_report(results, out)
+            save_pictures(results, out / "pictures")
+            print(f"\n{title}\n\n{table(results)}", flush=True)
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Settings, description=Settings.__doc__))
