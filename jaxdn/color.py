@@ -82,14 +82,14 @@ def exposure(radiance: jax.Array) -> jax.Array:
     image. Means of blocks first: of single noisy pixels the logarithm is mostly noise. Twice the light halves the
     factor, so that what is computed from ``exposure(x) * x`` does not depend on the unit of radiance. No gradient.
     """
-    light = luminance(jax.lax.stop_gradient(radiance))[..., 0]
+    light = jnp.minimum(luminance(jax.lax.stop_gradient(radiance))[..., 0], RADIANCE_MAX)
     height, width = light.shape
     block = [min(16, size) for size in (height, width)]
     # Rows and columns beyond the last whole block have no say.
     rows, columns = (size // side for size, side in zip((height, width), block, strict=True))
     light = light[: rows * block[0], : columns * block[1]]
     means = light.reshape(rows, block[0], columns, block[1]).mean((1, 3))
-    lit = (means > 0) & (means < jnp.inf)
+    lit = means > 0
     logs = jnp.where(lit, jnp.log(jnp.where(lit, means, 1.0)), 0.0)
     count = jnp.sum(lit, dtype=light.dtype)
     return jnp.where(count > 0, _MIDDLE_GREY * jnp.exp(-jnp.sum(logs) / jnp.maximum(count, 1)), 1.0)

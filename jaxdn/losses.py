@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxdn import color
 from jaxdn.checks import check_image, check_option, check_same_size
+from jaxdn.frame import RADIANCE_MAX
 from jaxdn.numerics import absolute
 from jaxdn.stencils import correlate, pad_edge
 
@@ -30,7 +31,7 @@ def unbiased(denoised: jax.Array, reference: jax.Array) -> tuple[jax.Array, jax.
     some light from the brightest pixels of hard scenes, where L1 would take a third of all light.
     """
     fixed = jax.lax.stop_gradient(denoised)
-    point = jnp.maximum(fixed, 0.02)
+    point = jnp.clip(fixed, 0.02, RADIANCE_MAX)
     _, slope = jax.jvp(color.compress, (point,), (jnp.ones_like(point),))
     return denoised * slope, jnp.minimum(reference, 10.0 * (fixed + 0.1)) * slope
 

@@ -30,9 +30,6 @@ from jaxdn.scales import compose_scales, downsample
 GROUPS = (3, 3, 3, 1, 3, 1)
 HEADS = (2 * TAPS + 1, TAPS + 1, TAPS + 1)
 
-ORDINARY = {"kernels": "plain", "background": "filter"}
-"""Options of the shipped weights that are not the default."""
-
 REPROJECTION, NETWORK, FILTERING, BLENDING = "reprojection", "features and kernels", "applying kernels", "blending"
 WHOLE = "whole step"
 
@@ -51,7 +48,7 @@ class Subject(NamedTuple):
 def subjects(denoisers: Sequence[Candidate], *, quick: bool = False) -> Iterator[Subject]:
     """Denoisers whose step has the parts below, in plain XLA and in each available engine (``quick``: only XLA).
 
-    These are weights of ``ntd`` with :data:`ORDINARY` options except for the network's size: others change the parts.
+    These are weights of ``ntd`` with the options ``steps.PLAIN`` and any size of network: others change the parts.
     """
     method = steps.METHOD
     fitting = [ENGINES[name] for name in method.engines if ENGINES[name].purpose == "inference"]
@@ -60,7 +57,7 @@ def subjects(denoisers: Sequence[Candidate], *, quick: bool = False) -> Iterator
         if each.method != method:
             continue
         options: Any = make(method.options, each.options, method=method.name)
-        ordinary: Any = make(method.options, ORDINARY, method=method.name)
+        ordinary: Any = make(method.options, steps.PLAIN, method=method.name)
         if dataclasses.replace(options, size=ordinary.size) != ordinary:
             continue
         widths = steps.WIDTHS.get(options.size, options.size)

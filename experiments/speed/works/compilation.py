@@ -59,7 +59,10 @@ def _xla(program: str) -> float:
     from jaxdn.learning.step import initial_state, make_train_step
 
     kind, size, detail, *remat = program.split("-")
-    denoiser, recipe = steps.METHOD.factory(size=size), train_steps.RECIPE._replace(rematerialize=bool(remat))
+    denoiser, recipe = (
+        steps.METHOD.factory(size=size, **steps.PLAIN),
+        train_steps.RECIPE._replace(rematerialize=bool(remat)),
+    )
     step: Any
     arguments: tuple[Any, ...]
     if kind == "step":
@@ -86,7 +89,9 @@ def _torch(program: str) -> float:
     kind, size, detail = program.split("-")
     if kind == "step":
         frame = frame_at(scene.clip(1, 720, 1280).frames, 0)
-        call = steps.pytorch(size, steps.METHOD.factory(size=size).init(jax.random.key(0), frame), frame, compiled=True)
+        call = steps.pytorch(
+            size, steps.METHOD.factory(size=size, **steps.PLAIN).init(jax.random.key(0), frame), frame, compiled=True
+        )
     else:
         call = train_steps.pytorch(size, train_steps.batch_of(int(detail)), train_steps.RECIPE, compiled=True)
     began = time.perf_counter()

@@ -25,7 +25,7 @@ WINDOWS, STEPS = 3, 4
 
 def measure_input(recipe: Recipe) -> dict[str, Timing]:
     """``wait`` and ``loop`` (milliseconds per step in training), and ``alone`` (the step on a batch in memory)."""
-    denoiser = steps.METHOD.factory(size="large")  # its program has been compiled for the train steps
+    denoiser = steps.METHOD.factory(size="large", **steps.PLAIN)  # its program has been compiled for the train steps
     with tempfile.TemporaryDirectory() as place:
         side = recipe.crop + recipe.crop // 2
         for seed in range(2 * recipe.batch):

@@ -20,6 +20,8 @@ HEIGHT, WIDTH = 720, 1280
 WIDTHS = {"large": LARGE, "small": SMALL}
 METHOD = method_named("ntd")
 """The method whose network the peers also implement."""
+PLAIN = {"kernels": "plain", "background": "filter", "exposure": "given", "initialization": "xavier"}
+"""Options of the paper's form of it, which is the one they implement, and that of the weights that are shipped."""
 
 
 def implementations(purpose: Purpose) -> dict[str, dict[str, Any]]:
@@ -87,10 +89,10 @@ def works(*, height: int = HEIGHT, width: int = WIDTH, title: str = "720p") -> I
     lacking = peers.missing()
     frame = jax.tree.map(jnp.asarray, frame_at(scene.clip(2, height, width).frames, 1))
     for size, widths in WIDTHS.items():
-        params = METHOD.factory(size=size).init(jax.random.key(0), frame)
+        params = METHOD.factory(size=size, **PLAIN).init(jax.random.key(0), frame)
 
         def ours(options: dict[str, Any], size: str = size, params: Any = params) -> Callable[[], Call]:
-            return lambda: recurrent(METHOD.factory(size=size, **options), params, frame)
+            return lambda: recurrent(METHOD.factory(size=size, **PLAIN, **options), params, frame)
 
         def torch(compiled: bool, size: str = size, params: Any = params) -> Callable[[], Call]:
             return lambda: pytorch(size, params, frame, compiled=compiled)

@@ -10,7 +10,7 @@ import numpy as np
 from experiments.speed import peers, roofline
 from experiments.speed.timing import Call
 from experiments.speed.works import Work, scene
-from experiments.speed.works.steps import METHOD, WIDTHS, implementations
+from experiments.speed.works.steps import METHOD, PLAIN, WIDTHS, implementations
 from jaxdn.frame import Clip
 from jaxdn.learning.step import initial_state, make_train_step
 from jaxdn.networks.engines import ENGINES
@@ -29,7 +29,7 @@ def batch_of(size: int, recipe: Recipe = RECIPE) -> Clip:
 
 def ours(size: str, batch: Clip, recipe: Recipe, **options: Any) -> Call:
     """A call that makes one update; state and batch are on the device, the old state's memory is donated."""
-    denoiser = METHOD.factory(size=size, **options)
+    denoiser = METHOD.factory(size=size, **PLAIN, **options)
     state = [initial_state(denoiser, recipe, batch)]
     step, there = make_train_step(denoiser, recipe), jax.tree.map(jnp.asarray, batch)
 
@@ -44,7 +44,7 @@ def pytorch(size: str, batch: Clip, recipe: Recipe, *, compiled: bool) -> Call:
     """The same in PyTorch."""
     from experiments.speed.peers.pytorch_training import Trainer, batch_tensors
 
-    params = initial_state(METHOD.factory(size=size), recipe, batch).params
+    params = initial_state(METHOD.factory(size=size, **PLAIN), recipe, batch).params
     trainer = Trainer(WIDTHS[size], params, recipe, compiled=compiled)
     tensors = batch_tensors(batch)
     return lambda: trainer(*tensors)
