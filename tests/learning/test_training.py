@@ -192,7 +192,9 @@ def test_a_recipe_is_kept_as_json():
     assert kept["steps"] == 8
 
 
-def test_the_running_mean_follows_the_weights(denoiser):
+@pytest.mark.slow
+def test_the_running_mean_follows_the_weights():
+    denoiser = ntd(size=TINY, kernels="plain")  # compiles sooner
     recipe = RECIPE._replace(average=0.5, decay=False)
     step = make_train_step(denoiser, recipe)
     batch = batch_of(make_clip(0), make_clip(1))
