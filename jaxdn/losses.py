@@ -27,8 +27,8 @@ def unbiased(denoised: jax.Array, reference: jax.Array) -> tuple[jax.Array, jax.
     out. For linear radiance.
 
     Two limits keep a single bright sample of a target from outweighing all else: below 0.02 the slope stays that at
-    0.02 (at black it is 152), and the target is at most ``10 (denoised + 0.1)``. Of targets with 32 samples this takes
-    some light from the brightest pixels of hard scenes, where L1 would take a third of all light.
+    0.02 (at black it is 152), and the target is at most ``10 (denoised + 0.1)``. This takes some
+    light from the brightest pixels of hard scenes; how much has not been measured.
     """
     fixed = jax.lax.stop_gradient(denoised)
     point = jnp.clip(fixed, 0.02, RADIANCE_MAX)

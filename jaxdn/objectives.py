@@ -55,7 +55,7 @@ def unbiased_illumination(*, hidden: float = 1.0, squared_from: float = 0.6) -> 
     weights are far from good; then they are squares that the noise of the target does not bias
     (:func:`jaxdn.losses.unbiased`), so that images end as bright as they should be. The occlusion term has the weight
     ``hidden`` from the first update on, and its mask is where the previous frame did not see the point
-    (``Frame.visible``): dual vectors that differ mark a quarter of these pixels.
+    (``Frame.visible``): dual vectors that differ mark less than half of these pixels.
     """
 
     def loss(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:
@@ -74,7 +74,7 @@ def unbiased_illumination(*, hidden: float = 1.0, squared_from: float = 0.6) -> 
 
 
 _SQUARES = 8.0
-"""Makes the gradient of squares about as large as that of absolute values at usual errors, 0.06 when compressed."""
+"""The gradient of squares is then that of absolute values at an error of 1/16."""
 
 
 def hidden_pixels(frames: Frame) -> jax.Array:

@@ -3,7 +3,7 @@
     python -m experiments.papers.learning data/train --validation data/validation --tests data/scenes --steps 400
 
 Every row trains SMALL from new weights for as many updates, and is scored on the validation clips and on the tests,
-scenes of another kind. The table has the seconds too: only the guided kernels take longer. Rows that exist are not
+scenes of another kind. The table has the seconds too. Rows that exist are not
 trained again, and one that was interrupted goes on, its seconds then those of the last part. Writes
 ``runs/learning/ROW`` and a report for each folder of clips. Run nothing else meanwhile.
 """
