@@ -1,5 +1,6 @@
 """Weights as safetensors plus a small JSON that names the denoiser's factory and its options; no pickle."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -56,9 +57,13 @@ def save_weights(
       path: its suffix is replaced by ``.safetensors``; its folder is created if it is missing.
       params: what to save.
       factory: a name in ``jaxdn.denoisers``.
-      options: keyword arguments of the factory.
+      options: keyword arguments of the factory. The JSON records every option, those not given with their defaults,
+        as a later version may have others.
       record: how the weights were made (data, recipe, scores); further entries of the JSON.
+
+    Raises ValueError for an unknown factory or option.
     """
+    options = dataclasses.asdict(method_named(factory).made(options))
     path = Path(path).with_suffix(".safetensors")
     path.parent.mkdir(parents=True, exist_ok=True)
     description = json.dumps({"factory": factory, "options": options, **record}, indent=1, sort_keys=True) + "\n"

@@ -1,6 +1,5 @@
 """``jaxdn train``: a learned method, trained on rendered clips."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -78,11 +77,6 @@ def train(
         **begun,
         **(record or {}),
     }
-    given = dataclasses.asdict(method.made(options))
     return save_weights(
-        out / "weights.safetensors",
-        state.average,
-        factory=method.name,
-        options=given,
-        record=about,
+        out / "weights.safetensors", state.average, factory=method.name, options=dict(options), record=about
     )

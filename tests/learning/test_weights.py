@@ -20,6 +20,13 @@ EARLIER = {"kernels": "plain", "background": "filter", "exposure": "given"}
 """What weights without a record of these options were trained with."""
 
 
+def saved_earlier(path, params, options):
+    """Weights whose JSON lacks the options that their version did not have."""
+    path = save_weights(path, params, factory="ntd", options={"size": TINY}, record={})
+    path.with_suffix(".json").write_text(json.dumps({"factory": "ntd", "options": {"size": TINY, **options}}))
+    return path
+
+
 @pytest.fixture
 def saved(tmp_path):
     params = ntd(size=TINY).init(jax.random.key(0), FRAME)
@@ -48,7 +55,7 @@ def test_round_trip(saved):
 def test_weights_of_an_earlier_version_are_read(tmp_path, earlier, today):
     """Whether to divide by the albedo was a yes or no, yes unless it was given; it has become what to divide by."""
     params = ntd(size=TINY, kernels="plain").init(jax.random.key(0), FRAME)
-    saved = save_weights(tmp_path / "w", params, factory="ntd", options={"size": TINY, **earlier}, record={})
+    saved = saved_earlier(tmp_path / "w", params, earlier)
     frame = FRAME._replace(albedo=np.full((16, 16, 3), 0.1, np.float32))
     images = []
     for denoiser in (jaxdn.load_weights(saved)[0], ntd(size=TINY, **EARLIER, demodulate=today)):
@@ -60,9 +67,18 @@ def test_a_preset_of_an_earlier_version_keeps_what_it_divides_by(tmp_path):
     """The exact paper settings divide by nothing, whatever the default was and is."""
     options = {"size": TINY, "preset": "parity"}
     params = ntd(**options).init(jax.random.key(0), FRAME)
-    saved = save_weights(tmp_path / "w", params, factory="ntd", options=options, record={})
+    saved = saved_earlier(tmp_path / "w", params, options)
     assert jaxdn.load_weights(saved)[0].reads == ntd(**options).reads
     assert "demodulate" not in jaxdn.weights.describe(saved)["options"]
+
+
+def test_defaults_are_recorded(tmp_path):
+    """An option that the caller left to its default is not taken for one that an earlier version did not have."""
+    options = {"size": TINY}
+    params = ntd(**options).init(jax.random.key(0), FRAME)
+    path = save_weights(tmp_path / "w", params, factory="ntd", options=options, record={})
+    assert jaxdn.weights.describe(path)["options"]["kernels"] == "guided"
+    assert set(jaxdn.load_weights(path)[1]) == set(params)
 
 
 def test_guided_kernels_continue_from_plain_ones(tmp_path):
@@ -92,7 +108,7 @@ def test_weights_without_a_record_of_guides_have_plain_kernels_and_filter_the_ba
     frame = FRAME._replace(radiance=rng.exponential(size=(16, 16, 3)).astype(np.float32), depth=depth)
     images = []
     for number, options in enumerate(({"demodulate": "brdf"}, {"demodulate": "brdf", **EARLIER})):
-        path = save_weights(tmp_path / str(number), params, factory="ntd", options={"size": TINY, **options}, record={})
+        path = saved_earlier(tmp_path / str(number), params, options)
         denoiser, loaded = jaxdn.load_weights(path)
         images.append(denoiser.step(loaded, denoiser.start(loaded, frame), frame)[1])
     np.testing.assert_array_equal(*images)

@@ -343,15 +343,15 @@ def test_weights_of_a_network_run_on_the_available_engine(installed, engine, mon
     if installed and not ENGINES["onnxruntime"].available():
         pytest.skip("onnxruntime is not installed")
     engines(monkeypatch, onnxruntime=installed, onednn=True)
-    denoiser = jaxdn.denoisers.ntd(size=TINY, kernels="plain")  # as weights without a record of it
+    denoiser = jaxdn.denoisers.ntd(size=TINY, kernels="plain")
     params = denoiser.init(jax.random.key(0), Frame(jnp.ones((16, 16, 3))))
-    path = save_weights(tmp_path / "tiny", params, factory="ntd", options={"size": TINY}, record={})
+    options = {"size": TINY, "kernels": "plain"}
+    path = save_weights(tmp_path / "tiny", params, factory="ntd", options=options, record={})
     found, taken = candidate_on(str(path))
     assert taken == engine
     assert found.options.get("implementation") == (engine if installed else None)
-    half = save_weights(
-        tmp_path / "half", params, factory="ntd", options={"size": TINY, "compute_dtype": "bfloat16"}, record={}
-    )
+    options["compute_dtype"] = "bfloat16"
+    half = save_weights(tmp_path / "half", params, factory="ntd", options=options, record={})
     assert candidate_on(str(half))[1] == "reference"
 
 
