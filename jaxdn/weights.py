@@ -15,6 +15,7 @@ from jaxdn.denoiser import Denoiser, Params
 from jaxdn.files import write_whole
 from jaxdn.frame import Frame
 from jaxdn.methods.table import method_named
+from jaxdn.networks.widen import widen
 
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the weights that come with the package."""
@@ -102,33 +103,31 @@ def load_weights(name_or_path: str | Path, **options_instead: Any) -> tuple[Deno
 def starting_params(name_or_path: str | Path, denoiser: Denoiser) -> Params:
     """Parameters to continue training ``denoiser`` from: those of shipped weights or of a file.
 
-    The denoiser may see more than the one that the weights were trained for: where a kernel has more input channels
-    than the stored one, the last ones are zero, so that its first images are those of the stored weights. Arrays beside
-    the network's layers that the stored weights lack, such as the precisions of guided kernels, have the values that
-    training starts from, and the first images differ. Raises ValueError as :func:`load_weights` does, and for weights
-    of another network.
+    The denoiser may see more than the one that the weights were trained for, and its network may be larger
+    (:func:`jaxdn.networks.widen.widen`): its first images are those of the stored weights. Arrays beside the network's
+    layers that the stored weights lack, such as the precisions of guided kernels, have the values that training starts
+    from, and the first images differ. Raises ValueError as :func:`load_weights` does, and for weights of another
+    network.
     """
     path = weights_path(name_or_path)
-    _, params = load_weights(path)
-    wanted = _initial_shapes(denoiser)
-    found, grown = flatten(params), {}
-    beside = {name for name in wanted if name not in found and not name.endswith(("/kernel", "/bias"))}
-    if beside:
-        initial = flatten(denoiser.init(jax.random.key(0), Frame(np.zeros((16, 16, 3), np.float32))))
-        found |= {name: initial[name] for name in beside}
-    for name, (shape, _) in wanted.items():
-        stored = found.get(name, np.zeros(()))
-        inputs = len(shape) - 2  # kernels are [height, width, inputs, outputs]
-        more = [new - old for old, new in zip(stored.shape, shape, strict=False)]
-        growing = all(extra == 0 or (axis == inputs and extra > 0) for axis, extra in enumerate(more))
-        if name not in found or len(stored.shape) != len(shape) or not growing:
-            raise ValueError(
-                f"weights {path}: expected a network that training can continue from, but {name} is "
-                f"{stored.shape if name in found else 'missing'} there and {shape} in the denoiser to train; choose "
-                "the same variant and options."
-            )
-        grown[name] = np.pad(stored, [(0, extra) for extra in more])
-    return unflatten(grown)
+    trained = flatten(load_weights(path)[1])
+    initial = flatten(denoiser.init(jax.random.key(0), Frame(np.zeros((16, 16, 3), np.float32))))
+    layers = {name for name in initial.keys() | trained.keys() if name.endswith(("/kernel", "/bias"))}
+
+    def network(weights: dict[str, np.ndarray], kept: bool) -> dict[str, np.ndarray]:
+        return {name: array for name, array in weights.items() if (name in layers) == kept}
+
+    try:
+        grown = widen(network(trained, True), network(initial, True))
+        beside = network(initial, False) | network(trained, False)
+        if found := [name for name in beside if name not in initial or beside[name].shape != initial[name].shape]:
+            raise ValueError(f"{found[0]} is {beside[found[0]].shape} there")
+    except ValueError as error:
+        raise ValueError(
+            f"weights {path}: expected a network that training can continue from, but {error}; choose the same "
+            "options, and the same or a larger size."
+        ) from error
+    return unflatten(beside | grown)
 
 
 def weights_path(name_or_path: str | Path) -> Path:

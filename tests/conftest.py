@@ -45,6 +45,18 @@ def key() -> jax.Array:
     return jax.random.key(20210629)
 
 
+@pytest.fixture(scope="module")
+def plain_programs() -> Iterator[None]:
+    """XLA compiles this module's programs without optimisation: operations the same, in half of the time.
+
+    For modules whose tests run large programs once or twice. What users run is optimised: the slow tests, real
+    processes and all other modules compile so.
+    """
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
 @pytest.fixture
 def x64() -> Iterator[None]:
     """Double precision for this one test: make every array inside it, not at module level."""

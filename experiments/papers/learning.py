@@ -99,7 +99,7 @@ BRANCHES = (
         on=_LAST,
     ),
     Row("half the clips", on=_LAST, clips=every_other),
-    Row("half the samples in references", on=_LAST, clips=half_reference),
+    Row("half the samples in references", recipe={"spp": (1, 1, 1, 2, 4)}, on=_LAST, clips=half_reference),
     Row("windows of half as many frames", on=_LAST, batch=(2.0, 1.0, 0.5)),
     Row("smaller crops", on=_LAST, batch=(2.0, 2 / 3, 1.0)),
     Row("half batches, twice the updates", on=_LAST, longer=2.0, batch=(0.5, 1.0, 1.0)),

@@ -4,6 +4,7 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,11 @@ Channels = dict[str, np.ndarray]
 
 def without_draws(clips: Path, out: Path) -> None:
     """One noisy image a frame for ever, instead of single samples that are drawn anew."""
-    _rewritten(clips, out, lambda channels: {n: c for n, c in channels.items() if not re.match(r"draw_\d", n)})
+
+    def first_only(channels: Channels) -> Channels:
+        return {name: image for name, image in channels.items() if not re.match(r"draw_\d", name)}
+
+    _rewritten(clips, out, first_only, lambda record: {n: value for n, value in record.items() if n != "draws"})
 
 
 def half_reference(clips: Path, out: Path) -> None:
@@ -27,19 +32,20 @@ def half_reference(clips: Path, out: Path) -> None:
         halves = {f"reference.{letter}": channels[f"reference_half.{letter}"] for letter in "RGB"}
         return {n: c for n, c in (channels | halves).items() if not n.startswith("reference_half.")}
 
-    _rewritten(clips, out, halved)
+    _rewritten(clips, out, halved, lambda record: record | {"reference_spp": record["reference_spp"] // 2})
 
 
 def every_other(clips: Path, out: Path) -> None:
     """Half of the clips, every second in the order of their names."""
     for clip in find_clips(clips)[::2]:
-        shutil.copytree(clip, out / clip.name, ignore=shutil.ignore_patterns("cache*"), dirs_exist_ok=True)
+        shutil.copytree(clip, out / clip.name, dirs_exist_ok=True)
 
 
-def _rewritten(clips: Path, out: Path, change: Callable[[Channels], Channels]) -> None:
+def _rewritten(
+    clips: Path, out: Path, frames: Callable[[Channels], Channels], record: Callable[[dict[str, Any]], dict[str, Any]]
+) -> None:
     for clip in find_clips(clips):
         (out / clip.name).mkdir(parents=True, exist_ok=True)
         for frame in sorted(clip.glob("frame_*.exr")):
-            write_exr(out / clip.name / frame.name, change(read_exr(frame)))
-        record = {name: value for name, value in read_json(clip / "clip.json").items() if name != "draws"}
-        write_json(out / clip.name / "clip.json", record)
+            write_exr(out / clip.name / frame.name, frames(read_exr(frame)))
+        write_json(out / clip.name / "clip.json", record(read_json(clip / "clip.json")))

@@ -96,10 +96,13 @@ def read_window(
     window: tuple[slice, ...],
     *,
     spp: int = 1,
+    light: tuple[np.ndarray, np.ndarray | None] | None = None,
     buffers: Collection[str] | None = None,
     layers: bool = False,
 ) -> Clip:
     """The part ``window`` (frames, rows, columns) of a clip as a Clip of plain arrays with ``spp`` samples per pixel.
+
+    ``light``: noisy radiance and reference of the window, where they are not to be read (``spp`` is not used then).
 
     Buffers have the dtypes of :attr:`jaxdn.frame.Buffer.dtype`. ``buffers`` names the ones to read (default:
     all there are); of a clip that was rendered by a plan, those that it lacks are written out. With ``layers`` the
@@ -107,11 +110,14 @@ def read_window(
     """
     asked = clip.buffers if buffers is None else set(buffers) & set(GUIDES)
     guides = {name: read_array(clip, name, window) for name in clip.buffers & asked}
-    frames = Frame(radiance=read_layers(clip, window, spp), **guides)
+    if light is None:
+        reference = read_array(clip, "reference", window) if "reference" in clip.arrays else None
+        light = read_layers(clip, window, spp), reference
+    frames = Frame(radiance=light[0], **guides)
     counts = doubling_layers(clip.layers, clip.path) if layers else ()
     return Clip(
         written_out(frames, asked) if clip.planned else frames,
-        read_array(clip, "reference", window) if "reference" in clip.arrays else None,
+        light[1],
         {samples: read_array(clip, _noisy(samples), window) for samples in counts} if layers else None,
     )
 

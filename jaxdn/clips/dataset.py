@@ -84,11 +84,10 @@ def training_batches(
         starts = [int(rng.integers(0, has - wants + 1)) for has, wants in zip(source.shape, sizes, strict=True)]
         window = tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))
         samples = counts[int(rng.integers(len(counts)))]
-        clip = read_window(source, window, spp=source.layers[0], buffers=names, layers=layers)
+        light = draw_light(source, window, samples, rng, beauty=bool(rng.random() < variation.beauty))
+        clip = read_window(source, window, light=light, buffers=names, layers=layers)
         if clip.layers is not None:
             clip = clip._replace(layers={count: clip.layers[count] for count in common})
-        light = draw_light(source, window, samples, rng, beauty=bool(rng.random() < variation.beauty))
-        clip = clip._replace(frames=clip.frames._replace(radiance=light.noisy), reference=light.reference)
         if augment:
             turns = int(rng.integers(4)) if height == width else 2 * int(rng.integers(2))
             clip = transform_clip(clip, flip=bool(rng.integers(2)), turns=turns)

@@ -14,6 +14,8 @@ from jaxdn.denoisers import ntd
 from jaxdn.methods.table import method_named
 from tests.learning.test_training import TINY, make_clip
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 METHOD = method_named("ntd")
 PLAIN = {"kernels": "plain", "background": "filter"}
 """Compiles sooner, and the loop is the same."""

@@ -22,6 +22,8 @@ from jaxdn.denoisers import svgf
 from jaxdn.frame import BUFFERS, FAR, Frame
 from jaxdn.variation import STILL
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 SIDE, FRAMES, DRAWS = 20, 4, 3
 SMALL = Packing(crop=8, frames=3)
 EVERYTHING = (slice(None),) * 3

@@ -15,7 +15,8 @@ from jaxdn.methods.table import method_named
 from jaxdn.motion import occlusion_mask
 from jaxdn.objectives import unbiased_illumination
 from jaxdn.rollout import denoise
-from tests.plainly import jit_plainly
+
+pytestmark = pytest.mark.usefixtures("plain_programs")
 
 TINY = ((4,), (4,), (4,), (4,), (4,))
 RECIPE = method_named("ntd").recipe_named(None)._replace(steps=8, batch=2, crop=16, frames=4)
@@ -79,7 +80,7 @@ def test_the_last_frame_gives_no_gradient(denoiser, state):
     clip = make_clip(0)
     changed = clip._replace(reference=clip.reference.copy())
     changed.reference[-1] *= 3.0
-    gradient = jit_plainly(jax.grad(lambda params, clip: clip_loss(denoiser, params, clip, RECIPE.objective)[0]))
+    gradient = jax.jit(jax.grad(lambda params, clip: clip_loss(denoiser, params, clip, RECIPE.objective)[0]))
     for one, other in zip(
         jax.tree.leaves(gradient(state.params, clip)), jax.tree.leaves(gradient(state.params, changed)), strict=True
     ):
@@ -108,7 +109,7 @@ def test_rematerialised_gradients_are_the_same(denoiser, state):
         def loss(params):
             return clip_loss(denoiser, params, clip, RECIPE.objective, rematerialize=rematerialize)[0]
 
-        return jit_plainly(jax.grad(loss))(state.params)
+        return jax.jit(jax.grad(loss))(state.params)
 
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), gradient(False), gradient(True))
 

@@ -11,6 +11,8 @@ from scipy import stats
 
 from jaxdn import glints, microfacets
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 OPTIONS = ("lobe", "flakes", "bins")
 LEVEL = 6
 glint_distribution = jax.jit(glints.glint_distribution, static_argnames=OPTIONS)

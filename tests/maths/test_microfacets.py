@@ -9,6 +9,8 @@ from scipy.special import erfc
 
 from jaxdn import microfacets
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 CELLS = 128
 
 

@@ -14,7 +14,8 @@ from jaxdn.frame import FAR, Frame, frame_at, only
 from jaxdn.methods.ntd import depth_feature, guided_features, ntd
 from jaxdn.rollout import unroll
 from jaxdn.weights import load_weights
-from tests.plainly import jit_plainly
+
+pytestmark = pytest.mark.usefixtures("plain_programs")
 
 TINY = ((4,), (4,), (5,), (5,), (6,))
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -294,13 +295,13 @@ def test_gradient_through_time(name: str, rng: np.random.Generator, key: jax.Arr
             images.append(image)
         return jnp.mean(weights * jnp.stack(images))
 
-    gradient = jit_plainly(jax.grad(scanned))(params)
+    gradient = jax.jit(jax.grad(scanned))(params)
     flat = jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(gradient)])
     assert jnp.linalg.norm(flat) > 1e-3
     if name == "default":
-        same = jit_plainly(jax.grad(looped))(params)
+        same = jax.jit(jax.grad(looped))(params)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), gradient, same)
-    value = jit_plainly(scanned)
+    value = jax.jit(scanned)
     for seed in range(3):
         keys = jax.random.split(jax.random.key(seed), len(jax.tree.leaves(params)))
         keys = jax.tree.unflatten(jax.tree.structure(params), list(keys))
@@ -317,7 +318,7 @@ def test_truncation_stops_the_gradient_at_the_history(truncate: bool, rng: np.ra
     denoiser = tiny(truncate=truncate)
     frames = random_frames(rng)
     params = initial(denoiser, key, frames)
-    slope = jit_plainly(
+    slope = jax.jit(
         jax.grad(lambda radiance: jnp.sum(unroll(denoiser, params, frames._replace(radiance=radiance))[1]))
     )(frames.radiance)
     assert np.any(slope[1])
@@ -334,8 +335,8 @@ def test_batch_is_each_clip_alone(rng: np.random.Generator, key: jax.Array) -> N
     def loss(params: Any, frames: Frame) -> jax.Array:
         return jnp.mean(unroll(denoiser, params, frames) ** 2)
 
-    alone = jit_plainly(jax.value_and_grad(loss))
-    together = jit_plainly(jax.value_and_grad(lambda params: jnp.mean(jax.vmap(loss, (None, 0))(params, batch))))
+    alone = jax.jit(jax.value_and_grad(loss))
+    together = jax.jit(jax.value_and_grad(lambda params: jnp.mean(jax.vmap(loss, (None, 0))(params, batch))))
     value, slope = together(params)
     values, slopes = zip(*[alone(params, clip) for clip in clips], strict=True)
     np.testing.assert_allclose(value, sum(values) / 2, rtol=1e-5)

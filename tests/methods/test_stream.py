@@ -12,6 +12,8 @@ from jaxdn.rollout import denoise, stream
 from tests.hard_cases.inputs import good
 from tests.methods.test_ntd import TINY
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 COUNT = 4
 METHODS = {"svgf": lambda: svgf(levels=2), "ntd": lambda: ntd(size=TINY)}
 

@@ -12,6 +12,8 @@ from jaxdn.networks import LARGE, LEVELS, SMALL, onnx
 from jaxdn.networks.unet import NEGATIVE_SLOPE, Network, count, unet
 from jaxdn.ops import onednn
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 GROUPS = (3, 3, 3, 1, 3, 1)
 HEADS = (51, 26, 26)
 TINY = ((4, 5), (6,), (5,), (4, 4), (7,))

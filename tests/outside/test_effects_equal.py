@@ -19,6 +19,8 @@ from jaxdn.frame import Frame, present, written_out
 from jaxdn.render.clip import render_clip
 from jaxdn.render.scene_file import SceneFile
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 WIDTH, HEIGHT, FRAMES = 24, 16, 4
 
 
