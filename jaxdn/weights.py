@@ -96,7 +96,7 @@ def load_weights(name_or_path: str | Path, **options_instead: Any) -> tuple[Deno
         ) from error
     if options_instead:
         denoiser = method.factory(**options | options_instead)
-    _check_params(flat, denoiser, path)
+    _check_params(flat, denoiser, path, options_instead)
     return denoiser, unflatten(flat)
 
 
@@ -167,16 +167,20 @@ def describe(name_or_path: str | Path) -> dict[str, Any]:
     return {**description, "factory": factory, "options": options}
 
 
-def _check_params(flat: dict[str, np.ndarray], denoiser: Denoiser, path: Path) -> None:
+def _check_params(flat: dict[str, np.ndarray], denoiser: Denoiser, path: Path, instead: dict[str, Any]) -> None:
     """Raise ValueError unless the arrays have the names, shapes and types of the denoiser's initial parameters."""
     wanted = _initial_shapes(denoiser)
     found = {name: (array.shape, array.dtype) for name, array in flat.items()}
     if found != wanted:
         differing = sorted(name for name in {*found, *wanted} if found.get(name) != wanted.get(name))
         first = differing[0]
+        cause, advice = "its JSON describes", "copy both files together"
+        if instead:
+            cause = f"{' '.join(f'{option}={value}' for option, value in instead.items())} needs"
+            advice = "leave the option out, or train with it from these weights (`jaxdn train --start`)"
         raise ValueError(
-            f"weights {path}: expected the weights that its JSON describes, but {len(differing)} of them differ, such "
-            f"as {first}: expected {wanted.get(first)}, got {found.get(first)}; copy both files together."
+            f"weights {path}: expected the weights that {cause}, but {len(differing)} of them differ, such "
+            f"as {first}: expected {wanted.get(first)}, got {found.get(first)}; {advice}."
         )
 
 

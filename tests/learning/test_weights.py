@@ -89,6 +89,8 @@ def test_guided_kernels_continue_from_plain_ones(tmp_path):
     params = ntd(**options).init(jax.random.key(0), FRAME)
     assert "guide" not in params
     path = save_weights(tmp_path / "plain", params, factory="ntd", options=options, record={})
+    with pytest.raises(ValueError, match=r"that kernels=guided needs, .* guide/albedo: .*jaxdn train --start"):
+        jaxdn.load_weights(path, kernels="guided")
     guided = starting_params(path, ntd(size=TINY))
     np.testing.assert_array_equal(guided["guide"]["depth"], np.full((3, 1), 6.0))
     jax.tree.map(np.testing.assert_array_equal, {n: guided[n] for n in params}, params)

@@ -1,0 +1,132 @@
+"""The shipped weights: render the clips, train `ntd-small` and `ntd-large`, and A, B, C at equal steps.
+
+    python -m experiments.papers.weights --rooms rooms/*/scene.xml    # `make weights`: hours; resumable
+
+Clips: tours of furnished Mitsuba scenes and the procedural families, 128 x 128 pixels, 10 frames, references of 32
+samples and six more single samples, 25 to 50 seconds of one core each. The rooms that the shipped weights saw are six
+of Benedikt Bitterli's rendering resources (bathroom, kitchen, living-room-2, spaceship, veach-ajar, veach-lamp);
+without ``--rooms`` the families are all there is. Finished clips and stages are reused, interrupted ones go on. Each
+network is trained at a constant rate first, so that it can always be continued, and with a falling rate at the end;
+LARGE begins as SMALL grown (:mod:`jaxdn.networks.widen`).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import tyro
+
+from jaxdn.commands.errors import plain_errors
+from jaxdn.commands.render import render
+from jaxdn.commands.train import train
+from jaxdn.methods.table import method_named
+from jaxdn.weights import SHIPPED, shipped_names
+
+FAMILIES = {"parlour": 90, "fruit": 14, "mobile": 14, "pinkroom": 14, "robot": 14}
+"""Clips of each procedural family."""
+
+
+class Stage(NamedTuple):
+    """One run of training."""
+
+    name: str
+    options: Mapping[str, Any]
+    steps: int
+    start: str = ""
+    """The stage to continue from."""
+    decay: bool = True
+    recipe: str = "usual"
+
+
+STAGES = (
+    Stage("small-begun", {"size": "small"}, 4000, decay=False),
+    Stage("ntd-small", {"size": "small"}, 1000, start="small-begun"),
+    Stage("large-begun", {"size": "large"}, 2000, start="small-begun", decay=False),
+    Stage("ntd-large", {"size": "large"}, 1000, start="large-begun"),
+    Stage("A", {"size": "small", "motion": "traditional"}, 500, recipe="without-occlusion"),
+    Stage("B", {"size": "small", "motion": "dual"}, 500, recipe="without-occlusion"),
+    Stage("C", {"size": "small", "motion": "dual"}, 500),
+)
+"""Those with the name of shipped weights are what is shipped."""
+
+
+@dataclass
+class Settings:
+    """Render the training clips, train the shipped weights and the paper's ablation."""
+
+    rooms: list[Path] = field(default_factory=list)
+    """Mitsuba scenes (.xml) to make tours of."""
+    tours: int = 30
+    """Clips of each of them."""
+    stages: list[str] = field(default_factory=lambda: [stage.name for stage in STAGES])
+    """The runs to train."""
+    data: Path = Path("data/weights")
+    """Folder for the clips."""
+    out: Path = Path("runs/weights")
+    """Folder for the runs."""
+    workers: int | None = None
+    """Number of rendering processes; default: the number of cores."""
+    ship: bool = False
+    """Put the weights into the package."""
+
+
+def render_all(settings: Settings) -> None:
+    """Render what is missing: training clips of seeds from 0 on, and a validation clip of seed 1000 of each kind."""
+    sources = [(str(room), settings.tours, True) for room in settings.rooms]
+    sources += [(family, clips, False) for family, clips in FAMILIES.items()]
+    for part, seeds in (("train", range), ("validation", lambda clips: range(1000, 1001))):
+        for source, clips, tours in sources:
+            render(
+                source,
+                settings.data / part,
+                animation=None,
+                tours=tours,
+                seeds=list(seeds(clips)),
+                width=128,
+                height=128,
+                frames=10,
+                reference_spp=32,
+                layers=[1],
+                draws=6,
+                max_depth=None,
+                effects="auto",
+                workers=settings.workers,
+            )
+
+
+def train_stage(stage: Stage, settings: Settings) -> Path:
+    """The weights of a stage, trained if they do not exist."""
+    method = method_named("ntd")
+    recipe = method.recipe_named(stage.recipe)._replace(
+        steps=stage.steps, decay=stage.decay, average=0.99, spp=(1, 1, 1, 2, 4, 16)
+    )
+    return train(
+        method,
+        recipe,
+        [settings.data / "train"],
+        settings.out / stage.name,
+        options=stage.options,
+        start=str(settings.out / stage.start / "weights.safetensors") if stage.start else None,
+        validation=[settings.data / "validation"],
+        label=stage.name,
+    )
+
+
+def main(settings: Settings) -> None:
+    """Render, train, ship. Raises ValueError for an unknown stage."""
+    known = [stage.name for stage in STAGES]
+    if unknown := [name for name in settings.stages if name not in known]:
+        raise ValueError(f"--stages: expected some of {', '.join(known)}, got {', '.join(unknown)}.")
+    render_all(settings)
+    for stage in STAGES:
+        if stage.name in settings.stages:
+            weights = train_stage(stage, settings)
+            if settings.ship and stage.name in shipped_names():
+                for suffix in (".safetensors", ".json"):
+                    (SHIPPED / stage.name).with_suffix(suffix).write_bytes(weights.with_suffix(suffix).read_bytes())
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Settings, description=Settings.__doc__))
