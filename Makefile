@@ -28,7 +28,7 @@ train: setup  ## render clips, train the denoiser and its ablations, evaluate, w
 	$(BIN)/python -m experiments.papers.ablation $(SETTINGS)
 
 weights: setup  ## train the shipped weights again (hours; resumable)
-	$(BIN)/python -m experiments.papers.ablation --preset full --ship $(SETTINGS)
+	$(BIN)/python -m experiments.papers.weights --ship $(SETTINGS)
 
 test: setup  ## the tests (minutes)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m "not slow" $(SETTINGS)

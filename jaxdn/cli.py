@@ -139,7 +139,8 @@ class Train:
     start: str | None = None
     """Shipped weights or a .safetensors file to continue from; default: new weights."""
     recipe: str | None = None
-    """One of the method's recipes (for ntd: usual, without-occlusion, parity); default: the usual one."""
+    """One of the method's recipes; for ntd: usual, without-occlusion, paper, paper-without-occlusion, parity. Default:
+    the usual one."""
     steps: int | None = None
     """Parameter updates; default, as for the next seven options: as in the recipe."""
     batch: int | None = None

@@ -4,7 +4,6 @@ A warps the history with traditional motion vectors, B with dual ones, C adds th
 half of training; all three share the network, the data, the seed and the number of steps.
 
     python -m experiments.papers.ablation                  # `make train`: a demonstration, about a quarter of an hour
-    python -m experiments.papers.ablation --preset full    # `make weights`: the shipped weights, the README's table
     python -m experiments.papers.ablation --preset specialist  # trained and tested on different clips of one scene
 
 Everything is kept under ``data/`` and ``runs/``: finished clips and runs are reused, interrupted ones are resumed.
@@ -27,10 +26,8 @@ from jaxdn.methods.table import Method, method_named
 from jaxdn.recipe import Recipe
 from jaxdn.render import ClipJob, choose_variant, render_clips
 from jaxdn.report import Results, TrainingCurve, text_table, write_report
-from jaxdn.weights import SHIPPED
 
 FAMILIES = ("fruit", "robot", "pinkroom", "mobile")
-FAILURES = ("edge", "dash")
 METHOD = "ntd"
 """The method under ablation."""
 
@@ -44,7 +41,6 @@ class ClipSet(NamedTuple):
     """Width and height in pixels."""
     frames: int
     reference_spp: int
-    layers: tuple[int, ...] = (1,)
 
 
 class Run(NamedTuple):
@@ -91,9 +87,9 @@ def _abc(steps: int) -> dict[str, Run]:
     """The three runs of the paper's ablation, with the small network."""
     traditional, dual = ({"size": "small", "motion": motion} for motion in ("traditional", "dual"))
     return {
-        "A": Run("A", traditional, "without-occlusion", steps),
-        "B": Run("B", dual, "without-occlusion", steps),
-        "C": Run("C", dual, "usual", steps),
+        "A": Run("A", traditional, "paper-without-occlusion", steps),
+        "B": Run("B", dual, "paper-without-occlusion", steps),
+        "C": Run("C", dual, "paper", steps),
     }
 
 
@@ -105,41 +101,23 @@ PRESETS = {
         runs=tuple(_abc(steps=100).values()),
         learning={"learning_rate": 2e-3, "crop": 48},
     ),
-    "full": Preset(
-        train=ClipSet(_seeds(FAMILIES, range(6)), size=96, frames=10, reference_spp=96),
-        validation=ClipSet(_seeds(FAMILIES, range(100, 101)), size=96, frames=10, reference_spp=96),
-        tests=(
-            ClipSet(
-                (*_seeds(FAMILIES, range(200, 204)), *_seeds(FAILURES, range(200, 202))), 96, 8, 128, layers=(1, 2, 4)
-            ),
-            ClipSet((("mobile", 300, 0),), size=96, frames=110, reference_spp=64),
-        ),
-        runs=(
-            Run("C large", {"size": "large", "motion": "dual"}, "usual", 1200),
-            *reversed(_abc(steps=1200).values()),
-        ),
-        learning={"learning_rate": 2e-3, "crop": 48},
-    ),
     "specialist": Preset(
         train=ClipSet(_parts("pinkroom", range(0, 400, 20)), size=96, frames=10, reference_spp=96),
         validation=ClipSet(_parts("pinkroom", range(500, 501)), size=96, frames=10, reference_spp=96),
         tests=(ClipSet(_parts("pinkroom", range(600, 680, 20)), size=96, frames=10, reference_spp=128),),
-        runs=tuple(_abc(steps=800).values()),
+        runs=tuple(_abc(steps=400).values()),
         learning={"learning_rate": 2e-3, "crop": 48},
     ),
 }
-
-SHIPPED_RUNS = {"C large": "ntd-large", "C": "ntd-small"}
-"""The runs of the full preset whose weights are shipped with the package, and their names there."""
 
 
 @dataclass
 class Settings:
     """Render clips, train the denoiser and its ablations, evaluate them on held-out clips, write a report."""
 
-    preset: Literal["demo", "full", "specialist"] = "demo"
-    """demo: SMALL networks and a dozen small clips, to see that it learns. full: the shipped weights. specialist: the
-    paper's own protocol, trained and tested on different clips of one scene."""
+    preset: Literal["demo", "specialist"] = "demo"
+    """demo: SMALL networks and a dozen small clips, to see that it learns. specialist: the paper's own protocol,
+    trained and tested on different clips of one scene."""
     name: str | None = None
     """Folder under runs/ for weights, logs and the report; default: the preset's name."""
     only: Literal["all", "render", "train", "report"] = "all"
@@ -148,8 +126,6 @@ class Settings:
     """Labels of the runs to train; default: all of the preset."""
     workers: int | None = None
     """Number of rendering processes; default: the number of cores."""
-    ship: bool = False
-    """Put the weights of the full preset into the package."""
 
 
 def jobs(clips: ClipSet, folder: Path) -> list[ClipJob]:
@@ -161,7 +137,6 @@ def jobs(clips: ClipSet, folder: Path) -> list[ClipJob]:
             width=clips.size,
             height=clips.size,
             frames=clips.frames,
-            layers=clips.layers,
             reference_spp=clips.reference_spp,
             seed=seed + start,
         )
@@ -237,22 +212,11 @@ def main(settings: Settings) -> None:
             if not settings.runs or run.label in settings.runs:
                 train_run(run, preset, data, folder)
         print(f"trained: {time.monotonic() - began:.0f} s so far", flush=True)
-    if settings.ship:
-        ship(folder)
     if settings.only in ("all", "report"):
         results = evaluate(preset, settings, data, folder, machine)
         page = write_report(results, folder)
         print(text_table(results))
         print(f"metrics: {folder / 'metrics.json'}\nreport:  {page}  ({time.monotonic() - began:.0f} s in all)")
-
-
-def ship(folder: Path) -> None:
-    """Copy the weights of the full preset into the package."""
-    for run in PRESETS["full"].runs:
-        if run.label in SHIPPED_RUNS:
-            for suffix in (".safetensors", ".json"):
-                source = folder / run.folder / f"weights{suffix}"
-                (SHIPPED / f"{SHIPPED_RUNS[run.label]}{suffix}").write_bytes(source.read_bytes())
 
 
 if __name__ == "__main__":

@@ -26,12 +26,13 @@ from jaxdn.methods.demodulated import Demodulation, demodulated
 from jaxdn.methods.table import method
 from jaxdn.motion import on_screen
 from jaxdn.networks import LARGE, SMALL, Widths, crop, pad
-from jaxdn.objectives import indirect_illumination
+from jaxdn.objectives import indirect_illumination, unbiased_illumination
 from jaxdn.ops.softmax_filter import softmax_filter
 from jaxdn.ops.warp import warp
 from jaxdn.recipe import Recipe
 from jaxdn.repair import repair_image
 from jaxdn.scales import compose_scales, downsample, fill
+from jaxdn.variation import STILL
 
 TAPS = 25
 SCALES = 3
@@ -235,9 +236,13 @@ def _blend(
     title="Neural temporal denoising for indirect illumination (Zeng et al. 2021)",
     presets={"parity": PARITY},
     recipes={
-        "usual": Recipe(indirect_illumination()),
-        "without-occlusion": Recipe(indirect_illumination(occlusion=False)),
-        "parity": Recipe(indirect_illumination(), learning_rate=1e-4, decay=False, clip_norm=0.0),
+        "usual": Recipe(unbiased_illumination()),
+        "without-occlusion": Recipe(unbiased_illumination(hidden=0.0)),
+        "paper": Recipe(indirect_illumination(), variation=STILL, average=0.0),
+        "paper-without-occlusion": Recipe(indirect_illumination(occlusion=False), variation=STILL, average=0.0),
+        "parity": Recipe(
+            indirect_illumination(), learning_rate=1e-4, decay=False, clip_norm=0.0, variation=STILL, average=0.0
+        ),
     },
     variants={"ntd-large": {"size": "large"}, "ntd-small": {"size": "small"}},
     engines=("onnxruntime", "onednn"),

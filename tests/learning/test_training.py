@@ -15,11 +15,12 @@ from jaxdn.methods.table import method_named
 from jaxdn.motion import occlusion_mask
 from jaxdn.objectives import unbiased_illumination
 from jaxdn.rollout import denoise
+from jaxdn.variation import STILL
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
 TINY = ((4,), (4,), (4,), (4,), (4,))
-RECIPE = method_named("ntd").recipe_named(None)._replace(steps=8, batch=2, crop=16, frames=4)
+RECIPE = method_named("ntd").recipe_named("paper")._replace(steps=8, batch=2, crop=16, frames=4)
 
 
 def make_clip(seed, *, frames=4, size=16):
@@ -183,6 +184,8 @@ def test_the_papers_recipe_is_constant_adam():
     assert parity.learning_rate == 1e-4
     assert not parity.decay
     assert parity.clip_norm == 0
+    assert parity.variation == STILL
+    assert parity.average == 0
     assert parity.objective.name == RECIPE.objective.name  # the loss is the paper's own in both
 
 

@@ -188,7 +188,10 @@ def test_compare_ends_with_a_report(clip, tmp_path):
         (("train", "CLIP", "-o", "out", "--method", "magic"), "expected one of ntd, svgf"),
         (("train", "CLIP", "-o", "out", "--method", "svgf"), "expected a method that learns"),
         (("train", "CLIP", "-o", "out", "--variant", "ntd-huge"), "expected a variant out of ntd-large, ntd-small"),
-        (("train", "CLIP", "-o", "out", "--recipe", "wild"), "out of usual, without-occlusion, parity, got 'wild'"),
+        (
+            ("train", "CLIP", "-o", "out", "--recipe", "wild"),
+            "paper-without-occlusion, parity, got 'wild'",
+        ),
         (("train", "CLIP", "-o", "out", "--set", "motoin=dual"), "expected options out of size, motion,"),
         (("train", "CLIP", "-o", "out", "--set", "motion=wild"), "motion: expected one of 'dual', 'traditional'"),
         (("train", "CLIP", "-o", "out", "--set", "motion"), "--set 'motion': expected name=value"),
