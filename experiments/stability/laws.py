@@ -1,0 +1,131 @@
+"""How far does each denoiser deviate from laws that light transport obeys: mirrors, exposure, channels, axes?
+
+    python -m experiments.stability.laws CLIP ... [--subjects svgf ntd-small mine.safetensors]
+
+The difference between the output for a changed clip, changed back, and the output for the clip itself: its root mean
+square relative to the image's, both tone-mapped, over all frames. The last row is the same of the difference from the
+reference.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from jaxdn import color
+from jaxdn.candidates import NOISY, all_names, candidate
+from jaxdn.clips import find_clips, read_clip
+from jaxdn.clips.augment import transform_clip, transform_image
+from jaxdn.commands.errors import plain_errors
+from jaxdn.denoiser import Denoiser, Params
+from jaxdn.frame import BUFFERS, Clip
+from jaxdn.rollout import denoise
+
+Image = np.ndarray
+
+
+@dataclass
+class Settings:
+    """Measure how far denoisers deviate from laws of light transport."""
+
+    clips: Annotated[list[Path], tyro.conf.Positional]
+    """Clips, or folders of clips."""
+    subjects: list[str] = field(default_factory=lambda: [name for name in all_names() if name != NOISY])
+    """Filters, and names or files of weights; default: all that are shipped."""
+
+
+class Law(NamedTuple):
+    """A change of a clip, and how to change its image back."""
+
+    change: Callable[[Clip], Clip]
+    back: Callable[[Image], Image]
+
+
+def light_times(factor: float) -> Law:
+    """All light times a factor."""
+    return Law(
+        lambda clip: _each(clip, "light", lambda image: image * np.float32(factor)), lambda image: image / factor
+    )
+
+
+def mirror(turns: int) -> Law:
+    """The image mirrored left to right (0) or top to bottom (2)."""
+    # A mirror is its own inverse.
+    return Law(
+        lambda clip: transform_clip(clip, flip=True, turns=turns),
+        lambda image: transform_image(image, flip=True, turns=turns),
+    )
+
+
+def _each(clip: Clip, kind: str, change: Callable[[Image], Image]) -> Clip:
+    """The clip with every buffer of three channels of a kind changed."""
+    buffers = {
+        name: change(np.asarray(image))
+        for name, image in clip.frames._asdict().items()
+        if image is not None and BUFFERS[name].kind == kind and BUFFERS[name].channels == 3
+    }
+    return clip._replace(frames=clip.frames._replace(**buffers))
+
+
+def _channels(clip: Clip) -> Clip:
+    light = _each(clip, "light", lambda image: image[..., [2, 0, 1]])
+    return _each(light, "fraction", lambda image: image[..., [2, 0, 1]])
+
+
+_AXES = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], np.float32)
+
+LAWS = {
+    "mirrored left to right": mirror(0),
+    "mirrored top to bottom": mirror(2),
+    "red, green and blue exchanged": Law(_channels, lambda image: image[..., [1, 2, 0]]),
+    "the world's axes exchanged": Law(
+        lambda clip: _each(clip, "direction", lambda image: image @ _AXES), lambda image: image
+    ),
+    "a sixteenth of the light": light_times(1 / 16),
+    "a quarter of the light": light_times(1 / 4),
+    "four times the light": light_times(4),
+    "sixteen times the light": light_times(16),
+}
+
+
+def deviations(denoiser: Denoiser, params: Params, clip: Clip) -> dict[str, float]:
+    """Law -> relative deviation; ``"error"`` -> the same of the difference from the reference."""
+    run = jax.jit(lambda clip: denoise(denoiser, params, clip))
+    bare = clip._replace(reference=None)
+
+    def seen(image: Image) -> Image:
+        return np.asarray(color.tonemap(jnp.asarray(image)), np.float64)
+
+    image = seen(np.asarray(run(bare)))
+    size = np.sqrt(np.mean(image**2))
+
+    def difference(other: Image) -> float:
+        return float(np.sqrt(np.mean((seen(other) - image) ** 2)) / size)
+
+    found = {name: difference(law.back(np.asarray(run(law.change(bare))))) for name, law in LAWS.items()}
+    return found | {"error": difference(np.asarray(clip.reference))}
+
+
+def main(settings: Settings) -> None:
+    """Measure and print a table in the form of Markdown: means over the clips."""
+    folders = [folder for place in settings.clips for folder in find_clips(place)]
+    columns = {}
+    for subject in settings.subjects:
+        one = candidate(subject)
+        if one.denoiser is None:
+            raise ValueError(f"--subjects: expected denoisers, got {subject}, which is the noisy image.")
+        rows = [deviations(one.denoiser, one.params, read_clip(folder)) for folder in folders]
+        columns[one.label] = {name: np.mean([row[name] for row in rows]) for name in rows[0]}
+    print("| change | " + " | ".join(columns) + " |\n" + "|---" * (1 + len(columns)) + "|")
+    for name in next(iter(columns.values())):
+        print(f"| {name} | " + " | ".join(f"{100 * column[name]:.2g} %" for column in columns.values()) + " |")
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Settings, description=Settings.__doc__))
