@@ -74,6 +74,7 @@ def test_interrupted_training_ends_in_bit_identical_weights(engine, clips, tmp_p
     assert read_curve(tmp_path / "whole") == read_curve(tmp_path / "stopped")
 
 
+@pytest.mark.slow
 def test_a_finished_run_is_not_trained_again(clips, tmp_path):
     first = run(clips, tmp_path)
     again = run(clips, tmp_path, source=Stopping(batches(clips), 1))
@@ -91,6 +92,7 @@ def test_a_torn_log_line_is_left_out(tmp_path):
     assert read_log(tmp_path / "log.jsonl") == [{"step": 1, "loss": 2.0}]
 
 
+@pytest.mark.slow
 def test_training_begins_with_given_weights_and_refuses_others_for_the_same_run(clips, tmp_path):
     one = run(clips, tmp_path / "one")
     # The warm-up's first update has a learning rate of zero.

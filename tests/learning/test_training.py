@@ -88,6 +88,7 @@ def test_the_last_frame_gives_no_gradient(denoiser, state):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_a_step_learns_and_compiles_once_over_both_phases(step, state):
     batch = batch_of(make_clip(0), make_clip(1))
     reports = []

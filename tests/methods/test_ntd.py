@@ -251,6 +251,7 @@ def test_first_frame_uses_no_history_and_no_motion(
 POISON = (np.nan, np.inf, -np.inf, 1e30, -1.0)
 
 
+@pytest.mark.slow
 def test_poison_stays_finite_and_is_counted(rng: np.random.Generator, key: jax.Array) -> None:
     denoiser = tiny()
     frames = random_frames(rng)
