@@ -45,9 +45,8 @@ def part(picture: Path, place: tuple[int, int, int, int]) -> np.ndarray:
         pixels = np.asarray(image.convert("RGB"), np.float64) / 255.0
     found = pixels[y : y + height, x : x + width]
     if min(place) < 0 or found.shape[:2] != (height, width) or 0 in (height, width):
-        raise ValueError(
-            f"--places: expected a part of {picture} ({pixels.shape[1]} x {pixels.shape[0]}), got {place}."
-        )
+        size = f"{pixels.shape[1]} x {pixels.shape[0]} pixels"
+        raise ValueError(f"--places: expected a part of {picture} ({size}), got {place}.")
     return found
 
 

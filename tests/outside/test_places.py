@@ -21,7 +21,7 @@ def test_places_are_the_pixels_of_each_method(tmp_path, rng):
     np.testing.assert_array_equal(sheet[: 5 * SCALE : SCALE, 7 * SCALE : 13 * SCALE : SCALE], first)
     second = np.rint(255 * images["svgf"][15:20, :6])
     np.testing.assert_array_equal(sheet[6 * SCALE + 1 : 11 * SCALE : SCALE, : 6 * SCALE : SCALE], second)
-    with pytest.raises(ValueError, match="expected a part of .*30 x 20 pixels., got .25, 0, 6, 5."):
+    with pytest.raises(ValueError, match=r"expected a part of .*30 x 20 pixels., got .25, 0, 6, 5."):
         main(Settings(tmp_path, ["room:25,0,6,5"], ["svgf"], tmp_path / "out.png"))
 
 
