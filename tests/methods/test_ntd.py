@@ -10,10 +10,9 @@ import pytest
 
 from jaxdn import brdf
 from jaxdn.denoiser import Denoiser, Recurrent
-from jaxdn.frame import FAR, Frame, frame_at, only
+from jaxdn.frame import FAR, Frame, frame_at
 from jaxdn.methods.ntd import depth_feature, guided_features, ntd
 from jaxdn.rollout import unroll
-from jaxdn.weights import load_weights
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -443,17 +442,6 @@ def test_the_background_passes_through_and_gives_surfaces_no_light(rng: np.rando
     assert denoiser.reads == filtering.reads
     without = frames._replace(depth=None)
     np.testing.assert_array_equal(step(params, without), run(filtering)(params, without))
-
-
-@pytest.mark.parametrize("name", ["ntd-small", "ntd-large"])
-def test_shipped_weights_keep_their_images(name: str, rng: np.random.Generator) -> None:
-    """They were trained with plain kernels that filter the background too, and their files do not say so."""
-    denoiser, params = load_weights(name)
-    explicit = ntd(size=name.removeprefix("ntd-"), kernels="plain", background="filter", exposure="given")
-    assert "guide" not in params
-    frames = random_frames(rng, (32, 32))
-    frames = only(frames._replace(depth=frames.depth.at[:, :8].set(FAR)), denoiser.reads)
-    np.testing.assert_array_equal(run(denoiser)(params, frames), run(explicit)(params, frames))
 
 
 def test_depth_feature_is_independent_of_units(rng: np.random.Generator) -> None:

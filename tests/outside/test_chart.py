@@ -30,7 +30,7 @@ from experiments.speed.chart.summary import (
 )
 from experiments.speed.chart.way import way
 from experiments.speed.chart.ways import chosen, left_out, registered, ways
-from experiments.speed.works import scene, steps
+from experiments.speed.works import scene
 from jaxdn.candidates import Candidate, untrained
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.frame import Clip, frame_at
@@ -296,9 +296,8 @@ def test_steps_with_known_parts_are_broken_down(denoisers):
     names = [subject.name for subject in subjects(denoisers, quick=True)]
     assert names == ["ntd-large, reference", "ntd-small, reference"]
     tiny = {"size": ((4,), (4,), (5,), (5,), (6,))}
-    plain = {**tiny, **steps.PLAIN}
-    assert not list(subjects([untrained(method_named("ntd"), **plain, domain="compressed")]))
-    subject = next(subjects([untrained(method_named("ntd"), **plain)]))
+    assert not list(subjects([untrained(method_named("ntd"), **tiny, domain="compressed")]))
+    subject = next(subjects([untrained(method_named("ntd"), **tiny)]))
     parts = breakdown(subject, frame_at(scene.clip(2, 16, 32).frames, 1), rounds=2)
     assert list(parts)[-1] == WHOLE
     assert len(parts) == 5

@@ -23,7 +23,6 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 
-from experiments.speed import peers
 from experiments.speed.chart import footage, summary
 from experiments.speed.chart.breakdown import breakdown, subjects
 from experiments.speed.chart.energy import NOT_MEASURABLE, Meter, find_meter
@@ -217,10 +216,6 @@ def main(settings: Settings) -> None:
         run.say(sentence)
     if run.store.kept:
         run.say(f"{run.store.path}: resuming the earlier measurements with these settings on this machine")
-    if "torch" not in peers.missing():
-        from experiments.speed.peers import pytorch
-
-        pytorch.prepare_process()
     run.errors()
     run.render_costs()
     run.times()

@@ -15,8 +15,8 @@ from experiments.speed.works import steps
 from jaxdn import brdf, color
 from jaxdn.candidates import Candidate
 from jaxdn.denoiser import Denoiser, Params
-from jaxdn.frame import Frame
-from jaxdn.methods.ntd import TAPS, depth_feature
+from jaxdn.frame import FAR, Frame
+from jaxdn.methods.ntd import TAPS, depth_feature, guided_features
 from jaxdn.motion import on_screen
 from jaxdn.networks import MULTIPLE, Widths
 from jaxdn.networks.engines import ENGINES
@@ -25,7 +25,7 @@ from jaxdn.ops.softmax_filter import softmax_filter
 from jaxdn.ops.warp import warp
 from jaxdn.options import make
 from jaxdn.repair import repair, repair_image
-from jaxdn.scales import compose_scales, downsample
+from jaxdn.scales import compose_scales, downsample, fill
 
 GROUPS = (3, 3, 3, 1, 3, 1)
 HEADS = (2 * TAPS + 1, TAPS + 1, TAPS + 1)
@@ -48,7 +48,7 @@ class Subject(NamedTuple):
 def subjects(denoisers: Sequence[Candidate], *, quick: bool = False) -> Iterator[Subject]:
     """Denoisers whose step has the parts below, in plain XLA and in each available engine (``quick``: only XLA).
 
-    These are weights of ``ntd`` with the options ``steps.PLAIN`` and any size of network: others change the parts.
+    These are weights of ``ntd`` with its default options and any size of network: others change the parts.
     """
     method = steps.METHOD
     fitting = [ENGINES[name] for name in method.engines if ENGINES[name].purpose == "inference"]
@@ -57,8 +57,9 @@ def subjects(denoisers: Sequence[Candidate], *, quick: bool = False) -> Iterator
         if each.method != method:
             continue
         options: Any = make(method.options, each.options, method=method.name)
-        ordinary: Any = make(method.options, steps.PLAIN, method=method.name)
-        if dataclasses.replace(options, size=ordinary.size) != ordinary:
+        ordinary: Any = method.options()
+        kept = {"size": ordinary.size, "initialization": ordinary.initialization}
+        if dataclasses.replace(options, **kept) != ordinary:
             continue
         widths = steps.WIDTHS.get(options.size, options.size)
         for engine in engines:
@@ -72,25 +73,27 @@ def reproject(history: jax.Array, frame: Frame, noisy: jax.Array) -> tuple[jax.A
     return jnp.where(lost, noisy, repair_image(warp(history, frame.dual_motion))), lost
 
 
-def apply_kernels(noisy: jax.Array, recalled: jax.Array, heads: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+Images = tuple[jax.Array, ...]
+
+
+def apply_kernels(noisy: jax.Array, recalled: jax.Array, heads: Images, guiding: Sequence[jax.Array | None]) -> Images:
     """The noisy image at three scales and the history, filtered."""
     full, half, quarter = heads
     middle = downsample(noisy)
-    coarse = softmax_filter(downsample(middle)[None], quarter)[0]
-    finest, temporal = softmax_filter(jnp.stack([noisy, recalled]), full)
-    return coarse, softmax_filter(middle[None], half)[0], finest, temporal
+    coarse = softmax_filter(downsample(middle)[None], quarter, features=guiding[2])[0]
+    finest, temporal = softmax_filter(jnp.stack([noisy, recalled]), full, features=guiding[0])
+    return coarse, softmax_filter(middle[None], half, features=guiding[1])[0], finest, temporal
 
 
-def blend(
-    filtered: tuple[jax.Array, ...], heads: tuple[jax.Array, ...], lost: jax.Array, colors: jax.Array
-) -> jax.Array:
-    """The scales composed, blended with the history, multiplied by the albedo."""
+def blend(filtered: Images, heads: Images, lost: jax.Array, colors: jax.Array, frame: Frame) -> jax.Array:
+    """The scales composed, blended with the history, multiplied by what surfaces reflect; the background as it was."""
     coarse, middle, finest, temporal = filtered
     full, half, quarter = heads
     composed = compose_scales(middle, coarse, jax.nn.sigmoid(quarter[..., TAPS:]))
     composed = compose_scales(finest, composed, jax.nn.sigmoid(half[..., TAPS:]))
     current = jnp.where(lost, 1.0, jax.nn.sigmoid(full[..., 2 * TAPS :]))
-    return jnp.maximum(current * composed + (1.0 - current) * temporal, 0.0) * colors
+    image = jnp.maximum(current * composed + (1.0 - current) * temporal, 0.0) * colors
+    return jnp.where(frame.depth < FAR, image, frame.radiance)
 
 
 def breakdown(subject: Subject, frame: Frame, *, rounds: int) -> dict[str, Timing]:
@@ -103,28 +106,28 @@ def breakdown(subject: Subject, frame: Frame, *, rounds: int) -> dict[str, Timin
 
     def predict(params: Params, frame: Frame, noisy: jax.Array, recalled: jax.Array, lost: jax.Array) -> Any:
         frame, _ = repair(frame)
-        features = [
-            color.compress(noisy),
-            frame.albedo - 1.0,
-            frame.normal,
-            depth_feature(frame.depth),
-            color.compress(recalled),
-            lost.astype(noisy.dtype),
-        ]
-        return tuple(head[0] for head in network.apply(params, [feature[None] for feature in features]))
+        known = frame.depth < FAR
+        noisy, recalled = fill(noisy, known), fill(recalled, known)
+        gain = color.exposure(noisy)
+        seen = {"albedo": frame.albedo - 1.0, "normal": frame.normal, "depth": depth_feature(frame.depth)}
+        history = color.compress(gain * recalled)
+        features = [color.compress(gain * noisy), *seen.values(), history, lost.astype(noisy.dtype)]
+        layers = {name: part for name, part in params.items() if name != "guide"}
+        heads = tuple(head[0] for head in network.apply(layers, [feature[None] for feature in features]))
+        return (noisy, recalled), heads, guided_features(params["guide"], seen)
 
     colors = brdf.divisor(frame.albedo if frame.reflectance is None else frame.reflectance)
     noisy = frame.radiance / colors
     reproject_jit, predict_jit = jax.jit(reproject), jax.jit(predict)
     recalled, lost = reproject_jit(noisy, frame, noisy)
-    heads = predict_jit(params, frame, noisy, recalled, lost)
+    images, heads, guiding = predict_jit(params, frame, noisy, recalled, lost)
     apply_jit = jax.jit(apply_kernels)
-    filtered = apply_jit(noisy, recalled, heads)
+    filtered = apply_jit(*images, heads, guiding)
     calls: dict[str, Call] = {
         REPROJECTION: _waiting(reproject_jit, noisy, frame, noisy),
         NETWORK: _waiting(predict_jit, params, frame, noisy, recalled, lost),
-        FILTERING: _waiting(apply_jit, noisy, recalled, heads),
-        BLENDING: _waiting(jax.jit(blend), filtered, heads, lost, colors),
+        FILTERING: _waiting(apply_jit, *images, heads, guiding),
+        BLENDING: _waiting(jax.jit(blend), filtered, heads, lost, colors, frame),
         WHOLE: steps.recurrent(subject.denoiser, params, frame),
     }
     return measure(calls, rounds=rounds)

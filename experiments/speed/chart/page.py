@@ -169,8 +169,8 @@ def _top(data: Mapping[str, Any], sizes: tuple[str, str]) -> str:
         "of their references. The plain ones saturate at that noise.",
         f"Time is for one frame of {sizes[0]} (median of repeats, methods interleaved), or of the clips' own size. "
         "Rendering times beyond four samples per pixel are extrapolated linearly in the number of samples.",
-        "Marks at the bottom of the plot have no error: untrained widths, the same network in PyTorch, and the time "
-        "of a frame in which nothing moves. They are placed at the time of a frame with 1 sample per pixel.",
+        "Marks at the bottom of the plot have no error: untrained widths, and the time of a frame in which nothing "
+        "moves. They are placed at the time of a frame with 1 sample per pixel.",
         "Effects all has every buffer that a denoiser reads, plain only those of the clip's effects: the same image, "
         "and the same program if the clip has all effects.",
         *(escape(sentence) for sentence in data["left_out"]["here"]),

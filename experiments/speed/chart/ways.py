@@ -105,12 +105,12 @@ def ways(denoisers: Sequence[Candidate], *, quick: bool = False) -> list[Way]:
     found = [*registered(denoisers), *open_image_denoise()]
     if quick:
         return [each for each in found if each.variant == PLAIN]
-    return [*found, *of_ntd.untrained(), *of_ntd.pytorch()]
+    return [*found, *of_ntd.untrained()]
 
 
 def left_out() -> list[str]:
     """Why some rows are missing here, in sentences."""
-    sentences = list(dict.fromkeys(peers.missing().values()))
+    sentences = [why for name, why in peers.missing().items() if name == "pyoidn"]
     wanted = {name for method in methods().values() for name in method.engines}
     for name, engine in ENGINES.items():
         if name in wanted and engine.purpose == "inference" and not engine.available():

@@ -21,7 +21,7 @@ WIDTHS = {"large": LARGE, "small": SMALL}
 METHOD = method_named("ntd")
 """The method whose network the peers also implement."""
 PLAIN = {"kernels": "plain", "background": "filter", "exposure": "given", "initialization": "xavier"}
-"""Options of the paper's form of it, which is the one they implement, and that of the weights that are shipped."""
+"""Options of the paper's form of it, which is the one that they implement."""
 
 
 def implementations(purpose: Purpose) -> dict[str, dict[str, Any]]:
