@@ -49,7 +49,8 @@ class Law(NamedTuple):
 def light_times(factor: float) -> Law:
     """All light times a factor."""
     return Law(
-        lambda clip: _each(clip, "light", lambda image: image * np.float32(factor)), lambda image: image / factor
+        lambda clip: _each(clip, ("light", "signed"), lambda image: image * np.float32(factor)),
+        lambda image: image / factor,
     )
 
 
@@ -62,19 +63,19 @@ def mirror(turns: int) -> Law:
     )
 
 
-def _each(clip: Clip, kind: str, change: Callable[[Image], Image]) -> Clip:
-    """The clip with every buffer of three channels of a kind changed."""
+def _each(clip: Clip, kinds: tuple[str, ...], change: Callable[[Image], Image]) -> Clip:
+    """The clip with every buffer of these kinds changed."""
     buffers = {
         name: change(np.asarray(image))
         for name, image in clip.frames._asdict().items()
-        if image is not None and BUFFERS[name].kind == kind and BUFFERS[name].channels == 3
+        if image is not None and BUFFERS[name].kind in kinds
     }
     return clip._replace(frames=clip.frames._replace(**buffers))
 
 
 def _channels(clip: Clip) -> Clip:
-    light = _each(clip, "light", lambda image: image[..., [2, 0, 1]])
-    return _each(light, "fraction", lambda image: image[..., [2, 0, 1]])
+    colors = ("light", "fraction")
+    return _each(clip, colors, lambda image: image[..., [2, 0, 1]] if image.shape[-1] == 3 else image)
 
 
 _AXES = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], np.float32)
@@ -84,7 +85,7 @@ LAWS = {
     "mirrored top to bottom": mirror(2),
     "red, green and blue exchanged": Law(_channels, lambda image: image[..., [1, 2, 0]]),
     "the world's axes exchanged": Law(
-        lambda clip: _each(clip, "direction", lambda image: image @ _AXES), lambda image: image
+        lambda clip: _each(clip, ("direction",), lambda image: image @ _AXES), lambda image: image
     ),
     "a sixteenth of the light": light_times(1 / 16),
     "a quarter of the light": light_times(1 / 4),

@@ -27,6 +27,12 @@ def test_every_change_is_changed_back(clip):
     assert max(found.values()) < 1e-6
 
 
+@pytest.mark.parametrize("name", [name for name in LAWS if name.startswith("mirrored")])
+def test_mirroring_twice_is_the_identity(clip, name):
+    change = LAWS[name].change
+    jax.tree.map(np.testing.assert_array_equal, change(change(clip)), clip)
+
+
 @pytest.mark.parametrize(
     ("broken", "change", "reads"),
     [
