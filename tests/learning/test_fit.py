@@ -104,6 +104,7 @@ def test_training_begins_with_given_weights_and_refuses_others_for_the_same_run(
         again(batches(clips), start=Start("another", one.params))
 
 
+@pytest.mark.slow
 def test_training_stops_at_its_time_limit_and_goes_on_from_there(clips, tmp_path, capsys):
     stopped = run(clips, tmp_path / "limited", time_limit=1e-9)
     assert int(stopped.step) == 0

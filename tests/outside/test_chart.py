@@ -292,6 +292,7 @@ def test_methods_that_request_samples_are_left_out_with_a_message(monkeypatch):
     assert [sentence for sentence in left_out() if sentence.startswith("sampler requests samples from the renderer")]
 
 
+@pytest.mark.slow
 def test_steps_with_known_parts_are_broken_down(denoisers):
     names = [subject.name for subject in subjects(denoisers, quick=True)]
     assert names == ["ntd-large, reference", "ntd-small, reference"]
