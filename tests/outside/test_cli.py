@@ -122,7 +122,8 @@ def test_train_denoise_and_compare_with_new_weights(tmp_path):
     write_clip(make_clip(0, frames=10, size=20), tmp_path / "clips" / "square")
     few = ("--steps", "2", "--batch", "1", "--crop", "16")
     options = ("--variant", "ntd-small", "--set", "size=[[4], [4], [4], [4], [4]]", "motion=traditional")
-    train = ("train", tmp_path / "clips", "-o", tmp_path / "mine", *options, "--recipe", "paper-without-occlusion", *few)
+    recipe = ("--recipe", "paper-without-occlusion")
+    train = ("train", tmp_path / "clips", "-o", tmp_path / "mine", *options, *recipe, *few)
     done = jaxdn(*train)
     assert done.returncode == 0, done.stderr
     weights = tmp_path / "mine" / "weights.safetensors"
