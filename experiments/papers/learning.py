@@ -166,8 +166,8 @@ def main(settings: Settings) -> None:
 
 def table(results: Results, runs: Path) -> str:
     """One line per row: seconds of training, PSNR and its gain over the row that it changes, temporal PSNR, FLIP."""
-    means, changed = mean_scores(results), dict(itertools.pairwise(row.name for row in LADDER))
-    before = {new: old for old, new in changed.items()} | {row.name: row.on for row in BRANCHES}
+    means = mean_scores(results)
+    before = {new.name: old.name for old, new in itertools.pairwise(LADDER)} | {row.name: row.on for row in BRANCHES}
     field, lines = headline_psnr([clip.scores for clip in results.clips]), [results.title]
     for label in results.methods:
         seconds = json.loads((runs / folder_name(label) / "seconds.json").read_text())

@@ -59,10 +59,8 @@ def _xla(program: str) -> float:
     from jaxdn.learning.step import initial_state, make_train_step
 
     kind, size, detail, *remat = program.split("-")
-    denoiser, recipe = (
-        steps.METHOD.factory(size=size, **steps.PLAIN),
-        train_steps.RECIPE._replace(rematerialize=bool(remat)),
-    )
+    denoiser = steps.METHOD.factory(size=size, **steps.PLAIN)
+    recipe = train_steps.RECIPE._replace(rematerialize=bool(remat))
     step: Any
     arguments: tuple[Any, ...]
     if kind == "step":
