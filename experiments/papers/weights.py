@@ -21,6 +21,7 @@ from jaxdn.commands.errors import plain_errors
 from jaxdn.commands.render import render
 from jaxdn.commands.train import train
 from jaxdn.methods.table import method_named
+from jaxdn.objectives import unbiased_illumination
 from jaxdn.weights import SHIPPED, shipped_names
 
 FAMILIES = {"parlour": 90, "fruit": 14, "mobile": 14, "pinkroom": 14, "robot": 14}
@@ -101,6 +102,8 @@ def train_stage(stage: Stage, settings: Settings) -> Path:
     recipe = method.recipe_named(stage.recipe)._replace(
         steps=stage.steps, decay=stage.decay, average=0.99, spp=(1, 1, 1, 2, 4, 16)
     )
+    if stage.start:  # has had its L1, which would make its images darker again
+        recipe = recipe._replace(objective=unbiased_illumination(squared_from=0.0))
     return train(
         method,
         recipe,

@@ -158,7 +158,7 @@ class Run:
         frames = {self.timed_size: made, self.own_size: own}
         groups: dict[str, list[Way]] = {}
         for way in self.ways:
-            if not all(size in self.store.data["times"].get(way.name, {}) for size in self._sizes_of(way)):
+            if not all(size in self.store.data["times"].get(way.name, {}) for size in frames):
                 groups.setdefault(way.group, []).append(way)
         with self.counted("times", len(groups)) as done:
             for group, members in groups.items():
@@ -171,11 +171,8 @@ class Run:
                         self.store.put("times", name, sizes)
                 done(group)
 
-    def _sizes_of(self, way: Way) -> tuple[str, ...]:
-        return (self.timed_size, self.own_size) if way.small else (self.timed_size,)
-
     def _timed(self, members: Sequence[Way], frame: Frame, size: str) -> dict[str, dict[str, Any]]:
-        calls = {way.name: way.timed(frame) for way in members if size in self._sizes_of(way)}
+        calls = {way.name: way.timed(frame) for way in members}
         # Small frames vary more and take little time.
         rounds = self.sizes.rounds if size == self.timed_size else 7 * self.sizes.rounds
         found: dict[str, dict[str, Any]] = {}

@@ -46,8 +46,6 @@ class Way(NamedTuple):
     """Frames [T, H, W, C] -> images [T, H, W, 3]; None if only the time can be measured."""
     group: str
     """Methods of one group are timed interleaved."""
-    small: bool = True
-    """Whether it is also timed on a small frame."""
 
 
 def as_it_is(frame: Frame, reads: frozenset[str]) -> Frame:
