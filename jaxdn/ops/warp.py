@@ -91,6 +91,46 @@ def _fetch(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     return (1 - fy) * upper + fy * lower
 
 
+def corners(image: jax.Array, top: jax.Array, left: jax.Array) -> jax.Array:
+    """The four pixels of cells, [H, W, 4, C]: upper left, upper right, lower left, lower right. No gradient."""
+    image = _at_least_two(lax.stop_gradient(image))
+    height, width, channels = image.shape
+    flat = image.reshape(-1)
+    start = (top * width + left) * channels
+    pairs = lax.GatherDimensionNumbers(offset_dims=(top.ndim,), collapsed_slice_dims=(), start_index_map=(0,))
+
+    def row(offset: int) -> jax.Array:
+        return lax.gather(flat, (start + offset)[..., None], pairs, (2 * channels,), mode="promise_in_bounds")
+
+    return jnp.stack([row(0), row(width * channels)], axis=-2).reshape(*top.shape, 4, channels)
+
+
+@jax.custom_vjp
+def weighted_cells(image: jax.Array, top: jax.Array, left: jax.Array, weights: jax.Array) -> jax.Array:
+    """The sum of the four pixels of each cell, each times one of ``weights`` [H, W, 4]; gradient by the image only."""
+    return jnp.sum(corners(image, top, left) * weights[..., None], axis=-2)
+
+
+def _cells_forward(image, top, left, weights):
+    return weighted_cells(image, top, left, weights), (image[:, :, :, None][..., :0], top, left, weights)
+
+
+def _cells_backward(residuals, cotangent):
+    shape, top, left, weights = residuals
+    height, width, channels = shape.shape[:3]
+    blocks = (weights[..., None] * cotangent[..., None, :]).reshape(-1, 2, 2 * channels)
+    where = jnp.stack([top, left * channels], axis=-1).reshape(-1, 2)
+    windows = lax.ScatterDimensionNumbers(
+        update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
+    )
+    empty = jnp.zeros((height, width * channels), cotangent.dtype)
+    total = lax.scatter_add(empty, where, blocks, windows, mode="promise_in_bounds").reshape(height, width, channels)
+    return total, None, None, None
+
+
+weighted_cells.defvjp(_cells_forward, _cells_backward)
+
+
 def _spread(shape: tuple[int, ...], x: jax.Array, y: jax.Array, cotangent: jax.Array) -> jax.Array:
     """The adjoint of the fetch: every value is scattered to its four pixels."""
     height, width, channels = max(shape[0], 2), max(shape[1], 2), shape[2]
