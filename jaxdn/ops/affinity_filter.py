@@ -1,11 +1,21 @@
-"""A cross-bilateral filter whose weights come from the distances between the features of two pixels.
+"""A cross-bilateral filter whose weights are affinities: how alike the features of two pixels are.
 
-``out(p) = sum_q h(q - p) c(q) exp(-d(p, q)) x(q) / sum_q h(q - p) c(q) exp(-d(p, q))`` over the taps q = p + step * o, o
-in a (2r+1)^2 stencil. The distance ``d(p, q) = sum_f (F_f(p) - F_f(q))^2 + (z(q) - z(p) - (q - p) . (g(p) + g(q)) / 2)^2``
-is that of q to p, so that one exponential serves two taps; the second term is 0 on a plane, whose inverse depth z is
-affine in screen coordinates with slopes g. c is each pixel's confidence; pixels beyond the border have none.
+    out(p) = sum_q h(o) c(q) exp(-d(p, q)) x(q) / sum_q h(o) c(q) exp(-d(p, q)),    q = p + step o,
 
-Planar arrays: [C, H, W] runs along contiguous rows and vectorises. The gradient recomputes the weights.
+over the offsets o of a 5x5 stencil; h is the B3 spline, c each pixel's confidence, and with features F, a slanted guide
+z and its slopes g
+
+    d(p, q) = sum_f (F_f(p) - F_f(q))^2 + (z(q) - z(p) - (q - p) . (g(p) + g(q)) / 2)^2.
+
+The second term is 0 on a plane whose z is affine in screen coordinates, as the inverse depth is: a floor that recedes is
+one surface. Both terms are those of q to p. Spacing the taps by ``step`` = 1, 2, 4 ... gives the levels of an a-trous
+filter (Dammertz et al. 2010); learned features: Isik et al. 2021, "Interactive Monte Carlo Denoising using Affinity of
+Neural Features".
+
+Arrays are planar, ``[C, H, W]``: the stencil then runs along contiguous rows and vectorises. The forward pass works on
+strips of rows that fit into the cache; the gradient keeps only the arguments and recomputes the weights. Both scan over
+pairs of opposite taps and compute the weights of one pair while they use those of the pair before: in one expression,
+XLA:CPU would compute every weight once for each channel that uses it.
 """
 
 import functools
@@ -16,114 +26,143 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+RADIUS = 2
 SPLINE = (0.375, 0.25, 0.0625)
 """The B3 spline, from its centre outwards."""
 _STRIP = 16384
 """Approximate number of pixels in a strip."""
+_NO_WEIGHT = 1e-12
+
+Planes = list[jax.Array]
 
 
 class Guide(NamedTuple):
     """What the weights are made of."""
 
     features: jax.Array
-    """[F, H, W]."""
+    """[F, H, W]; a feature with standard deviation sigma of a Gaussian weight is divided by ``sqrt(2) sigma``."""
     slanted: jax.Array
-    """[3, H, W] a value that is affine on planes and its slopes along x and y."""
+    """[3, H, W] a value that is affine on planes, scaled likewise, and its slopes along x and y per pixel."""
     confidence: jax.Array
-    """[H, W] >= 0."""
+    """[H, W] >= 0; 0 for pixels that no other may take anything from."""
 
 
-def _half(radius: int) -> np.ndarray:
-    """Rows of (dy, dx) of the second half of the taps; the others are their opposites."""
-    taps = [(dy, dx) for dy in range(-radius, radius + 1) for dx in range(-radius, radius + 1)]
-    return np.array(taps[len(taps) // 2 + 1 :], np.int32)
+def affinity_filter(image: jax.Array, guide: Guide, *, step: int = 1) -> jax.Array:
+    """The filtered image [C, H, W], any colour space; taps are ``step`` pixels apart.
+
+    Taps beyond the border do not count. A pixel whose weights sum to nothing keeps its value. Differentiable by the
+    image and by all of the guide. Raises ValueError for shapes that do not fit each other.
+    """
+    image = jnp.asarray(image)
+    size = image.shape[1:]
+    shapes = (guide.features.shape[1:], guide.slanted.shape, guide.confidence.shape)
+    if image.ndim != 3 or shapes != (size, (3, *size), size):
+        raise ValueError(
+            f"guide: expected features [F, H, W], slanted [3, H, W] and confidence [H, W] for an image [C, H, W], got "
+            f"{guide.features.shape}, {guide.slanted.shape} and {guide.confidence.shape} for {image.shape}."
+        )
+    return _filtered(image, guide, step)
 
 
-def _spatial(offsets: np.ndarray) -> np.ndarray:
-    return np.array([SPLINE[abs(dy)] * SPLINE[abs(dx)] for dy, dx in offsets], np.float32)
+class _Pair(NamedTuple):
+    """Two opposite taps."""
+
+    shift: jax.Array
+    """[2] int32 (y, x) to the first of them, in pixels."""
+    spline: jax.Array
+    """h of both."""
+
+    def offset(self, sign: int) -> tuple[jax.Array, jax.Array]:
+        """(y, x) to one of them."""
+        return sign * self.shift[0], sign * self.shift[1]
+
+    def slant(self, sign: int, dtype: jnp.dtype) -> tuple[jax.Array, jax.Array]:
+        """The same as numbers."""
+        return sign * self.shift[0].astype(dtype), sign * self.shift[1].astype(dtype)
 
 
-def affinity_filter(image: jax.Array, guide: Guide, *, step: int = 1, radius: int = 2) -> jax.Array:
-    """The filtered image [C, H, W]; a pixel without any weight keeps its value."""
-    return _filtered(image, guide, step, radius)
+def _pairs(step: int, dtype: jnp.dtype) -> _Pair:
+    """All pairs, stacked."""
+    span = range(-RADIUS, RADIUS + 1)
+    after = [(dy, dx) for dy in span for dx in span if (dy, dx) > (0, 0)]
+    spline = [SPLINE[abs(dy)] * SPLINE[abs(dx)] for dy, dx in after]
+    return _Pair(jnp.asarray(step * np.array(after), jnp.int32), jnp.asarray(spline, dtype))
 
 
-Planes = list[jax.Array]
+def _from(pairs: _Pair, first: int) -> _Pair:
+    return jax.tree.map(lambda each: each[first:], pairs)
 
 
-def _window(planes: Planes, top, left, shape) -> Planes:
-    at = tuple(jnp.asarray(each, jnp.int32) for each in (top, left))
-    return [lax.dynamic_slice(plane, at, shape) for plane in planes]
+def _one(pairs: _Pair, index: int) -> _Pair:
+    return jax.tree.map(lambda each: each[index], pairs)
 
 
-def _affinity(here: Planes, there: Planes, count: int, dy: jax.Array, dx: jax.Array) -> jax.Array:
-    """exp(-d) of the features, the slanted value and its slopes at both ends."""
-    total = jnp.square(_slant(here, there, count, dy, dx))
-    for f in range(count):
-        total = total + jnp.square(here[f] - there[f])
+def _window(planes: Planes, top: jax.Array | int, left: jax.Array | int, size: tuple[int, int]) -> Planes:
+    corner = (jnp.asarray(top, jnp.int32), jnp.asarray(left, jnp.int32))
+    return [lax.dynamic_slice(plane, corner, size) for plane in planes]
+
+
+def _residual(here: Planes, there: Planes, dy: jax.Array, dx: jax.Array) -> jax.Array:
+    """How far the slanted guide at q is from where the plane through p expects it; its three planes come last."""
+    (z, slope_x, slope_y), (other_z, other_x, other_y) = here[-3:], there[-3:]
+    return other_z - z - 0.5 * (dx * (slope_x + other_x) + dy * (slope_y + other_y))
+
+
+def _affinity(here: Planes, there: Planes, dy: jax.Array, dx: jax.Array) -> jax.Array:
+    """exp(-d) between the guides of two pixels."""
+    total = jnp.square(_residual(here, there, dy, dx))
+    for one, other in zip(here[:-3], there[:-3], strict=True):
+        total = total + jnp.square(one - other)
     return jnp.exp(-total)
-
-
-def _slant(here: Planes, there: Planes, count: int, dy: jax.Array, dx: jax.Array) -> jax.Array:
-    slope_x, slope_y = here[count + 1] + there[count + 1], here[count + 2] + there[count + 2]
-    return there[count] - here[count] - 0.5 * (dx * slope_x + dy * slope_y)
 
 
 def _dot(one: Planes, other: Planes) -> jax.Array:
     return functools.reduce(jnp.add, [a * b for a, b in zip(one, other, strict=True)])
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
-def _filtered(image: jax.Array, guide: Guide, step: int, radius: int) -> jax.Array:
-    return _forward(image, guide, step, radius)[0]
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _filtered(image: jax.Array, guide: Guide, step: int) -> jax.Array:
+    return _forward(image, guide, step)[0]
 
 
-def _taps(step: int, radius: int, dtype) -> tuple[jax.Array, jax.Array]:
-    offsets = _half(radius)
-    return jnp.asarray(step * offsets, jnp.int32), jnp.asarray(_spatial(offsets), dtype)
+_Residuals = tuple[jax.Array, Guide, jax.Array, jax.Array]
 
 
-def _forward(image, guide, step, radius):
+def _forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, _Residuals]:
     channels, height, width = image.shape
-    dtype, count, margin = image.dtype, guide.features.shape[0], step * radius
+    dtype, margin = image.dtype, step * RADIUS
     rows = height if jax.default_backend() != "cpu" else min(height, max(8 * step, _STRIP // width))
     strips = -(-height // rows)
-    spare = strips * rows - height
+    below = margin + strips * rows - height
 
-    def around(plane):
-        return jnp.pad(plane, ((margin, margin + spare), (margin, margin)))
+    def around(plane: jax.Array) -> jax.Array:
+        return jnp.pad(plane, ((margin, below), (margin, margin)))
 
     guides = [around(plane) for plane in (*guide.features, *guide.slanted)]
     mass = [around(plane * guide.confidence) for plane in image] + [around(guide.confidence)]
-    shifts, numbers = _taps(step, radius, dtype)
+    pairs = _pairs(step, dtype)
 
-    def strip(top):
-        def at(planes, dy, dx):
+    def strip(top: jax.Array | int) -> jax.Array:
+        def at(planes: Planes, dy: jax.Array | int, dx: jax.Array | int) -> Planes:
             return _window(planes, top + margin + dy, margin + dx, (rows, width))
 
-        def weigh(tap):
-            (dy, dx), number = tap
-            fy, fx = dy.astype(dtype), dx.astype(dtype)
+        def weigh(pair: _Pair) -> Planes:
             here = at(guides, 0, 0)
-            after = _affinity(here, at(guides, dy, dx), count, fy, fx)
-            before = _affinity(at(guides, -dy, -dx), here, count, fy, fx)
-            return number * after, number * before
+            signed = [_affinity(here, at(guides, *pair.offset(sign)), *pair.slant(sign, dtype)) for sign in (1, -1)]
+            return [pair.spline * one for one in signed]
 
-        def add(total, ready, shift):
-            (after, before), (dy, dx) = ready, shift
-            pairs = zip(total, at(mass, dy, dx), at(mass, -dy, -dx), strict=True)
-            return [old + after * a + before * b for old, a, b in pairs]
+        def add(total: Planes, pair: _Pair, weights: Planes) -> Planes:
+            for sign, weight in zip((1, -1), weights, strict=True):
+                total = [old + weight * one for old, one in zip(total, at(mass, *pair.offset(sign)), strict=True)]
+            return total
 
-        def body(carry, tap):
-            total, ready, shift = carry
-            return (add(total, ready, shift), weigh(tap), tap[0]), None
+        def body(carry: tuple[Planes, _Pair, Planes], pair: _Pair) -> tuple[tuple[Planes, _Pair, Planes], None]:
+            return (add(*carry), pair, weigh(pair)), None
 
-        # While a tap's weights are computed, the tap before is added: fused into the sums, XLA:CPU would compute every
-        # weight once for each channel.
-        own = [SPLINE[0] ** 2 * plane for plane in at(mass, 0, 0)]
-        first = weigh((shifts[0], numbers[0]))
-        (total, ready, shift), _ = lax.scan(body, (own, first, shifts[0]), (shifts[1:], numbers[1:]))
-        return jnp.stack(add(total, ready, shift))
+        first = _one(pairs, 0)
+        begin = ([SPLINE[0] ** 2 * plane for plane in at(mass, 0, 0)], first, weigh(first))
+        carry, _ = lax.scan(body, begin, _from(pairs, 1))
+        return jnp.stack(add(*carry))
 
     if strips == 1:
         totals = strip(0)
@@ -131,76 +170,81 @@ def _forward(image, guide, step, radius):
         totals = lax.map(strip, rows * jnp.arange(strips, dtype=jnp.int32))
         totals = totals.transpose(1, 0, 2, 3).reshape(channels + 1, strips * rows, width)[:, :height]
     weight = totals[-1:]
-    some = weight > 1e-12
-    out = jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), image)
-    return out, (image, guide, out, weight)
+    some = weight > _NO_WEIGHT
+    filtered = jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), image)
+    return filtered, (image, guide, filtered, weight)
 
 
-def _backward(step, radius, residuals, cotangent):
-    image, guide, out, weight = residuals
-    channels, height, width = image.shape
-    dtype, count, margin = image.dtype, guide.features.shape[0], step * radius
-    some = weight > 1e-12
+def _backward(step: int, residuals: _Residuals, cotangent: jax.Array) -> tuple[jax.Array, Guide]:
+    """Gathered: every pixel p collects what it gets as the centre and what it gets as a tap of its neighbours q.
+
+    With g = cotangent / W and s = <g, out>, the gradient by the weight of q in p is ``<g(p), x(q)> - s(p)``.
+    """
+    image, guide, filtered, weight = residuals
+    size, dtype, margin = image.shape[1:], image.dtype, step * RADIUS
+    some = weight > _NO_WEIGHT
     scaled = jnp.where(some, cotangent / jnp.where(some, weight, 1.0), 0.0)
-    level = jnp.sum(scaled * out, axis=0)
+    level = jnp.sum(scaled * filtered, axis=0)
 
-    def around(planes):
+    def around(planes: Planes | jax.Array) -> Planes:
         return [jnp.pad(plane, margin) for plane in planes]
 
-    guides = around([*guide.features, *guide.slanted])
-    lights, trust, gains, levels = around(image), around([guide.confidence]), around(scaled), around([level])
-    shifts, numbers = _taps(step, radius, dtype)
+    here = [*guide.features, *guide.slanted]
+    guides, lights, gains = around(here), around(image), around(scaled)
+    trusts, levels = around([guide.confidence]), around([level])
+    x, g, c = list(image), list(scaled), guide.confidence
+    pairs = _pairs(step, dtype)
 
-    def at(planes, dy, dx):
-        return _window(planes, margin + dy, margin + dx, (height, width))
+    def at(planes: Planes, pair: _Pair, sign: int) -> Planes:
+        dy, dx = pair.offset(sign)
+        return _window(planes, margin + dy, margin + dx, size)
 
-    here, x, g, s, c = list((*guide.features, *guide.slanted)), list(image), list(scaled), level, guide.confidence
-    inner = _dot(g, x) - s
-    centre = SPLINE[0] ** 2
-    begin = ([centre * one * c for one in g], centre * inner, [jnp.zeros_like(s)] * (count + 3))
+    def weigh(pair: _Pair) -> Planes:
+        signed = [_affinity(here, at(guides, pair, sign), *pair.slant(sign, dtype)) for sign in (1, -1)]
+        return [pair.spline * one for one in signed]
 
-    def signed(shift, sign):
-        dy, dx = sign * shift[0], sign * shift[1]
-        return (dy, dx), (dy.astype(dtype), dx.astype(dtype))
-
-    def weigh(shift, number):
-        return [number * _affinity(here, at(guides, *signed(shift, sign)[0]), count, *signed(shift, sign)[1]) for sign in (1, -1)]
-
-    def slope(shift, ready):
+    def slopes(pair: _Pair, weights: Planes) -> list[Planes]:
+        """By the distance (times -2), the same times the slanted residual, by the confidence; for both taps."""
         found = []
-        for sign, e in zip((1, -1), ready, strict=True):
-            place, ends = signed(shift, sign)
-            p_reads = _dot(g, at(lights, *place)) - s
-            q_reads = _dot(at(gains, *place), x) - at(levels, *place)[0]
-            by_distance = -2.0 * e * (at(trust, *place)[0] * p_reads + c * q_reads)
-            found.append((by_distance, by_distance * _slant(here, at(guides, *place), count, *ends), e * q_reads))
+        for sign, one in zip((1, -1), weights, strict=True):
+            p_takes = _dot(g, at(lights, pair, sign)) - level
+            q_takes = _dot(at(gains, pair, sign), x) - at(levels, pair, sign)[0]
+            by_distance = -2.0 * one * (at(trusts, pair, sign)[0] * p_takes + c * q_takes)
+            residual = _residual(here, at(guides, pair, sign), *pair.slant(sign, dtype))
+            found.append([by_distance, by_distance * residual, one * q_takes])
         return found
 
-    def add(sums, shift, ready, slopes):
-        by_x, by_c, by_guides = sums
-        for sign, e, (by_distance, slant, by_confidence) in zip((1, -1), ready, slopes, strict=True):
-            place, (fy, fx) = signed(shift, sign)
-            share = e * c
-            by_x = [old + share * one for old, one in zip(by_x, at(gains, *place), strict=True)]
-            by_c = by_c + by_confidence
-            there = at(guides[:count], *place)
-            features = [old + by_distance * (a - b) for old, a, b in zip(by_guides, here, there, strict=False)]
-            a, b, d = by_guides[count:]
-            by_guides = [*features, a - slant, b - 0.5 * fx * slant, d - 0.5 * fy * slant]
-        return by_x, by_c, by_guides
+    def add(sums: Planes, pair: _Pair, weights: Planes, ready: list[Planes]) -> Planes:
+        by_image, by_confidence, by_guides = sums[: len(x)], sums[len(x)], sums[len(x) + 1 :]
+        for sign, one, (by_distance, by_residual, by_trust) in zip((1, -1), weights, ready, strict=True):
+            share = one * c
+            by_image = [old + share * gain for old, gain in zip(by_image, at(gains, pair, sign), strict=True)]
+            by_confidence = by_confidence + by_trust
+            there = at(guides, pair, sign)[:-3]
+            features = [old + by_distance * (a - b) for old, a, b in zip(by_guides[:-3], here[:-3], there, strict=True)]
+            dy, dx = pair.slant(sign, dtype)
+            z, slope_x, slope_y = by_guides[-3:]
+            slanted = [z - by_residual, slope_x - 0.5 * dx * by_residual, slope_y - 0.5 * dy * by_residual]
+            by_guides = [*features, *slanted]
+        return [*by_image, by_confidence, *by_guides]
 
-    # A pipeline of three stages, for the same reason as in the forward pass.
-    def body(carry, tap):
-        sums, (older, oldest_ready, slopes), (shift, ready) = carry
-        return (add(sums, older, oldest_ready, slopes), (shift, ready, slope(shift, ready)), (tap[0], weigh(*tap))), None
+    # Three stages, each one pair behind the one before.
+    Carry = tuple[Planes, tuple[_Pair, Planes, list[Planes]], tuple[_Pair, Planes]]
 
-    first, second = weigh(shifts[0], numbers[0]), weigh(shifts[1], numbers[1])
-    carry = (begin, (shifts[0], first, slope(shifts[0], first)), (shifts[1], second))
-    (sums, (older, oldest_ready, slopes), (shift, ready)), _ = lax.scan(body, carry, (shifts[2:], numbers[2:]))
-    sums = add(sums, older, oldest_ready, slopes)
-    by_x, by_c, by_guides = add(sums, shift, ready, slope(shift, ready))
-    by_image = jnp.stack(by_x) + jnp.where(some, 0.0, cotangent)
-    return by_image, Guide(jnp.stack(by_guides[:count]), jnp.stack(by_guides[count:]), by_c)
+    def body(carry: Carry, pair: _Pair) -> tuple[Carry, None]:
+        sums, oldest, (older, weights) = carry
+        return (add(sums, *oldest), (older, weights, slopes(older, weights)), (pair, weigh(pair))), None
+
+    centre = SPLINE[0] ** 2
+    begin = [centre * one * c for one in g] + [centre * (_dot(g, x) - level)] + [jnp.zeros_like(level)] * len(here)
+    first, second = _one(pairs, 0), _one(pairs, 1)
+    ready = weigh(first)
+    carry: Carry = (begin, (first, ready, slopes(first, ready)), (second, weigh(second)))
+    (sums, oldest, (last, weights)), _ = lax.scan(body, carry, _from(pairs, 2))
+    sums = add(add(sums, *oldest), last, weights, slopes(last, weights))
+    by_image = jnp.stack(sums[: len(x)]) + jnp.where(some, 0.0, cotangent)
+    by_guides = sums[len(x) + 1 :]
+    return by_image, Guide(jnp.stack(by_guides[:-3]), jnp.stack(by_guides[-3:]), sums[len(x)])
 
 
 _filtered.defvjp(_forward, _backward)

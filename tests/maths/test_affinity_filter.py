@@ -1,0 +1,93 @@
+"""The affinity filter against its formula in float64, its gradients, and what it promises at borders and edges."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jaxdn.ops import affinity_filter as module
+from jaxdn.ops.affinity_filter import SPLINE, Guide, affinity_filter
+
+
+def drawn(rng, height=9, width=11, *, features=3, channels=2):
+    image = rng.normal(size=(channels, height, width))
+    slanted = 0.2 * rng.normal(size=(3, height, width))
+    return image, 0.5 * rng.normal(size=(features, height, width)), slanted, rng.uniform(0.1, 1, (height, width))
+
+
+def by_formula(image, features, slanted, confidence, step):
+    channels, height, width = image.shape
+    out = np.zeros_like(image)
+    z, slope = slanted[0], slanted[1:]
+    for i, j in np.ndindex(height, width):
+        total, weight = np.zeros(channels), 0.0
+        for dy, dx in np.ndindex(5, 5):
+            dy, dx = dy - 2, dx - 2
+            a, b = i + step * dy, j + step * dx
+            if not (0 <= a < height and 0 <= b < width):
+                continue
+            expected = 0.5 * step * (np.array([dx, dy]) @ (slope[:, i, j] + slope[:, a, b]))
+            distance = ((features[:, i, j] - features[:, a, b]) ** 2).sum() + (z[a, b] - z[i, j] - expected) ** 2
+            one = SPLINE[abs(dy)] * SPLINE[abs(dx)] * confidence[a, b] * np.exp(-distance)
+            total, weight = total + one * image[:, a, b], weight + one
+        out[:, i, j] = total / weight
+    return out
+
+
+@pytest.mark.parametrize("step", [1, 2, 4])
+@pytest.mark.parametrize("strip", [16384, 22])
+def test_it_is_the_formula(step, strip, rng, x64, monkeypatch):
+    monkeypatch.setattr(module, "_STRIP", strip)
+    image, *guide = drawn(rng, 19)
+    found = affinity_filter(jnp.asarray(image), Guide(*map(jnp.asarray, guide)), step=step)
+    np.testing.assert_allclose(found, by_formula(image, *guide, step), rtol=1e-10)
+
+
+@pytest.mark.parametrize("step", [1, 3])
+def test_gradients(step, rng, x64):
+    def filtered(image, *guide):
+        return affinity_filter(image, Guide(*guide), step=step)
+
+    check_grads(filtered, tuple(map(jnp.asarray, drawn(rng))), order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
+
+
+def test_a_plane_that_recedes_is_one_surface_and_two_planes_are_not(rng):
+    """Inverse depth is affine on a plane; noise is averaged there as without the guide, and nothing crosses an edge."""
+    rows, columns = np.mgrid[:16, :32].astype(np.float32)
+    z = 3 * columns - 2 * rows
+    slanted = np.stack([z, np.full_like(z, 3), np.full_like(z, -2)])
+    image = rng.normal(size=(1, 16, 32)).astype(np.float32)
+    nothing, all_of_it = np.zeros((0, 16, 32), np.float32), np.ones((16, 32), np.float32)
+    flat = affinity_filter(image, Guide(nothing, np.zeros_like(slanted), all_of_it), step=2)
+    np.testing.assert_allclose(affinity_filter(image, Guide(nothing, slanted, all_of_it), step=2), flat, rtol=1e-4)
+    slanted[0, :, 16:] += 40
+    image[:, :, 16:] += 100
+    apart = affinity_filter(image, Guide(nothing, slanted, all_of_it), step=2)
+    assert np.abs(apart[:, :, :16]).max() < 5
+    assert apart[:, :, 16:].min() > 95
+
+
+def test_pixels_without_confidence_give_nothing_and_may_hold_anything_large(rng):
+    image, features, slanted, confidence = (np.float32(each) for each in drawn(rng))
+    confidence[:, 5:] = 0
+    guide = Guide(features, slanted, confidence)
+    found = affinity_filter(image, guide)
+    np.testing.assert_array_equal(found[:, :, 7:], image[:, :, 7:])  # no tap with confidence: the value stays
+    image[:, :, 5:] = 1e30
+    np.testing.assert_array_equal(affinity_filter(image, guide)[:, :, :5], found[:, :, :5])
+
+
+def test_a_constant_stays_and_shapes_are_checked(rng):
+    _, features, slanted, confidence = (np.float32(each) for each in drawn(rng))
+    flat = np.full((3, 9, 11), 0.7, np.float32)
+    np.testing.assert_allclose(affinity_filter(flat, Guide(features, slanted, confidence), step=2), flat, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"slanted \[3, H, W\].* got \(3, 9, 11\), \(2, 9, 11\)"):
+        affinity_filter(flat, Guide(features, slanted[:2], confidence))
+
+
+def test_batches_are_single_images(rng):
+    first, second = (tuple(np.float32(each) for each in drawn(rng)) for _ in range(2))
+    both = jax.vmap(lambda image, *guide: affinity_filter(image, Guide(*guide)))(*map(np.stack, zip(first, second)))
+    for one, (image, *guide) in zip(both, (first, second), strict=True):
+        np.testing.assert_allclose(one, affinity_filter(image, Guide(*guide)), rtol=1e-5, atol=1e-6)
