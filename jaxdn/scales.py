@@ -20,6 +20,23 @@ def downsample(image: jax.Array, *, down: str = "mean") -> jax.Array:
     return jnp.maximum(jnp.maximum(corners[0], corners[1]), jnp.maximum(corners[2], corners[3]))
 
 
+def fold(image: jax.Array) -> jax.Array:
+    """[H, W, C] -> [H/2, W/2, 4C]: the pixels of each 2x2 block side by side, channel by channel. Odd sizes raise
+    ValueError."""
+    check_image(image, "image")
+    height, width, channels = image.shape
+    _check_even(height, width, "image")
+    blocks = image.reshape(height // 2, 2, width // 2, 2, channels)
+    return blocks.transpose(0, 2, 4, 1, 3).reshape(height // 2, width // 2, 4 * channels)
+
+
+def unfold(image: jax.Array) -> jax.Array:
+    """The inverse of :func:`fold`: [H, W, 4C] -> [2H, 2W, C]."""
+    height, width, channels = image.shape
+    blocks = image.reshape(height, width, channels // 4, 2, 2)
+    return blocks.transpose(0, 3, 1, 4, 2).reshape(2 * height, 2 * width, channels // 4)
+
+
 def fill(image: jax.Array, known: jax.Array) -> jax.Array:
     """[H, W, C] with the mean of the known pixels of the same 2x2 block, else 4x4 block, where a pixel is not known.
 

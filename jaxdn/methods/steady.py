@@ -1,23 +1,28 @@
-"""A steady denoiser of our own (``steady``): a variance-guided filter's skeleton, guided by a small recurrent network.
+"""``steady``, a denoiser of our own: an edge-stopping recurrent filter whose every decision a small network makes.
 
 For each frame: divide by what surfaces reflect; fetch the history with a test of every tap; blend the noisy frame into
-a running mean whose effective number of samples is known per pixel; filter that mean by an edge-stopping a-trous
-cascade, one level at full resolution and the others at half; add what the coarse levels found; blend with the warped
-output of the last frame. A U-Net at half resolution decides, per pixel: features whose differences stop the filter,
-how much a pixel is to be trusted, how much of each level to take, and how fast both histories follow.
+a running mean whose effective number of samples is known per pixel; filter the mean by affinities, one level at full
+resolution and four at half, each reaching twice as far as the one before; blend the result with the last output.
+
+What a hand-made filter leaves to constants, a U-Net at half resolution decides for every pixel: learned features that
+stop the filter beside albedo, normal and depth; how far a pixel can be trusted (a firefly is not); how fast both
+histories follow; how much of each level is taken. Its first decisions are plausible ones, so that training begins from
+a filter and not from noise.
+
+The filter is variance-guided filtering without its variance (Schied et al. 2017), with affinities of learned features
+(Isik et al. 2021) and a recurrent network's view of noisy frame, mean and last output (Zeng et al. 2021).
 """
 
-import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxdn import color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.filters.guides import Guides, depth_slopes, guides_of, hit_mask, shared, unpack
-from jaxdn.filters.reprojection import same_surface
+from jaxdn.filters.guides import Guides, depth_slopes, guides_of, hit_mask
+from jaxdn.filters.recall import recall
 from jaxdn.frame import FAR, RADIANCE_MAX, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated
 from jaxdn.methods.ntd import depth_feature
@@ -25,222 +30,253 @@ from jaxdn.methods.table import method
 from jaxdn.networks import Widths, crop, pad
 from jaxdn.objectives import unbiased_illumination
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
-from jaxdn.ops.warp import corners, weighted_cells
+from jaxdn.options import Range
 from jaxdn.recipe import Recipe
-from jaxdn.scales import downsample, fill, upsample
+from jaxdn.scales import downsample, fill, fold, unfold, upsample
 
 LEVELS = 4
-"""Levels of the cascade at half resolution."""
-FEATURES = (5, 8)
+"""Levels of the filter at half resolution; taps are 2, 4, 8 and 16 pixels apart."""
+FEATURES, HALF_FEATURES = 5, 8
 """Learned features at full and at half resolution."""
-_PACKED = FEATURES[0] + 5  # confidence, share of the frame, history's share, coarse share, feedback
-_HALF = FEATURES[1] + 1 + LEVELS
-WIDTHS: dict[str, Widths] = {
+MULTIPLE = 32
+"""Height and width that the network works on are multiples of this."""
+QUALITIES: dict[str, Widths] = {
     "fast": ((16,), (24,), (32,), (32,), (32,)),
     "balanced": ((32,), (48,), (64,), (64,), (64,)),
     "high": ((48, 48), (64, 64), (80, 80), (96, 96), (96, 96)),
 }
+"""Channels of the U-Net's convolutions, from half resolution down."""
+
+BEGIN = {"trust": 4.0, "follow": 0.0, "blend": 0.0, "coarse": 4.0, "feedback": -4.0}
+"""Decisions for every pixel, one logit each, and what they are before training."""
+_TAKE = 4.0
+"""The same for how much of each level at half resolution is taken."""
+PRECISIONS = {"albedo": 1.0, "normal": 1.0, "depth": 6.0}
+"""Guide of the filter -> the logarithm of its precision before training."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options."""
+    """The network's size and what it does not decide."""
 
     quality: Literal["fast", "balanced", "high"] | Widths = "balanced"
-    history_max: float = 32.0
+    """The network's widths, by name or as tuples."""
+    history_max: Annotated[float, Range(1)] = 32.0
+    """Largest effective number of samples of the running mean, in frames."""
     demodulate: Demodulation | bool = "brdf"
+    """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     implementation: Literal["reference", "onnxruntime", "onednn"] | None = None
+    """Engine of the U-Net: XLA, or on CPUs ONNX Runtime (inference) or oneDNN (training). None is XLA."""
 
 
 class SteadyState(NamedTuple):
-    """State."""
+    """What is carried from one frame to the next."""
 
     history: jax.Array
-    """[H, W, 8] mean (3), second moment of luminance (1), effective number of samples (1), output (3)."""
+    """[H, W, 8] running mean of the radiance (3) and of its luminance's square, effective number of samples, output (3).
+    """
     guides: Guides
+    """Depth, normal and ids of the previous frame, as far as present."""
+
+
+class _Surfaces(NamedTuple):
+    """A frame's guides, padded; 0 is the neutral value."""
+
+    albedo: jax.Array
+    normal: jax.Array
+    depth: jax.Array | None
+    hit: jax.Array
+    """[H, W, 1] bool, there is a surface."""
+
+
+class _Past(NamedTuple):
+    """What is recalled of the history, padded."""
+
+    mean: jax.Array
+    square: jax.Array
+    count: jax.Array
+    shown: jax.Array
+    valid: jax.Array
+
+
+class _Decisions(NamedTuple):
+    """What the network decided."""
+
+    features: jax.Array
+    """[H, W, FEATURES]."""
+    logits: dict[str, jax.Array]
+    """Name in :data:`BEGIN` -> [H, W, 1]."""
+    half_features: jax.Array
+    """[H/2, W/2, HALF_FEATURES]."""
+    half_trust: jax.Array
+    """[H/2, W/2, 1]."""
+    take: jax.Array
+    """[H/2, W/2, LEVELS]."""
 
 
 @method(
     Options,
-    title="Steady",
-    recipes={"usual": Recipe(unbiased_illumination(squared_from=0.0))},
-    variants={"steady": {"quality": "balanced"}},
-    engines=("onednn",),
+    title="A steady recurrent filter guided by a network at half resolution",
+    recipes={"usual": Recipe(unbiased_illumination())},
+    variants={f"steady-{quality}": {"quality": quality} for quality in QUALITIES},
+    engines=("onnxruntime", "onednn"),
 )
 def steady(options: Options) -> Denoiser:
-    """Steady."""
+    """The denoiser.
+
+    Reads reflectance, albedo, normal, depth, previous_depth, motion and ids; without a buffer, what it would guide or
+    test is left out. Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for an
+    unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
+    """
+    # Flax is imported only when a network is built: filters without weights need only jax and numpy.
     from jaxdn.networks.unet import unet
 
-    widths = WIDTHS[options.quality] if isinstance(options.quality, str) else options.quality
-    network = unet((28, 19), (4 * _PACKED + _HALF,), widths=widths, implementation=options.implementation)
-    reads = frozenset({"albedo", "normal", "depth", "previous_depth", "motion", "dual_motion", "ids"})
+    widths = QUALITIES[options.quality] if isinstance(options.quality, str) else options.quality
+    heads = (4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS,)
+    network = unet((28, 20), heads, widths=widths, implementation=options.implementation)
+    reads = frozenset({"albedo", "normal", "depth", "previous_depth", "motion", "ids"})
 
     def init(key: jax.Array, frame: Frame) -> Params:
         params = network.init(key)
-        bias = params["head_0"]["bias"]
-        at = 4 * FEATURES[0]
-        begin = {0: 4.0, 1: 0.0, 2: 0.0, 3: 4.0, 4: -4.0}
-        for index, value in begin.items():
-            bias = bias.at[at + 4 * index : at + 4 * index + 4].set(value)
-        bias = bias.at[4 * _PACKED + FEATURES[1]].set(4.0)
-        bias = bias.at[-LEVELS:].set(4.0)
-        params = {**params, "head_0": {**params["head_0"], "bias": bias}}
-        guide = {
-            "albedo": jnp.full((1 + LEVELS, 1), 1.0),
-            "normal": jnp.full((1 + LEVELS, 1), math.log(8.0) - 1.0),
-            "depth": jnp.full((1 + LEVELS, 1), 6.0),
-            "light": jnp.full((1 + LEVELS, 1), math.log(4.0)),
-        }
-        return {**params, "guide": guide}
+        pixel = [0.0] * FEATURES + list(BEGIN.values())
+        bias = (
+            [value for value in pixel for _ in range(4)] + [0.0] * HALF_FEATURES + [BEGIN["trust"]] + [_TAKE] * LEVELS
+        )
+        precisions = {name: jnp.full((1 + LEVELS, 1), value) for name, value in PRECISIONS.items()}
+        return {**params, "head_0": {**params["head_0"], "bias": jnp.asarray(bias)}, "guide": precisions}
 
     def start(params: Params, frame: Frame) -> SteadyState:
         nothing = jnp.zeros((*frame.radiance.shape[:2], 8), frame.radiance.dtype)
         return SteadyState(nothing, jax.tree.map(jnp.zeros_like, guides_of(frame)))
 
-    def step(params: Params, state: SteadyState, frame: Frame, first: jax.Array):
+    def step(
+        params: Params, state: SteadyState, frame: Frame, first: jax.Array
+    ) -> tuple[SteadyState, jax.Array, jax.Array]:
         size = frame.radiance.shape[:2]
-        frame = frame._replace(radiance=jnp.minimum(frame.radiance, RADIANCE_MAX))
-        past, valid, broken = _recall(state, frame, first)
-        valid = valid[..., None]
-
-        hit = hit_mask(frame.depth, frame.ids)
-        hit = jnp.ones(size, bool) if hit is None else hit
-        wide = lambda image: pad(image, 32)
-        noisy, past, valid, hit = wide(frame.radiance), wide(past), wide(valid), wide(hit[..., None])
-        noisy = fill(noisy, hit)
-        gain = color.exposure(noisy)
-        reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
-        albedo = jnp.zeros_like(noisy) if reflectance is None else wide(reflectance) - 1.0
-        normal = jnp.zeros_like(noisy) if frame.normal is None else wide(frame.normal)
-        depth = None if frame.depth is None else wide(frame.depth)
-        closeness = jnp.zeros_like(noisy[..., :1]) if depth is None else depth_feature(depth)
-        mean, moment, count, shown = past[..., :3], past[..., 3:4], past[..., 4:5], past[..., 5:8]
-        light = color.luminance(noisy)
-        spread = jnp.sqrt(jnp.maximum(moment - color.luminance(mean) ** 2, 0.0) + 1e-12) / (
-            color.luminance(mean) + 1e-3 / gain
-        )
-        seen_noisy = color.compress(gain * noisy)
-        seen_mean = jnp.where(valid, color.compress(gain * mean), seen_noisy)
-        seen_shown = jnp.where(valid, color.compress(gain * shown), seen_noisy)
-        geometry = jnp.concatenate([albedo, normal, closeness], -1)
-        lights = jnp.concatenate(
-            [seen_noisy, seen_mean, seen_shown, jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + count), hit.astype(noisy.dtype)],
-            -1,
-        )
-        fine = jnp.concatenate([color.luminance(seen_noisy), color.luminance(seen_shown)], -1)
-        features = [_packed(geometry), jnp.concatenate([downsample(lights), _packed(color.luminance(seen_shown)), _packed(color.luminance(seen_noisy))[..., :3]], -1)]
+        found = recall(state.history, state.guides, frame, first)
+        surfaces, past = _surfaces(frame), _past(found.history, found.valid)
+        # Divided by a small reflectance it may be beyond what the network has ever seen.
+        noisy = fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), MULTIPLE), surfaces.hit)
         weights = {name: part for name, part in params.items() if name != "guide"}
-        head = network.apply(weights, [group[None] for group in features])[0][0]
-        full = _unpacked(head[..., : 4 * _PACKED])
-        half = head[..., 4 * _PACKED :]
-        own, (trust, follow, blend, coarse, back) = full[..., : FEATURES[0]], jnp.split(full[..., FEATURES[0] :], 5, -1)
-
-        # The running mean
-        usual = 1.0 / (1.0 + count)
-        share = jax.nn.sigmoid(follow + jnp.log(usual / jnp.maximum(1.0 - usual, 1e-6)))
-        share = jnp.where(valid, share, 1.0)
-        now = jnp.concatenate([noisy, light * light], -1)
-        then = jnp.where(valid, past[..., :4], now)
-        mixed = then + share * (now - then)
-        mean, moment = mixed[..., :3], mixed[..., 3:4]
-        number = 1.0 / (jnp.square(1.0 - share) / jnp.maximum(count, 1e-6) + share * share)
-        number = jnp.where(valid, jnp.minimum(number, options.history_max), 1.0)
-
-        # cascade
-        guide = {name: jnp.exp(0.5 * part) for name, part in params["guide"].items()}
-
-        def planar(image):
-            return image.transpose(2, 0, 1)
-
-        def guide_at(level, geometry, own, slanted, trust, hit):
-            scales = [guide["albedo"][level]] * 3 + [guide["normal"][level]] * 3
-            geometry = geometry * jnp.concatenate(scales)[None, None]
-            slanted = guide["depth"][level] * slanted
-            confidence = (jax.nn.sigmoid(trust) + 1e-3) * hit
-            return Guide(planar(jnp.concatenate([geometry, own], -1)), planar(slanted), confidence[..., 0])
-
-        def filtered(image, step, guide):
-            return affinity_filter(planar(image), guide, step=step).transpose(1, 2, 0)
-
-        solid = hit.astype(noisy.dtype)
-        slanted = jnp.zeros_like(noisy) if depth is None else _slanted(depth)
-        surface = jnp.concatenate([albedo, normal], -1)
-        y0 = filtered(mean, 1, guide_at(0, surface, own, slanted, trust, solid))
-        small_hit = (downsample(solid) > 0).astype(noisy.dtype)
-        x = downsample(fill(y0, hit))
-        begin = x
-        own_half, trust_half, mixes = half[..., : FEATURES[1]], half[..., FEATURES[1] : FEATURES[1] + 1], half[..., -LEVELS:]
-        surface, slanted = downsample(surface), jnp.zeros_like(x) if depth is None else _slanted(depth[::2, ::2])
-        for level in range(LEVELS):
-            y = filtered(x, 2**level, guide_at(1 + level, surface, own_half, slanted, trust_half, small_hit))
-            x = x + jax.nn.sigmoid(mixes[..., level : level + 1]) * (y - x)
-        image = y0 + jax.nn.sigmoid(coarse) * upsample(x - begin)
-        image = jnp.maximum(image, 0.0)
-        # stabilise
-        newest = jnp.where(valid, jax.nn.sigmoid(blend), 1.0)
-        out = jnp.where(valid, shown, image)
-        out = out + newest * (image - out)
-        out = jnp.minimum(out, RADIANCE_MAX)
-        kept = mean + jax.nn.sigmoid(back) * (y0 - mean)
-        history = jnp.concatenate([kept, moment, number, out], -1)
-        history, out, hit = crop(history, size), crop(out, size), crop(hit, size)
-        result = jnp.where(hit, out, frame.radiance)
-        return SteadyState(history, guides_of(frame)), result, broken
+        groups = [group[None] for group in _seen(noisy, past, surfaces)]
+        decided = _decisions(network.apply(weights, groups)[0][0])
+        mean, square, count = _accumulated(noisy, past, decided.logits["follow"], options.history_max)
+        fine, image = _filtered(params["guide"], mean, surfaces, decided)
+        newest = jnp.where(past.valid, jax.nn.sigmoid(decided.logits["blend"]), 1.0)
+        shown = jnp.clip(past.shown + newest * (image - past.shown), 0.0, RADIANCE_MAX)
+        kept = mean + jax.nn.sigmoid(decided.logits["feedback"]) * (fine - mean)
+        history = crop(jnp.concatenate([kept, square, count, shown], axis=-1), size)
+        image = jnp.where(crop(surfaces.hit, size), history[..., 5:], frame.radiance)
+        return SteadyState(history, guides_of(frame)), image, found.broken
 
     return demodulated(recurrent(Core(start, step, reads, init)), by=options.demodulate)
 
 
-def _packed(image: jax.Array) -> jax.Array:
-    height, width, channels = image.shape
-    blocks = image.reshape(height // 2, 2, width // 2, 2, channels)
-    return blocks.transpose(0, 2, 4, 1, 3).reshape(height // 2, width // 2, 4 * channels)
+def _surfaces(frame: Frame) -> _Surfaces:
+    nothing = jnp.zeros_like(frame.radiance)
+    reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
+    hit = hit_mask(frame.depth, frame.ids)
+    return _Surfaces(
+        pad(nothing if reflectance is None else reflectance - 1.0, MULTIPLE),
+        pad(nothing if frame.normal is None else frame.normal, MULTIPLE),
+        None if frame.depth is None else pad(frame.depth, MULTIPLE),
+        pad((jnp.ones_like(nothing[..., 0], bool) if hit is None else hit)[..., None], MULTIPLE),
+    )
 
 
-def _unpacked(image: jax.Array) -> jax.Array:
-    height, width, channels = image.shape
-    blocks = image.reshape(height, width, channels // 4, 2, 2)
-    return blocks.transpose(0, 3, 1, 4, 2).reshape(2 * height, 2 * width, channels // 4)
+def _past(history: jax.Array, valid: jax.Array) -> _Past:
+    wide = pad(history, MULTIPLE)
+    return _Past(*jnp.split(wide, (3, 4, 5), axis=-1), pad(valid, MULTIPLE))
+
+
+def _seen(noisy: jax.Array, past: _Past, surfaces: _Surfaces) -> tuple[jax.Array, jax.Array]:
+    """What the network sees at half resolution: surfaces, all four pixels of a block; light, mostly their mean.
+
+    Light is seen at one brightness (:func:`jaxdn.color.exposure`) and compressed; where there is no history, in its
+    place the noisy frame. Spread is the standard deviation of luminance relative to its mean.
+    """
+    gain = color.exposure(noisy)
+    closeness = jnp.zeros_like(past.count) if surfaces.depth is None else depth_feature(surfaces.depth)
+    geometry = fold(jnp.concatenate([surfaces.albedo, surfaces.normal, closeness], axis=-1))
+    level = color.luminance(past.mean)
+    spread = jnp.sqrt(jnp.maximum(past.square - level**2, 0.0) + 1e-12) / (level + 1e-3 / gain)
+    seen = color.compress(gain * noisy)
+    mean, shown = (jnp.where(past.valid, color.compress(gain * one), seen) for one in (past.mean, past.shown))
+    facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + past.count), surfaces.hit.astype(noisy.dtype)]
+    light = downsample(jnp.concatenate([seen, mean, shown, *facts], axis=-1))
+    details = fold(jnp.concatenate([color.luminance(seen), color.luminance(shown)], axis=-1))
+    return geometry, jnp.concatenate([light, details], axis=-1)
+
+
+def _decisions(head: jax.Array) -> _Decisions:
+    pixel = unfold(head[..., : 4 * (FEATURES + len(BEGIN))])
+    block = head[..., 4 * (FEATURES + len(BEGIN)) :]
+    logits = jnp.split(pixel[..., FEATURES:], len(BEGIN), axis=-1)
+    own, trust, take = jnp.split(block, (HALF_FEATURES, HALF_FEATURES + 1), axis=-1)
+    return _Decisions(pixel[..., :FEATURES], dict(zip(BEGIN, logits, strict=True)), own, trust, jax.nn.sigmoid(take))
+
+
+def _accumulated(
+    noisy: jax.Array, past: _Past, follow: jax.Array, history_max: float
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The running mean of the radiance and of its luminance's square, and their effective number of samples.
+
+    In the mean of N frames and a new one, the new one has the weight 1 / (N + 1); ``follow`` is added to its logit. With
+    weights 1 - a and a, the variance is ``(1 - a)^2 / N + a^2`` of a frame's: the effective number is its inverse.
+    """
+    # The logit of 1 / (N + 1) is -log N.
+    share = jnp.where(past.valid, jax.nn.sigmoid(follow - jnp.log(jnp.maximum(past.count, 1e-6))), 1.0)
+    now = jnp.concatenate([noisy, color.luminance(noisy) ** 2], axis=-1)
+    then = jnp.where(past.valid, jnp.concatenate([past.mean, past.square], axis=-1), now)
+    mixed = then + share * (now - then)
+    variance = jnp.square(1.0 - share) / jnp.maximum(past.count, 1e-6) + share**2
+    count = jnp.where(past.valid, jnp.minimum(1.0 / variance, history_max), 1.0)
+    return mixed[..., :3], mixed[..., 3:], count
+
+
+def _filtered(
+    guide: dict[str, Any], mean: jax.Array, surfaces: _Surfaces, decided: _Decisions
+) -> tuple[jax.Array, jax.Array]:
+    """The mean after the level at full resolution, and after all levels.
+
+    What the levels at half resolution change is enlarged and added, with a weight for every pixel.
+    """
+    scales = {name: jnp.exp(0.5 * logarithm) for name, logarithm in guide.items()}
+
+    def level(image: jax.Array, index: int, parts: _Surfaces, own: jax.Array, trust: jax.Array) -> jax.Array:
+        albedo, normal = scales["albedo"][index] * parts.albedo, scales["normal"][index] * parts.normal
+        slanted = jnp.zeros_like(image) if parts.depth is None else scales["depth"][index] * _slanted(parts.depth)
+        confidence = (jax.nn.sigmoid(trust) + _LEAST_TRUST) * parts.hit
+        made = Guide(_planar(jnp.concatenate([albedo, normal, own], -1)), _planar(slanted), confidence[..., 0])
+        return affinity_filter(_planar(image), made, step=2 ** max(index - 1, 0)).transpose(1, 2, 0)
+
+    fine = level(mean, 0, surfaces, decided.features, decided.logits["trust"])
+    half = _Surfaces(
+        downsample(surfaces.albedo),
+        downsample(surfaces.normal),
+        None if surfaces.depth is None else surfaces.depth[::2, ::2],
+        downsample(surfaces.hit.astype(mean.dtype)) > 0,
+    )
+    coarse = begin = downsample(fill(fine, surfaces.hit))
+    for index in range(LEVELS):
+        smoother = level(coarse, 1 + index, half, decided.half_features, decided.half_trust)
+        coarse = coarse + decided.take[..., index : index + 1] * (smoother - coarse)
+    image = fine + jax.nn.sigmoid(decided.logits["coarse"]) * upsample(coarse - begin)
+    return fine, jnp.maximum(image, 0.0)
+
+
+_LEAST_TRUST = 1e-3
+"""So that a pixel is filtered even where none is trusted."""
+
+
+def _planar(image: jax.Array) -> jax.Array:
+    return image.transpose(2, 0, 1)
 
 
 def _slanted(depth: jax.Array) -> jax.Array:
-    """[H, W, 3] the logarithm-like inverse depth, affine on planes, relative to its mean, and its slopes."""
+    """[H, W, 3] inverse depth relative to its mean, which is affine on planes, and its slopes; 0 without a surface."""
     known = (depth > 0) & (depth < FAR)
     inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0)
     middle = jnp.sum(inverse) / jnp.maximum(jnp.sum(known, dtype=depth.dtype), 1.0)
-    inverse = inverse / jnp.maximum(middle, 1e-12)
-    slope_x, slope_y = depth_slopes(inverse, None)
-    return jnp.stack([inverse[..., 0], slope_x, slope_y], -1)
-
-
-def _recall(state: SteadyState, frame: Frame, first: jax.Array):
-    before = shared(state.guides, guides_of(frame))
-    accept = same_surface(frame, before, depth_tolerance=0.02, normal_threshold=0.9)
-    height, width = frame.radiance.shape[:2]
-    motion = jnp.zeros_like(frame.radiance[..., :2]) if frame.motion is None else frame.motion
-    motion = jax.lax.stop_gradient(motion)
-    known = jnp.all(jnp.isfinite(motion), axis=-1)
-    motion = jnp.where(known[..., None], motion, 0.0)
-    x = jax.lax.broadcasted_iota(motion.dtype, (height, width), 1) + motion[..., 0]
-    y = jax.lax.broadcasted_iota(motion.dtype, (height, width), 0) + motion[..., 1]
-    left = jnp.clip(jnp.floor(x), 0, max(width - 2, 0))
-    top = jnp.clip(jnp.floor(y), 0, max(height - 2, 0))
-    fx, fy = x - left, y - top
-    inside = known & (fx >= 0) & (fx <= 1) & (fy >= 0) & (fy <= 1) & ~first
-    fx, fy = jnp.clip(fx, 0, 1), jnp.clip(fy, 0, 1)
-    top, left = top.astype(jnp.int32), left.astype(jnp.int32)
-    shares = [(1 - fy) * (1 - fx), (1 - fy) * fx, fy * (1 - fx), fy * fx]
-    present = [each for each in before if each is not None]
-    sound = jnp.all(jnp.isfinite(state.history) & (state.history >= 0), axis=-1, keepdims=True)
-    clean = jnp.where(sound, state.history, 0.0)
-    packed = jnp.concatenate([sound.astype(clean.dtype), *present], -1)
-    taps = corners(packed, top, left)
-    weights = []
-    for index, share in enumerate(shares):
-        _, tap = unpack(taps[..., index, :], before)
-        weights.append(jnp.where(inside & accept(tap) & (taps[..., index, 0] > 0.5), share, 0.0))
-    weights = jnp.stack(weights, -1)
-    total = jnp.sum(weights, -1, keepdims=True)
-    valid = total[..., 0] >= 0.01
-    weights = jnp.where(valid[..., None], weights / jnp.where(valid[..., None], total, 1.0), 0.0)
-    past = weighted_cells(clean, top, left, jax.lax.stop_gradient(weights))
-    return past, valid, jnp.sum(~sound & ~first, dtype=jnp.int32)
+    inverse = inverse / jnp.where(middle > 0, middle, 1.0)
+    return jnp.stack([inverse[..., 0], *depth_slopes(inverse, None)], axis=-1)

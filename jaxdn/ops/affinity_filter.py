@@ -7,10 +7,10 @@ z and its slopes g
 
     d(p, q) = sum_f (F_f(p) - F_f(q))^2 + (z(q) - z(p) - (q - p) . (g(p) + g(q)) / 2)^2.
 
-The second term is 0 on a plane whose z is affine in screen coordinates, as the inverse depth is: a floor that recedes is
-one surface. Both terms are those of q to p. Spacing the taps by ``step`` = 1, 2, 4 ... gives the levels of an a-trous
-filter (Dammertz et al. 2010); learned features: Isik et al. 2021, "Interactive Monte Carlo Denoising using Affinity of
-Neural Features".
+The second term is 0 on a plane whose z is affine in screen coordinates, as the inverse depth is: a floor that recedes
+is one surface. Both terms are those of q to p. Spacing the taps by ``step`` = 1, 2, 4 ... gives the levels of an
+a-trous filter (Dammertz et al. 2010); learned features: Isik et al. 2021, "Interactive Monte Carlo Denoising using
+Affinity of Neural Features".
 
 Arrays are planar, ``[C, H, W]``: the stencil then runs along contiguous rows and vectorises. The forward pass works on
 strips of rows that fit into the cache; the gradient keeps only the arguments and recomputes the weights. Both scan over

@@ -49,7 +49,7 @@ def _position_dtype(image: jax.Array) -> jnp.dtype:
     return jnp.promote_types(image.dtype, jnp.float32)
 
 
-def _cells(x: jax.Array, y: jax.Array, height: int, width: int) -> tuple[jax.Array, ...]:
+def cells(x: jax.Array, y: jax.Array, height: int, width: int) -> tuple[jax.Array, ...]:
     """The upper left pixel of each position's cell and the position inside it; the last pixel belongs to a cell too."""
     left = jnp.clip(jnp.floor(x), 0, max(width - 2, 0))
     top = jnp.clip(jnp.floor(y), 0, max(height - 2, 0))
@@ -60,7 +60,7 @@ def _cells(x: jax.Array, y: jax.Array, height: int, width: int) -> tuple[jax.Arr
 def reference(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     """Four fetches and their weighted sum."""
     height, width = image.shape[:2]
-    left, top, fx, fy = _cells(x, y, height, width)
+    left, top, fx, fy = cells(x, y, height, width)
     right, below = jnp.minimum(left + 1, width - 1), jnp.minimum(top + 1, height - 1)
     upper = (1 - fx) * image[top, left] + fx * image[top, right]
     lower = (1 - fx) * image[below, left] + fx * image[below, right]
@@ -73,79 +73,78 @@ def _at_least_two(image: jax.Array) -> jax.Array:
     return jnp.pad(image, ((0, int(height == 1)), (0, int(width == 1)), (0, 0)), mode="edge")
 
 
-def _fetch(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+def corners(image: jax.Array, top: jax.Array, left: jax.Array) -> jax.Array:
+    """The four pixels of cells [h, w]: [h, w, 4, C], upper left, upper right, lower left, lower right."""
     image = _at_least_two(image)
-    height, width, channels = image.shape
-    left, top, fx, fy = _cells(x, y, height, width)
+    _, width, channels = image.shape
     flat = image.reshape(-1)
     start = (top * width + left) * channels
     # Two neighbours of a row are contiguous in memory: one index fetches 2C numbers.
-    pairs = lax.GatherDimensionNumbers(offset_dims=(x.ndim,), collapsed_slice_dims=(), start_index_map=(0,))
-
-    def row(offset: int) -> jax.Array:
-        return lax.gather(flat, (start + offset)[..., None], pairs, (2 * channels,), mode="promise_in_bounds")
-
-    upper, lower = row(0), row(width * channels)
-    upper = (1 - fx) * upper[..., :channels] + fx * upper[..., channels:]
-    lower = (1 - fx) * lower[..., :channels] + fx * lower[..., channels:]
-    return (1 - fy) * upper + fy * lower
-
-
-def corners(image: jax.Array, top: jax.Array, left: jax.Array) -> jax.Array:
-    """The four pixels of cells, [H, W, 4, C]: upper left, upper right, lower left, lower right. No gradient."""
-    image = _at_least_two(lax.stop_gradient(image))
-    height, width, channels = image.shape
-    flat = image.reshape(-1)
-    start = (top * width + left) * channels
     pairs = lax.GatherDimensionNumbers(offset_dims=(top.ndim,), collapsed_slice_dims=(), start_index_map=(0,))
 
     def row(offset: int) -> jax.Array:
         return lax.gather(flat, (start + offset)[..., None], pairs, (2 * channels,), mode="promise_in_bounds")
 
-    return jnp.stack([row(0), row(width * channels)], axis=-2).reshape(*top.shape, 4, channels)
+    return jnp.concatenate([row(0), row(width * channels)], axis=-1).reshape(*top.shape, 4, channels)
 
 
-@jax.custom_vjp
-def weighted_cells(image: jax.Array, top: jax.Array, left: jax.Array, weights: jax.Array) -> jax.Array:
-    """The sum of the four pixels of each cell, each times one of ``weights`` [H, W, 4]; gradient by the image only."""
-    return jnp.sum(corners(image, top, left) * weights[..., None], axis=-2)
+def _fetch(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+    left, top, fx, fy = cells(x, y, *image.shape[:2])
+    found = corners(image, top, left)
+    upper = (1 - fx) * found[..., 0, :] + fx * found[..., 1, :]
+    lower = (1 - fx) * found[..., 2, :] + fx * found[..., 3, :]
+    return (1 - fy) * upper + fy * lower
 
 
-def _cells_forward(image, top, left, weights):
-    return weighted_cells(image, top, left, weights), (image[:, :, :, None][..., :0], top, left, weights)
-
-
-def _cells_backward(residuals, cotangent):
-    shape, top, left, weights = residuals
-    height, width, channels = shape.shape[:3]
-    blocks = (weights[..., None] * cotangent[..., None, :]).reshape(-1, 2, 2 * channels)
+def _scattered(shape: tuple[int, ...], top: jax.Array, left: jax.Array, blocks: jax.Array) -> jax.Array:
+    """The adjoint of :func:`corners`: blocks [h, w, 4, C] are added to the four pixels of their cells."""
+    height, width, channels = max(shape[0], 2), max(shape[1], 2), shape[2]
     where = jnp.stack([top, left * channels], axis=-1).reshape(-1, 2)
     windows = lax.ScatterDimensionNumbers(
         update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
     )
-    empty = jnp.zeros((height, width * channels), cotangent.dtype)
-    total = lax.scatter_add(empty, where, blocks, windows, mode="promise_in_bounds").reshape(height, width, channels)
-    return total, None, None, None
-
-
-weighted_cells.defvjp(_cells_forward, _cells_backward)
+    empty = jnp.zeros((height, width * channels), blocks.dtype)
+    total = lax.scatter_add(
+        empty, where, blocks.reshape(-1, 2, 2 * channels), windows, mode="promise_in_bounds"
+    ).reshape(height, width, channels)
+    if shape[0] == 1:
+        total = total[:1] + total[1:]
+    return total[:, :1] + total[:, 1:] if shape[1] == 1 else total
 
 
 def _spread(shape: tuple[int, ...], x: jax.Array, y: jax.Array, cotangent: jax.Array) -> jax.Array:
     """The adjoint of the fetch: every value is scattered to its four pixels."""
-    height, width, channels = max(shape[0], 2), max(shape[1], 2), shape[2]
-    left, top, fx, fy = _cells(x, y, height, width)
-    rows = [jnp.concatenate([wy * (1 - fx) * cotangent, wy * fx * cotangent], axis=-1) for wy in (1 - fy, fy)]
-    blocks = jnp.stack(rows, axis=-2).reshape(-1, 2, 2 * channels)
-    where = jnp.stack([top, left * channels], axis=-1).reshape(-1, 2)
-    windows = lax.ScatterDimensionNumbers(
-        update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
-    )
-    empty = jnp.zeros((height, width * channels), cotangent.dtype)
-    total = lax.scatter_add(empty, where, blocks, windows, mode="promise_in_bounds").reshape(height, width, channels)
-    if shape[0] == 1:
-        total = total[:1] + total[1:]
-    return total[:, :1] + total[:, 1:] if shape[1] == 1 else total
+    left, top, fx, fy = cells(x, y, *shape[:2])
+    blocks = [wy * wx * cotangent for wy in (1 - fy, fy) for wx in (1 - fx, fx)]
+    return _scattered(shape, top, left, jnp.stack(blocks, axis=-2))
+
+
+@jax.custom_vjp
+def weighted_cells(image: jax.Array, top: jax.Array, left: jax.Array, weights: jax.Array) -> jax.Array:
+    """The sum of the four pixels of every cell, each times one of ``weights`` [h, w, 4], as [h, w, C].
+
+    The order is that of :func:`corners`. Only the image has a gradient.
+    """
+    return jnp.sum(corners(image, top, left) * weights[..., None], axis=-2)
+
+
+_Cells = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+
+
+def _weighted_forward(
+    image: jax.Array, top: jax.Array, left: jax.Array, weights: jax.Array
+) -> tuple[jax.Array, _Cells]:
+    # An empty slice carries the image's shape and dtype through a scan at no cost.
+    return weighted_cells(image, top, left, weights), (image[:, :, :, None][..., :0], top, left, weights)
+
+
+def _weighted_backward(residuals: _Cells, cotangent: jax.Array) -> tuple[jax.Array, None, None, None]:
+    shape, top, left, weights = residuals
+    blocks = weights[..., None] * cotangent[..., None, :]
+    return _scattered(shape.shape[:3], top, left, blocks).astype(shape.dtype), None, None, None
+
+
+weighted_cells.defvjp(_weighted_forward, _weighted_backward)
 
 
 @jax.custom_vjp
