@@ -73,8 +73,8 @@ class SteadyState(NamedTuple):
     """What is carried from one frame to the next."""
 
     history: jax.Array
-    """[H, W, 8] running mean of the radiance (3) and of its luminance's square, effective number of samples, output (3).
-    """
+    """[H, W, 8] running mean of the radiance (3) and of its luminance's square, effective number of samples, last
+    output (3)."""
     guides: Guides
     """Depth, normal and ids of the previous frame, as far as present."""
 
@@ -221,8 +221,8 @@ def _accumulated(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The running mean of the radiance and of its luminance's square, and their effective number of samples.
 
-    In the mean of N frames and a new one, the new one has the weight 1 / (N + 1); ``follow`` is added to its logit. With
-    weights 1 - a and a, the variance is ``(1 - a)^2 / N + a^2`` of a frame's: the effective number is its inverse.
+    In the mean of N frames and a new one, the new one has the weight 1 / (N + 1); ``follow`` is added to its logit.
+    With weights 1 - a and a, the variance is ``(1 - a)^2 / N + a^2`` of a frame's: the effective number is its inverse.
     """
     # The logit of 1 / (N + 1) is -log N.
     share = jnp.where(past.valid, jax.nn.sigmoid(follow - jnp.log(jnp.maximum(past.count, 1e-6))), 1.0)
