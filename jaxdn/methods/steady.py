@@ -21,6 +21,7 @@ import jax.numpy as jnp
 
 from jaxdn import color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.filters.enlarge import enlarge
 from jaxdn.filters.guides import Guides, depth_slopes, guides_of, hit_mask
 from jaxdn.filters.recall import recall
 from jaxdn.frame import FAR, RADIANCE_MAX, Frame
@@ -32,7 +33,7 @@ from jaxdn.objectives import unbiased_illumination
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
 from jaxdn.options import Range
 from jaxdn.recipe import Recipe
-from jaxdn.scales import downsample, fill, fold, unfold, upsample
+from jaxdn.scales import downsample, fill, fold, unfold
 
 LEVELS = 4
 """Levels of the filter at half resolution; taps are 2, 4, 8 and 16 pixels apart."""
@@ -239,32 +240,42 @@ def _filtered(
 ) -> tuple[jax.Array, jax.Array]:
     """The mean after the level at full resolution, and after all levels.
 
-    What the levels at half resolution change is enlarged and added, with a weight for every pixel.
+    The image of the levels at half resolution is enlarged along the guides, and takes a share of every pixel.
     """
     scales = {name: jnp.exp(0.5 * logarithm) for name, logarithm in guide.items()}
 
-    def level(image: jax.Array, index: int, parts: _Surfaces, own: jax.Array, trust: jax.Array) -> jax.Array:
+    def guided(parts: _Surfaces, slanted: jax.Array, index: int, own: jax.Array, trust: jax.Array) -> Guide:
         albedo, normal = scales["albedo"][index] * parts.albedo, scales["normal"][index] * parts.normal
-        slanted = jnp.zeros_like(image) if parts.depth is None else scales["depth"][index] * _slanted(parts.depth)
         confidence = (jax.nn.sigmoid(trust) + _LEAST_TRUST) * parts.hit
-        made = Guide(_planar(jnp.concatenate([albedo, normal, own], -1)), _planar(slanted), confidence[..., 0])
-        return affinity_filter(_planar(image), made, step=2 ** max(index - 1, 0)).transpose(1, 2, 0)
+        features = _planar(jnp.concatenate([albedo, normal, own], axis=-1))
+        return Guide(features, scales["depth"][index] * slanted, confidence[..., 0])
 
-    fine = level(mean, 0, surfaces, decided.features, decided.logits["trust"])
+    slanted = jnp.zeros_like(_planar(mean)) if surfaces.depth is None else _planar(_slanted(surfaces.depth))
+    at_full = guided(surfaces, slanted, 0, decided.features, decided.logits["trust"])
+    fine = affinity_filter(_planar(mean), at_full).transpose(1, 2, 0)
     half = _Surfaces(
         downsample(surfaces.albedo),
         downsample(surfaces.normal),
-        None if surfaces.depth is None else surfaces.depth[::2, ::2],
+        None,
         downsample(surfaces.hit.astype(mean.dtype)) > 0,
     )
-    coarse = begin = downsample(fill(fine, surfaces.hit))
+    slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
+    coarse = downsample(fill(fine, surfaces.hit))
     for index in range(LEVELS):
-        smoother = level(coarse, 1 + index, half, decided.half_features, decided.half_trust)
+        at_half = guided(half, slanted_half, 1 + index, decided.half_features, decided.half_trust)
+        smoother = affinity_filter(_planar(coarse), at_half, step=2**index).transpose(1, 2, 0)
         coarse = coarse + decided.take[..., index : index + 1] * (smoother - coarse)
-    image = fine + jax.nn.sigmoid(decided.logits["coarse"]) * upsample(coarse - begin)
-    return fine, jnp.maximum(image, 0.0)
+    nothing = jnp.zeros_like(decided.half_features[..., :0])
+    there = guided(half, slanted[:, ::2, ::2], 0, nothing, decided.half_trust)
+    here = guided(surfaces, slanted, 0, jnp.zeros_like(mean[..., :0]), decided.logits["trust"])
+    enlarged, weight = enlarge(_planar(coarse), there, here)
+    share = jax.nn.sigmoid(decided.logits["coarse"]) * (weight / (weight + _LIKENESS))[..., None]
+    image = fine + share * (enlarged.transpose(1, 2, 0) - fine)
+    return fine, image
 
 
+_LIKENESS = 0.02
+"""Weight of coarse pixels at which half of the enlarged image is taken."""
 _LEAST_TRUST = 1e-3
 """So that a pixel is filtered even where none is trusted."""
 
