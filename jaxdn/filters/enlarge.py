@@ -2,17 +2,27 @@
 
 Kopf et al. 2007, "Joint Bilateral Upsampling". Bilinear enlarging carries light across silhouettes, and adding only
 what the coarse image changed leaves noise of two to four pixels in the fine one.
+
+The four fine pixels of a block are four planes of the coarse image's size: all work runs along contiguous rows, in
+strips that fit into the cache, over a scan of the nine taps (as in :mod:`jaxdn.ops.affinity_filter`).
 """
 
-import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 
-from jaxdn.ops.affinity_filter import Guide
+from jaxdn.ops.affinity_filter import Guide, affinity
 
 _SPREAD = 3.0
 """Twice the variance of the spatial weights, in pixels of the fine image."""
+_STRIP = 4096
+"""Approximate number of coarse pixels in a strip."""
+_NO_WEIGHT = 1e-6
+
+Planes = list[jax.Array]
 
 
 def enlarge(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, jax.Array]:
@@ -23,37 +33,84 @@ def enlarge(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, ja
     confidence is not used). The slanted guide of a coarse pixel is that of the upper left of its four pixels, and its
     slopes are those per fine pixel. Where no coarse pixel is alike, the sum of weights is 0 and so is the image.
     """
+    totals = _totals(coarse, there, here)
+    weight = totals[-1]
+    some = weight > _NO_WEIGHT
+    return jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), 0.0), jnp.where(some, weight, 0.0)
+
+
+def _totals(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
+    """[C + 1, 2h, 2w] the weighted sum of every fine pixel's taps and of their weights."""
     channels, height, width = coarse.shape
+    rows = height if jax.default_backend() != "cpu" else min(height, max(1, _STRIP // width))
+    strips = -(-height // rows)
+    below = strips * rows - height
 
-    def around(planes: jax.Array, mode: str) -> jax.Array:
-        pads = ((0, 0), (1, 1), (1, 1))
-        return jnp.pad(planes, pads, mode="edge") if mode == "edge" else jnp.pad(planes, pads)
+    def around(plane: jax.Array) -> jax.Array:
+        return jnp.pad(jnp.pad(plane, 1, mode="edge"), ((0, below), (0, 0)))
 
-    guides = around(jnp.concatenate([there.features, there.slanted]), "edge")
-    mass = around(jnp.concatenate([coarse * there.confidence[None], there.confidence[None]]), "zero")
-    count = there.features.shape[0]
-    phases = []
-    for py in (0, 1):
-        for px in (0, 1):
-            own, slanted = here.features[:, py::2, px::2], here.slanted[:, py::2, px::2]
-            total = jnp.zeros((channels + 1, height, width), coarse.dtype)
-            full = 0.0
-            for dy in (-1, 0, 1):
-                for dx in (-1, 0, 1):
-                    window = guides[:, 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
-                    # The centre of a coarse pixel lies between its four; its slanted guide is that of the first.
-                    away_y, away_x = 2 * dy + 0.5 - py, 2 * dx + 0.5 - px
-                    spatial = math.exp(-(away_y**2 + away_x**2) / _SPREAD)
-                    sy, sx = 2 * dy - py, 2 * dx - px
-                    expected = 0.5 * (sx * (slanted[1] + window[count + 1]) + sy * (slanted[2] + window[count + 2]))
-                    distance = jnp.square(window[count] - slanted[0] - expected)
-                    distance = distance + jnp.sum(jnp.square(window[:count] - own), axis=0)
-                    weight = spatial * jnp.exp(-distance)
-                    total = total + weight[None] * mass[:, 1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
-                    full += spatial
-            phases.append(total / full)
-    blocks = jnp.stack(phases).reshape(2, 2, channels + 1, height, width)
-    found = blocks.transpose(2, 3, 0, 4, 1).reshape(channels + 1, 2 * height, 2 * width)
-    weight = found[-1]
-    some = weight > 1e-6
-    return jnp.where(some[None], found[:-1] / jnp.where(some, weight, 1.0)[None], 0.0), jnp.where(some, weight, 0.0)
+    def outside(plane: jax.Array) -> jax.Array:
+        return jnp.pad(plane, ((1, 1 + below), (1, 1)))
+
+    guides = [around(plane) for plane in (*there.features, *there.slanted)]
+    mass = [outside(plane * there.confidence) for plane in coarse] + [outside(there.confidence)]
+    blocks = [
+        [jnp.pad(plane[y::2, x::2], ((0, below), (0, 0))) for plane in (*here.features, *here.slanted)]
+        for y, x in np.ndindex(2, 2)
+    ]
+    taps = _taps(coarse.dtype)
+
+    def strip(top: jax.Array | int) -> jax.Array:
+        def at(planes: Planes, shift: jax.Array | np.ndarray) -> Planes:
+            return [lax.dynamic_slice(plane, (top + 1 + shift[0], 1 + shift[1]), (rows, width)) for plane in planes]
+
+        own = [[lax.dynamic_slice_in_dim(plane, top, rows) for plane in planes] for planes in blocks]
+
+        def weigh(tap: _Taps) -> Planes:
+            other = at(guides, tap.shift)
+            return [tap.spatial[phase] * affinity(planes, other, *tap.offset[phase]) for phase, planes in enumerate(own)]
+
+        def add(totals: list[Planes], shift: jax.Array, weights: Planes) -> list[Planes]:
+            found = at(mass, shift)
+            return [
+                [old + weight * one for old, one in zip(total, found, strict=True)]
+                for total, weight in zip(totals, weights, strict=True)
+            ]
+
+        # The weights of one tap are computed while those of the tap before are used, see affinity_filter.
+        def body(carry: _Carry, tap: _Taps) -> tuple[_Carry, None]:
+            return (add(*carry), tap.shift, weigh(tap)), None
+
+        first = jax.tree.map(lambda each: each[0], taps)
+        empty = [[jnp.zeros((rows, width), coarse.dtype)] * len(mass) for _ in own]
+        rest = jax.tree.map(lambda each: each[1:], taps)
+        carry, _ = lax.scan(body, (empty, first.shift, weigh(first)), rest)
+        return jnp.stack([jnp.stack(planes) for planes in add(*carry)])
+
+    found = strip(0)[None] if strips == 1 else lax.map(strip, rows * jnp.arange(strips, dtype=jnp.int32))
+    found = found.reshape(strips, 2, 2, channels + 1, rows, width).transpose(3, 0, 4, 1, 5, 2)
+    return found.reshape(channels + 1, 2 * strips * rows, 2 * width)[:, : 2 * height]
+
+
+class _Taps(NamedTuple):
+    """The taps of a block's four pixels, row by row; stacked."""
+
+    shift: jax.Array
+    """[2] int32 (y, x) to the coarse pixel."""
+    spatial: jax.Array
+    """[4] its spatial weight for each of the four; of the nine taps they sum to 1."""
+    offset: jax.Array
+    """[4, 2] (y, x) from each of the four to the upper left fine pixel of the coarse one."""
+
+
+_Carry = tuple[list[Planes], jax.Array, Planes]
+
+
+def _taps(dtype: jnp.dtype) -> _Taps:
+    shift = np.array([(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+    pixel = np.array(list(np.ndindex(2, 2)))
+    offset = 2 * shift[:, None] - pixel
+    # The centre of a coarse pixel lies between its four.
+    spatial = np.exp(-np.sum(np.square(offset + 0.5), axis=-1) / _SPREAD)
+    spatial /= spatial.sum(axis=0)
+    return _Taps(jnp.asarray(shift, jnp.int32), jnp.asarray(spatial, dtype), jnp.asarray(offset, dtype))

@@ -5,7 +5,9 @@ orientation) and the accepted ones are renormalised; where none is accepted, the
 tried (Schied et al. 2017).
 """
 
+import functools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,39 +21,47 @@ WEIGHT_MIN = 0.01
 """Minimum sum of accepted bilinear weights that counts as history."""
 
 
-def same_surface(
-    frame: Frame, before: Guides, *, depth_tolerance: float, normal_threshold: float
-) -> Callable[[Guides], jax.Array]:
-    """The test of one tap of the previous frame: does it show the same surface as the current pixel?
+class Expected(NamedTuple):
+    """What a tap of the previous frame must show, for every pixel; ``None`` for what one of the frames lacks."""
 
-    A tap passes where ids agree, ``|z - z_expected| <= depth_tolerance z_expected + 2 (|dz/dx| + |dz/dy|)`` and the
-    cosine of the normals exceeds ``normal_threshold``; what one of the two frames lacks is not tested. The result maps
-    the guides at a tap, [H, W, C] for every pixel, to bool [H, W].
+    depth: jax.Array | None
+    """[H, W]."""
+    tolerance: jax.Array | None
+    """[H, W] of the depth."""
+    normal: jax.Array | None
+    """[H, W, 3]."""
+    ids: jax.Array | None
+    """[H, W]."""
 
-    Args:
-      frame: the current frame.
-      before: the guides of the previous frame.
-      depth_tolerance: relative to the expected depth.
-      normal_threshold: of the cosine.
+
+def expected(frame: Frame, before: Guides, *, depth_tolerance: float) -> Expected:
+    """What a tap must show, for a previous frame with the guides ``before``.
+
+    The depth at the target and ``depth_tolerance z + 2 (|dz/dx| + |dz/dy|)``, the normal and the id of the pixel.
     """
-    now = guides_of(frame)
-    tested = shared(now, before)
-    if tested.depth is not None:
-        expected = (tested.depth if frame.previous_depth is None else frame.previous_depth)[..., 0]
-        slope_x, slope_y = depth_slopes(tested.depth, frame.ids)
-        tolerance = depth_tolerance * expected + 2 * (jnp.abs(slope_x) + jnp.abs(slope_y))
+    tested = shared(guides_of(frame), before)
+    ids = None if tested.ids is None else tested.ids[..., 0]
+    if tested.depth is None:
+        return Expected(None, None, tested.normal, ids)
+    depth = (tested.depth if frame.previous_depth is None else frame.previous_depth)[..., 0]
+    slope_x, slope_y = depth_slopes(tested.depth, frame.ids)
+    return Expected(depth, depth_tolerance * depth + 2 * (jnp.abs(slope_x) + jnp.abs(slope_y)), tested.normal, ids)
 
-    def accept(tap: Guides) -> jax.Array:
-        accepted = jnp.ones(frame.radiance.shape[:2], bool)
-        if tap.depth is not None:
-            accepted &= jnp.abs(tap.depth[..., 0] - expected) <= tolerance
-        if tap.normal is not None and tested.normal is not None:
-            accepted &= cosine(tap.normal, tested.normal) > normal_threshold
-        if tap.ids is not None and tested.ids is not None:
-            accepted &= tap.ids[..., 0] == tested.ids[..., 0]
-        return accepted
 
-    return accept
+def same_surface(tap: Guides, wanted: Expected, *, normal_threshold: float) -> jax.Array:
+    """The test of one tap for every pixel, bool [H, W]: does it show the same surface?
+
+    It does where ids agree, its depth is the expected one within the tolerance and the cosine of the normals exceeds
+    ``normal_threshold``. ``tap`` are the guides [H, W, C] of the taps, those that ``wanted`` has.
+    """
+    passed = []
+    if tap.depth is not None:
+        passed.append(jnp.abs(tap.depth[..., 0] - wanted.depth) <= wanted.tolerance)
+    if tap.normal is not None:
+        passed.append(cosine(tap.normal, wanted.normal) > normal_threshold)
+    if tap.ids is not None:
+        passed.append(tap.ids[..., 0] == wanted.ids)
+    return functools.reduce(jnp.logical_and, passed, jnp.asarray(True))
 
 
 def reproject(

@@ -44,7 +44,7 @@ MULTIPLE = 32
 QUALITIES: dict[str, Widths] = {
     "fast": ((16,), (24,), (32,), (32,), (32,)),
     "balanced": ((32,), (48,), (64,), (64,), (64,)),
-    "high": ((48, 48), (64, 64), (80, 80), (96, 96), (96, 96)),
+    "high": ((48,), (64,), (80,), (96,), (96,)),
 }
 """Channels of the U-Net's convolutions, from half resolution down."""
 
@@ -52,7 +52,7 @@ BEGIN = {"trust": 4.0, "follow": 0.0, "blend": 0.0, "coarse": 4.0, "feedback": -
 """Decisions for every pixel, one logit each, and what they are before training."""
 _TAKE = 4.0
 """The same for how much of each level at half resolution is taken."""
-PRECISIONS = {"albedo": 1.0, "normal": 1.0, "depth": 6.0}
+PRECISIONS = {"albedo": 1.0, "normal": 1.0, "depth": 6.0, "learned": 0.0}
 """Guide of the filter -> the logarithm of its precision before training."""
 
 
@@ -134,7 +134,7 @@ def steady(options: Options) -> Denoiser:
 
     widths = QUALITIES[options.quality] if isinstance(options.quality, str) else options.quality
     heads = (4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS,)
-    network = unet((28, 20), heads, widths=widths, implementation=options.implementation)
+    network = unet((28, 20), heads, widths=widths, head_size=1, implementation=options.implementation)
     reads = frozenset({"albedo", "normal", "depth", "previous_depth", "motion", "ids"})
 
     def init(key: jax.Array, frame: Frame) -> Params:
@@ -247,7 +247,7 @@ def _filtered(
     def guided(parts: _Surfaces, slanted: jax.Array, index: int, own: jax.Array, trust: jax.Array) -> Guide:
         albedo, normal = scales["albedo"][index] * parts.albedo, scales["normal"][index] * parts.normal
         confidence = (jax.nn.sigmoid(trust) + _LEAST_TRUST) * parts.hit
-        features = _planar(jnp.concatenate([albedo, normal, own], axis=-1))
+        features = _planar(jnp.concatenate([albedo, normal, scales["learned"][index] * own], axis=-1))
         return Guide(features, scales["depth"][index] * slanted, confidence[..., 0])
 
     slanted = jnp.zeros_like(_planar(mean)) if surfaces.depth is None else _planar(_slanted(surfaces.depth))
@@ -265,10 +265,8 @@ def _filtered(
         at_half = guided(half, slanted_half, 1 + index, decided.half_features, decided.half_trust)
         smoother = affinity_filter(_planar(coarse), at_half, step=2**index).transpose(1, 2, 0)
         coarse = coarse + decided.take[..., index : index + 1] * (smoother - coarse)
-    nothing = jnp.zeros_like(decided.half_features[..., :0])
-    there = guided(half, slanted[:, ::2, ::2], 0, nothing, decided.half_trust)
-    here = guided(surfaces, slanted, 0, jnp.zeros_like(mean[..., :0]), decided.logits["trust"])
-    enlarged, weight = enlarge(_planar(coarse), there, here)
+    there = guided(half, slanted[:, ::2, ::2], 0, downsample(decided.features), decided.half_trust)
+    enlarged, weight = enlarge(_planar(coarse), there, at_full)
     share = jax.nn.sigmoid(decided.logits["coarse"]) * (weight / (weight + _LIKENESS))[..., None]
     image = fine + share * (enlarged.transpose(1, 2, 0) - fine)
     return fine, image

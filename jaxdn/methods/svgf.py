@@ -24,7 +24,7 @@ from jaxdn.filters.accumulation import accumulate, luminance
 from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
 from jaxdn.filters.blur import blur_variance
 from jaxdn.filters.guides import Guides, guides_of, hit_mask, pack, shared, unpack
-from jaxdn.filters.reprojection import reproject, same_surface
+from jaxdn.filters.reprojection import expected, reproject, same_surface
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.filters.weights import Weight, depth_weight, luminance_weight, normal_weight
 from jaxdn.frame import Frame
@@ -138,11 +138,12 @@ def _recall(options: Options, state: SvgfState, frame: Frame, first: jax.Array) 
     """The fetched history [6, H, W], 0 where missing; the number of invalid history pixels."""
     # Guides may come and go within a clip.
     before = shared(state.guides, guides_of(frame))
-    tolerances = {"depth_tolerance": options.depth_tolerance, "normal_threshold": options.normal_threshold}
-    accept = same_surface(frame, before, **tolerances)
-    packed, valid = reproject(
-        pack(state.history, before), frame.motion, lambda tap: accept(unpack(tap, before)[1]) & ~first
-    )
+    wanted = expected(frame, before, depth_tolerance=options.depth_tolerance)
+
+    def accept(tap: jax.Array) -> jax.Array:
+        return same_surface(unpack(tap, before)[1], wanted, normal_threshold=options.normal_threshold) & ~first
+
+    packed, valid = reproject(pack(state.history, before), frame.motion, accept)
     past, _ = unpack(packed, before)
     sound = jnp.all(jnp.isfinite(past) & (past >= 0), axis=-1)
     broken = jnp.sum(valid & ~sound, dtype=jnp.int32)

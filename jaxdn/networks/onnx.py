@@ -77,7 +77,8 @@ def model(
     def convolution(x: str, kernel: np.ndarray, bias: np.ndarray | None) -> str:
         """HWIO as OIHW; zeros beyond the border."""
         arguments = [x, constant(kernel.transpose(3, 2, 0, 1)), *([] if bias is None else [constant(bias)])]
-        return node("Conv", *arguments, kernel_shape=[3, 3], pads=[1, 1, 1, 1])
+        size = kernel.shape[0]
+        return node("Conv", *arguments, kernel_shape=[size, size], pads=[size // 2] * 4)
 
     def activated(x: str) -> str:
         return node("LeakyRelu", x, alpha=slope)

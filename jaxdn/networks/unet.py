@@ -11,7 +11,7 @@ for "about 850,000 weights".
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -53,15 +53,18 @@ ONEDNN = Convolver(functools.partial(convolve, implementation="onednn"), 1)
 
 
 class Convolution(nnx.Module):
-    """A 3x3 convolution with bias; zeros beyond the border."""
+    """A 3x3 convolution with bias, zeros beyond the border; of size 1 a map of each pixel's channels."""
 
-    def __init__(self, inputs: int, outputs: int) -> None:
-        self.kernel = nnx.Param(jnp.zeros((3, 3, inputs, outputs), jnp.float32))
+    def __init__(self, inputs: int, outputs: int, size: Literal[1, 3] = 3) -> None:
+        self.kernel = nnx.Param(jnp.zeros((size, size, inputs, outputs), jnp.float32))
         self.bias = nnx.Param(jnp.zeros((outputs,), jnp.float32))
 
     def __call__(self, convolver: Convolver, *parts: Part) -> jax.Array:
         kernel, dtype = self.kernel[...], parts[0][0].dtype
         outputs = kernel.shape[-1]
+        if kernel.shape[0] == 1:
+            ((x, _),) = parts
+            return x @ kernel[0, 0].astype(dtype) + self.bias[...].astype(dtype)
         kernel = jnp.pad(kernel, ((0, 0), (0, 0), (0, 0), (0, -outputs % convolver.multiple))).astype(dtype)
 
         def share(used: Sequence[slice] | None) -> jax.Array:
@@ -105,7 +108,7 @@ def enlarge(x: jax.Array) -> jax.Array:
 class UNet(nnx.Module):
     """Encoder, decoder and three heads; called with features and their slices of the first kernel."""
 
-    def __init__(self, inputs: int, heads: Sequence[int], widths: Widths) -> None:
+    def __init__(self, inputs: int, heads: Sequence[int], widths: Widths, head_size: Literal[1, 3]) -> None:
         self.heads = len(heads)
         for level, channels in enumerate(widths):
             setattr(self, f"encoder_{level}", Level(inputs, channels))
@@ -114,7 +117,7 @@ class UNet(nnx.Module):
             setattr(self, f"decoder_{level}", Level(inputs + widths[level][-1], widths[level]))
             inputs = widths[level][-1]
         for level, outputs in enumerate(heads):
-            setattr(self, f"head_{level}", Convolution(widths[level][-1], outputs))
+            setattr(self, f"head_{level}", Convolution(widths[level][-1], outputs, head_size))
 
     def __call__(
         self, convolver: Convolver, features: jax.Array, used: Sequence[slice] | None
@@ -194,6 +197,7 @@ def unet(
     heads: Sequence[int],
     *,
     widths: Widths = LARGE,
+    head_size: Literal[1, 3] = 3,
     initialization: str = "he",
     implementation: str | None = None,
 ) -> Network:
@@ -202,7 +206,7 @@ def unet(
     ``groups`` are the channel counts of the feature groups; ``apply`` takes one array ``[N, H, W, c]`` for each, or
     ``None`` where it is absent, which equals an array of zeros but skips its part of the first convolution: the shapes
     of ``params`` never depend on it. H and W are multiples of 16. ``heads`` are the channel counts at full,
-    half and quarter resolution; their outputs are raw (logits). ``widths`` gives the channels of each convolution of
+    half and quarter resolution; their outputs are raw (logits), by convolutions of ``head_size``. ``widths`` gives the channels of each convolution of
     each of the five levels; the decoder mirrors the first four. ``initialization``: see :func:`initial`. Computes in
     the features' dtype. ``implementation``: None or "reference" (XLA), "onnxruntime" (inference, see
     :mod:`jaxdn.networks.onnx`) or "onednn" (convolutions and their gradients, see :mod:`jaxdn.ops.onednn`). Raises
@@ -217,7 +221,7 @@ def unet(
             "see jaxdn.networks.unet.LARGE."
         )
 
-    abstract = nnx.eval_shape(lambda: UNet(sum(groups), heads, widths))
+    abstract = nnx.eval_shape(lambda: UNet(sum(groups), heads, widths, head_size))
     graph, state = nnx.split(abstract, nnx.Param, graph=False)
     shapes = nnx.to_pure_dict(state)
 

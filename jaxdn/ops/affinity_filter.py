@@ -108,7 +108,7 @@ def _residual(here: Planes, there: Planes, dy: jax.Array, dx: jax.Array) -> jax.
     return other_z - z - 0.5 * (dx * (slope_x + other_x) + dy * (slope_y + other_y))
 
 
-def _affinity(here: Planes, there: Planes, dy: jax.Array, dx: jax.Array) -> jax.Array:
+def affinity(here: Planes, there: Planes, dy: jax.Array, dx: jax.Array) -> jax.Array:
     """exp(-d) between the guides of two pixels."""
     total = jnp.square(_residual(here, there, dy, dx))
     for one, other in zip(here[:-3], there[:-3], strict=True):
@@ -148,7 +148,7 @@ def _forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, _Res
 
         def weigh(pair: _Pair) -> Planes:
             here = at(guides, 0, 0)
-            signed = [_affinity(here, at(guides, *pair.offset(sign)), *pair.slant(sign, dtype)) for sign in (1, -1)]
+            signed = [affinity(here, at(guides, *pair.offset(sign)), *pair.slant(sign, dtype)) for sign in (1, -1)]
             return [pair.spline * one for one in signed]
 
         def add(total: Planes, pair: _Pair, weights: Planes) -> Planes:
@@ -200,7 +200,7 @@ def _backward(step: int, residuals: _Residuals, cotangent: jax.Array) -> tuple[j
         return _window(planes, margin + dy, margin + dx, size)
 
     def weigh(pair: _Pair) -> Planes:
-        signed = [_affinity(here, at(guides, pair, sign), *pair.slant(sign, dtype)) for sign in (1, -1)]
+        signed = [affinity(here, at(guides, pair, sign), *pair.slant(sign, dtype)) for sign in (1, -1)]
         return [pair.spline * one for one in signed]
 
     def slopes(pair: _Pair, weights: Planes) -> list[Planes]:

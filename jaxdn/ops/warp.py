@@ -120,31 +120,33 @@ def _spread(shape: tuple[int, ...], x: jax.Array, y: jax.Array, cotangent: jax.A
 
 
 @jax.custom_vjp
-def weighted_cells(image: jax.Array, top: jax.Array, left: jax.Array, weights: jax.Array) -> jax.Array:
-    """The sum of the four pixels of every cell, each times one of ``weights`` [h, w, 4], as [h, w, C].
+def differentiable_mean(
+    mean: jax.Array, image: jax.Array, top: jax.Array, left: jax.Array, weights: jax.Array
+) -> jax.Array:
+    """``mean`` with a gradient by ``image``: the sum of the four pixels of each cell times ``weights`` [h, w, 4].
 
-    The order is that of :func:`corners`. Only the image has a gradient.
+    The order is that of :func:`corners`. For fetches that are done another way than their gradient.
     """
-    return jnp.sum(corners(image, top, left) * weights[..., None], axis=-2)
+    return mean
 
 
 _Cells = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 
 
-def _weighted_forward(
-    image: jax.Array, top: jax.Array, left: jax.Array, weights: jax.Array
+def _mean_forward(
+    mean: jax.Array, image: jax.Array, top: jax.Array, left: jax.Array, weights: jax.Array
 ) -> tuple[jax.Array, _Cells]:
     # An empty slice carries the image's shape and dtype through a scan at no cost.
-    return weighted_cells(image, top, left, weights), (image[:, :, :, None][..., :0], top, left, weights)
+    return mean, (image[:, :, :, None][..., :0], top, left, weights)
 
 
-def _weighted_backward(residuals: _Cells, cotangent: jax.Array) -> tuple[jax.Array, None, None, None]:
+def _mean_backward(residuals: _Cells, cotangent: jax.Array) -> tuple[None, jax.Array, None, None, None]:
     shape, top, left, weights = residuals
     blocks = weights[..., None] * cotangent[..., None, :]
-    return _scattered(shape.shape[:3], top, left, blocks).astype(shape.dtype), None, None, None
+    return None, _scattered(shape.shape[:3], top, left, blocks).astype(shape.dtype), None, None, None
 
 
-weighted_cells.defvjp(_weighted_forward, _weighted_backward)
+differentiable_mean.defvjp(_mean_forward, _mean_backward)
 
 
 @jax.custom_vjp
