@@ -34,9 +34,9 @@ def enlarge(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, ja
     slopes are those per fine pixel. Where no coarse pixel is alike, the sum of weights is 0 and so is the image.
     """
     totals = _totals(coarse, there, here)
-    weight = totals[-1]
+    weight = totals[-1:]
     some = weight > _NO_WEIGHT
-    return jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), 0.0), jnp.where(some, weight, 0.0)
+    return jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), 0.0), jnp.where(some, weight, 0.0)[0]
 
 
 def _totals(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:

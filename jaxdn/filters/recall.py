@@ -53,29 +53,27 @@ def recall(
       depth_tolerance: see :func:`jaxdn.filters.reprojection.expected`.
       normal_threshold: see :func:`jaxdn.filters.reprojection.same_surface`.
     """
-    height, width = history.shape[:2]
     before = shared(before, guides_of(frame))
     wanted = expected(frame, before, depth_tolerance=depth_tolerance)
-    motion = jnp.zeros((height, width, 2), history.dtype) if frame.motion is None else lax.stop_gradient(frame.motion)
-    known = jnp.all(jnp.isfinite(motion), axis=-1)
-    motion = jnp.where(known[..., None], motion, 0.0)
-    x = lax.broadcasted_iota(motion.dtype, (height, width), 1) + motion[..., 0]
-    y = lax.broadcasted_iota(motion.dtype, (height, width), 0) + motion[..., 1]
-    inside = known & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1) & ~first
-    left, top, fx, fy = cells(jnp.clip(x, 0, width - 1), jnp.clip(y, 0, height - 1), height, width)
-
     sound = jnp.all(jnp.isfinite(history) & (history >= 0), axis=-1, keepdims=True)
+    broken = jnp.sum(~sound & ~first, dtype=jnp.int32)
     history = jnp.where(sound, history, 0.0)
+    if frame.motion is None:
+        same = same_surface(before, wanted, normal_threshold=normal_threshold)
+        valid = sound & (same & ~first)[..., None]
+        return Recalled(jnp.where(valid, history, 0.0), valid, broken)
+
+    cell = _cells(frame.motion, first)
     packed = lax.stop_gradient(pack(jnp.concatenate([history, sound.astype(history.dtype)], axis=-1), before))
 
-    def strip(parts: _Strip) -> tuple[jax.Array, jax.Array, jax.Array]:
-        found = corners(packed, parts.top, parts.left)
+    def strip(part: tuple[_Cells, Expected]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        cell, wanted = part
+        found = corners(packed, cell.top, cell.left)
         taps = [unpack(found[..., index, :], before) for index in range(4)]
-        shares = ((1 - y) * (1 - x) for y in (parts.fy, 1 - parts.fy) for x in (parts.fx, 1 - parts.fx))
         weights = []
-        for share, (whole, guides) in zip(shares, taps, strict=True):
-            same = same_surface(guides, parts.wanted, normal_threshold=normal_threshold)
-            weights.append(jnp.where(parts.inside & (whole[..., -1] > 0) & same, share[..., 0], 0.0))
+        for share, (whole, guides) in zip(cell.shares(), taps, strict=True):
+            same = same_surface(guides, wanted, normal_threshold=normal_threshold)
+            weights.append(jnp.where(cell.inside & (whole[..., -1] > 0) & same, share[..., 0], 0.0))
         total = functools.reduce(jnp.add, weights)
         valid = total >= WEIGHT_MIN
         weights = [jnp.where(valid, weight / jnp.where(valid, total, 1.0), 0.0) for weight in weights]
@@ -83,17 +81,32 @@ def recall(
         return functools.reduce(jnp.add, mean), valid[..., None], jnp.stack(weights, axis=-1)
 
     # The weights are for the gradient; where none is taken, they are not computed.
-    mean, valid, weights = by_strips(strip, _Strip(top, left, fy, fx, inside, wanted), pixels=_STRIP)
-    fetched = differentiable_mean(mean, history, top, left, weights)
-    return Recalled(fetched, valid, jnp.sum(~sound & ~first, dtype=jnp.int32))
+    mean, valid, weights = by_strips(strip, (cell, wanted), pixels=_STRIP)
+    return Recalled(differentiable_mean(mean, history, cell.top, cell.left, weights), valid, broken)
 
 
-class _Strip(NamedTuple):
-    """Where the pixels of a strip fetch, and what they must find; names as in :func:`jaxdn.ops.warp.cells`."""
+class _Cells(NamedTuple):
+    """Where every pixel fetches; names as in :func:`jaxdn.ops.warp.cells`."""
 
-    top: jax.Array
     left: jax.Array
-    fy: jax.Array
+    top: jax.Array
     fx: jax.Array
+    fy: jax.Array
     inside: jax.Array
-    wanted: Expected
+    """[H, W] bool, the target is in the image and known."""
+
+    def shares(self) -> list[jax.Array]:
+        """The bilinear weights of the four corners."""
+        return [(1 - y) * (1 - x) for y in (self.fy, 1 - self.fy) for x in (self.fx, 1 - self.fx)]
+
+
+def _cells(motion: jax.Array, first: jax.Array) -> _Cells:
+    """The cells of the targets ``p + motion(p)``."""
+    height, width = motion.shape[:2]
+    motion = lax.stop_gradient(motion)
+    known = jnp.all(jnp.isfinite(motion), axis=-1)
+    motion = jnp.where(known[..., None], motion, 0.0)
+    x = lax.broadcasted_iota(motion.dtype, (height, width), 1) + motion[..., 0]
+    y = lax.broadcasted_iota(motion.dtype, (height, width), 0) + motion[..., 1]
+    inside = known & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1) & ~first
+    return _Cells(*cells(jnp.clip(x, 0, width - 1), jnp.clip(y, 0, height - 1), height, width), inside)

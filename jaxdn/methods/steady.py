@@ -143,7 +143,7 @@ def steady(options: Options) -> Denoiser:
         bias = (
             [value for value in pixel for _ in range(4)] + [0.0] * HALF_FEATURES + [BEGIN["trust"]] + [_TAKE] * LEVELS
         )
-        precisions = {name: jnp.full((1 + LEVELS, 1), value) for name, value in PRECISIONS.items()}
+        precisions = {name: jnp.full((1 + LEVELS,), value) for name, value in PRECISIONS.items()}
         return {**params, "head_0": {**params["head_0"], "bias": jnp.asarray(bias)}, "guide": precisions}
 
     def start(params: Params, frame: Frame) -> SteadyState:

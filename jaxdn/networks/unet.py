@@ -64,7 +64,7 @@ class Convolution(nnx.Module):
         outputs = kernel.shape[-1]
         if kernel.shape[0] == 1:
             ((x, _),) = parts
-            return x @ kernel[0, 0].astype(dtype) + self.bias[...].astype(dtype)
+            return x @ kernel[0, 0].astype(dtype) + jnp.reshape(self.bias[...].astype(dtype), (1, 1, 1, -1))
         kernel = jnp.pad(kernel, ((0, 0), (0, 0), (0, 0), (0, -outputs % convolver.multiple))).astype(dtype)
 
         def share(used: Sequence[slice] | None) -> jax.Array:
