@@ -60,7 +60,7 @@ def recall(
     history = jnp.where(sound, history, 0.0)
     if frame.motion is None:
         same = same_surface(before, wanted, normal_threshold=normal_threshold)
-        valid = sound & (same & ~first)[..., None]
+        valid = (sound[..., 0] & same & ~first)[..., None]
         return Recalled(jnp.where(valid, history, 0.0), valid, broken)
 
     cell = _cells(frame.motion, first)

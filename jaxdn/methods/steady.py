@@ -175,13 +175,16 @@ def steady(options: Options) -> Denoiser:
 
 def _surfaces(frame: Frame) -> _Surfaces:
     nothing = jnp.zeros_like(frame.radiance)
+    height, width = nothing.shape[:2]
     reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
     hit = hit_mask(frame.depth, frame.ids)
+    hit = jnp.ones((height, width), bool) if hit is None else hit
     return _Surfaces(
         pad(nothing if reflectance is None else reflectance - 1.0, MULTIPLE),
         pad(nothing if frame.normal is None else frame.normal, MULTIPLE),
         None if frame.depth is None else pad(frame.depth, MULTIPLE),
-        pad((jnp.ones_like(nothing[..., 0], bool) if hit is None else hit)[..., None], MULTIPLE),
+        # What is padded is no surface: noise of the last row would count as often as it is repeated.
+        jnp.pad(hit, ((0, -height % MULTIPLE), (0, -width % MULTIPLE)))[..., None],
     )
 
 

@@ -1,0 +1,160 @@
+"""``steady``: what it promises before it has learnt anything, and that it can learn."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jaxdn import brdf
+from jaxdn.denoiser import Denoiser
+from jaxdn.frame import FAR, Frame, frame_at
+from jaxdn.methods.steady import steady
+from jaxdn.rollout import unroll
+
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
+TINY = ((4,), (4,), (4,), (4,), (4,))
+SIZE = (24, 40)
+"""Not a multiple of what the network works on."""
+
+
+def tiny(**options: Any) -> Denoiser:
+    return steady(quality=TINY, **options)
+
+
+def room(rng, count=3, *, size=SIZE):
+    """A floor that recedes and a textured box before it, all buffers, a camera that stands still."""
+    rows, columns = np.mgrid[: size[0], : size[1]].astype(np.float32)
+    box = (abs(rows - 12) < 6) & (abs(columns - 20) < 8)
+    albedo = np.where(box[..., None], 0.2 + 0.6 * (columns[..., None] % 2), np.float32([0.7, 0.5, 0.3]))
+    frame = Frame(
+        radiance=np.ones((*size, 3), np.float32),
+        albedo=albedo.astype(np.float32),
+        normal=np.where(box[..., None], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]).astype(np.float32),
+        depth=np.where(box, 2.0, 90 / (rows + 10))[..., None].astype(np.float32),
+        motion=np.zeros((*size, 2), np.float32),
+        ids=box.astype(np.int32)[..., None],
+    )
+    clip = jax.tree.map(lambda each: np.broadcast_to(each, (count, *each.shape)), frame)
+    light = rng.exponential(size=(count, *size, 1)).astype(np.float32)
+    return jax.tree.map(jnp.asarray, clip._replace(radiance=light * brdf.divisor(clip.albedo)))
+
+
+def denoised(frames, *, key=None, sharper=0.0):
+    """With the same decisions for all pixels, or (``key``) with random ones; guides that stop the filter more."""
+    denoiser = tiny()
+    params = denoiser.init(jax.random.key(0), frame_at(frames, 0))
+    params["guide"] = {name: value + sharper for name, value in params["guide"].items()}
+    if key is None:
+        params["head_0"]["kernel"] = 0.0 * params["head_0"]["kernel"]
+    else:
+        params = jax.tree.map(lambda leaf: leaf + 0.3 * jax.random.normal(key, leaf.shape), params)
+    return np.asarray(jax.jit(lambda p, f: unroll(denoiser, p, f))(params, frames))
+
+
+def test_constant_light_comes_out_as_it_went_in(rng, key):
+    frames = room(rng)
+    flat = frames._replace(radiance=0.5 * brdf.divisor(frames.albedo))
+    np.testing.assert_allclose(denoised(flat, key=key), flat.radiance, rtol=1e-4)
+
+
+def test_noise_falls_within_a_frame_and_with_every_further_one(rng):
+    frames = room(rng, 8)
+    error = denoised(frames) / brdf.divisor(frames.albedo) - 1.0
+    spread = np.sqrt(np.mean(np.square(error), axis=(1, 2, 3)))
+    assert spread[0] < 0.1  # of 1 in the noisy frame
+    assert spread[7] < 0.6 * spread[0]
+
+
+@pytest.mark.parametrize("gain", [1 / 64, 64.0])
+def test_brighter_light_gives_the_same_picture(gain, rng, key):
+    frames = room(rng)
+    plain, bright = denoised(frames, key=key), denoised(frames._replace(radiance=gain * frames.radiance), key=key)
+    assert np.mean(np.abs(bright / gain - plain)) < 0.01 * np.mean(plain)
+
+
+def test_textures_and_silhouettes_stay(rng):
+    """Light that differs between two surfaces: neither takes from the other."""
+    frames = room(rng, 4)
+    box = frames.ids == 1
+    lit = frames._replace(radiance=jnp.where(box, 2.0, 0.5) * brdf.divisor(frames.albedo))
+    error = np.abs(denoised(lit, sharper=3.0) / np.asarray(lit.radiance) - 1.0)
+    assert error.max() < 0.01
+
+
+def test_the_sky_passes_through_and_gives_nothing(rng, key):
+    frames = room(rng)
+    sky = jnp.arange(SIZE[1])[None, None, :, None] < 12
+    frames = frames._replace(
+        radiance=jnp.where(sky, 1000.0, 0.5 * brdf.divisor(frames.albedo)),
+        depth=jnp.where(sky, FAR, frames.depth),
+        albedo=jnp.where(sky, 1.0, frames.albedo),
+        ids=jnp.where(sky, -1, frames.ids),
+    )
+    np.testing.assert_allclose(denoised(frames, key=key), frames.radiance, rtol=1e-4)
+
+
+def test_a_moving_history_is_followed(rng):
+    """A camera that pans by a pixel a frame along a wall of boards, each lit in its own way: all stay in their place."""
+    frames = room(rng, 6)
+    board = (np.arange(SIZE[1]) + np.arange(6)[:, None])[:, None, :, None] // 8
+    facing = np.stack([np.cos(board), np.sin(board), 0.0 * board], axis=-1)[..., 0, :]
+    light = jnp.asarray(np.where(board % 2, 2.0, 0.5), jnp.float32)
+    moving = Frame(
+        radiance=light * jnp.ones_like(frames.radiance),
+        normal=jnp.broadcast_to(jnp.asarray(facing, jnp.float32), frames.radiance.shape),
+        motion=jnp.broadcast_to(jnp.asarray([1.0, 0.0]), frames.motion.shape),
+    )
+    np.testing.assert_allclose(denoised(moving, sharper=3.0), moving.radiance, rtol=0.01)
+
+
+def test_broken_state_heals(rng):
+    denoiser, frames = tiny(), room(rng, 3)
+    params = denoiser.init(jax.random.key(0), frame_at(frames, 0))
+    step = jax.jit(denoiser.step)
+    state, _ = step(params, denoiser.start(params, frame_at(frames, 0)), frame_at(frames, 0))
+    state = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan) if x.dtype == jnp.float32 else x, state)
+    _, image = step(params, state, frame_at(frames, 1))
+    assert np.isfinite(image).all()
+
+
+@pytest.mark.parametrize("absent", [("albedo", "motion"), ("normal", "depth", "ids")])
+def test_an_absent_buffer_equals_its_neutral_value(absent, rng, key):
+    frames = room(rng, 2)
+    image = denoised(frames._replace(**dict.fromkeys(absent)), key=key)
+    assert np.isfinite(image).all()
+    neutral = {"albedo": 1.0, "motion": 0.0, "normal": 0.0, "depth": 0.0, "ids": 0}
+    explicit = {name: jnp.full_like(getattr(frames, name), neutral[name]) for name in absent}
+    np.testing.assert_allclose(image, denoised(frames._replace(**explicit), key=key), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_gradients_through_time(rng, x64):
+    denoiser = tiny()
+    frames = room(rng, 2, size=(32, 32))
+    frames = frames._replace(motion=frames.motion + 0.3, **{
+        name: getattr(frames, name).astype(jnp.float64) for name in ("radiance", "albedo", "normal", "depth")
+    })
+    params = denoiser.init(jax.random.key(0), frame_at(frames, 0))
+    params = jax.tree.map(lambda x: x.astype(jnp.float64), params)
+    noise = jax.random.normal(jax.random.key(1), frames.radiance.shape, jnp.float64)
+
+    @jax.jit
+    def loss(head, guide):
+        return jnp.sum(noise * unroll(denoiser, {**params, "head_0": head, "guide": guide}, frames))
+
+    check_grads(loss, (params["head_0"], params["guide"]), order=1, modes=["rev"], rtol=1e-4, eps=1e-5)
+
+
+@pytest.mark.slow
+def test_every_weight_learns(rng, key):
+    denoiser = tiny()
+    frames = room(rng, 3)
+    params = denoiser.init(key, frame_at(frames, 0))
+    gradient = jax.jit(jax.grad(lambda p: jnp.mean(jnp.square(unroll(denoiser, p, frames)))))(params)
+    still = [jax.tree_util.keystr(path) for path, leaf in jax.tree.leaves_with_path(gradient) if not np.any(leaf)]
+    assert still == []
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
