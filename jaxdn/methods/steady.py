@@ -1,7 +1,7 @@
 """``steady``, a denoiser of our own: an edge-stopping recurrent filter whose every decision a small network makes.
 
 For each frame: divide by what surfaces reflect; fetch the history with a test of every tap; blend the noisy frame into
-a running mean whose effective number of samples is known per pixel; filter the mean by affinities, one level at full
+a running mean whose effective number of samples is known per pixel; filter the mean by affinities, two levels at full
 resolution and four at half, each reaching twice as far as the one before; blend the result with the last output.
 
 What a hand-made filter leaves to constants, a U-Net at half resolution decides for every pixel: learned features that
@@ -35,8 +35,8 @@ from jaxdn.options import Range
 from jaxdn.recipe import Recipe
 from jaxdn.scales import downsample, fill, fold, unfold
 
-LEVELS = 4
-"""Levels of the filter at half resolution; taps are 2, 4, 8 and 16 pixels apart."""
+FULL_LEVELS, LEVELS = 2, 4
+"""Levels of the filter at full resolution, taps 1 and 2 pixels apart, and at half: 2, 4, 8 and 16 pixels apart."""
 FEATURES, HALF_FEATURES = 5, 8
 """Learned features at full and at half resolution."""
 MULTIPLE = 32
@@ -85,6 +85,7 @@ class _Surfaces(NamedTuple):
 
     albedo: jax.Array
     normal: jax.Array
+    roughness: jax.Array
     depth: jax.Array | None
     hit: jax.Array
     """[H, W, 1] bool, there is a surface."""
@@ -125,7 +126,7 @@ class _Decisions(NamedTuple):
 def steady(options: Options) -> Denoiser:
     """The denoiser.
 
-    Reads reflectance, albedo, normal, depth, previous_depth, motion and ids; without a buffer, what it would guide or
+    Reads reflectance, albedo, normal, roughness, depth, previous_depth, motion and ids; without a buffer, what it would guide or
     test is left out. Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for an
     unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
     """
@@ -134,8 +135,8 @@ def steady(options: Options) -> Denoiser:
 
     widths = QUALITIES[options.quality] if isinstance(options.quality, str) else options.quality
     heads = (4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS,)
-    network = unet((28, 20), heads, widths=widths, head_size=1, implementation=options.implementation)
-    reads = frozenset({"albedo", "normal", "depth", "previous_depth", "motion", "ids"})
+    network = unet((32, 20), heads, widths=widths, head_size=1, implementation=options.implementation)
+    reads = frozenset({"albedo", "normal", "roughness", "depth", "previous_depth", "motion", "ids"})
 
     def init(key: jax.Array, frame: Frame) -> Params:
         params = network.init(key)
@@ -182,6 +183,7 @@ def _surfaces(frame: Frame) -> _Surfaces:
     return _Surfaces(
         pad(nothing if reflectance is None else reflectance - 1.0, MULTIPLE),
         pad(nothing if frame.normal is None else frame.normal, MULTIPLE),
+        pad(nothing[..., :1] if frame.roughness is None else frame.roughness - 1.0, MULTIPLE),
         None if frame.depth is None else pad(frame.depth, MULTIPLE),
         # What is padded is no surface: noise of the last row would count as often as it is repeated.
         jnp.pad(hit, ((0, -height % MULTIPLE), (0, -width % MULTIPLE)))[..., None],
@@ -201,7 +203,7 @@ def _seen(noisy: jax.Array, past: _Past, surfaces: _Surfaces) -> tuple[jax.Array
     """
     gain = color.exposure(noisy)
     closeness = jnp.zeros_like(past.count) if surfaces.depth is None else depth_feature(surfaces.depth)
-    geometry = fold(jnp.concatenate([surfaces.albedo, surfaces.normal, closeness], axis=-1))
+    geometry = fold(jnp.concatenate([surfaces.albedo, surfaces.normal, closeness, surfaces.roughness], axis=-1))
     level = color.luminance(past.mean)
     spread = jnp.sqrt(jnp.maximum(past.square - level**2, 0.0) + 1e-12) / (level + 1e-3 / gain)
     seen = color.compress(gain * noisy)
@@ -241,7 +243,7 @@ def _accumulated(
 def _filtered(
     guide: dict[str, Any], mean: jax.Array, surfaces: _Surfaces, decided: _Decisions
 ) -> tuple[jax.Array, jax.Array]:
-    """The mean after the level at full resolution, and after all levels.
+    """The mean after the levels at full resolution, and after all levels.
 
     The image of the levels at half resolution is enlarged along the guides, and takes a share of every pixel.
     """
@@ -255,12 +257,14 @@ def _filtered(
 
     slanted = jnp.zeros_like(_planar(mean)) if surfaces.depth is None else _planar(_slanted(surfaces.depth))
     at_full = guided(surfaces, slanted, 0, decided.features, decided.logits["trust"])
-    fine = affinity_filter(_planar(mean), at_full).transpose(1, 2, 0)
-    half = _Surfaces(
-        downsample(surfaces.albedo),
-        downsample(surfaces.normal),
-        None,
-        downsample(surfaces.hit.astype(mean.dtype)) > 0,
+    fine = _planar(mean)
+    for index in range(FULL_LEVELS):
+        fine = affinity_filter(fine, at_full, step=2**index)
+    fine = fine.transpose(1, 2, 0)
+    half = surfaces._replace(
+        albedo=downsample(surfaces.albedo),
+        normal=downsample(surfaces.normal),
+        hit=downsample(surfaces.hit.astype(mean.dtype)) > 0,
     )
     slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
     coarse = downsample(fill(fine, surfaces.hit))
