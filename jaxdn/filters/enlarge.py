@@ -54,17 +54,15 @@ def _totals(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
 
     guides = [around(plane) for plane in (*there.features, *there.slanted)]
     mass = [outside(plane * there.confidence) for plane in coarse] + [outside(there.confidence)]
-    blocks = [
-        [jnp.pad(plane[y::2, x::2], ((0, below), (0, 0))) for plane in (*here.features, *here.slanted)]
-        for y, x in np.ndindex(2, 2)
-    ]
+    fine = jnp.concatenate([here.features, here.slanted]).reshape(-1, height, 2, width, 2).transpose(2, 4, 0, 1, 3)
+    blocks = jnp.pad(fine, ((0, 0), (0, 0), (0, 0), (0, below), (0, 0))).reshape(4, -1, height + below, width)
     taps = _taps(coarse.dtype)
 
     def strip(top: jax.Array | int) -> jax.Array:
         def at(planes: Planes, shift: jax.Array | np.ndarray) -> Planes:
             return [lax.dynamic_slice(plane, (top + 1 + shift[0], 1 + shift[1]), (rows, width)) for plane in planes]
 
-        own = [[lax.dynamic_slice_in_dim(plane, top, rows) for plane in planes] for planes in blocks]
+        own = [list(planes) for planes in lax.dynamic_slice_in_dim(blocks, top, rows, 2)]
 
         def weigh(tap: _Taps) -> Planes:
             other = at(guides, tap.shift)

@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxdn import color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
@@ -112,8 +113,8 @@ class _Decisions(NamedTuple):
     """[H/2, W/2, HALF_FEATURES]."""
     half_trust: jax.Array
     """[H/2, W/2, 1]."""
-    take: jax.Array
-    """[H/2, W/2, LEVELS]."""
+    take: list[jax.Array]
+    """Level -> [H/2, W/2, 1] in [0, 1]."""
 
 
 @method(
@@ -215,11 +216,12 @@ def _seen(noisy: jax.Array, past: _Past, surfaces: _Surfaces) -> tuple[jax.Array
 
 
 def _decisions(head: jax.Array) -> _Decisions:
-    pixel = unfold(head[..., : 4 * (FEATURES + len(BEGIN))])
-    block = head[..., 4 * (FEATURES + len(BEGIN)) :]
-    logits = jnp.split(pixel[..., FEATURES:], len(BEGIN), axis=-1)
-    own, trust, take = jnp.split(block, (HALF_FEATURES, HALF_FEATURES + 1), axis=-1)
-    return _Decisions(pixel[..., :FEATURES], dict(zip(BEGIN, logits, strict=True)), own, trust, jax.nn.sigmoid(take))
+    width = 4 * (FEATURES + len(BEGIN))
+    # Splits, not slices: the gradient of a slice is an array of the whole size, and all of them are added.
+    pixel, own, trust, take = jnp.split(head, np.cumsum([width, HALF_FEATURES, 1]), axis=-1)
+    features, *logits = jnp.split(unfold(pixel), np.arange(len(BEGIN)) + FEATURES, axis=-1)
+    shares = jnp.split(jax.nn.sigmoid(take), LEVELS, axis=-1)
+    return _Decisions(features, dict(zip(BEGIN, logits, strict=True)), own, trust, shares)
 
 
 def _accumulated(
@@ -271,7 +273,7 @@ def _filtered(
     for index in range(LEVELS):
         at_half = guided(half, slanted_half, 1 + index, decided.half_features, decided.half_trust)
         smoother = affinity_filter(_planar(coarse), at_half, step=2**index).transpose(1, 2, 0)
-        coarse = coarse + decided.take[..., index : index + 1] * (smoother - coarse)
+        coarse = coarse + decided.take[index] * (smoother - coarse)
     there = guided(half, slanted[:, ::2, ::2], 0, downsample(decided.features), decided.half_trust)
     enlarged, weight = enlarge(_planar(coarse), there, at_full)
     share = jax.nn.sigmoid(decided.logits["coarse"]) * (weight / (weight + _LIKENESS))[..., None]
