@@ -30,13 +30,6 @@ def fold(image: jax.Array) -> jax.Array:
     return blocks.transpose(0, 2, 4, 1, 3).reshape(height // 2, width // 2, 4 * channels)
 
 
-def unfold(image: jax.Array) -> jax.Array:
-    """The inverse of :func:`fold`: [H, W, 4C] -> [2H, 2W, C]."""
-    height, width, channels = image.shape
-    blocks = image.reshape(height, width, channels // 4, 2, 2)
-    return blocks.transpose(0, 3, 1, 4, 2).reshape(2 * height, 2 * width, channels // 4)
-
-
 def fill(image: jax.Array, known: jax.Array) -> jax.Array:
     """[H, W, C] with the mean of the known pixels of the same 2x2 block, else 4x4 block, where a pixel is not known.
 

@@ -34,7 +34,7 @@ from jaxdn.objectives import unbiased_illumination
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
 from jaxdn.options import Range
 from jaxdn.recipe import Recipe
-from jaxdn.scales import downsample, fill, fold, unfold
+from jaxdn.scales import downsample, fill, fold
 
 FULL_LEVELS, LEVELS = 2, 4
 """Levels of the filter at full resolution, taps 1 and 2 pixels apart, and at half: 2, 4, 8 and 16 pixels apart."""
@@ -43,9 +43,9 @@ FEATURES, HALF_FEATURES = 5, 8
 MULTIPLE = 32
 """Height and width that the network works on are multiples of this."""
 QUALITIES: dict[str, Widths] = {
-    "fast": ((16,), (24,), (32,), (32,), (32,)),
-    "balanced": ((32,), (48,), (64,), (64,), (64,)),
     "high": ((48,), (64,), (80,), (96,), (96,)),
+    "balanced": ((32,), (48,), (64,), (64,), (64,)),
+    "fast": ((16,), (24,), (32,), (32,), (32,)),
 }
 """Channels of the U-Net's convolutions, from half resolution down."""
 
@@ -103,16 +103,18 @@ class _Past(NamedTuple):
 
 
 class _Decisions(NamedTuple):
-    """What the network decided."""
+    """What the network decided; planar."""
 
     features: jax.Array
-    """[H, W, FEATURES]."""
-    logits: dict[str, jax.Array]
-    """Name in :data:`BEGIN` -> [H, W, 1]."""
+    """[FEATURES, H, W]."""
+    mean_features: jax.Array
+    """[FEATURES, H/2, W/2] their means over blocks."""
+    shares: dict[str, jax.Array]
+    """Name in :data:`BEGIN` -> [H, W, 1] in [0, 1]."""
     half_features: jax.Array
-    """[H/2, W/2, HALF_FEATURES]."""
+    """[HALF_FEATURES, H/2, W/2]."""
     half_trust: jax.Array
-    """[H/2, W/2, 1]."""
+    """[H/2, W/2, 1] in [0, 1]."""
     take: list[jax.Array]
     """Level -> [H/2, W/2, 1] in [0, 1]."""
 
@@ -163,11 +165,11 @@ def steady(options: Options) -> Denoiser:
         weights = {name: part for name, part in params.items() if name != "guide"}
         groups = [group[None] for group in _seen(noisy, past, surfaces)]
         decided = _decisions(network.apply(weights, groups)[0][0])
-        mean, square, count = _accumulated(noisy, past, decided.logits["follow"], options.history_max)
+        mean, square, count = _accumulated(noisy, past, decided.shares["follow"], options.history_max)
         fine, image = _filtered(params["guide"], mean, surfaces, decided)
-        newest = jnp.where(past.valid, jax.nn.sigmoid(decided.logits["blend"]), 1.0)
+        newest = jnp.where(past.valid, decided.shares["blend"], 1.0)
         shown = jnp.clip(past.shown + newest * (image - past.shown), 0.0, RADIANCE_MAX)
-        kept = mean + jax.nn.sigmoid(decided.logits["feedback"]) * (fine - mean)
+        kept = mean + decided.shares["feedback"] * (fine - mean)
         history = crop(jnp.concatenate([kept, square, count, shown], axis=-1), size)
         image = jnp.where(crop(surfaces.hit, size), history[..., 5:], frame.radiance)
         return SteadyState(history, guides_of(frame)), image, found.broken
@@ -216,12 +218,21 @@ def _seen(noisy: jax.Array, past: _Past, surfaces: _Surfaces) -> tuple[jax.Array
 
 
 def _decisions(head: jax.Array) -> _Decisions:
-    width = 4 * (FEATURES + len(BEGIN))
+    height, width = head.shape[:2]
     # Splits, not slices: the gradient of a slice is an array of the whole size, and all of them are added.
-    pixel, own, trust, take = jnp.split(head, np.cumsum([width, HALF_FEATURES, 1]), axis=-1)
-    features, *logits = jnp.split(unfold(pixel), np.arange(len(BEGIN)) + FEATURES, axis=-1)
-    shares = jnp.split(jax.nn.sigmoid(take), LEVELS, axis=-1)
-    return _Decisions(features, dict(zip(BEGIN, logits, strict=True)), own, trust, shares)
+    own, logits, half, rest = jnp.split(head, np.cumsum([4 * FEATURES, 4 * len(BEGIN), HALF_FEATURES]), axis=-1)
+    # Before they are unfolded, while they lie side by side in memory.
+    shares = dict(zip(BEGIN, _unfolded(jax.nn.sigmoid(logits))[..., None], strict=True))
+    trust, *take = jnp.split(jax.nn.sigmoid(rest), 1 + LEVELS, axis=-1)
+    means = jnp.mean(own.reshape(height, width, FEATURES, 4), axis=-1)
+    return _Decisions(_unfolded(own), _planar(means), shares, _planar(half), trust, take)
+
+
+def _unfolded(blocks: jax.Array) -> jax.Array:
+    """[H/2, W/2, 4C], made by :func:`jaxdn.scales.fold`, as planes [C, H, W]."""
+    height, width, channels = blocks.shape
+    parts = blocks.reshape(height, width, channels // 4, 2, 2).transpose(2, 0, 3, 1, 4)
+    return parts.reshape(channels // 4, 2 * height, 2 * width)
 
 
 def _accumulated(
@@ -229,11 +240,12 @@ def _accumulated(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The running mean of the radiance and of its luminance's square, and their effective number of samples.
 
-    In the mean of N frames and a new one, the new one has the weight 1 / (N + 1); ``follow`` is added to its logit.
+    In the mean of N frames and a new one, the new one has the weight 1 / (N + 1); ``follow`` = 1/2 keeps that, and
+    its logit is added to that of the weight.
     With weights 1 - a and a, the variance is ``(1 - a)^2 / N + a^2`` of a frame's: the effective number is its inverse.
     """
-    # The logit of 1 / (N + 1) is -log N.
-    share = jnp.where(past.valid, jax.nn.sigmoid(follow - jnp.log(jnp.maximum(past.count, 1e-6))), 1.0)
+    # The odds of 1 / (N + 1) are 1 to N.
+    share = jnp.where(past.valid, follow / (follow + jnp.maximum(past.count, 1e-6) * (1.0 - follow)), 1.0)
     now = jnp.concatenate([noisy, color.luminance(noisy) ** 2], axis=-1)
     then = jnp.where(past.valid, jnp.concatenate([past.mean, past.square], axis=-1), now)
     mixed = then + share * (now - then)
@@ -252,13 +264,12 @@ def _filtered(
     scales = {name: jnp.exp(0.5 * logarithm) for name, logarithm in guide.items()}
 
     def guided(parts: _Surfaces, slanted: jax.Array, index: int, own: jax.Array, trust: jax.Array) -> Guide:
-        albedo, normal = scales["albedo"][index] * parts.albedo, scales["normal"][index] * parts.normal
-        confidence = (jax.nn.sigmoid(trust) + _LEAST_TRUST) * parts.hit
-        features = _planar(jnp.concatenate([albedo, normal, scales["learned"][index] * own], axis=-1))
-        return Guide(features, scales["depth"][index] * slanted, confidence[..., 0])
+        surfaces = jnp.concatenate([scales["albedo"][index] * parts.albedo, scales["normal"][index] * parts.normal], -1)
+        features = jnp.concatenate([_planar(surfaces), scales["learned"][index] * own])
+        return Guide(features, scales["depth"][index] * slanted, ((trust + _LEAST_TRUST) * parts.hit)[..., 0])
 
     slanted = jnp.zeros_like(_planar(mean)) if surfaces.depth is None else _planar(_slanted(surfaces.depth))
-    at_full = guided(surfaces, slanted, 0, decided.features, decided.logits["trust"])
+    at_full = guided(surfaces, slanted, 0, decided.features, decided.shares["trust"])
     fine = _planar(mean)
     for index in range(FULL_LEVELS):
         fine = affinity_filter(fine, at_full, step=2**index)
@@ -274,9 +285,9 @@ def _filtered(
         at_half = guided(half, slanted_half, 1 + index, decided.half_features, decided.half_trust)
         smoother = affinity_filter(_planar(coarse), at_half, step=2**index).transpose(1, 2, 0)
         coarse = coarse + decided.take[index] * (smoother - coarse)
-    there = guided(half, slanted[:, ::2, ::2], 0, downsample(decided.features), decided.half_trust)
+    there = guided(half, slanted[:, ::2, ::2], 0, decided.mean_features, decided.half_trust)
     enlarged, weight = enlarge(_planar(coarse), there, at_full)
-    share = jax.nn.sigmoid(decided.logits["coarse"]) * (weight / (weight + _LIKENESS))[..., None]
+    share = decided.shares["coarse"] * (weight / (weight + _LIKENESS))[..., None]
     image = fine + share * (enlarged.transpose(1, 2, 0) - fine)
     return fine, image
 
