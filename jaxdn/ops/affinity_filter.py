@@ -29,7 +29,7 @@ from jax import lax
 RADIUS = 2
 SPLINE = (0.375, 0.25, 0.0625)
 """The B3 spline, from its centre outwards."""
-_STRIP = 16384
+_STRIP = 32768
 """Approximate number of pixels in a strip."""
 _NO_WEIGHT = 1e-12
 
@@ -133,34 +133,41 @@ def _forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, _Res
     dtype, margin = image.dtype, step * RADIUS
     rows = height if jax.default_backend() != "cpu" else min(height, max(8 * step, _STRIP // width))
     strips = -(-height // rows)
-    below = margin + strips * rows - height
+    below = strips * rows - height
 
-    def around(plane: jax.Array) -> jax.Array:
-        return jnp.pad(plane, ((margin, below), (margin, margin)))
+    def around(plane: jax.Array, margin: int) -> jax.Array:
+        return jnp.pad(plane, ((margin, margin + below), (margin, margin)))
 
-    guides = [around(plane) for plane in (*guide.features, *guide.slanted)]
-    mass = [around(plane * guide.confidence) for plane in image] + [around(guide.confidence)]
+    guides = [around(plane, 2 * margin) for plane in (*guide.features, *guide.slanted)]
+    mass = [around(plane, margin) for plane in (*image * guide.confidence[None], guide.confidence)]
     pairs = _pairs(step, dtype)
+    wide = (rows + margin, width + 2 * margin)
 
     def strip(top: jax.Array | int) -> jax.Array:
-        def at(planes: Planes, dy: jax.Array | int, dx: jax.Array | int) -> Planes:
-            return _window(planes, top + margin + dy, margin + dx, (rows, width))
+        def weigh(pair: _Pair) -> jax.Array:
+            """The weight of p and p + o, for all p of the strip and the pixels before and beside it.
 
-        def weigh(pair: _Pair) -> Planes:
-            here = at(guides, 0, 0)
-            signed = [affinity(here, at(guides, *pair.offset(sign)), *pair.slant(sign, dtype)) for sign in (1, -1)]
-            return [pair.spline * one for one in signed]
+            It is that of p + o and p too: shifted by o, it serves the opposite tap.
+            """
+            there = _window(guides, top + margin + pair.shift[0], margin + pair.shift[1], wide)
+            here = _window(guides, top + margin, margin, wide)
+            return pair.spline * affinity(here, there, *pair.slant(1, dtype))
 
-        def add(total: Planes, pair: _Pair, weights: Planes) -> Planes:
-            for sign, weight in zip((1, -1), weights, strict=True):
-                total = [old + weight * one for old, one in zip(total, at(mass, *pair.offset(sign)), strict=True)]
+        def add(total: Planes, pair: _Pair, weights: jax.Array) -> Planes:
+            for sign in (1, -1):
+                back = pair.shift if sign < 0 else jnp.zeros_like(pair.shift)
+                (weight,) = _window([weights], margin - back[0], margin - back[1], (rows, width))
+                dy, dx = pair.offset(sign)
+                taps = _window(mass, top + margin + dy, margin + dx, (rows, width))
+                total = [old + weight * one for old, one in zip(total, taps, strict=True)]
             return total
 
-        def body(carry: tuple[Planes, _Pair, Planes], pair: _Pair) -> tuple[tuple[Planes, _Pair, Planes], None]:
+        def body(carry: tuple[Planes, _Pair, jax.Array], pair: _Pair) -> tuple[tuple[Planes, _Pair, jax.Array], None]:
             return (add(*carry), pair, weigh(pair)), None
 
         first = _one(pairs, 0)
-        begin = ([SPLINE[0] ** 2 * plane for plane in at(mass, 0, 0)], first, weigh(first))
+        centre = _window(mass, top + margin, margin, (rows, width))
+        begin = ([SPLINE[0] ** 2 * plane for plane in centre], first, weigh(first))
         carry, _ = lax.scan(body, begin, _from(pairs, 1))
         return jnp.stack(add(*carry))
 
