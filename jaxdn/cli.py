@@ -19,7 +19,7 @@ class Inspect:
 
     For example:
 
-    jaxdn inspect kitchen/scene.xml --animation kitchen.json --denoiser ntd-large
+    jaxdn inspect kitchen/scene.xml --animation kitchen.json --denoiser steady-balanced
 
     jaxdn inspect data/test/fruit-200 --json
     """
@@ -29,7 +29,7 @@ class Inspect:
     animation: Path | None = None
     """Animation file for a scene file."""
     denoiser: str | None = None
-    """Plan for this denoiser (svgf, ntd-large ...); default: for every buffer that a denoiser may read."""
+    """Plan for this denoiser (svgf, steady-balanced ...); default: for every buffer that a denoiser may read."""
     width: int = 128
     height: int = 128
     frames: int | None = None
@@ -178,8 +178,8 @@ class Denoise:
     """Folder of a clip, folder of EXR files, or a quoted pattern of EXR files."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the denoised frames."""
-    method: str = "ntd-large"
-    """Shipped weights (ntd-large, ntd-small), a filter (svgf), or the path of a .safetensors file."""
+    method: str = "steady-balanced"
+    """Shipped weights (steady-balanced, ntd-large, ntd-small), a filter (svgf), or the path of a .safetensors file."""
     spp: int = 1
     """Samples per pixel to take from the clip's layers."""
     preview: bool = False
@@ -198,7 +198,7 @@ class Compare:
 
     For example:
 
-    jaxdn compare data/test -o runs/compare --methods noisy svgf ntd-small ntd-large
+    jaxdn compare data/test -o runs/compare --methods noisy svgf ntd-small steady-balanced
     """
 
     clips: _PATH

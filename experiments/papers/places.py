@@ -32,7 +32,7 @@ class Settings:
     places: list[str]
     """CLIP:X,Y,WIDTH,HEIGHT in pixels."""
     methods: list[str] = field(
-        default_factory=lambda: ["noisy", "svgf", "Open-Image-Denoise", "ntd-small", "ntd-large", "reference"]
+        default_factory=lambda: ["noisy", "svgf", "Open-Image-Denoise", "ntd-small", "steady-balanced", "reference"]
     )
     """File names of the pictures."""
     out: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = Path("runs/places.png")

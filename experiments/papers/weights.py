@@ -1,4 +1,4 @@
-"""The shipped weights: render the clips, train `ntd-small` and `ntd-large`, and A, B, C at equal steps.
+"""The shipped weights: render the clips, train `steady-balanced`, `ntd-small` and `ntd-large`, and A, B, C.
 
     python -m experiments.papers.weights --rooms rooms/*/scene.xml    # `make weights`: hours; resumable
 
@@ -7,7 +7,7 @@ samples and six more single samples, 25 to 50 seconds of one core each. The room
 of Benedikt Bitterli's rendering resources (bathroom, kitchen, living-room-2, spaceship, veach-ajar, veach-lamp);
 without ``--rooms`` the families are all there is. Finished clips and stages are reused, interrupted ones go on. Each
 network is trained at a constant rate first, so that it can always be continued, and with a falling rate at the end;
-LARGE begins as SMALL grown (:mod:`jaxdn.networks.widen`).
+LARGE begins as SMALL grown (:mod:`jaxdn.networks.widen`). A, B and C take the same number of updates.
 """
 
 from collections.abc import Mapping
@@ -32,6 +32,7 @@ class Stage(NamedTuple):
     """One run of training."""
 
     name: str
+    method: str
     options: Mapping[str, Any]
     steps: int
     start: str = ""
@@ -41,13 +42,15 @@ class Stage(NamedTuple):
 
 
 STAGES = (
-    Stage("small-begun", {"size": "small"}, 4000, decay=False),
-    Stage("ntd-small", {"size": "small"}, 1000, start="small-begun"),
-    Stage("large-begun", {"size": "large"}, 2000, start="small-begun", decay=False),
-    Stage("ntd-large", {"size": "large"}, 1000, start="large-begun"),
-    Stage("A", {"size": "small", "motion": "traditional"}, 500, recipe="without-occlusion"),
-    Stage("B", {"size": "small", "motion": "dual"}, 500, recipe="without-occlusion"),
-    Stage("C", {"size": "small", "motion": "dual"}, 500),
+    Stage("steady-begun", "steady", {"quality": "balanced"}, 8000, decay=False),
+    Stage("steady-balanced", "steady", {"quality": "balanced"}, 1000, start="steady-begun"),
+    Stage("small-begun", "ntd", {"size": "small"}, 4000, decay=False),
+    Stage("ntd-small", "ntd", {"size": "small"}, 1000, start="small-begun"),
+    Stage("large-begun", "ntd", {"size": "large"}, 2000, start="small-begun", decay=False),
+    Stage("ntd-large", "ntd", {"size": "large"}, 1000, start="large-begun"),
+    Stage("A", "ntd", {"size": "small", "motion": "traditional"}, 500, recipe="without-occlusion"),
+    Stage("B", "ntd", {"size": "small", "motion": "dual"}, 500, recipe="without-occlusion"),
+    Stage("C", "ntd", {"size": "small", "motion": "dual"}, 500),
 )
 """Those with the name of shipped weights are what is shipped."""
 
@@ -98,7 +101,7 @@ def render_all(settings: Settings) -> None:
 
 def train_stage(stage: Stage, settings: Settings) -> Path:
     """The weights of a stage, trained if they do not exist."""
-    method = method_named("ntd")
+    method = method_named(stage.method)
     recipe = method.recipe_named(stage.recipe)._replace(
         steps=stage.steps, decay=stage.decay, average=0.99, spp=(1, 1, 1, 2, 4, 16)
     )

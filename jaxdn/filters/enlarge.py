@@ -66,7 +66,9 @@ def _totals(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
 
         def weigh(tap: _Taps) -> Planes:
             other = at(guides, tap.shift)
-            return [tap.spatial[phase] * affinity(planes, other, *tap.offset[phase]) for phase, planes in enumerate(own)]
+            return [
+                tap.spatial[phase] * affinity(planes, other, *tap.offset[phase]) for phase, planes in enumerate(own)
+            ]
 
         def add(totals: list[Planes], shift: jax.Array, weights: Planes) -> list[Planes]:
             found = at(mass, shift)

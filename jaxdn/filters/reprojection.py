@@ -52,14 +52,14 @@ def same_surface(tap: Guides, wanted: Expected, *, normal_threshold: float) -> j
     """The test of one tap for every pixel, bool [H, W]: does it show the same surface?
 
     It does where ids agree, its depth is the expected one within the tolerance and the cosine of the normals exceeds
-    ``normal_threshold``. ``tap`` are the guides [H, W, C] of the taps, those that ``wanted`` has.
+    ``normal_threshold``; what one of the two lacks is not tested. ``tap`` are the guides [H, W, C] of the taps.
     """
-    passed = []
-    if tap.depth is not None:
+    passed: list[jax.Array] = []
+    if tap.depth is not None and wanted.depth is not None and wanted.tolerance is not None:
         passed.append(jnp.abs(tap.depth[..., 0] - wanted.depth) <= wanted.tolerance)
-    if tap.normal is not None:
+    if tap.normal is not None and wanted.normal is not None:
         passed.append(cosine(tap.normal, wanted.normal) > normal_threshold)
-    if tap.ids is not None:
+    if tap.ids is not None and wanted.ids is not None:
         passed.append(tap.ids[..., 0] == wanted.ids)
     return functools.reduce(jnp.logical_and, passed, jnp.asarray(True))
 

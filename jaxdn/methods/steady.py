@@ -97,7 +97,7 @@ class _Past(NamedTuple):
 
     mean: jax.Array
     square: jax.Array
-    count: jax.Array
+    number: jax.Array
     shown: jax.Array
     valid: jax.Array
 
@@ -129,9 +129,9 @@ class _Decisions(NamedTuple):
 def steady(options: Options) -> Denoiser:
     """The denoiser.
 
-    Reads reflectance, albedo, normal, roughness, depth, previous_depth, motion and ids; without a buffer, what it would guide or
-    test is left out. Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for an
-    unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
+    Reads reflectance, albedo, normal, roughness, depth, previous_depth, motion and ids; without a buffer, what it would
+    guide or test is left out. Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for
+    an unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
     """
     # Flax is imported only when a network is built: filters without weights need only jax and numpy.
     from jaxdn.networks.unet import unet
@@ -165,12 +165,12 @@ def steady(options: Options) -> Denoiser:
         weights = {name: part for name, part in params.items() if name != "guide"}
         groups = [group[None] for group in _seen(noisy, past, surfaces)]
         decided = _decisions(network.apply(weights, groups)[0][0])
-        mean, square, count = _accumulated(noisy, past, decided.shares["follow"], options.history_max)
+        mean, square, number = _accumulated(noisy, past, decided.shares["follow"], options.history_max)
         fine, image = _filtered(params["guide"], mean, surfaces, decided)
         newest = jnp.where(past.valid, decided.shares["blend"], 1.0)
         shown = jnp.clip(past.shown + newest * (image - past.shown), 0.0, RADIANCE_MAX)
         kept = mean + decided.shares["feedback"] * (fine - mean)
-        history = crop(jnp.concatenate([kept, square, count, shown], axis=-1), size)
+        history = crop(jnp.concatenate([kept, square, number, shown], axis=-1), size)
         image = jnp.where(crop(surfaces.hit, size), history[..., 5:], frame.radiance)
         return SteadyState(history, guides_of(frame)), image, found.broken
 
@@ -195,7 +195,8 @@ def _surfaces(frame: Frame) -> _Surfaces:
 
 def _past(history: jax.Array, valid: jax.Array) -> _Past:
     wide = pad(history, MULTIPLE)
-    return _Past(*jnp.split(wide, (3, 4, 5), axis=-1), pad(valid, MULTIPLE))
+    mean, square, number, shown = jnp.split(wide, (3, 4, 5), axis=-1)
+    return _Past(mean, square, number, shown, pad(valid, MULTIPLE))
 
 
 def _seen(noisy: jax.Array, past: _Past, surfaces: _Surfaces) -> tuple[jax.Array, jax.Array]:
@@ -205,13 +206,13 @@ def _seen(noisy: jax.Array, past: _Past, surfaces: _Surfaces) -> tuple[jax.Array
     place the noisy frame. Spread is the standard deviation of luminance relative to its mean.
     """
     gain = color.exposure(noisy)
-    closeness = jnp.zeros_like(past.count) if surfaces.depth is None else depth_feature(surfaces.depth)
+    closeness = jnp.zeros_like(past.number) if surfaces.depth is None else depth_feature(surfaces.depth)
     geometry = fold(jnp.concatenate([surfaces.albedo, surfaces.normal, closeness, surfaces.roughness], axis=-1))
     level = color.luminance(past.mean)
     spread = jnp.sqrt(jnp.maximum(past.square - level**2, 0.0) + 1e-12) / (level + 1e-3 / gain)
     seen = color.compress(gain * noisy)
     mean, shown = (jnp.where(past.valid, color.compress(gain * one), seen) for one in (past.mean, past.shown))
-    facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + past.count), surfaces.hit.astype(noisy.dtype)]
+    facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + past.number), surfaces.hit.astype(noisy.dtype)]
     light = downsample(jnp.concatenate([seen, mean, shown, *facts], axis=-1))
     details = fold(jnp.concatenate([color.luminance(seen), color.luminance(shown)], axis=-1))
     return geometry, jnp.concatenate([light, details], axis=-1)
@@ -245,13 +246,13 @@ def _accumulated(
     With weights 1 - a and a, the variance is ``(1 - a)^2 / N + a^2`` of a frame's: the effective number is its inverse.
     """
     # The odds of 1 / (N + 1) are 1 to N.
-    share = jnp.where(past.valid, follow / (follow + jnp.maximum(past.count, 1e-6) * (1.0 - follow)), 1.0)
+    share = jnp.where(past.valid, follow / (follow + jnp.maximum(past.number, 1e-6) * (1.0 - follow)), 1.0)
     now = jnp.concatenate([noisy, color.luminance(noisy) ** 2], axis=-1)
     then = jnp.where(past.valid, jnp.concatenate([past.mean, past.square], axis=-1), now)
     mixed = then + share * (now - then)
-    variance = jnp.square(1.0 - share) / jnp.maximum(past.count, 1e-6) + share**2
-    count = jnp.where(past.valid, jnp.minimum(1.0 / variance, history_max), 1.0)
-    return mixed[..., :3], mixed[..., 3:], count
+    variance = jnp.square(1.0 - share) / jnp.maximum(past.number, 1e-6) + share**2
+    number = jnp.where(past.valid, jnp.minimum(1.0 / variance, history_max), 1.0)
+    return mixed[..., :3], mixed[..., 3:], number
 
 
 def _filtered(

@@ -206,11 +206,11 @@ def unet(
     ``groups`` are the channel counts of the feature groups; ``apply`` takes one array ``[N, H, W, c]`` for each, or
     ``None`` where it is absent, which equals an array of zeros but skips its part of the first convolution: the shapes
     of ``params`` never depend on it. H and W are multiples of 16. ``heads`` are the channel counts at full,
-    half and quarter resolution; their outputs are raw (logits), by convolutions of ``head_size``. ``widths`` gives the channels of each convolution of
-    each of the five levels; the decoder mirrors the first four. ``initialization``: see :func:`initial`. Computes in
-    the features' dtype. ``implementation``: None or "reference" (XLA), "onnxruntime" (inference, see
-    :mod:`jaxdn.networks.onnx`) or "onednn" (convolutions and their gradients, see :mod:`jaxdn.ops.onednn`). Raises
-    ValueError when ``widths`` is not five non-empty levels of positive integers, the features do not fit, or the
+    half and quarter resolution; their outputs are raw (logits), by convolutions of ``head_size``. ``widths`` gives the
+    channels of each convolution of each of the five levels; the decoder mirrors the first four. ``initialization``: see
+    :func:`initial`. Computes in the features' dtype. ``implementation``: None or "reference" (XLA), "onnxruntime"
+    (inference, see :mod:`jaxdn.networks.onnx`) or "onednn" (convolutions and their gradients, see
+    :mod:`jaxdn.ops.onednn`). Raises ValueError when ``widths`` is not five non-empty levels of positive integers, the features do not fit, or the
     implementation cannot run here.
     """
     run = resolve("unet", implementation)

@@ -188,7 +188,8 @@ def _backward(step: int, residuals: _Residuals, cotangent: jax.Array) -> tuple[j
     With g = cotangent / W and s = <g, out>, the gradient by the weight of q in p is ``<g(p), x(q)> - s(p)``.
     """
     image, guide, filtered, weight = residuals
-    size, dtype, margin = image.shape[1:], image.dtype, step * RADIUS
+    _, height, width = image.shape
+    dtype, margin = image.dtype, step * RADIUS
     some = weight > _NO_WEIGHT
     scaled = jnp.where(some, cotangent / jnp.where(some, weight, 1.0), 0.0)
     level = jnp.sum(scaled * filtered, axis=0)
@@ -204,7 +205,7 @@ def _backward(step: int, residuals: _Residuals, cotangent: jax.Array) -> tuple[j
 
     def at(planes: Planes, pair: _Pair, sign: int) -> Planes:
         dy, dx = pair.offset(sign)
-        return _window(planes, margin + dy, margin + dx, size)
+        return _window(planes, margin + dy, margin + dx, (height, width))
 
     def weigh(pair: _Pair) -> Planes:
         signed = [affinity(here, at(guides, pair, sign), *pair.slant(sign, dtype)) for sign in (1, -1)]

@@ -190,7 +190,7 @@ def test_the_json_says_how_they_came_to_be(saved):
     assert json.loads(saved[0].with_suffix(".json").read_text())["note"] == "test"
 
 
-@pytest.mark.parametrize("name", ["ntd-large", "ntd-small"])
+@pytest.mark.parametrize("name", ["ntd-large", "ntd-small", "steady-balanced"])
 def test_shipped_weights_work(name):
     assert name in shipped_names()
     denoiser, params = jaxdn.load_weights(name)
@@ -203,10 +203,11 @@ def test_shipped_weights_work(name):
     assert abs(float(np.mean(image[1])) - 1.0) < 0.25
 
 
+@pytest.mark.parametrize("name", ["ntd-small", "steady-balanced"])
 @pytest.mark.parametrize("size", [(72, 128), (33, 57), (1, 1)])
-def test_shipped_weights_take_any_size(size):
+def test_shipped_weights_take_any_size(size, name):
     # 72 x 128 was found on a real room: the coarsest level, 5 x 8 there, was pooled once too often.
-    denoiser, params = jaxdn.load_weights("ntd-small")
+    denoiser, params = jaxdn.load_weights(name)
     frame = Frame(radiance=np.ones((*size, 3), np.float32))
     _, image = jax.eval_shape(lambda p, f: denoiser.step(p, denoiser.start(p, f), f), params, frame)
     assert image.shape == (*size, 3)

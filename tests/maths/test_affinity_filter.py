@@ -88,6 +88,8 @@ def test_a_constant_stays_and_shapes_are_checked(rng):
 
 def test_batches_are_single_images(rng):
     first, second = (tuple(np.float32(each) for each in drawn(rng)) for _ in range(2))
-    both = jax.vmap(lambda image, *guide: affinity_filter(image, Guide(*guide)))(*map(np.stack, zip(first, second)))
+    both = jax.vmap(lambda image, *guide: affinity_filter(image, Guide(*guide)))(
+        *map(np.stack, zip(first, second, strict=True))
+    )
     for one, (image, *guide) in zip(both, (first, second), strict=True):
         np.testing.assert_allclose(one, affinity_filter(image, Guide(*guide)), rtol=1e-5, atol=1e-6)

@@ -98,7 +98,7 @@ def test_the_sky_passes_through_and_gives_nothing(rng, key):
 
 
 def test_a_moving_history_is_followed(rng):
-    """A camera that pans by a pixel a frame along a wall of boards, each lit in its own way: all stay in their place."""
+    """A camera that pans along a wall of boards, each lit in its own way: all stay in their place."""
     frames = room(rng, 6)
     board = (np.arange(SIZE[1]) + np.arange(6)[:, None])[:, None, :, None] // 8
     facing = np.stack([np.cos(board), np.sin(board), 0.0 * board], axis=-1)[..., 0, :]
@@ -135,9 +135,10 @@ def test_an_absent_buffer_equals_its_neutral_value(absent, rng, key):
 def test_gradients_through_time(rng, x64):
     denoiser = tiny()
     frames = room(rng, 2, size=(32, 32))
-    frames = frames._replace(motion=frames.motion + 0.3, **{
-        name: getattr(frames, name).astype(jnp.float64) for name in ("radiance", "albedo", "normal", "depth")
-    })
+    frames = frames._replace(
+        motion=frames.motion + 0.3,
+        **{name: getattr(frames, name).astype(jnp.float64) for name in ("radiance", "albedo", "normal", "depth")},
+    )
     params = denoiser.init(jax.random.key(0), frame_at(frames, 0))
     params = jax.tree.map(lambda x: x.astype(jnp.float64), params)
     noise = jax.random.normal(jax.random.key(1), frames.radiance.shape, jnp.float64)
