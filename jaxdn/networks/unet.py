@@ -210,8 +210,8 @@ def unet(
     channels of each convolution of each of the five levels; the decoder mirrors the first four. ``initialization``: see
     :func:`initial`. Computes in the features' dtype. ``implementation``: None or "reference" (XLA), "onnxruntime"
     (inference, see :mod:`jaxdn.networks.onnx`) or "onednn" (convolutions and their gradients, see
-    :mod:`jaxdn.ops.onednn`). Raises ValueError when ``widths`` is not five non-empty levels of positive integers, the features do not fit, or the
-    implementation cannot run here.
+    :mod:`jaxdn.ops.onednn`). Raises ValueError when ``widths`` is not five non-empty levels of positive integers, the
+    features do not fit, or the implementation cannot run here.
     """
     run = resolve("unet", implementation)
     widths = tuple(tuple(level) for level in widths)
