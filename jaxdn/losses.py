@@ -52,6 +52,27 @@ def temporal(denoised: jax.Array, reference: jax.Array, *, squared: bool = False
     return _mean_size(error[1:] - error[:-1], squared=squared)
 
 
+def pyramid(denoised: jax.Array, reference: jax.Array, *, levels: int = 4) -> jax.Array:
+    """The sum of the mean absolute errors in the bands of a Laplacian pyramid.
+
+    A band is what remains of the error after the means of 2x2 blocks are taken from it; the next band is made of these
+    means, and the last is the means themselves, of blocks of ``2**levels`` pixels. Fewer levels where a size is odd.
+    L1 of pixels seeks the median of noisy targets, which is darker than their mean. Here only the means of large blocks
+    decide about brightness, and noise that is averaged over 256 pixels has nearly the same median and mean.
+
+    Bojanowski et al. 2018, "Optimizing the Latent Space of Generative Networks", use such a loss (with Gaussian bands).
+    """
+    error, total = _difference(denoised, reference), jnp.zeros((), denoised.dtype)
+    for _ in range(levels):
+        frames, height, width, channels = error.shape
+        if height % 2 or width % 2:
+            break
+        blocks = error.reshape(frames, height // 2, 2, width // 2, 2, channels)
+        error = jnp.mean(blocks, axis=(2, 4))
+        total = total + _mean_size(blocks - error[:, :, None, :, None])
+    return total + _mean_size(error)
+
+
 def gradient(denoised: jax.Array, reference: jax.Array, *, operator: str = "difference") -> jax.Array:
     """Mean absolute difference of the image gradients; constant offsets do not count.
 

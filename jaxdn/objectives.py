@@ -73,6 +73,20 @@ def unbiased_illumination(*, hidden: float = 1.0, squared_from: float = 0.6) -> 
     return Objective(f"unbiased illumination, hidden {hidden:g}, squares from {squared_from:g}", loss, reads)
 
 
+def pyramid_illumination(*, temporal: float = 1.0) -> Objective:
+    """L1 in the bands of a Laplacian pyramid of each frame's error and of the error of the frames' differences.
+
+    Errors are linear in the target (:func:`jaxdn.losses.unbiased`): robust as L1, and nearly without its bias.
+    """
+
+    def loss(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:
+        denoised, wanted = losses.unbiased(images, clip.reference)
+        change = losses.pyramid(denoised[1:] - denoised[:-1], wanted[1:] - wanted[:-1])
+        return losses.pyramid(denoised, wanted) + temporal * change
+
+    return Objective(f"pyramid illumination, changes {temporal:g}", loss)
+
+
 _SQUARES = 8.0
 """The gradient of squares is then that of absolute values at an error of 1/16."""
 

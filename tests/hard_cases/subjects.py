@@ -14,6 +14,7 @@ from jaxdn.frame import FAR, RADIANCE_MAX, Clip, Frame
 from jaxdn.methods.table import methods
 from jaxdn.motion import on_screen
 from jaxdn.networks import pad
+from jaxdn.ops.affinity_filter import Guide, affinity_filter
 from jaxdn.ops.softmax_filter import softmax_filter
 from jaxdn.repair import repair
 from tests.hard_cases.inputs import HEIGHT, WIDTH, Inputs
@@ -21,6 +22,7 @@ from tests.hard_cases.inputs import HEIGHT, WIDTH, Inputs
 _BORDERS = ("clamp", "zeros")
 _METRICS = ("psnr", "temporal_psnr", "ssim", "l1", "mse", "flip", "relative_mse")
 _UNBIASED = ("unbiased_mse", "unbiased_psnr", "unbiased_temporal_psnr", "unbiased_relative_mse")
+_LOSSES = ("spatial", "temporal", "pyramid", "gradient")
 _PICTURED = {*(f"warp, {border}" for border in _BORDERS), "apply_kernels", "compose_scales"} | {
     "softmax_filter",
     "softmax_filter, guided",
@@ -117,6 +119,13 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         features = 20 * jnp.concatenate([frame.albedo, frame.normal], axis=-1)
         return softmax_filter(frame.radiance[None], inputs.logits, features=features)[0]
 
+    def by_affinity(inputs: Inputs) -> jax.Array:
+        frame = repair(jax.tree.map(lambda buffer: buffer[-1], inputs.clip.frames))[0]
+        features = 20 * jnp.concatenate([frame.albedo, frame.normal], axis=-1).transpose(2, 0, 1)
+        flat = jnp.zeros((3, *features.shape[1:]), features.dtype)
+        guide = Guide(features, flat, jnp.ones_like(flat[0]))
+        return affinity_filter(frame.radiance.transpose(2, 0, 1), guide).transpose(1, 2, 0)
+
     def even(inputs: Inputs) -> jax.Array:
         """As the error for odd sizes says."""
         image = inputs.clip.frames.radiance[-1]
@@ -192,8 +201,10 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "apply_kernels": filtered,
         "softmax_filter": filtered_by_logits,
         "softmax_filter, guided": guided_by_features,
+        "affinity_filter": by_affinity,
         "compose_scales": composed,
         "downsample": lambda inputs: scales.downsample(even(inputs)),
+        "fold": lambda inputs: scales.fold(even(inputs)),
         "fill": filled,
         "upsample": lambda inputs: scales.upsample(inputs.clip.frames.radiance[-1]),
         "brdf.directional_albedo": reflected,
@@ -225,7 +236,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "numerics.safe_norm": lambda inputs: numerics.safe_norm(inputs.clip.frames.normal),
         "numerics.safe_norm of light": of_light(numerics.safe_norm),
         "numerics.safe_power": of_light(numerics.safe_power, exponent=0.45),
-        **{f"losses.{name}": partial(lost, loss=getattr(losses, name)) for name in ("spatial", "temporal", "gradient")},
+        **{f"losses.{name}": partial(lost, loss=getattr(losses, name)) for name in _LOSSES},
         "losses.gradient, hfen": partial(lost, loss=losses.gradient, operator="hfen"),
         "losses.unbiased": lambda inputs: jnp.stack(losses.unbiased(*_images(inputs))),
         "losses.occlusion": lambda inputs: lost(inputs, losses.occlusion, inputs.mask),

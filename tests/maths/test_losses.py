@@ -14,6 +14,7 @@ spatial = jax.jit(losses.spatial)
 temporal = jax.jit(losses.temporal)
 gradient = jax.jit(losses.gradient, static_argnames="operator")
 occlusion = jax.jit(losses.occlusion, static_argnames="weights")
+pyramid = jax.jit(losses.pyramid, static_argnames="levels")
 
 
 def pair(rng: np.random.Generator, shape: tuple[int, ...] = SHAPE) -> tuple[np.ndarray, np.ndarray]:
@@ -134,6 +135,7 @@ CASES = {
     "spatial": spatial,
     "temporal": temporal,
     "difference": gradient,
+    "pyramid": lambda x, y: pyramid(x, y, levels=2),
     "hfen": lambda x, y: gradient(x, y, operator="hfen"),
     "occlusion": lambda x, y: occlusion(x, y, jnp.ones((*x.shape[:-1], 1), x.dtype)),
 }
@@ -199,6 +201,29 @@ def test_squares_of_the_unbiased_pair_seek_the_mean_of_noisy_targets_and_l1_does
         found[loss.__name__] = float(x)
     np.testing.assert_allclose(found["by_squares"], targets.mean(), rtol=0.01)
     np.testing.assert_allclose(found["by_l1"], np.median(targets), rtol=0.05)  # 0.69: a third too dark
+
+
+def test_pyramid_is_the_sum_of_its_bands(rng: np.random.Generator) -> None:
+    x, y = pair(rng, (2, 8, 12, 3))
+    error, wanted = x.astype(np.float64) - y, 0.0
+    for size in (2, 4):
+        means = error.reshape(2, 8 // size, size, 12 // size, size, 3).mean(axis=(2, 4))
+        above = error.reshape(2, 16 // size, size // 2, 24 // size, size // 2, 3).mean(axis=(2, 4))
+        wanted += np.abs(above - np.repeat(np.repeat(means, 2, 1), 2, 2)).mean()
+    wanted += np.abs(means).mean()
+    np.testing.assert_allclose(pyramid(x, y, levels=2), wanted, rtol=1e-5)
+    # 12 can be halved twice, and then it is odd.
+    np.testing.assert_allclose(pyramid(x, y, levels=9), wanted, rtol=1e-5)
+    np.testing.assert_allclose(pyramid(x[:, 1:], y[:, 1:], levels=3), spatial(x[:, 1:], y[:, 1:]), rtol=1e-5)
+
+
+def test_pyramid_seeks_nearly_the_mean_of_noisy_targets(rng: np.random.Generator) -> None:
+    """One value for all pixels, learned from targets whose median is a third below their mean."""
+    targets = rng.exponential(size=(8, 64, 64, 1)).astype(np.float32)
+    slope, x = jax.jit(jax.grad(lambda x: losses.pyramid(jnp.full(targets.shape, 1.0) * x, targets))), jnp.float32(0.5)
+    for _ in range(400):
+        x = x - 0.01 * slope(x)
+    np.testing.assert_allclose(x, targets.mean(), rtol=0.02)
 
 
 def test_the_unbiased_pair_is_the_compressed_pair_to_first_order(rng: np.random.Generator) -> None:

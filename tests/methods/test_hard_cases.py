@@ -14,7 +14,7 @@ from jaxdn import brdf, color, glints, losses, metrics, microfacets, motion, num
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.methods import table as methods_table
 from jaxdn.methods.table import method, methods
-from jaxdn.ops import kernels, softmax_filter, warp
+from jaxdn.ops import affinity_filter, kernels, softmax_filter, warp
 from jaxdn.ops.registry import implementations
 from jaxdn.recipe import Recipe
 from tests.hard_cases import __main__ as whole
@@ -37,7 +37,7 @@ LONG_TO_COMPILE = ("metrics.flip", "metrics.ssim", "losses.gradient, hfen")
 OPERATIONS = [one for one in operation_subjects() if not one.name.startswith(LONG_TO_COMPILE)]
 INNER = {
     *("targets", "check_taps", "offsets", "angles", "alpha_of", "cosine_and_sine"),
-    *("albedo_table", "ggx_albedo_table"),
+    *("albedo_table", "ggx_albedo_table", "affinity", "cells", "corners", "differentiable_mean"),
 }  # fmt: skip
 """Helpers of operations, which are tested through them, and tables that take no image."""
 PLAIN = [one for one in OPERATIONS if not one.name.endswith(", masked")]
@@ -82,7 +82,7 @@ def test_every_denoiser_and_every_public_operation_is_tested():
     tried = {subject.name.split(",")[0].split(".")[-1] for subject in operation_subjects()}
     modules = (
         *(brdf, color, glints, losses, metrics, microfacets, motion, numerics, scales),
-        *(kernels, softmax_filter, warp),
+        *(affinity_filter, kernels, softmax_filter, warp),
     )
     for module in modules:
         functions = inspect.getmembers(module, inspect.isfunction)
