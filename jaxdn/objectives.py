@@ -81,8 +81,10 @@ def pyramid_illumination(*, temporal: float = 1.0) -> Objective:
 
     def loss(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:
         denoised, wanted = losses.unbiased(images, clip.reference)
-        change = losses.pyramid(denoised[1:] - denoised[:-1], wanted[1:] - wanted[:-1])
-        return losses.pyramid(denoised, wanted) + temporal * change
+        total = losses.pyramid(denoised, wanted)
+        if images.shape[0] == 1:
+            return total
+        return total + temporal * losses.pyramid(denoised[1:] - denoised[:-1], wanted[1:] - wanted[:-1])
 
     return Objective(f"pyramid illumination, changes {temporal:g}", loss)
 

@@ -21,7 +21,7 @@ from jaxdn.commands.errors import plain_errors
 from jaxdn.commands.render import render
 from jaxdn.commands.train import train
 from jaxdn.methods.table import method_named
-from jaxdn.objectives import unbiased_illumination
+from jaxdn.objectives import Objective, unbiased_illumination
 from jaxdn.weights import SHIPPED, shipped_names
 
 FAMILIES = {"parlour": 90, "fruit": 14, "mobile": 14, "pinkroom": 14, "robot": 14}
@@ -39,15 +39,20 @@ class Stage(NamedTuple):
     """The stage to continue from."""
     decay: bool = True
     recipe: str = "usual"
+    objective: Objective | None = None
+    """Instead of the recipe's."""
 
+
+SQUARES = unbiased_illumination(squared_from=0.0)
+"""For stages whose start has had its L1, which would make images darker again."""
 
 STAGES = (
     Stage("steady-begun", "steady", {"quality": "balanced"}, 8000, decay=False),
     Stage("steady-balanced", "steady", {"quality": "balanced"}, 1000, start="steady-begun"),
     Stage("small-begun", "ntd", {"size": "small"}, 4000, decay=False),
-    Stage("ntd-small", "ntd", {"size": "small"}, 1000, start="small-begun"),
-    Stage("large-begun", "ntd", {"size": "large"}, 2000, start="small-begun", decay=False),
-    Stage("ntd-large", "ntd", {"size": "large"}, 1000, start="large-begun"),
+    Stage("ntd-small", "ntd", {"size": "small"}, 1000, start="small-begun", objective=SQUARES),
+    Stage("large-begun", "ntd", {"size": "large"}, 2000, start="small-begun", decay=False, objective=SQUARES),
+    Stage("ntd-large", "ntd", {"size": "large"}, 1000, start="large-begun", objective=SQUARES),
     Stage("A", "ntd", {"size": "small", "motion": "traditional"}, 500, recipe="without-occlusion"),
     Stage("B", "ntd", {"size": "small", "motion": "dual"}, 500, recipe="without-occlusion"),
     Stage("C", "ntd", {"size": "small", "motion": "dual"}, 500),
@@ -105,8 +110,8 @@ def train_stage(stage: Stage, settings: Settings) -> Path:
     recipe = method.recipe_named(stage.recipe)._replace(
         steps=stage.steps, decay=stage.decay, average=0.99, spp=(1, 1, 1, 2, 4, 16)
     )
-    if stage.start:  # has had its L1, which would make its images darker again
-        recipe = recipe._replace(objective=unbiased_illumination(squared_from=0.0))
+    if stage.objective is not None:
+        recipe = recipe._replace(objective=stage.objective)
     return train(
         method,
         recipe,

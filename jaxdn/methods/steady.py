@@ -30,7 +30,7 @@ from jaxdn.methods.demodulated import Demodulation, demodulated
 from jaxdn.methods.ntd import depth_feature
 from jaxdn.methods.table import method
 from jaxdn.networks import Widths, crop, pad
-from jaxdn.objectives import unbiased_illumination
+from jaxdn.objectives import pyramid_illumination
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
 from jaxdn.options import Range
 from jaxdn.recipe import Recipe
@@ -122,7 +122,7 @@ class _Decisions(NamedTuple):
 @method(
     Options,
     title="A steady recurrent filter guided by a network at half resolution",
-    recipes={"usual": Recipe(unbiased_illumination())},
+    recipes={"usual": Recipe(pyramid_illumination())},
     variants={f"steady-{quality}": {"quality": quality} for quality in QUALITIES},
     engines=("onnxruntime", "onednn"),
 )

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxdn import losses
 from jaxdn.frame import Clip, Frame
 from jaxdn.methods.table import methods
-from jaxdn.objectives import disocclusions, indirect_illumination
+from jaxdn.objectives import disocclusions, indirect_illumination, pyramid_illumination
 
 SHAPE = (5, 6, 7)
 OBJECTIVE = indirect_illumination()
@@ -107,6 +108,22 @@ def test_both_halves_of_training_are_one_program(images, clip):
     for progress in (0.0, 0.25, 0.5, 1.0):
         loss(images, clip, jnp.asarray(progress))
     assert loss._cache_size() == 1
+
+
+def test_pyramid_illumination_is_the_pyramid_of_frames_and_of_their_changes(images, clip):
+    denoised, wanted = losses.unbiased(images, clip.reference)
+    frames, changes = (
+        losses.pyramid(denoised, wanted),
+        losses.pyramid(jnp.diff(denoised, axis=0), jnp.diff(wanted, axis=0)),
+    )
+    found = pyramid_illumination(temporal=0.5).loss(images, clip, jnp.asarray(0.0))
+    np.testing.assert_allclose(found, frames + 0.5 * changes, rtol=1e-6)
+    one = jax.tree.map(lambda buffer: buffer[:1], clip)
+    np.testing.assert_allclose(
+        pyramid_illumination().loss(images[:1], one, jnp.asarray(0.0)),
+        losses.pyramid(denoised[:1], wanted[:1]),
+        rtol=1e-6,
+    )
 
 
 @pytest.mark.parametrize("name", [name for name, method in methods().items() if method.learns])
