@@ -21,8 +21,10 @@ def downsample(image: jax.Array, *, down: str = "mean") -> jax.Array:
 
 
 def fold(image: jax.Array) -> jax.Array:
-    """[H, W, C] -> [H/2, W/2, 4C]: the pixels of each 2x2 block side by side, channel by channel. Odd sizes raise
-    ValueError."""
+    """[H, W, C] -> [H/2, W/2, 4C]: the pixels of each 2x2 block side by side, channel by channel.
+
+    Odd sizes raise ValueError.
+    """
     check_image(image, "image")
     height, width, channels = image.shape
     _check_even(height, width, "image")

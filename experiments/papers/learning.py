@@ -12,13 +12,13 @@ import itertools
 import json
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import tyro
 
-from experiments.papers.other_clips import every_other, half_reference, without_draws
+from experiments.papers.other_clips import every_other, half_reference, three_of_four, without_draws
 from jaxdn.candidates import candidate
 from jaxdn.clips import find_clips
 from jaxdn.commands.compare import compare
@@ -48,6 +48,8 @@ class Settings:
     crop: int = 64
     batch: int = 4
     frames: int = 10
+    rows: list[str] = field(default_factory=list)
+    """Names of the rows to train; default: all."""
     out: Path = Path("runs/learning")
     """Folder for the runs and the report."""
 
@@ -99,6 +101,7 @@ BRANCHES = (
         on=_LAST,
     ),
     Row("half the clips", on=_LAST, clips=every_other),
+    Row("three quarters of the clips", on=_LAST, clips=three_of_four),
     Row("half the samples in references", recipe={"spp": (1, 1, 1, 2, 4)}, on=_LAST, clips=half_reference),
     Row("windows of half as many frames", on=_LAST, batch=(2.0, 1.0, 0.5)),
     Row("smaller crops", on=_LAST, batch=(2.0, 2 / 3, 1.0)),
@@ -152,9 +155,11 @@ def folder_name(label: str) -> str:
 
 
 def main(settings: Settings) -> None:
-    """Train, compare, report."""
-    contestants = []
-    for row, options, recipe in rows().values():
+    """Train, compare, report. Raises ValueError for an unknown row."""
+    contestants, every = [], rows()
+    if unknown := [name for name in settings.rows if name not in every]:
+        raise ValueError(f"--rows: expected some of {', '.join(every)}; got {', '.join(unknown)}.")
+    for row, options, recipe in [every[name] for name in settings.rows or every]:
         weights = train_row(settings, row, options, recipe)
         contestants.append(candidate(str(weights))._replace(label=row.name))
     for place in (settings.validation, settings.tests):
@@ -168,12 +173,12 @@ def table(results: Results, runs: Path) -> str:
     """One line per row: seconds of training, PSNR and its gain over the row that it changes, temporal PSNR, FLIP."""
     means = mean_scores(results)
     before = {new.name: old.name for old, new in itertools.pairwise(LADDER)} | {row.name: row.on for row in BRANCHES}
-    field, lines = headline_psnr([clip.scores for clip in results.clips]), [results.title]
+    score, lines = headline_psnr([clip.scores for clip in results.clips]), [results.title]
     for label in results.methods:
         seconds = json.loads((runs / folder_name(label) / "seconds.json").read_text())
         one = means[label]
-        psnr = getattr(one, field)
-        gain = f"{psnr - getattr(means[before[label]], field):+6.2f}" if label in before else ""
+        psnr = getattr(one, score)
+        gain = f"{psnr - getattr(means[before[label]], score):+6.2f}" if before.get(label) in means else ""
         lines.append(
             f"{label:50} {seconds:6.0f} s  {psnr:6.2f} dB {gain:6}  temporal "
             f"{one.unbiased_temporal_psnr:6.2f}  FLIP {one.flip:.3f}"

@@ -37,7 +37,21 @@ def half_reference(clips: Path, out: Path) -> None:
 
 def every_other(clips: Path, out: Path) -> None:
     """Half of the clips, every second in the order of their names."""
-    for clip in find_clips(clips)[::2]:
+    _some(find_clips(clips)[::2], out)
+
+
+def three_of_four(clips: Path, out: Path) -> None:
+    """Three quarters of the clips.
+
+    With references of 32 samples they take as much rendering time as all of them with 16: a room's clip (128 x 128
+    pixels, 10 frames, six draws, two of them measured) took 1.27 times as many seconds of a core with 32 as with 16, a
+    parlour's 1.45 times.
+    """
+    _some([clip for index, clip in enumerate(find_clips(clips)) if index % 4], out)
+
+
+def _some(clips: list[Path], out: Path) -> None:
+    for clip in clips:
         shutil.copytree(clip, out / clip.name, dirs_exist_ok=True)
 
 

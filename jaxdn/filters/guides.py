@@ -55,6 +55,20 @@ def hit_mask(depth: jax.Array | None, ids: jax.Array | None) -> jax.Array | None
     return None if not known else known[0] if len(known) == 1 else known[0] & known[1]
 
 
+def depth_feature(depth: jax.Array, *, scale: str = "geometric") -> jax.Array:
+    """Depth as ``z / (z + g)`` in [0, 1); g is the geometric mean over surfaces, or 1 with ``"unit"``.
+
+    ``depth`` [H, W, 1] >= 0; 0 (the neutral value) gives 0. The geometric mean makes the feature independent of
+    the scene's unit of length.
+    """
+    if scale == "unit":
+        return depth / (depth + 1.0)
+    known = (depth > 0) & (depth < FAR)
+    logarithms = jnp.where(known, jnp.log(jnp.where(known, depth, 1.0)), 0.0)
+    middle = jnp.exp(jnp.sum(logarithms) / jnp.maximum(jnp.sum(known, dtype=depth.dtype), 1.0))
+    return depth / (depth + middle)
+
+
 def cosine(first: jax.Array, second: jax.Array) -> jax.Array:
     """[..., 3] normals -> [...] cosine, where the zero normal of *no surface* is orthogonal to all except itself."""
     both_absent = jnp.all(first == 0, axis=-1) & jnp.all(second == 0, axis=-1)

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 
 from jaxdn import color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.filters.guides import hit_mask
-from jaxdn.frame import FAR, RADIANCE_MAX, Frame
+from jaxdn.filters.guides import depth_feature, hit_mask
+from jaxdn.frame import RADIANCE_MAX, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated
 from jaxdn.methods.table import method
 from jaxdn.motion import on_screen
@@ -60,7 +60,7 @@ class Options:
     domain: Literal["linear", "compressed"] = "linear"
     """Kernels filter radiance, or compressed radiance (robust to fireflies, but it darkens)."""
     depth_scale: Literal["geometric", "unit"] = "geometric"
-    """Scaling of the depth feature, see :func:`depth_feature`."""
+    """Scaling of the depth feature, see :func:`jaxdn.filters.guides.depth_feature`."""
     border: Literal["clamp", "zeros"] = "clamp"
     """Border of the warp."""
     first_frame: Literal["none", "noisy"] = "none"
@@ -106,20 +106,6 @@ PARITY = Options(
     demodulate="none",
 )
 """The exact paper settings: D is max-pooling (eq. 4), taps outside the image are 0, the first history is noisy."""
-
-
-def depth_feature(depth: jax.Array, *, scale: str = "geometric") -> jax.Array:
-    """Depth as ``z / (z + g)`` in [0, 1); g is the geometric mean over surfaces, or 1 with ``"unit"``.
-
-    ``depth`` [H, W, 1] >= 0; 0 (the neutral value) gives 0. The geometric mean makes the feature independent of
-    the scene's unit of length.
-    """
-    if scale == "unit":
-        return depth / (depth + 1.0)
-    known = (depth > 0) & (depth < FAR)
-    logarithms = jnp.where(known, jnp.log(jnp.where(known, depth, 1.0)), 0.0)
-    middle = jnp.exp(jnp.sum(logarithms) / jnp.maximum(jnp.sum(known, dtype=depth.dtype), 1.0))
-    return depth / (depth + middle)
 
 
 def initial_precisions(guides: Literal["geometry", "materials"]) -> Params:

@@ -23,11 +23,10 @@ import numpy as np
 from jaxdn import color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.enlarge import enlarge
-from jaxdn.filters.guides import Guides, depth_slopes, guides_of, hit_mask
+from jaxdn.filters.guides import Guides, depth_feature, depth_slopes, guides_of, hit_mask
 from jaxdn.filters.recall import recall
 from jaxdn.frame import FAR, RADIANCE_MAX, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated
-from jaxdn.methods.ntd import depth_feature
 from jaxdn.methods.table import method
 from jaxdn.networks import Widths, crop, pad
 from jaxdn.objectives import pyramid_illumination
@@ -242,8 +241,8 @@ def _accumulated(
     """The running mean of the radiance and of its luminance's square, and their effective number of samples.
 
     In the mean of N frames and a new one, the new one has the weight 1 / (N + 1); ``follow`` = 1/2 keeps that, and
-    its logit is added to that of the weight.
-    With weights 1 - a and a, the variance is ``(1 - a)^2 / N + a^2`` of a frame's: the effective number is its inverse.
+    its logit is added to that of the weight. With weights 1 - a and a, the variance is ``(1 - a)^2 / N + a^2`` of a
+    frame's: the effective number is its inverse.
     """
     # The odds of 1 / (N + 1) are 1 to N.
     share = jnp.where(past.valid, follow / (follow + jnp.maximum(past.number, 1e-6) * (1.0 - follow)), 1.0)

@@ -130,17 +130,17 @@ def differentiable_mean(
     return mean
 
 
-_Cells = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+_Residuals = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 
 
 def _mean_forward(
     mean: jax.Array, image: jax.Array, top: jax.Array, left: jax.Array, weights: jax.Array
-) -> tuple[jax.Array, _Cells]:
+) -> tuple[jax.Array, _Residuals]:
     # An empty slice carries the image's shape and dtype through a scan at no cost.
     return mean, (image[:, :, :, None][..., :0], top, left, weights)
 
 
-def _mean_backward(residuals: _Cells, cotangent: jax.Array) -> tuple[None, jax.Array, None, None, None]:
+def _mean_backward(residuals: _Residuals, cotangent: jax.Array) -> tuple[None, jax.Array, None, None, None]:
     shape, top, left, weights = residuals
     blocks = weights[..., None] * cotangent[..., None, :]
     return None, _scattered(shape.shape[:3], top, left, blocks).astype(shape.dtype), None, None, None

@@ -10,8 +10,9 @@ import pytest
 
 from jaxdn import brdf
 from jaxdn.denoiser import Denoiser, Recurrent
+from jaxdn.filters.guides import depth_feature
 from jaxdn.frame import FAR, Frame, frame_at
-from jaxdn.methods.ntd import depth_feature, guided_features, ntd
+from jaxdn.methods.ntd import guided_features, ntd
 from jaxdn.rollout import unroll
 
 pytestmark = pytest.mark.usefixtures("plain_programs")

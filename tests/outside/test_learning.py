@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.papers.learning import BRANCHES, LADDER, rows
-from experiments.papers.other_clips import every_other, half_reference, without_draws
+from experiments.papers.learning import BRANCHES, LADDER, Settings, main, rows
+from experiments.papers.other_clips import every_other, half_reference, three_of_four, without_draws
 from experiments.papers.weights import STAGES
 from jaxdn import clips
 from jaxdn.clips.cache import open_cached
@@ -64,3 +64,10 @@ def test_clips_in_another_form(folder: Path, tmp_path: Path):
     np.testing.assert_allclose(clips.read_clip(half.path).reference, 0.1, rtol=1e-3)
     every_other(folder, tmp_path / "fewer")
     assert [clip.name for clip in clips.find_clips(tmp_path / "fewer")] == ["room-0", "room-2"]
+    three_of_four(folder, tmp_path / "most")
+    assert [clip.name for clip in clips.find_clips(tmp_path / "most")] == ["room-1", "room-2"]
+
+
+def test_unknown_rows_are_named(folder: Path):
+    with pytest.raises(ValueError, match="--rows: expected some of .*guided kernels.*; got guided kernel"):
+        main(Settings(folder, folder, folder, rows=["guided kernel"]))

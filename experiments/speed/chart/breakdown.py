@@ -15,8 +15,9 @@ from experiments.speed.works import steps
 from jaxdn import brdf, color
 from jaxdn.candidates import Candidate
 from jaxdn.denoiser import Denoiser, Params
+from jaxdn.filters.guides import depth_feature
 from jaxdn.frame import FAR, Frame
-from jaxdn.methods.ntd import TAPS, depth_feature, guided_features
+from jaxdn.methods.ntd import TAPS, guided_features
 from jaxdn.motion import on_screen
 from jaxdn.networks import MULTIPLE, Widths
 from jaxdn.networks.engines import ENGINES
