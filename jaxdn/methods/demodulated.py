@@ -33,9 +33,7 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "brdf") -> Deno
     the denoiser. Raises ValueError for another ``by``, and for a denoiser that :func:`jaxdn.denoiser.recurrent` did not
     make, because invalid values have to be repaired before the division.
     """
-    if isinstance(by, bool):  # as it was before there were three choices
-        by = "albedo" if by else "none"
-    check_option(by, "by", ("brdf", "albedo", "none"))
+    by = _chosen(by)
     if by == "none":
         return denoiser
     if not isinstance(denoiser.step, RecurrentStep):
@@ -59,6 +57,26 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "brdf") -> Deno
     return recurrent(Core(start, step, core.reads | reads, core.init, requests))
 
 
+def texture_left(frame: Frame, by: Demodulation | bool) -> jax.Array | None:
+    """The texture [H, W, 3] that the division leaves in a frame inside :func:`demodulated`; None if it leaves none.
+
+    A filter that averages it with the weights of the light can give it back (:func:`jaxdn.brdf.restore`). If the
+    reflectance is the albedo everywhere, nothing tells that the albedo is all that is reflected: only its colours are
+    to be given back then (:func:`jaxdn.brdf.hue_left`; on frames of metal and gloss without a reflectance, giving
+    back brightness too costs svgf 1.4 dB). ``by="albedo"`` leaves the textures of black pixels alone, as it was.
+    """
+    reflectance = _reflectance(frame)
+    if _chosen(by) != "brdf" or reflectance is None:
+        return None
+    texture = brdf.texture_left(reflectance, brdf.divisor(reflectance))
+    if frame.albedo is None:
+        return texture
+    colours = brdf.hue_left(texture)
+    if frame.reflectance is None:
+        return colours
+    return jnp.where(jnp.any(frame.reflectance != frame.albedo), texture, colours)
+
+
 def _divided(frame: Frame, by: Demodulation) -> tuple[Frame, jax.Array | None]:
     """The frame with demodulated radiance, and the divisor."""
     divisor = _divisor(frame, by)
@@ -69,7 +87,18 @@ def _divided(frame: Frame, by: Demodulation) -> tuple[Frame, jax.Array | None]:
 
 def _divisor(frame: Frame, by: Demodulation) -> jax.Array | None:
     if by == "brdf":
-        # The albedo is the reflectance's neutral value: the same function of either.
-        reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
+        reflectance = _reflectance(frame)
         return None if reflectance is None else brdf.divisor(reflectance)
     return None if frame.albedo is None else jnp.where(frame.albedo > SMALLEST_ALBEDO, frame.albedo, 1.0)
+
+
+def _reflectance(frame: Frame) -> jax.Array | None:
+    # The albedo is the reflectance's neutral value: the same function of either.
+    return frame.albedo if frame.reflectance is None else frame.reflectance
+
+
+def _chosen(by: Demodulation | bool) -> Demodulation:
+    if isinstance(by, bool):  # as it was before there were three choices
+        return "albedo" if by else "none"
+    check_option(by, "by", ("brdf", "albedo", "none"))
+    return by

@@ -20,13 +20,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn import color
+from jaxdn import brdf, color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.enlarge import enlarge
 from jaxdn.filters.guides import Guides, depth_feature, depth_slopes, guides_of, hit_mask
 from jaxdn.filters.recall import recall
 from jaxdn.frame import FAR, RADIANCE_MAX, Frame
-from jaxdn.methods.demodulated import Demodulation, demodulated
+from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
 from jaxdn.methods.table import method
 from jaxdn.networks import Widths, crop, pad
 from jaxdn.objectives import pyramid_illumination
@@ -165,7 +165,9 @@ def steady(options: Options) -> Denoiser:
         groups = [group[None] for group in _seen(noisy, past, surfaces)]
         decided = _decisions(network.apply(weights, groups)[0][0])
         mean, square, number = _accumulated(noisy, past, decided.shares["follow"], options.history_max)
-        fine, image = _filtered(params["guide"], mean, surfaces, decided)
+        texture = texture_left(frame, options.demodulate)
+        texture = None if texture is None else fill(pad(texture, MULTIPLE), surfaces.hit)
+        fine, image = _filtered(params["guide"], mean, texture, surfaces, decided)
         newest = jnp.where(past.valid, decided.shares["blend"], 1.0)
         shown = jnp.clip(past.shown + newest * (image - past.shown), 0.0, RADIANCE_MAX)
         kept = mean + decided.shares["feedback"] * (fine - mean)
@@ -255,11 +257,12 @@ def _accumulated(
 
 
 def _filtered(
-    guide: dict[str, Any], mean: jax.Array, surfaces: _Surfaces, decided: _Decisions
+    guide: dict[str, Any], mean: jax.Array, texture: jax.Array | None, surfaces: _Surfaces, decided: _Decisions
 ) -> tuple[jax.Array, jax.Array]:
     """The mean after the levels at full resolution, and after all levels.
 
-    The image of the levels at half resolution is enlarged along the guides, and takes a share of every pixel.
+    The image of the levels at half resolution is enlarged along the guides, and takes a share of every pixel. The
+    texture that the division left is filtered likewise, and given back (:func:`jaxdn.brdf.restore`).
     """
     scales = {name: jnp.exp(0.5 * logarithm) for name, logarithm in guide.items()}
 
@@ -270,7 +273,7 @@ def _filtered(
 
     slanted = jnp.zeros_like(_planar(mean)) if surfaces.depth is None else _planar(_slanted(surfaces.depth))
     at_full = guided(surfaces, slanted, 0, decided.features, decided.shares["trust"])
-    fine = _planar(mean)
+    fine = _planar(mean if texture is None else jnp.concatenate([mean, texture], axis=-1))
     for index in range(FULL_LEVELS):
         fine = affinity_filter(fine, at_full, step=2**index)
     fine = fine.transpose(1, 2, 0)
@@ -289,6 +292,9 @@ def _filtered(
     enlarged, weight = enlarge(_planar(coarse), there, at_full)
     share = decided.shares["coarse"] * (weight / (weight + _LIKENESS))[..., None]
     image = fine + share * (enlarged.transpose(1, 2, 0) - fine)
+    if texture is None:
+        return fine, image
+    fine, image = (brdf.restore(light[..., :3], texture, light[..., 3:]) for light in (fine, image))
     return fine, image
 
 

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxdn import brdf
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.accumulation import accumulate, luminance
 from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
@@ -28,7 +29,7 @@ from jaxdn.filters.reprojection import expected, reproject, same_surface
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.filters.weights import Weight, depth_weight, luminance_weight, normal_weight
 from jaxdn.frame import Frame
-from jaxdn.methods.demodulated import Demodulation, demodulated
+from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
 from jaxdn.methods.table import method
 from jaxdn.options import Range
 
@@ -123,7 +124,9 @@ def svgf(options: Options) -> Denoiser:
             weights.append(normal_weight(frame.normal, sigma=options.sigma_normal))
         color, variance = estimate_variance(history, hit, weights, short_history=options.short_history)
         feedback = color if options.feedback_level else history[:3]
-        image, feedback = _filter(options, color, variance, feedback, hit, weights)
+        texture = texture_left(frame, options.demodulate)
+        texture = None if texture is None else texture.transpose(2, 0, 1)
+        image, feedback = _filter(options, color, variance, feedback, texture, hit, weights)
         image = image.transpose(1, 2, 0)
         if hit is not None:
             image = jnp.where(hit[..., None], image, frame.radiance)
@@ -155,6 +158,7 @@ def _filter(
     color: jax.Array,
     variance: jax.Array,
     feedback: jax.Array,
+    texture: jax.Array | None,
     hit: jax.Array | None,
     weights: list[Weight],
 ) -> tuple[jax.Array, jax.Array]:
@@ -165,6 +169,7 @@ def _filter(
       color: [3, H, W].
       variance: [H, W] of its luminance.
       feedback: [3, H, W] the colour history if no level replaces it.
+      texture: [3, H, W] what the division left, filtered with the colour and given back (:func:`brdf.restore`).
       hit: [H, W] bool, a surface is seen; None: everywhere.
       weights: edge-stopping weights, without that of luminance.
     """
@@ -173,14 +178,19 @@ def _filter(
     def filter_level(carry: _Planes, level: jax.Array) -> tuple[_Planes, None]:
         color, variance, feedback = carry
         deviation = jnp.sqrt(jnp.maximum(blur_variance(variance), 1e-10))
-        light = luminance_weight(luminance(color), deviation, sigma=options.sigma_luminance)
+        light = luminance_weight(luminance(color[:3]), deviation, sigma=options.sigma_luminance)
         color, spread = edge_average(
             color, hit, [*weights, light], _TAPS, step=2**level, step_max=2 ** (levels - 1), variance=variance
         )
         assert spread is not None
         return (color, spread, jnp.where(level + 1 == options.feedback_level, color, feedback)), None
 
+    if texture is not None:
+        color, feedback = (jnp.concatenate([light, texture]) for light in (color, feedback))
     if levels:
         carry = (color, variance, feedback)
         (color, _, feedback), _ = lax.scan(filter_level, carry, jnp.arange(levels, dtype=jnp.int32))
-    return color, feedback
+    if texture is None:
+        return color, feedback
+    image, kept = (brdf.restore(light[:3], texture, light[3:]) for light in (color, feedback))
+    return image, kept

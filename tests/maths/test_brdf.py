@@ -155,3 +155,38 @@ def test_wrong_shapes_raise():
         brdf.directional_albedo(color, color, one, one, lobe="phong")
     with pytest.raises(ValueError, match="same size"):
         brdf.demodulate(color, color[:1])
+
+
+def test_what_a_division_leaves():
+    reflectance = np.float32([0.0, 0.002, 0.05, 0.15, 0.4, 1.0])
+    divisor = ((reflectance.astype(np.float64) ** 4 + 0.15**4) / (1 + 0.15**4)) ** 0.25
+    left = brdf.texture_left(jnp.asarray(reflectance), brdf.divisor(jnp.asarray(reflectance)))
+    np.testing.assert_allclose(left, np.minimum(reflectance / divisor, 1.0), rtol=1e-6)
+
+
+def test_the_hue_of_what_is_left():
+    texture = np.float32([[1.0, 0.0, 0.5], [0.02, 0.02, 0.02], [0.0, 0.0, 0.0], [0.01, 0.02, 0.0]])
+    hue = brdf.hue_left(jnp.asarray(texture))
+    np.testing.assert_allclose(hue, (texture + 0.1) / (texture.max(-1, keepdims=True) + 0.1), rtol=1e-6)
+    np.testing.assert_array_equal(hue[2], 1.0)
+
+
+def test_a_blurred_texture_is_restored(rng):
+    """Light times texture, averaged with any weights: the ratio of the means gives the light again."""
+    texture, weights = rng.uniform(0.2, 1.0, (1, 8, 3)), rng.random((1, 8, 1))
+    mean, mean_texture = ((weights * one).sum(1, keepdims=True) / weights.sum() for one in (3.0 * texture, texture))
+    restored = brdf.restore(jnp.asarray(mean), jnp.asarray(texture), jnp.asarray(mean_texture))
+    np.testing.assert_allclose(restored, mean * (texture + 0.01) / (mean_texture + 0.01), rtol=1e-6)
+    np.testing.assert_allclose(restored, 3.0 * texture, rtol=0.1)
+    even = jnp.full((1, 8, 3), 0.013)
+    np.testing.assert_allclose(brdf.restore(3.0 * even, even, even), 3.0 * even, rtol=1e-6)
+
+
+def test_restored_light_is_bounded_where_no_reflectance_explains_it():
+    restored = brdf.restore(jnp.full((1, 1, 3), 7.0), jnp.ones((1, 1, 3)), jnp.zeros((1, 1, 3)))
+    np.testing.assert_allclose(restored, 7.0 * 101.0, rtol=1e-5)
+
+
+def test_gradients_of_restored_light(x64, rng):
+    check_grads(brdf.restore, tuple(rng.uniform(0.1, 1.0, (2, 3, 3)) for _ in range(3)), order=1, modes=["rev"])
+    check_grads(brdf.hue_left, (rng.uniform(0.1, 1.0, (2, 3, 3)),), order=1, modes=["rev"])

@@ -150,18 +150,20 @@ def reference_step(past, frame, levels=3):
             length = min(fetched[5] + 1, 32)
             share = max(0.2, 1 / length)
             history[p] = [*((1 - share) * fetched[:5] + share * now), length]
-    color = history[..., :3].copy()
+    left = np.minimum(frame.albedo / divisor, 1.0)
+    left = (left + 0.1) / (left.max(-1, keepdims=True) + 0.1)
+    color = np.concatenate([history[..., :3], left], axis=-1)
     variance = np.maximum(history[..., 4] - history[..., 3] ** 2, 0)
     seven = [(dy, dx, 1.0) for dy in range(-3, 4) for dx in range(-3, 4)]
     for p in np.ndindex(HEIGHT, WIDTH):
         if history[p][5] < 4 and hit[p]:
             mean, _ = reference_average(history[..., :5], seven, p, geometry)
-            color[p], variance[p] = mean[:3], max(0, mean[4] - mean[3] ** 2) * 4 / history[p][5]
+            color[p][:3], variance[p] = mean[:3], max(0, mean[4] - mean[3] ** 2) * 4 / history[p][5]
     spline = np.array([1, 4, 6, 4, 1]) / 16
     taps = [(i - 2, j - 2, spline[i] * spline[j]) for i in range(5) for j in range(5)]
     for level in range(levels):
         guide = np.sqrt(np.maximum(reference_blur(variance), 1e-10))
-        levels_light = color @ LUMINANCE
+        levels_light = color[..., :3] @ LUMINANCE
         filtered, spread = color.copy(), variance.copy()
         for p in np.ndindex(HEIGHT, WIDTH):
             if hit[p]:
@@ -172,6 +174,7 @@ def reference_step(past, frame, levels=3):
         color, variance = filtered, spread
         if level == 0:
             feedback = color
+    color, feedback = (one[..., :3] * (left + 0.01) / (one[..., 3:] + 0.01) for one in (color, feedback))
     image = np.where(hit[..., None], color * divisor, frame.radiance)
     kept = np.concatenate([feedback, history[..., 3:]], axis=-1)
     return (kept, depth, frame.normal, ids), image, hit
@@ -210,6 +213,18 @@ def test_a_constant_image_stays(rng):
     for _ in range(3):
         state, image = STEP({}, state, frame)
         np.testing.assert_allclose(image, 0.37, rtol=1e-5)
+
+
+def test_colours_of_a_texture_do_not_run(rng):
+    """Even light on a checkerboard of purple, white and red: green does not flow from white to purple."""
+    frame = moving_frames(rng, 1)[0]
+    squares = np.float32([[0.26, 0.002, 0.36], [0.8, 0.8, 0.8], [0.5, 0.01, 0.02]])
+    albedo = squares[np.indices((HEIGHT, WIDTH)).sum(0) % 3]
+    frame = Frame(radiance=0.4 * albedo, albedo=albedo, reflectance=albedo + np.float32(1e-4))
+    state = DENOISER.start({}, frame)
+    for _ in range(3):
+        state, image = STEP({}, state, frame)
+    np.testing.assert_allclose(image, frame.radiance, atol=0.01)
 
 
 def test_static_history_counts_up_and_is_the_mean_while_it_does(rng):

@@ -69,5 +69,5 @@ def test_clips_in_another_form(folder: Path, tmp_path: Path):
 
 
 def test_unknown_rows_are_named(folder: Path):
-    with pytest.raises(ValueError, match="--rows: expected some of .*guided kernels.*; got guided kernel"):
+    with pytest.raises(ValueError, match=r"--rows: expected some of .*guided kernels.*; got guided kernel"):
         main(Settings(folder, folder, folder, rows=["guided kernel"]))
