@@ -86,8 +86,8 @@ def test_textures_and_silhouettes_stay(rng):
 
 def test_colours_of_a_texture_do_not_run(rng, key):
     """Even light on a checkerboard of purple, white and red: green does not flow from white to purple."""
-    squares = np.float32([[0.26, 0.002, 0.36], [0.8, 0.8, 0.8], [0.5, 0.01, 0.02]])
-    albedo = jnp.asarray(np.broadcast_to(squares[np.indices(SIZE).sum(0) % 3], (3, *SIZE, 3)))
+    squares = np.float32([[0.26, 0.002, 0.36], [0.8, 0.8, 0.8], [0.5, 0.01, 0.02], [0.4, 0.6, 0.5]])
+    albedo = jnp.asarray(np.broadcast_to(squares[np.indices(SIZE).sum(0) % 4], (3, *SIZE, 3)))
     frames = Frame(radiance=0.4 * albedo, albedo=albedo, reflectance=albedo + 1e-4)
     np.testing.assert_allclose(denoised(frames, key=key), frames.radiance, atol=0.01)
 

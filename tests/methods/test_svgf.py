@@ -218,8 +218,8 @@ def test_a_constant_image_stays(rng):
 def test_colours_of_a_texture_do_not_run(rng):
     """Even light on a checkerboard of purple, white and red: green does not flow from white to purple."""
     frame = moving_frames(rng, 1)[0]
-    squares = np.float32([[0.26, 0.002, 0.36], [0.8, 0.8, 0.8], [0.5, 0.01, 0.02]])
-    albedo = squares[np.indices((HEIGHT, WIDTH)).sum(0) % 3]
+    squares = np.float32([[0.26, 0.002, 0.36], [0.8, 0.8, 0.8], [0.5, 0.01, 0.02], [0.4, 0.6, 0.5]])
+    albedo = squares[np.indices((HEIGHT, WIDTH)).sum(0) % 4]
     frame = Frame(radiance=0.4 * albedo, albedo=albedo, reflectance=albedo + np.float32(1e-4))
     state = DENOISER.start({}, frame)
     for _ in range(3):
