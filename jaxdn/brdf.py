@@ -203,7 +203,7 @@ def hue_left(texture: jax.Array) -> jax.Array:
     """The colour [..., 3] of what is left of a texture, without its brightness: about 1 in its brightest channel.
 
     For albedos that may not be all that a surface reflects: metal and gloss, whose albedo is 0 or dark, give light all
-    the same, and to darken it would be wrong. ``(s + e) / (max s + e)``, e = 0.1: 1 for black.
+    the same, and to darken it would be wrong. ``(s + e) / (max s + e)``, e = 0.3: 1 for black.
     """
     return (texture + _FAINT) / (jnp.max(texture, axis=-1, keepdims=True) + _FAINT)
 
@@ -219,5 +219,5 @@ def restore(filtered: jax.Array, texture: jax.Array, filtered_texture: jax.Array
     return filtered * ((texture + _UNEXPLAINED) / (filtered_texture + _UNEXPLAINED))
 
 
-_FAINT, _UNEXPLAINED = 0.1, 0.01
+_FAINT, _UNEXPLAINED = 0.3, 0.01
 """Twice or half of either makes no difference of more than 0.03 dB to svgf (means of four to nine clips)."""

@@ -151,7 +151,7 @@ def reference_step(past, frame, levels=3):
             share = max(0.2, 1 / length)
             history[p] = [*((1 - share) * fetched[:5] + share * now), length]
     left = np.minimum(frame.albedo / divisor, 1.0)
-    left = (left + 0.1) / (left.max(-1, keepdims=True) + 0.1)
+    left = (left + 0.3) / (left.max(-1, keepdims=True) + 0.3)
     color = np.concatenate([history[..., :3], left], axis=-1)
     variance = np.maximum(history[..., 4] - history[..., 3] ** 2, 0)
     seven = [(dy, dx, 1.0) for dy in range(-3, 4) for dx in range(-3, 4)]
