@@ -38,7 +38,6 @@ LAYERS = {
     **dict.fromkeys(("cli", "commands"), 7),
 }
 OUTSIDE = {
-    "flax": {"networks"},
     "optax": {"learning"},
     "mitsuba": {"render"},
     "drjit": {"render"},

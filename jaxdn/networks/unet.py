@@ -1,30 +1,22 @@
-"""The U-Net that predicts kernels: five resolution levels, heads on the last three decoder levels.
-
-Flax NNX is used only inside this module. Its results are plain nested dicts of arrays and two pure functions, so that
-optimisers, checkpoints and users never see its types.
-
-Architecture (Zeng et al. 2021, sec. 4.3 and fig. 6, after Hasselgren et al. 2020): 3x3 convolutions, LeakyReLU, 2x2
-max-pooling down, nearest upsampling and skip concatenation up. The papers give no widths; :data:`LARGE` is our choice
-for "about 850,000 weights".
-"""
+"""The U-Net that predicts kernels, as plain nested dicts of arrays and two pure functions, and its engines."""
 
 import functools
+import itertools
 import math
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from flax import nnx
 
 from jaxdn.checks import check_option
 from jaxdn.denoiser import Params
-from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, onnx
+from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, description, onnx
+from jaxdn.networks.description import NEGATIVE_SLOPE, Description, evaluate
 from jaxdn.ops import onednn
 from jaxdn.ops.convolution import convolve
 from jaxdn.ops.registry import register, resolve
-
-NEGATIVE_SLOPE = 0.01
 
 
 class Network(NamedTuple):
@@ -36,110 +28,45 @@ class Network(NamedTuple):
     """(params, feature groups [N, H, W, c] or None) -> heads at full, half and quarter resolution."""
 
 
-Part = tuple[jax.Array, Sequence[slice] | None]
-"""An input of a convolution and the slices of the kernel's input channels that it consists of (None: all of them)."""
-
-
-class Convolver(NamedTuple):
-    """An implementation of the convolutions."""
+class Layers(NamedTuple):
+    """The layers in XLA (:class:`jaxdn.networks.description.Operations`), on arrays [N, H, W, C]."""
 
     convolve: Callable[[jax.Array, jax.Array], jax.Array]
+    """Of an image with a 3x3 kernel."""
     multiple: int
     """The number of output channels is padded to a multiple of this."""
 
-
-XLA = Convolver(convolve, 16)  # 51 outputs take XLA:CPU 1.4 times as long as 64
-ONEDNN = Convolver(functools.partial(convolve, implementation="onednn"), 1)
-
-
-class Convolution(nnx.Module):
-    """A 3x3 convolution with bias, zeros beyond the border; of size 1 a map of each pixel's channels."""
-
-    def __init__(self, inputs: int, outputs: int, size: Literal[1, 3] = 3) -> None:
-        self.kernel = nnx.Param(jnp.zeros((size, size, inputs, outputs), jnp.float32))
-        self.bias = nnx.Param(jnp.zeros((outputs,), jnp.float32))
-
-    def __call__(self, convolver: Convolver, *parts: Part) -> jax.Array:
-        kernel, dtype = self.kernel[...], parts[0][0].dtype
-        outputs = kernel.shape[-1]
-        if kernel.shape[0] == 1:
-            ((x, _),) = parts
-            return x @ kernel[0, 0].astype(dtype) + jnp.reshape(self.bias[...].astype(dtype), (1, 1, 1, -1))
-        kernel = jnp.pad(kernel, ((0, 0), (0, 0), (0, 0), (0, -outputs % convolver.multiple))).astype(dtype)
-
-        def share(used: Sequence[slice] | None) -> jax.Array:
-            return kernel if used is None else jnp.concatenate([kernel[:, :, channels] for channels in used], axis=2)
-
+    def convolution(self, inputs: Sequence[jax.Array], kernels: Sequence[jax.Array], bias: jax.Array) -> jax.Array:
+        dtype, outputs = inputs[0].dtype, bias.shape[0]
+        if kernels[0].shape[0] == 1:
+            parts = [x @ kernel[0, 0].astype(dtype) for x, kernel in zip(inputs, kernels, strict=True)]
+        else:
+            spare = ((0, 0), (0, 0), (0, 0), (0, -outputs % self.multiple))
+            padded = [jnp.pad(kernel, spare).astype(dtype) for kernel in kernels]
+            parts = [self.convolve(x, kernel) for x, kernel in zip(inputs, padded, strict=True)]
         # A sum of convolutions equals the convolution of the concatenated parts, and concatenating costs more.
-        total = functools.reduce(jnp.add, [convolver.convolve(x, share(used)) for x, used in parts])
-        return total[..., :outputs] + jnp.reshape(self.bias[...].astype(dtype), (1, 1, 1, -1))
+        total = functools.reduce(jnp.add, parts)
+        return total[..., :outputs] + jnp.reshape(bias.astype(dtype), (1, 1, 1, -1))
+
+    def rectifier(self, x: jax.Array) -> jax.Array:
+        return jnp.where(x >= 0, x, NEGATIVE_SLOPE * x)
+
+    def pool(self, x: jax.Array) -> jax.Array:
+        # Four strided views: 3.6 times as fast on XLA:CPU as reshape and reduce.
+        corners = [x[:, i::2, j::2] for i in (0, 1) for j in (0, 1)]
+        return jnp.maximum(jnp.maximum(corners[0], corners[1]), jnp.maximum(corners[2], corners[3]))
+
+    def enlarge(self, x: jax.Array) -> jax.Array:
+        n, height, width, channels = x.shape
+        blocks = jnp.broadcast_to(x[:, :, None, :, None, :], (n, height, 2, width, 2, channels))
+        return jnp.reshape(blocks, (n, 2 * height, 2 * width, channels))
 
 
-class Level(nnx.Module):
-    """The convolutions of one resolution level, each followed by a LeakyReLU."""
-
-    def __init__(self, inputs: int, widths: Sequence[int]) -> None:
-        self.count = len(widths)
-        for index, (before, after) in enumerate(zip((inputs, *widths), widths, strict=False)):
-            setattr(self, f"convolution_{index}", Convolution(before, after))
-
-    def __call__(self, convolver: Convolver, *parts: Part) -> jax.Array:
-        for index in range(self.count):
-            x = getattr(self, f"convolution_{index}")(convolver, *parts)
-            x = jnp.where(x >= 0, x, NEGATIVE_SLOPE * x)
-            parts = ((x, None),)
-        return x
+XLA = Layers(convolve, 16)  # 51 outputs take XLA:CPU 1.4 times as long as 64
+ONEDNN = Layers(functools.partial(convolve, implementation="onednn"), 1)
 
 
-def pool(x: jax.Array) -> jax.Array:
-    """The maximum of each 2x2 block: [N, H, W, C] -> [N, H/2, W/2, C]."""
-    # Four strided views: 3.6 times as fast on XLA:CPU as reshape and reduce.
-    corners = [x[:, i::2, j::2] for i in (0, 1) for j in (0, 1)]
-    return jnp.maximum(jnp.maximum(corners[0], corners[1]), jnp.maximum(corners[2], corners[3]))
-
-
-def enlarge(x: jax.Array) -> jax.Array:
-    """Repeat every pixel 2x2 times: [N, H, W, C] -> [N, 2H, 2W, C]."""
-    n, height, width, channels = x.shape
-    blocks = jnp.broadcast_to(x[:, :, None, :, None, :], (n, height, 2, width, 2, channels))
-    return jnp.reshape(blocks, (n, 2 * height, 2 * width, channels))
-
-
-class UNet(nnx.Module):
-    """Encoder, decoder and three heads; called with features and their slices of the first kernel."""
-
-    def __init__(self, inputs: int, heads: Sequence[int], widths: Widths, head_size: Literal[1, 3]) -> None:
-        self.heads = len(heads)
-        for level, channels in enumerate(widths):
-            setattr(self, f"encoder_{level}", Level(inputs, channels))
-            inputs = channels[-1]
-        for level in reversed(range(LEVELS - 1)):
-            setattr(self, f"decoder_{level}", Level(inputs + widths[level][-1], widths[level]))
-            inputs = widths[level][-1]
-        for level, outputs in enumerate(heads):
-            setattr(self, f"head_{level}", Convolution(widths[level][-1], outputs, head_size))
-
-    def __call__(
-        self, convolver: Convolver, features: jax.Array, used: Sequence[slice] | None
-    ) -> tuple[jax.Array, ...]:
-        part: Part = (features, used)
-        skips: list[jax.Array] = []
-        for level in range(LEVELS):
-            if level:
-                part = (pool(skips[-1]), None)
-            skips.append(getattr(self, f"encoder_{level}")(convolver, part))
-        x = skips.pop()
-        outputs: list[jax.Array] = []
-        for level in reversed(range(LEVELS - 1)):
-            below = x.shape[-1]
-            parts = (enlarge(x), [slice(0, below)]), (skips[level], [slice(below, None)])
-            x = getattr(self, f"decoder_{level}")(convolver, *parts)
-            if level < self.heads:
-                outputs.insert(0, getattr(self, f"head_{level}")(convolver, (x, None)))
-        return tuple(outputs)
-
-
-def initial(key: jax.Array, shapes: dict[str, Any], *, scheme: str) -> dict[str, Any]:
+def initial(key: jax.Array, network: Description, *, scheme: str) -> dict[str, Any]:
     """Kernels uniform within +-limit, biases zero.
 
     ``scheme``: with "he" the limit is ``sqrt(6 / fan_in)``, so that signals keep their size through the rectifiers (He
@@ -150,46 +77,43 @@ def initial(key: jax.Array, shapes: dict[str, Any], *, scheme: str) -> dict[str,
     All kernels are slices of one draw: with a generator for each, XLA takes twenty seconds to compile.
     """
     check_option(scheme, "initialization", ("he", "xavier"))
-    named, tree = jax.tree_util.tree_flatten_with_path(shapes)
-    leaves = [leaf for _, leaf in named]
-    draw = jax.random.uniform(
-        key, (sum(math.prod(leaf.shape) for leaf in leaves if leaf.ndim == 4),), jnp.float32, -1, 1
-    )
-    params, start = [], 0
-    for path, leaf in named:
-        if leaf.ndim < 4:
-            params.append(jnp.zeros(leaf.shape, leaf.dtype))
-            continue
-        size = math.prod(leaf.shape)
-        area, (inputs, outputs) = math.prod(leaf.shape[:2]), leaf.shape[2:]
-        head = jax.tree_util.keystr(path[:1]).startswith("['head_")
-        he = 0.1 * math.sqrt(3 / (area * inputs)) if head else math.sqrt(6 / (area * inputs))
+    shapes = sorted(network.kernels().items())
+    draw = jax.random.uniform(key, (sum(math.prod(shape) for _, shape in shapes),), jnp.float32, -1, 1)
+    params: dict[str, Any] = {}
+    start = 0
+    for name, shape in shapes:
+        area, inputs, outputs = shape[0] * shape[1], *shape[2:]
+        he = 0.1 * math.sqrt(3 / (area * inputs)) if name in network.outputs else math.sqrt(6 / (area * inputs))
         limit = he if scheme == "he" else math.sqrt(6 / (area * (inputs + outputs)))
-        params.append(limit * jnp.reshape(draw[start : start + size], leaf.shape))
-        start += size
-    return jax.tree.unflatten(tree, params)
+        end = start + math.prod(shape)
+        level, _, layer = name.rpartition("/")
+        place = params.setdefault(level, {}) if level else params
+        place[layer] = {"bias": jnp.zeros(outputs, jnp.float32), "kernel": limit * jnp.reshape(draw[start:end], shape)}
+        start = end
+    return params
+
+
+def by_xla(layers: Layers, network: Description) -> onnx.Apply:
+    """The network as XLA compiles it."""
+    return lambda weights, groups: evaluate(network, weights, jnp.concatenate(groups, axis=-1), layers)
 
 
 @register("unet", "reference")
-def reference(network: Callable[[Convolver], onnx.Apply], heads: int, used: Sequence[slice] | None) -> onnx.Apply:
-    """The network as XLA compiles it."""
-    return network(XLA)
+def reference(network: Description) -> onnx.Apply:
+    """XLA alone."""
+    return by_xla(XLA, network)
 
 
 @register("unet", "onednn", requires=onednn.check_available)
-def convolved_by_onednn(
-    network: Callable[[Convolver], onnx.Apply], heads: int, used: Sequence[slice] | None
-) -> onnx.Apply:
+def convolved_by_onednn(network: Description) -> onnx.Apply:
     """XLA with oneDNN's convolutions and their gradients: for training on CPUs."""
-    return network(ONEDNN)
+    return by_xla(ONEDNN, network)
 
 
 @register("unet", "onnxruntime", requires=onnx.check_available)
-def run_by_onnxruntime(
-    network: Callable[[Convolver], onnx.Apply], heads: int, used: Sequence[slice] | None
-) -> onnx.Apply:
+def run_by_onnxruntime(network: Description) -> onnx.Apply:
     """The whole network in ONNX Runtime, for inference; the gradient is XLA's."""
-    return onnx.engine(network(XLA), heads=heads, slope=NEGATIVE_SLOPE, used=used)
+    return onnx.engine(network, by_xla(XLA, network))
 
 
 def unet(
@@ -221,12 +145,11 @@ def unet(
             "see jaxdn.networks.unet.LARGE."
         )
 
-    abstract = nnx.eval_shape(lambda: UNet(sum(groups), heads, widths, head_size))
-    graph, state = nnx.split(abstract, nnx.Param, graph=False)
-    shapes = nnx.to_pure_dict(state)
+    def described(channels: int) -> Description:
+        return description.unet(channels, heads, widths=widths, head_size=head_size)
 
     def init(key: jax.Array) -> dict[str, Any]:
-        return initial(key, shapes, scheme=initialization)
+        return initial(key, described(sum(groups)), scheme=initialization)
 
     def apply(params: dict[str, Any], features: Sequence[jax.Array | None]) -> tuple[jax.Array, ...]:
         present = [group for group in features if group is not None]
@@ -240,17 +163,14 @@ def unet(
                 f"features: expected [N, H, W, c] or None with c = {tuple(groups)}, H and W multiples of {MULTIPLE}, "
                 f"got shapes {got}; pad by the edge and crop the result."
             )
-        used, start = [], 0
-        for channels, group in zip(groups, features, strict=True):
-            if group is not None:
-                used.append(slice(start, start + channels))
-            start += channels
-        parts = used if len(used) < len(groups) else None
-
-        def network(convolver: Convolver) -> onnx.Apply:
-            return lambda params, present: nnx.merge(graph, params)(convolver, jnp.concatenate(present, axis=-1), parts)
-
-        return run(network, len(heads), parts)(params, present)
+        network = described(sum(group.shape[-1] for group in present))
+        weights = {name: functools.reduce(operator.getitem, name.split("/"), params) for name in network.kernels()}
+        if len(present) < len(groups):
+            first = next(iter(weights))
+            parts = jnp.split(weights[first]["kernel"], list(itertools.accumulate(groups))[:-1], axis=2)
+            used = [part for part, group in zip(parts, features, strict=True) if group is not None]
+            weights[first] = {**weights[first], "kernel": jnp.concatenate(used, axis=2)}
+        return run(network)(weights, present)
 
     return Network(init, apply)
 
