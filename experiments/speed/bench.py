@@ -4,9 +4,10 @@
     python -m experiments.speed.bench --only steps     # one group
 
 Writes ``runs/bench.json``, a list of rows ``{"work", "implementation", "median_ms", "min_ms", "max_ms", "peak_mib",
-"against", "ratio"}`` with ``ratio`` = own median over that of ``against``, and prints a table. Compared programs are
-measured interleaved in one process. The peers are optional (`make bench` installs them); the rows of a missing one are
-left out with a message.
+"against", "ratio"}`` with ``ratio`` = own median over that of ``against``, and prints a table. Every implementation has
+a process of its own (:mod:`experiments.speed.workers`) and runs in turns with those that it is compared with. Large
+buffers are in huge pages only in the rows that say so. The peers are optional (`make bench` installs them); the rows of
+what is missing or fails are left out with a message.
 """
 
 import os
@@ -19,20 +20,22 @@ from pathlib import Path
 from typing import Any, Literal
 
 import jax
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from experiments.speed import peers, roofline
 from experiments.speed.roofline import Probe
-from experiments.speed.timing import Call, Timing, measure, peak_mib
+from experiments.speed.timing import Timing, summary
+from experiments.speed.workers import Team, WorkerError, apart
 from experiments.speed.works import Work, compilation, input_share, operations, steps, train_steps
 from jaxdn.commands.errors import plain_errors
 from jaxdn.files import write_json
 
 Row = dict[str, Any]
 
-BUDGET_S = {"steps": 180, "operations": 180, "train": 240, "input": 90, "compile": 60}
+BUDGET_S = {"steps": 180, "operations": 300, "train": 240, "input": 90, "compile": 60}
 """Seconds for each group, in the order in which they run: a workload starts only while its group has time left.
 Compiling in advance does not count; on two cores it takes about as long as all of this."""
 ONE_WORK_S = {"steps": 45, "operations": 6, "train": 60}
@@ -93,7 +96,7 @@ def compare(
     timings: Mapping[str, Timing],
     peaks: Mapping[str, float | None],
     others: Sequence[str],
-    ideal_ms: float,
+    ideal_ms: float | None,
 ) -> list[Row]:
     """Rows of one workload: everything compared with the roofline, and ours with each of the ``others``.
 
@@ -102,55 +105,57 @@ def compare(
       timings: name -> timing of every implementation.
       peaks: name -> memory in MiB.
       others: names of the peers.
-      ideal_ms: the roofline's time.
+      ideal_ms: the roofline's time; None if it is not known.
     """
     rows = []
     for name, timing in timings.items():
         for other in [] if name in others else others:
             rows.append(row(work, name, timing, peaks[name], other, timings[other].median_ms))
-        rows.append(row(work, name, timing, peaks[name], "roofline", ideal_ms))
+        if ideal_ms is not None:
+            rows.append(row(work, name, timing, peaks[name], "roofline", ideal_ms))
     return rows
 
 
-def run(work: Work, probe: Probe, *, budget_s: float, say: Callable[[str], None]) -> list[Row]:
-    """Build the programs of a workload, time them interleaved with the ceilings, then measure their peak memory."""
-    calls: dict[str, Call] = {}
-    for name, build in {**work.ours, **work.peers}.items():
-        try:
-            calls[name] = build()
-        except (ImportError, ValueError) as error:  # an engine that is not installed or cannot run here
-            say(f"{work.name}: {name} is left out: {error}")
-    ceilings = {"copy": probe.copy, "matrix product": probe.matmul}
-    timings = measure({**calls, **ceilings}, rounds=work.rounds, budget_s=budget_s)
-    reached = probe.ceilings(*(timings.pop(name).median_ms for name in ceilings))
-    first = ", ".join(f"{name} {timing.first_ms / 1e3:.1f} s" for name, timing in timings.items())
-    say(
-        f"{work.name}: first calls (with compilation): {first}; then {next(iter(timings.values())).rounds} rounds; "
-        f"{reached.copy_gb_s:.1f} GB/s copied, {reached.matmul_gflop_s:.0f} GFLOP/s in matrix products"
-    )
-    peaks = {name: peak_mib(work.alone.get(name, call)) for name, call in calls.items()}
-    others = [name for name in work.peers if name in calls]
-    return compare(work.name, timings, peaks, others, roofline.milliseconds(work.roofline, reached))
+def run(work: Work, probes: Mapping[str, Probe], *, budget_s: float, say: Callable[[str], None]) -> list[Row]:
+    """Time the implementations of a workload in turns with the ceilings, then measure their peak memory."""
+    with Team(work.name, say) as team:
+        builds = {**work.ours, **work.peers, **{name: probe.build for name, probe in probes.items()}}
+        first = team.start(builds, work.huge_pages)
+        samples = team.turns(rounds=work.rounds, budget_s=budget_s)
+        probed = {name: float(np.median(samples.pop(name))) for name in probes if name in samples}
+        timings = {name: summary(values, first[name]) for name, values in samples.items()}
+        peaks = {name: team.peak(name, work.alone.get(name)) for name in timings}
+    calls = ", ".join(f"{name} {timing.first_ms / 1e3:.1f} s" for name, timing in timings.items())
+    rounds = max((timing.rounds for timing in timings.values()), default=0)
+    say(f"{work.name}: first calls (with compilation): {calls}; then {rounds} rounds")
+    ideal_ms = None
+    if len(probed) == len(probes):
+        reached = roofline.ceilings(probes, probed)
+        ideal_ms = roofline.milliseconds(work.roofline, reached)
+        say(
+            f"{work.name}: {reached.copy_gb_s:.1f} GB/s copied, {reached.matmul_gflop_s:.0f} GFLOP/s in matrix products"
+        )
+    return compare(work.name, timings, peaks, [name for name in work.peers if name in timings], ideal_ms)
 
 
 def compile_rows(
-    program: str, cache: Path, taken: dict[compilation.Program, float | None], *, say: Callable[[str], None]
+    program: str, cache: Path, taken: dict[compilation.Program, compilation.Seconds], *, say: Callable[[str], None]
 ) -> list[Row]:
     """Compile time of one program: cold (from ``taken`` or measured now), from the cache, and PyTorch's."""
-    work, seconds = f"compile-{program}", {}
-    compilers = ["xla"] if "torch-compiled" in peers.missing() else ["xla", "torch"]
-    for pair in [(compiler, program) for compiler in compilers]:
+    work = f"compile-{program}"
+    compilers = {"xla-cold": "xla"} | ({} if "torch-compiled" in peers.missing() else {"torch-compiled": "torch"})
+    for pair in [(compiler, program) for compiler in compilers.values()]:
         if pair not in taken:
             taken[pair] = compilation.compile_seconds(*pair, cache, limit_s=COMPILE_S)
-    seconds["xla-cold"], seconds["torch-compiled"] = (taken.get((compiler, program)) for compiler in ("xla", "torch"))
-    if seconds["xla-cold"] is not None:
+    seconds = {name: taken[compiler, program] for name, compiler in compilers.items()}
+    if isinstance(seconds["xla-cold"], float):
         seconds["xla-cached"] = compilation.compile_seconds("xla", program, cache, limit_s=COMPILE_S)
     timings = {}
     for name, value in seconds.items():
-        if value is not None:
-            timings[name] = Timing(1e3 * value, 1e3 * value, 1e3 * value, 1e3 * value, 1)
-        elif name.split("-")[0] in compilers:
-            say(f"{work}: {name} did not finish within {COMPILE_S} s; its rows are left out")
+        if isinstance(value, str):
+            say(f"{work}: {name} is left out: {value}")
+        else:
+            timings[name] = summary([1e3 * value], 1e3 * value)
     pairs = (("xla-cold", "torch-compiled"), ("xla-cached", "xla-cold"), ("torch-compiled", "xla-cold"))
     return [
         row(work, name, timings[name], None, against, timings[against].median_ms)
@@ -159,9 +164,13 @@ def compile_rows(
     ]
 
 
-def input_rows() -> list[Row]:
+def input_rows(say: Callable[[str], None]) -> list[Row]:
     """The share of time that training waits for a batch, and the total cost of the input."""
-    timings = input_share.measure_input(train_steps.RECIPE)
+    try:
+        timings = apart(input_share.measure_input, train_steps.RECIPE)
+    except WorkerError as error:
+        say(f"train-input is left out: {error}")
+        return []
     wait, loop, alone = (timings[name] for name in ("wait", "loop", "alone"))
     return [
         row("train-input", "waiting", wait, None, "train-loop", loop.median_ms),
@@ -192,7 +201,7 @@ def table(rows: Sequence[Row]) -> Table:
 def compiled(
     works: Callable[[], Iterator[Work]],
     cache: Path,
-    taken: dict[compilation.Program, float | None],
+    taken: dict[compilation.Program, compilation.Seconds],
     *,
     say: Callable[[str], None],
 ) -> Iterator[Work]:
@@ -205,29 +214,32 @@ def compiled(
     programs: list[compilation.Program] = [("torch", work.name) for work in listed if "torch-compiled" in work.peers]
     for work in listed:
         # Programs that call an engine are compiled where they run, as jax's cache does not share them.
-        programs += [("xla", work.name + name.removeprefix("xla")) for name in work.ours if name.startswith("xla")]
+        own = [name for name in work.ours if name.startswith("xla") and name not in work.huge_pages]
+        programs += [("xla", work.name + name.removeprefix("xla")) for name in own]
     say(f"compiling {', '.join(sorted({name for _, name in programs}))} ...")
     taken |= compilation.warm(programs, cache, limit_s=COMPILE_S)
     for work in listed:
-        if taken.get(("torch", work.name), 0.0) is None:
-            say(f"{work.name}: torch-compiled is left out: it did not compile within {COMPILE_S} s")
+        reason = taken.get(("torch", work.name))
+        if isinstance(reason, str):
+            say(f"{work.name}: torch-compiled is left out: {reason}")
             work.peers.pop("torch-compiled")
         yield work
 
 
-def groups(cache: Path, probe: Probe, say: Callable[[str], None]) -> dict[str, Iterator[Callable[[], list[Row]]]]:
+def groups(cache: Path, say: Callable[[str], None]) -> dict[str, Iterator[Callable[[], list[Row]]]]:
     """Group -> its workloads as calls that return rows."""
+    probes = roofline.probes()
 
     def timed(group: str, works: Iterator[Work]) -> Iterator[Callable[[], list[Row]]]:
         for work in works:
-            yield partial(run, work, probe, budget_s=ONE_WORK_S[group], say=say)
+            yield partial(run, work, probes, budget_s=ONE_WORK_S[group], say=say)
 
-    taken: dict[compilation.Program, float | None] = {}
+    taken: dict[compilation.Program, compilation.Seconds] = {}
     return {
         "steps": timed("steps", compiled(steps.works, cache, taken, say=say)),
         "operations": timed("operations", operations.works()),
         "train": timed("train", compiled(train_steps.works, cache, taken, say=say)),
-        "input": iter([input_rows]),
+        "input": iter([partial(input_rows, say)]),
         "compile": (partial(compile_rows, program, cache, taken, say=say) for program in COMPILED),
     }
 
@@ -242,19 +254,13 @@ def main(settings: Settings) -> None:
 
     for reason in dict.fromkeys(peers.missing().values()):
         say(reason)
-    if "torch" not in peers.missing():
-        from experiments.speed.peers import pytorch
-
-        pytorch.prepare_process()
-    pages = "on" if "hugetlb=1" in os.environ.get("GLIBC_TUNABLES", "") else "off"
-    say(f"{os.cpu_count()} cores, jax {jax.__version__} on {jax.default_backend()}, huge pages {pages}")
-    probe = roofline.probe()
+    # Several processes share a GPU: none may reserve most of its memory.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    say(f"{os.cpu_count()} cores, jax {jax.__version__} on {jax.default_backend()}")
     with tempfile.TemporaryDirectory() as place:
         # Programs that several groups use are compiled once.
-        jax.config.update("jax_compilation_cache_dir", str(Path(place) / "jax"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-        os.environ["TORCHINDUCTOR_CACHE_DIR"] = str(Path(place) / "torch")
-        for group, calls in groups(Path(place), probe, say).items():
+        os.environ |= compilation.environment(Path(place))
+        for group, calls in groups(Path(place), say).items():
             if settings.only not in ("all", group):
                 continue
             with console.status(f"{group}: preparing ..."):

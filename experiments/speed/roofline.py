@@ -7,17 +7,18 @@ counted.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.speed.timing import Call, measure
+from experiments.speed.timing import Call
 from jaxdn.methods.ntd import TAPS
-from jaxdn.networks import LEVELS, Widths
+from jaxdn.networks import Widths, description
 
 FLOAT = 4
 """Bytes of a number."""
@@ -40,51 +41,70 @@ class Ceilings(NamedTuple):
 
 
 class Probe(NamedTuple):
-    """Calls that reach the ceilings, to be timed interleaved with the workload: a shared machine's speed varies."""
+    """A call that reaches a ceiling, to be timed interleaved with the workload: a shared machine's speed varies."""
 
-    copy: Call
+    build: Callable[[], Call]
     bytes: float
-    matmul: Call
     operations: float
 
-    def ceilings(self, copy_ms: float, matmul_ms: float) -> Ceilings:
-        """The ceilings from the times of the two calls."""
-        return Ceilings(self.bytes / copy_ms / 1e6, self.operations / matmul_ms / 1e6)
+
+def probes() -> dict[str, Probe]:
+    """Copying, and float32 matrix products, on jax's default device."""
+    if jax.default_backend() != "cpu":
+        size, length = 8192, 1 << 27
+        return {
+            "copy": Probe(partial(copy_on_device, length), 2.0 * FLOAT * length, 0),
+            "matrix product": Probe(partial(product_by_jax, size), 0, 2.0 * size**3),
+        }
+    size, length = 1536, 32 << 20
+    return {
+        "copy": Probe(partial(copy_by_threads, length), 2.0 * FLOAT * length, 0),
+        "matrix product": Probe(partial(product_by_jax, size), 0, 2.0 * size**3),
+        "matrix product, numpy": Probe(partial(product_by_numpy, size), 0, 2.0 * size**3),  # sometimes faster
+    }
 
 
-def probe() -> Probe:
-    """Copying, and the fastest available float32 matrix product, on jax's default device."""
-    cpu = jax.default_backend() == "cpu"
-    size = 1536 if cpu else 8192
-    a = np.random.default_rng(0).standard_normal((size, size), np.float32)
-    on_device = jnp.asarray(a)
-    product = jax.jit(lambda a: jnp.dot(a, a, precision="highest"))
-    matmul: Call = lambda: product(on_device).block_until_ready()  # noqa: E731
-    if cpu:  # NumPy's library is sometimes faster
-        by_numpy: Call = lambda: a @ a  # noqa: E731
-        times = measure({"jax": matmul, "numpy": by_numpy}, rounds=5)
-        matmul = matmul if times["jax"].median_ms < times["numpy"].median_ms else by_numpy
-    copy, copied = _copy_by_threads() if cpu else _copy_on_device()
-    return Probe(copy, copied, matmul, 2.0 * size**3)
+def ceilings(probes: Mapping[str, Probe], median_ms: Mapping[str, float]) -> Ceilings:
+    """The highest rates of the probes, from their times."""
+    return Ceilings(
+        max(probe.bytes / median_ms[name] for name, probe in probes.items()) / 1e6,
+        max(probe.operations / median_ms[name] for name, probe in probes.items()) / 1e6,
+    )
 
 
-def _copy_by_threads() -> tuple[Call, float]:
-    """A copy of 128 MiB, divided among the cores, and the bytes it moves."""
+def _square(size: int) -> np.ndarray:
+    return np.random.default_rng(0).standard_normal((size, size), np.float32)
+
+
+def product_by_jax(size: int) -> Call:
+    """The product of two square matrices."""
+    a, product = jnp.asarray(_square(size)), jax.jit(lambda a: jnp.dot(a, a, precision="highest"))
+    return lambda: product(a).block_until_ready()
+
+
+def product_by_numpy(size: int) -> Call:
+    """The same by NumPy's library."""
+    a = _square(size)
+    return lambda: a @ a
+
+
+def copy_by_threads(length: int) -> Call:
+    """A copy of this many numbers, divided among the cores."""
     cores = os.cpu_count() or 1
-    source, target = (np.ones((cores, (32 << 20) // cores), np.float32) for _ in range(2))
+    source, target = (np.ones((cores, length // cores), np.float32) for _ in range(2))
     pool = ThreadPoolExecutor(cores)
-    return lambda: list(pool.map(np.copyto, target, source)), 2.0 * source.nbytes
+    return lambda: list(pool.map(np.copyto, target, source))
 
 
-def _copy_on_device() -> tuple[Call, float]:
-    """512 MiB read, changed and written back in place."""
-    x = [jnp.zeros(1 << 27, jnp.float32)]
+def copy_on_device(length: int) -> Call:
+    """So many numbers read, changed and written back in place."""
+    x = [jnp.zeros(length, jnp.float32)]
     add = jax.jit(lambda x: x + 1, donate_argnums=0)
 
     def copy() -> None:
         x[0] = jax.block_until_ready(add(x[0]))
 
-    return copy, 2.0 * x[0].nbytes
+    return copy
 
 
 def milliseconds(costs: Sequence[Cost], ceilings: Ceilings) -> float:
@@ -147,21 +167,10 @@ def network(
       features: input channels.
       heads: output channels at full, half and quarter resolution.
     """
-    costs, inputs = [], features
-
-    def level_of(n: int, inputs: int, channels: Sequence[int]) -> int:
-        for outputs in channels:
-            costs.append(convolution(count, height >> n, width >> n, inputs, outputs))
-            inputs = outputs
-        return inputs
-
-    for n, channels in enumerate(widths):
-        inputs = level_of(n, inputs, channels)
-    for n in reversed(range(LEVELS - 1)):
-        inputs = level_of(n, inputs + widths[n][-1], widths[n])
-        if n < len(heads):
-            costs.append(convolution(count, height >> n, width >> n, inputs, heads[n]))
-    return costs
+    described = description.unet(features, heads, widths=widths, head_size=3)
+    kernels = described.kernels()
+    sizes = [(height >> described.layers[name].depth, width >> described.layers[name].depth) for name in kernels]
+    return [convolution(count, *size, *kernel[2:]) for size, kernel in zip(sizes, kernels.values(), strict=True)]
 
 
 def step(widths: Widths, height: int, width: int) -> list[Cost]:

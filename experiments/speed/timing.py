@@ -1,14 +1,15 @@
 """Relative timing of calls, and the memory of one call.
 
-The speed of a shared machine varies from one minute to the next: compared calls are measured interleaved in one
-process, and results are ratios of medians.
+The speed of a shared machine varies from one minute to the next: compared calls are measured interleaved, and results
+are ratios of medians.
 """
 
 import ctypes
 import gc
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,30 +34,41 @@ class Timing(NamedTuple):
 
 
 def measure(calls: Mapping[str, Call], *, rounds: int = 7, budget_s: float = 60.0) -> dict[str, Timing]:
-    """Time calls interleaved: each once to compile, then ``rounds`` times, or until ``budget_s`` is spent.
+    """Time calls of this process interleaved: each once to compile, then in rounds (:func:`interleave`)."""
+    first = {name: milliseconds(call) for name, call in calls.items()}
 
-    There are at least two rounds, and all are complete: every call is timed equally often. The budget counts from the
-    end of the first calls.
+    def turn(call: Call) -> float:
+        time.sleep(PAUSE_S)
+        return milliseconds(call)
+
+    samples = interleave({name: partial(turn, call) for name, call in calls.items()}, rounds=rounds, budget_s=budget_s)
+    return {name: summary(values, first[name]) for name, values in samples.items()}
+
+
+def interleave(turns: Mapping[str, Callable[[], float]], *, rounds: int, budget_s: float) -> dict[str, list[float]]:
+    """What each turn returns in ``rounds`` rounds, or until ``budget_s`` is spent.
+
+    There are at least two rounds, and all are complete: every turn is taken equally often.
     """
-    first, samples = {}, {name: [] for name in calls}  # type: dict[str, float], dict[str, list[float]]
-    for name, call in calls.items():
-        first[name] = _milliseconds(call)
+    samples: dict[str, list[float]] = {name: [] for name in turns}
     began = time.perf_counter()
     for done in range(rounds):
         # The next round is expected to take the mean time of a round so far.
         spent = time.perf_counter() - began
         if done >= 2 and spent * (done + 1) / done > budget_s:
             break
-        for name, call in calls.items():
-            time.sleep(PAUSE_S)
-            samples[name].append(_milliseconds(call))
-    return {
-        name: Timing(float(np.median(values)), min(values), max(values), first[name], len(values))
-        for name, values in samples.items()
-    }
+        for name, turn in turns.items():
+            samples[name].append(turn())
+    return samples
 
 
-def _milliseconds(call: Call) -> float:
+def summary(values: Sequence[float], first_ms: float) -> Timing:
+    """The timing of these milliseconds."""
+    return Timing(float(np.median(values)), min(values), max(values), first_ms, len(values))
+
+
+def milliseconds(call: Call) -> float:
+    """The time of one call."""
     began = time.perf_counter()
     call()
     return 1e3 * (time.perf_counter() - began)
@@ -77,15 +89,17 @@ def peak_mib(call: Call) -> float | None:
         Path("/proc/self/clear_refs").write_text("5")  # reset the peak
     except OSError:  # some sandboxes forbid it
         return None
-    before = _status("VmRSS")
+    before = status_mib("VmRSS")
     result = call()
-    peak = _status("VmHWM") - before
+    peak = status_mib("VmHWM")
     del result
-    return max(peak, 0.0)
+    return None if before is None or peak is None else max(peak - before, 0.0)
 
 
-def _status(name: str) -> float:
-    """An entry of /proc/self/status in MiB."""
+def status_mib(name: str) -> float | None:
+    """An entry of /proc/self/status in MiB; None where there is none."""
+    if sys.platform != "linux":
+        return None
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(name + ":"):
             return int(line.split()[1]) / 1024

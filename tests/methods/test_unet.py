@@ -8,9 +8,11 @@ import numpy as np
 import optax
 import pytest
 
-from jaxdn.networks import LARGE, LEVELS, SMALL, onnx
-from jaxdn.networks.unet import NEGATIVE_SLOPE, Network, count, unet
+from jaxdn.networks import LARGE, LEVELS, SMALL, description, onnx
+from jaxdn.networks.description import FEATURES, NEGATIVE_SLOPE, Description, Layer
+from jaxdn.networks.unet import XLA, Network, by_xla, count, unet
 from jaxdn.ops import onednn
+from jaxdn.weights import flatten, load_weights
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -140,16 +142,6 @@ def test_every_level_begins_to_learn_at_the_same_pace(key: jax.Array, rng: np.ra
     assert 4 * spread("he") < spread("xavier")
 
 
-def test_only_the_networks_package_imports_flax() -> None:
-    import pathlib
-
-    import jaxdn
-
-    package = pathlib.Path(jaxdn.__file__).parent
-    users = {path.parent.name for path in package.rglob("*.py") if "from flax" in path.read_text()}
-    assert users == {"networks"}
-
-
 def test_errors_say_what_was_expected(rng: np.random.Generator, key: jax.Array) -> None:
     with pytest.raises(ValueError, match="widths: expected 5 levels"):
         unet(GROUPS, HEADS, widths=((4,), (4,)))
@@ -163,6 +155,56 @@ def test_errors_say_what_was_expected(rng: np.random.Generator, key: jax.Array) 
         network.apply(params, features(rng, (3, 3)))
     with pytest.raises(ValueError, match="features: expected"):
         network.apply(params, [None, None])
+
+
+def test_shipped_weights_are_those_of_the_description() -> None:
+    """Neither more nor fewer convolutions, each of the described shape."""
+    for name, groups, heads, widths, size in (
+        ("ntd-small", GROUPS, HEADS, SMALL, 3),
+        ("ntd-large", GROUPS, HEADS, LARGE, 3),
+    ):
+        _, params = load_weights(name)
+        found = {path: leaf.shape for path, leaf in flatten(params).items() if not path.startswith("guide")}
+        kernels = description.unet(sum(groups), heads, widths=widths, head_size=size).kernels()
+        wanted = {f"{layer}/kernel": shape for layer, shape in kernels.items()}
+        wanted |= {f"{layer}/bias": shape[3:] for layer, shape in kernels.items()}
+        assert found == wanted
+
+
+OTHER = Description(
+    {
+        FEATURES: Layer("input", (), 18, 0),
+        "thin": Layer("convolution", (FEATURES,), 3, 0, 1),
+        "half": Layer("pool", (FEATURES,), 18, 1),
+        "wide": Layer("convolution", ("half",), 5, 1, 3),
+        "bent": Layer("rectifier", ("wide",), 5, 1),
+        "large": Layer("enlarge", ("bent",), 5, 0),
+        "end": Layer("convolution", ("thin", "large", FEATURES), 4, 0, 3),
+    },
+    ("bent", "end"),
+)
+"""No U-Net: outputs at two levels, one of them rectified, three inputs joined."""
+
+
+@pytest.mark.parametrize("engine", ["xla", "onnxruntime"])
+def test_every_engine_runs_whatever_network_is_described(engine: str, rng: np.random.Generator) -> None:
+    if engine == "onnxruntime" and not onnx.available():
+        pytest.skip("onnxruntime is not installed")
+    weights = {
+        name: {"kernel": 0.2 * rng.normal(size=shape), "bias": rng.normal(size=shape[3:])}
+        for name, shape in OTHER.kernels().items()
+    }
+    x = rng.normal(size=(2, 6, 8, 18))
+    thin = x @ weights["thin"]["kernel"][0, 0] + weights["thin"]["bias"]
+    wide = numpy_convolution(x.reshape(2, 3, 2, 4, 2, 18).max(axis=(2, 4)), weights["wide"])
+    bent = np.where(wide < 0, NEGATIVE_SLOPE * wide, wide)
+    end = numpy_convolution(np.concatenate([thin, bent.repeat(2, 1).repeat(2, 2), x], axis=-1), weights["end"])
+
+    run = by_xla(XLA, OTHER) if engine == "xla" else onnx.engine(OTHER, by_xla(XLA, OTHER))
+    single = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), weights)
+    found = jax.jit(run)(single, [jnp.asarray(x[..., :7], jnp.float32), jnp.asarray(x[..., 7:], jnp.float32)])
+    for got, wanted in zip(found, (bent, end), strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("absent", [(), (1, 3)])

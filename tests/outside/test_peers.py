@@ -97,7 +97,7 @@ def test_pytorch_trains():
     from experiments.speed.works import train_steps
 
     recipe = RECIPE._replace(batch=1, frames=2)
-    call = train_steps.pytorch("small", train_steps.batch_of(16, recipe), recipe, compiled=False)
+    call = train_steps.pytorch("small", 16, recipe, compiled=False)
     first, *_, last = [call() for _ in range(4)]
     assert last < first
 

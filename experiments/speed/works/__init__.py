@@ -9,7 +9,11 @@ from experiments.speed.timing import Call
 
 
 class Work(NamedTuple):
-    """One workload with several implementations; ``ours`` and ``peers`` build calls, with their arrays, on demand."""
+    """One workload with several implementations.
+
+    ``ours`` and ``peers`` build calls, with their arrays, in processes of their own: they are functions of a module, or
+    a ``functools.partial`` of one.
+    """
 
     name: str
     ours: dict[str, Callable[[], Call]]
@@ -18,3 +22,5 @@ class Work(NamedTuple):
     rounds: int = 5
     alone: Mapping[str, Callable[[], Any]] = MappingProxyType({})
     """Calls for measuring the peak memory, where they differ: for engines that keep memory between calls."""
+    huge_pages: frozenset[str] = frozenset()
+    """Implementations whose large buffers are in huge pages."""

@@ -18,9 +18,20 @@ from typing import Any
 
 Program = tuple[str, str]
 """Compiler, "xla" or "torch", and a program's name."""
+Seconds = float | str
+"""How long it took, or why there is no figure."""
 
 
-def warm(programs: Sequence[Program], cache: Path, *, limit_s: float) -> dict[Program, float | None]:
+def environment(cache: Path) -> dict[str, str]:
+    """The variables with which jax and PyTorch keep compiled programs in the folder ``cache``."""
+    return {
+        "JAX_COMPILATION_CACHE_DIR": str(cache / "jax"),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "TORCHINDUCTOR_CACHE_DIR": str(cache / "torch"),
+    }
+
+
+def warm(programs: Sequence[Program], cache: Path, *, limit_s: float) -> dict[Program, Seconds]:
     """Compile into the caches in ``cache``, one process per core, and return the seconds that each took.
 
     They slow each other down a little, all equally.
@@ -30,32 +41,24 @@ def warm(programs: Sequence[Program], cache: Path, *, limit_s: float) -> dict[Pr
         return dict(zip(programs, seconds, strict=True))
 
 
-def compile_seconds(compiler: str, program: str, cache: Path, *, limit_s: float) -> float | None:
-    """Compile in a separate process with its cache in the folder ``cache``; None if it takes longer than the limit.
-
-    Raises RuntimeError with the last line of the child's error output if it fails.
-    """
-    environment = os.environ | {
-        "JAX_COMPILATION_CACHE_DIR": str(cache / "jax"),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "TORCHINDUCTOR_CACHE_DIR": str(cache / "torch"),
-    }
+def compile_seconds(compiler: str, program: str, cache: Path, *, limit_s: float) -> Seconds:
+    """Compile in a separate process with its cache in the folder ``cache``."""
     command = [sys.executable, "-m", "experiments.speed.works.compilation", compiler, program]
     try:
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=limit_s, check=False)
+        done = subprocess.run(
+            command, env=os.environ | environment(cache), capture_output=True, text=True, timeout=limit_s, check=False
+        )
     except subprocess.TimeoutExpired:
-        return None
+        return f"it did not compile within {limit_s:.0f} s"
     if done.returncode:
-        message = done.stderr.strip().splitlines()[-1:]
-        raise RuntimeError(f"{compiler} did not compile {program}: {''.join(message)}")
+        return f"it did not compile: {''.join(done.stderr.strip().splitlines()[-1:])}"
     return float(done.stdout.split()[-1])
 
 
 def _xla(program: str) -> float:
     import jax
 
-    from experiments.speed.works import scene, steps, train_steps
-    from jaxdn.frame import frame_at
+    from experiments.speed.works import steps, train_steps
     from jaxdn.learning.step import initial_state, make_train_step
 
     kind, size, detail, *remat = program.split("-")
@@ -64,7 +67,7 @@ def _xla(program: str) -> float:
     step: Any
     arguments: tuple[Any, ...]
     if kind == "step":
-        frame = frame_at(scene.clip(1, 720, 1280).frames, 0)
+        frame = steps.frame_of(steps.HEIGHT, steps.WIDTH)
         params = denoiser.init(jax.random.key(0), frame)
         step, arguments = steps.program(denoiser), (params, denoiser.start(params, frame), frame)
     else:
@@ -77,21 +80,13 @@ def _xla(program: str) -> float:
 
 
 def _torch(program: str) -> float:
-    import jax
+    from experiments.speed.works import steps, train_steps
 
-    from experiments.speed.peers import pytorch
-    from experiments.speed.works import scene, steps, train_steps
-    from jaxdn.frame import frame_at
-
-    pytorch.prepare_process()
     kind, size, detail = program.split("-")
     if kind == "step":
-        frame = frame_at(scene.clip(1, 720, 1280).frames, 0)
-        call = steps.pytorch(
-            size, steps.METHOD.factory(size=size, **steps.PLAIN).init(jax.random.key(0), frame), frame, compiled=True
-        )
+        call = steps.pytorch(size, steps.HEIGHT, steps.WIDTH, compiled=True)
     else:
-        call = train_steps.pytorch(size, train_steps.batch_of(int(detail)), train_steps.RECIPE, compiled=True)
+        call = train_steps.pytorch(size, int(detail), compiled=True)
     began = time.perf_counter()
     call()
     return time.perf_counter() - began

@@ -5,6 +5,7 @@ names. An engine that is not installed is left out.
 """
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import jax
@@ -24,6 +25,8 @@ CONVOLUTIONS = ((1, 720, 1280, 32, 32), (1, 360, 640, 128, 64), (4, 128, 128, 96
 """(images, height, width, inputs, outputs): layers of LARGE, of a 720p frame and of a training batch."""
 
 Function = Callable[..., Any]
+Arrays = Callable[[], list[np.ndarray]]
+"""The arguments of an operation, made in the process that calls it."""
 
 
 def forms(operation: str) -> dict[str, str | None]:
@@ -34,175 +37,201 @@ def forms(operation: str) -> dict[str, str | None]:
     return {"xla": None, **{f"xla-{name}": name for name in others}, **{name: name for name in engines}}
 
 
-def jitted(function: Function, *arguments: jax.Array) -> Callable[[], Call]:
+def jitted(function: Function, arrays: Arrays) -> Call:
     """A call of the jitted function that waits for its result."""
+    program, arguments = jax.jit(function), [jnp.asarray(array) for array in arrays()]
+    return lambda: jax.block_until_ready(program(*arguments))
 
-    def build() -> Call:
-        program = jax.jit(function)
-        return lambda: jax.block_until_ready(program(*arguments))
 
-    return build
+def gradients(function: Function, chosen: tuple[int, ...], *values: jax.Array) -> Any:
+    """The function's value and gradients by some of its arguments, for a cotangent of ones."""
+
+    def of_some(*some: jax.Array) -> jax.Array:
+        given = dict(zip(chosen, some, strict=True))
+        return function(*[given.get(index, value) for index, value in enumerate(values)])
+
+    out, pull = jax.vjp(of_some, *[values[index] for index in chosen])
+    return out, pull(jnp.ones_like(out))
+
+
+def torch_call(function: Callable[[], Function], arrays: Arrays, chosen: tuple[int, ...], *, compiled: bool) -> Call:
+    """``function()`` of tensors in PyTorch; with ``chosen``, also back to those arguments.
+
+    The arrays are [N, H, W, C] (channels-last tensors) or anything else.
+    """
+    import torch
+
+    from experiments.speed.peers import pytorch
+
+    pytorch.prepare_process()
+    tensors = [torch.from_numpy(array).movedim(-1, -3) for array in arrays()]
+    for index in chosen:
+        tensors[index].requires_grad_()
+    run = torch.compile(function(), dynamic=False) if compiled else function()
+
+    def call() -> Any:
+        if not chosen:
+            with torch.inference_mode():
+                return run(*tensors)
+        out = run(*tensors)
+        return torch.autograd.grad(out, [tensors[index] for index in chosen], torch.ones_like(out))
+
+    return call
 
 
 def torch_calls(
-    forward: Function, arrays: list[np.ndarray], *, gradient: tuple[int, ...] = (), eager: Function | None = None
+    forward: Callable[[], Function],
+    arrays: Arrays,
+    chosen: tuple[int, ...],
+    *,
+    eager: Callable[[], Function] | None = None,
 ) -> dict[str, Callable[[], Call]]:
-    """``forward`` of tensors in PyTorch, eager and compiled; with ``gradient``, also back to those arguments.
-
-    ``arrays`` are [N, H, W, C] (channels-last tensors) or anything else. ``eager`` is the version that is faster there.
-    """
+    """PyTorch eager and compiled, where they can run; ``eager`` is the version that is faster there."""
     lacking = peers.missing()
-
-    def build(function: Function, compiled: bool) -> Callable[[], Call]:
-        def made() -> Call:
-            import torch
-
-            tensors = [torch.from_numpy(np.array(array)).movedim(-1, -3) for array in arrays]
-            for index in gradient:
-                tensors[index].requires_grad_()
-            run = torch.compile(function, dynamic=False) if compiled else function
-
-            def call() -> Any:
-                if not gradient:
-                    with torch.inference_mode():
-                        return run(*tensors)
-                out = run(*tensors)
-                return torch.autograd.grad(out, [tensors[index] for index in gradient], torch.ones_like(out))
-
-            return call
-
-        return made
-
-    calls = {}
+    calls: dict[str, Callable[[], Call]] = {}
     if "torch-compiled" not in lacking:
-        calls["torch-compiled"] = build(forward, True)
+        calls["torch-compiled"] = partial(torch_call, forward, arrays, chosen, compiled=True)
     if "torch" not in lacking:
-        calls["torch-eager"] = build(eager or forward, False)
+        calls["torch-eager"] = partial(torch_call, eager or forward, arrays, chosen, compiled=False)
     return calls
+
+
+def image_and_logits(height: int, width: int) -> list[np.ndarray]:
+    """[1, H, W, 3] and [1, H, W, 25]."""
+    rng = np.random.default_rng(0)
+    image = rng.exponential(size=(1, height, width, 3)).astype(np.float32)
+    return [image, rng.standard_normal((1, height, width, 25), np.float32)]
+
+
+def filtered(image: jax.Array, logits: jax.Array, *, implementation: str | None) -> jax.Array:
+    """One image by its kernels."""
+    return softmax_filter(image, logits[0], implementation=implementation)
+
+
+def torch_filtered(form: str) -> Function:
+    """The same in PyTorch, by one of its ways to apply kernels."""
+
+    def run(image: Any, logits: Any) -> Any:
+        from experiments.speed.peers import pytorch
+
+        return getattr(pytorch, f"apply_kernels_{form}")(image, logits.softmax(1))
+
+    return run
 
 
 def kernel_works(height: int, width: int, title: str) -> Iterator[Work]:
     """Softmax and application of 5x5 kernels: forward, and forward with both gradients."""
-    rng = np.random.default_rng(0)
-    image = rng.exponential(size=(height, width, 3)).astype(np.float32)
-    logits = rng.standard_normal((height, width, 25), np.float32)
-    here = jnp.asarray(image), jnp.asarray(logits)
-
-    def filtered(name: str | None) -> Function:
-        return lambda image, logits: softmax_filter(image[None], logits, implementation=name)[0]
-
-    def peer(form: str) -> Function:
-        def run(image: Any, logits: Any) -> Any:
-            from experiments.speed.peers import pytorch
-
-            return getattr(pytorch, f"apply_kernels_{form}")(image, logits.softmax(1))
-
-        return run
-
-    for kind, gradient in (("", False), ("-gradient", True)):
+    arrays = partial(image_and_logits, height, width)
+    for kind, chosen in (("", ()), ("-gradient", (0, 1))):
         yield Work(
             f"apply-kernels-{title}{kind}",
-            {
-                shown: jitted(with_gradient(filtered(name), (0, 1)) if gradient else filtered(name), *here)
-                for shown, name in forms("softmax_filter").items()
-            },
+            ours(filtered, "softmax_filter", arrays, chosen),
             torch_calls(
-                peer("loop"),
-                [image[None], logits[None]],
-                gradient=(0, 1) if gradient else (),
-                eager=peer("unfold") if gradient else None,
+                partial(torch_filtered, "loop"),
+                arrays,
+                chosen,
+                eager=partial(torch_filtered, "unfold") if chosen else None,
             ),
-            [roofline.kernel_application(height, width, gradient=gradient)],
+            [roofline.kernel_application(height, width, gradient=bool(chosen))],
         )
 
 
-def with_gradient(function: Function, arguments: tuple[int, ...]) -> Function:
-    """The function's gradients by some of its arguments, for a cotangent of ones."""
+def image_and_motion(height: int, width: int) -> list[np.ndarray]:
+    """[1, H, W, 3] and [1, H, W, 2]; neighbours move together."""
+    rng = np.random.default_rng(0)
+    image = rng.exponential(size=(1, height, width, 3)).astype(np.float32)
+    motion = 3 * rng.standard_normal((1, height // 8, width // 8, 2), np.float32)
+    return [image, np.repeat(np.repeat(motion, 8, 1), 8, 2)]
 
-    def run(*values: jax.Array) -> Any:
-        def of_some(*some: jax.Array) -> jax.Array:
-            chosen = dict(zip(arguments, some, strict=True))
-            return function(*[chosen.get(index, value) for index, value in enumerate(values)])
 
-        out, pull = jax.vjp(of_some, *[values[index] for index in arguments])
-        return out, pull(jnp.ones_like(out))
+def warped(image: jax.Array, motion: jax.Array, *, implementation: str | None) -> jax.Array:
+    """A bilinear fetch."""
+    return warp(image[0], motion[0], implementation=implementation)
+
+
+def torch_warped() -> Function:
+    """The same in PyTorch."""
+
+    def run(image: Any, motion: Any) -> Any:
+        from experiments.speed.peers import pytorch
+
+        return pytorch.warp(image, motion)
 
     return run
 
 
 def warp_works(height: int, width: int, title: str) -> Iterator[Work]:
     """A bilinear fetch of RGB compared with ``grid_sample``, and with its gradient by the image."""
-    rng = np.random.default_rng(0)
-    image = rng.exponential(size=(height, width, 3)).astype(np.float32)
-    motion = 3 * rng.standard_normal((height // 8, width // 8, 2), np.float32)
-    motion = np.repeat(np.repeat(motion, 8, 0), 8, 1)  # neighbours move together
-    here = jnp.asarray(image), jnp.asarray(motion)
-
-    def warped(name: str | None) -> Function:
-        return lambda image, motion: warp(image, motion, implementation=name)
-
-    def peer(image: Any, motion: Any) -> Any:
-        from experiments.speed.peers import pytorch
-
-        return pytorch.warp(image, motion)
-
-    for kind, gradient in (("", False), ("-gradient", True)):
+    arrays = partial(image_and_motion, height, width)
+    for kind, chosen in (("", ()), ("-gradient", (0,))):
         yield Work(
             f"warp-{title}{kind}",
-            {
-                shown: jitted(with_gradient(warped(name), (0,)) if gradient else warped(name), *here)
-                for shown, name in forms("warp").items()
-            },
-            torch_calls(peer, [image[None], motion[None]], gradient=(0,) if gradient else ()),
-            [roofline.bilinear_warp(height, width, gradient=gradient)],
+            ours(warped, "warp", arrays, chosen),
+            torch_calls(torch_warped, arrays, chosen),
+            [roofline.bilinear_warp(height, width, gradient=bool(chosen))],
         )
+
+
+def ours(function: Function, operation: str, arrays: Arrays, chosen: tuple[int, ...]) -> dict[str, Callable[[], Call]]:
+    """The operation in each of its implementations, with its gradient by the arguments ``chosen``."""
+    ways = {shown: partial(function, implementation=name) for shown, name in forms(operation).items()}
+    return {
+        shown: partial(jitted, partial(gradients, way, chosen) if chosen else way, arrays)
+        for shown, way in ways.items()
+    }
+
+
+def layer(count: int, height: int, width: int, inputs: int, outputs: int) -> list[np.ndarray]:
+    """Images, a kernel and a cotangent."""
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((count, height, width, inputs), np.float32)
+    kernel = rng.standard_normal((3, 3, inputs, outputs), np.float32) / 24
+    return [x, kernel, rng.standard_normal((count, height, width, outputs), np.float32)]
+
+
+def convolved(
+    x: jax.Array, kernel: jax.Array, cotangent: jax.Array, *, direction: str, implementation: str | None
+) -> jax.Array:
+    """One direction of a convolution; backward only that."""
+    if direction == "forward":
+        return convolve(x, kernel, implementation=implementation)
+    if direction == "image":
+        return jax.vjp(lambda x: convolve(x, kernel, implementation=implementation), x)[1](cotangent)[0]
+    return jax.vjp(lambda kernel: convolve(x, kernel, implementation=implementation), kernel)[1](cotangent)[0]
+
+
+def torch_convolved(direction: str, arrays: Arrays) -> Call:
+    """The same in PyTorch."""
+    import torch
+
+    from experiments.speed.peers import pytorch
+
+    pytorch.prepare_process()
+    x, kernel, cotangent = arrays()
+    image, gradient = (torch.from_numpy(array).movedim(-1, -3) for array in (x, cotangent))
+    weights = torch.from_numpy(kernel).permute(3, 2, 0, 1).contiguous(memory_format=torch.channels_last)
+    wanted = [direction == "image", direction == "kernel", False]
+
+    def call() -> Any:
+        with torch.inference_mode():
+            if direction == "forward":
+                return torch.conv2d(image, weights, padding=1)
+            return torch.ops.aten.convolution_backward(
+                gradient, image, weights, None, [1, 1], [1, 1], [1, 1], False, [0, 0], 1, wanted
+            )
+
+    return call
 
 
 def convolution_works(shape: tuple[int, int, int, int, int]) -> Iterator[Work]:
     """One 3x3 convolution: forward, gradient by the image, gradient by the kernel (only the backward passes)."""
     count, height, width, inputs, outputs = shape
-    rng = np.random.default_rng(0)
-    x = rng.standard_normal((count, height, width, inputs), np.float32)
-    kernel = rng.standard_normal((3, 3, inputs, outputs), np.float32) / 24
-    cotangent = rng.standard_normal((count, height, width, outputs), np.float32)
-    here = jnp.asarray(x), jnp.asarray(kernel), jnp.asarray(cotangent)
-
-    def function(kind: str, name: str | None) -> Function:
-        def run(x: jax.Array, kernel: jax.Array, cotangent: jax.Array) -> jax.Array:
-            if kind == "forward":
-                return convolve(x, kernel, implementation=name)
-            if kind == "image":
-                return jax.vjp(lambda x: convolve(x, kernel, implementation=name), x)[1](cotangent)[0]
-            return jax.vjp(lambda kernel: convolve(x, kernel, implementation=name), kernel)[1](cotangent)[0]
-
-        return run
-
-    def peer(kind: str) -> Callable[[], Call]:
-        def made() -> Call:
-            import torch
-
-            image, gradient = (torch.from_numpy(array).movedim(-1, -3) for array in (x, cotangent))
-            weights = torch.from_numpy(kernel).permute(3, 2, 0, 1).contiguous(memory_format=torch.channels_last)
-            wanted = [kind == "image", kind == "kernel", False]
-
-            def call() -> Any:
-                with torch.inference_mode():
-                    if kind == "forward":
-                        return torch.conv2d(image, weights, padding=1)
-                    return torch.ops.aten.convolution_backward(
-                        gradient, image, weights, None, [1, 1], [1, 1], [1, 1], False, [0, 0], 1, wanted
-                    )
-
-            return call
-
-        return made
-
-    for kind in ("forward", "image", "kernel"):
-        title = f"convolution-{count}x{height}x{width}-{inputs}-{outputs}"
+    title, arrays = f"convolution-{count}x{height}x{width}-{inputs}-{outputs}", partial(layer, *shape)
+    for direction in ("forward", "image", "kernel"):
         yield Work(
-            title if kind == "forward" else f"{title}-gradient-by-{kind}",
-            {shown: jitted(function(kind, name), *here) for shown, name in forms("convolution").items()},
-            {} if "torch" in peers.missing() else {"torch-eager": peer(kind)},
+            title if direction == "forward" else f"{title}-gradient-by-{direction}",
+            ours(partial(convolved, direction=direction), "convolution", arrays, ()),
+            {} if "torch" in peers.missing() else {"torch-eager": partial(torch_convolved, direction, arrays)},
             [roofline.convolution(*shape)],
         )
 

@@ -1,6 +1,7 @@
 """One recurrent ``ntd`` step at 1280x720: ours in each engine, the same network in PyTorch, Open Image Denoise."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import jax
@@ -51,15 +52,37 @@ def recurrent(denoiser: Denoiser, params: Any, frame: Frame) -> Call:
     return call
 
 
-def pytorch(size: str, params: Any, frame: Frame, *, compiled: bool) -> Call:
+def open_image_denoise(frame: Frame, quality: str) -> Call:
+    """Open Image Denoise on radiance, albedo and normal; building the filter is not timed."""
+    from experiments.speed.peers.oidn import oidn
+
+    arrays = tuple(np.asarray(buffer, np.float32) for buffer in (frame.radiance, frame.albedo, frame.normal))
+    denoise = oidn(*arrays[0].shape[:2], quality=quality)
+    return lambda: denoise(*arrays)
+
+
+def frame_of(height: int, width: int) -> Frame:
+    """What all implementations denoise."""
+    return jax.tree.map(jnp.asarray, frame_at(scene.clip(2, height, width).frames, 1))
+
+
+def ours(size: str, height: int, width: int, options: dict[str, Any]) -> Call:
+    """The step with new weights."""
+    denoiser, frame = METHOD.factory(size=size, **PLAIN, **options), frame_of(height, width)
+    return recurrent(denoiser, denoiser.init(jax.random.key(0), frame), frame)
+
+
+def pytorch(size: str, height: int, width: int, *, compiled: bool) -> Call:
     """The same with PyTorch's step, in inference mode."""
     import torch
 
     from experiments.speed.peers import pytorch as peer
 
+    peer.prepare_process()
+    frame = frame_of(height, width)
     step = peer.NTD(
         WIDTHS[size],
-        params,
+        METHOD.factory(size=size, **PLAIN).init(jax.random.key(0), frame),
         apply_kernels=peer.apply_kernels_loop,
         compile_network=compiled,
         compile_kernels=compiled,
@@ -75,40 +98,35 @@ def pytorch(size: str, params: Any, frame: Frame, *, compiled: bool) -> Call:
     return call
 
 
-def open_image_denoise(frame: Frame, quality: str) -> Call:
-    """Open Image Denoise on the same radiance, albedo and normal; building the filter is not timed."""
-    from experiments.speed.peers.oidn import oidn
+def oidn_high(height: int, width: int) -> Call:
+    """Open Image Denoise on the same frame."""
+    return open_image_denoise(frame_of(height, width), "high")
 
-    arrays = tuple(np.asarray(buffer, np.float32) for buffer in (frame.radiance, frame.albedo, frame.normal))
-    denoise = oidn(*arrays[0].shape[:2], quality=quality)
-    return lambda: denoise(*arrays)
+
+def oidn_high_once(height: int, width: int) -> Any:
+    """The same with building the filter, which keeps its memory."""
+    return oidn_high(height, width)()
 
 
 def works(*, height: int = HEIGHT, width: int = WIDTH, title: str = "720p") -> Iterator[Work]:
     """``step-large-720p`` and ``step-small-720p``."""
     lacking = peers.missing()
-    frame = jax.tree.map(jnp.asarray, frame_at(scene.clip(2, height, width).frames, 1))
     for size, widths in WIDTHS.items():
-        params = METHOD.factory(size=size, **PLAIN).init(jax.random.key(0), frame)
-
-        def ours(options: dict[str, Any], size: str = size, params: Any = params) -> Callable[[], Call]:
-            return lambda: recurrent(METHOD.factory(size=size, **PLAIN, **options), params, frame)
-
-        def torch(compiled: bool, size: str = size, params: Any = params) -> Callable[[], Call]:
-            return lambda: pytorch(size, params, frame, compiled=compiled)
-
         others: dict[str, Callable[[], Call]] = {}
         if "torch-compiled" not in lacking:
-            others["torch-compiled"] = torch(True)
+            others["torch-compiled"] = partial(pytorch, size, height, width, compiled=True)
         if "torch" not in lacking:
-            others["torch-eager"] = torch(False)
+            others["torch-eager"] = partial(pytorch, size, height, width, compiled=False)
         alone = {}
         if "pyoidn" not in lacking:
-            others["oidn-high"] = lambda: open_image_denoise(frame, "high")
-            alone["oidn-high"] = lambda: open_image_denoise(frame, "high")()
+            others["oidn-high"] = partial(oidn_high, height, width)
+            alone["oidn-high"] = partial(oidn_high_once, height, width)
         yield Work(
             f"step-{size}-{title}",
-            {name: ours(options) for name, options in implementations("inference").items()},
+            {
+                name: partial(ours, size, height, width, options)
+                for name, options in implementations("inference").items()
+            },
             others,
             roofline.step(widths, height, width),
             alone=alone,
