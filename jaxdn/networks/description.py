@@ -8,7 +8,7 @@ from jaxdn.networks import LEVELS, Widths
 
 NEGATIVE_SLOPE = 0.01
 FEATURES = "features"
-"""The network's input."""
+"""The network's input, which only convolutions read: an engine may add channels to it."""
 
 Value = TypeVar("Value")
 Weights = Mapping[str, Mapping[str, Any]]

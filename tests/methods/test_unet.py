@@ -175,7 +175,7 @@ OTHER = Description(
     {
         FEATURES: Layer("input", (), 18, 0),
         "thin": Layer("convolution", (FEATURES,), 3, 0, 1),
-        "half": Layer("pool", (FEATURES,), 18, 1),
+        "half": Layer("pool", ("thin",), 3, 1),
         "wide": Layer("convolution", ("half",), 5, 1, 3),
         "bent": Layer("rectifier", ("wide",), 5, 1),
         "large": Layer("enlarge", ("bent",), 5, 0),
@@ -196,7 +196,7 @@ def test_every_engine_runs_whatever_network_is_described(engine: str, rng: np.ra
     }
     x = rng.normal(size=(2, 6, 8, 18))
     thin = x @ weights["thin"]["kernel"][0, 0] + weights["thin"]["bias"]
-    wide = numpy_convolution(x.reshape(2, 3, 2, 4, 2, 18).max(axis=(2, 4)), weights["wide"])
+    wide = numpy_convolution(thin.reshape(2, 3, 2, 4, 2, 3).max(axis=(2, 4)), weights["wide"])
     bent = np.where(wide < 0, NEGATIVE_SLOPE * wide, wide)
     end = numpy_convolution(np.concatenate([thin, bent.repeat(2, 1).repeat(2, 2), x], axis=-1), weights["end"])
 
