@@ -1,6 +1,6 @@
 """`make bench`: the speed of jaxdn on this machine, compared with its roofline, PyTorch and Open Image Denoise.
 
-    python -m experiments.speed.bench                  # everything, less than 20 minutes on two cores
+    python -m experiments.speed.bench                  # everything, 20 to 30 minutes on two cores
     python -m experiments.speed.bench --only steps     # one group
 
 Writes ``runs/bench.json``, a list of rows ``{"work", "implementation", "median_ms", "min_ms", "max_ms", "peak_mib",

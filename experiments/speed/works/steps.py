@@ -1,7 +1,7 @@
 """One recurrent ``ntd`` step at 1280x720: ours in each engine, the same network in PyTorch, Open Image Denoise."""
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -61,8 +61,9 @@ def open_image_denoise(frame: Frame, quality: str) -> Call:
     return lambda: denoise(*arrays)
 
 
+@cache
 def frame_of(height: int, width: int) -> Frame:
-    """What all implementations denoise."""
+    """What all implementations denoise; made once in a process."""
     return jax.tree.map(jnp.asarray, frame_at(scene.clip(2, height, width).frames, 1))
 
 
