@@ -38,6 +38,7 @@ LAYERS = {
     **dict.fromkeys(("cli", "commands"), 7),
 }
 OUTSIDE = {
+    "flax": {"networks"},
     "optax": {"learning"},
     "mitsuba": {"render"},
     "drjit": {"render"},

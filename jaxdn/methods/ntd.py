@@ -26,7 +26,6 @@ from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
 from jaxdn.methods.table import method
 from jaxdn.motion import on_screen
 from jaxdn.networks import LARGE, SMALL, Widths, crop, pad
-from jaxdn.networks.unet import unet
 from jaxdn.objectives import indirect_illumination, unbiased_illumination
 from jaxdn.ops.softmax_filter import softmax_filter
 from jaxdn.ops.warp import warp
@@ -272,6 +271,9 @@ def ntd(options: Options) -> Denoiser:
     # or coarser scale.
     fine = options.alpha_at == "fine"
     heads = (2 * TAPS + 2, TAPS + 1, TAPS) if fine else (2 * TAPS + 1, TAPS + 1, TAPS + 1)
+    # Flax is imported only when a network is built: filters without weights need only jax and numpy.
+    from jaxdn.networks.unet import unet
+
     sizes = {"large": LARGE, "small": SMALL}
     widths = sizes[options.size] if isinstance(options.size, str) else options.size
     scheme, engine = options.initialization, options.implementation

@@ -29,7 +29,6 @@ from jaxdn.frame import FAR, RADIANCE_MAX, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
 from jaxdn.methods.table import method
 from jaxdn.networks import Widths, crop, pad
-from jaxdn.networks.unet import unet
 from jaxdn.objectives import pyramid_illumination
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
 from jaxdn.options import Range
@@ -133,6 +132,9 @@ def steady(options: Options) -> Denoiser:
     guide or test is left out. Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for
     an unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
     """
+    # Flax is imported only when a network is built: filters without weights need only jax and numpy.
+    from jaxdn.networks.unet import unet
+
     widths = QUALITIES[options.quality] if isinstance(options.quality, str) else options.quality
     heads = (4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS,)
     network = unet((32, 20), heads, widths=widths, head_size=1, implementation=options.implementation)

@@ -1,14 +1,18 @@
-"""The U-Net that predicts kernels, as plain nested dicts of arrays and two pure functions, and its engines."""
+"""The U-Net that predicts kernels, and its engines.
+
+Flax NNX is used only inside this module. Its results are plain nested dicts of arrays and two pure functions, so that
+no other module depends on Flax.
+"""
 
 import functools
 import itertools
 import math
-import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import nnx
 
 from jaxdn.checks import check_option
 from jaxdn.denoiser import Params
@@ -64,6 +68,30 @@ class Layers(NamedTuple):
 
 XLA = Layers(convolve, 16)  # 51 outputs take XLA:CPU 1.4 times as long as 64
 ONEDNN = Layers(functools.partial(convolve, implementation="onednn"), 1)
+
+
+class Convolution(nnx.Module):
+    """One convolution's weights."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.kernel = nnx.Param(jnp.zeros(shape, jnp.float32))
+        self.bias = nnx.Param(jnp.zeros(shape[-1], jnp.float32))
+
+
+class Convolutions(nnx.Module):
+    """The weights of a described network: a convolution ``a/b`` is the attribute ``b`` of the attribute ``a``."""
+
+    def __init__(self, network: Description) -> None:
+        for name, shape in network.kernels().items():
+            level, _, layer = name.rpartition("/")
+            if level and not hasattr(self, level):
+                setattr(self, level, nnx.Module())
+            setattr(getattr(self, level) if level else self, layer, Convolution(shape))
+
+    def weights(self, names: Iterable[str]) -> dict[str, Any]:
+        """:data:`jaxdn.networks.description.Weights`, by the names of the convolutions."""
+        found: dict[str, Any] = {name: functools.reduce(getattr, name.split("/"), self) for name in names}
+        return {name: {"kernel": one.kernel[...], "bias": one.bias[...]} for name, one in found.items()}
 
 
 def initial(key: jax.Array, network: Description, *, scheme: str) -> dict[str, Any]:
@@ -148,6 +176,9 @@ def unet(
     def described(channels: int) -> Description:
         return description.unet(channels, heads, widths=widths, head_size=head_size)
 
+    abstract = nnx.eval_shape(lambda: Convolutions(described(sum(groups))))
+    graph, _ = nnx.split(abstract, nnx.Param, graph=False)
+
     def init(key: jax.Array) -> dict[str, Any]:
         return initial(key, described(sum(groups)), scheme=initialization)
 
@@ -164,7 +195,7 @@ def unet(
                 f"got shapes {got}; pad by the edge and crop the result."
             )
         network = described(sum(group.shape[-1] for group in present))
-        weights = {name: functools.reduce(operator.getitem, name.split("/"), params) for name in network.kernels()}
+        weights = nnx.merge(graph, params).weights(network.kernels())
         if len(present) < len(groups):
             first = next(iter(weights))
             parts = jnp.split(weights[first]["kernel"], list(itertools.accumulate(groups))[:-1], axis=2)
