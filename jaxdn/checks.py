@@ -32,6 +32,13 @@ def check_same_size(first: Any, second: Any, names: tuple[str, str]) -> None:
         )
 
 
+def check_at_least(least: int, **values: int) -> None:
+    """Raise ValueError for the first of ``values`` that is smaller than ``least``."""
+    for name, value in values.items():
+        if value < least:
+            raise ValueError(f"{name}: expected at least {least}, got {value}.")
+
+
 def check_option(value: Any, name: str, choices: tuple[Any, ...]) -> None:
     """Raise ValueError unless ``value`` is one of ``choices``."""
     if value not in choices:

@@ -142,7 +142,8 @@ class Train:
     """One of the method's recipes; for ntd: usual, without-occlusion, paper, paper-without-occlusion, parity. Default:
     the usual one."""
     steps: int | None = None
-    """Parameter updates; default, as for the next seven options: as in the recipe."""
+    """Parameter updates, more than before to go on with a finished run; default, as for the next seven options: as in
+    the recipe."""
     batch: int | None = None
     """Clips per update."""
     crop: int | None = None
@@ -177,7 +178,7 @@ class Denoise:
     clip: tyro.conf.Positional[Path]
     """Folder of a clip, folder of EXR files, or a quoted pattern of EXR files."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """Folder for the denoised frames."""
+    """Folder for the denoised frames; for a single frame, also the name of an EXR file."""
     method: str = "steady-balanced"
     """Shipped weights (steady-balanced, ntd-large, ntd-small), a filter (svgf), or the path of a .safetensors file."""
     spp: int = 1
@@ -211,6 +212,13 @@ class Compare:
     """Samples per pixel to take from the clips' layers."""
 
 
+def _folder(out: Path) -> Path:
+    """``-o`` of a command that writes into a folder. Raises ValueError for what is plainly the name of a file."""
+    if out.suffix.lower() in (".exr", ".png", ".safetensors", ".json", ".html"):
+        raise ValueError(f"-o {out}: expected a folder, got the name of a file.")
+    return out
+
+
 def _inspect(options: Inspect) -> None:
     from jaxdn.commands.inspect import inspect_to_terminal
 
@@ -230,7 +238,7 @@ def _render(options: Render) -> None:
 
     render(
         options.scene,
-        options.out,
+        _folder(options.out),
         animation=options.animation,
         tours=options.tour,
         seeds=_numbers(options.seeds),
@@ -297,7 +305,7 @@ def _train(options: Train) -> None:
         method,
         recipe,
         options.clips,
-        options.out,
+        _folder(options.out),
         options={**method.variant_named(options.variant), **parse(options.set)},
         start=options.start,
         validation=[options.validation] if options.validation else [],
@@ -337,12 +345,12 @@ def _compare(options: Compare) -> None:
     from jaxdn.commands.compare import compare
     from jaxdn.report import text_table, write_report
 
-    names = options.methods or all_names()
+    out, names = _folder(options.out), options.methods or all_names()
     methods = [candidate(name) for name in names]
     folders = find_clips(options.clips)
     settings = {"clips": len(folders), "spp": options.spp, "methods": names}
     results = compare(methods, folders, title=f"Denoisers on {options.clips.name}", settings=settings, spp=options.spp)
-    page = write_report(results, options.out)
+    page = write_report(results, out)
     print(text_table(results))
     print(f"report: {page}")
 

@@ -14,6 +14,7 @@ PACKAGE = Path(jaxdn.__file__).parent
 
 MATHS = (
     "checks",
+    "extras",
     "options",
     "frame",
     "repair",

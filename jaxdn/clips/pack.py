@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxdn.checks import check_at_least
 from jaxdn.clips.cache import CachedClip, kept, open_cached, read_array
 from jaxdn.clips.compact import CODES, squeeze, unsqueeze
 from jaxdn.clips.files import ClipError, read_json
@@ -139,13 +140,12 @@ def _check(clip: CachedClip, packing: Packing) -> None:
     unknown = set(packing.buffers) - set(GUIDES)
     if unknown:
         raise ValueError(f"buffers: expected some of {', '.join(GUIDES)}, got {', '.join(sorted(unknown))}.")
-    for name, value, least in (("crop", packing.crop, 1), ("frames", packing.frames, 1), ("draws", packing.draws, 0)):
-        if value < least:
-            raise ValueError(f"{name}: expected at least {least}, got {value}.")
+    check_at_least(1, crop=packing.crop, frames=packing.frames)
+    check_at_least(0, draws=packing.draws)
     if min(clip.shape[1:]) < packing.crop:
         raise ClipError(
             f"{clip.path}: expected at least {packing.crop} x {packing.crop} pixels for the crop, got {clip.shape[2]} "
-            f"x {clip.shape[1]}; make the crop smaller."
+            f"x {clip.shape[1]}; make it smaller (--crop {min(clip.shape[1:])})."
         )
     if "reference" not in clip.arrays:
         raise ClipError(f"{clip.path}: there is no reference to train towards; render the clip with one.")

@@ -65,7 +65,7 @@ def denoise_files(
 
     Args:
       source: folder of a clip; or a folder of, or a pattern for, EXR files.
-      out: folder for the denoised frames.
+      out: folder for the denoised frames; of a single frame, also the name of an EXR file.
       method: the denoiser.
       spp: samples per pixel to take from a clip's layers.
       preview: write a PNG next to each frame.
@@ -74,16 +74,19 @@ def denoise_files(
       say: called with the number of frames done and the total.
       log: called with lines about what is read and derived from files of other renderers.
     """
+    single = out.suffix.lower() == ".exr"
     needs_layers = method.denoiser is not None and method.denoiser.samples is not None
     names, frames = _open(source, needs_layers, spp, motion_convention, channels, log)
-    if out.resolve() in {source.resolve(), *(name.resolve().parent for name in names)}:
-        raise ValueError(f"{out}: expected another folder than the input's, whose frames would be overwritten.")
+    if single and len(names) > 1:
+        raise ValueError(f"{out}: expected a folder for {len(names)} frames, got the name of one EXR file.")
+    if out.resolve() in {source.resolve(), *(place for name in names for place in (name.resolve(), name.resolve().parent))}:
+        raise ValueError(f"{out}: expected another place than the input's, whose frames would be overwritten.")
     step = None if method.denoiser is None else stream(method.denoiser, method.params)
-    out.mkdir(parents=True, exist_ok=True)
+    (out.parent if single else out).mkdir(parents=True, exist_ok=True)
     written = []
     for name, (frame, layers) in zip(names, frames, strict=True):
         image = _light(frame.radiance) if step is None else np.asarray(step(frame, layers))
-        path = out / f"{name.stem}.exr"
+        path = out if single else out / f"{name.stem}.exr"
         beauty = image + _light(frame.direct) + _light(frame.emission)
         write_exr(path, _channels("", beauty) | _channels("denoised.", image))
         if preview:

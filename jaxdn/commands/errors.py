@@ -7,15 +7,8 @@ from typing import NoReturn
 
 from rich.console import Console
 
+from jaxdn.extras import extra_of, install
 from jaxdn.render.errors import RenderError
-
-EXTRAS: dict[str, tuple[str, ...]] = {
-    "render": ("mitsuba", "drjit"),
-    "train": ("optax", "orbax", "grain", "matplotlib"),
-    "onnx": ("onnxruntime", "onnx"),
-    "bench": ("torch", "pyoidn"),
-}
-"""Extra of pyproject.toml -> the packages that it installs, by their import names."""
 
 
 @contextmanager
@@ -33,10 +26,10 @@ def plain_errors() -> Iterator[None]:
         _end(f"{where}{error.strerror or error}")
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        extra = next((extra for extra, packages in EXTRAS.items() if package in packages), None)
+        extra = extra_of(package)
         if extra is None:
             raise
-        _end(f"this needs the package {package!r}: pip install 'jaxdn[{extra}]'.")
+        _end(f"this needs the package {package!r}, which is not installed: {install(extra)}")
     except KeyboardInterrupt:
         Console(stderr=True).print("jaxdn: interrupted; what is finished is kept.", highlight=False)
         sys.exit(130)

@@ -19,6 +19,7 @@ from jaxdn.checkpoint import Checkpoints
 from jaxdn.clips import find_clips, read_clip
 from jaxdn.clips.cache import read_window
 from jaxdn.clips.pack import open_pack
+from jaxdn.commands.interrupt import Interrupt
 from jaxdn.commands.log import Log
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.files import write_json
@@ -65,7 +66,8 @@ def fit(
 ) -> TrainState:
     """Train to ``recipe.steps`` updates, resuming from the newest checkpoint in ``folder`` to the same result.
 
-    On Ctrl-C the state is saved before KeyboardInterrupt is raised again, and at the time limit before it is returned.
+    A run that was started with fewer steps goes on to ``recipe.steps``, along the schedule of that many. On Ctrl-C the
+    update is finished, logged and saved before KeyboardInterrupt is raised; at the time limit the state is returned.
     Raises ValueError for impossible values in the recipe, and, with what to change, after many updates in a row that
     changed nothing.
 
@@ -85,7 +87,7 @@ def fit(
     recipe.check()
     end = math.inf if time_limit is None else time.monotonic() + time_limit
     folder.mkdir(parents=True, exist_ok=True)
-    _same_recipe(folder / "recipe.json", recipe, None if start is None else start.name)
+    extended = _same_recipe(folder / "recipe.json", recipe, None if start is None else start.name)
     checkpoints = Checkpoints(folder / "checkpoints")
     first_position = batches.get_state()  # type: ignore[attr-defined]
     state = initial_state(denoiser, recipe, next(batches))
@@ -104,26 +106,35 @@ def fit(
     position = batches.get_state()  # type: ignore[attr-defined]
     saved = step
     watch = _Divergence(label, recipe, step, int(state.skipped))
-    with _Progress(label, recipe, step) as progress:
+    with (
+        _Progress(label, recipe, step) as progress,
+        Interrupt(lambda: progress.say(f"{label}: stopping after this update; press Ctrl-C again to lose it")) as stop,
+    ):
+        if extended is not None:
+            progress.say(f"{label}: begun with {extended} steps, goes on to {recipe.steps} along their learning rates")
         try:
-            while step < recipe.steps and time.monotonic() < end:
+            while step < recipe.steps and time.monotonic() < end and not stop.asked:
                 batch = next(batches)
                 state, report = train_step(state, batch)
                 step, position = step + 1, batches.get_state()  # type: ignore[attr-defined]
-                if step % log_every == 0 or step == recipe.steps:
-                    loss, skipped = float(report.loss), int(state.skipped)
-                    log.write(step=step, loss=loss, last_frame_psnr=float(report.validation_psnr))
-                    progress.advance(step, loss=loss, skipped=skipped)
-                    watch.look(step, skipped=skipped, norm=float(report.gradient_norm))
+                logs = step % log_every == 0 or step == recipe.steps
+                if logs:
+                    log.write(step=step, loss=float(report.loss), last_frame_psnr=float(report.validation_psnr))
                 if validation and (step % validate_every == 0 or step == recipe.steps):
                     psnr = validate(state.average)
                     log.write(step=step, validation_psnr=psnr)
                     progress.validated(psnr)
+                if logs:  # after the validation: the last line shows the last one
+                    skipped = int(state.skipped)
+                    progress.advance(step, loss=float(report.loss), skipped=skipped)
+                    watch.look(step, skipped=skipped, norm=float(report.gradient_norm))
                 if step % checkpoint_every == 0 or step == recipe.steps:
                     checkpoints.save(state, position)
                     saved = step
+            if stop.asked:
+                raise KeyboardInterrupt
         except KeyboardInterrupt:
-            if saved < step:
+            if saved < step and _is_whole(state, step):
                 checkpoints.save(state, position)
             progress.say(f"{label}: stopped after {step} of {recipe.steps} steps; the same command continues there.")
             raise
@@ -153,20 +164,39 @@ def load_validation(denoiser: Denoiser, places: Sequence[Path], *, spp: int = 1)
     return clips
 
 
-def _same_recipe(path: Path, recipe: Recipe, start: str | None) -> None:
-    """Write the recipe of a new run; raise ValueError if an existing run has another one."""
+def _is_whole(state: TrainState, step: int) -> bool:
+    """Whether a state is that after ``step`` updates: a second Ctrl-C may come while an update takes its memory."""
+    return not any(leaf.is_deleted() for leaf in jax.tree.leaves(state)) and int(state.step) == step
+
+
+def _same_recipe(path: Path, recipe: Recipe, start: str | None) -> int | None:
+    """Write the recipe of a new run, or of one that is made longer, and return how long the latter was.
+
+    Raises ValueError if an existing run has another recipe.
+    """
     wanted = {**recipe.record(), "start": start}
+    extended: int | None = None
     if path.is_file():
         there = json.loads(path.read_text())
         differing = {key: (there.get(key), value) for key, value in wanted.items() if there.get(key) != value}
-        if differing:
+        if differing.keys() == {"steps"} and there["steps"] < recipe.steps:
+            extended = there["steps"]
+            wanted["begun_with"] = [*there.get("begun_with", []), extended]
+        elif differing:
             changes = ", ".join(f"{key} {old!r} -> {new!r}" for key, (old, new) in differing.items())
             raise ValueError(
                 f"{path}: expected the recipe that this run was started with, got {changes}; give the new run another "
                 "name, or delete the folder to start over."
             )
-        return
+        else:
+            return None
     write_json(path, wanted)
+    return extended
+
+
+def begun_with(folder: Path) -> list[int]:
+    """The numbers of steps that a run was started with before it was made longer; their schedules shaped its weights."""
+    return list(json.loads((folder / "recipe.json").read_text()).get("begun_with", []))
 
 
 class _Divergence:

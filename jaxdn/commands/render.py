@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxdn.checks import check_at_least
 from jaxdn.clips.folder import begun_record
 from jaxdn.denoiser import Denoiser
 from jaxdn.effects import Effects, Plan, chosen, inspect, plan
@@ -101,6 +102,7 @@ def render(
     Prints the Mitsuba variant, each clip's effects, and the progress. Raises ValueError for a source that is not a
     scene and for options out of range, and RenderError, at the end, for clips that failed.
     """
+    check_at_least(1, width=width, height=height, frames=frames)
     scenes = _tours(source, animation, seeds, frames, out) if tours else _scenes(source, animation, seeds)
     choice = choose_variant()
     print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)

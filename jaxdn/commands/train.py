@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdn.clips import training_batches
-from jaxdn.commands.fit import Start, fit, load_validation
+from jaxdn.commands.fit import Start, begun_with, fit, load_validation
 from jaxdn.methods.table import Method
 from jaxdn.recipe import Recipe
 from jaxdn.weights import save_weights, starting_params
@@ -69,7 +69,10 @@ def train(
     held_out = load_validation(denoiser, validation, spp=min(recipe.spp))
     first = None if start is None else Start(str(start), starting_params(start, denoiser))
     state = fit(denoiser, recipe, batches, out, label=label, start=first, validation=held_out, time_limit=time_limit)
-    begun = {} if first is None else {"start": first.name}
+    begun: dict[str, Any] = {} if first is None else {"start": first.name}
+    shorter = begun_with(out)
+    if shorter:
+        begun["begun_with"] = shorter
     about = {
         "recipe": recipe.record(),
         "updates": int(state.step),

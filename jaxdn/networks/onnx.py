@@ -2,7 +2,7 @@
 
 XLA:CPU's convolutions reach about two thirds of the machine's peak. ONNX Runtime keeps activations in blocks of 16
 channels from one convolution to the next; a 720p step takes 0.77 to 1.03 of XLA's time (``docs/performance.md``). It
-is an extra (``pip install jaxdn[onnx]``) and for inference only: the gradient is that of the network in plain XLA,
+is an extra (``pip install onnxruntime onnx``) and for inference only: the gradient is that of the network in plain XLA,
 recomputed. None of this is visible outside: ``unet(..., implementation="onnxruntime")`` is the same pure function.
 """
 
@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
+from jaxdn.extras import install
 from jaxdn.networks.description import FEATURES, NEGATIVE_SLOPE, Description, Weights, evaluate
 
 OPSET = 17
@@ -43,7 +44,7 @@ def check_available() -> None:
         )
     if not available():
         raise ValueError(
-            'implementation: "onnxruntime" needs the packages onnxruntime and onnx; pip install "jaxdn[onnx]".'
+            f'implementation: "onnxruntime" needs the packages onnxruntime and onnx: {install("onnx")}'
         )
 
 

@@ -1,7 +1,7 @@
 """oneDNN's 3x3 convolutions and their gradients, called from inside a jitted program on CPUs.
 
 XLA:CPU has no fast gradient of a convolution by its kernel, and its convolutions reach two thirds of the machine's
-peak. oneDNN (Apache-2.0; the engine under PyTorch on CPUs) is an extra, ``pip install jaxdn[onednn]``: a
+peak. oneDNN (Apache-2.0; the engine under PyTorch on CPUs) is an extra, ``pip install onednn-cpu-gomp``: a
 shared library, called through its C interface (version 3) by ctypes, so that no compiler is needed. It reads and
 writes XLA's own buffers. :mod:`jaxdn.ops.convolution` makes one differentiable operation of the three functions.
 """
@@ -18,6 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
+
+from jaxdn.extras import install
 
 PACKAGE = "onednn-cpu-gomp"
 _LIBRARY = "libdnnl.so.3"
@@ -78,7 +80,7 @@ def check_available() -> None:
         )
     if not available():
         raise ValueError(
-            f'implementation: "onednn" needs the package {PACKAGE} (Linux, x86-64); pip install "jaxdn[onednn]".'
+            f'implementation: "onednn" needs the package {PACKAGE} (Linux, x86-64): {install("onednn")}'
         )
 
 

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdn.checks import check_at_least
 from jaxdn.clips import ClipError, read_frame, write_frame
 from jaxdn.clips.folder import begin_record, begun_record, finish_record, frame_path
 from jaxdn.frame import Frame
@@ -175,8 +176,7 @@ def render_clip(
     """
     folder = Path(folder)
     frames = scene.frames if frames is None else frames
-    if frames < 1:
-        raise ValueError(f"frames: expected at least 1, got {frames}.")
+    check_at_least(1, frames=frames)
     _check_options(width, height, layers, reference_spp, draws)
     if plan is not None and len(plan.frames) != frames:
         raise ValueError(f"plan: expected one for {frames} frames, got one for {len(plan.frames)}.")
@@ -283,8 +283,7 @@ def _single(image: np.ndarray) -> np.ndarray:
 
 
 def _check_options(width: int, height: int, layers: Sequence[int], reference_spp: int, draws: int) -> None:
-    if width < 1 or height < 1:
-        raise ValueError(f"width and height: expected at least 1, got {width} x {height}.")
+    check_at_least(1, width=width, height=height)
     powers = all(isinstance(samples, int) and samples >= 1 and samples & (samples - 1) == 0 for samples in layers)
     if not layers or not powers or len(set(layers)) != len(layers):
         raise ValueError(f"layers: expected different powers of two, such as (1, 2, 4), got {tuple(layers)}.")
@@ -308,16 +307,51 @@ def _versions() -> dict[str, str]:
 
 def _check_settings(folder: Path, wanted: Mapping[str, Any], found: Mapping[str, Any]) -> None:
     """Raise ClipError if the frames in a folder were rendered with other settings."""
-    found = {**found, "plan": entries(found.get("plan")), "draws": found.get("draws", 0)}
-    # Compared in the form read from JSON, where tuples have become lists.
-    differing = [key for key in wanted if key not in _FREE and _plain(found.get(key)) != _plain(wanted[key])]
+    # Frames may be added: what both records say about the same ones is compared.
+    common = min(int(found["frames"]), int(wanted["frames"]))
+    both = [
+        {**record, "plan": _planned(record.get("plan"), common), "draws": record.get("draws", 0)}
+        for record in (found, wanted)
+    ]
+    names = [name for name in wanted if name not in _FREE]
+    differing = [line for name in names for line in _differences(name, both[0].get(name), both[1][name])]
     cameras = zip(found.get("cameras", []), wanted["cameras"], strict=False)
     if any(_plain(first) != _plain(second) for first, second in cameras):
-        differing.append("cameras")
+        differing.append("another camera path")
     if differing:
-        pairs = ((key, str(found.get(key))[:60], str(wanted[key])[:60]) for key in differing)
-        what = "; ".join(f"{key}: {there} there, {new} wanted" for key, there, new in pairs)
+        if found["frames"] != wanted["frames"]:
+            differing.insert(0, f"{found['frames']} frames there, {wanted['frames']} wanted")
+        what = "; ".join(dict.fromkeys(differing))
         raise ClipError(f"{folder}: was rendered with other settings ({what}); choose another folder or remove it.")
+
+
+def _planned(plan: Mapping[str, Any] | None, frames: int) -> dict[str, Any] | None:
+    """What a plan's record says about the first frames; the names of its effects follow from that."""
+    known = entries(plan)
+    if known is None:
+        return None
+    cut = {name: known[name][:frames] for name in ("frames", "held") if name in known}
+    return {name: value for name, value in known.items() if name != "effects"} | cut
+
+
+def _differences(name: str, there: Any, wanted: Any) -> list[str]:
+    """In words, one for each entry, where two values of a record differ; long ones are not written out."""
+    # Compared in the form read from JSON, where tuples have become lists.
+    there, wanted = _plain(there), _plain(wanted)
+    if there == wanted:
+        return []
+    if isinstance(there, dict) and isinstance(wanted, dict):
+        keys = dict.fromkeys((*wanted, *there))
+        return [line for key in keys for line in _differences(f"{name} {key}", there.get(key), wanted.get(key))]
+    if name == "plan frames":
+        pairs = ((index, set(old), set(new)) for index, (old, new) in enumerate(zip(there, wanted, strict=True)))
+        index, old, new = next((index, old, new) for index, old, new in pairs if old != new)
+        lists = (", ".join(sorted(buffers)) or "no more" for buffers in (old - new, new - old))
+        return ["buffers of frame {}: {} there, {} wanted".format(index, *lists)]
+    name = name.removeprefix("plan ")
+    if len(f"{there}{wanted}") > 120:
+        return [f"{name} differs"]
+    return [f"{name}: {there} there, {wanted} wanted"]
 
 
 def _plain(value: Any) -> Any:

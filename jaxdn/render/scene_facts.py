@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxdn.checks import check_at_least
 from jaxdn.planning.facts import Facts, Light, Moment, Surface
 from jaxdn.render.scene import AnimatedScene, brightness
 from jaxdn.render.variant import use_variant
@@ -20,7 +21,12 @@ _LOOK = 16
 
 
 def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | None = None) -> Facts:
-    """Facts about the first ``frames`` frames (default: all) of an animated scene, seen at ``width`` x ``height``."""
+    """Facts about the first ``frames`` frames (default: all) of an animated scene, seen at ``width`` x ``height``.
+
+    Raises ValueError for a size or a number of frames below 1.
+    """
+    count = scene.frames if frames is None else frames
+    check_at_least(1, width=width, height=height, frames=count)
     use_variant()
     # Mitsuba's names exist only after a variant is chosen.
     from jaxdn.render.gbuffer import gbuffer, shape_names
@@ -36,7 +42,6 @@ def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | Non
         around = frozenset()
 
     stage = _Stage(scene, shapes, (height, width), around)
-    count = scene.frames if frames is None else frames
     return Facts(
         surfaces=tuple(surfaces),
         lights=tuple(lights),

@@ -8,6 +8,7 @@ for its children.
 
 import glob
 import importlib
+import importlib.util
 import os
 import re
 import subprocess
@@ -112,8 +113,10 @@ def choose_variant(requested: str | None = None) -> Choice:
     """The variant to render with: ``requested``, else ``JAXDN_VARIANT``, else the fastest that works here.
 
     A probe runs once per process and choice; child processes find its result in their environment. Raises
-    ValueError if the requested variant is unknown or does not run here.
+    ValueError if the requested variant is unknown or does not run here, and ModuleNotFoundError without Mitsuba.
     """
+    if importlib.util.find_spec("mitsuba") is None:  # every probe below would fail, which says nothing about LLVM
+        raise ModuleNotFoundError("No module named 'mitsuba'", name="mitsuba")
     requested = requested or os.environ.get(OVERRIDE) or None
     if requested is not None and requested not in VARIANTS:
         raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {requested!r}.")

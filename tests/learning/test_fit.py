@@ -1,17 +1,24 @@
 """The training loop: stopped at any moment and started again, it continues as if never stopped."""
 
 import json
+import os
+import signal
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from jaxdn.clips import training_batches, write_clip
-from jaxdn.commands.fit import Start, fit
-from jaxdn.commands.log import read_curve, read_log
+from jaxdn.commands import fit as loop
+from jaxdn.commands.fit import Start, begun_with, fit, load_validation
+from jaxdn.commands.log import Log, read_curve, read_log
+from jaxdn.denoiser import Core, recurrent
 from jaxdn.denoisers import ntd
 from jaxdn.methods.table import method_named
+from jaxdn.objectives import Objective
+from jaxdn.recipe import Recipe
 from tests.learning.test_training import TINY, make_clip
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -112,3 +119,98 @@ def test_training_stops_at_its_time_limit_and_goes_on_from_there(clips, tmp_path
     whole, continued = run(clips, tmp_path / "whole"), run(clips, tmp_path / "limited")
     assert int(continued.step) == 6
     jax.tree.map(np.testing.assert_array_equal, whole.average, continued.average)
+
+
+def gain():
+    """The frame times a learned number: compiles at once, and the loop is the same."""
+
+    def step(params, state, frame, first):
+        image = params["gain"] * frame.radiance
+        return image, image, 0
+
+    return recurrent(
+        Core(lambda params, frame: frame.radiance, step, frozenset(), lambda key, frame: {"gain": jnp.float32(0.5)})
+    )
+
+
+SQUARES = Objective("squares", lambda images, clip, progress: jnp.mean((images - clip.reference) ** 2))
+SHORT = Recipe(SQUARES, steps=4, batch=2, crop=16, frames=4)
+
+
+def run_gain(clips, folder, recipe=SHORT, source=None, **options):
+    return fit(gain(), recipe, source or batches(clips), folder, label="gain", log_every=2, **options)
+
+
+def test_ctrl_c_on_a_logging_step_keeps_its_log_entry(clips, tmp_path, monkeypatch):
+    whole = run_gain(clips, tmp_path / "whole")
+    write = Log.write
+
+    def interrupted(log, **entry):
+        if entry["step"] == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        write(log, **entry)
+
+    monkeypatch.setattr(Log, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_gain(clips, tmp_path / "stopped")
+    assert read_curve(tmp_path / "stopped").step == [2]
+    monkeypatch.undo()
+    continued = run_gain(clips, tmp_path / "stopped")
+    assert read_curve(tmp_path / "stopped") == read_curve(tmp_path / "whole")
+    np.testing.assert_array_equal(continued.params["gain"], whole.params["gain"])
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_second_ctrl_c_stops_at_once_and_the_run_still_ends_the_same(clips, tmp_path, monkeypatch):
+    whole = run_gain(clips, tmp_path / "whole")
+    make = loop.make_train_step
+
+    def interrupting(denoiser, recipe):
+        step = make(denoiser, recipe)
+
+        def twice(state, batch):
+            given = int(state.step)
+            found = step(state, batch)  # the old state's memory is gone from here on
+            if given == 2:
+                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), signal.SIGINT)
+            return found
+
+        return twice
+
+    monkeypatch.setattr(loop, "make_train_step", interrupting)
+    with pytest.raises(KeyboardInterrupt):
+        run_gain(clips, tmp_path / "stopped", checkpoint_every=1)
+    monkeypatch.undo()
+    continued = run_gain(clips, tmp_path / "stopped")
+    assert read_curve(tmp_path / "stopped") == read_curve(tmp_path / "whole")
+    np.testing.assert_array_equal(continued.params["gain"], whole.params["gain"])
+
+
+def test_a_finished_run_goes_on_with_more_steps_and_says_so(clips, tmp_path, capsys):
+    first = run_gain(clips, tmp_path)
+    assert begun_with(tmp_path) == []
+    longer = run_gain(clips, tmp_path, SHORT._replace(steps=8))
+    assert "begun with 4 steps, goes on to 8" in capsys.readouterr().out
+    assert int(longer.step) == 8
+    assert read_curve(tmp_path).step == [2, 4, 6, 8]
+    assert begun_with(tmp_path) == [4]
+    assert float(longer.params["gain"]) != float(first.params["gain"])
+    run_gain(clips, tmp_path, SHORT._replace(steps=8))
+    assert begun_with(tmp_path) == [4]
+    for other in (SHORT, SHORT._replace(steps=9, learning_rate=0.5)):
+        with pytest.raises(ValueError, match="steps 8 -> "):
+            run_gain(clips, tmp_path, other)
+    assert begun_with(tmp_path) == [4]
+
+
+def test_the_validation_reaches_the_terminal(clips, tmp_path, capsys):
+    run_gain(clips, tmp_path, validation=load_validation(gain(), [clips[0]]))
+    psnr = read_curve(tmp_path).validation_psnr[-1]
+    assert f"validation {psnr:.2f} dB" in capsys.readouterr().out
+
+
+def test_training_without_a_step_is_refused_before_anything_is_written(clips, tmp_path):
+    with pytest.raises(ValueError, match=r"steps: expected a whole number >= 1, got 0"):
+        run_gain(clips, tmp_path / "run", SHORT._replace(steps=0))
+    assert not (tmp_path / "run").exists()

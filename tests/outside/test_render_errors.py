@@ -1,12 +1,15 @@
 """Which errors end with one message and which keep their traceback, with and without the packages of the extras."""
 
-import importlib.metadata
+import re
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
-from jaxdn.commands.errors import EXTRAS, plain_errors
+from jaxdn.commands.errors import plain_errors
+from jaxdn.extras import EXTRAS, install
 
 WITHOUT_RENDERER = """
 import importlib.abc, sys
@@ -44,16 +47,32 @@ def test_without_the_renderer_a_failed_rendering_is_one_message():
 def test_without_the_renderer_rendering_says_what_to_install(tmp_path):
     done = run("import jaxdn.render.clip")
     assert done.returncode == 2
-    assert done.stderr.strip().endswith("pip install 'jaxdn[render]'.")
+    assert done.stderr.strip().endswith("pip install mitsuba")
 
 
-@pytest.mark.parametrize(("extra", "package"), [(extra, name) for extra, names in EXTRAS.items() for name in names])
-def test_a_missing_package_is_in_the_extra_that_is_named(extra, package, capsys):
+def test_without_the_renderer_llvm_is_not_blamed(tmp_path):
+    done = run(f"from jaxdn.cli import main; main(['render', 'edge', '-o', {str(tmp_path / 'out')!r}])")
+    assert done.returncode == 2
+    assert done.stderr.strip().endswith("pip install mitsuba")
+    assert "LLVM" not in done.stdout + done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("extra", "module"), [(name, module) for name in EXTRAS for module in EXTRAS[name].modules])
+def test_a_missing_package_is_named_with_the_command_that_installs_it(extra, module, capsys):
     with pytest.raises(SystemExit) as ended, plain_errors():
-        raise ModuleNotFoundError(f"No module named {package!r}", name=f"{package}.inner")
+        raise ModuleNotFoundError(f"No module named {module!r}", name=f"{module}.inner")
     assert ended.value.code == 2
-    assert f"pip install 'jaxdn[{extra}]'" in capsys.readouterr().err
-    assert extra in importlib.metadata.metadata("jaxdn").get_all("Provides-Extra")
+    message = " ".join(capsys.readouterr().err.split())
+    assert message.endswith(install(extra))
+    assert "jaxdn[" not in message  # no package index has jaxdn
+
+
+@pytest.mark.parametrize("extra", EXTRAS)
+def test_the_extras_are_those_of_the_project(extra):
+    declared = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    needed = declared["optional-dependencies"][extra]
+    assert EXTRAS[extra].packages == tuple(re.match(r"[\w-]+", requirement)[0] for requirement in needed)
 
 
 @pytest.mark.parametrize("name", ["jaxdn.nowhere", "PIL", None])
