@@ -111,7 +111,10 @@ def _stack(clips: Sequence[Clip]) -> Clip:
 
 def _check(clip: CachedClip, sizes: tuple[int, int, int], counts: Sequence[int]) -> None:
     if clip.shape[0] < sizes[0]:
-        raise ClipError(f"{clip.path}: expected at least {sizes[0]} frames, got {clip.shape[0]}; train on fewer (--frames {clip.shape[0]}).")
+        raise ClipError(
+            f"{clip.path}: expected at least {sizes[0]} frames, got {clip.shape[0]}; train on fewer "
+            f"(--frames {clip.shape[0]})."
+        )
     if clip.shape[1] < sizes[1] or clip.shape[2] < sizes[2]:
         raise ClipError(
             f"{clip.path}: expected at least {sizes[2]} x {sizes[1]} pixels for the crop, got {clip.shape[2]} x "

@@ -79,7 +79,10 @@ def denoise_files(
     names, frames = _open(source, needs_layers, spp, motion_convention, channels, log)
     if single and len(names) > 1:
         raise ValueError(f"{out}: expected a folder for {len(names)} frames, got the name of one EXR file.")
-    if out.resolve() in {source.resolve(), *(place for name in names for place in (name.resolve(), name.resolve().parent))}:
+    if out.resolve() in {
+        source.resolve(),
+        *(place for name in names for place in (name.resolve(), name.resolve().parent)),
+    }:
         raise ValueError(f"{out}: expected another place than the input's, whose frames would be overwritten.")
     step = None if method.denoiser is None else stream(method.denoiser, method.params)
     (out.parent if single else out).mkdir(parents=True, exist_ok=True)

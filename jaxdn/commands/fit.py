@@ -195,7 +195,7 @@ def _same_recipe(path: Path, recipe: Recipe, start: str | None) -> int | None:
 
 
 def begun_with(folder: Path) -> list[int]:
-    """The numbers of steps that a run was started with before it was made longer; their schedules shaped its weights."""
+    """The numbers of steps that a run had before it was made longer; their schedules shaped its weights."""
     return list(json.loads((folder / "recipe.json").read_text()).get("begun_with", []))
 
 

@@ -59,7 +59,7 @@ def plan_clip(
     # Measuring needs a path tracer, and indirect light that longer paths may add.
     if max_depth is not None or not made.indirect or made.integrator != "path":
         return Planned(found, made)
-    depth = measure_depth(scene)
+    depth = measure_depth(scene, frames=frames)
     return Planned(found, plan(found, denoiser, max_depth=depth.max_depth), depth)
 
 

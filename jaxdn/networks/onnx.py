@@ -43,9 +43,7 @@ def check_available() -> None:
             "leave it None, or set JAX_PLATFORMS=cpu."
         )
     if not available():
-        raise ValueError(
-            f'implementation: "onnxruntime" needs the packages onnxruntime and onnx: {install("onnx")}'
-        )
+        raise ValueError(f'implementation: "onnxruntime" needs the packages onnxruntime and onnx: {install("onnx")}')
 
 
 class Graph:

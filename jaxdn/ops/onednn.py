@@ -79,9 +79,7 @@ def check_available() -> None:
             "leave it None, or set JAX_PLATFORMS=cpu."
         )
     if not available():
-        raise ValueError(
-            f'implementation: "onednn" needs the package {PACKAGE} (Linux, x86-64): {install("onednn")}'
-        )
+        raise ValueError(f'implementation: "onednn" needs the package {PACKAGE} (Linux, x86-64): {install("onednn")}')
 
 
 def _call(function: str, *arguments: Any) -> None:

@@ -11,11 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxdn.planning.plan import BOUND
-from jaxdn.render.scene import AnimatedScene
+from jaxdn.render.scene import AnimatedScene, brightness
 from jaxdn.render.seeds import DEPTH
 from jaxdn.render.variant import use_variant
 
 _SIDE, _SAMPLES = 24, 16
+_FRAMES = 3
+"""Frames that are measured, evenly from the first to the last, besides those in which a light is brightest."""
 _DEPTHS = (2, 3, 4, 5, 6, 8, 10, 13, 17, 24)
 
 
@@ -30,14 +32,18 @@ class PathDepth(NamedTuple):
     """The allowed share."""
     light: dict[int, float]
     """Path length -> mean reflected radiance, as measured."""
+    frame: int = 0
+    """The frame that needs this length."""
 
 
-def measure_depth(scene: AnimatedScene, *, bound: float = BOUND) -> PathDepth:
-    """The shortest path length that leaves out at most ``bound`` of the reflected light, measured in the first frame.
+def measure_depth(scene: AnimatedScene, *, frames: int | None = None, bound: float = BOUND) -> PathDepth:
+    """The shortest path length that leaves out at most ``bound`` of the reflected light in every measured frame.
 
-    Light that the camera sees directly does not count: next to a bright window everything else would be negligible. It
-    takes 16 samples for each of 24 x 24 pixels; all depths follow the same paths, so that their differences are exact.
-    The result is at most the scene's own ``max_depth`` and always includes indirect light. The light beyond depth D is
+    Measured are the first, the middle and the last of ``frames`` frames (default: all of the animation), and for each
+    light whose brightness changes the frame in which it is brightest: a clip may begin in the dark. Light that the
+    camera sees directly does not count: next to a bright window everything else would be negligible. It takes 16
+    samples for each of 24 x 24 pixels; all depths follow the same paths, so that their differences are exact. The
+    result is at most the scene's own ``max_depth`` and always includes indirect light. The light beyond depth D is
     estimated as a geometric series with the ratio of the last two measured bounces, or of the last three if they decay
     slower. Raises ValueError for a bound outside (0, 1).
     """
@@ -46,14 +52,33 @@ def measure_depth(scene: AnimatedScene, *, bound: float = BOUND) -> PathDepth:
     from jaxdn.render.clip import tracer
 
     accumulate, _ = tracer(use_variant())
-    built = scene.build(0, _SIDE, _SIDE)
-    light: dict[int, float] = {}
-    for depth in sorted({min(depth, scene.max_depth) for depth in _DEPTHS}):
-        sums = accumulate(built, seed=0, frame=0, stream=DEPTH, first=0, count=_SAMPLES, max_depth=depth)
-        light[depth] = float(np.mean(sums.direct + sums.indirect)) / _SAMPLES
-        if depth >= 4 and _remaining(light) <= bound:
-            break
-    return _shortest(light, bound)
+    found: list[PathDepth] = []
+    for frame in _measured_frames(scene, scene.frames if frames is None else frames):
+        built = scene.build(frame, _SIDE, _SIDE)
+        light: dict[int, float] = {}
+        for depth in sorted({min(depth, scene.max_depth) for depth in _DEPTHS}):
+            sums = accumulate(built, seed=0, frame=0, stream=DEPTH, first=0, count=_SAMPLES, max_depth=depth)
+            light[depth] = float(np.mean(sums.direct + sums.indirect)) / _SAMPLES
+            if depth >= 4 and _remaining(light) <= bound:
+                break
+        found.append(_shortest(light, bound)._replace(frame=frame))
+    return max(found, key=lambda one: (one.max_depth, one.remaining))
+
+
+def _measured_frames(scene: AnimatedScene, frames: int) -> list[int]:
+    """The frames to measure; of those that show the same only the first."""
+    chosen = {round(share * (frames - 1)) for share in np.linspace(0, 1, _FRAMES)}
+    scales = [brightness(scene, frame) for frame in range(frames)]
+    for light in scales[0]:
+        means = [float(np.mean(scale[light])) for scale in scales]
+        if max(means) > min(means):
+            chosen.add(int(np.argmax(means)))
+    different: dict[str, int] = {}
+    for frame in sorted(chosen):
+        poses = {name: np.asarray(pose).tolist() for name, pose in scene.pose(frame).items()}
+        camera = scene.camera(frame)
+        different.setdefault(repr((poses, camera.to_world.tolist(), camera.x_fov, scales[frame])), frame)
+    return list(different.values())
 
 
 def _gains(light: dict[int, float]) -> list[float]:

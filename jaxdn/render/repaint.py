@@ -3,7 +3,7 @@
 The loaded objects are edited and not the file, so that a texture changes like a constant colour.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import mitsuba as mi
@@ -17,8 +17,8 @@ _COLORS = frozenset({"reflectance", "diffuse_reflectance", "specular_reflectance
 _GREY = np.full(3, 3**-0.5)
 
 
-def repaint(scene: Any, materials: Mapping[str, Mapping[str, Any]]) -> None:
-    """Edit the materials of a loaded scene in place.
+def repaint(shapes: Iterable[Any], materials: Mapping[str, Mapping[str, Any]]) -> None:
+    """Edit the materials of loaded shapes in place.
 
     A reflectance c becomes ``clip(tint * (g + s (R c - g)), 0, 1)``: R rotates by the ``hue`` about the axis of greys,
     g is the mean of R c's channels, s the ``saturation``. ``roughness`` r sets alpha = r^2 (a principled BSDF's
@@ -26,21 +26,31 @@ def repaint(scene: Any, materials: Mapping[str, Mapping[str, Any]]) -> None:
     Raises ValueError for a roughness of a material that has none to set.
 
     Args:
-      scene: an ``mi.Scene``.
+      shapes: such as :func:`shapes_of` a scene. A BSDF that several of them share changes once; shapes that were loaded
+        apart from each other have one each.
       materials: id of a BSDF, or of a shape whose BSDF has no id -> its changes, as in
         :mod:`jaxdn.render.animation`.
     """
-    done: set[str] = set()
-    for name, bsdf in named_materials(scene):
-        if name in materials and name not in done:  # shapes share a BSDF, and it changes once
-            done.add(name)
+    done: list[Any] = []
+    for name, bsdf in _named(shapes):
+        if name in materials and not any(bsdf is other for other in done):
+            done.append(bsdf)
             _change(bsdf, name, materials[name])
 
 
-def named_materials(scene: Any) -> list[tuple[str, Any]]:
-    """Name and BSDF of every shape, those of shape groups included: the BSDF's id, else the shape's."""
+def shapes_of(scene: Any) -> list[Any]:
+    """The shapes of a scene, those of shape groups included."""
     grouped = [part for group in shape_groups(scene) for _, part in children(group) if hasattr(part, "bsdf")]
-    pairs = [(shape.id(), shape.bsdf()) for shape in [*scene.shapes(), *grouped]]
+    return [*scene.shapes(), *grouped]
+
+
+def named_materials(scene: Any) -> list[tuple[str, Any]]:
+    """Name and BSDF of every shape of a scene: the BSDF's id, else the shape's."""
+    return _named(shapes_of(scene))
+
+
+def _named(shapes: Iterable[Any]) -> list[tuple[str, Any]]:
+    pairs = [(shape.id(), shape.bsdf()) for shape in shapes]
     return [(bsdf.id() or name, bsdf) for name, bsdf in pairs if bsdf is not None]
 
 

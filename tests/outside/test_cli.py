@@ -11,6 +11,7 @@ import OpenEXR
 import pytest
 from safetensors.numpy import load_file
 
+from jaxdn import cli
 from jaxdn.clips import write_clip
 from jaxdn.frame import Clip, Frame
 from jaxdn.methods.ntd import Options
@@ -81,6 +82,30 @@ def test_denoise_adds_direct_and_emitted_light_back(clip, tmp_path):
         channels = {name: channel.pixels for name, channel in file.channels().items()}
     for letter in "RGB":
         np.testing.assert_allclose(channels[letter] - channels[f"denoised.{letter}"], 0.75, atol=1e-5)
+
+
+def test_one_frame_becomes_the_file_that_is_named(shot, tmp_path, capsys):
+    one, out = shot / "shot_0000.exr", tmp_path / "new" / "clean.exr"
+    cli.main(["denoise", str(one), "-o", str(out), "--method", "svgf", "--preview"])
+    assert sorted(path.name for path in out.parent.iterdir()) == ["clean.exr", "clean.png"]
+    assert out.is_file()
+    for source, place, words in (
+        (shot, tmp_path / "x.exr", "expected a folder for 2 frames"),
+        (one, one, "expected another place than the input's"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            cli.main(["denoise", str(source), "-o", str(place), "--method", "svgf"])
+        assert ended.value.code == 2
+        assert words in capsys.readouterr().err
+    assert not (tmp_path / "x.exr").exists()
+
+
+def test_short_and_small_clips_name_the_options_that_fit_them(clip, tmp_path, capsys):
+    for options, advice in (([], "--frames 3"), (["--frames", "3"], "--crop 20")):
+        with pytest.raises(SystemExit):
+            cli.main(["train", str(clip), "-o", str(tmp_path / "run"), *options])
+        assert f"({advice})" in capsys.readouterr().err
+        assert advice.split()[0][2:] in cli.Train.__dataclass_fields__
 
 
 def test_denoise_plain_exr_files_with_the_shipped_network(tmp_path):

@@ -3,8 +3,12 @@
 import pytest
 
 from experiments.speed.small_rooms import CASES
+from jaxdn import cli
+from jaxdn.clips import ClipError
 from jaxdn.clips.folder import is_clip, read_record
 from jaxdn.commands import render as command
+from jaxdn.render.clip import render_clip
+from jaxdn.render.scene_file import SceneFile
 
 OPTIONS = {
     "animation": None,
@@ -86,3 +90,46 @@ def test_clips_are_rendered(tmp_path):
     folders = command.render(str(path), tmp_path / "out", seeds=[0, 1], **{**OPTIONS, "workers": 2})
     assert all(is_clip(folder) for folder in folders)
     assert [read_record(folder)["seed"] for folder in folders] == [0, 1]
+
+
+@pytest.mark.parametrize("verb", [["inspect", "edge"], ["render", "edge", "-o", "{out}"]])
+@pytest.mark.parametrize("option", ["--width", "--height", "--frames"])
+def test_an_empty_size_is_refused_in_words(verb, option, tmp_path, capsys):
+    out = tmp_path / "out"
+    with pytest.raises(SystemExit) as ended:
+        cli.main([*(word.format(out=out) for word in verb), option, "0"])
+    assert ended.value.code == 2
+    assert f"{option[2:]}: expected at least 1, got 0" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def planned_clip(scene, folder, frames, **options):
+    size = {"width": 16, "height": 12}
+    planned = command.plan_clip(scene, frames=frames, max_depth=options.pop("max_depth", 3), **size)
+    render_clip(scene, folder, frames=frames, plan=planned.plan, **{"seed": 1, **size, **options})
+
+
+def test_a_clip_gets_more_frames_and_other_settings_are_said_in_words(tmp_path):
+    path = CASES["moving: ball"].write(tmp_path)
+    scene = SceneFile(path)
+    planned_clip(scene, tmp_path / "clip", 2)
+    first = (tmp_path / "clip" / "frame_0001.exr").read_bytes()
+    planned_clip(scene, tmp_path / "clip", 3)
+    assert read_record(tmp_path / "clip")["frames"] == len(read_record(tmp_path / "clip")["plan"]["frames"]) == 3
+    assert (tmp_path / "clip" / "frame_0001.exr").read_bytes() == first
+    with pytest.raises(ClipError) as refused:
+        planned_clip(scene, tmp_path / "clip", 4, seed=2, max_depth=5)
+    assert "3 frames there, 4 wanted; max_depth: 3 there, 5 wanted; seed: 1 there, 2 wanted" in str(refused.value)
+    assert "{" not in str(refused.value)
+    static = SceneFile.from_record({**scene.record, "animation": {"frames": 4}})
+    with pytest.raises(ClipError, match=r"buffers of frame 0: .*motion.* there, no more wanted.*animation"):
+        planned_clip(static, tmp_path / "clip", 4)
+
+
+@pytest.mark.parametrize("words", [["render", "edge"], ["train", "clips"], ["compare", "clips"]])
+def test_a_folder_is_not_named_like_a_file(words, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main([*words, "-o", str(tmp_path / "x.exr")])
+    assert ended.value.code == 2
+    assert "expected a folder" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

@@ -159,8 +159,8 @@ def test_changed_materials_and_tinted_lights(folder):
     assert scene.brightness(0) == {"bulb": (1, 0, 0)}
     assert scene.brightness(1) == {"bulb": (1, 0.5, 0.5)}
     assert scene.brightness(2) == {"bulb": 1}
-    radiance = next(one for one in scene.describe(0, 4, 4).iter("rgb") if one.get("name") == "radiance")
-    assert radiance.get("value") == "20.0 0.0 0.0"
+    bulb = next(shape for shape in scene.build(0, 4, 4).shapes() if shape.id() == "bulb")
+    np.testing.assert_array_equal(np.ravel(np.array(mi.traverse(bulb.emitter())["radiance.value"])), [20, 0, 0])
 
 
 @pytest.mark.parametrize(

@@ -239,9 +239,18 @@ def test_missing_files(folder, tmp_path):
     (folder / "wall.png").unlink()
     with pytest.raises(ValueError, match=r"wall\.png"):
         SceneFile(folder / "scene.xml")
-    (folder / "list.xml").write_text("<list/>")
+    (folder / "list.xml").write_text('<shape version="3.0.0" type="sphere"/>')
     with pytest.raises(ValueError, match="<scene>"):
         SceneFile(folder / "list.xml")
+    for text, words in (
+        ("<scene", "start element"),
+        ("<list/>", "missing version"),
+        ('<scene version="3.0.0"><shape type="sphere"><ref id="chrome"/></shape></scene>', '"chrome"'),
+        ('<scene version="3.0.0"><include filename="walls.xml"/></scene>', r"walls\.xml"),
+    ):
+        (folder / "list.xml").write_text(text)
+        with pytest.raises(ValueError, match=rf"list\.xml: expected a Mitsuba scene.*{words}"):
+            SceneFile(folder / "list.xml")
 
 
 def test_a_scene_without_a_camera_needs_keys(folder):
