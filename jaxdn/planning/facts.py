@@ -20,7 +20,7 @@ class Surface(NamedTuple):
     textured: bool = False
     """Its diffuse reflectance varies over the surface."""
     medium: bool = False
-    """It bounds fog, smoke or another participating medium."""
+    """It bounds fog, smoke or another medium that scatters light; one that only absorbs it does not count."""
     specular: bool = False
     """It is not perfectly diffuse, so that its reflectance is not its albedo: even metal of roughness 1."""
 
@@ -58,7 +58,7 @@ class Facts(NamedTuple):
     moments: tuple[Moment, ...]
     """One per frame; the first has no previous frame."""
     medium: bool = False
-    """The camera itself is in a participating medium."""
+    """The camera itself is in such a medium."""
     interreflects: bool = True
     """Light reflected by one surface may reach another one."""
     max_depth: int | None = None

@@ -11,17 +11,18 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from jaxdn.render.media import media_of
 from jaxdn.render.seeds import pass_seed
 from jaxdn.render.wavefront import BRIGHTEST, Accumulated, no_light
 
 _NO_ROULETTE = 1000
 
 
-def _integrators(max_depth: int) -> list[Any]:
+def _integrators(max_depth: int, kind: str) -> list[Any]:
     """Integrators of all light, of light without the indirect part, and of emission only."""
     # Three renderings are three times faster than one "aov" integrator around all three.
     return [
-        mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": _NO_ROULETTE})
+        mi.load_dict({"type": kind, "max_depth": depth, "rr_depth": _NO_ROULETTE})
         for depth in (max_depth, min(2, max_depth), 1)
     ]
 
@@ -41,7 +42,8 @@ def accumulate(
       max_depth: path length.
     """
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
-    integrators = _integrators(max_depth)
+    # The path tracer for media draws whether light is absorbed: the same mean, with noise.
+    integrators = _integrators(max_depth, "volpath" if media_of(scene) else "path")
     total = no_light((height, width))
     render: Any = mi.render
     for index in range(first, first + count):

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.frame import FAR
+from jaxdn.render.media import absorbs, media_of
 from jaxdn.render.reflectance import Reflectances
 from jaxdn.render.wavefront import camera_rays
 
@@ -54,8 +55,12 @@ def shape_names(scene: Any) -> list[str]:
 def check_scene(scene: Any) -> None:
     """Raise ValueError for effects that the tracers would otherwise silently ignore."""
     sensor = scene.sensors()[0]
-    if sensor.get_medium() is not None or any(shape.is_medium_transition() for shape in scene.shapes()):
-        raise ValueError("scene: participating media (fog, smoke) are not supported yet; remove them from the scene.")
+    scattering = [name for name, medium in media_of(scene).items() if not absorbs(medium)]
+    if scattering:
+        raise ValueError(
+            f"scene: participating media that scatter light (fog, smoke) are not supported yet, but {scattering[0]!r} "
+            "has one; remove it, or set its albedo to 0."
+        )
     if sensor.needs_aperture_sample():
         raise ValueError("scene: depth of field is not supported yet; expected a 'perspective' (pinhole) camera.")
     if sensor.shutter_open_time() > 0:

@@ -5,6 +5,7 @@ nodes, one for each plugin of the file, whose properties refer to other nodes by
 scene; its children are the shapes, lights, sensors and materials of the file.
 """
 
+import importlib
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -156,8 +157,7 @@ def _parse(path: Path) -> Any:
 @contextmanager
 def _searched(folder: Path) -> Iterator[Any]:
     """Let Mitsuba look for files in a folder too, as its own loader does with that of the scene."""
-    import mitsuba as mi
-
+    mi: Any = importlib.import_module("mitsuba")
     before = mi.file_resolver()
     resolver = mi.FileResolver(before)
     resolver.prepend(str(folder.resolve()))

@@ -46,7 +46,7 @@ def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | Non
         surfaces=tuple(surfaces),
         lights=tuple(lights),
         moments=tuple(stage.moment(frame, lights) for frame in range(count)),
-        medium=built.sensors()[0].get_medium() is not None,
+        medium=_in_fog(built.sensors()[0]),
         interreflects=_interreflects(stage, shapes, surfaces, lights),
         max_depth=scene.max_depth,
         uncertain=uncertain,
@@ -56,9 +56,11 @@ def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | Non
 def _surfaces(built: Any, shapes: Mapping[str, Any]) -> tuple[list[Surface], dict[str, str]]:
     """The surfaces of a scene, and effect -> why their materials leave it undecided."""
     from jaxdn.render.materials import NOTHING, is_lambertian, material_of
+    from jaxdn.render.media import absorbs, media_of
     from jaxdn.render.plugins import children, shape_groups
 
     grouped = [part for group in shape_groups(built) for _, part in children(group) if hasattr(part, "bsdf")]
+    scattering = {name for name, medium in media_of(built).items() if not absorbs(medium)}
     surfaces: list[Surface] = []
     uncertain: dict[str, str] = {}
     for name, shape in shapes.items():
@@ -72,8 +74,15 @@ def _surfaces(built: Any, shapes: Mapping[str, Any]) -> tuple[list[Surface], dic
         lobes = frozenset().union(*(material.lobes for material in materials))
         textured = any(material.textured for material in materials)
         specular = any(part.bsdf() is not None and not is_lambertian(part.bsdf()) for part in members)
-        surfaces.append(Surface(name, lobes, textured, bool(shape.is_medium_transition()), specular))
+        surfaces.append(Surface(name, lobes, textured, shape.id() in scattering, specular))
     return surfaces, uncertain
+
+
+def _in_fog(sensor: Any) -> bool:
+    """Whether the camera stands in a medium that scatters light."""
+    from jaxdn.render.media import absorbs
+
+    return sensor.get_medium() is not None and not absorbs(sensor.get_medium())
 
 
 def _lights(built: Any, shapes: Mapping[str, Any]) -> list[Light]:

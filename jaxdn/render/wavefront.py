@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from jaxdn.render.media import media_of, transmittance
 from jaxdn.render.seeds import frame_key
 
 MAX_LANES = 1 << 20
@@ -73,6 +74,8 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
     ``max_depth`` counts as Mitsuba does: 1 is emission, 2 adds direct light, 3 one indirect bounce. No Russian
     roulette: it does not help at these depths.
     """
+    absorbing = bool(media_of(scene))  # without media nothing of them is compiled
+    medium = mi.MediumPtr(scene.sensors()[0].get_medium())
     context = mi.BSDFContext()
     emitted, direct, indirect = mi.Spectrum(0.0), mi.Spectrum(0.0), mi.Spectrum(0.0)
     throughput = mi.Spectrum(1.0)
@@ -84,6 +87,8 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
     active: Any = mi.Bool(True)
     while active:
         hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=depth == 0, active=active)
+        if absorbing:
+            throughput *= transmittance(medium, hit.t, active)
 
         # The BSDF sample found an emitter: weigh it against having sampled that emitter directly.
         found: Any = mi.DirectionSample3f(scene, hit, last)
@@ -110,17 +115,26 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
         )
         weight = dr.select(towards.delta, 1.0, towards.pdf / (towards.pdf + bsdf_pdf))
         light = dr.select(smooth, throughput * reflected * radiance * weight, 0.0)
+        if absorbing:  # surfaces between two media block this ray: it stays in one
+            light *= transmittance(_behind(hit, medium, towards.d), towards.dist, smooth)
         direct += dr.select(depth == 0, light, 0.0)
         indirect += dr.select(depth >= 1, light, 0.0)
 
         throughput *= bsdf_weight
         ray = hit.spawn_ray(hit.to_world(sampled.wo))
+        if absorbing:
+            medium = _behind(hit, medium, ray.d)
         last = hit
         last_pdf = sampled.pdf
         last_delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
         active &= dr.max(throughput) != 0
         depth += 1
     return emitted, direct, indirect
+
+
+def _behind(hit: Any, medium: Any, direction: Any) -> Any:
+    """The medium of rays that leave a surface."""
+    return dr.select(hit.is_medium_transition(), hit.target_medium(direction), medium)
 
 
 def _chunk(

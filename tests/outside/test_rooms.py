@@ -263,7 +263,7 @@ def test_a_scene_without_free_space_or_with_fog_is_refused(folder, tmp_path):
     with pytest.raises(ValueError, match=r"expected free space around the scene's camera, found none"):
         tour(path, 0, 2)
     path.write_text(room(fog='<medium type="homogeneous" name="interior"/>'))
-    with pytest.raises(ValueError, match="participating media"):
+    with pytest.raises(ValueError, match="participating media that scatter light"):
         tour(path, 0, 3)
     with pytest.raises(ValueError, match="tour frames: expected at least 1"):
         tour(path, 0, 0)

@@ -7,6 +7,7 @@ import pytest
 
 from jaxdn.render.scene_file import SceneFile
 from jaxdn.render.variant import use_variant
+from tests.outside.render_scenes import fast_variants
 
 mi = pytest.importorskip("mitsuba")
 
@@ -225,3 +226,51 @@ def test_a_scene_that_begins_in_the_dark_keeps_its_light(folder):
     assert measure_depth(animate(path, lights=dark), frames=2).max_depth == 3  # nothing is lit there
     flash = {"bulb": [{"frame": at, "scale": scale} for at, scale in ((0, 0), (3, 0), (4, 1), (5, 0))]}
     assert measure_depth(animate(path, lights=flash), frames=20).frame == 4
+
+
+GLASS = """<shape type="sphere" id="glass"><point name="center" x="{x}" y="1" z="1.5"/>
+  <float name="radius" value="0.8"/><bsdf type="{bsdf}"/>
+  <medium type="homogeneous" name="interior"><rgb name="albedo" value="0"/>
+  <rgb name="sigma_t" value="0.05, 0.3, 1"/><float name="scale" value="3"/></medium>
+</shape>"""
+
+
+def volpath(path, samples):
+    """Mitsuba's image with its integrator for media."""
+    integrator = mi.load_dict({"type": "volpath", "max_depth": DEPTH, "rr_depth": 1000})
+    return np.array(mi.render(mi.load_file(str(path)), integrator=integrator, spp=samples, seed=7)).mean(axis=(0, 1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bsdf", ["dielectric", "roughdielectric"])
+@pytest.mark.parametrize("variant", fast_variants())
+def test_glass_that_absorbs_has_the_light_of_mitsubas_integrator_for_media(variant, bsdf, folder):
+    mi.set_variant(variant)
+    bulb = BULB.format(emitter=GLOW)
+    inside = (
+        '<shape type="sphere"><point name="center" x="-1" y="1" z="1.5"/><float name="radius" value="0.4"/></shape>'
+    )
+    path = write(folder, bulb + GLASS.format(x=-1, bsdf=bsdf) + inside)
+    found = ours(SceneFile(path))
+    # The scalar variant draws whether light is absorbed: its mean scatters by two per cent.
+    np.testing.assert_allclose(found, volpath(path, 2048), rtol=0.06 if variant == "scalar_rgb" else 0.03)
+    clear = path.read_text().replace("0.05, 0.3, 1", "0")
+    path.write_text(clear)
+    assert np.all(ours(SceneFile(path)) > 1.02 * found)
+
+
+def test_fog_is_refused_by_the_name_of_what_bounds_it(folder):
+    from jaxdn.render.gbuffer import check_scene
+
+    fog = GLASS.format(x=0, bsdf="dielectric").replace('name="albedo" value="0"', 'name="albedo" value="0.5"')
+    scene = SceneFile(write(folder, LAMP.format(x=0, power=20) + fog))
+    with pytest.raises(ValueError, match=r"scatter light \(fog, smoke\) are not supported yet, but 'glass' has one"):
+        check_scene(scene.build(0, WIDTH, HEIGHT))
+
+
+def test_a_medium_around_the_camera_is_kept(folder):
+    medium = """<medium type="homogeneous" id="air"><rgb name="albedo" value="{albedo}"/>
+      <rgb name="sigma_t" value="0.05, 0.1, 0.2"/></medium>"""
+    film = FILM.format(id="", crop="") + '<ref id="air"/>'
+    path = write(folder, BULB.format(emitter=GLOW), before=medium.format(albedo=0), film=film)
+    np.testing.assert_allclose(ours(SceneFile(path)), volpath(path, 256), rtol=0.03)

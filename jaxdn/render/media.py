@@ -1,0 +1,36 @@
+"""Media that only absorb light, such as coloured glass: Beer's law along every segment of a path.
+
+Between two surfaces the transmittance of a homogeneous medium is ``exp(-sigma_t d)``, with its extinction ``sigma_t``
+for red, green and blue and the distance ``d``. Media that scatter light (fog, smoke) are not supported.
+"""
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+
+def media_of(scene: Any) -> dict[str, Any]:
+    """The media of a loaded scene: name of a shape -> the one inside it or around it, and ``"camera"``."""
+    found: dict[str, Any] = {}
+    for shape in scene.shapes():
+        for medium in (shape.interior_medium(), shape.exterior_medium()):
+            if medium is not None:
+                found[shape.id()] = medium
+    around = scene.sensors()[0].get_medium()
+    return found if around is None else {**found, "camera": around}
+
+
+def absorbs(medium: Any) -> bool:
+    """Whether a medium is homogeneous and scatters nothing."""
+    albedo = [value for key, value in mi.traverse(medium) if key.startswith("albedo")]
+    return bool(medium.is_homogeneous()) and bool(albedo) and not any(np.any(np.array(value)) for value in albedo)
+
+
+def transmittance(medium: Any, distance: Any, active: Any) -> Any:
+    """The share of light that is left after a distance in a medium, for arrays of media; no medium leaves all."""
+    point = dr.zeros(mi.MediumInteraction3f, dr.width(distance))
+    extinction = medium.get_scattering_coefficients(point, active)[2]
+    # A ray that meets nothing has an infinite length: no extinction times that is not a number.
+    return dr.exp(-mi.Spectrum(extinction) * dr.minimum(distance, dr.largest(mi.Float)))
