@@ -1,4 +1,4 @@
-"""The command line: ``jaxdn inspect | render | pack | train | denoise | compare``; every command has ``--help``."""
+"""The command line: ``jaxdn inspect | render | pack | train | denoise | compare | doctor``; each has ``--help``."""
 
 import sys
 from dataclasses import dataclass, field
@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
+import jaxdn
 from jaxdn.commands.errors import plain_errors
 
 _PATH = tyro.conf.Positional[Path]
@@ -22,6 +23,8 @@ class Inspect:
     jaxdn inspect kitchen/scene.xml --animation kitchen.json --denoiser steady-balanced
 
     jaxdn inspect data/test/fruit-200 --json
+
+    jaxdn inspect "shots/*.exr" --channels albedo=diffuseFilter
     """
 
     scene: tyro.conf.Positional[str]
@@ -35,7 +38,13 @@ class Inspect:
     frames: int | None = None
     """Number of frames to inspect; default: all of the animation."""
     json: bool = False
-    """Print only one JSON object: {"effects": [...], "plan": {...}, "uncertain": [...]}."""
+    """Print only one JSON object: {"effects": [...], "plan": {...}, "uncertain": [...]}, of files also "sources"."""
+    motion_convention: str | None = None
+    """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
+    channels: list[str] = field(default_factory=list)
+    """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out."""
+    layer: str | None = None
+    """For files of other renderers: the view layer or part to look for buffers in."""
 
 
 @dataclass
@@ -189,6 +198,8 @@ class Denoise:
     """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
     channels: list[str] = field(default_factory=list)
     """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out."""
+    layer: str | None = None
+    """For files of other renderers: the view layer or part to look for buffers in."""
     implementation: str = "auto"
     """Engine for the network: reference (XLA), onnxruntime (CPU; the extra onnx); auto: the fastest available."""
 
@@ -212,6 +223,11 @@ class Compare:
     """Samples per pixel to take from the clips' layers."""
 
 
+@dataclass
+class Doctor:
+    """Show what this machine computes, denoises, trains and renders with, and what to install for more."""
+
+
 def _folder(out: Path) -> Path:
     """``-o`` of a command that writes into a folder. Raises ValueError for what is plainly the name of a file."""
     if out.suffix.lower() in (".exr", ".png", ".safetensors", ".json", ".html"):
@@ -230,7 +246,19 @@ def _inspect(options: Inspect) -> None:
         height=options.height,
         frames=options.frames,
         as_json=options.json,
+        **_naming(options),
     )
+
+
+def _naming(options: Inspect | Denoise) -> dict[str, Any]:
+    """How the buffers of other renderers' files are found."""
+    from jaxdn.options import parse
+
+    return {
+        "motion_convention": options.motion_convention,
+        "channels": parse(options.channels, option="--channels", words=True),
+        "layer": options.layer,
+    }
 
 
 def _render(options: Render) -> None:
@@ -317,10 +345,11 @@ def _train(options: Train) -> None:
 
 def _denoise(options: Denoise) -> None:
     from jaxdn.commands.denoise import candidate_on, denoise_files
-    from jaxdn.options import parse
+    from jaxdn.commands.sources import show_sources
 
-    console = Console(stderr=True)
+    console, naming = Console(stderr=True), _naming(options)
     method, engine = candidate_on(options.method, options.implementation)
+    show_sources(options.clip, reads=frozenset() if method.denoiser is None else method.denoiser.reads, **naming)
     with console.status(f"{options.method}: reading ...") as status:
         written = denoise_files(
             options.clip,
@@ -328,8 +357,7 @@ def _denoise(options: Denoise) -> None:
             method,
             spp=options.spp,
             preview=options.preview,
-            motion_convention=options.motion_convention,
-            channels=parse(options.channels, option="--channels", words=True),
+            **naming,
             say=lambda done, total: status.update(f"{options.method}: frame {done} of {total}"),
             log=print,
         )
@@ -355,6 +383,12 @@ def _compare(options: Compare) -> None:
     print(f"report: {page}")
 
 
+def _doctor(options: Doctor) -> None:
+    from jaxdn.commands.doctor import doctor
+
+    doctor()
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Parse the command line and run one command; errors a user can fix end with one message and exit code 2."""
     run: dict[type, Any] = {
@@ -364,11 +398,16 @@ def main(arguments: list[str] | None = None) -> None:
         Train: _train,
         Denoise: _denoise,
         Compare: _compare,
+        Doctor: _doctor,
     }
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments == ["--version"]:
+        print(f"jaxdn {jaxdn.__version__}")
+        return
     options = tyro.cli(
-        Inspect | Render | Pack | Train | Denoise | Compare,
+        Inspect | Render | Pack | Train | Denoise | Compare | Doctor,
         prog="jaxdn",
-        description="Remove Monte Carlo noise from path-traced animations.",
+        description="Remove Monte Carlo noise from path-traced animations. --version prints the version.",
         args=arguments,
     )
     with plain_errors():

@@ -5,6 +5,7 @@ the renderer follows the plan. What is left out is ``None`` in a :class:`jaxdn.F
 result is that of the neutral value, at a lower cost.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,14 @@ from jaxdn.planning.plan import plan_from_record as plan_from_record
 
 
 def inspect(
-    scene: Any, animation: Any = None, *, width: int = 128, height: int = 128, frames: int | None = None
+    scene: Any,
+    animation: Any = None,
+    *,
+    width: int = 128,
+    height: int = 128,
+    frames: int | None = None,
+    channels: Mapping[str, str] | None = None,
+    layer: str | None = None,
 ) -> Effects:
     """The effects that a scene, or a finished clip, has.
 
@@ -37,6 +45,8 @@ def inspect(
       width: of the image in pixels; with ``height`` it decides what is on screen.
       height: of the image in pixels.
       frames: number of frames to inspect; default: all of the scene's animation, or of the clip.
+      channels: of EXR files of other renderers, as in :func:`jaxdn.clips.open_frames`.
+      layer: the same.
 
     An undecidable effect counts as present and is listed in ``uncertain``. A scene takes milliseconds besides loading;
     a clip has to be read. Raises ValueError for any other ``scene``, and for files that cannot be read.
@@ -48,7 +58,7 @@ def inspect(
     if _is_footage(scene):
         from jaxdn.clips.evidence import read_facts
 
-        facts = read_facts(scene, animation)
+        facts = read_facts(scene, animation, channels=channels, layer=layer)
         return find(facts._replace(moments=facts.moments[:frames]))
     from jaxdn.render.opening import open_scene
     from jaxdn.render.scene_facts import facts_of

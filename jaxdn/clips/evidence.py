@@ -26,9 +26,10 @@ _HIDDEN = {
 """Effects that no buffer can rule out."""
 
 
-def read_facts(path: str | Path, animation: Any = None) -> Facts:
+def read_facts(path: str | Path, animation: Any = None, **naming: Any) -> Facts:
     """Facts about a clip's folder, or EXR files of any renderer; frames are read one at a time.
 
+    ``naming``: ``channels`` and ``layer`` of :func:`jaxdn.clips.open_frames`, for files of other renderers.
     Raises ClipError as :func:`jaxdn.clips.read_clip` does, and ValueError for an ``animation``, which a finished clip
     does not need.
     """
@@ -37,7 +38,8 @@ def read_facts(path: str | Path, animation: Any = None) -> Facts:
     record: Mapping[str, Any] = read_record(path) if is_clip(path) else {}
     look = _Look(record)
     # Whether anything moves is the same in every convention of motion vectors.
-    _, frames = open_frames(path, spp=record["layers"][0] if record else 1, motion_convention="previous-current")
+    spp = record["layers"][0] if record else 1
+    _, frames = open_frames(path, spp=spp, motion_convention="previous-current", **naming)
     for stored in frames:
         look.at(stored.frame)
     return look.facts()

@@ -104,6 +104,24 @@ def read_header(path: str | Path) -> dict[str, Any]:
         raise ClipError(f"{path}: not readable as OpenEXR ({error}); write the frame again.") from error
 
 
+def read_names(path: str | Path) -> list[str]:
+    """The names of a file's channels as :func:`read_exr` gives them, from its header alone. Raises as that does."""
+    path = Path(path)
+    if not path.is_file():
+        raise ClipError(f"{path}: there is no such file.")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            parts = list(file.parts)
+            return [
+                _full_name(part.header, channel.name, len(parts))
+                for part in parts
+                for channel in part.header["channels"]
+                if (channel.xSampling, channel.ySampling) == (1, 1)
+            ]
+    except (RuntimeError, ValueError, KeyError, TypeError, UnicodeDecodeError) as error:
+        raise ClipError(f"{path}: not readable as OpenEXR ({error}); write the frame again.") from error
+
+
 def write_image(path: str | Path, image: np.ndarray) -> None:
     """Write ``[H, W, 3]`` as plain R, G, B in float32. Raises as :func:`write_exr` does."""
     image = np.asarray(image)

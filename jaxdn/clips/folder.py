@@ -211,6 +211,7 @@ def open_frames(
     spp: int = 1,
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
+    layer: str | None = None,
     log: Callable[[str], None] = lambda line: None,
 ) -> tuple[list[Path], Iterator[StoredFrame]]:
     """The files of a clip, or of another renderer's sequence, and their frames, each read when it is requested.
@@ -225,7 +226,7 @@ def open_frames(
         raise _unfinished(Path(path))
     if spp != 1:
         raise ClipError(f"{path}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
-    files, plain = plain_frames(path, motion_convention=motion_convention, channels=channels, log=log)
+    files, plain = plain_frames(path, motion_convention=motion_convention, channels=channels, layer=layer, log=log)
     return files, (StoredFrame(frame, {}, None, None) for frame in plain)
 
 
@@ -236,6 +237,7 @@ def read_clip(
     layers: bool = False,
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
+    layer: str | None = None,
 ) -> Clip:
     """Read a clip as NumPy arrays, with the dtypes of :attr:`jaxdn.frame.Buffer.dtype`.
 
@@ -243,13 +245,13 @@ def read_clip(
 
     ``path`` is the folder of a clip, of which ``spp`` samples a pixel are read, and with ``layers`` the independent
     noisy layers of 1, 2, 4, ... samples too (``Clip.layers``); or a folder of, or a glob pattern for, the EXR files of
-    another renderer, whose channels are found by their names (``motion_convention`` and ``channels``: see
+    another renderer, whose channels are found by their names (``motion_convention``, ``channels`` and ``layer``: see
     :func:`jaxdn.clips.import_exr.plain_frames`).
 
     Raises ClipError, naming the file and the reason: no such folder, no ``clip.json``, another format version, missing
     or unreadable frames, missing channels, frames that differ in size or channels, ``spp`` or ``layers`` not available.
     """
-    _, opened = open_frames(path, spp=spp, motion_convention=motion_convention, channels=channels)
+    _, opened = open_frames(path, spp=spp, motion_convention=motion_convention, channels=channels, layer=layer)
     stored = list(opened)
     counts = doubling_layers(stored[0].layers, path) if layers else []
     named = {name for one in stored for name in present(one.frame)}

@@ -8,7 +8,7 @@ the caller says so. What surfaces reflect is derived where the file brings the p
 
 import glob
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -86,14 +86,16 @@ def plain_frames(
     *,
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
+    layer: str | None = None,
     log: Callable[[str], None] = lambda line: None,
 ) -> tuple[list[Path], Iterator[Frame]]:
     """The files of another renderer's sequence, and their frames, each read when it is asked for.
 
     All frames have the size and the buffers of the first. ``motion_convention`` says what the motion vectors mean (a
     key of ``MOTION_CONVENTIONS``) and is needed as soon as there are any that are not Cycles' ``Vector``; ``"none"``
-    leaves them out. ``channels``: see :func:`jaxdn.clips.layers.detect_channels`. ``log`` is called with lines about
-    what is read and derived from which layer, when the first frame is. Depth is taken for view-space z (far or infinite
+    leaves them out. ``channels`` and ``layer``: see :func:`jaxdn.clips.layers.detect_channels`; what they choose, see
+    :func:`jaxdn.clips.sources.sources_of`. ``log`` is called with lines about what is derived or left unused, when the
+    first frame is read. Depth is taken for view-space z (far or infinite
     becomes ``FAR``); ids count from 1 with 0 for nothing, and are left out of all frames if they say nothing in the
     first. Normals are expected in world space, roughness linear (GGX alpha is its square).
 
@@ -103,18 +105,19 @@ def plain_frames(
     if motion_convention not in (None, "none", *MOTION_CONVENTIONS):
         raise ClipError(f"motion_convention: {_conventions()}; got {motion_convention!r}.")
     files = sequence_files(path)
-    return files, _frames(files, motion_convention, channels, log)
+    return files, _frames(files, motion_convention, channels, layer, log)
 
 
 def _frames(
     files: Sequence[Path],
     motion_convention: str | None,
     channels: Mapping[str, str] | None,
+    layer: str | None,
     log: Callable[[str], None],
 ) -> Iterator[Frame]:
     first: _First | None = None
     for file in files:
-        frame, lines = _read(file, motion_convention, channels)
+        frame, lines = _read(file, motion_convention, channels, layer)
         if first is None:
             for line in lines:
                 log(line)
@@ -134,12 +137,14 @@ class _First(NamedTuple):
     """Its ids say nothing."""
 
 
-def _read(file: Path, motion_convention: str | None, channels: Mapping[str, str] | None) -> tuple[Frame, list[str]]:
-    """One frame, and in words what it was read and derived from."""
+def _read(
+    file: Path, motion_convention: str | None, channels: Mapping[str, str] | None, layer: str | None
+) -> tuple[Frame, list[str]]:
+    """One frame, and in words what was derived, or left unused."""
     there = read_exr(file)
     try:
-        found = detect_channels(list(there), channels=channels)
-        convention = _motion_convention(found, there, motion_convention)
+        found = detect_channels(list(there), channels=channels, layer=layer)
+        convention = motion_convention_of(found, there, motion_convention)
         if convention is None:
             found.pop("motion", None)
         images = {name: np.stack([there[channel] for channel in found[name]], axis=-1) for name in found}
@@ -149,7 +154,7 @@ def _read(file: Path, motion_convention: str | None, channels: Mapping[str, str]
         frame, derived = with_reflectance(Frame(**buffers), found, there, lambda: read_header(file))
     except ClipError as error:
         raise ClipError(f"{file}: {error}") from error
-    lines = ["read: " + ", ".join(f"{name} from {layer_of(found[name])!r}" for name in found)]
+    lines = []
     unpaired = None if "specular_reflectance" in (channels or {}) else unpaired_specular(list(there), found)
     if unpaired is not None:
         lines.append(
@@ -172,10 +177,11 @@ def _converted(image: np.ndarray, buffer: Buffer, convention: str | None) -> np.
     return image
 
 
-def _motion_convention(
-    found: Mapping[str, Channels], there: Mapping[str, np.ndarray], stated: str | None
-) -> str | None:
-    """The convention of a file's motion vectors; None where there are none, or none are wanted."""
+def motion_convention_of(found: Mapping[str, Channels], there: Collection[str], stated: str | None) -> str | None:
+    """The convention of the motion vectors among a file's channels; None where there are none, or none are wanted.
+
+    Raises ClipError where nobody has stated it and the names do not tell.
+    """
     if "motion" not in found or stated == "none":
         return None
     if stated is not None:

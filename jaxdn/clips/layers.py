@@ -68,15 +68,19 @@ NOT_WANTED = "none"
 """``channels={"roughness": "none"}`` leaves a buffer out."""
 
 
-def detect_channels(names: Sequence[str], *, channels: Mapping[str, str] | None = None) -> dict[str, Channels]:
+def detect_channels(
+    names: Sequence[str], *, channels: Mapping[str, str] | None = None, layer: str | None = None
+) -> dict[str, Channels]:
     """Which channels make up which buffer, by their names; buffers without channels are left out.
 
     A specular albedo is found only together with the diffuse albedo that belongs to it, which is then the albedo: any
     other albedo may be the sum of both. ``channels`` names the layer of a buffer outright, for example
-    ``{"radiance": "ViewLayer.Combined"}``; ``"none"`` leaves the buffer out. Raises ClipError if two layers fit a
-    buffer equally well, if a named layer is not there, or if there is no radiance.
+    ``{"radiance": "ViewLayer.Combined"}``; ``"none"`` leaves the buffer out. ``layer`` is a view layer or part, such as
+    ``"ViewLayer"``: what is not named outright is looked for in it alone. Raises ClipError if two layers fit a buffer
+    equally well, if a named layer is not there, or if there is no radiance.
     """
     groups = grouped(names)
+    inside = groups if layer is None else _inside(groups, layer)
     stated = channels or {}
     unknown = set(stated) - set(LAYERS)
     if unknown:
@@ -88,13 +92,22 @@ def detect_channels(names: Sequence[str], *, channels: Mapping[str, str] | None 
         fitting = (
             _named(groups, buffer, stated[buffer])
             if buffer in stated
-            else find(groups, layers, BUFFERS[buffer], f"{buffer}: ", f"; {name_it(buffer)}")
+            else find(inside, layers, BUFFERS[buffer], f"{buffer}: ", f"; {name_it(buffer)}, or a view layer: --layer")
         )
         if fitting:
             found[buffer] = fitting
     if "radiance" not in found:
         raise ClipError(f"no radiance among the channels {', '.join(sorted(names))}; {name_it('radiance')}.")
-    return _with_partner(groups, found, stated)
+    return _with_partner(inside, found, stated)
+
+
+def _inside(groups: Groups, layer: str) -> Groups:
+    """The layers of a view layer, and itself. Raises ClipError if there are none."""
+    found = {name: group for name, group in groups.items() if name == layer or name.startswith(f"{layer}.")}
+    if not found:
+        heads = dict.fromkeys(name.partition(".")[0] for name in groups if name)
+        raise ClipError(f"layer: there is none called {layer!r}; there are {', '.join(map(repr, heads)) or 'none'}.")
+    return found
 
 
 def grouped(names: Sequence[str]) -> Groups:

@@ -1,6 +1,6 @@
 """``jaxdn denoise``: a noisy clip in, denoised EXR frames out, one frame at a time."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +11,6 @@ from jaxdn.candidates import Candidate, candidate
 from jaxdn.clips.exr import write_exr
 from jaxdn.clips.folder import open_frames
 from jaxdn.clips.frames import StoredFrame, doubling_layers
-from jaxdn.frame import Frame
 from jaxdn.repair import repair_image
 from jaxdn.report.images import save_png
 from jaxdn.rollout import Layers, stream
@@ -52,6 +51,7 @@ def denoise_files(
     preview: bool = False,
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
+    layer: str | None = None,
     say: Callable[[int, int], None] = lambda done, total: None,
     log: Callable[[str], None] = lambda line: None,
 ) -> Written:
@@ -71,12 +71,16 @@ def denoise_files(
       preview: write a PNG next to each frame.
       motion_convention: that of motion vectors in files of other renderers (:mod:`jaxdn.clips.import_exr`).
       channels: buffer -> layer to take it from in files of other renderers.
+      layer: view layer or part to look for the other buffers in.
       say: called with the number of frames done and the total.
-      log: called with lines about what is read and derived from files of other renderers.
+      log: called with lines about what is derived from files of other renderers, or left unused.
     """
     single = out.suffix.lower() == ".exr"
     needs_layers = method.denoiser is not None and method.denoiser.samples is not None
-    names, frames = _open(source, needs_layers, spp, motion_convention, channels, log)
+    names, stored = open_frames(
+        source, spp=spp, motion_convention=motion_convention, channels=channels, layer=layer, log=log
+    )
+    frames = ((one.frame, _layers(one, source) if needs_layers else None) for one in stored)
     if single and len(names) > 1:
         raise ValueError(f"{out}: expected a folder for {len(names)} frames, got the name of one EXR file.")
     if out.resolve() in {
@@ -99,32 +103,9 @@ def denoise_files(
     return Written(written, 0 if step is None else len(step.programs), 0 if step is None else step.repaired)
 
 
-def _open(
-    source: Path,
-    needs_layers: bool,
-    spp: int,
-    motion_convention: str | None,
-    channels: Mapping[str, str] | None,
-    log: Callable[[str], None],
-) -> tuple[list[Path], Iterator[tuple[Frame, Layers]]]:
-    """The files and their frames, read when needed.
-
-    Args:
-      source: folder of a clip, or a folder of, or a pattern for, EXR files.
-      needs_layers: give independent layers, for a method that requests samples.
-      spp: samples per pixel to take from a clip's layers.
-      motion_convention: as in :func:`denoise_files`.
-      channels: as in :func:`denoise_files`.
-      log: as in :func:`denoise_files`.
-    """
-    names, frames = open_frames(source, spp=spp, motion_convention=motion_convention, channels=channels, log=log)
-
-    def layers(stored: StoredFrame) -> Layers:
-        return (
-            {count: stored.layers[count] for count in doubling_layers(stored.layers, source)} if needs_layers else None
-        )
-
-    return names, ((stored.frame, layers(stored)) for stored in frames)
+def _layers(stored: StoredFrame, source: Path) -> Layers:
+    """The independent layers of a frame, for a method that requests samples."""
+    return {count: stored.layers[count] for count in doubling_layers(stored.layers, source)}
 
 
 def _light(radiance: np.ndarray | None) -> Any:

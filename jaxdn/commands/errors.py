@@ -1,9 +1,10 @@
 """Errors that a user at a terminal can act on: one message, exit code 2, no traceback."""
 
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from rich.console import Console
 
@@ -15,8 +16,11 @@ from jaxdn.render.errors import RenderError
 def plain_errors() -> Iterator[None]:
     """Turn errors that a user can fix (wrong input, missing or unwritable file) into one message and exit code 2.
 
-    Anything else is a bug and keeps its traceback. Ctrl-C ends with exit code 130, as shells expect.
+    Anything else is a bug and keeps its traceback. Ctrl-C ends with exit code 130, as shells expect. Warnings are one
+    line each, without the place in the code.
     """
+    before = warnings.formatwarning
+    warnings.formatwarning = _line
     try:
         yield
     except (ValueError, RenderError) as error:
@@ -33,6 +37,12 @@ def plain_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         Console(stderr=True).print("jaxdn: interrupted; what is finished is kept.", highlight=False)
         sys.exit(130)
+    finally:
+        warnings.formatwarning = before
+
+
+def _line(message: Warning | str, *place: Any, **more: Any) -> str:
+    return f"jaxdn: {message}\n"
 
 
 def _end(message: str) -> NoReturn:

@@ -3,7 +3,7 @@
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,9 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxdn.candidates import candidate
+from jaxdn.clips.sources import sources_of
 from jaxdn.commands.render import Planned, plan_clip
+from jaxdn.commands.sources import show_sources
 from jaxdn.denoiser import Denoiser
 from jaxdn.effects import EFFECTS, Plan, everything, inspect, plan
 from jaxdn.frame import BUFFERS
@@ -41,8 +43,13 @@ def inspect_to_terminal(
     height: int,
     frames: int | None,
     as_json: bool,
+    motion_convention: str | None = None,
+    channels: Mapping[str, str] | None = None,
+    layer: str | None = None,
 ) -> None:
     """Print the table of effects and the plan for a scene, a family or a finished clip.
+
+    Of a finished clip, or files of other renderers, first what is read from which layer.
 
     Args:
       source: a Mitsuba scene (.xml), a family, or a finished clip.
@@ -52,24 +59,51 @@ def inspect_to_terminal(
       height: in pixels.
       frames: number of frames to inspect; None: all.
       as_json: print only one JSON object.
+      motion_convention: of files of other renderers, as in :func:`jaxdn.clips.open_frames`.
+      channels: the same.
+      layer: the same.
     """
     reader = None if denoiser is None else denoiser_named(denoiser)
+    naming: dict[str, Any] = {"channels": channels or None, "layer": layer}
+    files = Path(source).is_dir() or source.endswith(".exr")
+    if not files and (motion_convention or any(naming.values())):
+        raise ValueError(
+            f"scene {source!r}: expected none of --channels, --layer, --motion-convention, which are for EXR files."
+        )
+    if files and not as_json:
+        show_sources(
+            source, reads=None if reader is None else reader.reads, motion_convention=motion_convention, **naming
+        )
     with _nothing_else_on_stdout():
-        planned = _planned(source, animation, reader, width=width, height=height, frames=frames)
+        planned = _planned(source, animation, reader, width=width, height=height, frames=frames, naming=naming)
     if as_json:
         found = planned.effects
-        record = {"effects": list(found), "plan": plan_record(planned, reader), "uncertain": sorted(found.uncertain)}
+        record: dict[str, Any] = {
+            "effects": list(found),
+            "plan": plan_record(planned, reader),
+            "uncertain": sorted(found.uncertain),
+        }
+        if files:
+            chosen = sources_of(source, motion_convention=motion_convention, **naming)
+            record["sources"] = [one._asdict() for one in chosen]
         print(json.dumps(record, indent=1))
         return
     _show(source, planned, reader, denoiser)
 
 
 def _planned(
-    source: str, animation: Path | None, reader: Denoiser | None, *, width: int, height: int, frames: int | None
+    source: str,
+    animation: Path | None,
+    reader: Denoiser | None,
+    *,
+    width: int,
+    height: int,
+    frames: int | None,
+    naming: Mapping[str, Any],
 ) -> Planned:
     """The effects of a scene or a finished clip, and what would be rendered for them."""
     if Path(source).is_dir() or source.endswith(".exr"):
-        found = inspect(source, animation, frames=frames)
+        found = inspect(source, animation, frames=frames, **naming)
         return Planned(found, plan(found, reader))
     scene = open_scene(source, animation)
     count = scene.frames if frames is None else frames

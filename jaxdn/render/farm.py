@@ -7,6 +7,7 @@ only one clip. A frame's file gets its name when it is complete, so an interrupt
 import multiprocessing
 import os
 import signal
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from multiprocessing.connection import Connection, wait
@@ -145,6 +146,7 @@ def _work(job: ClipJob, messages: Connection, threads: int) -> None:
     """Runs in a separate process: render one clip and report each frame."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    warnings.filterwarnings("ignore", message="scene ")  # whoever opened the scene has been warned
     try:
         from jaxdn.render.clip import render_clip
         from jaxdn.render.variant import use_variant

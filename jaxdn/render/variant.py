@@ -82,13 +82,14 @@ def _works(variant: str, library: str = "") -> bool:
     return probe.returncode == 0 and "WORKS" in probe.stdout
 
 
-def _has_cuda() -> bool:
+def has_cuda() -> bool:
+    """Whether an NVIDIA driver is there."""
     return os.path.exists("/dev/nvidiactl") or os.path.exists("/dev/dxg")
 
 
 def _find(requested: str | None) -> Choice:
     if requested in (None, "cuda_ad_rgb"):
-        if (requested or _has_cuda()) and _works("cuda_ad_rgb"):
+        if (requested or has_cuda()) and _works("cuda_ad_rgb"):
             return Choice("cuda_ad_rgb", "", "a CUDA device with OptiX was found")
         if requested:
             raise ValueError(f"variant: {requested!r} does not run here (it needs an NVIDIA driver with OptiX).")

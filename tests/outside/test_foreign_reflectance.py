@@ -75,7 +75,6 @@ def test_diffuse_and_specular_albedo_make_the_reflectance(tmp_path, scene, progr
     assert np.any(expected == 1)
     np.testing.assert_allclose(frame.reflectance, expected, atol=1e-6)
     assert lines[-1] == f"derived: reflectance = {diffuse!r} + {specular!r}"
-    assert lines[0].startswith("read: radiance from ")
     assert read_facts(path).surfaces[0].specular
 
 
@@ -106,7 +105,7 @@ def test_layers_that_are_named_are_taken_at_their_word(tmp_path, scene):
 def test_an_albedo_alone_stays_what_it_is(tmp_path, scene):
     frame, lines = read(write(tmp_path / "a.exr", layer("", scene["light"]), layer("albedo", scene["diffuse"])))
     assert frame.reflectance is None
-    assert lines == ["read: radiance from 'R, G, B', albedo from 'albedo'"]
+    assert lines == []
 
 
 def world_to_camera(*, transposed: bool = False) -> np.ndarray:
@@ -225,4 +224,5 @@ def test_the_command_prints_what_it_read_and_derived(tmp_path, scene):
     done = subprocess.run([*command, "--method", "svgf"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("derived: reflectance = 'diffuse_albedo' + 'specular_albedo'") == 1
-    assert "read: radiance from 'R, G, B', albedo from 'diffuse_albedo'" in done.stdout
+    rows = [line.split() for line in done.stdout.splitlines()]
+    assert ["albedo", "diffuse_albedo", "R,", "G,", "B", "share", "of", "light,", "0", "to", "1"] in rows

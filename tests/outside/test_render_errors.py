@@ -79,3 +79,9 @@ def test_the_extras_are_those_of_the_project(extra):
 def test_a_missing_package_of_no_extra_keeps_its_traceback(name):
     with pytest.raises(ModuleNotFoundError), plain_errors():
         raise ModuleNotFoundError("No module", name=name)
+
+
+def test_a_warning_is_one_line_without_a_place_in_the_code():
+    done = run("import warnings; warnings.warn('scene a.xml: its film shows a crop.')")
+    assert done.returncode == 0
+    assert done.stderr == "jaxdn: scene a.xml: its film shows a crop.\n"

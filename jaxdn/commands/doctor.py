@@ -1,0 +1,82 @@
+"""``jaxdn doctor``: what this machine computes, denoises, trains and renders with, and what to install for more."""
+
+import os
+import platform
+from collections.abc import Iterator
+from importlib import metadata
+from importlib.util import find_spec
+from typing import NamedTuple
+
+import jax
+from rich.console import Console
+from rich.table import Table
+
+import jaxdn
+from jaxdn.extras import EXTRAS, install
+from jaxdn.networks.engines import ENGINES
+from jaxdn.render.variant import choose_variant, has_cuda
+
+_EXTRA_OF = {"onnxruntime": "onnx", "onednn": "onednn"}
+"""Engine -> the extra that brings it."""
+
+
+class Finding(NamedTuple):
+    """One thing that was looked at."""
+
+    what: str
+    found: str
+    advice: str = ""
+    """What to do for more; empty where nothing is missing."""
+
+
+def doctor() -> list[Finding]:
+    """Print the findings as a table, and return them."""
+    found = list(_findings())
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for column in ("what", "found", "advice"):
+        table.add_column(column, overflow="fold")
+    for finding in found:
+        table.add_row(*finding, style="yellow" if finding.advice else None)
+    Console().print(table)
+    return found
+
+
+def _findings() -> Iterator[Finding]:
+    yield Finding("jaxdn", f"{jaxdn.__version__}, Python {platform.python_version()}, {os.cpu_count()} cores")
+    yield _device()
+    for engine in ENGINES.values():
+        if engine.available():
+            yield Finding(f"engine for {engine.purpose}", engine.name)
+        elif jax.default_backend() == "cpu":
+            yield Finding(f"engine for {engine.purpose}", "XLA alone", f"faster: {install(_EXTRA_OF[engine.name])}")
+        else:
+            yield Finding(f"engine for {engine.purpose}", "XLA, as on every GPU")
+    yield _packages("training", "train")
+    yield _renderer()
+
+
+def _device() -> Finding:
+    """What jax computes on."""
+    backend = jax.default_backend()
+    names = ", ".join(dict.fromkeys(device.device_kind for device in jax.devices()))
+    found = f"jax {jax.__version__} on {backend} ({names})"
+    if backend == "cpu" and has_cuda():
+        return Finding("device", found, "an NVIDIA GPU is there too: pip install 'jax[cuda13]' or 'jax[cuda12]'")
+    return Finding("device", found)
+
+
+def _packages(what: str, extra: str) -> Finding:
+    missing = [module for module in EXTRAS[extra].modules if find_spec(module) is None]
+    if missing:
+        return Finding(what, f"without {', '.join(missing)}", f"to use it: {install(extra)}")
+    return Finding(what, ", ".join(f"{name} {metadata.version(name)}" for name in EXTRAS[extra].packages))
+
+
+def _renderer() -> Finding:
+    """Mitsuba, its variant, and the LLVM library that it needs."""
+    if find_spec("mitsuba") is None:
+        return _packages("rendering", "render")
+    choice = choose_variant()
+    found = f"mitsuba {metadata.version('mitsuba')}, {choice.variant}"
+    reason, _, advice = choice.reason.partition(". ")
+    return Finding("rendering", f"{found}: {reason}", advice)

@@ -1,0 +1,56 @@
+"""The table that ``jaxdn denoise`` and ``jaxdn inspect`` begin with: what is read from where, and what is missing."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from jaxdn.clips.layers import LAYERS
+from jaxdn.clips.sources import Source, sources_of
+from jaxdn.planning.plan import COMPOSED
+
+CONSEQUENCES: dict[str, str] = {
+    "albedo": "textures are blurred together with the noise",
+    "normal": "edges where two surfaces of one depth meet are blurred",
+    "depth": "edges between near and far are blurred, and what comes into view may keep a wrong history",
+    "roughness": "every surface counts as diffuse: sharp reflections are blurred",
+    "motion": "everything counts as still: what moves leaves trails",
+    "ids": "things that touch are told apart by their normals and depths alone",
+    "specular_reflectance": "light is divided by the albedo alone: more noise stays on glossy surfaces",
+}
+"""What it costs not to have a buffer that other renderers have a name for."""
+
+
+def missing(found: Iterable[Source], reads: frozenset[str] | None) -> dict[str, str]:
+    """Buffer -> the consequence of its absence, for those that a denoiser reads (None: any) and files may have."""
+    there = {source.buffer for source in found}
+    wanted = [name for name in LAYERS if name in CONSEQUENCES and name not in there]
+    return {name: CONSEQUENCES[name] for name in wanted if reads is None or name in reads}
+
+
+def show_sources(
+    path: str | Path,
+    *,
+    reads: frozenset[str] | None = None,
+    motion_convention: str | None = None,
+    channels: Mapping[str, str] | None = None,
+    layer: str | None = None,
+) -> list[Source]:
+    """Print the table for a sequence and a denoiser that reads some buffers (None: any denoiser); returns its sources.
+
+    Raises as :func:`jaxdn.clips.sources.sources_of` does.
+    """
+    found = sources_of(path, motion_convention=motion_convention, channels=channels, layer=layer)
+    table = Table(title=f"{path}: what is read", title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for column in ("buffer", "from layer", "channels", "taken for"):
+        table.add_column(column, overflow="fold")
+    for source in found:
+        used = reads is None or source.buffer in reads | {"radiance"}
+        note = "" if used else " (added back)" if source.buffer in COMPOSED else " (not used)"
+        letters = ", ".join(name.rpartition(".")[2] for name in source.channels)
+        table.add_row(source.buffer + note, source.layer, letters, source.convention)
+    for name, consequence in missing(found, reads).items():
+        table.add_row(name, "missing", "", consequence, style="yellow")
+    Console().print(table)
+    return found

@@ -1,0 +1,141 @@
+"""What was chosen is said first: which buffer is read from where, what it is taken for, and what is missing."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from jaxdn import cli
+from jaxdn.clips import ClipError, read_clip, write_clip
+from jaxdn.clips.exr import read_exr, read_names
+from jaxdn.clips.layers import LAYERS
+from jaxdn.clips.sources import sources_of
+from jaxdn.commands.doctor import doctor
+from jaxdn.commands.sources import CONSEQUENCES, missing
+from jaxdn.extras import install
+from jaxdn.methods.table import methods
+from tests.learning.test_training import make_clip
+
+
+def write(path: Path, *layers: str, value: float = 0.5) -> Path:
+    """A file of constant channels, each layer as ``name:letters``."""
+    names = [f"{name}.{letter}" if name else letter for name, _, letters in (one.partition(":") for one in layers)
+             for letter in letters]  # fmt: skip
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    pixels = {name: np.full((16, 16), value, np.float32) for name in names}
+    OpenEXR.File(header, pixels).write(str(path))
+    return path
+
+
+BLENDER = ("Combined:RGBA", "Denoising Albedo:RGB", "Denoising Normal:XYZ", "Depth:Z", "Vector:XYZW", "IndexOB:X")
+
+
+def blender(view: str) -> list[str]:
+    return [f"{view}.{layer}" for layer in BLENDER]
+
+
+@pytest.fixture
+def shot(tmp_path):
+    """A file of Blender's with two view layers."""
+    return write(tmp_path / "shot_0001.exr", *blender("Room"), *blender("Hall"))
+
+
+def test_the_names_in_a_header_are_those_of_the_pixels(shot, tmp_path):
+    assert sorted(read_names(shot)) == sorted(read_exr(shot))
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    plane = np.ones((4, 4), np.float32)
+    parts = [OpenEXR.Part({**header, "name": name}, {"R": plane.copy(), "Z": plane.copy()}) for name in ("a", "b.c")]
+    OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
+    assert sorted(read_names(tmp_path / "parts.exr")) == sorted(read_exr(tmp_path / "parts.exr"))
+    (tmp_path / "no.exr").write_bytes(b"not an image")
+    with pytest.raises(ClipError, match="not readable as OpenEXR"):
+        read_names(tmp_path / "no.exr")
+    with pytest.raises(ClipError, match="no such file"):
+        read_names(tmp_path / "nowhere.exr")
+
+
+def test_a_view_layer_is_chosen(shot, capsys):
+    with pytest.raises(ClipError, match=r"'Hall\.Combined' and 'Room\.Combined' fit equally well.*--layer"):
+        sources_of(shot)
+    found = {source.buffer: source for source in sources_of(shot, layer="Hall")}
+    assert found["radiance"].layer == "Hall.Combined"
+    assert found["albedo"].channels == tuple(f"Hall.Denoising Albedo.{letter}" for letter in "RGB")
+    assert found["motion"].convention.startswith("pixels, previous minus current position, y up (Blender")
+    assert all(source.layer.startswith("Hall.") for source in found.values())
+    mixed = {source.buffer: source.layer for source in sources_of(shot, layer="Hall", channels={"depth": "Room.Depth"})}
+    assert (mixed["depth"], mixed["normal"]) == ("Room.Depth", "Hall.Denoising Normal")
+    with pytest.raises(ClipError, match=r"layer: there is none called 'Cellar'; there are '\w+', '\w+'"):
+        sources_of(shot, layer="Cellar")
+    assert read_clip(shot, layer="Hall").frames.albedo is not None
+
+
+def run(capsys, *arguments):
+    cli.main([str(argument) for argument in arguments])
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_denoise_begins_with_the_table(shot, tmp_path, capsys):
+    text = run(capsys, "denoise", shot, "-o", tmp_path / "out", "--method", "svgf", "--layer", "Hall")
+    for row in (
+        "radiance Hall.Combined R, G, B linear light",
+        "normal Hall.Denoising Normal X, Y, Z world space",
+        "depth Hall.Depth Z along the optical axis (view-space z), not along the ray",
+        "motion Hall.Vector X, Y pixels, previous minus current position, y up (Blender's Vector pass,",
+    ):
+        assert row in text
+    assert text.index("radiance Hall") < text.index("1 frames denoised")
+    assert "missing" not in text.partition("1 frames")[0].replace("specular_reflectance missing", "")
+
+
+def test_what_is_missing_is_said_with_its_consequence(tmp_path, capsys):
+    path = write(tmp_path / "a_1.exr", ":RGB", "diffuseFilter:RGB", "Paint:RGB", "mvec:XY")
+    reads = methods()["svgf"].factory().reads
+    lost = missing(sources_of(path), reads)
+    assert set(lost) == {"normal", "depth", "ids"} | ({"specular_reflectance"} & reads)
+    options = ("--motion-convention", "uv", "--channels", "albedo=Paint")
+    text = run(capsys, "denoise", path, "-o", tmp_path / "out", "--method", "svgf", *options)
+    assert "albedo Paint R, G, B" in text
+    assert "motion mvec X, Y fractions of the image" in text
+    for name, consequence in lost.items():
+        assert f"{name} missing {consequence}" in text
+
+
+def test_inspect_prints_the_same_and_gives_it_as_json(tmp_path, capsys):
+    path = write(tmp_path / "a_1.exr", ":RGB", "diffuseFilter:RGB", "mvec:XY")
+    text = run(capsys, "inspect", path)
+    assert "albedo diffuseFilter R, G, B" in text
+    assert "motion mvec X, Y nothing says: state --motion-convention" in text
+    assert f"depth missing {CONSEQUENCES['depth']}" in text
+    sources = json.loads(run(capsys, "inspect", path, "--json", "--channels", "albedo=none"))["sources"]
+    assert [source["buffer"] for source in sources] == ["radiance", "motion"]
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["inspect", "edge", "--layer", "Hall"])
+    assert ended.value.code == 2
+    assert "expected none of --channels, --layer, --motion-convention" in capsys.readouterr().err
+
+
+def test_a_clip_of_ours_has_a_table_too(tmp_path, capsys):
+    write_clip(make_clip(0), tmp_path / "clip")
+    found = {source.buffer: source for source in sources_of(tmp_path / "clip")}
+    assert found["radiance"].channels == ("noisy_1spp.R", "noisy_1spp.G", "noisy_1spp.B")
+    assert set(found) == {"radiance", "albedo", "normal", "depth", "motion", "dual_motion"}
+    assert "motion motion X, Y pixels, previous minus current position, y down" in run(
+        capsys, "inspect", tmp_path / "clip"
+    )
+
+
+def test_every_buffer_that_other_renderers_have_has_a_consequence():
+    assert set(CONSEQUENCES) == set(LAYERS) - {"radiance"}
+
+
+def test_the_version_and_what_is_installed(capsys, monkeypatch):
+    assert run(capsys, "--version") == f"jaxdn {cli.jaxdn.__version__}"
+    text = run(capsys, "doctor")
+    for word in ("jax ", " on ", "engine for inference", "engine for training", "optax", "mitsuba", "Python"):
+        assert word in text
+    monkeypatch.setattr("jaxdn.commands.doctor.find_spec", lambda name: None)
+    advice = {finding.what: finding.advice for finding in doctor()}
+    assert advice["training"].endswith(install("train"))
+    assert advice["rendering"].endswith(install("render"))
