@@ -4,6 +4,8 @@ BIN := .venv/bin
 SETTINGS ?=
 # Huge pages for large buffers (glibc; ignored elsewhere): a train step takes 0.87 of the time. The bench measures both.
 train weights: export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
+# XLA raises its errors; what it logs besides is an alarm at every compilation of more than two minutes.
+export TF_CPP_MIN_LOG_LEVEL ?= 3
 
 .PHONY: help setup train test test-slow bench chart hard-cases lint format docs weights clean
 

@@ -1,5 +1,6 @@
 """The command line: ``jaxdn inspect | render | pack | train | denoise | compare | doctor``; each has ``--help``."""
 
+import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -391,6 +392,8 @@ def _doctor(options: Doctor) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Parse the command line and run one command; errors a user can fix end with one message and exit code 2."""
+    # XLA raises its errors; what it logs besides is an alarm at every compilation of more than two minutes.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     run: dict[type, Any] = {
         Inspect: _inspect,
         Render: _render,
