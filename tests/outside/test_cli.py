@@ -1,6 +1,7 @@
 """The command line in real processes: messages instead of tracebacks, exit code 2, complete files."""
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import asdict
@@ -250,3 +251,12 @@ def test_sizes_that_differ_are_refused(clip, tmp_path):
     write_clip(Clip(Frame(radiance=small.frames.radiance)), tmp_path / "small")
     (mixed / "frame_0002.exr").write_bytes((tmp_path / "small" / "frame_0000.exr").read_bytes())
     assert "frame_0002.exr" in fails("denoise", mixed, "-o", tmp_path / "out", "--method", "svgf")
+
+
+def test_the_compilers_alarm_is_silenced_before_jax_reads_the_setting():
+    # The alarm itself comes after two minutes of compiling.
+    lines = "import os, sys; from jaxdn import cli; cli.main(['--version'])"
+    code = f"{lines}; print('jax' in sys.modules, os.environ['TF_CPP_MIN_LOG_LEVEL'])"
+    environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
+    assert done.stdout.splitlines()[1:] == ["False 3"], done.stderr
