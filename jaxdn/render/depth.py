@@ -45,7 +45,7 @@ def measure_depth(scene: AnimatedScene, *, bound: float = BOUND) -> PathDepth:
         raise ValueError(f"bound: expected a share of the light between 0 and 1, got {bound!r}.")
     from jaxdn.render.clip import tracer
 
-    accumulate, _ = tracer(use_variant())
+    accumulate = tracer(use_variant()).accumulate
     built = scene.build(0, _SIDE, _SIDE)
     light: dict[int, float] = {}
     for depth in sorted({min(depth, scene.max_depth) for depth in _DEPTHS}):

@@ -11,8 +11,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from jaxdn.render.seeds import pass_seed
-from jaxdn.render.wavefront import BRIGHTEST, Accumulated, no_light
+from jaxdn.render.seeds import pass_seed, tea
+from jaxdn.render.wavefront import BRIGHTEST, Accumulated, Replayed, camera_rays, no_light
 
 _NO_ROULETTE = 1000
 
@@ -56,3 +56,30 @@ def accumulate(
         direct, indirect = np.maximum(two - one, 0.0), np.maximum(whole - two, 0.0)
         total = total.plus(Accumulated(one, direct, indirect, int(np.sum(~finite))))
     return total
+
+
+def replay(
+    scene: Any, target: np.ndarray, pixel: np.ndarray, *, key: tuple[int, int], sample: int, max_depth: int
+) -> Replayed:
+    """Paths through any points of the image with reproducible random numbers; see :func:`wavefront.replay`.
+
+    The numbers depend on the same arguments, but are not those of :func:`accumulate`, whose passes have one stream for
+    each block of pixels.
+    """
+    sensor = scene.sensors()[0]
+    deep, two, _ = _integrators(max_depth)
+    sampler: Any = mi.load_dict({"type": "independent"})
+    light, position = np.zeros((len(pixel), 3)), np.full((len(pixel), 3), np.nan)
+    for index, (x, y) in enumerate(target):
+        ray = camera_rays(sensor, float(x) - 0.5, float(y) - 0.5)
+        number = tea(key[0] ^ int(pixel[index]), key[1] ^ sample)[0]
+        parts = []
+        for integrator in (deep, two):
+            sampler.seed(number, 1)
+            parts.append(np.array(integrator.sample(scene, sampler, ray)[0], np.float64))
+        if np.all(parts[0] < BRIGHTEST):
+            light[index] = np.maximum(parts[0] - parts[1], 0.0)
+        hit = scene.ray_intersect(ray)
+        if hit.is_valid():
+            position[index] = hit.p
+    return Replayed(light, position)
