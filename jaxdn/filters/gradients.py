@@ -13,10 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdn.filters.accumulation import luminance
 from jaxdn.filters.atrous import edge_average, stencil
-from jaxdn.filters.blur import blur_variance
-from jaxdn.filters.weights import Weight, luminance_weight
+from jaxdn.filters.weights import Weight
 from jaxdn.frame import Array
 from jaxdn.numerics import absolute
 
@@ -34,8 +32,6 @@ class Change(NamedTuple):
     """The change of luminance, of either sign."""
     size: jax.Array
     """The larger of the luminances before and after; 0 where nothing is known."""
-    variance: jax.Array
-    """The variance of ``delta``; 0 if it is exact."""
 
 
 def stratum_sums(plane: jax.Array) -> jax.Array:
@@ -60,14 +56,13 @@ def replayed(gradient: jax.Array) -> Change:
     # Luminance is not negative, so the larger one is at least the change.
     size = jnp.maximum(gradient[..., 1], jnp.abs(delta))
     delta, size = stratum_sums(delta), stratum_sums(size)
-    return Change(delta, size, jnp.zeros_like(delta))
+    return Change(delta, size)
 
 
 def observed(now: jax.Array, past: jax.Array, hit: jax.Array | None) -> Change:
     """The change of the frames' own luminance against that of the history, where no samples were replayed.
 
-    The difference of both means over the stratum's pixels with a history; the variance of the new one, from the scatter
-    of these pixels.
+    The difference of both means over the stratum's pixels with a history.
 
     Args:
       now: luminance of the new frame [H, W], noisy.
@@ -77,73 +72,53 @@ def observed(now: jax.Array, past: jax.Array, hit: jax.Array | None) -> Change:
     there = (past[5] > 0).astype(now.dtype)
     if hit is not None:
         there = there * hit
-    count = stratum_sums(there)
-    new, scatter = _mean_and_scatter(now, there)
-    old = stratum_sums(past[3] * there) / jnp.maximum(count, 1.0)
-    return Change(new - old, jnp.maximum(new, old), scatter)
-
-
-def stratum_luminance(now: jax.Array, hit: jax.Array | None) -> tuple[jax.Array, jax.Array]:
-    """The mean luminance of each stratum of colour ``now`` [3, H, W], and the variance of this mean: [Hs, Ws]."""
-    light = luminance(now)
-    return _mean_and_scatter(light, jnp.ones_like(light) if hit is None else hit.astype(light.dtype))
-
-
-def _mean_and_scatter(light: jax.Array, there: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Mean over the pixels of each stratum that are ``there``, and the variance of the mean."""
     count = jnp.maximum(stratum_sums(there), 1.0)
-    mean = stratum_sums(light * there) / count
-    scatter = jnp.maximum(stratum_sums(light * light * there) / count - mean * mean, 0.0)
-    return mean, scatter / jnp.maximum(count - 1.0, 1.0)
+    new, old = (stratum_sums(light * there) / count for light in (now, past[3]))
+    return Change(new - old, jnp.maximum(new, old))
 
 
 def reconstruct(
     change: Change,
-    light: tuple[jax.Array, jax.Array] | None,
     hit: jax.Array | None,
     weights: Sequence[Weight],
     *,
     levels: int,
-    sigma: float,
     significance: float,
 ) -> jax.Array:
-    """The share [Hs, Ws] in [0, 1] by which light has changed: ``max(0, |delta| - s deviation) / size``.
+    """The share ``|delta| / size`` [Hs, Ws] in [0, 1] by which light has changed.
 
-    ``delta`` and ``size`` are each filtered by an a-trous cascade of 3x3 taps, 2^i strata apart, and then divided. The
-    luminance of the strata, which stops the filter at the edges of light, is filtered along with them. Where nothing is
-    known nearby, nothing has changed: 0.
+    ``delta`` and ``size`` are each filtered by an a-trous cascade of 3x3 taps, 2^i strata apart, and then divided. Paths
+    that differ by chance give a ``delta`` too, around 0: the share is multiplied by ``|delta| / (s deviation) - 1``
+    within [0, 1], so that it is 0 up to s standard deviations of the filtered ``delta`` and whole from 2 s on. Where
+    nothing is known nearby, nothing has changed.
 
     Args:
       change: of the strata.
-      light: mean luminance of the strata and its variance; None: light has no edges.
-      hit: [Hs, Ws] bool, a surface is seen.
-      weights: edge-stopping weights of the surfaces, of the size of the strata.
+      hit: [Hs, Ws] bool, a surface is seen; None: everywhere.
+      weights: edge-stopping weights, of the size of the strata.
       levels: of the cascade.
-      sigma: edge-stopping parameter for luminance, in standard deviations.
-      significance: s, the standard deviations of ``delta`` that count as noise.
+      significance: s; 0 takes every difference for a change.
     """
-    planes = jnp.stack([change.delta, change.size, *(() if light is None else light[:1])])
-    variance = change.variance if light is None else light[1]
 
-    def level(carry: tuple[jax.Array, jax.Array], index: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
-        planes, variance = carry
-        stops = list(weights)
-        if light is not None:
-            deviation = jnp.sqrt(jnp.maximum(blur_variance(variance), 1e-10))
-            stops.append(luminance_weight(planes[2], deviation, sigma=sigma))
-        planes, spread = edge_average(
-            planes, hit, stops, _TAPS, step=2**index, step_max=2 ** (levels - 1), variance=variance
+    def level(planes: tuple[jax.Array, jax.Array], index: jax.Array) -> tuple[tuple[jax.Array, jax.Array], None]:
+        fields, variance = planes
+        fields, spread = edge_average(
+            fields, hit, weights, _TAPS, step=2**index, step_max=2 ** (levels - 1), variance=variance
         )
         assert spread is not None
-        return (planes, spread), None
+        return (fields, spread), None
 
+    # The variance of a single delta, if its mean is 0.
+    fields, variance = jnp.stack([change.delta, change.size]), change.delta**2
     if levels:
-        (planes, variance), _ = lax.scan(level, (planes, variance), jnp.arange(levels, dtype=jnp.int32))
-    delta, size = absolute(planes[0]), planes[1]
-    if significance:
-        delta = jnp.maximum(delta - significance * jnp.sqrt(jnp.maximum(variance, _LEAST**2)), 0.0)
+        (fields, variance), _ = lax.scan(level, (fields, variance), jnp.arange(levels, dtype=jnp.int32))
+    delta, size = absolute(fields[0]), fields[1]
     lit = size > _LEAST
-    return jnp.where(lit, jnp.clip(delta / jnp.where(lit, size, 1.0), 0.0, 1.0), 0.0)
+    share = jnp.where(lit, jnp.minimum(delta / jnp.where(lit, size, 1.0), 1.0), 0.0)
+    if significance:
+        deviation = significance * jnp.sqrt(jnp.maximum(variance, _LEAST**2))
+        share = share * jnp.clip(delta / deviation - 1.0, 0.0, 1.0)
+    return share
 
 
 def to_pixels(share: jax.Array, height: int, width: int) -> jax.Array:

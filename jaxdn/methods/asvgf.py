@@ -26,7 +26,6 @@ from jaxdn.filters.gradients import (
     reconstruct,
     replayed,
     stratum_centers,
-    stratum_luminance,
     to_pixels,
 )
 from jaxdn.filters.guides import hit_mask
@@ -36,10 +35,6 @@ from jaxdn.methods.demodulated import demodulated
 from jaxdn.methods.table import method
 from jaxdn.options import Range
 
-_NOISE = 2.0
-"""Standard deviations of the observed change that count as noise."""
-
-
 @dataclass(frozen=True)
 class Options(svgf.Options):
     """The options of ``svgf``, and those of the gradients."""
@@ -48,6 +43,9 @@ class Options(svgf.Options):
     """Minimum weight of the new frame in colour, where light has not changed."""
     gradient_levels: Annotated[int, Range(0, 8)] = 5
     """Levels of the a-trous filter over strata."""
+    significance: Annotated[float, Range(0)] = 3.0
+    """Standard deviations up to which a change is taken for noise; from twice as many on it counts in full. With 0, as
+    in the paper, every path that differs by chance shortens the history."""
     antilag: Annotated[float, Range(1)] = 4.0
     """The history keeps the share ``(1 - lambda)^antilag``, where lambda is the share by which light has changed. With
     the paper's 1 (``preset="paper"``) light that doubles leaves half of the history."""
@@ -56,7 +54,7 @@ class Options(svgf.Options):
 @method(
     Options,
     title="SVGF that adapts to changes of light (Schied et al. 2018)",
-    presets={"paper": Options(sigma_normal=128.0, antilag=1.0)},
+    presets={"paper": Options(sigma_normal=128.0, significance=0.0, antilag=1.0)},
 )
 def asvgf(options: Options) -> Denoiser:
     """A-SVGF, a filter without weights (``params`` is ``{}``).
@@ -88,26 +86,23 @@ def changed(options: Options, past: jax.Array, frame: Frame) -> jax.Array:
     depth, normal, ids = (stratum_centers(buffer) for buffer in (frame.depth, frame.normal, frame.ids))
     weights = svgf.surface_weights(options, depth, normal, ids)
 
-    def filtered(change: Change, light: tuple[jax.Array, jax.Array] | None, significance: float) -> jax.Array:
+    def filtered(change: Change) -> jax.Array:
         return reconstruct(
             change,
-            light,
             hit_mask(depth, ids),
             weights,
             levels=options.gradient_levels,
-            sigma=options.sigma_luminance,
-            significance=significance,
+            significance=options.significance,
         )
 
-    def from_frames() -> jax.Array:
-        return filtered(observed(luminance(now), past, hit), None, _NOISE)
-
-    def from_samples(change: Change) -> jax.Array:
-        return filtered(change, stratum_luminance(now, hit), 0.0)
-
     if frame.luminance_gradient is None:
-        share = from_frames()
+        share = filtered(observed(luminance(now), past, hit))
     else:
         change = replayed(frame.luminance_gradient)
-        share = lax.cond(jnp.any(change.size > 0), from_samples, lambda _: from_frames(), change)
+        share = lax.cond(
+            jnp.any(change.size > 0),
+            filtered,
+            lambda _: filtered(observed(luminance(now), past, hit)),
+            change,
+        )
     return to_pixels(share, *now.shape[1:])
