@@ -87,10 +87,10 @@ def reconstruct(
 ) -> jax.Array:
     """The share ``|delta| / size`` [Hs, Ws] in [0, 1] by which light has changed.
 
-    ``delta`` and ``size`` are each filtered by an a-trous cascade of 3x3 taps, 2^i strata apart, and then divided. Paths
-    that differ by chance give a ``delta`` too, around 0: the share is multiplied by ``|delta| / (s deviation) - 1``
-    within [0, 1], so that it is 0 up to s standard deviations of the filtered ``delta`` and whole from 2 s on. Where
-    nothing is known nearby, nothing has changed.
+    ``delta`` and ``size`` are each filtered by an a-trous cascade of 3x3 taps, 2^i strata apart, and then divided.
+    Paths that differ by chance give a ``delta`` too, around 0: the share is multiplied by ``|delta| / (s deviation) -
+    1`` within [0, 1], so that it is 0 up to s standard deviations of the filtered ``delta`` and whole from 2 s on.
+    Where nothing is known nearby, nothing has changed.
 
     Args:
       change: of the strata.

@@ -35,6 +35,7 @@ from jaxdn.methods.demodulated import demodulated
 from jaxdn.methods.table import method
 from jaxdn.options import Range
 
+
 @dataclass(frozen=True)
 class Options(svgf.Options):
     """The options of ``svgf``, and those of the gradients."""
