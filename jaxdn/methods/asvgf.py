@@ -42,9 +42,9 @@ class Options(svgf.Options):
 
     alpha: Annotated[float, Range(0, 1, without_low=True)] = 0.1
     """Minimum weight of the new frame in colour, where light has not changed."""
-    gradient_levels: Annotated[int, Range(0, 8)] = 5
-    """Levels of the a-trous filter over strata."""
-    significance: Annotated[float, Range(0)] = 3.0
+    gradient_levels: Annotated[int, Range(0, 5)] = 3
+    """Levels of the filter over strata: it averages over ``3 * 3^levels`` pixels in each direction."""
+    significance: Annotated[float, Range(0)] = 2.0
     """Standard deviations up to which a change is taken for noise; from twice as many on it counts in full. With 0, as
     in the paper, every path that differs by chance shortens the history."""
     antilag: Annotated[float, Range(1)] = 4.0

@@ -47,9 +47,9 @@ class Subject(NamedTuple):
 
 
 def denoiser_subjects() -> list[Subject]:
-    """Every registered method, in its smallest variant, each precision, both ways to divide light and to filter it, after svgf.
+    """Every registered method, in its smallest variant, each precision, both ways to divide light and to filter it.
 
-    A network has the weights that training starts from.
+    A network has the weights that training starts from; what may follow another method also follows svgf.
     """
     subjects = []
     for name, method in methods().items():

@@ -78,7 +78,7 @@ def test_the_observed_change_matches_a_loop(rng):
     np.testing.assert_allclose(change.size, np.maximum(new, old), rtol=1e-5)
 
 
-@pytest.mark.parametrize("significance", [0.0, 1.5])
+@pytest.mark.parametrize("significance", [0.0, 1.0])
 def test_the_reconstruction_matches_a_loop(significance, rng, x64):
     frame = moving_frames(rng, 1, np.float64)[0]
     depth, ids, normal = frame.depth[..., 0], frame.ids[..., 0], frame.normal
@@ -98,7 +98,7 @@ def test_the_reconstruction_matches_a_loop(significance, rng, x64):
         filtered, spread = fields.copy(), variance.copy()
         for p in np.ndindex(depth.shape):
             if hit[p]:
-                filtered[p], spread[p] = reference_average(fields, stencil(1), p, geometry, 2**level, None, variance)
+                filtered[p], spread[p] = reference_average(fields, stencil(1), p, geometry, 3**level, None, variance)
         fields, variance = filtered, spread
     share = np.minimum(np.abs(fields[..., 0]) / np.maximum(fields[..., 1], 1e-8), 1.0)
     if significance:
@@ -166,7 +166,7 @@ def test_gradients_of_the_formulas(rng, x64):
 
 def whole_share(gradient, **options):
     strata = replayed(jnp.asarray(gradient))
-    return np.asarray(reconstruct(strata, None, [], **{"levels": 5, "significance": 3.0, **options}))
+    return np.asarray(reconstruct(strata, None, [], **{"levels": 3, "significance": 2.0, **options}))
 
 
 @pytest.mark.parametrize(("new", "expected"), [(1.0, 0.0), (2.0, 0.5), (0.5, 0.5), (0.0, 1.0)])
@@ -214,9 +214,9 @@ def run(denoiser, frames):
 def still(rng, levels, *, samples):
     """Frames of one flat surface under light of the given levels, and gradient samples of its changes."""
     frames = []
-    before = np.zeros((HEIGHT, WIDTH))
+    before = np.zeros((24, 30, 3))
     for index, level in enumerate(levels):
-        radiance = level * rng.uniform(0.5, 1.5, (HEIGHT, WIDTH, 1)) * np.ones(3)
+        radiance = level * rng.uniform(0.5, 1.5, (24, 30, 1)) * np.ones(3)
         old = before @ LUMINANCE if index else before
         new = old * level / levels[index - 1] if index else old
         gradient = sparse_gradient(rng, old.shape, old=old, new=new).astype(np.float32) if samples else None
@@ -264,13 +264,12 @@ def test_without_a_change_of_light_it_is_svgf(rng):
         np.testing.assert_allclose(image, other, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("gradient", [None, 0.0, 0.3])
+@pytest.mark.parametrize("gradient", [0.0, 0.3])
 def test_a_constant_image_stays(gradient, rng):
     frame = moving_frames(rng, 1)[0]
     frame = frame._replace(radiance=frame.albedo * 0 + np.float32(0.37), albedo=np.full_like(frame.albedo, 0.6))
-    if gradient is not None:
-        plane = np.full((*frame.radiance.shape[:2], 1), gradient, np.float32)
-        frame = frame._replace(luminance_gradient=np.concatenate([plane, 2 * plane], -1))
+    plane = np.full((*frame.radiance.shape[:2], 1), gradient, np.float32)
+    frame = frame._replace(luminance_gradient=np.concatenate([plane, 2 * plane], -1))
     for _, image in run(asvgf(levels=2), [frame] * 3):
         np.testing.assert_allclose(image, 0.37, rtol=1e-5)
 
@@ -289,11 +288,14 @@ def test_no_samples_are_those_of_the_neutral_value(rng):
 def test_no_buffer_has_to_be_there(rng):
     denoiser = asvgf(levels=1)
     frames = [frame._replace(luminance_gradient=np.full((10, 12, 2), 0.5, np.float32)) for frame in moving_frames(rng)]
-    images = []
-    for dropped in [(), *([name] for name in sorted(denoiser.reads)), sorted(denoiser.reads)]:
-        given = [frame._replace(**dict.fromkeys(dropped)) for frame in frames]
-        images.append(run(denoiser, given)[-1][1])
-        assert np.isfinite(images[-1]).all()
+
+    def shape_of(frame):
+        return jax.eval_shape(lambda frame: denoiser.step({}, denoiser.start({}, frame), frame)[1], frame).shape
+
+    for name in denoiser.reads:
+        assert shape_of(frames[0]._replace(**{name: None})) == (10, 12, 3)
+    bare = [Frame(frame.radiance) for frame in frames]
+    assert all(np.isfinite(image).all() for _, image in run(denoiser, bare))
 
 
 def test_a_larger_luminance_that_is_smaller_than_the_change_is_mended(rng):
