@@ -128,7 +128,8 @@ def resolve(
     center, size = box_around(to_ycocg(image), options.box, options.gamma)
     clipped = jnp.maximum(from_ycocg(clip_to_box(to_ycocg(past[..., :3]), center, size)), 0.0)
     share = jnp.maximum(options.alpha, 1.0 / length)
-    return jnp.concatenate([clipped + share * (image - clipped), length], axis=-1), broken
+    # In this form the image itself, to the last bit, where there is no history.
+    return jnp.concatenate([share * image + (1.0 - share) * clipped, length], axis=-1), broken
 
 
 def sharpened(image: jax.Array, strength: float) -> jax.Array:

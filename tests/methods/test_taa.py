@@ -291,7 +291,7 @@ def test_after_a_denoiser_its_parameters_samples_and_repairs_stay_its_own(rng):
     )
     frame = Frame(rng.random((4, 5, 3)).astype(np.float32))
     frame = frame._replace(radiance=np.where(np.arange(5)[:, None] == 2, np.nan, frame.radiance))
-    denoiser = taa(after=recurrent(core))
+    denoiser = taa(after=recurrent(core), gamma=100.0)  # a box that holds every pixel
     params = denoiser.init(jax.random.key(0), frame)
     assert denoiser.samples is not None
     state, images = run(denoiser, [frame] * 2, params)
