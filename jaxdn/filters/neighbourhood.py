@@ -63,9 +63,14 @@ def box_around(image: jax.Array, box: Box, gamma: float) -> tuple[jax.Array, jax
 
 
 def clip_to_box(color: jax.Array, center: jax.Array, size: jax.Array) -> jax.Array:
-    """``color`` moved towards the centre until it lies in the box: ``c + v / max(1, max_k |v_k| / size_k)``."""
+    """``color`` moved towards the centre until it lies in the box: ``c + v / max(1, max_k |v_k| / size_k)``.
+
+    All in YCoCg. A size below a thousandth of the centre's luma counts as that much: where the neighbourhood has only
+    one hue, rounding would decide how far a colour lies outside.
+    """
     offset = color - center
-    excess = jnp.max(jnp.abs(offset) / jnp.maximum(size, 1e-6), axis=-1, keepdims=True)
+    smallest = 1e-3 * jnp.abs(center[..., :1]) + 1e-6
+    excess = jnp.max(jnp.abs(offset) / jnp.maximum(size, smallest), axis=-1, keepdims=True)
     return center + offset / jnp.maximum(excess, 1.0)
 
 
