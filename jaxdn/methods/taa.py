@@ -3,7 +3,7 @@
 It compares colours and no surfaces: whatever the new frame does not show around a pixel, old light as well as what lies
 behind a moved edge, is pulled into the range of its 3x3 neighbourhood. That needs an image with little noise, because
 noise widens the range: it follows a denoiser (``taa(after=jaxdn.denoisers.svgf())``), whose remaining flicker it
-removes. Alone, on noisy frames, it is a plain accumulation that leaves trails.
+removes. Alone, on noisy frames, it darkens: where nine pixels found no light, the history is clipped to black.
 
 In games the camera rays are moved within the pixel from frame to frame, and the mean of the history smooths edges. A
 :class:`jaxdn.Frame` has no such offset: rays are taken to go through the same point of every pixel, so edges are
