@@ -200,7 +200,7 @@ def test_only_json_is_printed(tmp_path):
     assert set(said["effects"]) == {"indirect", "glossy", "specular"}
     assert said["plan"]["motion"] == "none"
     assert 0 < said["plan"]["remaining"] < 1
-    assert len(said["plan"]["buffers"]) + said["plan"]["buffers_left_out"] == 12
+    assert len(said["plan"]["buffers"]) + said["plan"]["buffers_left_out"] == 13
     assert said["uncertain"] == []
 
 
