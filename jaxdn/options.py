@@ -1,7 +1,7 @@
 """The options of a method: one frozen dataclass, read by its factory, the command line and the docs.
 
 Only a field's annotation is declared: ``Literal`` for a choice, ``Annotated[float, Range(...)]`` for a number,
-``bool``, ``None`` and unions of these, nested tuples of numbers. Given values are checked here and nowhere else.
+``bool``, ``None``, a class, unions of these, nested tuples of numbers. Given values are checked here and nowhere else.
 """
 
 import dataclasses
@@ -80,7 +80,7 @@ def describe(cls: type) -> str:
 
 
 def _tuples(value: Any) -> Any:
-    return tuple(map(_tuples, value)) if isinstance(value, list | tuple) else value
+    return tuple(map(_tuples, value)) if type(value) in (list, tuple) else value
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -111,4 +111,4 @@ def _expected(hint: Any) -> str:
     if origin is tuple:
         return f"a tuple of {_expected(arguments[0])}"
     names = {float: "a number", int: "a whole number", bool: "True or False", NoneType: "None", str: "a string"}
-    return names.get(hint, str(hint))
+    return names.get(hint) or f"a {hint.__name__}"

@@ -12,11 +12,21 @@ def luminance(planes: jax.Array) -> jax.Array:
     return red * planes[0] + green * planes[1] + blue * planes[2]
 
 
-def accumulate(past: jax.Array, now: jax.Array, *, alpha: float, alpha_moments: float, history_max: int) -> jax.Array:
+def accumulate(
+    past: jax.Array,
+    now: jax.Array,
+    *,
+    alpha: float,
+    alpha_moments: float,
+    history_max: int,
+    change: jax.Array | None = None,
+) -> jax.Array:
     """The history [6, H, W] with colour ``now`` [3, H, W] blended in (Schied et al. 2017, sec. 4.1 and 4.2).
 
     Planes are colour, the first and second moment of its luminance, and the history length N in frames. The new frame
-    has the weight ``max(alpha, 1 / N)``: without a history, the result is the new frame.
+    has the weight ``a = max(alpha, 1 / N)``: without a history, the result is the new frame. Where light has changed by
+    a share ``c``, the weight is ``(1 - c) a + c`` (Schied et al. 2018), and N becomes ``N / (1 - c + c N)``, the
+    length that this share is worth.
 
     Args:
       past: the history [6, H, W], 0 where there is none.
@@ -24,11 +34,16 @@ def accumulate(past: jax.Array, now: jax.Array, *, alpha: float, alpha_moments: 
       alpha: minimum weight of the new frame in colour.
       alpha_moments: minimum weight of the new frame in the moments.
       history_max: maximum of N.
+      change: [H, W] in [0, 1], the share by which the history is outdated; None: nothing has changed.
     """
     level = luminance(now)
     length = jnp.minimum(past[5] + 1.0, history_max)
     share = jnp.maximum(alpha, 1.0 / length)
     share_moments = jnp.maximum(alpha_moments, 1.0 / length)
+    if change is not None:
+        share = share + change * (1.0 - share)
+        share_moments = share_moments + change * (1.0 - share_moments)
+        length = length / (1.0 - change + change * length)
     color = past[:3] + share[None] * (now - past[:3])
     moments = past[3:5] + share_moments[None] * (jnp.stack([level, level * level]) - past[3:5])
     return jnp.concatenate([color, moments, length[None]])

@@ -28,7 +28,7 @@ from jaxdn.filters.guides import Guides, guides_of, hit_mask, pack, shared, unpa
 from jaxdn.filters.reprojection import expected, reproject, same_surface
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.filters.weights import Weight, depth_weight, luminance_weight, normal_weight
-from jaxdn.frame import Frame
+from jaxdn.frame import Array, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
 from jaxdn.methods.table import method
 from jaxdn.options import Range
@@ -73,7 +73,7 @@ class Options:
     def __post_init__(self) -> None:
         if self.feedback_level > self.levels:
             raise ValueError(
-                f"svgf feedback_level: expected a whole number from 0 to levels ({self.levels}), "
+                f"feedback_level: expected a whole number from 0 to levels ({self.levels}), "
                 f"got {self.feedback_level!r}."
             )
 
@@ -101,43 +101,23 @@ def svgf(options: Options) -> Denoiser:
     radiance that is not [H, W, 3].
     """
 
-    def start(params: Params, frame: Frame) -> SvgfState:
-        nothing = jnp.zeros((*frame.radiance.shape[:2], 6), frame.radiance.dtype)
-        return SvgfState(nothing, jax.tree.map(jnp.zeros_like, guides_of(frame)))
-
     def step(
         params: Params, state: SvgfState, frame: Frame, first: jax.Array
     ) -> tuple[SvgfState, jax.Array, jax.Array]:
-        past, broken = _recall(options, state, frame, first)
-        history = accumulate(
-            past,
-            frame.radiance.transpose(2, 0, 1),
-            alpha=options.alpha,
-            alpha_moments=options.alpha_moments,
-            history_max=options.history_max,
-        )
-        hit = hit_mask(frame.depth, frame.ids)
-        weights: list[Weight] = []
-        if frame.depth is not None:
-            weights.append(depth_weight(frame.depth, frame.ids, sigma=options.sigma_depth))
-        if frame.normal is not None:
-            weights.append(normal_weight(frame.normal, sigma=options.sigma_normal))
-        color, variance = estimate_variance(history, hit, weights, short_history=options.short_history)
-        feedback = color if options.feedback_level else history[:3]
-        texture = texture_left(frame, options.demodulate)
-        texture = None if texture is None else texture.transpose(2, 0, 1)
-        image, feedback = _filter(options, color, variance, feedback, texture, hit, weights)
-        image = image.transpose(1, 2, 0)
-        if hit is not None:
-            image = jnp.where(hit[..., None], image, frame.radiance)
-        kept = jnp.concatenate([feedback, history[3:]]).transpose(1, 2, 0)
-        return SvgfState(kept, guides_of(frame)), image, broken
+        past, broken = recall_history(options, state, frame, first)
+        return (*filter_history(options, blend(options, past, frame), frame), broken)
 
     plain = recurrent(Core(start, step, READS))
     return demodulated(plain, by=options.demodulate)
 
 
-def _recall(options: Options, state: SvgfState, frame: Frame, first: jax.Array) -> tuple[jax.Array, jax.Array]:
+def start(params: Params, frame: Frame) -> SvgfState:
+    """No history."""
+    nothing = jnp.zeros((*frame.radiance.shape[:2], 6), frame.radiance.dtype)
+    return SvgfState(nothing, jax.tree.map(jnp.zeros_like, guides_of(frame)))
+
+
+def recall_history(options: Options, state: SvgfState, frame: Frame, first: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The fetched history [6, H, W], 0 where missing; the number of invalid history pixels."""
     # Guides may come and go within a clip.
     before = shared(state.guides, guides_of(frame))
@@ -151,6 +131,44 @@ def _recall(options: Options, state: SvgfState, frame: Frame, first: jax.Array) 
     sound = jnp.all(jnp.isfinite(past) & (past >= 0), axis=-1)
     broken = jnp.sum(valid & ~sound, dtype=jnp.int32)
     return jnp.where((valid & sound)[..., None], past, 0.0).transpose(2, 0, 1), broken
+
+
+def blend(options: Options, past: jax.Array, frame: Frame, change: jax.Array | None = None) -> jax.Array:
+    """The history [6, H, W] with the new frame blended in; ``change`` as in ``accumulate``."""
+    return accumulate(
+        past,
+        frame.radiance.transpose(2, 0, 1),
+        alpha=options.alpha,
+        alpha_moments=options.alpha_moments,
+        history_max=options.history_max,
+        change=change,
+    )
+
+
+def surface_weights(options: Options, depth: Array, normal: Array, ids: Array) -> list[Weight]:
+    """The edge-stopping weights of depth [H, W, 1] and normals [H, W, 3], as far as present."""
+    weights: list[Weight] = []
+    if depth is not None:
+        weights.append(depth_weight(depth, ids, sigma=options.sigma_depth))
+    if normal is not None:
+        weights.append(normal_weight(normal, sigma=options.sigma_normal))
+    return weights
+
+
+def filter_history(options: Options, history: jax.Array, frame: Frame) -> tuple[SvgfState, jax.Array]:
+    """The state after a frame and its image [H, W, 3], from the blended history [6, H, W]."""
+    hit = hit_mask(frame.depth, frame.ids)
+    weights = surface_weights(options, frame.depth, frame.normal, frame.ids)
+    color, variance = estimate_variance(history, hit, weights, short_history=options.short_history)
+    feedback = color if options.feedback_level else history[:3]
+    texture = texture_left(frame, options.demodulate)
+    texture = None if texture is None else texture.transpose(2, 0, 1)
+    image, feedback = _filter(options, color, variance, feedback, texture, hit, weights)
+    image = image.transpose(1, 2, 0)
+    if hit is not None:
+        image = jnp.where(hit[..., None], image, frame.radiance)
+    kept = jnp.concatenate([feedback, history[3:]]).transpose(1, 2, 0)
+    return SvgfState(kept, guides_of(frame)), image
 
 
 def _filter(

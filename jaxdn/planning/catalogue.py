@@ -117,10 +117,11 @@ def _emission(facts: Facts, moment: Moment) -> str:
 
 
 _MOTION = frozenset({"motion", "previous_depth"})
+_CHANGE = frozenset({"luminance_gradient"})
 _SURFACE = frozenset({"roughness"})
 
 EFFECTS: tuple[Effect, ...] = (
-    Effect("camera-motion", "The camera moves, turns or zooms.", _camera_motion, _MOTION, in_time=True),
+    Effect("camera-motion", "The camera moves, turns or zooms.", _camera_motion, _MOTION | _CHANGE, in_time=True),
     Effect("object-motion", "Something on screen moves.", _object_motion, _MOTION, in_time=True),
     Effect(
         "disocclusion",
@@ -143,9 +144,10 @@ EFFECTS: tuple[Effect, ...] = (
         "moving-shadow",
         "Something that moves blocks or reflects light; it need not be on screen itself.",
         _moving_shadow,
+        _CHANGE,
         in_time=True,
     ),
-    Effect("changing-light", "A light moves, or becomes brighter or darker.", _changing_light, in_time=True),
+    Effect("changing-light", "A light moves, or becomes brighter or darker.", _changing_light, _CHANGE, in_time=True),
     Effect("texture", "Diffuse reflectance varies over a surface: dividing by the albedo pays.", _texture),
     Effect("environment", "Light comes from all around the scene.", _environment),
     Effect("media", "Light is scattered between surfaces: fog, smoke.", _media, integrator="volpath"),

@@ -18,6 +18,7 @@ from jaxdn.planning.plan import Plan, entries
 from jaxdn.render.errors import RenderError
 from jaxdn.render.gbuffer import check_scene, gbuffer
 from jaxdn.render.geometry import View, motion_between
+from jaxdn.render.gradient_samples import Replay, luminance_gradient
 from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.seeds import DRAWS, NOISY, REFERENCE
 from jaxdn.render.variant import use_variant
@@ -26,6 +27,7 @@ from jaxdn.render.wavefront import Accumulated, no_light
 _SURFACE = ("albedo", "normal", "depth", "roughness", "reflectance", "ids")
 _DISOCCLUSION = frozenset({"dual_motion", "visible"})
 _MOTION = frozenset({"motion", "previous_depth"}) | _DISOCCLUSION
+_GRADIENT = "luminance_gradient"
 _FREE = ("frames", "cameras", "versions", "bad_samples")
 """Entries of a record that may change when rendering is resumed."""
 
@@ -87,12 +89,14 @@ def render_frame(
         for bit.
     """
     _check_options(width, height, layers, reference_spp, draws)
-    accumulate, _ = tracer(use_variant(variant))
+    use = tracer(use_variant(variant))
     depth = _path_length(scene, max_depth, plan)
     repeated = plan is not None and plan.held[frame] != frame
     wanted = frozenset(Frame._fields if plan is None else () if repeated else plan.frames[frame])
-    if wanted & _MOTION and previous is None and frame > 0:
-        previous = _view(scene, frame - 1, scene.build(frame - 1, width, height), frozenset())
+    before = None
+    if frame > 0 and (_GRADIENT in wanted or (wanted & _MOTION and previous is None)):
+        before = scene.build(frame - 1, width, height)
+        previous = previous or _view(scene, frame - 1, before, frozenset())
     built = scene.build(frame, width, height)
     check_scene(built)
     view = previous if repeated else _view(scene, frame, built, wanted) if wanted else None
@@ -103,7 +107,7 @@ def render_frame(
     def light(stream: int, first: int, count: int) -> Accumulated:
         if dark or (noise_only and stream == NOISY and reference_spp):
             return no_light((height, width))
-        return accumulate(built, seed=seed, frame=frame, stream=stream, first=first, count=count, max_depth=depth)
+        return use.accumulate(built, seed=seed, frame=frame, stream=stream, first=first, count=count, max_depth=depth)
 
     # Layer n always holds the samples n-1 ... 2n-2: its image does not depend on the other layers.
     noisy = {samples: light(NOISY, samples - 1, samples) for samples in sorted(layers)}
@@ -124,6 +128,11 @@ def render_frame(
         found |= {name: getattr(view.gbuffer, name) for name in _SURFACE}
         if wanted & _MOTION:
             found |= _motion(view, previous, disocclusion=bool(wanted & _DISOCCLUSION))
+        if _GRADIENT in wanted:
+            found[_GRADIENT] = np.zeros((height, width, 2), np.float32)
+            if previous is not None and not dark and (plan is None or plan.indirect):
+                numbers = {"seed": seed, "frame": frame, "sample": min(layers) - 1, "max_depth": depth}
+                found[_GRADIENT] = luminance_gradient(use.replay, (before, previous), (built, view), **numbers)
     buffers = {name: buffer for name, buffer in found.items() if name in wanted}
     return Rendered(
         frame=Frame(radiance=images[min(images)], **buffers),
@@ -193,7 +202,7 @@ def render_clip(
         "max_depth": _path_length(scene, max_depth, plan),
         "plan": None if plan is None else plan.record(),
         "seed": seed,
-        "jittered": tracer(chosen)[1],
+        "jittered": tracer(chosen).jittered,
         "cameras": [_camera_record(scene, frame) for frame in range(frames)],
         "scene": dict(scene.record),
         "versions": _versions(),
@@ -246,15 +255,24 @@ def _path_length(scene: AnimatedScene, max_depth: int | None, plan: Plan | None)
     return max_depth or (plan.max_depth if plan else None) or scene.max_depth
 
 
-def tracer(variant: str) -> tuple[Callable[..., Accumulated], bool]:
-    """The tracer of a variant, and whether it distributes its samples over the pixel."""
+class Tracer(NamedTuple):
+    """How a variant traces paths."""
+
+    accumulate: Callable[..., Accumulated]
+    replay: Replay
+    jittered: bool
+    """It distributes its samples over the pixel."""
+
+
+def tracer(variant: str) -> Tracer:
+    """The tracer of a variant."""
     if variant.startswith("scalar"):
-        from jaxdn.render.exact import accumulate as exact
+        from jaxdn.render import exact
 
-        return exact, True
-    from jaxdn.render.wavefront import accumulate as wavefront
+        return Tracer(exact.accumulate, exact.replay, True)
+    from jaxdn.render import wavefront
 
-    return wavefront, False
+    return Tracer(wavefront.accumulate, wavefront.replay, False)
 
 
 def _view(scene: AnimatedScene, frame: int, built: Any, wanted: frozenset[str]) -> View:

@@ -51,7 +51,7 @@ def measure_depth(scene: AnimatedScene, *, frames: int | None = None, bound: flo
         raise ValueError(f"bound: expected a share of the light between 0 and 1, got {bound!r}.")
     from jaxdn.render.clip import tracer
 
-    accumulate, _ = tracer(use_variant())
+    accumulate = tracer(use_variant()).accumulate
     found: list[PathDepth] = []
     for frame in _measured_frames(scene, scene.frames if frames is None else frames):
         built = scene.build(frame, _SIDE, _SIDE)

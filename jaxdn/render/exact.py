@@ -12,14 +12,16 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.media import media_of
-from jaxdn.render.seeds import pass_seed
-from jaxdn.render.wavefront import BRIGHTEST, Accumulated, no_light
+from jaxdn.render.seeds import pass_seed, tea
+from jaxdn.render.wavefront import BRIGHTEST, Accumulated, Replayed, camera_rays, no_light
 
 _NO_ROULETTE = 1000
 
 
-def _integrators(max_depth: int, kind: str) -> list[Any]:
+def _integrators(scene: Any, max_depth: int) -> list[Any]:
     """Integrators of all light, of light without the indirect part, and of emission only."""
+    # The path tracer for media draws whether light is absorbed: the same mean, with noise.
+    kind = "volpath" if media_of(scene) else "path"
     # Three renderings are three times faster than one "aov" integrator around all three.
     return [
         mi.load_dict({"type": kind, "max_depth": depth, "rr_depth": _NO_ROULETTE})
@@ -42,8 +44,7 @@ def accumulate(
       max_depth: path length.
     """
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
-    # The path tracer for media draws whether light is absorbed: the same mean, with noise.
-    integrators = _integrators(max_depth, "volpath" if media_of(scene) else "path")
+    integrators = _integrators(scene, max_depth)
     total = no_light((height, width))
     render: Any = mi.render
     for index in range(first, first + count):
@@ -58,3 +59,30 @@ def accumulate(
         direct, indirect = np.maximum(two - one, 0.0), np.maximum(whole - two, 0.0)
         total = total.plus(Accumulated(one, direct, indirect, int(np.sum(~finite))))
     return total
+
+
+def replay(
+    scene: Any, target: np.ndarray, pixel: np.ndarray, *, key: tuple[int, int], sample: int, max_depth: int
+) -> Replayed:
+    """Paths through any points of the image with reproducible random numbers; see :func:`wavefront.replay`.
+
+    The numbers depend on the same arguments, but are not those of :func:`accumulate`, whose passes have one stream for
+    each block of pixels.
+    """
+    sensor = scene.sensors()[0]
+    deep, two, _ = _integrators(scene, max_depth)
+    sampler: Any = mi.load_dict({"type": "independent"})
+    light, position = np.zeros((len(pixel), 3)), np.full((len(pixel), 3), np.nan)
+    for index, (x, y) in enumerate(target):
+        ray = camera_rays(sensor, float(x) - 0.5, float(y) - 0.5)
+        number = tea(key[0] ^ int(pixel[index]), key[1] ^ sample)[0]
+        parts = []
+        for integrator in (deep, two):
+            sampler.seed(number, 1)
+            parts.append(np.array(integrator.sample(scene, sampler, ray)[0], np.float64))
+        if np.all(parts[0] < BRIGHTEST):
+            light[index] = np.maximum(parts[0] - parts[1], 0.0)
+        hit = scene.ray_intersect(ray)
+        if hit.is_valid():
+            position[index] = hit.p
+    return Replayed(light, position)

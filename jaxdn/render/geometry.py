@@ -98,13 +98,13 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
         raise ValueError("motion: expected two frames of one size with the same shapes; none may appear or disappear.")
     size = now.ids.shape[:2]
     back = relative_poses(now.names, current.pose, previous.pose)[now.ids[..., 0]]
-    same_camera = _same(current.camera, previous.camera)
+    fixed = same_camera(current.camera, previous.camera)
 
     points = _homogeneous(now)
     old_points = np.einsum("hwij,hwj->hwi", back, points)
     target, z = project(old_points, previous.camera, size)
     motion = target - project(points, current.camera, size)[0]
-    motion[same_camera & _still(back)] = 0.0
+    motion[fixed & unmoved(back)] = 0.0
     sky = now.ids < 0
     previous_depth = np.where(sky, FAR, np.maximum(z, 0.0)).astype(np.float32)
     if not disocclusion:
@@ -114,7 +114,7 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
     old_surface = _homogeneous(before)
     moved, _ = project(np.einsum("hwij,hwj->hwi", there, old_surface), current.camera, size)
     forward = moved - project(old_surface, previous.camera, size)[0]
-    forward[same_camera & _still(there)] = 0.0
+    forward[fixed & unmoved(there)] = 0.0
 
     normals = np.einsum("hwij,hwj->hwi", back[..., :3, :3], now.normal)
     lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
@@ -132,11 +132,13 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
     return Motion(motion, forward, seen, previous_depth)
 
 
-def _same(first: Camera, second: Camera) -> bool:
+def same_camera(first: Camera, second: Camera) -> bool:
+    """Whether two cameras see exactly the same."""
     return first.x_fov == second.x_fov and np.array_equal(first.to_world, second.to_world)
 
 
-def _still(motions: np.ndarray) -> np.ndarray:
+def unmoved(motions: np.ndarray) -> np.ndarray:
+    """Whether each of the motions [..., 4, 4] is none: [...] bool."""
     return np.all(motions == np.eye(4), axis=(-2, -1))
 
 

@@ -5,15 +5,20 @@ with the noisy layers. The mixing function is TEA (Zafar, Olano and Curtis 2010)
 same level collide.
 """
 
+from typing import TypeVar
+
+import numpy as np
+
 NOISY, REFERENCE, DEPTH, DRAWS = range(4)
 """The independent streams of a frame: noisy layers, reference, the few samples that measure the path length, and the
 single samples that training draws from."""
 
 _MASK = 0xFFFFFFFF
+_Number = TypeVar("_Number", int, np.ndarray)
 
 
-def tea(first: int, second: int, rounds: int = 8) -> tuple[int, int]:
-    """A bijection of pairs of 32-bit numbers that removes the structure of its input."""
+def tea(first: _Number, second: _Number, rounds: int = 8) -> tuple[_Number, _Number]:
+    """A bijection of pairs of 32-bit numbers, or of int64 arrays of them, that removes the structure of its input."""
     first, second, total = first & _MASK, second & _MASK, 0
     for _ in range(rounds):
         total = (total + 0x9E3779B9) & _MASK

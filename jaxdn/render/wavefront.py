@@ -40,6 +40,15 @@ class Accumulated(NamedTuple):
         )
 
 
+class Replayed(NamedTuple):
+    """Paths that were traced with the random numbers of others."""
+
+    light: np.ndarray
+    """[n, 3] float64 indirect radiance; 0 where it was not finite."""
+    position: np.ndarray
+    """[n, 3] float64 what the camera ray hit; NaN where it hit nothing."""
+
+
 def no_light(shape: tuple[int, ...]) -> Accumulated:
     """The sums over no samples."""
     emitted, direct, indirect = np.zeros((3, *shape, 3))
@@ -209,3 +218,27 @@ def accumulate(
         runs.append(total)
     images = [np.concatenate([run[part] for run in runs]).reshape(height, width, 3) for part in range(3)]
     return Accumulated(images[0], images[1], images[2], sum(run.bad for run in runs))
+
+
+def replay(
+    scene: Any, target: np.ndarray, pixel: np.ndarray, *, key: tuple[int, int], sample: int, max_depth: int
+) -> Replayed:
+    """Paths through any points of the image, each with the random numbers of one sample of one pixel.
+
+    Args:
+      scene: the ``mi.Scene``.
+      target: [n, 2] (x, y) on the film; pixel centres are at 0.5.
+      pixel: [n] index of the pixel whose numbers are used.
+      key: of the stream (:func:`jaxdn.render.seeds.frame_key`).
+      sample: index of the sample.
+      max_depth: path length.
+    """
+    column, row = (mi.Float((target[:, axis] - 0.5).astype(np.float32)) for axis in range(2))
+    ray = camera_rays(scene.sensors()[0], column, row)
+    numbers = generator(mi.UInt32(pixel.astype(np.uint32)), dr.opaque(mi.UInt32, sample), key)
+    emitted, direct, indirect = trace(scene, ray, numbers, dr.opaque(mi.UInt32, max_depth))
+    light = dr.select(dr.all(emitted + direct + indirect < BRIGHTEST), indirect, 0.0)
+    hit = scene.ray_intersect(ray)
+    position = dr.select(hit.is_valid(), hit.p, dr.nan)
+    dr.eval(light, position)
+    return Replayed(*(np.array(values, np.float64).T for values in (light, position)))

@@ -49,7 +49,7 @@ class Subject(NamedTuple):
 def denoiser_subjects() -> list[Subject]:
     """Every registered method, in its smallest variant, each precision, both ways to divide light and to filter it.
 
-    A network has the weights that training starts from.
+    A network has the weights that training starts from; what may follow another method also follows svgf.
     """
     subjects = []
     for name, method in methods().items():
@@ -72,6 +72,9 @@ def denoiser_subjects() -> list[Subject]:
         if method.knows("demodulate"):
             plain = method.factory(**{**options, "demodulate": "albedo"})
             subjects.append(usual._replace(name=f"{name} by albedo", run=_on_clips(plain)))
+        if method.knows("after"):
+            after = method.factory(**{**options, "after": methods()["svgf"].factory()})
+            subjects.append(usual._replace(name=f"{name} after svgf", run=_on_clips(after)))
         if method.knows("kernels"):
             alone = method.factory(**{**options, "kernels": "plain", "background": "filter"})
             weights = {part: layers for part, layers in params.items() if part != "guide"}

@@ -212,7 +212,7 @@ def test_compare_ends_with_a_report(clip, tmp_path):
         (("render", "castle", "-o", "out"), "fruit"),
         (("render", "none.xml", "-o", "out"), "none.xml"),
         (("train", "CLIP", "-o", "out", "--steps", "1"), "expected at least 10 frames, got 3"),
-        (("train", "CLIP", "-o", "out", "--method", "magic"), "expected one of ntd, steady, svgf"),
+        (("train", "CLIP", "-o", "out", "--method", "magic"), "expected one of asvgf, ntd, steady, svgf, taa"),
         (("train", "CLIP", "-o", "out", "--method", "svgf"), "expected a method that learns"),
         (("train", "CLIP", "-o", "out", "--variant", "ntd-huge"), "expected a variant out of ntd-large, ntd-small"),
         (

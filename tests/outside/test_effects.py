@@ -171,7 +171,7 @@ def test_every_effect_has_a_description():
 
 def test_left_out_buffers_are_relative_to_rendering_without_a_plan():
     nothing = effects.plan(effects.chosen([], 1))
-    assert command.bytes_a_pixel(command.EVERYTHING) == 80
+    assert command.bytes_a_pixel(command.EVERYTHING) == 88
     assert set(command.left_out(nothing)) == {name for effect in EFFECTS for name in effect.buffers}
     assert command.bytes_a_pixel(nothing) == 18 + sum(BUFFERS[name].bytes for name in nothing.buffers)
     assert command.channels(("normal", "ids")) == ["normal.X", "normal.Y", "normal.Z", "ids.Y"]
@@ -200,7 +200,7 @@ def test_only_json_is_printed(tmp_path):
     assert set(said["effects"]) == {"indirect", "glossy", "specular"}
     assert said["plan"]["motion"] == "none"
     assert 0 < said["plan"]["remaining"] < 1
-    assert len(said["plan"]["buffers"]) + said["plan"]["buffers_left_out"] == 12
+    assert len(said["plan"]["buffers"]) + said["plan"]["buffers_left_out"] == 13
     assert said["uncertain"] == []
 
 

@@ -12,6 +12,7 @@ from jaxdn.frame import Frame
 
 SIZE = (32, 48)
 CHANNELS = {"depth": 1, "roughness": 1, "motion": 2, "dual_motion": 2, "visible": 1, "previous_depth": 1, "ids": 1}
+CHANNELS["luminance_gradient"] = 2
 KINDS = {"visible": bool, "ids": jnp.int32}
 
 

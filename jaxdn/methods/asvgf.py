@@ -1,0 +1,109 @@
+"""Adaptive spatiotemporal variance-guided filtering (``asvgf``): svgf that forgets where light has changed.
+
+The tests of svgf's history compare surfaces, so they cannot see that a lamp was switched on or that a shadow has moved:
+old light fades over many frames. Here the renderer shades a few points of the previous frame again with the random
+numbers they had then. Without a change of light both results are equal, noise included; their difference tells by what
+share the light has changed, and by this share the history is outdated.
+
+Without such samples (files of other renderers) the luminance of the frame is compared with that of the history, over
+large areas; changes that are small or faint against the noise stay unseen.
+
+Christoph Schied et al., "Gradient Estimation for Real-Time Adaptive Temporal Filtering", 2018.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.filters.accumulation import luminance
+from jaxdn.filters.gradients import (
+    Change,
+    observed,
+    reconstruct,
+    replayed,
+    stratum_centers,
+    to_pixels,
+)
+from jaxdn.filters.guides import hit_mask
+from jaxdn.frame import Frame
+from jaxdn.methods import svgf
+from jaxdn.methods.demodulated import demodulated
+from jaxdn.methods.table import method
+from jaxdn.options import Range
+
+
+@dataclass(frozen=True)
+class Options(svgf.Options):
+    """The options of ``svgf``, and those of the gradients."""
+
+    alpha: Annotated[float, Range(0, 1, without_low=True)] = 0.1
+    """Minimum weight of the new frame in colour, where light has not changed."""
+    gradient_levels: Annotated[int, Range(0, 5)] = 3
+    """Levels of the filter over strata: it averages over ``3 * 3^levels`` pixels in each direction."""
+    significance: Annotated[float, Range(0)] = 2.0
+    """Standard deviations up to which a change is taken for noise; from twice as many on it counts in full. With 0, as
+    in the paper, every path that differs by chance shortens the history."""
+    antilag: Annotated[float, Range(1)] = 4.0
+    """The history keeps the share ``(1 - lambda)^antilag``, where lambda is the share by which light has changed. With
+    the paper's 1 (``preset="paper"``) light that doubles leaves half of the history."""
+
+
+@method(
+    Options,
+    title="SVGF that adapts to changes of light (Schied et al. 2018)",
+    presets={"paper": Options(sigma_normal=128.0, significance=0.0, antilag=1.0)},
+)
+def asvgf(options: Options) -> Denoiser:
+    """A-SVGF, a filter without weights (``params`` is ``{}``).
+
+    Reads what ``svgf`` reads, and luminance_gradient. A frame in which no sample was replayed (the buffer is absent, or
+    0 everywhere) is compared with the history instead.
+    Raises ValueError for options out of range and radiance that is not [H, W, 3].
+    """
+
+    def step(
+        params: Params, state: svgf.SvgfState, frame: Frame, first: jax.Array
+    ) -> tuple[svgf.SvgfState, jax.Array, jax.Array]:
+        past, broken = svgf.recall_history(options, state, frame, first)
+        change = 1.0 - (1.0 - changed(options, past, frame)) ** options.antilag
+        history = svgf.blend(options, past, frame, change)
+        return (*svgf.filter_history(options, history, frame), broken)
+
+    plain = recurrent(Core(svgf.start, step, svgf.READS | {"luminance_gradient"}))
+    return demodulated(plain, by=options.demodulate)
+
+
+def changed(options: Options, past: jax.Array, frame: Frame) -> jax.Array:
+    """lambda [H, W] in [0, 1]: the share by which light has changed since the previous frame.
+
+    ``past`` is the fetched history [6, H, W].
+    """
+    now = frame.radiance.transpose(2, 0, 1)
+    hit = hit_mask(frame.depth, frame.ids)
+    depth, normal, ids = (stratum_centers(buffer) for buffer in (frame.depth, frame.normal, frame.ids))
+    weights = svgf.surface_weights(options, depth, normal, ids)
+
+    def filtered(change: Change) -> jax.Array:
+        return reconstruct(
+            change,
+            hit_mask(depth, ids),
+            weights,
+            levels=options.gradient_levels,
+            significance=options.significance,
+        )
+
+    if frame.luminance_gradient is None:
+        share = filtered(observed(luminance(now), past, hit))
+    else:
+        change = replayed(frame.luminance_gradient)
+        share = lax.cond(
+            jnp.any(change.size > 0),
+            filtered,
+            lambda _: filtered(observed(luminance(now), past, hit)),
+            change,
+        )
+    return to_pixels(share, *now.shape[1:])

@@ -1,0 +1,140 @@
+"""Temporal antialiasing (``taa``): the history is blended in after it was clipped to what the new frame shows.
+
+It compares colours and no surfaces: whatever the new frame does not show around a pixel, old light as well as what lies
+behind a moved edge, is pulled into the range of its 3x3 neighbourhood. That needs an image with little noise, because
+noise widens the range: it follows a denoiser (``taa(after=jaxdn.denoisers.svgf())``), whose remaining flicker it
+removes. Alone, on noisy frames, it darkens: where nine pixels found no light, the history is clipped to black.
+
+In games the camera rays are moved within the pixel from frame to frame, and the mean of the history smooths edges. A
+:class:`jaxdn.Frame` has no such offset: rays are taken to go through the same point of every pixel, so edges are
+smoothed only where the image moves. Colours are averaged without weights against bright pixels, which would darken
+light that is still noisy.
+
+Brian Karis, "High Quality Temporal Supersampling", 2014.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn.denoiser import Core, Denoiser, Params, RecurrentStep, State, recurrent
+from jaxdn.filters.cubic import warp_cubic
+from jaxdn.filters.neighbourhood import (
+    Box,
+    box_around,
+    clip_to_box,
+    extremes_around,
+    from_ycocg,
+    mean_around,
+    nearest_motion,
+    to_ycocg,
+)
+from jaxdn.frame import RADIANCE_MAX, Frame
+from jaxdn.methods.table import method
+from jaxdn.options import Range
+
+READS = frozenset({"motion", "depth"})
+
+
+@dataclass(frozen=True)
+class Options:
+    """The parameters; defaults as they are common in games."""
+
+    after: Denoiser | None = None
+    """The denoiser whose images are smoothed; parameters are those of that one. None: the noisy frames."""
+    alpha: Annotated[float, Range(0, 1, without_low=True)] = 0.1
+    """Minimum weight of the new frame; the weight is ``max(alpha, 1 / N)`` at history length N."""
+    box: Box = "variance"
+    """What the history is clipped to: mean and deviation of the 3x3 neighbourhood, or its extremes (``"minmax"``)."""
+    gamma: Annotated[float, Range(0)] = 1.0
+    """Half size of the ``"variance"`` box in standard deviations."""
+    sharpening: Annotated[float, Range(0, 1)] = 0.0
+    """How much of the difference from the 3x3 mean is added to the image, but not to the history."""
+
+    def __post_init__(self) -> None:
+        if self.after is not None and not isinstance(self.after.step, RecurrentStep):
+            raise ValueError(
+                "taa after: expected a denoiser made by jaxdn.denoiser.recurrent, got another; make it so."
+            )
+
+
+class TaaState(NamedTuple):
+    """What is carried from one frame to the next."""
+
+    after: State
+    """Of the denoiser before; () without one."""
+    history: jax.Array
+    """[H, W, 4] the last image, not sharpened, and the history length in frames."""
+
+
+@method(Options, title="Temporal antialiasing (Karis 2014)")
+def taa(options: Options) -> Denoiser:
+    """TAA, a filter without weights, alone or after any denoiser.
+
+    Reads motion and depth, besides what the denoiser before reads. Without depth, edges do not take over the motion of
+    the thing in front; without motion the image is taken to stand still.
+    Raises ValueError for options out of range, for a denoiser that :func:`jaxdn.denoiser.recurrent` did not make, and
+    for radiance that is not [H, W, 3].
+    """
+    before = Core(lambda params, frame: (), _noisy, frozenset())
+    if options.after is not None:
+        assert isinstance(options.after.step, RecurrentStep)
+        before = options.after.step.core
+
+    def start(params: Params, frame: Frame) -> TaaState:
+        nothing = jnp.zeros((*frame.radiance.shape[:2], 4), frame.radiance.dtype)
+        return TaaState(before.start(params, frame), nothing)
+
+    def step(
+        params: Params, state: TaaState, frame: Frame, first: jax.Array
+    ) -> tuple[TaaState, jax.Array, jax.Array | int]:
+        inner, image, lost = before.step(params, state.after, frame, first)
+        image = jnp.clip(image, 0.0, RADIANCE_MAX)
+        history, broken = resolve(options, image, state.history, frame, first)
+        kept = history[..., :3]
+        return TaaState(inner, history), sharpened(kept, options.sharpening), lost + broken
+
+    samples = None
+    if before.samples is not None:
+        ask = before.samples
+
+        def samples(params: Params, state: TaaState, frame: Frame) -> jax.Array:
+            return ask(params, state.after, frame)
+
+    return recurrent(Core(start, step, before.reads | READS, before.init, samples))
+
+
+def _noisy(params: Params, state: State, frame: Frame, first: jax.Array) -> tuple[State, jax.Array, int]:
+    return state, frame.radiance, 0
+
+
+def resolve(
+    options: Options, image: jax.Array, history: jax.Array, frame: Frame, first: Any
+) -> tuple[jax.Array, jax.Array]:
+    """The new history [H, W, 4], colour and length, and how many pixels of the old one were invalid.
+
+    ``image`` [H, W, 3] is blended with weight ``max(alpha, 1 / N)`` into the fetched history, clipped to the box of the
+    image's 3x3 neighbourhood in YCoCg.
+    """
+    sound = jnp.all(jnp.isfinite(history) & (history >= 0), axis=-1, keepdims=True)
+    broken = jnp.sum(~sound & ~first, dtype=jnp.int32)
+    past = jnp.where(sound & ~first, history, 0.0)
+    if frame.motion is not None:
+        motion = frame.motion if frame.depth is None else nearest_motion(frame.motion, frame.depth)
+        past, _ = warp_cubic(past, motion)
+    length = jnp.minimum(past[..., 3:], 1.0 / options.alpha) + 1.0
+    center, size = box_around(to_ycocg(image), options.box, options.gamma)
+    clipped = jnp.maximum(from_ycocg(clip_to_box(to_ycocg(past[..., :3]), center, size)), 0.0)
+    share = jnp.maximum(options.alpha, 1.0 / length)
+    # In this form the image itself, to the last bit, where there is no history.
+    return jnp.concatenate([share * image + (1.0 - share) * clipped, length], axis=-1), broken
+
+
+def sharpened(image: jax.Array, strength: float) -> jax.Array:
+    """``image + strength (image - its 3x3 mean)``, within the extremes of the 3x3 neighbourhood: no halos."""
+    if not strength:
+        return image
+    low, high = extremes_around(image)
+    return jnp.clip(image + strength * (image - mean_around(image)), low, high)
