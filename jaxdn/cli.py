@@ -190,7 +190,8 @@ class Denoise:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the denoised frames; for a single frame, also the name of an EXR file."""
     method: str = "steady-balanced"
-    """Shipped weights (steady-balanced, ntd-large, ntd-small), a filter (svgf), or the path of a .safetensors file."""
+    """Shipped weights (steady-balanced, ntd-large, ntd-small), a filter (svgf, asvgf, taa), or the path of a
+    .safetensors file."""
     spp: int = 1
     """Samples per pixel to take from the clip's layers."""
     preview: bool = False
