@@ -162,10 +162,12 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
     def divided(inputs: Inputs, way: Callable[..., jax.Array]) -> jax.Array:
         return way(inputs.clip.frames.radiance, inputs.clip.frames.reflectance)
 
+    def texture(inputs: Inputs) -> jax.Array:
+        reflectance = inputs.clip.frames.reflectance
+        return brdf.texture_left(reflectance, brdf.divisor(reflectance))
+
     def restored(inputs: Inputs) -> jax.Array:
-        frames = inputs.clip.frames
-        texture = brdf.texture_left(frames.reflectance, brdf.divisor(frames.reflectance))
-        return brdf.restore(frames.radiance, texture, brdf.hue_left(texture))
+        return brdf.restore(inputs.clip.frames.radiance, texture(inputs), brdf.hue_left(texture(inputs)))
 
     def of_light(function: Callable[..., jax.Array], **options: Any) -> Callable[[Inputs], jax.Array]:
         return lambda inputs: function(inputs.clip.frames.radiance, **options)
@@ -219,6 +221,8 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "brdf.divisor": lambda inputs: brdf.divisor(inputs.clip.frames.reflectance),
         "brdf.demodulate": partial(divided, way=brdf.demodulate),
         "brdf.remodulate": partial(divided, way=brdf.remodulate),
+        "brdf.texture_left": texture,
+        "brdf.hue_left": lambda inputs: brdf.hue_left(texture(inputs)),
         "brdf.restore": restored,
         "color.compress": of_light(color.compress),
         "color.expand": lambda inputs: color.expand(jnp.minimum(inputs.clip.frames.radiance, 2.0)),

@@ -189,15 +189,18 @@ def test_compare_ends_with_a_report(clip, tmp_path):
     ("arguments", "told"),
     [
         (("denoise", "nowhere", "-o", "out"), "nowhere"),
-        (("denoise", "CLIP", "-o", "out", "--method", "magic"), "expected one of noisy, svgf, ntd-large, ntd-small"),
+        (
+            ("denoise", "CLIP", "-o", "out", "--method", "magic"),
+            "expected one of noisy, asvgf, svgf, taa, ntd-large, ntd-small",
+        ),
         (("denoise", "CLIP", "-o", "out", "--method", "ntd"), "expected its weights"),
-        (("denoise", "CLIP", "-o", "CLIP", "--method", "svgf"), "another folder"),
+        (("denoise", "CLIP", "-o", "CLIP", "--method", "svgf"), "another place"),
         (("denoise", "CLIP", "-o", "out", "--method", "svgf", "--spp", "2"), "2 samples a pixel are not available"),
         (("denoise", "CLIP", "-o", "out", "--wrong"), "--wrong"),
         (("denoise", "CLIP", "-o", "out", "--method", "svgf", "--implementation", "onnxruntime"), "'implementation'"),
         (("compare", "nowhere", "-o", "out", "--methods", "noisy"), "nowhere: there is no such folder"),
         (("compare", ".", "-o", "out", "--methods", "noisy"), "expected a clip (a folder with clip.json)"),
-        (("compare", "CLIP", "-o", "out", "--methods", "noisy", "magic"), "expected one of noisy, svgf"),
+        (("compare", "CLIP", "-o", "out", "--methods", "noisy", "magic"), "expected one of noisy, asvgf, svgf"),
         (("denoise", "SHOT", "-o", "out", "--method", "svgf", "--channels", "radiance"), "expected name=value"),
         (
             ("denoise", "SHOT", "-o", "out", "--method", "svgf", "--channels", "light=R"),

@@ -50,7 +50,7 @@ def ours(scene, frame=0):
     """Mean of emitted, direct and indirect light, as clips are made of."""
     from jaxdn.render.clip import tracer
 
-    accumulate, _ = tracer(mi.variant())
+    accumulate = tracer(mi.variant()).accumulate
     sums = accumulate(
         scene.build(frame, WIDTH, HEIGHT), seed=1, frame=frame, stream=0, first=0, count=256, max_depth=DEPTH
     )
