@@ -220,5 +220,4 @@ def restore(filtered: jax.Array, texture: jax.Array, filtered_texture: jax.Array
 
 
 _FAINT, _UNEXPLAINED = 0.3, 0.01
-"""From 0.1 on the first and up to 0.05 the second make no difference of more than 0.03 dB to svgf (means of four and of
-nine clips)."""
+"""Twice or half of either makes no difference of more than 0.03 dB to svgf (means of four to nine clips)."""

@@ -18,11 +18,11 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from jaxdn import brdf, color
+from jaxdn import color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.guides import depth_feature, hit_mask
 from jaxdn.frame import RADIANCE_MAX, Frame
-from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
+from jaxdn.methods.demodulated import Demodulation, demodulated
 from jaxdn.methods.table import method
 from jaxdn.motion import on_screen
 from jaxdn.networks import LARGE, SMALL, Widths, crop, pad
@@ -84,9 +84,6 @@ class Options:
     """Of the U-Net's weights, see :func:`jaxdn.networks.unet.initial`."""
     demodulate: Demodulation | bool = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
-    texture: Literal["restored", "left"] = "restored"
-    """The texture that the division leaves is filtered by the same kernels and given back
-    (:func:`jaxdn.brdf.restore`); or the kernels have to keep it apart. Of ``domain="linear"`` only."""
     truncate: bool = False
     """Stop the gradient at the history."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
@@ -192,7 +189,6 @@ def _blend(
     noisy: jax.Array,
     recalled: jax.Array,
     absent: jax.Array,
-    texture: jax.Array | None,
 ) -> jax.Array:
     """The kernels applied, and the scales and the history blended, in the domain of the images.
 
@@ -203,11 +199,8 @@ def _blend(
       noisy: [H, W, 3], in the domain that kernels work on.
       recalled: [H, W, 3] the warped history, in the same domain.
       absent: bool [H, W, 1], there is no history.
-      texture: [H, W, 3] what the division left, filtered with the light and given back (:func:`brdf.restore`).
     """
     full, half, quarter = heads
-    if texture is not None:
-        noisy, recalled = (jnp.concatenate([light, texture], axis=-1) for light in (noisy, recalled))
     scales = [noisy]
     for _ in range(SCALES - 1):
         scales.append(downsample(scales[-1], down=options.pyramid))
@@ -221,10 +214,7 @@ def _blend(
         composed = compose_scales(image, composed, jax.nn.sigmoid(seam), down=options.down, up=options.up)
     current = jax.nn.sigmoid(full[..., 2 * TAPS : 2 * TAPS + 1])
     current = jnp.where(absent, 1.0, current)
-    blended = current * composed + (1.0 - current) * temporal
-    if texture is None:
-        return blended
-    return brdf.restore(blended[..., :3], texture, blended[..., 3:])
+    return current * composed + (1.0 - current) * temporal
 
 
 @method(
@@ -244,7 +234,6 @@ def _blend(
     engines=("onnxruntime", "onednn"),
     earlier={
         "demodulate": "albedo",
-        "texture": "left",
         "kernels": "plain",
         "background": "filter",
         "exposure": "given",
@@ -323,13 +312,10 @@ def ntd(options: Options) -> Denoiser:
         guiding = guided_features(params["guide"] if guided else {}, seen)
 
         if options.domain == "compressed":
-            blended = _blend(options, predicted, guiding, squeezed, squeezed_history, absent, None)
+            blended = _blend(options, predicted, guiding, squeezed, squeezed_history, absent)
             image = color.expand(jnp.maximum(blended, 0.0)) / gain
         else:
-            texture = texture_left(frame, options.demodulate) if options.texture == "restored" else None
-            if texture is not None:
-                texture = pad(texture) if hit is None else fill(pad(texture), pad(hit[..., None]))
-            image = _blend(options, predicted, guiding, noisy, recalled, absent, texture)
+            image = _blend(options, predicted, guiding, noisy, recalled, absent)
         image = jnp.clip(crop(image, size), 0.0, RADIANCE_MAX)
         shown = image if hit is None else jnp.where(hit[..., None], image, frame.radiance)
         return image, shown, broken
