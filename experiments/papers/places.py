@@ -1,7 +1,8 @@
 """Hard places side by side: the same part of every method's image, enlarged without smoothing.
 
     python -m experiments.papers.places runs/results/indirect-1/pictures -o docs/results/places.png \\
-        --places living-room-0:10,18,64,48 staircase2-0:100,90,64,48
+        --places living-room-0:10,18,64,48 living-room-0:146,104,64,48 parlour-2008:0,30,64,48 \\
+        living-room-0:256,20,64,48 staircase2-0:105,100,64,48 staircase2-0:24,128,64,48 staircase2-0:110,18,64,48
 
 Reads the pictures that `experiments.papers.results` writes. Each row is a place, each column a method.
 """

@@ -18,7 +18,7 @@ TINY = ((4,), (4,), (4,), (4,), (4,))
 SAVED = {"size": TINY, "kernels": "guided", "background": "pass"}
 FRAME = Frame(radiance=np.ones((16, 16, 3), np.float32))
 
-EARLIER = {"texture": "left", "kernels": "plain", "background": "filter", "exposure": "given"}
+EARLIER = {"kernels": "plain", "background": "filter", "exposure": "given"}
 """What weights without a record of these options were trained with."""
 
 
