@@ -4,7 +4,7 @@ import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -82,10 +82,14 @@ class Render:
     """Independent noisy layers, in samples per pixel (powers of two)."""
     draws: int = 0
     """Further noisy images of one sample each, of indirect and of direct light: training draws from them."""
+    light: Literal["indirect", "reflected"] = "indirect"
+    """Light with noise: indirect light, with direct light beside it, or all that is reflected, with its shadows."""
     max_depth: int | None = None
     """Path length (1 emission, 2 direct, 3 one bounce of indirect light ...); default: as the scene needs."""
     effects: str = "auto"
     """auto: the effects that the scene has (see `jaxdn inspect`); all: every effect; or names separated by commas."""
+    denoiser: str | None = None
+    """Render only what this denoiser (svgf, relax ...) reads; default: all but what few denoisers read."""
     workers: int | None = None
     """Number of processes; default: the number of cores."""
 
@@ -176,22 +180,33 @@ class Train:
 
 @dataclass
 class Denoise:
-    """Denoise a clip, or EXR files of any renderer; adds direct and emitted light back where the clip has them.
+    """Denoise clips, or EXR files of any renderer; everything else in the files stays as it is.
 
     For example:
 
     jaxdn denoise data/test/fruit-7 -o out --preview
 
     jaxdn denoise "shots/*.exr" -o out --method ntd-small --motion-convention cycles --channels albedo=DiffCol
+
+    jaxdn denoise shots/a shots/b -o out --frames 10-40 --skip-existing
     """
 
-    clip: tyro.conf.Positional[Path]
-    """Folder of a clip, folder of EXR files, or a quoted pattern of EXR files."""
+    clips: tyro.conf.Positional[list[Path]]
+    """Folders of clips, folders of EXR files, quoted patterns of EXR files, or files; one or several."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the denoised frames; for a single frame, also the name of an EXR file."""
     method: str = "steady-balanced"
     """Shipped weights (steady-balanced, ntd-large, ntd-small), a filter (svgf, asvgf, taa), or the path of a
     .safetensors file."""
+    frames: list[str] = field(default_factory=list)
+    """Numbers of the frames to denoise, such as 7 or 10-40; frames before them are read for their history."""
+    skip_existing: bool = False
+    """Leave out frames whose result is there already."""
+    only_beauty: bool = False
+    """Of EXR files of other renderers, write the denoised beauty and its alpha alone, without the other layers."""
+    aovs: Literal["keep", "additive"] = "keep"
+    """Other layers of light in such files: keep them as they are, or (additive) denoise those that are parts of the
+    beauty so that they still add up to it."""
     spp: int = 1
     """Samples per pixel to take from the clip's layers."""
     preview: bool = False
@@ -271,28 +286,30 @@ def _render(options: Render) -> None:
         _folder(options.out),
         animation=options.animation,
         tours=options.tour,
-        seeds=_numbers(options.seeds),
+        seeds=_numbers(options.seeds, "--seeds"),
         width=options.width,
         height=options.height,
         frames=options.frames,
         reference_spp=options.reference_spp,
         layers=options.layers,
         draws=options.draws,
+        light=options.light,
         max_depth=options.max_depth,
         effects=options.effects,
+        denoiser=options.denoiser,
         workers=options.workers,
     )
 
 
-def _numbers(words: list[str]) -> list[int]:
+def _numbers(words: list[str], option: str) -> list[int]:
     """The whole numbers of words such as 3 and 0-49, whose ends count. Raises ValueError for anything else."""
     numbers: list[int] = []
     for word in words:
         first, _, last = word.partition("-")
         if not first.isdecimal() or not (last or first).isdecimal() or word.endswith("-"):
-            raise ValueError(f"--seeds: expected whole numbers >= 0 or ranges such as 0-49, got {word!r}.")
+            raise ValueError(f"{option}: expected whole numbers >= 0 or ranges such as 0-49, got {word!r}.")
         if last and int(last) < int(first):
-            raise ValueError(f"--seeds: expected a range from low to high, got {word!r}; swap its ends.")
+            raise ValueError(f"{option}: expected a range from low to high, got {word!r}; swap its ends.")
         numbers += range(int(first), int(last or first) + 1)
     return numbers
 
@@ -346,22 +363,31 @@ def _train(options: Train) -> None:
 
 
 def _denoise(options: Denoise) -> None:
-    from jaxdn.commands.denoise import candidate_on, denoise_files
+    from jaxdn.commands.denoise import Settings, candidate_on, denoise_files
+    from jaxdn.commands.progress import reporter
     from jaxdn.commands.sources import show_sources
 
-    console, naming = Console(stderr=True), _naming(options)
+    naming = _naming(options)
     method, engine = candidate_on(options.method, options.implementation)
-    show_sources(options.clip, reads=frozenset() if method.denoiser is None else method.denoiser.reads, **naming)
-    with console.status(f"{options.method}: reading ...") as status:
+    reads = frozenset[str]() if method.denoiser is None else method.denoiser.reads
+    settings = Settings(
+        spp=options.spp,
+        frames=_numbers(options.frames, "--frames") if options.frames else None,
+        skip_existing=options.skip_existing,
+        only_beauty=options.only_beauty,
+        aovs=options.aovs,
+        preview=options.preview,
+        **naming,
+    )
+    with reporter(options.method) as report:
         written = denoise_files(
-            options.clip,
+            options.clips,
             options.out,
             method,
-            spp=options.spp,
-            preview=options.preview,
-            **naming,
-            say=lambda done, total: status.update(f"{options.method}: frame {done} of {total}"),
-            log=print,
+            settings,
+            begin=lambda work: show_sources(work.source, reads=reads, **naming),
+            say=report.say,
+            log=report.log,
         )
     compiled = f"{written.programs} program{'s' * (written.programs != 1)} compiled"
     print(f"{len(written.files)} frames denoised by {options.method} in {options.out} ({engine}, {compiled})")

@@ -24,9 +24,9 @@ from jaxdn.clips.folder import write_clip as write_clip
 from jaxdn.clips.frames import StoredFrame as StoredFrame
 from jaxdn.clips.frames import read_frame as read_frame
 from jaxdn.clips.frames import write_frame as write_frame
-from jaxdn.clips.import_exr import MOTION_CONVENTIONS as MOTION_CONVENTIONS
 from jaxdn.clips.import_exr import plain_frames as plain_frames
 from jaxdn.clips.layers import detect_channels as detect_channels
+from jaxdn.clips.vectors import MOTION_CONVENTIONS as MOTION_CONVENTIONS
 
 
 def __getattr__(name: str) -> Any:

@@ -24,7 +24,7 @@ from jaxdn.clips.folder import frame_path, read_frames, read_record
 from jaxdn.clips.frames import StoredFrame, combine, doubling_layers, layers_for
 from jaxdn.clips.record import is_planned
 from jaxdn.files import write_json
-from jaxdn.frame import BUFFERS, GUIDES, Buffer, Clip, Frame, present, written_out
+from jaxdn.frame import BUFFERS, GUIDES, OF_SAMPLES, Buffer, Clip, Frame, present, written_out
 
 _VERSION = 2  # of the cache's layout; caches of other versions are not used
 _LIGHT = BUFFERS["radiance"]
@@ -102,13 +102,16 @@ def read_window(
 ) -> Clip:
     """The part ``window`` (frames, rows, columns) of a clip as a Clip of plain arrays with ``spp`` samples per pixel.
 
-    ``light``: noisy radiance and reference of the window, where they are not to be read (``spp`` is not used then).
+    ``light``: noisy radiance and reference of the window, where they are not to be read (``spp`` is not used then). The
+    buffers of samples (:data:`jaxdn.frame.OF_SAMPLES`) are read only where the radiance is the layer they belong to.
 
     Buffers have the dtypes of :attr:`jaxdn.frame.Buffer.dtype`. ``buffers`` names the ones to read (default:
     all there are); of a clip that was rendered by a plan, those that it lacks are written out. With ``layers`` the
     clip's independent noisy layers of 1, 2, 4, ... samples are read too (``Clip.layers``).
     """
-    asked = clip.buffers if buffers is None else set(buffers) & set(GUIDES)
+    asked = set(clip.buffers) if buffers is None else set(buffers) & set(GUIDES)
+    if light is not None or layers_for(spp, clip.layers, clip.path) != [min(clip.layers)]:
+        asked -= OF_SAMPLES
     guides = {name: read_array(clip, name, window) for name in clip.buffers & asked}
     if light is None:
         reference = read_array(clip, "reference", window) if "reference" in clip.arrays else None

@@ -7,7 +7,7 @@ is not a clip yet.
 
 import itertools
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from jaxdn.clips.frames import StoredFrame, doubling_layers, layers_for, read_fr
 from jaxdn.clips.import_exr import plain_frames
 from jaxdn.clips.record import FORMAT, checked, held_frames, is_planned
 from jaxdn.files import write_json
-from jaxdn.frame import Clip, frame_at, only, present, written_out
+from jaxdn.frame import OF_SAMPLES, Clip, frame_at, only, present, written_out
 
 _RECORD = "clip.json"
 _UNFINISHED = "clip.unfinished.json"
@@ -144,11 +144,12 @@ def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
     """The frames of a clip one by one, for clips that do not fit into memory. Raises as :func:`read_clip` does.
 
     Frames of a clip that was rendered by a plan may have different buffers (an object starts to move): absent ones are
-    ``None``. A frame that shows the same as an earlier one takes its buffers and its reference from there.
+    ``None``. A frame that shows the same as an earlier one takes its buffers and its reference from there, except for
+    those of its own samples.
     """
     folder = Path(path)
     record = read_record(folder)
-    layers_for(spp, record["layers"], folder)
+    own_samples = layers_for(spp, record["layers"], folder) == [min(record["layers"])]
     count, size = record["frames"], (record["height"], record["width"])
     _all_there(folder, count)
     held = held_frames(record)
@@ -171,7 +172,7 @@ def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
             if held[index] != index:
                 stored = _from(stored, source[1])
             if is_planned(record):
-                wanted = set(record["plan"]["frames"][index])
+                wanted = set(record["plan"]["frames"][index]) - (frozenset() if own_samples else OF_SAMPLES)
                 stored = _checked_buffers(stored, wanted, file)
             names = _names(stored, planned=is_planned(record))
             first = names if first is None else first
@@ -194,7 +195,8 @@ def _all_there(folder: Path, count: int) -> None:
 
 def _from(stored: StoredFrame, source: StoredFrame) -> StoredFrame:
     """The noise of one frame with everything else of another."""
-    frame = source.frame._replace(radiance=stored.frame.radiance)
+    noise = {name: getattr(stored.frame, name) for name in ("radiance", *OF_SAMPLES)}
+    frame = source.frame._replace(**noise)
     return stored._replace(frame=frame, reference=source.reference, reference_half=source.reference_half)
 
 
@@ -206,7 +208,7 @@ def _checked_buffers(stored: StoredFrame, wanted: set[str], file: Path) -> Store
 
 
 def open_frames(
-    path: str | Path,
+    path: str | Path | Sequence[Path],
     *,
     spp: int = 1,
     motion_convention: str | None = None,
@@ -216,14 +218,14 @@ def open_frames(
 ) -> tuple[list[Path], Iterator[StoredFrame]]:
     """The files of a clip, or of another renderer's sequence, and their frames, each read when it is requested.
 
-    Takes what :func:`read_clip` takes and raises as it does; ``log`` as in
+    Takes what :func:`read_clip` takes, or a list of another renderer's files, and raises as it does; ``log`` as in
     :func:`jaxdn.clips.import_exr.plain_frames`. The frames of another renderer have no ``layers`` and no reference.
     """
-    if is_clip(path):
-        frames = read_frames(path, spp=spp)  # first checks that all frames of the record exist
-        return [frame_path(path, index) for index in range(read_record(path)["frames"])], frames
-    if _looks_unfinished(path):
-        raise _unfinished(Path(path))
+    if isinstance(path, str | Path):
+        if is_clip(path):
+            frames = read_frames(path, spp=spp)  # first checks that all frames of the record exist
+            return [frame_path(path, index) for index in range(read_record(path)["frames"])], frames
+        refuse_unfinished(path)
     if spp != 1:
         raise ClipError(f"{path}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
     files, plain = plain_frames(path, motion_convention=motion_convention, channels=channels, layer=layer, log=log)
@@ -262,6 +264,12 @@ def read_clip(
         np.stack(references) if references else None,
         {count: np.stack([one.layers[count] for one in stored]) for count in counts} if layers else None,
     )
+
+
+def refuse_unfinished(path: str | Path) -> None:
+    """Raise ClipError if a folder is one of our clips whose rendering was interrupted."""
+    if _looks_unfinished(path):
+        raise _unfinished(Path(path))
 
 
 def _unfinished(folder: Path) -> ClipError:

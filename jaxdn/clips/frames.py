@@ -6,6 +6,7 @@ sample count up to their sum: ``n`` samples are ``sum(2^k * layer_k) / n`` over 
 stored follows from its row in :data:`jaxdn.frame.BUFFERS`.
 """
 
+import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +15,7 @@ import numpy as np
 
 from jaxdn.clips.exr import read_exr, to_half, write_exr
 from jaxdn.clips.files import ClipError
-from jaxdn.frame import BUFFERS, GUIDES, Buffer, Frame
+from jaxdn.frame import BUFFERS, GUIDES, OF_SAMPLES, Buffer, Frame
 
 _LIGHT = BUFFERS["radiance"]
 """How noisy layers and references are stored; the radiance itself is combined from the layers."""
@@ -80,6 +81,9 @@ def write_frame(
 def read_frame(path: str | Path, *, spp: int = 1) -> StoredFrame:
     """Read one frame with ``spp`` samples a pixel of noise.
 
+    The buffers of samples (:data:`jaxdn.frame.OF_SAMPLES`) belong to the layer with the fewest: with any other number
+    they are None, and a warning says so.
+
     Raises ClipError, naming the file and the reason, if it is unreadable, a channel is missing, or ``spp`` cannot be
     made of the layers.
     """
@@ -87,6 +91,11 @@ def read_frame(path: str | Path, *, spp: int = 1) -> StoredFrame:
     layers = {n: _required(path, channels, f"noisy_{n}spp", _LIGHT) for n in stored_layers(channels)}
     chosen = layers_for(spp, layers, path)
     buffers = {name: _optional(path, channels, name, BUFFERS[name]) for name in GUIDES}
+    others = [name for name in OF_SAMPLES if buffers[name] is not None]
+    if others and chosen != [min(layers)]:
+        buffers |= dict.fromkeys(others)
+        left_out = ", ".join(sorted(others))
+        warnings.warn(f"spp {spp}: left out {left_out}, which belong to the layer of {min(layers)} spp.", stacklevel=2)
     return StoredFrame(
         Frame(radiance=combine({n: layers[n] for n in chosen}), **buffers),
         layers,

@@ -1,110 +1,72 @@
-"""EXR sequences of other renderers: their files, frames, and which way their motion vectors point.
+"""EXR sequences of other renderers: their files, and frames made from them.
 
-Channels are found by their names (:mod:`jaxdn.clips.layers`). Motion vectors differ in direction, unit and axes from
-one program to the next, and nothing in the file says which: unless the layer is Cycles' own four-component ``Vector``,
-the caller says so. What surfaces reflect is derived where the file brings the parts of it
+Channels are found by their names (:mod:`jaxdn.clips.layers`), motion vectors are converted to our convention
+(:mod:`jaxdn.clips.vectors`), and what surfaces reflect is derived where the file brings the parts of it
 (:mod:`jaxdn.clips.reflectance`).
 """
 
-import glob
-import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxdn.clips.exr import read_exr, read_header
+from jaxdn.clips.exr import read_exr, read_header, read_windows
 from jaxdn.clips.files import ClipError
-from jaxdn.clips.layers import Channels, detect_channels, layer_of, unpaired_specular
+from jaxdn.clips.layers import (
+    UNSURE_ALBEDO,
+    Channels,
+    detect_channels,
+    is_cryptomatte,
+    last_name,
+    layer_of,
+    unpaired_specular,
+)
+from jaxdn.clips.lighting import why_light
+from jaxdn.clips.measured_motion import fitting_conventions
 from jaxdn.clips.reflectance import check_fraction, with_reflectance
+from jaxdn.clips.shots import sequence_files
+from jaxdn.clips.vectors import (
+    MOTION_CONVENTIONS,
+    UnknownMotion,
+    contradicts_cycles,
+    conventions,
+    convert_motion,
+    dual_of,
+    forward_channels,
+    forward_of_cycles,
+    motion_convention_of,
+)
+from jaxdn.clips.windows import Window, place, union
 from jaxdn.frame import BUFFERS, FAR, Buffer, Frame, present
-
-MOTION_CONVENTIONS: dict[str, str] = {
-    "previous-current": "pixels, previous minus current position, y down (ours; NTASD, Zeng et al., SVGF)",
-    "current-previous": "pixels, current minus previous position, y down (OptiX flow)",
-    "cycles": "pixels, previous minus current position, y up (Blender's Vector pass, first two components)",
-    "uv": "fractions of the image, previous minus current, y down (Falcor, NRD, DLSS scaled to [-1, 1])",
-    "ndc": "clip space [-1, 1], previous minus current, y up",
-    "rows-columns": "pixels, previous minus current, (row, column) order (Noisebase)",
-}
-"""What ``motion_convention`` may be, in words."""
-
-
-def convert_motion(motion: np.ndarray, convention: str) -> np.ndarray:
-    """Motion vectors ``[H, W, 2]`` of one of ``MOTION_CONVENTIONS`` in ours. Raises ClipError for another name."""
-    height, width = motion.shape[:2]
-    if convention == "rows-columns":
-        return motion[..., ::-1]
-    scales: dict[str, tuple[float, float]] = {
-        "previous-current": (1, 1),
-        "current-previous": (-1, -1),
-        "cycles": (1, -1),
-        "uv": (width, height),
-        "ndc": (width / 2, -height / 2),
-    }
-    if convention not in scales:
-        raise ClipError(f"motion_convention: {_conventions()}; got {convention!r}.")
-    return motion * np.asarray(scales[convention], motion.dtype)
-
-
-def sequence_files(path: str | Path) -> list[Path]:
-    """The EXR files of one sequence in the order of their frame numbers.
-
-    ``path`` is a folder, a glob pattern or one file. Raises ClipError if there are none, if they belong to several
-    sequences, or if frame numbers are missing.
-    """
-    path = Path(path)
-    if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix.lower() == ".exr" and file.name[0] != ".")
-    elif path.is_file():
-        files = [path]
-    else:
-        files = sorted(Path(name) for name in glob.glob(str(path)))
-    if not files:
-        raise ClipError(f"{path}: expected a folder of EXR files, a pattern that fits some, or one; found none.")
-    if len(files) == 1:
-        return files
-    numbered: dict[str, dict[int, Path]] = {}
-    for file in files:
-        match = re.fullmatch(r"(.*?)(\d+)", file.stem)
-        if match is None:
-            raise ClipError(f"{file}: expected a file name that ends in a frame number, such as shot_0001.exr.")
-        numbered.setdefault(match[1], {})[int(match[2])] = file
-    if len(numbered) > 1:
-        raise ClipError(f"{path}: expected one sequence, got several: {', '.join(sorted(numbered))}; use a pattern.")
-    frames = next(iter(numbered.values()))
-    missing = sorted(set(range(min(frames), max(frames) + 1)) - set(frames))
-    if missing:
-        shown = ", ".join(map(str, missing[:8])) + (" ..." if len(missing) > 8 else "")
-        raise ClipError(f"{path}: frames are missing between {min(frames)} and {max(frames)}: {shown}.")
-    return [frames[number] for number in sorted(frames)]
 
 
 def plain_frames(
-    path: str | Path,
+    path: str | Path | Sequence[Path],
     *,
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
     layer: str | None = None,
     log: Callable[[str], None] = lambda line: None,
 ) -> tuple[list[Path], Iterator[Frame]]:
-    """The files of another renderer's sequence, and their frames, each read when it is asked for.
+    """The files of another renderer's sequence (or those given), and their frames, each read when it is asked for.
 
-    All frames have the size and the buffers of the first. ``motion_convention`` says what the motion vectors mean (a
-    key of ``MOTION_CONVENTIONS``) and is needed as soon as there are any that are not Cycles' ``Vector``; ``"none"``
-    leaves them out. ``channels`` and ``layer``: see :func:`jaxdn.clips.layers.detect_channels`; what they choose, see
-    :func:`jaxdn.clips.sources.sources_of`. ``log`` is called with lines about what is derived or left unused, when the
-    first frame is read. Depth is taken for view-space z (far or infinite
-    becomes ``FAR``); ids count from 1 with 0 for nothing, and are left out of all frames if they say nothing in the
-    first. Normals are expected in world space, roughness linear (GGX alpha is its square).
+    All frames have the size of the picture and the buffers of the first; frames that store different parts of it (data
+    windows) are put into one image. ``motion_convention`` says what the motion vectors mean (a key of
+    ``MOTION_CONVENTIONS``) and is needed as soon as there are any that are not Cycles' ``Vector``; ``"none"`` leaves
+    them out. The four components of ``Vector`` give dual motion vectors too. ``channels`` and ``layer``: see
+    :func:`jaxdn.clips.layers.detect_channels`; what they choose, see :func:`jaxdn.clips.sources.sources_of`. ``log`` is
+    called with lines about what is derived or left unused, when the first frame is read. Depth is taken for view-space
+    z (0, far and infinite become ``FAR``); ids count from 1 with 0 for nothing, or are those of a Cryptomatte, and are
+    left out of all frames if they say nothing in the first. Normals are expected in world space, roughness linear (GGX
+    alpha is its square).
 
     Raises ClipError at once where the files are no sequence, and, naming the file, when a frame is asked for that
     cannot be read or differs from the first.
     """
     if motion_convention not in (None, "none", *MOTION_CONVENTIONS):
-        raise ClipError(f"motion_convention: {_conventions()}; got {motion_convention!r}.")
-    files = sequence_files(path)
+        raise ClipError(f"motion_convention: {conventions()}; got {motion_convention!r}.")
+    files = sequence_files(path) if isinstance(path, str | Path) else list(path)
     return files, _frames(files, motion_convention, channels, layer, log)
 
 
@@ -115,98 +77,192 @@ def _frames(
     layer: str | None,
     log: Callable[[str], None],
 ) -> Iterator[Frame]:
+    canvas = canvas_of(files)
     first: _First | None = None
+    forward: np.ndarray | None = None
     for file in files:
-        frame, lines = _read(file, motion_convention, channels, layer)
+        there = read_placed(file, canvas)
+        try:
+            # What the first frame decides is decided for all: a lighting pass is light in every frame.
+            refused = None if first is None else first.refused
+            chosen = choose(there, motion_convention=motion_convention, channels=channels, layer=layer, refused=refused)
+            frame, derived = _frame(file, there, chosen)
+        except UnknownMotion as error:
+            raise UnknownMotion(f"{file}: {_measured(files, canvas, channels, layer)}{error}") from error
+        except ClipError as error:
+            raise ClipError(f"{file}: {error}") from error
+        if chosen.forward:
+            frame = frame._replace(dual_motion=dual_of(frame.motion, forward))
+            forward = forward_of_cycles(np.stack([there[name] for name in chosen.forward], axis=-1))
         if first is None:
-            for line in lines:
+            for line in [*chosen.notes, *derived]:
                 log(line)
             # Renderers write zeros where nobody asked for ids. Whether all frames do is not known before the last one.
             silent = frame.ids is not None and bool(np.all(frame.ids < 0))
-            first = _First(frame.radiance.shape, present(frame), silent)
+            first = _First(present(frame), silent, chosen.refused)
         _check_like_first(file, frame, first)
         yield frame._replace(ids=None) if first.silent else frame
+
+
+def _measured(files: Sequence[Path], canvas: Window, channels: Mapping[str, str] | None, layer: str | None) -> str:
+    """What the first two frames tell about the convention of their motion vectors, as a sentence; "" for nothing."""
+    if len(files) < 2:
+        return ""
+    before, now = (read_placed(file, canvas) for file in files[:2])
+    fitting = fitting_conventions(before, now, detect_channels(list(now), channels=channels, layer=layer))
+    if not fitting:
+        return ""
+    return f"--motion-convention {' or '.join(fitting)} fits {files[0].name} and {files[1].name}. "
 
 
 class _First(NamedTuple):
     """What all later frames have in common with the first."""
 
-    shape: tuple[int, ...]
     buffers: tuple[str, ...]
     silent: bool
     """Its ids say nothing."""
+    refused: frozenset[str]
 
 
-def _read(
-    file: Path, motion_convention: str | None, channels: Mapping[str, str] | None, layer: str | None
-) -> tuple[Frame, list[str]]:
-    """One frame, and in words what was derived, or left unused."""
-    there = read_exr(file)
-    try:
-        found = detect_channels(list(there), channels=channels, layer=layer)
-        convention = motion_convention_of(found, there, motion_convention)
-        if convention is None:
-            found.pop("motion", None)
-        images = {name: np.stack([there[channel] for channel in found[name]], axis=-1) for name in found}
-        buffers = {name: _converted(image, BUFFERS[name], convention) for name, image in images.items()}
-        for name in {"roughness", "specular_reflectance"} & set(found):
-            buffers[name] = check_fraction(name, layer_of(found[name]), buffers[name])
-        frame, derived = with_reflectance(Frame(**buffers), found, there, lambda: read_header(file))
-    except ClipError as error:
-        raise ClipError(f"{file}: {error}") from error
-    lines = []
-    unpaired = None if "specular_reflectance" in (channels or {}) else unpaired_specular(list(there), found)
-    if unpaired is not None:
-        lines.append(
+class Chosen(NamedTuple):
+    """What is read of a file, from which channels."""
+
+    found: dict[str, Channels]
+    """Buffer -> its channels."""
+    convention: str | None
+    """Of the motion vectors."""
+    forward: Channels | None
+    """The channels that dual motion vectors are made from, with those of the frame before."""
+    refused: frozenset[str]
+    """Buffers whose channels turned out to be something else."""
+    notes: list[str]
+    """What was left unused, and why, in words."""
+
+
+def choose(
+    there: Mapping[str, np.ndarray],
+    *,
+    motion_convention: str | None = None,
+    channels: Mapping[str, str] | None = None,
+    layer: str | None = None,
+    refused: frozenset[str] | None = None,
+) -> Chosen:
+    """Which channels of a file make up which buffer, by their names and, where a name says too little, by their values.
+
+    A layer called ``diffuse`` that is light (:func:`jaxdn.clips.lighting.why_light`), and a Cryptomatte in half
+    precision, are left out and noted. Raises ClipError as :func:`jaxdn.clips.layers.detect_channels` does, for motion
+    vectors whose convention nobody has stated, and for light that was named the albedo outright.
+
+    Args:
+      there: every channel of the file.
+      motion_convention: see :func:`plain_frames`.
+      channels: the same.
+      layer: the same.
+      refused: what an earlier frame of the sequence has decided; None: decide.
+    """
+    stated = channels or {}
+    found = detect_channels(list(there), channels=channels, layer=layer)
+    convention = motion_convention_of(found, there, motion_convention)
+    if convention is None:
+        found.pop("motion", None)
+    notes: dict[str, str] = _something_else(there, found, stated) if refused is None else {}
+    refused = frozenset(notes) if refused is None else refused
+    found = {name: channels for name, channels in found.items() if name not in refused}
+    if "specular_reflectance" not in stated and (unpaired := unpaired_specular(list(there), found)) is not None:
+        notes["specular_reflectance"] = (
             f"not used: {unpaired!r}, as the albedo may have this part in it already; if yours is the diffuse part "
             f"alone, name it: --channels specular_reflectance={unpaired}"
         )
-    return frame, lines if derived is None else [*lines, derived]
+    if contradicts_cycles(found, there, convention):
+        notes["motion"] = (
+            f"{layer_of(found['motion'])!r} looks like Blender's, whose convention is 'cycles'; read as stated"
+        )
+    return Chosen(found, convention, forward_channels(found, there, convention), refused, list(notes.values()))
 
 
-def _converted(image: np.ndarray, buffer: Buffer, convention: str | None) -> np.ndarray:
+def _something_else(
+    there: Mapping[str, np.ndarray], found: Mapping[str, Channels], stated: Mapping[str, str]
+) -> dict[str, str]:
+    """Buffers whose channels are not what their names promise, with the reason. Raises ClipError for one named so."""
+    notes = {}
+    albedo, ids = found.get("albedo"), found.get("ids")
+    if albedo is not None and ("albedo" in stated or last_name(albedo) == UNSURE_ALBEDO):
+        why = why_light(_stack(there, albedo), _stack(there, found["radiance"]))
+        if why is not None and "albedo" not in stated:
+            notes["albedo"] = f"not used: {layer_of(albedo)!r} is a lighting pass and no albedo: {why}"
+        elif why is not None and "at most" in why:  # who names a layer knows better, except about this
+            raise ClipError(
+                f"albedo: {layer_of(albedo)!r} is no albedo: {why}; name another, or --channels albedo=none."
+            )
+    if ids is not None and is_cryptomatte(ids) and there[ids[0]].dtype != np.float32:
+        notes["ids"] = f"not used: {layer_of(ids)!r}, as half precision has destroyed the ids in it"
+    return notes
+
+
+def canvas_of(files: Sequence[Path]) -> Window:
+    """The pixels that a sequence has: the union of its data windows, from the headers alone.
+
+    Raises ClipError for files whose pictures (display windows) differ. A file that cannot be read is left out here; it
+    is an error when its frame is read.
+    """
+    windows: list[Window] = []
+    picture: Window | None = None
+    for file in files:
+        try:
+            display, found = read_windows(file)
+        except ClipError:
+            continue
+        picture = picture or display
+        if display != picture:
+            raise ClipError(
+                f"{file}: expected {picture.size[1]} x {picture.size[0]} pixels as in the first frame, "
+                f"got {display.size[1]} x {display.size[0]}."
+            )
+        windows += found.values()
+    return union(windows) if windows else Window(0, 0, 0, 0)
+
+
+def read_placed(file: Path, canvas: Window) -> dict[str, np.ndarray]:
+    """Every channel of a file as an image of the canvas; 0 where it has none."""
+    there = read_exr(file)
+    _, windows = read_windows(file)
+    return {name: place(pixels, windows[name], canvas) for name, pixels in there.items()}
+
+
+def _frame(file: Path, there: Mapping[str, np.ndarray], chosen: Chosen) -> tuple[Frame, list[str]]:
+    """One frame, and in words what was derived, or left unused."""
+    found = chosen.found
+    buffers = {name: _converted(name, _stack(there, found[name]), found[name], chosen.convention) for name in found}
+    for name in {"roughness", "specular_reflectance"} & set(found):
+        buffers[name] = check_fraction(name, layer_of(found[name]), buffers[name])
+    frame, derived = with_reflectance(Frame(**buffers), found, there, lambda: read_header(file))
+    return frame, [] if derived is None else [derived]
+
+
+def _stack(there: Mapping[str, np.ndarray], channels: Channels) -> np.ndarray:
+    return np.stack([there[channel] for channel in channels], axis=-1)
+
+
+def _converted(name: str, image: np.ndarray, channels: Channels, convention: str | None) -> np.ndarray:
     """One of their buffers as ours."""
+    buffer: Buffer = BUFFERS[name]
     if buffer.kind == "id":
+        if is_cryptomatte(channels):  # the bits of a hash; 0 is nothing
+            bits = np.ascontiguousarray(image).view(np.uint32) & np.uint32(0x7FFFFFFF)
+            return np.where(bits == 0, -1, bits.astype(np.int64)).astype(np.int32)
         ids = np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
         return (np.clip(np.rint(ids), 0, 2**31 - 1) - 1).astype(np.int32)
     image = image.astype(buffer.dtype)
     if buffer.kind == "vector" and convention is not None:
         return convert_motion(image, convention)
     if buffer.kind == "distance":
-        return np.where(np.isfinite(image) & (image < FAR), image, np.float32(FAR))
+        image = np.abs(image)  # some cameras look along -z
+        # Where there is nothing, programs write 0, infinity or a large number.
+        return np.where(np.isfinite(image) & (image > 0) & (image < FAR), image, np.float32(FAR))
     return image
 
 
-def motion_convention_of(found: Mapping[str, Channels], there: Collection[str], stated: str | None) -> str | None:
-    """The convention of the motion vectors among a file's channels; None where there are none, or none are wanted.
-
-    Raises ClipError where nobody has stated it and the names do not tell.
-    """
-    if "motion" not in found or stated == "none":
-        return None
-    if stated is not None:
-        return stated
-    layer = found["motion"][0].rpartition(".")[0]
-    four = all(f"{layer}.{component}" in there for component in "XYZW")
-    if four and layer.rpartition(".")[2].lower() == "vector":
-        return "cycles"
-    raise ClipError(
-        f"{', '.join(found['motion'])}: nothing in the file says what these motion vectors mean; state "
-        f"motion_convention (jaxdn denoise --motion-convention): {_conventions()}."
-    )
-
-
-def _conventions() -> str:
-    words = "; ".join(f"{name!r}: {meaning}" for name, meaning in MOTION_CONVENTIONS.items())
-    return f"expected one of {words}; 'none': leave the motion out"
-
-
 def _check_like_first(file: Path, frame: Frame, first: _First) -> None:
-    if frame.radiance.shape != first.shape:
-        raise ClipError(
-            f"{file}: expected {first.shape[1]} x {first.shape[0]} pixels as in the first frame, "
-            f"got {frame.radiance.shape[1]} x {frame.radiance.shape[0]}."
-        )
     differing = sorted(set(present(frame)) ^ set(first.buffers))
     if differing:
         raise ClipError(f"{file}: expected the same buffers as in the first frame, but {', '.join(differing)} differs.")

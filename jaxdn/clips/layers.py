@@ -1,9 +1,10 @@
 """Which channels of another renderer's EXR file make up which buffer, by their names.
 
-The names are those that Blender Cycles, pbrt, Arnold, V-Ray, RenderMan, Mitsuba, Corona, Falcor and the tools of Open
-Image Denoise use, a view layer's name in front or not.
+The names are those that Blender Cycles, pbrt, Arnold, V-Ray, RenderMan, Houdini, Mitsuba, Corona, Falcor and the tools
+of Open Image Denoise use, a view layer's name in front or not. ``docs/files.md`` has what is read of each program.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 
 from jaxdn.clips.files import ClipError
@@ -15,7 +16,7 @@ Groups = Mapping[str, Mapping[str, str]]
 """Layer -> component, lower case -> full name of the channel."""
 
 LAYERS: dict[str, tuple[str, ...]] = {
-    "radiance": ("noisy image", "", "beauty", "rgba", "combined", "color", "ci"),
+    "radiance": ("noisy image", "", "beauty", "rgba", "combined", "color", "ci", "c", "rgb_color"),
     "albedo": (
         "albedo",
         "denoising albedo",
@@ -27,7 +28,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "vraydiffusefilter",
         "diffcol",
         "diffuse color",
-        "diffuse",
+        "diffuse",  # V-Ray for Maya's filter, everybody else's lighting: jaxdn.clips.reflectance tells them apart
     ),
     "normal": (
         "denoising normal",
@@ -39,11 +40,39 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "n_noice",
         "visiblenormals",
         "optixnormals",
+        "nn",
+        "__nworld",
+        "vraynormals",
+        "hitn",
     ),
-    "depth": ("depth", "denoising depth", "z"),
+    "depth": ("depth", "z", "zfiltered", "zdepth", "vrayzdepth", "pz", "hitpz", "denoising depth", "dd", "dd.y"),
     "roughness": ("denoising roughness", "roughness", "specular_roughness"),
-    "motion": ("vector", "motionvector", "motion", "mvec", "backward"),
-    "ids": ("ids", "indexob", "shape_index", "object_id", "id"),
+    "motion": (
+        "vector",
+        "motionvector",
+        "motion",
+        "mvec",
+        "backward",
+        "motionback",
+        "motionvectors",
+        "velocity",
+        "vrayvelocity",
+    ),
+    "ids": (
+        "ids",
+        "indexob",
+        "shape_index",
+        "object_id",
+        "id",
+        "cryptoobject00",
+        "crypto_object00",
+        "cryptoasset00",
+        "crypto_asset00",
+        "cryptomatte00",
+        "vraycryptomatte00",
+        "cryptomaterial00",
+        "crypto_material00",
+    ),
     "specular_reflectance": (
         "specular_albedo",
         "denoising specular albedo",
@@ -63,6 +92,9 @@ _DIFFUSE_PARTNERS: dict[str, str] = {
     "vrayreflectionfilter": "vraydiffusefilter",
 }
 """Specular albedo -> the layer that is the diffuse rest. Any other albedo may have the specular part in it already."""
+
+UNSURE_ALBEDO = "diffuse"
+"""The layer that is an albedo in one program and a lighting pass in the others."""
 
 NOT_WANTED = "none"
 """``channels={"roughness": "none"}`` leaves a buffer out."""
@@ -156,6 +188,29 @@ def name_it(buffer: str) -> str:
     return f"name its layer: channels={{{buffer!r}: LAYER}} (jaxdn denoise --channels {buffer}=LAYER)"
 
 
+def last_name(channels: Channels) -> str:
+    """The last part of the name of the layer that the channels of a buffer lie in, lower case."""
+    return layer_of(channels).rpartition(".")[2].lower()
+
+
+def is_cryptomatte(channels: Channels) -> bool:
+    """Whether they lie in the first layer of a Cryptomatte, whose first two channels are an id's bits and its cover."""
+    return re.fullmatch(r".*crypto.*00", last_name(channels)) is not None
+
+
+def beauty(names: Sequence[str], found: Mapping[str, Channels]) -> Channels:
+    """The channels that a denoised image belongs in: those that the radiance was read from.
+
+    If that was Blender's ``Noisy Image``, they are those of the ``Combined`` beside it, which Blender denoises into.
+    """
+    read = found["radiance"]
+    head, _, last = layer_of(read).rpartition(".")
+    if last.lower() == "noisy image":
+        combined = _fitting(grouped(names).get(f"{head}.Combined" if head else "Combined", {}), BUFFERS["radiance"])
+        return combined or read
+    return read
+
+
 def unpaired_specular(names: Sequence[str], found: Mapping[str, Channels]) -> str | None:
     """The layer of a specular albedo that was left out, as no diffuse albedo belongs to it; None if there is none."""
     if "specular_reflectance" in found:
@@ -185,7 +240,7 @@ def _components(buffer: Buffer) -> tuple[Channels, ...]:
     if buffer.channels == 2:
         return (("x", "y"), ("r", "g"), ("u", "v"))
     if buffer.kind == "distance":
-        return (("z",), ("v",), ("y",), ("",))
+        return (("z",), ("v",), ("y",), ("",), ("t",), ("r",))
     return (("z",), ("y",), ("v",), ("x",), ("r",), ("i",), ("",))
 
 

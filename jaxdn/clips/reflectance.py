@@ -16,24 +16,23 @@ import numpy as np
 from jaxdn.brdf import directional_albedo
 from jaxdn.clips.files import ClipError
 from jaxdn.clips.layers import NOT_WANTED, Channels, find, grouped, layer_of, name_it
+from jaxdn.clips.lighting import SLACK
 from jaxdn.frame import BUFFERS, Frame
 
 _POINT = BUFFERS["normal"]
 """Positions have the components of a direction."""
-_CAMERA_NORMALS = ("denoising normal", "ncam", "normal_camera", "camera_normal")
+CAMERA_NORMALS = ("denoising normal", "ncam", "normal_camera", "camera_normal")
 """Layers with normals in camera space; Cycles' denoising normals are."""
 _CAMERA_POSITIONS = ("pcam", "position_camera", "camera_position")
 _WORLD_POSITIONS = ("p", "position", "posw", "world_position")
 _F0 = ("f0", "specular_f0")
 """Specular colours at normal incidence."""
-_SLACK = 0.1
-"""By so much fractions may leave [0, 1]: pixel filters with negative lobes overshoot at edges."""
 
 
 def check_fraction(name: str, layer: str, values: np.ndarray) -> np.ndarray:
     """``values`` in [0, 1], what a pixel filter overshot cut off. Raises ClipError where they are of another kind."""
     known = values[np.isfinite(values)]
-    if known.size and not (known.min() >= -_SLACK and known.max() <= 1 + _SLACK):
+    if known.size and not (known.min() >= -SLACK and known.max() <= 1 + SLACK):
         advice = "rename it if it is something else"
         if name in BUFFERS:
             advice = f"{name_it(name)}, or leave it out: --channels {name}={NOT_WANTED}"
@@ -95,12 +94,12 @@ def _cosine(
 ) -> tuple[np.ndarray | None, str]:
     """The cosine [H, W, 1] between normal and view, NaN where there is no normal; and from what, or why not."""
     groups = grouped(list(there))
-    normals, places = find(groups, _CAMERA_NORMALS, _POINT), find(groups, _CAMERA_POSITIONS, _POINT)
+    normals, places = find(groups, CAMERA_NORMALS, _POINT), find(groups, _CAMERA_POSITIONS, _POINT)
     if normals and places:
         where = f"{layer_of(normals)!r} and {layer_of(places)!r} in camera space"
         return _between(_stack(there, normals), -_stack(there, places)), where
     places = find(groups, _WORLD_POSITIONS, _POINT)
-    world = frame.normal is not None and not _is_one_of(layer_of(found["normal"]), _CAMERA_NORMALS)
+    world = frame.normal is not None and not _is_one_of(layer_of(found["normal"]), CAMERA_NORMALS)
     if not places or not world:
         return None, "there are no normals and positions of one space to find it"
     eye = _camera_place(header().get("worldToCamera"))

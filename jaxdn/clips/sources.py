@@ -1,15 +1,18 @@
-"""Where the buffers of a sequence come from, and what its numbers are taken for, from the header of its first file."""
+"""Where the buffers of a sequence come from, and what its numbers are taken for, from its first file."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from jaxdn.clips.exr import read_names
+from jaxdn.clips.exr import read_exr, read_names
 from jaxdn.clips.files import ClipError
 from jaxdn.clips.folder import frame_path, is_clip
 from jaxdn.clips.frames import stored_layers
-from jaxdn.clips.import_exr import MOTION_CONVENTIONS, motion_convention_of, sequence_files
-from jaxdn.clips.layers import detect_channels, layer_of
+from jaxdn.clips.import_exr import choose
+from jaxdn.clips.layers import Channels, detect_channels, is_cryptomatte, last_name, layer_of
+from jaxdn.clips.reflectance import CAMERA_NORMALS
+from jaxdn.clips.shots import sequence_files
+from jaxdn.clips.vectors import MOTION_CONVENTIONS, UnknownMotion, motion_convention_of
 from jaxdn.frame import BUFFERS, GUIDES, Buffer
 
 OWN = "previous-current"
@@ -32,29 +35,36 @@ def sources_of(
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
     layer: str | None = None,
+    log: Callable[[str], None] = lambda line: None,
 ) -> list[Source]:
-    """The sources of a clip's buffers, or of those of another renderer's files, without reading a pixel.
+    """The sources of a clip's buffers, or of those of another renderer's files, from its first file.
 
     Takes what :func:`jaxdn.clips.import_exr.plain_frames` takes and raises as it does, except that motion vectors whose
-    convention nobody has stated are listed as such.
+    convention nobody has stated are listed as such. ``log`` is called with lines about what is left unused.
     """
     if is_clip(path):
         return _of_clip(read_names(frame_path(path, 0)))
     file = sequence_files(path)[0]
-    names = read_names(file)
+    there = read_exr(file)
+    naming: Any = {"channels": channels, "layer": layer}
+    unknown = False
     try:
-        found = detect_channels(names, channels=channels, layer=layer)
+        try:
+            motion_convention_of(detect_channels(list(there), **naming), there, motion_convention)
+        except UnknownMotion:
+            unknown = True
+        chosen = choose(there, motion_convention=OWN if unknown else motion_convention, **naming)
     except ClipError as error:
         raise ClipError(f"{file}: {error}") from error
-    stated: str | None = None
-    if "motion" in found:
-        try:
-            stated = motion_convention_of(found, names, motion_convention)
-        except ClipError:
-            stated = "unknown"
-    if stated is None:
-        found.pop("motion", None)
-    return [Source(name, layer_of(found[name]), found[name], _words(name, stated)) for name in found]
+    for note in chosen.notes:
+        log(note)
+    said = "unknown" if unknown else chosen.convention
+    found = [Source(name, layer_of(each), each, _words(name, each, said)) for name, each in chosen.found.items()]
+    if chosen.forward:
+        place = 1 + next(index for index, source in enumerate(found) if source.buffer == "motion")
+        words = "pixels, current minus next, y up, of the frame before (Blender's Vector pass, last two components)"
+        found.insert(place, Source("dual_motion", layer_of(chosen.forward), chosen.forward, words))
+    return found
 
 
 def _of_clip(names: list[str]) -> list[Source]:
@@ -62,22 +72,23 @@ def _of_clip(names: list[str]) -> list[Source]:
     layers = {"radiance": f"noisy_{min(stored_layers(names), default=1)}spp", **{name: name for name in GUIDES}}
     found = {name: tuple(f"{layers[name]}.{letter}" for letter in BUFFERS[name].letters) for name in layers}
     there = {name: channels for name, channels in found.items() if set(channels) <= set(names)}
-    return [Source(name, layers[name], there[name], _words(name, OWN)) for name in there]
+    return [Source(name, layers[name], there[name], _words(name, there[name], OWN)) for name in there]
 
 
-def _words(name: str, motion: str | None) -> str:
+def _words(name: str, channels: Channels, motion: str | None) -> str:
     """What the numbers of a buffer are taken for."""
     buffer: Buffer = BUFFERS[name]
+    last = last_name(channels)
     if buffer.kind == "vector":
         return MOTION_CONVENTIONS.get(motion or "", "nothing says: state --motion-convention")
-    kinds = {
-        "light": "linear light",
-        "direction": "world space",
-        "id": "whole numbers, 0 is nothing",
-        "flag": "0 or 1",
-    }
     if name in ("depth", "previous_depth"):
-        return "along the optical axis (view-space z), not along the ray"
+        along_ray = last == "denoising depth" or channels[0].lower().endswith(".t")  # Cycles; Mitsuba
+        return "along the ray" if along_ray else "along the optical axis (view-space z), not along the ray"
+    if name == "normal":
+        return "camera space" if last in CAMERA_NORMALS else "world space"
     if name == "roughness":
         return "linear, GGX alpha is its square"
+    if name == "ids" and is_cryptomatte(channels):
+        return "hash of what covers most of the pixel (Cryptomatte)"
+    kinds = {"light": "linear light", "id": "whole numbers, 0 is nothing", "flag": "0 or 1"}
     return kinds.get(buffer.kind, "share of light, 0 to 1" if buffer.kind == "fraction" else buffer.kind)

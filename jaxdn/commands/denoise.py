@@ -1,8 +1,9 @@
-"""``jaxdn denoise``: a noisy clip in, denoised EXR frames out, one frame at a time."""
+"""``jaxdn denoise``: noisy clips in, denoised EXR frames out, one frame at a time."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -11,9 +12,37 @@ from jaxdn.candidates import Candidate, candidate
 from jaxdn.clips.exr import write_exr
 from jaxdn.clips.folder import open_frames
 from jaxdn.clips.frames import StoredFrame, doubling_layers
+from jaxdn.clips.import_exr import canvas_of
+from jaxdn.clips.result import write_result
+from jaxdn.commands.aovs import Aovs
+from jaxdn.commands.work import Work, work_on
 from jaxdn.repair import repair_image
 from jaxdn.report.images import save_png
-from jaxdn.rollout import Layers, stream
+from jaxdn.rollout import Layers, Stream, stream
+
+
+class Settings(NamedTuple):
+    """How frames are read, which of them are denoised, and what is written."""
+
+    spp: int = 1
+    """Samples per pixel to take from a clip's layers."""
+    motion_convention: str | None = None
+    """That of motion vectors in files of other renderers (:data:`jaxdn.clips.MOTION_CONVENTIONS`)."""
+    channels: Mapping[str, str] | None = None
+    """Buffer -> layer to take it from in files of other renderers."""
+    layer: str | None = None
+    """View layer or part to look for the other buffers in."""
+    frames: Collection[int] | None = None
+    """Numbers of the frames to denoise; None: all."""
+    skip_existing: bool = False
+    """Leave out what is there already."""
+    only_beauty: bool = False
+    """Of files of other renderers, write the denoised beauty and its alpha alone."""
+    aovs: Literal["keep", "additive"] = "keep"
+    """What becomes of the other layers of light in files of other renderers: they stay, or are denoised too, so that
+    they still add up to the beauty (:mod:`jaxdn.additive`)."""
+    preview: bool = False
+    """Write a PNG next to each frame."""
 
 
 class Written(NamedTuple):
@@ -43,64 +72,99 @@ def candidate_on(name: str, implementation: str = "auto") -> tuple[Candidate, st
 
 
 def denoise_files(
-    source: Path,
+    sources: Sequence[Path],
     out: Path,
     method: Candidate,
+    settings: Settings = Settings(),  # noqa: B008, immutable
     *,
-    spp: int = 1,
-    preview: bool = False,
-    motion_convention: str | None = None,
-    channels: Mapping[str, str] | None = None,
-    layer: str | None = None,
-    say: Callable[[int, int], None] = lambda done, total: None,
+    begin: Callable[[Work], object] = lambda work: None,
+    say: Callable[[Path, int, int], None] = lambda path, done, total: None,
     log: Callable[[str], None] = lambda line: None,
 ) -> Written:
-    """Denoise a clip's folder, or EXR files of another renderer; returns the files written.
+    """Denoise clips' folders, and EXR files of other renderers; returns the files written.
 
-    Each output frame has the channels ``R, G, B``: the denoised radiance with the directly reflected and the emitted
-    light of the clip added back (files of other renderers: the denoised beauty), and ``denoised.R/G/B``, the denoised
-    part alone. Frames are read, denoised and written one at a time, so that a sequence of any length takes the memory
-    of one. Files are never left incomplete. Raises ValueError for input that cannot be read or is inconsistent, before
-    the frame concerned is written.
+    A frame of another renderer is its own file with the denoised beauty in place of the noisy one
+    (:func:`jaxdn.clips.result.write_result`). A frame of one of our clips has the channels ``R, G, B``, the denoised
+    radiance with the directly reflected and the emitted light added back, and ``denoised.R/G/B``, the denoised part
+    alone. Frames are read, denoised and written one at a time, so that a sequence of any length takes the memory
+    of one. Files are never left incomplete. Where frames are missing, the history begins anew. Raises ValueError for
+    input that cannot be read or is inconsistent, before the frame concerned is written.
 
     Args:
-      source: folder of a clip; or a folder of, or a pattern for, EXR files.
+      sources: folders of clips, and folders of, patterns for, or names of EXR files.
       out: folder for the denoised frames; of a single frame, also the name of an EXR file.
       method: the denoiser.
-      spp: samples per pixel to take from a clip's layers.
-      preview: write a PNG next to each frame.
-      motion_convention: that of motion vectors in files of other renderers (:mod:`jaxdn.clips.import_exr`).
-      channels: buffer -> layer to take it from in files of other renderers.
-      layer: view layer or part to look for the other buffers in.
-      say: called with the number of frames done and the total.
-      log: called with lines about what is derived from files of other renderers, or left unused.
+      settings: the rest.
+      begin: called with each shot before its first frame is read.
+      say: called with a file that was written, the number of frames done, and the total.
+      log: called with lines about what is derived from files of other renderers, left unused or cannot be kept.
     """
-    single = out.suffix.lower() == ".exr"
+    if settings.aovs == "additive" and settings.only_beauty:
+        raise ValueError("--aovs additive: expected the other layers to be written; leave out --only-beauty.")
+    works = work_on(sources, out, frames=settings.frames, skip_existing=settings.skip_existing)
+    total = sum(len(work.wanted) for work in works)
+    files: list[Path] = []
+    programs: set[tuple[str, ...]] = set()
+    repaired = 0
+    for work in works:
+        for note in work.notes:
+            log(note)
+        if work.wanted:
+            begin(work)
+        told: set[str] = set()
+
+        def once(line: str, told: set[str] = told) -> None:
+            if line not in told:
+                log(line)
+            told.add(line)
+
+        for stretch in work.stretches():
+            step = None if method.denoiser is None else stream(method.denoiser, method.params)
+            for path in _denoise(work, stretch, method, step, settings, once):
+                files.append(path)
+                say(path, len(files), total)
+            if step is not None:
+                programs |= step.programs
+                repaired += step.repaired
+    return Written(files, len(programs), repaired)
+
+
+def _denoise(
+    work: Work,
+    stretch: range,
+    method: Candidate,
+    step: Stream | None,
+    settings: Settings,
+    log: Callable[[str], None],
+) -> Iterator[Path]:
+    """Denoise consecutive frames of a shot; yields the files as they are written."""
     needs_layers = method.denoiser is not None and method.denoiser.samples is not None
-    names, stored = open_frames(
-        source, spp=spp, motion_convention=motion_convention, channels=channels, layer=layer, log=log
-    )
-    frames = ((one.frame, _layers(one, source) if needs_layers else None) for one in stored)
-    if single and len(names) > 1:
-        raise ValueError(f"{out}: expected a folder for {len(names)} frames, got the name of one EXR file.")
-    if out.resolve() in {
-        source.resolve(),
-        *(place for name in names for place in (name.resolve(), name.resolve().parent)),
-    }:
-        raise ValueError(f"{out}: expected another place than the input's, whose frames would be overwritten.")
-    step = None if method.denoiser is None else stream(method.denoiser, method.params)
-    (out.parent if single else out).mkdir(parents=True, exist_ok=True)
-    written = []
-    for name, (frame, layers) in zip(names, frames, strict=True):
+    naming: dict[str, Any] = {"channels": settings.channels, "layer": settings.layer}
+    names = list(work.shot.files[stretch.start : stretch.stop])
+    opened: Any = names if work.clip is None else work.clip
+    _, every = open_frames(opened, spp=settings.spp, motion_convention=settings.motion_convention, log=log, **naming)
+    stored = every if work.clip is None else islice(every, stretch.start, stretch.stop)
+    canvas = canvas_of(names)
+    aovs = Aovs(canvas, naming, log) if settings.aovs == "additive" and work.clip is None else None
+    for index, name, one in zip(stretch, names, stored, strict=True):
+        frame = one.frame
+        layers = _layers(one, work.source) if needs_layers else None
         image = _light(frame.radiance) if step is None else np.asarray(step(frame, layers))
-        path = out if single else out / f"{name.stem}.exr"
+        parts = {} if aovs is None else aovs.denoise(name, frame, image)
+        if index not in work.wanted:
+            continue
+        path = work.targets[index]
+        path.parent.mkdir(parents=True, exist_ok=True)
         beauty = image + _light(frame.direct) + _light(frame.emission)
-        write_exr(path, _channels("", beauty) | _channels("denoised.", image))
-        if preview:
+        if work.clip is None:
+            images = {"": beauty, **parts}
+            for line in write_result(name, path, images, canvas, only_beauty=settings.only_beauty, **naming):
+                log(line)
+        else:
+            write_exr(path, _channels("", beauty) | _channels("denoised.", image))
+        if settings.preview:
             save_png(path.with_suffix(".png"), color.tonemap(beauty))
-        written.append(path)
-        say(len(written), len(names))
-    return Written(written, 0 if step is None else len(step.programs), 0 if step is None else step.repaired)
+        yield path
 
 
 def _layers(stored: StoredFrame, source: Path) -> Layers:

@@ -11,27 +11,17 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from jaxdn.candidates import candidate
+from jaxdn.clips.shots import ranges
 from jaxdn.clips.sources import sources_of
-from jaxdn.commands.render import Planned, plan_clip
+from jaxdn.commands.render import Planned, denoiser_named, plan_clip
 from jaxdn.commands.sources import show_sources
 from jaxdn.denoiser import Denoiser
 from jaxdn.effects import EFFECTS, Plan, everything, inspect, plan
-from jaxdn.frame import BUFFERS
-from jaxdn.methods.table import methods
+from jaxdn.frame import BUFFERS, OF_SAMPLES
 from jaxdn.render.opening import open_scene
 
 EVERYTHING = plan(everything(1))
 """The plan that corresponds to rendering everything."""
-
-
-def denoiser_named(name: str) -> Denoiser | None:
-    """A denoiser to plan for: a method, shipped weights or a file; None for the noisy image, which is not denoised.
-
-    The weights do not matter here, so a learned method needs none. Raises ValueError for any other name.
-    """
-    known = methods()
-    return known[name].factory() if name in known else candidate(name).denoiser
 
 
 def inspect_to_terminal(
@@ -71,9 +61,8 @@ def inspect_to_terminal(
             f"scene {source!r}: expected none of --channels, --layer, --motion-convention, which are for EXR files."
         )
     if files and not as_json:
-        show_sources(
-            source, reads=None if reader is None else reader.reads, motion_convention=motion_convention, **naming
-        )
+        reads = None if reader is None else reader.reads
+        show_sources(source, reads=reads, motion_convention=motion_convention, log=print, **naming)
     with _nothing_else_on_stdout():
         planned = _planned(source, animation, reader, width=width, height=height, frames=frames, naming=naming)
     if as_json:
@@ -154,7 +143,8 @@ def bytes_a_pixel(made: Plan) -> float:
     """Mean bytes per pixel and frame before compression, including one noisy layer, the reference and its half."""
     light = BUFFERS["radiance"].bytes
     whole = [3 * light + sum(BUFFERS[name].bytes for name in names) for names in made.frames]
-    stored = [light if held != index else whole[index] for index, held in enumerate(made.held)]
+    noise = [light + sum(BUFFERS[name].bytes for name in OF_SAMPLES & set(names)) for names in made.frames]
+    stored = [noise[index] if held != index else whole[index] for index, held in enumerate(made.held)]
     return round(sum(stored) / len(stored), 2)
 
 
@@ -181,7 +171,7 @@ def _show(source: str, planned: Planned, reader: Denoiser | None, name: str | No
     for effect in EFFECTS:
         there = "" if effect.name not in found else "uncertain" if effect.name in found.uncertain else "yes"
         why = found.uncertain.get(effect.name) or found.why.get(effect.name) or effect.sentence
-        where = _ranges([index for index, present in enumerate(found.frames) if effect.name in present])
+        where = ranges([index for index, present in enumerate(found.frames) if effect.name in present])
         table.add_row(effect.name, there, where, why, style=None if there else "dim")
     console.print(table)
     measured = ""
@@ -197,14 +187,3 @@ def _show(source: str, planned: Planned, reader: Denoiser | None, name: str | No
     console.print(f"rendered once {noise_alone(made)} of {len(made.held)} frames store only their noise")
     sizes = f"{bytes_a_pixel(made):g} of {bytes_a_pixel(EVERYTHING):g} bytes per pixel and frame"
     console.print(f"on disk       {sizes}, uncompressed")
-
-
-def _ranges(indices: list[int]) -> str:
-    """``0-3, 7``."""
-    parts: list[str] = []
-    for index in indices:
-        if parts and index == int(parts[-1].split("-")[-1]) + 1:
-            parts[-1] = f"{parts[-1].split('-')[0]}-{index}"
-        else:
-            parts.append(str(index))
-    return ", ".join(parts)

@@ -4,17 +4,21 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxdn.candidates import candidate
 from jaxdn.checks import check_at_least
 from jaxdn.clips.folder import begun_record
 from jaxdn.denoiser import Denoiser
-from jaxdn.effects import Effects, Plan, chosen, inspect, plan
+from jaxdn.effects import Effects, Plan, chosen, everything, inspect, plan
+from jaxdn.frame import OF_SAMPLES
+from jaxdn.methods.table import methods
+from jaxdn.planning.catalogue import NoisyLight
 from jaxdn.render.depth import PathDepth, measure_depth
 from jaxdn.render.families import FAMILIES
 from jaxdn.render.farm import ClipJob, render_clips
 from jaxdn.render.opening import family_scene
 from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.scene_file import SceneFile
-from jaxdn.render.variant import choose_variant, use_variant
+from jaxdn.render.variant import choose_variant, tells_lobes, use_variant
 
 
 class Planned(NamedTuple):
@@ -26,6 +30,15 @@ class Planned(NamedTuple):
     """How the plan's path length was measured; None if it was not."""
 
 
+def denoiser_named(name: str) -> Denoiser | None:
+    """A denoiser to plan for: a method, shipped weights or a file; None for the noisy image, which is not denoised.
+
+    The weights do not matter here, so a learned method needs none. Raises ValueError for any other name.
+    """
+    known = methods()
+    return known[name].factory() if name in known else candidate(name).denoiser
+
+
 def plan_clip(
     scene: AnimatedScene,
     *,
@@ -35,32 +48,35 @@ def plan_clip(
     height: int,
     frames: int,
     max_depth: int | None = None,
+    light: NoisyLight = "indirect",
 ) -> Planned | None:
-    """The effects to render an animated scene for, and the plan; None means to render everything (``"all"``).
+    """The effects to render an animated scene for, and the plan; None means no plan: ``"all"`` without a denoiser.
 
     Raises ValueError for a name that is not an effect.
 
     Args:
       scene: what is rendered.
       effects: ``"auto"``, ``"all"``, or names separated by commas.
-      denoiser: plan for the buffers that it reads; None: for every buffer that a denoiser may read.
+      denoiser: plan for the buffers that it reads; None: for any denoiser, without the buffers that only few read.
       width: in pixels.
       height: in pixels.
       frames: number of frames.
       max_depth: path length; by default, with ``"auto"``, it is measured.
+      light: as in :func:`jaxdn.render.render_frame`.
     """
     if effects == "all":
-        return None
+        whole = everything(frames)
+        return None if denoiser is None else Planned(whole, plan(whole, denoiser, max_depth=max_depth, light=light))
     if effects != "auto":
         named = chosen([name.strip() for name in effects.split(",") if name.strip()], frames)
-        return Planned(named, plan(named, denoiser, max_depth=max_depth))
+        return Planned(named, plan(named, denoiser, max_depth=max_depth, light=light))
     found = inspect(scene, width=width, height=height, frames=frames)
-    made = plan(found, denoiser, max_depth=max_depth)
+    made = plan(found, denoiser, max_depth=max_depth, light=light)
     # Measuring needs a path tracer, and indirect light that longer paths may add.
     if max_depth is not None or not made.indirect or made.integrator != "path":
         return Planned(found, made)
     depth = measure_depth(scene, frames=frames)
-    return Planned(found, plan(found, denoiser, max_depth=depth.max_depth), depth)
+    return Planned(found, plan(found, denoiser, max_depth=depth.max_depth, light=light), depth)
 
 
 def render(
@@ -76,8 +92,10 @@ def render(
     reference_spp: int,
     layers: Sequence[int],
     draws: int = 0,
+    light: NoisyLight = "indirect",
     max_depth: int | None,
     effects: str,
+    denoiser: str | None = None,
     workers: int | None,
 ) -> list[Path]:
     """Render clips into folders ``out/<scene>-<seed>``, or resume them, and return these folders.
@@ -95,8 +113,10 @@ def render(
       reference_spp: samples per pixel of the reference; 0 for none.
       layers: samples per pixel of the noisy layers, powers of two.
       draws: further images of one sample each, for training.
+      light: which light is noisy: the indirect part, or all that is reflected.
       max_depth: path length (1 emission, 2 direct light ...); default: measured, or the scene's own.
       effects: as in :func:`plan_clip`.
+      denoiser: name of the denoiser to render for; None: for any, without the buffers that only few read.
       workers: number of processes; default: the number of cores.
 
     Prints the Mitsuba variant, each clip's effects, and the progress. Raises ValueError for a source that is not a
@@ -106,10 +126,11 @@ def render(
     scenes = _tours(source, animation, seeds, frames, out) if tours else _scenes(source, animation, seeds)
     choice = choose_variant()
     print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
+    reader = None if denoiser is None else _reader(denoiser, choice.variant)
     size: dict[str, Any] = {"width": width, "height": height, "frames": frames}
     jobs = []
     for name, scene, noises in scenes:
-        planned = plan_clip(scene, effects=effects, max_depth=max_depth, **size)
+        planned = plan_clip(scene, effects=effects, denoiser=reader, max_depth=max_depth, light=light, **size)
         for seed in noises:
             clip = f"{name}-{seed}"
             if planned is not None:
@@ -121,6 +142,7 @@ def render(
                 **size,
                 layers=tuple(layers),
                 draws=draws,
+                light=light,
                 reference_spp=reference_spp,
                 max_depth=max_depth,
                 seed=seed,
@@ -128,6 +150,15 @@ def render(
             )
             jobs.append(job)
     return render_clips(jobs, workers=workers)
+
+
+def _reader(name: str, variant: str) -> Denoiser | None:
+    """A denoiser with what it reads, as far as the variant can render it; prints what is left out."""
+    found = denoiser_named(name)
+    if found is None or tells_lobes(variant) or not found.reads & OF_SAMPLES:
+        return found
+    print(f"{variant} cannot tell diffuse from specular light: {', '.join(sorted(found.reads & OF_SAMPLES))} left out")
+    return found._replace(reads=found.reads - OF_SAMPLES)
 
 
 def _scenes(

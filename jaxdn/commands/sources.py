@@ -1,6 +1,6 @@
 """The table that ``jaxdn denoise`` and ``jaxdn inspect`` begin with: what is read from where, and what is missing."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from rich.console import Console
@@ -36,12 +36,13 @@ def show_sources(
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
     layer: str | None = None,
+    log: Callable[[str], None] = lambda line: None,
 ) -> list[Source]:
     """Print the table for a sequence and a denoiser that reads some buffers (None: any denoiser); returns its sources.
 
     Raises as :func:`jaxdn.clips.sources.sources_of` does.
     """
-    found = sources_of(path, motion_convention=motion_convention, channels=channels, layer=layer)
+    found = sources_of(path, motion_convention=motion_convention, channels=channels, layer=layer, log=log)
     table = Table(title=f"{path}: what is read", title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for column in ("buffer", "from layer", "channels", "taken for"):
         table.add_column(column, overflow="fold")

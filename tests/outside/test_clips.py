@@ -13,7 +13,7 @@ from jaxdn import clips
 from jaxdn.clips import ClipError
 from jaxdn.clips.evidence import read_facts
 from jaxdn.clips.exr import to_half
-from jaxdn.clips.import_exr import convert_motion
+from jaxdn.clips.vectors import convert_motion
 from jaxdn.frame import BUFFERS, FAR, Clip, Frame
 
 HALF = tuple(name for name, row in BUFFERS.items() if row.stored == "half")
@@ -410,6 +410,7 @@ def test_every_convention_means_the_same_movement() -> None:
         "previous-current": (3, 2),
         "current-previous": (-3, -2),
         "cycles": (3, -2),
+        "forward-up": (-3, 2),
         "uv": (3 / 40, 2 / 20),
         "ndc": (3 / 20, -2 / 10),
         "rows-columns": (2, 3),

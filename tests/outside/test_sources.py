@@ -80,7 +80,7 @@ def test_denoise_begins_with_the_table(shot, tmp_path, capsys):
     text = run(capsys, "denoise", shot, "-o", tmp_path / "out", "--method", "svgf", "--layer", "Hall")
     for row in (
         "radiance Hall.Combined R, G, B linear light",
-        "normal Hall.Denoising Normal X, Y, Z world space",
+        "normal Hall.Denoising Normal X, Y, Z camera space",
         "depth Hall.Depth Z along the optical axis (view-space z), not along the ray",
         "motion Hall.Vector X, Y pixels, previous minus current position, y up (Blender's Vector pass,",
     ):
