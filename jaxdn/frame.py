@@ -44,6 +44,10 @@ class Buffer(NamedTuple):
     kind: Kind
     neutral: float | str = 0.0
     """The meaning of ``None``: a number, or the name of a buffer declared before this one, whose values it takes."""
+    on_request: bool = False
+    """Rendered only for a denoiser that reads it, as few do."""
+    of_samples: bool = False
+    """It describes the very samples that ``radiance`` is the mean of: another noisy image has another one."""
 
     @property
     def stored(self) -> Literal["half", "single", "flag", "id"]:
@@ -99,24 +103,35 @@ class Frame(NamedTuple):
     """[H, W, 3] directly reflected light; neutral: 0."""
     emission: Annotated[Array, Buffer(3, "light")] = None
     """[H, W, 3] light emitted towards the camera; neutral: 0."""
-    specular: Annotated[Array, Buffer(3, "light")] = None
+    specular: Annotated[Array, Buffer(3, "light", on_request=True, of_samples=True)] = None
     """[H, W, 3] the part of ``radiance`` whose last reflection was specular; the rest is diffuse; neutral: 0."""
     reflectance: Annotated[Array, Buffer(3, "fraction", "albedo")] = None
     """[H, W, 3] share of uniform incident light that the surface reflects to the camera; neutral: ``albedo``."""
-    specular_reflectance: Annotated[Array, Buffer(3, "fraction")] = None
+    specular_reflectance: Annotated[Array, Buffer(3, "fraction", on_request=True)] = None
     """[H, W, 3] the specular lobes' part of ``reflectance``; neutral: 0."""
-    hit_distance: Annotated[Array, Buffer(1, "distance")] = None
-    """[H, W, 1] length of the path's segment after the first hit, diffuse samples; 0 (neutral) means unknown."""
-    specular_hit_distance: Annotated[Array, Buffer(1, "distance")] = None
+    hit_distance: Annotated[Array, Buffer(1, "distance", on_request=True, of_samples=True)] = None
+    """[H, W, 1] length of the path's segment after the first hit, the mean over diffuse samples; ``FAR`` where it left
+    the scene; 0 (neutral) means unknown."""
+    specular_hit_distance: Annotated[Array, Buffer(1, "distance", on_request=True, of_samples=True)] = None
     """[H, W, 1] the same for specular samples; 0 (neutral) means unknown."""
+    ray_length: Annotated[Array, Buffer(1, "distance", "depth", on_request=True)] = None
+    """[H, W, 1] length of the camera ray up to the surface, ``FAR`` on a miss; neutral: ``depth``."""
+    far_motion: Annotated[Array, Buffer(2, "vector", "motion", on_request=True)] = None
+    """[H, W, 2] px, where what is infinitely far away in the pixel's direction lay in the previous frame; neutral:
+    ``motion``."""
     sample_count: Annotated[Array, Buffer(1, "count", 1.0)] = None
     """[H, W, 1] samples that ``radiance`` is the mean of; neutral: 1."""
     luminance_gradient: Annotated[Array, Buffer(2, "signed")] = None
     """[H, W, 2] change of a replayed sample's luminance since the previous frame, and the larger of both luminances;
     0 (neutral) where nothing was replayed (Schied et al. 2018)."""
-    shadow_motion: Annotated[Array, Buffer(2, "vector", "motion")] = None
-    """[H, W, 2] px, where the shadow on this point lay in the previous frame; neutral: ``motion``."""
-    glossy_motion: Annotated[Array, Buffer(2, "vector", "motion")] = None
+    shadowed: Annotated[Array, Buffer(3, "light", on_request=True, of_samples=True)] = None
+    """[H, W, 3] the part of ``radiance`` that comes straight from sampled points of lights, by diffuse reflection;
+    neutral: 0."""
+    unshadowed: Annotated[Array, Buffer(3, "light", "shadowed", on_request=True, of_samples=True)] = None
+    """[H, W, 3] what ``shadowed`` would be if nothing stood in the light's way; neutral: ``shadowed``."""
+    shadow_motion: Annotated[Array, Buffer(2, "vector", "motion", on_request=True, of_samples=True)] = None
+    """[H, W, 2] px, where the shadow on this point, or its edge, lay in the previous frame; neutral: ``motion``."""
+    glossy_motion: Annotated[Array, Buffer(2, "vector", "motion", on_request=True, of_samples=True)] = None
     """[H, W, 2] px, where the reflection seen at this point lay in the previous frame; neutral: ``motion``."""
 
 
@@ -130,6 +145,13 @@ BUFFERS: dict[str, Buffer] = _table()
 
 GUIDES: tuple[str, ...] = Frame._fields[1:]
 """The buffers that may be ``None``: all but ``radiance``."""
+
+
+ON_REQUEST: frozenset[str] = frozenset(name for name, buffer in BUFFERS.items() if buffer.on_request)
+"""The buffers that are rendered only for a denoiser that reads them."""
+
+OF_SAMPLES: frozenset[str] = frozenset(name for name, buffer in BUFFERS.items() if buffer.of_samples)
+"""The buffers that belong to one noisy image, and not to another of the same frame."""
 
 
 class Clip(NamedTuple):

@@ -6,10 +6,15 @@ the effects that produce it, or add an effect. The absence of an effect equals t
 """
 
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from jaxdn.planning.facts import Facts, Moment
 
+NoisyLight = Literal["indirect", "reflected"]
+"""The light that is rendered with noise: the indirect part, or all that surfaces reflect."""
+INDIRECT: NoisyLight = "indirect"
+OF_SHADOWS = frozenset({"shadowed", "unshadowed", "shadow_motion"})
+"""Buffers of direct light with noise."""
 DIRECT = 2
 """Path length, in Mitsuba's count, of light reflected by one surface: 1 is emission, 3 one more reflection."""
 
@@ -116,7 +121,14 @@ def _emission(facts: Facts, moment: Moment) -> str:
     return f"{_list(moment.shining)} is seen by the camera" if moment.shining else ""
 
 
-_MOTION = frozenset({"motion", "previous_depth"})
+def _moving_reflection(facts: Facts, moment: Moment) -> str:
+    names = [surface.name for surface in facts.surfaces if {"glossy", "mirror"} & surface.lobes]
+    if not names or not (moment.camera or moment.moving):
+        return ""
+    return f"{_list(moment.moving) or 'the camera'} moves, and {_list(names)} may reflect it"
+
+
+_MOTION = frozenset({"motion", "previous_depth", "far_motion"})
 _CHANGE = frozenset({"luminance_gradient"})
 _SURFACE = frozenset({"roughness"})
 
@@ -130,7 +142,13 @@ EFFECTS: tuple[Effect, ...] = (
         frozenset({"dual_motion", "visible"}),
         in_time=True,
     ),
-    Effect("indirect", "Light arrives after more than one reflection.", _indirect, depth=DIRECT + 1),
+    Effect(
+        "indirect",
+        "Light arrives after more than one reflection.",
+        _indirect,
+        frozenset({"hit_distance"}),
+        depth=DIRECT + 1,
+    ),
     Effect("glossy", "A surface reflects sharper than a diffuse one.", _glossy, _SURFACE),
     Effect("mirror", "A surface reflects like a mirror.", _mirror, _SURFACE),
     Effect("transmission", "Light passes through a surface.", _transmission, _SURFACE),
@@ -138,13 +156,20 @@ EFFECTS: tuple[Effect, ...] = (
         "specular",
         "A surface's reflectance differs from its albedo.",
         _specular,
-        frozenset({"reflectance"}),
+        frozenset({"reflectance", "specular", "specular_reflectance", "specular_hit_distance", "ray_length"}),
     ),
     Effect(
         "moving-shadow",
         "Something that moves blocks or reflects light; it need not be on screen itself.",
         _moving_shadow,
-        _CHANGE,
+        _CHANGE | OF_SHADOWS,
+        in_time=True,
+    ),
+    Effect(
+        "moving-reflection",
+        "A reflection moves over the surface that shows it.",
+        _moving_reflection,
+        frozenset({"glossy_motion"}),
         in_time=True,
     ),
     Effect("changing-light", "A light moves, or becomes brighter or darker.", _changing_light, _CHANGE, in_time=True),

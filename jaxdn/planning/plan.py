@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from jaxdn.denoiser import Denoiser
-from jaxdn.frame import GUIDES
-from jaxdn.planning.catalogue import DIRECT, EFFECTS
+from jaxdn.frame import GUIDES, ON_REQUEST
+from jaxdn.planning.catalogue import DIRECT, EFFECTS, INDIRECT, OF_SHADOWS, NoisyLight
 from jaxdn.planning.found import Effects
 
 GEOMETRY = frozenset({"albedo", "normal", "depth", "ids"})
@@ -24,7 +24,7 @@ class Plan(NamedTuple):
     max_depth: int | None
     """Path length; None: that of the scene."""
     indirect: bool
-    """Whether there is anything to denoise."""
+    """Whether there is anything to denoise: indirect light, or direct light with noise."""
     effects: tuple[str, ...]
     frames: tuple[tuple[str, ...], ...]
     """The buffers of each frame's file, without ``radiance``."""
@@ -65,14 +65,25 @@ def plan_from_record(record: Mapping[str, Any]) -> Plan:
     return Plan(**{**(entries(record) or {}), **tuples})
 
 
-def plan(effects: Effects, denoiser: Denoiser | None = None, *, max_depth: int | None = None) -> Plan:
-    """The intersection of the effects of a scene and the buffers that a denoiser reads (None: all buffers).
+def plan(
+    effects: Effects,
+    denoiser: Denoiser | None = None,
+    *,
+    max_depth: int | None = None,
+    light: NoisyLight = INDIRECT,
+) -> Plan:
+    """The intersection of the effects of a scene and the buffers that a denoiser reads.
+
+    Without a denoiser these are all buffers but those that are rendered on request alone
+    (:data:`jaxdn.frame.ON_REQUEST`).
 
     ``max_depth`` is the path length to render with, by default the scene's
-    (:func:`jaxdn.render.depth.measure_depth` measures it).
+    (:func:`jaxdn.render.depth.measure_depth` measures it). With ``light="reflected"`` direct light is a part of the
+    noisy radiance, and its shadows have buffers, instead of a buffer of its own.
     """
     by_name = {effect.name: effect for effect in EFFECTS}
-    wanted = frozenset(GUIDES) if denoiser is None else denoiser.reads | COMPOSED
+    wanted = frozenset(GUIDES) - ON_REQUEST if denoiser is None else denoiser.reads | COMPOSED
+    wanted -= {"direct"} if light == "reflected" else OF_SHADOWS
     there = [by_name[name] for name in effects.names]
 
     def buffers(present: frozenset[str]) -> tuple[str, ...]:
@@ -87,7 +98,7 @@ def plan(effects: Effects, denoiser: Denoiser | None = None, *, max_depth: int |
     return Plan(
         integrator="none" if not effects.lit else asked[0] if asked else "path",
         max_depth=depth if needed > DIRECT or depth is None else min(depth, DIRECT),
-        indirect=needed > DIRECT,
+        indirect=needed > DIRECT or (light == "reflected" and effects.lit),
         effects=effects.names,
         frames=tuple(buffers(present) for present in effects.frames),
         held=effects.held,

@@ -2,34 +2,38 @@
 
 import importlib.metadata
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn.checks import check_at_least
+from jaxdn.checks import check_at_least, check_option
 from jaxdn.clips import ClipError, read_frame, write_frame
 from jaxdn.clips.folder import begin_record, begun_record, finish_record, frame_path
-from jaxdn.frame import Frame
+from jaxdn.frame import GUIDES, OF_SAMPLES, ON_REQUEST, Frame
 from jaxdn.motion import dual_motion
-from jaxdn.planning.plan import Plan, entries
+from jaxdn.planning.catalogue import OF_SHADOWS, NoisyLight
+from jaxdn.planning.plan import Plan
 from jaxdn.render.errors import RenderError
 from jaxdn.render.gbuffer import check_scene, gbuffer
-from jaxdn.render.geometry import View, motion_between
+from jaxdn.render.geometry import View, far_motion, motion_between, ray_length
+from jaxdn.render.glossy_vectors import glossy_motion
 from jaxdn.render.gradient_samples import Replay, luminance_gradient
 from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.seeds import DRAWS, NOISY, REFERENCE
-from jaxdn.render.variant import use_variant
-from jaxdn.render.wavefront import Accumulated, no_light
+from jaxdn.render.settings import check_settings
+from jaxdn.render.shadow_vectors import shadow_motion
+from jaxdn.render.variant import advice, tells_lobes, use_variant
+from jaxdn.render.wavefront import Accumulated, Request, no_light
 
-_SURFACE = ("albedo", "normal", "depth", "roughness", "reflectance", "ids")
+_SURFACE = ("albedo", "normal", "depth", "roughness", "reflectance", "specular_reflectance", "ids")
 _DISOCCLUSION = frozenset({"dual_motion", "visible"})
-_MOTION = frozenset({"motion", "previous_depth"}) | _DISOCCLUSION
+_MOTION = frozenset({"motion", "previous_depth", "far_motion"}) | _DISOCCLUSION
 _GRADIENT = "luminance_gradient"
-_FREE = ("frames", "cameras", "versions", "bad_samples")
-"""Entries of a record that may change when rendering is resumed."""
+_LOBES = frozenset({"specular", "hit_distance", "specular_hit_distance"})
+_VECTORS = frozenset({"shadow_motion", "glossy_motion"})
 
 
 class Rendered(NamedTuple):
@@ -38,9 +42,9 @@ class Rendered(NamedTuple):
     frame: Frame
     """``radiance`` is the noisy layer with the fewest samples."""
     layers: dict[int, np.ndarray]
-    """Samples per pixel -> [H, W, 3] independent noisy indirect radiance."""
+    """Samples per pixel -> [H, W, 3] independent noisy radiance."""
     reference: np.ndarray | None
-    """[H, W, 3] converged indirect radiance, of samples that no noisy layer contains."""
+    """[H, W, 3] the same converged, of samples that no noisy layer contains."""
     reference_half: np.ndarray | None
     """[H, W, 3] the same from the first half of its samples."""
     draws: np.ndarray | None
@@ -63,6 +67,7 @@ def render_frame(
     seed: int = 0,
     variant: str | None = None,
     draws: int = 0,
+    light: NoisyLight = "indirect",
     previous: View | None = None,
     plan: Plan | None = None,
 ) -> Rendered:
@@ -70,7 +75,8 @@ def render_frame(
 
     ``direct`` and ``emission`` are means over the reference's samples, or over the noisy ones if ``reference_spp`` is
     0. The result depends only on the arguments: the same frame rendered again, alone or in another process, is the same
-    bit for bit. Raises ValueError for options out of range and scenes with unsupported effects.
+    bit for bit. Raises ValueError for options out of range, scenes with unsupported effects, and, with the scalar
+    variant, for a plan with buffers of samples (:data:`jaxdn.frame.OF_SAMPLES`), which it cannot render.
 
     Args:
       scene: to render.
@@ -83,62 +89,85 @@ def render_frame(
       seed: of the random numbers.
       variant: Mitsuba's; default: the fastest that works here.
       draws: further images of one sample each, for training on noise that rarely repeats.
+      light: what the radiance holds: ``"indirect"`` light, beside which there is ``direct``, or all that is
+        ``"reflected"``, without ``direct``.
       previous: the ``view`` of the frame before, computed if it is not given; frame 0 has none, and its motion is 0.
       plan: what to leave out: buffers (None then), paths longer than its ``max_depth``, and, in a frame that shows the
         same as an earlier one (``plan.held``), everything except the noise. The rest is the same as without a plan, bit
-        for bit.
+        for bit. Without one there are all buffers but those on request (:data:`jaxdn.frame.ON_REQUEST`).
     """
-    _check_options(width, height, layers, reference_spp, draws)
-    use = tracer(use_variant(variant))
+    _check_options(width, height, layers, reference_spp, draws, light, plan)
+    chosen = use_variant(variant)
+    use = tracer(chosen)
     depth = _path_length(scene, max_depth, plan)
     repeated = plan is not None and plan.held[frame] != frame
-    wanted = frozenset(Frame._fields if plan is None else () if repeated else plan.frames[frame])
+    planned = frozenset(GUIDES) - ON_REQUEST if plan is None else frozenset(plan.frames[frame])
+    if light == "reflected":
+        planned -= {"direct"}
+    apart, wanted = planned & OF_SAMPLES, frozenset() if repeated else planned - OF_SAMPLES
+    if apart and not tells_lobes(chosen):
+        raise ValueError(f"plan: {chosen} cannot render {', '.join(sorted(apart))}; plan without them. {advice()}")
     before = None
-    if frame > 0 and (_GRADIENT in wanted or (wanted & _MOTION and previous is None)):
+    again = bool(apart & _VECTORS) or _GRADIENT in wanted
+    if frame > 0 and not repeated and (again or (wanted & _MOTION and previous is None)):
         before = scene.build(frame - 1, width, height)
         previous = previous or _view(scene, frame - 1, before, frozenset())
     built = scene.build(frame, width, height)
     check_scene(built)
-    view = previous if repeated else _view(scene, frame, built, wanted) if wanted else None
+    view = previous if repeated else _view(scene, frame, built, wanted) if wanted | (apart & _VECTORS) else None
 
     dark = plan is not None and plan.integrator == "none"
     noise_only = plan is not None and not plan.indirect
 
-    def light(stream: int, first: int, count: int) -> Accumulated:
+    def traced(stream: int, first: int, count: int, request: Request | None = None) -> Accumulated:
         if dark or (noise_only and stream == NOISY and reference_spp):
-            return no_light((height, width))
-        return use.accumulate(built, seed=seed, frame=frame, stream=stream, first=first, count=count, max_depth=depth)
+            return no_light((height, width), request or Request())
+        there = {"request": request} if request else {}
+        numbers = {"seed": seed, "frame": frame, "stream": stream}
+        return use.accumulate(built, **numbers, first=first, count=count, max_depth=depth, **there)
+
+    def noise(part: Accumulated) -> np.ndarray:
+        return part.indirect if light == "indirect" else part.indirect + part.direct
 
     # Layer n always holds the samples n-1 ... 2n-2: its image does not depend on the other layers.
-    noisy = {samples: light(NOISY, samples - 1, samples) for samples in sorted(layers)}
+    fewest = min(layers)
+    request = Request(bool(apart & _LOBES), bool(apart & OF_SHADOWS), light == "reflected") if apart else None
+    noisy = {count: traced(NOISY, count - 1, count, request if count == fewest else None) for count in sorted(layers)}
     halves = []
     if reference_spp and not repeated:
         first_half = (reference_spp + 1) // 2
-        halves = [light(REFERENCE, 0, first_half), light(REFERENCE, first_half, reference_spp - first_half)]
+        halves = [traced(REFERENCE, 0, first_half), traced(REFERENCE, first_half, reference_spp - first_half)]
     sums = halves or list(noisy.values())
     total = sums[0]
     for part in sums[1:]:
         total = total.plus(part)
     samples = reference_spp or sum(layers)
-    singles = [light(DRAWS, index, 1) for index in range(draws)]
+    singles = [traced(DRAWS, index, 1) for index in range(draws)]
 
-    images = {count: _single(part.indirect / count) for count, part in noisy.items()}
+    images = {count: _single(noise(part) / count) for count, part in noisy.items()}
     found: dict[str, Any] = {"direct": _single(total.direct / samples), "emission": _single(total.emitted / samples)}
     if view is not None:
         found |= {name: getattr(view.gbuffer, name) for name in _SURFACE}
+        if "ray_length" in wanted:
+            found["ray_length"] = ray_length(view)
         if wanted & _MOTION:
-            found |= _motion(view, previous, disocclusion=bool(wanted & _DISOCCLUSION))
+            found |= _motion(view, previous, wanted)
         if _GRADIENT in wanted:
             found[_GRADIENT] = np.zeros((height, width, 2), np.float32)
             if previous is not None and not dark and (plan is None or plan.indirect):
-                numbers = {"seed": seed, "frame": frame, "sample": min(layers) - 1, "max_depth": depth}
+                numbers = {"seed": seed, "frame": frame, "sample": fewest - 1, "max_depth": depth}
                 found[_GRADIENT] = luminance_gradient(use.replay, (before, previous), (built, view), **numbers)
-    buffers = {name: buffer for name, buffer in found.items() if name in wanted}
+    found |= _of_samples(noisy[fewest], fewest)
+    if view is not None and apart & _VECTORS:
+        start = previous if frame > 0 and not repeated else None
+        numbers = {"seed": seed, "frame": frame, "sample": fewest - 1}
+        found |= _vectors(apart, (before, start), (built, view), **numbers)
+    buffers = {name: buffer for name, buffer in found.items() if name in wanted | apart}
     return Rendered(
-        frame=Frame(radiance=images[min(images)], **buffers),
+        frame=Frame(radiance=images[fewest], **buffers),
         layers=images,
-        reference=_single(total.indirect / samples) if halves else None,
-        reference_half=_single(halves[0].indirect / ((reference_spp + 1) // 2)) if halves else None,
+        reference=_single(noise(total) / samples) if halves else None,
+        reference_half=_single(noise(halves[0]) / ((reference_spp + 1) // 2)) if halves else None,
         draws=np.stack([_single(np.concatenate([one.indirect, one.direct], -1)) for one in singles]) if draws else None,
         view=view,
         bad_samples=sum(part.bad for part in (*noisy.values(), *halves, *singles)),
@@ -158,6 +187,7 @@ def render_clip(
     seed: int = 0,
     variant: str | None = None,
     draws: int = 0,
+    light: NoisyLight = "indirect",
     plan: Plan | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Path:
@@ -174,19 +204,20 @@ def render_clip(
       width: in pixels.
       height: in pixels.
       frames: number of frames; default: that of the scene.
-      layers: as in :func:`render_frame`, like the next six.
+      layers: as in :func:`render_frame`, like the next seven.
       reference_spp: samples per pixel of the reference; 0 for none.
       max_depth: path length.
       seed: of the random numbers.
       variant: Mitsuba's.
       draws: further images of one sample each.
+      light: what the radiance holds.
       plan: for these frames; it is stored in the record.
       progress: called with the index of every frame that is finished or already exists.
     """
     folder = Path(folder)
     frames = scene.frames if frames is None else frames
     check_at_least(1, frames=frames)
-    _check_options(width, height, layers, reference_spp, draws)
+    _check_options(width, height, layers, reference_spp, draws, light, plan)
     if plan is not None and len(plan.frames) != frames:
         raise ValueError(f"plan: expected one for {frames} frames, got one for {len(plan.frames)}.")
     chosen = use_variant(variant)
@@ -198,6 +229,7 @@ def render_clip(
         "layers": sorted(layers),
         "reference_spp": reference_spp,
         "draws": draws,
+        "light": light,
         "variant": chosen,
         "max_depth": _path_length(scene, max_depth, plan),
         "plan": None if plan is None else plan.record(),
@@ -210,11 +242,11 @@ def render_clip(
     }
     before = begun_record(folder)
     if before is not None:
-        _check_settings(folder, record, before)
+        check_settings(folder, record, before)
         record["bad_samples"] = before.get("bad_samples", 0)
     begin_record(record, folder)
     options: dict[str, Any] = {"width": width, "height": height, "layers": layers, "reference_spp": reference_spp}
-    options |= {"max_depth": max_depth, "seed": seed, "variant": chosen, "draws": draws, "plan": plan}
+    options |= {"max_depth": max_depth, "seed": seed, "variant": chosen, "draws": draws, "light": light, "plan": plan}
     previous: View | None = None
     for frame in range(frames):
         path = frame_path(folder, frame)
@@ -275,20 +307,52 @@ def tracer(variant: str) -> Tracer:
     return Tracer(wavefront.accumulate, wavefront.replay, False)
 
 
+def _of_samples(noisy: Accumulated, samples: int) -> dict[str, Any]:
+    """The buffers of a Frame that belong to one noisy image."""
+    found: dict[str, Any] = {}
+    if noisy.lobes is not None:
+        diffuse, specular = (_single(distance) for distance in noisy.lobes.hit_distances())
+        light = _single(noisy.lobes.specular / samples)
+        found |= {"specular": light, "hit_distance": diffuse, "specular_hit_distance": specular}
+    if noisy.shadows is not None:
+        found |= {name: _single(part / samples) for name, part in noisy.shadows._asdict().items()}
+    return found
+
+
+def _vectors(
+    wanted: frozenset[str], previous: tuple[Any, View | None], current: tuple[Any, View], **numbers: Any
+) -> dict[str, Any]:
+    """The vectors of shadows and of reflections; 0 where there is no previous frame."""
+    if previous[1] is None:
+        return dict.fromkeys(_VECTORS, np.zeros((*current[1].gbuffer.ids.shape[:2], 2), np.float32))
+    scene, then = previous[0], previous[1]
+    motion = motion_between(current[1], then, disocclusion=False).motion
+    found: dict[str, Any] = {}
+    if "shadow_motion" in wanted:
+        found["shadow_motion"] = shadow_motion((scene, then), current, motion, **numbers)
+    if "glossy_motion" in wanted:
+        found["glossy_motion"] = glossy_motion((scene, then), current, motion, **numbers)
+    return found
+
+
 def _view(scene: AnimatedScene, frame: int, built: Any, wanted: frozenset[str]) -> View:
     pose = {name: np.asarray(matrix, np.float64) for name, matrix in scene.pose(frame).items()}
-    return View(gbuffer(built, reflectance="reflectance" in wanted), scene.camera(frame), pose)
+    parts = {"reflectance": "reflectance" in wanted, "specular": "specular_reflectance" in wanted}
+    return View(gbuffer(built, **parts), scene.camera(frame), pose)
 
 
-def _motion(view: View, previous: View | None, *, disocclusion: bool) -> dict[str, Any]:
+def _motion(view: View, previous: View | None, wanted: frozenset[str]) -> dict[str, Any]:
     """The motion buffers of a Frame; in the first frame nothing has moved yet."""
     if previous is None:
         zero = np.zeros((*view.gbuffer.ids.shape[:2], 2), np.float32)
         seen = np.ones_like(view.gbuffer.ids, bool)
-        return {"motion": zero, "dual_motion": zero, "visible": seen, "previous_depth": view.gbuffer.depth}
-    found = motion_between(view, previous, disocclusion=disocclusion)
+        still = dict.fromkeys(("motion", "dual_motion", "far_motion"), zero)
+        return {**still, "visible": seen, "previous_depth": view.gbuffer.depth}
+    found = motion_between(view, previous, disocclusion=bool(wanted & _DISOCCLUSION))
     motion = found.motion.astype(np.float32)
     buffers = {"motion": motion, "previous_depth": found.previous_depth}
+    if "far_motion" in wanted:
+        buffers["far_motion"] = far_motion(view, previous).astype(np.float32)
     if found.forward_motion is not None and found.visible is not None:
         forward = jnp.asarray(found.forward_motion.astype(np.float32))
         dual = dual_motion(jnp.asarray(motion), forward, visible=jnp.asarray(found.visible[..., 0]))
@@ -300,7 +364,15 @@ def _single(image: np.ndarray) -> np.ndarray:
     return image.astype(np.float32)
 
 
-def _check_options(width: int, height: int, layers: Sequence[int], reference_spp: int, draws: int) -> None:
+def _check_options(
+    width: int,
+    height: int,
+    layers: Sequence[int],
+    reference_spp: int,
+    draws: int,
+    light: NoisyLight,
+    plan: Plan | None,
+) -> None:
     check_at_least(1, width=width, height=height)
     powers = all(isinstance(samples, int) and samples >= 1 and samples & (samples - 1) == 0 for samples in layers)
     if not layers or not powers or len(set(layers)) != len(layers):
@@ -309,6 +381,12 @@ def _check_options(width: int, height: int, layers: Sequence[int], reference_spp
         raise ValueError(f"reference_spp: expected 0 (no reference) or at least 2, got {reference_spp}.")
     if draws < 0:
         raise ValueError(f"draws: expected 0 or more images of one sample each, got {draws}.")
+    check_option(light, "light", ("indirect", "reflected"))
+    if draws and light == "reflected":
+        raise ValueError("draws: expected 0 with light 'reflected', as training draws indirect light; leave one out.")
+    wrong = OF_SHADOWS if light == "indirect" else {"direct"}
+    if plan is not None and wrong & set(plan.buffers):
+        raise ValueError(f"plan: expected one that was made for light {light!r}; pass light={light!r} to effects.plan.")
 
 
 def _camera_record(scene: AnimatedScene, frame: int) -> dict[str, Any]:
@@ -321,63 +399,6 @@ def _versions() -> dict[str, str]:
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in ("mitsuba", "drjit")},
     }
-
-
-def _check_settings(folder: Path, wanted: Mapping[str, Any], found: Mapping[str, Any]) -> None:
-    """Raise ClipError if the frames in a folder were rendered with other settings."""
-    # Frames may be added: what both records say about the same ones is compared.
-    common = min(int(found["frames"]), int(wanted["frames"]))
-    both = [
-        {**record, "plan": _planned(record.get("plan"), common), "draws": record.get("draws", 0)}
-        for record in (found, wanted)
-    ]
-    names = [name for name in wanted if name not in _FREE]
-    differing = [line for name in names for line in _differences(name, both[0].get(name), both[1][name])]
-    cameras = zip(found.get("cameras", []), wanted["cameras"], strict=False)
-    if any(_plain(first) != _plain(second) for first, second in cameras):
-        differing.append("another camera path")
-    if differing:
-        if found["frames"] != wanted["frames"]:
-            differing.insert(0, f"{found['frames']} frames there, {wanted['frames']} wanted")
-        what = "; ".join(dict.fromkeys(differing))
-        raise ClipError(f"{folder}: was rendered with other settings ({what}); choose another folder or remove it.")
-
-
-def _planned(plan: Mapping[str, Any] | None, frames: int) -> dict[str, Any] | None:
-    """What a plan's record says about the first frames; the names of its effects follow from that."""
-    known = entries(plan)
-    if known is None:
-        return None
-    cut = {name: known[name][:frames] for name in ("frames", "held") if name in known}
-    return {name: value for name, value in known.items() if name != "effects"} | cut
-
-
-def _differences(name: str, there: Any, wanted: Any) -> list[str]:
-    """In words, one for each entry, where two values of a record differ; long ones are not written out."""
-    # Compared in the form read from JSON, where tuples have become lists.
-    there, wanted = _plain(there), _plain(wanted)
-    if there == wanted:
-        return []
-    if isinstance(there, dict) and isinstance(wanted, dict):
-        keys = dict.fromkeys((*wanted, *there))
-        return [line for key in keys for line in _differences(f"{name} {key}", there.get(key), wanted.get(key))]
-    if name == "plan frames":
-        pairs = ((index, set(old), set(new)) for index, (old, new) in enumerate(zip(there, wanted, strict=True)))
-        index, old, new = next((index, old, new) for index, old, new in pairs if old != new)
-        lists = (", ".join(sorted(buffers)) or "no more" for buffers in (old - new, new - old))
-        return ["buffers of frame {}: {} there, {} wanted".format(index, *lists)]
-    name = name.removeprefix("plan ")
-    if len(f"{there}{wanted}") > 120:
-        return [f"{name} differs"]
-    return [f"{name}: {there} there, {wanted} wanted"]
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value
 
 
 def _is_whole(path: Path) -> bool:

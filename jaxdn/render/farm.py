@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxdn.clips.folder import begun_record, frame_path, is_clip, read_record
+from jaxdn.planning.catalogue import NoisyLight
 from jaxdn.planning.plan import entries, plan_from_record
 from jaxdn.render.errors import RenderError
 from jaxdn.render.opening import scene_from_record
@@ -39,6 +40,7 @@ class ClipJob(NamedTuple):
     max_depth: int | None = None
     seed: int = 0
     draws: int = 0
+    light: NoisyLight = "indirect"
     variant: str | None = None
     """None: the one that the clip in the folder was started with, else the fastest that works here."""
     plan: dict[str, Any] | None = None
@@ -124,6 +126,8 @@ def _finished(job: ClipJob) -> bool:
     chosen = {"max_depth": job.max_depth, "variant": job.variant}
     # A clip from before plans existed has no such entry, and all buffers.
     if entries(record.get("plan")) != entries(job.plan) or record.get("draws", 0) != job.draws:
+        return False
+    if record.get("light", "indirect") != job.light:
         return False
     wanted |= {key: value for key, value in chosen.items() if value is not None}
     # A frame's file gets its name only when it is complete.

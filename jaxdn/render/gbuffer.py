@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.frame import FAR
+from jaxdn.render.light_samples import diffuse_reflectance
 from jaxdn.render.media import absorbs, media_of
 from jaxdn.render.reflectance import Reflectances
 from jaxdn.render.wavefront import camera_rays
@@ -42,6 +43,8 @@ class GBuffer(NamedTuple):
     reflectance: np.ndarray | None = None
     """[H, W, 3] float32 share of uniform incident light that is reflected to the camera, in [0, 1], 1 on a miss; None
     if it was not requested."""
+    specular_reflectance: np.ndarray | None = None
+    """[H, W, 3] float32 the part of it that lobes other than diffuse ones reflect, 0 on a miss; None as above."""
 
 
 def shape_names(scene: Any) -> list[str]:
@@ -67,18 +70,18 @@ def check_scene(scene: Any) -> None:
         raise ValueError("scene: motion blur is not supported yet; expected an instantaneous shutter.")
 
 
-def gbuffer(scene: Any, *, reflectance: bool = False) -> GBuffer:
+def gbuffer(scene: Any, *, reflectance: bool = False, specular: bool = False) -> GBuffer:
     """Trace one ray through the centre of every pixel of the scene's first sensor, with the current variant.
 
     With ``reflectance`` (:mod:`jaxdn.render.reflectance`) a material that cannot be averaged gives one warning with the
-    name of its shape, and its albedo is used.
+    name of its shape, and its albedo is used; with ``specular`` there is its specular part as well.
     """
     names = shape_names(scene)
     ranks = {name: rank for rank, name in enumerate(sorted(names))}
     trace = _one_by_one if str(mi.variant()).startswith("scalar") else _vectorised
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
-    reflectances = Reflectances(scene) if reflectance else None
-    traced = trace(scene, names, ranks, reflectances)
+    reflectances = Reflectances(scene) if reflectance or specular else None
+    traced = trace(scene, names, ranks, reflectances, specular)
     found = {name: buffer.reshape(height, width, -1) for name, buffer in traced.items()}
 
     hit = found["ids"] >= 0
@@ -89,6 +92,7 @@ def gbuffer(scene: Any, *, reflectance: bool = False) -> GBuffer:
     depth = (position - to_world[:3, 3]) @ forward[:, None]
     away = np.sum(normal * direction, axis=-1, keepdims=True) > 0
     albedo = np.where(hit, np.clip(np.nan_to_num(found["albedo"]), 0.0, 1.0), 1.0).astype(np.float32)
+    reflected = None if reflectances is None else _reflectance(found, albedo, sorted(names))
     return GBuffer(
         albedo=albedo,
         normal=np.where(hit, np.where(away, -normal, normal), 0.0).astype(np.float32),
@@ -98,7 +102,8 @@ def gbuffer(scene: Any, *, reflectance: bool = False) -> GBuffer:
         direction=direction,
         ids=found["ids"].astype(np.int32),
         names=tuple(sorted(names)),
-        reflectance=_reflectance(found, albedo, sorted(names)) if reflectance else None,
+        reflectance=reflected,
+        specular_reflectance=_specular(found, reflected) if specular and reflected is not None else None,
     )
 
 
@@ -111,6 +116,12 @@ def _reflectance(found: dict[str, np.ndarray], albedo: np.ndarray, names: Sequen
     return np.where(known, np.clip(found["reflectance"], 0.0, 1.0), albedo).astype(np.float32)
 
 
+def _specular(found: dict[str, np.ndarray], whole: np.ndarray) -> np.ndarray:
+    """The specular part of the averaged reflectance, at most ``whole``; 0 where it is not known."""
+    known = (found["ids"] >= 0) & np.all(np.isfinite(found["specular_reflectance"]), axis=-1, keepdims=True)
+    return np.minimum(np.where(known, np.maximum(found["specular_reflectance"], 0.0), 0.0), whole).astype(np.float32)
+
+
 @functools.cache
 def _warn(shape: str) -> None:
     """Warn once for each shape, not for each frame."""
@@ -118,7 +129,7 @@ def _warn(shape: str) -> None:
 
 
 def _vectorised(
-    scene: Any, names: Sequence[str], ranks: dict[str, int], reflectances: Reflectances | None
+    scene: Any, names: Sequence[str], ranks: dict[str, int], reflectances: Reflectances | None, specular: bool
 ) -> dict[str, np.ndarray]:
     """All pixels at once; flat buffers."""
     sensor = scene.sensors()[0]
@@ -131,46 +142,53 @@ def _vectorised(
     bsdf = hit.bsdf(ray)
 
     flags = bsdf.flags()
-    diffuse = valid & mi.has_flag(flags, mi.BSDFFlags.Diffuse)
-    albedo = dr.select(diffuse, mi.Color3f(bsdf.eval_diffuse_reflectance(hit, diffuse)), 0.0)
-    # "principled" reports its base colour even for pure metal or glass.
-    for part in ("metallic", "spec_trans"):
-        there = diffuse & bsdf.has_attribute(part, diffuse)
-        albedo *= 1.0 - dr.select(there, bsdf.eval_attribute_1(part, hit, there), 0.0)
-
+    albedo = diffuse_reflectance(bsdf, hit, valid)
     roughness = dr.select(mi.has_flag(flags, mi.BSDFFlags.Smooth), mi.Float(1.0), 0.0)
     there = valid & bsdf.has_attribute("alpha", valid)
     roughness = dr.select(there, dr.sqrt(dr.maximum(bsdf.eval_attribute_1("alpha", hit, there), 0.0)), roughness)
     there = valid & bsdf.has_attribute("roughness", valid)
     roughness = dr.select(there, bsdf.eval_attribute_1("roughness", hit, there), roughness)
 
-    instance = dr.reinterpret_array(mi.UInt32, hit.instance)
-    shape = dr.select(instance != 0, instance, dr.reinterpret_array(mi.UInt32, hit.shape))
-    shape = dr.select(valid, shape, 0)
     buffers: dict[str, Any] = {
         "albedo": albedo,
         "normal": hit.sh_frame.n,
         "position": hit.p,
         "direction": ray.d,
         "roughness": roughness,
-        "shape": shape,
+        "shape": shape_of(hit),
     }
     if reflectances is not None:
-        buffers["reflectance"] = reflectances.of_pixels(hit, bsdf, valid, albedo)
+        whole, part = reflectances.of_pixels(hit, bsdf, valid, albedo)
+        # Not evaluated unless it is named here.
+        buffers |= {"reflectance": whole} | ({"specular_reflectance": part} if specular else {})
     dr.eval(buffers)
     arrays = {name: np.array(buffer).T.astype(np.float64) for name, buffer in buffers.items()}
+    arrays["ids"] = ids_of(scene, arrays.pop("shape"))
+    return arrays
+
+
+def shape_of(hit: Any) -> Any:
+    """Mitsuba's number of the shape, or instance, of every hit; 0 where there is none."""
+    instance = dr.reinterpret_array(mi.UInt32, hit.instance)
+    shape = dr.select(instance != 0, instance, dr.reinterpret_array(mi.UInt32, hit.shape))
+    return dr.select(hit.is_valid(), shape, 0)
+
+
+def ids_of(scene: Any, numbers: np.ndarray) -> np.ndarray:
+    """The ids of shapes by their numbers of :func:`shape_of`: the positions of their sorted names, -1 for none."""
     # Registry numbers depend on the other existing objects; names do not.
+    names = shape_names(scene)
+    ranks = {name: rank for rank, name in enumerate(sorted(names))}
     lookup = {0: -1}
     reinterpret: Any = dr.reinterpret_array
     for own, name in zip(scene.shapes(), names, strict=True):
         lookup[int(reinterpret(mi.UInt32, mi.ShapePtr(own))[0])] = ranks[name]
-    numbers, inverse = np.unique(arrays.pop("shape").astype(np.int64), return_inverse=True)
-    arrays["ids"] = np.array([lookup.get(int(number), -1) for number in numbers])[inverse]
-    return arrays
+    different, inverse = np.unique(numbers.astype(np.int64), return_inverse=True)
+    return np.array([lookup.get(int(number), -1) for number in different])[inverse]
 
 
 def _one_by_one(
-    scene: Any, names: Sequence[str], ranks: dict[str, int], reflectances: Reflectances | None
+    scene: Any, names: Sequence[str], ranks: dict[str, int], reflectances: Reflectances | None, specular: bool
 ) -> dict[str, np.ndarray]:
     """The same buffers, a pixel at a time, for the variant without vectorisation."""
     sensor = scene.sensors()[0]
@@ -179,7 +197,7 @@ def _one_by_one(
     sizes = {"albedo": 3, "normal": 3, "position": 3, "direction": 3, "roughness": 1}
     arrays: dict[str, np.ndarray] = {name: np.zeros((width * height, size)) for name, size in sizes.items()}
     if reflectances is not None:
-        arrays["reflectance"] = np.zeros((width * height, 3))
+        arrays |= {name: np.zeros((width * height, 3)) for name in ("reflectance", "specular_reflectance")}
     arrays["ids"] = np.full(width * height, -1)
     for pixel in range(width * height):
         row, column = divmod(pixel, width)
@@ -195,7 +213,8 @@ def _one_by_one(
         albedo, arrays["roughness"][pixel] = _surface(hit)
         arrays["albedo"][pixel] = albedo
         if reflectances is not None:
-            arrays["reflectance"][pixel] = reflectances.of_one(hit, hit.bsdf(), albedo)
+            found = reflectances.of_one(hit, hit.bsdf(), albedo)
+            arrays["reflectance"][pixel], arrays["specular_reflectance"][pixel] = found
     return arrays
 
 

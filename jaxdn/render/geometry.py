@@ -132,6 +132,26 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
     return Motion(motion, forward, seen, previous_depth)
 
 
+def ray_length(view: View) -> np.ndarray:
+    """[H, W, 1] float32 length of the camera rays up to the surfaces, ``FAR`` on a miss."""
+    camera = np.asarray(view.camera.to_world, np.float64)[:3, 3]
+    length = np.linalg.norm(view.gbuffer.position - camera, axis=-1, keepdims=True)
+    return np.where(view.gbuffer.ids >= 0, length, FAR).astype(np.float32)
+
+
+def far_motion(current: View, previous: View) -> np.ndarray:
+    """[H, W, 2] float64 px, motion as in :func:`motion_between` of what is infinitely far away in every pixel.
+
+    It turns with the camera and does not move with it; NaN where the direction was behind the previous camera.
+    """
+    direction = current.gbuffer.direction
+    size = direction.shape[:2]
+    if same_camera(current.camera, previous.camera):
+        return np.zeros((*size, 2))
+    points = np.concatenate([direction, np.zeros((*size, 1))], axis=-1)
+    return project(points, previous.camera, size)[0] - project(points, current.camera, size)[0]
+
+
 def same_camera(first: Camera, second: Camera) -> bool:
     """Whether two cameras see exactly the same."""
     return first.x_fov == second.x_fov and np.array_equal(first.to_world, second.to_world)

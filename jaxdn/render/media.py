@@ -34,3 +34,8 @@ def transmittance(medium: Any, distance: Any, active: Any) -> Any:
     extinction = medium.get_scattering_coefficients(point, active)[2]
     # A ray that meets nothing has an infinite length: no extinction times that is not a number.
     return dr.exp(-mi.Spectrum(extinction) * dr.minimum(distance, dr.largest(mi.Float)))
+
+
+def medium_behind(hit: Any, medium: Any, direction: Any) -> Any:
+    """The medium of rays that leave a surface, for arrays of hits; ``medium`` is the one in front of it."""
+    return dr.select(hit.is_medium_transition(), hit.target_medium(direction), medium)

@@ -13,6 +13,9 @@ The samples are fixed low-discrepancy points, the same in every pixel and frame:
 Transmitted light counts as reflected. Its radiance is scaled by 1 / eta^2 on the way in and back on the way out, which
 is not a loss: without that factor clear glass has F_b = 1, so its radiance is not divided. For a mask, the light that
 passes through counts as 1: ``opacity * F_b + 1 - opacity``.
+
+The specular part of F_b is the mean of the same weights with those of diffuse lobes left out, as the path tracer tells
+diffuse and specular samples apart (:mod:`jaxdn.render.lobes`).
 """
 
 import functools
@@ -64,10 +67,13 @@ class Reflectances:
                 number = _AVERAGED - len(self._averaged)
                 self._averaged.append(material)
             self._numbers[id(material)] = number
-        self._tables = np.stack(tables) if tables else np.ones((1, 2 * COSINES, 3), np.float32)
+        self._tables = np.stack(tables) if tables else np.ones((1, 2 * COSINES, 6), np.float32)
 
-    def of_pixels(self, hit: Any, bsdf: Any, active: Any, albedo: Any) -> Any:
-        """F_b of all hits at once, for the vectorised variants; NaN where a material cannot be averaged."""
+    def of_pixels(self, hit: Any, bsdf: Any, active: Any, albedo: Any) -> tuple[Any, Any]:
+        """F_b of all hits at once and its specular part, for the vectorised variants.
+
+        F_b is NaN where a material cannot be averaged.
+        """
         numbers = {int(_identity(mi.BSDFPtr(one))[0]): self._numbers[id(one)] for one in self._materials}
         by_identity = np.full(max(numbers, default=0) + 1, _NEITHER, np.int32)
         by_identity[list(numbers)] = list(numbers.values())
@@ -76,28 +82,35 @@ class Reflectances:
         low, share = _places(hit.wi.z, dr)
         tabled = there & (number >= 0)
         start = mi.UInt32(number) * (2 * COSINES) + mi.UInt32(low)
-        stored = mi.Float(self._tables.ravel())
-        ends = [dr.gather(mi.Color3f, stored, start + step, tabled) for step in (0, 1)]
-        found = dr.select(tabled, dr.lerp(ends[0], ends[1], share), dr.nan)
-        found = dr.select(number == _ALBEDO, albedo, found)
+        found, specular = (self._looked_up(part, start, share, tabled) for part in (slice(3), slice(3, 6)))
+        found = dr.select(number == _ALBEDO, albedo, dr.select(tabled, found, dr.nan))
         # Called one by one: a call through the pointer would be compiled for every material of the scene.
         for place, material in enumerate(self._averaged):
             mine = there & (number == _AVERAGED - place)
-            found = dr.select(mine, _averages(hit, material, _points(PIXEL_SAMPLES), mine), found)
-        return found
+            whole, part = _averages(hit, material, _points(PIXEL_SAMPLES), mine)
+            found, specular = dr.select(mine, whole, found), dr.select(mine, part, specular)
+        return found, specular
 
-    def of_one(self, hit: Any, bsdf: Any, albedo: np.ndarray) -> np.ndarray:
-        """F_b [3] of one hit, for the variant without vectorisation."""
+    def _looked_up(self, part: slice, start: Any, share: Any, tabled: Any) -> Any:
+        """Three of the tables' columns between two entries; 0 where there is no table."""
+        stored = mi.Float(np.ascontiguousarray(self._tables[..., part]).ravel())
+        ends = [dr.gather(mi.Color3f, stored, start + step, tabled) for step in (0, 1)]
+        return dr.select(tabled, dr.lerp(ends[0], ends[1], share), 0.0)
+
+    def of_one(self, hit: Any, bsdf: Any, albedo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """F_b [3] of one hit and its specular part [3], for the variant without vectorisation."""
         number = self._numbers.get(id(bsdf), _NEITHER)
         if number == _ALBEDO:
-            return albedo
+            return albedo, np.zeros(3)
         if number == _NEITHER:
-            return np.full(3, np.nan)
+            return np.full(3, np.nan), np.zeros(3)
         if number <= _AVERAGED:
-            return _average(hit, bsdf, _points_array(PIXEL_SAMPLES))
-        low, share = _places(hit.wi[2], np)
-        ends = self._tables[number, int(low) : int(low) + 2]
-        return np.asarray((1 - share) * ends[0] + share * ends[1], np.float64)
+            found = _average(hit, bsdf, _points_array(PIXEL_SAMPLES))
+        else:
+            low, share = _places(hit.wi[2], np)
+            ends = self._tables[number, int(low) : int(low) + 2]
+            found = np.asarray((1 - share) * ends[0] + share * ends[1], np.float64)
+        return found[:3], found[3:]
 
 
 def _materials(scene: Any) -> Iterator[Any]:
@@ -186,29 +199,36 @@ def _points(count: int) -> Any:
 
 
 @dr.syntax
-def _averages(hit: Any, bsdf: Any, points: Any, active: Any) -> Any:
-    """The mean weight of the samples at ``points`` in every lane that is active."""
+def _averages(hit: Any, bsdf: Any, points: Any, active: Any) -> tuple[Any, Any]:
+    """The mean weight of the samples at ``points``, and that of specular lobes, in every lane that is active."""
     context = mi.BSDFContext()
     # Opaque values are data, in which a loop is recorded once; literals would turn into data in a second recording.
     nothing, count = dr.opaque(mi.Float, 0), dr.opaque(mi.UInt32, PIXEL_SAMPLES)
     total = mi.Color3f(nothing, nothing, nothing)
+    specular = mi.Color3f(nothing, nothing, nothing)
     index: Any = dr.opaque(mi.UInt32, 0)
     running: Any = mi.Bool(active)
     while running:
         lobe, x, y = (dr.gather(mi.Float, points, index * 3 + axis, running) for axis in range(3))
         sampled, weight = bsdf.sample(context, hit, lobe, mi.Point2f(x, y), running)
-        total += dr.select(running, mi.Color3f(weight * dr.square(sampled.eta)), 0.0)
+        light = mi.Color3f(weight * dr.square(sampled.eta))
+        total += dr.select(running, light, 0.0)
+        is_specular = running & ~mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Diffuse)
+        specular += dr.select(is_specular, light, 0.0)
         index += 1
         running &= index < count
-    return total / float(PIXEL_SAMPLES)
+    return total / float(PIXEL_SAMPLES), specular / float(PIXEL_SAMPLES)
 
 
 def _average(hit: Any, bsdf: Any, points: np.ndarray) -> np.ndarray:
-    """The same of one hit, for the variant without vectorisation."""
-    context, total = mi.BSDFContext(), np.zeros(3)
+    """The same of one hit as one array [6], for the variant without vectorisation."""
+    context, total = mi.BSDFContext(), np.zeros(6)
     for lobe, x, y in points.tolist():
         sampled, weight = bsdf.sample(context, hit, lobe, [x, y])
-        total += np.array(weight, np.float64) * sampled.eta**2 if sampled.pdf > 0 else 0.0
+        if sampled.pdf > 0:
+            light = np.array(weight, np.float64) * sampled.eta**2
+            total[:3] += light
+            total[3:] += 0.0 if int(sampled.sampled_type) & int(mi.BSDFFlags.Diffuse) else light
     return total / len(points)
 
 
@@ -216,7 +236,8 @@ _made: dict[str, np.ndarray] = {}
 
 
 def _table(bsdf: Any) -> np.ndarray:
-    """[2 * COSINES, 3] F_b of a material that is constant over the surface, from inside and from outside."""
+    """[2 * COSINES, 6] F_b of a material that is constant over the surface, from inside and from outside, and its
+    specular part."""
     content = _content(bsdf)
     if content not in _made:
         if len(_made) >= _KEPT:
@@ -246,8 +267,10 @@ def _table_at_once(bsdf: Any, cosines: np.ndarray) -> np.ndarray:
     sampled, weight = bsdf.sample(mi.BSDFContext(), hit, lobe, mi.Point2f(x, y), True)
     # A weight that is the same for all lanes (thin glass) has only one value.
     weight = mi.Color3f(weight * dr.square(sampled.eta)) + mi.Color3f(dr.zeros(mi.Float, dr.width(lane)))
-    dr.eval(weight)
-    return np.array(weight, np.float64).T.reshape(len(cosines), TABLE_SAMPLES, 3).mean(axis=1)
+    specular = dr.select(mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Diffuse), mi.Color3f(0.0), weight)
+    dr.eval(weight, specular)
+    lights = [np.array(each, np.float64).T.reshape(len(cosines), TABLE_SAMPLES, 3) for each in (weight, specular)]
+    return np.concatenate([each.mean(axis=1) for each in lights], axis=-1)
 
 
 def _table_one_by_one(bsdf: Any, cosines: np.ndarray) -> np.ndarray:

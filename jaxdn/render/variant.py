@@ -102,6 +102,11 @@ def _find(requested: str | None) -> Choice:
     return Choice("scalar_rgb", "", f"no LLVM library works here. {advice()}" if not requested else "it was requested")
 
 
+def tells_lobes(variant: str) -> bool:
+    """Whether a variant can tell diffuse from specular samples: the scalar one uses Mitsuba's own integrators."""
+    return not variant.startswith("scalar")
+
+
 def advice() -> str:
     """What to install to render faster."""
     return (

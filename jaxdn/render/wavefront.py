@@ -2,16 +2,20 @@
 
 One lane is one path through the centre of one pixel. The estimator is that of Mitsuba's ``path`` integrator (next-event
 estimation and BSDF sampling, balance heuristic; Veach 1997, sec. 9.2), so sums agree with it, but one pass gives all
-three parts, and the random numbers depend only on (pixel, sample, frame, seed).
+three parts, and the random numbers depend only on (pixel, sample, frame, seed). Which lobe a path took at its first hit
+is found by a second, short trace with the same numbers (:mod:`jaxdn.render.lobes`), where that is requested.
 """
 
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from jaxdn.render.media import media_of, transmittance
+from jaxdn.render.light_samples import Shadows, light_sample, no_shadows, shadow_sums
+from jaxdn.render.lobes import Lobes, bounce_numbers, first_segment, lobe_sums, no_lobes
+from jaxdn.render.media import media_of, medium_behind, transmittance
 from jaxdn.render.seeds import frame_key
 
 MAX_LANES = 1 << 20
@@ -29,6 +33,10 @@ class Accumulated(NamedTuple):
     indirect: np.ndarray
     bad: int
     """Number of samples that were not finite (or beyond ``BRIGHTEST``); they count as black."""
+    lobes: Lobes | None = None
+    """The same samples by the lobe of their first reflection; None if it was not requested."""
+    shadows: Shadows | None = None
+    """Their light straight from lights, with and without its shadows; None if it was not requested."""
 
     def plus(self, other: "Accumulated") -> "Accumulated":
         """The sums over both sets of samples."""
@@ -37,7 +45,20 @@ class Accumulated(NamedTuple):
             self.direct + other.direct,
             self.indirect + other.indirect,
             self.bad + other.bad,
+            None if self.lobes is None or other.lobes is None else self.lobes.plus(other.lobes),
+            None if self.shadows is None or other.shadows is None else self.shadows.plus(other.shadows),
         )
+
+
+class Request(NamedTuple):
+    """What else is to be told of samples."""
+
+    lobes: bool = False
+    """Diffuse and specular samples apart (``Accumulated.lobes``)."""
+    shadows: bool = False
+    """Light with and without shadows (``Accumulated.shadows``)."""
+    direct: bool = False
+    """The lobes' light is all that is reflected, not the indirect light alone."""
 
 
 class Replayed(NamedTuple):
@@ -49,10 +70,14 @@ class Replayed(NamedTuple):
     """[n, 3] float64 what the camera ray hit; NaN where it hit nothing."""
 
 
-def no_light(shape: tuple[int, ...]) -> Accumulated:
+_NOTHING_ELSE = Request()
+
+
+def no_light(shape: tuple[int, ...], request: Request = _NOTHING_ELSE) -> Accumulated:
     """The sums over no samples."""
     emitted, direct, indirect = np.zeros((3, *shape, 3))
-    return Accumulated(emitted, direct, indirect, 0)
+    lobes = no_lobes(shape) if request.lobes else None
+    return Accumulated(emitted, direct, indirect, 0, lobes, no_shadows(shape) if request.shadows else None)
 
 
 def generator(pixel: Any, sample: Any, key: tuple[int, int]) -> Any:
@@ -114,9 +139,7 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
 
         # Sample an emitter, and draw the numbers of this bounce whether or not they are used.
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        pick = mi.Point2f(numbers.next_float32(), numbers.next_float32())
-        lobe = numbers.next_float32()
-        point = mi.Point2f(numbers.next_float32(), numbers.next_float32())
+        pick, lobe, point = bounce_numbers(numbers)
         towards, radiance = scene.sample_emitter_direction(hit, pick, True, smooth)
         smooth &= towards.pdf != 0.0
         reflected, bsdf_pdf, sampled, bsdf_weight = bsdf.eval_pdf_sample(
@@ -125,14 +148,14 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
         weight = dr.select(towards.delta, 1.0, towards.pdf / (towards.pdf + bsdf_pdf))
         light = dr.select(smooth, throughput * reflected * radiance * weight, 0.0)
         if absorbing:  # surfaces between two media block this ray: it stays in one
-            light *= transmittance(_behind(hit, medium, towards.d), towards.dist, smooth)
+            light *= transmittance(medium_behind(hit, medium, towards.d), towards.dist, smooth)
         direct += dr.select(depth == 0, light, 0.0)
         indirect += dr.select(depth >= 1, light, 0.0)
 
         throughput *= bsdf_weight
         ray = hit.spawn_ray(hit.to_world(sampled.wo))
         if absorbing:
-            medium = _behind(hit, medium, ray.d)
+            medium = medium_behind(hit, medium, ray.d)
         last = hit
         last_pdf = sampled.pdf
         last_delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
@@ -141,13 +164,15 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
     return emitted, direct, indirect
 
 
-def _behind(hit: Any, medium: Any, direction: Any) -> Any:
-    """The medium of rays that leave a surface."""
-    return dr.select(hit.is_medium_transition(), hit.target_medium(direction), medium)
-
-
 def _chunk(
-    scene: Any, first_pixel: int, pixels: int, first: int, count: int, key: tuple[int, int], depth: int
+    scene: Any,
+    first_pixel: int,
+    pixels: int,
+    first: int,
+    count: int,
+    key: tuple[int, int],
+    depth: int,
+    request: Request,
 ) -> Accumulated:
     """The sums of ``count`` samples of consecutive pixels, flat [pixels, 3].
 
@@ -159,6 +184,7 @@ def _chunk(
       count: samples per pixel.
       key: of the stream (:func:`jaxdn.render.seeds.frame_key`).
       depth: path length.
+      request: what else is told of the samples.
     """
     sensor = scene.sensors()[0]
     width = dr.opaque(mi.UInt32, int(sensor.film().crop_size()[0]))
@@ -179,7 +205,28 @@ def _chunk(
     sums = [[dr.block_sum(part[channel], count) for channel in range(3)] for part in parts]
     dr.eval(sums)
     images = [np.stack([np.array(channel, np.float64) for channel in part], axis=-1) for part in sums]
-    return Accumulated(images[0], images[1], images[2], int(dr.sum(bad)[0]))
+    found = _apart(scene, ray, lambda: generator(pixel, sample, key), parts, finite, count, request)
+    return Accumulated(images[0], images[1], images[2], int(dr.sum(bad)[0]), *found)
+
+
+def _apart(
+    scene: Any, ray: Any, numbers: Callable[[], Any], parts: list[Any], finite: Any, count: int, request: Request
+) -> tuple[Lobes | None, Shadows | None]:
+    """What is requested of the lanes whose light is ``parts``: emitted, direct, indirect; ``numbers`` begins anew."""
+    lobes = shadows = None
+    lamp = light_sample(scene, ray, numbers()) if request.shadows or (request.lobes and request.direct) else None
+    if request.lobes:
+        segment = first_segment(scene, ray, numbers())
+        arriving, glossy = parts[2], mi.Spectrum(0.0)
+        if request.direct and lamp is not None:
+            # Straight from a light's sampled point by both kinds of lobes; the rest by the lobe that was sampled.
+            found = dr.select(lamp.blocked, 0.0, lamp.whole)
+            arriving = arriving + dr.maximum(parts[1] - found, 0.0)
+            glossy = dr.select(lamp.blocked, 0.0, lamp.whole - lamp.diffuse)
+        lobes = lobe_sums(segment, dr.select(segment[1], arriving, 0.0) + glossy, finite, count)
+    if request.shadows and lamp is not None:
+        shadows = shadow_sums(lamp, finite, count)
+    return lobes, shadows
 
 
 def accumulate(
@@ -192,6 +239,7 @@ def accumulate(
     count: int,
     max_depth: int,
     max_lanes: int = MAX_LANES,
+    request: Request = _NOTHING_ELSE,
 ) -> Accumulated:
     """The sums of the samples ``first`` to ``first + count`` of one stream over the scene's film.
 
@@ -204,6 +252,7 @@ def accumulate(
       count: samples per pixel.
       max_depth: path length.
       max_lanes: paths traced at a time.
+      request: what else is told of the samples.
     """
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     key = frame_key(seed, frame, stream)
@@ -212,12 +261,23 @@ def accumulate(
     runs = []
     for start in range(0, width * height, pixels):
         size = min(pixels, width * height - start)
-        total = no_light((size,))
+        total = no_light((size,), request)
         for done in range(0, count, batch):
-            total = total.plus(_chunk(scene, start, size, first + done, min(batch, count - done), key, max_depth))
+            samples = (first + done, min(batch, count - done))
+            total = total.plus(_chunk(scene, start, size, *samples, key, max_depth, request))
         runs.append(total)
-    images = [np.concatenate([run[part] for run in runs]).reshape(height, width, 3) for part in range(3)]
-    return Accumulated(images[0], images[1], images[2], sum(run.bad for run in runs))
+    parts = zip(*((run.emitted, run.direct, run.indirect) for run in runs), strict=True)
+    images = [_whole(part, height, width) for part in parts]
+    found = [run.lobes for run in runs if run.lobes is not None]
+    lobes = Lobes(*(_whole(part, height, width) for part in zip(*found, strict=True))) if found else None
+    lamps = [run.shadows for run in runs if run.shadows is not None]
+    shadows = Shadows(*(_whole(part, height, width) for part in zip(*lamps, strict=True))) if lamps else None
+    return Accumulated(images[0], images[1], images[2], sum(run.bad for run in runs), lobes, shadows)
+
+
+def _whole(parts: Iterable[np.ndarray], height: int, width: int) -> np.ndarray:
+    """Flat parts of an image as one image."""
+    return np.concatenate(list(parts)).reshape(height, width, -1)
 
 
 def replay(

@@ -13,6 +13,9 @@ CHAINS = {
     "dual_motion": "motion",
     "previous_depth": "depth",
     "reflectance": "albedo",
+    "ray_length": "depth",
+    "far_motion": "motion",
+    "unshadowed": "shadowed",
     "shadow_motion": "motion",
     "glossy_motion": "motion",
 }

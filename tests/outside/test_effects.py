@@ -15,7 +15,7 @@ from experiments.speed.small_rooms import CASES, FRAMES
 from jaxdn import effects
 from jaxdn.commands import inspect as command
 from jaxdn.effects import EFFECTS, Effect, Effects, Facts, Light, Moment, Surface
-from jaxdn.frame import BUFFERS, Frame
+from jaxdn.frame import BUFFERS, ON_REQUEST, Frame
 
 SIZE = {"width": 24, "height": 16}
 PLANNING = Path(effects.__file__).parent / "planning"
@@ -163,7 +163,7 @@ def test_an_invalid_scene_is_refused(scene):
 
 
 def test_every_effect_has_a_description():
-    assert len({effect.name for effect in EFFECTS}) == 14
+    assert len({effect.name for effect in EFFECTS}) == 15
     for effect in EFFECTS:
         assert effect.sentence.endswith(".")
         assert effect.buffers <= set(Frame._fields)
@@ -172,7 +172,7 @@ def test_every_effect_has_a_description():
 def test_left_out_buffers_are_relative_to_rendering_without_a_plan():
     nothing = effects.plan(effects.chosen([], 1))
     assert command.bytes_a_pixel(command.EVERYTHING) == 88
-    assert set(command.left_out(nothing)) == {name for effect in EFFECTS for name in effect.buffers}
+    assert set(command.left_out(nothing)) == {name for effect in EFFECTS for name in effect.buffers} - ON_REQUEST
     assert command.bytes_a_pixel(nothing) == 18 + sum(BUFFERS[name].bytes for name in nothing.buffers)
     assert command.channels(("normal", "ids")) == ["normal.X", "normal.Y", "normal.Z", "ids.Y"]
 

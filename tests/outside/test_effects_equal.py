@@ -129,7 +129,8 @@ def test_training_mixes_clips_of_different_effects(tmp_path):
 def test_a_finished_clip_is_inspected_without_its_scene(tmp_path):
     everything, auto = rendered(room("rough metal", "ball"), tmp_path)
     found = effects.inspect(auto)
-    assert set(found) == {"object-motion", "disocclusion", "indirect", "glossy", "specular", "moving-shadow"}
+    seen = {"object-motion", "disocclusion", "indirect", "glossy", "specular", "moving-shadow", "moving-reflection"}
+    assert set(found) == seen
     blind = effects.inspect(everything)
     assert set(found) <= set(blind)
     assert {"transmission", "media"} <= set(blind.uncertain)
