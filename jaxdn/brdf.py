@@ -191,12 +191,18 @@ def remodulate(light: jax.Array, reflectance: jax.Array, *, floor: float = FLOOR
     return light * divisor(reflectance, floor=floor)
 
 
-def texture_left(reflectance: jax.Array, divided_by: jax.Array) -> jax.Array:
+def texture_left(reflectance: jax.Array, divided_by: jax.Array, light: jax.Array | None = None) -> jax.Array:
     """The texture that a division leaves: what light of 1 looks like after it, ``reflectance / divided_by``, <= 1.
 
-    It is 1 where the reflectance is not small, and dark where the divisor is larger than the reflectance.
+    It is 1 where the reflectance is not small, and dark where the divisor is larger than the reflectance. It is 1, too,
+    where there is ``light`` [..., 3] though less than 0.005 of every colour is reflected: that light is emitted, and
+    the texture is none of it. Without ``light`` nothing is.
     """
-    return jnp.minimum(reflectance / divided_by, 1.0)
+    texture = jnp.minimum(reflectance / divided_by, 1.0)
+    if light is None:
+        return texture
+    black = jnp.max(reflectance, axis=-1, keepdims=True) < _BLACK
+    return jnp.where(black & (jnp.max(light, axis=-1, keepdims=True) > 0), 1.0, texture)
 
 
 def hue_left(texture: jax.Array) -> jax.Array:
@@ -220,6 +226,7 @@ def restore(filtered: jax.Array, texture: jax.Array, filtered_texture: jax.Array
     return filtered * ((texture + _UNEXPLAINED) / (filtered_texture + _UNEXPLAINED))
 
 
+_BLACK = 0.005
 _FAINT, _UNEXPLAINED = 0.3, 0.01
 """From 0.1 to 0.3 the first, and from 0.02 to 0.1 the second, make no difference of more than 0.03 dB to svgf (means
 of four and of nine clips).

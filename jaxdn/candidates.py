@@ -50,14 +50,13 @@ def candidate(name: str, **options: Any) -> Candidate:
         return Candidate(name, None, {})
     if name in methods():
         method = method_named(name)
-        if method.learns:
+        if not method.filter:
             trained = [each for each in shipped_names() if describe(each)["factory"] == name]
             raise ValueError(
                 f"method {name!r}: expected its weights, {', '.join([*trained, 'the path of a .safetensors file'])}; "
                 "`jaxdn train` makes some."
             )
-        denoiser = method.factory(**options)
-        return Candidate(name, denoiser, denoiser.init(jax.random.key(0), _smallest()), method, options)
+        return Candidate(name, method.factory(**options), {}, method, options)
     if not name.endswith(".safetensors") and name not in shipped_names():
         raise ValueError(
             f"method {name!r}: expected one of {', '.join(all_names())} or the path of a .safetensors file."
@@ -78,8 +77,8 @@ def untrained(method: Method, **options: Any) -> Candidate:
 
 
 def filters() -> list[str]:
-    """The names of the methods that have no weights."""
-    return [name for name, method in methods().items() if not method.learns]
+    """The names of the methods that denoise without training."""
+    return [name for name, method in methods().items() if method.filter]
 
 
 def all_names() -> list[str]:
@@ -91,7 +90,7 @@ def everything() -> Iterator[Candidate]:
     """Filters, shipped weights, and learned methods without shipped weights, with initial weights."""
     yield from (candidate(name) for name in all_names() if name != NOISY)
     trained = {describe(name)["factory"] for name in shipped_names()}
-    yield from (untrained(method) for name, method in methods().items() if method.learns and name not in trained)
+    yield from (untrained(method) for name, method in methods().items() if not method.filter and name not in trained)
 
 
 def _smallest() -> Frame:

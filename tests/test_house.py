@@ -33,7 +33,7 @@ LAYERS = {
     **dict.fromkeys((*MATHS, "ops", "losses", "metrics", "flip", "sampling", "objectives", "recipe", "variation"), 1),
     **dict.fromkeys(("filters", "networks"), 2),
     **dict.fromkeys(("methods", "denoisers"), 3),
-    **dict.fromkeys(("rollout", "learning", "planning"), 4),
+    **dict.fromkeys(("rollout", "additive", "learning", "planning"), 4),
     **dict.fromkeys(("files", "render", "clips", "checkpoint", "report", "weights", "candidates"), 5),
     "effects": 6,
     **dict.fromkeys(("cli", "commands"), 7),

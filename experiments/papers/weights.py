@@ -1,4 +1,4 @@
-"""The shipped weights: render the clips, train `steady-balanced`, `ntd-small` and `ntd-large`, and A, B, C.
+"""The shipped weights: render the clips, fit `svgf`, train `steady-balanced`, `ntd-small` and `ntd-large`, and A, B, C.
 
     python -m experiments.papers.weights --rooms rooms/*/scene.xml    # `make weights`: hours; resumable
 
@@ -47,6 +47,7 @@ SQUARES = unbiased_illumination(squared_from=0.0)
 """For stages whose start has had its L1, which would make images darker again."""
 
 STAGES = (
+    Stage("svgf-fitted", "svgf", {}, 300),
     Stage("steady-begun", "steady", {"quality": "balanced"}, 8000, decay=False),
     Stage("steady-balanced", "steady", {"quality": "balanced"}, 1000, start="steady-begun"),
     Stage("small-begun", "ntd", {"size": "small"}, 4000, decay=False),
@@ -107,9 +108,10 @@ def render_all(settings: Settings) -> None:
 def train_stage(stage: Stage, settings: Settings) -> Path:
     """The weights of a stage, trained if they do not exist."""
     method = method_named(stage.method)
-    recipe = method.recipe_named(stage.recipe)._replace(
-        steps=stage.steps, decay=stage.decay, average=0.99, spp=(1, 1, 1, 2, 4, 16)
-    )
+    recipe = method.recipe_named(stage.recipe)
+    # The few numbers of a filter are at rest sooner: its own recipe says over how many updates their mean is taken.
+    average = recipe.average if method.filter else 0.99
+    recipe = recipe._replace(steps=stage.steps, decay=stage.decay, average=average, spp=(1, 1, 1, 2, 4, 16))
     if stage.objective is not None:
         recipe = recipe._replace(objective=stage.objective)
     return train(

@@ -230,7 +230,7 @@ CASES: dict[str, Case] = {
     "no light": Case(box(), {}, set()),
     "instances": Case(box() + BEHIND + INSTANCES, {}, LIT | {"specular", "mirror"}),
     "instances that move": Case(
-        box() + BEHIND + INSTANCES, ANIMATIONS["ball"][0], LIT | OBJECT | {"specular", "mirror"}
+        box() + BEHIND + INSTANCES, ANIMATIONS["ball"][0], LIT | OBJECT | {"specular", "mirror", "moving-reflection"}
     ),
     "open to the sky": Case(box(open_front=True) + ENVIRONMENT, {}, LIT | {"environment", "emission"}),
     "a sky that cannot be seen": Case(
@@ -248,7 +248,16 @@ CASES: dict[str, Case] = {
         LIT
         | OBJECT
         | CAMERA
-        | {"changing-light", "emission", "texture", "specular", "mirror", "transmission", "glossy"},
+        | {
+            "changing-light",
+            "emission",
+            "texture",
+            "specular",
+            "mirror",
+            "transmission",
+            "glossy",
+            "moving-reflection",
+        },
     ),
 }
 """Name -> scene with exactly the effects that have to be found."""

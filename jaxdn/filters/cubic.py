@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxdn.motion import targets
 
-def warp_cubic(image: jax.Array, motion: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Fetch ``image`` [H, W, C] at ``p + motion(p)`` by Catmull-Rom interpolation; [H, W, 1] bool, it is on screen.
+
+def warp_cubic(image: jax.Array, motion: jax.Array) -> jax.Array:
+    """Fetch ``image`` [H, W, C] at ``p + motion(p)`` by Catmull-Rom interpolation.
 
     Sharper than bilinear interpolation, whose blur a history adds up. With f the fraction between two pixels, the
     weights of four pixels in a row are ``-f/2 + f^2 - f^3/2, 1 - 5f^2/2 + 3f^3/2, f/2 + 2f^2 - 3f^3/2,
@@ -16,9 +18,7 @@ def warp_cubic(image: jax.Array, motion: jax.Array) -> tuple[jax.Array, jax.Arra
     height, width, channels = image.shape
     motion = lax.stop_gradient(motion)
     known = jnp.all(jnp.isfinite(motion), axis=-1)
-    motion = jnp.where(known[..., None], motion, 0.0)
-    x = lax.broadcasted_iota(motion.dtype, (height, width), 1) + motion[..., 0]
-    y = lax.broadcasted_iota(motion.dtype, (height, width), 0) + motion[..., 1]
+    x, y = targets(jnp.where(known[..., None], motion, 0.0))
     inside = known & (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
     x, y = jnp.where(inside, x, 0.0), jnp.where(inside, y, 0.0)
     left, top = jnp.floor(x), jnp.floor(y)
@@ -33,7 +33,7 @@ def warp_cubic(image: jax.Array, motion: jax.Array) -> tuple[jax.Array, jax.Arra
             flat, (start + row * (width + 4) * channels)[..., None], four, (4 * channels,), mode="promise_in_bounds"
         ).reshape(height, width, 4, channels)
         total = total + down[..., None] * sum(weight[..., None] * found[:, :, i] for i, weight in enumerate(across))
-    return jnp.where(inside[..., None], jnp.maximum(total, 0.0), 0.0), inside[..., None]
+    return jnp.where(inside[..., None], jnp.maximum(total, 0.0), 0.0)
 
 
 def catmull_rom(f: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:

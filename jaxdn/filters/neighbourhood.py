@@ -16,17 +16,20 @@ Box = Literal["variance", "minmax"]
 """How the neighbourhood limits the history, see :func:`box_around`."""
 
 
-def to_ycocg(image: jax.Array) -> jax.Array:
-    """RGB to luma and two differences: Y = (R + 2G + B) / 4, Co = (R - B) / 2, Cg = (2G - R - B) / 4."""
-    red, green, blue = image[..., 0], image[..., 1], image[..., 2]
-    return jnp.stack([(red + 2 * green + blue) / 4, (red - blue) / 2, (2 * green - red - blue) / 4], axis=-1)
+def to_ycocg(image: jax.Array, *, axis: int = -1) -> jax.Array:
+    """RGB to luma and two differences: Y = (R + 2G + B) / 4, Co = (R - B) / 2, Cg = (2G - R - B) / 4.
+
+    ``axis`` is that of the channels.
+    """
+    red, green, blue = jnp.moveaxis(image, axis, 0)
+    return jnp.stack([(red + 2 * green + blue) / 4, (red - blue) / 2, (2 * green - red - blue) / 4], axis=axis)
 
 
-def from_ycocg(image: jax.Array) -> jax.Array:
+def from_ycocg(image: jax.Array, *, axis: int = -1) -> jax.Array:
     """The inverse of :func:`to_ycocg`."""
-    luma, orange, green = image[..., 0], image[..., 1], image[..., 2]
+    luma, orange, green = jnp.moveaxis(image, axis, 0)
     rest = luma - green
-    return jnp.stack([rest + orange, luma + green, rest - orange], axis=-1)
+    return jnp.stack([rest + orange, luma + green, rest - orange], axis=axis)
 
 
 def neighbours(image: jax.Array) -> Iterator[jax.Array]:

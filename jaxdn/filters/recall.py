@@ -16,6 +16,7 @@ from jax import lax
 from jaxdn.filters.guides import Guides, guides_of, pack, shared, unpack
 from jaxdn.filters.reprojection import WEIGHT_MIN, Expected, expected, same_surface
 from jaxdn.frame import Frame
+from jaxdn.motion import targets
 from jaxdn.ops.strips import by_strips
 from jaxdn.ops.warp import cells, corners, differentiable_mean
 
@@ -105,9 +106,7 @@ def _cells(motion: jax.Array, first: jax.Array) -> _Cells:
     height, width = motion.shape[:2]
     motion = lax.stop_gradient(motion)
     known = jnp.all(jnp.isfinite(motion), axis=-1)
-    motion = jnp.where(known[..., None], motion, 0.0)
-    x = lax.broadcasted_iota(motion.dtype, (height, width), 1) + motion[..., 0]
-    y = lax.broadcasted_iota(motion.dtype, (height, width), 0) + motion[..., 1]
+    x, y = targets(jnp.where(known[..., None], motion, 0.0))
     inside = known & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1) & ~first
     left, top, fx, fy = cells(jnp.clip(x, 0, width - 1), jnp.clip(y, 0, height - 1), height, width)
     return _Cells(left, top, fx, fy, inside)

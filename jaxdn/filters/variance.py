@@ -5,22 +5,35 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
+from jaxdn import brdf
+from jaxdn.filters.accumulation import luminance
 from jaxdn.filters.atrous import edge_average, stencil
 from jaxdn.filters.weights import Weight
 
 
 def estimate_variance(
-    history: jax.Array, hit: jax.Array | None, weights: Sequence[Weight], *, short_history: int
+    history: jax.Array,
+    hit: jax.Array | None,
+    weights: Sequence[Weight],
+    *,
+    short_history: int,
+    texture: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Colour [3, H, W] and the variance [H, W] of its luminance, from a history of ``accumulate``.
 
     Where the length N is less than ``short_history``, both are those of the edge-stopped 7x7 neighbourhood, and the
-    variance is multiplied by ``short_history / N`` (Schied et al. 2017, sec. 4.2).
+    variance is multiplied by ``short_history / N`` (Schied et al. 2017, sec. 4.2). The ``texture`` [3, H, W] that a
+    division left is averaged likewise and given back to this colour (:func:`jaxdn.brdf.restore`); the deviation changes
+    as grey light would.
     """
     color, moments, length = history[:3], history[3:5], history[5]
     variance = jnp.maximum(moments[1] - moments[0] ** 2, 0.0)
     short = length < short_history
     needed = short if hit is None else short & hit
-    mean, _ = edge_average(history[:5], hit, weights, stencil(3), needed=needed)
-    spatial = jnp.maximum(mean[4] - mean[3] ** 2, 0.0) * (short_history / length)
-    return jnp.where(needed[None], mean[:3], color), jnp.where(needed, spatial, variance)
+    planes = history[:5] if texture is None else jnp.concatenate([history[:5], texture])
+    mean, _ = edge_average(planes, hit, weights, stencil(3), needed=needed)
+    around, spatial = mean[:3], jnp.maximum(mean[4] - mean[3] ** 2, 0.0) * (short_history / length)
+    if texture is not None:
+        around = brdf.restore(around, texture, mean[5:])
+        spatial = spatial * brdf.restore(jnp.ones_like(spatial), luminance(texture), luminance(mean[5:])) ** 2
+    return jnp.where(needed[None], around, color), jnp.where(needed, spatial, variance)

@@ -32,6 +32,7 @@ from jaxdn.filters.guides import hit_mask
 from jaxdn.frame import Frame
 from jaxdn.methods import svgf
 from jaxdn.methods.demodulated import demodulated
+from jaxdn.methods.fitted import FITTING, LEARNED, moved, unmoved
 from jaxdn.methods.table import method
 from jaxdn.options import Range
 
@@ -40,7 +41,7 @@ from jaxdn.options import Range
 class Options(svgf.Options):
     """The options of ``svgf``, and those of the gradients."""
 
-    alpha: Annotated[float, Range(0, 1, without_low=True)] = 0.1
+    alpha: Annotated[float, Range(0, 1, without_low=True), LEARNED] = 0.1
     """Minimum weight of the new frame in colour, where light has not changed."""
     gradient_levels: Annotated[int, Range(0, 5)] = 3
     """Levels of the filter over strata: it averages over ``3 * 3^levels`` pixels in each direction."""
@@ -56,9 +57,11 @@ class Options(svgf.Options):
     Options,
     title="SVGF that adapts to changes of light (Schied et al. 2018)",
     presets={"paper": Options(sigma_normal=128.0, significance=0.0, antilag=1.0)},
+    recipes={"usual": FITTING},
+    filter=True,
 )
 def asvgf(options: Options) -> Denoiser:
-    """A-SVGF, a filter without weights (``params`` is ``{}``).
+    """A-SVGF, a filter that needs no weights: ``params`` are ``{}``, or move the options that ``svgf``'s move.
 
     Reads what ``svgf`` reads, and luminance_gradient. A frame in which no sample was replayed (the buffer is absent, or
     0 everywhere) is compared with the history instead.
@@ -68,12 +71,14 @@ def asvgf(options: Options) -> Denoiser:
     def step(
         params: Params, state: svgf.SvgfState, frame: Frame, first: jax.Array
     ) -> tuple[svgf.SvgfState, jax.Array, jax.Array]:
-        past, broken = svgf.recall_history(options, state, frame, first)
-        change = 1.0 - (1.0 - changed(options, past, frame)) ** options.antilag
-        history = svgf.blend(options, past, frame, change)
-        return (*svgf.filter_history(options, history, frame), broken)
+        fitted = moved(options, params)
+        past, broken = svgf.recall_history(fitted, state, frame, first)
+        change = 1.0 - (1.0 - changed(fitted, past, frame)) ** fitted.antilag
+        history = svgf.blend(fitted, past, frame, change)
+        return (*svgf.filter_history(fitted, history, frame), broken)
 
-    plain = recurrent(Core(svgf.start, step, svgf.READS | {"luminance_gradient"}))
+    reads = svgf.READS | {"luminance_gradient"}
+    plain = recurrent(Core(svgf.start, step, reads, lambda key, frame: unmoved(options)))
     return demodulated(plain, by=options.demodulate)
 
 

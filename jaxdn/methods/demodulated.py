@@ -66,9 +66,15 @@ def texture_left(frame: Frame, by: Demodulation | bool) -> jax.Array | None:
     back brightness too costs svgf 1.4 dB). ``by="albedo"`` leaves the textures of black pixels alone, as it was.
     """
     reflectance = _reflectance(frame)
-    if _chosen(by) != "brdf" or reflectance is None:
-        return None
-    texture = brdf.texture_left(reflectance, brdf.divisor(reflectance))
+    return None if _chosen(by) != "brdf" or reflectance is None else texture_of(reflectance, frame, frame.radiance)
+
+
+def texture_of(reflectance: jax.Array, frame: Frame, light: jax.Array) -> jax.Array:
+    """The texture [H, W, 3] that a division leaves of a reflectance of the frame, whole or without its specular part.
+
+    As in :func:`texture_left`. ``light`` [H, W, 3] is what is divided by it, or was.
+    """
+    texture = brdf.texture_left(reflectance, brdf.divisor(reflectance), light)
     if frame.albedo is None:
         return texture
     colours = brdf.hue_left(texture)

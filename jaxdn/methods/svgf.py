@@ -13,23 +13,22 @@ Illumination", 2017.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 
-from jaxdn import brdf
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.filters.accumulation import accumulate, luminance
-from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
-from jaxdn.filters.blur import blur_variance
+from jaxdn.filters.accumulation import accumulate
+from jaxdn.filters.atrous import B3_SPLINE, stencil
+from jaxdn.filters.cascade import cascade
 from jaxdn.filters.guides import Guides, guides_of, hit_mask, pack, shared, unpack
 from jaxdn.filters.reprojection import expected, reproject, same_surface
 from jaxdn.filters.variance import estimate_variance
-from jaxdn.filters.weights import Weight, depth_weight, luminance_weight, normal_weight
+from jaxdn.filters.weights import Weight, depth_weight, normal_weight
 from jaxdn.frame import Array, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
+from jaxdn.methods.fitted import FITTING, LEARNED, LEARNED_PER_LEVEL, at_level, moved, unmoved
 from jaxdn.methods.table import method
 from jaxdn.options import Range
 
@@ -37,23 +36,22 @@ READS = frozenset({"normal", "depth", "previous_depth", "motion", "ids"})
 _TAPS = stencil(2, kernel=B3_SPLINE)
 _POSITIVE = Range(0, without_low=True)
 _SHARE = Range(0, 1, without_low=True)
-_Planes = tuple[jax.Array, jax.Array, jax.Array]
 
 
 @dataclass(frozen=True)
 class Options:
     """The parameters, with the paper's defaults where it gives them, except for ``sigma_normal``."""
 
-    alpha: Annotated[float, _SHARE] = 0.2
+    alpha: Annotated[float, _SHARE, LEARNED] = 0.2
     """Minimum weight of the new frame in colour; the weight is ``max(alpha, 1 / N)`` at history length N."""
-    alpha_moments: Annotated[float, _SHARE] = 0.2
+    alpha_moments: Annotated[float, _SHARE, LEARNED] = 0.2
     """The same for the moments of luminance."""
-    sigma_depth: Annotated[float, _POSITIVE] = 1.0
+    sigma_depth: Annotated[float, _POSITIVE, LEARNED_PER_LEVEL] = 1.0
     """Edge-stopping parameter for differences in depth."""
-    sigma_normal: Annotated[float, Range(0)] = 16.0
+    sigma_normal: Annotated[float, Range(0), LEARNED_PER_LEVEL] = 16.0
     """Exponent of the cosine of normals. The paper's 128 (``preset="paper"``) keeps light of one curved or bumpy
     surface apart: at 1 sample per pixel 16 has 1.6 dB more on held-out clips."""
-    sigma_luminance: Annotated[float, _POSITIVE] = 4.0
+    sigma_luminance: Annotated[float, _POSITIVE, LEARNED_PER_LEVEL] = 4.0
     """Edge-stopping parameter for differences in luminance, in standard deviations."""
     levels: Annotated[int, Range(0, 10)] = 5
     """Levels of the a-trous filter."""
@@ -91,9 +89,12 @@ class SvgfState(NamedTuple):
     Options,
     title="Spatiotemporal variance-guided filtering (Schied et al. 2017)",
     presets={"paper": Options(sigma_normal=128.0)},
+    recipes={"usual": FITTING},
+    variants={"svgf-fitted": {}},
+    filter=True,
 )
 def svgf(options: Options) -> Denoiser:
-    """SVGF, a filter without weights (``params`` is ``{}``).
+    """SVGF, a filter that needs no weights: ``params`` are ``{}``, or move alpha, alpha_moments and the sigmas.
 
     Reads reflectance, albedo, normal, depth, previous_depth, motion and ids; without a buffer, its test or weight is
     left out.
@@ -104,10 +105,11 @@ def svgf(options: Options) -> Denoiser:
     def step(
         params: Params, state: SvgfState, frame: Frame, first: jax.Array
     ) -> tuple[SvgfState, jax.Array, jax.Array]:
-        past, broken = recall_history(options, state, frame, first)
-        return (*filter_history(options, blend(options, past, frame), frame), broken)
+        fitted = moved(options, params)
+        past, broken = recall_history(fitted, state, frame, first)
+        return (*filter_history(fitted, blend(fitted, past, frame), frame), broken)
 
-    plain = recurrent(Core(start, step, READS))
+    plain = recurrent(Core(start, step, READS, lambda key, frame: unmoved(options)))
     return demodulated(plain, by=options.demodulate)
 
 
@@ -145,13 +147,13 @@ def blend(options: Options, past: jax.Array, frame: Frame, change: jax.Array | N
     )
 
 
-def surface_weights(options: Options, depth: Array, normal: Array, ids: Array) -> list[Weight]:
-    """The edge-stopping weights of depth [H, W, 1] and normals [H, W, 3], as far as present."""
+def surface_weights(options: Options, depth: Array, normal: Array, ids: Array, level: Any = 0) -> list[Weight]:
+    """The edge-stopping weights of depth [H, W, 1] and normals [H, W, 3] at one level, as far as present."""
     weights: list[Weight] = []
     if depth is not None:
-        weights.append(depth_weight(depth, ids, sigma=options.sigma_depth))
+        weights.append(depth_weight(depth, ids, sigma=at_level(options.sigma_depth, level)))
     if normal is not None:
-        weights.append(normal_weight(normal, sigma=options.sigma_normal))
+        weights.append(normal_weight(normal, sigma=at_level(options.sigma_normal, level)))
     return weights
 
 
@@ -159,56 +161,23 @@ def filter_history(options: Options, history: jax.Array, frame: Frame) -> tuple[
     """The state after a frame and its image [H, W, 3], from the blended history [6, H, W]."""
     hit = hit_mask(frame.depth, frame.ids)
     weights = surface_weights(options, frame.depth, frame.normal, frame.ids)
-    color, variance = estimate_variance(history, hit, weights, short_history=options.short_history)
-    feedback = color if options.feedback_level else history[:3]
     texture = texture_left(frame, options.demodulate)
     texture = None if texture is None else texture.transpose(2, 0, 1)
-    image, feedback = _filter(options, color, variance, feedback, texture, hit, weights)
+    color, variance = estimate_variance(history, hit, weights, short_history=options.short_history, texture=texture)
+    image, feedback = cascade(
+        color,
+        variance,
+        hit,
+        lambda level: surface_weights(options, frame.depth, frame.normal, frame.ids, level),
+        _TAPS,
+        levels=options.levels,
+        sigma_luminance=options.sigma_luminance,
+        texture=texture,
+        feedback=color if options.feedback_level else history[:3],
+        feedback_level=options.feedback_level,
+    )
     image = image.transpose(1, 2, 0)
     if hit is not None:
         image = jnp.where(hit[..., None], image, frame.radiance)
     kept = jnp.concatenate([feedback, history[3:]]).transpose(1, 2, 0)
     return SvgfState(kept, guides_of(frame)), image
-
-
-def _filter(
-    options: Options,
-    color: jax.Array,
-    variance: jax.Array,
-    feedback: jax.Array,
-    texture: jax.Array | None,
-    hit: jax.Array | None,
-    weights: list[Weight],
-) -> tuple[jax.Array, jax.Array]:
-    """The a-trous cascade: the image [3, H, W] and the colour history [3, H, W].
-
-    Args:
-      options: of the method.
-      color: [3, H, W].
-      variance: [H, W] of its luminance.
-      feedback: [3, H, W] the colour history if no level replaces it.
-      texture: [3, H, W] what the division left, filtered with the colour and given back (:func:`brdf.restore`).
-      hit: [H, W] bool, a surface is seen; None: everywhere.
-      weights: edge-stopping weights, without that of luminance.
-    """
-    levels = options.levels
-
-    def filter_level(carry: _Planes, level: jax.Array) -> tuple[_Planes, None]:
-        color, variance, feedback = carry
-        deviation = jnp.sqrt(jnp.maximum(blur_variance(variance), 1e-10))
-        light = luminance_weight(luminance(color[:3]), deviation, sigma=options.sigma_luminance)
-        color, spread = edge_average(
-            color, hit, [*weights, light], _TAPS, step=2**level, step_max=2 ** (levels - 1), variance=variance
-        )
-        assert spread is not None
-        return (color, spread, jnp.where(level + 1 == options.feedback_level, color, feedback)), None
-
-    if texture is not None:
-        color, feedback = (jnp.concatenate([light, texture]) for light in (color, feedback))
-    if levels:
-        carry = (color, variance, feedback)
-        (color, _, feedback), _ = lax.scan(filter_level, carry, jnp.arange(levels, dtype=jnp.int32))
-    if texture is None:
-        return color, feedback
-    image, kept = (brdf.restore(light[:3], texture, light[3:]) for light in (color, feedback))
-    return image, kept

@@ -123,7 +123,7 @@ def resolve(
     past = jnp.where(sound & ~first, history, 0.0)
     if frame.motion is not None:
         motion = frame.motion if frame.depth is None else nearest_motion(frame.motion, frame.depth)
-        past, _ = warp_cubic(past, motion)
+        past = warp_cubic(past, motion)
     length = jnp.minimum(past[..., 3:], 1.0 / options.alpha) + 1.0
     center, size = box_around(to_ycocg(image), options.box, options.gamma)
     clipped = jnp.maximum(from_ycocg(clip_to_box(to_ycocg(past[..., :3]), center, size)), 0.0)

@@ -36,23 +36,25 @@ class Method:
     presets: Mapping[str, Any]
     """Name -> options, for the option ``preset``."""
     recipes: Mapping[str, Recipe]
-    """Name -> how it is trained, the usual one first; empty for a filter, which has nothing to learn."""
+    """Name -> how it is trained, the usual one first; empty if it has nothing to learn."""
     variants: Mapping[str, Mapping[str, Any]]
     """Names of weights that are or may be shipped -> options, from the most accurate to the fastest."""
     engines: tuple[str, ...]
     """Values of its option ``implementation`` besides XLA: names in :data:`jaxdn.networks.engines.ENGINES`."""
     earlier: Mapping[str, Any]
     """Options that weights without a record of them were trained with, where the default is another today."""
+    filter: bool
+    """It denoises without any training: its params are ``{}``, or move its options (:mod:`jaxdn.methods.fitted`)."""
 
     @property
     def learns(self) -> bool:
-        """Whether it has weights."""
+        """Whether it can be trained."""
         return bool(self.recipes)
 
     def recipe_named(self, name: str | None) -> Recipe:
         """A recipe; None is the usual one. Raises ValueError, naming those there are."""
         if not self.recipes:
-            raise ValueError(f"{self.name}: expected a method that learns, and this is a filter without weights.")
+            raise ValueError(f"{self.name}: expected a method that learns, and this one has nothing to learn.")
         if name is not None and name not in self.recipes:
             raise ValueError(f"{self.name}: expected a recipe out of {', '.join(self.recipes)}, got {name!r}.")
         return next(iter(self.recipes.values())) if name is None else self.recipes[name]
@@ -101,12 +103,15 @@ def method(
     variants: Mapping[str, Mapping[str, Any]] = _NOTHING,
     engines: tuple[str, ...] = (),
     earlier: Mapping[str, Any] = _NOTHING,
+    filter: bool | None = None,
 ) -> Callable[[Callable[[Any], Denoiser]], Callable[..., Denoiser]]:
     """Decorator: enter ``build(options) -> Denoiser`` in the table and make it a factory ``(**options) -> Denoiser``.
 
     The factory checks what it is given (:func:`jaxdn.options.make`), and takes ``preset=`` where there are presets.
-    The arguments are the columns of :class:`Method`; the function's name is the method's.
+    The arguments are the columns of :class:`Method`; the function's name is the method's. Without recipes it is a
+    filter.
     """
+    ready = not recipes if filter is None else filter
 
     def enter(build: Callable[[Any], Denoiser]) -> Callable[..., Denoiser]:
         name = build.__name__
@@ -127,7 +132,7 @@ def method(
         if presets:
             signature.append(inspect.Parameter("preset", keyword, default=None, annotation=str | None))
         factory.__signature__ = inspect.Signature(signature, return_annotation=Denoiser)  # type: ignore[attr-defined]
-        row = Method(name, title, factory, options, presets, recipes, variants, engines, earlier)
+        row = Method(name, title, factory, options, presets, recipes, variants, engines, earlier, ready)
         _METHODS[name] = row
         return factory
 

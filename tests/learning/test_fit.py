@@ -10,15 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.clips import training_batches, write_clip
+from jaxdn.candidates import candidate
+from jaxdn.clips import read_clip, training_batches, write_clip
 from jaxdn.commands import fit as loop
 from jaxdn.commands.fit import Start, begun_with, fit, load_validation
 from jaxdn.commands.log import Log, read_curve, read_log
+from jaxdn.commands.train import train
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.denoisers import ntd
 from jaxdn.methods.table import method_named
 from jaxdn.objectives import Objective
 from jaxdn.recipe import Recipe
+from jaxdn.rollout import denoise
 from tests.learning.test_training import TINY, make_clip
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -88,6 +91,22 @@ def test_a_finished_run_is_not_trained_again(clips, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, first.params, again.params)
 
 
+def test_the_options_of_a_filter_are_fitted_and_its_weights_denoise(clips, tmp_path):
+    method = method_named("svgf")
+    recipe = method.recipe_named(None)._replace(steps=4, batch=2, crop=16, frames=3)
+    weights = train(method, recipe, clips, tmp_path, options={"levels": 2})
+    fitted = candidate(str(weights))
+    assert {name: array.shape for name, array in fitted.params.items()} == {
+        **dict.fromkeys(("alpha", "alpha_moments"), ()),
+        **dict.fromkeys(("sigma_depth", "sigma_normal", "sigma_luminance"), (2,)),
+    }
+    assert 0 < float(jnp.max(jnp.abs(fitted.params["sigma_luminance"]))) < 1
+    clip = read_clip(clips[0])._replace(reference=None)
+    image, plain = (denoise(fitted.denoiser, params, clip) for params in (fitted.params, {}))
+    assert jnp.isfinite(image).all()
+    assert float(jnp.max(jnp.abs(image - plain))) > 1e-5
+
+
 def test_another_recipe_in_the_same_folder_is_refused(clips, tmp_path):
     (tmp_path / "recipe.json").write_text(json.dumps({**RECIPE.record(), "learning_rate": 7.0}))
     with pytest.raises(ValueError, match=r"learning_rate 7.0 -> 0.001"):
@@ -142,6 +161,7 @@ def run_gain(clips, folder, recipe=SHORT, source=None, **options):
 
 
 def test_ctrl_c_on_a_logging_step_keeps_its_log_entry(clips, tmp_path, monkeypatch):
+    before = signal.getsignal(signal.SIGINT)  # ignored in a process that a shell put into the background
     whole = run_gain(clips, tmp_path / "whole")
     write = Log.write
 
@@ -158,7 +178,7 @@ def test_ctrl_c_on_a_logging_step_keeps_its_log_entry(clips, tmp_path, monkeypat
     continued = run_gain(clips, tmp_path / "stopped")
     assert read_curve(tmp_path / "stopped") == read_curve(tmp_path / "whole")
     np.testing.assert_array_equal(continued.params["gain"], whole.params["gain"])
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_second_ctrl_c_stops_at_once_and_the_run_still_ends_the_same(clips, tmp_path, monkeypatch):

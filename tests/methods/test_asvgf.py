@@ -7,17 +7,9 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxdn.denoisers import asvgf, svgf
+from jaxdn.filters import gradients
 from jaxdn.filters.accumulation import accumulate
 from jaxdn.filters.atrous import stencil
-from jaxdn.filters.gradients import (
-    Change,
-    observed,
-    reconstruct,
-    replayed,
-    stratum_centers,
-    stratum_sums,
-    to_pixels,
-)
 from jaxdn.filters.weights import depth_weight, normal_weight
 from jaxdn.frame import Frame
 from tests.methods.test_svgf import LUMINANCE, moving_frames, reference_average, reference_slopes
@@ -55,12 +47,12 @@ def sparse_gradient(rng, shape, *, old=None, new=None):
 @pytest.mark.parametrize("shape", [(10, 13), (3, 3), (1, 1), (2, 9)])
 def test_strata_match_a_loop(shape, rng):
     plane = rng.normal(size=shape)
-    np.testing.assert_allclose(stratum_sums(jnp.asarray(plane)), by_strata(plane), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(gradients.stratum_sums(jnp.asarray(plane)), by_strata(plane), rtol=1e-5, atol=1e-6)
     gradient = sparse_gradient(rng, shape)
-    change = replayed(jnp.asarray(gradient))
+    change = gradients.replayed(jnp.asarray(gradient))
     np.testing.assert_allclose(change.delta, by_strata(gradient[..., 0]), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(change.size, by_strata(gradient[..., 1]), rtol=1e-5, atol=1e-6)
-    centers = stratum_centers(jnp.asarray(plane)[..., None])[..., 0]
+    centers = gradients.stratum_centers(jnp.asarray(plane)[..., None])[..., 0]
     middle = by_strata(plane, lambda part: part[min(1, part.shape[0] - 1), min(1, part.shape[1] - 1)])
     np.testing.assert_allclose(centers, middle, rtol=1e-6)
 
@@ -70,7 +62,7 @@ def test_the_observed_change_matches_a_loop(rng):
     now, hit = rng.exponential(size=shape), rng.random(shape) < 0.8
     past = rng.exponential(size=(6, *shape))
     past[5] = rng.integers(0, 3, shape)
-    change = observed(jnp.asarray(now), jnp.asarray(past), jnp.asarray(hit))
+    change = gradients.observed(jnp.asarray(now), jnp.asarray(past), jnp.asarray(hit))
     there = hit & (past[5] > 0)
     count = np.maximum(by_strata(there), 1)
     new, old = by_strata(now * there) / count, by_strata(past[3] * there) / count
@@ -88,8 +80,12 @@ def test_the_reconstruction_matches_a_loop(significance, rng, x64):
     hit = ids >= 0
     weights = [depth_weight(jnp.asarray(frame.depth), jnp.asarray(frame.ids), sigma=1.0)]
     weights.append(normal_weight(jnp.asarray(normal), sigma=128.0))
-    found = reconstruct(
-        Change(jnp.asarray(delta), jnp.asarray(size)), jnp.asarray(hit), weights, levels=3, significance=significance
+    found = gradients.reconstruct(
+        gradients.Change(jnp.asarray(delta), jnp.asarray(size)),
+        jnp.asarray(hit),
+        weights,
+        levels=3,
+        significance=significance,
     )
 
     geometry = (hit, depth, reference_slopes(depth, ids), normal)
@@ -121,7 +117,7 @@ def test_enlarging_matches_a_loop(rng):
         for dy, dx in np.ndindex(2, 2):
             weight = (down if dy else 1 - down) * (right if dx else 1 - right)
             expected[y, x] += weight * largest[top + dy, left + dx]
-    np.testing.assert_allclose(to_pixels(jnp.asarray(share), 11, 13), expected, rtol=1e-5)
+    np.testing.assert_allclose(gradients.to_pixels(jnp.asarray(share), 11, 13), expected, rtol=1e-5)
 
 
 def test_blending_by_the_share_that_changed_matches_the_formula(rng):
@@ -144,12 +140,14 @@ def test_blending_by_the_share_that_changed_matches_the_formula(rng):
 
 
 def test_gradients_of_the_formulas(rng, x64):
-    change = Change(jnp.asarray(rng.normal(size=(4, 5))), jnp.asarray(rng.uniform(3, 4, (4, 5))))
+    change = gradients.Change(jnp.asarray(rng.normal(size=(4, 5))), jnp.asarray(rng.uniform(3, 4, (4, 5))))
     depth = jnp.asarray(rng.uniform(4, 5, (4, 5, 1)))
 
     def share(delta, size, depth):
         weights = [depth_weight(depth, None, sigma=1.0)]
-        return to_pixels(reconstruct(Change(delta, size), None, weights, levels=2, significance=0.5), 11, 14)
+        return gradients.to_pixels(
+            gradients.reconstruct(gradients.Change(delta, size), None, weights, levels=2, significance=0.5), 11, 14
+        )
 
     check_grads(share, (*change, depth), order=1, modes=("rev",))
     past, now = jnp.asarray(rng.uniform(1, 2, (6, 8, 7))), jnp.asarray(rng.uniform(1, 2, (3, 8, 7)))
@@ -158,15 +156,15 @@ def test_gradients_of_the_formulas(rng, x64):
         return accumulate(past, now, alpha=0.1, alpha_moments=0.2, history_max=32, change=change)
 
     check_grads(blended, (past, now, jnp.asarray(rng.uniform(0.1, 0.9, (8, 7)))), order=1, modes=("rev",))
-    check_grads(lambda now, past: observed(now, past, None), (now[0], past), order=1, modes=("rev",))
+    check_grads(lambda now, past: gradients.observed(now, past, None), (now[0], past), order=1, modes=("rev",))
 
 
 # The gradients' meaning.
 
 
 def whole_share(gradient, **options):
-    strata = replayed(jnp.asarray(gradient))
-    return np.asarray(reconstruct(strata, None, [], **{"levels": 3, "significance": 2.0, **options}))
+    strata = gradients.replayed(jnp.asarray(gradient))
+    return np.asarray(gradients.reconstruct(strata, None, [], **{"levels": 3, "significance": 2.0, **options}))
 
 
 @pytest.mark.parametrize(("new", "expected"), [(1.0, 0.0), (2.0, 0.5), (0.5, 0.5), (0.0, 1.0)])

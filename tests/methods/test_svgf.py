@@ -4,12 +4,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 
 from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
 from jaxdn.filters.reprojection import reproject
-from jaxdn.filters.weights import depth_weight, luminance_weight
-from jaxdn.frame import FAR, Frame
+from jaxdn.filters.weights import Weight, depth_weight, luminance_weight
+from jaxdn.frame import FAR, Clip, Frame, frame_at
 from jaxdn.methods.svgf import svgf
+from jaxdn.methods.table import methods
+from jaxdn.rollout import denoise
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 HEIGHT, WIDTH = 10, 12
@@ -157,8 +160,10 @@ def reference_step(past, frame, levels=3):
     seven = [(dy, dx, 1.0) for dy in range(-3, 4) for dx in range(-3, 4)]
     for p in np.ndindex(HEIGHT, WIDTH):
         if history[p][5] < 4 and hit[p]:
-            mean, _ = reference_average(history[..., :5], seven, p, geometry)
-            color[p][:3], variance[p] = mean[:3], max(0, mean[4] - mean[3] ** 2) * 4 / history[p][5]
+            mean, _ = reference_average(np.concatenate([history[..., :5], left], axis=-1), seven, p, geometry)
+            color[p][:3] = mean[:3] * (left[p] + 0.01) / (mean[5:] + 0.01)
+            grey = (left[p] @ LUMINANCE + 0.01) / (mean[5:] @ LUMINANCE + 0.01)
+            variance[p] = max(0, mean[4] - mean[3] ** 2) * 4 / history[p][5] * grey**2
     spline = np.array([1, 4, 6, 4, 1]) / 16
     taps = [(i - 2, j - 2, spline[i] * spline[j]) for i in range(5) for j in range(5)]
     for level in range(levels):
@@ -215,15 +220,20 @@ def test_a_constant_image_stays(rng):
         np.testing.assert_allclose(image, 0.37, rtol=1e-5)
 
 
-def test_colours_of_a_texture_do_not_run(rng):
-    """Even light on a checkerboard of purple, white and red: green does not flow from white to purple."""
+@pytest.mark.parametrize("levels", [5, 0])
+def test_colours_of_a_texture_do_not_run(rng, levels):
+    """Even light on a checkerboard of purple, white and red: green does not flow from white to purple.
+
+    Nor in the mean around pixels whose history is short, which is all that is left without levels.
+    """
     frame = moving_frames(rng, 1)[0]
     squares = np.float32([[0.26, 0.002, 0.36], [0.8, 0.8, 0.8], [0.5, 0.01, 0.02], [0.4, 0.6, 0.5]])
     albedo = squares[np.indices((HEIGHT, WIDTH)).sum(0) % 4]
     frame = Frame(radiance=0.4 * albedo, albedo=albedo, reflectance=albedo + np.float32(1e-4))
-    state = DENOISER.start({}, frame)
+    denoiser = svgf(preset="paper", levels=levels, feedback_level=min(levels, 1))
+    state, step = denoiser.start({}, frame), jax.jit(denoiser.step)
     for _ in range(3):
-        state, image = STEP({}, state, frame)
+        state, image = step({}, state, frame)
     np.testing.assert_allclose(image, frame.radiance, atol=0.01)
 
 
@@ -407,6 +417,60 @@ def test_a_clip_is_one_program_and_vmap_is_a_loop(rng):
 
 
 @pytest.mark.slow
+def clip_of(frames, dtype=np.float32):
+    stacked = jax.tree.map(lambda *each: np.stack(each), *[frame._replace(motion=None) for frame in frames])
+    return Clip(jax.tree.map(lambda a: a.astype(dtype) if a.dtype.kind == "f" else a, stacked))
+
+
+def test_a_lamp_that_reflects_nothing_stays_bright(rng):
+    """Its reflectance is 0: averaged with the wall's, that texture would make the lamp black."""
+    lamp = np.zeros((24, 32, 1), bool)
+    lamp[8:16, 10:20] = True
+    light = np.where(lamp, 5.0, 0.4 * rng.gamma(2.0, 0.5, (24, 32, 3))).astype(np.float32)
+    ids = lamp.astype(np.int32)
+    reflectance = np.where(lamp, 0.0, 0.8 * np.ones(3)).astype(np.float32)
+    for name in ("svgf", "asvgf", "relax", "reblur", "trmv"):
+        frame = Frame(light, reflectance=reflectance, ids=ids)
+        denoiser = methods()[name].factory()
+        _, image = denoiser.step({}, denoiser.start({}, frame), frame)
+        inside = np.asarray(image)[10:14, 13:17]
+        assert inside.min() > 0.3, (name, inside.min())  # black: 0.003
+
+
+def test_params_before_training_change_nothing(rng):
+    clip = clip_of(moving_frames(rng))
+    denoiser = svgf(levels=3)
+    params = denoiser.init(jax.random.key(0), moving_frames(rng, 1)[0])
+    assert params["sigma_normal"].shape == (3,)
+    np.testing.assert_allclose(denoise(denoiser, params, clip), denoise(denoiser, {}, clip), rtol=2e-5, atol=1e-6)
+
+
+def test_params_are_the_options_that_they_stand_for(rng):
+    clip = clip_of(moving_frames(rng))
+    factors = {"alpha": 3.0, "sigma_depth": 2.0, "sigma_normal": 0.5, "sigma_luminance": 0.25}
+    params = {name: jnp.log(jnp.full(() if name == "alpha" else (3,), factor)) for name, factor in factors.items()}
+    found = denoise(svgf(levels=3), params, clip)
+    alpha = 3 * 0.2 / (3 * 0.2 + 0.8)  # odds three times as high
+    wanted = svgf(levels=3, alpha=alpha, sigma_depth=2.0, sigma_normal=8.0, sigma_luminance=1.0)
+    np.testing.assert_allclose(found, denoise(wanted, {}, clip), rtol=2e-5, atol=1e-6)
+
+
+def test_every_level_has_its_own_params(rng):
+    clip = clip_of(moving_frames(rng))
+    denoiser, plain = svgf(levels=3), denoise(svgf(levels=3), {}, clip)
+    for name in ("sigma_depth", "sigma_normal", "sigma_luminance"):
+        for level in range(3):
+            image = denoise(denoiser, {name: jnp.zeros(3).at[level].set(1.0)}, clip)
+            assert float(jnp.max(jnp.abs(image - plain))) > 1e-4, (name, level)
+
+
+def test_gradients_of_params(rng, x64):
+    clip = clip_of(moving_frames(rng), np.float64)
+    denoiser = svgf(levels=2)
+    params = denoiser.init(jax.random.key(0), frame_at(clip.frames, 0))
+    check_grads(lambda params: jnp.mean(denoise(denoiser, params, clip)), (params,), 1, ["rev"], eps=1e-5)
+
+
 def test_gradients_are_finite(rng):
     denoiser = svgf(levels=2)
     frames = moving_frames(rng, 2)
@@ -457,6 +521,23 @@ def test_a_rejected_tap_may_be_anything(rng):
 def test_options_out_of_range_raise(options, word):
     with pytest.raises(ValueError, match=word):
         svgf(**options)
+
+
+def test_the_smallest_sums_of_weights_that_count_spoil_no_gradient():
+    # A row of pixels without a surface, below one that they are unlike; the square of the sum squared would underflow.
+    totals = np.geomspace(1.01e-10, 1e-6, 64)
+    light = jnp.asarray(np.stack([-np.log(totals), np.zeros(64)]), jnp.float32)
+    hit = jnp.zeros((2, 64), bool).at[1].set(True)
+
+    @jax.jit
+    def spread(variance, light):
+        weight = Weight(light[None], light[None], lambda there, here, offset: jnp.abs(there[0] - here[0]))
+        taps = np.array([[0, 0, 1.0], [1, 0, 1.0]])
+        return edge_average(variance[None], hit, [weight], taps, variance=variance)[1][0].sum()
+
+    slopes = jax.grad(spread, (0, 1))(jnp.ones((2, 64)), light)
+    np.testing.assert_allclose(slopes[0], [[0.0] * 64, [1.0] * 64], rtol=1e-5)
+    np.testing.assert_allclose(slopes[1], 0.0, atol=1e-5)
 
 
 def test_a_pixel_without_a_surface_among_strangers_spoils_no_gradient(rng):

@@ -214,8 +214,10 @@ def test_the_table_finds_the_methods_of_its_package():
     assert {"ntd", "svgf"} <= set(found)
     assert list(found) == sorted(found)
     assert all(row.name == name and row.title for name, row in found.items())
-    assert found["ntd"].learns
-    assert not found["svgf"].learns
+    assert {name for name, row in found.items() if row.filter} >= {"svgf", "asvgf", "taa"}
+    assert {name for name, row in found.items() if row.learns} >= {"ntd", "steady", "svgf", "asvgf"}
+    assert not found["ntd"].filter
+    assert not found["taa"].learns
     assert found["ntd"].knows("implementation")
     assert not found["svgf"].knows("implementation")
 
@@ -245,8 +247,8 @@ def test_an_unknown_name_says_which_there_are():
         ntd.recipe_named("wild")
     with pytest.raises(ValueError, match=r"ntd: expected a variant out of ntd-large, ntd-small, got 'ntd-huge'"):
         ntd.variant_named("ntd-huge")
-    with pytest.raises(ValueError, match="svgf: expected a method that learns"):
-        svgf.recipe_named(None)
+    with pytest.raises(ValueError, match="taa: expected a method that learns"):
+        methods()["taa"].recipe_named(None)
     assert svgf.variant_named(None) == {}
     assert ntd.variant_named(None) == ntd.variants["ntd-small"]  # the fastest
     assert ntd.recipe_named(None) is ntd.recipes["usual"]

@@ -53,9 +53,13 @@ def _requests_samples(candidate: Candidate) -> bool:
 
 
 def _place(candidate: Candidate) -> int:
-    """Its index among the variants of its method, which are ordered from the most accurate to the fastest."""
-    variants = list(_row(candidate).variants)
-    return variants.index(candidate.label) if candidate.label in variants else -1
+    """Its index among the variants of its method, which are ordered from the most accurate to the fastest.
+
+    A filter's declared constants come last: they are compiled into its program, fitted ones are not.
+    """
+    row = _row(candidate)
+    places = [*row.variants, *([row.name] if row.filter else [])]
+    return places.index(candidate.label) if candidate.label in places else -1
 
 
 def _alternatives(method: Method) -> dict[str, dict[str, Any]]:

@@ -1,0 +1,348 @@
+"""Temporally reliable motion vectors (``trmv``): every effect has a history that is fetched where the effect was.
+
+Shadows and reflections do not move with the surfaces that show them, so a history fetched along the surface's motion
+has the old shadow in it. Here light is filtered in up to three parts, each with a vector of its own and none blended
+with another's:
+
+* light straight from lights: what it would be without shadows moves with the surface; the share of it that the shadows
+  leave follows the *shadow vectors*;
+* specular light follows the *glossy vectors*, along which the virtual image moves;
+* all other light follows the *dual vectors*, which lead a disoccluded pixel beside its former occluder.
+
+Everything else is ``svgf``: running means with tested taps, the variance, and a-trous levels guided by it; but nothing
+that was filtered in space is fed back into the histories of shadows and of specular light, as their edges would blur.
+
+Zheng Zeng, Shiqiu Liu, Jinglei Yang, Lu Wang, Ling-Qi Yan, "Temporally Reliable Motion Vectors for Real-time Ray
+Tracing", 2021, as far as their follow-up on learned denoising and other descriptions tell; how the parts are put
+together is our own. The share of shadows is a ratio of two filtered images (Heitz, Hill and McGuire, "Combining
+Analytic Direct Illumination and Stochastic Shadows", 2018).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn import brdf
+from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.filters.accumulation import accumulate, luminance
+from jaxdn.filters.atrous import B3_SPLINE, stencil
+from jaxdn.filters.cascade import cascade
+from jaxdn.filters.clamping import clamp_to_fast
+from jaxdn.filters.guides import Guides, guides_of, hit_mask, pack, shared, unpack
+from jaxdn.filters.reprojection import expected, reproject, same_surface
+from jaxdn.filters.variance import estimate_variance
+from jaxdn.filters.weights import Weight, depth_weight, lobe_weight, luminance_weight, roughness_weight
+from jaxdn.frame import Array, Frame
+from jaxdn.methods import svgf
+from jaxdn.methods.demodulated import Demodulation
+from jaxdn.methods.fitted import FITTING, LEARNED, at_level, moved, unmoved
+from jaxdn.methods.lobes import Light, apart
+from jaxdn.methods.table import method
+from jaxdn.options import Range
+
+READS = svgf.READS | {
+    *("albedo", "reflectance", "specular_reflectance", "roughness", "dual_motion"),
+    *("specular", "glossy_motion", "shadowed", "unshadowed", "shadow_motion"),
+}
+_TAPS = stencil(2, kernel=B3_SPLINE)
+_LENGTH = 5
+"""The plane of the history length."""
+_DARK = 1e-6
+"""Unshadowed light below this has no shadows."""
+
+
+@dataclass(frozen=True)
+class Options(svgf.Options):
+    """The options of ``svgf``, and those of specular light."""
+
+    clamp_sigma: Annotated[float, Range(0, without_low=True), LEARNED] = 1.0
+    """The history's share of shadows may be this many standard deviations from the mean of the frame's own over 5x5
+    pixels: where none of them is shadowed, none has been."""
+    sigma_specular: Annotated[float, Range(0, without_low=True), LEARNED] = 1.0
+    """Edge-stopping parameter for differences in luminance, in standard deviations, of specular light: it has the
+    textures and edges of what is reflected, which no buffer shows."""
+    lobe_fraction: Annotated[float, Range(0, without_low=True), LEARNED] = 0.5
+    """For specular light, normals may differ by this fraction of the lobe's angle."""
+    roughness_fraction: Annotated[float, Range(0, without_low=True), LEARNED] = 0.15
+    """For specular light, roughness may differ by this fraction."""
+    demodulate: Demodulation = "brdf"
+    """What light is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`; diffuse and specular
+    light each by its own part."""
+
+
+class TrmvState(NamedTuple):
+    """What is carried from one frame to the next."""
+
+    rest: jax.Array
+    """[H, W, 6], with shadows [H, W, 9]: divided colour, first and second moment of its luminance, history length;
+    unshadowed light along the same vectors."""
+    shadows: jax.Array | None
+    """[H, W, 9] the same of light with its shadows, and unshadowed light along the shadow vectors; None without."""
+    specular: jax.Array | None
+    """[H, W, 6] the same of specular light; None without."""
+    guides: Guides
+    """Depth, normal and ids of the previous frame, as far as present."""
+
+
+class _Parts(NamedTuple):
+    """A frame's light in parts, divided, [3, H, W]; ``None`` where a part is absent."""
+
+    rest: jax.Array
+    shadowed: jax.Array | None
+    unshadowed: jax.Array | None
+    diffuse: Light
+    """All but specular light, with its divisor."""
+    shine: Light | None
+    """Specular light."""
+
+
+@method(
+    Options,
+    title="Motion vectors of shadows and reflections (Zeng, Liu et al. 2021)",
+    recipes={"usual": FITTING},
+    filter=True,
+)
+def trmv(given: Options) -> Denoiser:
+    """The filter, which needs no weights: ``params`` are ``{}``, or move the options that may be learned.
+
+    Reads shadowed, unshadowed, shadow_motion, specular, glossy_motion, dual_motion, reflectance, specular_reflectance,
+    albedo, normal, depth, previous_depth, roughness, motion and ids. Without ``shadowed`` direct light follows the dual
+    vectors as all other diffuse light; without ``specular`` reflected light does too; a missing vector is ``motion``;
+    without any other buffer its test or weight is left out. Pixels without a surface (depth at ``FAR`` or id -1) pass
+    through. Raises ValueError for options out of range and radiance that is not [H, W, 3].
+    """
+
+    def start(params: Params, frame: Frame) -> TrmvState:
+        def nothing(planes: int) -> jax.Array:
+            return jnp.zeros((*frame.radiance.shape[:2], planes), frame.radiance.dtype)
+
+        guides = jax.tree.map(jnp.zeros_like, guides_of(frame))
+        lit, shines = frame.shadowed is not None, frame.specular is not None
+        return TrmvState(nothing(9 if lit else 6), nothing(9) if lit else None, nothing(6) if shines else None, guides)
+
+    def step(
+        params: Params, state: TrmvState, frame: Frame, first: jax.Array
+    ) -> tuple[TrmvState, jax.Array, jax.Array]:
+        options = moved(given, params)
+        parts = _split(frame, options.demodulate)
+        state = _fitting(state, start(params, frame))
+        along = frame.motion if frame.dual_motion is None else frame.dual_motion
+        past, broken = _recalled(options, state.rest, state.guides, frame, along, first)
+        diffuse = frame._replace(radiance=parts.rest.transpose(1, 2, 0), reflectance=_diffuse_reflectance(frame))
+        # As in a wrapper by `demodulated`: the light is divided, and the reflectance is what it was divided by.
+        kept, image = svgf.filter_history(options, svgf.blend(options, past[:6], diffuse), diffuse)
+        rest, shadows, specular = kept.history, None, None
+        hit = hit_mask(frame.depth, frame.ids)
+
+        if parts.shadowed is not None and parts.unshadowed is not None and state.shadows is not None:
+            free = _mean(options, past[6:], parts.unshadowed, past[_LENGTH])
+            along = frame.motion if frame.shadow_motion is None else frame.shadow_motion
+            past, lost = _recalled(options, state.shadows, state.guides, frame, along, first, any_surface=True)
+            shadows, lit = _shaded(options, past, parts, free, frame, hit)
+            rest = jnp.concatenate([rest, free.transpose(1, 2, 0)], axis=-1)
+            image, broken = image + lit, broken + lost
+        image = parts.diffuse.whole(image.transpose(2, 0, 1))
+
+        if parts.shine is not None and state.specular is not None:
+            along = frame.motion if frame.glossy_motion is None else frame.glossy_motion
+            past, lost = _recalled(options, state.specular, state.guides, frame, along, first)
+            history = _accumulated(options, past, parts.shine.light)
+            image = image + parts.shine.whole(_mirrored(options, history, parts.shine.texture, frame, hit))
+            specular = history.transpose(1, 2, 0)
+            broken = broken + lost
+        if hit is not None:
+            image = jnp.where(hit[..., None], image, frame.radiance)
+        return TrmvState(rest, shadows, specular, guides_of(frame)), image, broken
+
+    return recurrent(Core(start, step, READS, lambda key, frame: unmoved(given)))
+
+
+def _split(frame: Frame, by: Demodulation) -> _Parts:
+    diffuse, specular = apart(frame, by)
+    if frame.shadowed is None:
+        return _Parts(diffuse.light, None, None, diffuse, specular)
+
+    def divided(image: jax.Array) -> jax.Array:
+        planes = image.transpose(2, 0, 1)
+        return planes if diffuse.divisor is None else planes / diffuse.divisor
+
+    shadowed = jnp.minimum(divided(frame.shadowed), diffuse.light)
+    unshadowed = shadowed if frame.unshadowed is None else jnp.maximum(divided(frame.unshadowed), shadowed)
+    return _Parts(diffuse.light - shadowed, shadowed, unshadowed, diffuse, specular)
+
+
+def _diffuse_reflectance(frame: Frame) -> Array:
+    """What diffuse light is divided by: the reflectance less that of specular lobes."""
+    if frame.specular_reflectance is None:
+        return frame.reflectance
+    whole = frame.albedo if frame.reflectance is None else frame.reflectance
+    return jnp.maximum((1.0 if whole is None else whole) - frame.specular_reflectance, 0.0)
+
+
+def _fitting(state: TrmvState, begun: TrmvState) -> TrmvState:
+    """The state with the histories that this frame needs; those that have come within the clip are empty."""
+    rest, planes = state.rest, begun.rest.shape[-1]
+    if rest.shape[-1] != planes:
+        rest = jnp.concatenate([rest[..., :6], begun.rest[..., 6:]], axis=-1)
+    shadows = begun.shadows if state.shadows is None or begun.shadows is None else state.shadows
+    specular = begun.specular if state.specular is None or begun.specular is None else state.specular
+    return TrmvState(rest, shadows, specular, state.guides)
+
+
+def _recalled(
+    options: Options,
+    history: jax.Array,
+    before: Guides,
+    frame: Frame,
+    vector: Array,
+    first: jax.Array,
+    *,
+    any_surface: bool = False,
+) -> tuple[jax.Array, jax.Array]:
+    """The history [C, H, W] fetched along a vector, 0 where missing; how many of its pixels were invalid.
+
+    Where the vector is that of the surface, taps must show the same surface, as in ``svgf``. Elsewhere they show
+    another place of it, whose depth tells nothing, or with ``any_surface`` one beside it: normals must agree there.
+    """
+    before = shared(before, guides_of(frame))
+    wanted = expected(frame, before, depth_tolerance=options.depth_tolerance)
+    still = 0.0 if frame.motion is None else frame.motion
+    elsewhere = None if vector is None else jnp.any(jnp.isfinite(vector) & (vector != still), axis=-1)
+
+    def accept(tap: jax.Array) -> jax.Array:
+        guides = unpack(tap, before)[1]
+        same = same_surface(guides, wanted, normal_threshold=options.normal_threshold)
+        if elsewhere is not None:
+            loose = wanted._replace(ids=None) if any_surface else wanted
+            alike = same_surface(guides._replace(depth=None), loose, normal_threshold=options.normal_threshold)
+            same = jnp.where(elsewhere, alike, same)
+        return same & ~first
+
+    packed, valid = reproject(pack(history, before), vector, accept)
+    past, _ = unpack(packed, before)
+    sound = jnp.all(jnp.isfinite(past) & (past >= 0), axis=-1)
+    broken = jnp.sum(valid & ~sound, dtype=jnp.int32)
+    return jnp.where((valid & sound)[..., None], past, 0.0).transpose(2, 0, 1), broken
+
+
+def _accumulated(options: Options, past: jax.Array, now: jax.Array) -> jax.Array:
+    return accumulate(
+        past, now, alpha=options.alpha, alpha_moments=options.alpha_moments, history_max=options.history_max
+    )
+
+
+def _mean(options: Options, past: jax.Array, now: jax.Array, length: jax.Array) -> jax.Array:
+    """The running mean of colour [3, H, W] with the weights that ``accumulate`` has at a past of ``length``."""
+    share = jnp.maximum(options.alpha, 1.0 / jnp.minimum(length + 1.0, options.history_max))
+    return past + share[None] * (now - past)
+
+
+def _shaded(
+    options: Options,
+    past: jax.Array,
+    parts: _Parts,
+    free: jax.Array,
+    frame: Frame,
+    hit: jax.Array | None,
+) -> tuple[jax.Array, jax.Array]:
+    """The history [H, W, 9] of shadows, and direct light [H, W, 3].
+
+    The share that shadows leave is S / U, with S light and U unshadowed light, both fetched along the shadow vectors
+    and filtered with the same weights; it multiplies the unshadowed light that moves with the surface (``free``).
+    """
+    assert parts.shadowed is not None
+    assert parts.unshadowed is not None
+    held = _clamped(options, past, parts.shadowed, parts.unshadowed, hit)
+    history = _accumulated(options, held, parts.shadowed)
+    under = _mean(options, past[6:], parts.unshadowed, past[_LENGTH])
+    texture = parts.diffuse.texture
+
+    def weights(level: Any) -> list[Weight]:
+        return svgf.surface_weights(options, frame.depth, frame.normal, frame.ids, level)
+
+    def estimated(light: jax.Array) -> tuple[jax.Array, jax.Array]:
+        planes = history.at[:3].set(light)
+        return estimate_variance(planes, hit, weights(0), short_history=options.short_history, texture=texture)
+
+    color, variance = estimated(history[:3])
+    # The ratio needs the same neighbours for all.
+    lights = [color, estimated(under)[0], estimated(free)[0]]
+    planes = jnp.concatenate([*lights, *([] if texture is None else [texture])])
+    found = _filtered(options, planes, variance, hit, weights, options.sigma_luminance)
+    light = _share(found[:3], found[3:6]) * found[6:9]
+    if texture is not None:
+        light = brdf.restore(light, texture, found[9:])
+    return jnp.concatenate([history, under]).transpose(1, 2, 0), light.transpose(1, 2, 0)
+
+
+def _clamped(options: Options, past: jax.Array, lit: jax.Array, free: jax.Array, hit: jax.Array | None) -> jax.Array:
+    """The history [6, H, W] of light with its shadows, clamped to what the frame shows around each pixel."""
+    shines = jnp.any(free > _DARK, axis=0)
+    known = shines if hit is None else shines & hit
+    before = _share(past[:3], past[6:])
+    held = clamp_to_fast(before, _share(lit, free), known, sigma=options.clamp_sigma)
+    color = past[:3] + (held - before) * past[6:]
+    # The mean has changed, the variance has not.
+    mean = jnp.maximum(past[3] + luminance(color) - luminance(past), 0.0)
+    spread = jnp.maximum(past[4] - past[3] ** 2, 0.0)
+    return jnp.concatenate([jnp.maximum(color, 0.0), jnp.stack([mean, mean * mean + spread]), past[5:6]])
+
+
+def _share(lit: jax.Array, free: jax.Array) -> jax.Array:
+    """The share of light that shadows leave; 1 where there is no light."""
+    some = free > _DARK
+    return jnp.where(some, lit / jnp.where(some, free, 1.0), 1.0)
+
+
+def _mirrored(
+    options: Options, history: jax.Array, texture: jax.Array | None, frame: Frame, hit: jax.Array | None
+) -> jax.Array:
+    """Specular light [3, H, W], from its history [6, H, W].
+
+    What is reflected has colours that no division removes: differences of channels stop the filter as those of
+    luminance do.
+    """
+    first = _lobe_weights(options, frame, 0)
+    color, variance = estimate_variance(history, hit, first, short_history=options.short_history, texture=texture)
+    deviation = jnp.sqrt(jnp.maximum(variance, 1e-10))
+    hues = [luminance_weight(color[one] - color[1], deviation, sigma=options.sigma_specular) for one in (0, 2)]
+    return _filtered(
+        options,
+        color,
+        variance,
+        hit,
+        lambda level: [*_lobe_weights(options, frame, level), *hues],
+        options.sigma_specular,
+        texture,
+    )
+
+
+def _lobe_weights(options: Options, frame: Frame, level: Any) -> list[Weight]:
+    """The edge-stopping weights of specular light; without roughness its lobes are as wide as diffuse ones."""
+    weights: list[Weight] = []
+    size = frame.radiance.shape[:2]
+    rough = jnp.ones((*size, 1), frame.radiance.dtype) if frame.roughness is None else frame.roughness
+    if frame.roughness is not None:
+        weights.append(roughness_weight(rough, fraction=options.roughness_fraction))
+    if frame.depth is not None:
+        weights.append(depth_weight(frame.depth, frame.ids, sigma=at_level(options.sigma_depth, level)))
+    if frame.normal is not None:
+        weights.append(lobe_weight(frame.normal, rough, fraction=options.lobe_fraction))
+    return weights
+
+
+def _filtered(
+    options: Options,
+    planes: jax.Array,
+    variance: jax.Array,
+    hit: jax.Array | None,
+    weights: Callable[[Any], Sequence[Weight]],
+    sigma: float | jax.Array,
+    texture: jax.Array | None = None,
+) -> jax.Array:
+    """The image [C, H, W] after the a-trous levels, none of which is fed back: edges of shadows stay sharp."""
+    levels = options.levels
+    return cascade(planes, variance, hit, weights, _TAPS, levels=levels, sigma_luminance=sigma, texture=texture)[0]

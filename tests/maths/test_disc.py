@@ -1,0 +1,145 @@
+"""Rotated discs, the weight of closeness, and steady luminance against float64 loops."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jaxdn.filters.disc import TAPS, disc_average, rotations
+from jaxdn.filters.stabilisation import stabilise
+from jaxdn.filters.weights import closeness_weight, depth_weight, normal_weight
+
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+HEIGHT, WIDTH = 9, 11
+
+
+def surfaces(rng):
+    depth = 4 + 0.2 * np.arange(WIDTH) + rng.normal(0, 0.05, (HEIGHT, WIDTH))
+    normal = rng.normal(0, 0.2, (HEIGHT, WIDTH, 3)) + [0, 0, -1]
+    return depth, normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+
+
+def reference_slopes(depth):
+    """Of the two differences along each axis the one that is smaller."""
+    slopes = np.zeros((*depth.shape, 2))
+    for y, x in np.ndindex(depth.shape):
+        for axis, (dy, dx) in enumerate(((0, 1), (1, 0))):
+            found = []
+            for sign in (1, -1):
+                v, u = y + sign * dy, x + sign * dx
+                if 0 <= v < depth.shape[0] and 0 <= u < depth.shape[1]:
+                    found.append(sign * (depth[v, u] - depth[y, x]))
+            slopes[y, x, axis] = min(found, key=abs)
+    return slopes
+
+
+def reference_disc(values, hit, depth, normal, radius, angle):
+    out, slopes = np.zeros_like(values), reference_slopes(depth)
+    for y, x in np.ndindex(depth.shape):
+        if not hit[y, x]:
+            continue
+        total, weights = values[:, y, x].copy(), 1.0
+        for number in range(8):
+            far = 1.0 if number < 4 else 0.5
+            around = angle[y, x] + np.pi / 2 * number + (0 if number < 4 else np.pi / 4)
+            dx, dy = (np.round(radius[y, x] * far * part(around)) for part in (np.cos, np.sin))
+            v, u = y + int(dy), x + int(dx)
+            if not (0 <= v < HEIGHT and 0 <= u < WIDTH) or not hit[v, u]:
+                continue
+            scale = abs(slopes[y, x] @ [dx, dy]) + 1e-3 / HEIGHT * np.hypot(dx, dy) * depth[y, x] + 1e-10
+            w = np.exp(-0.66 * far**2) * np.exp(-abs(depth[v, u] - depth[y, x]) / scale)
+            w *= max(0.0, normal[y, x] @ normal[v, u]) ** 16
+            total, weights = total + w * values[:, v, u], weights + w
+        out[:, y, x] = total / weights
+    return out
+
+
+def test_a_disc_matches_a_loop(rng, x64):
+    depth, normal = surfaces(rng)
+    values, hit = rng.exponential(size=(4, HEIGHT, WIDTH)), rng.random((HEIGHT, WIDTH)) < 0.8
+    radius, angle = rng.uniform(0, 6, (HEIGHT, WIDTH)), rng.uniform(0, 7, (HEIGHT, WIDTH))
+    weights = [
+        depth_weight(jnp.asarray(depth)[..., None], None, sigma=1.0),
+        normal_weight(jnp.asarray(normal), sigma=16.0),
+    ]
+    found = disc_average(jnp.asarray(values), jnp.asarray(hit), weights, jnp.asarray(radius), jnp.asarray(angle))
+    np.testing.assert_allclose(found, reference_disc(values, hit, depth, normal, radius, angle), rtol=1e-9)
+
+
+def test_strips_do_not_show(rng, monkeypatch):
+    values = jnp.asarray(rng.random((3, HEIGHT, WIDTH)), jnp.float32)
+    place = jnp.full((HEIGHT, WIDTH), 3.0), jnp.asarray(rng.uniform(0, 6, (HEIGHT, WIDTH)), jnp.float32)
+    whole = disc_average(values, None, [], *place)
+    monkeypatch.setattr("jaxdn.filters.disc._STRIP", 2 * WIDTH)
+    np.testing.assert_allclose(disc_average(values, None, [], *place), whole, rtol=1e-6)
+
+
+def test_a_disc_of_no_size_changes_nothing(rng):
+    values = jnp.asarray(rng.random((3, HEIGHT, WIDTH)), jnp.float32)
+    nothing = jnp.zeros((HEIGHT, WIDTH))
+    np.testing.assert_allclose(disc_average(values, None, [], nothing, nothing), values, rtol=1e-6)
+
+
+def test_rotations_are_even_and_differ_from_frame_to_frame():
+    first, second = (np.asarray(rotations((64, 64), number, jnp.dtype("float32"))) for number in (3, 4))
+    np.testing.assert_array_equal(first, rotations((64, 64), 3, jnp.dtype("float32")))
+    for angles in (first, second):
+        np.testing.assert_allclose(np.histogram(angles, 8, (0, 2 * np.pi))[0], 512, rtol=0.2)
+    assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.05
+    assert abs(np.corrcoef(first[:, 1:].ravel(), first[:, :-1].ravel())[0, 1]) < 0.05
+
+
+def test_the_taps_are_on_two_rings():
+    np.testing.assert_allclose(np.sort(np.hypot(*TAPS[:, :2].T)), [0.5] * 4 + [1.0] * 4)
+    np.testing.assert_allclose(TAPS[:, :2].sum(0), 0.0, atol=1e-12)
+
+
+def test_gradients_reach_values_and_guides(rng, x64):
+    depth, _ = surfaces(rng)
+    radius, angle = (jnp.asarray(rng.uniform(1, 4, (HEIGHT, WIDTH))) for _ in range(2))
+
+    def mean(values, depth):
+        return disc_average(values, None, [depth_weight(depth[..., None], None, sigma=1.0)], radius, angle)
+
+    check_grads(
+        mean, (jnp.asarray(rng.random((2, HEIGHT, WIDTH))), jnp.asarray(depth)), order=1, modes=("rev",), eps=1e-7
+    )
+
+
+def test_the_weight_of_closeness_is_its_formula(rng, x64):
+    here, there = rng.random((2, 5, 6))
+    here[0], there[:, 0] = 0.0, 0.0
+    weight = closeness_weight(jnp.asarray(here), tolerance=0.2, least=0.1)
+    found = np.exp(-np.asarray(weight.exponent([jnp.asarray(there)], [jnp.asarray(here)], None)))
+    expected = np.where((here > 0) & (there > 0), np.maximum(np.exp(-abs(here - there) / 0.2), 0.1), 1.0)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert (expected == 0.1).any()
+
+
+def test_steady_luminance_matches_a_loop(rng, x64):
+    color, past = rng.exponential(size=(3, HEIGHT, WIDTH)), rng.exponential(size=(HEIGHT, WIDTH))
+    color[:, 2, 3] = 0.0
+    share, hit = rng.uniform(0, 0.97, (HEIGHT, WIDTH)), rng.random((HEIGHT, WIDTH)) < 0.8
+    image, kept = stabilise(*map(jnp.asarray, (color, past, share, hit)), sigma=0.7)
+    level = np.einsum("cyx,c->yx", color, LUMINANCE)
+    for y, x in np.ndindex(HEIGHT, WIDTH):
+        box = slice(max(y - 1, 0), y + 2), slice(max(x - 1, 0), x + 2)
+        near = level[box][hit[box]]
+        assert near.size
+        mean, deviation = near.mean(), np.sqrt(max(near.var(), 1e-10))
+        low, high = min(mean - 0.7 * deviation, level[y, x]), max(mean + 0.7 * deviation, level[y, x])
+        steady = level[y, x] + share[y, x] * (np.clip(past[y, x], low, high) - level[y, x])
+        if level[y, x] == 0:
+            assert kept[y, x] == 0
+            continue
+        np.testing.assert_allclose(kept[y, x], steady, rtol=1e-6)
+        np.testing.assert_allclose(image[:, y, x], color[:, y, x] * steady / level[y, x], rtol=1e-6)
+
+
+@pytest.mark.parametrize("brightness", [0.0, 1e-9, 1.0, 1e4])
+def test_an_even_image_stays_even(brightness):
+    even = jnp.full((3, 4, 5), brightness)
+    image, kept = jax.jit(stabilise, static_argnames="sigma")(even, even[0], jnp.full((4, 5), 0.9), None, sigma=1.0)
+    np.testing.assert_allclose(image, even, rtol=1e-5)
+    np.testing.assert_allclose(kept, even[0], rtol=1e-5)
