@@ -18,8 +18,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
-from jaxdn.filters.guides import Guides, guides_of, hit_mask, pack, shared, unpack
-from jaxdn.filters.reprojection import expected, reproject, same_surface
+from jaxdn.filters.guides import Guides, guides_of, hit_mask
+from jaxdn.filters.recall import recall
 from jaxdn.filters.weights import Offset, Planes, Weight, depth_weight, normal_weight
 from jaxdn.frame import Frame
 from jaxdn.repair import repair, repair_image
@@ -82,13 +82,15 @@ def share(state: Shares, frame: Frame, beauty: jax.Array, parts: jax.Array) -> t
 
 def _blend(state: Shares, frame: Frame, noisy: jax.Array) -> jax.Array:
     """The history with a frame's light blended in: a mean over the frames in which a point was seen."""
-    before = shared(state.guides, guides_of(frame))
-    wanted = expected(frame, before, depth_tolerance=_DEPTH_TOLERANCE)
-
-    def accept(tap: jax.Array) -> jax.Array:
-        return same_surface(unpack(tap, before)[1], wanted, normal_threshold=_NORMAL_THRESHOLD)
-
-    past, _ = unpack(reproject(pack(state.history, before), frame.motion, accept)[0], before)
+    past = recall(
+        state.history,
+        state.guides,
+        frame,
+        jnp.asarray(False),
+        depth_tolerance=_DEPTH_TOLERANCE,
+        normal_threshold=_NORMAL_THRESHOLD,
+        around=True,
+    ).history
     length = past[..., -1:] + 1
     weight = jnp.maximum(_ALPHA, 1 / length)
     return jnp.concatenate([past[..., :-1] + weight * (noisy - past[..., :-1]), length], axis=-1)

@@ -33,7 +33,8 @@ class Inspect:
     animation: Path | None = None
     """Animation file for a scene file."""
     denoiser: str | None = None
-    """Plan for this denoiser (svgf, steady-balanced ...); default: for every buffer that a denoiser may read."""
+    """Plan for this denoiser (svgf, steady-balanced ...), or several (svgf,relax); default: for every buffer that a
+    denoiser may read."""
     width: int = 128
     height: int = 128
     frames: int | None = None
@@ -89,7 +90,8 @@ class Render:
     effects: str = "auto"
     """auto: the effects that the scene has (see `jaxdn inspect`); all: every effect; or names separated by commas."""
     denoiser: str | None = None
-    """Render only what this denoiser (svgf, relax ...) reads; default: all but what few denoisers read."""
+    """Render only what this denoiser (svgf, relax ...) reads, or several (svgf,relax); default: all but what few
+    denoisers read."""
     workers: int | None = None
     """Number of processes; default: the number of cores."""
 

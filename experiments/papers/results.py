@@ -8,9 +8,10 @@ reference and both its halves, rendered with as many single samples as the large
 every clip as ``pictures/CLIP/METHOD.png``, to be looked at at 100 %.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated
 
 import numpy as np
@@ -28,6 +29,7 @@ from jaxdn.report.results import mean_scores
 from jaxdn.weights import shipped_names
 
 Read = Callable[..., Footage]
+_NOTHING: Mapping[str, Mapping[str, str]] = MappingProxyType({})
 
 
 def beauty(folder: Path, *, spp: int, layers: bool = False) -> Footage:
@@ -97,16 +99,19 @@ def contestants(weights: list[str]) -> Iterator[Candidate]:
         yield Candidate("Open Image Denoise", frame_by_frame(), {})
 
 
-def table(results: Results) -> str:
-    """One line per method, in the form of Markdown: means over the clips, without the noise of the references."""
-    lines = ["| method | PSNR | temporal PSNR | FLIP | L1 | hidden pixels, PSNR |", "|---|---|---|---|---|---|"]
+def table(results: Results, more: Mapping[str, Mapping[str, str]] = _NOTHING) -> str:
+    """One line per method, in the form of Markdown: means over the clips, without the noise of the references.
+
+    ``more`` are further columns: title -> label of a method -> what stands there.
+    """
+    titles = ["method", "PSNR", "temporal PSNR", "FLIP", "L1", "hidden pixels, PSNR", *more]
+    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
     for label, one in mean_scores(results).items():
         with np.errstate(divide="ignore", invalid="ignore"):
             hidden = -10 * np.log10(one.unbiased_disoccluded_mse)
-        lines.append(
-            f"| {label} | {one.unbiased_psnr:.2f} | {one.unbiased_temporal_psnr:.2f} | {one.flip:.3f} | {one.l1:.4f} "
-            f"| {hidden:.2f} |"
-        )
+        cells = [label, f"{one.unbiased_psnr:.2f}", f"{one.unbiased_temporal_psnr:.2f}", f"{one.flip:.3f}"]
+        cells += [f"{one.l1:.4f}", f"{hidden:.2f}", *(column.get(label, "") for column in more.values())]
+        lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

@@ -7,6 +7,7 @@ SCENES are folders with Benedikt Bitterli's scenes for Mitsuba (``living-room/sc
 ``runs/rooms/report.html``.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -42,31 +43,37 @@ class Settings:
     """Number of rendering processes; default: the number of cores."""
 
 
-def jobs(settings: Settings) -> list[ClipJob]:
-    """What to render: every room whose scene is there. Raises ValueError if none is."""
+def scenes_in(folders: Sequence[Path]) -> list[tuple[Path, Path]]:
+    """Scene file and animation file of every room that is there. Raises ValueError if none is."""
     found = []
     for animation in sorted(ANIMATIONS.glob("*.json")):
         scene = Path(animation.stem) / "scene.xml"
-        path = next((folder / scene for folder in settings.scenes if (folder / scene).is_file()), None)
+        path = next((folder / scene for folder in folders if (folder / scene).is_file()), None)
         if path is None:
             print(f"{scene} does not exist in any of the folders: this room is left out")
-            continue
-        found.append(
-            ClipJob(
-                SceneFile(path, animation).record,
-                str(Path("data/rooms") / animation.stem),
-                width=settings.width,
-                height=settings.height,
-                frames=settings.frames,
-                layers=settings.layers,
-                reference_spp=settings.reference_spp,
-            )
-        )
+        else:
+            found.append((path, animation))
     if not found:
         names = ", ".join(path.stem for path in sorted(ANIMATIONS.glob("*.json")))
-        places = ", ".join(map(str, settings.scenes))
+        places = ", ".join(map(str, folders))
         raise ValueError(f"{places}: expected folders out of {names} with a scene.xml each, found none.")
     return found
+
+
+def jobs(settings: Settings) -> list[ClipJob]:
+    """What to render: every room whose scene is there. Raises ValueError if none is."""
+    return [
+        ClipJob(
+            SceneFile(path, animation).record,
+            str(Path("data/rooms") / animation.stem),
+            width=settings.width,
+            height=settings.height,
+            frames=settings.frames,
+            layers=settings.layers,
+            reference_spp=settings.reference_spp,
+        )
+        for path, animation in scenes_in(settings.scenes)
+    ]
 
 
 def contestants(runs: Path | None) -> list[Candidate]:

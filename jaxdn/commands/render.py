@@ -30,13 +30,16 @@ class Planned(NamedTuple):
     """How the plan's path length was measured; None if it was not."""
 
 
-def denoiser_named(name: str) -> Denoiser | None:
+def denoiser_named(names: str) -> Denoiser | None:
     """A denoiser to plan for: a method, shipped weights or a file; None for the noisy image, which is not denoised.
 
-    The weights do not matter here, so a learned method needs none. Raises ValueError for any other name.
+    Of several names, separated by commas, it is the first, with all buffers that one of them reads. The weights do not
+    matter here, so a learned method needs none. Raises ValueError for any other name.
     """
     known = methods()
-    return known[name].factory() if name in known else candidate(name).denoiser
+    each = [known[name].factory() if name in known else candidate(name).denoiser for name in names.split(",")]
+    found = [one for one in each if one is not None]
+    return found[0]._replace(reads=frozenset[str]().union(*(one.reads for one in found))) if found else None
 
 
 def plan_clip(
@@ -116,7 +119,8 @@ def render(
       light: which light is noisy: the indirect part, or all that is reflected.
       max_depth: path length (1 emission, 2 direct light ...); default: measured, or the scene's own.
       effects: as in :func:`plan_clip`.
-      denoiser: name of the denoiser to render for; None: for any, without the buffers that only few read.
+      denoiser: names of the denoisers to render for, separated by commas; None: for any, without the buffers that only
+        few read.
       workers: number of processes; default: the number of cores.
 
     Prints the Mitsuba variant, each clip's effects, and the progress. Raises ValueError for a source that is not a
@@ -152,9 +156,9 @@ def render(
     return render_clips(jobs, workers=workers)
 
 
-def _reader(name: str, variant: str) -> Denoiser | None:
+def _reader(names: str, variant: str) -> Denoiser | None:
     """A denoiser with what it reads, as far as the variant can render it; prints what is left out."""
-    found = denoiser_named(name)
+    found = denoiser_named(names)
     if found is None or tells_lobes(variant) or not found.reads & OF_SAMPLES:
         return found
     print(f"{variant} cannot tell diffuse from specular light: {', '.join(sorted(found.reads & OF_SAMPLES))} left out")

@@ -47,3 +47,10 @@ def accumulate(
     color = past[:3] + share[None] * (now - past[:3])
     moments = past[3:5] + share_moments[None] * (jnp.stack([level, level * level]) - past[3:5])
     return jnp.concatenate([color, moments, length[None]])
+
+
+def after_shift(moments: jax.Array, shift: jax.Array) -> jax.Array:
+    """Moments [2, H, W] of luminance after the mean has changed by ``shift`` [H, W], and the variance has not."""
+    mean = jnp.maximum(moments[0] + shift, 0.0)
+    spread = jnp.maximum(moments[1] - moments[0] ** 2, 0.0)
+    return jnp.stack([mean, mean * mean + spread])

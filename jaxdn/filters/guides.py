@@ -1,5 +1,6 @@
-"""Guides that distinguish surfaces: depth and its slopes, normals and ids."""
+"""Guides that distinguish surfaces: depth and its slopes, normals and ids; which pixels show the same surface."""
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -98,3 +99,47 @@ def depth_slopes(depth: jax.Array, ids: jax.Array | None) -> tuple[jax.Array, ja
         return jnp.where(take_forward, forward, jnp.where(has_backward, backward, 0.0))
 
     return along(1), along(0)
+
+
+class Expected(NamedTuple):
+    """What a tap of the previous frame must show, for every pixel; ``None`` for what one of the frames lacks."""
+
+    depth: jax.Array | None
+    """[H, W]."""
+    tolerance: jax.Array | None
+    """[H, W] of the depth; infinite where any depth is right."""
+    normal: jax.Array | None
+    """[H, W, 3]."""
+    ids: jax.Array | None
+    """[H, W]; not a number where any id is right."""
+
+
+def expected(frame: Frame, before: Guides, *, depth_tolerance: float) -> Expected:
+    """What a tap must show, for a previous frame with the guides ``before``.
+
+    The depth at the target and ``depth_tolerance z + 2 (|dz/dx| + |dz/dy|)``, the normal and the id of the pixel.
+    """
+    tested = shared(guides_of(frame), before)
+    ids = None if tested.ids is None else tested.ids[..., 0]
+    if tested.depth is None:
+        return Expected(None, None, tested.normal, ids)
+    depth = (tested.depth if frame.previous_depth is None else frame.previous_depth)[..., 0]
+    slope_x, slope_y = depth_slopes(tested.depth, frame.ids)
+    return Expected(depth, depth_tolerance * depth + 2 * (jnp.abs(slope_x) + jnp.abs(slope_y)), tested.normal, ids)
+
+
+def same_surface(tap: Guides, wanted: Expected, *, normal_threshold: float) -> jax.Array:
+    """The test of one tap for every pixel, bool [...]: does it show the same surface?
+
+    It does where ids agree, its depth is the expected one within the tolerance and the cosine of the normals exceeds
+    ``normal_threshold``; what one of the two lacks is not tested (Schied et al. 2017, sec. 4.1). ``tap`` are the guides
+    [..., C] of the taps, ``wanted`` what is expected [...].
+    """
+    passed: list[jax.Array] = []
+    if tap.depth is not None and wanted.depth is not None and wanted.tolerance is not None:
+        passed.append(jnp.abs(tap.depth[..., 0] - wanted.depth) <= wanted.tolerance)
+    if tap.normal is not None and wanted.normal is not None:
+        passed.append(cosine(tap.normal, wanted.normal) > normal_threshold)
+    if tap.ids is not None and wanted.ids is not None:
+        passed.append((tap.ids[..., 0] == wanted.ids) | jnp.isnan(wanted.ids))
+    return functools.reduce(jnp.logical_and, passed, jnp.asarray(True))

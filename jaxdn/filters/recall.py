@@ -1,27 +1,32 @@
-"""The history of every pixel, from the taps of its cell that show the same surface; with a gradient that is cheap.
+"""The history of every pixel, from the taps of the previous frame that show the same surface.
 
-The same test of every tap as in :mod:`jaxdn.filters.reprojection`, without its second chance among neighbours: a pixel
-whose four taps all show something else has no history. Fetches and weights do not depend on the history's values, so
-that training needs only the adjoint of a weighted sum. They run by strips: at 720p, fetching the taps of all pixels at
-once takes twice as long.
+A plain bilinear warp mixes all four taps. Here each is accepted or rejected, and the accepted ones are renormalised;
+where none is, the 3x3 pixels around the target are tried on request (Schied et al. 2017). What is fetched and with
+which weights does not depend on the history's values, so that training needs only the adjoint of a weighted sum.
+Fetches run by strips: at 720p, fetching the taps of all pixels at once takes twice as long.
 """
 
 import functools
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
-from jaxdn.filters.guides import Guides, guides_of, pack, shared, unpack
-from jaxdn.filters.reprojection import WEIGHT_MIN, Expected, expected, same_surface
+from jaxdn.filters.guides import Expected, Guides, expected, guides_of, pack, same_surface, shared, unpack
 from jaxdn.frame import Frame
 from jaxdn.motion import targets
 from jaxdn.ops.strips import by_strips
-from jaxdn.ops.warp import cells, corners, differentiable_mean
+from jaxdn.ops.warp import cells, differentiable_mean, windows
 
+WEIGHT_MIN = 0.01
+"""Minimum sum of accepted bilinear weights that counts as history."""
 _STRIP = 5_000
 """Approximate number of pixels in a strip."""
+_RUN = 640
+"""Pixels that search around their targets together, if one of them has to."""
 
 
 class Recalled(NamedTuple):
@@ -43,6 +48,7 @@ def recall(
     *,
     depth_tolerance: float = 0.02,
     normal_threshold: float = 0.9,
+    around: bool = False,
 ) -> Recalled:
     """Fetch ``history`` [H, W, C] >= 0 of the previous frame at ``p + motion(p)``.
 
@@ -51,62 +57,140 @@ def recall(
       before: the guides of the previous frame.
       frame: the current frame; no motion is zero motion.
       first: bool scalar, there is no history.
-      depth_tolerance: see :func:`jaxdn.filters.reprojection.expected`.
-      normal_threshold: see :func:`jaxdn.filters.reprojection.same_surface`.
+      depth_tolerance: see :func:`jaxdn.filters.guides.expected`.
+      normal_threshold: see :func:`jaxdn.filters.guides.same_surface`.
+      around: see :func:`fetch`.
     """
-    before = shared(before, guides_of(frame))
     wanted = expected(frame, before, depth_tolerance=depth_tolerance)
+    before = shared(before, guides_of(frame))
+    return fetch(history, before, frame.motion, wanted, first, normal_threshold=normal_threshold, around=around)
+
+
+def fetch(
+    history: jax.Array,
+    before: Guides,
+    motion: jax.Array | None,
+    wanted: Expected,
+    first: jax.Array,
+    *,
+    normal_threshold: float,
+    around: bool,
+) -> Recalled:
+    """The same along any vectors [H, W, 2], for taps that show what is ``wanted``.
+
+    Taps outside the image are rejected; where the vector is not finite there is no history; no gradient flows into the
+    vectors. With ``around``, a pixel all of whose taps are rejected gets the mean of those among the 3x3 pixels around
+    its target that are accepted.
+    """
     sound = jnp.all(jnp.isfinite(history) & (history >= 0), axis=-1, keepdims=True)
     broken = jnp.sum(~sound & ~first, dtype=jnp.int32)
     history = jnp.where(sound, history, 0.0)
-    if frame.motion is None:
-        same = same_surface(before, wanted, normal_threshold=normal_threshold)
-        valid = (sound[..., 0] & same & ~first)[..., None]
-        return Recalled(jnp.where(valid, history, 0.0), valid, broken)
-
-    cell = _cells(frame.motion, first)
+    x, y, inside = _targets(history, motion, first)
     packed = lax.stop_gradient(pack(jnp.concatenate([history, sound.astype(history.dtype)], axis=-1), before))
 
-    def strip(part: tuple[_Cells, Expected]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        cell, wanted = part
-        found = corners(packed, cell.top, cell.left)
-        taps = [unpack(found[..., index, :], before) for index in range(4)]
-        weights = []
-        for share, (whole, guides) in zip(cell.shares(), taps, strict=True):
-            same = same_surface(guides, wanted, normal_threshold=normal_threshold)
-            weights.append(jnp.where(cell.inside & (whole[..., -1] > 0) & same, share[..., 0], 0.0))
-        total = functools.reduce(jnp.add, weights)
-        valid = total >= WEIGHT_MIN
-        weights = [jnp.where(valid, weight / jnp.where(valid, total, 1.0), 0.0) for weight in weights]
-        mean = [weight[..., None] * whole[..., :-1] for weight, (whole, _) in zip(weights, taps, strict=True)]
-        return functools.reduce(jnp.add, mean), valid[..., None], jnp.stack(weights, axis=-1)
+    def accepted(tap: jax.Array, wanted: Expected) -> jax.Array:
+        whole, guides = unpack(tap, before)
+        return (whole[..., -1] > 0) & same_surface(guides, wanted, normal_threshold=normal_threshold)
+
+    if motion is None:
+        valid = inside & accepted(packed, wanted)
+        mean = jnp.where(valid[..., None], history, 0.0)
+    else:
+        mean, valid = _of_cells(history, packed, (x, y), inside, wanted, accepted)
+    if around:
+        more, found = _around(history, packed, (x, y), inside & ~valid, wanted, accepted)
+        mean, valid = jnp.where(found[..., None], more, mean), valid | found
+    return Recalled(mean, valid[..., None], broken)
+
+
+def _targets(history: jax.Array, motion: jax.Array | None, first: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Where every pixel's history is: positions x and y [H, W] within the image, and bool [H, W], whether it has one.
+
+    Less than a pixel outside there are taps of the outermost pixels alone, as at their centres.
+    """
+    height, width, _ = history.shape
+    vector = jnp.zeros((height, width, 2), history.dtype) if motion is None else lax.stop_gradient(motion)
+    known = jnp.all(jnp.isfinite(vector), axis=-1)
+    x, y = targets(jnp.where(known[..., None], vector, 0.0))
+    inside = known & (x > -1) & (x < width) & (y > -1) & (y < height) & ~first
+    return jnp.clip(x, 0, width - 1), jnp.clip(y, 0, height - 1), inside
+
+
+_Position = tuple[jax.Array, jax.Array]
+_Accepted = Callable[[jax.Array, Expected], jax.Array]
+"""(tap [..., C], what it must show [...]) -> bool [...]."""
+
+
+def _of_cells(
+    history: jax.Array,
+    packed: jax.Array,
+    at: _Position,
+    inside: jax.Array,
+    wanted: Expected,
+    accepted: _Accepted,
+) -> tuple[jax.Array, jax.Array]:
+    """The mean [H, W, C] of the accepted taps of each target's cell, and bool [H, W], whether there is one."""
+    cell = cells(*at, *history.shape[:2])
+
+    def strip(part: tuple[tuple[jax.Array, ...], jax.Array, Expected]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        (left, top, fx, fy), inside, wanted = part
+        taps = windows(packed, top, left, 2)
+        shares = ((wy * wx)[..., 0] for wy in (1 - fy, fy) for wx in (1 - fx, fx))
+        weights = [
+            jnp.where(inside & accepted(taps[..., index, :], wanted), share, 0.0) for index, share in enumerate(shares)
+        ]
+        return _mean(taps, weights, history.shape[-1], least=WEIGHT_MIN)
 
     # The weights are for the gradient; where none is taken, they are not computed.
-    mean, valid, weights = by_strips(strip, (cell, wanted), pixels=_STRIP)
-    return Recalled(differentiable_mean(mean, history, cell.top, cell.left, weights), valid, broken)
+    mean, valid, weights = by_strips(strip, (cell, inside, wanted), pixels=_STRIP)
+    return differentiable_mean(mean, history, cell[1], cell[0], weights), valid
 
 
-class _Cells(NamedTuple):
-    """Where every pixel fetches; names as in :func:`jaxdn.ops.warp.cells`."""
+def _around(
+    history: jax.Array,
+    packed: jax.Array,
+    at: _Position,
+    lost: jax.Array,
+    wanted: Expected,
+    accepted: _Accepted,
+) -> tuple[jax.Array, jax.Array]:
+    """The same for ``lost`` pixels alone, of the 3x3 pixels around their targets, which count alike."""
+    height, width, channels = history.shape
+    column, row = (jnp.floor(position + 0.5).astype(jnp.int32) for position in at)
+    # At the border the window lies inside the image, and the pixels of it that are too far away do not count.
+    top, left = jnp.clip(row - 1, 0, max(height - 3, 0)), jnp.clip(column - 1, 0, max(width - 3, 0))
 
-    left: jax.Array
-    top: jax.Array
-    fx: jax.Array
-    fy: jax.Array
-    inside: jax.Array
-    """[H, W] bool, the target is in the image and known."""
+    def search(part: tuple[jax.Array, tuple[jax.Array, ...], Expected]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        lost, (row, column, top, left), wanted = part
+        taps = windows(packed, top, left, 3)
+        weights = []
+        for index, (dy, dx) in enumerate(np.ndindex(3, 3)):
+            y, x = top + dy, left + dx
+            near = (jnp.abs(y - row) <= 1) & (jnp.abs(x - column) <= 1) & (y < height) & (x < width)
+            weights.append((lost & near & accepted(taps[..., index, :], wanted)).astype(history.dtype))
+        return _mean(taps, weights, channels, least=1.0)
 
-    def shares(self) -> list[jax.Array]:
-        """The bilinear weights of the four corners."""
-        return [(1 - y) * (1 - x) for y in (self.fy, 1 - self.fy) for x in (self.fx, 1 - self.fx)]
+    def run(part: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+        def nothing(part: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+            return jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), jax.eval_shape(search, part))
+
+        return lax.cond(jnp.any(part[0]), search, nothing, part)
+
+    # Lost pixels are few, and near each other: as one long row, most runs of pixels have none.
+    flat = jax.tree.map(lambda one: one.reshape(-1, 1, *one.shape[2:]), (lost, (row, column, top, left), wanted))
+    mean, found, weights = (one.reshape(height, width, *one.shape[2:]) for one in by_strips(run, flat, pixels=_RUN))
+    return differentiable_mean(mean, history, top, left, weights), found
 
 
-def _cells(motion: jax.Array, first: jax.Array) -> _Cells:
-    """The cells of the targets ``p + motion(p)``."""
-    height, width = motion.shape[:2]
-    motion = lax.stop_gradient(motion)
-    known = jnp.all(jnp.isfinite(motion), axis=-1)
-    x, y = targets(jnp.where(known[..., None], motion, 0.0))
-    inside = known & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1) & ~first
-    left, top, fx, fy = cells(jnp.clip(x, 0, width - 1), jnp.clip(y, 0, height - 1), height, width)
-    return _Cells(left, top, fx, fy, inside)
+def _mean(
+    taps: jax.Array, weights: list[jax.Array], channels: int, *, least: float
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The weighted mean of the first ``channels`` of taps [..., n, C], whether there is one, and its weights [..., n].
+
+    There is none, but 0, where the n weights [...] sum to less than ``least``.
+    """
+    total = functools.reduce(jnp.add, weights)
+    valid = total >= least
+    weights = [jnp.where(valid, weight / jnp.where(valid, total, 1.0), 0.0) for weight in weights]
+    parts = [weight[..., None] * taps[..., index, :channels] for index, weight in enumerate(weights)]
+    return functools.reduce(jnp.add, parts), valid, jnp.stack(weights, axis=-1)

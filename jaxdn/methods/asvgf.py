@@ -74,7 +74,7 @@ def asvgf(options: Options) -> Denoiser:
         fitted = moved(options, params)
         past, broken = svgf.recall_history(fitted, state, frame, first)
         change = 1.0 - (1.0 - changed(fitted, past, frame)) ** fitted.antilag
-        history = svgf.blend(fitted, past, frame, change)
+        history = svgf.blend(fitted, past, frame.radiance.transpose(2, 0, 1), change)
         return (*svgf.filter_history(fitted, history, frame), broken)
 
     reads = svgf.READS | {"luminance_gradient"}

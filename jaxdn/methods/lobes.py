@@ -48,7 +48,7 @@ def apart(frame: Frame, by: Demodulation) -> tuple[Light, Light | None]:
     ``specular_reflectance`` and the rest by the rest of the reflectance (by all of it where that buffer is absent),
     ``"albedo"`` diffuse light alone by the albedo.
     """
-    rest, part = _reflectances(frame)
+    rest, part = reflectances(frame)
     specular = None if frame.specular is None else jnp.minimum(frame.specular, frame.radiance)
     diffuse = frame.radiance if specular is None else frame.radiance - specular
     below: tuple[jax.Array | None, ...] = (None, None)
@@ -65,7 +65,7 @@ def apart(frame: Frame, by: Demodulation) -> tuple[Light, Light | None]:
     return _light(diffuse, below[0], left[0]), None if specular is None else _light(specular, below[1], left[1])
 
 
-def _reflectances(frame: Frame) -> tuple[jax.Array | None, jax.Array | None]:
+def reflectances(frame: Frame) -> tuple[jax.Array | None, jax.Array | None]:
     """What diffuse and what other lobes reflect, [H, W, 3]; None where that is not known."""
     whole, part = frame.albedo if frame.reflectance is None else frame.reflectance, frame.specular_reflectance
     rest = whole if part is None else jnp.maximum((1.0 if whole is None else whole) - part, 0.0)
@@ -112,8 +112,7 @@ def recall_both(
     ``length_plane``.
     """
     packed = diffuse if specular is None else jnp.concatenate([diffuse, specular], axis=-1)
-    tests = {"depth_tolerance": depth_tolerance, "normal_threshold": normal_threshold}
-    surface = recall(packed, before, frame, first, **tests)
+    surface = recall(packed, before, frame, first, depth_tolerance=depth_tolerance, normal_threshold=normal_threshold)
     planes = surface.history.transpose(2, 0, 1)
     if specular is None:
         return Histories(planes, None, None, surface.broken)

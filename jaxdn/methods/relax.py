@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.filters.accumulation import accumulate
+from jaxdn.filters.accumulation import accumulate, after_shift
 from jaxdn.filters.atrous import stencil
 from jaxdn.filters.cascade import cascade
 from jaxdn.filters.clamping import without_fireflies
@@ -90,7 +90,7 @@ def _denoised(options: Options, kind: Kind) -> tuple[jax.Array, jax.Array]:
     slow = accumulate(kind.past[:6], now, alpha=0.0, alpha_moments=0.0, history_max=options.history_max)
     fast = by_lobes.fast_mean(options, kind.past[6:9], now, slow[_LENGTH])
     held, length, moved = by_lobes.respond(options, kind, slow[:3], fast, slow[_LENGTH])
-    moments = _moved(slow[3:5], moved)
+    moments = after_shift(slow[3:5], moved)
     history = jnp.concatenate([held, moments, length[None], fast])
     calm = without_fireflies(held, kind.same) if options.anti_firefly else held
     seen = jnp.concatenate([calm, moments, length[None]])
@@ -100,10 +100,3 @@ def _denoised(options: Options, kind: Kind) -> tuple[jax.Array, jax.Array]:
     own |= {"levels": options.levels, "sigma_luminance": sigma}
     image, _ = cascade(calm, variance, kind.hit, lambda level: kind.weights, _TAPS, **own)
     return history, image
-
-
-def _moved(moments: jax.Array, change: jax.Array) -> jax.Array:
-    """Moments [2, H, W] of luminance after the mean changed and the variance did not."""
-    mean = jnp.maximum(moments[0] + change, 0.0)
-    spread = jnp.maximum(moments[1] - moments[0] ** 2, 0.0)
-    return jnp.stack([mean, mean * mean + spread])

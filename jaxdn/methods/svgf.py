@@ -22,8 +22,8 @@ from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.accumulation import accumulate
 from jaxdn.filters.atrous import B3_SPLINE, stencil
 from jaxdn.filters.cascade import cascade
-from jaxdn.filters.guides import Guides, guides_of, hit_mask, pack, shared, unpack
-from jaxdn.filters.reprojection import expected, reproject, same_surface
+from jaxdn.filters.guides import Guides, guides_of, hit_mask
+from jaxdn.filters.recall import recall
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.filters.weights import Weight, depth_weight, normal_weight
 from jaxdn.frame import Array, Frame
@@ -107,7 +107,7 @@ def svgf(options: Options) -> Denoiser:
     ) -> tuple[SvgfState, jax.Array, jax.Array]:
         fitted = moved(options, params)
         past, broken = recall_history(fitted, state, frame, first)
-        return (*filter_history(fitted, blend(fitted, past, frame), frame), broken)
+        return (*filter_history(fitted, blend(fitted, past, frame.radiance.transpose(2, 0, 1)), frame), broken)
 
     plain = recurrent(Core(start, step, READS, lambda key, frame: unmoved(options)))
     return demodulated(plain, by=options.demodulate)
@@ -121,25 +121,23 @@ def start(params: Params, frame: Frame) -> SvgfState:
 
 def recall_history(options: Options, state: SvgfState, frame: Frame, first: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The fetched history [6, H, W], 0 where missing; the number of invalid history pixels."""
-    # Guides may come and go within a clip.
-    before = shared(state.guides, guides_of(frame))
-    wanted = expected(frame, before, depth_tolerance=options.depth_tolerance)
-
-    def accept(tap: jax.Array) -> jax.Array:
-        return same_surface(unpack(tap, before)[1], wanted, normal_threshold=options.normal_threshold) & ~first
-
-    packed, valid = reproject(pack(state.history, before), frame.motion, accept)
-    past, _ = unpack(packed, before)
-    sound = jnp.all(jnp.isfinite(past) & (past >= 0), axis=-1)
-    broken = jnp.sum(valid & ~sound, dtype=jnp.int32)
-    return jnp.where((valid & sound)[..., None], past, 0.0).transpose(2, 0, 1), broken
+    found = recall(
+        state.history,
+        state.guides,
+        frame,
+        first,
+        depth_tolerance=options.depth_tolerance,
+        normal_threshold=options.normal_threshold,
+        around=True,
+    )
+    return found.history.transpose(2, 0, 1), found.broken
 
 
-def blend(options: Options, past: jax.Array, frame: Frame, change: jax.Array | None = None) -> jax.Array:
-    """The history [6, H, W] with the new frame blended in; ``change`` as in ``accumulate``."""
+def blend(options: Options, past: jax.Array, now: jax.Array, change: jax.Array | None = None) -> jax.Array:
+    """The history [6, H, W] with light [3, H, W] blended in; ``change`` as in ``accumulate``."""
     return accumulate(
         past,
-        frame.radiance.transpose(2, 0, 1),
+        now,
         alpha=options.alpha,
         alpha_moments=options.alpha_moments,
         history_max=options.history_max,

@@ -27,19 +27,19 @@ import jax.numpy as jnp
 
 from jaxdn import brdf
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.filters.accumulation import accumulate, luminance
+from jaxdn.filters.accumulation import after_shift, luminance
 from jaxdn.filters.atrous import B3_SPLINE, stencil
 from jaxdn.filters.cascade import cascade
 from jaxdn.filters.clamping import clamp_to_fast
-from jaxdn.filters.guides import Guides, guides_of, hit_mask, pack, shared, unpack
-from jaxdn.filters.reprojection import expected, reproject, same_surface
+from jaxdn.filters.guides import Guides, expected, guides_of, hit_mask, shared
+from jaxdn.filters.recall import fetch
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.filters.weights import Weight, depth_weight, lobe_weight, luminance_weight, roughness_weight
 from jaxdn.frame import Array, Frame
 from jaxdn.methods import svgf
 from jaxdn.methods.demodulated import Demodulation
 from jaxdn.methods.fitted import FITTING, LEARNED, at_level, moved, unmoved
-from jaxdn.methods.lobes import Light, apart
+from jaxdn.methods.lobes import Light, apart, reflectances
 from jaxdn.methods.table import method
 from jaxdn.options import Range
 
@@ -131,9 +131,9 @@ def trmv(given: Options) -> Denoiser:
         state = _fitting(state, start(params, frame))
         along = frame.motion if frame.dual_motion is None else frame.dual_motion
         past, broken = _recalled(options, state.rest, state.guides, frame, along, first)
-        diffuse = frame._replace(radiance=parts.rest.transpose(1, 2, 0), reflectance=_diffuse_reflectance(frame))
+        diffuse = frame._replace(radiance=parts.rest.transpose(1, 2, 0), reflectance=reflectances(frame)[0])
         # As in a wrapper by `demodulated`: the light is divided, and the reflectance is what it was divided by.
-        kept, image = svgf.filter_history(options, svgf.blend(options, past[:6], diffuse), diffuse)
+        kept, image = svgf.filter_history(options, svgf.blend(options, past[:6], parts.rest), diffuse)
         rest, shadows, specular = kept.history, None, None
         hit = hit_mask(frame.depth, frame.ids)
 
@@ -149,7 +149,7 @@ def trmv(given: Options) -> Denoiser:
         if parts.shine is not None and state.specular is not None:
             along = frame.motion if frame.glossy_motion is None else frame.glossy_motion
             past, lost = _recalled(options, state.specular, state.guides, frame, along, first)
-            history = _accumulated(options, past, parts.shine.light)
+            history = svgf.blend(options, past, parts.shine.light)
             image = image + parts.shine.whole(_mirrored(options, history, parts.shine.texture, frame, hit))
             specular = history.transpose(1, 2, 0)
             broken = broken + lost
@@ -172,14 +172,6 @@ def _split(frame: Frame, by: Demodulation) -> _Parts:
     shadowed = jnp.minimum(divided(frame.shadowed), diffuse.light)
     unshadowed = shadowed if frame.unshadowed is None else jnp.maximum(divided(frame.unshadowed), shadowed)
     return _Parts(diffuse.light - shadowed, shadowed, unshadowed, diffuse, specular)
-
-
-def _diffuse_reflectance(frame: Frame) -> Array:
-    """What diffuse light is divided by: the reflectance less that of specular lobes."""
-    if frame.specular_reflectance is None:
-        return frame.reflectance
-    whole = frame.albedo if frame.reflectance is None else frame.reflectance
-    return jnp.maximum((1.0 if whole is None else whole) - frame.specular_reflectance, 0.0)
 
 
 def _fitting(state: TrmvState, begun: TrmvState) -> TrmvState:
@@ -207,31 +199,17 @@ def _recalled(
     Where the vector is that of the surface, taps must show the same surface, as in ``svgf``. Elsewhere they show
     another place of it, whose depth tells nothing, or with ``any_surface`` one beside it: normals must agree there.
     """
-    before = shared(before, guides_of(frame))
     wanted = expected(frame, before, depth_tolerance=options.depth_tolerance)
-    still = 0.0 if frame.motion is None else frame.motion
-    elsewhere = None if vector is None else jnp.any(jnp.isfinite(vector) & (vector != still), axis=-1)
-
-    def accept(tap: jax.Array) -> jax.Array:
-        guides = unpack(tap, before)[1]
-        same = same_surface(guides, wanted, normal_threshold=options.normal_threshold)
-        if elsewhere is not None:
-            loose = wanted._replace(ids=None) if any_surface else wanted
-            alike = same_surface(guides._replace(depth=None), loose, normal_threshold=options.normal_threshold)
-            same = jnp.where(elsewhere, alike, same)
-        return same & ~first
-
-    packed, valid = reproject(pack(history, before), vector, accept)
-    past, _ = unpack(packed, before)
-    sound = jnp.all(jnp.isfinite(past) & (past >= 0), axis=-1)
-    broken = jnp.sum(valid & ~sound, dtype=jnp.int32)
-    return jnp.where((valid & sound)[..., None], past, 0.0).transpose(2, 0, 1), broken
-
-
-def _accumulated(options: Options, past: jax.Array, now: jax.Array) -> jax.Array:
-    return accumulate(
-        past, now, alpha=options.alpha, alpha_moments=options.alpha_moments, history_max=options.history_max
-    )
+    if vector is not None:
+        still = 0.0 if frame.motion is None else frame.motion
+        elsewhere = jnp.any(jnp.isfinite(vector) & (vector != still), axis=-1)
+        if wanted.tolerance is not None:
+            wanted = wanted._replace(tolerance=jnp.where(elsewhere, jnp.inf, wanted.tolerance))
+        if any_surface and wanted.ids is not None:
+            wanted = wanted._replace(ids=jnp.where(elsewhere, jnp.nan, wanted.ids))
+    before = shared(before, guides_of(frame))
+    found = fetch(history, before, vector, wanted, first, normal_threshold=options.normal_threshold, around=True)
+    return found.history.transpose(2, 0, 1), found.broken
 
 
 def _mean(options: Options, past: jax.Array, now: jax.Array, length: jax.Array) -> jax.Array:
@@ -256,7 +234,7 @@ def _shaded(
     assert parts.shadowed is not None
     assert parts.unshadowed is not None
     held = _clamped(options, past, parts.shadowed, parts.unshadowed, hit)
-    history = _accumulated(options, held, parts.shadowed)
+    history = svgf.blend(options, held, parts.shadowed)
     under = _mean(options, past[6:], parts.unshadowed, past[_LENGTH])
     texture = parts.diffuse.texture
 
@@ -285,10 +263,8 @@ def _clamped(options: Options, past: jax.Array, lit: jax.Array, free: jax.Array,
     before = _share(past[:3], past[6:])
     held = clamp_to_fast(before, _share(lit, free), known, sigma=options.clamp_sigma)
     color = past[:3] + (held - before) * past[6:]
-    # The mean has changed, the variance has not.
-    mean = jnp.maximum(past[3] + luminance(color) - luminance(past), 0.0)
-    spread = jnp.maximum(past[4] - past[3] ** 2, 0.0)
-    return jnp.concatenate([jnp.maximum(color, 0.0), jnp.stack([mean, mean * mean + spread]), past[5:6]])
+    moments = after_shift(past[3:5], luminance(color) - luminance(past))
+    return jnp.concatenate([jnp.maximum(color, 0.0), moments, past[5:6]])
 
 
 def _share(lit: jax.Array, free: jax.Array) -> jax.Array:

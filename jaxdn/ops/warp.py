@@ -4,6 +4,8 @@ The public :func:`warp` and its implementations: each samples at array positions
 image (0 <= x <= W - 1, likewise y).
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -67,49 +69,55 @@ def reference(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     return (1 - fy) * upper + fy * lower
 
 
-def _at_least_two(image: jax.Array) -> jax.Array:
-    """An image of one row or column gets its neighbour: a cell needs two."""
-    height, width = image.shape[:2]
-    return jnp.pad(image, ((0, int(height == 1)), (0, int(width == 1)), (0, 0)), mode="edge")
+def _at_least(image: jax.Array, size: int) -> jax.Array:
+    """An image smaller than a window of ``size`` pixels is continued by its last row and column."""
+    missing = (max(size - length, 0) for length in image.shape[:2])
+    return jnp.pad(image, (*((0, more) for more in missing), (0, 0)), mode="edge")
 
 
-def corners(image: jax.Array, top: jax.Array, left: jax.Array) -> jax.Array:
-    """The four pixels of cells [h, w]: [h, w, 4, C], upper left, upper right, lower left, lower right."""
-    image = _at_least_two(image)
+def windows(image: jax.Array, top: jax.Array, left: jax.Array, size: int) -> jax.Array:
+    """The pixels of square windows whose upper left pixels are ``top``, ``left`` [...]: [..., size * size, C], by rows.
+
+    All windows lie in the image; the last row and column of one that is smaller than a window are repeated.
+    """
+    image = _at_least(image, size)
     _, width, channels = image.shape
     flat = image.reshape(-1)
     start = (top * width + left) * channels
-    # Two neighbours of a row are contiguous in memory: one index fetches 2C numbers.
-    pairs = lax.GatherDimensionNumbers(offset_dims=(top.ndim,), collapsed_slice_dims=(), start_index_map=(0,))
+    # Neighbours of a row are contiguous in memory: one index fetches all of them.
+    rows = lax.GatherDimensionNumbers(offset_dims=(top.ndim,), collapsed_slice_dims=(), start_index_map=(0,))
 
     def row(offset: int) -> jax.Array:
-        return lax.gather(flat, (start + offset)[..., None], pairs, (2 * channels,), mode="promise_in_bounds")
+        return lax.gather(flat, (start + offset)[..., None], rows, (size * channels,), mode="promise_in_bounds")
 
-    return jnp.concatenate([row(0), row(width * channels)], axis=-1).reshape(*top.shape, 4, channels)
+    found = jnp.concatenate([row(index * width * channels) for index in range(size)], axis=-1)
+    return found.reshape(*top.shape, size * size, channels)
 
 
 def _fetch(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     left, top, fx, fy = cells(x, y, *image.shape[:2])
-    found = corners(image, top, left)
+    found = windows(image, top, left, 2)
     upper = (1 - fx) * found[..., 0, :] + fx * found[..., 1, :]
     lower = (1 - fx) * found[..., 2, :] + fx * found[..., 3, :]
     return (1 - fy) * upper + fy * lower
 
 
 def _scattered(shape: tuple[int, ...], top: jax.Array, left: jax.Array, blocks: jax.Array) -> jax.Array:
-    """The adjoint of :func:`corners`: blocks [h, w, 4, C] are added to the four pixels of their cells."""
-    height, width, channels = max(shape[0], 2), max(shape[1], 2), shape[2]
+    """The adjoint of :func:`windows`: blocks [..., size * size, C] are added to the pixels of their windows."""
+    size = math.isqrt(blocks.shape[-2])
+    height, width, channels = max(shape[0], size), max(shape[1], size), shape[2]
     where = jnp.stack([top, left * channels], axis=-1).reshape(-1, 2)
-    windows = lax.ScatterDimensionNumbers(
+    dimensions = lax.ScatterDimensionNumbers(
         update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
     )
     empty = jnp.zeros((height, width * channels), blocks.dtype)
-    total = lax.scatter_add(
-        empty, where, blocks.reshape(-1, 2, 2 * channels), windows, mode="promise_in_bounds"
-    ).reshape(height, width, channels)
-    if shape[0] == 1:
-        total = total[:1] + total[1:]
-    return total[:, :1] + total[:, 1:] if shape[1] == 1 else total
+    updates = blocks.reshape(-1, size, size * channels)
+    total = lax.scatter_add(empty, where, updates, dimensions, mode="promise_in_bounds")
+    total = total.reshape(height, width, channels)
+    # What fell on repeated rows and columns belongs to the last ones.
+    last_row, last_column = shape[0] - 1, shape[1] - 1
+    total = jnp.concatenate([total[:last_row], total[last_row:].sum(0, keepdims=True)], axis=0)
+    return jnp.concatenate([total[:, :last_column], total[:, last_column:].sum(1, keepdims=True)], axis=1)
 
 
 def _spread(shape: tuple[int, ...], x: jax.Array, y: jax.Array, cotangent: jax.Array) -> jax.Array:
@@ -123,9 +131,9 @@ def _spread(shape: tuple[int, ...], x: jax.Array, y: jax.Array, cotangent: jax.A
 def differentiable_mean(
     mean: jax.Array, image: jax.Array, top: jax.Array, left: jax.Array, weights: jax.Array
 ) -> jax.Array:
-    """``mean`` with a gradient by ``image``: the sum of the four pixels of each cell times ``weights`` [h, w, 4].
+    """``mean`` with a gradient by ``image``: the sum of the pixels of each window times ``weights`` [..., size * size].
 
-    The order is that of :func:`corners`. For fetches that are done another way than their gradient.
+    The order is that of :func:`windows`. For fetches that are done another way than their gradient.
     """
     return mean
 

@@ -29,45 +29,91 @@ def drawn(rng):
     return rng.uniform(0.1, 1, (HEIGHT, WIDTH, 2)), frame
 
 
-def by_loops(history, frame):
+def by_loops(history, frame, *, around=False):
+    """The definition, pixel by pixel."""
     out, valid = np.zeros(history.shape), np.zeros((HEIGHT, WIDTH, 1), bool)
+
+    def accepted(y, x, pixel):
+        return 0 <= y < HEIGHT and 0 <= x < WIDTH and frame.ids[y, x] == frame.ids[pixel]
+
     for row, column in np.ndindex(HEIGHT, WIDTH):
         x, y = np.array([column, row]) + frame.motion[row, column]
-        if not (0 <= x <= WIDTH - 1 and 0 <= y <= HEIGHT - 1):
+        if not (-1 < x < WIDTH and -1 < y < HEIGHT):
             continue
-        left, top = min(int(x), WIDTH - 2), min(int(y), HEIGHT - 2)
-        total, weight = np.zeros(history.shape[2]), 0.0
-        for b, a in np.ndindex(2, 2):
-            share = abs(1 - b - (y - top)) * abs(1 - a - (x - left))
-            if frame.ids[top + b, left + a] == frame.ids[row, column]:
-                total, weight = total + share * history[top + b, left + a], weight + share
-        if weight >= 0.01:
-            out[row, column], valid[row, column] = total / weight, True
+        x, y = np.clip(x, 0, WIDTH - 1), np.clip(y, 0, HEIGHT - 1)
+        left, top = int(x), int(y)
+        taps = {(top + b, left + a): abs(1 - b - (y - top)) * abs(1 - a - (x - left)) for b, a in np.ndindex(2, 2)}
+        taps = {at: share for at, share in taps.items() if share > 0 and accepted(*at, (row, column))}
+        if around and sum(taps.values()) < 0.01:
+            middle = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+            near = [(middle[0] + b - 1, middle[1] + a - 1) for b, a in np.ndindex(3, 3)]
+            taps = {at: 1.0 for at in near if accepted(*at, (row, column))}
+        if sum(taps.values()) >= 0.01:
+            out[row, column] = sum(share * history[at] for at, share in taps.items()) / sum(taps.values())
+            valid[row, column] = True
     return out, valid
 
 
-def recalled(history, frame, *, first=False, before=None):
+def recalled(history, frame, *, first=False, around=False):
     frame = jax.tree.map(jnp.asarray, frame)
-    before = guides_of(frame) if before is None else before
-    return recall(jnp.asarray(history), before, frame, jnp.asarray(first))
+    return recall(jnp.asarray(history), guides_of(frame), frame, jnp.asarray(first), around=around)
 
 
+@pytest.mark.parametrize("around", [False, True])
 @pytest.mark.parametrize("strip", [5_000, 20])
 @pytest.mark.parametrize("guide", ["ids", "normal", "depth"])
-def test_it_is_the_mean_of_the_taps_of_the_same_surface(guide, strip, rng, x64, monkeypatch):
+def test_it_is_the_mean_of_the_taps_of_the_same_surface(guide, strip, around, rng, x64, monkeypatch):
     monkeypatch.setattr(module, "_STRIP", strip)
+    monkeypatch.setattr(module, "_RUN", strip // 10)
     history, frame = drawn(rng)
     one = Frame(radiance=frame.radiance, motion=frame.motion, **{guide: getattr(frame, guide)})
-    found = recalled(history, one)
-    wanted, valid = by_loops(history, frame)
+    found = recalled(history, one, around=around)
+    wanted, valid = by_loops(history, frame, around=around)
     np.testing.assert_array_equal(found.valid, valid)
     np.testing.assert_allclose(found.history, wanted, rtol=1e-12)
     assert 0 < valid.sum() < valid.size
+    assert around == (valid.sum() > by_loops(history, frame)[1].sum())
 
 
-def test_its_gradient(rng, x64):
+@pytest.mark.parametrize("around", [False, True])
+def test_its_gradient(around, rng, x64):
     history, frame = drawn(rng)
-    check_grads(lambda x: recalled(x, frame).history, (jnp.asarray(history),), order=1, modes=["rev"])
+    function = jax.jit(lambda x: recalled(x, frame, around=around).history)
+    check_grads(function, (jnp.asarray(history),), order=1, modes=["rev"])
+    gradient = jax.grad(lambda x: function(x).sum())(jnp.asarray(history))
+    np.testing.assert_allclose(gradient.sum(), 2 * recalled(history, frame, around=around).valid.sum())
+
+
+def test_an_image_smaller_than_the_places_around(rng, x64):
+    history, frame = drawn(rng)
+    small = jax.tree.map(lambda one: one[:2, :2], frame)._replace(ids=np.array([[[0], [1]], [[1], [1]]]))
+    for vector in ([0.0, 0.0], [0.4, 0.0], [-0.6, 0.7]):
+        moving = small._replace(motion=np.broadcast_to(np.array(vector), (2, 2, 2)), depth=None, normal=None)
+        before = guides_of(moving)._replace(ids=jnp.array([[[1.0], [1]], [[1], [0]]]))
+        rest = before, jax.tree.map(jnp.asarray, moving), jnp.asarray(False)
+        found = recall(jnp.asarray(history[:2, :2]), *rest, around=True)
+        assert found.valid.all()  # every place is near
+        np.testing.assert_array_equal(found.history[0, 0], history[1, 1])  # the only pixel of its kind
+        gradient = jax.grad(lambda x, rest=rest: recall(x, *rest, around=True).history.sum())(
+            jnp.asarray(history[:2, :2])
+        )
+        np.testing.assert_allclose(gradient.sum(), 8.0)
+
+
+def test_a_still_pixel_that_shows_something_else_looks_around(rng, x64):
+    history, frame = drawn(rng)
+    changed = frame._replace(ids=frame.ids.copy(), motion=None, depth=None, normal=None)
+    changed.ids[3, 5] = 1
+    for given in (changed, changed._replace(motion=np.zeros((HEIGHT, WIDTH, 2)))):
+        given = jax.tree.map(jnp.asarray, given)
+        before = guides_of(jax.tree.map(jnp.asarray, frame._replace(depth=None, normal=None)))
+        assert not recall(jnp.asarray(history), before, given, jnp.asarray(False)).valid[3, 5]
+        assert not recall(jnp.asarray(history), before, given, jnp.asarray(False), around=True).valid[3, 5]
+        frame.ids[2, 4] = 1
+        before = guides_of(jax.tree.map(jnp.asarray, frame._replace(depth=None, normal=None)))
+        found = recall(jnp.asarray(history), before, given, jnp.asarray(False), around=True)
+        np.testing.assert_array_equal(found.history[3, 5], history[2, 4])
+        frame.ids[2, 4] = 0
 
 
 def test_without_motion_it_is_the_pixel_itself(rng, x64):

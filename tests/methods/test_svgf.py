@@ -7,7 +7,6 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
-from jaxdn.filters.reprojection import reproject
 from jaxdn.filters.weights import Weight, depth_weight, luminance_weight
 from jaxdn.frame import FAR, Clip, Frame, frame_at
 from jaxdn.methods.svgf import svgf
@@ -495,17 +494,6 @@ def test_double_precision_stays_double(x64, rng):
     denoiser = svgf(levels=1)
     state, image = jax.eval_shape(lambda f: denoiser.step({}, denoiser.start({}, f), f), frame)
     assert image.dtype == state.core.history.dtype == jnp.float64
-
-
-def test_a_rejected_tap_may_be_anything(rng):
-    packed = rng.random((5, 6, 2)).astype(np.float32)
-    packed[2, 3] = np.nan
-    motion = np.full((5, 6, 2), 0.5, np.float32)
-    fetch = jax.jit(lambda packed, motion: reproject(packed, motion, lambda tap: jnp.isfinite(tap[..., 0])))
-    mean, valid = fetch(packed, motion)
-    assert np.isfinite(mean).all()
-    assert bool(valid.all())
-    np.testing.assert_allclose(mean[1, 2], (packed[1, 2] + packed[1, 3] + packed[2, 2]) / 3, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

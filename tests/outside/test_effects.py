@@ -182,6 +182,14 @@ def test_a_plan_is_made_for_a_method_with_or_without_weights(name):
     assert command.denoiser_named(name).reads
 
 
+def test_several_denoisers_read_what_each_of_them_reads():
+    apart = [command.denoiser_named(name).reads for name in ("taa", "relax", "asvgf")]
+    assert command.denoiser_named("taa,relax,asvgf").reads == frozenset().union(*apart) != apart[1]
+    assert command.denoiser_named("noisy,taa").reads == apart[0]
+    with pytest.raises(ValueError, match="magic"):
+        command.denoiser_named("svgf,magic")
+
+
 def test_an_unknown_method_is_refused():
     with pytest.raises(ValueError, match="magic"):
         command.denoiser_named("magic")

@@ -8,7 +8,6 @@ import numpy as np
 from experiments.speed.chart.energy import Meter
 from experiments.speed.timing import measure
 from jaxdn import effects
-from jaxdn.frame import Frame
 from jaxdn.render import AnimatedScene, render_frame
 
 SAMPLES = (1, 2, 4)
@@ -53,7 +52,7 @@ def measure_cost(scene: AnimatedScene, height: int, width: int, meter: Meter | N
         return lambda: render_frame(scene, FRAME, width=width, height=height, layers=(spp,), previous=before, plan=plan)
 
     calls = {f"light {spp}": frame(spp, ()) for spp in SAMPLES}
-    calls |= {"features": frame(1, tuple(FEATURES)), "motion": frame(1, Frame._fields[1:])}
+    calls |= {"features": frame(1, tuple(FEATURES)), "motion": frame(1, everything.buffers)}
     seconds = {name: timing.median_ms / 1e3 for name, timing in measure(calls, rounds=3, budget_s=40).items()}
     costs = {"seconds": _fitted(seconds)._asdict()}
     if meter is not None:

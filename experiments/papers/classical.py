@@ -1,0 +1,161 @@
+"""`make compare`: the filters side by side, next to shipped weights and Open Image Denoise, in error and in time.
+
+    python -m experiments.papers.classical [SCENES ...]
+
+Renders one test clip of each family, of a seed that nothing was trained on, and the rooms that are found in the folders
+SCENES (as :mod:`experiments.papers.rooms`), with everything that a filter reads: indirect light, and all light that
+surfaces reflect, whose shadows are noisy too. Writes ``runs/compare/LIGHT/report.html``, every method's image of every
+clip as ``pictures/CLIP/METHOD.png``, and ``table.md``: errors without the noise of the references, and the time of a
+720p frame, in processes of their own that take turns. Rendered clips are used again.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from experiments.papers import results, rooms
+from experiments.papers.preintegration import save_pictures
+from experiments.speed import peers
+from experiments.speed.timing import Call
+from experiments.speed.workers import Team
+from experiments.speed.works import steps
+from jaxdn.candidates import candidate, filters
+from jaxdn.clips import read_clip
+from jaxdn.commands.compare import compare
+from jaxdn.commands.errors import plain_errors
+from jaxdn.commands.render import render
+from jaxdn.frame import frame_at
+from jaxdn.planning.catalogue import NoisyLight
+from jaxdn.report import write_report
+from jaxdn.weights import shipped_names
+
+FAMILIES = ("fruit", "robot", "mobile", "pinkroom", "parlour")
+SEED = 2000
+LIGHTS: tuple[NoisyLight, ...] = ("indirect", "reflected")
+PEER = "Open Image Denoise"
+AGAINST = "svgf"
+"""The filter that the times of all others are compared with."""
+
+
+@dataclass
+class Settings:
+    """Compare all filters on test clips and rooms."""
+
+    scenes: Annotated[list[Path], tyro.conf.Positional] = field(default_factory=list)
+    """Folders of rooms: one folder with a scene.xml each."""
+    families: tuple[str, ...] = FAMILIES
+    """Families of test clips."""
+    size: int = 128
+    """Width and height of the families' clips in pixels."""
+    frames: int = 10
+    reference_spp: int = 128
+    timed: tuple[int, int] = (720, 1280)
+    """Height and width of the frame that is timed."""
+    rounds: int = 5
+    """Turns of each method."""
+    data: Path = Path("data/compare")
+    """Folder for the clips."""
+    out: Path = Path("runs/compare")
+    """Folder for the reports."""
+    workers: int | None = None
+    """Number of rendering processes; default: the number of cores."""
+
+
+def render_clips(settings: Settings, light: NoisyLight) -> list[Path]:
+    """The clips with this noisy light, rendered as far as they do not exist."""
+    shared: dict[str, Any] = {
+        "seeds": [SEED],
+        "layers": [1],
+        "reference_spp": settings.reference_spp,
+        "light": light,
+        "max_depth": None,
+        "effects": "auto",
+        "denoiser": ",".join([*filters(), *shipped_names()]),
+        "workers": settings.workers,
+    }
+    square: dict[str, Any] = {"width": settings.size, "height": settings.size}
+    place = settings.data / light
+    found = []
+    for family in settings.families:
+        found += render(family, place, animation=None, frames=settings.frames, **square, **shared)
+    for scene, animation in rooms.scenes_in(settings.scenes) if settings.scenes else []:
+        found += render(str(scene), place, animation=animation, frames=8, width=320, height=180, **shared)
+    return found
+
+
+def timed_frame(settings: Settings) -> Path:
+    """A clip of the size that is timed, with all light that surfaces reflect and its shadows: the most work."""
+    height, width = settings.timed
+    return render(
+        settings.families[-1],
+        settings.data / "timed",
+        animation=None,
+        seeds=[SEED],
+        width=width,
+        height=height,
+        frames=2,
+        reference_spp=0,
+        layers=[1],
+        light="reflected",
+        max_depth=None,
+        effects="all",
+        denoiser=",".join([*filters(), *shipped_names()]),
+        workers=settings.workers,
+    )[0]
+
+
+def step(folder: Path, name: str) -> Call:
+    """The call that is timed, made in its own process: another step on the second frame of a clip."""
+    frame = jax.tree.map(jnp.asarray, frame_at(read_clip(folder).frames, 1))
+    if name == PEER:
+        return steps.open_image_denoise(frame, "high")
+    method = candidate(name)
+    engine = method.engine()
+    if engine is not None:
+        method = candidate(name, implementation=engine)
+    assert method.denoiser is not None
+    return steps.recurrent(method.denoiser, method.params, frame)
+
+
+def milliseconds(
+    folder: Path, names: list[str], *, rounds: int, say: Callable[[str], None] = print
+) -> dict[str, float]:
+    """Median milliseconds of a frame of each method; those that fail are said and left out."""
+    with Team("time of a frame", say) as team:
+        team.start({name: partial(step, folder, name) for name in names})
+        turns = team.turns(rounds=rounds, budget_s=600.0)
+    return {name: float(np.median(samples)) for name, samples in turns.items()}
+
+
+def main(settings: Settings) -> None:
+    """Render, compare, time, report."""
+    methods = list(results.contestants([]))
+    places = {light: render_clips(settings, light) for light in LIGHTS}
+    names = [*filters(), *shipped_names(), *([] if "pyoidn" in peers.missing() else [PEER])]
+    times = milliseconds(timed_frame(settings), names, rounds=settings.rounds)
+    shown = {name: f"{ms:.0f} ({ms / times[AGAINST]:.2f})" for name, ms in times.items()}
+    height, width = settings.timed
+    lines = [f"Milliseconds of a frame of {width} x {height} pixels, and in brackets against {AGAINST}."]
+    for light, folders in places.items():
+        facts = {"clips": len(folders), "reference spp": settings.reference_spp}
+        title = f"Filters, 1 sample per pixel, {light} light"
+        found = compare(methods, folders, title=title, settings=facts)
+        page = write_report(found, settings.out / light)
+        save_pictures(found, settings.out / light / "pictures")
+        lines += ["", title, "", results.table(found, {"milliseconds": shown})]
+        print(f"report: {page}", flush=True)
+    table = settings.out / "table.md"
+    table.write_text("\n".join(lines) + "\n")
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Settings, description=Settings.__doc__))

@@ -1,0 +1,46 @@
+"""The classical family side by side: every filter has a row with its errors and its time."""
+
+import re
+
+import pytest
+
+from experiments.papers import classical, results
+from jaxdn.candidates import NOISY, filters
+
+
+@pytest.mark.slow
+def test_every_filter_is_scored_and_timed(tmp_path, capsys):
+    pytest.importorskip("mitsuba")
+    settings = classical.Settings(
+        families=("fruit",),
+        size=24,
+        frames=2,
+        reference_spp=4,
+        timed=(24, 32),
+        rounds=1,
+        data=tmp_path / "data",
+        out=tmp_path / "out",
+        workers=1,
+    )
+    classical.main(settings)
+    written = (tmp_path / "out" / "table.md").read_text()
+    assert written.strip() in capsys.readouterr().out
+    for light in classical.LIGHTS:
+        assert (tmp_path / "out" / light / "report.html").is_file()
+        assert (tmp_path / "out" / light / "pictures" / "fruit-2000" / "trmv.png").is_file()
+    rows = [line.split(" | ") for line in written.splitlines() if line.startswith("| ")]
+    for name in filters():
+        own = [row for row in rows if row[0] == f"| {name}"]
+        assert len(own) == 2
+        for row in own:
+            assert float(row[1]) > 0
+            assert re.fullmatch(r"\d+ \(\d+\.\d\d\) \|", row[-1])
+    assert {row[-1] for row in rows if row[0] == f"| {NOISY}"} == {" |"}
+    assert {row[-1] for row in rows if row[0] == f"| {classical.AGAINST}"} <= {
+        row[-1] for row in rows if "(1.00)" in row[-1]
+    }
+
+
+def test_a_table_may_have_further_columns():
+    table = results.table(results.Results("", {}, {}, [], [], {}), {"milliseconds": {"svgf": "1"}})
+    assert table.splitlines()[0].endswith("| hidden pixels, PSNR | milliseconds |")
