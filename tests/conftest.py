@@ -3,6 +3,7 @@
 Markers: ``slow`` (more than 10 s), ``browser`` (needs Chromium through Playwright).
 """
 
+import gc
 from collections.abc import Iterator
 
 import hypothesis
@@ -31,6 +32,18 @@ def pytest_configure(config: pytest.Config) -> None:
     # Most of a test's time is compilation, and most of it is the same as in the last run.
     jax.config.update("jax_compilation_cache_dir", str(config.rootpath / ".pytest_cache" / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forgotten_programs() -> Iterator[None]:
+    """A module's compiled programs are forgotten after it.
+
+    Each maps some twenty pieces of memory. Those of all tests together are more than Linux allows a process (65,530 by
+    default), and the next one that is compiled crashes it.
+    """
+    yield
+    jax.clear_caches()
+    gc.collect()
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from jaxdn.filters.weights import Offset, Weight
 
 B3_SPLINE = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
 _STRIP_PIXELS = 16384
-_NO_WEIGHT = 1e-10
+NO_WEIGHT = 1e-10
 """Smaller sums of weights count as no tap: their cube, in the gradient of the variance, would underflow to 0. So would
 the square of their square, in that of a division by it: there are two divisions instead."""
 
@@ -127,7 +127,7 @@ def edge_average(
         begin = (sums, jnp.full((rows, width), taps[0, 2], dtype), offsets[0])
         (sums, ready, offset), _ = lax.scan(body, begin, (offsets[1:], numbers[1:]))
         total, total_spread = add(sums, ready, offset)
-        some = total[-1] > _NO_WEIGHT
+        some = total[-1] > NO_WEIGHT
         share = jnp.where(some, total[-1], 1.0)
         mean = jnp.stack([jnp.where(some, plane, 0.0) / share for plane in total[:-1]])
         return mean, None if total_spread is None else jnp.where(some, total_spread, 0.0) / share / share

@@ -9,6 +9,7 @@ from jax import lax
 
 from jaxdn import brdf
 from jaxdn.filters.atrous import edge_average, stencil
+from jaxdn.filters.few import average_of_few, few_or_all
 from jaxdn.filters.weights import Weight
 
 WIDEST = 14
@@ -45,13 +46,22 @@ def fix_history(
     whole = jnp.clip(jnp.round(length), 1, None)
     planes = color if texture is None else jnp.concatenate([color, texture])
 
-    def fill(fixed: jax.Array, each: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
-        number, stride = each
-        needed = whole == number
-        needed = needed if hit is None else needed & hit
-        mean, _ = edge_average(planes, hit, weights, _TAPS, step=stride, step_max=int(strides.max()), needed=needed)
-        filled = mean if texture is None else brdf.restore(mean[:3], texture, mean[3:])
-        return jnp.where(needed[None], filled, fixed), None
+    short = whole <= frames
+    short = short if hit is None else short & hit
 
-    fixed, _ = lax.scan(fill, color, (jnp.asarray(numbers, length.dtype), jnp.asarray(strides)))
-    return fixed
+    def few() -> jax.Array:
+        step = jnp.asarray(strides)[jnp.clip(whole - 1, 0, frames - 1).astype(jnp.int32)]
+        return average_of_few(planes, hit, weights, _TAPS, short, step=step)
+
+    def many() -> jax.Array:
+        def fill(filled: jax.Array, each: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+            number, stride = each
+            own = short & (whole == number)
+            mean, _ = edge_average(planes, hit, weights, _TAPS, step=stride, step_max=int(strides.max()), needed=own)
+            return jnp.where(own[None], mean, filled), None
+
+        return lax.scan(fill, planes, (jnp.asarray(numbers, length.dtype), jnp.asarray(strides)))[0]
+
+    mean = few_or_all(short, few, many)
+    filled = mean if texture is None else brdf.restore(mean[:3], texture, mean[3:])
+    return jnp.where(short[None], filled, color)

@@ -8,7 +8,7 @@ Fetches run by strips: at 720p, fetching the taps of all pixels at once takes tw
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,15 +18,13 @@ from jax import lax
 from jaxdn.filters.guides import Expected, Guides, expected, guides_of, pack, same_surface, shared, unpack
 from jaxdn.frame import Frame
 from jaxdn.motion import targets
-from jaxdn.ops.strips import by_strips
+from jaxdn.ops.strips import by_strips, where_needed
 from jaxdn.ops.warp import cells, differentiable_mean, windows
 
 WEIGHT_MIN = 0.01
 """Minimum sum of accepted bilinear weights that counts as history."""
 _STRIP = 5_000
 """Approximate number of pixels in a strip."""
-_RUN = 640
-"""Pixels that search around their targets together, if one of them has to."""
 
 
 class Recalled(NamedTuple):
@@ -160,25 +158,17 @@ def _around(
     # At the border the window lies inside the image, and the pixels of it that are too far away do not count.
     top, left = jnp.clip(row - 1, 0, max(height - 3, 0)), jnp.clip(column - 1, 0, max(width - 3, 0))
 
-    def search(part: tuple[jax.Array, tuple[jax.Array, ...], Expected]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        lost, (row, column, top, left), wanted = part
+    def search(part: tuple[tuple[jax.Array, ...], Expected]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        (row, column, top, left), wanted = part
         taps = windows(packed, top, left, 3)
         weights = []
         for index, (dy, dx) in enumerate(np.ndindex(3, 3)):
             y, x = top + dy, left + dx
             near = (jnp.abs(y - row) <= 1) & (jnp.abs(x - column) <= 1) & (y < height) & (x < width)
-            weights.append((lost & near & accepted(taps[..., index, :], wanted)).astype(history.dtype))
+            weights.append((near & accepted(taps[..., index, :], wanted)).astype(history.dtype))
         return _mean(taps, weights, channels, least=1.0)
 
-    def run(part: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-        def nothing(part: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-            return jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), jax.eval_shape(search, part))
-
-        return lax.cond(jnp.any(part[0]), search, nothing, part)
-
-    # Lost pixels are few, and near each other: as one long row, most runs of pixels have none.
-    flat = jax.tree.map(lambda one: one.reshape(-1, 1, *one.shape[2:]), (lost, (row, column, top, left), wanted))
-    mean, found, weights = (one.reshape(height, width, *one.shape[2:]) for one in by_strips(run, flat, pixels=_RUN))
+    mean, found, weights = where_needed(search, lost, ((row, column, top, left), wanted))
     return differentiable_mean(mean, history, top, left, weights), found
 
 

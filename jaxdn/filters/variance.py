@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxdn import brdf
 from jaxdn.filters.accumulation import luminance
 from jaxdn.filters.atrous import edge_average, stencil
+from jaxdn.filters.few import average_of_few, few_or_all
 from jaxdn.filters.weights import Weight
 
 
@@ -31,7 +32,11 @@ def estimate_variance(
     short = length < short_history
     needed = short if hit is None else short & hit
     planes = history[:5] if texture is None else jnp.concatenate([history[:5], texture])
-    mean, _ = edge_average(planes, hit, weights, stencil(3), needed=needed)
+    mean = few_or_all(
+        needed,
+        lambda: average_of_few(planes, hit, weights, stencil(3), needed),
+        lambda: edge_average(planes, hit, weights, stencil(3), needed=needed)[0],
+    )
     around, spatial = mean[:3], jnp.maximum(mean[4] - mean[3] ** 2, 0.0) * (short_history / length)
     if texture is not None:
         around = brdf.restore(around, texture, mean[5:])

@@ -64,7 +64,6 @@ def recalled(history, frame, *, first=False, around=False):
 @pytest.mark.parametrize("guide", ["ids", "normal", "depth"])
 def test_it_is_the_mean_of_the_taps_of_the_same_surface(guide, strip, around, rng, x64, monkeypatch):
     monkeypatch.setattr(module, "_STRIP", strip)
-    monkeypatch.setattr(module, "_RUN", strip // 10)
     history, frame = drawn(rng)
     one = Frame(radiance=frame.radiance, motion=frame.motion, **{guide: getattr(frame, guide)})
     found = recalled(history, one, around=around)

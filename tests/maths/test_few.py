@@ -1,0 +1,80 @@
+"""Averages of few pixels are those of all pixels, at these pixels; what is needed alone is worked on alone."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdn.filters import few
+from jaxdn.filters.atrous import edge_average, stencil
+from jaxdn.filters.history_fix import fix_history
+from jaxdn.filters.variance import estimate_variance
+from jaxdn.filters.weights import depth_weight, luminance_weight, normal_weight
+from jaxdn.ops.strips import where_needed
+
+HEIGHT, WIDTH = 23, 17
+
+
+def drawn(rng):
+    """Planes, surfaces, weights and a history of random lengths."""
+    planes = jnp.asarray(rng.random((5, HEIGHT, WIDTH)))
+    normal = rng.normal(size=(HEIGHT, WIDTH, 3)) * 0.2 + [0, 0, 1]
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    depth = jnp.asarray(rng.uniform(2, 3, (HEIGHT, WIDTH, 1)))
+    weights = [
+        depth_weight(depth, None, sigma=1.0),
+        normal_weight(jnp.asarray(normal), sigma=16.0),
+        luminance_weight(planes[0], planes[1], sigma=2.0),
+    ]
+    return planes, jnp.asarray(rng.random((HEIGHT, WIDTH)) < 0.8), weights
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+@pytest.mark.parametrize("step", [1, 3])
+def test_few_pixels_get_what_all_get(share, step, rng, x64):
+    planes, hit, weights = drawn(rng)
+    needed = jnp.asarray(rng.random((HEIGHT, WIDTH)) < share)
+    every, _ = edge_average(planes, hit, weights, stencil(2), step=step, step_max=step)
+    found = jax.jit(lambda: few.average_of_few(planes, hit, weights, stencil(2), needed, step=step))()
+    np.testing.assert_allclose(found, np.where(needed, every, 0.0), rtol=1e-12, atol=1e-14)
+
+
+def test_every_pixel_may_have_a_step_of_its_own(rng, x64):
+    planes, hit, weights = drawn(rng)
+    step = jnp.asarray(rng.integers(1, 4, (HEIGHT, WIDTH)))
+    found = few.average_of_few(planes, hit, weights, stencil(1), jnp.ones((HEIGHT, WIDTH), bool), step=step)
+    for each in (1, 2, 3):
+        every, _ = edge_average(planes, hit, weights, stencil(1), step=each, step_max=3)
+        own = step == each
+        np.testing.assert_allclose(found[:, own], every[:, own], rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("least", [0.0, 1.0])
+def test_large_images_get_what_small_ones_get(least, rng, x64, monkeypatch):
+    """Variance and history fix, with few short histories and with many; the gradient too."""
+    planes, hit, weights = drawn(rng)
+    length = jnp.where(jnp.asarray(rng.random((HEIGHT, WIDTH))) < 0.05 + least, 1.0, 9.0)
+    texture = jnp.asarray(rng.uniform(0.5, 1, (3, HEIGHT, WIDTH)))
+
+    def both(planes):
+        history = jnp.concatenate([planes, length[None]])
+        color, variance = estimate_variance(history, hit, weights, short_history=4, texture=texture)
+        fixed = fix_history(planes[:3], length, hit, weights, frames=4, texture=texture)
+        return color, variance, fixed
+
+    def slope(planes):
+        return jax.grad(lambda planes: sum(jnp.sum(each**2) for each in both(planes)))(planes)
+
+    small = jax.jit(both)(planes), jax.jit(slope)(planes)
+    monkeypatch.setattr(few, "_WORTH", 0)
+    large = jax.jit(lambda x: both(x))(planes), jax.jit(lambda x: slope(x))(planes)
+    jax.tree.map(lambda one, two: np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-12), small, large)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 1.0])
+def test_work_is_done_where_it_is_needed(share, rng):
+    array = jnp.asarray(rng.random((HEIGHT, WIDTH, 2)), jnp.float32)
+    needed = jnp.asarray(rng.random((HEIGHT, WIDTH)) < share)
+    found = where_needed(lambda part: (part + 1, part[:, 0] > 0.5), needed, array)
+    np.testing.assert_array_equal(found[0], np.where(np.asarray(needed)[..., None], array + 1, 0))
+    np.testing.assert_array_equal(found[1], np.asarray(needed) & (np.asarray(array)[..., 0] > 0.5))
