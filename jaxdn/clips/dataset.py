@@ -19,7 +19,7 @@ from jaxdn.clips.draws import check_samples, draw_light
 from jaxdn.clips.files import ClipError
 from jaxdn.clips.frames import doubling_layers
 from jaxdn.clips.pack import open_clips
-from jaxdn.frame import Clip
+from jaxdn.frame import OF_SAMPLES, Clip, written_out
 from jaxdn.variation import STILL, Variation, varied
 
 
@@ -54,6 +54,9 @@ def training_batches(
       variation: of light, normals and the buffers that are there.
       threads: batches prepared in advance, each by its own thread; 0 prepares them when requested.
 
+    Buffers that belong to one noisy image (:data:`jaxdn.frame.OF_SAMPLES`: specular light, shadows) come with that
+    image, the layer with the fewest samples, instead of noise drawn anew; with all other noise they are neutral.
+
     Its ``get_state()`` is a small dict for a checkpoint, to be passed to ``set_state`` of an equal iterator.
 
     Raises ClipError, naming the clip, for clips that are broken, shorter than ``frames``, smaller than ``crop``,
@@ -76,6 +79,7 @@ def training_batches(
     for source in sources:
         _check(source, (frames, height, width), counts)
     names = _common_buffers(sources, buffers)
+    of_samples = names & OF_SAMPLES
     # Each clip has the first layers of 1, 2, 4, ...: the clip with the fewest decides.
     common = min((doubling_layers(source.layers, source.path) for source in sources), key=len) if layers else []
 
@@ -84,8 +88,13 @@ def training_batches(
         starts = [int(rng.integers(0, has - wants + 1)) for has, wants in zip(source.shape, sizes, strict=True)]
         window = tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))
         samples = counts[int(rng.integers(len(counts)))]
-        light = draw_light(source, window, samples, rng, beauty=bool(rng.random() < variation.beauty))
-        clip = read_window(source, window, light=light, buffers=names, layers=layers)
+        beauty = bool(rng.random() < variation.beauty)
+        if of_samples & source.buffers and samples == min(source.layers, default=0) and not beauty:
+            clip = read_window(source, window, spp=samples, buffers=names, layers=layers)
+        else:
+            light = draw_light(source, window, samples, rng, beauty=beauty)
+            clip = read_window(source, window, light=light, buffers=names, layers=layers)
+        clip = clip._replace(frames=written_out(clip.frames, of_samples))
         if clip.layers is not None:
             clip = clip._replace(layers={count: clip.layers[count] for count in common})
         if augment:

@@ -63,6 +63,30 @@ def test_elements_are_windows_of_one_clip(folder: Path) -> None:
     assert len(starts) > 20
 
 
+def test_buffers_of_samples_come_with_their_own_noise(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Clips with single samples to draw from: specular light is that of the layer, or it is none."""
+    for index in range(2):
+        home = tmp_path / f"clip{index}"
+        home.mkdir()
+        for t in range(3):
+            light, draws = rng.random((HEIGHT, WIDTH, 3), np.float32), rng.random((4, HEIGHT, WIDTH, 6), np.float32)
+            frame = Frame(radiance=light, specular=light / 2)
+            options = {"layers": {1: light}, "reference": light, "draws": draws}
+            clips.write_frame(clips.frame_path(home, t), frame, **options)
+        clips.finish_record({"frames": 3, "width": WIDTH, "height": HEIGHT, "layers": [1], "draws": 4}, home)
+    options = {"batch": 8, "crop": 8, "frames": 2, "seed": 1}
+    batch = next(training_batches(tmp_path, **options))
+    np.testing.assert_allclose(batch.frames.specular, batch.frames.radiance / 2, rtol=2e-3)
+    np.testing.assert_allclose(batch.reference, batch.frames.radiance, rtol=2e-3)
+    more = next(training_batches(tmp_path, **options, spp=2))
+    assert not np.any(more.frames.specular)
+    mixed = next(training_batches(tmp_path, **options, spp=(1, 2)))
+    assert 0 < np.any(mixed.frames.specular, axis=(1, 2, 3, 4)).sum() < 8
+    drawn = next(training_batches(tmp_path, **options, buffers=()))
+    assert drawn.frames.specular is None
+    assert np.abs(drawn.reference - drawn.frames.radiance).max() > 0.1
+
+
 def test_augmented_elements_are_symmetries_of_image_and_motion(folder: Path) -> None:
     batch = next(training_batches(folder, batch=24, crop=6, frames=2, seed=3))
     shapes = set()
