@@ -78,7 +78,7 @@ def fetch(
 
     Taps outside the image are rejected; where the vector is not finite there is no history; no gradient flows into the
     vectors. With ``around``, a pixel all of whose taps are rejected gets the mean of those among the 3x3 pixels around
-    its target that are accepted.
+    its target that are accepted. Without vectors nothing is searched: what does not move has nothing beside it.
     """
     sound = jnp.all(jnp.isfinite(history) & (history >= 0), axis=-1, keepdims=True)
     broken = jnp.sum(~sound & ~first, dtype=jnp.int32)
@@ -95,7 +95,7 @@ def fetch(
         mean = jnp.where(valid[..., None], history, 0.0)
     else:
         mean, valid = _of_cells(history, packed, (x, y), inside, wanted, accepted)
-    if around:
+    if around and motion is not None:
         more, found = _around(history, packed, (x, y), inside & ~valid, wanted, accepted)
         mean, valid = jnp.where(found[..., None], more, mean), valid | found
     return Recalled(mean, valid[..., None], broken)

@@ -49,7 +49,7 @@ def where_needed(work: Callable[[Arrays], Arrays], needed: jax.Array, arrays: Ar
     count, rank = jnp.sum(alone, dtype=jnp.int32), jnp.cumsum(alone, dtype=jnp.int32) - 1
     places = jnp.where(alone, rank, _BATCHES * batch)
     listed = jnp.zeros(_BATCHES * batch, jnp.int32).at[places].set(jnp.arange(pixels, dtype=jnp.int32), mode="drop")
-    flat = jax.tree.map(lambda array: array.reshape(pixels, *array.shape[2:]), arrays)
+    flat = jax.tree.map(lambda array: jnp.asarray(array).reshape(pixels, *array.shape[2:]), arrays)
 
     def some(own: jax.Array) -> Arrays:
         return work(jax.tree.map(lambda array: array[own], flat))

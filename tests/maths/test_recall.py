@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxdn.filters import recall as module
-from jaxdn.filters.guides import guides_of
+from jaxdn.filters.guides import Guides, guides_of
 from jaxdn.filters.recall import recall
 from jaxdn.frame import Frame
 from jaxdn.ops.strips import by_strips
@@ -99,20 +99,22 @@ def test_an_image_smaller_than_the_places_around(rng, x64):
         np.testing.assert_allclose(gradient.sum(), 8.0)
 
 
-def test_a_still_pixel_that_shows_something_else_looks_around(rng, x64):
+def test_around_a_pixel_that_shows_something_else(rng, x64):
     history, frame = drawn(rng)
-    changed = frame._replace(ids=frame.ids.copy(), motion=None, depth=None, normal=None)
-    changed.ids[3, 5] = 1
-    for given in (changed, changed._replace(motion=np.zeros((HEIGHT, WIDTH, 2)))):
-        given = jax.tree.map(jnp.asarray, given)
-        before = guides_of(jax.tree.map(jnp.asarray, frame._replace(depth=None, normal=None)))
-        assert not recall(jnp.asarray(history), before, given, jnp.asarray(False)).valid[3, 5]
-        assert not recall(jnp.asarray(history), before, given, jnp.asarray(False), around=True).valid[3, 5]
-        frame.ids[2, 4] = 1
-        before = guides_of(jax.tree.map(jnp.asarray, frame._replace(depth=None, normal=None)))
-        found = recall(jnp.asarray(history), before, given, jnp.asarray(False), around=True)
-        np.testing.assert_array_equal(found.history[3, 5], history[2, 4])
-        frame.ids[2, 4] = 0
+    zero = frame._replace(motion=np.zeros((HEIGHT, WIDTH, 2)), depth=None, normal=None)
+    before = frame.ids.astype(float)
+    changed = zero._replace(ids=frame.ids.copy())
+    changed.ids[3, 5] = 1  # appears where there was nothing of its kind near by
+
+    def found(before, frame, **options):
+        given = jnp.asarray(history), Guides(None, None, jnp.asarray(before)), jax.tree.map(jnp.asarray, frame)
+        return recall(*given, jnp.asarray(False), **options)
+
+    assert not found(before, changed).valid[3, 5]
+    assert not found(before, changed, around=True).valid[3, 5]
+    before[2, 4] = 1
+    np.testing.assert_array_equal(found(before, changed, around=True).history[3, 5], history[2, 4])
+    assert not found(before, changed._replace(motion=None), around=True).valid[3, 5]  # nothing moves
 
 
 def test_without_motion_it_is_the_pixel_itself(rng, x64):

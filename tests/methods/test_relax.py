@@ -88,7 +88,8 @@ def test_metal_darkens_no_diffuse_neighbour():
     diffuse, _ = apart(frame, "brdf")
     np.testing.assert_allclose(diffuse.texture[:, 0, 4:], 0.0, atol=1e-6)
     np.testing.assert_allclose(diffuse.texture[:, 0, :4], 1.0, rtol=1e-3)  # the divisor is a soft maximum
-    np.testing.assert_allclose(relax().step({}, relax().start({}, frame), frame)[1][0, :4], 0.4, rtol=1e-3)
+    # Giving back divides by one too, at each of eight averages.
+    np.testing.assert_allclose(relax().step({}, relax().start({}, frame), frame)[1][0, :4], 0.4, rtol=0.01)
 
 
 @pytest.mark.parametrize("by", ["brdf", "albedo", "none"])

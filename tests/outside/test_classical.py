@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from experiments.papers import classical, results
+from experiments.papers import classical
 from jaxdn.candidates import NOISY, filters
 
 
@@ -39,8 +39,3 @@ def test_every_filter_is_scored_and_timed(tmp_path, capsys):
     assert {row[-1] for row in rows if row[0] == f"| {classical.AGAINST}"} <= {
         row[-1] for row in rows if "(1.00)" in row[-1]
     }
-
-
-def test_a_table_may_have_further_columns():
-    table = results.table(results.Results("", {}, {}, [], [], {}), {"milliseconds": {"svgf": "1"}})
-    assert table.splitlines()[0].endswith("| hidden pixels, PSNR | milliseconds |")

@@ -56,3 +56,6 @@ def test_the_table_scores_what_a_view_reads(folder: Path) -> None:
     psnr = {view: float(line.split("|")[2]) for view, line in lines.items()}
     assert psnr["indirect"] > psnr["beauty"]
     assert lines["beauty"].startswith("| noisy |")
+    wider = table(results, {"milliseconds": {"noisy": "7"}}).splitlines()
+    assert wider[0].endswith("| hidden pixels, PSNR | milliseconds |")
+    assert wider[-1] == f"{lines['beauty']} 7 |"
