@@ -30,9 +30,10 @@ from jaxdn.candidates import candidate, filters
 from jaxdn.clips import read_clip
 from jaxdn.commands.compare import compare
 from jaxdn.commands.errors import plain_errors
-from jaxdn.commands.render import render
+from jaxdn.commands.render import clips_of
 from jaxdn.frame import frame_at
 from jaxdn.planning.catalogue import NoisyLight
+from jaxdn.render import ClipJob, render_clips
 from jaxdn.report import write_report
 from jaxdn.weights import shipped_names
 
@@ -68,8 +69,8 @@ class Settings:
     """Number of rendering processes; default: the number of cores."""
 
 
-def render_clips(settings: Settings, light: NoisyLight) -> list[Path]:
-    """The clips with this noisy light, rendered as far as they do not exist."""
+def clips(settings: Settings, light: NoisyLight) -> list[ClipJob]:
+    """The clips with this noisy light."""
     shared: dict[str, Any] = {
         "seeds": [SEED],
         "layers": [1],
@@ -78,22 +79,21 @@ def render_clips(settings: Settings, light: NoisyLight) -> list[Path]:
         "max_depth": None,
         "effects": "auto",
         "denoiser": ",".join([*filters(), *shipped_names()]),
-        "workers": settings.workers,
     }
     square: dict[str, Any] = {"width": settings.size, "height": settings.size}
     place = settings.data / light
-    found = []
+    found: list[ClipJob] = []
     for family in settings.families:
-        found += render(family, place, animation=None, frames=settings.frames, **square, **shared)
+        found += clips_of(family, place, animation=None, frames=settings.frames, **square, **shared)
     for scene, animation in rooms.scenes_in(settings.scenes) if settings.scenes else []:
-        found += render(str(scene), place, animation=animation, frames=8, width=320, height=180, **shared)
+        found += clips_of(str(scene), place, animation=animation, frames=8, width=320, height=180, **shared)
     return found
 
 
-def timed_frame(settings: Settings) -> Path:
+def timed_clip(settings: Settings) -> ClipJob:
     """A clip of the size that is timed, with all light that surfaces reflect and its shadows: the most work."""
     height, width = settings.timed
-    return render(
+    return clips_of(
         settings.families[-1],
         settings.data / "timed",
         animation=None,
@@ -107,7 +107,6 @@ def timed_frame(settings: Settings) -> Path:
         max_depth=None,
         effects="all",
         denoiser=",".join([*filters(), *shipped_names()]),
-        workers=settings.workers,
     )[0]
 
 
@@ -137,13 +136,16 @@ def milliseconds(
 def main(settings: Settings) -> None:
     """Render, compare, time, report."""
     methods = list(results.contestants([]))
-    places = {light: render_clips(settings, light) for light in LIGHTS}
+    jobs = {light: clips(settings, light) for light in LIGHTS}
+    timed = timed_clip(settings)
+    render_clips([*(job for own in jobs.values() for job in own), timed], workers=settings.workers)
     names = [*filters(), *shipped_names(), *([] if "pyoidn" in peers.missing() else [PEER])]
-    times = milliseconds(timed_frame(settings), names, rounds=settings.rounds)
+    times = milliseconds(Path(timed.folder), names, rounds=settings.rounds)
     shown = {name: f"{ms:.0f} ({ms / times[AGAINST]:.2f})" for name, ms in times.items()}
     height, width = settings.timed
     lines = [f"Milliseconds of a frame of {width} x {height} pixels, and in brackets against {AGAINST}."]
-    for light, folders in places.items():
+    for light, own in jobs.items():
+        folders = [Path(job.folder) for job in own]
         facts = {"clips": len(folders), "reference spp": settings.reference_spp}
         title = f"Filters, 1 sample per pixel, {light} light"
         found = compare(methods, folders, title=title, settings=facts)

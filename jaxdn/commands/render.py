@@ -82,7 +82,16 @@ def plan_clip(
     return Planned(found, plan(found, denoiser, max_depth=depth.max_depth, light=light), depth)
 
 
-def render(
+def render(source: str, out: Path, *, workers: int | None, **wanted: Any) -> list[Path]:
+    """Render clips into folders ``out/<scene>-<seed>``, or resume them, and return these folders.
+
+    ``workers`` is the number of processes, by default that of cores; ``wanted`` are the arguments of
+    :func:`clips_of`. Raises what that raises, and RenderError, at the end, for clips that failed.
+    """
+    return render_clips(clips_of(source, out, **wanted), workers=workers)
+
+
+def clips_of(
     source: str,
     out: Path,
     *,
@@ -99,9 +108,8 @@ def render(
     max_depth: int | None,
     effects: str,
     denoiser: str | None = None,
-    workers: int | None,
-) -> list[Path]:
-    """Render clips into folders ``out/<scene>-<seed>``, or resume them, and return these folders.
+) -> list[ClipJob]:
+    """The clips to render into folders ``out/<scene>-<seed>``.
 
     Args:
       source: a family, for which each seed gives another scene, or a Mitsuba scene (.xml), whose seeds differ only
@@ -121,10 +129,9 @@ def render(
       effects: as in :func:`plan_clip`.
       denoiser: names of the denoisers to render for, separated by commas; None: for any, without the buffers that only
         few read.
-      workers: number of processes; default: the number of cores.
 
-    Prints the Mitsuba variant, each clip's effects, and the progress. Raises ValueError for a source that is not a
-    scene and for options out of range, and RenderError, at the end, for clips that failed.
+    Prints the Mitsuba variant and each clip's effects. Raises ValueError for a source that is not a scene and for
+    options out of range.
     """
     check_at_least(1, width=width, height=height, frames=frames)
     scenes = _tours(source, animation, seeds, frames, out) if tours else _scenes(source, animation, seeds)
@@ -153,7 +160,7 @@ def render(
                 plan=None if planned is None else planned.plan.record(),
             )
             jobs.append(job)
-    return render_clips(jobs, workers=workers)
+    return jobs
 
 
 def _reader(names: str, variant: str) -> Denoiser | None:
