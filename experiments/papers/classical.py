@@ -141,7 +141,8 @@ def main(settings: Settings) -> None:
     render_clips([*(job for own in jobs.values() for job in own), timed], workers=settings.workers)
     names = [*filters(), *shipped_names(), *([] if "pyoidn" in peers.missing() else [PEER])]
     times = milliseconds(Path(timed.folder), names, rounds=settings.rounds)
-    shown = {name: f"{ms:.0f} ({ms / times[AGAINST]:.2f})" for name, ms in times.items()}
+    own_ms = times.get(AGAINST, float("nan"))
+    shown = {name: f"{ms:.0f} ({ms / own_ms:.2f})" for name, ms in times.items()}
     height, width = settings.timed
     lines = [f"Milliseconds of a frame of {width} x {height} pixels, and in brackets against {AGAINST}."]
     for light, own in jobs.items():

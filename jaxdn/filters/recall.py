@@ -78,7 +78,7 @@ def fetch(
 
     Taps outside the image are rejected; where the vector is not finite there is no history; no gradient flows into the
     vectors. With ``around``, a pixel all of whose taps are rejected gets the mean of those among the 3x3 pixels around
-    its target that are accepted. Without vectors nothing is searched: what does not move has nothing beside it.
+    its target that are accepted.
     """
     sound = jnp.all(jnp.isfinite(history) & (history >= 0), axis=-1, keepdims=True)
     broken = jnp.sum(~sound & ~first, dtype=jnp.int32)
@@ -95,8 +95,10 @@ def fetch(
         mean = jnp.where(valid[..., None], history, 0.0)
     else:
         mean, valid = _of_cells(history, packed, (x, y), inside, wanted, accepted)
-    if around and motion is not None:
-        more, found = _around(history, packed, (x, y), inside & ~valid, wanted, accepted)
+    if around:
+        lost = inside & ~valid
+        given = history, packed, lost, wanted, accepted
+        more, found = _beside(*given) if motion is None else _around((x, y), *given)
         mean, valid = jnp.where(found[..., None], more, mean), valid | found
     return Recalled(mean, valid[..., None], broken)
 
@@ -145,9 +147,9 @@ def _of_cells(
 
 
 def _around(
+    at: _Position,
     history: jax.Array,
     packed: jax.Array,
-    at: _Position,
     lost: jax.Array,
     wanted: Expected,
     accepted: _Accepted,
@@ -170,6 +172,31 @@ def _around(
 
     mean, found, weights = where_needed(search, lost, ((row, column, top, left), wanted))
     return differentiable_mean(mean, history, top, left, weights), found
+
+
+def _beside(
+    history: jax.Array, packed: jax.Array, lost: jax.Array, wanted: Expected, accepted: _Accepted
+) -> tuple[jax.Array, jax.Array]:
+    """The same where nothing moves: around the pixels themselves, without a gather."""
+    height, width, _ = history.shape
+
+    def shifted(image: jax.Array, dy: int, dx: int) -> jax.Array:
+        wide = jnp.pad(image, ((1, 1), (1, 1), (0, 0)))
+        return wide[dy : dy + height, dx : dx + width]
+
+    def search(history: jax.Array) -> tuple[jax.Array, jax.Array]:
+        total, count = jnp.zeros_like(history), jnp.zeros((height, width), history.dtype)
+        for dy, dx in np.ndindex(3, 3):  # beyond the border there are zeros, which are not accepted
+            taken = lost & accepted(shifted(packed, dy, dx), wanted)
+            total = total + jnp.where(taken[..., None], shifted(history, dy, dx), 0.0)
+            count = count + taken
+        found = count > 0
+        return total / jnp.where(found, count, 1.0)[..., None], found
+
+    def nothing(history: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jnp.zeros_like(history), jnp.zeros((height, width), bool)
+
+    return lax.cond(jnp.any(lost), search, nothing, history)
 
 
 def _mean(

@@ -49,9 +49,9 @@ class Options:
     """Edge-stopping parameter for differences in depth."""
     sigma_normal: Annotated[float, Range(0), LEARNED] = 16.0
     """Exponent of the cosine of normals, for diffuse light."""
-    lobe_fraction: Annotated[float, _POSITIVE, LEARNED] = 0.5
+    lobe_fraction: Annotated[float, _POSITIVE, LEARNED] = 2.0
     """For specular light, normals may differ by this fraction of the lobe's angle."""
-    roughness_fraction: Annotated[float, _POSITIVE, LEARNED] = 0.15
+    roughness_fraction: Annotated[float, _POSITIVE, LEARNED] = 1.0
     """For specular light, roughness may differ by this fraction."""
     depth_tolerance: Annotated[float, Range(0)] = 0.02
     """Allowed relative difference of a history tap from the expected depth, in addition to the slope term."""

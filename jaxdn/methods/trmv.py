@@ -64,9 +64,9 @@ class Options(svgf.Options):
     sigma_specular: Annotated[float, Range(0, without_low=True), LEARNED] = 1.0
     """Edge-stopping parameter for differences in luminance, in standard deviations, of specular light: it has the
     textures and edges of what is reflected, which no buffer shows."""
-    lobe_fraction: Annotated[float, Range(0, without_low=True), LEARNED] = 0.5
+    lobe_fraction: Annotated[float, Range(0, without_low=True), LEARNED] = 2.0
     """For specular light, normals may differ by this fraction of the lobe's angle."""
-    roughness_fraction: Annotated[float, Range(0, without_low=True), LEARNED] = 0.15
+    roughness_fraction: Annotated[float, Range(0, without_low=True), LEARNED] = 1.0
     """For specular light, roughness may differ by this fraction."""
     demodulate: Demodulation = "brdf"
     """What light is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`; diffuse and specular
