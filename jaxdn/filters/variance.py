@@ -11,6 +11,9 @@ from jaxdn.filters.atrous import edge_average, stencil
 from jaxdn.filters.few import average_of_few, few_or_all
 from jaxdn.filters.weights import Weight
 
+_ROUNDING = 1e-3
+"""Frames that a length may lack through rounding: the mean of lengths of 4 is seldom exactly 4."""
+
 
 def estimate_variance(
     history: jax.Array,
@@ -29,7 +32,7 @@ def estimate_variance(
     """
     color, moments, length = history[:3], history[3:5], history[5]
     variance = jnp.maximum(moments[1] - moments[0] ** 2, 0.0)
-    short = length < short_history
+    short = length < short_history - _ROUNDING
     needed = short if hit is None else short & hit
     planes = history[:5] if texture is None else jnp.concatenate([history[:5], texture])
     mean = few_or_all(
