@@ -85,6 +85,8 @@ class Render:
     """Further noisy images of one sample each, of indirect and of direct light: training draws from them."""
     light: Literal["indirect", "reflected"] = "indirect"
     """Light with noise: indirect light, with direct light beside it, or all that is reflected, with its shadows."""
+    jitter: bool = False
+    """Rays go through another point of the pixels in every frame, for taa; references are means over the pixels."""
     max_depth: int | None = None
     """Path length (1 emission, 2 direct, 3 one bounce of indirect light ...); default: as the scene needs."""
     effects: str = "auto"
@@ -296,6 +298,7 @@ def _render(options: Render) -> None:
         layers=options.layers,
         draws=options.draws,
         light=options.light,
+        jitter=options.jitter,
         max_depth=options.max_depth,
         effects=options.effects,
         denoiser=options.denoiser,

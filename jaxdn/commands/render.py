@@ -12,6 +12,7 @@ from jaxdn.effects import Effects, Plan, chosen, everything, inspect, plan
 from jaxdn.frame import OF_SAMPLES
 from jaxdn.methods.table import methods
 from jaxdn.planning.catalogue import NoisyLight
+from jaxdn.planning.plan import SCORED, THROUGH_CENTRES
 from jaxdn.render.depth import PathDepth, measure_depth
 from jaxdn.render.families import FAMILIES
 from jaxdn.render.farm import ClipJob, render_clips
@@ -52,6 +53,7 @@ def plan_clip(
     frames: int,
     max_depth: int | None = None,
     light: NoisyLight = "indirect",
+    jitter: bool = False,
 ) -> Planned | None:
     """The effects to render an animated scene for, and the plan; None means no plan: ``"all"`` without a denoiser.
 
@@ -66,20 +68,22 @@ def plan_clip(
       frames: number of frames.
       max_depth: path length; by default, with ``"auto"``, it is measured.
       light: as in :func:`jaxdn.render.render_frame`.
+      jitter: as there.
     """
+    options: dict[str, Any] = {"light": light, "jitter": jitter}
     if effects == "all":
         whole = everything(frames)
-        return None if denoiser is None else Planned(whole, plan(whole, denoiser, max_depth=max_depth, light=light))
+        return None if denoiser is None else Planned(whole, plan(whole, denoiser, max_depth=max_depth, **options))
     if effects != "auto":
         named = chosen([name.strip() for name in effects.split(",") if name.strip()], frames)
-        return Planned(named, plan(named, denoiser, max_depth=max_depth, light=light))
+        return Planned(named, plan(named, denoiser, max_depth=max_depth, **options))
     found = inspect(scene, width=width, height=height, frames=frames)
-    made = plan(found, denoiser, max_depth=max_depth, light=light)
+    made = plan(found, denoiser, max_depth=max_depth, **options)
     # Measuring needs a path tracer, and indirect light that longer paths may add.
     if max_depth is not None or not made.indirect or made.integrator != "path":
         return Planned(found, made)
     depth = measure_depth(scene, frames=frames)
-    return Planned(found, plan(found, denoiser, max_depth=depth.max_depth, light=light), depth)
+    return Planned(found, plan(found, denoiser, max_depth=depth.max_depth, **options), depth)
 
 
 def render(source: str, out: Path, *, workers: int | None, **wanted: Any) -> list[Path]:
@@ -105,6 +109,7 @@ def clips_of(
     layers: Sequence[int],
     draws: int = 0,
     light: NoisyLight = "indirect",
+    jitter: bool = False,
     max_depth: int | None,
     effects: str,
     denoiser: str | None = None,
@@ -125,10 +130,11 @@ def clips_of(
       layers: samples per pixel of the noisy layers, powers of two.
       draws: further images of one sample each, for training.
       light: which light is noisy: the indirect part, or all that is reflected.
+      jitter: another point of the pixels in every frame, and references that are means over the pixels.
       max_depth: path length (1 emission, 2 direct light ...); default: measured, or the scene's own.
       effects: as in :func:`plan_clip`.
-      denoiser: names of the denoisers to render for, separated by commas; None: for any, without the buffers that only
-        few read.
+      denoiser: names of the denoisers to render for, separated by commas (with a reference, what errors are reported by
+        is rendered too); None: for any, without the buffers that only few read.
 
     Prints the Mitsuba variant and each clip's effects. Raises ValueError for a source that is not a scene and for
     options out of range.
@@ -138,10 +144,17 @@ def clips_of(
     choice = choose_variant()
     print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
     reader = None if denoiser is None else _reader(denoiser, choice.variant)
+    if reader is not None and jitter and reader.reads & THROUGH_CENTRES:
+        print(f"with jitter there is no {', '.join(sorted(reader.reads & THROUGH_CENTRES))}: left out", flush=True)
+    if reader is not None and reference_spp:
+        reader = reader._replace(reads=reader.reads | SCORED)
     size: dict[str, Any] = {"width": width, "height": height, "frames": frames}
+    noisy: dict[str, Any] = {"light": light, "jitter": jitter}
     jobs = []
     for name, scene, noises in scenes:
-        planned = plan_clip(scene, effects=effects, denoiser=reader, max_depth=max_depth, light=light, **size)
+        planned = plan_clip(
+            scene, effects=effects, denoiser=reader, max_depth=max_depth, light=light, jitter=jitter, **size
+        )
         for seed in noises:
             clip = f"{name}-{seed}"
             if planned is not None:
@@ -153,7 +166,7 @@ def clips_of(
                 **size,
                 layers=tuple(layers),
                 draws=draws,
-                light=light,
+                **noisy,
                 reference_spp=reference_spp,
                 max_depth=max_depth,
                 seed=seed,

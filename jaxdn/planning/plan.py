@@ -12,6 +12,10 @@ GEOMETRY = frozenset({"albedo", "normal", "depth", "ids"})
 """Buffers that every scene has. A constant albedo is kept too: dividing by it makes scenes similar."""
 COMPOSED = frozenset({"direct", "emission"})
 """Buffers that are added to the denoised image, whether or not the denoiser reads them."""
+SCORED = frozenset({"visible"})
+"""Buffers that errors are reported by, where there is a reference: which pixels the previous frame did not see."""
+THROUGH_CENTRES = frozenset({"luminance_gradient", "shadow_motion", "glossy_motion"})
+"""Buffers that are found by rays through the centres of pixels: none with sub-pixel jitter."""
 BOUND = 0.01
 """Largest share of an image's reflected light that limited path lengths may leave out."""
 
@@ -71,6 +75,7 @@ def plan(
     *,
     max_depth: int | None = None,
     light: NoisyLight = INDIRECT,
+    jitter: bool = False,
 ) -> Plan:
     """The intersection of the effects of a scene and the buffers that a denoiser reads.
 
@@ -79,11 +84,13 @@ def plan(
 
     ``max_depth`` is the path length to render with, by default the scene's
     (:func:`jaxdn.render.depth.measure_depth` measures it). With ``light="reflected"`` direct light is a part of the
-    noisy radiance, and its shadows have buffers, instead of a buffer of its own.
+    noisy radiance, and its shadows have buffers, instead of a buffer of its own. With ``jitter`` no frame shows the
+    same as another, and what is found through the centres of pixels (``THROUGH_CENTRES``) is left out.
     """
     by_name = {effect.name: effect for effect in EFFECTS}
     wanted = frozenset(GUIDES) - ON_REQUEST if denoiser is None else denoiser.reads | COMPOSED
     wanted -= {"direct"} if light == "reflected" else OF_SHADOWS
+    wanted -= THROUGH_CENTRES if jitter else frozenset()
     there = [by_name[name] for name in effects.names]
 
     def buffers(present: frozenset[str]) -> tuple[str, ...]:
@@ -101,5 +108,5 @@ def plan(
         indirect=needed > DIRECT or (light == "reflected" and effects.lit),
         effects=effects.names,
         frames=tuple(buffers(present) for present in effects.frames),
-        held=effects.held,
+        held=tuple(range(len(effects.held))) if jitter else effects.held,
     )

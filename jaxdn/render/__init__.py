@@ -15,7 +15,7 @@ _HOMES = {
     "ClipJob": "farm",
     "render_clips": "farm",
     "render_clip": "clip",
-    "render_frame": "clip",
+    "render_frame": "frame",
 }
 
 __all__ = [*_HOMES]

@@ -49,7 +49,7 @@ def measure_depth(scene: AnimatedScene, *, frames: int | None = None, bound: flo
     """
     if not 0 < bound < 1:
         raise ValueError(f"bound: expected a share of the light between 0 and 1, got {bound!r}.")
-    from jaxdn.render.clip import tracer
+    from jaxdn.render.frame import tracer
 
     accumulate = tracer(use_variant()).accumulate
     found: list[PathDepth] = []

@@ -41,6 +41,7 @@ class ClipJob(NamedTuple):
     seed: int = 0
     draws: int = 0
     light: NoisyLight = "indirect"
+    jitter: bool = False
     variant: str | None = None
     """None: the one that the clip in the folder was started with, else the fastest that works here."""
     plan: dict[str, Any] | None = None

@@ -16,7 +16,7 @@ def check_settings(folder: Path, wanted: Mapping[str, Any], found: Mapping[str, 
     # Frames may be added: what both records say about the same ones is compared.
     common = min(int(found["frames"]), int(wanted["frames"]))
     both = [
-        {"draws": 0, "light": "indirect", **record, "plan": _planned(record.get("plan"), common)}
+        {"draws": 0, "light": "indirect", "jitter": False, **record, "plan": _planned(record.get("plan"), common)}
         for record in (found, wanted)
     ]
     names = [name for name in wanted if name not in _FREE]

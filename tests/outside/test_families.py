@@ -324,7 +324,7 @@ def test_a_later_part_is_the_same_scene_from_there_on(name: str) -> None:
 
 def test_a_later_part_is_rendered_with_its_motion(mitsuba: Any) -> None:
     """Also in its first frame nothing has moved, as in every clip."""
-    from jaxdn.render.clip import render_frame
+    from jaxdn.render.frame import render_frame
 
     whole, later = (scene_from_record({"family": "dash", "seed": 2, **start}) for start in ({}, {"start": 3}))
     size: Any = {"width": 12, "height": 8, "variant": "scalar_rgb"}

@@ -8,7 +8,7 @@ from render_scenes import HEIGHT, PIXEL, SQUARE_Z, WIDTH, Stage, fast_variants, 
 
 from jaxdn import effects
 from jaxdn.color import LUMINANCE
-from jaxdn.render.clip import render_frame, tracer
+from jaxdn.render.frame import render_frame, tracer
 from jaxdn.render.gradient_samples import luminance_gradient, pick, scattered
 from jaxdn.render.seeds import NOISY, frame_key
 from jaxdn.render.variant import choose_variant, use_variant

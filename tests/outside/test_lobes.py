@@ -12,7 +12,8 @@ from jaxdn.clips import read_clip
 from jaxdn.clips.cache import open_cached, read_window
 from jaxdn.frame import FAR, GUIDES, OF_SAMPLES, ON_REQUEST, present
 from jaxdn.planning.catalogue import OF_SHADOWS
-from jaxdn.render.clip import render_clip, render_frame
+from jaxdn.render.clip import render_clip
+from jaxdn.render.frame import render_frame
 from jaxdn.render.variant import choose_variant
 
 FAST = choose_variant().variant

@@ -8,7 +8,7 @@ import pytest
 from experiments.papers import reflectance as paper
 from experiments.speed.small_rooms import CASES
 from jaxdn import effects
-from jaxdn.render.clip import render_frame
+from jaxdn.render.frame import render_frame
 from jaxdn.render.opening import open_scene
 from jaxdn.render.variant import choose_variant, use_variant
 

@@ -18,8 +18,9 @@ from jaxdn.clips import ClipError, read_frame
 from jaxdn.clips.folder import begun_record, is_clip, read_record
 from jaxdn.frame import present
 from jaxdn.render import farm
-from jaxdn.render.clip import Rendered, render_clip, render_frame
+from jaxdn.render.clip import render_clip
 from jaxdn.render.errors import RenderError
+from jaxdn.render.frame import Rendered, render_frame
 from jaxdn.render.opening import scene_from_record
 from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.seeds import NOISY, REFERENCE, frame_key, pass_seed, tea

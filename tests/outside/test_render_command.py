@@ -72,6 +72,16 @@ def test_chosen_effects_are_not_inspected(counted, tmp_path, effects, planned):
     assert (counted["jobs"][0].plan is not None) == planned
 
 
+@pytest.mark.parametrize("reference_spp", [0, 4])
+def test_what_errors_are_reported_by_is_rendered_with_the_reference_alone(counted, tmp_path, reference_spp):
+    path = CASES["moving: ball"].write(tmp_path)
+    options = {**OPTIONS, "reference_spp": reference_spp, "denoiser": "taa"}
+    command.render(str(path), tmp_path / "out", seeds=[0], **options)
+    buffers = counted["jobs"][0].plan["frames"][1]
+    assert "motion" in buffers
+    assert ("visible" in buffers) == (reference_spp > 0)
+
+
 def test_an_invalid_scene_is_refused_at_once(tmp_path, capsys):
     with pytest.raises(ValueError, match=r"'castle': expected a family \(dash, .*\) or a Mitsuba scene"):
         command.render("castle", tmp_path, seeds=[0], **OPTIONS)

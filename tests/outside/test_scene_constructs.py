@@ -48,7 +48,7 @@ def fast():
 
 def ours(scene, frame=0, samples=256):
     """Mean of emitted, direct and indirect light, as clips are made of."""
-    from jaxdn.render.clip import tracer
+    from jaxdn.render.frame import tracer
 
     accumulate = tracer(mi.variant()).accumulate
     sums = accumulate(
@@ -206,7 +206,7 @@ def test_a_crop_and_hidden_lights_are_not_ignored_in_silence(folder):
     path = write(folder, '<emitter type="constant"/>', integrator=hidden)
     with pytest.warns(UserWarning, match="its integrator hides lights"):
         scene = SceneFile(path)
-    from jaxdn.render.clip import render_frame
+    from jaxdn.render.frame import render_frame
 
     found = render_frame(scene, 0, width=WIDTH, height=HEIGHT, reference_spp=256, max_depth=DEPTH)
     kept = (found.reference + found.frame.direct).mean(axis=(0, 1))

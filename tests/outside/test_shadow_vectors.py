@@ -11,7 +11,7 @@ import jaxdn
 from jaxdn import effects
 from jaxdn.frame import GUIDES, OF_SAMPLES, present
 from jaxdn.planning.catalogue import OF_SHADOWS
-from jaxdn.render.clip import render_frame
+from jaxdn.render.frame import render_frame
 from jaxdn.render.geometry import project
 from jaxdn.render.shadow_vectors import meets_plane
 

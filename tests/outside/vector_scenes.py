@@ -9,7 +9,7 @@ from render_scenes import grey
 import jaxdn
 from jaxdn import effects
 from jaxdn.frame import GUIDES
-from jaxdn.render.clip import Rendered, render_frame
+from jaxdn.render.frame import Rendered, render_frame
 from jaxdn.render.scene import Camera
 from jaxdn.render.variant import choose_variant
 
