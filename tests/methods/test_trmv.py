@@ -1,7 +1,5 @@
 """``trmv``: svgf where it has nothing of its own to follow, and shadows and reflections that are followed."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +8,7 @@ import pytest
 from jaxdn.frame import Frame, written_out
 from jaxdn.methods.svgf import svgf
 from jaxdn.methods.trmv import trmv
+from tests.methods.lobe_scenes import compiled, run
 from tests.methods.test_svgf import HEIGHT, WIDTH, moving_frames
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -19,20 +18,6 @@ MEANS = {"levels": 0, "feedback_level": 0, "short_history": 0, "demodulate": "no
 """Nothing but running means."""
 UNHELD = {**MEANS, "clamp_sigma": 1e6}
 """Nor is the share of shadows clamped."""
-
-
-@functools.cache
-def compiled(denoiser):
-    """Its step: compiled once for each set of buffers."""
-    return jax.jit(denoiser.step)
-
-
-def run(denoiser, frames):
-    step, state, images = compiled(denoiser), denoiser.start({}, frames[0]), []
-    for frame in frames:
-        state, image = step({}, state, frame)
-        images.append(np.asarray(image))
-    return state, images
 
 
 def all_light(rng, count=3, dtype=np.float32):
