@@ -33,10 +33,10 @@ weights: setup  ## train the shipped weights again (hours; resumable)
 	$(BIN)/python -m experiments.papers.weights --ship $(SETTINGS)
 
 test: setup  ## the tests (minutes)
-	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m "not slow" $(SETTINGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q -m "not slow" $(SETTINGS)
 
 test-slow: setup  ## the slow tests: real training runs, the notebook, real processes
-	$(BIN)/python -m pytest -n 2 --dist loadfile -q -m slow $(SETTINGS)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q -m slow $(SETTINGS)
 
 hard-cases: setup  ## run every operation and denoiser on every hard case: runs/hard-cases/table.html
 	$(BIN)/python -m tests.hard_cases

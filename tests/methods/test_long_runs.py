@@ -17,7 +17,8 @@ from jaxdn.methods.table import methods
 from jaxdn.weights import shipped_names
 
 SIZE = 32
-LONG, SHORT = 2000, 240
+LONG, SHORT = 2000, 250
+"""Frames; the long run is made of short ones, so that one program is compiled."""
 LIGHTEST = [list(method.variants)[-1] for method in methods().values() if method.variants]
 METHODS = [*filters(), *(name for name in LIGHTEST if name in shipped_names())]
 FORGETS = {"ntd-small": 80, "relax": 155}
@@ -46,8 +47,8 @@ def wall():
 
 
 @functools.cache
-def compiled(name, frames):
-    """A run of that many frames of a wall, while the camera slides back and forth."""
+def compiled(name):
+    """``SHORT`` frames of a wall from any frame on, while the camera slides back and forth; and the first state."""
     _, denoiser, params, *_ = candidate(name)
     base = jax.tree.map(jnp.asarray, wall())
 
@@ -62,17 +63,21 @@ def compiled(name, frames):
         healthy = jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state)]))
         return state, (jnp.mean(image), jnp.max(image), healthy & jnp.all(jnp.isfinite(image)), image[::4, ::4])
 
-    def run(settings):
-        _, seen = lax.scan(functools.partial(body, settings), denoiser.start(params, base), jnp.arange(frames))
-        return seen
+    def part(settings, state, first):
+        return lax.scan(functools.partial(body, settings), state, first + jnp.arange(SHORT))
 
-    return jax.jit(run)
+    return jax.jit(part), denoiser.start(params, base)
 
 
 def run(name, frames, *, speed=0.7, poison=0.0, at=-1, dark=10**6):
     """Mean and largest value of every output frame, whether all was finite, and every fourth pixel."""
     settings = (jnp.float32(speed), jnp.float32(poison), jnp.int32(at), jnp.int32(dark))
-    return tuple(np.asarray(seen) for seen in compiled(name, frames)(settings))
+    part, state = compiled(name)
+    parts = []
+    for first in range(0, frames, SHORT):
+        state, seen = part(settings, state, first)
+        parts.append(seen)
+    return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
 
 
 @pytest.mark.slow
