@@ -156,8 +156,8 @@ def _gather_many(graph: Graph, equation: Any, numbers: Any, x: str, indices: str
     count = len(equation.outvars[0].aval.shape)
     inner = list(range(count - len(numbers.offset_dims), count))
     order = list(range(count - len(inner)))
-    for axis, one in zip(numbers.offset_dims, inner, strict=True):
-        order.insert(axis, one)
+    for axis, source in zip(numbers.offset_dims, inner, strict=True):
+        order.insert(axis, source)
     return found if order == sorted(order) else graph.value("Transpose", found, perm=order)
 
 

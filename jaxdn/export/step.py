@@ -54,16 +54,15 @@ def exported_step(
     wanted = _chosen(denoiser, buffers)
     if size is not None:
         return _traced(denoiser, params, wanted, size, None)
-    reason = ""
     for multiple in MULTIPLES:
         least = max(1, _SMALLEST // multiple)
         text = f"{multiple}*h, {multiple}*w"
-        lengths = export.symbolic_shape(text, constraints=[f"h >= {least}", f"w >= {least}"])
+        lengths: Any = export.symbolic_shape(text, constraints=[f"h >= {least}", f"w >= {least}"])
         try:
             return _traced(denoiser, params, wanted, lengths, multiple)
-        except (TypeError, ValueError) as error:  # a size had to be known
-            reason = str(error).splitlines()[0]
-    raise ValueError(f"size: a step for images of any size cannot be made ({reason}); give --width and --height.")
+        except (TypeError, ValueError):  # a size had to be known
+            continue
+    raise ValueError("size: expected a method whose step is the same for all sizes; give --width and --height.")
 
 
 def channels(buffer: str) -> list[str]:
@@ -103,8 +102,8 @@ def _traced(
             follow = dict(zip(places, jax.tree.leaves(after.core), strict=True))
             return {"image": image, **{f"next{place}": follow[place] for place in places}, "repaired": after.repaired}
 
-        inputs = {**frame, **{f"state{place}": _spec(leaf.shape, leaf.dtype) for place, leaf in zip(places, leaves)}}
-        inputs["first"] = _spec((), np.dtype(bool))
+        specs = {f"state{place}": _spec(leaf.shape, leaf.dtype) for place, leaf in zip(places, leaves, strict=True)}
+        inputs = {**frame, **specs, "first": _spec((), np.dtype(bool))}
         names = list(inputs)
         outputs = ("image", *(f"next{place}" for place in places), "repaired")
 

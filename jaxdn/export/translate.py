@@ -38,7 +38,8 @@ def translate(graph: Graph, program: core.ClosedJaxpr, inputs: Sequence[str]) ->
 
     def read(atom: Any) -> str:
         if isinstance(atom, core.Literal):
-            return graph.constant(np.asarray(atom.val, atom.aval.dtype))
+            aval: Any = atom.aval
+            return graph.constant(np.asarray(atom.val, aval.dtype))
         return names[atom]
 
     for equation in jaxpr.eqns:
