@@ -2,6 +2,10 @@
 //
 //   denoise METHOD.onnx NOISY_LAYER OUT_FOLDER FRAME.exr...
 //
+// Compile it with OpenEXR 3 and ONNX Runtime 1.20 or newer:
+//
+//   g++ -std=c++17 -O2 denoise.cpp -o denoise $(pkg-config --cflags --libs OpenEXR) -lonnxruntime
+//
 // NOISY_LAYER is the layer of the noisy image ("noisy_1spp" in clips of jaxdn, "" for the channels R, G, B). The other
 // buffers have the names that the model's metadata gives. Frames are consecutive: the state goes from one to the next.
 
