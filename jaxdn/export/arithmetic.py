@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxdn.export.graph import Graph
+from jaxdn.export.graph import Graph, untranslated
 
 Rule = Callable[..., str | list[str]]
 """(graph, equation, names of the inputs) -> name or names of the results."""
@@ -134,7 +134,7 @@ def _convolution(graph: Graph, equation: Any, x: str, kernel: str) -> str:
     given = equation.params
     layout = given["dimension_numbers"]
     if given["batch_group_count"] != 1 or set(given["lhs_dilation"]) != {1}:
-        raise ValueError("onnx: expected convolutions without dilated input or grouped batches, got one with; use XLA.")
+        raise untranslated("a convolution of a dilated input or of grouped batches")
     back = [layout.out_spec.index(axis) for axis in range(len(layout.out_spec))]
     low, high = zip(*given["padding"], strict=True)
     made = graph.value(

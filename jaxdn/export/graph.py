@@ -111,6 +111,13 @@ class Graph(onnx.Graph):
         return helper.make_graph(kept[::-1], name, inputs, outputs, constants)
 
 
+def untranslated(what: str) -> ValueError:
+    """The error for an operation that the translation does not know, and what to do."""
+    return ValueError(
+        f"onnx: expected operations that have a translation, got {what}; export StableHLO alone: --format stablehlo."
+    )
+
+
 def element_type(dtype: Any) -> int:
     """ONNX's number of a NumPy type."""
     from onnx import helper

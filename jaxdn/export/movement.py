@@ -7,7 +7,7 @@ import numpy as np
 from jax.lax import GatherScatterMode
 
 from jaxdn.export.arithmetic import Rule
-from jaxdn.export.graph import Graph
+from jaxdn.export.graph import Graph, untranslated
 
 
 def _broadcast(graph: Graph, equation: Any, x: str, *sizes: str) -> str:
@@ -63,7 +63,7 @@ def _slice(graph: Graph, equation: Any, x: str) -> str:
 def _pad(graph: Graph, equation: Any, x: str, filling: str) -> str:
     low, high, inner = zip(*equation.params["padding_config"], strict=True)
     if any(inner) or any(isinstance(each, int | np.integer) and each < 0 for each in (*low, *high)):
-        raise ValueError("onnx: expected padding >= 0 at the ends, got another; write it as a slice.")
+        raise untranslated("padding between elements or below 0")
     return graph.value("Pad", x, graph.shape((*low, *high)), filling)
 
 
@@ -106,10 +106,10 @@ def _window(
 def _gather(graph: Graph, equation: Any, x: str, indices: str) -> str:
     """Slices of x at places that lie inside, or are moved so that they do."""
     if equation.params["mode"] == GatherScatterMode.FILL_OR_DROP:
-        raise ValueError('onnx: expected gathers with places inside (mode="clip"), got one that fills; clip them.')
+        raise untranslated("a gather that fills what lies outside")
     numbers = equation.params["dimension_numbers"]
     if numbers.operand_batching_dims:
-        raise ValueError("onnx: expected gathers from one array, got one of a batch; use no vmap.")
+        raise untranslated("a gather from a batch of arrays")
     places = equation.invars[1].aval.shape
     gather = _gather_one if len(places) == 1 else _gather_many
     return gather(graph, equation, numbers, x, indices)
@@ -135,7 +135,7 @@ def _gather_many(graph: Graph, equation: Any, numbers: Any, x: str, indices: str
     rest = [axis for axis in range(len(shape)) if axis not in indexed]
     window = [axis for axis in indexed if axis not in numbers.collapsed_slice_dims]
     if any(sizes[axis] != shape[axis] for axis in rest) or (window and (len(indexed) > 1 or rest)):
-        raise ValueError(f"onnx: expected gathers of elements or of whole rows, got slices of {sizes} from {shape}.")
+        raise untranslated(f"a gather of slices {sizes} from {shape}")
     flat = graph.value("Transpose", x, perm=[*indexed, *rest]) if [*indexed, *rest] != sorted(indexed + rest) else x
     if len(indexed) > 1:
         flat = graph.value("Reshape", flat, graph.shape([-1, *(shape[axis] for axis in rest)]))
@@ -165,7 +165,7 @@ def _scatter(graph: Graph, equation: Any, x: str, indices: str, updates: str) ->
     """Single elements of a vector set; those outside go to a place that is cut off."""
     numbers, shape = equation.params["dimension_numbers"], equation.invars[0].aval.shape
     if len(shape) != 1 or numbers.update_window_dims or numbers.operand_batching_dims:
-        raise ValueError(f"onnx: expected elements of a vector to be set, got slices of {shape}; set them one by one.")
+        raise untranslated(f"a scatter of slices into {shape}")
     aval = equation.invars[1].aval
     size, zero = graph.cast(graph.size(shape[0]), aval.dtype), graph.constant(np.zeros((), aval.dtype))
     outside = graph.value("Or", graph.value("Less", indices, zero), graph.value("GreaterOrEqual", indices, size))

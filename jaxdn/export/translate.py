@@ -13,7 +13,7 @@ import numpy as np
 from jax.extend import core
 
 from jaxdn.export.arithmetic import ARITHMETIC
-from jaxdn.export.graph import Graph, element_type
+from jaxdn.export.graph import Graph, element_type, untranslated
 from jaxdn.export.movement import MOVEMENT
 
 _INLINE = {
@@ -56,10 +56,7 @@ def _rule(equation: core.JaxprEqn) -> Callable[..., str | list[str]]:
         return _inlined
     rule = {**ARITHMETIC, **MOVEMENT, **_CONTROL}.get(name)
     if rule is None:
-        raise ValueError(
-            f"onnx: expected operations that have a translation, got {name!r} "
-            f"({', '.join(str(one.aval) for one in equation.invars)}); export StableHLO alone: --format stablehlo."
-        )
+        raise untranslated(f"{name!r} ({', '.join(str(one.aval) for one in equation.invars)})")
     return rule
 
 
@@ -97,7 +94,7 @@ def _cond(graph: Graph, equation: core.JaxprEqn, index: str, *inputs: str) -> li
     """``lax.cond``."""
     branches = equation.params["branches"]
     if len(branches) != 2:
-        raise ValueError(f"onnx: expected a choice of two, got one of {len(branches)}; use nested jax.lax.cond.")
+        raise untranslated(f"a choice of {len(branches)} programs")
     made = []
     for number, program in enumerate(branches):
         branch = Graph(graph)
