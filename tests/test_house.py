@@ -34,9 +34,9 @@ LAYERS = {
     **dict.fromkeys(("filters", "networks"), 2),
     **dict.fromkeys(("methods", "denoisers"), 3),
     **dict.fromkeys(("rollout", "additive", "learning", "planning"), 4),
-    **dict.fromkeys(("files", "render", "clips", "checkpoint", "report", "weights", "candidates"), 5),
+    **dict.fromkeys(("files", "render", "clips", "checkpoint", "report", "weights", "candidates", "export"), 5),
     "effects": 6,
-    **dict.fromkeys(("cli", "commands"), 7),
+    **dict.fromkeys(("cli", "arguments", "commands"), 7),
 }
 OUTSIDE = {
     "flax": {"networks"},
@@ -49,7 +49,7 @@ OUTSIDE = {
     "matplotlib": {"report"},
     "PIL": {"report"},
     "safetensors": {"weights"},
-    "tyro": {"cli"},
+    "tyro": {"cli", "arguments"},
 }
 
 

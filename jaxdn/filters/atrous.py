@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 
 from jaxdn.filters.weights import Offset, Weight
+from jaxdn.ops.platform import platform
 
 B3_SPLINE = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
 _STRIP_PIXELS = 16384
@@ -65,7 +66,7 @@ def edge_average(
     _, height, width = values.shape
     dtype = values.dtype
     # Strips are for the CPU's cache only; other devices take one strip.
-    rows = height if jax.default_backend() != "cpu" else min(height, max(8, _STRIP_PIXELS // width))
+    rows = height if platform() != "cpu" else min(height, max(8, _STRIP_PIXELS // width))
     strips = -(-height // rows)
     spare = strips * rows - height
     reach_y, reach_x = (int(np.abs(taps[:, axis]).max()) * step_max for axis in (0, 1))

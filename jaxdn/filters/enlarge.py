@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 
 from jaxdn.ops.affinity_filter import Guide, affinity
+from jaxdn.ops.platform import platform
 
 _SPREAD = 3.0
 """Twice the variance of the spatial weights, in pixels of the fine image."""
@@ -42,7 +43,7 @@ def enlarge(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, ja
 def _totals(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
     """[C + 1, 2h, 2w] the weighted sum of every fine pixel's taps and of their weights."""
     channels, height, width = coarse.shape
-    rows = height if jax.default_backend() != "cpu" else min(height, max(1, _STRIP // width))
+    rows = height if platform() != "cpu" else min(height, max(1, _STRIP // width))
     strips = -(-height // rows)
     below = strips * rows - height
 

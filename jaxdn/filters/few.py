@@ -14,6 +14,7 @@ from jax import lax
 
 from jaxdn.filters.atrous import NO_WEIGHT
 from jaxdn.filters.weights import Offset, Weight
+from jaxdn.ops.platform import ANY, platform
 from jaxdn.ops.strips import where_needed
 
 _WORTH = 100_000
@@ -23,8 +24,11 @@ _FEW = 1 / 4
 
 
 def few_or_all(needed: jax.Array, few: Callable[[], Any], many: Callable[[], Any]) -> Any:
-    """``few()`` where few pixels are ``needed`` [H, W], else ``many()``, and for small images; both give the same."""
-    if needed.size < _WORTH:
+    """``few()`` where few pixels are ``needed`` [H, W], else ``many()``; both give the same.
+
+    Small images, and portable programs, whose images may be small, have ``many()`` alone.
+    """
+    if platform() == ANY or needed.size < _WORTH:
         return many()
     return lax.cond(jnp.mean(needed, dtype=jnp.float32) < _FEW, few, many)
 

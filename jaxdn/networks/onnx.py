@@ -56,7 +56,7 @@ class Graph:
     def constant(self, array: np.ndarray) -> str:
         from onnx import numpy_helper
 
-        self.constants.append(numpy_helper.from_array(np.ascontiguousarray(array), f"constant_{len(self.constants)}"))
+        self.constants.append(numpy_helper.from_array(np.asarray(array, order="C"), f"constant_{len(self.constants)}"))
         return self.constants[-1].name
 
     def node(self, kind: str, *inputs: str, output: str | None = None, **attributes: Any) -> str:

@@ -26,6 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxdn.ops.platform import platform
+
 RADIUS = 2
 SPLINE = (0.375, 0.25, 0.0625)
 """The B3 spline, from its centre outwards."""
@@ -131,7 +133,7 @@ _Residuals = tuple[jax.Array, Guide, jax.Array, jax.Array]
 def _forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, _Residuals]:
     channels, height, width = image.shape
     dtype, margin = image.dtype, step * RADIUS
-    rows = height if jax.default_backend() != "cpu" else min(height, max(8 * step, _STRIP // width))
+    rows = height if platform() != "cpu" else min(height, max(8 * step, _STRIP // width))
     strips = -(-height // rows)
     below = strips * rows - height
 

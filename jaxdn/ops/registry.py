@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
+from jaxdn.ops.platform import platform
 
 
 class _Implementation(NamedTuple):
@@ -37,15 +37,15 @@ def implementations(operation: str) -> tuple[str, ...]:
 
 
 def resolve(operation: str, implementation: str | None) -> Callable[..., Any]:
-    """The function that runs: the named one, or with None the one preferred on jax's default platform.
+    """The function that runs: the named one, or with None the one preferred on :func:`jaxdn.ops.platform.platform`.
 
     Resolved during tracing, so the choice costs nothing at run time. There is no fallback: ValueError for a name that
     does not exist or cannot run.
     """
     known = _IMPLEMENTATIONS[operation]
     if implementation is None:
-        platform = jax.default_backend()
-        preferred = (candidate.function for candidate in known.values() if platform in candidate.preferred_on)
+        here = platform()
+        preferred = (candidate.function for candidate in known.values() if here in candidate.preferred_on)
         return next(preferred, known["reference"].function)
     if implementation not in known:
         raise ValueError(

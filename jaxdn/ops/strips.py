@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxdn.ops.platform import platform
+
 Arrays = Any
 """A pytree of arrays [H, ...]."""
 _BATCHES = 64
@@ -21,7 +23,7 @@ def by_strips(work: Callable[[Arrays], Arrays], arrays: Arrays, *, pixels: int) 
     zeros.
     """
     height, width = jax.tree.leaves(arrays)[0].shape[:2]
-    rows = min(height, max(1, pixels // width)) if jax.default_backend() == "cpu" else height
+    rows = min(height, max(1, pixels // width)) if platform() == "cpu" else height
     if rows == height:
         return work(arrays)
     strips = -(-height // rows)

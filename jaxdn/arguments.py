@@ -1,0 +1,268 @@
+"""What each command of ``jaxdn`` takes: its options, with their help."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+_PATH = tyro.conf.Positional[Path]
+
+
+@dataclass
+class Inspect:
+    """List the effects of a scene and why it has them, what will be rendered for them, and what that saves.
+
+    For example:
+
+    jaxdn inspect kitchen/scene.xml --animation kitchen.json --denoiser steady-balanced
+
+    jaxdn inspect data/test/fruit-200 --json
+
+    jaxdn inspect "shots/*.exr" --channels albedo=diffuseFilter
+    """
+
+    scene: tyro.conf.Positional[str]
+    """A Mitsuba scene (.xml), a family, or a finished clip: its folder, or EXR files of any renderer."""
+    animation: Path | None = None
+    """Animation file for a scene file."""
+    denoiser: str | None = None
+    """Plan for this denoiser (svgf, steady-balanced ...), or several (svgf,relax); default: for every buffer that a
+    denoiser may read."""
+    width: int = 128
+    height: int = 128
+    frames: int | None = None
+    """Number of frames to inspect; default: all of the animation."""
+    json: bool = False
+    """Print only one JSON object: {"effects": [...], "plan": {...}, "uncertain": [...]}, of files also "sources"."""
+    motion_convention: str | None = None
+    """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
+    channels: list[str] = field(default_factory=list)
+    """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out."""
+    layer: str | None = None
+    """For files of other renderers: the view layer or part to look for buffers in."""
+
+
+@dataclass
+class Render:
+    """Render animated clips with Mitsuba: noisy indirect light, references, G-buffers and motion vectors.
+
+    Run the same command again to resume an interrupted rendering.
+
+    For example:
+
+    jaxdn render fruit --seeds 0 1 2 -o data/train
+
+    jaxdn render kitchen/scene.xml --animation kitchen.json -o data/kitchen
+
+    jaxdn render kitchen/scene.xml --tour --seeds 0-49 -o data/train
+    """
+
+    scene: tyro.conf.Positional[str]
+    """A family (fruit, robot, pinkroom, mobile, edge, dash, glitter, parlour) or the path of a Mitsuba scene (.xml)."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Output folder; it gets one folder per clip."""
+    animation: Path | None = None
+    """Animation file (JSON: camera keys, rigid keys, inserted shapes) for a scene file."""
+    tour: bool = False
+    """Make an animation of the scene file for each seed: camera path, moving things, materials and lights."""
+    seeds: list[str] = field(default_factory=lambda: ["0"])
+    """One clip of the family, or tour of the scene, for each seed, such as 3 or 0-49; else the seeds of the noise."""
+    width: int = 128
+    height: int = 128
+    frames: int = 10
+    reference_spp: int = 256
+    """Samples per pixel of the reference; 0 for none."""
+    layers: list[int] = field(default_factory=lambda: [1])
+    """Independent noisy layers, in samples per pixel (powers of two)."""
+    draws: int = 0
+    """Further noisy images of one sample each, of indirect and of direct light: training draws from them."""
+    light: Literal["indirect", "reflected"] = "indirect"
+    """Light with noise: indirect light, with direct light beside it, or all that is reflected, with its shadows."""
+    jitter: bool = False
+    """Rays go through another point of the pixels in every frame, for taa; references are means over the pixels."""
+    max_depth: int | None = None
+    """Path length (1 emission, 2 direct, 3 one bounce of indirect light ...); default: as the scene needs."""
+    effects: str = "auto"
+    """auto: the effects that the scene has (see `jaxdn inspect`); all: every effect; or names separated by commas."""
+    denoiser: str | None = None
+    """Render only what this denoiser (svgf, relax ...) reads, or several (svgf,relax); default: all but what few
+    denoisers read."""
+    workers: int | None = None
+    """Number of processes; default: the number of cores."""
+
+
+@dataclass
+class Pack:
+    """Pack random windows of rendered clips into one compact file, to train on a machine that clips are too large for.
+
+    For example:
+
+    jaxdn pack data/train -o train.pack --mib 50 --crop 64 --draws 2
+
+    jaxdn train train.pack -o runs/mine
+    """
+
+    clips: tyro.conf.Positional[list[Path]]
+    """Folders of clips."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The file to write."""
+    mib: float
+    """Largest size of the file in MiB."""
+    crop: int = 64
+    """Width and height of the windows, in pixels; training may crop them further."""
+    frames: int = 10
+    """Consecutive frames of a window; of a shorter clip all."""
+    draws: int = 2
+    """Single samples to store of each window; 0: the layer of one sample instead."""
+    buffers: list[str] | None = None
+    """Buffers to store; default: those that every variant of ntd is trained with."""
+    indirect_only: bool = False
+    """Leave out direct and emitted light: smaller, but nothing can be trained on all light."""
+    without_half: bool = False
+    """Leave out the reference's first half: a quarter smaller, but no inputs of half the reference's samples."""
+    seed: int = 0
+    """Of the choice of windows."""
+
+
+@dataclass
+class Train:
+    """Train a learned method on rendered clips; run it again to resume.
+
+    For example:
+
+    jaxdn train data/train --validation data/validation -o runs/mine --steps 3000
+
+    jaxdn train data/train -o runs/traditional --variant ntd-large --set motion=traditional
+    """
+
+    clips: tyro.conf.Positional[list[Path]]
+    """Folders of clips, or files of `jaxdn pack`, to train on."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The run's folder: checkpoints, log, and finally weights.safetensors with its JSON."""
+    validation: Path | None = None
+    """Folder of held-out clips, or a file of `jaxdn pack`, for validation, used whole."""
+    method: str = "ntd"
+    """Method to train; an unknown name lists the available ones."""
+    variant: str | None = None
+    """One of the method's variants (ntd-large, ntd-small); default: the fastest."""
+    set: list[str] = field(default_factory=list)
+    """Options of the method as option=value, such as motion=traditional preset=parity; an unknown name lists them."""
+    start: str | None = None
+    """Shipped weights or a .safetensors file to continue from; default: new weights."""
+    recipe: str | None = None
+    """One of the method's recipes; for ntd: usual, without-occlusion, paper, paper-without-occlusion, parity. Default:
+    the usual one."""
+    steps: int | None = None
+    """Parameter updates, more than before to go on with a finished run; default, as for the next seven options: as in
+    the recipe."""
+    batch: int | None = None
+    """Clips per update."""
+    crop: int | None = None
+    """Width and height of the crops that are trained on, in pixels."""
+    frames: int | None = None
+    """Consecutive frames of a clip per update."""
+    learning_rate: float | None = None
+    """Peak learning rate."""
+    rematerialize: bool | None = None
+    """Recompute in the backward pass: a quarter of the memory for 1.1 to 1.4 times the time."""
+    seed: int | None = None
+    """Seed of the initial weights and of the data's order."""
+    spp: list[int] | None = None
+    """Samples per pixel of the noisy input; of several numbers, each clip of a batch has one at random."""
+    time_limit: float | None = None
+    """Minutes after which training stops and writes its weights; the same command goes on from there."""
+    implementation: str = "auto"
+    """Engine for convolutions: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest available."""
+
+
+@dataclass
+class Denoise:
+    """Denoise clips, or EXR files of any renderer; everything else in the files stays as it is.
+
+    For example:
+
+    jaxdn denoise data/test/fruit-7 -o out --preview
+
+    jaxdn denoise "shots/*.exr" -o out --method ntd-small --motion-convention cycles --channels albedo=DiffCol
+
+    jaxdn denoise shots/a shots/b -o out --frames 10-40 --skip-existing
+    """
+
+    clips: tyro.conf.Positional[list[Path]]
+    """Folders of clips, folders of EXR files, quoted patterns of EXR files, or files; one or several."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for the denoised frames; for a single frame, also the name of an EXR file."""
+    method: str = "steady-balanced"
+    """Shipped weights (steady-balanced, ntd-large, ntd-small), a filter (svgf, asvgf, taa), or the path of a
+    .safetensors file."""
+    frames: list[str] = field(default_factory=list)
+    """Numbers of the frames to denoise, such as 7 or 10-40; frames before them are read for their history."""
+    skip_existing: bool = False
+    """Leave out frames whose result is there already."""
+    only_beauty: bool = False
+    """Of EXR files of other renderers, write the denoised beauty and its alpha alone, without the other layers."""
+    aovs: Literal["keep", "additive"] = "keep"
+    """Other layers of light in such files: keep them as they are, or (additive) denoise those that are parts of the
+    beauty so that they still add up to it."""
+    spp: int = 1
+    """Samples per pixel to take from the clip's layers."""
+    preview: bool = False
+    """Write a PNG next to every EXR."""
+    motion_convention: str | None = None
+    """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
+    channels: list[str] = field(default_factory=list)
+    """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out."""
+    layer: str | None = None
+    """For files of other renderers: the view layer or part to look for buffers in."""
+    implementation: str = "auto"
+    """Engine for the network: reference (XLA), onnxruntime (CPU; the extra onnx); auto: the fastest available."""
+
+
+@dataclass
+class Compare:
+    """Score methods on clips with references; writes metrics.json and report.html, and prints a table.
+
+    For example:
+
+    jaxdn compare data/test -o runs/compare --methods noisy svgf ntd-small steady-balanced
+    """
+
+    clips: _PATH
+    """Folder of clips, or one clip."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for the report."""
+    methods: list[str] = field(default_factory=list)
+    """noisy, filters, shipped weights or .safetensors files; default: all that come with the package."""
+    spp: int = 1
+    """Samples per pixel to take from the clips' layers."""
+
+
+@dataclass
+class Export:
+    """Write one recurrent step of a method as StableHLO and as ONNX, for programs that are not Python.
+
+    For example:
+
+    jaxdn export steady-balanced -o exported
+
+    jaxdn export svgf -o exported --width 1920 --height 1080 --buffers albedo normal depth motion
+    """
+
+    method: tyro.conf.Positional[str]
+    """A filter (svgf, taa), shipped weights (steady-balanced, ntd-large), or the path of a .safetensors file."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for METHOD.stablehlo and METHOD.onnx."""
+    width: int | None = None
+    """Of the images, with --height; default: any, a multiple of 16 or 32 for networks."""
+    height: int | None = None
+    """Of the images, with --width."""
+    buffers: list[str] | None = None
+    """Buffers that the frames will have besides radiance; default: all that the method reads."""
+    format: Literal["both", "stablehlo", "onnx"] = "both"
+    """What to write; some filters have operations that are not translated to ONNX."""
+
+
+@dataclass
+class Doctor:
+    """Show what this machine computes, denoises, trains and renders with, and what to install for more."""
