@@ -80,8 +80,7 @@ def page(results: Results) -> str:
         "<kbd>D</kbd> marks disoccluded pixels, <kbd>Space</kbd> plays the frames, <kbd>,</kbd> and <kbd>.</kbd> step "
         "through them. Error is the mean over channels of |method − reference| on display "
         f"values in 0..1; one colour scale for the whole page: {_scale_bar(scale)}</p>",
-        "<noscript><p>The player, all other images and the curves need JavaScript, which this page contains.</p>"
-        "</noscript>",
+        "<noscript><p>The player, other images and curves need JavaScript, which this page contains.</p></noscript>",
         *sections,
         "</section>",
         _training(results),
@@ -241,7 +240,8 @@ def _clip(
         where &= mask
     pictures = {label: images.data_address(images.encode_png(clip.images[label])) for label in [*labels, REFERENCE]}
     wrong = {label: images.data_address(images.encode_error(maps[label], scale)) for label in labels}
-    spent = sum(map(len, pictures.values())) + sum(map(len, wrong.values()))
+    still = _still(results, clip)
+    spent = sum(map(len, pictures.values())) + sum(map(len, wrong.values())) + len(still)
     data: dict[str, Any] = {
         "labels": [*labels, REFERENCE],
         "width": mask.shape[1],
@@ -260,7 +260,7 @@ def _clip(
         data |= {"images": pictures, "errors": wrong}
         data["mask"] = images.data_address(images.encode_mask(mask)) if mask.any() else None
     else:
-        spent = 0
+        spent, still = 0, ""
         notice = (
             '<p class="note">No pictures: this page would become too large to open comfortably. '
             "Report fewer clips, or smaller ones, to see them.</p>"
@@ -274,7 +274,7 @@ def _clip(
         f'<details class="clip" id="clip-{index}"{opened}><summary><span class="name">'
         f'{escape(clip.name)}</span> <span class="note">{gist}'
         f"floor {show(clip.noise_floor_psnr, 'psnr')} dB</span></summary>"
-        f'{notice}{_still(results, clip)}<div class="views"></div><h3>Scores on this clip</h3>'
+        f'{notice}{still}<div class="views"></div><h3>Scores on this clip</h3>'
         f"{_table(clip.scores, columns(results), results, clip.noise_floor_psnr)}"
         '<div class="curves"></div>'
         f"{_json_script(data)}</details>"

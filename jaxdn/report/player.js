@@ -49,7 +49,7 @@ const player = (clip, page, el) => {
     chooser.value = labels.includes(wanted) ? wanted : labels[Math.min(number, labels.length - 1)];
     chooser.addEventListener("change", () => { load(chooser.value); draw(); });
     for (const each of [canvas, wrong]) each.addEventListener("click", () => toggle());
-    return { canvas, wrong, caption, chooser, node: el("figure", {}, chooser, canvas, wrong, caption) };
+    return { canvas, wrong, caption, chooser, node: el("figure", {}, chooser, canvas, caption, wrong) };
   });
   const load = (label) => [...film.pictures[label], ...(film.errors[label] || [])].forEach(image);
 
@@ -76,11 +76,11 @@ const player = (clip, page, el) => {
       wrong.style.visibility = errors ? "visible" : "hidden";
       if (errors) paint(wrong, errors[state.frame], true);
       const l1 = errors && clip.curves.l1 && clip.curves.l1[label] && clip.curves.l1[label][state.frame];
-      caption.replaceChildren(page.about[label] || label, ...(typeof l1 === "number" ? [el("span", {}, "L1 of this frame " + l1.toPrecision(3))] : []));
+      caption.replaceChildren(page.about[label] || "", ...(typeof l1 === "number" ? [el("span", {}, "L1 of this frame " + l1.toPrecision(3))] : []));
     }
     timeline.value = state.frame;
     timeline.setAttribute("aria-valuetext", `frame ${state.frame}`);
-    count.textContent = `frame ${state.frame} of 0 … ${last}` + (film.frames < film.of ? ` (the clip has ${film.of})` : "");
+    count.textContent = `frame ${state.frame} (0 to ${last}` + (film.frames < film.of ? `, of ${film.of} in the clip)` : ")");
     play.replaceChildren(el("small", {}, "Space"), playing() ? "❚❚ pause" : "▶ play");
     play.setAttribute("aria-pressed", playing());
   }
@@ -99,7 +99,7 @@ const player = (clip, page, el) => {
     const first = state.frame;
     state.since = performance.now();
     state.timer = setInterval(() => {
-      if (!node.offsetParent) return pause(); // its clip was closed
+      if (!node.closest("details").open) return pause();
       const frame = (first + Math.floor((performance.now() - state.since) / FRAME_MS)) % film.frames;
       if (frame !== state.frame) show(frame);
     }, FRAME_MS / 4);
@@ -109,7 +109,11 @@ const player = (clip, page, el) => {
     pause();
     show(state.frame + by);
   }
-  timeline.addEventListener("input", () => { pause(); show(Number(timeline.value)); });
+  timeline.addEventListener("input", () => {
+    const chosen = Number(timeline.value); // read before anything is drawn, which sets it
+    pause();
+    show(chosen);
+  });
   const node = el("div", { class: "player" }, el("h3", {}, "Play: 10 frames per second, and the error of each frame"),
     el("div", { class: "bar" }, play, back, forth, timeline, count), el("div", { class: "films" }, ...panels.map((panel) => panel.node)));
   const keys = (key) => {
