@@ -2,7 +2,7 @@
 
     jaxdn render living-room/scene.xml --animation experiments/papers/rooms/living-room.json \\
         --frames 8 --width 320 --height 180 --reference-spp 64 --seeds 2000 -o data/rooms
-    python -m experiments.papers.front_page data/rooms/living-room-2000 --part 146,90,80,45
+    python -m experiments.papers.front_page data/rooms/living-room-2000 --part 96,90,160,90
 
 Renders the last frame once more with many samples, to ``runs/front-page``, denoises the clip by the shipped weights
 that `jaxdn denoise` uses, and writes a WebP: whole frames above, a part of each, enlarged without smoothing, below.
@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from experiments.papers.places import parsed
 from jaxdn import color
-from jaxdn.candidates import OURS, candidate
+from jaxdn.candidates import OURS
 from jaxdn.clips import read_clip
 from jaxdn.clips.folder import read_record
 from jaxdn.commands.errors import plain_errors
@@ -28,6 +28,7 @@ from jaxdn.frame import Clip
 from jaxdn.render import ClipJob, render_clips
 from jaxdn.report.images import displayed_bytes
 from jaxdn.rollout import denoise
+from jaxdn.weights import load_weights
 
 _GAP = 4
 """Pixels between the pictures."""
@@ -94,8 +95,8 @@ def main(settings: Settings) -> None:
     clip = read_clip(settings.clip)
     last = len(clip.frames.radiance) - 1
     clean = clean_frame(settings.clip, last, settings.reference_spp)
-    ours = candidate(OURS)
-    denoised = jax.jit(partial(denoise, ours.denoiser))(ours.params, clip._replace(reference=None))
+    denoiser, params = load_weights(OURS)
+    denoised = jax.jit(partial(denoise, denoiser))(params, clip._replace(reference=None))
     pictures = {
         "before: 1 sample per pixel": lit(clip.frames.radiance[last], clean, 0),
         f"after: {OURS}": lit(denoised[last], clean, 0),
