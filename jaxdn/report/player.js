@@ -49,7 +49,7 @@ const player = (clip, page, el) => {
     chooser.value = labels.includes(wanted) ? wanted : labels[Math.min(number, labels.length - 1)];
     chooser.addEventListener("change", () => { load(chooser.value); draw(); });
     for (const each of [canvas, wrong]) each.addEventListener("click", () => toggle());
-    return { canvas, wrong, caption, chooser, node: el("figure", {}, chooser, canvas, caption, wrong) };
+    return { canvas, wrong, caption, chooser, node: el("figure", {}, chooser, canvas, wrong, caption) };
   });
   const load = (label) => [...film.pictures[label], ...(film.errors[label] || [])].forEach(image);
 

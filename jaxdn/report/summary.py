@@ -141,12 +141,12 @@ def sentences(results: Results) -> list[str]:
             word = "lower" if top.disoccluded_less >= 0 else "higher"
             text = (
                 f"In disoccluded pixels the L1 error of {named(top.occlusion, results)} is "
-                f"{abs(top.disoccluded_less):.0%} {word} than that of {named(top.traditional, results)} "
-                f"({show(c, 'l1')} against {show(a, 'l1')}"
+                f"{abs(top.disoccluded_less):.0%} {word} than that of {named(top.traditional, results)}: "
+                f"{show(c, 'l1')} against {show(a, 'l1')}"
             )
             if math.isfinite(top.disoccluded_gain):
                 text += f"; {'+' if top.disoccluded_gain >= 0 else ''}{show(top.disoccluded_gain, 'psnr')} dB PSNR"
-            found.append(text + ").")
+            found.append(text + ".")
     if math.isnan(top.floor):
         found.append("The noise floor of the references is not known.")
     else:
