@@ -19,6 +19,9 @@ from jaxdn.weights import describe, load_weights, shipped_names
 NOISY = "noisy"
 """The name of the noisy image itself."""
 
+OURS = "steady-balanced"
+"""The shipped weights that reports open on: those that `jaxdn denoise` uses."""
+
 
 class Candidate(NamedTuple):
     """A denoiser that is ready to run."""

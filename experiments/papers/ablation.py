@@ -26,6 +26,7 @@ from jaxdn.methods.table import Method, method_named
 from jaxdn.recipe import Recipe
 from jaxdn.render import ClipJob, choose_variant, render_clips
 from jaxdn.report import Results, TrainingCurve, text_table, write_report
+from jaxdn.weights import describe, shipped_names
 
 FAMILIES = ("fruit", "robot", "pinkroom", "mobile")
 METHOD = "ntd"
@@ -52,6 +53,8 @@ class Run(NamedTuple):
     recipe: str
     """The name of one of the method's recipes."""
     steps: int
+    about: str
+    """What it is, in a few words."""
 
     @property
     def folder(self) -> str:
@@ -87,9 +90,9 @@ def _abc(steps: int) -> dict[str, Run]:
     """The three runs of the paper's ablation, with the small network."""
     traditional, dual = ({"size": "small", "motion": motion} for motion in ("traditional", "dual"))
     return {
-        "A": Run("A", traditional, "paper-without-occlusion", steps),
-        "B": Run("B", dual, "paper-without-occlusion", steps),
-        "C": Run("C", dual, "paper", steps),
+        "A": Run("A", traditional, "paper-without-occlusion", steps, "ntd, traditional motion vectors"),
+        "B": Run("B", dual, "paper-without-occlusion", steps, "ntd, dual motion vectors"),
+        "C": Run("C", dual, "paper", steps, "ntd, dual motion vectors and motion-occlusion loss"),
     }
 
 
@@ -97,7 +100,7 @@ PRESETS = {
     "demo": Preset(
         train=ClipSet(_seeds(FAMILIES, range(2)), size=64, frames=10, reference_spp=32),
         validation=ClipSet((("fruit", 100, 0),), size=64, frames=10, reference_spp=32),
-        tests=(ClipSet((*_seeds(FAMILIES[1:], range(200, 201)), ("edge", 200, 0)), 64, 10, reference_spp=64),),
+        tests=(ClipSet((*_seeds(FAMILIES[1:], range(200, 201)), ("edge", 200, 0)), 96, 10, reference_spp=256),),
         runs=tuple(_abc(steps=100).values()),
         learning={"learning_rate": 2e-3, "crop": 48},
     ),
@@ -176,14 +179,18 @@ def train_run(run: Run, preset: Preset, data: Path, folder: Path) -> Path:
 
 
 def evaluate(preset: Preset, settings: Settings, data: Path, folder: Path, machine: dict[str, Any]) -> Results:
-    """Score the noisy image, every filter and every run that has weights on the test clips."""
+    """Score the noisy image, every filter, every run that has weights, and shipped weights on the test clips."""
     contestants = [candidate(name) for name in (NOISY, *filters())]
-    curves = {}
+    curves, about = {}, {}
     for run in sorted(preset.runs, key=lambda run: run.label):
         path = folder / run.folder / "weights.safetensors"
         if path.is_file():
             contestants.append(candidate(str(path))._replace(label=run.label))
+            about[run.label] = f"{run.about}: {run.steps} steps here"
             curves[run.label] = TrainingCurve(*read_curve(path.parent))
+    for name in shipped_names():
+        contestants.append(candidate(name))
+        about[name] = f"{method_named(describe(name)['factory']).title}: shipped with jaxdn"
     tests = [place for clips in preset.tests for place in folders(clips, data / "test")]
     recipe = preset.recipe(method_named(METHOD), preset.runs[0]).record()
     facts = {
@@ -194,7 +201,7 @@ def evaluate(preset: Preset, settings: Settings, data: Path, folder: Path, machi
         **{key.replace("_", " "): value for key, value in recipe.items() if key not in ("steps", "objective")},
     }
     title = "Neural temporal denoising: the ablation"
-    results = compare(contestants, tests, title=title, settings=facts, training=curves)
+    results = compare(contestants, tests, title=title, settings=facts, training=curves, about=about)
     return results._replace(machine={**results.machine, **machine})
 
 

@@ -61,6 +61,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "ids": (
         "ids",
         "indexob",
+        "object index",
         "shape_index",
         "object_id",
         "id",

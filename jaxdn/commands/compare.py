@@ -3,7 +3,7 @@
 import os
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,12 +11,13 @@ import jax
 import numpy as np
 
 from jaxdn import __version__, color, metrics
-from jaxdn.candidates import Candidate
+from jaxdn.candidates import OURS, Candidate
 from jaxdn.clips import read_clip
 from jaxdn.clips.noise_floor import read_halves, read_noise_floor
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.frame import Clip
 from jaxdn.report import ClipResult, Results, Scores, TrainingCurve
+from jaxdn.report.film import FRAMES, film
 from jaxdn.report.results import headline_psnr
 from jaxdn.rollout import denoise
 
@@ -94,6 +95,7 @@ def compare(
     title: str,
     settings: dict[str, Any],
     training: dict[str, TrainingCurve] | None = None,
+    about: Mapping[str, str] | None = None,
     spp: int = 1,
     read: Callable[..., Footage] = read_footage,
     say: Callable[[str], None] = print,
@@ -112,6 +114,7 @@ def compare(
       title: of the report.
       settings: shown in the report.
       training: label of a method -> its training curve, for the report.
+      about: label of a method -> what it is, in a few words, where that is not the title of the method.
       spp: samples per pixel to take from the clips' layers.
       read: (folder, spp, layers) -> what to score by.
       say: prints one line per clip.
@@ -135,7 +138,16 @@ def compare(
         )
         clips.append(result)
     labels = [method.label for method in methods]
-    return Results(title, settings, describe_machine(), labels, clips, training or {})
+    known = {method.label: method.method.title for method in methods if method.method is not None}
+    opens_on = OURS if OURS in labels else _last_network(methods)
+    told = {**known, **(about or {})}
+    return Results(title, settings, describe_machine(), labels, clips, training or {}, told, opens_on)
+
+
+def _last_network(methods: Sequence[Candidate]) -> str | None:
+    """The last label of a network, which is what somebody brought to compare; None without any."""
+    networks = [method.label for method in methods if method.method is not None and not method.method.filter]
+    return networks[-1] if networks else None
 
 
 def _compile(denoiser: Denoiser) -> Callable[[Params, Clip], jax.Array]:
@@ -169,6 +181,8 @@ def _compare_on(
     shown = int(np.argmax(hidden.sum((1, 2, 3)))) if hidden.any() else shape[0] - 1
     scores, per_frame = {}, {}
     images = {"reference": np.asarray(color.tonemap(reference[shown]))}
+    wanted = np.asarray(color.tonemap(reference[:FRAMES]))
+    films = {"reference": film(wanted, None)}
     for method in methods:
         if method.denoiser is None:
             denoised, milliseconds = inputs.frames.radiance, 0.0
@@ -183,7 +197,8 @@ def _compare_on(
             "disoccluded_l1": np.where(hidden.any((1, 2, 3)), found["frame_disoccluded_l1"], np.nan).tolist(),
         }
         images[method.label] = np.asarray(color.tonemap(denoised[shown]))
-    return ClipResult(name, footage.noise_floor, scores, per_frame, shown, images, hidden[shown, ..., 0])
+        films[method.label] = film(np.asarray(color.tonemap(denoised[:FRAMES])), wanted)
+    return ClipResult(name, footage.noise_floor, scores, per_frame, shown, images, hidden[shown, ..., 0], films)
 
 
 def _as_scores(found: dict[str, np.ndarray], hidden: np.ndarray, milliseconds: float, spp: int) -> Scores:

@@ -29,6 +29,14 @@ def save_png(path: str | os.PathLike[str], image: Any) -> None:
 
 def encode_png(image: Any) -> bytes:
     """The bytes of an 8-bit PNG of a display-encoded image [H, W, 3] or [H, W] in 0..1."""
+    return _encode(Image.fromarray(displayed_bytes(image)))
+
+
+def displayed_bytes(image: Any) -> np.ndarray:
+    """A display-encoded image [H, W, 3] or [H, W] in 0..1 as [H, W, 3] of 0..255, magenta where it is not finite.
+
+    Raises ValueError for another shape.
+    """
     pixels = np.asarray(image, np.float64)
     if pixels.ndim not in (2, 3) or 0 in pixels.shape or (pixels.ndim == 3 and pixels.shape[2] != 3):
         raise ValueError(f"image: expected [H, W, 3] or [H, W], got shape {pixels.shape}; pass one frame in RGB.")
@@ -36,7 +44,7 @@ def encode_png(image: Any) -> bytes:
         pixels = np.repeat(pixels[..., None], 3, axis=2)
     finite = np.isfinite(pixels).all(axis=2, keepdims=True)
     pixels = np.where(finite, np.clip(np.nan_to_num(pixels), 0.0, 1.0), NOT_FINITE)
-    return _encode(Image.fromarray(np.rint(pixels * 255.0).astype(np.uint8)))
+    return np.rint(pixels * 255.0).astype(np.uint8)
 
 
 def error_map(image: Any, reference: Any) -> np.ndarray:
@@ -77,7 +85,7 @@ def encode_mask(mask: Any) -> bytes:
     return _encode(Image.fromarray(pixels))
 
 
-def worst_crop(errors: list[np.ndarray], disoccluded: Any, *, size: int = 40) -> tuple[int, int, int, int]:
+def worst_crop(errors: list[np.ndarray], disoccluded: Any, *, size: int = 64) -> tuple[int, int, int, int]:
     """(x, y, width, height) of the window with the largest error in disoccluded pixels, summed over ``errors`` [H, W].
 
     Without disoccluded pixels, the window with the largest error of all; 4:3 in shape and inside the image.
@@ -97,9 +105,10 @@ def worst_crop(errors: list[np.ndarray], disoccluded: Any, *, size: int = 40) ->
     return int(x), int(y), width, height
 
 
-def data_address(png: bytes) -> str:
-    """The PNG as a ``data:`` URL, which needs neither file nor server."""
-    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+def data_address(file: bytes) -> str:
+    """A PNG or WebP file as a ``data:`` URL, which needs neither file nor server."""
+    kind = "webp" if file.startswith(b"RIFF") else "png"
+    return f"data:image/{kind};base64," + base64.b64encode(file).decode("ascii")
 
 
 def _encode(picture: Image.Image) -> bytes:

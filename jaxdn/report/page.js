@@ -16,6 +16,7 @@
   const el = (tag, attributes, ...children) => put(document.createElement(tag), attributes, children);
   const svg = (tag, attributes, ...children) => put(document.createElementNS("http://www.w3.org/2000/svg", tag), attributes, children);
   const colorOf = (label) => (page.noisy.includes(label) ? "cn" : "c" + (page.methods.indexOf(label) % 8));
+  const named = (label) => label + (page.about[label] ? ": " + page.about[label] : "");
   const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 
   // ---- pictures -----------------------------------------------------------------------------------------------------
@@ -55,7 +56,7 @@
       if (mask) mask.classList.toggle("on", state.mask);
       errorButton.setAttribute("aria-pressed", state.error);
       if (maskButton) maskButton.setAttribute("aria-pressed", state.mask);
-      tag.textContent = (state.error && state.label !== REFERENCE ? "error of " : "") + state.label;
+      tag.textContent = (state.error && state.label !== REFERENCE ? "error of " : "") + named(state.label);
     };
     const button = (key, text, act) => {
       const node = el("button", { type: "button", "aria-pressed": "false" }, ...(key ? [el("small", {}, key)] : []), text);
@@ -82,7 +83,7 @@
       else return false;
       return true;
     };
-    set({ label: clip.labels.includes(page.best) ? page.best : clip.labels[0] });
+    set({ label: clip.labels.includes(page.opens) ? page.opens : clip.labels[0] });
     const node = el("div", {}, el("h3", {}, "Flip"), el("div", { class: "bar" }, ...Object.values(buttons)), box,
       el("div", { class: "bar tools" }, errorButton, ...(maskButton ? [maskButton] : [])));
     return { node, keys, box };
@@ -90,7 +91,7 @@
 
   function splitView(clip) {
     const known = (label) => clip.labels.includes(label);
-    const right = [page.best, ...clip.labels].find(known);
+    const right = [page.opens, ...clip.labels].find(known);
     const left = [page.svgf, ...clip.labels].find((label) => known(label) && label !== right) || right;
     const box = stage(clip, "split", { tabindex: "0", role: "slider", "aria-label": "split between two methods",
       "aria-valuemin": "0", "aria-valuemax": "100" });
@@ -138,7 +139,7 @@
     const tiles = Object.entries(clip.errors).map(([label, source]) => {
       const tile = el("div", { class: "tile" }, place(el("img", { src: source, alt: "error of " + label }), [0, 0, clip.width, clip.height], clip));
       tile.style.aspectRatio = clip.width + " / " + clip.height;
-      return el("figure", {}, tile, el("figcaption", {}, label, el("span", {}, "L1 " + clip.error[label])));
+      return el("figure", {}, tile, el("figcaption", {}, named(label), el("span", {}, "L1 " + clip.error[label])));
     });
     const scale = document.querySelector(".scale").cloneNode(true);
     return tiles.length ? el("div", {}, el("h3", {}, "Error of frame " + clip.shownFrame + "\u2003", scale), el("div", { class: "tiles errors" }, ...tiles)) : "";
@@ -156,7 +157,7 @@
       }
       return el("figure", {}, box, el("figcaption", {}, caption, ...(error ? [el("span", {}, "L1 " + error)] : [])));
     };
-    const tiles = clip.labels.map((label) => tile([[clip.images[label], "picture"]], label, clip.cropError[label]));
+    const tiles = clip.labels.map((label) => tile([[clip.images[label], "picture"]], named(label), clip.cropError[label]));
     if (clip.mask) tiles.push(tile([[clip.images[REFERENCE], ""], [clip.mask, "mask"]], "disoccluded in cyan, where L1 is taken"));
     const title = clip.mask ? "Worst disocclusion" : "Largest error (this frame has no disoccluded pixels)";
     return el("div", {}, el("h3", {}, `${title}: frame ${clip.shownFrame}, ${w} × ${h} px at (${x}, ${y})`), el("div", { class: "tiles crops" }, ...tiles));
@@ -302,6 +303,11 @@
       ({ keys, box } = flip);
       section.querySelector(".views").append(el("div", { class: "pair" }, flip.node, splitView(clip)), crops(clip), errorTiles(clip));
     }
+    if (clip.film) {
+      const films = player(clip, page, el), rest = keys;
+      section.querySelector(".views").prepend(films.node);
+      keys = (key) => films.keys(key) || rest(key);
+    }
     views.set(section, { keys, box });
     section.querySelector(".curves").append(...clipCurves(clip));
   }
@@ -318,6 +324,7 @@
   }
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || /^(INPUT|SELECT|TEXTAREA)$/.test(event.target.tagName)) return;
+    if (event.key === " " && /^(BUTTON|SUMMARY|A)$/.test(event.target.tagName)) return; // it presses them
     const section = current();
     if (section && views.get(section).keys(event.key.toLowerCase())) event.preventDefault();
   });

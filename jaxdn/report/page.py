@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxdn.report import images
+from jaxdn.report.film import encode_webp, frames_within
 from jaxdn.report.results import (
     REFERENCE,
     ClipResult,
@@ -28,6 +29,9 @@ from jaxdn.report.summary import Column, best_methods, columns, floor_score, hea
 
 IMAGE_BUDGET = 27_000_000
 """Bytes of images (as base64 text) in one page; clips beyond it have only numbers and curves."""
+
+FILM_BUDGET = 16_000_000
+"""Bytes of films (as base64 text) in one page, in equal parts for all clips; frames beyond a part are left out."""
 
 ARROWS = {1: "\N{NO-BREAK SPACE}↑", -1: "\N{NO-BREAK SPACE}↓", 0: ""}
 
@@ -54,7 +58,9 @@ def page(results: Results) -> str:
     data = {
         "methods": results.methods,
         "noisy": [method for method in results.methods if is_noisy(method)],
-        "best": headline(results).best,
+        "opens": results.opens_on or headline(results).best,
+        "about": dict(results.about),
+        "errorScale": scale,
         "svgf": headline(results).svgf,
         "errorColors": images.ERROR_COLORS,
         "training": {label: _curve(curve) for label, curve in results.training.items()},
@@ -66,14 +72,15 @@ def page(results: Results) -> str:
         left -= spent
         sections.append(section)
     body = [
-        _top(results),
+        _top(results, sum(map(len, sections))),
         _means(results),
         _overview(results),
         '<section id="clips"><h2>Clips</h2>',
         '<p class="note">Keys <kbd>1</kbd> … switch the picture of the clip in view, <kbd>E</kbd> shows its error, '
-        "<kbd>D</kbd> marks disoccluded pixels. Error is the mean over channels of |method − reference| on display "
+        "<kbd>D</kbd> marks disoccluded pixels, <kbd>Space</kbd> plays the frames, <kbd>,</kbd> and <kbd>.</kbd> step "
+        "through them. Error is the mean over channels of |method − reference| on display "
         f"values in 0..1; one colour scale for the whole page: {_scale_bar(scale)}</p>",
-        "<noscript><p>The images and curves need JavaScript, which this page contains.</p></noscript>",
+        "<noscript><p>The player, other images and curves need JavaScript, which this page contains.</p></noscript>",
         *sections,
         "</section>",
         _training(results),
@@ -97,6 +104,7 @@ def page(results: Results) -> str:
             *body,
             "</main>",
             _json_script(data, 'id="page-data"'),
+            f"<script>\n{here.joinpath('player.js').read_text('utf-8')}</script>",
             f"<script>\n{here.joinpath('page.js').read_text('utf-8')}</script>",
             "</body></html>",
             "",
@@ -104,7 +112,8 @@ def page(results: Results) -> str:
     )
 
 
-def _top(results: Results) -> str:
+def _top(results: Results, size: int) -> str:
+    """Title, cards and sentences; ``size`` is in characters, that of the clips' sections: nearly all of the page."""
     top = headline(results)
     free = "" if top.field == "psnr" else ", unbiased"
     cards = []
@@ -124,6 +133,7 @@ def _top(results: Results) -> str:
     )
     findings = "".join(f"<li>{escape(sentence)}</li>" for sentence in sentences(results))
     count = f"{len(results.clips)} clip{'s' if len(results.clips) != 1 else ''}"
+    megabytes = f"{size / 1e6:.1f} MB, complete in this file"
     links = {"scores": "Scores", "overview": "By clip", "clips": "Pictures", "training": "Training", "made": "Settings"}
     navigation = " ".join(
         f'<a href="#{anchor}">{label}</a>'
@@ -131,7 +141,8 @@ def _top(results: Results) -> str:
         if anchor != "training" or results.training
     )
     return (
-        f'<header><h1>{escape(results.title)}</h1><p class="note">{count}, {len(results.methods)} methods</p>'
+        f"<header><h1>{escape(results.title)}</h1>"
+        f'<p class="note">{count}, {len(results.methods)} methods; {megabytes}</p>'
         f"<nav>{navigation}</nav></header>"
         f'<section id="summary"><div class="cards">{shown}</div>'
         f"<ul>{findings}</ul></section>"
@@ -143,7 +154,7 @@ def _means(results: Results) -> str:
     explained = "; ".join(f"<b>{column.label}</b>: {column.explanation}" for column in shown)
     return (
         '<section id="scores"><h2>Scores, mean over all clips</h2>'
-        f"{_table(mean_scores(results), shown, results.methods, mean_noise_floor(results))}"
+        f"{_table(mean_scores(results), shown, results, mean_noise_floor(results))}"
         f'<p class="note">Arrows point to better, the best of a column is bold. {explained}. '
         "The last row is what a perfect image would score against references that are noisy themselves; unbiased "
         "scores do not have that noise in them, and are the ones to compare by. "
@@ -151,7 +162,7 @@ def _means(results: Results) -> str:
     )
 
 
-def _table(scores: dict[str, Scores], shown: Sequence[Column], methods: list[str], floor: float) -> str:
+def _table(scores: dict[str, Scores], shown: Sequence[Column], results: Results, floor: float) -> str:
     """Methods down, metrics across, the noise floor as the last row."""
     head = "".join(
         f'<th scope="col" title="{escape(column.explanation)}">{column.label}{ARROWS[column.better]}</th>'
@@ -159,12 +170,12 @@ def _table(scores: dict[str, Scores], shown: Sequence[Column], methods: list[str
     )
     best = {column.field: best_methods(scores, column) for column in shown}
     rows = []
-    for number, method in enumerate(methods):
+    for number, method in enumerate(results.methods):
         cells = "".join(
             _cell(getattr(scores[method], column.field), column.field, best=method in best[column.field])
             for column in shown
         )
-        rows.append(f'<tr><th scope="row">{_swatch(number, method)}{escape(method)}</th>{cells}</tr>')
+        rows.append(f'<tr><th scope="row">{_swatch(number, method)}{_named(method, results)}</th>{cells}</tr>')
     cells = "".join(f"<td>{show(floor_score(floor, column.field), column.field)}</td>" for column in shown)
     rows.append(f'<tr class="floor"><th scope="row">noise floor</th>{cells}</tr>')
     return (
@@ -179,7 +190,7 @@ def _overview(results: Results) -> str:
     shown = columns(results)[:-2]
     for column in shown:
         head = "".join(
-            f'<th scope="col">{_swatch(number, method)}{escape(method)}</th>'
+            f'<th scope="col">{_swatch(number, method)}{_named(method, results)}</th>'
             for number, method in enumerate(results.methods)
         )
         rows = []
@@ -229,7 +240,8 @@ def _clip(
         where &= mask
     pictures = {label: images.data_address(images.encode_png(clip.images[label])) for label in [*labels, REFERENCE]}
     wrong = {label: images.data_address(images.encode_error(maps[label], scale)) for label in labels}
-    spent = sum(map(len, pictures.values())) + sum(map(len, wrong.values()))
+    still = _still(results, clip)
+    spent = sum(map(len, pictures.values())) + sum(map(len, wrong.values())) + len(still)
     data: dict[str, Any] = {
         "labels": [*labels, REFERENCE],
         "width": mask.shape[1],
@@ -241,13 +253,14 @@ def _clip(
         "error": {label: show(float(maps[label].mean()), "l1") for label in labels},
         "cropError": {label: show(float(maps[label][where].mean()), "l1") for label in labels},
         "curves": _curves(clip),
+        "film": _film(clip, FILM_BUDGET // len(results.clips)),
     }
     notice = ""
     if spent <= budget:
         data |= {"images": pictures, "errors": wrong}
         data["mask"] = images.data_address(images.encode_mask(mask)) if mask.any() else None
     else:
-        spent = 0
+        spent, still = 0, ""
         notice = (
             '<p class="note">No pictures: this page would become too large to open comfortably. '
             "Report fewer clips, or smaller ones, to see them.</p>"
@@ -261,11 +274,40 @@ def _clip(
         f'<details class="clip" id="clip-{index}"{opened}><summary><span class="name">'
         f'{escape(clip.name)}</span> <span class="note">{gist}'
         f"floor {show(clip.noise_floor_psnr, 'psnr')} dB</span></summary>"
-        f'{notice}<div class="views"></div><h3>Scores on this clip</h3>'
-        f"{_table(clip.scores, columns(results), results.methods, clip.noise_floor_psnr)}"
+        f'{notice}{still}<div class="views"></div><h3>Scores on this clip</h3>'
+        f"{_table(clip.scores, columns(results), results, clip.noise_floor_psnr)}"
         '<div class="curves"></div>'
         f"{_json_script(data)}</details>"
     ), spent
+
+
+def _film(clip: ClipResult, budget: int) -> dict[str, Any] | None:
+    """What the player plays: as many first frames as ``budget`` bytes hold; None if there are no films."""
+    count = frames_within(clip.films, budget)
+    if not count:
+        return None
+    films = {
+        label: [[*map(images.data_address, files[:count])] for files in each] for label, each in clip.films.items()
+    }
+    return {
+        "frames": count,
+        "of": max((len(curve) for metrics in clip.per_frame.values() for curve in metrics.values()), default=count),
+        "pictures": {label: pictures for label, (pictures, _) in films.items()},
+        "errors": {label: errors for label, (_, errors) in films.items() if errors},
+    }
+
+
+def _still(results: Results, clip: ClipResult) -> str:
+    """Three pictures of the shown frame for browsers that run no script; others do not even decode them."""
+    opens = results.opens_on or headline(results).best
+    wanted = [next(filter(is_noisy, results.methods), None), opens, REFERENCE]
+    shown = "".join(
+        f'<figure><img src="{images.data_address(encode_webp(clip.images[label]))}" alt="{escape(label)}">'
+        f"<figcaption>{escape(label)}</figcaption></figure>"
+        for label in wanted
+        if label is not None and label in clip.images
+    )
+    return f'<noscript><div class="still">{shown}</div></noscript>'
 
 
 def _curves(clip: ClipResult) -> dict[str, dict[str, list[float]]]:
@@ -323,6 +365,12 @@ def _flat(value: Any, prefix: str = "") -> list[tuple[str, str]]:
         return [(prefix, ", ".join(map(str, value)) or "none")]
     text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
     return [(prefix, {"null": "–", "true": "yes", "false": "no", "{}": "none"}.get(text, text))]
+
+
+def _named(method: str, results: Results) -> str:
+    """A label, and beneath it what it is."""
+    about = results.about.get(method)
+    return escape(method) + (f' <small class="about">{escape(about)}</small>' if about else "")
 
 
 def _cell(value: float, field: str, *, best: bool) -> str:

@@ -2,9 +2,12 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from jaxdn.report.film import Film
 
 REFERENCE = "reference"
 """The label under which every clip keeps its reference image; no method may have this name."""
@@ -63,6 +66,8 @@ class ClipResult(NamedTuple):
     """method or "reference" -> float [H, W, 3], display-encoded, in 0..1."""
     disoccluded: Any
     """[H, W] bool, the disoccluded pixels of the shown frame."""
+    films: Mapping[str, Film] = MappingProxyType({})
+    """method or "reference" -> its frames from the first on, for the player; may be empty."""
 
 
 class TrainingCurve(NamedTuple):
@@ -86,6 +91,10 @@ class Results(NamedTuple):
     clips: list[ClipResult]
     training: dict[str, TrainingCurve]
     """label -> curve; empty if nothing was trained."""
+    about: Mapping[str, str] = MappingProxyType({})
+    """label -> what it is, in a few words, shown where the label stands; may leave labels out."""
+    opens_on: str | None = None
+    """The label that the page shows first; None is the one with the best PSNR."""
 
 
 def check_results(results: Results) -> None:
@@ -104,7 +113,8 @@ def check_results(results: Results) -> None:
             raise ValueError(
                 f"{where}: expected scores of {methods}, got {list(clip.scores)}; score every method on every clip."
             )
-        for part, labels in (("per_frame", clip.per_frame), ("images", set(clip.images) - {REFERENCE})):
+        pictured = {"images": set(clip.images) - {REFERENCE}, "films": set(clip.films) - {REFERENCE}}
+        for part, labels in {"per_frame": set(clip.per_frame), **pictured}.items():
             if not set(labels) <= set(methods):
                 raise ValueError(f"{where}: {part} has {sorted(labels)}, expected labels out of {methods}.")
         if REFERENCE not in clip.images:
@@ -117,6 +127,11 @@ def check_results(results: Results) -> None:
                 raise ValueError(f"{where}: image of {label!r} is {np.shape(image)}, the reference {shape}; crop one.")
         if np.shape(clip.disoccluded) != shape[:2]:
             raise ValueError(f"{where}: expected disoccluded {shape[:2]}, got {np.shape(clip.disoccluded)}.")
+        if len(lengths := {len(files) for film in clip.films.values() for files in film if files}) > 1:
+            raise ValueError(f"{where}: expected films of one length, got {sorted(lengths)} frames; cut them.")
+    told = {*results.about, *filter(None, [results.opens_on])}
+    if not told <= set(methods):
+        raise ValueError(f"results: about and opens_on have {sorted(told)}, expected labels out of {methods}.")
     for label, curve in results.training.items():
         if len(curve.step) != len(curve.loss) or len(curve.validation_step) != len(curve.validation_psnr):
             raise ValueError(f"training curve {label!r}: expected one value for each step; check the lengths.")
@@ -172,6 +187,7 @@ def metrics(results: Results) -> dict[str, Any]:
             "format": 1,
             "title": results.title,
             "methods": list(results.methods),
+            "about": dict(results.about),
             "noise_floor_psnr": mean_noise_floor(results),
             "mean": {method: scores._asdict() for method, scores in mean_scores(results).items()},
             "clips": [

@@ -140,12 +140,13 @@ def sentences(results: Results) -> list[str]:
             a, c = (means[method].disoccluded_l1 for method in (top.traditional, top.occlusion))
             word = "lower" if top.disoccluded_less >= 0 else "higher"
             text = (
-                f"In disoccluded pixels the L1 error of {top.occlusion} is {abs(top.disoccluded_less):.0%} {word} than "
-                f"that of {top.traditional} ({show(c, 'l1')} against {show(a, 'l1')}"
+                f"In disoccluded pixels the L1 error of {named(top.occlusion, results)} is "
+                f"{abs(top.disoccluded_less):.0%} {word} than that of {named(top.traditional, results)}: "
+                f"{show(c, 'l1')} against {show(a, 'l1')}"
             )
             if math.isfinite(top.disoccluded_gain):
                 text += f"; {'+' if top.disoccluded_gain >= 0 else ''}{show(top.disoccluded_gain, 'psnr')} dB PSNR"
-            found.append(text + ").")
+            found.append(text + ".")
     if math.isnan(top.floor):
         found.append("The noise floor of the references is not known.")
     else:
@@ -160,6 +161,12 @@ def sentences(results: Results) -> list[str]:
                 "references with more samples would show it."
             )
     return found
+
+
+def named(method: str, results: Results) -> str:
+    """A label, followed by what it is, in brackets, where that is known."""
+    about = results.about.get(method)
+    return f"{method} ({about})" if about else method
 
 
 def columns(results: Results) -> tuple[Column, ...]:

@@ -421,18 +421,19 @@ def test_every_convention_means_the_same_movement() -> None:
         np.testing.assert_allclose(convert_motion(motion, convention)[4, 7], (3, 2), rtol=1e-6, err_msg=convention)
 
 
-def test_blender_sequences_need_no_options(tmp_path: Path, rng: np.random.Generator) -> None:
-    names = [*BLENDER, "ViewLayer.IndexOB.X"]
+@pytest.mark.parametrize("index", ["IndexOB", "Object Index"])  # before and since Blender 5.0
+def test_blender_sequences_need_no_options(tmp_path: Path, rng: np.random.Generator, index: str) -> None:
+    names = [*BLENDER, f"ViewLayer.{index}.X"]
     write_plain(tmp_path / "a1.exr", names, rng)
     channels = clips.read_exr(tmp_path / "a1.exr")
     channels["ViewLayer.Depth.Z"][:] = 1e10
-    channels["ViewLayer.IndexOB.X"][:] = [0, 1, 2, 3, 4, 5]
+    channels[f"ViewLayer.{index}.X"][:] = [0, 1, 2, 3, 4, 5]
     clips.write_exr(tmp_path / "a1.exr", channels)
     clip = clips.read_clip(tmp_path)
     np.testing.assert_array_equal(clip.frames.motion[0, ..., 1], -channels["ViewLayer.Vector.Y"])
     np.testing.assert_array_equal(clip.frames.ids[0, 0, :, 0], [-1, 0, 1, 2, 3, 4])
     assert np.all(clip.frames.depth == np.float32(FAR))
-    channels["ViewLayer.IndexOB.X"][:] = 0
+    channels[f"ViewLayer.{index}.X"][:] = 0
     clips.write_exr(tmp_path / "a1.exr", channels)
     assert clips.read_clip(tmp_path).frames.ids is None
 

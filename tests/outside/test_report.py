@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from jaxdn.report import ClipResult, Results, Scores, TrainingCurve, mean_scores, save_png, write_report
+from jaxdn.report import film as films
 from jaxdn.report import images as pictures
 from jaxdn.report import page as page_module
 from jaxdn.report.summary import headline, sentences, show, text_table
@@ -120,7 +121,7 @@ def test_metrics_hold_every_number_and_no_picture(tmp_path):
     text = (tmp_path / "new" / "run" / "metrics.json").read_text()
     numbers = strict(text)
     assert set(numbers) == {
-        "format", "title", "methods", "noise_floor_psnr", "mean", "clips", "training", "settings", "machine",
+        "format", "title", "methods", "about", "noise_floor_psnr", "mean", "clips", "training", "settings", "machine",
     }  # fmt: skip
     assert numbers["methods"] == METHODS
     assert list(numbers["mean"]) == METHODS
@@ -172,6 +173,19 @@ def test_means_leave_out_clips_with_nothing_to_measure_but_never_hide_a_failure(
     assert math.isnan(means["noisy"].ms_per_frame)
     assert means["ntd C"].psnr == pytest.approx(np.mean([clip.scores["ntd C"].psnr for clip in results.clips]))
     assert "Without a PSNR on at least one clip: svgf." in sentences(results)
+
+
+def with_films(results, frames=12):
+    """The same results with films: the noise moves, and in frame t the reference has a white column at x = t."""
+    clips, rng = [], np.random.default_rng(1)
+    for clip in results.clips:
+        reference = np.repeat(np.asarray(clip.images["reference"])[None], frames, 0)
+        for index in range(frames):
+            reference[index, :, index * 4 % reference.shape[2]] = 1.0
+        noisy = {name: reference + QUALITY.get(name, 0.1) * rng.normal(size=reference.shape) for name in clip.scores}
+        made = {name: films.film(np.clip(image, 0, 1), reference) for name, image in noisy.items()}
+        clips.append(clip._replace(films={**made, "reference": films.film(reference, None)}))
+    return results._replace(clips=clips)
 
 
 def scored(**rows):
@@ -355,7 +369,9 @@ def test_the_page_is_one_closed_document_that_fetches_nothing(tmp_path):
     text = write_report(synthetic(), tmp_path).read_text()
     parsed = outline(text)
     assert not {"link", "iframe", "object", "embed", "base"} & set(parsed.tags)
-    assert not [value for name, value in parsed.attributes if name in ("src", "srcset", "action")]
+    fetched = [value for name, value in parsed.attributes if name in ("src", "srcset", "action")]
+    assert all(value.startswith("data:image/webp;base64,") for value in fetched)  # the stills for pages without script
+    assert len(fetched) == 2 * 3
     assert not re.search(r"@import|url\(|fetch\(|XMLHttpRequest", text)
     # The only address in the page names a vocabulary, not a place to ask.
     assert set(re.findall(r"https?://[^\s\"']+", text)) == {"http://www.w3.org/2000/svg"}
@@ -409,6 +425,69 @@ def test_long_training_is_drawn_with_few_points():
     assert len(drawn["step"]) == len(drawn["loss"]) == page_module.POINTS
     assert drawn["step"][0] == pytest.approx(24.5)
     assert drawn["loss"][-1] == pytest.approx(drawn["step"][-1], rel=1e-4)
+
+
+ABOUT = {"ntd A": "traditional motion vectors", "ntd C": "dual motion vectors and the occlusion loss"}
+
+
+def test_labels_are_explained_where_they_stand(tmp_path):
+    text = write_report(synthetic()._replace(about=ABOUT), tmp_path).read_text()
+    for label, about in ABOUT.items():
+        assert f'{label} <small class="about">{about}</small>' in text
+    assert "ntd C (dual motion vectors and the occlusion loss)" in text
+    assert strict((tmp_path / "metrics.json").read_text())["about"] == ABOUT
+
+
+@pytest.mark.parametrize("change", [{"about": {"x": "y"}}, {"opens_on": "x"}])
+def test_explanations_of_unknown_labels_are_refused(tmp_path, change):
+    with pytest.raises(ValueError, match="labels out of"):
+        write_report(synthetic()._replace(**change), tmp_path)
+
+
+def test_a_film_is_small_and_near_the_images_and_has_their_exact_errors():
+    rng = np.random.default_rng(0)
+    reference = np.repeat(np.linspace(0, 1, 64)[None, None, :, None], 3, 3).repeat(40, 1).repeat(70, 0)
+    images = np.clip(reference + 0.05 * rng.normal(size=reference.shape), 0, 1)
+    made = films.film(images, reference)
+    assert len(made.pictures) == len(made.errors) == films.FRAMES == 60
+    decoded = np.asarray(Image.open(io.BytesIO(made.pictures[7])), np.float64) / 255
+    assert np.abs(decoded.mean((0, 2)) - images[7].mean((0, 2))).max() < 0.03
+    grey = np.asarray(Image.open(io.BytesIO(made.errors[7])).convert("L"), np.float64) / 255
+    # Grey is the root of the error, so that lossy compression of small errors stays small.
+    wanted = pictures.error_map(images[7], reference[7])
+    assert abs((grey**2).mean() - wanted.mean()) < 0.1 * wanted.mean()
+    assert films.film(images, None).errors == []
+    broken = films.film(np.full((1, 8, 8, 3), math.nan), np.zeros((1, 8, 8, 3)))
+    assert np.asarray(Image.open(io.BytesIO(broken.errors[0])).convert("L")).min() > 250
+    wide = Image.open(io.BytesIO(films.encode_webp(np.zeros((30, 1930, 3)))))
+    assert wide.size[0] <= films.WIDTH
+
+
+def test_films_stay_within_their_bytes_and_say_what_they_leave_out(tmp_path, monkeypatch):
+    results = with_films(synthetic(training=False))
+    whole = write_report(results, tmp_path).read_text()
+    size = sum(
+        4 * ((len(file) + 2) // 3) for each in results.clips[0].films.values() for files in each for file in files
+    )
+    assert films.frames_within(results.clips[0].films, size) == 12
+    assert films.frames_within(results.clips[0].films, size - 1) == 11
+    assert films.frames_within({}, 100) == 0
+    monkeypatch.setattr(page_module, "FILM_BUDGET", size)  # for two clips
+    half = write_report(results, tmp_path).read_text()
+    assert len(half) < len(whole) - 0.8 * size
+    frames = [int(found) for found in re.findall(r'"film":{"frames":(\d+),"of":12', half)]
+    assert len(frames) == 2
+    assert all(4 <= each <= 7 for each in frames)
+    monkeypatch.setattr(page_module, "FILM_BUDGET", 10)
+    assert write_report(results, tmp_path).read_text().count('"film":null') == 2
+    assert re.search(r"\d\.\d MB, complete in this file", whole)
+
+
+def test_films_of_different_lengths_are_refused(tmp_path):
+    clip = with_films(synthetic(clips=1)).clips[0]
+    cut = clip.films | {"svgf": films.Film(clip.films["svgf"].pictures[:5], clip.films["svgf"].errors[:5])}
+    with pytest.raises(ValueError, match="films of one length"):
+        write_report(synthetic(clips=1)._replace(clips=[clip._replace(films=cut)]), tmp_path)
 
 
 # ---- in a browser --------------------------------------------------------------------------------
@@ -587,17 +666,17 @@ def test_the_page_follows_the_color_scheme_and_is_not_blank(visit, scheme, dark)
 
 @pytest.mark.browser
 def test_the_flip_view_shows_the_very_pixels_of_the_image(visit):
-    results = synthetic(clips=1)
+    results = synthetic(clips=1, height=96, width=144)
     tab = visit(results)
     tab.keyboard.press("6")
     stage = np.asarray(Image.open(io.BytesIO(tab.locator(".flip").screenshot())).convert("RGB"), np.float64)
-    rows, columns = stage.shape[0] / 32, stage.shape[1] / 48
+    rows, columns = stage.shape[0] / 96, stage.shape[1] / 144
     wanted = results.clips[0].images["reference"] * 255
     # Away from the crop's frame and the label, which lie over the picture.
-    x, y, width, height = pictures.worst_crop([np.ones((32, 48))], results.clips[0].disoccluded)
+    x, y, width, height = pictures.worst_crop([np.ones((96, 144))], results.clips[0].disoccluded)
     compared = 0
-    for row in range(1, 24, 3):
-        for column in range(1, 48, 3):
+    for row in range(1, 72, 9):
+        for column in range(1, 144, 9):
             if not (x - 2 < column < x + width + 2 and y - 2 < row < y + height + 2):
                 pixel = stage[int((row + 0.5) * rows), int((column + 0.5) * columns)]
                 np.testing.assert_allclose(pixel, wanted[row, column], atol=2)
@@ -636,3 +715,117 @@ def test_hard_contents_break_nothing(visit):
     tab.keyboard.press("3")
     assert shown_label(tab) == long
     assert tab.evaluate("document.documentElement.scrollWidth") == 420
+
+
+def frame_of(tab, film=0, clip=0):
+    return int(tab.locator(f"#clip-{clip} .films canvas").nth(2 * film).get_attribute("data-frame"))
+
+
+def drawn(tab, canvas):
+    """The pixels [H, W, 3] of one of the player's canvases: pictures are even, errors odd."""
+    code = """number => {
+        const canvas = document.querySelectorAll("#clip-0 .films canvas")[number];
+        const pixels = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+        return [canvas.height, canvas.width, [...pixels.data]];
+    }"""
+    height, width, values = tab.evaluate(code, canvas)
+    return np.asarray(values, np.float64).reshape(height, width, 4)[..., :3]
+
+
+def column(tab, canvas=4):
+    """Where the reference's white column stands in the frame that is drawn."""
+    return int(drawn(tab, canvas)[:8].mean((0, 2)).argmax()) // 4
+
+
+@pytest.mark.browser
+def test_the_player_steps_and_draws_the_frames_it_names(visit):
+    results = with_films(synthetic(clips=1))
+    tab = visit(results)
+    tab.wait_for_function("document.querySelectorAll('#clip-0 .films canvas[data-frame]').length >= 5")
+    assert frame_of(tab) == results.clips[0].shown_frame == 6
+    assert column(tab) == 6
+    tab.keyboard.press(".")
+    assert [frame_of(tab, film) for film in range(3)] == [7, 7, 7]
+    assert column(tab) == 7
+    tab.keyboard.press(",")
+    tab.keyboard.press(",")
+    assert (frame_of(tab), column(tab)) == (5, 5)
+    tab.get_by_label("frame", exact=True).focus()
+    tab.keyboard.press("End")
+    tab.wait_for_function("document.querySelector('#clip-0 .films canvas').dataset.frame === '11'")
+    assert (frame_of(tab), column(tab)) == (11, 11)
+    tab.locator("#clip-0 .player button", has_text="step ▸").click()  # from the last to the first
+    assert (frame_of(tab), column(tab)) == (0, 0)
+    assert "frame 0 (0 to 11)" in tab.locator("#clip-0 .count").inner_text()
+
+
+@pytest.mark.browser
+def test_the_player_plays_ten_frames_a_second_by_key_and_by_mouse(visit):
+    tab = visit(with_films(synthetic(clips=1)))
+    tab.wait_for_function("document.querySelectorAll('#clip-0 .films canvas[data-frame]').length >= 5")
+    watch = """() => new Promise(done => {
+        const canvas = document.querySelector("#clip-0 .films canvas"), seen = [], began = performance.now();
+        const timer = setInterval(() => {
+            if (seen.at(-1)?.[0] !== canvas.dataset.frame) seen.push([canvas.dataset.frame, performance.now() - began]);
+            if (seen.length > 13) { clearInterval(timer); done(seen); }
+        }, 5);
+    })"""
+    tab.keyboard.press("Space")
+    assert tab.locator("#clip-0 .player button", has_text="pause").count() == 1
+    seen = tab.evaluate(watch)
+    frames, times = np.asarray([int(frame) for frame, _ in seen]), [time for _, time in seen]
+    passed = int((np.diff(frames) % 12).sum())  # a busy machine drops frames, but the film does not slow down
+    assert passed / (times[-1] - times[0]) == pytest.approx(0.01, rel=0.2)
+    assert len(set(frames.tolist())) >= 6
+    tab.keyboard.press("Space")
+    still = frame_of(tab)
+    tab.wait_for_timeout(350)
+    assert frame_of(tab) == still
+    tab.locator("#clip-0 .films canvas").first.click()
+    tab.wait_for_function(
+        "frame => document.querySelector('#clip-0 .films canvas').dataset.frame != frame", arg=str(still)
+    )
+    tab.locator("#clip-0 > summary").click()  # a closed clip does not play on
+    tab.wait_for_timeout(350)
+    assert tab.locator("#clip-0 .player button", has_text="❚❚").count() == 0
+
+
+@pytest.mark.browser
+def test_the_player_shows_the_error_of_the_frame_in_the_colours_of_the_page(visit):
+    results = with_films(synthetic(clips=1, training=False))._replace(about=ABOUT, opens_on="ntd A")
+    tab = visit(results)
+    assert tab.get_by_label("film 2").input_value() == "ntd A"
+    assert shown_label(tab) == "ntd A"
+    tab.wait_for_function("document.querySelectorAll('#clip-0 .films canvas[data-frame]').length >= 5")
+    clip = results.clips[0]
+    scale = json.loads(tab.locator("#page-data").text_content())["errorScale"]
+    files = clip.films["ntd A"].errors[6]
+    error = (np.asarray(Image.open(io.BytesIO(files)).convert("L"), np.float64) / 255) ** 2
+    steps = np.linspace(0, 1, len(pictures.ERROR_COLORS))
+    wanted = [np.interp(np.clip(error / scale, 0, 1), steps, color) for color in np.transpose(pictures.ERROR_COLORS)]
+    np.testing.assert_allclose(drawn(tab, 3), np.stack(wanted, -1), atol=6)
+    captions = tab.locator("#clip-0 .films figcaption").all_inner_texts()
+    assert f"{clip.per_frame['ntd A']['l1'][6]:.3g}"[:5] in captions[1]
+    assert "traditional motion vectors" in captions[1]
+    assert not tab.locator("#clip-0 .films canvas").nth(5).is_visible()  # the reference has no error
+    tab.get_by_label("film 2").select_option("svgf")
+    before = drawn(tab, 3)
+    tab.wait_for_timeout(300)
+    assert np.abs(drawn(tab, 3) - np.stack(wanted, -1)).mean() > 5 or np.abs(before - drawn(tab, 3)).mean() > 5
+
+
+@pytest.mark.browser
+def test_without_script_the_page_shows_a_still(visit):
+    tab = visit(with_films(synthetic(clips=1))._replace(opens_on="ntd A"), java_script_enabled=False)
+    still = tab.locator("#clip-0 .still img")
+    assert [image.get_attribute("alt") for image in still.all()] == ["noisy", "ntd A", "reference"]
+    shot = np.asarray(Image.open(io.BytesIO(still.nth(1).screenshot())).convert("RGB"), np.float64)
+    assert shot.std(axis=(0, 1)).max() > 10
+    assert tab.locator("#scores tbody tr").count() == 6
+
+
+@pytest.mark.browser
+def test_the_player_fits_a_narrow_screen(visit):
+    tab = visit(with_films(synthetic())._replace(about=ABOUT), width=420, height=800)
+    assert tab.evaluate("document.documentElement.scrollWidth") == 420
+    assert tab.locator("#clip-0 .films canvas").first.bounding_box()["width"] > 100
