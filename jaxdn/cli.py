@@ -202,6 +202,9 @@ class Denoise:
     method: str = "steady-balanced"
     """Shipped weights (steady-balanced, ntd-large, ntd-small), a filter (svgf, asvgf, taa), or the path of a
     .safetensors file."""
+    bidirectional: bool = False
+    """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
+    frames are as good as the last."""
     frames: list[str] = field(default_factory=list)
     """Numbers of the frames to denoise, such as 7 or 10-40; frames before them are read for their history."""
     skip_existing: bool = False
@@ -382,6 +385,7 @@ def _denoise(options: Denoise) -> None:
         only_beauty=options.only_beauty,
         aovs=options.aovs,
         preview=options.preview,
+        bidirectional=options.bidirectional,
         **naming,
     )
     with reporter(options.method) as report:

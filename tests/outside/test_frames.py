@@ -78,9 +78,9 @@ def test_only_the_wanted_frames_are_written(tmp_path: Path) -> None:
         denoise(source, tmp_path / "out", frames=[20, 21])
 
 
-def part_of(numbers: Any, wanted: Any) -> list[range]:
+def part_of(numbers: Any, wanted: Any, **options: Any) -> list[range]:
     names = tuple(Path(f"{number}.exr") for number in numbers)
-    return list(Work(Shot(names, tuple(numbers)), None, names, frozenset(wanted), ()).stretches())
+    return list(Work(Shot(names, tuple(numbers)), None, names, frozenset(wanted), ()).stretches(**options))
 
 
 def test_stretches_have_a_lead_in_and_do_not_cross_gaps() -> None:
