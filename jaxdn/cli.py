@@ -205,6 +205,8 @@ class Denoise:
     bidirectional: bool = False
     """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
     frames are as good as the last."""
+    safe: bool = True
+    """Measure the noise, and keep of the frames what is none of it: clean ones come back as they are."""
     frames: list[str] = field(default_factory=list)
     """Numbers of the frames to denoise, such as 7 or 10-40; frames before them are read for their history."""
     skip_existing: bool = False
@@ -386,6 +388,7 @@ def _denoise(options: Denoise) -> None:
         aovs=options.aovs,
         preview=options.preview,
         bidirectional=options.bidirectional,
+        safe=options.safe,
         **naming,
     )
     with reporter(options.method) as report:

@@ -6,6 +6,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import jax
 import numpy as np
 
 from jaxdn import color
@@ -21,6 +22,9 @@ from jaxdn.commands.work import Work, work_on
 from jaxdn.repair import repair_image
 from jaxdn.report.images import save_png
 from jaxdn.rollout import Layers, stream
+from jaxdn.shrinkage import NOISY, Combined, combine
+
+_combine = jax.jit(combine)
 
 
 class Settings(NamedTuple):
@@ -47,6 +51,8 @@ class Settings(NamedTuple):
     """Write a PNG next to each frame."""
     bidirectional: bool = False
     """Denoise from the last frame to the first too, and blend both passes (:mod:`jaxdn.filters.both_ways`)."""
+    safe: bool = True
+    """Keep of the noisy image what is no noise (:mod:`jaxdn.shrinkage`)."""
 
 
 class Written(NamedTuple):
@@ -90,9 +96,10 @@ def denoise_files(
     A frame of another renderer is its own file with the denoised beauty in place of the noisy one
     (:func:`jaxdn.clips.result.write_result`). A frame of one of our clips has the channels ``R, G, B``, the denoised
     radiance with the directly reflected and the emitted light added back, and ``denoised.R/G/B``, the denoised part
-    alone. Frames are read, denoised and written one at a time, so that a sequence of any length takes the memory
-    of one. Files are never left incomplete. Where frames are missing, the history begins anew. Raises ValueError for
-    input that cannot be read or is inconsistent, before the frame concerned is written.
+    alone. What is no noise is kept as it was (``settings.safe``). Frames are read, denoised and written one at a time,
+    so that a sequence of any length takes the memory of one. Files are never left incomplete. Where frames are missing,
+    the history begins anew. Raises ValueError for input that cannot be read or is inconsistent, before the frame
+    concerned is written.
 
     Args:
       sources: folders of clips, and folders of, patterns for, or names of EXR files.
@@ -147,6 +154,10 @@ class _Pass:
         return np.asarray(self._step(stored.frame, _layers(stored, self._source) if self._needs_layers else None))
 
     @property
+    def denoises(self) -> bool:
+        return self._step is not None
+
+    @property
     def programs(self) -> set[tuple[str, ...]]:
         return set() if self._step is None else self._step.programs
 
@@ -179,7 +190,9 @@ def _forwards(
     log: Callable[[str], None],
 ) -> Iterator[Path]:
     """The forward pass up to the last frame that is wanted, and all that becomes of its images."""
-    last = max(index for index in stretch if index in work.wanted)
+    wanted = [index for index in stretch if index in work.wanted]
+    first, last = wanted[0], wanted[-1]
+    safe = settings.safe and forwards.denoises
     naming: dict[str, Any] = {"channels": settings.channels, "layer": settings.layer}
     names = work.shot.files[stretch.start : stretch.stop]
     canvas = canvas_of(names)
@@ -188,6 +201,11 @@ def _forwards(
         frame, image = stored.frame, forwards(stored)
         if backwards is not None:
             image = backwards.blended(index, frame, image)
+        if safe:
+            combined = _combine(frame.radiance, image)
+            image = np.asarray(combined.image)
+            if index == first:
+                log(_measured(name, combined))
         parts = {} if aovs is None else aovs.denoise(name, frame, image)
         if index not in work.wanted:
             continue
@@ -222,6 +240,17 @@ def _frames(
         log=log,
     )
     return frames
+
+
+def _measured(name: Path, combined: Combined) -> str:
+    """What was measured in a frame, and what it decided, as a line."""
+    noise, share = float(combined.noise), float(np.mean(combined.share))
+    line = (
+        f"{name.name}: noise is about {noise:.1%} of the light; {share:.0%} of the frame is kept (--no-safe: nothing)"
+    )
+    if share > 0.5 and noise > NOISY:
+        return f"{line}; the denoised image differs from it by more than noise: do its guides belong to it?"
+    return line
 
 
 def _layers(stored: StoredFrame, source: Path) -> Layers:
