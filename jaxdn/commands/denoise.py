@@ -190,8 +190,7 @@ def _forwards(
     log: Callable[[str], None],
 ) -> Iterator[Path]:
     """The forward pass up to the last frame that is wanted, and all that becomes of its images."""
-    wanted = [index for index in stretch if index in work.wanted]
-    first, last = wanted[0], wanted[-1]
+    last = max(index for index in stretch if index in work.wanted)
     safe = settings.safe and forwards.denoises
     naming: dict[str, Any] = {"channels": settings.channels, "layer": settings.layer}
     names = work.shot.files[stretch.start : stretch.stop]
@@ -204,7 +203,7 @@ def _forwards(
         if safe:
             combined = _combine(frame.radiance, image)
             image = np.asarray(combined.image)
-            if index == first:
+            if index == min(work.wanted):
                 log(_measured(name, combined))
         parts = {} if aovs is None else aovs.denoise(name, frame, image)
         if index not in work.wanted:
