@@ -196,6 +196,11 @@ class Denoise:
     method: str = "steady-balanced"
     """Shipped weights (steady-balanced, ntd-large, ntd-small), a filter (svgf, asvgf, taa), or the path of a
     .safetensors file."""
+    bidirectional: bool = False
+    """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
+    frames are as good as the last."""
+    safe: bool = True
+    """Measure the noise, and keep of the frames what is none of it: clean ones come back as they are."""
     frames: list[str] = field(default_factory=list)
     """Numbers of the frames to denoise, such as 7 or 10-40; frames before them are read for their history."""
     skip_existing: bool = False

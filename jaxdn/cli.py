@@ -49,13 +49,14 @@ def _naming(options: Inspect | Denoise) -> dict[str, Any]:
 
 def _render(options: Render) -> None:
     from jaxdn.commands.render import render
+    from jaxdn.options import numbers
 
     render(
         options.scene,
         _folder(options.out),
         animation=options.animation,
         tours=options.tour,
-        seeds=_numbers(options.seeds, "--seeds"),
+        seeds=numbers(options.seeds, "--seeds"),
         width=options.width,
         height=options.height,
         frames=options.frames,
@@ -69,19 +70,6 @@ def _render(options: Render) -> None:
         denoiser=options.denoiser,
         workers=options.workers,
     )
-
-
-def _numbers(words: list[str], option: str) -> list[int]:
-    """The whole numbers of words such as 3 and 0-49, whose ends count. Raises ValueError for anything else."""
-    numbers: list[int] = []
-    for word in words:
-        first, _, last = word.partition("-")
-        if not first.isdecimal() or not (last or first).isdecimal() or word.endswith("-"):
-            raise ValueError(f"{option}: expected whole numbers >= 0 or ranges such as 0-49, got {word!r}.")
-        if last and int(last) < int(first):
-            raise ValueError(f"{option}: expected a range from low to high, got {word!r}; swap its ends.")
-        numbers += range(int(first), int(last or first) + 1)
-    return numbers
 
 
 def _pack(options: Pack) -> None:
@@ -136,17 +124,20 @@ def _denoise(options: Denoise) -> None:
     from jaxdn.commands.denoise import Settings, candidate_on, denoise_files
     from jaxdn.commands.progress import reporter
     from jaxdn.commands.sources import show_sources
+    from jaxdn.options import numbers
 
     naming = _naming(options)
     method, engine = candidate_on(options.method, options.implementation)
     reads = frozenset[str]() if method.denoiser is None else method.denoiser.reads
     settings = Settings(
         spp=options.spp,
-        frames=_numbers(options.frames, "--frames") if options.frames else None,
+        frames=numbers(options.frames, "--frames") if options.frames else None,
         skip_existing=options.skip_existing,
         only_beauty=options.only_beauty,
         aovs=options.aovs,
         preview=options.preview,
+        bidirectional=options.bidirectional,
+        safe=options.safe,
         **naming,
     )
     with reporter(options.method) as report:

@@ -54,6 +54,19 @@ def check(values: Mapping[str, Any], hints: Mapping[str, Any], *, of: str) -> No
             raise ValueError(f"{of} {name}: expected {_expected(hints[name])}, got {value!r}.")
 
 
+def numbers(words: list[str], option: str) -> list[int]:
+    """The whole numbers of words such as 3 and 0-49, whose ends count. Raises ValueError for anything else."""
+    found: list[int] = []
+    for word in words:
+        first, _, last = word.partition("-")
+        if not first.isdecimal() or not (last or first).isdecimal() or word.endswith("-"):
+            raise ValueError(f"{option}: expected whole numbers >= 0 or ranges such as 0-49, got {word!r}.")
+        if last and int(last) < int(first):
+            raise ValueError(f"{option}: expected a range from low to high, got {word!r}; swap its ends.")
+        found += range(int(first), int(last or first) + 1)
+    return found
+
+
 def parse(assignments: Sequence[str], *, option: str = "--set", words: bool = False) -> dict[str, Any]:
     """``["size=small", "levels=3"]`` as a dict: values are parsed as JSON if possible, else taken as strings.
 

@@ -31,6 +31,7 @@ MATHS = (
 )
 LAYERS = {
     **dict.fromkeys((*MATHS, "ops", "losses", "metrics", "flip", "sampling", "objectives", "recipe", "variation"), 1),
+    "shrinkage": 1,
     **dict.fromkeys(("filters", "networks"), 2),
     **dict.fromkeys(("methods", "denoisers"), 3),
     **dict.fromkeys(("rollout", "additive", "learning", "planning"), 4),

@@ -7,7 +7,7 @@ is not a clip yet.
 
 import itertools
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ from jaxdn.clips.frames import StoredFrame, doubling_layers, layers_for, read_fr
 from jaxdn.clips.import_exr import plain_frames
 from jaxdn.clips.record import FORMAT, checked, held_frames, is_planned
 from jaxdn.files import write_json
-from jaxdn.frame import OF_SAMPLES, Clip, frame_at, only, present, written_out
+from jaxdn.filters.both_ways import turned
+from jaxdn.frame import OF_SAMPLES, Clip, Frame, frame_at, only, present, written_out
 
 _RECORD = "clip.json"
 _UNFINISHED = "clip.unfinished.json"
@@ -140,8 +141,10 @@ def write_clip(clip: Clip, path: str | Path, *, record: Mapping[str, Any] | None
     finish_record(whole_record, folder)
 
 
-def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
+def read_frames(path: str | Path, *, spp: int = 1, order: Iterable[int] | None = None) -> Iterator[StoredFrame]:
     """The frames of a clip one by one, for clips that do not fit into memory. Raises as :func:`read_clip` does.
+
+    ``order`` are the indices of those to read; None: all.
 
     Frames of a clip that was rendered by a plan may have different buffers (an object starts to move): absent ones are
     ``None``. A frame that shows the same as an earlier one takes its buffers and its reference from there, except for
@@ -157,7 +160,7 @@ def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
     def frames() -> Iterator[StoredFrame]:
         first: set[str] | None = None
         source: tuple[int, StoredFrame] | None = None
-        for index in range(count):
+        for index in range(count) if order is None else order:
             file = frame_path(folder, index)
             stored = read_frame(file, spp=spp)
             found = stored.frame.radiance.shape[:2]
@@ -178,7 +181,7 @@ def read_frames(path: str | Path, *, spp: int = 1) -> Iterator[StoredFrame]:
             first = names if first is None else first
             if names != first:
                 differing = ", ".join(sorted(names ^ first))
-                raise ClipError(f"{file}: expected the same channels as in frame 0, but {differing} differs.")
+                raise ClipError(f"{file}: expected the same channels as in the other frames, but {differing} differs.")
             yield stored
 
     return frames()
@@ -214,22 +217,36 @@ def open_frames(
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
     layer: str | None = None,
+    part: range | None = None,
+    backwards: bool = False,
     log: Callable[[str], None] = lambda line: None,
 ) -> tuple[list[Path], Iterator[StoredFrame]]:
     """The files of a clip, or of another renderer's sequence, and their frames, each read when it is requested.
 
-    Takes what :func:`read_clip` takes, or a list of another renderer's files, and raises as it does; ``log`` as in
+    Takes what :func:`read_clip` takes, or a list of another renderer's files, and raises as it does; ``part`` are the
+    indices to read of a clip, None: all. ``backwards`` and ``log`` as in
     :func:`jaxdn.clips.import_exr.plain_frames`. The frames of another renderer have no ``layers`` and no reference.
     """
     if isinstance(path, str | Path):
         if is_clip(path):
-            frames = read_frames(path, spp=spp)  # first checks that all frames of the record exist
-            return [frame_path(path, index) for index in range(read_record(path)["frames"])], frames
+            part = range(read_record(path)["frames"]) if part is None else part
+            # First checks that all frames of the record exist.
+            frames = read_frames(path, spp=spp, order=part[::-1] if backwards else part)
+            return [frame_path(path, index) for index in part], _turned(frames) if backwards else frames
         refuse_unfinished(path)
     if spp != 1:
         raise ClipError(f"{path}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
-    files, plain = plain_frames(path, motion_convention=motion_convention, channels=channels, layer=layer, log=log)
+    naming: dict[str, Any] = {"motion_convention": motion_convention, "channels": channels, "layer": layer}
+    files, plain = plain_frames(path, **naming, backwards=backwards, log=log)
     return files, (StoredFrame(frame, {}, None, None) for frame in plain)
+
+
+def _turned(frames: Iterator[StoredFrame]) -> Iterator[StoredFrame]:
+    """Frames that come from the last to the first, with time turned around."""
+    after: Frame | None = None
+    for stored in frames:
+        yield stored._replace(frame=turned(stored.frame, after))
+        after = stored.frame
 
 
 def read_clip(

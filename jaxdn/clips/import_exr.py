@@ -38,6 +38,7 @@ from jaxdn.clips.vectors import (
     motion_convention_of,
 )
 from jaxdn.clips.windows import Window, place, union
+from jaxdn.filters.both_ways import turned
 from jaxdn.frame import BUFFERS, FAR, Buffer, Frame, present
 
 
@@ -47,6 +48,7 @@ def plain_frames(
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
     layer: str | None = None,
+    backwards: bool = False,
     log: Callable[[str], None] = lambda line: None,
 ) -> tuple[list[Path], Iterator[Frame]]:
     """The files of another renderer's sequence (or those given), and their frames, each read when it is asked for.
@@ -54,7 +56,8 @@ def plain_frames(
     All frames have the size of the picture and the buffers of the first; frames that store different parts of it (data
     windows) are put into one image. ``motion_convention`` says what the motion vectors mean (a key of
     ``MOTION_CONVENTIONS``) and is needed as soon as there are any that are not Cycles' ``Vector``; ``"none"`` leaves
-    them out. The four components of ``Vector`` give dual motion vectors too. ``channels`` and ``layer``: see
+    them out. The four components of ``Vector`` give dual motion vectors too. With ``backwards``, frames come from the
+    last to the first, with time turned around (:func:`jaxdn.filters.both_ways.turned`). ``channels`` and ``layer``: see
     :func:`jaxdn.clips.layers.detect_channels`; what they choose, see :func:`jaxdn.clips.sources.sources_of`. ``log`` is
     called with lines about what is derived or left unused, when the first frame is read. Depth is taken for view-space
     z (0, far and infinite become ``FAR``); ids count from 1 with 0 for nothing, or are those of a Cryptomatte, and are
@@ -67,7 +70,7 @@ def plain_frames(
     if motion_convention not in (None, "none", *MOTION_CONVENTIONS):
         raise ClipError(f"motion_convention: {conventions()}; got {motion_convention!r}.")
     files = sequence_files(path) if isinstance(path, str | Path) else list(path)
-    return files, _frames(files, motion_convention, channels, layer, log)
+    return files, _frames(files, motion_convention, channels, layer, backwards, log)
 
 
 def _frames(
@@ -75,12 +78,15 @@ def _frames(
     motion_convention: str | None,
     channels: Mapping[str, str] | None,
     layer: str | None,
+    backwards: bool,
     log: Callable[[str], None],
 ) -> Iterator[Frame]:
     canvas = canvas_of(files)
     first: _First | None = None
     forward: np.ndarray | None = None
-    for file in files:
+    after: Frame | None = None
+    # The first file decides for all, so it is read first in either direction.
+    for turn, file in enumerate([files[0], *reversed(files)] if backwards else files):
         there = read_placed(file, canvas)
         try:
             # What the first frame decides is decided for all: a lighting pass is light in every frame.
@@ -91,8 +97,9 @@ def _frames(
             raise UnknownMotion(f"{file}: {_measured(files, canvas, channels, layer)}{error}") from error
         except ClipError as error:
             raise ClipError(f"{file}: {error}") from error
+        before, forward = forward, None
         if chosen.forward:
-            frame = frame._replace(dual_motion=dual_of(frame.motion, forward))
+            frame = frame._replace(dual_motion=dual_of(frame.motion, before))
             forward = forward_of_cycles(np.stack([there[name] for name in chosen.forward], axis=-1))
         if first is None:
             for line in [*chosen.notes, *derived]:
@@ -101,7 +108,12 @@ def _frames(
             silent = frame.ids is not None and bool(np.all(frame.ids < 0))
             first = _First(present(frame), silent, chosen.refused)
         _check_like_first(file, frame, first)
-        yield frame._replace(ids=None) if first.silent else frame
+        frame = frame._replace(ids=None) if first.silent else frame
+        if not backwards:
+            yield frame
+        elif turn > 0:
+            yield turned(frame, after, forward)
+            after = frame
 
 
 def _measured(files: Sequence[Path], canvas: Window, channels: Mapping[str, str] | None, layer: str | None) -> str:

@@ -1,10 +1,12 @@
 """``jaxdn denoise``: noisy clips in, denoised EXR frames out, one frame at a time."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import jax
 import numpy as np
 
 from jaxdn import color
@@ -15,10 +17,14 @@ from jaxdn.clips.frames import StoredFrame, doubling_layers
 from jaxdn.clips.import_exr import canvas_of
 from jaxdn.clips.result import write_result
 from jaxdn.commands.aovs import Aovs
+from jaxdn.commands.backwards import Backwards, backward_pass
 from jaxdn.commands.work import Work, work_on
 from jaxdn.repair import repair_image
 from jaxdn.report.images import save_png
-from jaxdn.rollout import Layers, Stream, stream
+from jaxdn.rollout import Layers, stream
+from jaxdn.shrinkage import NOISY, Combined, combine
+
+_combine = jax.jit(combine)
 
 
 class Settings(NamedTuple):
@@ -43,6 +49,10 @@ class Settings(NamedTuple):
     they still add up to the beauty (:mod:`jaxdn.additive`)."""
     preview: bool = False
     """Write a PNG next to each frame."""
+    bidirectional: bool = False
+    """Denoise from the last frame to the first too, and blend both passes (:mod:`jaxdn.filters.both_ways`)."""
+    safe: bool = True
+    """Keep of the noisy image what is no noise (:mod:`jaxdn.shrinkage`)."""
 
 
 class Written(NamedTuple):
@@ -86,9 +96,10 @@ def denoise_files(
     A frame of another renderer is its own file with the denoised beauty in place of the noisy one
     (:func:`jaxdn.clips.result.write_result`). A frame of one of our clips has the channels ``R, G, B``, the denoised
     radiance with the directly reflected and the emitted light added back, and ``denoised.R/G/B``, the denoised part
-    alone. Frames are read, denoised and written one at a time, so that a sequence of any length takes the memory
-    of one. Files are never left incomplete. Where frames are missing, the history begins anew. Raises ValueError for
-    input that cannot be read or is inconsistent, before the frame concerned is written.
+    alone. What is no noise is kept as it was (``settings.safe``). Frames are read, denoised and written one at a time,
+    so that a sequence of any length takes the memory of one. Files are never left incomplete. Where frames are missing,
+    the history begins anew. Raises ValueError for input that cannot be read or is inconsistent, before the frame
+    concerned is written.
 
     Args:
       sources: folders of clips, and folders of, patterns for, or names of EXR files.
@@ -118,38 +129,82 @@ def denoise_files(
                 log(line)
             told.add(line)
 
-        for stretch in work.stretches():
-            step = None if method.denoiser is None else stream(method.denoiser, method.params)
-            for path in _denoise(work, stretch, method, step, settings, once):
-                files.append(path)
-                say(path, len(files), total)
-            if step is not None:
-                programs |= step.programs
-                repaired += step.repaired
+        for stretch in work.stretches(both_ways=settings.bidirectional):
+            passes = [_Pass(work, method) for _ in range(1 + settings.bidirectional)]
+            with closing(_denoise(work, stretch, passes, settings, once)) as paths:
+                for path in paths:
+                    files.append(path)
+                    say(path, len(files), total)
+            programs |= {program for each in passes for program in each.programs}
+            repaired += passes[0].repaired  # the other pass repairs the same frames
     return Written(files, len(programs), repaired)
 
 
+class _Pass:
+    """A denoiser on its way through consecutive frames; gives the image [H, W, 3] of each."""
+
+    def __init__(self, work: Work, method: Candidate) -> None:
+        self._step = None if method.denoiser is None else stream(method.denoiser, method.params)
+        self._source = work.source
+        self._needs_layers = method.denoiser is not None and method.denoiser.samples is not None
+
+    def __call__(self, stored: StoredFrame) -> np.ndarray:
+        if self._step is None:
+            return np.asarray(_light(stored.frame.radiance))
+        return np.asarray(self._step(stored.frame, _layers(stored, self._source) if self._needs_layers else None))
+
+    @property
+    def denoises(self) -> bool:
+        return self._step is not None
+
+    @property
+    def programs(self) -> set[tuple[str, ...]]:
+        return set() if self._step is None else self._step.programs
+
+    @property
+    def repaired(self) -> int:
+        return 0 if self._step is None else self._step.repaired
+
+
 def _denoise(
+    work: Work, stretch: range, passes: Sequence[_Pass], settings: Settings, log: Callable[[str], None]
+) -> Generator[Path, None, None]:
+    """Denoise consecutive frames of a shot; yields the files as they are written."""
+    wanted = [index for index in stretch if index in work.wanted]
+    with ExitStack() as stack:
+        backwards: Backwards | None = None
+        if settings.bidirectional:
+            log(f"backwards first, through {stretch.stop - wanted[0]} frames; nothing is written meanwhile")
+            turned = zip(reversed(stretch), _frames(work, stretch, settings, log, backwards=True), strict=True)
+            needed = islice(turned, stretch.stop - wanted[0])
+            backwards = stack.enter_context(backward_pass(needed, passes[1], wanted, work.targets[wanted[0]].parent))
+        yield from _forwards(work, stretch, passes[0], backwards, settings, log)
+
+
+def _forwards(
     work: Work,
     stretch: range,
-    method: Candidate,
-    step: Stream | None,
+    forwards: _Pass,
+    backwards: Backwards | None,
     settings: Settings,
     log: Callable[[str], None],
 ) -> Iterator[Path]:
-    """Denoise consecutive frames of a shot; yields the files as they are written."""
-    needs_layers = method.denoiser is not None and method.denoiser.samples is not None
+    """The forward pass up to the last frame that is wanted, and all that becomes of its images."""
+    last = max(index for index in stretch if index in work.wanted)
+    safe = settings.safe and forwards.denoises
     naming: dict[str, Any] = {"channels": settings.channels, "layer": settings.layer}
-    names = list(work.shot.files[stretch.start : stretch.stop])
-    opened: Any = names if work.clip is None else work.clip
-    _, every = open_frames(opened, spp=settings.spp, motion_convention=settings.motion_convention, log=log, **naming)
-    stored = every if work.clip is None else islice(every, stretch.start, stretch.stop)
+    names = work.shot.files[stretch.start : stretch.stop]
     canvas = canvas_of(names)
     aovs = Aovs(canvas, naming, log) if settings.aovs == "additive" and work.clip is None else None
-    for index, name, one in zip(stretch, names, stored, strict=True):
-        frame = one.frame
-        layers = _layers(one, work.source) if needs_layers else None
-        image = _light(frame.radiance) if step is None else np.asarray(step(frame, layers))
+    for index, name, stored in zip(stretch, names, _frames(work, stretch, settings, log), strict=True):
+        frame, image = stored.frame, forwards(stored)
+        if backwards is not None:
+            image = backwards.blended(index, frame, image)
+        if safe:
+            combined = _combine(frame.radiance, image)
+            image = np.asarray(combined.image)
+            if index == min(work.wanted):
+                log(_measured(name, combined))
         parts = {} if aovs is None else aovs.denoise(name, frame, image)
         if index not in work.wanted:
             continue
@@ -165,6 +220,36 @@ def _denoise(
         if settings.preview:
             save_png(path.with_suffix(".png"), color.tonemap(beauty))
         yield path
+        if index == last:
+            return
+
+
+def _frames(
+    work: Work, part: range, settings: Settings, log: Callable[[str], None], *, backwards: bool = False
+) -> Iterator[StoredFrame]:
+    """Consecutive frames of a shot, or the same from the last to the first."""
+    _, frames = open_frames(
+        list(work.shot.files[part.start : part.stop]) if work.clip is None else work.clip,
+        spp=settings.spp,
+        motion_convention=settings.motion_convention,
+        channels=settings.channels,
+        layer=settings.layer,
+        part=part,
+        backwards=backwards,
+        log=log,
+    )
+    return frames
+
+
+def _measured(name: Path, combined: Combined) -> str:
+    """What was measured in a frame, and what it decided, as a line."""
+    noise, share = float(combined.noise), float(np.mean(combined.share))
+    line = (
+        f"{name.name}: noise is about {noise:.1%} of the light; {share:.0%} of the frame is kept (--no-safe: nothing)"
+    )
+    if share > 0.5 and noise > NOISY:
+        return f"{line}; the denoised image differs from it by more than noise: do its guides belong to it?"
+    return line
 
 
 def _layers(stored: StoredFrame, source: Path) -> Layers:

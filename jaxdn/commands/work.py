@@ -32,8 +32,11 @@ class Work(NamedTuple):
         """What tells of which layers it consists: the clip's folder, or the first file."""
         return self.clip or self.shot.files[0]
 
-    def stretches(self) -> Iterator[range]:
-        """Indices of consecutive frames, each after the first with a history: the wanted ones and their lead-in."""
+    def stretches(self, *, both_ways: bool = False) -> Iterator[range]:
+        """Indices of consecutive frames, each after the first with a history: the wanted ones and their lead-in.
+
+        With ``both_ways`` there are as many frames after the last wanted one.
+        """
         last = len(self.shot.files) - 1
         breaks = {index + 1 for index, (one, next_) in enumerate(pairwise(self.shot.numbers)) if next_ != one + 1}
         begun: int | None = None
@@ -44,6 +47,8 @@ class Work(NamedTuple):
             ahead = range(index, min(index + LEAD_IN, last) + 1)
             end = next((later for later in ahead if later > index and later in breaks), last + 1)
             needed = any(later in self.wanted for later in ahead if later < end)
+            if both_ways and begun is not None:
+                needed |= any(earlier in self.wanted for earlier in range(max(begun, index - LEAD_IN), index))
             if needed and begun is None:
                 begun = index
             elif not needed and begun is not None:

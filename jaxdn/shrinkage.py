@@ -1,0 +1,113 @@
+"""A noisy image and what a denoiser made of it, combined so that the result is not worse than either.
+
+What a denoiser changes, ``d = noisy - denoised``, is noise that it took away and detail that it lost. With the noise's
+variance ``V``, the best mixture ``denoised + share d`` has the share that James and Stein's estimator has,
+
+    share = max(0, 1 - c V / mean(d^2)),
+
+where the mean is over a window: nothing of ``d`` where all of it is noise, all where none is (Efron and Morris,
+"Stein's estimation rule and its competitors", 1973; for renderings: Gu et al., "Neural James-Stein Combiner for
+Unbiased and Biased Renderings", 2022, whose V comes from the renderer's samples).
+
+Here V comes from the image alone. Noise of a renderer without a pixel filter differs from pixel to pixel, lost detail
+mostly does not: V is the mean of squared second differences of ``d``, which are free of slopes (Immerkaer, "Fast Noise
+Variance Estimation", 1996, whose mask is the same in two dimensions), along that of four directions in which it is
+smallest, because edges are smooth along themselves. Detail of single pixels still counts as noise.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdn.checks import check_image, check_same_size
+from jaxdn.frame import RADIANCE_MAX
+from jaxdn.stencils import correlate
+
+RADIUS = 7
+"""Windows have 2 RADIUS + 1 = 15 pixels a side."""
+DOUBT = 2.0
+"""c = 1 + DOUBT / sqrt(n), at most MOST: V is uncertain by the inverse root of the number n of values it is from."""
+MOST = 3.0
+CLEAN, NOISY = 0.02, 0.06
+"""Noise, as a share of the light, up to which a region is left as it is, and from which the share above decides."""
+BLOCK = 32
+"""Side of the regions whose noise is judged, in pixels."""
+_DARK = 0.05
+"""Differences are relative to the light plus this share of the image's mean."""
+_WHITE, _STRONG = 0.7, 0.1
+"""What is so much noise of so large a mean square is not kept in a clean region either: a firefly."""
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+
+
+class Combined(NamedTuple):
+    """The combined image and what it was decided by."""
+
+    image: jax.Array
+    """[H, W, 3]."""
+    share: jax.Array
+    """[H, W, 1] in [0, 1], how much of the noisy image is in it."""
+    noise: jax.Array
+    """Median over the pixels of the noisy image's noise (standard deviation), as a share of their light."""
+
+
+def combine(noisy: jax.Array, denoised: jax.Array) -> Combined:
+    """The mixture of a noisy image [H, W, 3] and its denoised version, linear radiance >= 0.
+
+    Noisy values that are not finite, negative or above ``RADIANCE_MAX`` are not used. Raises ValueError for other
+    shapes.
+    """
+    check_image(noisy, "noisy", channels=3)
+    check_same_size(noisy, denoised, ("noisy", "denoised"))
+    sound = jnp.all(jnp.isfinite(noisy) & (noisy >= 0) & (noisy <= RADIANCE_MAX), axis=-1, keepdims=True)
+    change = jnp.where(sound, noisy - denoised, 0.0)
+    light = jnp.mean(denoised, axis=-1, keepdims=True)
+    light = light + _DARK * jnp.mean(light)
+    # Limited, so that the fourth power is finite.
+    relative = jnp.clip(change / jnp.where(light > 0, light, 1.0), -1e4, 1e4)
+    energy, variance, number = _moments(relative)
+    doubtful = jnp.minimum(1 + DOUBT / jnp.sqrt(number), MOST)
+    share = jnp.clip(1 - doubtful * variance / jnp.where(energy > 0, energy, 1.0), 0.0, 1.0)
+    firefly = (variance > _WHITE * energy) & (energy > _STRONG)
+    kept = jnp.where(firefly, 0.0, _clean(jnp.sqrt(variance)))
+    share = share + (1 - share) * kept
+    return Combined(denoised + share * change, jnp.where(sound, share, 0.0), jnp.median(jnp.sqrt(variance)))
+
+
+def _moments(change: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Of each pixel's window, [H, W, 1] each: the mean square, the variance of noise, and the number of values.
+
+    The number is that of equal values with the same fourth moment: 1 if all is in one pixel.
+    """
+    height, width = change.shape[:2]
+    # Mirrored: repeated pixels at the border would look smooth.
+    wide = jnp.pad(change, ((1, 1), (1, 1), (0, 0)), mode="reflect")
+
+    def at(dy: int, dx: int) -> jax.Array:
+        return wide[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
+
+    curved = [at(dy, dx) - 2 * change + at(-dy, -dx) for dy, dx in _DIRECTIONS]
+    square = jnp.mean(change**2, axis=-1)
+    parts = [jnp.ones_like(square), square, square**2, *(jnp.mean(each**2, axis=-1) / 6 for each in curved)]
+    planes = jnp.pad(jnp.stack(parts, axis=-1), ((RADIUS, RADIUS), (RADIUS, RADIUS), (0, 0)))
+    for axis in (-3, -2):
+        planes = correlate(planes, np.ones((2 * RADIUS + 1, 1)), axis=axis)
+    count, energy, fourth, variance = planes[..., :1], planes[..., 1:2], planes[..., 2:3], planes[..., 3:]
+    number = jnp.where(fourth > 0, energy**2 / jnp.where(fourth > 0, fourth, 1.0), count)
+    return energy / count, jnp.min(variance, axis=-1, keepdims=True) / count, jnp.maximum(number, 1.0)
+
+
+def _clean(noise: jax.Array) -> jax.Array:
+    """How clean a region is, [H, W, 1] in [0, 1], by the median noise [H, W, 1] of blocks, interpolated between them.
+
+    A region whose flat parts are without noise has none at its edges either, whatever was lost there.
+    """
+    height, width = noise.shape[:2]
+    rows, columns = -(-height // BLOCK), -(-width // BLOCK)
+    widths = ((0, rows * BLOCK - height), (0, columns * BLOCK - width))
+    blocks = jnp.pad(noise[..., 0], widths, mode="edge").reshape(rows, BLOCK, columns, BLOCK)
+    level = jnp.median(blocks, axis=(1, 3))
+    level = jax.image.resize(level, (rows * BLOCK, columns * BLOCK), "linear")[:height, :width, None]
+    part = jnp.clip((NOISY - level) / (NOISY - CLEAN), 0.0, 1.0)
+    return part * part * (3 - 2 * part)

@@ -1,0 +1,83 @@
+"""No result is worse than its input: noise is measured, and what is none of it comes back. Real files."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxdn import clips, color
+from jaxdn.candidates import candidate
+from jaxdn.commands.denoise import Settings, denoise_files
+from jaxdn.metrics import psnr
+
+SIZE = (48, 64)
+
+
+def picture(frame: int) -> np.ndarray:
+    """A wall with a soft shadow and a bright box with sharp edges that moves, without noise; no guides tell of them."""
+    rows, columns = np.mgrid[: SIZE[0], : SIZE[1]].astype(np.float32)
+    wall = 0.4 + 0.3 / (1 + np.exp(-(columns - 30) / 6))
+    left = 8 + 3 * frame
+    inside = np.clip(columns - left, 0, 1) * np.clip(left + 16 - columns, 0, 1) * np.clip(rows - 11.5, 0, 1)
+    return ((wall + 0.8 * inside * (rows < 34))[..., None] * np.array([1.0, 0.8, 0.6])).astype(np.float32)
+
+
+def write(folder: Path, samples: int | None, frames: int = 3) -> Path:
+    """Frames of the picture with the noise of so many samples; None: without."""
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for frame in range(frames):
+        light = picture(frame)
+        if samples is not None:
+            light = (light * rng.gamma(samples, 1 / samples, light.shape)).astype(np.float32)
+        clips.write_exr(folder / f"a.{frame:04d}.exr", dict(zip("RGB", np.moveaxis(light, -1, 0), strict=True)))
+    return folder
+
+
+def read(path: Path) -> np.ndarray:
+    return np.stack([clips.read_exr(path)[letter] for letter in "RGB"], axis=-1)
+
+
+def decibels(files: list[Path]) -> list[float]:
+    mapped = [(color.tonemap(read(file)), color.tonemap(picture(frame))) for frame, file in enumerate(files)]
+    return [float(psnr(*pair)) for pair in mapped]
+
+
+def denoise(source: Path, out: Path, **settings: Any) -> tuple[list[Path], list[str]]:
+    told: list[str] = []
+    written = denoise_files([source], out, candidate("svgf"), Settings(**settings), log=told.append)
+    return written.files, told
+
+
+def test_a_clean_render_comes_back(tmp_path: Path) -> None:
+    source = write(tmp_path / "in", None)
+    plain, _ = denoise(source, tmp_path / "plain", safe=False)
+    assert max(decibels(plain)) < 40
+    safe, told = denoise(source, tmp_path / "safe")
+    assert min(decibels(safe)) > 50
+    assert "a.0000.exr: noise is about 0." in told[-1]
+    assert "% of the frame is kept (--no-safe: nothing)" in told[-1]
+
+
+@pytest.mark.parametrize("samples", [1, 16, 64, 256])
+def test_no_frame_is_worse_than_it_was(tmp_path: Path, samples: int) -> None:
+    source = write(tmp_path / "in", samples)
+    before = decibels([source / f"a.{frame:04d}.exr" for frame in range(3)])
+    plain, safe = (decibels(denoise(source, tmp_path / str(on), safe=on)[0]) for on in (False, True))
+    assert all(now > then for now, then in zip(safe, before, strict=True))
+    assert all(now > then - 0.02 for now, then in zip(safe, plain, strict=True))
+
+
+def test_guides_that_do_not_belong_to_the_frame_are_told(tmp_path: Path) -> None:
+    """An albedo of other colours than the picture's: what the denoiser makes of it is not taken."""
+    source = write(tmp_path / "in", 256)
+    rng = np.random.default_rng(1)
+    for file in sorted(source.iterdir()):
+        there = clips.read_exr(file)
+        blocks = np.kron(rng.uniform(0.05, 1.0, (6, 8)), np.ones((8, 8))).astype(np.float32)
+        clips.write_exr(file, {**there, **{f"albedo.{letter}": blocks for letter in "RGB"}})
+    plain, _ = denoise(source, tmp_path / "plain", safe=False)
+    safe, told = denoise(source, tmp_path / "safe")
+    assert min(decibels(safe)) > min(decibels(plain)) + 6
+    assert "do its guides belong to it?" in told[-1]
