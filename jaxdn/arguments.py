@@ -271,3 +271,7 @@ class Export:
 @dataclass
 class Doctor:
     """Show what this machine computes, denoises, trains and renders with, and what to install for more."""
+
+
+COMMANDS = Inspect | Render | Pack | Train | Denoise | Compare | Export | Doctor
+"""All of them, as tyro reads them from a command line."""

@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 
 import jaxdn
-from jaxdn.arguments import Compare, Denoise, Doctor, Export, Inspect, Pack, Render, Train
+from jaxdn.arguments import COMMANDS, Compare, Denoise, Doctor, Export, Inspect, Pack, Render, Train
 from jaxdn.commands.errors import plain_errors
 
 
@@ -219,7 +219,7 @@ def main(arguments: list[str] | None = None) -> None:
         print(f"jaxdn {jaxdn.__version__}")
         return
     options = tyro.cli(
-        Inspect | Render | Pack | Train | Denoise | Compare | Export | Doctor,
+        COMMANDS,
         prog="jaxdn",
         description="Remove Monte Carlo noise from path-traced animations. --version prints the version.",
         args=arguments,

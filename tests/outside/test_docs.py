@@ -10,14 +10,13 @@ import tyro
 from PIL import Image
 
 from experiments.papers import before_after, front_page, vectors
-from jaxdn import cli
+from jaxdn.arguments import COMMANDS, Denoise
 from jaxdn.candidates import OURS
 from jaxdn.clips import write_clip
 from tests.learning.test_training import make_clip
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-COMMANDS = cli.Inspect | cli.Render | cli.Pack | cli.Train | cli.Denoise | cli.Compare | cli.Doctor
 
 
 def pytest_id(path):
@@ -49,7 +48,7 @@ def test_the_pictures_are_small():
 
 
 def test_the_default_of_denoise_is_what_reports_open_on():
-    assert cli.Denoise.__dataclass_fields__["method"].default == OURS
+    assert Denoise.__dataclass_fields__["method"].default == OURS
 
 
 def test_the_tutorials_denoiser_runs_and_learns(tmp_path, monkeypatch, capsys):
