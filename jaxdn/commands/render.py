@@ -152,9 +152,7 @@ def clips_of(
     noisy: dict[str, Any] = {"light": light, "jitter": jitter}
     jobs = []
     for name, scene, noises in scenes:
-        planned = plan_clip(
-            scene, effects=effects, denoiser=reader, max_depth=max_depth, light=light, jitter=jitter, **size
-        )
+        planned = plan_clip(scene, effects=effects, denoiser=reader, max_depth=max_depth, **noisy, **size)
         for seed in noises:
             clip = f"{name}-{seed}"
             if planned is not None:
