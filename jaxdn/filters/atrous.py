@@ -47,6 +47,7 @@ def edge_average(
     step_max: int = 1,
     variance: jax.Array | None = None,
     needed: jax.Array | None = None,
+    counted: bool = False,
 ) -> tuple[jax.Array, jax.Array | None]:
     """Weighted mean of ``values`` [C, H, W] over ``taps``, and the variance of this mean.
 
@@ -55,15 +56,18 @@ def edge_average(
 
     Args:
       values: planes to average.
-      hit: [H, W] bool, a surface is seen; other pixels are never taps. None: everywhere.
+      hit: [H, W] bool, a surface is seen; other pixels are never taps. Or numbers in [0, 1]: how much each
+        pixel counts. None: all count.
       weights: edge-stopping weights, see :mod:`jaxdn.filters.weights`.
       taps: rows of (dy, dx, h), see :func:`stencil`.
       step: spacing of the taps; it may be traced, so that all levels share one compiled loop, up to ``step_max``.
       step_max: the largest ``step``.
       variance: [H, W], becomes ``sum w^2 variance / (sum w)^2``.
       needed: [H, W] bool, strips of the image without a needed pixel are skipped and come back as 0.
+      counted: the mean gets another plane, the sum of weights.
     """
     _, height, width = values.shape
+    planes = values.shape[0] + counted
     dtype = values.dtype
     # Strips are for the CPU's cache only; other devices take one strip.
     rows = height if platform() != "cpu" else min(height, max(8, _STRIP_PIXELS // width))
@@ -130,11 +134,12 @@ def edge_average(
         total, total_spread = add(sums, ready, offset)
         some = total[-1] > NO_WEIGHT
         share = jnp.where(some, total[-1], 1.0)
-        mean = jnp.stack([jnp.where(some, plane, 0.0) / share for plane in total[:-1]])
+        own = total[-1:] if counted else []
+        mean = jnp.stack([*(jnp.where(some, plane, 0.0) / share for plane in total[:-1]), *own])
         return mean, None if total_spread is None else jnp.where(some, total_spread, 0.0) / share / share
 
     def skipped(top: jax.Array) -> tuple[jax.Array, jax.Array | None]:
-        nothing = jnp.zeros((values.shape[0], rows, width), dtype)
+        nothing = jnp.zeros((planes, rows, width), dtype)
         return nothing, None if spread is None else jnp.zeros((rows, width), dtype)
 
     wanted = None if needed is None else jnp.pad(needed, ((0, spare), (0, 0)))
@@ -148,5 +153,5 @@ def edge_average(
     if strips == 1:
         return one(jnp.zeros((), jnp.int32))
     mean, filtered = lax.map(one, rows * jnp.arange(strips, dtype=jnp.int32))
-    mean = mean.transpose(1, 0, 2, 3).reshape(values.shape[0], strips * rows, width)[:, :height]
+    mean = mean.transpose(1, 0, 2, 3).reshape(planes, strips * rows, width)[:, :height]
     return mean, None if filtered is None else filtered.reshape(strips * rows, width)[:height]

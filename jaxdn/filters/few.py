@@ -42,7 +42,8 @@ def average_of_few(
     *,
     step: jax.Array | int = 1,
 ) -> jax.Array:
-    """Weighted mean of ``values`` [C, H, W] over ``taps`` for ``needed`` pixels [H, W], 0 elsewhere.
+    """Weighted mean of ``values`` [C, H, W] over ``taps``, and the sum of weights, for ``needed`` pixels [H, W]:
+    [C + 1, H, W], 0 elsewhere.
 
     The arguments are those of :func:`jaxdn.filters.atrous.edge_average`; the spacing ``step`` of the taps may be one
     [H, W] for each pixel.
@@ -51,7 +52,7 @@ def average_of_few(
     dtype = values.dtype
     inside = jnp.ones((1, height, width), dtype) if hit is None else hit[None].astype(dtype)
     # Masked pixels enter as zeros, in the sums and in the sum of weights.
-    layers = [values * inside, inside, *(one.there for one in weights)]
+    layers = [jnp.where(inside > 0, values, 0.0), inside, *(one.there for one in weights)]
     packed = jnp.concatenate(layers).reshape(-1, height * width).T
     own = [one.here.transpose(1, 2, 0) for one in weights]
     rows, columns = (lax.broadcasted_iota(jnp.int32, (height, width), axis) for axis in (0, 1))
@@ -80,6 +81,7 @@ def average_of_few(
         total = jnp.sum(factor, axis=1)
         some = total > NO_WEIGHT
         share = factor / jnp.where(some, total, 1.0)[:, None]
-        return jnp.where(some[:, None], jnp.einsum("nt,ntc->nc", share, found[..., :count]), 0.0)
+        mean = jnp.where(some[:, None], jnp.einsum("nt,ntc->nc", share, found[..., :count]), 0.0)
+        return jnp.concatenate([mean, total[:, None]], axis=-1)
 
     return where_needed(work, needed, (rows, columns, steps, own)).transpose(2, 0, 1)

@@ -51,7 +51,7 @@ def fix_history(
 
     def few() -> jax.Array:
         step = jnp.asarray(strides)[jnp.clip(whole - 1, 0, frames - 1).astype(jnp.int32)]
-        return average_of_few(planes, hit, weights, _TAPS, short, step=step)
+        return average_of_few(planes, hit, weights, _TAPS, short, step=step)[:-1]
 
     def many() -> jax.Array:
         def fill(filled: jax.Array, each: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:

@@ -95,7 +95,8 @@ def _denoised(options: Options, kind: Kind) -> tuple[jax.Array, jax.Array]:
     calm = without_fireflies(held, kind.same) if options.anti_firefly else held
     seen = jnp.concatenate([calm, moments, length[None]])
     own: dict[str, Any] = {"texture": kind.now.texture}
-    calm, variance = estimate_variance(seen, kind.hit, kind.weights, short_history=options.short_history, **own)
+    short: dict[str, Any] = {"short_history": options.short_history, "beside": kind.sticks is None}
+    calm, variance = estimate_variance(seen, kind.hit, kind.weights, **short, **own)
     sigma = options.sigma_diffuse if kind.sticks is None else options.sigma_specular
     own |= {"levels": options.levels, "sigma_luminance": sigma}
     image, _ = cascade(calm, variance, kind.hit, lambda level: kind.weights, _TAPS, **own)

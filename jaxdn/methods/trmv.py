@@ -282,7 +282,8 @@ def _mirrored(
     luminance do.
     """
     first = _lobe_weights(options, frame, 0)
-    color, variance = estimate_variance(history, hit, first, short_history=options.short_history, texture=texture)
+    short = options.short_history
+    color, variance = estimate_variance(history, hit, first, short_history=short, texture=texture, beside=False)
     deviation = jnp.sqrt(jnp.maximum(variance, 1e-10))
     hues = [luminance_weight(color[one] - color[1], deviation, sigma=options.sigma_specular) for one in (0, 2)]
     return _filtered(
