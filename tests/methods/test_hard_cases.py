@@ -53,6 +53,7 @@ def assert_green(subject, cases=SAME_SIZE, *, direction="forward"):
     assert not red, "\n".join(f"{row.case}, {row.precision}, {row.direction}: {row.reason}" for row in red)
 
 
+@pytest.mark.slow
 @named(PLAIN)
 def test_operations_withstand_every_case(subject):
     assert_green(subject)
