@@ -40,8 +40,8 @@ def pytest_configure(config: pytest.Config) -> None:
 def _compile_quickly() -> None:
     """XLA compiles this process's programs without fusion emitters, in half of the time.
 
-    The slow tests, hard cases among them, and real processes compile as users do. XLA reads its flags once, and ends the process for one that
-    it does not know: hence the version.
+    The slow tests, hard cases among them, and real processes compile as users do. XLA reads its flags once, and ends
+    the process for one that it does not know: hence the version.
     """
     if jax.__version_info__ >= (0, 11):
         return
