@@ -185,7 +185,14 @@ def test_an_error_and_an_interrupt_leave_nothing_behind(tmp_path: Path) -> None:
 def test_ctrl_c_in_the_backward_pass_leaves_nothing_behind(tmp_path: Path) -> None:
     source, out = noisy_wall(tmp_path / "in", 400), tmp_path / "out"
     command = [sys.executable, "-m", "jaxdn.cli", "denoise", source, "-o", out, "--method", "svgf", "--bidirectional"]
-    process = subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    # A shell lets processes that it puts into the background ignore Ctrl-C, and theirs inherit that.
+    process = subprocess.Popen(
+        [*map(str, command)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     until = time.monotonic() + 240
     while not list(out.glob(".backwards-*/*.npy")) and time.monotonic() < until:
         time.sleep(0.01)
