@@ -55,7 +55,7 @@ def _compile_quickly() -> None:
         os.environ["XLA_FLAGS"] = before
 
 
-MOST_MAPS = 30_000
+MOST_MAPS = 20_000
 """Pieces of memory that a process may map before its compiled programs are forgotten."""
 
 
