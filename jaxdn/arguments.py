@@ -198,7 +198,7 @@ class Denoise:
     .safetensors file."""
     bidirectional: bool = False
     """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
-    frames are as good as the last."""
+    frames are about as good as the last."""
     safe: bool = True
     """Measure the noise, and keep of the frames what is none of it: clean ones come back as they are."""
     frames: list[str] = field(default_factory=list)

@@ -142,7 +142,8 @@ def render_frame(
     halves = []
     if reference_spp and not repeated:
         halves = _halves(partial(traced, REFERENCE), reference_spp, built if jitter else None)
-        built = built_at(frame) if jitter else built
+        if jitter:
+            jitters.look_through(built, jitters.of_frame(frame))
     sums = halves or list(noisy.values())
     total = sums[0]
     for part in sums[1:]:
