@@ -1,13 +1,15 @@
 """Blending a new frame into its history: colour, moments of luminance, history length, as planes [6, H, W]."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
-def luminance(planes: jax.Array) -> jax.Array:
-    """Rec.709 luminance of planar colour [3, H, W]."""
+def luminance(planes: jax.Array | Sequence[jax.Array]) -> jax.Array:
+    """Rec.709 luminance [H, W] of planar colour, the first three of ``planes`` [H, W]."""
     red, green, blue = _LUMINANCE
     return red * planes[0] + green * planes[1] + blue * planes[2]
 

@@ -9,11 +9,11 @@ from jax import lax
 
 from jaxdn import brdf
 from jaxdn.filters.accumulation import luminance
-from jaxdn.filters.atrous import edge_average
 from jaxdn.filters.blur import blur_variance
+from jaxdn.filters.canvas import Guiding, canvas_for, guiding, weighted_sums
 from jaxdn.filters.weights import Weight, luminance_weight
 
-_Planes = tuple[jax.Array, jax.Array, jax.Array]
+_Planes = tuple[list[jax.Array], list[jax.Array]]
 
 
 def cascade(
@@ -35,7 +35,8 @@ def cascade(
       color: [3, H, W].
       variance: [H, W] of its luminance.
       hit: [H, W] bool, a surface is seen; None: everywhere.
-      weights: level, counted from 0 -> its edge-stopping weights, without that of luminance.
+      weights: level, counted from 0 -> its edge-stopping weights, without that of luminance. Their planes must be the
+        same at every level.
       taps: rows of (dy, dx, h), spaced ``2**level`` pixels apart.
       levels: number of levels.
       sigma_luminance: tolerated difference in luminance, in standard deviations; one number, or [levels].
@@ -48,21 +49,54 @@ def cascade(
         return color, second
     if texture is not None:
         color, second = (jnp.concatenate([light, texture]) for light in (color, second))
+    at = jnp.broadcast_to(jnp.asarray(sigma_luminance, color.dtype), (levels,))
+    image, second = _levels(color, variance, hit, weights, taps, at, second, feedback_level)
+    if texture is None:
+        return image, second
+    image, second = (brdf.restore(light[:3], texture, light[3:]) for light in (image, second))
+    return image, second
+
+
+def _levels(
+    color: jax.Array,
+    variance: jax.Array,
+    hit: jax.Array | None,
+    weights: Callable[[jax.Array], Sequence[Weight]],
+    taps: np.ndarray,
+    sigmas: jax.Array,
+    feedback: jax.Array,
+    feedback_level: int,
+) -> tuple[jax.Array, jax.Array]:
+    """``color`` [C, H, W] after a level for each of ``sigmas``, and after ``feedback_level``; 0: ``feedback``.
+
+    The planes stay on the canvas between the levels: to put them there again for each one took half of the time.
+    """
+    (height, width), levels = variance.shape, len(sigmas)
+    canvas = canvas_for(height, width, taps, step_max=2 ** (levels - 1))
+    guides = guiding(canvas, weights(jnp.zeros((), jnp.int32)))
+    inside = canvas.wide(jnp.ones((height, width), color.dtype) if hit is None else hit.astype(color.dtype))
 
     def filter_level(carry: _Planes, at: tuple[jax.Array, jax.Array]) -> tuple[_Planes, None]:
-        (level, sigma), (color, variance, feedback) = at, carry
-        deviation = jnp.sqrt(jnp.maximum(blur_variance(variance), 1e-10))
-        light = luminance_weight(luminance(color[:3]), deviation, sigma=sigma)
-        color, spread = edge_average(
-            color, hit, [*weights(level), light], taps, step=2**level, step_max=2 ** (levels - 1), variance=variance
-        )
-        assert spread is not None
-        return (color, spread, jnp.where(level + 1 == feedback_level, color, feedback)), None
+        (level, sigma), (planes, feedback) = at, carry
+        *colors, variance, light = planes
+        deviation = jnp.sqrt(jnp.maximum(blur_variance(canvas.within(variance)), 1e-10))
+        alike = luminance_weight(canvas.within(light), deviation, sigma=sigma)
+        stops = [*weights(level), alike]
+        own = Guiding([*guides.there, [light]], [*guides.here, [canvas.tall(plane) for plane in alike.here]])
 
-    at = (jnp.arange(levels, dtype=jnp.int32), jnp.broadcast_to(jnp.asarray(sigma_luminance, color.dtype), (levels,)))
-    carry = (color, variance, second)
-    (color, _, second), _ = lax.scan(filter_level, carry, at)
-    if texture is None:
-        return color, second
-    image, kept = (brdf.restore(light[:3], texture, light[3:]) for light in (color, second))
-    return image, kept
+        def strip(top: jax.Array) -> list[jax.Array]:
+            mean, spread = weighted_sums(canvas, top, taps, 2**level, stops, own, colors, inside, variance).mean()
+            assert spread is not None
+            seen = canvas.shifted(top, inside, jnp.asarray(canvas.margin, jnp.int32)) > 0
+            return [jnp.where(seen, plane, 0.0) for plane in (*mean, spread, luminance(mean))]
+
+        new = canvas.painted(strip)
+        kept = [jnp.where(level + 1 == feedback_level, *pair) for pair in zip(new[:-2], feedback, strict=True)]
+        return (new, kept), None
+
+    # Masked pixels enter as zeros in the sums and in the sum of weights.
+    planes = [canvas.wide(plane) * inside for plane in (*color, variance, luminance(color))]
+    carry = planes, [canvas.wide(plane) for plane in feedback]
+    carry, _ = lax.scan(filter_level, carry, (jnp.arange(levels, dtype=jnp.int32), sigmas))
+    last, kept = (jnp.stack([canvas.within(plane) for plane in each[: len(color)]]) for each in carry)
+    return last, kept

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.filters.atrous import NO_WEIGHT
+from jaxdn.filters.canvas import NO_WEIGHT
 from jaxdn.filters.weights import Offset, Weight
 from jaxdn.ops.platform import ANY, platform
 from jaxdn.ops.strips import where_needed

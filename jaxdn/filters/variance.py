@@ -7,7 +7,8 @@ import jax.numpy as jnp
 
 from jaxdn import brdf
 from jaxdn.filters.accumulation import luminance
-from jaxdn.filters.atrous import NO_WEIGHT, edge_average, stencil
+from jaxdn.filters.atrous import edge_average, stencil
+from jaxdn.filters.canvas import NO_WEIGHT
 from jaxdn.filters.few import average_of_few, few_or_all
 from jaxdn.filters.weights import Weight
 

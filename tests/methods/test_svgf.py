@@ -7,6 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
+from jaxdn.filters.cascade import cascade
 from jaxdn.filters.weights import Weight, depth_weight, luminance_weight
 from jaxdn.frame import FAR, Clip, Frame, frame_at
 from jaxdn.methods.svgf import svgf
@@ -270,12 +271,35 @@ def test_strips_do_not_show(rng, monkeypatch):
     needed[9, 4] = True
     arguments = (values, None, [depth_weight(jnp.asarray(depth), None, sigma=1.0)], stencil(3))
     whole, _ = edge_average(*arguments)
-    monkeypatch.setattr("jaxdn.filters.atrous._STRIP_PIXELS", 1)
+    monkeypatch.setattr("jaxdn.filters.canvas._STRIP_PIXELS", 1)
     strips, _ = edge_average(*arguments)
     some, _ = edge_average(*arguments, needed=jnp.asarray(needed))
     np.testing.assert_allclose(strips, whole, rtol=1e-6)
     np.testing.assert_allclose(some[:, 8:16], whole[:, 8:16], rtol=1e-6)
     np.testing.assert_array_equal(some[:, 16:], 0)
+
+
+@pytest.mark.parametrize("masked", [True, False], ids=["with-background", "surfaces-alone"])
+def test_strips_of_a_cascade_do_not_show(rng, monkeypatch, masked):
+    """Nor in its gradient; the last strip has rows below the image."""
+    color = jnp.asarray(rng.random((5, 21, 11)), jnp.float32)
+    depth = jnp.asarray(3 + rng.random((21, 11, 1)), jnp.float32)
+    hit = jnp.asarray(rng.random((21, 11)) > 0.2) if masked else None
+    options = {"levels": 3, "sigma_luminance": 2.0, "feedback_level": 1}
+
+    def filtered(color):
+        weights = [depth_weight(depth, None, sigma=1.0)]
+        taps = stencil(2, kernel=B3_SPLINE)
+        return jnp.stack(cascade(color, color[0] ** 2, hit, lambda level: weights, taps, **options))
+
+    whole, slope = jax.vjp(filtered, color)
+    away = jnp.asarray(rng.random(whole.shape), jnp.float32)
+    monkeypatch.setattr("jaxdn.filters.canvas._STRIP_PIXELS", 1)
+    strips, slope_of_strips = jax.vjp(filtered, color)
+    np.testing.assert_allclose(strips, whole, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(slope_of_strips(away)[0], slope(away)[0], rtol=1e-4, atol=1e-5)
+    if masked:
+        np.testing.assert_array_equal(strips[0][:, ~hit], 0)
 
 
 def test_the_first_frame_reads_no_history_and_no_motion(rng):
