@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxdn import brdf
 from jaxdn.filters.accumulation import luminance
 from jaxdn.filters.atrous import edge_average, stencil
-from jaxdn.filters.canvas import NO_WEIGHT
+from jaxdn.filters.beside import alone, with_those_beside
 from jaxdn.filters.few import average_of_few, few_or_all
 from jaxdn.filters.weights import Weight
 
@@ -32,9 +32,8 @@ def estimate_variance(
     division left is averaged likewise and given back to this colour (:func:`jaxdn.brdf.restore`); the deviation changes
     as grey light would.
 
-    At thin things nearly every tap may be rejected, and a pixel alone would keep what its own sample found: a black or
-    bright dot. As far as it lacks one whole neighbour, ``beside`` gives it the mean of the eight pixels beside it,
-    whatever they show; not for reflections, which are sharp where they are alone.
+    ``beside`` gives a pixel that is alone the mean of those beside it (:mod:`jaxdn.filters.beside`); not for
+    reflections, which are sharp where they are alone.
     """
     color, moments, length = history[:3], history[3:5], history[5]
     variance = jnp.maximum(moments[1] - moments[0] ** 2, 0.0)
@@ -54,25 +53,6 @@ def estimate_variance(
     color, variance = jnp.where(needed[None], around, color), jnp.where(needed, spatial, variance)
     if not beside:
         return color, variance
-    alone = jnp.where(needed, jnp.clip(2.0 - total, 0.0, 1.0), 0.0)  # the pixel itself counts 1
-    return _with_those_beside(color, variance, hit, alone)
-
-
-def _with_those_beside(
-    color: jax.Array, variance: jax.Array, hit: jax.Array | None, alone: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Both, mixed with their means over the 3x3 pixels around in so far as a pixel is ``alone``, [H, W] in [0, 1].
-
-    Others that are alone do not count; where there are only such, nothing changes.
-    """
     planes = jnp.concatenate([color, variance[None]])
-    known = 1.0 - alone if hit is None else jnp.where(hit, 1.0 - alone, 0.0)
-    lonely = alone > 0
-    mean = few_or_all(
-        lonely,
-        lambda: average_of_few(planes, known, [], stencil(1), lonely),
-        lambda: edge_average(planes, known, [], stencil(1), needed=lonely, counted=True)[0],
-    )
-    share = jnp.where(mean[-1] > NO_WEIGHT, alone, 0.0)
-    mixed = planes + share[None] * (mean[:-1] - planes)
+    mixed = with_those_beside(planes, hit, alone(total, needed))
     return mixed[:3], mixed[3]

@@ -37,6 +37,8 @@ class Options:
     """The same of the fast history."""
     fix_frames: Annotated[int, Range(0, 8)] = 4
     """Histories up to this length are filled from sparse taps around."""
+    fix_widest: Annotated[int, Range(1)] = 4
+    """These taps are ``fix_widest / (1 + N)`` pixels apart for a history of N frames."""
     clamp_sigma: Annotated[float, _POSITIVE, LEARNED] = 4.0
     """The slow history may be this many standard deviations from the fast one's mean over 5x5 pixels."""
     lag_sigma: Annotated[float, _POSITIVE, LEARNED] = 3.0
@@ -192,7 +194,16 @@ def respond(options: Options, kind: Kind, slow: jax.Array, fast: jax.Array, leng
     lag = contradiction(level, luminance(fast), kind.hit, sigma=options.lag_sigma, radius=_AROUND)
     length = length + lag * (jnp.minimum(length, options.fast_max) - length)
     new = slow + lag[None] * (fast - slow)
-    fixed = fix_history(new, length, kind.hit, kind.weights, frames=options.fix_frames, texture=kind.now.texture)
+    fixed = fix_history(
+        new,
+        length,
+        kind.hit,
+        kind.weights,
+        frames=options.fix_frames,
+        widest=options.fix_widest,
+        texture=kind.now.texture,
+        beside=kind.sticks is None,
+    )
     if kind.sticks is not None:
         fixed = new + kind.sticks[None] * (fixed - new)
     held = clamp_to_fast(fixed, fast, kind.hit, sigma=options.clamp_sigma)

@@ -59,7 +59,7 @@ def test_large_images_get_what_small_ones_get(least, rng, x64, monkeypatch):
     def both(planes):
         history = jnp.concatenate([planes, length[None]])
         color, variance = estimate_variance(history, hit, weights, short_history=4, texture=texture)
-        fixed = fix_history(planes[:3], length, hit, weights, frames=4, texture=texture)
+        fixed = fix_history(planes[:3], length, hit, weights, frames=4, widest=14, texture=texture)
         return color, variance, fixed
 
     def slope(planes):

@@ -10,7 +10,7 @@ from jaxdn.filters.atrous import edge_average, stencil
 from jaxdn.filters.clamping import clamp_to_fast, contradiction, neighbourhood, without_fireflies
 from jaxdn.filters.history_fix import fix_history
 from jaxdn.filters.virtual import closeness, diffuseness, virtual_motion
-from jaxdn.filters.weights import lobe_weight, roughness_weight
+from jaxdn.filters.weights import lobe_weight, normal_weight, roughness_weight
 
 FOCAL, SIZE = 160.0, np.array([320.0, 180.0])
 
@@ -179,21 +179,40 @@ def test_fireflies_take_the_range_of_their_neighbours(rng):
         np.testing.assert_array_equal(found[:, y, x], expected)
 
 
-def test_short_histories_are_filled_from_sparse_taps(x64, rng):
+@pytest.mark.parametrize(("widest", "strides"), [(14, (7, 4, 3)), (4, (2, 1, 1))])
+def test_short_histories_are_filled_from_sparse_taps(x64, rng, widest, strides):
     color = rng.random((3, 40, 44))
     length = np.full((40, 44), 9.0)
     length[20, 21], length[19, 22], length[18, 18] = 1, 2.8, 4.4
     hit = rng.random((40, 44)) < 0.7
     hit[20, 21] = hit[19, 22] = hit[18, 18] = True
-    found = np.asarray(fix_history(color, jnp.asarray(length), jnp.asarray(hit), [], frames=4))
+    found = np.asarray(fix_history(color, jnp.asarray(length), jnp.asarray(hit), [], frames=4, widest=widest))
     expected = color.copy()
-    for y, x, stride in ((20, 21, 7), (19, 22, 4), (18, 18, 3)):
+    for (y, x), stride in zip(((20, 21), (19, 22), (18, 18)), strides, strict=True):
         taps = [(y + stride * dy, x + stride * dx) for dy in range(-2, 3) for dx in range(-2, 3) if abs(dx * dy) < 4]
         assert len(taps) == 21
         there = [color[:, v, u] for v, u in taps if 0 <= v < 40 and 0 <= u < 44 and hit[v, u]]
         expected[:, y, x] = np.mean(there, axis=0)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
-    np.testing.assert_array_equal(fix_history(color, jnp.asarray(length), None, [], frames=0), color)
+    np.testing.assert_array_equal(fix_history(color, jnp.asarray(length), None, [], frames=0, widest=widest), color)
+
+
+def test_a_short_history_alone_on_its_surface_gets_the_light_beside_it(rng):
+    """Not a reflection's, and not where the history is long."""
+    color = jnp.asarray(rng.random((3, 9, 9)), jnp.float32)
+    normal = np.zeros((9, 9, 3), np.float32)
+    normal[..., 2] = 1.0
+    normal[4, 4] = normal[4, 7] = [1.0, 0.0, 0.0]  # not beside each other
+    length = jnp.full((9, 9), 9.0).at[4, 4].set(1.0)
+    weights = [normal_weight(jnp.asarray(normal), sigma=16.0)]
+    found, kept = (
+        np.asarray(fix_history(color, length, None, weights, frames=4, widest=4, beside=beside))
+        for beside in (True, False)
+    )
+    expected = np.array(color)
+    expected[:, 4, 4] = (expected[:, 3:6, 3:6].sum((1, 2)) - expected[:, 4, 4]) / 8
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    np.testing.assert_allclose(kept, color, rtol=1e-6)
 
 
 def test_gradients_of_every_part(x64, rng):
