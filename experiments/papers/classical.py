@@ -43,6 +43,8 @@ LIGHTS: tuple[NoisyLight, ...] = ("indirect", "reflected")
 PEER = "Open Image Denoise"
 AGAINST = "svgf"
 """The filter that the times of all others are compared with."""
+_WARM = 6
+"""Frames before those that are timed."""
 
 
 @dataclass
@@ -111,7 +113,10 @@ def timed_clip(settings: Settings) -> ClipJob:
 
 
 def step(folder: Path, name: str) -> Call:
-    """The call that is timed, made in its own process: another step on the second frame of a clip."""
+    """The call that is timed, made in its own process: another step on the second frame of a clip.
+
+    It has run before, so that histories are as long as in the middle of a clip: short ones take longer.
+    """
     frame = jax.tree.map(jnp.asarray, frame_at(read_clip(folder).frames, 1))
     if name == PEER:
         return steps.open_image_denoise(frame, "high")
@@ -120,7 +125,10 @@ def step(folder: Path, name: str) -> Call:
     if engine is not None:
         method = candidate(name, implementation=engine)
     assert method.denoiser is not None
-    return steps.recurrent(method.denoiser, method.params, frame)
+    call = steps.recurrent(method.denoiser, method.params, frame)
+    for _ in range(_WARM):
+        call()
+    return call
 
 
 def milliseconds(

@@ -54,15 +54,15 @@ def average_of_few(
     # Masked pixels enter as zeros, in the sums and in the sum of weights.
     layers = [jnp.where(inside > 0, values, 0.0), inside, *(one.there for one in weights)]
     packed = jnp.concatenate(layers).reshape(-1, height * width).T
-    own = [one.here.transpose(1, 2, 0) for one in weights]
-    rows, columns = (lax.broadcasted_iota(jnp.int32, (height, width), axis) for axis in (0, 1))
+    own = [[plane.reshape(-1) for plane in one.here] for one in weights]
     steps = jnp.broadcast_to(jnp.asarray(step, jnp.int32), (height, width))
     vectors = jnp.asarray(taps[:, :2], jnp.int32)
     lengths, shares = (jnp.asarray(each, dtype)[None] for each in (np.hypot(taps[:, 0], taps[:, 1]), taps[:, 2]))
     centre = (taps[:, 0] == 0) & (taps[:, 1] == 0)
 
-    def work(part: tuple[jax.Array, jax.Array, jax.Array, list[jax.Array]]) -> jax.Array:
-        row, column, step, here = part
+    def work(part: tuple[jax.Array, jax.Array]) -> list[jax.Array]:
+        place, step = part
+        row, column = place // width, place % width
         y, x = (at[:, None] + step[:, None] * vectors[None, :, axis] for axis, at in enumerate((row, column)))
         seen = (y >= 0) & (y < height) & (x >= 0) & (x < width)
         found = packed[jnp.clip(y, 0, height - 1) * width + jnp.clip(x, 0, width - 1)]
@@ -71,10 +71,10 @@ def average_of_few(
         x_step, y_step = (wide * vectors[None, :, axis].astype(dtype) for axis in (1, 0))
         offset = Offset(x_step, y_step, wide * lengths)
         factor, at = jnp.where(seen, planes[count], 0.0) * shares, count + 1
-        for one, mine in zip(weights, here, strict=True):
+        for one, here in zip(weights, own, strict=True):
             there = planes[at : at + one.there.shape[0]]
             at += len(there)
-            given = there, [mine[:, index][:, None] for index in range(mine.shape[-1])], offset
+            given = there, [plane[place][:, None] for plane in here], offset
             stops = one.factor(*given) if one.factor else jnp.ones((), dtype)
             stops = stops * jnp.exp(-one.exponent(*given)) if one.exponent else stops
             factor = factor * jnp.where(centre[None], 1.0, stops)
@@ -82,6 +82,7 @@ def average_of_few(
         some = total > NO_WEIGHT
         share = factor / jnp.where(some, total, 1.0)[:, None]
         mean = jnp.where(some[:, None], jnp.einsum("nt,ntc->nc", share, found[..., :count]), 0.0)
-        return jnp.concatenate([mean, total[:, None]], axis=-1)
+        return [*(mean[:, index] for index in range(count)), total]
 
-    return where_needed(work, needed, (rows, columns, steps, own)).transpose(2, 0, 1)
+    places = jnp.arange(height * width, dtype=jnp.int32).reshape(height, width)
+    return jnp.stack(where_needed(work, needed, (places, steps)))
