@@ -61,7 +61,7 @@ class Options(svgf.Options):
     clamp_sigma: Annotated[float, Range(0, without_low=True), LEARNED] = 1.0
     """The history's share of shadows may be this many standard deviations from the mean of the frame's own over 5x5
     pixels: where none of them is shadowed, none has been."""
-    sigma_specular: Annotated[float, Range(0, without_low=True), LEARNED] = 1.0
+    sigma_specular: Annotated[float, Range(0, without_low=True), LEARNED] = 2.0
     """Edge-stopping parameter for differences in luminance, in standard deviations, of specular light: it has the
     textures and edges of what is reflected, which no buffer shows."""
     lobe_fraction: Annotated[float, Range(0, without_low=True), LEARNED] = 2.0
