@@ -49,9 +49,9 @@ class Options(by_lobes.Options):
     """For N below this the variance is estimated from the 7x7 neighbourhood."""
     levels: Annotated[int, Range(0, 10)] = 5
     """Levels of the a-trous filter."""
-    sigma_diffuse: Annotated[float, _POSITIVE, LEARNED_PER_LEVEL] = 4.0
+    sigma_diffuse: Annotated[float, _POSITIVE, LEARNED_PER_LEVEL] = 2.0
     """Edge-stopping parameter for differences in luminance, in standard deviations, of diffuse light."""
-    sigma_specular: Annotated[float, _POSITIVE, LEARNED_PER_LEVEL] = 4.0
+    sigma_specular: Annotated[float, _POSITIVE, LEARNED_PER_LEVEL] = 2.0
     """The same of specular light."""
 
 
