@@ -17,6 +17,8 @@ from jaxdn.filters.canvas import canvas_for, guiding, weighted_sums
 from jaxdn.filters.weights import Weight
 
 B3_SPLINE = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
+GAUSSIAN = np.array([0.279, 0.442, 0.279])
+"""Three taps of a Gaussian: a third of the 5 x 5 taps' work, and half of their reach."""
 
 
 def stencil(radius: int, *, kernel: np.ndarray | None = None) -> np.ndarray:

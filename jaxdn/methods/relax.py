@@ -18,11 +18,10 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.accumulation import accumulate, after_shift
-from jaxdn.filters.atrous import stencil
+from jaxdn.filters.atrous import GAUSSIAN, stencil
 from jaxdn.filters.cascade import cascade
 from jaxdn.filters.clamping import without_fireflies
 from jaxdn.filters.variance import estimate_variance
@@ -37,7 +36,7 @@ from jaxdn.options import Range
 _PLANES = 9
 """Planes of a history: colour (3), two moments of its luminance, length in frames, fast colour (3)."""
 _LENGTH = 5
-_TAPS = stencil(1, kernel=np.array([0.279, 0.442, 0.279]))
+_TAPS = stencil(1, kernel=GAUSSIAN)
 _POSITIVE = Range(0, without_low=True)
 
 

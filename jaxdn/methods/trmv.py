@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jaxdn import brdf
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.accumulation import after_shift, luminance
-from jaxdn.filters.atrous import B3_SPLINE, stencil
+from jaxdn.filters.atrous import GAUSSIAN, stencil
 from jaxdn.filters.cascade import cascade
 from jaxdn.filters.clamping import clamp_to_fast
 from jaxdn.filters.guides import Guides, expected, guides_of, hit_mask, shared
@@ -47,7 +47,7 @@ READS = svgf.READS | {
     *("albedo", "reflectance", "specular_reflectance", "roughness", "dual_motion"),
     *("specular", "glossy_motion", "shadowed", "unshadowed", "shadow_motion"),
 }
-_TAPS = stencil(2, kernel=B3_SPLINE)
+_TAPS = stencil(1, kernel=GAUSSIAN)
 _LENGTH = 5
 """The plane of the history length."""
 _DARK = 1e-6
