@@ -1,4 +1,4 @@
-"""The shipped weights: render the clips, fit `svgf`, train `steady-balanced`, `ntd-small` and `ntd-large`, and A, B, C.
+"""The shipped weights: render clips, fit `svgf`, `relax`, train `steady-balanced`, `ntd-small`, `ntd-large`, A, B, C.
 
     python -m experiments.papers.weights --rooms rooms/*/scene.xml    # `make weights`: hours; resumable
 
@@ -48,6 +48,7 @@ SQUARES = unbiased_illumination(squared_from=0.0)
 
 STAGES = (
     Stage("svgf-fitted", "svgf", {}, 300),
+    Stage("relax-fitted", "relax", {}, 300),
     Stage("steady-begun", "steady", {"quality": "balanced"}, 8000, decay=False),
     Stage("steady-balanced", "steady", {"quality": "balanced"}, 1000, start="steady-begun"),
     Stage("small-begun", "ntd", {"size": "small"}, 4000, decay=False),
@@ -101,6 +102,7 @@ def render_all(settings: Settings) -> None:
                 draws=6,
                 max_depth=None,
                 effects="auto",
+                denoiser=",".join({stage.method: None for stage in STAGES}),
                 workers=settings.workers,
             )
 

@@ -58,6 +58,7 @@ class Options(by_lobes.Options):
     Options,
     title="Diffuse and specular light apart, a slow history clamped to a fast one (after ReLAX)",
     recipes={"usual": FITTING},
+    variants={"relax-fitted": {}},
     filter=True,
 )
 def relax(options: Options) -> Denoiser:
