@@ -72,14 +72,19 @@ def asvgf(options: Options) -> Denoiser:
         params: Params, state: svgf.SvgfState, frame: Frame, first: jax.Array
     ) -> tuple[svgf.SvgfState, jax.Array, jax.Array]:
         fitted = moved(options, params)
-        past, broken = svgf.recall_history(fitted, state, frame, first)
-        change = 1.0 - (1.0 - changed(fitted, past, frame)) ** fitted.antilag
-        history = svgf.blend(fitted, past, frame.radiance.transpose(2, 0, 1), change)
+        history, broken = accumulated(fitted, state, frame, first)
         return (*svgf.filter_history(fitted, history, frame), broken)
 
     reads = svgf.READS | {"luminance_gradient"}
     plain = recurrent(Core(svgf.start, step, reads, lambda key, frame: unmoved(options)))
     return demodulated(plain, by=options.demodulate)
+
+
+def accumulated(options: Options, state: svgf.SvgfState, frame: Frame, first: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The history [6, H, W] with the frame blended in, faster where light has changed; the number of invalid pixels."""
+    past, broken = svgf.recall_history(options, state, frame, first)
+    change = 1.0 - (1.0 - changed(options, past, frame)) ** options.antilag
+    return svgf.blend(options, past, frame.radiance.transpose(2, 0, 1), change), broken
 
 
 def changed(options: Options, past: jax.Array, frame: Frame) -> jax.Array:

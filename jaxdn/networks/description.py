@@ -7,8 +7,10 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 from jaxdn.networks import LEVELS, Widths
 
 NEGATIVE_SLOPE = 0.01
+RECURRENT_SLOPE = 0.1
+"""Of the recurrent autoencoder."""
 FEATURES = "features"
-"""The network's input, which only convolutions read: an engine may add channels to it."""
+"""What a network sees, which only convolutions read: an engine may add channels to it."""
 
 Value = TypeVar("Value")
 Weights = Mapping[str, Mapping[str, Any]]
@@ -25,6 +27,8 @@ class Layer(NamedTuple):
     depth: int
     size: int = 0
     """Height and width of a convolution's kernel."""
+    slope: float = NEGATIVE_SLOPE
+    """A rectifier's, of negative values."""
 
 
 class Description(NamedTuple):
@@ -48,8 +52,8 @@ class Operations(Protocol[Value]):
     def convolution(self, inputs: Sequence[Value], kernels: Sequence[Any], bias: Any) -> Value:
         """The sum of the inputs' convolutions, each with its part of the kernel: stride 1, zeros outside."""
 
-    def rectifier(self, x: Value) -> Value:
-        """LeakyReLU of :data:`NEGATIVE_SLOPE`."""
+    def rectifier(self, x: Value, slope: float) -> Value:
+        """LeakyReLU: negative values times ``slope``."""
 
     def pool(self, x: Value) -> Value:
         """The maximum of each 2x2 block."""
@@ -59,20 +63,43 @@ class Operations(Protocol[Value]):
 
 
 def evaluate(
-    network: Description, weights: Weights, features: Value, operations: Operations[Value]
+    network: Description, weights: Weights, inputs: Mapping[str, Value], operations: Operations[Value]
 ) -> tuple[Value, ...]:
-    """The outputs for ``features``, layer by layer."""
-    values = {FEATURES: features}
+    """The outputs for the values of all inputs, layer by layer."""
+    values = dict(inputs)
     for name, layer in network.layers.items():
-        inputs = [values[each] for each in layer.inputs]
+        read = [values[each] for each in layer.inputs]
         if layer.kind == "convolution":
             kernel, bias = weights[name]["kernel"], weights[name]["bias"]
             ends = list(accumulate(network.layers[each].channels for each in layer.inputs))
             kernels = [kernel[:, :, first:last] for first, last in zip([0, *ends], ends, strict=False)]
-            values[name] = operations.convolution(inputs, kernels, bias)
+            values[name] = operations.convolution(read, kernels, bias)
+        elif layer.kind == "rectifier":
+            values[name] = operations.rectifier(read[0], layer.slope)
         elif layer.kind != "input":
-            values[name] = getattr(operations, layer.kind)(*inputs)
+            values[name] = getattr(operations, layer.kind)(*read)
     return tuple(values[name] for name in network.outputs)
+
+
+class _Draft:
+    """A description in the making."""
+
+    def __init__(self, inputs: int) -> None:
+        self.layers = {FEATURES: Layer("input", (), inputs, 0)}
+
+    def add(self, name: str, kind: Any, *read: str, channels: int = 0, size: int = 0, **more: Any) -> str:
+        """A layer that reads others; its name."""
+        below = self.layers[read[0]]
+        depth = below.depth + {"pool": 1, "enlarge": -1}.get(kind, 0)
+        self.layers[name] = Layer(kind, read, channels or below.channels, depth, size, **more)
+        return name
+
+    def level(self, name: str, widths: Sequence[int], *read: str, first: int = 0, slope: float = NEGATIVE_SLOPE) -> str:
+        """3x3 convolutions, numbered from ``first`` on, each with its rectifier; the name of the last layer."""
+        for index, channels in enumerate(widths, first):
+            convolved = self.add(f"{name}/convolution_{index}", "convolution", *read, channels=channels, size=3)
+            read = (self.add(f"{name}/rectifier_{index}", "rectifier", convolved, slope=slope),)
+        return read[0]
 
 
 def unet(inputs: int, heads: Sequence[int], *, widths: Widths, head_size: Literal[1, 3]) -> Description:
@@ -81,26 +108,44 @@ def unet(inputs: int, heads: Sequence[int], *, widths: Widths, head_size: Litera
     Architecture (Zeng et al. 2021, sec. 4.3 and fig. 6, after Hasselgren et al. 2020): 3x3 convolutions, LeakyReLU, 2x2
     max-pooling down, nearest upsampling and skip concatenation up. The papers give no widths.
     """
-    layers = {FEATURES: Layer("input", (), inputs, 0)}
-
-    def add(name: str, kind: Any, *read: str, channels: int = 0, size: int = 0) -> str:
-        below = layers[read[0]]
-        depth = below.depth + {"pool": 1, "enlarge": -1}.get(kind, 0)
-        layers[name] = Layer(kind, read, channels or below.channels, depth, size)
-        return name
-
-    def level(name: str, widths: Sequence[int], *read: str) -> str:
-        for index, channels in enumerate(widths):
-            convolved = add(f"{name}/convolution_{index}", "convolution", *read, channels=channels, size=3)
-            read = (add(f"{name}/rectifier_{index}", "rectifier", convolved),)
-        return read[0]
-
-    skips = [level("encoder_0", widths[0], FEATURES)]
+    draft = _Draft(inputs)
+    skips = [draft.level("encoder_0", widths[0], FEATURES)]
     for depth in range(1, LEVELS):
-        skips.append(level(f"encoder_{depth}", widths[depth], add(f"pool_{depth}", "pool", skips[-1])))
+        skips.append(draft.level(f"encoder_{depth}", widths[depth], draft.add(f"pool_{depth}", "pool", skips[-1])))
     x = skips.pop()
     for depth in reversed(range(LEVELS - 1)):
-        x = level(f"decoder_{depth}", widths[depth], add(f"enlarge_{depth}", "enlarge", x), skips[depth])
+        x = draft.level(f"decoder_{depth}", widths[depth], draft.add(f"enlarge_{depth}", "enlarge", x), skips[depth])
         if depth < len(heads):
-            add(f"head_{depth}", "convolution", x, channels=heads[depth], size=head_size)
-    return Description(layers, tuple(f"head_{depth}" for depth in range(len(heads))))
+            draft.add(f"head_{depth}", "convolution", x, channels=heads[depth], size=head_size)
+    return Description(draft.layers, tuple(f"head_{depth}" for depth in range(len(heads))))
+
+
+def recurrent_unet(inputs: int, outputs: int, *, widths: Widths) -> Description:
+    """The recurrent autoencoder: a U-Net whose encoder remembers (Chaitanya et al. 2017, sec. 3.2 and fig. 4).
+
+    ``widths``: first the channels of each encoder stage, from full resolution down; then the channels of each decoder
+    level's convolutions, from coarse to full resolution. A stage is a convolution x and a recurrent block: a
+    convolution of x, one of its result and the stage's hidden state together, and one more, whose result is the stage's
+    output and its hidden state in the next frame. The inputs ``hidden_K`` are the states of the stages; outputs are the
+    head "output", then the stages' new states.
+    """
+    draft = _Draft(inputs)
+    stages, decoder = widths[0], widths[1:]
+    states: list[str] = []
+    for depth, channels in enumerate(stages):
+        below = draft.add(f"pool_{depth}", "pool", states[-1]) if depth else FEATURES
+        draft.layers[hidden(depth)] = Layer("input", (), channels, depth)
+        name, slope = f"encoder_{depth}", RECURRENT_SLOPE
+        block = draft.level(name, (channels, channels), below, slope=slope)
+        states.append(draft.level(name, (channels, channels), block, hidden(depth), first=2, slope=slope))
+    x = states[-1]
+    for level, depth in zip(decoder, reversed(range(len(decoder))), strict=True):
+        larger = draft.add(f"enlarge_{depth}", "enlarge", x)
+        x = draft.level(f"decoder_{depth}", level, larger, states[depth], slope=RECURRENT_SLOPE)
+    head = draft.add("output", "convolution", x, channels=outputs, size=3)
+    return Description(draft.layers, (head, *states))
+
+
+def hidden(stage: int) -> str:
+    """The name of the input that is the hidden state of an encoder stage."""
+    return f"hidden_{stage}"

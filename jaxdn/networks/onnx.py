@@ -18,7 +18,7 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
 from jaxdn.extras import install
-from jaxdn.networks.description import FEATURES, NEGATIVE_SLOPE, Description, Weights, evaluate
+from jaxdn.networks.description import FEATURES, Description, Weights, evaluate
 
 OPSET = 17
 BLOCK = 16
@@ -78,8 +78,8 @@ class Graph:
             parts.append(self.node("Conv", *arguments, kernel_shape=[size, size], pads=[size // 2] * 4))
         return functools.reduce(functools.partial(self.node, "Add"), parts)
 
-    def rectifier(self, x: str) -> str:
-        return self.node("LeakyRelu", x, alpha=NEGATIVE_SLOPE)
+    def rectifier(self, x: str, slope: float) -> str:
+        return self.node("LeakyRelu", x, alpha=slope)
 
     def pool(self, x: str) -> str:
         return self.node("MaxPool", x, kernel_shape=[2, 2], strides=[2, 2])
@@ -99,7 +99,7 @@ def model(network: Description, weights: Weights, shape: Sequence[int]) -> bytes
     from onnx import TensorProto, helper
 
     graph = Graph()
-    for name, planes in zip(network.outputs, evaluate(network, weights, FEATURES, graph), strict=True):
+    for name, planes in zip(network.outputs, evaluate(network, weights, {FEATURES: FEATURES}, graph), strict=True):
         graph.node("Transpose", planes, output=name, perm=[0, 2, 3, 1])
     features = helper.make_tensor_value_info(FEATURES, TensorProto.FLOAT, list(shape))
     outputs = [helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in network.outputs]

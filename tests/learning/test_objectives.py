@@ -8,7 +8,7 @@ import pytest
 from jaxdn import losses
 from jaxdn.frame import Clip, Frame
 from jaxdn.methods.table import methods
-from jaxdn.objectives import disocclusions, indirect_illumination, pyramid_illumination
+from jaxdn.objectives import disocclusions, indirect_illumination, pyramid_illumination, recurrent_illumination
 
 SHAPE = (5, 6, 7)
 OBJECTIVE = indirect_illumination()
@@ -131,3 +131,22 @@ def test_every_learned_method_names_its_objective(name):
     for recipe in methods()[name].recipes.values():
         assert recipe.objective.name
         assert recipe.record()["objective"] == recipe.objective.name
+
+
+def test_the_recurrent_objective_weighs_later_frames_more(rng):
+    """Against loops over frames, with the Laplacian of Gaussian of `losses.gradient` (tested for itself)."""
+    shape = (7, 18, 20, 3)
+    images, wanted = (rng.exponential(size=shape).astype(np.float32) for _ in range(2))
+    clip = Clip(Frame(jnp.asarray(images)), jnp.asarray(wanted))
+    error = numpy_compress(images) - numpy_compress(wanted)
+    published = (0.011, 0.044, 0.135, 0.325, 0.607, 0.882, 1.0)
+    for operator in ("hfen", "difference"):
+        total = 0.0
+        for t, weight in enumerate(np.exp(-(np.arange(6, -1, -1) ** 2) / 8)):
+            assert weight == pytest.approx(published[t], abs=6e-4)
+            pair = (jnp.asarray(numpy_compress(each[t : t + 1]), jnp.float32) for each in (images, wanted))
+            change = np.abs(error[t] - error[t - 1]).mean() if t else 0.0
+            structure = float(losses.gradient(*pair, operator=operator))
+            total += weight * (0.8 * np.abs(error[t]).mean() + 0.1 * structure + 0.1 * change) / 7
+        found = recurrent_illumination(operator=operator).loss(jnp.asarray(images), clip, jnp.asarray(0.5))
+        assert float(found) == pytest.approx(total, rel=1e-4)

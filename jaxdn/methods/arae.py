@@ -1,0 +1,62 @@
+"""``arae``: the recurrent autoencoder behind an adaptive temporal accumulation.
+
+``rae`` remembers, but does not follow motion: what moves is as noisy for it as in the first frame. Here each frame is
+first blended into a history that is fetched along motion vectors and shortened where light has changed, exactly as
+``asvgf`` does it; the autoencoder sees this mean in place of the noisy frame.
+
+A lecture names the combination (of Chaitanya et al. 2017 and Schied et al. 2018) without its wiring; that the mean goes
+into the network, and not its image into the mean, is our reading.
+"""
+
+from typing import NamedTuple
+
+import jax
+
+from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.filters.guides import guides_of
+from jaxdn.frame import Frame
+from jaxdn.methods import asvgf, rae, svgf
+from jaxdn.methods.demodulated import demodulated
+from jaxdn.methods.table import method
+
+_ACCUMULATION = asvgf.Options()
+"""How the history is fetched, tested and blended."""
+
+
+class AraeState(NamedTuple):
+    """What is carried from one frame to the next."""
+
+    light: svgf.SvgfState
+    """The mean of the frames so far."""
+    hidden: rae.Hidden
+
+
+@method(
+    rae.Options,
+    title="Recurrent denoising autoencoder behind an adaptive temporal accumulation",
+    presets=rae.PRESETS,
+    recipes=rae.RECIPES,
+    variants={"arae-large": {"size": "large"}, "arae-small": {"size": "small"}},
+    engines=("onednn",),
+)
+def arae(options: rae.Options) -> Denoiser:
+    """The recurrent autoencoder on accumulated light; ``params`` are those of ``rae``.
+
+    Reads what ``rae`` and ``asvgf`` read. Raises ValueError as ``rae`` does.
+    """
+    inner = rae.core_of(options)
+
+    def start(params: Params, frame: Frame) -> AraeState:
+        return AraeState(svgf.start(params, frame), inner.start(params, frame))
+
+    def step(
+        params: Params, state: AraeState, frame: Frame, first: jax.Array
+    ) -> tuple[AraeState, jax.Array, jax.Array]:
+        planes, broken = asvgf.accumulated(_ACCUMULATION, state.light, frame, first)
+        history = planes.transpose(1, 2, 0)
+        light = svgf.SvgfState(history, guides_of(frame))
+        hidden, image, lost = inner.step(params, state.hidden, frame._replace(radiance=history[..., :3]), first)
+        return AraeState(light, hidden), image, broken + lost
+
+    reads = inner.reads | svgf.READS | {"luminance_gradient"}
+    return demodulated(recurrent(Core(start, step, reads, inner.init)), by=options.demodulate)

@@ -1,0 +1,153 @@
+"""``rae``: a recurrent autoencoder that predicts the image itself.
+
+A U-Net sees the noisy light and the surfaces and says what the light is; no kernels, no motion vectors. What it has
+seen before it remembers in hidden states, one in each encoder stage, which stay where they are while the image moves.
+
+Chakravarty R. Alla Chaitanya et al., "Interactive Reconstruction of Monte Carlo Image Sequences using a Recurrent
+Denoising Autoencoder", 2017 ("Chaitanya et al. 2017" here). As in Hasselgren et al. 2020, its images may be followed by
+``taa(after=...)``.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn import color
+from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.filters.guides import depth_feature, hit_mask
+from jaxdn.frame import RADIANCE_MAX, Frame
+from jaxdn.methods.demodulated import Demodulation, demodulated
+from jaxdn.methods.table import method
+from jaxdn.networks import Widths, crop, pad
+from jaxdn.objectives import pyramid_illumination, recurrent_illumination
+from jaxdn.recipe import Recipe
+from jaxdn.scales import fill
+from jaxdn.variation import STILL
+
+LARGE: Widths = ((32, 43, 57, 76, 101, 101), (76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
+"""Channels of the encoder's stages, then of the decoder's convolutions from coarse to fine: 1.95 million weights. The
+paper's figure, as far as it is known; Hasselgren et al. 2020 count 2.6 million."""
+SMALL: Widths = ((16, 22, 28, 38, 50, 50), (38, 38), (28, 28), (22, 22), (16, 16), (32, 16))
+"""Half of these, and a quarter at full resolution, where the most time is spent."""
+
+Hidden = tuple[jax.Array, ...]
+"""The hidden state of each encoder stage, [1, h, w, c]."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Details that the papers leave open; the first choice is the default."""
+
+    size: Literal["large", "small"] | Widths = "large"
+    """The network's widths, by name or as tuples (see :func:`jaxdn.networks.description.recurrent_unet`)."""
+    guides: Literal["geometry", "materials"] = "geometry"
+    """What the network sees besides light: normal, depth and roughness, as in the paper; or the albedo too, as in
+    Hasselgren et al. 2020."""
+    background: Literal["pass", "filter"] = "pass"
+    """Pixels without a surface (depth at ``FAR``) keep their radiance; or they are predicted as all others."""
+    exposure: Literal["measured", "given"] = "measured"
+    """The network sees radiance times :func:`jaxdn.color.exposure` of each frame, so that twice the light gives twice
+    the image where nothing is remembered; or radiance as it is given."""
+    demodulate: Demodulation | bool = "brdf"
+    """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
+    implementation: Literal["reference", "onednn"] | None = None
+    """Engine of the network: XLA, or on CPUs oneDNN (training; the extra ``onednn``). None is XLA."""
+
+
+PRESETS = {
+    "paper": Options(background="filter", exposure="given", demodulate="albedo"),
+    "hasselgren": Options(guides="materials", background="filter", exposure="given", demodulate="none"),
+}
+"""The settings of Chaitanya et al. 2017, and those of the comparison in Hasselgren et al. 2020."""
+RECIPES = {
+    "usual": Recipe(pyramid_illumination(), frames=7),
+    "paper": Recipe(recurrent_illumination(), crop=128, frames=7, decay=False, variation=STILL, average=0.0),
+}
+
+
+@method(
+    Options,
+    title="Recurrent denoising autoencoder (Chaitanya et al. 2017)",
+    presets=PRESETS,
+    recipes=RECIPES,
+    variants={"rae-large": {"size": "large"}, "rae-small": {"size": "small"}},
+    engines=("onednn",),
+)
+def rae(options: Options) -> Denoiser:
+    """The recurrent autoencoder.
+
+    Light is compressed (:func:`jaxdn.color.compress`) before the network sees it, and the network predicts compressed
+    light. Normals are in world space, where the paper has them in the camera's: training turns them. Reads albedo,
+    reflectance, normal, depth and roughness; an absent buffer is neutral. Raises ValueError for an unknown option, and
+    ``step`` for a frame of the wrong shape or of another size than the first, never for its contents.
+    """
+    return demodulated(recurrent(core_of(options)), by=options.demodulate)
+
+
+def core_of(options: Options) -> Core:
+    """The method without division and shared processing; its state is :data:`Hidden`."""
+    # Flax is imported only when a network is built: filters without weights need only jax and numpy.
+    from jaxdn.networks.recurrent import recurrent_unet
+
+    materials = options.guides == "materials"
+    widths = {"large": LARGE, "small": SMALL}[options.size] if isinstance(options.size, str) else options.size
+    groups = (3, 3, 1, 1, *([3] if materials else []))
+    network = recurrent_unet(groups, 3, widths=widths, implementation=options.implementation)
+    multiple = max(4, 2 ** (len(widths[0]) - 1))  # 4: what `fill` works on
+
+    def init(key: jax.Array, frame: Frame) -> Params:
+        params = network.init(key)
+        # A middle grey: below 0 the image is black and nothing is learnt.
+        return {**params, "output": {**params["output"], "bias": color.compress(jnp.full((3,), 0.18, jnp.float32))}}
+
+    def start(params: Params, frame: Frame) -> Hidden:
+        height, width = (size + -size % multiple for size in frame.radiance.shape[:2])
+        return network.start(1, height, width, frame.radiance.dtype)
+
+    def step(params: Params, state: Hidden, frame: Frame, first: jax.Array) -> tuple[Hidden, jax.Array, jax.Array]:
+        size = frame.radiance.shape[:2]
+        # Divided by a small albedo it may be beyond what the network has ever seen.
+        noisy = pad(jnp.minimum(frame.radiance, RADIANCE_MAX), multiple)
+        _check_size(state, noisy, size)
+        hit = hit_mask(frame.depth, None) if options.background == "pass" else None
+        if hit is not None:
+            noisy = fill(noisy, pad(hit[..., None], multiple))
+        gain = color.exposure(noisy) if options.exposure == "measured" else 1.0
+        seen = [
+            color.compress(gain * noisy),
+            frame.normal,
+            None if frame.depth is None else depth_feature(frame.depth),
+            None if frame.roughness is None else frame.roughness - 1.0,
+        ]
+        if materials:
+            seen.append(None if frame.albedo is None else frame.albedo - 1.0)
+        features = [None if group is None else pad(group, multiple)[None] for group in seen]
+        remembered, broken = _sound(state)
+        output, kept = network.apply(params, features, remembered)
+        image = jnp.clip(crop(color.expand(output[0]) / gain, size), 0.0, RADIANCE_MAX)
+        if hit is not None:
+            image = jnp.where(hit[..., None], image, frame.radiance)
+        return kept, image, broken
+
+    guides = {"normal", "depth", "roughness"} | ({"albedo"} if materials else set())
+    return Core(start, step, frozenset(guides), init)
+
+
+def _check_size(state: Hidden, noisy: jax.Array, size: tuple[int, ...]) -> None:
+    if state[0].shape[1:3] != noisy.shape[:2]:
+        raise ValueError(
+            f"frame: expected the size of the first frame, got {size[0]} x {size[1]}, whose hidden state would have "
+            f"{noisy.shape[:2]} pixels and not {state[0].shape[1:3]}; start again for frames of another size."
+        )
+
+
+def _sound(states: Hidden) -> tuple[Hidden, jax.Array]:
+    """The hidden states without values that would stay for ever, and how many of these there were.
+
+    Rectifiers have no upper end, so nothing but training keeps a state small.
+    """
+    bounded = tuple(jnp.clip(jnp.nan_to_num(state), -RADIANCE_MAX, RADIANCE_MAX) for state in states)
+    changed = [jnp.sum(one != other, dtype=jnp.int32) for one, other in zip(states, bounded, strict=True)]
+    return bounded, sum(changed, start=jnp.zeros((), jnp.int32))
