@@ -35,10 +35,11 @@ class Denoiser(NamedTuple):
     step: Step
     reads: frozenset[str]
     """Names of the Frame buffers, in addition to ``radiance``, that it can use."""
-    samples: Callable[[Params, State, Frame], jax.Array] | None = None
-    """(params, state, frame) -> [H, W, 1] samples per pixel that it requests from the renderer before ``step`` (rounded
-    to whole numbers). Here the frame's radiance is what has been rendered before; in ``step`` it is the mean of the
-    requested samples, with ``sample_count``. None: no request, the radiance is used as it is."""
+    samples: Callable[[Params, State, Frame, int], jax.Array] | None = None
+    """(params, state, frame, most) -> [H, W, 1] samples per pixel that it requests from the renderer before ``step``
+    (rounded to whole numbers); a pixel can have ``most``. Here the frame's radiance is what has been rendered before;
+    in ``step`` it is the mean of the requested samples, with ``sample_count``. None: no request, the radiance is used
+    as it is."""
 
 
 class Core(NamedTuple):
@@ -51,7 +52,8 @@ class Core(NamedTuple):
     ``first`` is a bool scalar: there is no history yet, regardless of state and motion."""
     reads: frozenset[str]
     init: Callable[[jax.Array, Frame], Params] = lambda key, frame: {}
-    samples: Callable[[Params, State, Frame], jax.Array] | None = None
+    samples: Callable[[Params, State, Frame, jax.Array, int], jax.Array] | None = None
+    """(params, state, frame, first, most) -> [H, W, 1]."""
 
 
 class Recurrent(NamedTuple):
@@ -91,8 +93,8 @@ def recurrent(core: Core) -> Denoiser:
     if core.samples is not None:
         core_samples = core.samples
 
-        def samples(params: Params, state: Recurrent, frame: Frame) -> jax.Array:
-            return core_samples(params, state.core, repair(checked(frame, core.reads))[0])
+        def samples(params: Params, state: Recurrent, frame: Frame, most: int) -> jax.Array:
+            return core_samples(params, state.core, repair(checked(frame, core.reads))[0], state.age == 0, most)
 
     return Denoiser(core.init, start, RecurrentStep(core), core.reads, samples)
 

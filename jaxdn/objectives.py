@@ -112,6 +112,28 @@ def recurrent_illumination(*, operator: str = "hfen") -> Objective:
     return Objective(f"recurrent illumination, {operator}", loss)
 
 
+def compressed_illumination() -> Objective:
+    """``spatial`` of every frame on compressed radiance: for methods without a history."""
+
+    def loss(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:
+        return losses.spatial(color.compress(images), color.compress(clip.reference))
+
+    return Objective("compressed illumination", loss)
+
+
+def last_frames() -> Objective:
+    """``spatial`` of the last frame ``+ temporal`` of the last two, on compressed radiance.
+
+    Hasselgren et al. 2020, eq. 4. The frames before have a gradient only by what they leave behind.
+    """
+
+    def loss(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:
+        denoised, wanted = color.compress(images[-2:]), color.compress(clip.reference[-2:])
+        return losses.spatial(denoised[-1:], wanted[-1:]) + losses.temporal(denoised, wanted)
+
+    return Objective("last frames", loss)
+
+
 _SQUARES = 8.0
 """The gradient of squares is then that of absolute values at an error of 1/16."""
 

@@ -17,10 +17,12 @@ Layers = Mapping[int, Any] | None
 """Samples per pixel -> independent noisy radiance; see :class:`jaxdn.Clip`."""
 
 
-def sampled(denoiser: Denoiser, params: Params, state: State, frame: Frame, layers: Layers) -> Frame:
+def sampled(
+    denoiser: Denoiser, params: Params, state: State, frame: Frame, layers: Layers, reference: jax.Array | None = None
+) -> Frame:
     """The frame with the samples that the denoiser requests, taken from stored layers; unchanged without a request.
 
-    Raises ValueError for a request without layers.
+    Raises ValueError for a request without layers, and for one that they cannot fulfil.
 
     Args:
       denoiser: what requests samples.
@@ -28,17 +30,25 @@ def sampled(denoiser: Denoiser, params: Params, state: State, frame: Frame, laye
       state: before this frame.
       frame: [H, W, C], with the radiance rendered before.
       layers: samples per pixel -> independent radiance [H, W, 3].
+      reference: [H, W, 3], for a gradient of the image with respect to the numbers of samples.
     """
     if denoiser.samples is None:
         return only(frame, denoiser.reads)
     if layers is None:
         raise ValueError("layers: expected independent noisy layers, as this denoiser requests samples, got None.")
-    radiance, counts = from_layers(layers, denoiser.samples(params, state, only(frame, denoiser.reads)))
+    wanted = denoiser.samples(params, state, only(frame, denoiser.reads), sum(layers))
+    radiance, counts = from_layers(layers, wanted, reference=reference)
     return only(frame._replace(radiance=radiance, sample_count=counts), denoiser.reads)
 
 
 def unroll(
-    denoiser: Denoiser, params: Params, frames: Frame, layers: Layers = None, *, rematerialize: bool = False
+    denoiser: Denoiser,
+    params: Params,
+    frames: Frame,
+    layers: Layers = None,
+    reference: jax.Array | None = None,
+    *,
+    rematerialize: bool = False,
 ) -> jax.Array:
     """Denoise consecutive frames with one recurrent state; returns images ``[T, H, W, 3]``.
 
@@ -49,18 +59,19 @@ def unroll(
       params: its parameters.
       frames: a Frame of buffers ``[T, H, W, C]``.
       layers: samples per pixel -> ``[T, H, W, 3]``, for a denoiser that requests samples.
+      reference: ``[T, H, W, 3]``, with which such a denoiser learns where samples should go.
       rematerialize: recompute each step from its carried state in the backward pass, so that memory grows by one
         frame's state per frame instead of one network's activations (about a quarter of the memory for 1.1 to 1.4
         times the time; Chen et al. 2016, "Training Deep Nets with Sublinear Memory Cost").
     """
     frames = only(frames, denoiser.reads)
-    layers = layers if denoiser.samples is not None else None
+    layers, reference = (layers, reference) if denoiser.samples is not None else (None, None)
 
-    def step(state: State, given: tuple[Frame, Layers]) -> tuple[State, jax.Array]:
+    def step(state: State, given: tuple[Frame, Layers, jax.Array | None]) -> tuple[State, jax.Array]:
         return denoiser.step(params, state, sampled(denoiser, params, state, *given))
 
     body = jax.checkpoint(step, prevent_cse=False) if rematerialize else step
-    _, images = lax.scan(body, denoiser.start(params, frame_at(frames, 0)), (frames, layers))
+    _, images = lax.scan(body, denoiser.start(params, frame_at(frames, 0)), (frames, layers, reference))
     return images
 
 

@@ -75,7 +75,7 @@ def clip_loss(
       rematerialize: recompute each step in the backward pass, see :func:`jaxdn.rollout.unroll`.
     """
     clip = clip._replace(reference=repair_image(clip.reference))
-    images = unroll(denoiser, params, clip.frames, clip.layers, rematerialize=rematerialize)
+    images = unroll(denoiser, params, clip.frames, clip.layers, clip.reference, rematerialize=rematerialize)
     loss = objective.loss(images, clip, jnp.asarray(progress))
     last = jax.lax.stop_gradient(images[-1])
     return loss, metrics.psnr(color.tonemap(last), color.tonemap(clip.reference[-1]))

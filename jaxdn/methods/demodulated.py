@@ -48,9 +48,9 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "brdf") -> Deno
         state, image, lost = core.step(params, state, frame, first)
         return state, image if divisor is None else image * divisor, lost
 
-    def samples(params: Params, state: State, frame: Frame) -> jax.Array:
+    def samples(params: Params, state: State, frame: Frame, first: jax.Array, most: int) -> jax.Array:
         assert core.samples is not None
-        return core.samples(params, state, _divided(frame, by)[0])
+        return core.samples(params, state, _divided(frame, by)[0], first, most)
 
     requests = None if core.samples is None else samples
     reads = {"albedo", "reflectance"} if by == "brdf" else {"albedo"}

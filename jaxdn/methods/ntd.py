@@ -12,8 +12,9 @@ Yan Zeng, Lu Wang, Yanning Xu, Xiangxu Meng, "Neural Temporal Denoising for Indi
 Information", 2021.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -160,10 +161,13 @@ def _guides(options: Options, frame: Frame) -> dict[str, jax.Array | None]:
     return {name: None if guide is None else pad(guide) for name, guide in guides.items()}
 
 
-def _recall(
+def warped_history(
     options: Options, state: jax.Array, frame: Frame, first: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The warped history, where it is missing (bool [H, W, 1]), and how many of its values were invalid."""
+    """The history [H, W, 3] along the motion vectors, and the noisy frame where there is none.
+
+    Also where it is missing (bool [H, W, 1]), and how many of its values were invalid.
+    """
     noisy = frame.radiance
     absent = first if options.first_frame == "none" else jnp.zeros_like(first)
     absent = jnp.broadcast_to(absent, (*noisy.shape[:2], 1))
@@ -253,9 +257,31 @@ def ntd(options: Options) -> Denoiser:
     The paper trains with Adam at a constant 1e-4 for 200 epochs of 142 clips (the recipe "parity"). Raises ValueError
     for an unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
     """
+    return demodulated(recurrent(core_of(options)), by=options.demodulate)
+
+
+class More(NamedTuple):
+    """Features that a method gives the network in addition."""
+
+    groups: tuple[int, ...] = ()
+    """Their channel counts."""
+    of: Callable[[Frame], list[jax.Array | None]] = lambda frame: []
+    """frame -> one [H, W, c] for each, or None."""
+    reads: frozenset[str] = frozenset()
+    """Buffers that they are made of."""
+
+
+NO_MORE = More()
+
+
+def core_of(options: Options, more: More = NO_MORE) -> Core:
+    """The method without division and shared processing; its state is the last image [H, W, 3].
+
+    Where ``sample_count`` is among the buffers read, pixels without samples are filled from their neighbours.
+    """
     flagged, materials = options.missing_history == "current", options.guides == "materials"
     # What is optional comes last: weights trained without it can be continued with it.
-    groups = (3, 3, 3, 1, 3, *([1] if flagged else []), *([3, 1] if materials else []))
+    groups = (3, 3, 3, 1, 3, *([1] if flagged else []), *([3, 1] if materials else []), *more.groups)
     # full: two kernels and alpha^t; half, quarter: one kernel each. Each of the two blends has one alpha, at its finer
     # or coarser scale.
     fine = options.alpha_at == "fine"
@@ -270,6 +296,7 @@ def ntd(options: Options) -> Denoiser:
     reads = frozenset({"albedo", "normal", "depth", "motion"})
     reads |= {"dual_motion"} if options.motion == "dual" else set()
     reads |= {"reflectance", "roughness"} if materials else set()
+    reads |= more.reads
 
     guided = options.kernels == "guided"
 
@@ -295,12 +322,14 @@ def ntd(options: Options) -> Denoiser:
         size = frame.radiance.shape[:2]
         # Divided by a small albedo it may be beyond what the network has ever seen.
         frame = frame._replace(radiance=jnp.minimum(frame.radiance, RADIANCE_MAX))
-        recalled, absent, broken = _recall(options, state, frame, first)
+        recalled, absent, broken = warped_history(options, state, frame, first)
         seen = _guides(options, frame)
         noisy, recalled, absent = (pad(image) for image in (frame.radiance, recalled, absent))
         hit = hit_mask(frame.depth, None) if options.background == "pass" else None
         if hit is not None:
             noisy, recalled = (fill(image, pad(hit[..., None])) for image in (noisy, recalled))
+        if frame.sample_count is not None:
+            noisy = fill(noisy, pad(frame.sample_count > 0))
         gain = color.exposure(noisy) if options.exposure == "measured" else 1.0
         squeezed, squeezed_history = color.compress(gain * noisy), color.compress(gain * recalled)
         features = [squeezed, seen["albedo"], seen["normal"], seen["depth"], squeezed_history]
@@ -308,6 +337,7 @@ def ntd(options: Options) -> Denoiser:
             features.append(absent.astype(noisy.dtype))
         if materials:
             features += [seen["reflectance"], seen["roughness"]]
+        features += [None if extra is None else pad(extra) for extra in more.of(frame)]
         predicted = predict(params, features, noisy.dtype)
         guiding = guided_features(params["guide"] if guided else {}, seen)
 
@@ -320,5 +350,4 @@ def ntd(options: Options) -> Denoiser:
         shown = image if hit is None else jnp.where(hit[..., None], image, frame.radiance)
         return image, shown, broken
 
-    plain = recurrent(Core(start, step, reads, init))
-    return demodulated(plain, by=options.demodulate)
+    return Core(start, step, reads, init)

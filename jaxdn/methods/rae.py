@@ -14,16 +14,15 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from jaxdn import color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.filters.guides import depth_feature, hit_mask
+from jaxdn.filters.guides import depth_feature
 from jaxdn.frame import RADIANCE_MAX, Frame
+from jaxdn.methods import direct
 from jaxdn.methods.demodulated import Demodulation, demodulated
 from jaxdn.methods.table import method
-from jaxdn.networks import Widths, crop, pad
+from jaxdn.networks import Widths, pad
 from jaxdn.objectives import pyramid_illumination, recurrent_illumination
 from jaxdn.recipe import Recipe
-from jaxdn.scales import fill
 from jaxdn.variation import STILL
 
 LARGE: Widths = ((32, 43, 57, 76, 101, 101), (76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
@@ -95,41 +94,29 @@ def core_of(options: Options) -> Core:
     widths = {"large": LARGE, "small": SMALL}[options.size] if isinstance(options.size, str) else options.size
     groups = (3, 3, 1, 1, *([3] if materials else []))
     network = recurrent_unet(groups, 3, widths=widths, implementation=options.implementation)
-    multiple = max(4, 2 ** (len(widths[0]) - 1))  # 4: what `fill` works on
+    multiple = max(4, 2 ** (len(widths[0]) - 1))
 
     def init(key: jax.Array, frame: Frame) -> Params:
-        params = network.init(key)
-        # A middle grey: below 0 the image is black and nothing is learnt.
-        return {**params, "output": {**params["output"], "bias": color.compress(jnp.full((3,), 0.18, jnp.float32))}}
+        return direct.beginning_grey(network.init(key), "output")
 
     def start(params: Params, frame: Frame) -> Hidden:
         height, width = (size + -size % multiple for size in frame.radiance.shape[:2])
         return network.start(1, height, width, frame.radiance.dtype)
 
     def step(params: Params, state: Hidden, frame: Frame, first: jax.Array) -> tuple[Hidden, jax.Array, jax.Array]:
-        size = frame.radiance.shape[:2]
-        # Divided by a small albedo it may be beyond what the network has ever seen.
-        noisy = pad(jnp.minimum(frame.radiance, RADIANCE_MAX), multiple)
-        _check_size(state, noisy, size)
-        hit = hit_mask(frame.depth, None) if options.background == "pass" else None
-        if hit is not None:
-            noisy = fill(noisy, pad(hit[..., None], multiple))
-        gain = color.exposure(noisy) if options.exposure == "measured" else 1.0
-        seen = [
-            color.compress(gain * noisy),
+        light = direct.seen(frame, background=options.background, exposure=options.exposure, multiple=multiple)
+        _check_size(state, light.compressed, frame.radiance.shape[:2])
+        surfaces = [
             frame.normal,
             None if frame.depth is None else depth_feature(frame.depth),
             None if frame.roughness is None else frame.roughness - 1.0,
         ]
         if materials:
-            seen.append(None if frame.albedo is None else frame.albedo - 1.0)
-        features = [None if group is None else pad(group, multiple)[None] for group in seen]
+            surfaces.append(None if frame.albedo is None else frame.albedo - 1.0)
+        padded = [None if group is None else pad(group, multiple)[None] for group in surfaces]
         remembered, broken = _sound(state)
-        output, kept = network.apply(params, features, remembered)
-        image = jnp.clip(crop(color.expand(output[0]) / gain, size), 0.0, RADIANCE_MAX)
-        if hit is not None:
-            image = jnp.where(hit[..., None], image, frame.radiance)
-        return kept, image, broken
+        output, kept = network.apply(params, [light.compressed[None], *padded], remembered)
+        return kept, direct.image_of(output[0], light, frame), broken
 
     guides = {"normal", "depth", "roughness"} | ({"albedo"} if materials else set())
     return Core(start, step, frozenset(guides), init)

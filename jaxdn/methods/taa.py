@@ -100,8 +100,8 @@ def taa(options: Options) -> Denoiser:
     if before.samples is not None:
         ask = before.samples
 
-        def samples(params: Params, state: TaaState, frame: Frame) -> jax.Array:
-            return ask(params, state.after, frame)
+        def samples(params: Params, state: TaaState, frame: Frame, first: jax.Array, most: int) -> jax.Array:
+            return ask(params, state.after, frame, first, most)
 
     return recurrent(Core(start, step, before.reads | READS, before.init, samples))
 

@@ -1,11 +1,13 @@
-"""Images with any number of samples per pixel from layers of 1, 2, 4, ... samples."""
+"""Maps of samples that keep a budget, and images with any number of samples from layers of 1, 2, 4, ... samples."""
 
+import hypothesis
+import hypothesis.strategies as st
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.sampling import from_layers
+from jaxdn.sampling import from_layers, sample_map
 
 SIZE = (4, 5)
 
@@ -110,3 +112,95 @@ def test_the_mean_over_many_noise_realisations_is_the_noise_free_image():
         image, _ = from_layers(layers, jnp.full((*shape[:2], 1), float(count)))
         assert abs(float(np.mean(image)) - 1) < 0.015
         np.testing.assert_allclose(np.var(image), 1 / count, rtol=0.03)
+
+
+def test_a_further_sample_moves_the_image_towards_the_reference(rng):
+    """Against the mean of s samples and one without noise, in float64; half of the counts are clamped to 1."""
+    layers = single(drawn(rng, 3))
+    reference, weights = (jnp.asarray(rng.normal(size=(*SIZE, 3)), jnp.float32) for _ in range(2))
+    counts = jnp.asarray(rng.integers(0, 8, (*SIZE, 1)), jnp.float32)
+
+    def total(counts, reference):
+        return jnp.sum(weights * from_layers(layers, counts, reference=reference)[0])
+
+    by_count, by_reference = jax.grad(total, (0, 1))(counts, reference)
+    image = numpy_from_layers(layers, counts)
+    wanted = (weights * (reference - image)).sum(-1, keepdims=True) / np.maximum(counts, 1)
+    np.testing.assert_allclose(by_count, wanted, rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(by_reference, 0)
+    np.testing.assert_allclose(from_layers(layers, counts, reference=reference)[0], image, rtol=1e-6)
+
+
+def test_no_samples_have_a_slope_where_the_reference_is_lit_and_none_where_it_is_black():
+    layers = {1: jnp.zeros((2, 2, 3))}
+    reference = jnp.zeros((2, 2, 3)).at[0].set(2.0)
+    slope = jax.grad(lambda counts: jnp.sum(from_layers(layers, counts, reference=reference)[0]))(jnp.zeros((2, 2, 1)))
+    np.testing.assert_allclose(slope[..., 0], [[6.0, 6.0], [0.0, 0.0]])
+
+
+def test_even_logits_give_every_pixel_the_budget():
+    for value in (0.0, -50.0, 1e30):
+        np.testing.assert_array_equal(sample_map(jnp.full((7, 9, 1), value), 4, most=63), 4)
+
+
+@hypothesis.given(
+    st.integers(0, 2**32 - 1), st.floats(0.3, 6), st.sampled_from([0.0, 1.0, 30.0, 1e4]), st.sampled_from([0, 1])
+)
+def test_the_budget_is_kept_exactly(seed, budget, spread, least):
+    budget = max(budget, least)
+    logits = spread * np.random.default_rng(seed).normal(size=(11, 13, 1)).astype(np.float32)
+    counts = np.asarray(jax.jit(lambda logits: sample_map(logits, budget, least=least, most=7))(logits))
+    assert counts.sum() == round(143 * budget)
+    assert counts.min() >= least
+    assert counts.max() <= 7
+    np.testing.assert_array_equal(counts, np.round(counts))
+    inside = (counts > least) & (counts < 7)
+    more = np.argsort(logits[inside])
+    assert np.all(np.diff(counts[inside][more]) >= -1)  # in the order of the logits, but for rounding
+
+
+def test_a_whole_frame_keeps_the_budget_exactly(rng):
+    """Whose sum float32 no longer counts one by one."""
+    logits = jnp.asarray(2 * rng.normal(size=(1080, 1920, 1)), jnp.float32)
+    counts = np.asarray(sample_map(logits, 16, most=63), np.float64)
+    assert counts.sum() == 16 * 1080 * 1920
+
+
+def test_numbers_are_the_largest_remainders(rng):
+    logits = rng.normal(size=(5, 6, 1))
+    shares = 30 * 2.5 * np.exp(logits) / np.exp(logits).sum()
+    assert shares.max() < 63
+    wanted = np.floor(shares)
+    largest = np.argsort(-(shares - wanted).ravel())[: 75 - int(wanted.sum())]
+    wanted.ravel()[largest] += 1
+    np.testing.assert_array_equal(sample_map(jnp.asarray(logits, jnp.float32), 2.5, most=63), wanted)
+    paper = sample_map(jnp.asarray(logits, jnp.float32), 2.5, most=63, rounding="nearest")
+    np.testing.assert_array_equal(paper, np.round(shares))
+
+
+def test_one_huge_logit_takes_what_a_pixel_can_have_and_a_nan_counts_as_zero():
+    logits = jnp.zeros((4, 5, 1)).at[1, 2].set(1e6)
+    counts = sample_map(logits, 4, most=63)
+    assert counts[1, 2, 0] == 63
+    assert jnp.sum(counts) == 80
+    assert sample_map(logits, 4, most=63, rounding="nearest")[1, 2, 0] == 63
+    bad = jnp.zeros((4, 5, 1)).at[0, 0].set(jnp.nan).at[3, 3].set(jnp.inf)
+    np.testing.assert_array_equal(sample_map(bad, 4, most=63), 4)
+
+
+def test_the_gradient_is_that_of_the_softmax_and_sums_to_zero(rng):
+    with jax.enable_x64(True):
+        logits, weights = (jnp.asarray(rng.normal(size=(4, 5, 1))) for _ in range(2))
+        slope = jax.grad(lambda logits: jnp.sum(weights * sample_map(logits, 4, most=63)))(logits)
+        smooth = jax.grad(lambda logits: jnp.sum(weights * 80 * jax.nn.softmax(logits.ravel()).reshape(4, 5, 1)))
+        np.testing.assert_allclose(slope, smooth(logits), rtol=1e-6)
+        assert abs(float(jnp.sum(slope))) < 1e-9
+        clamped = logits.at[0, 0].set(10.0)
+        steep = jax.grad(lambda logits: sample_map(logits, 4, most=20)[0, 0, 0])(clamped)
+        np.testing.assert_array_equal(steep, 0)
+
+
+@pytest.mark.parametrize("budget", [0, -1, 8, 0.5, float("nan")])
+def test_a_budget_that_no_map_can_keep_raises(budget):
+    with pytest.raises(ValueError, match=r"budget: expected a mean number of samples above 0 from 1 to 7"):
+        sample_map(jnp.zeros((4, 4, 1)), budget, least=1, most=7)

@@ -130,12 +130,12 @@ WRONG = {
 def test_shapes_that_do_not_fit_raise(wrong, wrap, rng):
     spoil, told = WRONG[wrong]
     frame = frame_of(rng, depth=jnp.ones((*SIZE, 1)), albedo=jnp.ones((*SIZE, 3)))
-    denoiser = wrap(recurrent(identity(reads={"depth"}, samples=lambda params, state, frame: frame.depth)))
+    denoiser = wrap(recurrent(identity(reads={"depth"}, samples=lambda params, state, frame, first, most: frame.depth)))
     state = denoiser.start({}, frame)
     for function in (
         lambda given: denoiser.start({}, given),
         lambda given: denoiser.step({}, state, given),
-        lambda given: denoiser.samples({}, state, given),
+        lambda given: denoiser.samples({}, state, given, 7),
     ):
         with pytest.raises(ValueError, match=told):
             function(spoil(frame))
@@ -284,7 +284,7 @@ def test_a_denoiser_not_made_by_recurrent_is_refused():
 def adaptive(wrap=lambda denoiser: denoiser):
     """Requests more samples where the radiance rendered before is brighter, up to a learned number."""
 
-    def samples(params, state, frame):
+    def samples(params, state, frame, first, most):
         return params["most"] * frame.radiance[..., :1] / (1 + frame.radiance[..., :1])
 
     def step(params, state, frame, first):
@@ -350,7 +350,9 @@ def test_the_step_gets_the_actual_number_of_samples(rng):
         jax.debug.callback(lambda counts: told.append(np.array(counts)), frame.sample_count)
         return state, frame.radiance, 0
 
-    core = core_of(step, reads={"sample_count"}, samples=lambda params, state, frame: 100.0 * frame.radiance[..., :1])
+    core = core_of(
+        step, reads={"sample_count"}, samples=lambda params, state, frame, first, most: 100.0 * frame.radiance[..., :1]
+    )
     clip = layered(rng, count=1)
     one = stream(recurrent(core), {})
     layers = {samples: layer[0] for samples, layer in clip.layers.items()}

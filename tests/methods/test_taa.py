@@ -280,7 +280,7 @@ def test_after_a_denoiser_its_parameters_samples_and_repairs_stay_its_own(rng):
         step,
         frozenset({"albedo"}),
         lambda key, frame: {"gain": jnp.float32(3.0)},
-        lambda params, state, frame: 4 * jnp.ones_like(frame.radiance[..., :1]) + state,
+        lambda params, state, frame, first, most: 4 * jnp.ones_like(frame.radiance[..., :1]) + state,
     )
     frame = Frame(rng.random((4, 5, 3)).astype(np.float32))
     frame = frame._replace(radiance=np.where(np.arange(5)[:, None] == 2, np.nan, frame.radiance))
@@ -289,7 +289,7 @@ def test_after_a_denoiser_its_parameters_samples_and_repairs_stay_its_own(rng):
     assert denoiser.samples is not None
     state, images = run(denoiser, [frame] * 2, params)
     np.testing.assert_allclose(images[-1], 3 * np.nan_to_num(frame.radiance), rtol=1e-5, atol=1e-6)
-    np.testing.assert_array_equal(denoiser.samples(params, state, frame), 6)
+    np.testing.assert_array_equal(denoiser.samples(params, state, frame, 7), 6)
     # Two frames: 12 values of each, and two that the denoiser before has lost in each.
     assert int(state.repaired) == 2 * 12 + 2 * 2
 

@@ -1,0 +1,114 @@
+"""``dasr``: deep adaptive sampling, without a history.
+
+Each frame is rendered with one sample everywhere; a network that sees it says where further samples go, and a second
+one predicts the image from all of them. Both are trained together, through the renderer.
+
+Alexandr Kuznetsov, Nima Khademi Kalantari, Ravi Ramamoorthi, "Deep Adaptive Sampling for Low Sample Count Rendering",
+2018. As in the comparison of Hasselgren et al. 2020, the network is that of the other methods, and there is no buffer
+of visibility.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.filters.guides import depth_feature
+from jaxdn.frame import Frame
+from jaxdn.methods import direct
+from jaxdn.methods.demodulated import Demodulation, demodulated
+from jaxdn.methods.sampler import Sampling, mapped, sampler
+from jaxdn.methods.table import method
+from jaxdn.networks import LARGE, MULTIPLE, SMALL, Widths, pad
+from jaxdn.objectives import compressed_illumination, pyramid_illumination
+from jaxdn.recipe import Recipe
+from jaxdn.variation import STILL
+
+
+@dataclass(frozen=True)
+class Options(Sampling):
+    """Details that the papers leave open; the first choice is the default."""
+
+    size: Literal["large", "small"] | Widths = "large"
+    """The U-Nets' widths, by name or as tuples (see :func:`jaxdn.networks.unet.unet`)."""
+    background: Literal["pass", "filter"] = "pass"
+    """Pixels without a surface (depth at ``FAR``) keep their radiance; or they are predicted as all others."""
+    exposure: Literal["measured", "given"] = "measured"
+    """The networks see radiance times :func:`jaxdn.color.exposure` of each frame; or radiance as it is given."""
+    demodulate: Demodulation | bool = "brdf"
+    """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
+    implementation: Literal["reference", "onnxruntime", "onednn"] | None = None
+    """Engine of the U-Nets: XLA, or on CPUs ONNX Runtime (inference) or oneDNN (training). None is XLA."""
+
+    def __post_init__(self) -> None:
+        if self.least < 1:
+            raise ValueError(f"least: expected at least 1, the sample that is rendered first, got {self.least}.")
+
+
+@method(
+    Options,
+    title="Deep adaptive sampling and reconstruction (Kuznetsov et al. 2018)",
+    presets={"paper": Options(background="filter", exposure="given", rounding="nearest", demodulate="none")},
+    recipes={
+        "usual": Recipe(pyramid_illumination()),
+        "paper": Recipe(compressed_illumination(), frames=1, decay=False, variation=STILL, average=0.0),
+    },
+    variants={"dasr-large": {"size": "large"}, "dasr-small": {"size": "small"}},
+    engines=("onnxruntime", "onednn"),
+)
+def dasr(options: Options) -> Denoiser:
+    """Adaptive sampling of single frames; it requests samples, from stored layers of 1, 2, 4, ... or from the renderer.
+
+    ``budget`` counts the sample that is rendered first; a frame's radiance before the request is that sample.
+    ``params`` has the two networks, "sampler" (absent with ``adaptive=False``) and "predictor". Reads albedo, normal,
+    depth and sample_count. Raises ValueError for options out of range and for a budget that the layers cannot give, and
+    ``step`` for a frame of the wrong shape, never for its contents.
+    """
+    from jaxdn.networks.unet import unet
+
+    widths = {"large": LARGE, "small": SMALL}[options.size] if isinstance(options.size, str) else options.size
+    built: dict[str, Any] = {"implementation": options.implementation}
+    surfaces = (3, 3, 1)
+    network = sampler(options, (3, *surfaces), size=options.size, **built)
+    predictor = unet((3, *surfaces, 1), (3,), widths=widths, **built)
+
+    def seen(frame: Frame) -> direct.Light:
+        return direct.seen(frame, background=options.background, exposure=options.exposure, multiple=MULTIPLE)
+
+    def init(key: jax.Array, frame: Frame) -> Params:
+        first, second = jax.random.split(key)
+        params = {"predictor": direct.beginning_grey(predictor.init(first), "head_0")}
+        return {**params, "sampler": network.init(second)} if options.adaptive else params
+
+    def start(params: Params, frame: Frame) -> tuple[()]:
+        return ()
+
+    def step(params: Params, state: tuple[()], frame: Frame, first: jax.Array) -> tuple[tuple[()], jax.Array, int]:
+        light = seen(frame)
+        count = None if frame.sample_count is None else 1.0 / (1.0 + frame.sample_count)
+        groups = [light.compressed, *(None if group is None else pad(group) for group in (*_surfaces(frame), count))]
+        features = [None if group is None else group[None] for group in groups]
+        output = predictor.apply(params["predictor"], features)[0][0]
+        return (), direct.image_of(output, light, frame), 0
+
+    def samples(params: Params, state: tuple[()], frame: Frame, first: jax.Array, most: int) -> jax.Array:
+        even = jnp.zeros_like(frame.radiance[..., :1])
+        if not options.adaptive:
+            return mapped(options, even, most)
+        compressed = seen(frame).compressed[: even.shape[0], : even.shape[1]]
+        return network.counts(params["sampler"], [compressed, *_surfaces(frame)], jnp.asarray(False), most)
+
+    reads = frozenset({"albedo", "normal", "depth", "sample_count"})
+    core = Core(start, step, reads, init, samples)
+    return demodulated(recurrent(core), by=options.demodulate)
+
+
+def _surfaces(frame: Frame) -> tuple[jax.Array | None, ...]:
+    """What the networks see of the surfaces; 0 is the neutral value."""
+    return (
+        None if frame.albedo is None else frame.albedo - 1.0,
+        frame.normal,
+        None if frame.depth is None else depth_feature(frame.depth),
+    )

@@ -1,0 +1,122 @@
+"""``ntasd``: neural temporal adaptive sampling and denoising.
+
+Before a frame is rendered, one network sees the last image, warped to where its surfaces are now, and the surfaces'
+buffers, and says where samples go; the frame is rendered with as many samples as it says, and a second network denoises
+it with kernels at three scales and one on the warped image, as in ``ntd``. Both are trained together, through the
+renderer: what one more sample would have changed is known from the reference (:func:`jaxdn.sampling.more_samples`).
+
+Jon Hasselgren, Jacob Munkberg, Marco Salvi, Anjul Patney, Aaron Lefohn, "Neural Temporal Adaptive Sampling and
+Denoising", 2020 ("Hasselgren et al. 2020" here).
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn import color
+from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.filters.guides import depth_feature
+from jaxdn.frame import Frame
+from jaxdn.methods import ntd
+from jaxdn.methods.demodulated import demodulated
+from jaxdn.methods.sampler import Sampling, gray, mapped, motion_feature, sampler
+from jaxdn.methods.table import method
+from jaxdn.objectives import last_frames, unbiased_illumination
+from jaxdn.recipe import Recipe
+from jaxdn.variation import STILL
+
+
+@dataclass(frozen=True)
+class Options(ntd.Options, Sampling):
+    """The options of ``ntd``, of which some have other defaults here, and those of the samples."""
+
+    motion: Literal["dual", "traditional"] = "traditional"
+    """Vectors that warp the history."""
+    alpha_at: Literal["coarse", "fine"] = "fine"
+    """The blending weight of two scales: for each fine pixel (eq. 3), or at the coarse scale."""
+    up: Literal["bilinear", "nearest"] = "nearest"
+    """The upsampling U of coarser scales."""
+
+
+PAPER = Options(
+    depth_scale="unit",
+    border="zeros",
+    first_frame="noisy",
+    missing_history="blend",
+    kernels="plain",
+    background="filter",
+    exposure="given",
+    initialization="xavier",
+    least=0,
+    rounding="nearest",
+    demodulate="none",
+)
+"""The settings of Hasselgren et al. 2020, as far as they are known."""
+
+
+@method(
+    Options,
+    title="Neural temporal adaptive sampling and denoising (Hasselgren et al. 2020)",
+    presets={"paper": PAPER},
+    recipes={
+        "usual": Recipe(unbiased_illumination()),
+        "paper": Recipe(last_frames(), frames=5, decay=False, variation=STILL, average=0.0),
+    },
+    variants={"ntasd-large": {"size": "large"}, "ntasd-small": {"size": "small"}},
+    engines=("onnxruntime", "onednn"),
+)
+def ntasd(options: Options) -> Denoiser:
+    """Adaptive sampling and denoising; it requests samples, from stored layers of 1, 2, 4, ... or from the renderer.
+
+    The first frame has the same number of samples everywhere. ``params`` has the two networks, "sampler" (absent with
+    ``adaptive=False``) and "denoiser", whose parts are those of ``ntd``. Reads albedo, normal, depth, motion and
+    sample_count. Raises ValueError for an unknown option and for a budget that the layers cannot give, and ``step`` for
+    a frame of the wrong shape, never for its contents.
+    """
+    inner = ntd.core_of(options, ntd.More((2, 1), _seen_of_samples, frozenset({"motion", "sample_count"})))
+    flagged = options.missing_history == "current"
+    built: dict[str, Any] = {"size": options.size, "implementation": options.implementation}
+    network = sampler(options, (1, 1, 3, 1, 2, *([1] if flagged else [])), **built)
+
+    def init(key: jax.Array, frame: Frame) -> Params:
+        first, second = jax.random.split(key)
+        params = {"denoiser": inner.init(first, frame)}
+        return {**params, "sampler": network.init(second)} if options.adaptive else params
+
+    def start(params: Params, frame: Frame) -> jax.Array:
+        return inner.start(params["denoiser"], frame)
+
+    def step(
+        params: Params, state: jax.Array, frame: Frame, first: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array | int]:
+        return inner.step(params["denoiser"], state, frame, first)
+
+    def samples(params: Params, state: jax.Array, frame: Frame, first: jax.Array, most: int) -> jax.Array:
+        dark = frame._replace(radiance=jnp.zeros_like(frame.radiance))  # nothing is rendered yet
+        if not options.adaptive:
+            return mapped(options, dark.radiance[..., :1], most)
+        past, absent, _ = ntd.warped_history(options, state, dark, first)
+        gain = color.exposure(past) if options.exposure == "measured" else 1.0
+        features = [
+            gray(color.compress(gain * past)),
+            None if frame.albedo is None else gray(frame.albedo) - 1.0,
+            frame.normal,
+            None if frame.depth is None else depth_feature(frame.depth, scale=options.depth_scale),
+            None if frame.motion is None else motion_feature(frame.motion),
+        ]
+        if flagged:
+            features.append(absent.astype(past.dtype))
+        return network.counts(params["sampler"], features, first, most)
+
+    core = Core(start, step, inner.reads, init, samples)
+    return demodulated(recurrent(core), by=options.demodulate)
+
+
+def _seen_of_samples(frame: Frame) -> list[jax.Array | None]:
+    """Motion, and how noisy each pixel is: ``1 / (1 + n)`` for n samples."""
+    return [
+        None if frame.motion is None else motion_feature(frame.motion),
+        None if frame.sample_count is None else 1.0 / (1.0 + frame.sample_count),
+    ]

@@ -1,0 +1,87 @@
+"""A network that says where samples go, shared by the methods that request samples.
+
+It sees what is known before a frame is rendered, one number a pixel comes out, and one softmax over the image turns
+these into numbers of samples that keep a budget (:func:`jaxdn.sampling.sample_map`).
+
+Hasselgren et al. 2020, "Neural Temporal Adaptive Sampling and Denoising"; Kuznetsov et al. 2018, "Deep Adaptive
+Sampling for Low Sample Count Rendering".
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxdn.denoiser import Params
+from jaxdn.networks import LARGE, Widths, crop, pad
+from jaxdn.options import Range
+from jaxdn.sampling import sample_map
+
+SMALL: Widths = ((8,), (16, 16), (24, 24), (32, 32), (32, 32))
+"""Half of the widths of the denoiser's: it only has to find where noise will be."""
+GRAY = (0.2989, 0.587, 0.114)
+"""Weights of red, green and blue (Hasselgren et al. 2020, sec. 2.2)."""
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """The options of a method that requests samples."""
+
+    adaptive: bool = True
+    """A network says where samples go; or all pixels have the budget."""
+    budget: Annotated[float, Range(0, without_low=True)] = 4.0
+    """Mean number of samples per pixel."""
+    least: Annotated[int, Range(0)] = 1
+    """Every pixel has at least this many samples; 0 in the paper."""
+    rounding: Literal["exact", "nearest"] = "exact"
+    """The budget is kept exactly, or about (as in the paper), see :func:`jaxdn.sampling.sample_map`."""
+    slope: Literal["mixing", "amplitude"] = "mixing"
+    """What one more sample does to the image, in training, see :func:`jaxdn.sampling.more_samples`: a sample without
+    noise is mixed in, or the noise falls as the root of the number."""
+
+
+class Sampler(NamedTuple):
+    """Two pure functions."""
+
+    init: Callable[[jax.Array], Params]
+    counts: Callable[[Params, Sequence[jax.Array | None], jax.Array, int], jax.Array]
+    """(params, features [H, W, c] or None, even: bool scalar, most) -> [H, W, 1] numbers of samples; ``even``: all
+    pixels alike."""
+
+
+def sampler(options: Sampling, groups: Sequence[int], *, size: str | Widths, implementation: str | None) -> Sampler:
+    """The network for feature groups of these channel counts."""
+    from jaxdn.networks.unet import unet
+
+    widths = {"large": LARGE, "small": SMALL}[size] if isinstance(size, str) else size
+    network = unet(groups, (1,), widths=widths, implementation=implementation)
+
+    def counts(params: Params, features: Sequence[jax.Array | None], even: jax.Array, most: int) -> jax.Array:
+        present = next(group for group in features if group is not None)
+        batch = [None if group is None else pad(group)[None] for group in features]
+        logits = crop(network.apply(params, batch)[0][0], (present.shape[0], present.shape[1])).astype(present.dtype)
+        return mapped(options, jnp.where(even, 0.0, logits), most)
+
+    return Sampler(network.init, counts)
+
+
+def mapped(options: Sampling, logits: jax.Array, most: int) -> jax.Array:
+    """The numbers of samples [H, W, 1] for logits [H, W, 1]."""
+    counts = sample_map(logits, options.budget, least=options.least, most=most, rounding=options.rounding)
+    # The image's slope by its number of samples is that of mixing; if noise falls as 1 / sqrt(s), it is half of it.
+    return 0.5 * (counts + lax.stop_gradient(counts)) if options.slope == "amplitude" else counts
+
+
+def gray(image: jax.Array) -> jax.Array:
+    """[H, W, 3] -> [H, W, 1]."""
+    red, green, blue = GRAY
+    return red * image[..., 0:1] + green * image[..., 1:2] + blue * image[..., 2:3]
+
+
+def motion_feature(motion: jax.Array) -> jax.Array:
+    """Motion in pixels [H, W, 2] in (-1, 1), 0 where it is not finite."""
+    known = jnp.where(jnp.isfinite(motion), motion, 0.0)
+    return known / (1.0 + jnp.abs(known))

@@ -1,0 +1,173 @@
+"""``ntasd`` and ``dasr``: where samples go, that the budget is kept, and that both networks learn."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from jaxdn.denoiser import Denoiser, State
+from jaxdn.frame import Clip, Frame, frame_at, only
+from jaxdn.methods.dasr import dasr
+from jaxdn.methods.ntasd import ntasd
+from jaxdn.methods.table import methods
+from jaxdn.rollout import denoise, sampled, unroll
+from jaxdn.sampling import from_layers
+
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
+TINY = ((4,), (4,), (5,), (5,), (6,))
+SIZE = (18, 21)
+"""Not a multiple of what the networks work on."""
+LAYERS = (1, 2, 4, 8)
+METHODS = {"ntasd": ntasd, "dasr": dasr}
+
+
+def clip_of(rng: np.random.Generator, count: int = 3, size: tuple[int, int] = SIZE) -> Clip:
+    """All buffers, a wall whose right half is noisier, a camera that moves a little."""
+    shape = (count, *size)
+    normal = rng.normal(size=(*shape, 3))
+    reference = np.broadcast_to(rng.uniform(0.5, 1.5, size=(*size, 3)), (*shape, 3))
+    spread = np.where(np.arange(size[1]) < size[1] // 2, 0.02, 0.8)[:, None]
+    layers = {n: reference * (1 + spread * rng.normal(size=(*shape, 3)) / np.sqrt(n)) for n in LAYERS}
+    buffers = {
+        "radiance": layers[1],
+        "albedo": rng.uniform(0.3, 1, size=(*shape, 3)),
+        "normal": normal / np.linalg.norm(normal, axis=-1, keepdims=True),
+        "depth": rng.uniform(1, 9, size=(*shape, 1)),
+        "motion": rng.normal(size=(*shape, 2)),
+    }
+    clip = Clip(Frame(**buffers), reference, layers)
+    return jax.tree.map(lambda values: jnp.maximum(jnp.asarray(values, jnp.float32), -9.0), clip)
+
+
+def varied(denoiser: Denoiser, clip: Clip, key: jax.Array) -> Any:
+    """Parameters for which every pixel has another number of samples."""
+    params = denoiser.init(key, frame_at(clip.frames, 0))
+    return jax.tree.map(lambda leaf: leaf + 0.1 * jax.random.normal(key, leaf.shape), params)
+
+
+def counts_of(denoiser: Denoiser, params: Any, clip: Clip) -> list[np.ndarray]:
+    """The numbers of samples that each frame was given."""
+
+    def step(state: State, frame: Frame, layers: Any) -> Any:
+        given = sampled(denoiser, params, state, frame, layers)
+        return denoiser.step(params, state, given)[0], given.sample_count
+
+    state, found = denoiser.start(params, only(frame_at(clip.frames, 0), denoiser.reads)), []
+    for index in range(len(clip.frames.radiance)):
+        layers = {samples: layer[index] for samples, layer in clip.layers.items()}
+        state, counts = jax.jit(step)(state, frame_at(clip.frames, index), layers)
+        found.append(np.asarray(counts))
+    return found
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("budget", [2.5, 4.0])
+def test_every_frame_has_the_budget_and_every_pixel_its_own_number(name, budget, rng, key):
+    denoiser, clip = METHODS[name](size=TINY, budget=budget), clip_of(rng)
+    for counts in counts_of(denoiser, varied(denoiser, clip, key), clip)[1:]:
+        assert counts.sum() == round(budget * counts.size)
+        assert 1 <= counts.min() < budget < counts.max() <= 15
+
+
+def test_the_first_frame_is_sampled_evenly(rng, key):
+    denoiser, clip = ntasd(size=TINY), clip_of(rng)
+    first, second, _ = counts_of(denoiser, varied(denoiser, clip, key), clip)
+    np.testing.assert_array_equal(first, 4)
+    assert len(np.unique(second)) > 2
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_without_a_sampler_all_pixels_have_the_budget(name, rng, key):
+    denoiser, clip = METHODS[name](size=TINY, adaptive=False, budget=3), clip_of(rng)
+    params = varied(denoiser, clip, key)
+    assert "sampler" not in params
+    even = jax.vmap(lambda layers: from_layers(layers, jnp.full((*SIZE, 1), 3.0))[0])(clip.layers)
+    assert all(np.all(counts == 3) for counts in counts_of(denoiser, params, clip))
+    # Then no radiance but that of the layers counts.
+    images = denoise(denoiser, params, clip)
+    other = clip._replace(frames=clip.frames._replace(radiance=even))
+    np.testing.assert_array_equal(images, denoise(denoiser, params, other))
+
+
+def test_dasr_sees_the_first_sample_and_no_other_frame(rng, key):
+    denoiser, clip = dasr(size=TINY), clip_of(rng)
+    params = varied(denoiser, clip, key)
+    backwards = jax.tree.map(lambda leaf: leaf[::-1], clip)
+    run = jax.jit(lambda clip: denoise(denoiser, params, clip))
+    np.testing.assert_allclose(run(backwards)[::-1], run(clip), rtol=1e-5, atol=1e-6)
+    brighter = clip._replace(frames=clip.frames._replace(radiance=clip.frames.radiance.at[:, :9].multiply(5.0)))
+    plain, moved = (counts_of(denoiser, params, each)[0] for each in (clip, brighter))
+    assert np.any(plain != moved)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_samples_learn_to_go_where_noise_is(name, rng, key):
+    """The error of the image teaches the sampler, through the reference, which half of the wall is noisy."""
+    denoiser, clip = METHODS[name](size=TINY, demodulate="none"), clip_of(rng, 3, (16, 32))
+    clip = clip._replace(frames=clip.frames._replace(motion=0 * clip.frames.motion))
+    rule = optax.adam(3e-3)
+
+    def loss(params):
+        return jnp.mean(jnp.square(unroll(denoiser, params, clip.frames, clip.layers, clip.reference) - clip.reference))
+
+    @jax.jit
+    def update(params, state):
+        change, state = rule.update(jax.grad(loss)(params), state)
+        return optax.apply_updates(params, change), state
+
+    params = denoiser.init(key, frame_at(clip.frames, 0))
+    state = rule.init(params)
+    for _ in range(60):
+        params, state = update(params, state)
+    counts = counts_of(denoiser, params, clip)[-1]
+    assert counts[:, 16:].mean() > 1.5 * counts[:, :16].mean()
+
+
+def test_the_amplitude_slope_is_half_of_the_mixing_slope(rng, key):
+    clip = clip_of(rng)
+    slopes = []
+    for slope in ("mixing", "amplitude"):
+        denoiser = ntasd(size=TINY, slope=slope)
+        params = varied(denoiser, clip, key)
+
+        def loss(params, denoiser=denoiser):
+            return jnp.mean(unroll(denoiser, params, clip.frames, clip.layers, clip.reference)[1])
+
+        slopes.append(jax.tree.leaves(jax.jit(jax.grad(loss))(params)["sampler"]))
+    largest = max(np.abs(leaf).max() for leaf in slopes[0])
+    assert largest > 0
+    for whole, half in zip(*slopes, strict=True):
+        np.testing.assert_allclose(half, 0.5 * whole, rtol=1e-3, atol=1e-5 * largest)
+
+
+def test_pixels_without_samples_are_filled_from_their_neighbours(rng, key):
+    """The paper's map may give none; black pixels would darken all around them."""
+    denoiser, clip = ntasd(size=TINY, least=0, budget=1, demodulate="none"), clip_of(rng)
+    params = varied(denoiser, clip, key)
+    flat = clip._replace(layers={n: jnp.ones_like(layer) for n, layer in clip.layers.items()})
+    assert counts_of(denoiser, params, flat)[1].min() == 0
+    images = denoise(denoiser, params, flat)
+    np.testing.assert_allclose(np.median(images, axis=(1, 2, 3)), 1.0, rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_budget_that_the_layers_cannot_give_raises(name, rng, key):
+    denoiser, clip = METHODS[name](size=TINY, budget=16), clip_of(rng)
+    params = denoiser.init(key, frame_at(clip.frames, 0))
+    with pytest.raises(ValueError, match=r"budget: expected a mean number of samples above 0 from 1 to 15"):
+        denoise(denoiser, params, clip)
+    with pytest.raises(ValueError, match="layers: expected independent noisy layers"):
+        denoise(denoiser, params, clip._replace(layers=None))
+
+
+def test_options_that_make_no_sense_raise():
+    with pytest.raises(ValueError, match=r"least: expected at least 1, the sample that is rendered first, got 0"):
+        dasr(least=0)
+    for name in METHODS:
+        with pytest.raises(ValueError, match=r"budget: expected a number > 0, got 0"):
+            METHODS[name](budget=0)
+        assert methods()[name].made({"preset": "paper"}).rounding == "nearest"
