@@ -178,7 +178,8 @@ class Train:
 
 @dataclass
 class Denoise:
-    """Denoise clips, or EXR files of any renderer; everything else in the files stays as it is.
+    """Denoise clips, or EXR files of any renderer; everything else in the files stays as it is. Or render and denoise a
+    scene, with samples where the denoiser wants them.
 
     For example:
 
@@ -187,10 +188,13 @@ class Denoise:
     jaxdn denoise "shots/*.exr" -o out --method ntd-small --motion-convention cycles --channels albedo=DiffCol
 
     jaxdn denoise shots/a shots/b -o out --frames 10-40 --skip-existing
+
+    jaxdn denoise scene.xml -o out --method runs/ntasd/weights.safetensors --budget 4 --width 640 --height 360 --preview
     """
 
     clips: tyro.conf.Positional[list[Path]]
-    """Folders of clips, folders of EXR files, quoted patterns of EXR files, or files; one or several."""
+    """Folders of clips, folders of EXR files, quoted patterns of EXR files, or files; one or several. Or one Mitsuba
+    scene (.xml), or family of scenes, to be rendered."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the denoised frames; for a single frame, also the name of an EXR file."""
     method: str = "steady-balanced"
@@ -222,6 +226,17 @@ class Denoise:
     """For files of other renderers: the view layer or part to look for buffers in."""
     implementation: str = "auto"
     """Engine for the network: reference (XLA), onnxruntime (CPU; the extra onnx); auto: the fastest available."""
+    budget: float | None = None
+    """Samples per pixel for a method that says where they go (ntasd, dasr), and for a scene: their mean; default: the
+    method's own, else 4."""
+    width: int | None = None
+    """For a scene: the width in pixels; default, as for the next three: as `jaxdn render` has it."""
+    height: int | None = None
+    """For a scene: the height in pixels."""
+    animation: Path | None = None
+    """For a scene: its animation file; default: the one next to it."""
+    seed: int | None = None
+    """For a scene: the seed of its noise."""
 
 
 @dataclass

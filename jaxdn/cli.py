@@ -127,7 +127,11 @@ def _denoise(options: Denoise) -> None:
     from jaxdn.options import numbers
 
     naming = _naming(options)
-    method, engine = candidate_on(options.method, options.implementation)
+    budget = {} if options.budget is None else {"budget": options.budget}
+    if (scene := _scene_of(options)) is not None:
+        _denoise_scene(options, scene, budget)
+        return
+    method, engine = candidate_on(options.method, options.implementation, **budget)
     reads = frozenset[str]() if method.denoiser is None else method.denoiser.reads
     settings = Settings(
         spp=options.spp,
@@ -154,6 +158,51 @@ def _denoise(options: Denoise) -> None:
     print(f"{len(written.files)} frames denoised by {options.method} in {options.out} ({engine}, {compiled})")
     if written.repaired:
         print(f"{written.repaired} values were not usable numbers (NaN, infinite, negative ...) and were repaired")
+
+
+_OF_SCENES = ("width", "height", "animation", "seed")
+
+
+def _scene_of(options: Denoise) -> str | None:
+    """The scene to render, if there is one. Raises ValueError for options that only one of scene and clips has."""
+    from jaxdn.render.families import FAMILIES
+
+    scenes = [path for path in options.clips if path.suffix == ".xml" or (str(path) in FAMILIES and not path.exists())]
+    if not scenes:
+        if given := [name for name in _OF_SCENES if getattr(options, name) is not None]:
+            raise ValueError(f"--{given[0]}: expected a scene to render, got frames that are there; leave it out.")
+        return None
+    if len(options.clips) > 1:
+        raise ValueError(f"{scenes[0]}: expected one scene and nothing else, got {len(options.clips)} sources.")
+    usual = Denoise(options.clips, options.out)
+    kept = {"clips", "out", "method", "implementation", "frames", "preview", "budget", *_OF_SCENES}
+    other = [name for name in vars(usual) if name not in kept and getattr(options, name) != getattr(usual, name)]
+    if other:
+        raise ValueError(f"--{other[0].replace('_', '-')}: expected frames that are there, got a scene; leave it out.")
+    return str(scenes[0])
+
+
+def _denoise_scene(options: Denoise, scene: str, budget: dict[str, Any]) -> None:
+    from jaxdn.candidates import candidate
+    from jaxdn.commands.denoise import candidate_on
+    from jaxdn.commands.denoise_scene import Settings, denoise_scene
+    from jaxdn.commands.progress import reporter
+    from jaxdn.options import numbers
+
+    asks = getattr(candidate(options.method).denoiser, "samples", None) is not None
+    method, engine = candidate_on(options.method, options.implementation, **(budget if asks else {}))
+    size = {name: value for name in ("width", "height", "seed") if (value := getattr(options, name)) is not None}
+    settings = Settings(
+        frames=numbers(options.frames, "--frames") if options.frames else None,
+        preview=options.preview,
+        **size,
+        **budget,
+    )
+    with reporter(options.method) as report:
+        written = denoise_scene(
+            scene, options.animation, _folder(options.out), method, settings, say=report.say, log=report.log
+        )
+    print(f"{len(written.files)} frames rendered, and denoised by {options.method}, in {options.out} ({engine})")
 
 
 def _compare(options: Compare) -> None:

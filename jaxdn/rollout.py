@@ -22,7 +22,8 @@ def sampled(
 ) -> Frame:
     """The frame with the samples that the denoiser requests, taken from stored layers; unchanged without a request.
 
-    Raises ValueError for a request without layers, and for one that they cannot fulfil.
+    Without layers, a frame that has ``sample_count`` counts as rendered as requested. Raises ValueError for a request
+    without layers, and for one that they cannot fulfil.
 
     Args:
       denoiser: what requests samples.
@@ -32,10 +33,13 @@ def sampled(
       layers: samples per pixel -> independent radiance [H, W, 3].
       reference: [H, W, 3], for a gradient of the image with respect to the numbers of samples.
     """
-    if denoiser.samples is None:
+    if denoiser.samples is None or (layers is None and frame.sample_count is not None):
         return only(frame, denoiser.reads)
     if layers is None:
-        raise ValueError("layers: expected independent noisy layers, as this denoiser requests samples, got None.")
+        raise ValueError(
+            "layers: expected independent noisy layers, as this denoiser requests samples, or frames that have been "
+            "rendered as requested, with sample_count; got neither."
+        )
     wanted = denoiser.samples(params, state, only(frame, denoiser.reads), sum(layers))
     radiance, counts = from_layers(layers, wanted, reference=reference)
     return only(frame._replace(radiance=radiance, sample_count=counts), denoiser.reads)
@@ -104,6 +108,12 @@ def _step(denoiser: Denoiser, params: Params, state: State, frame: Frame, layers
     return denoiser.step(params, state, sampled(denoiser, params, state, frame, layers))
 
 
+@functools.partial(jax.jit, static_argnums=(0, 4))
+def _ask(denoiser: Denoiser, params: Params, state: State, frame: Frame, most: int) -> jax.Array:
+    assert denoiser.samples is not None
+    return jnp.clip(jnp.round(denoiser.samples(params, state, frame, most)), 0, most)
+
+
 class Stream:
     """Frames in, images out, one at a time: the recurrent state is kept between calls. Made by :func:`stream`.
 
@@ -118,13 +128,29 @@ class Stream:
 
     def __call__(self, frame: Frame, layers: Layers = None) -> jax.Array:
         """Denoise the next frame [H, W, C]; returns [H, W, 3]."""
-        frame = only(frame, self._denoiser.reads)
+        frame = self._begun(frame)
         self.programs.add(present(frame))
+        self._state, image = _step(self._denoiser, self._params, self._state, frame, layers)
+        return image
+
+    def ask(self, frame: Frame, most: int) -> jax.Array | None:
+        """The whole numbers of samples [H, W, 1] that the denoiser requests for the next frame; None without a request.
+
+        The frame's radiance is what has been rendered before; a pixel can have ``most`` samples. Then call with the
+        frame as rendered with these, and its ``sample_count``.
+        """
+        if self._denoiser.samples is None:
+            return None
+        frame = self._begun(frame)
+        return _ask(self._denoiser, self._params, self._state, frame, most)
+
+    def _begun(self, frame: Frame) -> Frame:
+        """What is read of a frame; the state starts with the first one."""
+        frame = only(frame, self._denoiser.reads)
         if self._state is None:
             # Copied: two donated arrays must not share memory.
             self._state = jax.tree.map(jnp.copy, _start(self._denoiser, self._params, frame))
-        self._state, image = _step(self._denoiser, self._params, self._state, frame, layers)
-        return image
+        return frame
 
     def each(self, frames: Iterable[Frame]) -> Iterator[jax.Array]:
         """The image of every frame, computed lazily."""

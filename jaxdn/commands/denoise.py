@@ -65,20 +65,21 @@ class Written(NamedTuple):
     """Invalid values (NaN, infinite, negative ...) of frames and histories that were replaced."""
 
 
-def candidate_on(name: str, implementation: str = "auto") -> tuple[Candidate, str]:
+def candidate_on(name: str, implementation: str = "auto", **options: Any) -> tuple[Candidate, str]:
     """The candidate of that name on an engine, and the engine's name; "reference" is XLA.
 
-    ``"auto"`` is the fastest engine for inference that the method has and that can run here. Raises ValueError for a
-    name that is not a method, and for an engine that cannot run it.
+    ``options`` are given to it (:func:`jaxdn.candidates.candidate`). ``"auto"`` is the fastest engine for inference
+    that the method has and that can run here. Raises ValueError for a name that is not a method, and for an engine that
+    cannot run it.
     """
-    found = candidate(name)
+    found = candidate(name, **options)
     known = found.method is not None and found.method.knows("implementation")
     if implementation == "auto":
         engine = found.engine("inference")
-        return (found, "reference") if engine is None else (candidate(name, implementation=engine), engine)
+        return (found, "reference") if engine is None else (candidate(name, implementation=engine, **options), engine)
     if implementation == "reference" and not known:
         return found, implementation
-    return candidate(name, implementation=implementation), implementation
+    return candidate(name, implementation=implementation, **options), implementation
 
 
 def denoise_files(
@@ -150,7 +151,7 @@ class _Pass:
 
     def __call__(self, stored: StoredFrame) -> np.ndarray:
         if self._step is None:
-            return np.asarray(_light(stored.frame.radiance))
+            return np.asarray(light_of(stored.frame.radiance))
         return np.asarray(self._step(stored.frame, _layers(stored, self._source) if self._needs_layers else None))
 
     @property
@@ -210,13 +211,13 @@ def _forwards(
             continue
         path = work.targets[index]
         path.parent.mkdir(parents=True, exist_ok=True)
-        beauty = image + _light(frame.direct) + _light(frame.emission)
+        beauty = image + light_of(frame.direct) + light_of(frame.emission)
         if work.clip is None:
             images = {"": beauty, **parts}
             for line in write_result(name, path, images, canvas, only_beauty=settings.only_beauty, **naming):
                 log(line)
         else:
-            write_exr(path, _channels("", beauty) | _channels("denoised.", image))
+            write_exr(path, lettered("", beauty) | lettered("denoised.", image))
         if settings.preview:
             save_png(path.with_suffix(".png"), color.tonemap(beauty))
         yield path
@@ -257,10 +258,11 @@ def _layers(stored: StoredFrame, source: Path) -> Layers:
     return {count: stored.layers[count] for count in doubling_layers(stored.layers, source)}
 
 
-def _light(radiance: np.ndarray | None) -> Any:
+def light_of(radiance: np.ndarray | None) -> Any:
     """Radiance that can be added: non-finite or negative values become 0, an absent part is 0."""
     return 0.0 if radiance is None else np.asarray(repair_image(radiance), np.float32)
 
 
-def _channels(layer: str, image: np.ndarray) -> dict[str, np.ndarray]:
+def lettered(layer: str, image: np.ndarray) -> dict[str, np.ndarray]:
+    """An image [H, W, 3] as the channels of a file, their names after ``layer``."""
     return {f"{layer}{letter}": np.ascontiguousarray(image[..., i], np.float32) for i, letter in enumerate("RGB")}

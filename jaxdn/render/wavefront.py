@@ -186,13 +186,26 @@ def _chunk(
       depth: path length.
       request: what else is told of the samples.
     """
-    sensor = scene.sensors()[0]
-    width = dr.opaque(mi.UInt32, int(sensor.film().crop_size()[0]))
     lane = dr.arange(mi.UInt32, pixels * count)
     block = dr.opaque(mi.UInt32, count)
     offset = lane // block
     sample = lane - offset * block + dr.opaque(mi.UInt32, first)
     pixel = offset + dr.opaque(mi.UInt32, first_pixel)
+    ray, parts, finite, bad = _traced(scene, pixel, sample, key, depth)
+    sums = [[dr.block_sum(part[channel], count) for channel in range(3)] for part in parts]
+    dr.eval(sums)
+    images = [np.stack([np.array(channel, np.float64) for channel in part], axis=-1) for part in sums]
+    found = _apart(scene, ray, lambda: generator(pixel, sample, key), parts, finite, count, request)
+    return Accumulated(images[0], images[1], images[2], int(dr.sum(bad)[0]), *found)
+
+
+def _traced(scene: Any, pixel: Any, sample: Any, key: tuple[int, int], depth: int) -> tuple[Any, list[Any], Any, Any]:
+    """One path for each lane's pixel and sample: its ray, its light (emitted, direct, indirect), whether it is finite.
+
+    Light that is not finite is 0, and the last result is 1 for it. Everything is evaluated.
+    """
+    sensor = scene.sensors()[0]
+    width = dr.opaque(mi.UInt32, int(sensor.film().crop_size()[0]))
     row = pixel // width
     ray = camera_rays(sensor, pixel - row * width, row)
     traced: Any = trace(scene, ray, generator(pixel, sample, key), dr.opaque(mi.UInt32, depth))
@@ -202,11 +215,7 @@ def _chunk(
     bad = dr.select(finite, mi.UInt32(0), mi.UInt32(1))
     # One kernel: a block sum of unevaluated values would trace everything again for each sum.
     dr.eval(parts, bad)
-    sums = [[dr.block_sum(part[channel], count) for channel in range(3)] for part in parts]
-    dr.eval(sums)
-    images = [np.stack([np.array(channel, np.float64) for channel in part], axis=-1) for part in sums]
-    found = _apart(scene, ray, lambda: generator(pixel, sample, key), parts, finite, count, request)
-    return Accumulated(images[0], images[1], images[2], int(dr.sum(bad)[0]), *found)
+    return ray, parts, finite, bad
 
 
 def _apart(
@@ -273,6 +282,42 @@ def accumulate(
     lamps = [run.shadows for run in runs if run.shadows is not None]
     shadows = Shadows(*(_whole(part, height, width) for part in zip(*lamps, strict=True))) if lamps else None
     return Accumulated(images[0], images[1], images[2], sum(run.bad for run in runs), lobes, shadows)
+
+
+def accumulate_each(
+    scene: Any,
+    counts: np.ndarray,
+    *,
+    seed: int,
+    frame: int,
+    stream: int,
+    first: int,
+    max_depth: int,
+    max_lanes: int = MAX_LANES,
+) -> Accumulated:
+    """The same sums with another number of samples in each pixel: those from ``first`` to ``first + counts``.
+
+    ``counts`` [H, W] are whole numbers >= 0; pixels without samples are 0. The other arguments are those of
+    :func:`accumulate`, whose samples these are: a pixel's do not depend on how many others have.
+    """
+    key = frame_key(seed, frame, stream)
+    number = np.asarray(counts, np.int64).reshape(-1)
+    sums = np.zeros((3, number.size, 3))
+    ends = np.cumsum(number)
+    bad = 0
+    for start in range(0, int(ends[-1]), max_lanes):
+        lane = np.arange(start, min(start + max_lanes, int(ends[-1])))
+        pixel = np.searchsorted(ends, lane, side="right")
+        sample = lane - (ends - number)[pixel] + first
+        of_lane, number_of_lane = (mi.UInt32(each.astype(np.uint32)) for each in (pixel, sample))
+        _, parts, _, wrong = _traced(scene, of_lane, number_of_lane, key, max_depth)
+        for total, part in zip(sums, parts, strict=True):
+            light = np.array(part, np.float64).T
+            for channel in range(3):
+                total[:, channel] += np.bincount(pixel, light[:, channel], number.size)
+        bad += int(dr.sum(wrong)[0])
+    images = sums.reshape(3, *counts.shape, 3)
+    return Accumulated(images[0], images[1], images[2], bad)
 
 
 def _whole(parts: Iterable[np.ndarray], height: int, width: int) -> np.ndarray:

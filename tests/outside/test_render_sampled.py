@@ -1,0 +1,141 @@
+"""Frames rendered with another number of samples in each pixel, and ``jaxdn denoise SCENE``."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from render_scenes import HEIGHT, WIDTH, Stage, fast_variants
+
+import jaxdn as library
+from jaxdn import effects
+from jaxdn.clips.exr import read_exr
+from jaxdn.frame import Frame
+from jaxdn.render import render_frame
+from jaxdn.render.adaptive import render_sampled
+from jaxdn.weights import save_weights
+
+VECTORISED = [variant for variant in fast_variants() if not variant.startswith("scalar")]
+pytestmark = pytest.mark.skipif(not VECTORISED, reason="scalar variants render whole images only")
+
+TINY = ((4,), (4,), (5,), (5,), (6,))
+SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
+
+
+def jaxdn(*arguments: Any) -> "subprocess.CompletedProcess[str]":
+    command = [sys.executable, "-m", "jaxdn.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+
+
+def planned(light="reflected"):
+    return effects.plan(effects.inspect(Stage(), **SIZE, frames=2), library.denoisers.svgf(), light=light)
+
+
+@pytest.mark.parametrize("light", ["indirect", "reflected"])
+def test_every_pixel_has_the_first_samples_of_its_frame(light, rng):
+    """n samples are the mean of the layer of one, of two and of four, as far as n has their samples."""
+    options: dict[str, Any] = {**SIZE, "plan": planned(light), "seed": 5, "light": light}
+    counts = rng.integers(0, 4, (HEIGHT, WIDTH, 1)) * 2 + 1  # 1, 3, 5, 7
+    seen = []
+
+    def ask(frame: Frame) -> np.ndarray:
+        seen.append(frame)
+        return counts
+
+    found = render_sampled(Stage(), 1, ask, **options)
+    layers = render_frame(Stage(), 1, layers=(1, 2, 4), **options).layers
+    np.testing.assert_array_equal(seen[0].radiance, layers[1])
+    whole = {1: layers[1], 3: (layers[1] + 2 * layers[2]) / 3, 7: (layers[1] + 2 * layers[2] + 4 * layers[4]) / 7}
+    for count, image in whole.items():
+        where = counts[..., 0] == count
+        assert where.any()
+        np.testing.assert_allclose(found.frame.radiance[where], image[where], rtol=1e-4, atol=1e-6)
+    np.testing.assert_array_equal(found.frame.sample_count, counts)
+    assert found.bad_samples == 0
+
+
+def test_pixels_without_samples_are_black():
+    ask = lambda frame: np.indices((HEIGHT, WIDTH)).sum(0)[..., None] % 2  # noqa: E731
+    found = render_sampled(Stage(), 0, ask, **SIZE, plan=planned(), seed=1)
+    dark = found.frame.sample_count[..., 0] == 0
+    assert not np.any(found.frame.radiance[dark])
+    one = render_frame(Stage(), 0, **SIZE, plan=planned(), seed=1, light="reflected")
+    np.testing.assert_allclose(found.frame.radiance[~dark], one.frame.radiance[~dark], rtol=1e-6)
+
+
+def test_more_samples_are_nearer_to_the_reference():
+    options: dict[str, Any] = {**SIZE, "plan": planned(), "light": "reflected"}
+    reference = render_frame(Stage(), 0, reference_spp=512, **options).reference
+    errors = []
+    for count in (1, 4, 16):
+        found = render_sampled(Stage(), 0, lambda frame, count=count: np.full((HEIGHT, WIDTH, 1), count), **options)
+        errors.append(np.mean(np.square(found.frame.radiance - reference)))
+    np.testing.assert_allclose(errors[0] / errors[1], 4, rtol=0.5)
+    np.testing.assert_allclose(errors[1] / errors[2], 4, rtol=0.5)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a small ``ntasd`` that nobody has trained, with decisive biases."""
+    denoiser = library.denoisers.ntasd(size=TINY)
+    key = jax.random.key(3)
+    params = denoiser.init(key, Frame(np.zeros((16, 16, 3), np.float32)))
+    params = jax.tree.map(lambda leaf: leaf + 0.2 * jax.random.normal(key, leaf.shape), params)
+    path = tmp_path_factory.mktemp("weights") / "tiny"
+    return save_weights(path, params, factory="ntasd", options={"size": TINY}, record={})
+
+
+@pytest.mark.slow
+def test_a_scene_is_rendered_and_denoised_within_its_budget(weights, tmp_path):
+    there = ("--width", "40", "--height", "24", "--frames", "0-2", "--budget", "3", "--preview")
+    done = jaxdn("denoise", "fruit", "-o", tmp_path, "--method", weights, *there)
+    assert done.returncode == 0, done.stderr
+    assert "3 frames rendered" in done.stdout
+    for index in range(3):
+        channels = read_exr(tmp_path / f"frame_{index:04d}.exr")
+        counts = channels["samples.Y"]
+        assert counts.sum() == 3 * 24 * 40
+        assert (len(np.unique(counts)) > 1) == (index > 0)  # the first frame is sampled evenly
+        assert np.isfinite(channels["R"]).all()
+        assert channels["R"].mean() >= channels["denoised.R"].mean() > 0
+        assert (tmp_path / f"frame_{index:04d}.samples.png").is_file()
+    assert "3 samples per pixel, 1 to" in done.stdout
+
+
+@pytest.mark.slow
+def test_a_filter_that_does_not_ask_gets_the_budget_everywhere(tmp_path):
+    done = jaxdn("denoise", "fruit", "-o", tmp_path, "--method", "svgf", "--frames", "1", "--budget", "2")
+    assert done.returncode == 0, done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["frame_0001.exr"]
+    np.testing.assert_array_equal(read_exr(tmp_path / "frame_0001.exr")["samples.Y"], 2)
+
+
+WRONG = {
+    "a budget below one sample": (("fruit", "--budget", "0.5"), "budget: expected a mean number of samples above 0"),
+    "no budget": (("fruit", "--budget", "0"), "budget: expected"),
+    "a frame that is not there": (("fruit", "--frames", "400"), "--frames: expected some of 0 to"),
+    "an option of files": (("fruit", "--layer", "View"), "--layer: expected frames that are there, got a scene"),
+    "two sources": (("fruit", "robot"), "expected one scene and nothing else, got 2 sources"),
+    "no such scene": (("nowhere.xml",), "nowhere.xml"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", WRONG)
+def test_what_cannot_be_rendered_is_told(wrong, weights, tmp_path):
+    arguments, told = WRONG[wrong]
+    done = jaxdn("denoise", *arguments, "-o", tmp_path / "out", "--method", weights, "--width", "32", "--height", "16")
+    assert done.returncode == 2
+    assert told in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_options_of_a_scene_do_not_fit_clips(weights, tmp_path):
+    done = jaxdn("denoise", tmp_path, "-o", tmp_path / "out", "--method", weights, "--width", "32")
+    assert done.returncode == 2
+    assert "--width: expected a scene to render, got frames that are there" in done.stderr
