@@ -21,10 +21,10 @@ LONG, SHORT = 2000, 250
 """Frames; the long run is made of short ones, so that one program is compiled."""
 LIGHTEST = [list(method.variants)[-1] for method in methods().values() if method.variants]
 METHODS = [*filters(), *(name for name in LIGHTEST if name in shipped_names())]
-FORGETS = {"ntd-small": 80, "relax": 155}
+FORGETS = {"ntd-small": 80, "relax": 155, "relax-fitted": 155}
 """Frames after which a poisoned frame has to be forgotten, to 1 % of the clean run; 120 for all others.
 
-``relax``: the largest number that a file holds fades from the fast mean, of 6 frames, to 1 % in 80 frames; what is left
+``relax``, with any constants: the largest number that a file holds fades from the fast mean, of 6 frames, to 1 % in 80 frames; what is left
 within the noise of that mean, a tenth, from the slow one, of 30 frames, in 70 more."""
 
 
