@@ -49,7 +49,7 @@ def training_batches(
         element takes one at random.
       buffers: Frame buffers to read, usually ``denoiser.reads`` (default: all that the clips have).
       layers: add the independent noisy layers of 1, 2, 4, ... samples that every clip has (``Clip.layers``), for a
-        denoiser that requests samples.
+        denoiser that requests samples; then no element has all light (``variation.beauty``), as layers have not.
       augment: flips and quarter turns (no odd turns for a crop that is not square).
       variation: of light, normals and the buffers that are there.
       threads: batches prepared in advance, each by its own thread; 0 prepares them when requested.
@@ -88,7 +88,8 @@ def training_batches(
         starts = [int(rng.integers(0, has - wants + 1)) for has, wants in zip(source.shape, sizes, strict=True)]
         window = tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))
         samples = counts[int(rng.integers(len(counts)))]
-        beauty = bool(rng.random() < variation.beauty)
+        # Layers hold the noisy light alone: there is no direct light to add to theirs.
+        beauty = bool(rng.random() < variation.beauty) and not layers
         if of_samples & source.buffers and samples == min(source.layers, default=0) and not beauty:
             clip = read_window(source, window, spp=samples, buffers=names, layers=layers)
         else:

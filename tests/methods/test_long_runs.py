@@ -24,8 +24,8 @@ METHODS = [*filters(), *(name for name in LIGHTEST if name in shipped_names())]
 FORGETS = {"ntd-small": 80, "relax": 155, "relax-fitted": 155}
 """Frames after which a poisoned frame has to be forgotten, to 1 % of the clean run; 120 for all others.
 
-``relax``, with any constants: the largest number that a file holds fades from the fast mean, of 6 frames, to 1 % in 80 frames; what is left
-within the noise of that mean, a tenth, from the slow one, of 30 frames, in 70 more."""
+``relax``, with any constants: the largest number that a file holds fades from the fast mean, of 6 frames, to 1 % in 80
+frames; what is left within the noise of that mean, a tenth, from the slow one, of 30 frames, in 70 more."""
 
 
 def test_filters_and_the_lightest_weights_are_tested():
