@@ -10,7 +10,7 @@ from jax import lax
 
 from jaxdn.checks import check_image
 from jaxdn.denoiser import Denoiser, Params, State
-from jaxdn.frame import Clip, Frame, frame_at, only, present
+from jaxdn.frame import RADIANCE_MAX, Clip, Frame, frame_at, only, present
 from jaxdn.sampling import from_layers
 
 Layers = Mapping[int, Any] | None
@@ -41,7 +41,11 @@ def sampled(
             "rendered as requested, with sample_count; got neither."
         )
     wanted = denoiser.samples(params, state, only(frame, denoiser.reads), sum(layers))
-    radiance, counts = from_layers(layers, wanted, reference=reference)
+    # Their sum must not overflow; what is not a number stays, to be repaired and counted in the step.
+    bounded = {
+        n: jnp.where(jnp.isfinite(layer), jnp.minimum(layer, RADIANCE_MAX), layer) for n, layer in layers.items()
+    }
+    radiance, counts = from_layers(bounded, wanted, reference=reference)
     return only(frame._replace(radiance=radiance, sample_count=counts), denoiser.reads)
 
 

@@ -299,6 +299,9 @@ def adaptive(wrap=lambda denoiser: denoiser):
     return wrap(recurrent(core))
 
 
+ONES = jnp.ones((*SIZE, 1))
+
+
 def layered(rng, count=3):
     """A clip with layers of 1, 2 and 4 samples, and the radiance rendered before."""
     shape = (count, *SIZE, 3)
@@ -360,6 +363,18 @@ def test_the_step_gets_the_actual_number_of_samples(rng):
     jax.effects_barrier()
     np.testing.assert_array_equal(told[0], np.clip(np.round(100 * clip.frames.radiance[0, ..., :1]), 0, 7))
     np.testing.assert_allclose(image, from_layers(layers, told[0])[0], rtol=1e-6)
+
+
+def test_layers_are_bounded_and_what_is_no_number_in_them_is_repaired_and_counted(rng):
+    """The largest number in every layer: eight of it are more than float32 has."""
+    core = core_of(lambda params, state, frame, first: (state, frame.radiance, 0), samples=lambda *given: 7.0 * ONES)
+    clip = layered(rng, count=1)
+    bright = {n: layer.at[0, 0, 0].set(3e38).at[0, 0, 1].set(np.nan) for n, layer in clip.layers.items()}
+    one = stream(recurrent(core), {})
+    image = one(frame_at(clip.frames, 0), {n: layer[0] for n, layer in bright.items()})
+    np.testing.assert_array_equal(image[0, 0], RADIANCE_MAX)
+    np.testing.assert_array_equal(image[0, 1], 0)
+    assert one.repaired >= 3  # the mean of the largest may be larger by a rounding
 
 
 @pytest.mark.parametrize("rematerialize", [False, True])
