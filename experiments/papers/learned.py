@@ -66,7 +66,7 @@ class Settings:
     """Mitsuba scenes (.xml) to make tours of, for training."""
     scenes: list[Path] = field(default_factory=list)
     """Folders of rooms to test on: one folder with a scene.xml each."""
-    clips: int = 4
+    clips: int = 2
     """Training clips of each room and family."""
     stages: list[str] = field(default_factory=lambda: list(STAGES))
     """The runs to train and compare."""
@@ -93,10 +93,10 @@ def render_all(settings: Settings) -> None:
         render(source, place, animation=None, tours=tours, seeds=seeds, reference_spp=64, **size, **shared)
     place = settings.data / "test"
     for family in FAMILIES:
-        render(family, place, animation=None, seeds=[2000], reference_spp=256, **size, **shared)
+        render(family, place, animation=None, seeds=[2000], reference_spp=128, **size, **shared)
     wide = {"width": 2 * settings.size, "height": settings.size}
     for scene, animation in rooms.scenes_in(settings.scenes) if settings.scenes else []:
-        render(str(scene), place, animation=animation, seeds=[2000], reference_spp=256, **wide, **shared)
+        render(str(scene), place, animation=animation, seeds=[2000], reference_spp=128, **wide, **shared)
 
 
 def trained(name: str, settings: Settings) -> Candidate:
