@@ -49,6 +49,9 @@ class Stage(NamedTuple):
 STAGES = {
     "ntasd": Stage("ntasd", {"size": "small"}),
     "ntasd, uniform": Stage("ntasd", {"size": "small", "adaptive": False}),
+    "ntasd, three scales": Stage("ntasd", {"size": "small", "prediction": "three-scales"}),
+    "ntasd, one scale": Stage("ntasd", {"size": "small", "prediction": "one-scale"}),
+    "ntasd, direct": Stage("ntasd", {"size": "small", "prediction": "direct"}),
     "dasr": Stage("dasr", {"size": "small"}),
     "dasr, uniform": Stage("dasr", {"size": "small", "adaptive": False}),
     "ntd": Stage("ntd", {"size": "small"}),
@@ -107,7 +110,7 @@ def trained(name: str, settings: Settings) -> Candidate:
     recipe = method.recipe_named(None)._replace(
         steps=settings.steps, frames=settings.frames, average=0.99, spp=(1,) if asks else (BUDGET,)
     )
-    out = settings.out / name.replace(", ", "-")
+    out = settings.out / name.replace(", ", "-").replace(" ", "-")
     weights = train(method, recipe, [settings.data / "train"], out, options=stage.options, label=name)
     return candidate(str(weights))._replace(label=name)
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.speed.timing import Call
-from jaxdn.methods.ntd import TAPS
+from jaxdn.methods.reconstruction import TAPS
 from jaxdn.networks import Widths, description
 
 FLOAT = 4

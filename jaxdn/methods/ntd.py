@@ -24,20 +24,17 @@ from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.guides import depth_feature, hit_mask
 from jaxdn.frame import RADIANCE_MAX, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated
+from jaxdn.methods.reconstruction import SCALES, Prediction, begin_blending, blend, heads_of
 from jaxdn.methods.table import method
 from jaxdn.motion import on_screen
 from jaxdn.networks import LARGE, SMALL, Widths, crop, pad
 from jaxdn.objectives import indirect_illumination, unbiased_illumination
-from jaxdn.ops.softmax_filter import softmax_filter
 from jaxdn.ops.warp import warp
 from jaxdn.recipe import Recipe
 from jaxdn.repair import repair_image
-from jaxdn.scales import compose_scales, downsample, fill
+from jaxdn.scales import downsample, fill
 from jaxdn.variation import STILL
 
-TAPS = 25
-SCALES = 3
-"""Full, half and quarter resolution."""
 PRECISIONS = {"albedo": (3, 3.0), "normal": (3, 3.0), "depth": (1, 6.0), "reflectance": (3, 3.0), "roughness": (1, 3.0)}
 """Guide of the kernels -> its channels, and the logarithm of its precision at the start of training."""
 
@@ -72,6 +69,9 @@ class Options:
     guides: Literal["geometry", "materials"] = "geometry"
     """Buffers that the network sees: albedo, normal and depth, as in the paper; or ``reflectance`` and ``roughness``
     too."""
+    prediction: Prediction = "temporal"
+    """What the network predicts, see :mod:`jaxdn.methods.reconstruction`: kernels at three scales and one for the
+    history; without the one for the history; kernels at full resolution alone; or the image itself."""
     kernels: Literal["guided", "plain"] = "guided"
     """The network's logits plus a cross-bilateral prior, see :func:`guided_features`; or these logits alone, as in the
     paper."""
@@ -113,18 +113,6 @@ def initial_precisions(guides: Literal["geometry", "materials"]) -> Params:
     """Name of a guide -> [3, C] the logarithms of its precisions at each scale, before training."""
     names = ("albedo", "normal", "depth", *(("reflectance", "roughness") if guides == "materials" else ()))
     return {name: jnp.full((SCALES, PRECISIONS[name][0]), PRECISIONS[name][1], jnp.float32) for name in names}
-
-
-def _begin_blending(params: Params, fine: bool) -> Params:
-    """The weights with biases of the heads for which the first images are those of a plausible filter.
-
-    The current frame has the weight 0.12 and coarser scales 0.88, where unbiased heads would give one half: measured on
-    untrained guided kernels, 1.5 dB more PSNR and 3 to 4 dB more temporal PSNR.
-    """
-    seams = (("head_0", 2 * TAPS + 1), ("head_1", TAPS)) if fine else (("head_1", TAPS), ("head_2", TAPS))
-    for head, channel, bias in (("head_0", 2 * TAPS, -2.0), *((*seam, 2.0) for seam in seams)):
-        params = {**params, head: {**params[head], "bias": params[head]["bias"].at[channel].set(bias)}}
-    return params
 
 
 def guided_features(precisions: Params, guides: dict[str, jax.Array | None]) -> list[jax.Array | None]:
@@ -184,41 +172,6 @@ def warped_history(
         recalled = jnp.where(lost, noisy, recalled)
         absent = absent | lost
     return recalled, absent, broken
-
-
-def _blend(
-    options: Options,
-    heads: list[jax.Array],
-    guiding: list[jax.Array | None],
-    noisy: jax.Array,
-    recalled: jax.Array,
-    absent: jax.Array,
-) -> jax.Array:
-    """The kernels applied, and the scales and the history blended, in the domain of the images.
-
-    Args:
-      options: of the method.
-      heads: logits at full, half and quarter resolution.
-      guiding: features of the prior at the same resolutions; None for plain kernels.
-      noisy: [H, W, 3], in the domain that kernels work on.
-      recalled: [H, W, 3] the warped history, in the same domain.
-      absent: bool [H, W, 1], there is no history.
-    """
-    full, half, quarter = heads
-    scales = [noisy]
-    for _ in range(SCALES - 1):
-        scales.append(downsample(scales[-1], down=options.pyramid))
-    fine = options.alpha_at == "fine"
-    seams = (full[..., 2 * TAPS + 1 :], half[..., TAPS:]) if fine else (half[..., TAPS:], quarter[..., TAPS:])
-    coarsest = softmax_filter(scales[2][None], quarter, features=guiding[2])[0]
-    middle = softmax_filter(scales[1][None], half, features=guiding[1])[0]
-    finest, temporal = softmax_filter(jnp.stack([noisy, recalled]), full, features=guiding[0])
-    composed = coarsest
-    for image, seam in ((middle, seams[1]), (finest, seams[0])):
-        composed = compose_scales(image, composed, jax.nn.sigmoid(seam), down=options.down, up=options.up)
-    current = jax.nn.sigmoid(full[..., 2 * TAPS : 2 * TAPS + 1])
-    current = jnp.where(absent, 1.0, current)
-    return current * composed + (1.0 - current) * temporal
 
 
 @method(
@@ -282,10 +235,8 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
     flagged, materials = options.missing_history == "current", options.guides == "materials"
     # What is optional comes last: weights trained without it can be continued with it.
     groups = (3, 3, 3, 1, 3, *([1] if flagged else []), *([3, 1] if materials else []), *more.groups)
-    # full: two kernels and alpha^t; half, quarter: one kernel each. Each of the two blends has one alpha, at its finer
-    # or coarser scale.
-    fine = options.alpha_at == "fine"
-    heads = (2 * TAPS + 2, TAPS + 1, TAPS) if fine else (2 * TAPS + 1, TAPS + 1, TAPS + 1)
+    fine, direct = options.alpha_at == "fine", options.prediction == "direct"
+    heads = heads_of(options.prediction, fine=fine)
     # Flax is imported only when a network is built: filters without weights need only jax and numpy.
     from jaxdn.networks.unet import unet
 
@@ -298,12 +249,12 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
     reads |= {"reflectance", "roughness"} if materials else set()
     reads |= more.reads
 
-    guided = options.kernels == "guided"
+    guided = options.kernels == "guided" and not direct
 
     def init(key: jax.Array, frame: Frame) -> Params:
         params = network.init(key)
         if options.initialization == "he":
-            params = _begin_blending(params, fine)
+            params = begin_blending(params, options.prediction, fine=fine)
         return {**params, "guide": initial_precisions(options.guides)} if guided else params
 
     def start(params: Params, frame: Frame) -> jax.Array:
@@ -341,11 +292,13 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
         predicted = predict(params, features, noisy.dtype)
         guiding = guided_features(params["guide"] if guided else {}, seen)
 
-        if options.domain == "compressed":
-            blended = _blend(options, predicted, guiding, squeezed, squeezed_history, absent)
+        if direct:
+            image = color.expand(predicted[0]) / gain
+        elif options.domain == "compressed":
+            blended = blend(options, predicted, guiding, squeezed, squeezed_history, absent)
             image = color.expand(jnp.maximum(blended, 0.0)) / gain
         else:
-            image = _blend(options, predicted, guiding, noisy, recalled, absent)
+            image = blend(options, predicted, guiding, noisy, recalled, absent)
         image = jnp.clip(crop(image, size), 0.0, RADIANCE_MAX)
         shown = image if hit is None else jnp.where(hit[..., None], image, frame.radiance)
         return image, shown, broken

@@ -131,6 +131,45 @@ def test_data_flow_with_known_heads(options: dict[str, Any], rng: np.random.Gene
     assert after.age == 4
 
 
+@pytest.mark.parametrize("prediction", ["three-scales", "one-scale", "direct"])
+def test_less_than_all_kernels_with_known_heads(prediction: Any, rng: np.random.Generator) -> None:
+    """The ladder of Hasselgren et al. 2020: constant heads, and the image by hand; the history has no kernel."""
+    denoiser = tiny(prediction=prediction, kernels="plain", exposure="given")
+    noisy, history = rng.exponential(size=(2, 16, 32, 3))
+    frame = Frame(jnp.asarray(noisy, jnp.float32))
+    params = jax.tree.map(jnp.zeros_like, denoiser.init(jax.random.key(0), frame))
+    names = [name for name in params if name.startswith("head")]
+    heads = {name: rng.normal(size=params[name]["bias"].shape) for name in names}
+    sizes = {"three-scales": [25, 26, 26], "one-scale": [25], "direct": [3]}
+    assert [len(heads[name]) for name in sorted(heads)] == sizes[prediction]
+    for name, head in heads.items():
+        params[name]["bias"] = jnp.asarray(head, jnp.float32)
+    state = Recurrent(jnp.asarray(history, jnp.float32), jnp.asarray(3), jnp.asarray(0))
+    _, image = jax.jit(denoiser.step)(params, state, frame)
+    if prediction == "direct":
+        wanted = np.broadcast_to(np.expm1(np.maximum(heads["head_0"], 0) ** 2.2), noisy.shape)
+    else:
+        wanted = box(noisy, softmax(heads["head_0"][:25]))
+    if prediction == "three-scales":
+        scales = [half(noisy), half(half(noisy))]
+        middle, coarse = (box(each, softmax(heads[f"head_{i}"][:25])) for i, each in enumerate(scales, 1))
+        for finer, alpha in ((middle, heads["head_2"][25]), (wanted, heads["head_1"][25])):
+            coarse = finer - sigmoid(alpha) * double(half(finer)) + sigmoid(alpha) * double(coarse)
+        wanted = np.maximum(coarse, 0)
+    np.testing.assert_allclose(image, wanted, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("prediction", ["three-scales", "one-scale", "direct"])
+def test_less_than_all_kernels_begins_plausibly_and_learns(prediction: Any, rng: np.random.Generator) -> None:
+    denoiser, frames = tiny(prediction=prediction), random_frames(rng)
+    params = denoiser.init(jax.random.key(0), frame_at(frames, 0))
+    images = run(denoiser)(params, frames)
+    assert 0.3 < float(jnp.mean(images) / jnp.mean(frames.radiance)) < 3
+    slopes = jax.jit(jax.grad(lambda params: jnp.sum(jnp.sqrt(unroll(denoiser, params, frames) + 1))))(params)
+    assert all(np.abs(slopes[name]["kernel"]).max() > 0 for name in slopes if name.startswith("head"))
+    assert ("guide" in params) == (prediction != "direct")
+
+
 def blending(params: Any, logit: float) -> Any:
     """The same parameters with alpha^t the same everywhere."""
     head = params["head_0"]

@@ -17,7 +17,8 @@ from jaxdn.candidates import Candidate
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.filters.guides import depth_feature
 from jaxdn.frame import FAR, Frame
-from jaxdn.methods.ntd import TAPS, guided_features
+from jaxdn.methods.ntd import guided_features
+from jaxdn.methods.reconstruction import TAPS
 from jaxdn.motion import on_screen
 from jaxdn.networks import MULTIPLE, Widths
 from jaxdn.networks.engines import ENGINES
