@@ -89,7 +89,7 @@ def sample_map(logits: jax.Array, budget: float, *, least: int = 0, most: int, r
     if not (least <= budget <= most and budget > 0):
         raise ValueError(
             f"budget: expected a mean number of samples above 0 from {least} to {most}, the fewest and the most that a "
-            f"pixel can have, got {budget:g}."
+            f"pixel can have, got {budget:g}. A clip has as many as all its layers: `jaxdn render --layers 1 2 4 8`."
         )
     logits = jnp.asarray(logits)
     logits = jnp.where(jnp.isfinite(logits), logits, 0.0).astype(jnp.promote_types(logits.dtype, jnp.float32))
