@@ -20,6 +20,7 @@ from jax import lax
 
 from experiments.papers import results, rooms
 from experiments.papers.preintegration import save_pictures
+from jaxdn import color
 from jaxdn.candidates import NOISY, Candidate, candidate
 from jaxdn.clips import find_clips, read_clip
 from jaxdn.commands.compare import compare
@@ -138,7 +139,7 @@ def correlation(first: np.ndarray, second: np.ndarray) -> float:
 def save_maps(asking: list[Candidate], folders: list[Path], out: Path) -> str:
     """The map of the last frame of each clip as a picture, and its rank correlation with the noise, as Markdown.
 
-    The noise is the variance of a single sample's luminance, from the layers' differences, in 5 x 5 pixels.
+    The noise is that of compressed radiance (:func:`variance_of`).
     """
     lines = ["| clip | " + " | ".join(one.label for one in asking) + " |", "|---" * (len(asking) + 1) + "|"]
     for folder in folders:
@@ -154,9 +155,13 @@ def save_maps(asking: list[Candidate], folders: list[Path], out: Path) -> str:
 
 
 def variance_of(clip: Clip) -> np.ndarray:
-    """[H, W] the variance of one sample of the last frame, in the mean over 5 x 5 pixels and over the layers."""
-    layers = clip.layers or {}
-    errors = [n * np.square(np.asarray(layer[-1] - clip.reference[-1])).mean(-1) for n, layer in layers.items()]
+    """[H, W] the noise of the last frame at 4 samples and more, as the losses see it, in the mean over 5 x 5 pixels.
+
+    The variance of compressed radiance, of the layers of at least 4 samples: of fewer, the curve hides most of it.
+    """
+    wanted, layers = color.compress(clip.reference[-1]), clip.layers or {}
+    noisy = {n: color.compress(layer[-1]) for n, layer in layers.items() if n >= BUDGET}
+    errors = [n * np.square(np.asarray(layer - wanted)).mean(-1) for n, layer in noisy.items()]
     padded = np.pad(np.mean(errors, axis=0), 2, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (5, 5))
     return windows.mean((-1, -2))

@@ -168,7 +168,7 @@ def test_a_method_registered_at_run_time_has_its_rows(monkeypatch):
             near = frame.radiance / (1.0 + frame.hit_distance)
             return state, params["share"].astype(options.compute_dtype or near.dtype).astype(near.dtype) * near, 0
 
-        def requested(params, state, frame):
+        def requested(params, state, frame, first, most):
             return jnp.full_like(frame.radiance[..., :1], 3.0)
 
         def init(key, frame):
