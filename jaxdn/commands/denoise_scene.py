@@ -63,6 +63,10 @@ def denoise_scene(
     size: dict[str, Any] = {"width": settings.width, "height": settings.height}
     planned = plan_clip(scene, denoiser=reads, frames=wanted[-1] + 1, light="reflected", **size)
     assert planned is not None
+    if method.denoiser.samples is None and settings.budget != round(settings.budget):
+        raise ValueError(
+            f"--budget {settings.budget:g}: expected a whole number, as {method.label} does not say where samples go."
+        )
     step = stream(method.denoiser, method.params)
     most = max(MOST, round(settings.budget * MOST))
 

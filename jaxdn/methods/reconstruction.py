@@ -9,13 +9,13 @@ The steps of Hasselgren et al. 2020, sec. 3.2, each of which can be left out:
 * ``"direct"``: three numbers a pixel, the compressed image.
 """
 
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import jax
 import jax.numpy as jnp
 
-from jaxdn import color
 from jaxdn.denoiser import Params
+from jaxdn.methods.direct import beginning_grey
 from jaxdn.ops.softmax_filter import softmax_filter
 from jaxdn.scales import compose_scales, downsample
 
@@ -62,10 +62,10 @@ def begin_blending(params: Params, prediction: Prediction, *, fine: bool) -> Par
     untrained guided kernels, 1.5 dB more PSNR and 3 to 4 dB more temporal PSNR. A direct image begins as a middle grey:
     below 0 it is black, and nothing is learnt.
     """
-    biases: list[tuple[str, Any, Any]] = []
     if prediction == "direct":
-        biases = [("head_0", slice(None), color.compress(jnp.float32(0.18)))]
-    elif prediction != "one-scale":
+        return beginning_grey(params, "head_0")
+    biases: list[tuple[str, int, float]] = []
+    if prediction != "one-scale":
         seams = (("head_0", -1), ("head_1", -1)) if fine else (("head_1", -1), ("head_2", -1))
         biases = [(*seam, 2.0) for seam in seams]
     if prediction == "temporal":

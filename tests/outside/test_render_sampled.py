@@ -135,6 +135,13 @@ def test_what_cannot_be_rendered_is_told(wrong, weights, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_filter_that_does_not_ask_cannot_have_half_a_sample(tmp_path):
+    done = jaxdn("denoise", "fruit", "-o", tmp_path / "out", "--method", "svgf", "--frames", "0", "--budget", "2.5")
+    assert done.returncode == 2
+    assert "--budget 2.5: expected a whole number, as svgf does not say where samples go" in done.stderr
+
+
+@pytest.mark.slow
 def test_options_of_a_scene_do_not_fit_clips(weights, tmp_path):
     done = jaxdn("denoise", tmp_path, "-o", tmp_path / "out", "--method", weights, "--width", "32")
     assert done.returncode == 2
