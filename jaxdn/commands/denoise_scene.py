@@ -63,9 +63,10 @@ def denoise_scene(
     size: dict[str, Any] = {"width": settings.width, "height": settings.height}
     planned = plan_clip(scene, denoiser=reads, frames=wanted[-1] + 1, light="reflected", **size)
     assert planned is not None
-    if method.denoiser.samples is None and settings.budget != round(settings.budget):
+    if method.denoiser.samples is None and (settings.budget < 1 or settings.budget % 1):
         raise ValueError(
-            f"--budget {settings.budget:g}: expected a whole number, as {method.label} does not say where samples go."
+            f"--budget {settings.budget:g}: expected a whole number of at least 1, as {method.label} does not say "
+            "where samples go."
         )
     step = stream(method.denoiser, method.params)
     most = max(MOST, round(settings.budget * MOST))

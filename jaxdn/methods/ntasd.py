@@ -40,19 +40,7 @@ class Options(ntd.Options, Sampling):
     """The upsampling U of coarser scales."""
 
 
-PAPER = Options(
-    depth_scale="unit",
-    border="zeros",
-    first_frame="noisy",
-    missing_history="blend",
-    kernels="plain",
-    background="filter",
-    exposure="given",
-    initialization="xavier",
-    least=0,
-    rounding="nearest",
-    demodulate="none",
-)
+PAPER = Options(least=0, rounding="nearest", **ntd.AS_PUBLISHED)
 """The settings of Hasselgren et al. 2020, as far as they are known."""
 
 

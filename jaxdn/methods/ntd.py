@@ -14,7 +14,7 @@ Information", 2021.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -94,18 +94,19 @@ class Options:
     ``onednn``). None is XLA."""
 
 
-PARITY = Options(
-    down="max",
-    depth_scale="unit",
-    border="zeros",
-    first_frame="noisy",
-    missing_history="blend",
-    kernels="plain",
-    background="filter",
-    exposure="given",
-    initialization="xavier",
-    demodulate="none",
-)
+AS_PUBLISHED: dict[str, Any] = {
+    "depth_scale": "unit",
+    "border": "zeros",
+    "first_frame": "noisy",
+    "missing_history": "blend",
+    "kernels": "plain",
+    "background": "filter",
+    "exposure": "given",
+    "initialization": "xavier",
+    "demodulate": "none",
+}
+"""The settings that this paper and that of ``ntasd`` share."""
+PARITY = Options(down="max", **AS_PUBLISHED)
 """The exact paper settings: D is max-pooling (eq. 4), taps outside the image are 0, the first history is noisy."""
 
 
