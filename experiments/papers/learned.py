@@ -35,7 +35,7 @@ from jaxdn.report.results import mean_scores
 from jaxdn.rollout import sampled
 
 FAMILIES = ("parlour", "fruit", "mobile", "pinkroom", "robot")
-LAYERS = [1, 2, 4, 8, 16]
+LAYERS = [1, 2, 4, 8, 16, 32]
 BUDGET = 4
 READERS = "ntd,rae,arae,ntasd,dasr,svgf,steady"
 
