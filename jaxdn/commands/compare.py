@@ -33,6 +33,8 @@ class Footage(NamedTuple):
     """Two independent references [T, H, W, 3] of half the samples each; None if they are not known."""
     noise_floor: float
     """dB, the PSNR of a perfect image against the reference; not a number without halves."""
+    relative_to: Any = None
+    """[T, H, W, 3] what relative MSE without the reference's noise is relative to; None: to the reference."""
 
 
 def read_footage(folder: Path, *, spp: int = 1, layers: bool = False) -> Footage:
@@ -48,7 +50,11 @@ def read_footage(folder: Path, *, spp: int = 1, layers: bool = False) -> Footage
 
 @jax.jit
 def _clip_scores(
-    denoised: jax.Array, reference: jax.Array, hidden: jax.Array, halves: Halves | None
+    denoised: jax.Array,
+    reference: jax.Array,
+    hidden: jax.Array,
+    halves: Halves | None,
+    relative_to: jax.Array | None = None,
 ) -> dict[str, jax.Array]:
     """Every score of a linear clip, and the curves over its frames; those without the noise of the reference too.
 
@@ -57,6 +63,7 @@ def _clip_scores(
       reference: [T, H, W, 3].
       hidden: [T, H, W, 1], above 0 where a point was hidden one frame earlier.
       halves: two independent references of half the samples each, where the clip has them.
+      relative_to: [T, H, W, 3] that of :func:`jaxdn.metrics.unbiased_relative_mse`.
     """
     image, wanted = color.tonemap(denoised), color.tonemap(reference)
     found = {
@@ -73,10 +80,12 @@ def _clip_scores(
         "frame_l1": jax.vmap(metrics.l1)(image, wanted),
         "frame_disoccluded_l1": jax.vmap(lambda a, b, m: metrics.l1(a, b, mask=m))(image, wanted, hidden),
     }
-    return found if halves is None else found | unbiased_scores(denoised, hidden, halves)
+    return found if halves is None else found | unbiased_scores(denoised, hidden, halves, relative_to)
 
 
-def unbiased_scores(denoised: jax.Array, hidden: jax.Array, halves: Halves) -> dict[str, jax.Array]:
+def unbiased_scores(
+    denoised: jax.Array, hidden: jax.Array, halves: Halves, relative_to: jax.Array | None = None
+) -> dict[str, jax.Array]:
     """The scores of a linear clip without the noise of the reference; the arguments are those of ``_clip_scores``."""
     image, shown = color.tonemap(denoised), color.tonemap_halves(*halves)
     return {
@@ -84,7 +93,7 @@ def unbiased_scores(denoised: jax.Array, hidden: jax.Array, halves: Halves) -> d
         "unbiased_temporal_psnr": metrics.unbiased_temporal_psnr(image, *shown),
         "unbiased_mse": metrics.unbiased_mse(image, *shown),
         "unbiased_disoccluded_mse": metrics.unbiased_mse(image, *shown, mask=hidden),
-        "unbiased_relative_mse": metrics.unbiased_relative_mse(denoised, *halves),
+        "unbiased_relative_mse": metrics.unbiased_relative_mse(denoised, *halves, relative_to=relative_to),
     }
 
 
@@ -188,7 +197,7 @@ def _compare_on(
             denoised, milliseconds = inputs.frames.radiance, 0.0
         else:
             denoised, milliseconds = _timed(compiled[method.label], method.params, inputs, shape[0])
-        scored = _clip_scores(denoised, reference, hidden * 1.0, halves)
+        scored = _clip_scores(denoised, reference, hidden * 1.0, halves, footage.relative_to)
         found = {name: np.asarray(value) for name, value in scored.items()}
         scores[method.label] = _as_scores(found, hidden, milliseconds, spp)
         per_frame[method.label] = {

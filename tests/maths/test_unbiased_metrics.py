@@ -129,6 +129,35 @@ def test_relative_mse_is_the_true_one_where_the_plain_one_is_twice_as_large(kind
         assert abs(off(jnp.mean((image - first) * (image - second) / (mean**2 + 0.01)))) > 0.7
 
 
+def test_relative_mse_under_noise_of_heavy_tails_needs_a_weight_without_it():
+    rng = np.random.default_rng(8)
+    truth = np.exp(rng.uniform(np.log(0.05), np.log(1.2), (300, 400, 3)))
+    # One pixel in fifty has 6 times its light in a half, and the others less, so that the mean is right.
+    lit = [rng.random(truth.shape) < 0.02 for _ in range(2)]
+    first, second = (truth * np.where(bright, 6.0, 0.88 / 0.98) for bright in lit)
+    image = truth * (1 + 0.1 * rng.standard_normal(truth.shape))
+    near = truth * (1 + 0.03 * rng.standard_normal(truth.shape))
+    true = np.mean((image - truth) ** 2 / (near**2 + 0.01))
+    image, first, second, near = singles(image, first, second, near)
+    assert float(metrics.unbiased_relative_mse(image, first, second)) > 5 * true
+    found = metrics.unbiased_relative_mse(image, first, second, relative_to=near)
+    assert float(found) == pytest.approx(true, rel=0.25)
+
+
+@pytest.mark.parametrize("clip", [True, False])
+def test_a_given_weight_is_used_alone(rng, clip):
+    shape = (3, 8, 9, 3) if clip else (8, 9, 3)
+    image, first, second, near = rng.exponential(0.3, (4, *shape))
+    mask = rng.random((*shape[:-1], 1)) < 0.5
+    broken = [jnp.where(mask, each, jnp.nan) for each in singles(image, first, second, near)]
+    x, a, b, n = (each[mask[..., 0]] for each in (image, first, second, near))
+    expected = np.mean((x - a) * (x - b) / (n**2 + 0.01))
+    found = metrics.unbiased_relative_mse(*broken[:3], relative_to=broken[3], mask=mask)
+    np.testing.assert_allclose(found, expected, rtol=2e-5)
+    with pytest.raises(ValueError, match="same size"):
+        metrics.unbiased_relative_mse(*singles(image, first, second), relative_to=near[..., 1:, :])
+
+
 @pytest.mark.parametrize("clip", [True, False])
 def test_what_is_computed_in_numpy(rng, clip):
     shape = (3, 8, 9, 3) if clip else (8, 9, 3)
