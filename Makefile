@@ -7,7 +7,7 @@ train weights: export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 # XLA raises its errors; what it logs besides is an alarm at every compilation of more than two minutes.
 export TF_CPP_MIN_LOG_LEVEL ?= 3
 
-.PHONY: help setup train test test-slow bench chart compare hard-cases lint format docs weights clean
+.PHONY: help setup train test test-slow bench chart compare papers hard-cases lint format docs weights clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -58,6 +58,9 @@ bench: .venv/tools  ## time operations, steps and training, compared with PyTorc
 
 chart: .venv/tools  ## error against time for every way to make an image: runs/chart/chart.html
 	$(BIN)/python -m experiments.speed.chart $(SETTINGS)
+
+papers: setup  ## the tables of the papers on learned denoisers, on small settings: runs/papers/report.md (tens of minutes)
+	$(BIN)/python -m experiments.papers.learned $(SETTINGS)
 
 compare: .venv/tools  ## the filters side by side, errors and times: runs/compare/table.md (SETTINGS="SCENES" adds rooms)
 	$(BIN)/python -m experiments.papers.classical $(SETTINGS)

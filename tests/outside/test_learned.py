@@ -1,38 +1,140 @@
-"""The comparison of the learned relatives, on one family and after two updates."""
+"""The tables of the papers on learned denoisers: on one family and after two updates, and from results made up."""
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from experiments.papers import learned
+from experiments.papers.learned import __main__ as learned
+from experiments.papers.learned import maps, ntasd_holdout, ntasd_methods, ntasd_sizes, reach, scores, stages
+from jaxdn.report import ClipResult, Results, Scores
 
-pytestmark = pytest.mark.slow
 
-
+@pytest.mark.slow
 def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(learned, "FAMILIES", ("fruit",))
-    stages = ["ntasd", "ntasd, uniform", "rae"]
-    settings = learned.Settings(
-        clips=1, stages=stages, steps=2, frames=2, size=64, data=tmp_path / "data", out=tmp_path / "runs", workers=1
+    monkeypatch.setattr(stages, "FAMILIES", ("fruit", "parlour"))
+    monkeypatch.setattr(ntasd_holdout, "HELD_OUT", ("parlour",))
+    seen = ntasd_holdout.SEEN
+    rows = (seen, f"{seen}, without parlour")
+    tables = {
+        "ntasd_holdout": ntasd_holdout.TABLE._replace(rows=rows),
+        "small": scores.Table(
+            "Two", ("ntasd", "rae"), lambda found: scores.ordinary(found, ("ntasd", "rae")), no_claims
+        ),
+    }
+    monkeypatch.setattr(learned, "TABLES", tables)
+    settings = stages.Settings(
+        clips=1, steps=2, frames=2, size=64, data=tmp_path / "data", out=tmp_path / "runs", workers=1
     )
     learned.main(settings)
-    text = (tmp_path / "runs" / "table.md").read_text()
-    for label in ("noisy", "svgf", *stages):
+    text = (tmp_path / "runs" / "report.md").read_text()
+    for label in ("ntasd", "rae", "parlour"):
         assert re.search(rf"\| {label} \| \d", text), text
-    assert re.search(r"\| fruit-2000 \| -?\d\.\d\d, 1 to \d+ \|", text), text
-    assert (tmp_path / "runs" / "pictures" / "fruit-2000" / "ntasd-samples.png").is_file()
+    assert re.search(r"\| fruit-2000 \| -?\d\.\d\d, \d+ to \d+ \|", text), text
+    for method in reach.DENOISERS:
+        assert re.search(rf"\| {method}( \| \d\.\d\d){{4}} \|", text), text
+    for name in ("ntasd-samples", "noise", "rae"):
+        assert (tmp_path / "runs" / "pictures" / "fruit-2000" / f"{name}.png").is_file()
     assert (tmp_path / "runs" / "report.html").is_file()
+    with_it, without = (
+        tmp_path / "runs" / each / "log.jsonl" for each in ("ntasd-uniform", "ntasd-uniform-without-parlour")
+    )
+    assert with_it.read_text() != without.read_text(), "the family was not left out"
 
 
-def test_unknown_stages_raise() -> None:
-    with pytest.raises(ValueError, match="--stages: expected some of ntasd"):
-        learned.main(learned.Settings(stages=["vae"]))
+def no_claims(_: Results) -> list[scores.Claim]:
+    return []
+
+
+def results_of(**columns: dict[str, float]) -> Results:
+    """Two clips with these scores: label -> field -> value, shifted by a little between the clips."""
+    image = np.zeros((4, 5, 3))
+
+    def clip(name: str, shift: float) -> ClipResult:
+        own: dict[str, Any] = {
+            label: {field: value + shift for field, value in given.items()} for label, given in columns.items()
+        }
+        nothing = dict.fromkeys(Scores._fields[:10], 0.0)
+        shown = {label: Scores(**{**nothing, **given}) for label, given in own.items()}
+        frames = {label: {"psnr": [20.0 + shift, 21.0 + shift]} for label in columns}
+        return ClipResult(name, 40.0, shown, frames, 0, {"reference": image}, np.zeros((4, 5), bool))
+
+    return Results("made up", {}, {}, list(columns), [clip("parlour-2000", -0.5), clip("mobile-2000", 0.5)], {})
+
+
+def test_claims_hold_or_not_by_the_numbers() -> None:
+    rows = {
+        label: {"unbiased_relative_mse": 2.0, "unbiased_psnr": 20.0, "unbiased_temporal_psnr": 20.0}
+        for label in ntasd_methods.ROWS
+    }
+    rows["ntasd"] |= {"unbiased_relative_mse": 1.0, "unbiased_temporal_psnr": 19.0}
+    rows["rae"] |= {"unbiased_psnr": 18.5}
+    claims = {claim.text: claim for claim in ntasd_methods.claims(results_of(**rows))}
+    adaptive = claims["adaptive / uniform sampling, relative MSE"]
+    assert (adaptive.ours, adaptive.holds) == ("0.50", True)
+    assert not claims["NTASD is steadier than DASR, temporal PSNR"].holds
+    assert claims["NTASD is better than RAE, PSNR"].ours == "+1.50 dB"
+    text = scores.claims_table(claims.values())
+    assert "| NTASD is steadier than DASR, temporal PSNR | above 0 | -1.00 dB | not here |" in text
+
+
+def test_the_loss_of_a_family_is_that_of_its_own_clips(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ntasd_holdout, "HELD_OUT", ("parlour", "mobile"))
+    seen = ntasd_holdout.SEEN
+    found = results_of(
+        **{
+            seen: {"unbiased_psnr": 30.0},
+            f"{seen}, without parlour": {"unbiased_psnr": 29.0},
+            f"{seen}, without mobile": {"unbiased_psnr": 29.6},
+        }
+    )
+    assert ntasd_holdout.losses(found)["parlour"] == pytest.approx((29.5, 28.5))
+    assert "| mobile | 30.50 | 30.10 | 0.40 |" in ntasd_holdout.text(found)
+    (claim,) = ntasd_holdout.claims(found)
+    assert (claim.ours, claim.holds) == ("0.40 to 1.00 dB", False)
+
+
+def test_the_ladder_is_climbed_step_by_step() -> None:
+    psnr = {ntasd_sizes.SMALL: 27.0, ntasd_sizes.LARGE: 27.5} | dict(
+        zip(ntasd_sizes.LADDER, (20, 24, 25, 25), strict=True)
+    )
+    given = {
+        label: {"unbiased_psnr": float(value), "unbiased_temporal_psnr": 25.0, "ms_per_frame": 10.0}
+        for label, value in psnr.items()
+    }
+    claims = {claim.text: claim for claim in ntasd_sizes.claims(results_of(**given))}
+    assert claims["a kernel in place of colours, PSNR"].ours == "+4.00 dB"
+    assert claims["three scales in place of one, PSNR"].ours == "+1.00 dB"
+    assert not claims["a kernel for the previous image, temporal PSNR"].holds
+
+
+def test_curves_over_frames_are_means_over_clips() -> None:
+    assert "| rae | 20.00 | 21.00 |" in scores.over_frames(results_of(rae={}), ["rae"])
+
+
+def test_unknown_tables_raise() -> None:
+    with pytest.raises(ValueError, match="--tables: expected some of ntasd_methods"):
+        learned.main(stages.Settings(tables=["vae"]))
+
+
+def test_a_family_is_left_out_by_its_name() -> None:
+    folders = [Path("data") / name for name in ("robot-0", "robot-1", "fruit-0", "robots-0")]
+    assert [folder.name for folder in stages.clips_without("robot", folders)] == ["fruit-0", "robots-0"]
+    assert stages.clips_without(None, folders) == folders
+
+
+def test_samples_are_placed_in_proportion(rng: np.random.Generator) -> None:
+    importance = np.ones((1, 8, 8))
+    importance[:, :, 4:] = 3
+    counts = np.asarray(reach.placed(importance))[..., 0]
+    assert counts.mean() == pytest.approx(stages.BUDGET)
+    assert counts[0, :, 4:].mean() / counts[0, :, :4].mean() == pytest.approx(3, rel=0.2)
 
 
 def test_ranks_correlate_whatever_their_scale(rng: np.random.Generator) -> None:
     values = rng.normal(size=(20, 20))
-    assert learned.correlation(values, np.exp(3 * values)) == pytest.approx(1)
-    assert learned.correlation(values, -values) == pytest.approx(-1)
-    assert abs(learned.correlation(values, rng.normal(size=(20, 20)))) < 0.2
+    assert maps.correlation(values, np.exp(3 * values)) == pytest.approx(1)
+    assert maps.correlation(values, -values) == pytest.approx(-1)
+    assert abs(maps.correlation(values, rng.normal(size=(20, 20)))) < 0.2

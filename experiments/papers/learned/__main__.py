@@ -1,0 +1,75 @@
+"""`make papers`: which of the papers' claims on learned temporal denoising hold here?
+
+    python -m experiments.papers.learned [--rooms rooms/*/scene.xml] [--scenes scenes]      # resumable
+
+Renders clips with layers of 1 to 32 samples, trains every network that a table needs, in its small size with the same
+number of updates and four samples a pixel, and scores them on clips of seeds and scenes that none has seen. Writes
+``runs/papers/report.md`` with every table and claim, ``report.html``, every method's image, and maps of samples.
+"""
+
+import tyro
+
+from experiments.papers.learned import (
+    ntasd_holdout,
+    ntasd_methods,
+    ntasd_sizes,
+    rae_methods,
+    reach,
+    zeng_methods,
+)
+from experiments.papers.learned.maps import asks, save_maps
+from experiments.papers.learned.scores import Table, claims_table, read
+from experiments.papers.learned.stages import BUDGET, STAGES, Settings, render_all, trained
+from experiments.papers.preintegration import save_pictures
+from jaxdn.candidates import candidate
+from jaxdn.commands.compare import compare
+from jaxdn.commands.errors import plain_errors
+from jaxdn.report import Results, write_report
+
+TABLES = {
+    file.__name__.rpartition(".")[2]: file.TABLE
+    for file in (ntasd_methods, ntasd_holdout, ntasd_sizes, rae_methods, zeng_methods)
+}
+REFERENCES = ("noisy", "svgf", "steady-balanced")
+"""In every run, whatever the tables."""
+
+
+def tables_named(names: list[str]) -> list[Table]:
+    """All for no names. Raises ValueError for an unknown one."""
+    if unknown := [name for name in names if name not in TABLES]:
+        raise ValueError(f"--tables: expected some of {', '.join(TABLES)}, got {', '.join(unknown)}.")
+    return [TABLES[name] for name in names or TABLES]
+
+
+def sections(tables: list[Table], found: Results) -> list[str]:
+    """Each table with its claims, as Markdown."""
+    return [f"## {one.title}\n\n{one.text(found)}\n\n{claims_table(one.claims(found))}" for one in tables]
+
+
+def main(settings: Settings) -> None:
+    """Render, train, compare, report. Raises ValueError for an unknown table."""
+    tables = tables_named(settings.tables)
+    folders = render_all(settings)
+    rows = dict.fromkeys([*REFERENCES, *(row for one in tables for row in one.rows)])
+    methods = [trained(row, settings) if row in STAGES else candidate(row) for row in rows]
+    title = f"The papers' tables after {settings.steps} updates, {BUDGET} samples a pixel"
+    found = compare(methods, folders, title=title, settings={"clips": len(folders)}, spp=BUDGET, read=read)
+    page = write_report(found, settings.out)
+    pictures = settings.out / "pictures"
+    save_pictures(found, pictures)
+    text = [f"# {title}", f"{len(folders)} test clips. Means without the noise of the references, but for FLIP and L1."]
+    text += sections(tables, found)
+    if asking := [one for one in methods if asks(one)]:
+        maps = save_maps(asking, folders, pictures)
+        text.append(f"## Where samples go: rank correlation with the noise, fewest to most\n\n{maps}")
+    known = [one for one in methods if one.label in reach.DENOISERS]
+    text.append(f"## How much well-placed samples could save\n\n{reach.table(known, folders)}")
+    report = settings.out / "report.md"
+    report.write_text("\n\n".join(text) + "\n")
+    print("\n\n".join(text))
+    print(f"\nreport: {report}, {page}")
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Settings, description=Settings.__doc__))

@@ -1,0 +1,28 @@
+"""SVGF, A-SVGF, RAE and A-RAE (Chaitanya et al. 2017; Schied et al. 2017, 2018), each with and without adaptive
+accumulation.
+"""
+
+from experiments.papers.learned.scores import Claim, Table, ordinary, over_frames, psnr_gain
+from jaxdn.report import Results
+from jaxdn.report.results import mean_scores
+
+ROWS = ("svgf", "asvgf", "rae", "arae")
+
+
+def text(found: Results) -> str:
+    """The table, and how errors change over the frames."""
+    return f"{ordinary(found, ROWS)}\n\n{over_frames(found, ROWS)}"
+
+
+def claims(found: Results) -> list[Claim]:
+    """On accumulation, and on the network against the filter. No number of the papers is known to us."""
+    means, found_claims = mean_scores(found), []
+    for first, second in (("arae", "rae"), ("asvgf", "svgf"), ("arae", "asvgf")):
+        better = psnr_gain(found, first, second)
+        steadier = means[first].unbiased_temporal_psnr - means[second].unbiased_temporal_psnr
+        ours = f"{better:+.2f} dB, temporal {steadier:+.2f} dB"
+        found_claims.append(Claim(f"{first} is better than {second}, PSNR", "above 0", ours, better > 0))
+    return found_claims
+
+
+TABLE = Table("SVGF, A-SVGF, RAE and A-RAE", ROWS, text, claims)

@@ -1,0 +1,103 @@
+"""The images of all methods on the test clips, and what the tables say of them."""
+
+from collections.abc import Callable, Iterable
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.papers import results
+from jaxdn.candidates import candidate
+from jaxdn.commands.compare import Footage, read_footage
+from jaxdn.frame import Frame
+from jaxdn.report import Results
+from jaxdn.report.results import mean_scores
+from jaxdn.rollout import unroll
+
+
+class Claim(NamedTuple):
+    """What a paper says, beside what was measured here."""
+
+    text: str
+    paper: str
+    ours: str
+    holds: bool
+
+
+class Table(NamedTuple):
+    """One table of a paper."""
+
+    title: str
+    rows: tuple[str, ...]
+    """Stages of training, filters and shipped weights, in the order of the table."""
+    text: Callable[[Results], str]
+    """The results of all rows -> the table as Markdown."""
+    claims: Callable[[Results], list[Claim]]
+
+
+def read(folder: Path, *, spp: int, layers: bool = False) -> Footage:
+    """A test clip whose relative MSE is relative to the image that :func:`near` makes of all stored samples.
+
+    The references have 128 samples, whose noise is 15 to 27 % of the light and has heavy tails: relative to them, the
+    errors of all methods would be that noise's.
+    """
+    footage = read_footage(folder, spp=spp, layers=True)
+    stored = footage.clip.layers
+    if not stored:
+        raise ValueError(f"{folder}: expected layers of samples; render the clip with --layers.")
+    mean = sum(n * layer for n, layer in stored.items()) / sum(stored)
+    frames = footage.clip.frames._replace(radiance=jnp.asarray(mean), sample_count=None)
+    clip = footage.clip if layers else footage.clip._replace(layers=None)
+    return footage._replace(clip=clip, relative_to=near()(jax.tree.map(jnp.asarray, frames)))
+
+
+@cache
+def near() -> Callable[[Frame], jax.Array]:
+    """Frames [T, ...] -> images near the truth: a shipped network, which none of the tables' networks shares."""
+    one = candidate("steady-balanced")
+    assert one.denoiser is not None
+    denoiser = one.denoiser
+    return jax.jit(lambda frames: unroll(denoiser, one.params, frames))
+
+
+def rows_of(found: Results, labels: Iterable[str]) -> Results:
+    """The results of some methods only."""
+    return found._replace(methods=list(labels))
+
+
+def ordinary(found: Results, labels: Iterable[str]) -> str:
+    """PSNR, temporal PSNR and others with relative MSE, in the mean over the clips, as Markdown."""
+    some = rows_of(found, labels)
+    errors = {label: f"{one.unbiased_relative_mse:.4f}" for label, one in mean_scores(some).items()}
+    return results.table(some, {"relative MSE": errors})
+
+
+def over_frames(found: Results, labels: Iterable[str]) -> str:
+    """PSNR of each frame in the mean over the clips, as Markdown; with the references' noise in it."""
+    curves = {label: np.mean([clip.per_frame[label]["psnr"] for clip in found.clips], axis=0) for label in labels}
+    numbers = range(1, 1 + len(next(iter(curves.values()))))
+    lines = ["| PSNR of frame | " + " | ".join(map(str, numbers)) + " |", "|---" * (len(numbers) + 1) + "|"]
+    lines += [f"| {label} | " + " | ".join(f"{value:.2f}" for value in curve) + " |" for label, curve in curves.items()]
+    return "\n".join(lines)
+
+
+def error_ratio(found: Results, first: str, second: str) -> float:
+    """Of the mean relative MSE of two methods."""
+    means = mean_scores(found)
+    return means[first].unbiased_relative_mse / means[second].unbiased_relative_mse
+
+
+def psnr_gain(found: Results, first: str, second: str) -> float:
+    """Mean decibels of the first above the second."""
+    means = mean_scores(found)
+    return means[first].unbiased_psnr - means[second].unbiased_psnr
+
+
+def claims_table(claims: Iterable[Claim]) -> str:
+    """As Markdown."""
+    lines = ["| the paper's claim | there | here | |", "|---|---|---|---|"]
+    lines += [f"| {one.text} | {one.paper} | {one.ours} | {'holds' if one.holds else 'not here'} |" for one in claims]
+    return "\n".join(lines)

@@ -1,0 +1,113 @@
+"""What the tables are made from: clips with layers, and networks that are trained on them alike."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from experiments.papers import rooms
+from jaxdn.candidates import Candidate, candidate
+from jaxdn.clips import find_clips
+from jaxdn.commands.render import render
+from jaxdn.commands.train import train
+from jaxdn.methods.table import method_named
+
+FAMILIES = ("parlour", "fruit", "mobile", "pinkroom", "robot")
+HELD_OUT = ("parlour", "mobile", "pinkroom", "robot")
+"""The families that :data:`STAGES` leave out of training, one each."""
+LAYERS = [1, 2, 4, 8, 16, 32]
+BUDGET = 4
+"""Samples a pixel: the same everywhere, or in the mean for those who ask for samples."""
+TRAINED = "ntd,rae,arae,ntasd,dasr,svgf,steady"
+"""The methods whose buffers the training clips have."""
+COMPARED = f"{TRAINED},asvgf,trmv"
+"""The methods whose buffers the test clips have."""
+TEST_SEED = 2000
+
+
+class Stage(NamedTuple):
+    """One run of training."""
+
+    method: str
+    options: dict[str, Any]
+    without: str | None = None
+    """The family whose clips are left out."""
+
+
+_UNIFORM = Stage("ntasd", {"size": "small", "adaptive": False})
+STAGES = {
+    "ntasd": Stage("ntasd", {"size": "small"}),
+    "ntasd, uniform": _UNIFORM,
+    "ntasd, uniform, large": Stage("ntasd", {"size": "large", "adaptive": False}),
+    "ntasd, three scales": Stage("ntasd", {"size": "small", "prediction": "three-scales"}),
+    "ntasd, one scale": Stage("ntasd", {"size": "small", "prediction": "one-scale"}),
+    "ntasd, direct": Stage("ntasd", {"size": "small", "prediction": "direct"}),
+    "dasr": Stage("dasr", {"size": "small"}),
+    "dasr, uniform": Stage("dasr", {"size": "small", "adaptive": False}),
+    "ntd": Stage("ntd", {"size": "small"}),
+    "rae": Stage("rae", {"size": "small"}),
+    "arae": Stage("arae", {"size": "small"}),
+    **{f"ntasd, uniform, without {family}": _UNIFORM._replace(without=family) for family in HELD_OUT},
+}
+
+
+@dataclass
+class Settings:
+    """Train the learned relatives alike and remake the papers' tables. The defaults are small."""
+
+    rooms: list[Path] = field(default_factory=list)
+    """Mitsuba scenes (.xml) to make tours of, for training."""
+    scenes: list[Path] = field(default_factory=list)
+    """Folders of rooms to test on: one folder with a scene.xml each."""
+    clips: int = 2
+    """Training clips of each room and family."""
+    tables: list[str] = field(default_factory=list)
+    """Files of this folder whose tables are made, without .py; none: all of them."""
+    steps: int = 100
+    """Updates of each network."""
+    frames: int = 5
+    """Frames that the gradient is propagated back through."""
+    size: int = 64
+    """Width and height of the clips in pixels; of rooms that are tested on, twice that and as high."""
+    data: Path = Path("data/papers")
+    out: Path = Path("runs/papers")
+    workers: int | None = None
+    """Number of rendering processes; default: the number of cores."""
+
+
+def render_all(settings: Settings) -> list[Path]:
+    """Render what is missing: clips to train on, of seeds from 0 on, and to test on, which are returned."""
+    size = {"width": settings.size, "height": settings.size}
+    shared: dict[str, Any] = {"layers": LAYERS, "draws": BUDGET, "max_depth": None, "effects": "auto"}
+    shared |= {"workers": settings.workers, "frames": 8}
+    seeds = list(range(settings.clips))
+    for source, tours in [*((str(room), True) for room in settings.rooms), *((name, False) for name in FAMILIES)]:
+        place = settings.data / "train"
+        own: dict[str, Any] = {"denoiser": TRAINED, "seeds": seeds, "reference_spp": 64, "tours": tours}
+        render(source, place, animation=None, **own, **size, **shared)
+    place = settings.data / "test"
+    shared |= {"denoiser": COMPARED, "seeds": [TEST_SEED], "reference_spp": 128}
+    for family in FAMILIES:
+        render(family, place, animation=None, **size, **shared)
+    wide = {"width": 2 * settings.size, "height": settings.size}
+    for scene, animation in rooms.scenes_in(settings.scenes) if settings.scenes else []:
+        render(str(scene), place, animation=animation, **wide, **shared)
+    return find_clips(place)
+
+
+def trained(name: str, settings: Settings) -> Candidate:
+    """A stage, trained if it is not."""
+    stage = STAGES[name]
+    method = method_named(stage.method)
+    recipe = method.recipe_named(None)._replace(
+        steps=settings.steps, frames=settings.frames, average=0.99, spp=(1,) if method.knows("budget") else (BUDGET,)
+    )
+    out = settings.out / name.replace(", ", "-").replace(" ", "-")
+    clips = clips_without(stage.without, find_clips(settings.data / "train"))
+    weights = train(method, recipe, clips, out, options=stage.options, label=name)
+    return candidate(str(weights))._replace(label=name)
+
+
+def clips_without(family: str | None, folders: Sequence[Path]) -> list[Path]:
+    """Those that are not of the family; rendered clips are named after it and their seed."""
+    return [folder for folder in folders if family is None or not folder.name.startswith(f"{family}-")]

@@ -1,0 +1,28 @@
+"""Zeng et al. 2021, table 2: SVGF, NTASD with uniform samples, TRMV, and their own network.
+
+Their PSNR has a peak of 255 on images in [0, 1]; the gaps below do not depend on it.
+"""
+
+from experiments.papers.learned.scores import Claim, Table, ordinary, psnr_gain
+from jaxdn.report import Results
+
+ROWS = ("svgf", "ntasd, uniform", "trmv", "ntd")
+GAPS = {"svgf": 10.48, "ntasd, uniform": 2.42, "trmv": 1.76}
+"""Decibels of their network above each."""
+
+
+def text(found: Results) -> str:
+    """The table."""
+    return ordinary(found, ROWS)
+
+
+def claims(found: Results) -> list[Claim]:
+    """On how far the network is ahead of each."""
+    ours = {name: psnr_gain(found, "ntd", name) for name in GAPS}
+    return [
+        Claim(f"ntd is better than {name}, PSNR", f"{there:.2f} dB", f"{ours[name]:+.2f} dB", ours[name] > 0)
+        for name, there in GAPS.items()
+    ]
+
+
+TABLE = Table("Zeng et al. 2021, table 2: methods", ROWS, text, claims)
