@@ -3,7 +3,7 @@
 A warps the history with traditional motion vectors, B with dual ones, C adds the motion-occlusion loss in the second
 half of training; all three share the network, the data, the seed and the number of steps.
 
-    python -m experiments.papers.ablation  # `make train`: a demonstration, about twenty minutes (estimate)
+    python -m experiments.papers.ablation  # `make train`: a demonstration, a quarter of an hour on two cores
     python -m experiments.papers.ablation --preset specialist  # trained and tested on different clips of one scene
 
 Everything is kept under ``data/`` and ``runs/``: finished clips and runs are reused, interrupted ones are resumed.
