@@ -1,7 +1,8 @@
 """Table 2 and the ablation of Zeng et al. 2021: noisy, filters, and ntd as A, B and C, on clips not used in training.
 
 A warps the history with traditional motion vectors, B with dual ones, C adds the motion-occlusion loss in the second
-half of training; all three share the network, the data, the seed and the number of steps.
+half of training; all three share the network, the data, the seed and the number of steps. The demonstration goes on
+from shipped weights, as a few minutes from nothing lose to every filter; the specialist begins with new ones.
 
     python -m experiments.papers.ablation  # `make train`: a demonstration, a quarter of an hour on two cores
     python -m experiments.papers.ablation --preset specialist  # trained and tested on different clips of one scene
@@ -71,6 +72,8 @@ class Preset(NamedTuple):
     runs: tuple[Run, ...]
     learning: Mapping[str, Any]
     """Entries of the runs' recipes that differ from the method's own."""
+    start: str | None = None
+    """The shipped weights that every run goes on from; None: new ones."""
 
     def recipe(self, method: Method, run: Run) -> Recipe:
         """How a run is trained."""
@@ -86,13 +89,13 @@ def _parts(family: str, starts: range) -> tuple[tuple[str, int, int], ...]:
     return tuple((family, 0, start) for start in starts)
 
 
-def _abc(steps: int) -> dict[str, Run]:
-    """The three runs of the paper's ablation, with the small network."""
+def _abc(steps: int, recipes: tuple[str, str]) -> dict[str, Run]:
+    """The three runs of the paper's ablation, with the small network; ``recipes``: without the occlusion loss, with."""
     traditional, dual = ({"size": "small", "motion": motion} for motion in ("traditional", "dual"))
     return {
-        "A": Run("A", traditional, "paper-without-occlusion", steps, "ntd, traditional motion vectors"),
-        "B": Run("B", dual, "paper-without-occlusion", steps, "ntd, dual motion vectors"),
-        "C": Run("C", dual, "paper", steps, "ntd, dual motion vectors and motion-occlusion loss"),
+        "A": Run("A", traditional, recipes[0], steps, "ntd, traditional motion vectors"),
+        "B": Run("B", dual, recipes[0], steps, "ntd, dual motion vectors"),
+        "C": Run("C", dual, recipes[1], steps, "ntd, dual motion vectors and motion-occlusion loss"),
     }
 
 
@@ -101,14 +104,15 @@ PRESETS = {
         train=ClipSet(_seeds(FAMILIES, range(2)), size=64, frames=10, reference_spp=32),
         validation=ClipSet((("fruit", 100, 0),), size=64, frames=10, reference_spp=32),
         tests=(ClipSet((*_seeds(FAMILIES[1:], range(200, 201)), ("edge", 200, 0)), 96, 10, reference_spp=256),),
-        runs=tuple(_abc(steps=100).values()),
-        learning={"learning_rate": 2e-3, "crop": 48},
+        runs=tuple(_abc(100, ("without-occlusion", "usual")).values()),
+        learning={"crop": 48},
+        start="ntd-small",
     ),
     "specialist": Preset(
         train=ClipSet(_parts("pinkroom", range(0, 400, 20)), size=96, frames=10, reference_spp=96),
         validation=ClipSet(_parts("pinkroom", range(500, 501)), size=96, frames=10, reference_spp=96),
         tests=(ClipSet(_parts("pinkroom", range(600, 680, 20)), size=96, frames=10, reference_spp=128),),
-        runs=tuple(_abc(steps=400).values()),
+        runs=tuple(_abc(400, ("paper-without-occlusion", "paper")).values()),
         learning={"learning_rate": 2e-3, "crop": 48},
     ),
 }
@@ -119,7 +123,7 @@ class Settings:
     """Render clips, train the denoiser and its ablations, evaluate them on held-out clips, write a report."""
 
     preset: Literal["demo", "specialist"] = "demo"
-    """demo: SMALL networks and a dozen small clips, to see that it learns. specialist: the paper's own protocol,
+    """demo: SMALL networks that go on from shipped weights on eight small clips. specialist: the paper's own protocol,
     trained and tested on different clips of one scene."""
     name: str | None = None
     """Folder under runs/ for weights, logs and the report; default: the preset's name."""
@@ -172,10 +176,15 @@ def train_run(run: Run, preset: Preset, data: Path, folder: Path) -> Path:
         folders(preset.train, data / "train"),
         folder / run.folder,
         options=run.options,
+        start=preset.start,
         validation=folders(preset.validation, data / "validation"),
         label=run.label,
         record={"data": origin},
     )
+
+
+def _after(start: str | None) -> str:
+    return "" if start is None else f", from {start} on"
 
 
 def evaluate(preset: Preset, settings: Settings, data: Path, folder: Path, machine: dict[str, Any]) -> Results:
@@ -186,7 +195,7 @@ def evaluate(preset: Preset, settings: Settings, data: Path, folder: Path, machi
         path = folder / run.folder / "weights.safetensors"
         if path.is_file():
             contestants.append(candidate(str(path))._replace(label=run.label))
-            about[run.label] = f"{run.about}: {run.steps} steps here"
+            about[run.label] = f"{run.about}: {run.steps} steps here{_after(preset.start)}"
             curves[run.label] = TrainingCurve(*read_curve(path.parent))
     for name in shipped_names():
         contestants.append(candidate(name))
@@ -197,7 +206,7 @@ def evaluate(preset: Preset, settings: Settings, data: Path, folder: Path, machi
         "preset": settings.preset,
         "training clips": len(preset.train.clips),
         "test clips (held out)": len(tests),
-        "training steps": ", ".join(f"{run.label} {run.steps}" for run in preset.runs),
+        "training steps": ", ".join(f"{run.label} {run.steps}" for run in preset.runs) + _after(preset.start),
         **{key.replace("_", " "): value for key, value in recipe.items() if key not in ("steps", "objective")},
     }
     title = "Neural temporal denoising: the ablation"
