@@ -32,7 +32,7 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
     text = (tmp_path / "runs" / "report.md").read_text()
     for label in ("ntasd", "rae", "parlour"):
         assert re.search(rf"\| {label} \| \d", text), text
-    assert re.search(r"\| fruit-2000 \| -?\d\.\d\d, \d+ to \d+ \|", text), text
+    assert re.search(r"\| fruit-2000 \| (even|-?\d\.\d\d, \d+ to \d+) \|", text), text
     for method in reach.DENOISERS:
         assert re.search(rf"\| {method}( \| \d\.\d\d){{4}} \|", text), text
     for name in ("ntasd-samples", "noise", "rae"):
@@ -138,3 +138,12 @@ def test_ranks_correlate_whatever_their_scale(rng: np.random.Generator) -> None:
     assert maps.correlation(values, np.exp(3 * values)) == pytest.approx(1)
     assert maps.correlation(values, -values) == pytest.approx(-1)
     assert abs(maps.correlation(values, rng.normal(size=(20, 20)))) < 0.2
+
+
+def test_counts_that_are_nearly_even_correlate_by_those_that_are_not() -> None:
+    """Equal counts in the order of their pixels would correlate with everything that brightens from top to bottom."""
+    slope = np.arange(400.0).reshape(20, 20)
+    assert np.isnan(maps.correlation(np.full((20, 20), 4.0), slope))
+    counts = np.full((20, 20), 4.0)
+    counts[0, 0], counts[-1, -1] = 5, 3
+    assert maps.correlation(counts, slope) == pytest.approx(-0.12, abs=0.01)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from scipy.stats import rankdata
 
 from experiments.papers.learned.stages import BUDGET
 from jaxdn import color
@@ -19,8 +20,9 @@ from jaxdn.rollout import sampled
 
 
 def asks(one: Candidate) -> bool:
-    """Whether a method says where its samples go."""
-    return one.denoiser is not None and one.denoiser.samples is not None
+    """Whether a method says where its samples go, unless it has been told to put as many everywhere."""
+    uniform = one.options.get("adaptive") is False
+    return one.denoiser is not None and one.denoiser.samples is not None and not uniform
 
 
 def counts_of(one: Candidate, clip: Clip) -> jax.Array:
@@ -37,10 +39,11 @@ def counts_of(one: Candidate, clip: Clip) -> jax.Array:
 
 
 def correlation(first: np.ndarray, second: np.ndarray) -> float:
-    """Of the ranks of two images (Spearman); ties have the order of their pixels."""
-    ranks = [np.argsort(np.argsort(each.ravel(), kind="stable"), kind="stable") for each in (first, second)]
+    """Of the ranks of two images (Spearman); equal values have the mean of their ranks. NaN where one is constant."""
+    ranks = [rankdata(each.ravel()) for each in (first, second)]
     first, second = (each - each.mean() for each in ranks)
-    return float((first * second).sum() / np.sqrt((first**2).sum() * (second**2).sum()))
+    with np.errstate(invalid="ignore"):
+        return float((first * second).sum() / np.sqrt((first**2).sum() * (second**2).sum()))
 
 
 def save_maps(asking: list[Candidate], folders: list[Path], out: Path) -> str:
@@ -57,7 +60,8 @@ def save_maps(asking: list[Candidate], folders: list[Path], out: Path) -> str:
         for one in asking:
             counts = np.asarray(jax.jit(partial(counts_of, one))(clip))[-1, ..., 0]
             save_png(out / folder.name / f"{one.label}-samples.png", np.sqrt(counts / counts.max()))
-            cells.append(f"{correlation(counts, noise):.2f}, {counts.min():.0f} to {counts.max():.0f}")
+            few, many = counts.min(), counts.max()
+            cells.append("even" if few == many else f"{correlation(counts, noise):.2f}, {few:.0f} to {many:.0f}")
         lines.append(f"| {folder.name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
