@@ -55,13 +55,18 @@ def contestants(weights: list[str]) -> Iterator[Candidate]:
         yield Candidate("Open Image Denoise", frame_by_frame(), {})
 
 
+def file_name(label: str) -> str:
+    """A label as part of a path."""
+    return label.replace(", ", "-").replace(" ", "-")
+
+
 def save_pictures(results: Results, folder: Path) -> None:
     """Each method's image of the frame that the report shows, and the reference's."""
     for clip in results.clips:
         place = folder / clip.name
         place.mkdir(parents=True, exist_ok=True)
         for label, image in clip.images.items():
-            save_png(place / f"{label.replace(', ', '-').replace(' ', '-')}.png", np.asarray(image))
+            save_png(place / f"{file_name(label)}.png", np.asarray(image))
 
 
 def main(settings: Settings) -> None:

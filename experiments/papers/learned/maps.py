@@ -11,6 +11,7 @@ from jax import lax
 from scipy.stats import rankdata
 
 from experiments.papers.learned.stages import BUDGET
+from experiments.papers.preintegration import file_name
 from jaxdn import color
 from jaxdn.candidates import Candidate
 from jaxdn.clips import read_clip
@@ -59,7 +60,7 @@ def save_maps(asking: list[Candidate], folders: list[Path], out: Path) -> str:
         cells = []
         for one in asking:
             counts = np.asarray(jax.jit(partial(counts_of, one))(clip))[-1, ..., 0]
-            save_png(out / folder.name / f"{one.label}-samples.png", np.sqrt(counts / counts.max()))
+            save_png(out / folder.name / f"{file_name(one.label)}-samples.png", np.sqrt(counts / counts.max()))
             few, many = counts.min(), counts.max()
             cells.append("even" if few == many else f"{correlation(counts, noise):.2f}, {few:.0f} to {many:.0f}")
         lines.append(f"| {folder.name} | {' | '.join(cells)} |")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments.papers import rooms
+from experiments.papers.preintegration import file_name
 from jaxdn.candidates import Candidate, candidate
 from jaxdn.clips import find_clips
 from jaxdn.commands.render import render
@@ -102,7 +103,7 @@ def trained(name: str, settings: Settings) -> Candidate:
     recipe = method.recipe_named(None)._replace(
         steps=settings.steps, frames=settings.frames, average=0.99, spp=(1,) if method.knows("budget") else (BUDGET,)
     )
-    out = settings.out / name.replace(", ", "-").replace(" ", "-")
+    out = settings.out / file_name(name)
     clips = clips_without(stage.without, find_clips(settings.data / "train"))
     weights = train(method, recipe, clips, out, options=stage.options, label=name)
     return candidate(str(weights))._replace(label=name)
