@@ -94,7 +94,7 @@ def compiled(denoiser: Denoiser, params: Any, frames: int) -> Callable[[Any], An
         frame = clean._replace(radiance=noisy, motion=motion)
         state, image = denoiser.step(params, state, sampled(denoiser, params, state, frame, layers(noisy, clean)))
         leaves = [leaf for leaf in jax.tree.leaves(state) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-        largest = jnp.max(jnp.stack([jnp.max(jnp.abs(leaf), initial=0.0) for leaf in leaves]))
+        largest = jnp.max(jnp.stack([jnp.zeros(()), *(jnp.max(jnp.abs(leaf), initial=0.0) for leaf in leaves)]))
         error = jnp.mean(jnp.abs(image - clean.radiance)) / jnp.mean(clean.radiance)
         return state, (largest, error, jnp.isfinite(largest) & jnp.isfinite(image).all(), image[::8, ::8])
 

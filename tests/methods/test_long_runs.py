@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from jax import lax
 
+from experiments.stability import long_runs
 from jaxdn.candidates import candidate, filters
+from jaxdn.denoiser import Core, recurrent
 from jaxdn.frame import RADIANCE_MAX, Frame
 from jaxdn.methods.table import methods
 from jaxdn.weights import shipped_names
@@ -30,6 +32,16 @@ frames; what is left within the noise of that mean, a tenth, from the slow one, 
 
 def test_filters_and_the_lightest_weights_are_tested():
     assert {"svgf", "ntd-small"} <= set(METHODS)
+
+
+def test_the_experiment_follows_denoisers_without_a_state():
+    as_it_is = recurrent(
+        Core(lambda params, frame: {}, lambda p, state, frame, _: (state, frame.radiance, 0), frozenset())
+    )
+    state, error, healthy, _ = long_runs.compiled(as_it_is, {}, 4)((0.7, 0.0, -1))
+    assert state.tolist() == [0, 0, 0, 0]
+    assert healthy.all()
+    assert (np.asarray(error) > 0.5).all()
 
 
 def wall():
