@@ -2,8 +2,8 @@
 
 A warps the history with traditional motion vectors, B with dual ones, C adds the motion-occlusion loss; all three share
 the network, the data, the seed and the number of steps. The demonstration goes on from shipped weights with the loss
-that these were trained with, as a few minutes from nothing lose to every filter; the specialist begins with new ones and
-has the paper's loss, whose occlusion term comes in the second half of training.
+that these were trained with, as a few minutes from nothing lose to every filter; the specialist begins with new ones
+and has the paper's loss, whose occlusion term comes in the second half of training.
 
     python -m experiments.papers.ablation  # `make train`: a demonstration, a quarter of an hour on two cores
     python -m experiments.papers.ablation --preset specialist  # trained and tested on different clips of one scene
