@@ -211,6 +211,9 @@ class Denoise:
     """Leave out frames whose result is there already."""
     only_beauty: bool = False
     """Of EXR files of other renderers, write the denoised beauty and its alpha alone, without the other layers."""
+    max_memory: float | None = None
+    """GiB of memory to take; larger frames are denoised in parts, with the same result. Default: half of the
+    machine's."""
     aovs: Literal["keep", "additive"] = "keep"
     """Other layers of light in such files: keep them as they are, or (additive) denoise those that are parts of the
     beauty so that they still add up to it."""

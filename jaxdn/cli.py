@@ -142,6 +142,7 @@ def _denoise(options: Denoise) -> None:
         preview=options.preview,
         bidirectional=options.bidirectional,
         safe=options.safe,
+        max_memory=None if options.max_memory is None else options.max_memory * 2**30,
         **naming,
     )
     with reporter(options.method) as report:

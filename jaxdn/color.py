@@ -82,6 +82,14 @@ def exposure(radiance: jax.Array) -> jax.Array:
     image. Means of blocks first: of single noisy pixels the logarithm is mostly noise. Twice the light halves the
     factor, so that what is computed from ``exposure(x) * x`` does not depend on the unit of radiance. No gradient.
     """
+    return exposure_of(brightness(radiance))
+
+
+def brightness(radiance: jax.Array) -> jax.Array:
+    """[2] what :func:`exposure` is made of: the sum of log L over blocks that are not black, and their number.
+
+    Those of images that lie side by side, with sides of whole blocks, add up to that of both. No gradient.
+    """
     light = jnp.minimum(luminance(jax.lax.stop_gradient(radiance))[..., 0], RADIANCE_MAX)
     height, width = light.shape
     block = [min(16, size) for size in (height, width)]
@@ -91,8 +99,13 @@ def exposure(radiance: jax.Array) -> jax.Array:
     means = light.reshape(rows, block[0], columns, block[1]).mean((1, 3))
     lit = means > 0
     logs = jnp.where(lit, jnp.log(jnp.where(lit, means, 1.0)), 0.0)
-    count = jnp.sum(lit, dtype=light.dtype)
-    return jnp.where(count > 0, _MIDDLE_GREY * jnp.exp(-jnp.sum(logs) / jnp.maximum(count, 1)), 1.0)
+    return jnp.stack([jnp.sum(logs), jnp.sum(lit, dtype=light.dtype)])
+
+
+def exposure_of(brightness: jax.Array) -> jax.Array:
+    """The :func:`exposure` of an image with this :func:`brightness`."""
+    logs, count = brightness
+    return jnp.where(count > 0, _MIDDLE_GREY * jnp.exp(-logs / jnp.maximum(count, 1)), 1.0)
 
 
 _MIDDLE_GREY = 0.18

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxdn.checks import check_image, check_same_size
 from jaxdn.frame import RADIANCE_MAX, Frame, only
 from jaxdn.repair import repair
+from jaxdn.whole import Whole
 
 Params = Any
 """Nested dicts of arrays; ``{}`` for a filter without weights."""
@@ -47,13 +48,19 @@ class Core(NamedTuple):
 
     start: Callable[[Params, Frame], State]
     """(params, frame) -> its own state."""
-    step: Callable[[Params, State, Frame, jax.Array], tuple[State, jax.Array, jax.Array | int]]
+    step: Callable[..., tuple[State, jax.Array, jax.Array | int]]
     """(params, state, frame, first) -> (state, image [H, W, 3], values of the history that had to be replaced).
-    ``first`` is a bool scalar: there is no history yet, regardless of state and motion."""
+    ``first`` is a bool scalar: there is no history yet, regardless of state and motion. With ``measure``, its result is
+    one argument more."""
     reads: frozenset[str]
     init: Callable[[jax.Array, Frame], Params] = lambda key, frame: {}
     samples: Callable[[Params, State, Frame, jax.Array, int], jax.Array] | None = None
     """(params, state, frame, first, most) -> [H, W, 1]."""
+    measure: Callable[[Frame], Whole] | None = None
+    """(frame) -> what ``step`` must know of the whole frame; None: nothing."""
+    reach: int | None = None
+    """In pixels: what is farther away decides nothing about a pixel, apart from the history, which may come from as
+    much farther as vectors are long, and from what is measured. None: not known, and frames cannot be parted."""
 
 
 class Recurrent(NamedTuple):
@@ -75,10 +82,22 @@ class RecurrentStep:
 
     def __call__(self, params: Params, state: Recurrent, frame: Frame) -> tuple[Recurrent, jax.Array]:
         """Check, repair, step, clamp, count."""
-        frame, replaced = repair(checked(frame, self.core.reads))
-        own, image, lost = self.core.step(params, state.core, frame, state.age == 0)
-        image = jnp.clip(image, 0.0, RADIANCE_MAX)
+        frame, whole, replaced = self.measured(frame)
+        own, image, lost = self.part(params, state.core, frame, state.age == 0, whole)
         return Recurrent(own, state.age + 1, state.repaired + replaced + lost), image
+
+    def measured(self, frame: Frame) -> tuple[Frame, Whole | None, jax.Array]:
+        """The repaired frame, what is measured of it, and the number of values that were replaced."""
+        frame, replaced = repair(checked(frame, self.core.reads))
+        return frame, None if self.core.measure is None else self.core.measure(frame), replaced
+
+    def part(
+        self, params: Params, state: State, frame: Frame, first: jax.Array, whole: Whole | None
+    ) -> tuple[State, jax.Array, jax.Array | int]:
+        """The step of the core, its image clamped, of a repaired frame or of a part of the frame that was measured."""
+        given = () if whole is None else (whole,)
+        state, image, lost = self.core.step(params, state, frame, first, *given)
+        return state, jnp.clip(image, 0.0, RADIANCE_MAX), lost
 
 
 def recurrent(core: Core) -> Denoiser:

@@ -34,6 +34,8 @@ CLEAN, NOISY = 0.02, 0.06
 """Noise, as a share of the light, up to which a region is left as it is, and from which the share above decides."""
 BLOCK = 32
 """Side of the regions whose noise is judged, in pixels."""
+REACH = 2 * BLOCK + RADIUS + 1
+"""In pixels: the next region, with the windows of its pixels."""
 _DARK = 0.05
 """Differences are relative to the light plus this share of the image's mean."""
 _WHITE, _STRONG = 0.7, 0.1
@@ -49,21 +51,22 @@ class Combined(NamedTuple):
     share: jax.Array
     """[H, W, 1] in [0, 1], how much of the noisy image is in it."""
     noise: jax.Array
-    """Median over the pixels of the noisy image's noise (standard deviation), as a share of their light."""
+    """[H, W, 1] the noisy image's noise (standard deviation), as a share of the light."""
 
 
-def combine(noisy: jax.Array, denoised: jax.Array) -> Combined:
+def combine(noisy: jax.Array, denoised: jax.Array, level: jax.Array | float | None = None) -> Combined:
     """The mixture of a noisy image [H, W, 3] and its denoised version, linear radiance >= 0.
 
-    Noisy values that are not finite, negative or above ``RADIANCE_MAX`` are not used. Raises ValueError for other
-    shapes.
+    Noisy values that are not finite, negative or above ``RADIANCE_MAX`` are not used. ``level`` is the mean of the
+    denoised image, or of the one that it is a part of; apart from it, a pixel depends on those up to :data:`REACH` away.
+    Raises ValueError for other shapes.
     """
     check_image(noisy, "noisy", channels=3)
     check_same_size(noisy, denoised, ("noisy", "denoised"))
     sound = jnp.all(jnp.isfinite(noisy) & (noisy >= 0) & (noisy <= RADIANCE_MAX), axis=-1, keepdims=True)
     change = jnp.where(sound, noisy - denoised, 0.0)
     light = jnp.mean(denoised, axis=-1, keepdims=True)
-    light = light + _DARK * jnp.mean(light)
+    light = light + _DARK * (jnp.mean(light) if level is None else level)
     # Limited, so that the fourth power is finite.
     relative = jnp.clip(change / jnp.where(light > 0, light, 1.0), -1e4, 1e4)
     energy, variance, number = _moments(relative)
@@ -72,7 +75,7 @@ def combine(noisy: jax.Array, denoised: jax.Array) -> Combined:
     firefly = (variance > _WHITE * energy) & (energy > _STRONG)
     kept = jnp.where(firefly, 0.0, _clean(jnp.sqrt(variance)))
     share = share + (1 - share) * kept
-    return Combined(denoised + share * change, jnp.where(sound, share, 0.0), jnp.median(jnp.sqrt(variance)))
+    return Combined(denoised + share * change, jnp.where(sound, share, 0.0), jnp.sqrt(variance))
 
 
 def _moments(change: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:

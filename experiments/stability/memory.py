@@ -28,6 +28,8 @@ class Settings:
     width: int = 1280
     height: int = 720
     method: str = "ntd-small"
+    max_memory: float | None = None
+    """`jaxdn denoise --max-memory`, in GiB."""
     out: Path = Path("runs/memory.json")
 
 
@@ -47,10 +49,11 @@ def write_sequence(folder: Path, frames: int, height: int, width: int) -> None:
         os.link(first, folder / f"frame_{index:04d}.exr")
 
 
-def peak_mib(source: Path, out: Path, method: str) -> float:
+def peak_mib(source: Path, out: Path, method: str, max_memory: float | None = None) -> float:
     """The peak resident set of one `jaxdn denoise`, in MiB. Raises RuntimeError where it fails."""
     command = [sys.executable, "-m", "jaxdn.cli", "denoise", str(source), "-o", str(out), "--method", method]
     command += ["--motion-convention", "previous-current"]
+    command += [] if max_memory is None else ["--max-memory", f"{max_memory:g}"]
     child = os.posix_spawn(sys.executable, command, os.environ)
     _, status, usage = os.wait4(child, 0)
     if status:
@@ -65,9 +68,9 @@ def main(settings: Settings) -> None:
         for count in settings.frames:
             source = Path(place) / f"frames-{count}"
             write_sequence(source, count, settings.height, settings.width)
-            found[str(count)] = peak_mib(source, Path(place) / f"out-{count}", settings.method)
+            found[str(count)] = peak_mib(source, Path(place) / f"out-{count}", settings.method, settings.max_memory)
             print(f"{count} frames: {found[str(count)]:.0f} MiB", flush=True)
-    sizes = {"width": settings.width, "height": settings.height, "method": settings.method}
+    sizes = {name: getattr(settings, name) for name in ("width", "height", "method", "max_memory")}
     settings.out.parent.mkdir(parents=True, exist_ok=True)
     write_json(settings.out, {**sizes, "peak MiB": found})
 

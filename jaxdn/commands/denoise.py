@@ -6,25 +6,21 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-import jax
 import numpy as np
 
 from jaxdn import color
 from jaxdn.candidates import Candidate, candidate
 from jaxdn.clips.exr import write_exr
 from jaxdn.clips.folder import open_frames
-from jaxdn.clips.frames import StoredFrame, doubling_layers
+from jaxdn.clips.frames import StoredFrame
 from jaxdn.clips.import_exr import canvas_of
 from jaxdn.clips.result import write_result
 from jaxdn.commands.aovs import Aovs
 from jaxdn.commands.backwards import Backwards, backward_pass
+from jaxdn.commands.passes import Pass, light_of
 from jaxdn.commands.work import Work, work_on
-from jaxdn.repair import repair_image
 from jaxdn.report.images import save_png
-from jaxdn.rollout import Layers, stream
-from jaxdn.shrinkage import NOISY, Combined, combine
-
-_combine = jax.jit(combine)
+from jaxdn.shrinkage import NOISY, Combined
 
 
 class Settings(NamedTuple):
@@ -53,6 +49,8 @@ class Settings(NamedTuple):
     """Denoise from the last frame to the first too, and blend both passes (:mod:`jaxdn.filters.both_ways`)."""
     safe: bool = True
     """Keep of the noisy image what is no noise (:mod:`jaxdn.shrinkage`)."""
+    max_memory: float | None = None
+    """Bytes; frames that need more are denoised in parts. None: half of the machine's memory."""
 
 
 class Written(NamedTuple):
@@ -131,7 +129,7 @@ def denoise_files(
             told.add(line)
 
         for stretch in work.stretches(both_ways=settings.bidirectional):
-            passes = [_Pass(work, method) for _ in range(1 + settings.bidirectional)]
+            passes = [Pass(work.source, method, limit=settings.max_memory, log=once) for _ in range(1 + settings.bidirectional)]
             with closing(_denoise(work, stretch, passes, settings, once)) as paths:
                 for path in paths:
                     files.append(path)
@@ -141,34 +139,8 @@ def denoise_files(
     return Written(files, len(programs), repaired)
 
 
-class _Pass:
-    """A denoiser on its way through consecutive frames; gives the image [H, W, 3] of each."""
-
-    def __init__(self, work: Work, method: Candidate) -> None:
-        self._step = None if method.denoiser is None else stream(method.denoiser, method.params)
-        self._source = work.source
-        self._needs_layers = method.denoiser is not None and method.denoiser.samples is not None
-
-    def __call__(self, stored: StoredFrame) -> np.ndarray:
-        if self._step is None:
-            return np.asarray(light_of(stored.frame.radiance))
-        return np.asarray(self._step(stored.frame, _layers(stored, self._source) if self._needs_layers else None))
-
-    @property
-    def denoises(self) -> bool:
-        return self._step is not None
-
-    @property
-    def programs(self) -> set[tuple[str, ...]]:
-        return set() if self._step is None else self._step.programs
-
-    @property
-    def repaired(self) -> int:
-        return 0 if self._step is None else self._step.repaired
-
-
 def _denoise(
-    work: Work, stretch: range, passes: Sequence[_Pass], settings: Settings, log: Callable[[str], None]
+    work: Work, stretch: range, passes: Sequence[Pass], settings: Settings, log: Callable[[str], None]
 ) -> Generator[Path, None, None]:
     """Denoise consecutive frames of a shot; yields the files as they are written."""
     wanted = [index for index in stretch if index in work.wanted]
@@ -185,7 +157,7 @@ def _denoise(
 def _forwards(
     work: Work,
     stretch: range,
-    forwards: _Pass,
+    forwards: Pass,
     backwards: Backwards | None,
     settings: Settings,
     log: Callable[[str], None],
@@ -202,8 +174,8 @@ def _forwards(
         if backwards is not None:
             image = backwards.blended(index, frame, image)
         if safe:
-            combined = _combine(frame.radiance, image)
-            image = np.asarray(combined.image)
+            combined = forwards.combined(frame.radiance, image)
+            image = combined.image
             if index == min(work.wanted):
                 log(_measured(name, combined))
         parts = {} if aovs is None else aovs.denoise(name, frame, image)
@@ -244,23 +216,13 @@ def _frames(
 
 def _measured(name: Path, combined: Combined) -> str:
     """What was measured in a frame, and what it decided, as a line."""
-    noise, share = float(combined.noise), float(np.mean(combined.share))
+    noise, share = float(np.median(combined.noise)), float(np.mean(combined.share))
     line = (
         f"{name.name}: noise is about {noise:.1%} of the light; {share:.0%} of the frame is kept (--no-safe: nothing)"
     )
     if share > 0.5 and noise > NOISY:
         return f"{line}; the denoised image differs from it by more than noise: do its guides belong to it?"
     return line
-
-
-def _layers(stored: StoredFrame, source: Path) -> Layers:
-    """The independent layers of a frame, for a method that requests samples."""
-    return {count: stored.layers[count] for count in doubling_layers(stored.layers, source)}
-
-
-def light_of(radiance: np.ndarray | None) -> Any:
-    """Radiance that can be added: non-finite or negative values become 0, an absent part is 0."""
-    return 0.0 if radiance is None else np.asarray(repair_image(radiance), np.float32)
 
 
 def lettered(layer: str, image: np.ndarray) -> dict[str, np.ndarray]:

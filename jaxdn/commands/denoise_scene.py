@@ -9,7 +9,8 @@ import numpy as np
 from jaxdn import color
 from jaxdn.candidates import Candidate
 from jaxdn.clips.exr import write_exr
-from jaxdn.commands.denoise import Written, lettered, light_of
+from jaxdn.commands.denoise import Written, lettered
+from jaxdn.commands.passes import light_of
 from jaxdn.commands.render import plan_clip
 from jaxdn.frame import OF_SAMPLES, Frame
 from jaxdn.render.adaptive import render_sampled

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn.frame import FAR, Frame
+from jaxdn.whole import geometric_mean, sums_of_depth
 
 
 class Guides(NamedTuple):
@@ -56,18 +57,15 @@ def hit_mask(depth: jax.Array | None, ids: jax.Array | None) -> jax.Array | None
     return None if not known else known[0] if len(known) == 1 else known[0] & known[1]
 
 
-def depth_feature(depth: jax.Array, *, scale: str = "geometric") -> jax.Array:
+def depth_feature(depth: jax.Array, *, scale: str = "geometric", middle: jax.Array | None = None) -> jax.Array:
     """Depth as ``z / (z + g)`` in [0, 1); g is the geometric mean over surfaces, or 1 with ``"unit"``.
 
     ``depth`` [H, W, 1] >= 0; 0 (the neutral value) gives 0. The geometric mean makes the feature independent of
-    the scene's unit of length.
+    the scene's unit of length; ``middle`` is that of the frame that the depth is a part of.
     """
     if scale == "unit":
         return depth / (depth + 1.0)
-    known = (depth > 0) & (depth < FAR)
-    logarithms = jnp.where(known, jnp.log(jnp.where(known, depth, 1.0)), 0.0)
-    middle = jnp.exp(jnp.sum(logarithms) / jnp.maximum(jnp.sum(known, dtype=depth.dtype), 1.0))
-    return depth / (depth + middle)
+    return depth / (depth + (geometric_mean(sums_of_depth(depth)) if middle is None else middle))
 
 
 def cosine(first: jax.Array, second: jax.Array) -> jax.Array:

@@ -9,6 +9,7 @@ from jaxdn import brdf
 from jaxdn.checks import check_option
 from jaxdn.denoiser import Core, Denoiser, Params, RecurrentStep, State, recurrent
 from jaxdn.frame import Frame
+from jaxdn.whole import Whole
 
 SMALLEST_ALBEDO = 0.01
 """Radiance is not divided by an albedo below this (``by="albedo"``)."""
@@ -43,33 +44,43 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "brdf") -> Deno
     def start(params: Params, frame: Frame) -> State:
         return core.start(params, _divided(frame, by)[0])
 
-    def step(params: Params, state: State, frame: Frame, first: jax.Array) -> tuple[State, jax.Array, jax.Array | int]:
+    def step(
+        params: Params, state: State, frame: Frame, first: jax.Array, *whole: Whole
+    ) -> tuple[State, jax.Array, jax.Array | int]:
         frame, divisor = _divided(frame, by)
-        state, image, lost = core.step(params, state, frame, first)
+        state, image, lost = core.step(params, state, frame, first, *whole)
         return state, image if divisor is None else image * divisor, lost
 
     def samples(params: Params, state: State, frame: Frame, first: jax.Array, most: int) -> jax.Array:
         assert core.samples is not None
         return core.samples(params, state, _divided(frame, by)[0], first, most)
 
+    def measure(frame: Frame) -> Whole:
+        assert core.measure is not None
+        return core.measure(_divided(frame, by)[0])
+
     requests = None if core.samples is None else samples
+    measuring = None if core.measure is None else measure
     reads = {"albedo", "reflectance"} if by == "brdf" else {"albedo"}
-    return recurrent(Core(start, step, core.reads | reads, core.init, requests))
+    return recurrent(Core(start, step, core.reads | reads, core.init, requests, measuring, core.reach))
 
 
-def texture_left(frame: Frame, by: Demodulation | bool) -> jax.Array | None:
+def texture_left(frame: Frame, by: Demodulation | bool, whole: Whole | None = None) -> jax.Array | None:
     """The texture [H, W, 3] that the division leaves in a frame inside :func:`demodulated`; None if it leaves none.
 
     A filter that averages it with the weights of the light can give it back (:func:`jaxdn.brdf.restore`). If the
     reflectance is the albedo everywhere, nothing tells that the albedo is all that is reflected: only its colours are
     to be given back then (:func:`jaxdn.brdf.hue_left`; on frames of metal and gloss without a reflectance, giving
     back brightness too costs svgf 1.4 dB). ``by="albedo"`` leaves the textures of black pixels alone, as it was.
+    ``whole`` is what was measured of the frame that this one is a part of; None: it is the whole one.
     """
     reflectance = _reflectance(frame)
-    return None if _chosen(by) != "brdf" or reflectance is None else texture_of(reflectance, frame, frame.radiance)
+    if _chosen(by) != "brdf" or reflectance is None:
+        return None
+    return texture_of(reflectance, frame, frame.radiance, whole)
 
 
-def texture_of(reflectance: jax.Array, frame: Frame, light: jax.Array) -> jax.Array:
+def texture_of(reflectance: jax.Array, frame: Frame, light: jax.Array, whole: Whole | None = None) -> jax.Array:
     """The texture [H, W, 3] that a division leaves of a reflectance of the frame, whole or without its specular part.
 
     As in :func:`texture_left`. ``light`` [H, W, 3] is what is divided by it, or was.
@@ -80,7 +91,8 @@ def texture_of(reflectance: jax.Array, frame: Frame, light: jax.Array) -> jax.Ar
     colours = brdf.hue_left(texture)
     if frame.reflectance is None:
         return colours
-    return jnp.where(jnp.any(frame.reflectance != frame.albedo), texture, colours)
+    other = jnp.any(frame.reflectance != frame.albedo) if whole is None else whole.other > 0
+    return jnp.where(other, texture, colours)
 
 
 def _divided(frame: Frame, by: Demodulation) -> tuple[Frame, jax.Array | None]:

@@ -26,6 +26,7 @@ from jaxdn.methods.table import method
 from jaxdn.objectives import last_frames, unbiased_illumination
 from jaxdn.recipe import Recipe
 from jaxdn.variation import STILL
+from jaxdn.whole import Whole
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,9 @@ def ntasd(options: Options) -> Denoiser:
         return inner.start(params["denoiser"], frame)
 
     def step(
-        params: Params, state: jax.Array, frame: Frame, first: jax.Array
+        params: Params, state: jax.Array, frame: Frame, first: jax.Array, whole: Whole
     ) -> tuple[jax.Array, jax.Array, jax.Array | int]:
-        return inner.step(params["denoiser"], state, frame, first)
+        return inner.step(params["denoiser"], state, frame, first, whole)
 
     def samples(params: Params, state: jax.Array, frame: Frame, first: jax.Array, most: int) -> jax.Array:
         dark = frame._replace(radiance=jnp.zeros_like(frame.radiance))  # nothing is rendered yet
@@ -98,7 +99,7 @@ def ntasd(options: Options) -> Denoiser:
             features.append(absent.astype(past.dtype))
         return network.counts(params["sampler"], features, first, most)
 
-    core = Core(start, step, inner.reads, init, samples)
+    core = Core(start, step, inner.reads, init, samples, inner.measure)
     return demodulated(recurrent(core), by=options.demodulate)
 
 

@@ -27,13 +27,14 @@ from jaxdn.methods.demodulated import Demodulation, demodulated
 from jaxdn.methods.reconstruction import SCALES, Prediction, begin_blending, blend, heads_of
 from jaxdn.methods.table import method
 from jaxdn.motion import on_screen
-from jaxdn.networks import LARGE, SMALL, Widths, crop, pad
+from jaxdn.networks import LARGE, SMALL, Widths, crop, description, pad
 from jaxdn.objectives import indirect_illumination, unbiased_illumination
 from jaxdn.ops.warp import warp
 from jaxdn.recipe import Recipe
 from jaxdn.repair import repair_image
 from jaxdn.scales import downsample, fill
 from jaxdn.variation import STILL
+from jaxdn.whole import Whole, measured
 
 PRECISIONS = {"albedo": (3, 3.0), "normal": (3, 3.0), "depth": (1, 6.0), "reflectance": (3, 3.0), "roughness": (1, 3.0)}
 """Guide of the kernels -> its channels, and the logarithm of its precision at the start of training."""
@@ -140,10 +141,11 @@ def guided_features(precisions: Params, guides: dict[str, jax.Array | None]) -> 
     return features
 
 
-def _guides(options: Options, frame: Frame) -> dict[str, jax.Array | None]:
+def _guides(options: Options, frame: Frame, whole: Whole) -> dict[str, jax.Array | None]:
     """The guides as the network and the prior see them, padded; 0 is the neutral value, None where one is absent."""
     reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
-    depth = None if frame.depth is None else depth_feature(frame.depth, scale=options.depth_scale)
+    middle, scale = whole.middle_depth, options.depth_scale
+    depth = None if frame.depth is None else depth_feature(frame.depth, scale=scale, middle=middle)
     fractions = {"albedo": frame.albedo, "reflectance": reflectance, "roughness": frame.roughness}
     guides = {name: None if guide is None else guide - 1.0 for name, guide in fractions.items()}
     guides |= {"normal": frame.normal, "depth": depth}
@@ -268,21 +270,32 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
         weights = {name: part for name, part in params.items() if name != "guide"}
         return [head[0].astype(dtype) for head in network.apply(weights, batch)]
 
+    def light(frame: Frame) -> tuple[jax.Array, jax.Array | None]:
+        """The noisy light, padded, without that of pixels that do not count; bool [H, W], where a surface is."""
+        hit = hit_mask(frame.depth, None) if options.background == "pass" else None
+        noisy = pad(frame.radiance)
+        if hit is not None:
+            noisy = fill(noisy, pad(hit[..., None]))
+        if frame.sample_count is not None:
+            noisy = fill(noisy, pad(frame.sample_count > 0))
+        return noisy, hit
+
+    def measure(frame: Frame) -> Whole:
+        bounded = frame._replace(radiance=jnp.minimum(frame.radiance, RADIANCE_MAX))
+        return measured(light(bounded)[0], frame.depth, frame)
+
     def step(
-        params: Params, state: jax.Array, frame: Frame, first: jax.Array
+        params: Params, state: jax.Array, frame: Frame, first: jax.Array, whole: Whole
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         size = frame.radiance.shape[:2]
         # Divided by a small albedo it may be beyond what the network has ever seen.
         frame = frame._replace(radiance=jnp.minimum(frame.radiance, RADIANCE_MAX))
         recalled, absent, broken = warped_history(options, state, frame, first)
-        seen = _guides(options, frame)
-        noisy, recalled, absent = (pad(image) for image in (frame.radiance, recalled, absent))
-        hit = hit_mask(frame.depth, None) if options.background == "pass" else None
+        seen = _guides(options, frame, whole)
+        (noisy, hit), recalled, absent = light(frame), pad(recalled), pad(absent)
         if hit is not None:
-            noisy, recalled = (fill(image, pad(hit[..., None])) for image in (noisy, recalled))
-        if frame.sample_count is not None:
-            noisy = fill(noisy, pad(frame.sample_count > 0))
-        gain = color.exposure(noisy) if options.exposure == "measured" else 1.0
+            recalled = fill(recalled, pad(hit[..., None]))
+        gain = whole.exposure if options.exposure == "measured" else 1.0
         squeezed, squeezed_history = color.compress(gain * noisy), color.compress(gain * recalled)
         features = [squeezed, seen["albedo"], seen["normal"], seen["depth"], squeezed_history]
         if flagged:
@@ -304,4 +317,9 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
         shown = image if hit is None else jnp.where(hit[..., None], image, frame.radiance)
         return image, shown, broken
 
-    return Core(start, step, reads, init)
+    seen = description.reach(description.unet(1, heads, widths=widths, head_size=3))
+    return Core(start, step, reads, init, measure=measure, reach=seen + _FILTERS_REACH)
+
+
+_FILTERS_REACH = 32
+"""That of kernels of 5x5 pixels at three scales, of the images between these, and of blocks that are filled."""

@@ -28,12 +28,13 @@ from jaxdn.filters.recall import recall
 from jaxdn.frame import FAR, RADIANCE_MAX, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
 from jaxdn.methods.table import method
-from jaxdn.networks import Widths, crop, pad
+from jaxdn.networks import Widths, crop, description, pad
 from jaxdn.objectives import pyramid_illumination
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
 from jaxdn.options import Range
 from jaxdn.recipe import Recipe
 from jaxdn.scales import downsample, fill, fold
+from jaxdn.whole import Whole, measured
 
 FULL_LEVELS, LEVELS = 2, 4
 """Levels of the filter at full resolution, taps 1 and 2 pixels apart, and at half: 2, 4, 8 and 16 pixels apart."""
@@ -154,20 +155,20 @@ def steady(options: Options) -> Denoiser:
         return SteadyState(nothing, jax.tree.map(jnp.zeros_like, guides_of(frame)))
 
     def step(
-        params: Params, state: SteadyState, frame: Frame, first: jax.Array
+        params: Params, state: SteadyState, frame: Frame, first: jax.Array, whole: Whole
     ) -> tuple[SteadyState, jax.Array, jax.Array]:
         size = frame.radiance.shape[:2]
         found = recall(state.history, state.guides, frame, first)
         surfaces, past = _surfaces(frame), _past(found.history, found.valid)
-        # Divided by a small reflectance it may be beyond what the network has ever seen.
-        noisy = fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), MULTIPLE), surfaces.hit)
+        noisy = _noisy(frame, surfaces)
         weights = {name: part for name, part in params.items() if name != "guide"}
-        groups = [group[None] for group in _seen(noisy, past, surfaces)]
+        groups = [group[None] for group in _seen(noisy, past, surfaces, whole)]
         decided = _decisions(network.apply(weights, groups)[0][0])
         mean, square, number = _accumulated(noisy, past, decided.shares["follow"], options.history_max)
-        texture = texture_left(frame, options.demodulate)
+        texture = texture_left(frame, options.demodulate, whole)
         texture = None if texture is None else fill(pad(texture, MULTIPLE), surfaces.hit)
-        fine, image = _filtered(params["guide"], mean, texture, surfaces, decided)
+        slanted = _slanted(surfaces, whole)
+        fine, image = _filtered(params["guide"], mean, texture, surfaces, slanted, decided)
         newest = jnp.where(past.valid, decided.shares["blend"], 1.0)
         shown = jnp.clip(past.shown + newest * (image - past.shown), 0.0, RADIANCE_MAX)
         kept = mean + decided.shares["feedback"] * (fine - mean)
@@ -175,7 +176,22 @@ def steady(options: Options) -> Denoiser:
         image = jnp.where(crop(surfaces.hit, size), history[..., 5:], frame.radiance)
         return SteadyState(history, guides_of(frame)), image, found.broken
 
-    return demodulated(recurrent(Core(start, step, reads, init)), by=options.demodulate)
+    def measure(frame: Frame) -> Whole:
+        surfaces = _surfaces(frame)
+        return measured(_noisy(frame, surfaces), surfaces.depth, frame)
+
+    seen = 2 * description.reach(description.unet(1, heads, widths=widths, head_size=1))
+    core = Core(start, step, reads, init, measure=measure, reach=seen + _FILTERS_REACH)
+    return demodulated(recurrent(core), by=options.demodulate)
+
+
+_FILTERS_REACH = 2 * (2**FULL_LEVELS - 1) + 4 * (2**LEVELS - 1) + 16
+"""That of the levels; in the rest are 2x2 and 4x4 blocks, what is enlarged and slopes."""
+
+
+def _noisy(frame: Frame, surfaces: _Surfaces) -> jax.Array:
+    # Divided by a small reflectance it may be beyond what the network has ever seen.
+    return fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), MULTIPLE), surfaces.hit)
 
 
 def _surfaces(frame: Frame) -> _Surfaces:
@@ -200,14 +216,14 @@ def _past(history: jax.Array, valid: jax.Array) -> _Past:
     return _Past(mean, square, number, shown, pad(valid, MULTIPLE))
 
 
-def _seen(noisy: jax.Array, past: _Past, surfaces: _Surfaces) -> tuple[jax.Array, jax.Array]:
+def _seen(noisy: jax.Array, past: _Past, surfaces: _Surfaces, whole: Whole) -> tuple[jax.Array, jax.Array]:
     """What the network sees at half resolution: surfaces, all four pixels of a block; light, mostly their mean.
 
     Light is seen at one brightness (:func:`jaxdn.color.exposure`) and compressed; where there is no history, in its
     place the noisy frame. Spread is the standard deviation of luminance relative to its mean.
     """
-    gain = color.exposure(noisy)
-    closeness = jnp.zeros_like(past.number) if surfaces.depth is None else depth_feature(surfaces.depth)
+    gain, depth = whole.exposure, surfaces.depth
+    closeness = jnp.zeros_like(past.number) if depth is None else depth_feature(depth, middle=whole.middle_depth)
     geometry = fold(jnp.concatenate([surfaces.albedo, surfaces.normal, closeness, surfaces.roughness], axis=-1))
     level = color.luminance(past.mean)
     spread = jnp.sqrt(jnp.maximum(past.square - level**2, 0.0) + 1e-12) / (level + 1e-3 / gain)
@@ -257,7 +273,12 @@ def _accumulated(
 
 
 def _filtered(
-    guide: dict[str, Any], mean: jax.Array, texture: jax.Array | None, surfaces: _Surfaces, decided: _Decisions
+    guide: dict[str, Any],
+    mean: jax.Array,
+    texture: jax.Array | None,
+    surfaces: _Surfaces,
+    slanted: jax.Array,
+    decided: _Decisions,
 ) -> tuple[jax.Array, jax.Array]:
     """The mean after the levels at full resolution, and after all levels.
 
@@ -271,7 +292,6 @@ def _filtered(
         features = jnp.concatenate([_planar(surfaces), scales["learned"][index] * own])
         return Guide(features, scales["depth"][index] * slanted, ((trust + _LEAST_TRUST) * parts.hit)[..., 0])
 
-    slanted = jnp.zeros_like(_planar(mean)) if surfaces.depth is None else _planar(_slanted(surfaces.depth))
     at_full = guided(surfaces, slanted, 0, decided.features, decided.shares["trust"])
     fine = _planar(mean if texture is None else jnp.concatenate([mean, texture], axis=-1))
     for index in range(FULL_LEVELS):
@@ -308,10 +328,11 @@ def _planar(image: jax.Array) -> jax.Array:
     return image.transpose(2, 0, 1)
 
 
-def _slanted(depth: jax.Array) -> jax.Array:
-    """[H, W, 3] inverse depth relative to its mean, which is affine on planes, and its slopes; 0 without a surface."""
+def _slanted(surfaces: _Surfaces, whole: Whole) -> jax.Array:
+    """[3, H, W] inverse depth relative to its mean, which is affine on planes, and its slopes; 0 without a surface."""
+    depth = surfaces.depth
+    if depth is None:
+        return jnp.zeros_like(_planar(surfaces.normal))
     known = (depth > 0) & (depth < FAR)
-    inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0)
-    middle = jnp.sum(inverse) / jnp.maximum(jnp.sum(known, dtype=depth.dtype), 1.0)
-    inverse = inverse / jnp.where(middle > 0, middle, 1.0)
-    return jnp.stack([inverse[..., 0], *depth_slopes(inverse, None)], axis=-1)
+    inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0) / whole.middle_inverse
+    return jnp.stack([inverse[..., 0], *depth_slopes(inverse, None)])

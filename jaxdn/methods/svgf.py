@@ -31,6 +31,7 @@ from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
 from jaxdn.methods.fitted import FITTING, LEARNED, LEARNED_PER_LEVEL, at_level, moved, unmoved
 from jaxdn.methods.table import method
 from jaxdn.options import Range
+from jaxdn.whole import Whole, measured
 
 READS = frozenset({"normal", "depth", "previous_depth", "motion", "ids"})
 _TAPS = stencil(2, kernel=B3_SPLINE)
@@ -103,14 +104,26 @@ def svgf(options: Options) -> Denoiser:
     """
 
     def step(
-        params: Params, state: SvgfState, frame: Frame, first: jax.Array
+        params: Params, state: SvgfState, frame: Frame, first: jax.Array, whole: Whole
     ) -> tuple[SvgfState, jax.Array, jax.Array]:
         fitted = moved(options, params)
         past, broken = recall_history(fitted, state, frame, first)
-        return (*filter_history(fitted, blend(fitted, past, frame.radiance.transpose(2, 0, 1)), frame), broken)
+        history = blend(fitted, past, frame.radiance.transpose(2, 0, 1))
+        return (*filter_history(fitted, history, frame, whole), broken)
 
-    plain = recurrent(Core(start, step, READS, lambda key, frame: unmoved(options)))
+    def measure(frame: Frame) -> Whole:
+        return measured(frame.radiance, None, frame)
+
+    def init(key: jax.Array, frame: Frame) -> Params:
+        return unmoved(options)
+
+    plain = recurrent(Core(start, step, READS, init, measure=measure, reach=_reach(options)))
     return demodulated(plain, by=options.demodulate)
+
+
+def _reach(options: Options) -> int:
+    """That of the levels, each with its blur of the variance, of 7x7 pixels and those beside them, and of slopes."""
+    return 2 * (2**options.levels - 1) + options.levels + 6
 
 
 def start(params: Params, frame: Frame) -> SvgfState:
@@ -145,28 +158,42 @@ def blend(options: Options, past: jax.Array, now: jax.Array, change: jax.Array |
     )
 
 
-def surface_weights(options: Options, depth: Array, normal: Array, ids: Array, level: Any = 0) -> list[Weight]:
-    """The edge-stopping weights of depth [H, W, 1] and normals [H, W, 3] at one level, as far as present."""
+def surface_weights(
+    options: Options, depth: Array, normal: Array, ids: Array, level: Any = 0, height: jax.Array | None = None
+) -> list[Weight]:
+    """The edge-stopping weights of depth [H, W, 1] and normals [H, W, 3] at one level, as far as present.
+
+    ``height`` is that of the frame that they are a part of.
+    """
     weights: list[Weight] = []
     if depth is not None:
-        weights.append(depth_weight(depth, ids, sigma=at_level(options.sigma_depth, level)))
+        weights.append(depth_weight(depth, ids, sigma=at_level(options.sigma_depth, level), height=height))
     if normal is not None:
         weights.append(normal_weight(normal, sigma=at_level(options.sigma_normal, level)))
     return weights
 
 
-def filter_history(options: Options, history: jax.Array, frame: Frame) -> tuple[SvgfState, jax.Array]:
-    """The state after a frame and its image [H, W, 3], from the blended history [6, H, W]."""
+def filter_history(
+    options: Options, history: jax.Array, frame: Frame, whole: Whole | None = None
+) -> tuple[SvgfState, jax.Array]:
+    """The state after a frame and its image [H, W, 3], from the blended history [6, H, W].
+
+    ``whole`` is what was measured of the frame that this one is a part of.
+    """
     hit = hit_mask(frame.depth, frame.ids)
-    weights = surface_weights(options, frame.depth, frame.normal, frame.ids)
-    texture = texture_left(frame, options.demodulate)
+    texture = texture_left(frame, options.demodulate, whole)
     texture = None if texture is None else texture.transpose(2, 0, 1)
-    color, variance = estimate_variance(history, hit, weights, short_history=options.short_history, texture=texture)
+
+    def weights(level: Any) -> list[Weight]:
+        height = None if whole is None else whole.height
+        return surface_weights(options, frame.depth, frame.normal, frame.ids, level, height)
+
+    color, variance = estimate_variance(history, hit, weights(0), short_history=options.short_history, texture=texture)
     image, feedback = cascade(
         color,
         variance,
         hit,
-        lambda level: surface_weights(options, frame.depth, frame.normal, frame.ids, level),
+        weights,
         _TAPS,
         levels=options.levels,
         sigma_luminance=options.sigma_luminance,

@@ -34,6 +34,7 @@ from jaxdn.filters.neighbourhood import (
 from jaxdn.frame import RADIANCE_MAX, Frame
 from jaxdn.methods.table import method
 from jaxdn.options import Range
+from jaxdn.whole import Whole
 
 READS = frozenset({"motion", "depth"})
 
@@ -78,7 +79,7 @@ def taa(options: Options) -> Denoiser:
     Raises ValueError for options out of range, for a denoiser that :func:`jaxdn.denoiser.recurrent` did not make, and
     for radiance that is not [H, W, 3].
     """
-    before = Core(lambda params, frame: (), _noisy, frozenset())
+    before = Core(lambda params, frame: (), _noisy, frozenset(), reach=0)
     if options.after is not None:
         assert isinstance(options.after.step, RecurrentStep)
         before = options.after.step.core
@@ -88,9 +89,9 @@ def taa(options: Options) -> Denoiser:
         return TaaState(before.start(params, frame), nothing)
 
     def step(
-        params: Params, state: TaaState, frame: Frame, first: jax.Array
+        params: Params, state: TaaState, frame: Frame, first: jax.Array, *whole: Whole
     ) -> tuple[TaaState, jax.Array, jax.Array | int]:
-        inner, image, lost = before.step(params, state.after, frame, first)
+        inner, image, lost = before.step(params, state.after, frame, first, *whole)
         image = jnp.clip(image, 0.0, RADIANCE_MAX)
         history, broken = resolve(options, image, state.history, frame, first)
         kept = history[..., :3]
@@ -103,7 +104,12 @@ def taa(options: Options) -> Denoiser:
         def samples(params: Params, state: TaaState, frame: Frame, first: jax.Array, most: int) -> jax.Array:
             return ask(params, state.after, frame, first, most)
 
-    return recurrent(Core(start, step, before.reads | READS, before.init, samples))
+    reach = None if before.reach is None else before.reach + _REACH
+    return recurrent(Core(start, step, before.reads | READS, before.init, samples, before.measure, reach))
+
+
+_REACH = 4
+"""That of the 3x3 pixels whose motion and colours count, and of the cubic interpolation."""
 
 
 def _noisy(params: Params, state: State, frame: Frame, first: jax.Array) -> tuple[State, jax.Array, int]:

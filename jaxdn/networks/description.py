@@ -46,6 +46,16 @@ class Description(NamedTuple):
         }
 
 
+def reach(network: Description) -> int:
+    """How many pixels away the outputs see, on each side, at the resolution of the input."""
+    found: dict[str, int] = {}
+    for name, layer in network.layers.items():
+        # An enlarged pixel is one of a block, which sees around the whole block; a pooled one is its block.
+        own = {"convolution": layer.size // 2, "enlarge": 1}.get(layer.kind, 0) << layer.depth
+        found[name] = own + max((found[each] for each in layer.inputs), default=0)
+    return max(found[name] for name in network.outputs)
+
+
 class Operations(Protocol[Value]):
     """An engine: what it does for each kind of layer. Its values are arrays, or the names of what will be arrays."""
 
