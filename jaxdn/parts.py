@@ -45,8 +45,8 @@ def windows(length: int, side: int, margin: int) -> list[Window]:
     size = side - (side - length) % GRID
     if size < 2 * (margin + GRID):
         raise ValueError(
-            f"parts of {2 * (margin + GRID) + GRID} pixels or more are needed, as {margin} around a pixel decide about it; "
-            f"there is room for {side}."
+            f"parts need sides of {2 * (margin + GRID) + GRID} pixels or more, as {margin} around a pixel decide about "
+            f"it; there is room for {side}."
         )
     found = [Window(0, size, 0, size - margin)]
     while found[-1].stop < length:
@@ -76,7 +76,9 @@ def by_parts(
     others = []
     for rows, columns in _crossed(*(windows(length, side, margin) for length in size)):
         # Copied: a view of a NumPy array would be copied to a new buffer at every use.
-        cut = jax.tree.map(lambda x, r=rows, c=columns: np.ascontiguousarray(x[r.start : r.stop, c.start : c.stop]), given)
+        cut = jax.tree.map(
+            lambda x, r=rows, c=columns: np.ascontiguousarray(x[r.start : r.stop, c.start : c.stop]), given
+        )
         pictures, other = function(cut)
         if whole is None:
             whole = jax.tree.map(lambda x: np.empty((*size, *x.shape[2:]), x.dtype), pictures)
@@ -94,7 +96,8 @@ def _paste(whole: Any, pictures: Any, rows: Window, columns: Window) -> None:
 
     def one(target: np.ndarray, picture: Any) -> None:
         inside = np.asarray(picture)[
-            rows.first - rows.start : rows.last - rows.start, columns.first - columns.start : columns.last - columns.start
+            rows.first - rows.start : rows.last - rows.start,
+            columns.first - columns.start : columns.last - columns.start,
         ]
         target[rows.first : rows.last, columns.first : columns.last] = inside
 

@@ -58,7 +58,7 @@ def combine(noisy: jax.Array, denoised: jax.Array, level: jax.Array | float | No
     """The mixture of a noisy image [H, W, 3] and its denoised version, linear radiance >= 0.
 
     Noisy values that are not finite, negative or above ``RADIANCE_MAX`` are not used. ``level`` is the mean of the
-    denoised image, or of the one that it is a part of; apart from it, a pixel depends on those up to :data:`REACH` away.
+    denoised image, or of the one that it is a part of; besides, pixels up to :data:`REACH` away decide about one.
     Raises ValueError for other shapes.
     """
     check_image(noisy, "noisy", channels=3)

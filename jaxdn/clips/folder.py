@@ -238,7 +238,12 @@ def open_frames(
         raise ClipError(f"{path}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
     naming: dict[str, Any] = {"motion_convention": motion_convention, "channels": channels, "layer": layer}
     files, plain = plain_frames(path, **naming, backwards=backwards, log=log)
-    return files, (StoredFrame(frame, {}, None, None) for frame in plain)
+    # Unlike the variable of a loop, this does not keep a frame while the next one is read.
+    return files, map(_of_another, plain)
+
+
+def _of_another(frame: Frame) -> StoredFrame:
+    return StoredFrame(frame, {}, None, None)
 
 
 def _turned(frames: Iterator[StoredFrame]) -> Iterator[StoredFrame]:

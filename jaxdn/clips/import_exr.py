@@ -109,8 +109,11 @@ def _frames(
             first = _First(present(frame), silent, chosen.refused)
         _check_like_first(file, frame, first)
         frame = frame._replace(ids=None) if first.silent else frame
+        # While the next file is read, nothing of this one is needed: of large frames, memory is what there is least of.
+        del there
         if not backwards:
             yield frame
+            del frame
         elif turn > 0:
             yield turned(frame, after, forward)
             after = frame

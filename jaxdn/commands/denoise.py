@@ -19,6 +19,7 @@ from jaxdn.commands.aovs import Aovs
 from jaxdn.commands.backwards import Backwards, backward_pass
 from jaxdn.commands.passes import Pass, light_of
 from jaxdn.commands.work import Work, work_on
+from jaxdn.frame import Frame
 from jaxdn.report.images import save_png
 from jaxdn.shrinkage import NOISY, Combined
 
@@ -129,7 +130,8 @@ def denoise_files(
             told.add(line)
 
         for stretch in work.stretches(both_ways=settings.bidirectional):
-            passes = [Pass(work.source, method, limit=settings.max_memory, log=once) for _ in range(1 + settings.bidirectional)]
+            given: dict[str, Any] = {"limit": settings.max_memory, "log": once}
+            passes = [Pass(work.source, method, **given) for _ in range(1 + settings.bidirectional)]
             with closing(_denoise(work, stretch, passes, settings, once)) as paths:
                 for path in paths:
                     files.append(path)
@@ -163,24 +165,27 @@ def _forwards(
     log: Callable[[str], None],
 ) -> Iterator[Path]:
     """The forward pass up to the last frame that is wanted, and all that becomes of its images."""
-    last = max(index for index in stretch if index in work.wanted)
-    safe = settings.safe and forwards.denoises
-    naming: dict[str, Any] = {"channels": settings.channels, "layer": settings.layer}
     names = work.shot.files[stretch.start : stretch.stop]
+    naming: dict[str, Any] = {"channels": settings.channels, "layer": settings.layer}
     canvas = canvas_of(names)
     aovs = Aovs(canvas, naming, log) if settings.aovs == "additive" and work.clip is None else None
-    for index, name, stored in zip(stretch, names, _frames(work, stretch, settings, log), strict=True):
+
+    def safer(index: int, frame: Frame, image: np.ndarray) -> np.ndarray:
+        combined = forwards.combined(frame.radiance, image)
+        if index == min(work.wanted):
+            log(_measured(work.shot.files[index], combined))
+        return np.asarray(combined.image)
+
+    def one(index: int, name: Path, stored: StoredFrame) -> Path | None:
+        """Denoise a frame, and write it if it is wanted. What this leaves in memory is gone when it returns."""
         frame, image = stored.frame, forwards(stored)
         if backwards is not None:
             image = backwards.blended(index, frame, image)
-        if safe:
-            combined = forwards.combined(frame.radiance, image)
-            image = combined.image
-            if index == min(work.wanted):
-                log(_measured(name, combined))
+        if settings.safe and forwards.denoises:
+            image = safer(index, frame, image)
         parts = {} if aovs is None else aovs.denoise(name, frame, image)
         if index not in work.wanted:
-            continue
+            return None
         path = work.targets[index]
         path.parent.mkdir(parents=True, exist_ok=True)
         beauty = image + light_of(frame.direct) + light_of(frame.emission)
@@ -192,9 +197,14 @@ def _forwards(
             write_exr(path, lettered("", beauty) | lettered("denoised.", image))
         if settings.preview:
             save_png(path.with_suffix(".png"), color.tonemap(beauty))
-        yield path
-        if index == last:
-            return
+        return path
+
+    frames = _frames(work, stretch, settings, log)
+    last = max(index for index in stretch if index in work.wanted)
+    for index, name in zip(stretch[: stretch.index(last) + 1], names, strict=False):
+        path = one(index, name, next(frames))
+        if path is not None:
+            yield path
 
 
 def _frames(

@@ -2,20 +2,21 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.candidates import Candidate
+from jaxdn.clips.exr import read_windows
+from jaxdn.clips.folder import frame_path
 from jaxdn.clips.frames import StoredFrame, doubling_layers
-from jaxdn.commands.room import memory_of_machine, needed, side_within
+from jaxdn.commands.room import GIB, give_back, memory_of_machine, needed, side_within
 from jaxdn.parts import Parted, by_parts, parted
 from jaxdn.repair import repair_image
 from jaxdn.rollout import Layers, Stream, stream
 from jaxdn.shrinkage import REACH, Combined, combine
-
-GIB = 2**30
 
 _combine = jax.jit(combine)
 
@@ -42,6 +43,7 @@ class Pass:
         if isinstance(self._step, Stream):
             return np.asarray(self._step(stored.frame, self._layers(stored)))
         image = self._step(stored.frame)
+        give_back()
         if self._step.out_of_reach > self._told:
             self._told = self._step.out_of_reach
             self._log(f"{self._told} pixels move too far for the parts and begin anew; give more --max-memory")
@@ -65,7 +67,7 @@ class Pass:
     def combined(self, noisy: np.ndarray, image: np.ndarray) -> Combined:
         """:func:`jaxdn.shrinkage.combine`, in parts where the frame was."""
         if not isinstance(self._step, Parted):
-            return Combined(*map(np.asarray, _combine(noisy, image)))
+            return _combine(noisy, image)
         level = jnp.asarray(np.mean(image, dtype=np.float64), jnp.float32)
         found, _ = by_parts(
             lambda given: (_combine(*given, level), None),
@@ -74,6 +76,7 @@ class Pass:
             side=self._step.side,
             margin=REACH,
         )
+        give_back()
         return found
 
     def _layers(self, stored: StoredFrame) -> Layers:
@@ -87,10 +90,12 @@ class Pass:
         denoiser, params = self._method.denoiser, self._method.params
         assert denoiser is not None
         limit = memory_of_machine() / 2 if self._limit is None else self._limit
-        side = side_within(limit, height, width)
+        file = frame_path(self._source, 0) if self._source.is_dir() else self._source
+        size = height, width, len(read_windows(file)[1])
+        side = side_within(limit, *size)
         if side is None:
             return stream(denoiser, params)
-        whole = f"whole frames of {width} x {height} need about {needed(height, width) / GIB:.1f} GiB"
+        whole = f"whole frames of {width} x {height} need about {needed(*size) / GIB:.1f} GiB"
         try:
             step = parted(denoiser, params, side, (height, width))
         except ValueError as error:
@@ -102,6 +107,6 @@ class Pass:
         return step
 
 
-def light_of(radiance: np.ndarray | None) -> np.ndarray | float:
+def light_of(radiance: np.ndarray | None) -> Any:
     """Radiance that can be added: non-finite or negative values become 0, an absent part is 0."""
     return 0.0 if radiance is None else np.asarray(repair_image(radiance), np.float32)

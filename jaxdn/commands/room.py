@@ -1,17 +1,22 @@
 """How a frame fits into memory: whole, or in parts whose image is the same."""
 
+import ctypes
 import math
 import os
+import sys
 
 from jaxdn.parts import GRID
 
-HELD = 300
-"""Bytes a pixel of a frame, however it is denoised: its buffers, the state before and after, the image, the file."""
+GIB = 2**30
+PROGRAM = 0.6 * GIB
+"""Bytes of the program itself, with XLA and what it compiles."""
+HELD = 140
+"""Bytes a pixel of what is there however a frame is denoised: its buffers, the state before and after, the image."""
+CHANNEL = 8
+"""Bytes a pixel of each channel of a file while it is written and read back."""
 STEP = 900
-"""Bytes a pixel of what is denoised at once, in addition: a window, or the whole frame."""
-PROGRAM = 0.6 * 2**30
-"""Bytes of the program itself, with XLA and what it compiles. All three are upper bounds for the shipped methods on two
-cores, by `python -m experiments.stability.memory`."""
+"""Bytes a pixel of what is denoised at once, a window or the whole frame. All four are upper bounds for the shipped
+methods on two cores, by ``python -m experiments.stability.memory``."""
 
 
 def memory_of_machine() -> float:
@@ -22,17 +27,29 @@ def memory_of_machine() -> float:
         return math.inf
 
 
-def needed(height: int, width: int) -> float:
-    """Bytes that denoising whole frames needs."""
-    return PROGRAM + (HELD + STEP) * height * width
+def needed(height: int, width: int, channels: int) -> float:
+    """Bytes that denoising whole frames needs, of files with so many channels."""
+    return _beside_step(height, width, channels) + STEP * height * width
 
 
-def side_within(limit: float, height: int, width: int) -> int | None:
+def side_within(limit: float, height: int, width: int, channels: int) -> int | None:
     """The side of square windows with which frames are denoised within ``limit`` bytes; None: whole frames fit.
 
     It is 0 where even what windows leave out does not fit.
     """
-    if needed(height, width) <= limit:
+    if needed(height, width, channels) <= limit:
         return None
-    left = limit - PROGRAM - HELD * height * width
+    left = limit - _beside_step(height, width, channels)
     return int(math.sqrt(max(left, 0) / STEP)) // GRID * GRID
+
+
+def give_back() -> None:
+    """Hand freed memory back to the system: pieces as large as a window's planes stay with the process otherwise."""
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc
+        if trim is not None:
+            trim(0)
+
+
+def _beside_step(height: int, width: int, channels: int) -> float:
+    return PROGRAM + (HELD + CHANNEL * channels) * height * width

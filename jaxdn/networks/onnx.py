@@ -150,6 +150,8 @@ class Session:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
+        # An arena would keep all that a run needed, between runs too; without one, runs take as long.
+        options.enable_cpu_mem_arena = False
         options.intra_op_num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
         options.log_severity_level = 3
         self._weights = [weight.copy() for weight in weights]

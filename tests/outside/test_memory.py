@@ -1,10 +1,16 @@
-"""A sequence of any length is denoised in the memory of a short one: measured on real processes."""
+"""Memory: a sequence of any length takes that of a short one, and large frames that of their parts."""
 
 import sys
 
+import numpy as np
 import pytest
 
 from experiments.stability.memory import peak_mib, write_sequence
+from jaxdn.candidates import candidate
+from jaxdn.clips import read_exr
+from jaxdn.clips.exr import read_windows
+from jaxdn.commands.denoise import Settings, denoise_files
+from jaxdn.commands.room import STEP, needed
 
 
 @pytest.mark.slow
@@ -18,3 +24,37 @@ def test_memory_does_not_grow_with_the_frames_of_a_foreign_sequence(tmp_path):
     everything = (long - short) * 12 * 4 * height * width / 2**20  # what keeping all frames would take
     assert everything > 250
     assert peaks[long] - peaks[short] < 0.2 * everything
+
+
+def test_frames_in_parts_are_the_same_files(tmp_path):
+    """Half the frame fits into the memory that is allowed; the safe mixture and the previews are made in parts too."""
+    height, width = 300, 520
+    write_sequence(tmp_path / "in", 2, height, width)
+    channels = len(read_windows(tmp_path / "in/frame_0001.exr")[1])
+    enough = needed(height, width, channels)
+    images, told = {}, []
+    for name, limit in (("whole", enough), ("parts", enough - STEP * (height * width - 288 * 288))):
+        settings = Settings(motion_convention="previous-current", max_memory=limit)
+        files = denoise_files([tmp_path / "in"], tmp_path / name, candidate("svgf"), settings, log=told.append).files
+        images[name] = [np.stack([read_exr(file)[letter] for letter in "RGB"], axis=-1) for file in files]
+    assert [line for line in told if "in parts of at most 288 x 288 pixels" in line] == told[-2:-1]
+    np.testing.assert_allclose(images["parts"], images["whole"], rtol=1e-4, atol=1e-5)
+    assert np.abs(images["whole"][1] - images["whole"][0]).mean() > 1e-4, "the history of the first frame is used"
+
+
+def test_too_little_memory_is_refused_before_anything_is_written(tmp_path):
+    write_sequence(tmp_path / "in", 1, 200, 300)
+    settings = Settings(motion_convention="previous-current", max_memory=0.61 * 2**30)
+    with pytest.raises(ValueError, match=r"--max-memory 0.61: whole frames of 300 x 200 need about .* there is room for"):
+        denoise_files([tmp_path / "in"], tmp_path / "out", candidate("svgf"), settings)
+    assert not list((tmp_path / "out").glob("**/*.exr"))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="the peak memory of a child process is only available on Unix")
+def test_a_process_keeps_to_the_memory_it_is_allowed(tmp_path):
+    height, width, limit = 540, 960, 0.9
+    write_sequence(tmp_path / "in", 2, height, width)
+    channels = len(read_windows(tmp_path / "in/frame_0001.exr")[1])
+    assert needed(height, width, channels) > 1.2 * limit * 2**30
+    assert peak_mib(tmp_path / "in", tmp_path / "out", "svgf", limit) < 1024 * limit

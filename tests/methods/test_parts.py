@@ -1,0 +1,222 @@
+"""Frames in parts: the image of the whole frame, for every method whose reach is known, and what decides about it."""
+
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxdn import color
+from jaxdn.denoiser import Denoiser
+from jaxdn.denoisers import asvgf, ntasd, ntd, steady, svgf, taa
+from jaxdn.filters.guides import depth_feature
+from jaxdn.frame import FAR, Frame, only
+from jaxdn.parts import GRID, by_parts, farthest_history, parted, windows
+from jaxdn.rollout import stream
+from jaxdn.shrinkage import REACH, combine
+from jaxdn.whole import Whole, measured
+
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
+TINY = ((4,), (4,), (4,), (4,), (4,))
+METHODS: dict[str, Any] = {
+    "svgf": lambda: svgf(levels=3),
+    "steady": lambda: steady(quality=TINY),
+    "ntd": lambda: ntd(size=TINY),
+    "taa after svgf": lambda: taa(after=svgf(levels=2)),
+}
+HEIGHT = 38
+"""One window high, and not a multiple of the blocks that networks work on."""
+
+
+def frames(count: int, width: int, *, height: int = HEIGHT, seed: int = 0) -> list[Frame]:
+    """Things of several materials before the sky that move by up to 6 pixels, with light that falls off to one side.
+
+    Only on the left is the reflectance another than the albedo, and only on the right is there sky.
+    """
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:height, :width]
+    things = (rows // 11 + columns // 17) % 5
+    sky = (things == 4) & (columns > width // 2)
+    directions = rng.normal(size=(5, 3))
+    normal = (directions / np.linalg.norm(directions, axis=1, keepdims=True))[things]
+    albedo = rng.uniform(0.02, 0.95, (5, 3))[things]
+    reflectance = np.where(columns[..., None] < 40, 0.5 * albedo, albedo)
+    depth = np.where(sky, FAR, 2.0 + 0.4 * things + columns / 200)[..., None]
+    motion = np.stack([2.3 + 0.9 * things, -1.7 + 0.0 * rows], axis=-1)
+    motion[3:6, :20] = np.nan
+    brightness = np.exp(columns / width * 3)[..., None]
+    same = {"albedo": albedo, "reflectance": reflectance, "normal": normal, "depth": depth, "motion": motion}
+    same |= {"dual_motion": motion + 1.0, "previous_depth": depth, "roughness": 0.3 + 0.0 * depth}
+    held: dict[str, Any] = {name: np.asarray(buffer, np.float32) for name, buffer in same.items()}
+    held["ids"] = np.where(sky, -1, things)[..., None].astype(np.int32)
+
+    def light() -> np.ndarray:
+        return (rng.gamma(0.5, 2.0, (height, width, 3)) * albedo * brightness).astype(np.float32)
+
+    return [Frame(radiance=light(), **held) for _ in range(count)]
+
+
+def doubled(frame: Frame) -> Frame:
+    return jax.tree.map(lambda x: x.astype(np.float64) if x.dtype == np.float32 else x, frame)
+
+
+def random_params(denoiser: Denoiser, frame: Frame) -> Any:
+    """Decisions that differ from pixel to pixel; those of a filter are its own."""
+    params = denoiser.init(jax.random.key(0), frame)
+    leaves, tree = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(1), max(len(leaves), 1))
+    moved = [leaf + 0.2 * jax.random.normal(key, leaf.shape) for leaf, key in zip(leaves, keys, strict=False)]
+    return jax.tree.unflatten(tree, moved) if jnp.size(leaves[0]) > 1 else params
+
+
+@given(st.integers(1, 3000), st.integers(0, 200), st.integers(0, 900))
+@settings(max_examples=300, deadline=None)
+def test_windows_cover_all_and_have_their_margins(length: int, margin: int, more: int) -> None:
+    side = 2 * (margin + GRID) + GRID + more
+    found = windows(length, side, margin)
+    assert found[0].first == 0
+    assert found[-1].last == length
+    for one, following in itertools.pairwise(found):
+        assert one.last == following.first
+    for one in found:
+        assert 0 <= one.start <= one.first < one.last <= one.stop <= length
+        assert one.stop - one.start == found[0].stop - found[0].start <= side
+        assert one.start % GRID == 0
+        assert one.start == 0 or one.first - one.start >= margin
+        assert one.stop == length or one.stop - one.last >= margin
+    with pytest.raises(ValueError, match=f"there is room for {2 * margin + GRID}"):
+        windows(length + 2 * margin + 2 * GRID, 2 * margin + GRID, margin)
+
+
+@pytest.mark.parametrize(
+    "without",
+    [
+        (),
+        pytest.param(("reflectance", "normal"), marks=pytest.mark.slow),
+        pytest.param(("motion", "dual_motion", "ids", "depth", "previous_depth"), marks=pytest.mark.slow),
+    ],
+    ids=["all buffers", "no materials", "no geometry"],
+)
+@pytest.mark.parametrize("name", METHODS)
+def test_parts_make_the_image_of_the_whole_frame(name: str, without: tuple[str, ...], x64: None) -> None:
+    """With fewer buffers too: then other guides are compared. In float64: what is left is rounding alone."""
+    denoiser = METHODS[name]()
+    reach = denoiser.step.core.reach
+    side = 2 * (reach + 10 + GRID) + 3 * GRID
+    width = side + 5 * GRID + 7
+    some = [doubled(only(frame, frozenset(Frame._fields) - set(without))) for frame in frames(2, width)]
+    params = random_params(denoiser, some[0])
+    whole, parts = stream(denoiser, params), parted(denoiser, params, side, (HEIGHT, width))
+    for frame in some:
+        expected, image = np.asarray(whole(frame)), parts(frame)
+        np.testing.assert_allclose(image, expected, rtol=1e-9, atol=1e-12)
+    assert parts.repaired == whole.repaired
+    assert parts.out_of_reach == 0
+    assert len(parts.programs) == 1
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_nothing_beyond_the_reach_decides_about_a_pixel(name: str, x64: None) -> None:
+    """Everything to the right of a column is other than it was, but not what is measured of the frame."""
+    denoiser = METHODS[name]()
+    core, reach, at = denoiser.step.core, denoiser.step.core.reach, 48
+    width = at + reach + 4 * GRID
+    cut = at + reach + 7  # and 6.8 pixels as far as motion fetches
+    one, other = (doubled(only(each[0], core.reads)) for each in (frames(1, width), frames(1, width, seed=1)))
+    changed = jax.tree.map(lambda a, b: np.concatenate([a[:, :cut], b[:, cut:]], axis=1), one, other)
+    params = random_params(denoiser, one)
+    state = jax.tree.map(jnp.zeros_like, core.start(params, one))
+    step = jax.jit(lambda state, frame, whole: denoiser.step.part(params, state, frame, jnp.asarray(False), whole))
+    whole = None if core.measure is None else core.measure(denoiser.step.measured(one)[0])
+    state = jax.tree.map(jnp.asarray, step(state, one, whole)[0])
+    images = []
+    for frame in (one, changed):
+        after, image, _ = step(state, denoiser.step.measured(frame)[0], whole)
+        images.append((after, image))
+    kept = [jax.tree.map(lambda x: np.asarray(x)[:, :at], each) for each in images]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12), *kept)
+    assert not np.allclose(images[0][1][:, cut + 8 :], images[1][1][:, cut + 8 :])
+
+
+def test_history_from_too_far_away_is_counted_and_begins_anew() -> None:
+    denoiser = svgf(levels=2)
+    side = 2 * (denoiser.step.core.reach + 20 + GRID) + GRID
+    clip = frames(2, 500)
+    for frame in clip:
+        # Ten stripes to the right there is the same thing, farther away.
+        frame.motion[10:14, 100:120] = (170.0, 0.0)
+        frame.previous_depth[10:14, 100:120] = frame.depth[10:14, 270:290]
+        frame.motion[20:24, 480:490] = (170.0, 0.0)  # leaves the frame: has no history anyway
+    parts = parted(denoiser, {}, side, (HEIGHT, 500))
+    whole = stream(denoiser, {})
+    for frame in clip:
+        image, expected = parts(frame), np.asarray(whole(frame))
+    assert parts.out_of_reach == 4 * 20
+    far = denoiser.step.core.reach
+    apart = np.abs(image - expected).max(axis=-1) > 1e-3 * expected.mean()
+    assert apart[10:14, 100:120].any()
+    assert not apart[:, : 100 - far].any()
+    assert not apart[:, 120 + far :].any()
+
+
+def test_how_far_history_is_fetched() -> None:
+    frame = only(frames(1, 200)[0], frozenset({"albedo"}))
+    assert farthest_history(frame, 100) == (3, 0)
+    motion = np.zeros((HEIGHT, 200, 2), np.float32)
+    motion[5, 50], motion[6, 60], motion[7, 10], motion[8, 8] = (-17.5, 0), (0, 12), (-60, 0), (np.inf, 0)
+    frame = frame._replace(motion=motion)
+    assert farthest_history(frame, 100) == (21, 0)
+    assert farthest_history(frame, 20) == (15, 1)
+    assert farthest_history(frame._replace(shadow_motion=2 * motion), 100) == (38, 0)
+
+
+def test_what_cannot_be_parted_is_refused() -> None:
+    for denoiser in (asvgf(), ntasd(size=TINY, budget=2.0)):
+        with pytest.raises(ValueError, match="cannot denoise a frame in parts"):
+            parted(denoiser, {}, 1024, (HEIGHT, 2000))
+    with pytest.raises(ValueError, match="there is room for 128"):
+        parted(svgf(), {}, 128, (HEIGHT, 2000))
+    parted(svgf(), {}, 128, (HEIGHT, 128))
+
+
+def test_sums_of_parts_are_those_of_the_frame() -> None:
+    frame = frames(1, 4 * GRID, height=2 * GRID)[0]
+    parts = [jax.tree.map(lambda x, c=c: x[:, c : c + GRID], frame) for c in range(0, 4 * GRID, GRID)]
+    sums = [measured(jnp.asarray(one.radiance), jnp.asarray(one.depth), one) for one in (frame, *parts)]
+    total: Whole = jax.tree.map(lambda *each: sum(each), *sums[1:])
+    whole = sums[0]
+    for name in ("exposure", "middle_depth", "middle_inverse", "other"):
+        np.testing.assert_allclose(getattr(total, name), getattr(whole, name), rtol=1e-5)
+    np.testing.assert_allclose(whole.exposure, color.exposure(frame.radiance), rtol=1e-6)
+    known = frame.depth[frame.depth < FAR].astype(np.float64)
+    np.testing.assert_allclose(whole.middle_depth, np.exp(np.log(known).mean()), rtol=1e-5)
+    np.testing.assert_allclose(whole.middle_inverse, (1 / known).mean(), rtol=1e-5)
+    np.testing.assert_allclose(
+        depth_feature(frame.depth, middle=whole.middle_depth), depth_feature(frame.depth), rtol=1e-5
+    )
+    differs = np.any(frame.reflectance != frame.albedo, axis=-1)
+    assert whole.other == differs.sum() > 0
+    assert measured(frame.radiance, None, frame._replace(albedo=None)).other == 0
+
+
+@pytest.mark.parametrize("samples", [4, 4096])
+def test_the_safe_mixture_in_parts_is_that_of_the_whole_frame(samples: int) -> None:
+    rng = np.random.default_rng(0)
+    height, width = 300, 411
+    columns = np.arange(width, dtype=np.float32)
+    truth = np.broadcast_to((1 + np.sin(columns / 9))[None, :, None], (height, width, 3))
+    noisy = (truth * rng.gamma(samples, 1 / samples, truth.shape)).astype(np.float32)
+    denoised = (truth + 0.05 * np.cos(columns / 50)[None, :, None]).astype(np.float32)
+    level = jnp.mean(jnp.asarray(denoised))
+    found, others = by_parts(
+        lambda given: (combine(*given, level), None), (noisy, denoised), (height, width), side=288, margin=REACH
+    )
+    assert len(others) == 4
+    expected = combine(noisy, denoised)
+    for name in ("share", "noise", "image"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
