@@ -3,7 +3,7 @@
 XLA:CPU has no fast gradient of a convolution by its kernel, and its convolutions reach two thirds of the machine's
 peak. oneDNN (Apache-2.0; the engine under PyTorch on CPUs) is an extra, ``pip install onednn-cpu-gomp``: a
 shared library, called through its C interface (version 3) by ctypes, so that no compiler is needed. It reads and
-writes XLA's own buffers. :mod:`jaxdn.ops.convolution` makes one differentiable operation of the three functions.
+writes XLA's own buffers. :mod:`jaxdn.ops.convolution` makes one differentiable operation of the two functions.
 """
 
 import ctypes
@@ -28,7 +28,7 @@ _LIBRARY = "libdnnl.so.3"
 _CPU, _FLOAT32, _ANY_LAYOUT, _IN_ORDER, _TRAINING, _DIRECT = 1, 3, 1, 1, 64, 1
 _ASK_WEIGHTS, _ASK_WEIGHTS_GRADIENT, _ASK_SCRATCHPAD = 131, 132, 136
 _SOURCE, _DESTINATION, _WEIGHTS = 1, 17, 33
-_SOURCE_GRADIENT, _DESTINATION_GRADIENT, _WEIGHTS_GRADIENT = 129, 145, 161
+_DESTINATION_GRADIENT, _WEIGHTS_GRADIENT = 145, 161
 _SCRATCHPAD, _USER_SCRATCHPAD = 80, 1
 _OWN_MEMORY, _NO_MEMORY = c_void_p(-1), c_void_p(None)
 
@@ -127,7 +127,7 @@ class _Convolution:
     The library chooses the layout of the kernel; every call converts to or from it (a few microseconds).
 
     Args:
-      direction: "forward", "image gradient" or "kernel gradient".
+      direction: "forward" or "kernel gradient".
       count: images N.
       height: of the images.
       width: of the images.
@@ -151,13 +151,7 @@ class _Convolution:
         )
         description, query = forward, _ASK_WEIGHTS
         roles = _SOURCE, _WEIGHTS, _DESTINATION
-        if direction == "image gradient":
-            description = _made(
-                "dnnl_convolution_backward_data_primitive_desc_create",
-                *(engine, _DIRECT, x, free, y, *window, forward, _attributes()),
-            )
-            x, y, roles = y, x, (_DESTINATION_GRADIENT, _WEIGHTS, _SOURCE_GRADIENT)
-        elif direction == "kernel gradient":
+        if direction == "kernel gradient":
             description = _made(
                 "dnnl_convolution_backward_weights_primitive_desc_create",
                 *(engine, _DIRECT, x, free, None, y, *window, forward, _attributes()),
@@ -189,7 +183,7 @@ class _Convolution:
         return primitive, len(given), (_Argument * len(given))(*[_Argument(*each) for each in given])
 
     def __call__(self, first: int, kernel: int, last: int) -> None:
-        """Addresses of x (the cotangent for the image's gradient), of the kernel or its gradient, and of y."""
+        """Addresses of x, of the kernel or its gradient, and of y."""
         for memory, address in zip(self._given, (first, kernel, last), strict=True):
             _call("dnnl_memory_set_data_handle", memory, address)
         for primitive, count, arguments in self._work:
@@ -208,54 +202,29 @@ def _address(array: np.ndarray) -> int:
 
 
 def _forward(context: Any, out: Any, x: Any, kernel: Any) -> None:
-    _with_kernel("forward", np.asarray(x), np.asarray(kernel), np.asarray(out))
-
-
-def _image_gradient(context: Any, out: Any, cotangent: Any, kernel: Any) -> None:
-    _with_kernel("image gradient", np.asarray(cotangent), np.asarray(kernel), np.asarray(out))
-
-
-def _with_kernel(direction: str, images: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
-    """All images at once for one kernel; one call per kernel if vmap batched the kernel."""
-    inputs, outputs = kernel.shape[-2:]
-    if kernel.size == 9 * inputs * outputs:
-        images, out = (array.reshape(1, -1, *array.shape[-3:]) for array in (images, out))
-        kernel = kernel.reshape(1, 3, 3, inputs, outputs)
-    run = _made_once(direction, *images.shape[-4:-1], inputs, outputs)
-    with _ALONE:
-        for index in np.ndindex(out.shape[:-4]):
-            run(*(_address(_at(array, index)) for array in (images, kernel, out)))
-
-
-def _at(array: np.ndarray, index: Sequence[int]) -> np.ndarray:
-    """The example at an index; an axis that vmap did not batch has length 1."""
-    return array[tuple(place if size > 1 else 0 for place, size in zip(index, array.shape, strict=False))]
+    _run("forward", x, kernel, out)
 
 
 def _kernel_gradient(context: Any, out: Any, x: Any, cotangent: Any) -> None:
-    """Under vmap each example has its own gradient, which jax adds up afterwards."""
-    images, gradients, cotangents = (np.asarray(array) for array in (x, out, cotangent))
-    run = _made_once("kernel gradient", *images.shape[-4:], cotangents.shape[-1])
+    _run("kernel gradient", x, out, cotangent)
+
+
+def _run(direction: str, x: Any, kernel: Any, y: Any) -> None:
+    buffers = [np.asarray(each) for each in (x, kernel, y)]
+    run = _made_once(direction, *buffers[0].shape, buffers[2].shape[-1])
     with _ALONE:
-        for index in np.ndindex(images.shape[:-4]):
-            run(*(_address(array[index]) for array in (images, gradients, cotangents)))
+        run(*map(_address, buffers))
 
 
-def _program(callback: Callable[..., None], shape: Sequence[int], *arguments: jax.Array, batch: str) -> jax.Array:
-    return buffer_callback(callback, jax.ShapeDtypeStruct(tuple(shape), jnp.float32), vmap_method=batch)(*arguments)
+def _program(callback: Callable[..., None], shape: Sequence[int], *arguments: jax.Array) -> jax.Array:
+    return buffer_callback(callback, jax.ShapeDtypeStruct(tuple(shape), jnp.float32))(*arguments)
 
 
 def forward(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """``x`` [N, H, W, Ci] convolved with ``kernel`` [3, 3, Ci, Co], float32, stride 1, zeros outside."""
-    return _program(_forward, (*x.shape[:3], kernel.shape[3]), x, kernel, batch="expand_dims")
-
-
-def image_gradient(cotangent: jax.Array, kernel: jax.Array) -> jax.Array:
-    """The gradient by the image [N, H, W, Ci] for the cotangent [N, H, W, Co]."""
-    return _program(_image_gradient, (*cotangent.shape[:3], kernel.shape[2]), cotangent, kernel, batch="expand_dims")
+    return _program(_forward, (*x.shape[:3], kernel.shape[3]), x, kernel)
 
 
 def kernel_gradient(x: jax.Array, cotangent: jax.Array) -> jax.Array:
     """The gradient by the kernel, ``sum_p x(p + offset) cotangent(p)``: [3, 3, Ci, Co]."""
-    shape = (3, 3, x.shape[3], cotangent.shape[3])
-    return _program(_kernel_gradient, shape, x, cotangent, batch="broadcast_all")
+    return _program(_kernel_gradient, (3, 3, x.shape[3], cotangent.shape[3]), x, cotangent)
