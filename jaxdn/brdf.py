@@ -176,7 +176,8 @@ def divisor(reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
     threshold (1 below it), reflectances of 0.009 and 0.011 would differ by a factor of 90 after the division.
     """
     larger, smaller = jnp.maximum(reflectance, floor), jnp.minimum(reflectance, floor)
-    return larger * (1 + (smaller / larger) ** 4) ** 0.25 / (1 + floor**4) ** 0.25
+    # Two square roots: XLA:CPU does not vectorise powers.
+    return larger * jnp.sqrt(jnp.sqrt(1 + (smaller / larger) ** 4)) / (1 + floor**4) ** 0.25
 
 
 def demodulate(radiance: jax.Array, reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:

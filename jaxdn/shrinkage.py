@@ -12,7 +12,11 @@ Unbiased and Biased Renderings", 2022, whose V comes from the renderer's samples
 Here V comes from the image alone. Noise of a renderer without a pixel filter differs from pixel to pixel, lost detail
 mostly does not: V is the mean of squared second differences of ``d``, which are free of slopes (Immerkaer, "Fast Noise
 Variance Estimation", 1996, whose mask is the same in two dimensions), along that of four directions in which it is
-smallest, because edges are smooth along themselves. Detail of single pixels still counts as noise.
+smallest, because edges are smooth along themselves.
+
+Texture of single pixels has no such direction, but it is seldom everywhere, and noise is: where there is little noise, V
+is that of the quietest block of pixels around. Of much noise this would be far too little, because few samples are
+mostly dark, with a few bright ones: there the mean of the whole window counts.
 """
 
 from typing import NamedTuple
@@ -40,7 +44,17 @@ _DARK = 0.05
 """Differences are relative to the light plus this share of the image's mean."""
 _WHITE, _STRONG = 0.7, 0.1
 """What is so much noise of so large a mean square is not kept in a clean region either: a firefly."""
+_OUTLIER = 25.0
+"""A pixel that is brighter than what was made of it, by so many times the mean square around it, is a firefly too."""
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+
+QUIET = 8
+"""Side of the blocks whose noise is compared, in pixels; :data:`BLOCK` is a multiple of it."""
+LITTLE, MUCH = 0.6, 0.9
+"""Noise, as a share of the light, up to which that of the quietest block counts, and from which that of the window."""
+_LEAST = {1: 1.68, 2: 1.88}
+"""Blocks around a pixel's own on each side -> variance of grey Gaussian noise, relative to the mean of the least of
+their measured ones."""
 
 
 class Combined(NamedTuple):
@@ -54,12 +68,19 @@ class Combined(NamedTuple):
     """[H, W, 1] the noisy image's noise (standard deviation), as a share of the light."""
 
 
-def combine(noisy: jax.Array, denoised: jax.Array, level: jax.Array | float | None = None) -> Combined:
+def combine(
+    noisy: jax.Array, denoised: jax.Array, level: jax.Array | float | None = None, *, blind: bool = False
+) -> Combined:
     """The mixture of a noisy image [H, W, 3] and its denoised version, linear radiance >= 0.
 
-    Noisy values that are not finite, negative or above ``RADIANCE_MAX`` are not used. ``level`` is the mean of the
-    denoised image, or of the one that it is a part of; besides, pixels up to :data:`REACH` away decide about one.
-    Raises ValueError for other shapes.
+    Noisy values that are not finite, negative or above ``RADIANCE_MAX`` are not used. Pixels up to :data:`REACH` away
+    decide about one, and ``level``. Raises ValueError for other shapes.
+
+    Args:
+      noisy: what was rendered.
+      denoised: what was made of it.
+      level: the mean of the denoised image, or of the one that it is a part of; None: it is the whole one.
+      blind: no guide told the denoiser of textures. It has lost them, and quiet blocks are sought farther away.
     """
     check_image(noisy, "noisy", channels=3)
     check_same_size(noisy, denoised, ("noisy", "denoised"))
@@ -69,7 +90,7 @@ def combine(noisy: jax.Array, denoised: jax.Array, level: jax.Array | float | No
     light = light + _DARK * (jnp.mean(light) if level is None else level)
     # Limited, so that the fourth power is finite.
     relative = jnp.clip(change / jnp.where(light > 0, light, 1.0), -1e4, 1e4)
-    energy, variance, number = _moments(relative)
+    energy, variance, number = _moments(relative, blind=blind)
     doubtful = jnp.minimum(1 + DOUBT / jnp.sqrt(number), MOST)
     share = jnp.clip(1 - doubtful * variance / jnp.where(energy > 0, energy, 1.0), 0.0, 1.0)
     firefly = (variance > _WHITE * energy) & (energy > _STRONG)
@@ -78,7 +99,7 @@ def combine(noisy: jax.Array, denoised: jax.Array, level: jax.Array | float | No
     return Combined(denoised + share * change, jnp.where(sound, share, 0.0), jnp.sqrt(variance))
 
 
-def _moments(change: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _moments(change: jax.Array, *, blind: bool = False) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Of each pixel's window, [H, W, 1] each: the mean square, the variance of noise, and the number of values.
 
     The number is that of equal values with the same fourth moment: 1 if all is in one pixel.
@@ -91,14 +112,34 @@ def _moments(change: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         return wide[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
 
     curved = [at(dy, dx) - 2 * change + at(-dy, -dx) for dy, dx in _DIRECTIONS]
+    curved = [jnp.mean(each**2, axis=-1) / 6 for each in curved]
     square = jnp.mean(change**2, axis=-1)
-    parts = [jnp.ones_like(square), square, square**2, *(jnp.mean(each**2, axis=-1) / 6 for each in curved)]
+    parts = [jnp.ones_like(square), square, square**2, *curved]
     planes = jnp.pad(jnp.stack(parts, axis=-1), ((RADIUS, RADIUS), (RADIUS, RADIUS), (0, 0)))
     for axis in (-3, -2):
         planes = correlate(planes, np.ones((2 * RADIUS + 1, 1)), axis=axis)
     count, energy, fourth, variance = planes[..., :1], planes[..., 1:2], planes[..., 2:3], planes[..., 3:]
     number = jnp.where(fourth > 0, energy**2 / jnp.where(fourth > 0, fourth, 1.0), count)
-    return energy / count, jnp.min(variance, axis=-1, keepdims=True) / count, jnp.maximum(number, 1.0)
+    energy, variance = energy / count, jnp.min(variance, axis=-1, keepdims=True) / count
+    little = _falling(jnp.sqrt(variance), LITTLE, MUCH)
+    outlier = (square[..., None] > _OUTLIER * energy) & (jnp.mean(change, axis=-1, keepdims=True) > 0)
+    quiet = jnp.minimum(variance, _quietest(curved, around=2 if blind else 1))
+    return energy, variance + jnp.where(outlier, 0.0, little) * (quiet - variance), jnp.maximum(number, 1.0)
+
+
+def _quietest(squares: list[jax.Array], *, around: int) -> jax.Array:
+    """The least mean of squares [H, W] over blocks near each pixel and over directions, [H, W, 1], without its bias.
+
+    The block of a pixel and ``around`` more on each side are compared, and what is found is interpolated.
+    """
+    height, width = squares[0].shape
+    rows, columns = -(-height // QUIET), -(-width // QUIET)
+    widths = ((0, rows * QUIET - height), (0, columns * QUIET - width))
+    parted = jnp.pad(jnp.stack(squares), ((0, 0), *widths), mode="edge")
+    least = jnp.min(jnp.mean(parted.reshape(-1, rows, QUIET, columns, QUIET), axis=(2, 4)), axis=0)
+    side = 2 * around + 1
+    least = jax.lax.reduce_window(least, jnp.inf, jax.lax.min, (side, side), (1, 1), "SAME")
+    return _LEAST[around] * _enlarged(least, QUIET)[:height, :width]
 
 
 def _clean(noise: jax.Array) -> jax.Array:
@@ -110,7 +151,16 @@ def _clean(noise: jax.Array) -> jax.Array:
     rows, columns = -(-height // BLOCK), -(-width // BLOCK)
     widths = ((0, rows * BLOCK - height), (0, columns * BLOCK - width))
     blocks = jnp.pad(noise[..., 0], widths, mode="edge").reshape(rows, BLOCK, columns, BLOCK)
-    level = jnp.median(blocks, axis=(1, 3))
-    level = jax.image.resize(level, (rows * BLOCK, columns * BLOCK), "linear")[:height, :width, None]
-    part = jnp.clip((NOISY - level) / (NOISY - CLEAN), 0.0, 1.0)
+    return _falling(_enlarged(jnp.median(blocks, axis=(1, 3)), BLOCK)[:height, :width], CLEAN, NOISY)
+
+
+def _enlarged(blocks: jax.Array, side: int) -> jax.Array:
+    """[h, w] interpolated to [side h, side w, 1]."""
+    height, width = blocks.shape
+    return jax.image.resize(blocks, (side * height, side * width), "linear")[..., None]
+
+
+def _falling(x: jax.Array, low: float, high: float) -> jax.Array:
+    """1 up to ``low``, 0 from ``high`` on, smooth between them."""
+    part = jnp.clip((high - x) / (high - low), 0.0, 1.0)
     return part * part * (3 - 2 * part)

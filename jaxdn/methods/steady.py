@@ -1,8 +1,8 @@
 """``steady``, a denoiser of our own: an edge-stopping recurrent filter whose every decision a small network makes.
 
 For each frame: divide by what surfaces reflect; fetch the history with a test of every tap; blend the noisy frame into
-a running mean whose effective number of samples is known per pixel; filter the mean by affinities, two levels at full
-resolution and four at half, each reaching twice as far as the one before; blend the result with the last output.
+a running mean whose effective number of samples is known per pixel; filter the mean by affinities, one or two levels at
+full resolution and four at half, each reaching twice as far as the one before; blend the result with the last output.
 
 What a hand-made filter leaves to constants, a U-Net at half resolution decides for every pixel: learned features that
 stop the filter beside albedo, normal and depth; how far a pixel can be trusted (a firefly is not); how fast both
@@ -36,18 +36,28 @@ from jaxdn.recipe import Recipe
 from jaxdn.scales import downsample, fill, fold
 from jaxdn.whole import Whole, measured
 
-FULL_LEVELS, LEVELS = 2, 4
-"""Levels of the filter at full resolution, taps 1 and 2 pixels apart, and at half: 2, 4, 8 and 16 pixels apart."""
+LEVELS = 4
+"""Levels of the filter at half resolution, taps 2, 4, 8 and 16 pixels apart."""
 FEATURES, HALF_FEATURES = 5, 8
 """Learned features at full and at half resolution."""
 MULTIPLE = 32
 """Height and width that the network works on are multiples of this."""
-QUALITIES: dict[str, Widths] = {
-    "high": ((48,), (64,), (80,), (96,), (96,)),
-    "balanced": ((32,), (48,), (64,), (64,), (64,)),
-    "fast": ((16,), (24,), (32,), (32,), (32,)),
+
+
+class Quality(NamedTuple):
+    """What one pays for."""
+
+    widths: Widths
+    """Channels of the U-Net's convolutions, from half resolution down."""
+    full_levels: int = 2
+    """Levels of the filter at full resolution, taps 1, 2 ... pixels apart."""
+
+
+QUALITIES = {
+    "high": Quality(((48,), (64,), (80,), (96,), (96,))),
+    "balanced": Quality(((32,), (48,), (64,), (64,), (64,))),
+    "fast": Quality(((16,), (24,), (32,), (32,), (32,)), full_levels=1),
 }
-"""Channels of the U-Net's convolutions, from half resolution down."""
 
 BEGIN = {"trust": 4.0, "follow": 0.0, "blend": 0.0, "coarse": 4.0, "feedback": -4.0}
 """Decisions for every pixel, one logit each, and what they are before training."""
@@ -62,7 +72,7 @@ class Options:
     """The network's size and what it does not decide."""
 
     quality: Literal["fast", "balanced", "high"] | Widths = "balanced"
-    """The network's widths, by name or as tuples."""
+    """By name, or the network's widths as tuples, with the filter of ``"balanced"``."""
     history_max: Annotated[float, Range(1)] = 32.0
     """Largest effective number of samples of the running mean, in frames."""
     demodulate: Demodulation | bool = "brdf"
@@ -136,9 +146,9 @@ def steady(options: Options) -> Denoiser:
     # Flax is imported only when a network is built: filters without weights need only jax and numpy.
     from jaxdn.networks.unet import unet
 
-    widths = QUALITIES[options.quality] if isinstance(options.quality, str) else options.quality
+    quality = QUALITIES[options.quality] if isinstance(options.quality, str) else Quality(options.quality)
     heads = (4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS,)
-    network = unet((32, 20), heads, widths=widths, head_size=1, implementation=options.implementation)
+    network = unet((32, 20), heads, widths=quality.widths, head_size=1, implementation=options.implementation)
     reads = frozenset({"albedo", "normal", "roughness", "depth", "previous_depth", "motion", "ids"})
 
     def init(key: jax.Array, frame: Frame) -> Params:
@@ -168,7 +178,7 @@ def steady(options: Options) -> Denoiser:
         texture = texture_left(frame, options.demodulate, whole)
         texture = None if texture is None else fill(pad(texture, MULTIPLE), surfaces.hit)
         slanted = _slanted(surfaces, whole)
-        fine, image = _filtered(params["guide"], mean, texture, surfaces, slanted, decided)
+        fine, image = _filtered(params["guide"], mean, texture, surfaces, slanted, decided, quality.full_levels)
         newest = jnp.where(past.valid, decided.shares["blend"], 1.0)
         shown = jnp.clip(past.shown + newest * (image - past.shown), 0.0, RADIANCE_MAX)
         kept = mean + decided.shares["feedback"] * (fine - mean)
@@ -180,13 +190,14 @@ def steady(options: Options) -> Denoiser:
         surfaces = _surfaces(frame)
         return measured(_noisy(frame, surfaces), surfaces.depth, frame)
 
-    seen = 2 * description.reach(description.unet(1, heads, widths=widths, head_size=1))
-    core = Core(start, step, reads, init, measure=measure, reach=seen + _FILTERS_REACH)
+    seen = 2 * description.reach(description.unet(1, heads, widths=quality.widths, head_size=1))
+    core = Core(start, step, reads, init, measure=measure, reach=seen + _filters_reach(quality.full_levels))
     return demodulated(recurrent(core), by=options.demodulate)
 
 
-_FILTERS_REACH = 2 * (2**FULL_LEVELS - 1) + 4 * (2**LEVELS - 1) + 16
-"""That of the levels; in the rest are 2x2 and 4x4 blocks, what is enlarged and slopes."""
+def _filters_reach(full_levels: int) -> int:
+    """That of the levels; in the rest are 2x2 and 4x4 blocks, what is enlarged and slopes."""
+    return 2 * (2**full_levels - 1) + 4 * (2**LEVELS - 1) + 16
 
 
 def _noisy(frame: Frame, surfaces: _Surfaces) -> jax.Array:
@@ -279,6 +290,7 @@ def _filtered(
     surfaces: _Surfaces,
     slanted: jax.Array,
     decided: _Decisions,
+    full_levels: int,
 ) -> tuple[jax.Array, jax.Array]:
     """The mean after the levels at full resolution, and after all levels.
 
@@ -294,7 +306,7 @@ def _filtered(
 
     at_full = guided(surfaces, slanted, 0, decided.features, decided.shares["trust"])
     fine = _planar(mean if texture is None else jnp.concatenate([mean, texture], axis=-1))
-    for index in range(FULL_LEVELS):
+    for index in range(full_levels):
         fine = affinity_filter(fine, at_full, step=2**index)
     fine = fine.transpose(1, 2, 0)
     half = surfaces._replace(

@@ -166,3 +166,19 @@ def test_every_weight_learns(rng, key):
     still = [jax.tree_util.keystr(path) for path, leaf in jax.tree.leaves_with_path(gradient) if not np.any(leaf)]
     assert still == []
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+
+
+def test_every_quality_takes_fewer_operations_than_the_next(rng):
+    """At a size where the border does not count."""
+    frame = frame_at(room(rng, 1, size=(96, 160)), 0)
+
+    def operations(quality):
+        denoiser = steady(quality=quality)
+        params = jax.eval_shape(denoiser.init, jax.random.key(0), frame)
+        state = jax.eval_shape(denoiser.start, params, frame)
+        return jax.jit(denoiser.step).lower(params, state, frame).cost_analysis()["flops"]
+
+    fast, balanced, high = map(operations, ("fast", "balanced", "high"))
+    assert fast < 0.5 * balanced
+    assert balanced < 0.7 * high
+    assert steady(quality="fast").step.core.reach < steady(quality="balanced").step.core.reach
