@@ -17,11 +17,10 @@ from jaxdn.clips.import_exr import canvas_of
 from jaxdn.clips.result import write_result
 from jaxdn.commands.aovs import Aovs
 from jaxdn.commands.backwards import Backwards, backward_pass
-from jaxdn.commands.passes import Pass, light_of
+from jaxdn.commands.passes import Pass, Safe, light_of
 from jaxdn.commands.work import Work, work_on
 from jaxdn.frame import Frame
 from jaxdn.report.images import save_png
-from jaxdn.shrinkage import NOISY, Combined
 
 
 class Settings(NamedTuple):
@@ -170,11 +169,18 @@ def _forwards(
     canvas = canvas_of(names)
     aovs = Aovs(canvas, naming, log) if settings.aovs == "additive" and work.clip is None else None
 
+    doubtful: list[Path] = []
+
     def safer(index: int, frame: Frame, image: np.ndarray) -> np.ndarray:
-        combined = forwards.combined(frame.radiance, image)
+        image, safe = forwards.safe(frame, image)
+        file = work.shot.files[index]
         if index == min(work.wanted):
-            log(_measured(work.shot.files[index], combined))
-        return np.asarray(combined.image)
+            log(_measured(file, safe))
+        if safe.judged.distrust > 0 and index in work.wanted:
+            if not doubtful:
+                log(_distrusted(file, safe))
+            doubtful.append(file)
+        return image
 
     def one(index: int, name: Path, stored: StoredFrame) -> Path | None:
         """Denoise a frame, and write it if it is wanted. What this leaves in memory is gone when it returns."""
@@ -205,6 +211,8 @@ def _forwards(
         path = one(index, name, next(frames))
         if path is not None:
             yield path
+    if len(doubtful) > 1:
+        log(f"likewise {len(doubtful) - 1} more, up to {doubtful[-1].name}")
 
 
 def _frames(
@@ -224,15 +232,23 @@ def _frames(
     return frames
 
 
-def _measured(name: Path, combined: Combined) -> str:
+def _measured(file: Path, safe: Safe) -> str:
     """What was measured in a frame, and what it decided, as a line."""
-    noise, share = float(np.median(combined.noise)), float(np.mean(combined.share))
-    line = (
-        f"{name.name}: noise is about {noise:.1%} of the light; {share:.0%} of the frame is kept (--no-safe: nothing)"
+    noise = f"noise is about {safe.judged.noise:.1%} of the light"
+    return f"{file.name}: {noise}; {safe.kept:.0%} of the frame is kept (--no-safe: nothing)"
+
+
+def _distrusted(file: Path, safe: Safe) -> str:
+    """Why a frame was kept, as a line."""
+    reason = (
+        "there is no albedo, so textures are lost; name one, --channels albedo=LAYER"
+        if safe.blind
+        else "do albedo, normals and depth belong to this frame?"
     )
-    if share > 0.5 and noise > NOISY:
-        return f"{line}; the denoised image differs from it by more than noise: do its guides belong to it?"
-    return line
+    return (
+        f"{file.name}: the denoised image differs by {safe.judged.lost:.0%} of the light, of which noise explains "
+        f"{safe.judged.noise:.0%}: {reason} {safe.judged.distrust:.0%} of the result is the frame as it came"
+    )
 
 
 def lettered(layer: str, image: np.ndarray) -> dict[str, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +13,24 @@ from jaxdn.clips.exr import read_windows
 from jaxdn.clips.folder import frame_path
 from jaxdn.clips.frames import StoredFrame, doubling_layers
 from jaxdn.commands.room import GIB, give_back, memory_of_machine, needed, side_within
+from jaxdn.frame import Frame
 from jaxdn.parts import Parted, by_parts, parted
 from jaxdn.repair import repair_image
 from jaxdn.rollout import Layers, Stream, stream
-from jaxdn.shrinkage import REACH, Combined, combine
+from jaxdn.shrinkage import REACH, Combined, Judged, combine, judge
 
-_combine = jax.jit(combine)
+_combine = jax.jit(combine, static_argnames="blind")
+_judge = jax.jit(judge)
+
+
+class Safe(NamedTuple):
+    """What decided about an image."""
+
+    judged: Judged
+    kept: float
+    """How much of the noisy frame was kept, pixel by pixel, in the mean."""
+    blind: bool
+    """No guide tells of textures."""
 
 
 class Pass:
@@ -64,14 +76,24 @@ class Pass:
         """Invalid values that were replaced."""
         return 0 if self._step is None else self._step.repaired
 
-    def combined(self, noisy: np.ndarray, image: np.ndarray) -> Combined:
-        """:func:`jaxdn.shrinkage.combine`, in parts where the frame was."""
+    def safe(self, frame: Frame, image: np.ndarray) -> tuple[np.ndarray, Safe]:
+        """The image of a frame with what is no noise as it was (:mod:`jaxdn.shrinkage`), and what decided."""
+        noisy = np.asarray(frame.radiance)
+        blind = frame.albedo is None and frame.reflectance is None
+        found = self._combined(noisy, image, blind=blind)
+        judged: Judged = jax.device_get(_judge(found))
+        image = np.asarray(found.image)
+        if judged.distrust > 0:
+            image = image + np.float32(judged.distrust) * (np.asarray(light_of(noisy)) - image)
+        return image, Safe(judged, float(np.mean(found.share)), blind)
+
+    def _combined(self, noisy: np.ndarray, image: np.ndarray, *, blind: bool) -> Combined:
         if not isinstance(self._step, Parted):
-            return _combine(noisy, image)
+            return _combine(noisy, image, blind=blind)
         level = jnp.asarray(np.mean(image, dtype=np.float64), jnp.float32)
         found, _ = by_parts(
-            lambda given: (_combine(*given, level), None),
-            (np.asarray(noisy), image),
+            lambda given: (_combine(*given, level, blind=blind), None),
+            (noisy, image),
             image.shape[:2],
             side=self._step.side,
             margin=REACH,
