@@ -19,6 +19,7 @@ V is that of the quietest block of pixels around. Of much noise this would be fa
 mostly dark, with a few bright ones: there the mean of the whole window counts.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -31,9 +32,9 @@ from jaxdn.stencils import correlate
 
 RADIUS = 7
 """Windows have 2 RADIUS + 1 = 15 pixels a side."""
-DOUBT = 2.0
-"""c = 1 + DOUBT / sqrt(n), at most MOST: V is uncertain by the inverse root of the number n of values it is from."""
-MOST = 3.0
+DOUBT, MOST = 2.0, 2.0
+"""c = 1 + DOUBT / sqrt(n), at most 1 + MOST: V is uncertain by the inverse root of the number n of values it is from.
+Where there is little noise, the quietest block decides, and c - 1 is half of that."""
 CLEAN, NOISY = 0.02, 0.06
 """Noise, as a share of the light, up to which a region is left as it is, and from which the share above decides."""
 BLOCK = 32
@@ -44,8 +45,9 @@ _DARK = 0.05
 """Differences are relative to the light plus this share of the image's mean."""
 _WHITE, _STRONG = 0.7, 0.1
 """What is so much noise of so large a mean square is not kept in a clean region either: a firefly."""
-_OUTLIER = 25.0
-"""A pixel that is brighter than what was made of it, by so many times the mean square around it, is a firefly too."""
+_OUTLIER, _ALONE = 50.0, 0.4
+"""A pixel that is brighter than what was made of it, by so many times the mean square around it, is a firefly too, if
+it is alone: its second differences are large in all directions (two thirds of its square for a single pixel)."""
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 QUIET = 8
@@ -108,8 +110,8 @@ def combine(
     # Limited, so that the fourth power is finite.
     relative = jnp.clip(change / jnp.where(light > 0, light, 1.0), -1e4, 1e4)
     energy, variance, number = _moments(relative, blind=blind)
-    doubtful = jnp.minimum(1 + DOUBT / jnp.sqrt(number), MOST)
-    share = jnp.clip(1 - doubtful * variance / jnp.where(energy > 0, energy, 1.0), 0.0, 1.0)
+    doubt = jnp.minimum(DOUBT / jnp.sqrt(number), MOST) * (1 - 0.5 * _falling(jnp.sqrt(variance), LITTLE, MUCH))
+    share = jnp.clip(1 - (1 + doubt) * variance / jnp.where(energy > 0, energy, 1.0), 0.0, 1.0)
     firefly = (variance > _WHITE * energy) & (energy > _STRONG)
     kept = jnp.where(firefly, 0.0, _clean(jnp.sqrt(variance)))
     share = share + (1 - share) * kept
@@ -153,9 +155,10 @@ def _moments(change: jax.Array, *, blind: bool = False) -> tuple[jax.Array, jax.
     number = jnp.where(fourth > 0, energy**2 / jnp.where(fourth > 0, fourth, 1.0), count)
     energy, variance = energy / count, jnp.min(variance, axis=-1, keepdims=True) / count
     little = _falling(jnp.sqrt(variance), LITTLE, MUCH)
-    outlier = (square[..., None] > _OUTLIER * energy) & (jnp.mean(change, axis=-1, keepdims=True) > 0)
+    alone = functools.reduce(jnp.minimum, curved) > _ALONE * square
+    outlier = (square > _OUTLIER * energy[..., 0]) & alone & (jnp.mean(change, axis=-1) > 0)
     quiet = jnp.minimum(variance, _quietest(curved, around=2 if blind else 1))
-    return energy, variance + jnp.where(outlier, 0.0, little) * (quiet - variance), jnp.maximum(number, 1.0)
+    return energy, variance + jnp.where(outlier[..., None], 0.0, little) * (quiet - variance), jnp.maximum(number, 1.0)
 
 
 def _quietest(squares: list[jax.Array], *, around: int) -> jax.Array:
