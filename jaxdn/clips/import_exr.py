@@ -180,9 +180,14 @@ def choose(
     convention = motion_convention_of(found, there, motion_convention)
     if convention is None:
         found.pop("motion", None)
-    notes: dict[str, str] = _something_else(there, found, stated) if refused is None else {}
+    decide = refused is None
+    notes: dict[str, str] = _something_else(there, found, stated) if decide else {}
     refused = frozenset(notes) if refused is None else refused
     found = {name: channels for name, channels in found.items() if name not in refused}
+    if decide and "albedo" in stated and "albedo" in found:
+        why = why_light(_stack(there, found["albedo"]), _stack(there, found["radiance"]))
+        if why is not None:
+            notes["albedo"] = f"taken as you say: {layer_of(found['albedo'])!r}, but it looks like light: {why}"
     if "specular_reflectance" not in stated and (unpaired := unpaired_specular(list(there), found)) is not None:
         notes["specular_reflectance"] = (
             f"not used: {unpaired!r}, as the albedo may have this part in it already; if yours is the diffuse part "

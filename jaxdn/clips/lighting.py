@@ -69,6 +69,17 @@ def parts_of(there: Mapping[str, np.ndarray], beauty: Channels, found: Mapping[s
     return parts
 
 
+def copies_of(there: Mapping[str, np.ndarray], beauty: Channels, parts: Mapping[str, Channels]) -> frozenset[str]:
+    """Those of the parts that are the beauty once more, within half precision: the compositor's, a viewer's."""
+    whole = np.stack([there[channel] for channel in beauty], axis=-1).astype(np.float64)
+
+    def same(channels: Channels) -> bool:
+        values = np.stack([there[channel] for channel in channels], axis=-1)
+        return bool(np.mean(np.abs(values - whole) <= 2e-3 * np.abs(whole)) >= _PART)
+
+    return frozenset(layer for layer, channels in parts.items() if same(channels))
+
+
 def _is_part(values: np.ndarray, beauty: np.ndarray) -> bool:
     """Whether values [H, W, 3] are nowhere brighter than the beauty, and anywhere above 0."""
     lit = np.any(values > 0, axis=-1)

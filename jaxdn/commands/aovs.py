@@ -1,6 +1,6 @@
 """The additive layers of other renderers' files, denoised with the beauty (``jaxdn denoise --aovs additive``)."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ import numpy as np
 from jaxdn.additive import Shares, share, start_shares
 from jaxdn.clips.import_exr import read_placed
 from jaxdn.clips.layers import Channels, beauty, detect_channels
-from jaxdn.clips.lighting import parts_of
+from jaxdn.clips.lighting import copies_of, parts_of
 from jaxdn.clips.windows import Window
 from jaxdn.frame import Frame
 
@@ -29,7 +29,8 @@ class Aovs:
         if self._parts is None:
             found = detect_channels(list(there), **self._naming)
             self._parts = parts_of(there, beauty(list(there), found), found)
-            self._log(_told(self._parts, there, found["radiance"]))
+            copies = copies_of(there, found["radiance"], self._parts)
+            self._log(_told(self._parts, copies, there, found["radiance"]))
         if not self._parts:
             return {}
         noisy = np.stack([_stack(there, channels) for channels in self._parts.values()])
@@ -40,12 +41,18 @@ class Aovs:
         return dict(zip(self._parts, np.asarray(images), strict=True))
 
 
-def _told(parts: Mapping[str, Channels], there: Mapping[str, np.ndarray], radiance: Channels) -> str:
-    if not parts:
-        return "--aovs additive: no layer is a part of the beauty; all stay as they are"
+def _told(
+    parts: Mapping[str, Channels], copies: Collection[str], there: Mapping[str, np.ndarray], radiance: Channels
+) -> str:
+    added = [layer for layer in parts if layer not in copies]
+    again = f"{', '.join(sorted(copies))} (the beauty once more)"
+    if not added:
+        told = "--aovs additive: no layer is a part of the beauty; all stay as they are"
+        return f"{told}, but {again}" if copies else told
     whole = np.nansum(_stack(there, radiance))
-    total = sum(np.nansum(_stack(there, channels)) for channels in parts.values())
-    return f"denoised with the beauty: {', '.join(parts)}; together they have {total / whole:.2f} of its light"
+    total = sum(np.nansum(_stack(there, parts[layer])) for layer in added)
+    told = f"denoised with the beauty: {', '.join(added)}; together they have {total / whole:.2f} of its light"
+    return f"{told}; and {again}" if copies else told
 
 
 def _stack(there: Mapping[str, np.ndarray], channels: Channels) -> np.ndarray:

@@ -85,6 +85,19 @@ def test_parts_of_the_beauty_are_found_by_their_values(name: str, tmp_path: Path
     assert set(parts) == set(ADDITIVE[name][0])
 
 
+def test_the_beauty_once_more_is_denoised_but_is_no_part(tmp_path: Path) -> None:
+    source, told = write_shot("Blender", tmp_path / "in"), list[str]()
+    denoise_files([source], tmp_path / "out", box_blur(), Settings(aovs="additive"), log=told.append)
+    line = next(line for line in told if "denoised with the beauty" in line)
+    assert line.startswith("denoised with the beauty: View Layer.DiffDir; together they have 0.")
+    assert line.endswith("of its light; and Composite.Combined (the beauty once more)")
+    for file in sorted((tmp_path / "out").iterdir()):
+        there = clips.read_exr(file)
+        for letter in "RGB":
+            copy, beauty = there[f"Composite.Combined.{letter}"], there[f"View Layer.Combined.{letter}"]
+            np.testing.assert_allclose(copy, beauty, rtol=2e-3, atol=1e-4)
+
+
 def test_in_files_they_add_up_and_the_rest_stays(tmp_path: Path) -> None:
     program, told = PROGRAMS["Arnold"], list[str]()
     source, out = write_shot("Arnold", tmp_path / "in"), tmp_path / "out"

@@ -192,6 +192,15 @@ def test_a_lighting_pass_is_no_albedo(tmp_path: Path, scale: float, why: str) ->
     assert "albedo" not in [source.buffer for source in sources_of(path)]
 
 
+def test_light_that_is_named_the_albedo_is_taken_with_a_warning(tmp_path: Path) -> None:
+    scene = truth(0, samples=1)
+    path = write_layers(tmp_path / "a.exr", scene, beauty=scene.light, diffuse=np.minimum(0.4 * scene.diffuse, 1.0))
+    lines: list[str] = []
+    frame = next(clips.plain_frames(path, channels={"albedo": "diffuse"}, log=lines.append)[1])
+    assert frame.albedo is not None
+    assert lines[0].startswith("taken as you say: 'diffuse', but it looks like light: it is noisy")
+
+
 def test_an_albedo_called_diffuse_is_one_and_the_user_knows_better(tmp_path: Path) -> None:
     scene = truth(0)
     path = write_layers(tmp_path / "a.exr", scene, beauty=scene.light, diffuse=scene.albedo, key=0.3 * scene.diffuse)
