@@ -26,7 +26,7 @@ from experiments.speed import peers
 from experiments.speed.timing import Call
 from experiments.speed.workers import Team
 from experiments.speed.works import steps
-from jaxdn.candidates import candidate, filters
+from jaxdn.candidates import NOISY, candidate, filters
 from jaxdn.clips import read_clip
 from jaxdn.commands.compare import compare
 from jaxdn.commands.errors import plain_errors
@@ -143,7 +143,7 @@ def milliseconds(
 
 def main(settings: Settings) -> None:
     """Render, compare, time, report."""
-    methods = list(results.contestants([]))
+    methods = list(results.contestants([NOISY, *filters(), *shipped_names()]))
     jobs = {light: clips(settings, light) for light in LIGHTS}
     timed = timed_clip(settings)
     render_clips([*(job for own in jobs.values() for job in own), timed], workers=settings.workers)

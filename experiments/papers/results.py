@@ -83,15 +83,17 @@ class Settings:
     """Samples per pixel."""
     views: list[str] = field(default_factory=lambda: list(VIEWS))
     """Some of: indirect, beauty, beauty-without-depth, beauty-without-motion."""
+    methods: list[str] = field(default_factory=lambda: [NOISY, *filters(), *shipped_names()])
+    """Filters and shipped weights to compare; Open Image Denoise comes in addition."""
     weights: list[str] = field(default_factory=list)
     """Files of weights to compare in addition to those that are shipped."""
     out: Path = Path("runs/results")
     """Folder for the reports and the pictures."""
 
 
-def contestants(weights: list[str]) -> Iterator[Candidate]:
-    """The noisy image, filters, weights, and Open Image Denoise."""
-    for name in (NOISY, *filters(), *shipped_names(), *weights):
+def contestants(names: list[str]) -> Iterator[Candidate]:
+    """Those with these names, and Open Image Denoise."""
+    for name in names:
         yield candidate(name)
     if "pyoidn" not in peers.missing():
         from experiments.speed.peers.oidn import frame_by_frame
@@ -121,7 +123,7 @@ def main(settings: Settings) -> None:
     if unknown:
         raise ValueError(f"--views: expected some of {', '.join(VIEWS)}, got {', '.join(unknown)}.")
     folders = [folder for place in settings.clips for folder in find_clips(place)]
-    methods = list(contestants(settings.weights))
+    methods = list(contestants(settings.methods + settings.weights))
     for view in settings.views:
         for spp in settings.spp:
             out, title = settings.out / f"{view}-{spp}", f"{view.replace('-', ' ')}, {spp} samples per pixel"
