@@ -13,6 +13,9 @@ _PATH = tyro.conf.Positional[Path]
 class Inspect:
     """List the effects of a scene and why it has them, what will be rendered for them, and what that saves.
 
+    Of files of other renderers, what is read from which layer, what is missing, and which conventions their motion
+    vectors may have.
+
     For example:
 
     jaxdn inspect kitchen/scene.xml --animation kitchen.json --denoiser steady-balanced
@@ -23,7 +26,8 @@ class Inspect:
     """
 
     scene: tyro.conf.Positional[str]
-    """A Mitsuba scene (.xml), a family, or a finished clip: its folder, or EXR files of any renderer."""
+    """A Mitsuba scene (.xml), a family, the folder of a finished clip, or EXR files of any renderer: a folder, or a
+    pattern in quotes."""
     animation: Path | None = None
     """Animation file for a scene file."""
     denoiser: str | None = None
@@ -32,9 +36,11 @@ class Inspect:
     width: int = 128
     height: int = 128
     frames: int | None = None
-    """Number of frames to inspect; default: all of the animation."""
+    """Number of frames of a scene or clip to inspect; default: all of the animation."""
     json: bool = False
-    """Print only one JSON object: {"effects": [...], "plan": {...}, "uncertain": [...]}, of files also "sources"."""
+    """Print only one JSON object: {"effects": [...], "plan": {...}, "uncertain": [...]}, of a clip also "sources". Of
+    files of other renderers {"frames": 8, "width": 320, "height": 180, "sources": [...], "missing": {...}, "notes":
+    [...], "fitting_conventions": [...]}, the last null where there is nothing to state."""
     motion_convention: str | None = None
     """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
     channels: list[str] = field(default_factory=list)
@@ -198,8 +204,8 @@ class Denoise:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the denoised frames; for a single frame, also the name of an EXR file."""
     method: str = "steady-balanced"
-    """Shipped weights (steady-balanced, ntd-large, ntd-small), a filter (svgf, asvgf, taa), or the path of a
-    .safetensors file."""
+    """Shipped weights (ntd-large, ntd-small, relax-fitted, steady-balanced, svgf-fitted), a filter (svgf, asvgf, taa),
+    or the path of a .safetensors file; an unknown name lists all."""
     bidirectional: bool = False
     """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
     frames are about as good as the last."""

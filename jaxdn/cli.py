@@ -15,8 +15,9 @@ from jaxdn.commands.errors import plain_errors
 
 
 def _folder(out: Path) -> Path:
-    """``-o`` of a command that writes into a folder. Raises ValueError for what is plainly the name of a file."""
-    if out.suffix.lower() in (".exr", ".png", ".safetensors", ".json", ".html"):
+    """``-o`` of a command that writes into a folder. Raises ValueError for a file, and for what is plainly its name."""
+    names = (".exr", ".png", ".safetensors", ".json", ".html", ".onnx", ".mlir", ".stablehlo")
+    if out.is_file() or out.suffix.lower() in names:
         raise ValueError(f"-o {out}: expected a folder, got the name of a file.")
     return out
 
@@ -38,8 +39,10 @@ def _inspect(options: Inspect) -> None:
 
 def _naming(options: Inspect | Denoise) -> dict[str, Any]:
     """How the buffers of other renderers' files are found."""
+    from jaxdn.clips.vectors import check_convention
     from jaxdn.options import parse
 
+    check_convention(options.motion_convention)
     return {
         "motion_convention": options.motion_convention,
         "channels": parse(options.channels, option="--channels", words=True),
@@ -155,10 +158,18 @@ def _denoise(options: Denoise) -> None:
             say=report.say,
             log=report.log,
         )
-    compiled = f"{written.programs} program{'s' * (written.programs != 1)} compiled"
-    print(f"{len(written.files)} frames denoised by {options.method} in {options.out} ({engine}, {compiled})")
+    if not written.files:
+        print(f"nothing to do in {options.out}")
+        return
+    frames, compiled = _count(len(written.files), "frame"), _count(written.programs, "program")
+    print(f"{frames} denoised by {options.method} in {options.out} ({engine}, {compiled} compiled)")
     if written.repaired:
-        print(f"{written.repaired} values were not usable numbers (NaN, infinite, negative ...) and were repaired")
+        print(f"{_count(written.repaired, 'value')} repaired: not usable numbers (NaN, infinite, negative ...)")
+
+
+def _count(number: int, noun: str) -> str:
+    """``1 frame``, ``2 frames``."""
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 _OF_SCENES = ("width", "height", "animation", "seed")
@@ -203,7 +214,8 @@ def _denoise_scene(options: Denoise, scene: str, budget: dict[str, Any]) -> None
         written = denoise_scene(
             scene, options.animation, _folder(options.out), method, settings, say=report.say, log=report.log
         )
-    print(f"{len(written.files)} frames rendered, and denoised by {options.method}, in {options.out} ({engine})")
+    frames = _count(len(written.files), "frame")
+    print(f"{frames} rendered, and denoised by {options.method}, in {options.out} ({engine})")
 
 
 def _compare(options: Compare) -> None:

@@ -31,10 +31,10 @@ MATHS = (
 )
 LAYERS = {
     **dict.fromkeys((*MATHS, "ops", "losses", "metrics", "flip", "sampling", "objectives", "recipe", "variation"), 1),
-    "shrinkage": 1,
+    **dict.fromkeys(("shrinkage", "whole"), 1),
     **dict.fromkeys(("filters", "networks"), 2),
     **dict.fromkeys(("methods", "denoisers"), 3),
-    **dict.fromkeys(("rollout", "additive", "learning", "planning"), 4),
+    **dict.fromkeys(("rollout", "parts", "additive", "learning", "planning"), 4),
     **dict.fromkeys(("files", "render", "clips", "checkpoint", "report", "weights", "candidates", "export"), 5),
     "effects": 6,
     **dict.fromkeys(("cli", "arguments", "commands"), 7),

@@ -235,7 +235,8 @@ def open_frames(
             return [frame_path(path, index) for index in part], _turned(frames) if backwards else frames
         refuse_unfinished(path)
     if spp != 1:
-        raise ClipError(f"{path}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
+        where = path if isinstance(path, str | Path) else f"{path[0]} ({len(path)} file{'s' * (len(path) != 1)})"
+        raise ClipError(f"{where}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
     naming: dict[str, Any] = {"motion_convention": motion_convention, "channels": channels, "layer": layer}
     files, plain = plain_frames(path, **naming, backwards=backwards, log=log)
     # Unlike the variable of a loop, this does not keep a frame while the next one is read.

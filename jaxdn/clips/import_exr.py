@@ -7,7 +7,7 @@ Channels are found by their names (:mod:`jaxdn.clips.layers`), motion vectors ar
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,10 +27,9 @@ from jaxdn.clips.measured_motion import fitting_conventions
 from jaxdn.clips.reflectance import check_fraction, with_reflectance
 from jaxdn.clips.shots import sequence_files
 from jaxdn.clips.vectors import (
-    MOTION_CONVENTIONS,
     UnknownMotion,
+    check_convention,
     contradicts_cycles,
-    conventions,
     convert_motion,
     dual_of,
     forward_channels,
@@ -56,8 +55,9 @@ def plain_frames(
     All frames have the size of the picture and the buffers of the first; frames that store different parts of it (data
     windows) are put into one image. ``motion_convention`` says what the motion vectors mean (a key of
     ``MOTION_CONVENTIONS``) and is needed as soon as there are any that are not Cycles' ``Vector``; ``"none"`` leaves
-    them out. The four components of ``Vector`` give dual motion vectors too. With ``backwards``, frames come from the
-    last to the first, with time turned around (:func:`jaxdn.filters.both_ways.turned`). ``channels`` and ``layer``: see
+    them out, as they are of a single image if nothing is stated. The four components of ``Vector`` give dual motion
+    vectors too. With ``backwards``, frames come from the last to the first, with time turned around
+    (:func:`jaxdn.filters.both_ways.turned`). ``channels`` and ``layer``: see
     :func:`jaxdn.clips.layers.detect_channels`; what they choose, see :func:`jaxdn.clips.sources.sources_of`. ``log`` is
     called with lines about what is derived or left unused, when the first frame is read. Depth is taken for view-space
     z (0, far and infinite become ``FAR``); ids count from 1 with 0 for nothing, or are those of a Cryptomatte, and are
@@ -67,8 +67,7 @@ def plain_frames(
     Raises ClipError at once where the files are no sequence, and, naming the file, when a frame is asked for that
     cannot be read or differs from the first.
     """
-    if motion_convention not in (None, "none", *MOTION_CONVENTIONS):
-        raise ClipError(f"motion_convention: {conventions()}; got {motion_convention!r}.")
+    check_convention(motion_convention)
     files = sequence_files(path) if isinstance(path, str | Path) else list(path)
     return files, _frames(files, motion_convention, channels, layer, backwards, log)
 
@@ -91,7 +90,8 @@ def _frames(
         try:
             # What the first frame decides is decided for all: a lighting pass is light in every frame.
             refused = None if first is None else first.refused
-            chosen = choose(there, motion_convention=motion_convention, channels=channels, layer=layer, refused=refused)
+            options: dict[str, Any] = {"channels": channels, "layer": layer, "alone": len(files) == 1}
+            chosen = choose(there, motion_convention=motion_convention, refused=refused, **options)
             frame, derived = _frame(file, there, chosen)
         except UnknownMotion as error:
             raise UnknownMotion(f"{file}: {_measured(files, canvas, channels, layer)}{error}") from error
@@ -119,15 +119,31 @@ def _frames(
             after = frame
 
 
-def _measured(files: Sequence[Path], canvas: Window, channels: Mapping[str, str] | None, layer: str | None) -> str:
-    """What the first two frames tell about the convention of their motion vectors, as a sentence; "" for nothing."""
+def fitting_files(
+    files: Sequence[Path], canvas: Window, *, channels: Mapping[str, str] | None = None, layer: str | None = None
+) -> list[str]:
+    """The conventions of motion vectors that bring the first two files of a sequence onto each other, best first.
+
+    As :func:`jaxdn.clips.measured_motion.fitting_conventions` measures them; none for a single file. ``channels`` and
+    ``layer`` as in :func:`plain_frames`. Raises ClipError for a second file without the channels of the first.
+    """
     if len(files) < 2:
-        return ""
+        return []
     before, now = (read_placed(file, canvas) for file in files[:2])
-    fitting = fitting_conventions(before, now, detect_channels(list(now), channels=channels, layer=layer))
+    found = detect_channels(list(before), channels=channels, layer=layer)
+    absent = sorted({channel for each in found.values() for channel in each} - set(now))
+    if absent:
+        raise ClipError(f"{files[1]}: expected the channels of the first frame, but {', '.join(absent)} are missing.")
+    return fitting_conventions(before, now, found)
+
+
+def _measured(files: Sequence[Path], canvas: Window, channels: Mapping[str, str] | None, layer: str | None) -> str:
+    """What the first two frames tell about the convention of their motion vectors, as a line; "" for nothing."""
+    fitting = fitting_files(files, canvas, channels=channels, layer=layer)
     if not fitting:
         return ""
-    return f"--motion-convention {' or '.join(fitting)} fits {files[0].name} and {files[1].name}. "
+    named = " or ".join(f"--motion-convention {name}" for name in fitting)
+    return f"{named} fits {files[0].name} and {files[1].name}.\n"
 
 
 class _First(NamedTuple):
@@ -161,6 +177,7 @@ def choose(
     channels: Mapping[str, str] | None = None,
     layer: str | None = None,
     refused: frozenset[str] | None = None,
+    alone: bool = False,
 ) -> Chosen:
     """Which channels of a file make up which buffer, by their names and, where a name says too little, by their values.
 
@@ -174,12 +191,12 @@ def choose(
       channels: the same.
       layer: the same.
       refused: what an earlier frame of the sequence has decided; None: decide.
+      alone: there is no other frame, so motion vectors that nobody has explained are left out and noted.
     """
     stated = channels or {}
     found = detect_channels(list(there), channels=channels, layer=layer)
-    convention = motion_convention_of(found, there, motion_convention)
-    if convention is None:
-        found.pop("motion", None)
+    convention = motion_convention_of(found, there, motion_convention, alone=alone)
+    vectors = found.pop("motion") if convention is None and "motion" in found else None
     decide = refused is None
     notes: dict[str, str] = _something_else(there, found, stated) if decide else {}
     refused = frozenset(notes) if refused is None else refused
@@ -192,6 +209,10 @@ def choose(
         notes["specular_reflectance"] = (
             f"not used: {unpaired!r}, as the albedo may have this part in it already; if yours is the diffuse part "
             f"alone, name it: --channels specular_reflectance={unpaired}"
+        )
+    if vectors is not None and motion_convention is None:
+        notes["motion"] = (
+            f"not used: {layer_of(vectors)!r}, as nothing says what these vectors mean; a single image needs none"
         )
     if contradicts_cycles(found, there, convention):
         notes["motion"] = (

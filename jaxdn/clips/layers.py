@@ -138,7 +138,7 @@ def _inside(groups: Groups, layer: str) -> Groups:
     """The layers of a view layer, and itself. Raises ClipError if there are none."""
     found = {name: group for name, group in groups.items() if name == layer or name.startswith(f"{layer}.")}
     if not found:
-        heads = dict.fromkeys(name.partition(".")[0] for name in groups if name)
+        heads = dict.fromkeys(name.partition(".")[0] for name, group in groups.items() if name and set(group) != {""})
         raise ClipError(f"layer: there is none called {layer!r}; there are {', '.join(map(repr, heads)) or 'none'}.")
     return found
 
@@ -252,8 +252,14 @@ def _fitting(group: Mapping[str, str], buffer: Buffer) -> Channels | None:
     return None
 
 
+def _is_letter(name: str, group: Mapping[str, str]) -> bool:
+    """Whether a channel without a layer is a letter of the image itself; ``Z`` is a depth, which can be named."""
+    return set(group) == {""} and len(name) == 1 and name.lower() != "z"
+
+
 def _named(groups: Groups, buffer: str, layer: str) -> Channels:
     channels = _fitting(groups.get(layer, {}), BUFFERS[buffer])
     if channels is None:
-        raise ClipError(f"channels: no {buffer} in layer {layer!r}; there are {', '.join(map(repr, sorted(groups)))}.")
+        there = [name for name, group in sorted(groups.items()) if name and not _is_letter(name, group)]
+        raise ClipError(f"channels: no {buffer} in layer {layer!r}; there are {', '.join(map(repr, there)) or 'none'}.")
     return channels

@@ -12,11 +12,13 @@ from jaxdn.clips.import_exr import choose
 from jaxdn.clips.layers import Channels, detect_channels, is_cryptomatte, last_name, layer_of
 from jaxdn.clips.reflectance import CAMERA_NORMALS
 from jaxdn.clips.shots import sequence_files
-from jaxdn.clips.vectors import MOTION_CONVENTIONS, UnknownMotion, motion_convention_of
+from jaxdn.clips.vectors import MOTION_CONVENTIONS, UnknownMotion, check_convention, motion_convention_of
 from jaxdn.frame import BUFFERS, GUIDES, Buffer
 
 OWN = "previous-current"
 """The convention of the motion vectors in jaxdn's own clips."""
+UNSTATED = "nothing says: state --motion-convention"
+"""What motion vectors are taken for whose convention nobody has stated."""
 
 
 class Source(NamedTuple):
@@ -44,6 +46,7 @@ def sources_of(
     """
     if is_clip(path):
         return _of_clip(read_names(frame_path(path, 0)))
+    check_convention(motion_convention)
     file = sequence_files(path)[0]
     there = read_exr(file)
     naming: Any = {"channels": channels, "layer": layer}
@@ -80,7 +83,7 @@ def _words(name: str, channels: Channels, motion: str | None) -> str:
     buffer: Buffer = BUFFERS[name]
     last = last_name(channels)
     if buffer.kind == "vector":
-        return MOTION_CONVENTIONS.get(motion or "", "nothing says: state --motion-convention")
+        return MOTION_CONVENTIONS.get(motion or "", UNSTATED)
     if name in ("depth", "previous_depth"):
         along_ray = last == "denoising depth" or channels[0].lower().endswith(".t")  # Cycles; Mitsuba
         return "along the ray" if along_ray else "along the optical axis (view-space z), not along the ray"

@@ -24,6 +24,8 @@ MOTION_CONVENTIONS: dict[str, str] = {
     "ndc": "clip space [-1, 1], previous minus current, y up",
     "rows-columns": "pixels, previous minus current, (row, column) order (Noisebase)",
 }
+"""What the numbers may mean, in words."""
+CHOICES = {**MOTION_CONVENTIONS, "none": "leave the motion out"}
 """What ``motion_convention`` may be, in words."""
 
 
@@ -45,20 +47,27 @@ def convert_motion(motion: np.ndarray, convention: str) -> np.ndarray:
         "ndc": (width / 2, -height / 2),
     }
     if convention not in scales:
-        raise ClipError(f"motion_convention: {conventions()}; got {convention!r}.")
+        raise ClipError(f"--motion-convention: expected one of the names below, got {convention!r}.\n{conventions()}")
     return motion * np.asarray(scales[convention], motion.dtype)
 
 
 def conventions() -> str:
-    """What ``motion_convention`` may be, as part of a sentence."""
-    words = "; ".join(f"{name!r}: {meaning}" for name, meaning in MOTION_CONVENTIONS.items())
-    return f"expected one of {words}; 'none': leave the motion out"
+    """What ``motion_convention`` may be, each on a line of its own."""
+    return "\n".join(f"  {name:<18}{meaning}" for name, meaning in CHOICES.items())
 
 
-def motion_convention_of(found: Mapping[str, Channels], there: Collection[str], stated: str | None) -> str | None:
+def check_convention(stated: str | None) -> None:
+    """Raise ClipError, listing the known ones, for a ``motion_convention`` that is none of them, "none" or None."""
+    if stated is not None and stated not in CHOICES:
+        raise ClipError(f"--motion-convention: expected one of the names below, got {stated!r}.\n{conventions()}")
+
+
+def motion_convention_of(
+    found: Mapping[str, Channels], there: Collection[str], stated: str | None, *, alone: bool = False
+) -> str | None:
     """The convention of the motion vectors among a file's channels; None where there are none, or none are wanted.
 
-    Raises UnknownMotion where nobody has stated it and the names do not tell.
+    Raises UnknownMotion where nobody has stated it and the names do not tell; of a file ``alone``, it is None.
     """
     if "motion" not in found or stated == "none":
         return None
@@ -66,9 +75,11 @@ def motion_convention_of(found: Mapping[str, Channels], there: Collection[str], 
         return stated
     if _is_cycles_vector(found["motion"], there):
         return CYCLES
+    if alone:
+        return None
     raise UnknownMotion(
-        f"{', '.join(found['motion'])}: nothing in the file says what these motion vectors mean; state "
-        f"motion_convention (jaxdn denoise --motion-convention): {conventions()}."
+        f"{', '.join(found['motion'])}: nothing in the file says what they mean; state --motion-convention NAME, "
+        f"one of these:\n{conventions()}"
     )
 
 

@@ -112,6 +112,7 @@ def denoise_files(
     if settings.aovs == "additive" and settings.only_beauty:
         raise ValueError("--aovs additive: expected the other layers to be written; leave out --only-beauty.")
     works = work_on(sources, out, frames=settings.frames, skip_existing=settings.skip_existing)
+    _refuse_unused(works, settings)
     total = sum(len(work.wanted) for work in works)
     files: list[Path] = []
     programs: set[tuple[str, ...]] = set()
@@ -138,6 +139,23 @@ def denoise_files(
             programs |= {program for each in passes for program in each.programs}
             repaired += passes[0].repaired  # the other pass repairs the same frames
     return Written(files, len(programs), repaired)
+
+
+def _refuse_unused(works: Sequence[Work], settings: Settings) -> None:
+    """Raise ValueError for settings that are for files of other renderers where there are only clips of ours."""
+    given = {
+        "--channels": settings.channels,
+        "--layer": settings.layer,
+        "--motion-convention": settings.motion_convention,
+        "--aovs": settings.aovs != "keep",
+        "--only-beauty": settings.only_beauty,
+    }
+    unused = [option for option, value in given.items() if value]
+    if unused and all(work.clip is not None for work in works):
+        raise ValueError(
+            f"{', '.join(unused)}: expected files of other renderers, got {works[0].clip}, a clip of jaxdn's own; "
+            f"leave {'it' if len(unused) == 1 else 'them'} out."
+        )
 
 
 def _denoise(

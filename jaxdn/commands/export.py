@@ -46,7 +46,10 @@ def export(
     if method.denoiser is None:
         raise ValueError(f"method {name!r}: expected one that denoises, such as svgf or steady-balanced.")
     say("tracing the step")
-    step = exported_step(method.denoiser, method.params, buffers=buffers, size=size)
+    try:
+        step = exported_step(method.denoiser, method.params, buffers=buffers, size=size)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
     contents: dict[Path, bytes | str] = {}
     if format != "stablehlo":
         say("translating it to ONNX")

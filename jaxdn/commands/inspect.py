@@ -1,4 +1,7 @@
-"""``jaxdn inspect``: which effects a scene has and why, what will be rendered for them, and what that saves."""
+"""``jaxdn inspect``: which effects a scene has and why, what will be rendered for them, and what that saves.
+
+Of files of other renderers: what is read from them (:mod:`jaxdn.commands.inspect_files`).
+"""
 
 import json
 import os
@@ -11,8 +14,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from jaxdn.clips.folder import is_clip
 from jaxdn.clips.shots import ranges
 from jaxdn.clips.sources import sources_of
+from jaxdn.commands.inspect_files import inspect_files
 from jaxdn.commands.render import Planned, denoiser_named, plan_clip
 from jaxdn.commands.sources import show_sources
 from jaxdn.denoiser import Denoiser
@@ -39,10 +44,10 @@ def inspect_to_terminal(
 ) -> None:
     """Print the table of effects and the plan for a scene, a family or a finished clip.
 
-    Of a finished clip, or files of other renderers, first what is read from which layer.
+    Of a finished clip, first what is read from which layer; of files of other renderers, only that and what is missing.
 
     Args:
-      source: a Mitsuba scene (.xml), a family, or a finished clip.
+      source: a Mitsuba scene (.xml), a family, a finished clip, or a folder of or pattern for EXR files.
       animation: animation file for a scene file.
       denoiser: name of the denoiser to plan for; None: for every buffer that a denoiser may read.
       width: in pixels.
@@ -55,16 +60,22 @@ def inspect_to_terminal(
     """
     reader = None if denoiser is None else denoiser_named(denoiser)
     naming: dict[str, Any] = {"channels": channels or None, "layer": layer}
-    files = Path(source).is_dir() or source.endswith(".exr")
-    if not files and (motion_convention or any(naming.values())):
+    clip = is_clip(source)
+    if not clip and (Path(source).is_dir() or source.endswith(".exr")):
+        if animation is not None or frames is not None:
+            raise ValueError(f"{source}: expected none of --animation, --frames, which are for scenes and own clips.")
+        reads = None if reader is None else reader.reads
+        inspect_files(source, reads=reads, as_json=as_json, motion_convention=motion_convention, **naming)
+        return
+    if not clip and (motion_convention or any(naming.values())):
         raise ValueError(
             f"scene {source!r}: expected none of --channels, --layer, --motion-convention, which are for EXR files."
         )
-    if files and not as_json:
+    if clip and not as_json:
         reads = None if reader is None else reader.reads
         show_sources(source, reads=reads, motion_convention=motion_convention, log=print, **naming)
     with _nothing_else_on_stdout():
-        planned = _planned(source, animation, reader, width=width, height=height, frames=frames, naming=naming)
+        planned = _planned(source, animation, reader, width=width, height=height, frames=frames)
     if as_json:
         found = planned.effects
         record: dict[str, Any] = {
@@ -72,7 +83,7 @@ def inspect_to_terminal(
             "plan": plan_record(planned, reader),
             "uncertain": sorted(found.uncertain),
         }
-        if files:
+        if clip:
             chosen = sources_of(source, motion_convention=motion_convention, **naming)
             record["sources"] = [one._asdict() for one in chosen]
         print(json.dumps(record, indent=1))
@@ -88,11 +99,10 @@ def _planned(
     width: int,
     height: int,
     frames: int | None,
-    naming: Mapping[str, Any],
 ) -> Planned:
     """The effects of a scene or a finished clip, and what would be rendered for them."""
-    if Path(source).is_dir() or source.endswith(".exr"):
-        found = inspect(source, animation, frames=frames, **naming)
+    if is_clip(source):
+        found = inspect(source, animation, frames=frames)
         return Planned(found, plan(found, reader))
     scene = open_scene(source, animation)
     count = scene.frames if frames is None else frames

@@ -16,6 +16,7 @@ from jaxdn.planning.plan import SCORED, THROUGH_CENTRES
 from jaxdn.render.depth import PathDepth, measure_depth
 from jaxdn.render.families import FAMILIES
 from jaxdn.render.farm import ClipJob, render_clips
+from jaxdn.render.frame import check_options
 from jaxdn.render.opening import family_scene
 from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.scene_file import SceneFile
@@ -140,6 +141,7 @@ def clips_of(
     options out of range.
     """
     check_at_least(1, width=width, height=height, frames=frames)
+    check_options(width, height, layers, reference_spp, draws, light, jitter, None)
     scenes = _tours(source, animation, seeds, frames, out) if tours else _scenes(source, animation, seeds)
     choice = choose_variant()
     print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)

@@ -64,8 +64,9 @@ def work_on(
     """The shots of folders, patterns and files; several sequences in a folder are several shots.
 
     Results have the names of their files. With inputs in several folders, they lie in folders of the same names below
-    ``out``. Raises ValueError for sources without frames, for ``frames`` that none of them has, where a file of the
-    input would be overwritten, and for the name of one file for several frames.
+    ``out``. Raises ValueError for no sources and sources without frames, for ``frames`` that none of them has, for a
+    frame that is there twice, where a file of the input would be overwritten or lies in the place of a folder, and for
+    the name of one file for several frames.
 
     Args:
       sources: folders of clips, folders of EXR files, patterns, or files.
@@ -73,12 +74,15 @@ def work_on(
       frames: numbers of the frames to denoise; None: all.
       skip_existing: leave out what is there already.
     """
+    if not sources:
+        raise ValueError("expected a folder, a pattern or a file to denoise, got none; name one.")
     found = [shot for source in sources for shot in _shots(source)]
     together = Path(commonpath([str(file.resolve().parent) for shot, _ in found for file in shot.files]))
     single = out.suffix.lower() == ".exr"
     count = sum(len(shot.files) for shot, _ in found)
     if single and count > 1:
         raise ValueError(f"{out}: expected a folder for {count} frames, got the name of one EXR file.")
+    _refuse_file(out.parent if single else out)
     works = []
     for shot, clip in found:
         below = [out / file.resolve().relative_to(together) for file in shot.files]
@@ -91,6 +95,7 @@ def work_on(
         wanted = frozenset(index for index in chosen if not (skip_existing and targets[index].is_file()))
         notes = _notes(shot, lone=len(found) > 1, there=len(chosen) - len(wanted))
         works.append(Work(shot, clip, targets, wanted, notes))
+    _refuse_twice(works)
     inputs = {file.resolve() for shot, _ in found for file in shot.files}
     if {target.resolve() for work in works for target in work.targets} & inputs or out.resolve() in inputs:
         raise ValueError(f"{out}: expected another place than the input's, whose frames would be overwritten.")
@@ -108,6 +113,26 @@ def _shots(source: Path) -> list[tuple[Shot, Path | None]]:
     return [(shot, None) for shot in find_shots(source)]
 
 
+def _refuse_file(folder: Path) -> None:
+    """Raise ValueError where a folder, or one that it is to lie in, is a file."""
+    taken = next((path for path in (folder, *folder.parents) if path.is_file()), None)
+    if taken is not None:
+        raise ValueError(f"-o {folder}: expected a folder, but {taken} is a file; name another.")
+
+
+def _refuse_twice(works: Sequence[Work]) -> None:
+    """Raise ValueError where two frames would be written into one file."""
+    frames: dict[Path, Path] = {}
+    for work in works:
+        for file, target in zip(work.shot.files, work.targets, strict=True):
+            other = frames.setdefault(target, file)
+            if other is file:
+                continue
+            if other.resolve() == file.resolve():
+                raise ValueError(f"{file}: expected every frame once, got it twice; name it once.")
+            raise ValueError(f"{target}: expected the result of one frame, got {other} and {file}; rename one of them.")
+
+
 def _notes(shot: Shot, *, lone: bool, there: int) -> tuple[str, ...]:
     notes = []
     gaps = missing(shot.numbers)
@@ -116,5 +141,6 @@ def _notes(shot: Shot, *, lone: bool, there: int) -> tuple[str, ...]:
     if lone and not shot.numbers:
         notes.append(f"{shot.label}: no frame number in its name, so it is denoised as an image of its own")
     if there:
-        notes.append(f"{shot.label}: {there} frames are there already and stay as they are")
+        they = f"{there} frames are there already and stay as they are"
+        notes.append(f"{shot.label}: {they if there > 1 else '1 frame is there already and stays as it is'}")
     return tuple(notes)

@@ -62,7 +62,7 @@ def exported_step(
             return _traced(denoiser, params, wanted, lengths, multiple)
         except (TypeError, ValueError):  # a size had to be known
             continue
-    raise ValueError("size: expected a method whose step is the same for all sizes; give --width and --height.")
+    raise ValueError("the step is not the same for all sizes; give --width and --height.")
 
 
 def channels(buffer: str) -> list[str]:

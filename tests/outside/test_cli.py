@@ -18,6 +18,7 @@ from jaxdn.clips import write_clip
 from jaxdn.frame import Clip, Frame
 from jaxdn.methods.ntd import Options
 from jaxdn.methods.table import methods
+from jaxdn.weights import shipped_names
 from tests.learning.test_training import make_clip
 
 
@@ -103,6 +104,35 @@ def test_one_frame_becomes_the_file_that_is_named(shot, tmp_path, capsys):
     assert not (tmp_path / "x.exr").exists()
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--channels", "albedo=Paint"],
+        ["--layer", "Room"],
+        ["--motion-convention", "uv"],
+        ["--aovs", "additive"],
+        ["--only-beauty"],
+    ],
+)
+def test_a_clip_of_ours_refuses_what_is_for_files_of_others(clip, tmp_path, capsys, options):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["denoise", str(clip), "-o", str(tmp_path / "out"), "--method", "noisy", *options])
+    assert ended.value.code == 2
+    shown = capsys.readouterr()
+    assert f"{options[0]}: expected files of other renderers, got {clip}, a clip of jaxdn's own" in shown.err
+    assert "what is read" not in shown.out
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_help_names_the_shipped_weights(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "400")
+    with pytest.raises(SystemExit):
+        cli.main(["denoise", "--help"])
+    text = capsys.readouterr().out
+    assert f"Shipped weights ({', '.join(shipped_names())})" in text
+    assert "an unknown name lists all" in text.partition("--method")[2].partition("--bidirectional")[0]
+
+
 def test_short_and_small_clips_name_the_options_that_fit_them(clip, tmp_path, capsys):
     for options, advice in (([], "--frames 3"), (["--frames", "3"], "--crop 20")):
         with pytest.raises(SystemExit):
@@ -124,7 +154,7 @@ def test_denoise_plain_exr_files_with_the_shipped_network(tmp_path):
         done = jaxdn("denoise", tmp_path / "shot_*.exr", "-o", out, "--method", "ntd-small", "--implementation", engine)
         assert done.returncode == 0, done.stderr
         assert f"({engine}, 1 program compiled)" in done.stdout
-        assert "6 values were not usable numbers" in done.stdout
+        assert "6 values repaired: not usable numbers" in done.stdout
         with OpenEXR.File(str(out / "shot_0001.exr"), separate_channels=True) as file:
             reds.append(file.channels()["R"].pixels)
     assert reds[0].shape == (33, 57)
@@ -212,7 +242,7 @@ def test_compare_ends_with_a_report(clip, tmp_path):
             ("denoise", "SHOT", "-o", "out", "--method", "svgf", "--channels", "albedo=Dyes"),
             "no albedo in layer 'Dyes'",
         ),
-        (("denoise", "SHOT", "-o", "out", "--method", "svgf", "--motion-convention", "maya"), "'cycles'"),
+        (("denoise", "SHOT", "-o", "out", "--method", "svgf", "--motion-convention", "maya"), "got 'maya'"),
         (("denoise", "SHOT", "-o", "out", "--method", "svgf", "--spp", "2"), "expected spp 1, got 2"),
         (("render", "castle", "-o", "out"), "fruit"),
         (("render", "none.xml", "-o", "out"), "none.xml"),

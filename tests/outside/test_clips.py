@@ -391,7 +391,7 @@ def test_ambiguous_or_missing_channels_are_refused() -> None:
 def test_foreign_motion_needs_a_convention(tmp_path: Path, rng: np.random.Generator) -> None:
     write_plain(tmp_path / "shot_0008.exr", [*rgb(""), "motion.X", "motion.Y"], rng)
     write_plain(tmp_path / "shot_0009.exr", [*rgb(""), "motion.X", "motion.Y"], rng)
-    with pytest.raises(ClipError, match=r"motion_convention \(jaxdn denoise --motion-convention\).*'cycles'"):
+    with pytest.raises(ClipError, match=r"state --motion-convention NAME.*(?s:.*)  cycles +pixels"):
         clips.read_clip(tmp_path)
     with pytest.raises(ClipError, match="got 'sideways'"):
         clips.read_clip(tmp_path, motion_convention="sideways")

@@ -177,6 +177,12 @@ def fails(*arguments):
     return " ".join(done.stderr.split())
 
 
+def test_a_method_whose_step_needs_a_size_is_named(tmp_path):
+    with pytest.raises(ValueError, match=r"^asvgf: the step is not the same for all sizes; give --width and --height"):
+        export("asvgf", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.slow
 def test_what_cannot_be_exported_is_an_error_that_says_what_to_do(tmp_path):
     out = tmp_path / "out"

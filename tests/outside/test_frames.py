@@ -155,6 +155,60 @@ def test_no_input_is_overwritten(tmp_path: Path) -> None:
     assert not (tmp_path / "x.exr").exists()
 
 
+def refused(capsys: Any, *arguments: Any) -> str:
+    """The message of a `jaxdn denoise` that ends with exit code 2."""
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["denoise", *map(str, arguments)])
+    assert ended.value.code == 2
+    return " ".join(capsys.readouterr().err.split())
+
+
+def test_inputs_have_to_be_named(tmp_path: Path, capsys: Any) -> None:
+    assert "expected a folder, a pattern or a file to denoise, got none" in refused(capsys, "-o", tmp_path / "out")
+
+
+def test_a_frame_that_is_named_twice_is_refused(tmp_path: Path, capsys: Any) -> None:
+    source = numbered(tmp_path / "in", [1, 2])
+    clips.write_clip(make_clip(0, frames=2, size=16), tmp_path / "clip")
+    for sources in ([source, source / "a.0002.exr"], [tmp_path / "clip", tmp_path / "in" / ".." / "clip"]):
+        message = refused(capsys, *sources, "-o", tmp_path / "out", "--method", "noisy")
+        assert "expected every frame once, got" in message
+        assert "twice; name it once" in message
+    image = source / "a.0001.EXR"
+    image.write_bytes((source / "a.0001.exr").read_bytes())
+    message = refused(capsys, source / "a.0001.exr", image, "-o", tmp_path / "out", "--method", "noisy")
+    assert f"{tmp_path}/out/a.0001.exr: expected the result of one frame" in message
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("below", ["", "further/down"])
+def test_a_file_in_the_place_of_the_folder_is_refused_at_once(below: str, tmp_path: Path, capsys: Any) -> None:
+    source, taken = numbered(tmp_path / "in", [1, 2]), tmp_path / "taken"
+    taken.write_text("mine")
+    message = refused(capsys, source, "-o", taken / below, "--method", "svgf")
+    assert f"expected a folder, but {taken} is a file" in message
+    assert "what is read" not in message
+    assert taken.read_text() == "mine"
+
+
+def test_sample_counts_of_files_name_the_shot_in_words(tmp_path: Path, capsys: Any) -> None:
+    source = numbered(tmp_path / "in", [1, 2, 3])
+    message = refused(capsys, source, "-o", tmp_path / "out", "--spp", "4", "--method", "noisy")
+    assert f"{source}/a.0001.exr (3 files): expected spp 1, got 4" in message
+    assert "PosixPath" not in message
+
+
+def test_what_was_done_is_said_in_the_right_number(tmp_path: Path, capsys: Any) -> None:
+    source = numbered(tmp_path / "in", [1])
+    command = ["denoise", str(source), "-o", str(tmp_path / "out"), "--method", "noisy", "--skip-existing"]
+    cli.main(command)
+    assert f"\n1 frame denoised by noisy in {tmp_path}/out" in capsys.readouterr().out
+    cli.main(command)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-2].endswith("1 frame is there already and stays as it is")
+    assert lines[-1] == f"nothing to do in {tmp_path}/out"
+
+
 def test_a_broken_frame_ends_in_words_and_leaves_no_incomplete_file(tmp_path: Path, capsys: Any) -> None:
     source = numbered(tmp_path / "in", range(1, 5))
     broken = (source / "a.0003.exr").read_bytes()

@@ -113,6 +113,20 @@ def test_an_empty_size_is_refused_in_words(verb, option, tmp_path, capsys):
     assert not out.exists()
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "told"),
+    [("--reference-spp", "-1", "reference_spp: expected 0 (no reference) or at least 2, got -1"),
+     ("--layers", "3", "layers: expected different powers of two"),
+     ("--draws", "-1", "draws: expected 0 or more")],
+)  # fmt: skip
+def test_sample_counts_out_of_range_are_refused_before_planning(option, value, told, counted, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["render", "edge", "-o", str(tmp_path / "out"), option, value])
+    assert ended.value.code == 2
+    assert told in capsys.readouterr().err
+    assert (counted["opened"], counted["planned"]) == (0, 0)
+
+
 def planned_clip(scene, folder, frames, **options):
     size = {"width": 16, "height": 12}
     planned = command.plan_clip(scene, frames=frames, max_depth=options.pop("max_depth", 3), **size)
@@ -136,10 +150,19 @@ def test_a_clip_gets_more_frames_and_other_settings_are_said_in_words(tmp_path):
         planned_clip(static, tmp_path / "clip", 4)
 
 
-@pytest.mark.parametrize("words", [["render", "edge"], ["train", "clips"], ["compare", "clips"]])
-def test_a_folder_is_not_named_like_a_file(words, tmp_path, capsys):
+@pytest.mark.parametrize("name", ["x.exr", "x.onnx", "x.mlir", "x.stablehlo"])
+@pytest.mark.parametrize("words", [["render", "edge"], ["train", "clips"], ["compare", "clips"], ["export", "svgf"]])
+def test_a_folder_is_not_named_like_a_file(words, name, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
-        cli.main([*words, "-o", str(tmp_path / "x.exr")])
+        cli.main([*words, "-o", str(tmp_path / name)])
     assert ended.value.code == 2
     assert "expected a folder" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_is_no_file_that_is_there(tmp_path, capsys):
+    (tmp_path / "taken").write_text("mine")
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["render", "edge", "-o", str(tmp_path / "taken")])
+    assert ended.value.code == 2
+    assert "expected a folder, got the name of a file" in capsys.readouterr().err

@@ -8,7 +8,7 @@ import OpenEXR
 import pytest
 
 from jaxdn import cli
-from jaxdn.clips import ClipError, read_clip, write_clip
+from jaxdn.clips import MOTION_CONVENTIONS, ClipError, read_clip, write_clip
 from jaxdn.clips.exr import read_exr, read_names
 from jaxdn.clips.layers import LAYERS
 from jaxdn.clips.sources import sources_of
@@ -71,6 +71,27 @@ def test_a_view_layer_is_chosen(shot, capsys):
     assert read_clip(shot, layer="Hall").frames.albedo is not None
 
 
+def test_only_what_can_be_named_is_listed_as_a_layer(tmp_path):
+    """The letters of the image itself are no layers; a depth without a layer can be named: Z."""
+    path = write(tmp_path / "a_1.exr", ":RGBAZ", "Paint:RGB", "N:XYZ")
+    with pytest.raises(ClipError, match=r"no albedo in layer 'Dyes'; there are 'N', 'Paint', 'Z'\.$"):
+        sources_of(path, channels={"albedo": "Dyes"})
+    with pytest.raises(ClipError, match=r"none called 'Cellar'; there are 'N', 'Paint'\.$|'Paint', 'N'\.$"):
+        sources_of(path, layer="Cellar")
+    with pytest.raises(ClipError, match=r"none called 'Cellar'; there are none\.$"):
+        sources_of(write(tmp_path / "b_1.exr", ":RGBA"), layer="Cellar")
+
+
+@pytest.mark.parametrize("command", [["inspect", "nowhere"], ["denoise", "nowhere", "-o", "out"]])
+def test_an_unknown_convention_is_refused_before_anything_is_read(command, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main([*command, "--motion-convention", "sideways"])
+    assert ended.value.code == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "jaxdn: --motion-convention: expected one of the names below, got 'sideways'."
+    assert [line.split()[0] for line in lines[1:]] == [*MOTION_CONVENTIONS, "none"]
+
+
 def run(capsys, *arguments):
     cli.main([str(argument) for argument in arguments])
     return " ".join(capsys.readouterr().out.split())
@@ -85,8 +106,8 @@ def test_denoise_begins_with_the_table(shot, tmp_path, capsys):
         "motion Hall.Vector X, Y pixels, previous minus current position, y up (Blender's Vector pass,",
     ):
         assert row in text
-    assert text.index("radiance Hall") < text.index("1 frames denoised")
-    assert "missing" not in text.partition("1 frames")[0].replace("specular_reflectance missing", "")
+    assert text.index("radiance Hall") < text.index("1 frame denoised")
+    assert "missing" not in text.partition("1 frame ")[0].replace("specular_reflectance missing", "")
 
 
 def test_what_is_missing_is_said_with_its_consequence(tmp_path, capsys):
