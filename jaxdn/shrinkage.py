@@ -52,7 +52,7 @@ _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 QUIET = 8
 """Side of the blocks whose noise is compared, in pixels; :data:`BLOCK` is a multiple of it."""
-LITTLE, MUCH = 0.6, 0.9
+LITTLE, MUCH = 0.4, 0.6
 """Noise, as a share of the light, up to which that of the quietest block counts, and from which that of the window."""
 LOST, LOST_TO_NOISE = (0.25, 0.35), (0.9, 1.2)
 """Detail, as a share of the light and relative to the noise, up to which a denoised frame is trusted, and from which
