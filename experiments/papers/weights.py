@@ -1,4 +1,4 @@
-"""The shipped weights: render clips, fit `svgf`, `relax`, train `steady-balanced`, `ntd-small`, `ntd-large`, A, B, C.
+"""The shipped weights: render clips, fit `svgf`, `relax`, train `steady`, `ntd-small`, `ntd-large`, A, B, C.
 
     python -m experiments.papers.weights --rooms rooms/*/scene.xml    # `make weights`: hours; resumable
 
@@ -51,6 +51,8 @@ STAGES = (
     Stage("relax-fitted", "relax", {}, 300),
     Stage("steady-begun", "steady", {"quality": "balanced"}, 8000, decay=False),
     Stage("steady-balanced", "steady", {"quality": "balanced"}, 1000, start="steady-begun"),
+    Stage("fast-begun", "steady", {"quality": "fast"}, 4000, decay=False),
+    Stage("steady-fast", "steady", {"quality": "fast"}, 1000, start="fast-begun"),
     Stage("small-begun", "ntd", {"size": "small"}, 4000, decay=False),
     Stage("ntd-small", "ntd", {"size": "small"}, 1000, start="small-begun", objective=SQUARES),
     Stage("large-begun", "ntd", {"size": "large"}, 2000, start="small-begun", decay=False, objective=SQUARES),
