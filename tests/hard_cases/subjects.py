@@ -229,6 +229,10 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "color.luminance": of_light(color.luminance),
         **{f"color.tonemap, {one}": of_light(color.tonemap, operator=one) for one in color.OPERATORS},
         "color.exposure": lambda inputs: jnp.reshape(color.exposure(inputs.clip.frames.radiance[-1]), (1, 1, 1)),
+        "color.brightness": lambda inputs: color.brightness(inputs.clip.frames.radiance[-1])[None, None],
+        "color.exposure_of": lambda inputs: jnp.reshape(
+            color.exposure_of(color.brightness(inputs.clip.frames.radiance[-1])), (1, 1, 1)
+        ),
         "color.tonemap_halves": lambda inputs: jnp.stack(color.tonemap_halves(*_images(inputs))),
         "color.srgb_encode": lambda inputs: color.srgb_encode(jnp.clip(inputs.clip.frames.radiance, 0.0, 1.0)),
         "color.srgb_decode": lambda inputs: color.srgb_decode(jnp.clip(inputs.clip.frames.radiance, 0.0, 1.0)),
