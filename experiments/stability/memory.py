@@ -7,6 +7,7 @@ in a separate process, whose peak resident set is measured. Unix only.
 """
 
 import os
+import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -54,11 +55,19 @@ def peak_mib(source: Path, out: Path, method: str, max_memory: float | None = No
     command = [sys.executable, "-m", "jaxdn.cli", "denoise", str(source), "-o", str(out), "--method", method]
     command += ["--motion-convention", "previous-current"]
     command += [] if max_memory is None else ["--max-memory", f"{max_memory:g}"]
-    child = os.posix_spawn(sys.executable, command, os.environ)
-    _, status, usage = os.wait4(child, 0)
-    if status:
-        raise RuntimeError(f"jaxdn denoise of {source} ended with status {status}")
-    return usage.ru_maxrss / (1024 if sys.platform != "darwin" else 1024**2)
+    told = subprocess.run([sys.executable, "-c", _LAUNCHER, *command], stdout=subprocess.PIPE, text=True, check=False)
+    if told.returncode:
+        raise RuntimeError(f"jaxdn denoise of {source} ended with status {told.returncode}")
+    return int(told.stdout.splitlines()[-1]) / (1024 if sys.platform != "darwin" else 1024**2)
+
+
+# Linux counts the memory of the process that starts another one as that one's, too: a small one has to start it.
+_LAUNCHER = """
+import resource, subprocess, sys
+status = subprocess.call(sys.argv[1:])
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+sys.exit(status)
+"""
 
 
 def main(settings: Settings) -> None:

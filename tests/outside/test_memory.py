@@ -50,6 +50,14 @@ def test_too_little_memory_is_refused_before_anything_is_written(tmp_path):
     assert not list((tmp_path / "out").glob("**/*.exr"))
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="the peak memory of a child process is only available on Unix")
+def test_the_peak_is_that_of_the_child_alone(tmp_path):
+    """Not that of this process, which after a thousand tests is larger."""
+    write_sequence(tmp_path / "in", 1, 40, 60)
+    own = np.ones(2**28)  # 2 GiB, touched
+    assert peak_mib(tmp_path / "in", tmp_path / "out", "taa") < 1536 < own.nbytes / 2**20
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="the peak memory of a child process is only available on Unix")
 def test_a_process_keeps_to_the_memory_it_is_allowed(tmp_path):
