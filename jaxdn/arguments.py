@@ -87,6 +87,8 @@ class Render:
     """Light with noise: indirect light, with direct light beside it, or all that is reflected, with its shadows."""
     jitter: bool = False
     """Rays go through another point of the pixels in every frame, for taa; references are means over the pixels."""
+    see_through: bool = False
+    """Guides of flat mirrors and of glass are those of what they show, so that it stays sharp; not for trmv, reblur."""
     max_depth: int | None = None
     """Path length (1 emission, 2 direct, 3 one bounce of indirect light ...); default: as the scene needs."""
     effects: str = "auto"

@@ -68,6 +68,7 @@ def _render(options: Render) -> None:
         draws=options.draws,
         light=options.light,
         jitter=options.jitter,
+        see_through=options.see_through,
         max_depth=options.max_depth,
         effects=options.effects,
         denoiser=options.denoiser,

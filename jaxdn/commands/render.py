@@ -12,7 +12,7 @@ from jaxdn.effects import Effects, Plan, chosen, everything, inspect, plan
 from jaxdn.frame import OF_SAMPLES
 from jaxdn.methods.table import methods
 from jaxdn.planning.catalogue import NoisyLight
-from jaxdn.planning.plan import SCORED, THROUGH_CENTRES
+from jaxdn.planning.plan import OF_FIRST_HITS, SCORED, THROUGH_CENTRES
 from jaxdn.render.depth import PathDepth, measure_depth
 from jaxdn.render.families import FAMILIES
 from jaxdn.render.farm import ClipJob, render_clips
@@ -55,6 +55,7 @@ def plan_clip(
     max_depth: int | None = None,
     light: NoisyLight = "indirect",
     jitter: bool = False,
+    see_through: bool = False,
 ) -> Planned | None:
     """The effects to render an animated scene for, and the plan; None means no plan: ``"all"`` without a denoiser.
 
@@ -70,8 +71,9 @@ def plan_clip(
       max_depth: path length; by default, with ``"auto"``, it is measured.
       light: as in :func:`jaxdn.render.render_frame`.
       jitter: as there.
+      see_through: as there.
     """
-    options: dict[str, Any] = {"light": light, "jitter": jitter}
+    options: dict[str, Any] = {"light": light, "jitter": jitter, "see_through": see_through}
     if effects == "all":
         whole = everything(frames)
         return None if denoiser is None else Planned(whole, plan(whole, denoiser, max_depth=max_depth, **options))
@@ -111,6 +113,7 @@ def clips_of(
     draws: int = 0,
     light: NoisyLight = "indirect",
     jitter: bool = False,
+    see_through: bool = False,
     max_depth: int | None,
     effects: str,
     denoiser: str | None = None,
@@ -132,6 +135,7 @@ def clips_of(
       draws: further images of one sample each, for training.
       light: which light is noisy: the indirect part, or all that is reflected.
       jitter: another point of the pixels in every frame, and references that are means over the pixels.
+      see_through: guides of what flat mirrors and glass show.
       max_depth: path length (1 emission, 2 direct light ...); default: measured, or the scene's own.
       effects: as in :func:`plan_clip`.
       denoiser: names of the denoisers to render for, separated by commas (with a reference, what errors are reported by
@@ -141,17 +145,19 @@ def clips_of(
     options out of range.
     """
     check_at_least(1, width=width, height=height, frames=frames)
-    check_options(width, height, layers, reference_spp, draws, light, jitter, None)
+    check_options(width, height, layers, reference_spp, draws, light, jitter, see_through, None)
     scenes = _tours(source, animation, seeds, frames, out) if tours else _scenes(source, animation, seeds)
     choice = choose_variant()
     print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
     reader = None if denoiser is None else _reader(denoiser, choice.variant)
     if reader is not None and jitter and reader.reads & THROUGH_CENTRES:
         print(f"with jitter there is no {', '.join(sorted(reader.reads & THROUGH_CENTRES))}: left out", flush=True)
+    if reader is not None and see_through and reader.reads & OF_FIRST_HITS:
+        print(f"seen through, there is no {', '.join(sorted(reader.reads & OF_FIRST_HITS))}: left out", flush=True)
     if reader is not None and reference_spp:
         reader = reader._replace(reads=reader.reads | SCORED)
     size: dict[str, Any] = {"width": width, "height": height, "frames": frames}
-    noisy: dict[str, Any] = {"light": light, "jitter": jitter}
+    noisy: dict[str, Any] = {"light": light, "jitter": jitter, "see_through": see_through}
     jobs = []
     for name, scene, noises in scenes:
         planned = plan_clip(scene, effects=effects, denoiser=reader, max_depth=max_depth, **noisy, **size)

@@ -16,6 +16,14 @@ SCORED = frozenset({"visible"})
 """Buffers that errors are reported by, where there is a reference: which pixels the previous frame did not see."""
 THROUGH_CENTRES = frozenset({"luminance_gradient", "shadow_motion", "glossy_motion"})
 """Buffers that are found by rays through the centres of pixels: none with sub-pixel jitter."""
+OF_FIRST_HITS = THROUGH_CENTRES | {
+    "specular",
+    "specular_reflectance",
+    "hit_distance",
+    "specular_hit_distance",
+    "ray_length",
+}
+"""Buffers of the surface that the camera ray meets first: none where mirrors and glass are seen through."""
 BOUND = 0.01
 """Largest share of an image's reflected light that limited path lengths may leave out."""
 
@@ -76,6 +84,7 @@ def plan(
     max_depth: int | None = None,
     light: NoisyLight = INDIRECT,
     jitter: bool = False,
+    see_through: bool = False,
 ) -> Plan:
     """The intersection of the effects of a scene and the buffers that a denoiser reads.
 
@@ -85,15 +94,20 @@ def plan(
     ``max_depth`` is the path length to render with, by default the scene's
     (:func:`jaxdn.render.depth.measure_depth` measures it). With ``light="reflected"`` direct light is a part of the
     noisy radiance, and its shadows have buffers, instead of a buffer of its own. With ``jitter`` no frame shows the
-    same as another, and what is found through the centres of pixels (``THROUGH_CENTRES``) is left out.
+    same as another, and what is found through the centres of pixels (``THROUGH_CENTRES``) is left out. With
+    ``see_through`` the guides are those of what mirrors and glass show: what belongs to the first surface
+    (``OF_FIRST_HITS``) is left out, and what moves in a mirror moves on screen.
     """
     by_name = {effect.name: effect for effect in EFFECTS}
     wanted = frozenset(GUIDES) - ON_REQUEST if denoiser is None else denoiser.reads | COMPOSED
     wanted -= {"direct"} if light == "reflected" else OF_SHADOWS
     wanted -= THROUGH_CENTRES if jitter else frozenset()
+    wanted -= OF_FIRST_HITS if see_through else frozenset()
     there = [by_name[name] for name in effects.names]
 
     def buffers(present: frozenset[str]) -> tuple[str, ...]:
+        if see_through and "moving-reflection" in present:
+            present |= {"object-motion", "disocclusion"}
         had = GEOMETRY.union(*(by_name[name].buffers for name in present))
         if effects.lit:
             had |= {"direct"}

@@ -36,6 +36,7 @@ def render_clip(
     draws: int = 0,
     light: NoisyLight = "indirect",
     jitter: bool = False,
+    see_through: bool = False,
     plan: Plan | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Path:
@@ -52,7 +53,7 @@ def render_clip(
       width: in pixels.
       height: in pixels.
       frames: number of frames; default: that of the scene.
-      layers: as in :func:`render_frame`, like the next eight.
+      layers: as in :func:`render_frame`, like the next nine.
       reference_spp: samples per pixel of the reference; 0 for none.
       max_depth: path length.
       seed: of the random numbers.
@@ -60,13 +61,14 @@ def render_clip(
       draws: further images of one sample each.
       light: what the radiance holds.
       jitter: another point of the pixels in every frame.
+      see_through: guides of what mirrors and glass show.
       plan: for these frames; it is stored in the record.
       progress: called with the index of every frame that is finished or already exists.
     """
     folder = Path(folder)
     frames = scene.frames if frames is None else frames
     check_at_least(1, frames=frames)
-    check_options(width, height, layers, reference_spp, draws, light, jitter, plan)
+    check_options(width, height, layers, reference_spp, draws, light, jitter, see_through, plan)
     if plan is not None and len(plan.frames) != frames:
         raise ValueError(f"plan: expected one for {frames} frames, got one for {len(plan.frames)}.")
     chosen = use_variant(variant)
@@ -80,6 +82,7 @@ def render_clip(
         "draws": draws,
         "light": light,
         "jitter": jitter,
+        "see_through": see_through,
         "variant": chosen,
         "max_depth": path_length(scene, max_depth, plan),
         "plan": None if plan is None else plan.record(),
@@ -97,7 +100,7 @@ def render_clip(
     begin_record(record, folder)
     options: dict[str, Any] = {"width": width, "height": height, "layers": layers, "reference_spp": reference_spp}
     options |= {"max_depth": max_depth, "seed": seed, "variant": chosen, "draws": draws, "light": light}
-    options |= {"jitter": jitter, "plan": plan}
+    options |= {"jitter": jitter, "see_through": see_through, "plan": plan}
     previous: View | None = None
     for frame in range(frames):
         path = frame_path(folder, frame)

@@ -20,6 +20,7 @@ from jaxdn.planning.catalogue import NoisyLight
 from jaxdn.planning.plan import entries, plan_from_record
 from jaxdn.render.errors import RenderError
 from jaxdn.render.opening import scene_from_record
+from jaxdn.render.settings import UNSAID
 from jaxdn.render.variant import choose_variant
 
 _THREADS = 2
@@ -42,6 +43,7 @@ class ClipJob(NamedTuple):
     draws: int = 0
     light: NoisyLight = "indirect"
     jitter: bool = False
+    see_through: bool = False
     variant: str | None = None
     """None: the one that the clip in the folder was started with, else the fastest that works here."""
     plan: dict[str, Any] | None = None
@@ -126,9 +128,9 @@ def _finished(job: ClipJob) -> bool:
     wanted |= {"layers": sorted(job.layers), "reference_spp": job.reference_spp, "scene": job.scene}
     chosen = {"max_depth": job.max_depth, "variant": job.variant}
     # A clip from before plans existed has no such entry, and all buffers.
-    if entries(record.get("plan")) != entries(job.plan) or record.get("draws", 0) != job.draws:
+    if entries(record.get("plan")) != entries(job.plan):
         return False
-    if record.get("light", "indirect") != job.light:
+    if any(record.get(name, unsaid) != getattr(job, name) for name, unsaid in UNSAID.items()):
         return False
     wanted |= {key: value for key, value in chosen.items() if value is not None}
     # A frame's file gets its name only when it is complete.

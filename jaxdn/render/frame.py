@@ -12,7 +12,7 @@ from jaxdn.checks import check_at_least, check_option
 from jaxdn.frame import GUIDES, OF_SAMPLES, ON_REQUEST, Frame
 from jaxdn.motion import dual_motion
 from jaxdn.planning.catalogue import OF_SHADOWS, NoisyLight
-from jaxdn.planning.plan import THROUGH_CENTRES, Plan
+from jaxdn.planning.plan import OF_FIRST_HITS, THROUGH_CENTRES, Plan
 from jaxdn.render import jitter as jitters
 from jaxdn.render.gbuffer import check_scene, gbuffer
 from jaxdn.render.geometry import View, far_motion, motion_between, ray_length
@@ -65,6 +65,7 @@ def render_frame(
     draws: int = 0,
     light: NoisyLight = "indirect",
     jitter: bool = False,
+    see_through: bool = False,
     previous: View | None = None,
     plan: Plan | None = None,
 ) -> Rendered:
@@ -90,19 +91,25 @@ def render_frame(
         ``"reflected"``, without ``direct``.
       jitter: rays go through another point of the pixels in every frame (:mod:`jaxdn.render.jitter`), and the reference
         is the mean over each pixel, instead of everything through the centres.
+      see_through: the guides of flat mirrors and of glass are those of what they show
+        (:mod:`jaxdn.render.replacement`); not with the scalar variant.
       previous: the ``view`` of the frame before, computed if it is not given; frame 0 has none, and its motion is 0.
       plan: what to leave out: buffers (None then), paths longer than its ``max_depth``, and, in a frame that shows the
         same as an earlier one (``plan.held``), everything except the noise. The rest is the same as without a plan, bit
         for bit. Without one there are all buffers but those on request (:data:`jaxdn.frame.ON_REQUEST`).
     """
-    check_options(width, height, layers, reference_spp, draws, light, jitter, plan)
+    check_options(width, height, layers, reference_spp, draws, light, jitter, see_through, plan)
     chosen = use_variant(variant)
     use = tracer(chosen)
     if jitter and use.jittered:
         raise ValueError(f"jitter: {chosen} spreads its samples over the pixels itself; leave it out. {advice()}")
+    if see_through and not tells_lobes(chosen):
+        raise ValueError(f"see_through: {chosen} cannot follow rays past mirrors and glass; leave it out. {advice()}")
     depth = path_length(scene, max_depth, plan)
     repeated = plan is not None and plan.held[frame] != frame
     planned = frozenset(GUIDES) - ON_REQUEST if plan is None else frozenset(plan.frames[frame])
+    if see_through:
+        planned -= OF_FIRST_HITS
     if light == "reflected":
         planned -= {"direct"}
     apart, wanted = planned & OF_SAMPLES, frozenset() if repeated else planned - OF_SAMPLES
@@ -117,10 +124,11 @@ def render_frame(
     again = bool(apart & _VECTORS) or _GRADIENT in wanted
     if frame > 0 and not repeated and (again or (wanted & _MOTION and previous is None)):
         before = built_at(frame - 1)
-        previous = previous or _view(scene, frame - 1, before, frozenset())
+        previous = previous or _view(scene, frame - 1, before, frozenset(), see_through)
     built = built_at(frame)
     check_scene(built)
-    view = previous if repeated else _view(scene, frame, built, wanted) if wanted | (apart & _VECTORS) else None
+    needed = bool(wanted | (apart & _VECTORS))
+    view = previous if repeated else _view(scene, frame, built, wanted, see_through) if needed else None
 
     dark = plan is not None and plan.integrator == "none"
     noise_only = plan is not None and not plan.indirect
@@ -257,10 +265,10 @@ def _vectors(
     return found
 
 
-def _view(scene: AnimatedScene, frame: int, built: Any, wanted: frozenset[str]) -> View:
+def _view(scene: AnimatedScene, frame: int, built: Any, wanted: frozenset[str], see_through: bool) -> View:
     pose = {name: np.asarray(matrix, np.float64) for name, matrix in scene.pose(frame).items()}
     parts = {"reflectance": "reflectance" in wanted, "specular": "specular_reflectance" in wanted}
-    return View(gbuffer(built, **parts), scene.camera(frame), pose)
+    return View(gbuffer(built, **parts, see_through=see_through), scene.camera(frame), pose)
 
 
 def _motion(view: View, previous: View | None, wanted: frozenset[str]) -> dict[str, Any]:
@@ -294,6 +302,7 @@ def check_options(
     draws: int,
     light: NoisyLight,
     jitter: bool,
+    see_through: bool,
     plan: Plan | None,
 ) -> None:
     """Raise ValueError for options of :func:`render_frame` that are out of range or contradict each other."""
@@ -315,3 +324,5 @@ def check_options(
         held = plan.held != tuple(range(len(plan.held)))
         if held or THROUGH_CENTRES & set(plan.buffers):
             raise ValueError("plan: expected one that was made for jitter; pass jitter=True to effects.plan.")
+    if see_through and plan is not None and OF_FIRST_HITS & set(plan.buffers):
+        raise ValueError("plan: expected one that was made to see through; pass see_through=True to effects.plan.")

@@ -18,6 +18,7 @@ from jaxdn.frame import FAR
 from jaxdn.render.light_samples import diffuse_reflectance
 from jaxdn.render.media import absorbs, media_of
 from jaxdn.render.reflectance import Reflectances
+from jaxdn.render.replacement import Followed, Images, follow, imaged
 from jaxdn.render.wavefront import camera_rays
 
 
@@ -45,6 +46,9 @@ class GBuffer(NamedTuple):
     if it was not requested."""
     specular_reflectance: np.ndarray | None = None
     """[H, W, 3] float32 the part of it that lobes other than diffuse ones reflect, 0 on a miss; None as above."""
+    images: Images | None = None
+    """The pixels whose buffers are those of an image in mirrors or of what is seen through glass, if they were
+    requested and there are any. Their ids are of no shape: each pair of shapes, seen and met first, has its own."""
 
 
 def shape_names(scene: Any) -> list[str]:
@@ -70,18 +74,22 @@ def check_scene(scene: Any) -> None:
         raise ValueError("scene: motion blur is not supported yet; expected an instantaneous shutter.")
 
 
-def gbuffer(scene: Any, *, reflectance: bool = False, specular: bool = False) -> GBuffer:
+def gbuffer(scene: Any, *, reflectance: bool = False, specular: bool = False, see_through: bool = False) -> GBuffer:
     """Trace one ray through the centre of every pixel of the scene's first sensor, with the current variant.
 
     With ``reflectance`` (:mod:`jaxdn.render.reflectance`) a material that cannot be averaged gives one warning with the
-    name of its shape, and its albedo is used; with ``specular`` there is its specular part as well.
+    name of its shape, and its albedo is used; with ``specular`` there is its specular part as well. With
+    ``see_through`` the buffers of flat mirrors and of glass are those of what they show
+    (:mod:`jaxdn.render.replacement`), for which the variant has to be a vectorised one.
     """
     names = shape_names(scene)
     ranks = {name: rank for rank, name in enumerate(sorted(names))}
     trace = _one_by_one if str(mi.variant()).startswith("scalar") else _vectorised
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     reflectances = Reflectances(scene) if reflectance or specular else None
-    traced = trace(scene, names, ranks, reflectances, specular)
+    traced, followed = trace(scene, names, ranks, reflectances, specular, see_through)
+    if followed is not None:
+        traced = imaged(traced, followed)
     found = {name: buffer.reshape(height, width, -1) for name, buffer in traced.items()}
 
     hit = found["ids"] >= 0
@@ -93,6 +101,10 @@ def gbuffer(scene: Any, *, reflectance: bool = False, specular: bool = False) ->
     away = np.sum(normal * direction, axis=-1, keepdims=True) > 0
     albedo = np.where(hit, np.clip(np.nan_to_num(found["albedo"]), 0.0, 1.0), 1.0).astype(np.float32)
     reflected = None if reflectances is None else _reflectance(found, albedo, sorted(names))
+    images = None if followed is None else _images(scene, followed, traced["ids"])
+    ids = found["ids"].astype(np.int32)
+    if images is not None:
+        ids.reshape(-1)[images.pixels] = _of_pairs(images, len(names))
     return GBuffer(
         albedo=albedo,
         normal=np.where(hit, np.where(away, -normal, normal), 0.0).astype(np.float32),
@@ -100,11 +112,27 @@ def gbuffer(scene: Any, *, reflectance: bool = False, specular: bool = False) ->
         roughness=np.where(hit, np.clip(np.nan_to_num(found["roughness"], nan=1.0), 0.0, 1.0), 1.0).astype(np.float32),
         position=np.where(hit, position, 0.0),
         direction=direction,
-        ids=found["ids"].astype(np.int32),
+        ids=ids,
         names=tuple(sorted(names)),
         reflectance=reflected,
         specular_reflectance=_specular(found, reflected) if specular and reflected is not None else None,
+        images=images,
     )
+
+
+def _images(scene: Any, followed: Followed, shapes: np.ndarray) -> Images | None:
+    """The replaced pixels with ids of shapes, from those of all pixels' surfaces; None if there are none."""
+    pixels = np.flatnonzero(followed.replaced)
+    if not len(pixels):
+        return None
+    mirrors = ids_of(scene, followed.mirrors[pixels].ravel()).reshape(len(pixels), -1)
+    first = ids_of(scene, followed.first[pixels])
+    return Images(pixels, shapes.reshape(-1)[pixels].astype(int), first, mirrors, followed.planes[pixels])
+
+
+def _of_pairs(images: Images, count: int) -> np.ndarray:
+    """Ids, the same in every frame, beyond those of the ``count`` shapes: one for each pair of shapes seen and met."""
+    return ((1 + images.first) * count + images.shapes).astype(np.int32)
 
 
 def _reflectance(found: dict[str, np.ndarray], albedo: np.ndarray, names: Sequence[str]) -> np.ndarray:
@@ -129,14 +157,23 @@ def _warn(shape: str) -> None:
 
 
 def _vectorised(
-    scene: Any, names: Sequence[str], ranks: dict[str, int], reflectances: Reflectances | None, specular: bool
-) -> dict[str, np.ndarray]:
-    """All pixels at once; flat buffers."""
+    scene: Any,
+    names: Sequence[str],
+    ranks: dict[str, int],
+    reflectances: Reflectances | None,
+    specular: bool,
+    see_through: bool,
+) -> tuple[dict[str, np.ndarray], Followed | None]:
+    """All pixels at once; flat buffers of the hits of all rays, and how these were followed."""
     sensor = scene.sensors()[0]
     width, height = (int(size) for size in sensor.film().crop_size())
     pixel = dr.arange(mi.UInt32, width * height)
     across = dr.opaque(mi.UInt32, width)
     ray = camera_rays(sensor, pixel % across, pixel // across)
+    direction = ray.d
+    followed = follow(scene, ray, shape_of) if see_through else None
+    if followed is not None:
+        ray = followed.ray
     hit = scene.ray_intersect(ray)
     valid = hit.is_valid()
     bsdf = hit.bsdf(ray)
@@ -153,7 +190,7 @@ def _vectorised(
         "albedo": albedo,
         "normal": hit.sh_frame.n,
         "position": hit.p,
-        "direction": ray.d,
+        "direction": direction,
         "roughness": roughness,
         "shape": shape_of(hit),
     }
@@ -164,7 +201,7 @@ def _vectorised(
     dr.eval(buffers)
     arrays = {name: np.array(buffer).T.astype(np.float64) for name, buffer in buffers.items()}
     arrays["ids"] = ids_of(scene, arrays.pop("shape"))
-    return arrays
+    return arrays, followed
 
 
 def shape_of(hit: Any) -> Any:
@@ -188,9 +225,16 @@ def ids_of(scene: Any, numbers: np.ndarray) -> np.ndarray:
 
 
 def _one_by_one(
-    scene: Any, names: Sequence[str], ranks: dict[str, int], reflectances: Reflectances | None, specular: bool
-) -> dict[str, np.ndarray]:
-    """The same buffers, a pixel at a time, for the variant without vectorisation."""
+    scene: Any,
+    names: Sequence[str],
+    ranks: dict[str, int],
+    reflectances: Reflectances | None,
+    specular: bool,
+    see_through: bool,
+) -> tuple[dict[str, np.ndarray], None]:
+    """The same buffers, a pixel at a time, for the variant without vectorisation, which follows no rays."""
+    if see_through:
+        raise ValueError(f"see_through: {mi.variant()} cannot follow rays past mirrors and glass; leave it out.")
     sensor = scene.sensors()[0]
     width, height = (int(size) for size in sensor.film().crop_size())
     by_shape = {_address(own): ranks[name] for own, name in zip(scene.shapes(), names, strict=True)}
@@ -215,7 +259,7 @@ def _one_by_one(
         if reflectances is not None:
             found = reflectances.of_one(hit, hit.bsdf(), albedo)
             arrays["reflectance"][pixel], arrays["specular_reflectance"][pixel] = found
-    return arrays
+    return arrays, None
 
 
 def _address(shape: Any) -> str:

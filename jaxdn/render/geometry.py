@@ -97,7 +97,7 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
     if now.names != before.names or now.ids.shape != before.ids.shape:
         raise ValueError("motion: expected two frames of one size with the same shapes; none may appear or disappear.")
     size = now.ids.shape[:2]
-    back = relative_poses(now.names, current.pose, previous.pose)[now.ids[..., 0]]
+    back = _carried(now, relative_poses(now.names, current.pose, previous.pose))
     fixed = same_camera(current.camera, previous.camera)
 
     points = _homogeneous(now)
@@ -110,7 +110,7 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
     if not disocclusion:
         return Motion(motion, None, None, previous_depth)
 
-    there = relative_poses(now.names, previous.pose, current.pose)[before.ids[..., 0]]
+    there = _carried(before, relative_poses(now.names, previous.pose, current.pose))
     old_surface = _homogeneous(before)
     moved, _ = project(np.einsum("hwij,hwj->hwi", there, old_surface), current.camera, size)
     forward = moved - project(old_surface, previous.camera, size)[0]
@@ -130,6 +130,29 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
         tap = np.floor(landing - np.float32(0.5)) + corner
         seen |= on_sky & _matches(now, before, tap, old_points, normals, z)[0]
     return Motion(motion, forward, seen, previous_depth)
+
+
+def _carried(gbuffer: GBuffer, motions: np.ndarray) -> np.ndarray:
+    """[H, W, 4, 4] the motion of what every pixel shows, from those of the shapes.
+
+    An image in mirrors with the reflections M = M_1 ... M_k moves by ``M' T M^-1``, where T is the motion of the thing
+    and M' are the reflections at the moved mirrors, ``B M_i B^-1`` with the mirror's motion B.
+    """
+    images, size = gbuffer.images, gbuffer.ids.shape[:2]
+    if images is None:
+        return motions[gbuffer.ids[..., 0]]
+    shapes = gbuffer.ids.reshape(-1).copy()
+    shapes[images.pixels] = images.shapes
+    found = motions[shapes]
+    now = then = np.broadcast_to(np.eye(4), (len(images.pixels), 4, 4))
+    moves = ~unmoved(found[images.pixels])
+    for index in range(images.mirrors.shape[1]):
+        plane, motion = images.planes[:, index], motions[images.mirrors[:, index]]
+        now, then = now @ plane, then @ motion @ plane @ np.linalg.inv(motion)
+        moves |= ~unmoved(motion)
+    whole = then @ found[images.pixels] @ np.linalg.inv(now)
+    found[images.pixels] = np.where(moves[:, None, None], whole, np.eye(4))
+    return found.reshape(*size, 4, 4)
 
 
 def ray_length(view: View) -> np.ndarray:

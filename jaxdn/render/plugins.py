@@ -1,6 +1,7 @@
 """Mitsuba's objects as a tree: a scene holds shapes, a shape a BSDF, a BSDF textures and other BSDFs."""
 
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import mitsuba as mi
@@ -39,3 +40,10 @@ def _walk(variant: str) -> Any:
 def shape_groups(scene: Any) -> list[Any]:
     """The shape groups that a scene instantiates; a group is not a shape of the scene itself."""
     return [child for _, child in children(scene) if child.class_name() == "ShapeGroupPlugin"]
+
+
+def materials(scene: Any) -> Iterator[Any]:
+    """Every BSDF that a hit may have, once."""
+    grouped = [part for group in shape_groups(scene) for _, part in children(group) if hasattr(part, "bsdf")]
+    seen = {id(bsdf): bsdf for bsdf in (shape.bsdf() for shape in (*scene.shapes(), *grouped)) if bsdf is not None}
+    yield from seen.values()

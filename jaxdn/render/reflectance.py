@@ -27,7 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.materials import is_lambertian
-from jaxdn.render.plugins import children, shape_groups
+from jaxdn.render.plugins import children, materials
 
 COSINES = 64
 """Entries of a material's table on each side of the surface, from grazing to head-on."""
@@ -57,7 +57,7 @@ class Reflectances:
         self._averaged: list[Any] = []
         self._numbers: dict[int, int] = {}
         # The wrappers are kept, so that Mitsuba returns the same ones again and their ids identify the materials.
-        self._materials = list(_materials(scene))
+        self._materials = list(materials(scene))
         for material in self._materials:
             number = _way(material)
             if number == _TABLED:
@@ -111,13 +111,6 @@ class Reflectances:
             ends = self._tables[number, int(low) : int(low) + 2]
             found = np.asarray((1 - share) * ends[0] + share * ends[1], np.float64)
         return found[:3], found[3:]
-
-
-def _materials(scene: Any) -> Iterator[Any]:
-    """Every BSDF that a hit may have, once."""
-    grouped = [part for group in shape_groups(scene) for _, part in children(group) if hasattr(part, "bsdf")]
-    seen = {id(bsdf): bsdf for bsdf in (shape.bsdf() for shape in (*scene.shapes(), *grouped)) if bsdf is not None}
-    yield from seen.values()
 
 
 def _identity(bsdf: Any) -> Any:

@@ -10,15 +10,15 @@ from jaxdn.planning.plan import entries
 _FREE = ("frames", "cameras", "versions", "bad_samples")
 """Entries of a record that may change when rendering is resumed."""
 
+UNSAID = {"draws": 0, "light": "indirect", "jitter": False, "see_through": False}
+"""What records of earlier versions do not say."""
+
 
 def check_settings(folder: Path, wanted: Mapping[str, Any], found: Mapping[str, Any]) -> None:
     """Raise ClipError if the frames in a folder were rendered with other settings, naming those; both are records."""
     # Frames may be added: what both records say about the same ones is compared.
     common = min(int(found["frames"]), int(wanted["frames"]))
-    both = [
-        {"draws": 0, "light": "indirect", "jitter": False, **record, "plan": _planned(record.get("plan"), common)}
-        for record in (found, wanted)
-    ]
+    both = [{**UNSAID, **record, "plan": _planned(record.get("plan"), common)} for record in (found, wanted)]
     names = [name for name in wanted if name not in _FREE]
     differing = [line for name in names for line in _differences(name, both[0].get(name), both[1][name])]
     cameras = zip(found.get("cameras", []), wanted["cameras"], strict=False)
