@@ -13,6 +13,7 @@ from jaxdn.commands.denoise import Written, lettered
 from jaxdn.commands.passes import light_of
 from jaxdn.commands.render import plan_clip
 from jaxdn.frame import OF_SAMPLES, Frame
+from jaxdn.planning.plan import OF_FIRST_HITS
 from jaxdn.render.adaptive import render_sampled
 from jaxdn.render.opening import open_scene
 from jaxdn.report.images import save_png
@@ -51,7 +52,8 @@ def denoise_scene(
 
     A method that does not ask has the budget in every pixel. All reflected light is noisy. A file has the channels
     ``R, G, B``, the picture, ``denoised.R/G/B``, the reflected light alone, and ``samples.Y``, the number of samples of
-    each pixel. Frames before the first that is wanted are rendered for their history. Raises ValueError for what is not
+    each pixel. Frames before the first that is wanted are rendered for their history. Flat mirrors and glass are seen
+    through, unless the method follows reflections itself. Raises ValueError for what is not
     a scene, for a budget that is out of range, and where Mitsuba has only scalar variants.
     """
     scene = open_scene(source, animation)
@@ -62,7 +64,9 @@ def denoise_scene(
         raise ValueError(f"--method {method.label}: expected a denoiser for a scene, got the noisy image itself.")
     reads = method.denoiser._replace(reads=method.denoiser.reads - OF_SAMPLES)
     size: dict[str, Any] = {"width": settings.width, "height": settings.height}
-    planned = plan_clip(scene, denoiser=reads, frames=wanted[-1] + 1, light="reflected", **size)
+    through = not reads.reads & OF_FIRST_HITS
+    wished: dict[str, Any] = {"light": "reflected", "see_through": through}
+    planned = plan_clip(scene, denoiser=reads, frames=wanted[-1] + 1, **wished, **size)
     assert planned is not None
     if method.denoiser.samples is None and (settings.budget < 1 or settings.budget % 1):
         raise ValueError(
@@ -76,10 +80,14 @@ def denoise_scene(
         asked = step.ask(frame, most)
         return np.full((*frame.radiance.shape[:2], 1), round(settings.budget)) if asked is None else np.asarray(asked)
 
+    if through and {"mirror", "transmission"} & set(planned.effects):
+        log("guides of flat mirrors and glass are those of what they show")
     files: list[Path] = []
     view = None
     for index in range(wanted[-1] + 1):
-        found = render_sampled(scene, index, ask, plan=planned.plan, seed=settings.seed, previous=view, **size)
+        found = render_sampled(
+            scene, index, ask, plan=planned.plan, seed=settings.seed, previous=view, **wished, **size
+        )
         view, counts = found.view, np.asarray(found.frame.sample_count)
         image = np.asarray(step(found.frame))
         if index not in wanted:

@@ -38,6 +38,7 @@ def render_sampled(
     plan: Plan,
     seed: int = 0,
     light: NoisyLight = "reflected",
+    see_through: bool = False,
     previous: View | None = None,
 ) -> Sampled:
     """Render a frame's buffers and one sample, ask how many samples each pixel gets, and render the rest of these.
@@ -55,6 +56,7 @@ def render_sampled(
       plan: what to render; with frames that hold those before, their buffers are rendered again.
       seed: of the random numbers.
       light: what the radiance holds, see :func:`jaxdn.render.render_frame`.
+      see_through: as there.
       previous: the ``view`` of the frame before.
     """
     if use_variant().startswith("scalar"):
@@ -65,7 +67,7 @@ def render_sampled(
 
     alone = alone_in_each_frame(plan)
     settings: dict[str, Any] = {"width": width, "height": height, "seed": seed, "light": light, "plan": alone}
-    rendered = render_frame(scene, frame, previous=previous, **settings)
+    rendered = render_frame(scene, frame, previous=previous, see_through=see_through, **settings)
     counts = np.asarray(ask(rendered.frame))
     whole = np.maximum(np.round(counts[..., 0]), 0).astype(np.int64)
     total, bad = np.where(whole[..., None] > 0, rendered.frame.radiance, 0.0), rendered.bad_samples

@@ -2,19 +2,24 @@
 
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from render_scenes import HEIGHT, SQUARE_Z, WIDTH, Stage, grey, shift, turn
 
 import jaxdn
-from jaxdn import effects
+from jaxdn import Clip, effects
+from jaxdn.candidates import candidate
 from jaxdn.clips import ClipError
+from jaxdn.commands.denoise_scene import Settings, denoise_scene
 from jaxdn.commands.render import clips_of
 from jaxdn.effects import plan
 from jaxdn.planning.plan import OF_FIRST_HITS
 from jaxdn.render.clip import render_clip
 from jaxdn.render.farm import render_clips
 from jaxdn.render.frame import render_frame
+from jaxdn.render.scene_file import SceneFile
 from jaxdn.render.variant import choose_variant
 
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
@@ -218,3 +223,43 @@ def test_a_clip_keeps_to_its_setting_and_the_command_says_what_is_left_out(tmp_p
     assert (job.see_through, other.see_through, same.see_through) == (True, False, True)
     with pytest.raises(ClipError, match="see_through: True there, False wanted"):
         render_clip(Stage(), folder, frames=2, variant=FAST, **SIZE)
+
+
+CHECKS = """<scene version="3.0.0">
+  <integrator type="path"/>
+  <sensor type="perspective"><float name="fov" value="60"/>
+    <transform name="to_world"><lookat origin="0, 1, 3" target="0, 1, 0" up="0, 1, 0"/></transform></sensor>
+  <shape type="rectangle" id="mirror"><bsdf type="conductor"/>
+    <transform name="to_world"><scale value="2"/><translate y="1"/></transform></shape>
+  <shape type="rectangle" id="checks">
+    <bsdf type="diffuse"><texture type="checkerboard" name="reflectance">
+      <rgb name="color0" value="0.1"/><rgb name="color1" value="0.8"/>
+      <transform name="to_uv"><scale value="8"/></transform></texture></bsdf>
+    <transform name="to_world"><scale value="4"/><rotate y="1" angle="180"/><translate y="1" z="5"/></transform></shape>
+  <emitter type="constant"><rgb name="radiance" value="0.8"/></emitter>
+</scene>"""
+
+
+def test_what_a_mirror_shows_stays_sharp(tmp_path):
+    """The picture of a checked wall in a mirror: svgf blurs it with the mirror's guides, and keeps it with its own."""
+    (tmp_path / "checks.xml").write_text(CHECKS)
+    scene, svgf, error = SceneFile(tmp_path / "checks.xml"), jaxdn.denoisers.svgf(), {}
+    for on in (False, True):
+        found = render_frame(
+            scene, 0, width=48, height=48, reference_spp=256, light="reflected", see_through=on, variant=FAST
+        )
+        clip = Clip(jax.tree.map(lambda buffer: jnp.asarray(buffer)[None], found.frame))
+        image = np.asarray(jaxdn.denoise(svgf, {}, clip)[0])
+        error[on] = float(np.mean((image - found.reference) ** 2))
+    assert error[True] < 0.1 * error[False]
+
+
+def test_a_scene_is_denoised_with_the_guides_of_what_is_seen(tmp_path):
+    (tmp_path / "checks.xml").write_text(CHECKS)
+    told: dict[str, list[str]] = {"svgf": [], "trmv": []}
+    for name, lines in told.items():
+        settings = Settings(width=16, height=16, frames=[0], budget=1)
+        denoise_scene(str(tmp_path / "checks.xml"), None, tmp_path / name, candidate(name), settings, log=lines.append)
+    line = "guides of flat mirrors and glass are those of what they show"
+    assert line in told["svgf"]
+    assert line not in told["trmv"], "trmv follows reflections by the mirror's own guides"
