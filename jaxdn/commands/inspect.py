@@ -71,9 +71,14 @@ def inspect_to_terminal(
         raise ValueError(
             f"scene {source!r}: expected none of --channels, --layer, --motion-convention, which are for EXR files."
         )
+    if clip and (motion_convention or any(naming.values())):
+        raise ValueError(
+            f"{source}: expected none of --channels, --layer, --motion-convention, which are for files of other "
+            "renderers; it is a clip of jaxdn's own."
+        )
     if clip and not as_json:
         reads = None if reader is None else reader.reads
-        show_sources(source, reads=reads, motion_convention=motion_convention, log=print, **naming)
+        show_sources(source, reads=reads, log=print)
     with _nothing_else_on_stdout():
         planned = _planned(source, animation, reader, width=width, height=height, frames=frames)
     if as_json:
@@ -84,8 +89,7 @@ def inspect_to_terminal(
             "uncertain": sorted(found.uncertain),
         }
         if clip:
-            chosen = sources_of(source, motion_convention=motion_convention, **naming)
-            record["sources"] = [one._asdict() for one in chosen]
+            record["sources"] = [one._asdict() for one in sources_of(source)]
         print(json.dumps(record, indent=1))
         return
     _show(source, planned, reader, denoiser)

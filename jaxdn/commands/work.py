@@ -14,6 +14,10 @@ LEAD_IN = 16
 what the history of svgf lacks makes a tenth of the noise that is left (tests/outside/test_frames.py)."""
 
 
+_OTHER_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".hdr", ".bmp", ".webp")
+"""What somebody may want to write, and no folder is called."""
+
+
 class Work(NamedTuple):
     """A shot, and what to write of it."""
 
@@ -64,9 +68,10 @@ def work_on(
     """The shots of folders, patterns and files; several sequences in a folder are several shots.
 
     Results have the names of their files. With inputs in several folders, they lie in folders of the same names below
-    ``out``. Raises ValueError for no sources and sources without frames, for ``frames`` that none of them has, for a
-    frame that is there twice, where a file of the input would be overwritten or lies in the place of a folder, and for
-    the name of one file for several frames.
+    ``out``. Raises ValueError for no sources and sources without frames, for ``frames`` of which none has any (one that
+    is missing between others is no error), for a frame that is there twice, where a file of the input would be
+    overwritten or lies in the place of a folder, for the name of one file for several frames, and for that of an image
+    which is no EXR file.
 
     Args:
       sources: folders of clips, folders of EXR files, patterns, or files.
@@ -79,11 +84,16 @@ def work_on(
     found = [shot for source in sources for shot in _shots(source)]
     together = Path(commonpath([str(file.resolve().parent) for shot, _ in found for file in shot.files]))
     single = out.suffix.lower() == ".exr"
+    if out.suffix.lower() in _OTHER_IMAGES:
+        raise ValueError(
+            f"-o {out}: expected a folder or the name of an EXR file; --preview writes a PNG next to every EXR."
+        )
     count = sum(len(shot.files) for shot, _ in found)
     if single and count > 1:
         raise ValueError(f"{out}: expected a folder for {count} frames, got the name of one EXR file.")
     _refuse_file(out.parent if single else out)
     works = []
+    named = frames is None
     for shot, clip in found:
         below = [out / file.resolve().relative_to(together) for file in shot.files]
         targets = (out,) if single else tuple(path.with_suffix(".exr") for path in below)
@@ -93,13 +103,14 @@ def work_on(
             if frames is None or set(shot.numbers[index : index + 1]) & set(frames)
         ]
         wanted = frozenset(index for index in chosen if not (skip_existing and targets[index].is_file()))
+        named |= bool(chosen) or not set(missing(shot.numbers)).isdisjoint(frames or ())
         notes = _notes(shot, lone=len(found) > 1, there=len(chosen) - len(wanted))
         works.append(Work(shot, clip, targets, wanted, notes))
     _refuse_twice(works)
     inputs = {file.resolve() for shot, _ in found for file in shot.files}
     if {target.resolve() for work in works for target in work.targets} & inputs or out.resolve() in inputs:
         raise ValueError(f"{out}: expected another place than the input's, whose frames would be overwritten.")
-    if frames is not None and not any(work.wanted or work.notes for work in works):
+    if frames is not None and not named:
         there = "; ".join(f"{work.shot.label}" for work in works)
         raise ValueError(f"--frames {ranges(sorted(frames))}: expected frames that are there, got none of {there}.")
     return works

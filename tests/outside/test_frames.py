@@ -78,6 +78,22 @@ def test_only_the_wanted_frames_are_written(tmp_path: Path) -> None:
         denoise(source, tmp_path / "out", frames=[20, 21])
 
 
+def test_a_wanted_frame_in_a_gap_is_nothing_to_do_and_one_beyond_is_told(tmp_path: Path) -> None:
+    source = numbered(tmp_path / "in", [1, 2, 5])
+    files, told = denoise(source, tmp_path / "out", frames=[4])
+    assert files == []
+    assert "3-4 missing" in told[0]
+    with pytest.raises(ValueError, match=r"--frames 20-21: expected frames that are there, got none of .* 1-2, 5"):
+        denoise(source, tmp_path / "out", frames=[20, 21])
+
+
+def test_the_name_of_another_image_is_no_folder(tmp_path: Path) -> None:
+    source = numbered(tmp_path / "in", [1])
+    with pytest.raises(ValueError, match="expected a folder or the name of an EXR file; --preview writes a PNG"):
+        denoise(source, tmp_path / "out.png")
+    assert not (tmp_path / "out.png").exists()
+
+
 def part_of(numbers: Any, wanted: Any, **options: Any) -> list[range]:
     names = tuple(Path(f"{number}.exr") for number in numbers)
     return list(Work(Shot(names, tuple(numbers)), None, names, frozenset(wanted), ()).stretches(**options))

@@ -164,6 +164,17 @@ def test_a_finished_clip_keeps_its_effects_and_plan(tmp_path: Path, run: Any) ->
     assert set(record) == {"effects", "plan", "uncertain", "sources"}
 
 
+FIRST = next(iter(MOTION_CONVENTIONS))
+
+
+@pytest.mark.parametrize("option", [("--channels", "albedo=a"), ("--layer", "a"), ("--motion-convention", FIRST)])
+def test_a_finished_clip_needs_no_options_of_files(option: tuple[str, str], tmp_path: Path, fails: Any) -> None:
+    clips.write_clip(make_clip(0), tmp_path / "clip")
+    message = fails("inspect", tmp_path / "clip", *option)
+    assert "expected none of --channels, --layer, --motion-convention" in message
+    assert "a clip of jaxdn's own" in message
+
+
 def test_the_help_says_that_files_are_read(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main(["inspect", "--help"])
