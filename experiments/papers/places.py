@@ -4,9 +4,11 @@
         --places living-room-0:10,18,64,48 living-room-0:146,104,64,48 parlour-2008:0,30,64,48 \\
         living-room-0:256,20,64,48 staircase2-0:105,100,64,48 staircase2-0:24,128,64,48 staircase2-0:110,18,64,48
 
-Reads the pictures that `experiments.papers.results` writes. Each row is a place, each column a method.
+Reads the pictures that `experiments.papers.results` writes, of one run or of several. Each row is a place, each
+column a method.
 """
 
+import itertools
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -28,8 +30,8 @@ _LABEL = 16
 class Settings:
     """Show parts of every method's image side by side."""
 
-    pictures: Annotated[Path, tyro.conf.Positional]
-    """Folder with one folder of pictures per clip."""
+    pictures: Annotated[list[Path], tyro.conf.Positional]
+    """Folders with one folder of pictures per clip; of several, each place is a row from each of them."""
     places: list[str]
     """CLIP:X,Y,WIDTH,HEIGHT in pixels."""
     methods: list[str] = field(
@@ -64,8 +66,8 @@ def parsed(place: str) -> tuple[str, tuple[int, int, int, int]]:
 def sheet(settings: Settings) -> np.ndarray:
     """All places [H, W, 3], with the methods' names above. Raises ValueError for places of different sizes."""
     rows = []
-    for clip, place in map(parsed, settings.places):
-        row = [part(settings.pictures / clip / f"{method}.png", place) for method in settings.methods]
+    for (clip, place), pictures in itertools.product(map(parsed, settings.places), settings.pictures):
+        row = [part(pictures / clip / f"{method}.png", place) for method in settings.methods]
         rows.append(np.concatenate([np.pad(one, ((0, 1), (0, 1), (0, 0))) for one in row], axis=1))
     if len({row.shape for row in rows}) != 1:
         raise ValueError("--places: expected places of one width and height.")

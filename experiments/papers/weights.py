@@ -10,7 +10,8 @@ network is trained at a constant rate first, so that it can always be continued,
 LARGE begins as SMALL grown (:mod:`jaxdn.networks.widen`). A, B and C take the same number of updates.
 """
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -51,6 +52,7 @@ STAGES = (
     Stage("relax-fitted", "relax", {}, 300),
     Stage("steady-begun", "steady", {"quality": "balanced"}, 8000, decay=False),
     Stage("steady-balanced", "steady", {"quality": "balanced"}, 1000, start="steady-begun"),
+    Stage("high-begun", "steady", {"quality": "high"}, 4000, start="steady-balanced", decay=False),
     Stage("fast-begun", "steady", {"quality": "fast"}, 4000, decay=False),
     Stage("steady-fast", "steady", {"quality": "fast"}, 1000, start="fast-begun"),
     Stage("small-begun", "ntd", {"size": "small"}, 4000, decay=False),
@@ -85,17 +87,25 @@ class Settings:
 
 
 def render_all(settings: Settings) -> None:
-    """Render what is missing: training clips of seeds from 0 on, and a validation clip of seed 1000 of each kind."""
+    """Render what is missing: training clips of seeds from 0 on, and a validation clip of seed 1000 of each kind.
+
+    In clips of odd seeds mirrors and glass are seen through, so that networks know both kinds of guides.
+    """
     sources = [(str(room), settings.tours, True) for room in settings.rooms]
     sources += [(family, clips, False) for family, clips in FAMILIES.items()]
-    for part, seeds in (("train", range), ("validation", lambda clips: range(1000, 1001))):
-        for source, clips, tours in sources:
+    parts: list[tuple[str, Callable[[int], range]]] = [("train", range), ("validation", lambda _: range(1000, 1001))]
+    for part, seeds in parts:
+        for (source, clips, tours), odd in itertools.product(sources, (False, True)):
+            chosen = [seed for seed in seeds(clips) if seed % 2 == odd]
+            if not chosen:
+                continue
             render(
                 source,
                 settings.data / part,
                 animation=None,
                 tours=tours,
-                seeds=list(seeds(clips)),
+                seeds=chosen,
+                see_through=odd,
                 width=128,
                 height=128,
                 frames=10,
