@@ -14,9 +14,10 @@ from rich.table import Table
 import jaxdn
 from jaxdn.extras import EXTRAS, install
 from jaxdn.networks.engines import ENGINES
+from jaxdn.ops import onednn_library
 from jaxdn.render.variant import choose_variant, has_cuda
 
-_EXTRA_OF = {"onnxruntime": "onnx", "onednn": "onednn"}
+_EXTRA_OF = {"onednn-bfloat16": "onednn", "onnxruntime": "onnx", "onednn": "onednn"}
 """Engine -> the extra that brings it."""
 
 
@@ -47,6 +48,8 @@ def _findings() -> Iterator[Finding]:
     for engine in ENGINES.values():
         if engine.available():
             yield Finding(f"engine for {engine.purpose}", engine.name)
+        elif engine.name == "onednn-bfloat16" and onednn_library.available():
+            yield Finding(f"engine for {engine.purpose}", "no bfloat16, with which this CPU does not compute")
         elif jax.default_backend() == "cpu":
             yield Finding(f"engine for {engine.purpose}", "XLA alone", f"faster: {install(_EXTRA_OF[engine.name])}")
         else:

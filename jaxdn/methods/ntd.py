@@ -90,9 +90,9 @@ class Options:
     """Stop the gradient at the history."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Precision of the U-Net only; None is the images' dtype."""
-    implementation: Literal["reference", "onnxruntime", "onednn"] | None = None
-    """Engine of the U-Net: XLA, or on CPUs ONNX Runtime (inference; the extra ``onnx``) or oneDNN (training; the extra
-    ``onednn``). None is XLA."""
+    implementation: Literal["reference", "onednn-bfloat16", "onnxruntime", "onednn"] | None = None
+    """Engine of the U-Net: XLA, or on CPUs ONNX Runtime (inference; the extra ``onnx``), oneDNN in bfloat16 (inference) or in
+    float32 (training; both the extra ``onednn``). None is XLA."""
 
 
 AS_PUBLISHED: dict[str, Any] = {
@@ -191,7 +191,7 @@ def warped_history(
         ),
     },
     variants={"ntd-large": {"size": "large"}, "ntd-small": {"size": "small"}},
-    engines=("onnxruntime", "onednn"),
+    engines=("onednn-bfloat16", "onnxruntime", "onednn"),
     earlier={
         "demodulate": "albedo",
         "kernels": "plain",

@@ -3,14 +3,14 @@
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-from jaxdn.networks import onnx
-from jaxdn.ops import onednn
+from jaxdn.networks import bfloat16, onnx
+from jaxdn.ops import onednn_library
 
 Purpose = Literal["inference", "training"]
 
 
 class Engine(NamedTuple):
-    """A value of a network's option ``implementation``; both engines compute only in float32."""
+    """A value of a network's option ``implementation``; their features and results are float32."""
 
     name: str
     purpose: Purpose
@@ -20,6 +20,7 @@ class Engine(NamedTuple):
 
 
 ENGINES: dict[str, Engine] = {
+    "onednn-bfloat16": Engine("onednn-bfloat16", "inference", bfloat16.available),
     "onnxruntime": Engine("onnxruntime", "inference", onnx.available),
-    "onednn": Engine("onednn", "training", onednn.available),
+    "onednn": Engine("onednn", "training", onednn_library.available),
 }

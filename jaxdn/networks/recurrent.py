@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxdn.networks import Widths, description
 from jaxdn.networks.description import FEATURES, Description, Weights, evaluate, hidden
 from jaxdn.networks.unet import ONEDNN, XLA, Layers, initial, present_groups, storage, weights_for
-from jaxdn.ops import onednn
+from jaxdn.ops import onednn_library
 from jaxdn.ops.registry import register, resolve
 
 Apply = Callable[[Weights, dict[str, jax.Array]], tuple[jax.Array, ...]]
@@ -42,7 +42,7 @@ def reference(network: Description) -> Apply:
     return by_xla(XLA, network)
 
 
-@register("recurrent_unet", "onednn", requires=onednn.check_available)
+@register("recurrent_unet", "onednn", requires=onednn_library.check_available)
 def convolved_by_onednn(network: Description) -> Apply:
     """XLA with oneDNN's convolutions and their gradients: for training on CPUs."""
     return by_xla(ONEDNN, network)

@@ -16,9 +16,9 @@ from flax import nnx
 
 from jaxdn.checks import check_option
 from jaxdn.denoiser import Params
-from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, description, onnx
+from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, bfloat16, description, onnx
 from jaxdn.networks.description import FEATURES, Description, evaluate
-from jaxdn.ops import onednn
+from jaxdn.ops import onednn_library
 from jaxdn.ops.convolution import convolve
 from jaxdn.ops.registry import register, resolve
 
@@ -132,10 +132,16 @@ def reference(network: Description) -> onnx.Apply:
     return by_xla(XLA, network)
 
 
-@register("unet", "onednn", requires=onednn.check_available)
+@register("unet", "onednn", requires=onednn_library.check_available)
 def convolved_by_onednn(network: Description) -> onnx.Apply:
     """XLA with oneDNN's convolutions and their gradients: for training on CPUs."""
     return by_xla(ONEDNN, network)
+
+
+@register("unet", "onednn-bfloat16", requires=bfloat16.check_available)
+def run_in_bfloat16(network: Description) -> onnx.Apply:
+    """The whole network in oneDNN in bfloat16, for inference; the gradient is XLA's."""
+    return bfloat16.engine(network, by_xla(XLA, network))
 
 
 @register("unet", "onnxruntime", requires=onnx.check_available)
@@ -160,10 +166,10 @@ def unet(
     of ``params`` never depend on it. H and W are multiples of 16. ``heads`` are the channel counts at full,
     half and quarter resolution; their outputs are raw (logits), by convolutions of ``head_size``. ``widths`` gives the
     channels of each convolution of each of the five levels; the decoder mirrors the first four. ``initialization``: see
-    :func:`initial`. Computes in the features' dtype. ``implementation``: None or "reference" (XLA), "onnxruntime"
-    (inference, see :mod:`jaxdn.networks.onnx`) or "onednn" (convolutions and their gradients, see
-    :mod:`jaxdn.ops.onednn`). Raises ValueError when ``widths`` is not five non-empty levels of positive integers, the
-    features do not fit, or the implementation cannot run here.
+    :func:`initial`. Computes in the features' dtype. ``implementation``: None or "reference" (XLA), "onednn-bfloat16"
+    or "onnxruntime" (inference, see :mod:`jaxdn.networks.bfloat16` and :mod:`jaxdn.networks.onnx`) or "onednn"
+    (convolutions and their gradients, see :mod:`jaxdn.ops.onednn`). Raises ValueError when ``widths`` is not five
+    non-empty levels of positive integers, the features do not fit, or the implementation cannot run here.
     """
     run = resolve("unet", implementation)
     widths = tuple(tuple(level) for level in widths)

@@ -19,7 +19,7 @@ from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from jaxdn.ops import onednn
+from jaxdn.ops import onednn, onednn_library
 from jaxdn.ops.registry import register, resolve
 
 Product = Callable[[jax.Array, jax.Array], jax.Array]
@@ -155,7 +155,7 @@ def blocked(x: jax.Array, kernel: jax.Array) -> jax.Array:
     return _blocked(x, kernel)
 
 
-@register("convolution", "onednn", requires=onednn.check_available)
+@register("convolution", "onednn", requires=onednn_library.check_available)
 def engine(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """oneDNN for float32, value and gradients; ``"blocked"`` for other types, which oneDNN does not run fast."""
     if x.dtype == kernel.dtype == jnp.float32:

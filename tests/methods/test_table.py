@@ -255,7 +255,9 @@ def test_an_unknown_name_says_which_there_are():
 
 
 def engines(monkeypatch, **available):
-    for name, there in available.items():
+    """Only these engines are available."""
+    for name in ENGINES:
+        there = available.get(name, False)
         monkeypatch.setitem(ENGINES, name, Engine(name, ENGINES[name].purpose, lambda there=there: there))
 
 
@@ -274,7 +276,9 @@ def test_the_engine_is_the_fastest_for_the_purpose_and_none_for_half_precision(p
     engines(monkeypatch, onnxruntime=True, onednn=True)
     assert ntd.engine(purpose, options) == expected
     assert svgf.engine(purpose, options) is None
-    engines(monkeypatch, onnxruntime=False, onednn=False)
+    engines(monkeypatch, **{"onednn-bfloat16": True, "onnxruntime": True, "onednn": True})
+    assert ntd.engine(purpose, options) == ("onednn-bfloat16" if expected == "onnxruntime" else expected)
+    engines(monkeypatch)
     assert ntd.engine(purpose, options) is None
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from experiments.speed import peers, roofline
 from experiments.speed.timing import Call
 from experiments.speed.works import Work
-from jaxdn.ops import onednn
+from jaxdn.ops import onednn_library
 from jaxdn.ops.convolution import convolve
 from jaxdn.ops.registry import implementations, resolve
 from jaxdn.ops.softmax_filter import softmax_filter
@@ -31,7 +31,7 @@ Arrays = Callable[[], list[np.ndarray]]
 
 def forms(operation: str) -> dict[str, str | None]:
     """Name in the results -> name in the registry; the default is ``xla``."""
-    engines = ["onednn"] if operation == "convolution" and onednn.available() else []
+    engines = ["onednn"] if operation == "convolution" and onednn_library.available() else []
     ways = [name for name in implementations(operation) if name not in ("reference", "onednn")]
     others = [name for name in ways if resolve(operation, name) is not resolve(operation, None)]
     return {"xla": None, **{f"xla-{name}": name for name in others}, **{name: name for name in engines}}

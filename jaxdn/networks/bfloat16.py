@@ -1,0 +1,234 @@
+"""A network run by oneDNN in bfloat16, from inside a jitted program, on CPUs that compute with it.
+
+bfloat16 has the range of float32 and 8 bits of precision; sums are float32. A CPU with AVX-512 BF16 or AMX multiplies
+twice as many of them at a time or more, and activations are half as large. What networks decide are shares, features
+and logits, for which 8 bits are enough: images differ by 76 to 85 dB (``docs/performance.md``). It is for inference
+only: the gradient is that of the network in plain XLA, recomputed.
+
+All primitives are made once for a shape, on memory of their own, and run one after the other; a rectifier is a part of
+its convolution. The layers: :mod:`jaxdn.ops.onednn_layers`.
+"""
+
+import math
+import threading
+from collections.abc import Callable, Sequence
+from ctypes import c_void_p
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+
+from jaxdn.networks.description import FEATURES, Description, Weights, evaluate
+from jaxdn.networks.onnx import Apply
+from jaxdn.ops import onednn_layers
+from jaxdn.ops import onednn_library as dnnl
+
+
+def available() -> bool:
+    """Whether oneDNN can be loaded, jax computes on the CPU, and the CPU multiplies numbers in bfloat16."""
+    return dnnl.available() and dnnl.computes_bfloat16()
+
+
+def check_available() -> None:
+    """Raise ValueError, with what to do, where the engine cannot run."""
+    try:
+        dnnl.check_available()
+    except ValueError as error:
+        raise ValueError(str(error).replace('"onednn"', '"onednn-bfloat16"', 1)) from error
+    if not dnnl.computes_bfloat16():
+        raise ValueError(
+            'implementation: "onednn-bfloat16" needs a CPU with AVX-512 BF16 or AMX; leave it None, or take '
+            '"onnxruntime".'
+        )
+
+
+class Value(NamedTuple):
+    """An array of a program."""
+
+    number: int
+    """Of the step that writes it; -1 for the input."""
+    channels: int
+    height: int
+    width: int
+
+
+class Step:
+    """One layer of a program."""
+
+    def __init__(self, kind: str, inputs: Sequence[Value], result: Value, kernel: Any = None, bias: Any = None) -> None:
+        self.kind, self.inputs, self.result, self.kernel, self.bias = kind, list(inputs), result, kernel, bias
+        self.slope: float | None = None
+        """Of the rectifier that is a part of it."""
+
+
+class Draft:
+    """The steps of a program (:class:`jaxdn.networks.description.Operations`)."""
+
+    def __init__(self) -> None:
+        self.steps: list[Step] = []
+
+    def _add(self, kind: str, inputs: Sequence[Value], channels: int, scale: float = 1.0, **weights: Any) -> Value:
+        height, width = (int(size * scale) for size in inputs[0][2:])
+        result = Value(len(self.steps), channels, height, width)
+        self.steps.append(Step(kind, inputs, result, **weights))
+        return result
+
+    def convolution(self, inputs: Sequence[Value], kernels: Sequence[np.ndarray], bias: np.ndarray) -> Value:
+        """Inputs are added one after the other; the bias comes with the last."""
+        total: list[Value] = []
+        for x, kernel in zip(inputs, kernels, strict=True):
+            last = bias if x is inputs[-1] else None
+            total = [self._add("convolution", [x, *total], kernel.shape[3], kernel=kernel, bias=last)]
+        return total[0]
+
+    def rectifier(self, x: Value, slope: float) -> Value:
+        """Of the convolution before."""
+        self.steps[x.number].slope = slope
+        return x
+
+    def pool(self, x: Value) -> Value:
+        """A step of its own."""
+        return self._add("pool", [x], x.channels, 0.5)
+
+    def enlarge(self, x: Value) -> Value:
+        """A step of its own."""
+        return self._add("enlarge", [x], x.channels, 2.0)
+
+
+class Program:
+    """The network with its weights, for one shape [N, H, W, c] of its features."""
+
+    def __init__(self, network: Description, weights: Weights, shape: Sequence[int]) -> None:
+        draft, self._count = Draft(), shape[0]
+        given = Value(-1, shape[3], shape[1], shape[2])
+        heads = evaluate(network, weights, {FEATURES: given}, draft)
+        self._memory: dict[int, c_void_p] = {-1: dnnl.memory(self._description(given, dnnl.BFLOAT16))}
+        self._free: list[np.ndarray] = []
+        self.bytes = 0
+        """Of all activations: what nobody reads any more is written over."""
+        self._arrays: dict[int, np.ndarray] = {}
+        self._kept: list[np.ndarray] = []
+        outputs = {head.number for head in heads}
+        last_use = {value.number: step.result.number for step in draft.steps for value in step.inputs}
+        self._primitives: list[dnnl.Primitive] = []
+        for step in draft.steps:
+            self._add(step, output=step.result.number in outputs)
+            for value in step.inputs:
+                if last_use[value.number] == step.result.number and value.number in self._arrays:
+                    self._free.append(self._arrays.pop(value.number))
+        self._scratch = np.empty(max(primitive.scratch_bytes for primitive in self._primitives), np.uint8)
+        for primitive in self._primitives:
+            dnnl.set_address(primitive.scratch, dnnl.address(self._scratch))
+        self._ends = [self._memory[-1], *(self._memory[head.number] for head in heads)]
+
+    def _description(self, value: Value, dtype: int) -> c_void_p:
+        return dnnl.images(self._count, value.height, value.width, value.channels, dtype)
+
+    def _add(self, step: Step, *, output: bool) -> None:
+        """The primitive of a step, on its memory: of what nobody reads any more, else new."""
+        result = self._description(step.result, dnnl.FLOAT32 if output else dnnl.BFLOAT16)
+        if len(step.inputs) > 1:
+            # The sum goes on in the memory of the sum so far.
+            before = step.inputs[1].number
+            self._memory[step.result.number] = self._memory[before]
+            if before in self._arrays:
+                self._arrays[step.result.number] = self._arrays.pop(before)
+        elif output:
+            self._memory[step.result.number] = dnnl.memory(result)
+        else:
+            array = self._room(2 * self._count * math.prod(step.result[1:]))
+            self._arrays[step.result.number] = array
+            self._memory[step.result.number] = dnnl.memory(result, dnnl.address(array))
+        source, target = self._memory[step.inputs[0].number], self._memory[step.result.number]
+        reads = self._description(step.inputs[0], dnnl.BFLOAT16)
+        if step.kind == "convolution":
+            after: Any = {"slope": step.slope, "adds": len(step.inputs) > 1}
+            placed = onednn_layers.convolution(reads, result, step.kernel, step.bias, **after)
+        else:
+            layer = onednn_layers.pooling if step.kind == "pool" else onednn_layers.enlarging
+            placed = layer(reads, result)
+        self._primitives.append(placed(source, target))
+
+    def _room(self, size: int) -> np.ndarray:
+        """The smallest piece of memory that nobody reads and that is large enough, else a new one."""
+        fitting = [index for index, array in enumerate(self._free) if array.size >= size]
+        if fitting:
+            return self._free.pop(min(fitting, key=lambda index: self._free[index].size))
+        self.bytes += size
+        array = np.empty(size, np.uint8)
+        self._kept.append(array)
+        return array
+
+    def __call__(self, features: int, heads: Sequence[int]) -> None:
+        """Run on addresses: of the features in bfloat16, and of the heads in float32."""
+        for memory, place in zip(self._ends, (features, *heads), strict=True):
+            dnnl.set_address(memory, place)
+        for primitive in self._primitives:
+            primitive()
+
+
+class Session:
+    """The program of one shape, made for the weights of its last call.
+
+    Every call compares its weights with those (by bytes, about a millisecond), which keeps the function pure.
+    """
+
+    def __init__(self, describe: Callable[[list[np.ndarray]], Program]) -> None:
+        self._describe = describe
+        self._weights: list[np.ndarray] = []
+        self._program: Any = None
+        self._lock = threading.Lock()
+
+    def __call__(self, context: Any, outputs: Sequence[Any], features: Any, *weights: Any) -> None:
+        """Fill ``outputs``; the arguments are views of XLA's own buffers."""
+        with self._lock:
+            given = [np.asarray(weight) for weight in weights]
+            if not _same(given, self._weights):
+                self._weights = [weight.copy() for weight in given]
+                self._program = self._describe(self._weights)
+            heads = [dnnl.address(np.asarray(output)) for output in outputs]
+            with dnnl.ALONE:
+                self._program(dnnl.address(np.asarray(features)), heads)
+
+
+def _same(new: Sequence[np.ndarray], old: Sequence[np.ndarray]) -> bool:
+    return len(new) == len(old) and all(
+        np.array_equal(one.view(np.int32), other.view(np.int32)) for one, other in zip(new, old, strict=True)
+    )
+
+
+def engine(network: Description, plain: Apply) -> Apply:
+    """``plain``, the network in XLA, run by oneDNN in bfloat16; the gradient is ``plain``'s.
+
+    Raises ValueError for features that are not float32.
+    """
+
+    @jax.custom_vjp
+    def run(weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:
+        leaves, tree = jax.tree.flatten(weights)
+        features = jnp.concatenate([group.astype(jnp.bfloat16) for group in groups], axis=-1)
+        shape = features.shape
+        session = Session(lambda leaves: Program(network, jax.tree.unflatten(tree, leaves), shape))
+        results = jax.eval_shape(plain, weights, groups)
+        return tuple(buffer_callback(session, results, vmap_method="sequential")(features, *leaves))
+
+    def forward(weights: Weights, groups: list[jax.Array]) -> tuple[Any, Any]:
+        return run(weights, groups), (weights, groups)
+
+    def backward(residuals: Any, cotangents: tuple[jax.Array, ...]) -> Any:
+        return jax.vjp(plain, *residuals)[1](cotangents)
+
+    run.defvjp(forward, backward)
+
+    def checked(weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:
+        dtype = jnp.result_type(*groups)
+        if dtype != jnp.float32:
+            raise ValueError(
+                f'implementation: "onednn-bfloat16" takes features in float32, got {dtype}; leave implementation or '
+                "compute_dtype None."
+            )
+        return run(weights, groups)
+
+    return checked
