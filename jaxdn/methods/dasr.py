@@ -40,8 +40,8 @@ class Options(Sampling):
     demodulate: Demodulation | bool = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     implementation: Literal["reference", "onednn-bfloat16", "onnxruntime", "onednn"] | None = None
-    """Engine of the U-Nets: XLA, or on CPUs ONNX Runtime or oneDNN in bfloat16 (inference) or oneDNN (training). None is
-    XLA."""
+    """Engine of the U-Nets: XLA, or on CPUs ONNX Runtime or oneDNN in bfloat16 (inference), or oneDNN (training). None
+    is XLA."""
 
     def __post_init__(self) -> None:
         if self.least < 1:

@@ -91,8 +91,8 @@ class Options:
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Precision of the U-Net only; None is the images' dtype."""
     implementation: Literal["reference", "onednn-bfloat16", "onnxruntime", "onednn"] | None = None
-    """Engine of the U-Net: XLA, or on CPUs ONNX Runtime (inference; the extra ``onnx``), oneDNN in bfloat16 (inference) or in
-    float32 (training; both the extra ``onednn``). None is XLA."""
+    """Engine of the U-Net: XLA, or on CPUs ONNX Runtime (inference; the extra ``onnx``) or oneDNN, in bfloat16
+    (inference) or in float32 (training; both the extra ``onednn``). None is XLA."""
 
 
 AS_PUBLISHED: dict[str, Any] = {

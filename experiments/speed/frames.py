@@ -1,0 +1,108 @@
+"""What a frame costs: shipped methods in each of their engines, and Open Image Denoise, at one or several sizes.
+
+    python -m experiments.speed.frames                                             # 1280 x 720
+    python -m experiments.speed.frames --sizes 256x144 1280x720 3840x2160 --methods steady-balanced svgf
+
+Each implementation has a process of its own and runs in turns with the others (:mod:`experiments.speed.workers`).
+Prints a table for each size: the median of the turns in milliseconds, its ratio to Open Image Denoise's, nanoseconds per
+pixel; writes ``runs/frames.json``.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from experiments.speed import peers
+from experiments.speed.timing import Call
+from experiments.speed.workers import Team
+from experiments.speed.works.steps import frame_of, oidn_high, recurrent
+from jaxdn.candidates import candidate
+from jaxdn.commands.errors import plain_errors
+from jaxdn.files import write_json
+from jaxdn.networks.engines import ENGINES
+
+OIDN = "Open Image Denoise high"
+
+
+@dataclass
+class Settings:
+    """Time single frames of shipped methods, in turns with Open Image Denoise; write runs/frames.json."""
+
+    methods: list[str] = field(default_factory=lambda: ["steady-balanced", "steady-fast", "svgf"])
+    sizes: list[str] = field(default_factory=lambda: ["1280x720"])
+    """WIDTHxHEIGHT in pixels."""
+    rounds: int = 7
+    """Turns of each implementation."""
+    out: Path = Path("runs/frames.json")
+
+
+def ours(name: str, engine: str | None, height: int, width: int) -> Call:
+    """The compiled step of a method, with its own state, on an engine; None is XLA."""
+    found, frame = candidate(name, **({} if engine is None else {"implementation": engine})), frame_of(height, width)
+    assert found.denoiser is not None
+    return recurrent(found.denoiser, found.params, frame)
+
+
+def builds(names: list[str], height: int, width: int) -> dict[str, Callable[[], Call]]:
+    """Label -> its call, for every engine for inference that a method has and that runs here. Raises ValueError."""
+    found: dict[str, Callable[[], Call]] = {}
+    for name in names:
+        one = candidate(name)
+        if one.denoiser is None or one.method is None:
+            raise ValueError(f"--methods {name}: expected a denoiser, got the noisy image.")
+        engines = [each for each in one.method.engines if ENGINES[each].purpose == "inference"]
+        for engine in [None, *(each for each in engines if ENGINES[each].available())]:
+            found[f"{name}, {engine or 'xla'}"] = partial(ours, name, engine, height, width)
+    if "pyoidn" not in peers.missing():
+        found[OIDN] = partial(oidn_high, height, width)
+    return found
+
+
+def measured(names: list[str], height: int, width: int, *, rounds: int, say: Callable[[str], None]) -> dict[str, float]:
+    """Label -> milliseconds of a frame, the median of its turns."""
+    with Team(f"{width} x {height}", say) as team:
+        team.start(builds(names, height, width))
+        turns = team.turns(rounds=rounds, budget_s=float("inf"))
+    return {label: float(np.median(samples)) for label, samples in turns.items()}
+
+
+def parsed(size: str) -> tuple[int, int]:
+    """Height and width. Raises ValueError for another form."""
+    width, _, height = size.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise ValueError(f"--sizes {size}: expected WIDTHxHEIGHT in pixels, such as 1280x720.")
+    return int(height), int(width)
+
+
+def table(title: str, found: Mapping[str, float], pixels: int) -> Table:
+    """The figures of one size."""
+    shown = Table(title=title)
+    for column in ("method, engine", "ms", f"of {OIDN}", "ns per pixel"):
+        shown.add_column(column, justify="left" if column.startswith("method") else "right")
+    for label, ms in found.items():
+        ratio = f"{ms / found[OIDN]:.2f}" if OIDN in found else ""
+        shown.add_row(label, f"{ms:,.1f}", ratio, f"{1e6 * ms / pixels:,.0f}")
+    return shown
+
+
+def main(settings: Settings) -> None:
+    """Measure, print, save."""
+    console, rows = Console(), []  # type: Console, list[dict[str, Any]]
+    sizes = [parsed(size) for size in settings.sizes]
+    for height, width in sizes:
+        found = measured(settings.methods, height, width, rounds=settings.rounds, say=console.print)
+        console.print(table(f"{width} x {height}", found, height * width))
+        rows += [{"width": width, "height": height, "implementation": name, "ms": ms} for name, ms in found.items()]
+        settings.out.parent.mkdir(parents=True, exist_ok=True)
+        write_json(settings.out, rows)
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Settings, description=Settings.__doc__))

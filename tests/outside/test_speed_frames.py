@@ -1,0 +1,37 @@
+"""The script that times single frames: what it times, and what it refuses."""
+
+import json
+
+import pytest
+
+from experiments.speed.frames import OIDN, Settings, builds, main, parsed
+from jaxdn.networks.engines import ENGINES
+
+
+def test_every_engine_for_inference_that_runs_here_is_timed():
+    engines = [name for name in ("onednn-bfloat16", "onnxruntime") if ENGINES[name].available()]
+    found = set(builds(["svgf", "steady-fast"], 32, 48)) - {OIDN}
+    assert found == {"svgf, xla", "steady-fast, xla", *(f"steady-fast, {name}" for name in engines)}
+
+
+@pytest.mark.slow
+def test_figures_are_printed_and_saved(tmp_path, capsys):
+    main(Settings(["taa"], ["48x32"], 2, tmp_path / "frames.json"))
+    rows = json.loads((tmp_path / "frames.json").read_text())
+    (own,) = [row for row in rows if row["implementation"] == "taa, xla"]
+    assert (own["width"], own["height"]) == (48, 32)
+    assert own["ms"] > 0
+    printed = capsys.readouterr().out
+    assert "taa, xla" in printed
+    assert f"{1e6 * own['ms'] / (48 * 32):,.0f}" in printed
+
+
+@pytest.mark.parametrize("size", ["720", "1280x", "0x720", "1280x720x3", "axb"])
+def test_other_sizes_are_refused(size):
+    with pytest.raises(ValueError, match="expected WIDTHxHEIGHT in pixels, such as 1280x720"):
+        parsed(size)
+
+
+def test_the_noisy_image_has_no_time():
+    with pytest.raises(ValueError, match="expected a denoiser, got the noisy image"):
+        builds(["noisy"], 32, 48)
