@@ -4,7 +4,7 @@
     python -m experiments.speed.frames --sizes 256x144 1280x720 3840x2160 --methods steady-balanced svgf
 
 Each implementation has a process of its own and runs in turns with the others (:mod:`experiments.speed.workers`).
-Prints a table for each size: the median of the turns in milliseconds, its ratio to Open Image Denoise's, nanoseconds per
+Prints a table for each size: the median of the turns in milliseconds, its ratio to Open Image Denoise, nanoseconds per
 pixel; writes ``runs/frames.json``.
 """
 
