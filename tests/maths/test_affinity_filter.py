@@ -9,6 +9,8 @@ from jax.test_util import check_grads
 from jaxdn.ops import affinity_filter as module
 from jaxdn.ops.affinity_filter import SPLINE, Guide, affinity_filter
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 
 def drawn(rng, height=9, width=11, *, features=3, channels=2):
     image = rng.normal(size=(channels, height, width))

@@ -10,6 +10,8 @@ from jaxdn.filters.disc import TAPS, disc_average, rotations
 from jaxdn.filters.stabilisation import stabilise
 from jaxdn.filters.weights import closeness_weight, depth_weight, normal_weight
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 HEIGHT, WIDTH = 9, 11
 

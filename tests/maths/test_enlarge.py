@@ -9,6 +9,8 @@ from jaxdn.filters import enlarge as module
 from jaxdn.filters.enlarge import enlarge
 from jaxdn.ops.affinity_filter import Guide
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 
 def drawn(rng, height=5, width=6, *, features=2):
     def guide(*size):

@@ -12,6 +12,8 @@ from jaxdn.ops.kernels import apply_kernels, normalize_kernels
 from jaxdn.ops.softmax_filter import softmax_filter
 from jaxdn.scales import compose_scales, downsample, fill, upsample
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 SCALES = [(down, up) for down in ("mean", "max") for up in ("bilinear", "nearest")]
 
 

@@ -11,6 +11,8 @@ from jax.test_util import check_grads
 from jaxdn import metrics
 from jaxdn.flip import flip_map
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 SHAPE = (3, 14, 17, 3)
 
 METRICS = {

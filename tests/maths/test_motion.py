@@ -8,6 +8,8 @@ import pytest
 from jaxdn.motion import dual_motion, occlusion_mask
 from jaxdn.ops.warp import warp
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 SIZE = 24
 
 

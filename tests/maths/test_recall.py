@@ -12,6 +12,8 @@ from jaxdn.filters.recall import recall
 from jaxdn.frame import Frame
 from jaxdn.ops.strips import by_strips
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 HEIGHT, WIDTH = 7, 9
 
 

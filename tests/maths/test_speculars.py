@@ -12,6 +12,8 @@ from jaxdn.filters.history_fix import fix_history
 from jaxdn.filters.virtual import closeness, diffuseness, virtual_motion
 from jaxdn.filters.weights import lobe_weight, normal_weight, roughness_weight
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 FOCAL, SIZE = 160.0, np.array([320.0, 180.0])
 
 
