@@ -51,7 +51,7 @@ def test_gradients(step, rng, x64):
     def filtered(image, *guide):
         return affinity_filter(image, Guide(*guide), step=step)
 
-    check_grads(filtered, tuple(map(jnp.asarray, drawn(rng))), order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
+    check_grads(jax.jit(filtered), tuple(map(jnp.asarray, drawn(rng))), order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
 
 
 def test_a_plane_that_recedes_is_one_surface_and_two_planes_are_not(rng):

@@ -1,5 +1,6 @@
 """Joint bilateral upsampling against its formula in float64."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -57,7 +58,7 @@ def test_gradients(rng, x64):
         return enlarge(coarse, Guide(*parts[:3]), Guide(*parts[3:], jnp.ones(here.confidence.shape)))
 
     arguments = tuple(map(jnp.asarray, (coarse, *there, *here[:2])))
-    check_grads(enlarged, arguments, order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
+    check_grads(jax.jit(enlarged), arguments, order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
 
 
 def test_a_fine_pixel_that_nothing_resembles_has_no_weight(rng):

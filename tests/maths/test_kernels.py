@@ -128,7 +128,7 @@ def test_gradients_of_kernel_application(rng):
 
         return jax.lax.scan(again, image, length=2)[0]
 
-    check_grads(filtered, (image, logits), order=1, modes=["rev"])
+    check_grads(jax.jit(filtered), (image, logits), order=1, modes=["rev"])
 
 
 def test_bilinear_upsampling_is_a_resize(rng):
@@ -176,7 +176,7 @@ def test_composition_is_the_formula(down, up, alpha_size, rng):
     out = compose_scales(fine, coarse, alpha, down=down, up=up)
     np.testing.assert_allclose(out, expected, atol=1e-12)
     check_grads(
-        lambda *arrays: jnp.sin(compose_scales(*arrays, down=down, up=up)),
+        jax.jit(lambda *arrays: jnp.sin(compose_scales(*arrays, down=down, up=up))),
         tuple(map(jnp.asarray, (fine, coarse, alpha))),
         order=1,
         modes=["rev"],
@@ -223,7 +223,7 @@ def test_fill_takes_the_mean_of_known_neighbours(rng: np.random.Generator) -> No
                 means += [image[block][inside].astype(np.float64).mean(0)] if inside.any() else []
             expected = means[0] if means else 0.0
         np.testing.assert_allclose(found[y, x], expected, rtol=1e-5)
-    slope = jax.grad(lambda x: jnp.sum(fill(x, known) ** 2))(jnp.asarray(image))
+    slope = jax.jit(jax.grad(lambda x: jnp.sum(fill(x, known) ** 2)))(jnp.asarray(image))
     np.testing.assert_array_equal(np.where(known, 0, slope), 0)  # what is not known has no say
     with pytest.raises(ValueError, match="even"):
         fill(np.zeros((6, 8, 3), np.float32), np.ones((6, 8, 1), bool))

@@ -248,21 +248,21 @@ def test_gradients(x64, rng):
             def alpha(data, shadowing=shadowing, lobe=lobe):
                 return microfacets.fit_alpha(microfacets.extract_distribution(data, shadowing=shadowing), lobe=lobe)
 
-            check_grads(alpha, [data], order=1, modes=["rev"], atol=1e-5, rtol=1e-4)
+            check_grads(jax.jit(alpha), [data], order=1, modes=["rev"], atol=1e-5, rtol=1e-4)
     difference = np.array([0.1, 0.7, 1.2])
     brdf = rng.uniform(0.0, 0.1, (3, 16, 2))
 
     def fresnel(brdf, data):
         return microfacets.extract_fresnel(brdf, jnp.asarray(difference), microfacets.extract_distribution(data))
 
-    check_grads(fresnel, [brdf, data], order=1, modes=["rev"], atol=1e-5, rtol=1e-4)
+    check_grads(jax.jit(fresnel), [brdf, data], order=1, modes=["rev"], atol=1e-5, rtol=1e-4)
     half, roughness = rng.normal(0, 0.3, (2, 3, 3)) + [0, 0, 1], rng.uniform(0.2, 0.9, (2, 3, 1))
     for lobe in microfacets.LOBES:
 
         def d(half, roughness, lobe=lobe):
             return microfacets.distribution(half, roughness, lobe=lobe)
 
-        check_grads(d, [half, roughness], order=1, modes=["rev"], atol=1e-5, rtol=1e-4)
+        check_grads(jax.jit(d), [half, roughness], order=1, modes=["rev"], atol=1e-5, rtol=1e-4)
 
 
 def test_wrong_shapes_and_options_raise():

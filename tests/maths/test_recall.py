@@ -1,5 +1,7 @@
 """The recalled history against loops over pixels in float64, its gradient, and what is no history."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,7 +60,13 @@ def by_loops(history, frame, *, around=False):
 
 def recalled(history, frame, *, first=False, around=False):
     frame = jax.tree.map(jnp.asarray, frame)
-    return recall(jnp.asarray(history), guides_of(frame), frame, jnp.asarray(first), around=around)
+    return program(around, module._STRIP)(jnp.asarray(history), guides_of(frame), frame, jnp.asarray(first))
+
+
+@functools.cache
+def program(around, strip):
+    """``recall``, compiled once for each set of buffers while a strip has so many pixels."""
+    return jax.jit(lambda *given: recall(*given, around=around))
 
 
 @pytest.mark.parametrize("around", [False, True])
@@ -88,17 +96,21 @@ def test_its_gradient(around, rng, x64):
 def test_an_image_smaller_than_the_places_around(rng, x64):
     history, frame = drawn(rng)
     small = jax.tree.map(lambda one: one[:2, :2], frame)._replace(ids=np.array([[[0], [1]], [[1], [1]]]))
+
+    @jax.jit
+    @functools.partial(jax.grad, has_aux=True)
+    def summed(history, *rest):
+        found = recall(history, *rest, around=True)
+        return found.history.sum(), found
+
     for vector in ([0.0, 0.0], [0.4, 0.0], [-0.6, 0.7]):
         moving = small._replace(motion=np.broadcast_to(np.array(vector), (2, 2, 2)), depth=None, normal=None)
         before = guides_of(moving)._replace(ids=jnp.array([[[1.0], [1]], [[1], [0]]]))
         rest = before, jax.tree.map(jnp.asarray, moving), jnp.asarray(False)
-        found = recall(jnp.asarray(history[:2, :2]), *rest, around=True)
+        slope, found = summed(jnp.asarray(history[:2, :2]), *rest)
         assert found.valid.all()  # every place is near
         np.testing.assert_array_equal(found.history[0, 0], history[1, 1])  # the only pixel of its kind
-        gradient = jax.grad(lambda x, rest=rest: recall(x, *rest, around=True).history.sum())(
-            jnp.asarray(history[:2, :2])
-        )
-        np.testing.assert_allclose(gradient.sum(), 8.0)
+        np.testing.assert_allclose(slope.sum(), 8.0)
 
 
 def test_around_a_pixel_that_shows_something_else(rng, x64):
