@@ -128,16 +128,17 @@ def test_samples_learn_to_go_where_noise_is(name, rng, key):
 
 
 def test_the_amplitude_slope_is_half_of_the_mixing_slope(rng, key):
-    clip = clip_of(rng)
+    clip = clip_of(rng, 2)
     slopes = []
     for slope in ("mixing", "amplitude"):
         denoiser = ntasd(size=TINY, slope=slope)
         params = varied(denoiser, clip, key)
 
-        def loss(params, denoiser=denoiser):
+        def loss(sampler, denoiser=denoiser, params=params):
+            params = params | {"sampler": sampler}
             return jnp.mean(unroll(denoiser, params, clip.frames, clip.layers, clip.reference)[1])
 
-        slopes.append(jax.tree.leaves(jax.jit(jax.grad(loss))(params)["sampler"]))
+        slopes.append(jax.tree.leaves(jax.jit(jax.grad(loss))(params["sampler"])))
     largest = max(np.abs(leaf).max() for leaf in slopes[0])
     assert largest > 0
     for whole, half in zip(*slopes, strict=True):

@@ -1,5 +1,7 @@
 """The recurrent autoencoder, alone and behind the accumulation: its network against NumPy, what it remembers."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -47,7 +49,24 @@ def varied(denoiser: Denoiser, frames: Frame, key: jax.Array) -> Any:
 
 
 def images_of(denoiser: Denoiser, params: Any, frames: Frame) -> np.ndarray:
-    return np.asarray(jax.jit(lambda params, frames: unroll(denoiser, params, frames))(params, frames))
+    return np.asarray(compiled(denoiser)(params, frames))
+
+
+@functools.cache
+def compiled(denoiser: Denoiser) -> Callable[[Any, Frame], jax.Array]:
+    """Images of params and frames, compiled once for each set of buffers."""
+    return jax.jit(functools.partial(unroll, denoiser))
+
+
+@functools.cache
+def plain() -> Denoiser:
+    """Once: what is compiled is kept by denoiser."""
+    return rae(**PLAIN)
+
+
+@functools.cache
+def tiny() -> Denoiser:
+    return rae(size=TINY)
 
 
 # The network in NumPy, in float64.
@@ -87,7 +106,7 @@ def numpy_compress(x: np.ndarray) -> np.ndarray:
 
 
 def test_three_frames_are_those_of_the_numpy_network(rng, key):
-    frames, denoiser = clip_of(rng), rae(**PLAIN)
+    frames, denoiser = clip_of(rng), plain()
     params = varied(denoiser, frames, key)
     found = images_of(denoiser, params, frames)
     states = [np.zeros((12 >> stage, 16 >> stage, channels)) for stage, channels in enumerate(TINY[0])]
@@ -110,7 +129,7 @@ def test_it_has_the_weights_of_the_published_layout(key):
 
 
 def test_an_absent_buffer_is_neutral(rng, key):
-    frames, denoiser = clip_of(rng), rae(**PLAIN)
+    frames, denoiser = clip_of(rng), plain()
     params = varied(denoiser, frames, key)
     absent = frames._replace(normal=None, depth=None, roughness=None)
     neutral = frames._replace(
@@ -120,7 +139,7 @@ def test_an_absent_buffer_is_neutral(rng, key):
 
 
 def test_it_remembers_what_it_saw_until_it_starts_again(rng, key):
-    frames, denoiser = clip_of(rng), rae(**PLAIN)
+    frames, denoiser = clip_of(rng), plain()
     params = varied(denoiser, frames, key)
     together = images_of(denoiser, params, frames)
     alone = images_of(denoiser, params, jax.tree.map(lambda buffer: buffer[2:], frames))
@@ -131,7 +150,7 @@ def test_it_remembers_what_it_saw_until_it_starts_again(rng, key):
 
 
 def test_a_frame_of_another_size_is_refused(rng, key):
-    frames, denoiser = clip_of(rng), rae(**PLAIN)
+    frames, denoiser = clip_of(rng), plain()
     params, first = varied(denoiser, frames, key), frame_at(frames, 0)
     state = denoiser.start(params, first)
     larger = frame_at(clip_of(rng, 1, (40, 40)), 0)
@@ -141,15 +160,15 @@ def test_a_frame_of_another_size_is_refused(rng, key):
 
 @pytest.mark.parametrize("gain", [1 / 64, 64.0])
 def test_brighter_light_gives_the_same_picture(gain, rng, key):
-    frames, denoiser = clip_of(rng), rae(size=TINY)
+    frames, denoiser = clip_of(rng), tiny()
     params = varied(denoiser, frames, key)
-    plain = images_of(denoiser, params, frames)
+    usual = images_of(denoiser, params, frames)
     bright = images_of(denoiser, params, frames._replace(radiance=gain * frames.radiance))
-    assert np.mean(np.abs(bright / gain - plain)) < 0.01 * np.mean(plain)
+    assert np.mean(np.abs(bright / gain - usual)) < 0.01 * np.mean(usual)
 
 
 def test_the_sky_passes_through_and_gives_nothing(rng, key):
-    frames, denoiser = clip_of(rng), rae(size=TINY)
+    frames, denoiser = clip_of(rng), tiny()
     sky = jnp.arange(SIZE[1])[None, None, :, None] < 4
     frames = frames._replace(depth=jnp.where(sky, FAR, frames.depth), albedo=None)
     params = varied(denoiser, frames, key)
@@ -162,7 +181,7 @@ def test_the_sky_passes_through_and_gives_nothing(rng, key):
 
 
 def test_a_hidden_state_that_overflows_does_not_stay(rng, key):
-    frames, denoiser = clip_of(rng), rae(**PLAIN)
+    frames, denoiser = clip_of(rng), plain()
     params, first = varied(denoiser, frames, key), frame_at(frames, 0)
     state = denoiser.start(params, first)
     worst = zip(state.core, (np.nan, 1e30, 0.0), strict=True)
@@ -173,7 +192,7 @@ def test_a_hidden_state_that_overflows_does_not_stay(rng, key):
 
 
 def test_gradients_flow_through_the_hidden_states(rng, key):
-    frames, denoiser = clip_of(rng, 2, (4, 8)), rae(**PLAIN)
+    frames, denoiser = clip_of(rng, 2, (4, 8)), plain()
     with jax.enable_x64(True):
         frames = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), frames)
         params = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), varied(denoiser, frames, key))
@@ -184,7 +203,7 @@ def test_gradients_flow_through_the_hidden_states(rng, key):
             radiance = jnp.concatenate([light[None], frames.radiance[1:]])
             return jnp.sum(unroll(denoiser, params, frames._replace(radiance=radiance))[1])
 
-        assert np.abs(jax.grad(from_first)(frames.radiance[0])).max() > 0
+        assert np.abs(jax.jit(jax.grad(from_first))(frames.radiance[0])).max() > 0
 
 
 def test_the_accumulation_gives_it_the_mean_of_all_frames(rng, key):

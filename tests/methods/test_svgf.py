@@ -1,5 +1,7 @@
 """SVGF against a float64 reference written pixel by pixel, and what must hold for any filter of its kind."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,10 +16,13 @@ from jaxdn.methods.svgf import svgf
 from jaxdn.methods.table import methods
 from jaxdn.rollout import denoise
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 HEIGHT, WIDTH = 10, 12
 DENOISER = svgf(preset="paper", levels=3)
 STEP = jax.jit(DENOISER.step)
+LEARNING = svgf(levels=3)
 
 
 def moving_frames(rng, count=3, dtype=np.float32):
@@ -292,12 +297,16 @@ def test_strips_of_a_cascade_do_not_show(rng, monkeypatch, masked):
         taps = stencil(2, kernel=B3_SPLINE)
         return jnp.stack(cascade(color, color[0] ** 2, hit, lambda level: weights, taps, **options))
 
-    whole, slope = jax.vjp(filtered, color)
-    away = jnp.asarray(rng.random(whole.shape), jnp.float32)
+    def with_slope(color, away):
+        image, pull = jax.vjp(filtered, color)
+        return image, pull(away)[0]
+
+    away = jnp.asarray(rng.random(jax.eval_shape(filtered, color).shape), jnp.float32)
+    whole, slope = jax.jit(lambda *given: with_slope(*given))(color, away)
     monkeypatch.setattr("jaxdn.filters.canvas._STRIP_PIXELS", 1)
-    strips, slope_of_strips = jax.vjp(filtered, color)
+    strips, slope_of_strips = jax.jit(lambda *given: with_slope(*given))(color, away)
     np.testing.assert_allclose(strips, whole, rtol=1e-5, atol=1e-7)
-    np.testing.assert_allclose(slope_of_strips(away)[0], slope(away)[0], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(slope_of_strips, slope, rtol=1e-4, atol=1e-5)
     if masked:
         np.testing.assert_array_equal(strips[0][:, ~hit], 0)
 
@@ -439,10 +448,15 @@ def test_a_clip_is_one_program_and_vmap_is_a_loop(rng):
         np.testing.assert_allclose(both[index], alone, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.slow
 def clip_of(frames, dtype=np.float32):
     stacked = jax.tree.map(lambda *each: np.stack(each), *[frame._replace(motion=None) for frame in frames])
     return Clip(jax.tree.map(lambda a: a.astype(dtype) if a.dtype.kind == "f" else a, stacked))
+
+
+@functools.cache
+def compiled_denoise(denoiser):
+    """Images of params and a clip."""
+    return jax.jit(functools.partial(denoise, denoiser))
 
 
 def test_a_lamp_that_reflects_nothing_stays_bright(rng):
@@ -461,29 +475,31 @@ def test_a_lamp_that_reflects_nothing_stays_bright(rng):
 
 
 def test_params_before_training_change_nothing(rng):
-    clip = clip_of(moving_frames(rng))
-    denoiser = svgf(levels=3)
+    clip, denoiser = clip_of(moving_frames(rng)), LEARNING
     params = denoiser.init(jax.random.key(0), moving_frames(rng, 1)[0])
     assert params["sigma_normal"].shape == (3,)
-    np.testing.assert_allclose(denoise(denoiser, params, clip), denoise(denoiser, {}, clip), rtol=2e-5, atol=1e-6)
+    image, plain = (compiled_denoise(denoiser)(given, clip) for given in (params, {}))
+    np.testing.assert_allclose(image, plain, rtol=2e-5, atol=1e-6)
 
 
 def test_params_are_the_options_that_they_stand_for(rng):
     clip = clip_of(moving_frames(rng))
     factors = {"alpha": 3.0, "sigma_depth": 2.0, "sigma_normal": 0.5, "sigma_luminance": 0.25}
     params = {name: jnp.log(jnp.full(() if name == "alpha" else (3,), factor)) for name, factor in factors.items()}
-    found = denoise(svgf(levels=3), params, clip)
+    found = compiled_denoise(LEARNING)(params, clip)
     alpha = 3 * 0.2 / (3 * 0.2 + 0.8)  # odds three times as high
     wanted = svgf(levels=3, alpha=alpha, sigma_depth=2.0, sigma_normal=8.0, sigma_luminance=1.0)
-    np.testing.assert_allclose(found, denoise(wanted, {}, clip), rtol=2e-5, atol=1e-6)
+    np.testing.assert_allclose(found, compiled_denoise(wanted)({}, clip), rtol=2e-5, atol=1e-6)
 
 
 def test_every_level_has_its_own_params(rng):
     clip = clip_of(moving_frames(rng))
-    denoiser, plain = svgf(levels=3), denoise(svgf(levels=3), {}, clip)
+    run, begun = compiled_denoise(LEARNING), LEARNING.init(jax.random.key(0), frame_at(clip.frames, 0))
+    plain = run({}, clip)
     for name in ("sigma_depth", "sigma_normal", "sigma_luminance"):
         for level in range(3):
-            image = denoise(denoiser, {name: jnp.zeros(3).at[level].set(1.0)}, clip)
+            # The other params as they begin, which changes nothing: then all of them share a program.
+            image = run(begun | {name: jnp.zeros(3).at[level].set(1.0)}, clip)
             assert float(jnp.max(jnp.abs(image - plain))) > 1e-4, (name, level)
 
 
@@ -491,7 +507,8 @@ def test_gradients_of_params(rng, x64):
     clip = clip_of(moving_frames(rng), np.float64)
     denoiser = svgf(levels=2)
     params = denoiser.init(jax.random.key(0), frame_at(clip.frames, 0))
-    check_grads(lambda params: jnp.mean(denoise(denoiser, params, clip)), (params,), 1, ["rev"], eps=1e-5)
+    mean = jax.jit(lambda params: jnp.mean(denoise(denoiser, params, clip)))
+    check_grads(mean, (params,), 1, ["rev"], eps=1e-5)
 
 
 def test_gradients_are_finite(rng):
@@ -500,16 +517,17 @@ def test_gradients_are_finite(rng):
     black = [frame._replace(radiance=frame.radiance * (frame.ids != 3)) for frame in frames]
     names = ("radiance", "albedo", "normal", "depth", "previous_depth")
 
-    def loss(given):
-        state = denoiser.start({}, black[0])
-        for frame, buffers in zip(black, given, strict=True):
-            state, image = denoiser.step({}, state, frame._replace(**buffers))
-        return jnp.sum(image**2)
+    stacked = jax.tree.map(lambda *each: jnp.stack(each), *black)
 
-    given = [{name: jnp.asarray(getattr(frame, name)) for name in names} for frame in black]
-    gradient = jax.jit(jax.grad(loss))(given)
+    def loss(given):
+        # A scan, as in `denoise`: the step is compiled once for both frames.
+        clip = stacked._replace(**given)
+        images = jax.lax.scan(functools.partial(denoiser.step, {}), denoiser.start({}, black[0]), clip)[1]
+        return jnp.sum(images[-1] ** 2)
+
+    gradient = jax.jit(jax.grad(loss))({name: getattr(stacked, name) for name in names})
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
-    assert all(float(jnp.abs(each["radiance"]).max()) > 0 for each in gradient)
+    assert all(float(jnp.abs(each).max()) > 0 for each in gradient["radiance"])
 
 
 def test_double_precision_stays_double(x64, rng):
@@ -574,10 +592,11 @@ def test_guides_that_come_and_go_are_not_tested_against_other_guides(rng):
     frame = moving_frames(rng, 1)[0]._replace(motion=None, previous_depth=None, depth=None, ids=None)
     near = np.full((HEIGHT, WIDTH, 1), 2.0, np.float32)
     frames = [frame._replace(depth=near), frame._replace(ids=np.full((HEIGHT, WIDTH, 1), 7, np.int32)), frame]
-    denoiser, lengths = svgf(demodulate="none"), []
-    state = denoiser.start({}, frames[0])
+    # Of histories alone: what is filtered after them does not change their length.
+    denoiser, lengths = svgf(demodulate="none", levels=0, feedback_level=0, short_history=0), []
+    step, state = jax.jit(denoiser.step), denoiser.start({}, frames[0])
     for each in frames:
-        state, _ = denoiser.step({}, state, each)
+        state, _ = step({}, state, each)
         lengths.append(state.core.history[..., 5])
     np.testing.assert_array_equal(lengths[1], 2)  # every pixel has found its history
     np.testing.assert_array_equal(lengths[2], 3)
