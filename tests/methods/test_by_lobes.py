@@ -204,6 +204,7 @@ def test_pixels_without_a_surface_pass_through(kind, rng):
     np.testing.assert_array_equal(run(kind.denoiser, [sky])[1][0], frame.radiance)
 
 
+@pytest.mark.slow  # test_fitted.py has the gradient by params of both
 def test_gradients_reach_both_kinds_of_light(kind, x64, rng):
     frames = scene(rng, 2, np.float64)
     weights = np.cos(np.arange(HEIGHT * WIDTH * 3)).reshape(HEIGHT, WIDTH, 3)

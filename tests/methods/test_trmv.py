@@ -61,14 +61,12 @@ def test_without_buffers_of_its_own_it_is_svgf(rng, by):
 @pytest.mark.parametrize(
     "names",
     [
+        # Two at once where each is read by a part of light of its own: a step takes ten seconds to compile.
         ("shadowed", "unshadowed"),
-        ("unshadowed",),
+        ("unshadowed", "glossy_motion"),
         ("specular",),
-        ("specular", "specular_reflectance"),
-        ("shadow_motion",),
-        ("glossy_motion",),
-        ("dual_motion",),
-        ("roughness",),
+        ("specular", "specular_reflectance", "dual_motion"),
+        ("shadow_motion", "roughness"),
         ("motion", "dual_motion", "shadow_motion", "glossy_motion", "previous_depth"),
         ("albedo", "reflectance", "specular_reflectance"),
     ],
@@ -171,6 +169,7 @@ def test_pixels_without_a_surface_pass_through(rng):
     np.testing.assert_array_equal(run(DENOISER, [frame])[1][0][0], frame.radiance[0])
 
 
+@pytest.mark.slow  # test_fitted.py has the gradient by params
 def test_gradients_reach_every_part_of_light(x64, rng):
     frames = all_light(rng, 2, np.float64)
     weights = np.cos(np.arange(HEIGHT * WIDTH * 3)).reshape(HEIGHT, WIDTH, 3)
