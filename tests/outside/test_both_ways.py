@@ -23,6 +23,8 @@ from tests.learning.test_training import make_clip
 from tests.outside.programs import PROGRAMS, truth, write_shot
 from tests.outside.test_frames import part_of
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 
 def frame_of(index: int, **changes: Any) -> Frame:
     """The scene of the programs' files as a frame of ours."""

@@ -1,4 +1,8 @@
-"""The command line in real processes: messages instead of tracebacks, exit code 2, complete files."""
+"""The command line: messages instead of tracebacks, exit code 2, complete files.
+
+Every kind of run is in a real process once; what is told about wrong arguments, which are many, is not: a process needs
+seconds to begin.
+"""
 
 import json
 import os
@@ -21,6 +25,8 @@ from jaxdn.methods.table import methods
 from jaxdn.weights import shipped_names
 from tests.learning.test_training import make_clip
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 
 def jaxdn(*arguments, timeout=300):
     return subprocess.run(
@@ -38,6 +44,16 @@ def fails(*arguments):
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stdout + done.stderr
     return " ".join((done.stdout + done.stderr).split())
+
+
+def told_here(capsys, *arguments):
+    """The same in this process, which an error that the command does not catch would leave."""
+    with pytest.raises(SystemExit) as ended:
+        cli.main([*map(str, arguments)])
+    shown = capsys.readouterr()
+    assert ended.value.code == 2, shown.err
+    assert "Traceback" not in shown.out + shown.err
+    return " ".join((shown.out + shown.err).split())
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +84,20 @@ def shot(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("verb", [(), ("inspect",), ("render",), ("train",), ("denoise",), ("compare",)])
-def test_help_shows_examples(verb):
-    done = jaxdn(*verb, "--help")
+def test_help_of_the_program():
+    done = jaxdn("--help")
     assert done.returncode == 0
     assert "jaxdn" in done.stdout
-    if verb:
-        assert "For example" in done.stdout
+
+
+@pytest.mark.parametrize("verb", ["inspect", "render", "train", "denoise", "compare"])
+def test_help_shows_examples(verb, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main([verb, "--help"])
+    assert ended.value.code == 0
+    shown = capsys.readouterr().out
+    assert "jaxdn" in shown
+    assert "For example" in shown
 
 
 def test_denoise_adds_direct_and_emitted_light_back(clip, tmp_path):
@@ -168,8 +191,7 @@ def test_a_layer_named_on_the_command_line_is_the_buffer(shot, tmp_path):
     checks = np.where(np.indices((24, 32)).sum(axis=0) // 3 % 2 == 0, 0.9, 0.1)
     errors = []
     for name, options in (("without", ()), ("with", ("--channels", "albedo=Paint"))):
-        done = jaxdn("denoise", shot, "-o", tmp_path / name, "--method", "svgf", *options)
-        assert done.returncode == 0, done.stderr
+        cli.main(["denoise", str(shot), "-o", str(tmp_path / name), "--method", "svgf", *options])
         with OpenEXR.File(str(tmp_path / name / "shot_0001.exr"), separate_channels=True) as file:
             errors.append(np.abs(file.channels()["G"].pixels - checks).mean())
     assert errors[1] < 0.5 * errors[0]
@@ -259,11 +281,15 @@ def test_compare_ends_with_a_report(clip, tmp_path):
         (("train", "CLIP", "-o", "out", "--set", "motion"), "--set 'motion': expected name=value"),
     ],
 )
-def test_user_errors_give_plain_messages(clip, shot, tmp_path, monkeypatch, arguments, told):
+def test_user_errors_give_plain_messages(clip, shot, tmp_path, monkeypatch, capsys, arguments, told):
     monkeypatch.chdir(tmp_path)
     places = {"CLIP": clip, "SHOT": shot}
-    assert told in fails(*(places.get(word, word) for word in arguments))
+    assert told in told_here(capsys, *(places.get(word, word) for word in arguments))
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]  # no incomplete file, hidden or not
+
+
+def test_wrong_arguments_end_a_process_with_a_message(clip, tmp_path):
+    assert f"expected one of {', '.join(all_names())}" in fails("denoise", clip, "-o", tmp_path, "--method", "magic")
 
 
 def test_a_truncated_frame_names_the_file(clip, tmp_path):
@@ -277,7 +303,7 @@ def test_a_truncated_frame_names_the_file(clip, tmp_path):
     assert not (tmp_path / "out" / "frame_0001.exr").exists()
 
 
-def test_sizes_that_differ_are_refused(clip, tmp_path):
+def test_sizes_that_differ_are_refused(clip, tmp_path, capsys):
     mixed = tmp_path / "mixed"
     mixed.mkdir()
     for path in clip.iterdir():
@@ -285,7 +311,7 @@ def test_sizes_that_differ_are_refused(clip, tmp_path):
     small = make_clip(1, frames=1, size=16)
     write_clip(Clip(Frame(radiance=small.frames.radiance)), tmp_path / "small")
     (mixed / "frame_0002.exr").write_bytes((tmp_path / "small" / "frame_0000.exr").read_bytes())
-    assert "frame_0002.exr" in fails("denoise", mixed, "-o", tmp_path / "out", "--method", "svgf")
+    assert "frame_0002.exr" in told_here(capsys, "denoise", mixed, "-o", tmp_path / "out", "--method", "svgf")
 
 
 def test_the_compilers_alarm_is_silenced_before_jax_reads_the_setting():

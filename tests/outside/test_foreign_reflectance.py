@@ -13,6 +13,8 @@ from jaxdn.brdf import directional_albedo
 from jaxdn.clips import ClipError
 from jaxdn.clips.evidence import read_facts
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 SIZE = (6, 8)
 EYE = np.array([1.0, 2.0, 5.0])
 

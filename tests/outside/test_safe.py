@@ -13,6 +13,8 @@ from jaxdn.commands.denoise import Settings, denoise_files
 from jaxdn.metrics import psnr
 from jaxdn.render import ClipJob, render_clips
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 SIZE = (48, 64)
 
 

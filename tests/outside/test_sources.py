@@ -18,6 +18,8 @@ from jaxdn.extras import install
 from jaxdn.methods.table import methods
 from tests.learning.test_training import make_clip
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 
 def write(path: Path, *layers: str, value: float = 0.5) -> Path:
     """A file of constant channels, each layer as ``name:letters``."""
