@@ -21,6 +21,8 @@ from tests.hard_cases.subjects import denoiser_subjects
 from tests.hard_cases.table import rows
 from tests.learning.test_training import make_clip
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 TOY_METHOD = '''"""Half of the frame, half of the history, times a learned gain: a toy."""
 
 from dataclasses import dataclass

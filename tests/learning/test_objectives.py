@@ -10,6 +10,8 @@ from jaxdn.frame import Clip, Frame
 from jaxdn.methods.table import methods
 from jaxdn.objectives import disocclusions, indirect_illumination, pyramid_illumination, recurrent_illumination
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 SHAPE = (5, 6, 7)
 OBJECTIVE = indirect_illumination()
 

@@ -105,7 +105,11 @@ def test_gradients_reach_values_and_guides(rng, x64):
         return disc_average(values, None, [depth_weight(depth[..., None], None, sigma=1.0)], radius, angle)
 
     check_grads(
-        jax.jit(mean), (jnp.asarray(rng.random((2, HEIGHT, WIDTH))), jnp.asarray(depth)), order=1, modes=("rev",), eps=1e-7
+        jax.jit(mean),
+        (jnp.asarray(rng.random((2, HEIGHT, WIDTH))), jnp.asarray(depth)),
+        order=1,
+        modes=("rev",),
+        eps=1e-7,
     )
 
 

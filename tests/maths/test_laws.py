@@ -20,6 +20,8 @@ from jaxdn.frame import Clip, Frame
 from jaxdn.motion import on_screen
 from jaxdn.scales import downsample, upsample
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 T, H, W = 3, 6, 8
 AXES = {"left to right": (-2, (-1.0, 1.0)), "top to bottom": (-3, (1.0, -1.0))}
 seeds = st.integers(0, 2**32 - 1)

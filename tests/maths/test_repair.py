@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from jaxdn.frame import BUFFERS, FAR, RADIANCE_MAX, Frame
 from jaxdn.repair import repair
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 repaired = jax.jit(repair)
 
 

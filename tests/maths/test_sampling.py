@@ -9,6 +9,8 @@ import pytest
 
 from jaxdn.sampling import from_layers, sample_map
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 SIZE = (4, 5)
 
 

@@ -7,7 +7,10 @@ import pytest
 
 from jaxdn.shrinkage import BLOCK, CLEAN, DOUBT, LITTLE, MOST, MUCH, NOISY, QUIET, RADIUS, combine, judge
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 SIZE = (48, 64)
+mixed = jax.jit(combine, static_argnames="blind")
 
 
 def mse(image, truth):
@@ -70,7 +73,7 @@ def test_the_share_is_that_of_numpy(rng, deviation):
     truth, blurred = (image[:BLOCK, :BLOCK] for image in box(BLOCK, BLOCK))
     noisy = (truth * rng.gamma(deviation**-2, deviation**2, truth.shape)).astype(np.float32)
     share, noise = reference(noisy, blurred)
-    found = jax.jit(combine)(noisy, blurred)
+    found = mixed(noisy, blurred)
     np.testing.assert_allclose(found.share, share, atol=2e-4)
     np.testing.assert_allclose(found.noise, noise, rtol=1e-4)
     np.testing.assert_allclose(found.image, blurred + share * (noisy - blurred), atol=1e-3)
@@ -79,7 +82,7 @@ def test_the_share_is_that_of_numpy(rng, deviation):
 def test_what_has_no_noise_comes_back(rng):
     truth, blurred = box(*SIZE)
     assert mse(blurred, truth) > 1e-3
-    assert mse(combine(truth, blurred).image, truth) < 1e-6
+    assert mse(mixed(truth, blurred).image, truth) < 1e-6
 
 
 @pytest.mark.parametrize("samples", [1, 4, 16, 64, 256])
@@ -87,7 +90,7 @@ def test_the_mixture_is_not_worse_than_either(rng, samples):
     """Of exponential noise, the mean of so many samples; at few of them nothing is lost, at many detail comes back."""
     truth, blurred = box(*SIZE)
     noisy = (truth * rng.gamma(samples, 1 / samples, truth.shape)).astype(np.float32)
-    image = combine(noisy, blurred).image
+    image = mixed(noisy, blurred).image
     assert mse(image, truth) < 1.01 * min(mse(noisy, truth), mse(blurred, truth))
     if samples >= 64:
         assert mse(image, truth) < 0.6 * min(mse(noisy, truth), mse(blurred, truth))
@@ -106,7 +109,7 @@ def test_texture_of_single_pixels_comes_back_where_quiet_blocks_are_near(rng, de
     """Near the border of the texture the noise of the wall tells what is noise; as sharp as the noise allows."""
     truth, wall = speckled(rng)
     noisy = truth * (1 + deviation * rng.standard_normal(truth[..., :1].shape)).astype(np.float32)
-    image = np.asarray(combine(noisy, wall).image)
+    image = np.asarray(mixed(noisy, wall).image)
     near, bare = np.s_[:, 59:63], np.s_[:, 80:]
     assert mse(image[near], truth[near]) < 0.05 * mse(wall[near], truth[near]) + 1.1 * mse(noisy[near], truth[near])
     assert mse(image[bare], truth[bare]) <= 0.6 * mse(noisy[bare], truth[bare])
@@ -117,7 +120,7 @@ def test_the_least_of_blocks_has_no_bias(rng):
     noise = np.repeat(rng.standard_normal((640, 640, 1)), 3, axis=-1)
     flat = np.ones_like(noise, np.float32)
     for blind in (False, True):
-        found = combine(jnp.asarray(flat + 0.1 * noise, jnp.float32), flat, blind=blind)
+        found = mixed(jnp.asarray(flat + 0.1 * noise, jnp.float32), flat, blind=blind)
         measured = np.mean(np.square(np.asarray(found.noise) * 1.05))  # relative to the light and 5 % of its mean
         assert 0.85 < measured / 0.1**2 < 1.0  # at most that of the window, which is sometimes less
 
@@ -126,7 +129,7 @@ def test_a_bright_speck_in_a_quiet_place_is_a_firefly(rng):
     wall = np.full((64, 64, 3), 0.5, np.float32)
     noisy = wall * (1 + 0.1 * rng.standard_normal((64, 64, 1))).astype(np.float32)
     noisy[20, 20] = 2.0
-    image = np.asarray(combine(noisy, wall).image)
+    image = np.asarray(mixed(noisy, wall).image)
     assert np.abs(image[20, 20] - 0.5).max() < 0.1
 
 
@@ -137,7 +140,7 @@ def test_a_frame_that_lost_more_than_noise_explains_is_not_trusted(rng, samples,
     pattern = np.kron(rng.uniform(0.3, 1.7, (12, 16, 1)), np.ones((8, 8, 3))).astype(np.float32)
     noisy = (truth * rng.gamma(samples, 1 / samples, truth[..., :1].shape)).astype(np.float32)
     for denoised, expected in ((truth * pattern, trusted), (truth, True)):
-        judged = judge(combine(noisy, denoised))
+        judged = judge(mixed(noisy, denoised))
         assert (judged.distrust < 0.05) if expected else (judged.distrust > 0.95)
     assert abs(float(judged.noise) - samples**-0.5) < 0.15 * samples**-0.5 + 0.01
 
@@ -148,7 +151,7 @@ def test_half_of_a_frame_may_be_clean(rng):
     truth, blurred = box(height, width)
     noisy = truth.copy()
     noisy[:, 96:] *= rng.gamma(1.0, 1.0, noisy[:, 96:].shape).astype(np.float32)
-    image = np.asarray(combine(noisy, blurred).image)
+    image = np.asarray(mixed(noisy, blurred).image)
     assert mse(image[:, :64], truth[:, :64]) < 1e-3 * mse(blurred[:, :64], truth[:, :64])
     assert mse(image[:, 128:], truth[:, 128:]) < 1.01 * mse(blurred[:, 128:], truth[:, 128:])
 
@@ -157,7 +160,7 @@ def test_fireflies_and_invalid_values_do_not_come_back():
     denoised = np.full((*SIZE, 3), 0.5, np.float32)
     noisy = denoised.copy()
     noisy[20, 30], noisy[3, 3, 0], noisy[40, 50], noisy[5, 60] = 200.0, np.nan, np.inf, -1.0
-    found = combine(noisy, denoised)
+    found = mixed(noisy, denoised)
     np.testing.assert_allclose(found.image, denoised, atol=1e-6)
     assert np.isfinite(found.share).all()
 
@@ -167,7 +170,7 @@ def test_small_and_black_images_stay_finite(shape):
     black = jnp.zeros(shape)
     for noisy in (black, black + 65504.0):
         for denoised in (black, black + 1.0):
-            found = combine(noisy, denoised)
+            found = mixed(noisy, denoised)
             assert np.isfinite(found.image).all()
             assert np.isfinite(found.noise).all()
             assert np.isfinite(found.lost).all()
@@ -175,6 +178,6 @@ def test_small_and_black_images_stay_finite(shape):
 
 def test_shapes_that_differ_are_refused():
     with pytest.raises(ValueError, match="noisy and denoised: expected the same size"):
-        combine(jnp.zeros((4, 4, 3)), jnp.zeros((4, 5, 3)))
+        mixed(jnp.zeros((4, 4, 3)), jnp.zeros((4, 5, 3)))
     with pytest.raises(ValueError, match="noisy: expected 3 channels"):
-        combine(jnp.zeros((4, 4, 1)), jnp.zeros((4, 4, 1)))
+        mixed(jnp.zeros((4, 4, 1)), jnp.zeros((4, 4, 1)))

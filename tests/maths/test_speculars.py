@@ -219,7 +219,9 @@ def test_a_short_history_alone_on_its_surface_gets_the_light_beside_it(rng):
 
 def test_gradients_of_every_part(x64, rng):
     slow, fast = rng.uniform(0.5, 1.5, (2, 3, 4, 5))
-    check_grads(jax.jit(lambda a, b: clamp_to_fast(a, b, None, sigma=0.5)), (slow, fast), order=1, modes=["rev"], eps=1e-6)
+    check_grads(
+        jax.jit(lambda a, b: clamp_to_fast(a, b, None, sigma=0.5)), (slow, fast), order=1, modes=["rev"], eps=1e-6
+    )
     check_grads(jax.jit(lambda a: without_fireflies(a, None)), (slow,), order=1, modes=["rev"], eps=1e-6)
     motion, far = rng.normal(size=(2, 4, 5, 2))
     near = rng.uniform(0.1, 0.9, (4, 5))

@@ -8,6 +8,8 @@ from jaxdn.filters import few
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.filters.weights import normal_weight
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 HEIGHT, WIDTH, SIGMA, SHORT = 11, 9, 16.0, 4
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 

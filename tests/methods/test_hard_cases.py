@@ -25,6 +25,8 @@ from tests.hard_cases.page import write_page
 from tests.hard_cases.subjects import Subject, denoiser_subjects, operation_subjects
 from tests.hard_cases.table import rows
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 
 def shapes(case):
     return [np.shape(leaf) for leaf in jax.tree.leaves(case.make(good()))]

@@ -13,6 +13,8 @@ from jaxdn.methods.demodulated import demodulated
 from jaxdn.rollout import denoise, stream, unroll
 from jaxdn.sampling import from_layers
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 SIZE = (4, 6)
 BY_ALBEDO = partial(demodulated, by="albedo")
 

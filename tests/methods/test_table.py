@@ -26,6 +26,8 @@ from jaxdn.recipe import Recipe
 from jaxdn.weights import save_weights
 from tests.methods.test_ntd import TINY
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 
 @dataclass(frozen=True)
 class Toys:

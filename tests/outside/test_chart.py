@@ -39,6 +39,8 @@ from jaxdn.methods.table import method, method_named, methods
 from jaxdn.networks.engines import ENGINES
 from jaxdn.rollout import denoise
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 SIZE, OWN = "1280x720", "64x64"
 PSNR = MEASURES[0]
 TIMING = {"median_ms": 30.0, "min_ms": 29.0, "max_ms": 33.0, "first_ms": 4000.0, "rounds": 3, "peak_mib": 100.0}

@@ -12,6 +12,8 @@ from jaxdn.frame import Frame
 from jaxdn.report import sentences, text_table, write_report
 from jaxdn.report.summary import headline
 
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
 SHAPE = (2, 60, 80, 3)
 ERROR = 0.02
 """Of the image and of the reference, in linear light about 0.2, where the transfer curve is nearly straight."""
