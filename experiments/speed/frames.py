@@ -93,7 +93,8 @@ def table(title: str, found: Mapping[str, float], pixels: int) -> Table:
 
 def main(settings: Settings) -> None:
     """Measure, print, save."""
-    console, rows = Console(), []  # type: Console, list[dict[str, Any]]
+    console = Console()
+    rows: list[dict[str, str | int | float]] = []
     sizes = [parsed(size) for size in settings.sizes]
     for height, width in sizes:
         found = measured(settings.methods, height, width, rounds=settings.rounds, say=console.print)
