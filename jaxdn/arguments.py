@@ -206,8 +206,8 @@ class Denoise:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the denoised frames; for a single frame, also the name of an EXR file."""
     method: str = "steady-balanced"
-    """Shipped weights (ntd-large, ntd-small, relax-fitted, steady-balanced, steady-fast, svgf-fitted), a filter (svgf,
-    asvgf, taa), or the path of a .safetensors file; an unknown name lists all."""
+    """Shipped weights (ntd-large, ntd-small, relax-fitted, steady-balanced, steady-fast, steady-high, svgf-fitted), a
+    filter (svgf, asvgf, taa), or the path of a .safetensors file; an unknown name lists all."""
     bidirectional: bool = False
     """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
     frames are about as good as the last."""

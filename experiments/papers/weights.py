@@ -53,6 +53,7 @@ STAGES = (
     Stage("steady-begun", "steady", {"quality": "balanced"}, 8000, decay=False),
     Stage("steady-balanced", "steady", {"quality": "balanced"}, 1000, start="steady-begun"),
     Stage("high-begun", "steady", {"quality": "high"}, 4000, start="steady-balanced", decay=False),
+    Stage("steady-high", "steady", {"quality": "high"}, 1000, start="high-begun"),
     Stage("fast-begun", "steady", {"quality": "fast"}, 4000, decay=False),
     Stage("steady-fast", "steady", {"quality": "fast"}, 1000, start="fast-begun"),
     Stage("small-begun", "ntd", {"size": "small"}, 4000, decay=False),

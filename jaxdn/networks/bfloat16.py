@@ -118,7 +118,7 @@ class Program:
             for value in step.inputs:
                 if last_use[value.number] == step.result.number and value.number in self._arrays:
                     self._free.append(self._arrays.pop(value.number))
-        self._scratch = np.empty(max(primitive.scratch_bytes for primitive in self._primitives), np.uint8)
+        self._scratch = dnnl.aligned(max(primitive.scratch_bytes for primitive in self._primitives))
         for primitive in self._primitives:
             dnnl.set_address(primitive.scratch, dnnl.address(self._scratch))
         self._ends = [self._memory[-1], *(self._memory[head.number] for head in heads)]
@@ -157,7 +157,7 @@ class Program:
         if fitting:
             return self._free.pop(min(fitting, key=lambda index: self._free[index].size))
         self.bytes += size
-        array = np.empty(size, np.uint8)
+        array = dnnl.aligned(size)
         self._kept.append(array)
         return array
 

@@ -28,6 +28,8 @@ ASK_WEIGHTS, ASK_WEIGHTS_GRADIENT, ASK_SCRATCHPAD = 131, 132, 136
 SOURCE, DESTINATION, WEIGHTS, BIAS, SCRATCHPAD = 1, 17, 33, 41, 80
 DESTINATION_GRADIENT, WEIGHTS_GRADIENT = 145, 161
 _CPU, _IN_ORDER, _USER_SCRATCHPAD = 1, 1, 1
+_LINE = 64
+"""Bytes of a cache line."""
 _HAS_BFLOAT16 = 0x80
 """The bit of ``dnnl_get_effective_cpu_isa`` that CPUs with AVX-512 BF16 have, and those with AMX."""
 OWN_MEMORY, NO_MEMORY = c_void_p(-1), c_void_p(None)
@@ -180,6 +182,16 @@ def reorder(source: c_void_p, target: c_void_p) -> c_void_p:
     """Describes the primitive that copies between two layouts or types."""
     cpu = engine()[0]
     return made("dnnl_reorder_primitive_desc_create", source, cpu, target, cpu, attributes())
+
+
+def aligned(size: int) -> np.ndarray:
+    """New memory of ``size`` bytes that begins at a multiple of 64.
+
+    The library writes large results past the caches, with instructions that end the process at any other address.
+    """
+    array = np.empty(size + _LINE, np.uint8)
+    first = -address(array) % _LINE
+    return array[first : first + size]
 
 
 def address(array: np.ndarray) -> int:

@@ -112,6 +112,20 @@ def test_under_vmap_and_with_the_gradient_of_xla(pair):
 
 
 @needs_bfloat16
+def test_large_results_of_64_channels():
+    """They are written past the caches, to addresses that have to be multiples of 64."""
+    network = description.unet(16, (8,), widths=((64,),) * 5, head_size=1)
+    weights = {
+        name: {"kernel": np.zeros(shape, np.float32), "bias": np.ones(shape[3], np.float32)}
+        for name, shape in network.kernels().items()
+    }
+    features, head = np.zeros((1, 384, 640, 16), np.uint16), np.zeros((1, 384, 640, 8), np.float32)
+    program = bfloat16.Program(network, weights, features.shape)
+    program(dnnl.address(features), [dnnl.address(head)])
+    np.testing.assert_array_equal(head, 1.0)
+
+
+@needs_bfloat16
 def test_memory_is_used_again():
     network = description.unet(20, (9,), widths=LARGE, head_size=3)
     weights = {
