@@ -21,7 +21,7 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
 from jaxdn.networks.description import FEATURES, Description, Weights, evaluate
-from jaxdn.networks.onnx import Apply
+from jaxdn.networks.inference import Apply, inference_only, same
 from jaxdn.ops import onednn_layers
 from jaxdn.ops import onednn_library as dnnl
 
@@ -185,7 +185,7 @@ class Session:
         """Fill ``outputs``; the arguments are views of XLA's own buffers."""
         with self._lock:
             given = [np.asarray(weight) for weight in weights]
-            if not _same(given, self._weights):
+            if not same(given, self._weights):
                 self._weights = [weight.copy() for weight in given]
                 self._program = self._describe(self._weights)
             heads = [dnnl.address(np.asarray(output)) for output in outputs]
@@ -193,19 +193,9 @@ class Session:
                 self._program(dnnl.address(np.asarray(features)), heads)
 
 
-def _same(new: Sequence[np.ndarray], old: Sequence[np.ndarray]) -> bool:
-    return len(new) == len(old) and all(
-        np.array_equal(one.view(np.int32), other.view(np.int32)) for one, other in zip(new, old, strict=True)
-    )
-
-
 def engine(network: Description, plain: Apply) -> Apply:
-    """``plain``, the network in XLA, run by oneDNN in bfloat16; the gradient is ``plain``'s.
+    """``plain``, the network in XLA, run by oneDNN in bfloat16 (:func:`jaxdn.networks.inference.inference_only`)."""
 
-    Raises ValueError for features that are not float32.
-    """
-
-    @jax.custom_vjp
     def run(weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:
         leaves, tree = jax.tree.flatten(weights)
         features = jnp.concatenate([group.astype(jnp.bfloat16) for group in groups], axis=-1)
@@ -214,21 +204,4 @@ def engine(network: Description, plain: Apply) -> Apply:
         results = jax.eval_shape(plain, weights, groups)
         return tuple(buffer_callback(session, results, vmap_method="sequential")(features, *leaves))
 
-    def forward(weights: Weights, groups: list[jax.Array]) -> tuple[Any, Any]:
-        return run(weights, groups), (weights, groups)
-
-    def backward(residuals: Any, cotangents: tuple[jax.Array, ...]) -> Any:
-        return jax.vjp(plain, *residuals)[1](cotangents)
-
-    run.defvjp(forward, backward)
-
-    def checked(weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:
-        dtype = jnp.result_type(*groups)
-        if dtype != jnp.float32:
-            raise ValueError(
-                f'implementation: "onednn-bfloat16" takes features in float32, got {dtype}; leave implementation or '
-                "compute_dtype None."
-            )
-        return run(weights, groups)
-
-    return checked
+    return inference_only("onednn-bfloat16", run, plain)

@@ -13,19 +13,16 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
 from jaxdn.extras import install
 from jaxdn.networks.description import FEATURES, Description, Weights, evaluate
+from jaxdn.networks.inference import Apply, inference_only, same
 
 OPSET = 17
 BLOCK = 16
 """Channels that the engine computes at a time; other input counts take a slow path (3 times the time)."""
-
-Apply = Callable[[Weights, list[jax.Array]], tuple[jax.Array, ...]]
-"""(weights, the present feature groups [N, H, W, c]) -> heads."""
 
 
 def available() -> bool:
@@ -141,11 +138,7 @@ class Session:
             self._session.run_with_iobinding(binding)
 
     def _prepare(self, weights: list[np.ndarray]) -> None:
-        same = len(weights) == len(self._weights) and all(
-            np.array_equal(new.view(np.int32), old.view(np.int32))
-            for new, old in zip(weights, self._weights, strict=True)
-        )
-        if same:
+        if same(weights, self._weights):
             return
         import onnxruntime
 
@@ -161,12 +154,8 @@ class Session:
 
 
 def engine(network: Description, plain: Apply) -> Apply:
-    """``plain``, the network in XLA, run by ONNX Runtime; the gradient is ``plain``'s.
+    """``plain``, the network in XLA, run by ONNX Runtime (:func:`jaxdn.networks.inference.inference_only`)."""
 
-    Raises ValueError for features that are not float32.
-    """
-
-    @jax.custom_vjp
     def run(weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:
         channels = network.layers[FEATURES].channels
         shape = (groups[0].shape[0], channels + -channels % BLOCK, *groups[0].shape[1:3])
@@ -178,21 +167,4 @@ def engine(network: Description, plain: Apply) -> Apply:
         # The groups are passed separately: XLA would concatenate them into newly allocated memory first.
         return tuple(buffer_callback(session, results, vmap_method="sequential")(*groups, *leaves))
 
-    def forward(weights: Weights, groups: list[jax.Array]) -> tuple[Any, Any]:
-        return run(weights, groups), (weights, groups)
-
-    def backward(residuals: Any, cotangents: tuple[jax.Array, ...]) -> Any:
-        return jax.vjp(plain, *residuals)[1](cotangents)
-
-    run.defvjp(forward, backward)
-
-    def checked(weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:
-        dtype = jnp.result_type(*groups)
-        if dtype != jnp.float32:
-            raise ValueError(
-                f'implementation: "onnxruntime" computes in float32, got features in {dtype}; '
-                "leave implementation or compute_dtype None."
-            )
-        return run(weights, groups)
-
-    return checked
+    return inference_only("onnxruntime", run, plain)

@@ -18,6 +18,7 @@ from jaxdn.checks import check_option
 from jaxdn.denoiser import Params
 from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, bfloat16, description, onnx
 from jaxdn.networks.description import FEATURES, Description, evaluate
+from jaxdn.networks.inference import Apply
 from jaxdn.ops import onednn_library
 from jaxdn.ops.convolution import convolve
 from jaxdn.ops.registry import register, resolve
@@ -121,31 +122,31 @@ def initial(key: jax.Array, network: Description, *, scheme: str) -> dict[str, A
     return params
 
 
-def by_xla(layers: Layers, network: Description) -> onnx.Apply:
+def by_xla(layers: Layers, network: Description) -> Apply:
     """The network as XLA compiles it."""
     return lambda weights, groups: evaluate(network, weights, {FEATURES: jnp.concatenate(groups, axis=-1)}, layers)
 
 
 @register("unet", "reference")
-def reference(network: Description) -> onnx.Apply:
+def reference(network: Description) -> Apply:
     """XLA alone."""
     return by_xla(XLA, network)
 
 
 @register("unet", "onednn", requires=onednn_library.check_available)
-def convolved_by_onednn(network: Description) -> onnx.Apply:
+def convolved_by_onednn(network: Description) -> Apply:
     """XLA with oneDNN's convolutions and their gradients: for training on CPUs."""
     return by_xla(ONEDNN, network)
 
 
 @register("unet", "onednn-bfloat16", requires=bfloat16.check_available)
-def run_in_bfloat16(network: Description) -> onnx.Apply:
+def run_in_bfloat16(network: Description) -> Apply:
     """The whole network in oneDNN in bfloat16, for inference; the gradient is XLA's."""
     return bfloat16.engine(network, by_xla(XLA, network))
 
 
 @register("unet", "onnxruntime", requires=onnx.check_available)
-def run_by_onnxruntime(network: Description) -> onnx.Apply:
+def run_by_onnxruntime(network: Description) -> Apply:
     """The whole network in ONNX Runtime, for inference; the gradient is XLA's."""
     return onnx.engine(network, by_xla(XLA, network))
 
