@@ -158,8 +158,8 @@ def steady(options: Options) -> Denoiser:
         bias = (
             [value for value in pixel for _ in range(4)] + [0.0] * HALF_FEATURES + [BEGIN["trust"]] + [_TAKE] * LEVELS
         )
-        precisions = {name: jnp.full((1 + LEVELS,), value) for name, value in PRECISIONS.items()}
-        return {**params, "head_0": {**params["head_0"], "bias": jnp.asarray(bias)}, "guide": precisions}
+        precisions = {name: jnp.full((1 + LEVELS,), value, jnp.float32) for name, value in PRECISIONS.items()}
+        return {**params, "head_0": {**params["head_0"], "bias": jnp.asarray(bias, jnp.float32)}, "guide": precisions}
 
     def start(params: Params, frame: Frame) -> SteadyState:
         nothing = jnp.zeros((*frame.radiance.shape[:2], 8), frame.radiance.dtype)

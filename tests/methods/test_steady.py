@@ -191,3 +191,9 @@ def test_every_quality_takes_fewer_operations_than_the_next(rng):
     assert fast < 0.5 * balanced
     assert balanced < 0.7 * high
     assert steady(quality="fast").step.core.reach < steady(quality="balanced").step.core.reach
+
+
+def test_new_parameters_and_loaded_ones_share_a_program(key):
+    """None of them is weakly typed, which would compile a second program."""
+    params = jax.eval_shape(lambda: steady().init(key, Frame(jnp.ones((32, 32, 3)))))
+    assert not [leaf for leaf in jax.tree.leaves(params) if leaf.weak_type]
