@@ -13,7 +13,7 @@ from jaxdn.commands.denoise import Written, lettered
 from jaxdn.commands.passes import light_of
 from jaxdn.commands.render import plan_clip
 from jaxdn.frame import OF_SAMPLES, Frame
-from jaxdn.planning.plan import OF_FIRST_HITS
+from jaxdn.planning.catalogue import OF_FIRST_HITS
 from jaxdn.render.adaptive import render_sampled
 from jaxdn.render.opening import open_scene
 from jaxdn.report.images import save_png

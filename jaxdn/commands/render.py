@@ -11,8 +11,8 @@ from jaxdn.denoiser import Denoiser
 from jaxdn.effects import Effects, Plan, chosen, everything, inspect, plan
 from jaxdn.frame import OF_SAMPLES
 from jaxdn.methods.table import methods
-from jaxdn.planning.catalogue import NoisyLight
-from jaxdn.planning.plan import OF_FIRST_HITS, SCORED, THROUGH_CENTRES
+from jaxdn.planning.catalogue import OF_FIRST_HITS, THROUGH_CENTRES, NoisyLight
+from jaxdn.planning.plan import SCORED
 from jaxdn.render.depth import PathDepth, measure_depth
 from jaxdn.render.families import FAMILIES
 from jaxdn.render.farm import ClipJob, render_clips

@@ -15,6 +15,16 @@ NoisyLight = Literal["indirect", "reflected"]
 INDIRECT: NoisyLight = "indirect"
 OF_SHADOWS = frozenset({"shadowed", "unshadowed", "shadow_motion"})
 """Buffers of direct light with noise."""
+THROUGH_CENTRES = frozenset({"luminance_gradient", "shadow_motion", "glossy_motion"})
+"""Buffers that are found by rays through the centres of pixels: none with sub-pixel jitter."""
+OF_FIRST_HITS = THROUGH_CENTRES | {
+    "specular",
+    "specular_reflectance",
+    "hit_distance",
+    "specular_hit_distance",
+    "ray_length",
+}
+"""Buffers of the surface that the camera ray meets first: none where mirrors and glass are seen through."""
 DIRECT = 2
 """Path length, in Mitsuba's count, of light reflected by one surface: 1 is emission, 3 one more reflection."""
 
@@ -33,6 +43,8 @@ class Effect(NamedTuple):
     """The shortest path length that shows it. From :data:`DIRECT` + 1 on there is indirect light to denoise."""
     integrator: str = "path"
     """Mitsuba's integrator that simulates it."""
+    seen_through: frozenset[str] = frozenset()
+    """Further buffers that it requires where mirrors and glass are seen through."""
     in_time: bool = False
     """It concerns two frames: the first frame of a clip takes it from the second."""
 
@@ -129,6 +141,7 @@ def _moving_reflection(facts: Facts, moment: Moment) -> str:
 
 
 _MOTION = frozenset({"motion", "previous_depth", "far_motion"})
+_REVEALED = frozenset({"dual_motion", "visible"})
 _CHANGE = frozenset({"luminance_gradient"})
 _SURFACE = frozenset({"roughness"})
 
@@ -139,7 +152,7 @@ EFFECTS: tuple[Effect, ...] = (
         "disocclusion",
         "Something comes into view that was hidden in the frame before.",
         _disocclusion,
-        frozenset({"dual_motion", "visible"}),
+        _REVEALED,
         in_time=True,
     ),
     Effect(
@@ -170,6 +183,7 @@ EFFECTS: tuple[Effect, ...] = (
         "A reflection moves over the surface that shows it.",
         _moving_reflection,
         frozenset({"glossy_motion"}),
+        seen_through=_MOTION | _REVEALED,
         in_time=True,
     ),
     Effect("changing-light", "A light moves, or becomes brighter or darker.", _changing_light, _CHANGE, in_time=True),

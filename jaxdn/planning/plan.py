@@ -5,7 +5,15 @@ from typing import Any, NamedTuple
 
 from jaxdn.denoiser import Denoiser
 from jaxdn.frame import GUIDES, ON_REQUEST
-from jaxdn.planning.catalogue import DIRECT, EFFECTS, INDIRECT, OF_SHADOWS, NoisyLight
+from jaxdn.planning.catalogue import (
+    DIRECT,
+    EFFECTS,
+    INDIRECT,
+    OF_FIRST_HITS,
+    OF_SHADOWS,
+    THROUGH_CENTRES,
+    NoisyLight,
+)
 from jaxdn.planning.found import Effects
 
 GEOMETRY = frozenset({"albedo", "normal", "depth", "ids"})
@@ -14,16 +22,6 @@ COMPOSED = frozenset({"direct", "emission"})
 """Buffers that are added to the denoised image, whether or not the denoiser reads them."""
 SCORED = frozenset({"visible"})
 """Buffers that errors are reported by, where there is a reference: which pixels the previous frame did not see."""
-THROUGH_CENTRES = frozenset({"luminance_gradient", "shadow_motion", "glossy_motion"})
-"""Buffers that are found by rays through the centres of pixels: none with sub-pixel jitter."""
-OF_FIRST_HITS = THROUGH_CENTRES | {
-    "specular",
-    "specular_reflectance",
-    "hit_distance",
-    "specular_hit_distance",
-    "ray_length",
-}
-"""Buffers of the surface that the camera ray meets first: none where mirrors and glass are seen through."""
 BOUND = 0.01
 """Largest share of an image's reflected light that limited path lengths may leave out."""
 
@@ -106,9 +104,9 @@ def plan(
     there = [by_name[name] for name in effects.names]
 
     def buffers(present: frozenset[str]) -> tuple[str, ...]:
-        if see_through and "moving-reflection" in present:
-            present |= {"object-motion", "disocclusion"}
         had = GEOMETRY.union(*(by_name[name].buffers for name in present))
+        if see_through:
+            had = had.union(*(by_name[name].seen_through for name in present))
         if effects.lit:
             had |= {"direct"}
         return tuple(name for name in GUIDES if name in had & wanted)

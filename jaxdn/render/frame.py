@@ -11,8 +11,8 @@ import numpy as np
 from jaxdn.checks import check_at_least, check_option
 from jaxdn.frame import GUIDES, OF_SAMPLES, ON_REQUEST, Frame
 from jaxdn.motion import dual_motion
-from jaxdn.planning.catalogue import OF_SHADOWS, NoisyLight
-from jaxdn.planning.plan import OF_FIRST_HITS, THROUGH_CENTRES, Plan
+from jaxdn.planning.catalogue import OF_FIRST_HITS, OF_SHADOWS, THROUGH_CENTRES, NoisyLight
+from jaxdn.planning.plan import Plan
 from jaxdn.render import jitter as jitters
 from jaxdn.render.gbuffer import check_scene, gbuffer
 from jaxdn.render.geometry import View, far_motion, motion_between, ray_length

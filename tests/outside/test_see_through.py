@@ -15,7 +15,7 @@ from jaxdn.clips import ClipError
 from jaxdn.commands.denoise_scene import Settings, denoise_scene
 from jaxdn.commands.render import clips_of
 from jaxdn.effects import plan
-from jaxdn.planning.plan import OF_FIRST_HITS
+from jaxdn.planning.catalogue import OF_FIRST_HITS
 from jaxdn.render.clip import render_clip
 from jaxdn.render.farm import render_clips
 from jaxdn.render.frame import render_frame
