@@ -11,7 +11,7 @@ LARGE begins as SMALL grown (:mod:`jaxdn.networks.widen`). A, B and C take the s
 """
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,6 +27,8 @@ from jaxdn.weights import SHIPPED, shipped_names
 
 FAMILIES = {"parlour": 90, "fruit": 14, "mobile": 14, "pinkroom": 14, "robot": 14}
 """Clips of each procedural family."""
+BLOCK = 10
+"""Clips of each kind that are rendered before the next kind has its turn."""
 
 
 class Stage(NamedTuple):
@@ -94,10 +96,11 @@ def render_all(settings: Settings) -> None:
     """
     sources = [(str(room), settings.tours, True) for room in settings.rooms]
     sources += [(family, clips, False) for family, clips in FAMILIES.items()]
-    parts: list[tuple[str, Callable[[int], range]]] = [("train", range), ("validation", lambda _: range(1000, 1001))]
-    for part, seeds in parts:
+    blocks = [("train", range(first, first + BLOCK)) for first in range(0, max(clips for _, clips, _ in sources), BLOCK)]
+    # Block by block, so that what is there is a mixture of all kinds at any time.
+    for part, seeds in [*blocks, ("validation", range(1000, 1001))]:
         for (source, clips, tours), odd in itertools.product(sources, (False, True)):
-            chosen = [seed for seed in seeds(clips) if seed % 2 == odd]
+            chosen = [seed for seed in seeds if seed % 2 == odd and (seed < clips or part == "validation")]
             if not chosen:
                 continue
             render(
