@@ -128,8 +128,10 @@ def _denoise(options: Denoise) -> None:
     from jaxdn.commands.denoise import Settings, candidate_on, denoise_files
     from jaxdn.commands.progress import reporter
     from jaxdn.commands.sources import show_sources
+    from jaxdn.heap import keep_memory
     from jaxdn.options import numbers
 
+    keep_memory()
     naming = _naming(options)
     budget = {} if options.budget is None else {"budget": options.budget}
     if (scene := _scene_of(options)) is not None:

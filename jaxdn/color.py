@@ -16,6 +16,8 @@ _TOE = 1e-4
 _TOE_VALUE = _TOE ** (1 / _GAMMA)
 _TOE_SLOPE = _TOE_VALUE / _TOE
 """About 152."""
+CURVE = (1 / _GAMMA, _TOE, _TOE_SLOPE)
+"""Of :func:`compress`: its power, the end of its toe and the slope there."""
 _TOP = 64.0
 """``expand`` saturates at the largest finite number divided by this, so that its slope stays finite too."""
 
@@ -96,7 +98,10 @@ def brightness(radiance: jax.Array) -> jax.Array:
     # Rows and columns beyond the last whole block have no say.
     rows, columns = (size // side for size, side in zip((height, width), block, strict=True))
     light = light[: rows * block[0], : columns * block[1]]
-    means = light.reshape(rows, block[0], columns, block[1]).mean((1, 3))
+    # Whole rows are added first, which vectorises; a product adds the columns.
+    sums = light.reshape(rows, block[0], -1).sum(1)
+    own = jnp.repeat(jnp.eye(columns, dtype=light.dtype), block[1], axis=0) / (block[0] * block[1])
+    means = jax.lax.dot(sums, own, precision="highest")
     lit = means > 0
     logs = jnp.where(lit, jnp.log(jnp.where(lit, means, 1.0)), 0.0)
     return jnp.stack([jnp.sum(logs), jnp.sum(lit, dtype=light.dtype)])

@@ -25,6 +25,8 @@ MATHS = (
     "motion",
     "scales",
     "ops",
+    "compiled",
+    "heap",
     "brdf",
     "microfacets",
     "glints",
@@ -41,6 +43,7 @@ LAYERS = {
 }
 OUTSIDE = {
     "flax": {"networks"},
+    "numba": {"compiled"},
     "optax": {"learning"},
     "mitsuba": {"render"},
     "drjit": {"render"},

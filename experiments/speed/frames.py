@@ -1,5 +1,7 @@
 """What a frame costs: shipped methods in each of their engines, and Open Image Denoise, at one or several sizes.
 
+Memory is kept between frames as in `jaxdn denoise` (:mod:`jaxdn.heap`).
+
     python -m experiments.speed.frames                                             # 1280 x 720
     python -m experiments.speed.frames --sizes 256x144 1280x720 3840x2160 --methods steady-balanced svgf
 
@@ -8,6 +10,7 @@ Prints a table for each size: the median of the turns in milliseconds, its ratio
 pixel; writes ``runs/frames.json``.
 """
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -24,7 +27,9 @@ from experiments.speed.workers import Team
 from experiments.speed.works.steps import frame_of, oidn_high, recurrent
 from jaxdn.candidates import candidate
 from jaxdn.commands.errors import plain_errors
+from jaxdn.compiled import strips
 from jaxdn.files import write_json
+from jaxdn.heap import keep_memory
 from jaxdn.networks.engines import ENGINES
 
 OIDN = "Open Image Denoise high"
@@ -42,8 +47,14 @@ class Settings:
     out: Path = Path("runs/frames.json")
 
 
-def ours(name: str, engine: str | None, height: int, width: int) -> Call:
-    """The compiled step of a method, with its own state, on an engine; None is XLA."""
+def ours(name: str, engine: str | None, height: int, width: int, *, compiled: bool = True) -> Call:
+    """The compiled step of a method, with its own state, on an engine; None is XLA.
+
+    To be called once in a process. Without ``compiled`` no loops of :mod:`jaxdn.compiled` are used.
+    """
+    keep_memory()
+    if not compiled:
+        os.environ["JAXDN_COMPILED"] = "0"
     found, frame = candidate(name, **({} if engine is None else {"implementation": engine})), frame_of(height, width)
     assert found.denoiser is not None
     return recurrent(found.denoiser, found.params, frame)
@@ -59,6 +70,8 @@ def builds(names: list[str], height: int, width: int) -> dict[str, Callable[[], 
         engines = [each for each in one.method.engines if ENGINES[each].purpose == "inference"]
         for engine in [None, *(each for each in engines if ENGINES[each].available())]:
             found[f"{name}, {engine or 'xla'}"] = partial(ours, name, engine, height, width)
+        if strips.available():
+            found[f"{name}, xla without compiled loops"] = partial(ours, name, None, height, width, compiled=False)
     if "pyoidn" not in peers.missing():
         found[OIDN] = partial(oidn_high, height, width)
     return found

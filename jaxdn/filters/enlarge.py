@@ -15,6 +15,8 @@ import numpy as np
 from jax import lax
 
 from jaxdn.ops.affinity_filter import Guide, affinity
+from jaxdn.compiled import strips
+from jaxdn.ops.faster import alone
 from jaxdn.ops.platform import platform
 
 _SPREAD = 3.0
@@ -30,22 +32,39 @@ def enlarge(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, ja
     """The coarse image [C, h, w] as [C, 2h, 2w], and the sum of weights [2h, 2w] in [0, 1].
 
     Every fine pixel takes the mean of the 3x3 coarse pixels around it, weighted by their distance, confidence and
-    affinity as in :mod:`jaxdn.ops.affinity_filter`. ``there`` guides the coarse pixels, ``here`` the fine ones (its
-    confidence is not used). The slanted guide of a coarse pixel is that of the upper left of its four pixels, and its
+    affinity as in :mod:`jaxdn.ops.affinity_filter`. ``there`` guides the coarse pixels, ``here`` the fine ones: its
+    confidence is not used, and its scales are those of both. The slanted guide of a coarse pixel is that of the upper left of its four pixels, and its
     slopes are those per fine pixel. Where no coarse pixel is alike, the sum of weights is 0 and so is the image.
     """
-    totals = _totals(coarse, there, here)
+    if strips.available() and coarse.dtype == here.features.dtype == jnp.float32:
+        return alone(_enlarged, _enlarged_by_compiled)(coarse, there, here)
+    return _enlarged(coarse, there, here)
+
+
+def _enlarged(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, jax.Array]:
+    totals = _totals(coarse, there._replace(scales=here.scales).scaled(), here.scaled())
     weight = totals[-1:]
     some = weight > _NO_WEIGHT
     return jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), 0.0), jnp.where(some, weight, 0.0)[0]
+
+
+def _enlarged_by_compiled(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, jax.Array]:
+    from jaxdn.compiled.affinities import enlarged
+
+    channels, height, width = coarse.shape
+    fine = 2 * height, 2 * width
+    arrays = [coarse, *there[:3], here.features, here.slanted, here.factors()]
+    numbers = _spatial()[1].reshape(3, 3, 2, 2).astype(np.float32), np.float32(_NO_WEIGHT)
+    image, weight = strips.call(enlarged, [(channels, *fine), fine], arrays, *numbers, rows=fine[0])
+    return image, weight
 
 
 def _totals(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
     """[C + 1, 2h, 2w] the weighted sum of every fine pixel's taps and of their weights."""
     channels, height, width = coarse.shape
     rows = height if platform() != "cpu" else min(height, max(1, _STRIP // width))
-    strips = -(-height // rows)
-    below = strips * rows - height
+    count = -(-height // rows)
+    below = count * rows - height
 
     def around(plane: jax.Array) -> jax.Array:
         return jnp.pad(jnp.pad(plane, 1, mode="edge"), ((0, below), (0, 0)))
@@ -88,9 +107,9 @@ def _totals(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
         carry, _ = lax.scan(body, (empty, first.shift, weigh(first)), rest)
         return jnp.stack([jnp.stack(planes) for planes in add(*carry)])
 
-    found = strip(0)[None] if strips == 1 else lax.map(strip, rows * jnp.arange(strips, dtype=jnp.int32))
-    found = found.reshape(strips, 2, 2, channels + 1, rows, width).transpose(3, 0, 4, 1, 5, 2)
-    return found.reshape(channels + 1, 2 * strips * rows, 2 * width)[:, : 2 * height]
+    found = strip(0)[None] if count == 1 else lax.map(strip, rows * jnp.arange(count, dtype=jnp.int32))
+    found = found.reshape(count, 2, 2, channels + 1, rows, width).transpose(3, 0, 4, 1, 5, 2)
+    return found.reshape(channels + 1, 2 * count * rows, 2 * width)[:, : 2 * height]
 
 
 class _Taps(NamedTuple):
@@ -108,10 +127,15 @@ _Carry = tuple[list[Planes], jax.Array, Planes]
 
 
 def _taps(dtype: jnp.dtype) -> _Taps:
+    offset, spatial = _spatial()
+    shift = offset[:, 0] // 2  # of the upper left pixel of a block
+    return _Taps(jnp.asarray(shift, jnp.int32), jnp.asarray(spatial, dtype), jnp.asarray(offset, dtype))
+
+
+def _spatial() -> tuple[np.ndarray, np.ndarray]:
+    """Of the nine taps of a block's four pixels, row by row: offsets [9, 4, 2] and spatial weights [9, 4]."""
     shift = np.array([(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
-    pixel = np.array(list(np.ndindex(2, 2)))
-    offset = 2 * shift[:, None] - pixel
+    offset = 2 * shift[:, None] - np.array(list(np.ndindex(2, 2)))
     # The centre of a coarse pixel lies between its four.
     spatial = np.exp(-np.sum(np.square(offset + 0.5), axis=-1) / _SPREAD)
-    spatial /= spatial.sum(axis=0)
-    return _Taps(jnp.asarray(shift, jnp.int32), jnp.asarray(spatial, dtype), jnp.asarray(offset, dtype))
+    return offset, spatial / spatial.sum(axis=0)

@@ -15,9 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxdn.compiled import strips
 from jaxdn.filters.guides import Expected, Guides, expected, guides_of, pack, same_surface, shared, unpack
 from jaxdn.frame import Frame
 from jaxdn.motion import targets
+from jaxdn.ops.faster import alone
 from jaxdn.ops.strips import by_strips, where_needed
 from jaxdn.ops.warp import cells, differentiable_mean, windows
 
@@ -25,6 +27,10 @@ WEIGHT_MIN = 0.01
 """Minimum sum of accepted bilinear weights that counts as history."""
 _STRIP = 5_000
 """Approximate number of pixels in a strip."""
+
+
+_Position = tuple[jax.Array, jax.Array]
+"""x and y [H, W], in pixels."""
 
 
 class Recalled(NamedTuple):
@@ -84,23 +90,69 @@ def fetch(
     broken = jnp.sum(~sound & ~first, dtype=jnp.int32)
     history = jnp.where(sound, history, 0.0)
     x, y, inside = _targets(history, motion, first)
+    options = {"normal_threshold": normal_threshold, "around": around}
+    find = functools.partial(_found, moving=motion is not None, **options)
+    if strips.available() and history.dtype == jnp.float32:
+        find = alone(find, functools.partial(_found_by_compiled, **options))
+    mean, valid = find(history, sound, before, (x, y), inside, wanted)
+    return Recalled(mean, valid[..., None], broken)
+
+
+def _found(
+    history: jax.Array,
+    sound: jax.Array,
+    before: Guides,
+    at: _Position,
+    inside: jax.Array,
+    wanted: Expected,
+    *,
+    moving: bool,
+    normal_threshold: float,
+    around: bool,
+) -> tuple[jax.Array, jax.Array]:
+    """The mean [H, W, C] and bool [H, W], whether there is one, of taps ``at`` the targets; ``sound`` ones count."""
     packed = lax.stop_gradient(pack(jnp.concatenate([history, sound.astype(history.dtype)], axis=-1), before))
 
     def accepted(tap: jax.Array, wanted: Expected) -> jax.Array:
         whole, guides = unpack(tap, before)
         return (whole[..., -1] > 0) & same_surface(guides, wanted, normal_threshold=normal_threshold)
 
-    if motion is None:
+    if moving:
+        mean, valid = _of_cells(history, packed, at, inside, wanted, accepted)
+    else:
         valid = inside & accepted(packed, wanted)
         mean = jnp.where(valid[..., None], history, 0.0)
-    else:
-        mean, valid = _of_cells(history, packed, (x, y), inside, wanted, accepted)
     if around:
         lost = inside & ~valid
         given = history, packed, lost, wanted, accepted
-        more, found = _beside(*given) if motion is None else _around((x, y), *given)
+        more, found = _around(at, *given) if moving else _beside(*given)
         mean, valid = jnp.where(found[..., None], more, mean), valid | found
-    return Recalled(mean, valid[..., None], broken)
+    return mean, valid
+
+
+def _found_by_compiled(
+    history: jax.Array,
+    sound: jax.Array,
+    before: Guides,
+    at: _Position,
+    inside: jax.Array,
+    wanted: Expected,
+    *,
+    normal_threshold: float,
+    around: bool,
+) -> tuple[jax.Array, jax.Array]:
+    from jaxdn.compiled.taps import fetched
+
+    tested = before._replace(
+        depth=None if wanted.depth is None or wanted.tolerance is None else before.depth,
+        normal=None if wanted.normal is None else before.normal,
+        ids=None if wanted.ids is None else before.ids,
+    )
+    arrays = [history, sound, *tested, *at, inside, wanted.depth, wanted.tolerance, wanted.normal, wanted.ids]
+    numbers = np.float32(normal_threshold), np.float32(WEIGHT_MIN), around
+    size = history.shape[:2]
+    mean, valid = strips.call(fetched, [history.shape, size], arrays, *numbers, rows=size[0])
+    return mean, valid > 0
 
 
 def _targets(history: jax.Array, motion: jax.Array | None, first: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -116,7 +168,6 @@ def _targets(history: jax.Array, motion: jax.Array | None, first: jax.Array) -> 
     return jnp.clip(x, 0, width - 1), jnp.clip(y, 0, height - 1), inside
 
 
-_Position = tuple[jax.Array, jax.Array]
 _Accepted = Callable[[jax.Array, Expected], jax.Array]
 """(tap [..., C], what it must show [...]) -> bool [...]."""
 

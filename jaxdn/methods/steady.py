@@ -22,6 +22,7 @@ import numpy as np
 
 from jaxdn import brdf, color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.filters.blocks import light_of_blocks
 from jaxdn.filters.enlarge import enlarge
 from jaxdn.filters.guides import Guides, depth_feature, depth_slopes, guides_of, hit_mask
 from jaxdn.filters.recall import recall
@@ -40,8 +41,10 @@ LEVELS = 4
 """Levels of the filter at half resolution, taps 2, 4, 8 and 16 pixels apart."""
 FEATURES, HALF_FEATURES = 5, 8
 """Learned features at full and at half resolution."""
-MULTIPLE = 32
-"""Height and width that the network works on are multiples of this."""
+_BLOCKS = 4
+"""Height and width that the filters work on are multiples of this: blocks of 4x4 pixels are filled."""
+_MULTIPLE = 16
+"""Height and width that the network works on, at half resolution, are multiples of this."""
 
 
 class Quality(NamedTuple):
@@ -173,11 +176,12 @@ def steady(options: Options) -> Denoiser:
         surfaces, past = _surfaces(frame), _past(found.history, found.valid)
         noisy = _noisy(frame, surfaces)
         weights = {name: part for name, part in params.items() if name != "guide"}
-        groups = [group[None] for group in _seen(noisy, past, surfaces, whole)]
-        decided = _decisions(network.apply(weights, groups)[0][0])
+        seen = _seen(noisy, past, surfaces, whole)
+        head = network.apply(weights, [pad(group, _MULTIPLE)[None] for group in seen])[0][0]
+        decided = _decisions(crop(head, seen[0].shape[:2]))
         mean, square, number = _accumulated(noisy, past, decided.shares["follow"], options.history_max)
         texture = texture_left(frame, options.demodulate, whole)
-        texture = None if texture is None else fill(pad(texture, MULTIPLE), surfaces.hit)
+        texture = None if texture is None else fill(pad(texture, _BLOCKS), surfaces.hit)
         slanted = _slanted(surfaces, whole)
         fine, image = _filtered(params["guide"], mean, texture, surfaces, slanted, decided, quality.full_levels)
         newest = jnp.where(past.valid, decided.shares["blend"], 1.0)
@@ -203,7 +207,7 @@ def _filters_reach(full_levels: int) -> int:
 
 def _noisy(frame: Frame, surfaces: _Surfaces) -> jax.Array:
     # Divided by a small reflectance it may be beyond what the network has ever seen.
-    return fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), MULTIPLE), surfaces.hit)
+    return fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), _BLOCKS), surfaces.hit)
 
 
 def _surfaces(frame: Frame) -> _Surfaces:
@@ -213,19 +217,19 @@ def _surfaces(frame: Frame) -> _Surfaces:
     hit = hit_mask(frame.depth, frame.ids)
     hit = jnp.ones((height, width), bool) if hit is None else hit
     return _Surfaces(
-        pad(nothing if reflectance is None else reflectance - 1.0, MULTIPLE),
-        pad(nothing if frame.normal is None else frame.normal, MULTIPLE),
-        pad(nothing[..., :1] if frame.roughness is None else frame.roughness - 1.0, MULTIPLE),
-        None if frame.depth is None else pad(frame.depth, MULTIPLE),
+        pad(nothing if reflectance is None else reflectance - 1.0, _BLOCKS),
+        pad(nothing if frame.normal is None else frame.normal, _BLOCKS),
+        pad(nothing[..., :1] if frame.roughness is None else frame.roughness - 1.0, _BLOCKS),
+        None if frame.depth is None else pad(frame.depth, _BLOCKS),
         # What is padded is no surface: noise of the last row would count as often as it is repeated.
-        jnp.pad(hit, ((0, -height % MULTIPLE), (0, -width % MULTIPLE)))[..., None],
+        jnp.pad(hit, ((0, -height % _BLOCKS), (0, -width % _BLOCKS)))[..., None],
     )
 
 
 def _past(history: jax.Array, valid: jax.Array) -> _Past:
-    wide = pad(history, MULTIPLE)
+    wide = pad(history, _BLOCKS)
     mean, square, number, shown = jnp.split(wide, (3, 4, 5), axis=-1)
-    return _Past(mean, square, number, shown, pad(valid, MULTIPLE))
+    return _Past(mean, square, number, shown, pad(valid, _BLOCKS))
 
 
 def _seen(noisy: jax.Array, past: _Past, surfaces: _Surfaces, whole: Whole) -> tuple[jax.Array, jax.Array]:
@@ -239,12 +243,12 @@ def _seen(noisy: jax.Array, past: _Past, surfaces: _Surfaces, whole: Whole) -> t
     geometry = fold(jnp.concatenate([surfaces.albedo, surfaces.normal, closeness, surfaces.roughness], axis=-1))
     level = color.luminance(past.mean)
     spread = jnp.sqrt(jnp.maximum(past.square - level**2, 0.0) + 1e-12) / (level + 1e-3 / gain)
-    seen = color.compress(gain * noisy)
-    mean, shown = (jnp.where(past.valid, color.compress(gain * one), seen) for one in (past.mean, past.shown))
     facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + past.number), surfaces.hit.astype(noisy.dtype)]
-    light = downsample(jnp.concatenate([seen, mean, shown, *facts], axis=-1))
-    details = fold(jnp.concatenate([color.luminance(seen), color.luminance(shown)], axis=-1))
-    return geometry, jnp.concatenate([light, details], axis=-1)
+    recent = (jnp.where(past.valid, one, noisy) for one in (past.mean, past.shown))
+    seen, mean, shown = (light_of_blocks(light, gain) for light in (noisy, *recent))
+    # One by one: XLA:CPU does not vectorise what it writes side by side.
+    means = [seen[..., :3], mean[..., :3], shown[..., :3], *map(downsample, facts)]
+    return geometry, jnp.concatenate([*means, seen[..., 3:], shown[..., 3:]], axis=-1)
 
 
 def _decisions(head: jax.Array) -> _Decisions:
@@ -298,14 +302,18 @@ def _filtered(
     The image of the levels at half resolution is enlarged along the guides, and takes a share of every pixel. The
     texture that the division left is filtered likewise, and given back (:func:`jaxdn.brdf.restore`).
     """
-    scales = {name: jnp.exp(0.5 * logarithm) for name, logarithm in guide.items()}
+    factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in guide.items()}
 
-    def guided(parts: _Surfaces, slanted: jax.Array, index: int, own: jax.Array, trust: jax.Array) -> Guide:
-        surfaces = jnp.concatenate([scales["albedo"][index] * parts.albedo, scales["normal"][index] * parts.normal], -1)
-        features = jnp.concatenate([_planar(surfaces), scales["learned"][index] * own])
-        return Guide(features, scales["depth"][index] * slanted, ((trust + _LEAST_TRUST) * parts.hit)[..., 0])
+    def guided(parts: _Surfaces, slanted: jax.Array, own: jax.Array, trust: jax.Array) -> Guide:
+        surfaces = jnp.concatenate([parts.albedo, parts.normal], axis=-1)
+        confidence = ((trust + _LEAST_TRUST) * parts.hit)[..., 0]
+        return Guide(jnp.concatenate([_planar(surfaces), own]), slanted, confidence)
 
-    at_full = guided(surfaces, slanted, 0, decided.features, decided.shares["trust"])
+    def at_level(guide: Guide, index: int) -> Guide:
+        count = {"albedo": 3, "normal": 3, "learned": guide.features.shape[0] - 6, "depth": 1}
+        return guide._replace(scales=jnp.concatenate([jnp.full(n, factors[name][index]) for name, n in count.items()]))
+
+    at_full = at_level(guided(surfaces, slanted, decided.features, decided.shares["trust"]), 0)
     fine = _planar(mean if texture is None else jnp.concatenate([mean, texture], axis=-1))
     for index in range(full_levels):
         fine = affinity_filter(fine, at_full, step=2**index)
@@ -317,11 +325,11 @@ def _filtered(
     )
     slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
     coarse = downsample(fill(fine, surfaces.hit))
+    at_half = guided(half, slanted_half, decided.half_features, decided.half_trust)
     for index in range(LEVELS):
-        at_half = guided(half, slanted_half, 1 + index, decided.half_features, decided.half_trust)
-        smoother = affinity_filter(_planar(coarse), at_half, step=2**index).transpose(1, 2, 0)
+        smoother = affinity_filter(_planar(coarse), at_level(at_half, 1 + index), step=2**index).transpose(1, 2, 0)
         coarse = coarse + decided.take[index] * (smoother - coarse)
-    there = guided(half, slanted[:, ::2, ::2], 0, decided.mean_features, decided.half_trust)
+    there = guided(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
     enlarged, weight = enlarge(_planar(coarse), there, at_full)
     share = decided.shares["coarse"] * (weight / (weight + _LIKENESS))[..., None]
     image = fine + share * (enlarged.transpose(1, 2, 0) - fine)

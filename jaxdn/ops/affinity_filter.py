@@ -26,6 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxdn.compiled import strips
+from jaxdn.ops.faster import alone
 from jaxdn.ops.platform import platform
 
 RADIUS = 2
@@ -47,6 +49,19 @@ class Guide(NamedTuple):
     """[3, H, W] a value that is affine on planes, scaled likewise, and its slopes along x and y per pixel."""
     confidence: jax.Array
     """[H, W] >= 0; 0 for pixels that no other may take anything from."""
+    scales: jax.Array | None = None
+    """[F + 1] factors of every feature and of the slanted guide, where the same guide serves several filters."""
+
+    def factors(self) -> jax.Array:
+        """[F + 1] the scales, 1 where there are none."""
+        return jnp.ones(self.features.shape[0] + 1, self.features.dtype) if self.scales is None else self.scales
+
+    def scaled(self) -> "Guide":
+        """The same guide without scales, which have been multiplied into it."""
+        if self.scales is None:
+            return self
+        factors = self.scales[:, None, None]
+        return Guide(factors[:-1] * self.features, factors[-1:] * self.slanted, self.confidence)
 
 
 def affinity_filter(image: jax.Array, guide: Guide, *, step: int = 1) -> jax.Array:
@@ -63,7 +78,22 @@ def affinity_filter(image: jax.Array, guide: Guide, *, step: int = 1) -> jax.Arr
             f"guide: expected features [F, H, W], slanted [3, H, W] and confidence [H, W] for an image [C, H, W], got "
             f"{guide.features.shape}, {guide.slanted.shape} and {guide.confidence.shape} for {image.shape}."
         )
-    return _filtered(image, guide, step)
+    plain = functools.partial(_filtered_once, step=step)
+    if strips.available() and image.dtype == guide.features.dtype == jnp.float32:
+        return alone(plain, functools.partial(_filtered_by_compiled, step=step))(image, guide)
+    return plain(image, guide)
+
+
+def _filtered_once(image: jax.Array, guide: Guide, *, step: int) -> jax.Array:
+    return _filtered(image, guide.scaled(), step)
+
+
+def _filtered_by_compiled(image: jax.Array, guide: Guide, *, step: int) -> jax.Array:
+    from jaxdn.compiled.affinities import filtered
+
+    arrays = [image, *guide[:3], guide.factors()]
+    numbers = step, np.asarray(SPLINE, np.float32), np.float32(_NO_WEIGHT)
+    return strips.call(filtered, [image.shape], arrays, *numbers, rows=image.shape[1], least=8 * step)[0]
 
 
 class _Pair(NamedTuple):
@@ -134,8 +164,8 @@ def _forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, _Res
     channels, height, width = image.shape
     dtype, margin = image.dtype, step * RADIUS
     rows = height if platform() != "cpu" else min(height, max(8 * step, _STRIP // width))
-    strips = -(-height // rows)
-    below = strips * rows - height
+    count = -(-height // rows)
+    below = count * rows - height
 
     def around(plane: jax.Array, margin: int) -> jax.Array:
         return jnp.pad(plane, ((margin, margin + below), (margin, margin)))
@@ -173,11 +203,11 @@ def _forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, _Res
         carry, _ = lax.scan(body, begin, _from(pairs, 1))
         return jnp.stack(add(*carry))
 
-    if strips == 1:
+    if count == 1:
         totals = strip(0)
     else:
-        totals = lax.map(strip, rows * jnp.arange(strips, dtype=jnp.int32))
-        totals = totals.transpose(1, 0, 2, 3).reshape(channels + 1, strips * rows, width)[:, :height]
+        totals = lax.map(strip, rows * jnp.arange(count, dtype=jnp.int32))
+        totals = totals.transpose(1, 0, 2, 3).reshape(channels + 1, count * rows, width)[:, :height]
     weight = totals[-1:]
     some = weight > _NO_WEIGHT
     filtered = jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), image)

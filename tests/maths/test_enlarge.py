@@ -45,7 +45,7 @@ def by_formula(coarse, there, here):
 def test_it_is_the_formula(strip, rng, x64, monkeypatch):
     monkeypatch.setattr(module, "_STRIP", strip)
     coarse, there, here = drawn(rng)
-    found, weight = enlarge(jnp.asarray(coarse), Guide(*map(jnp.asarray, there)), Guide(*map(jnp.asarray, here)))
+    found, weight = enlarge(jnp.asarray(coarse), *jax.tree.map(jnp.asarray, (there, here)))
     wanted, sums = by_formula(coarse, there, here)
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
     np.testing.assert_allclose(weight, sums, rtol=1e-10)
@@ -57,14 +57,14 @@ def test_gradients(rng, x64):
     def enlarged(coarse, *parts):
         return enlarge(coarse, Guide(*parts[:3]), Guide(*parts[3:], jnp.ones(here.confidence.shape)))
 
-    arguments = tuple(map(jnp.asarray, (coarse, *there, *here[:2])))
+    arguments = tuple(map(jnp.asarray, (coarse, *there[:3], *here[:2])))
     check_grads(jax.jit(enlarged), arguments, order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
 
 
 def test_a_fine_pixel_that_nothing_resembles_has_no_weight(rng):
     coarse, there, here = drawn(rng)
     here.features[:, 4, 5] = 100.0
-    found, weight = enlarge(jnp.asarray(coarse), Guide(*map(jnp.asarray, there)), Guide(*map(jnp.asarray, here)))
+    found, weight = enlarge(jnp.asarray(coarse), *jax.tree.map(jnp.asarray, (there, here)))
     assert weight[4, 5] == 0
     assert (found[:, 4, 5] == 0).all()
     assert (weight > 0).sum() == weight.size - 1

@@ -1,0 +1,104 @@
+"""A compiled loop for :mod:`jaxdn.filters.recall`: the taps of every pixel's target, fetched, tested and averaged."""
+
+import math
+
+import numpy as np
+
+from jaxdn.compiled.rows import Array, loop
+
+Given = np.ndarray | None
+
+
+@loop
+def fetched(
+    top: int,
+    bottom: int,
+    history: Array,
+    sound: Array,
+    depth: Given,
+    normal: Given,
+    ids: Given,
+    x: Array,
+    y: Array,
+    inside: Array,
+    wanted_depth: Given,
+    tolerance: Given,
+    wanted_normal: Given,
+    wanted_ids: Given,
+    mean: Array,
+    valid: Array,
+    threshold: float,
+    least: float,
+    around: bool,
+) -> None:
+    """Rows of ``mean`` [H, W, C] and ``valid`` [H, W] (1 or 0).
+
+    As :func:`jaxdn.filters.recall.fetch` says: accepted taps of the target's cell, renormalised if their weights sum to
+    ``least``; else, with ``around``, the mean of those of the 3x3 pixels around the target. ``history`` is finite.
+    """
+    height, width, channels = history.shape
+    zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+    weights = np.empty(4, np.float32)
+    for i in range(top, bottom):
+        for j in range(width):
+            valid[i, j] = zero
+            for channel in range(channels):
+                mean[i, j, channel] = zero
+            if not inside[i, j]:
+                continue
+            left = min(max(int(math.floor(x[i, j])), 0), max(width - 2, 0))
+            upper = min(max(int(math.floor(y[i, j])), 0), max(height - 2, 0))
+            right, lower = min(left + 1, width - 1), min(upper + 1, height - 1)
+            fx, fy = x[i, j] - np.float32(left), y[i, j] - np.float32(upper)
+            middle_x, middle_y = int(math.floor(x[i, j] + half)), int(math.floor(y[i, j] + half))
+            mass, wide = zero, False
+            # The four of the cell, then the nine around the target. No function tests them: passing it the arrays would
+            # count references, which takes longer than the test.
+            for tap in range(13 if around else 4):
+                if tap < 4:
+                    row, column = lower if tap // 2 else upper, right if tap % 2 else left
+                    weights[tap] = zero
+                else:
+                    if tap == 4:
+                        if mass >= least:
+                            break
+                        mass, wide = zero, True
+                    row, column = middle_y + (tap - 4) // 3 - 1, middle_x + (tap - 4) % 3 - 1
+                    if row < 0 or row >= height or column < 0 or column >= width:
+                        continue
+                if not sound[row, column, 0]:
+                    continue
+                if depth is not None:
+                    if not abs(depth[row, column, 0] - wanted_depth[i, j]) <= tolerance[i, j]:
+                        continue
+                if ids is not None:
+                    # Any id is right where none is wanted.
+                    if ids[row, column, 0] != wanted_ids[i, j] and wanted_ids[i, j] == wanted_ids[i, j]:
+                        continue
+                if normal is not None:
+                    nx, ny, nz = normal[row, column, 0], normal[row, column, 1], normal[row, column, 2]
+                    mx, my, mz = wanted_normal[i, j, 0], wanted_normal[i, j, 1], wanted_normal[i, j, 2]
+                    # Where there is no surface in both, they are alike.
+                    absent = nx == 0 and ny == 0 and nz == 0 and mx == 0 and my == 0 and mz == 0
+                    if not (nx * mx + ny * my + nz * mz > threshold or absent and threshold < 1):
+                        continue
+                if tap < 4:
+                    weights[tap] = (fy if tap // 2 else one - fy) * (fx if tap % 2 else one - fx)
+                    mass += weights[tap]
+                else:
+                    mass += one
+                    for channel in range(channels):
+                        mean[i, j, channel] += history[row, column, channel]
+            if mass < least:
+                continue
+            valid[i, j] = one
+            for channel in range(channels):
+                if wide:
+                    mean[i, j, channel] /= mass
+                    continue
+                mean[i, j, channel] = (
+                    weights[0] * history[upper, left, channel]
+                    + weights[1] * history[upper, right, channel]
+                    + weights[2] * history[lower, left, channel]
+                    + weights[3] * history[lower, right, channel]
+                ) / mass

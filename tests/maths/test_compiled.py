@@ -1,0 +1,146 @@
+"""The loops that Numba compiles against the operations in jax that they stand for, and when they are used."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdn.compiled import strips
+from jaxdn.filters.blocks import light_of_blocks
+from jaxdn.filters.enlarge import enlarge
+from jaxdn.filters.guides import guides_of
+from jaxdn.filters.recall import recall
+from jaxdn.frame import FAR, Frame
+from jaxdn.ops.affinity_filter import Guide, affinity_filter
+
+pytestmark = pytest.mark.skipif(not strips.available(), reason="no Numba, or jax computes on another device")
+
+
+@pytest.fixture
+def both(monkeypatch):
+    """The results of a function of arrays, once with the loops and once without, jitted anew."""
+
+    def run(function, *arguments):
+        found = []
+        for value, callbacks in (("1", 1), ("0", 0)):
+            monkeypatch.setenv("JAXDN_COMPILED", value)
+            program = jax.jit(lambda *given: function(*given))
+            assert (str(jax.make_jaxpr(program)(*arguments)).count("callback[") > 0) == callbacks
+            found.append(jax.tree.map(np.asarray, program(*arguments)))
+        return found
+
+    return run
+
+
+def drawn(rng, height, width, features=4):
+    """A guide with edges, pixels that nobody trusts, and one whose features are far from all others."""
+    planes = rng.uniform(-1, 1, (features, height, width)).round().astype(np.float32)
+    planes[:, height // 2, width // 2] = 50.0
+    confidence = rng.uniform(0, 1, (height, width)) * (rng.random((height, width)) > 0.2)
+    slanted = 0.3 * rng.normal(size=(3, height, width))
+    return Guide(*(jnp.asarray(each, jnp.float32) for each in (planes, slanted, confidence)))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 40), (37, 5), (33, 70)])
+@pytest.mark.parametrize("step", [1, 2, 8])
+def test_a_level_of_the_filter(size, step, rng, both):
+    image = jnp.asarray(10.0 ** rng.uniform(-4, 4, (3, *size)), jnp.float32)
+    guide = drawn(rng, *size)._replace(scales=jnp.asarray([0.5, 1.0, 2.0, 0.1, 3.0]))
+    found, wanted = both(lambda image, guide: affinity_filter(image, guide, step=step), image, guide)
+    np.testing.assert_allclose(found, wanted, rtol=3e-5)  # where all are unlike: a distance of 80 is rounded to 5e-6
+    given, multiplied = both(
+        lambda image, guide: (affinity_filter(image, guide), affinity_filter(image, guide.scaled())), image, guide
+    )[0]
+    np.testing.assert_allclose(given, multiplied, rtol=3e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 9), (17, 21)])
+def test_the_enlarged_image(size, rng, both):
+    coarse = jnp.asarray(10.0 ** rng.uniform(-4, 4, (3, *size)), jnp.float32)
+    there, here = drawn(rng, *size), drawn(rng, 2 * size[0], 2 * size[1])
+    here = here._replace(scales=jnp.asarray([0.5, 1.0, 2.0, 0.1, 3.0]))
+    (image, weight), (wanted, sums) = both(enlarge, coarse, there, here)
+    np.testing.assert_allclose(weight, sums, rtol=3e-6, atol=1e-7)
+    np.testing.assert_allclose(image, wanted, rtol=1e-5)
+    assert ((weight == 0) == (sums == 0)).all()
+
+
+@pytest.mark.parametrize("left_out", ["", "depth", "normal", "ids", "motion", "previous_depth", "depth normal ids"])
+@pytest.mark.parametrize("around", [False, True])
+def test_the_recalled_history(left_out, around, rng, both):
+    height, width = 23, 31
+    normal = rng.normal(size=(height, width, 3)).round()
+    frame = Frame(
+        radiance=np.zeros((height, width, 3)),
+        normal=normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6),
+        depth=rng.choice([1.0, 1.01, 3.0, FAR], (height, width, 1)),
+        previous_depth=rng.choice([1.0, 3.0], (height, width, 1)),
+        ids=rng.integers(-1, 2, (height, width, 1)),
+        motion=rng.choice([-2.5, -1.0, 0.0, 0.3, 1e6, np.nan], (height, width, 2), p=[0.1, 0.2, 0.3, 0.3, 0.05, 0.05]),
+    )._replace(**dict.fromkeys(left_out.split()))
+    frame = jax.tree.map(
+        lambda each: jnp.asarray(each, jnp.int32 if each.dtype == np.int64 else jnp.float32), frame
+    )
+    history = rng.uniform(0, 1, (height, width, 8)).astype(np.float32)
+    history[3, 4, 2], history[5, 6, 0], history[7, 7, 7] = np.nan, -1.0, np.inf
+
+    def recalled(history, frame, first):
+        return recall(history, guides_of(frame), frame, first, around=around)
+
+    for first in (False, True):
+        found, wanted = both(recalled, jnp.asarray(history), frame, jnp.asarray(first))
+        np.testing.assert_array_equal(found.valid, wanted.valid)
+        np.testing.assert_allclose(found.history, wanted.history, rtol=1e-5, atol=1e-7)
+        assert found.broken == wanted.broken
+        assert first == (not found.valid.any())
+
+
+@pytest.mark.parametrize("gain", [1e-6, 1.0, 1e6, 1e30])
+def test_light_of_blocks(gain, rng, both):
+    light = 10.0 ** rng.uniform(-12, 4.8, (14, 38, 3))
+    light[:2], light[2:4] = 0.0, 65504.0
+    found, wanted = both(light_of_blocks, jnp.asarray(light, jnp.float32), jnp.float32(gain))
+    np.testing.assert_allclose(found, wanted, rtol=3e-6, atol=1e-12)
+    assert wanted.max() > 1e-4
+
+
+def test_gradients_and_batches_are_those_of_jax(rng, both, monkeypatch):
+    image, guide = jnp.asarray(rng.random((2, 9, 12)), jnp.float32), drawn(rng, 9, 12)
+    coarse, there = image[:, :4, :6], drawn(rng, 4, 6)
+    fine = jax.tree.map(lambda plane: plane[..., :8, :], guide)
+
+    def loss(image, guide, coarse, there, fine):
+        enlarged, weight = enlarge(coarse, there, fine)
+        return (affinity_filter(image, guide) ** 2).sum() + (enlarged**2).sum() + weight.sum()
+
+    given = image, guide, coarse, there, fine
+    program = jax.grad(loss, argnums=(0, 1, 2, 3, 4))
+    assert "callback[" not in str(jax.make_jaxpr(program)(*given))
+    found = program(*given)
+    monkeypatch.setenv("JAXDN_COMPILED", "0")
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(program(*given)), strict=True):
+        np.testing.assert_array_equal(one, other)
+    monkeypatch.delenv("JAXDN_COMPILED")
+
+    two = jax.tree.map(lambda each: jnp.stack([each, each[..., ::-1]]), (image, guide))
+    batched = jax.vmap(affinity_filter)
+    assert "callback[" not in str(jax.make_jaxpr(batched)(*two))
+    alone = both(affinity_filter, *jax.tree.map(lambda each: each[1], two))[0]
+    np.testing.assert_allclose(batched(*two)[1], alone, rtol=3e-5)
+
+
+def test_an_error_in_a_loop_is_raised(rng):
+    def fails(top, bottom, image, out):
+        raise RuntimeError("the strip is torn")
+
+    with pytest.raises(jax.errors.JaxRuntimeError, match="the strip is torn"):
+        jax.block_until_ready(strips.call(fails, [(4, 4)], [jnp.ones((4, 4))], rows=4))
+
+
+def test_every_row_belongs_to_one_strip():
+    def counts(top, bottom, image, out):
+        out[top:bottom] = image[top:bottom] + 1
+
+    for rows in (1, 2, 7, 8, 9, 1000):
+        (found,) = strips.call(counts, [(rows, 3)], [jnp.zeros((rows, 3))], rows=rows)
+        np.testing.assert_array_equal(found, 1)
