@@ -5,11 +5,11 @@ import sys
 
 _TRIM_THRESHOLD, _MMAP_MAX, _ARENA_MAX = -1, -4, -8
 """Parameters of glibc's ``mallopt``."""
-_MOST = 2**31 - 1
+_NEVER = -1
 
 
 def keep_memory() -> bool:
-    """Let this process keep up to 2 GiB of memory that it has freed; whether the C library can (glibc on Linux).
+    """Let this process keep the memory that it has freed; whether the C library can (glibc on Linux).
 
     XLA allocates the arrays of a program anew at every call. Large ones come from the system, which clears every page
     of them: with 720p frames that is a sixth of the time. To be called before jax starts its threads.
@@ -20,4 +20,4 @@ def keep_memory() -> bool:
         option = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):  # another C library
         return False
-    return all([option(_MMAP_MAX, 0), option(_TRIM_THRESHOLD, _MOST), option(_ARENA_MAX, 1)])
+    return all([option(_MMAP_MAX, 0), option(_TRIM_THRESHOLD, _NEVER), option(_ARENA_MAX, 1)])

@@ -96,7 +96,9 @@ def render_all(settings: Settings) -> None:
     """
     sources = [(str(room), settings.tours, True) for room in settings.rooms]
     sources += [(family, clips, False) for family, clips in FAMILIES.items()]
-    blocks = [("train", range(first, first + BLOCK)) for first in range(0, max(clips for _, clips, _ in sources), BLOCK)]
+    blocks = [
+        ("train", range(first, first + BLOCK)) for first in range(0, max(clips for _, clips, _ in sources), BLOCK)
+    ]
     # Block by block, so that what is there is a mixture of all kinds at any time.
     for part, seeds in [*blocks, ("validation", range(1000, 1001))]:
         for (source, clips, tours), odd in itertools.product(sources, (False, True)):

@@ -6,11 +6,13 @@ Compiled loops are kept on disk, and compiled anew where their own file has chan
 deletes them (``rm jaxdn/compiled/__pycache__/*.nb?``).
 """
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
 # Sums may be done in any order; what is not finite keeps its meaning.
-_options = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy"}
+_options: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy"}
 # Into the loop itself: passing arrays to a function counts references, which takes longer than a short row.
 inlined = njit(**_options, inline="always")
 loop = njit(**_options, nogil=True, cache=True)

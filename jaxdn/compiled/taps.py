@@ -1,12 +1,14 @@
 """A compiled loop for :mod:`jaxdn.filters.recall`: the taps of every pixel's target, fetched, tested and averaged."""
 
 import math
+from typing import Any
 
 import numpy as np
 
 from jaxdn.compiled.rows import Array, loop
 
-Given = np.ndarray | None
+Given = Any
+"""An array, or None where there is none."""
 
 
 @loop
@@ -46,11 +48,11 @@ def fetched(
                 mean[i, j, channel] = zero
             if not inside[i, j]:
                 continue
-            left = min(max(int(math.floor(x[i, j])), 0), max(width - 2, 0))
-            upper = min(max(int(math.floor(y[i, j])), 0), max(height - 2, 0))
+            left = min(max(math.floor(x[i, j]), 0), max(width - 2, 0))
+            upper = min(max(math.floor(y[i, j]), 0), max(height - 2, 0))
             right, lower = min(left + 1, width - 1), min(upper + 1, height - 1)
             fx, fy = x[i, j] - np.float32(left), y[i, j] - np.float32(upper)
-            middle_x, middle_y = int(math.floor(x[i, j] + half)), int(math.floor(y[i, j] + half))
+            middle_x, middle_y = math.floor(x[i, j] + half), math.floor(y[i, j] + half)
             mass, wide = zero, False
             # The four of the cell, then the nine around the target. No function tests them: passing it the arrays would
             # count references, which takes longer than the test.
@@ -68,10 +70,11 @@ def fetched(
                         continue
                 if not sound[row, column, 0]:
                     continue
-                if depth is not None:
+                # Numba leaves out what asks for an absent buffer if nothing else is asked in the same condition.
+                if depth is not None:  # noqa: SIM102
                     if not abs(depth[row, column, 0] - wanted_depth[i, j]) <= tolerance[i, j]:
                         continue
-                if ids is not None:
+                if ids is not None:  # noqa: SIM102
                     # Any id is right where none is wanted.
                     if ids[row, column, 0] != wanted_ids[i, j] and wanted_ids[i, j] == wanted_ids[i, j]:
                         continue
@@ -80,7 +83,7 @@ def fetched(
                     mx, my, mz = wanted_normal[i, j, 0], wanted_normal[i, j, 1], wanted_normal[i, j, 2]
                     # Where there is no surface in both, they are alike.
                     absent = nx == 0 and ny == 0 and nz == 0 and mx == 0 and my == 0 and mz == 0
-                    if not (nx * mx + ny * my + nz * mz > threshold or absent and threshold < 1):
+                    if not (nx * mx + ny * my + nz * mz > threshold or (absent and threshold < 1)):
                         continue
                 if tap < 4:
                     weights[tap] = (fy if tap // 2 else one - fy) * (fx if tap % 2 else one - fx)

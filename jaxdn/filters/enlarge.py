@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.ops.affinity_filter import Guide, affinity
 from jaxdn.compiled import strips
+from jaxdn.ops.affinity_filter import Guide, affinity
 from jaxdn.ops.faster import alone
 from jaxdn.ops.platform import platform
 
@@ -33,8 +33,9 @@ def enlarge(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, ja
 
     Every fine pixel takes the mean of the 3x3 coarse pixels around it, weighted by their distance, confidence and
     affinity as in :mod:`jaxdn.ops.affinity_filter`. ``there`` guides the coarse pixels, ``here`` the fine ones: its
-    confidence is not used, and its scales are those of both. The slanted guide of a coarse pixel is that of the upper left of its four pixels, and its
-    slopes are those per fine pixel. Where no coarse pixel is alike, the sum of weights is 0 and so is the image.
+    confidence is not used, and its scales are those of both. The slanted guide of a coarse pixel is that of the upper
+    left of its four pixels, and its slopes are those per fine pixel. Where no coarse pixel is alike, the sum of weights
+    is 0 and so is the image.
     """
     if strips.available() and coarse.dtype == here.features.dtype == jnp.float32:
         return alone(_enlarged, _enlarged_by_compiled)(coarse, there, here)

@@ -90,66 +90,70 @@ def fetch(
     broken = jnp.sum(~sound & ~first, dtype=jnp.int32)
     history = jnp.where(sound, history, 0.0)
     x, y, inside = _targets(history, motion, first)
-    options = {"normal_threshold": normal_threshold, "around": around}
-    find = functools.partial(_found, moving=motion is not None, **options)
+    given = _Given(history, sound, before, (x, y), inside, wanted)
+    plain = functools.partial(_found, _Rules(motion is not None, normal_threshold, around))
     if strips.available() and history.dtype == jnp.float32:
-        find = alone(find, functools.partial(_found_by_compiled, **options))
-    mean, valid = find(history, sound, before, (x, y), inside, wanted)
+        mean, valid = alone(plain, functools.partial(_found_by_compiled, *plain.args))(given)
+    else:
+        mean, valid = plain(given)
     return Recalled(mean, valid[..., None], broken)
 
 
-def _found(
-    history: jax.Array,
-    sound: jax.Array,
-    before: Guides,
-    at: _Position,
-    inside: jax.Array,
-    wanted: Expected,
-    *,
-    moving: bool,
-    normal_threshold: float,
-    around: bool,
-) -> tuple[jax.Array, jax.Array]:
-    """The mean [H, W, C] and bool [H, W], whether there is one, of taps ``at`` the targets; ``sound`` ones count."""
+class _Rules(NamedTuple):
+    """How taps are chosen."""
+
+    moving: bool
+    normal_threshold: float
+    around: bool
+
+
+class _Given(NamedTuple):
+    """What they are chosen from."""
+
+    history: jax.Array
+    """[H, W, C], 0 where a pixel is not sound."""
+    sound: jax.Array
+    """[H, W, 1] bool."""
+    before: Guides
+    at: _Position
+    inside: jax.Array
+    """[H, W] bool, the target is in the image."""
+    wanted: Expected
+
+
+def _found(rules: _Rules, given: _Given) -> tuple[jax.Array, jax.Array]:
+    """The mean [H, W, C] of the accepted taps, and bool [H, W], whether there is one."""
+    history, sound, before, at, inside, wanted = given
     packed = lax.stop_gradient(pack(jnp.concatenate([history, sound.astype(history.dtype)], axis=-1), before))
 
     def accepted(tap: jax.Array, wanted: Expected) -> jax.Array:
         whole, guides = unpack(tap, before)
-        return (whole[..., -1] > 0) & same_surface(guides, wanted, normal_threshold=normal_threshold)
+        return (whole[..., -1] > 0) & same_surface(guides, wanted, normal_threshold=rules.normal_threshold)
 
-    if moving:
+    if rules.moving:
         mean, valid = _of_cells(history, packed, at, inside, wanted, accepted)
     else:
         valid = inside & accepted(packed, wanted)
         mean = jnp.where(valid[..., None], history, 0.0)
-    if around:
+    if rules.around:
         lost = inside & ~valid
-        given = history, packed, lost, wanted, accepted
-        more, found = _around(at, *given) if moving else _beside(*given)
+        search = history, packed, lost, wanted, accepted
+        more, found = _around(at, *search) if rules.moving else _beside(*search)
         mean, valid = jnp.where(found[..., None], more, mean), valid | found
     return mean, valid
 
 
-def _found_by_compiled(
-    history: jax.Array,
-    sound: jax.Array,
-    before: Guides,
-    at: _Position,
-    inside: jax.Array,
-    wanted: Expected,
-    *,
-    normal_threshold: float,
-    around: bool,
-) -> tuple[jax.Array, jax.Array]:
+def _found_by_compiled(rules: _Rules, given: _Given) -> tuple[jax.Array, jax.Array]:
     from jaxdn.compiled.taps import fetched
 
+    history, sound, before, at, inside, wanted = given
     tested = before._replace(
         depth=None if wanted.depth is None or wanted.tolerance is None else before.depth,
         normal=None if wanted.normal is None else before.normal,
         ids=None if wanted.ids is None else before.ids,
     )
     arrays = [history, sound, *tested, *at, inside, wanted.depth, wanted.tolerance, wanted.normal, wanted.ids]
-    numbers = np.float32(normal_threshold), np.float32(WEIGHT_MIN), around
+    numbers = np.float32(rules.normal_threshold), np.float32(WEIGHT_MIN), rules.around
     size = history.shape[:2]
     mean, valid = strips.call(fetched, [history.shape, size], arrays, *numbers, rows=size[0])
     return mean, valid > 0

@@ -178,7 +178,8 @@ def steady(options: Options) -> Denoiser:
         weights = {name: part for name, part in params.items() if name != "guide"}
         seen = _seen(noisy, past, surfaces, whole)
         head = network.apply(weights, [pad(group, _MULTIPLE)[None] for group in seen])[0][0]
-        decided = _decisions(crop(head, seen[0].shape[:2]))
+        height, width = seen[0].shape[:2]
+        decided = _decisions(crop(head, (height, width)))
         mean, square, number = _accumulated(noisy, past, decided.shares["follow"], options.history_max)
         texture = texture_left(frame, options.demodulate, whole)
         texture = None if texture is None else fill(pad(texture, _BLOCKS), surfaces.hit)

@@ -78,9 +78,7 @@ def test_the_recalled_history(left_out, around, rng, both):
         ids=rng.integers(-1, 2, (height, width, 1)),
         motion=rng.choice([-2.5, -1.0, 0.0, 0.3, 1e6, np.nan], (height, width, 2), p=[0.1, 0.2, 0.3, 0.3, 0.05, 0.05]),
     )._replace(**dict.fromkeys(left_out.split()))
-    frame = jax.tree.map(
-        lambda each: jnp.asarray(each, jnp.int32 if each.dtype == np.int64 else jnp.float32), frame
-    )
+    frame = jax.tree.map(lambda each: jnp.asarray(each, jnp.int32 if each.dtype == np.int64 else jnp.float32), frame)
     history = rng.uniform(0, 1, (height, width, 8)).astype(np.float32)
     history[3, 4, 2], history[5, 6, 0], history[7, 7, 7] = np.nan, -1.0, np.inf
 
