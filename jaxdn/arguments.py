@@ -237,7 +237,7 @@ class Denoise:
     """For files of other renderers: the view layer or part to look for buffers in."""
     implementation: str = "auto"
     """Engine for the network: reference (XLA), onednn-bfloat16 (CPUs with AVX-512 BF16 or AMX; the extra onednn),
-    onnxruntime (CPUs; the extra onnx); auto: the fastest available."""
+    onednn-float32 (CPUs; the extra onednn), onnxruntime (CPUs; the extra onnx); auto: the fastest available."""
     budget: float | None = None
     """Samples per pixel for a method that says where they go (ntasd, dasr), and for a scene: their mean; default: the
     method's own, else 4."""

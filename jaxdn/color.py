@@ -92,14 +92,14 @@ def brightness(radiance: jax.Array) -> jax.Array:
 
     Those of images that lie side by side, with sides of whole blocks, add up to that of both. No gradient.
     """
-    light = jnp.minimum(luminance(jax.lax.stop_gradient(radiance))[..., 0], RADIANCE_MAX)
-    height, width = light.shape
+    light = jnp.minimum(jax.lax.stop_gradient(radiance), RADIANCE_MAX)
+    height, width = light.shape[:2]
     block = [min(16, size) for size in (height, width)]
     # Rows and columns beyond the last whole block have no say.
     rows, columns = (size // side for size, side in zip((height, width), block, strict=True))
     light = light[: rows * block[0], : columns * block[1]]
     # Whole rows are added first, which vectorises; a product adds the columns.
-    sums = light.reshape(rows, block[0], -1).sum(1)
+    sums = luminance(light.reshape(rows, block[0], -1).sum(1).reshape(rows, -1, 3))[..., 0]
     own = jnp.repeat(jnp.eye(columns, dtype=light.dtype), block[1], axis=0) / (block[0] * block[1])
     means = jax.lax.dot(sums, own, precision="highest")
     lit = means > 0

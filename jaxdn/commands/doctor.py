@@ -18,7 +18,7 @@ from jaxdn.networks.engines import ENGINES
 from jaxdn.ops import onednn_library
 from jaxdn.render.variant import choose_variant, has_cuda
 
-_EXTRA_OF = {"onednn-bfloat16": "onednn", "onnxruntime": "onnx", "onednn": "onednn"}
+_EXTRA_OF = {"onednn-bfloat16": "onednn", "onednn-float32": "onednn", "onnxruntime": "onnx", "onednn": "onednn"}
 """Engine -> the extra that brings it."""
 
 
@@ -50,7 +50,7 @@ def _findings() -> Iterator[Finding]:
         if engine.available():
             yield Finding(f"engine for {engine.purpose}", engine.name)
         elif engine.name == "onednn-bfloat16" and onednn_library.available():
-            yield Finding(f"engine for {engine.purpose}", "no bfloat16, with which this CPU does not compute")
+            yield Finding(f"engine for {engine.purpose}", "no onednn-bfloat16: this CPU does not compute with it")
         elif jax.default_backend() == "cpu":
             yield Finding(f"engine for {engine.purpose}", "XLA alone", f"faster: {install(_EXTRA_OF[engine.name])}")
         else:

@@ -39,9 +39,9 @@ class Options(Sampling):
     """The networks see radiance times :func:`jaxdn.color.exposure` of each frame; or radiance as it is given."""
     demodulate: Demodulation | bool = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
-    implementation: Literal["reference", "onednn-bfloat16", "onnxruntime", "onednn"] | None = None
-    """Engine of the U-Nets: XLA, or on CPUs ONNX Runtime or oneDNN in bfloat16 (inference), or oneDNN (training). None
-    is XLA."""
+    implementation: Literal["reference", "onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"] | None = None
+    """Engine of the U-Nets: XLA, or on CPUs oneDNN in bfloat16 or float32 or ONNX Runtime (inference), or oneDNN
+    (training). None is XLA."""
 
     def __post_init__(self) -> None:
         if self.least < 1:
@@ -57,7 +57,7 @@ class Options(Sampling):
         "paper": Recipe(compressed_illumination(), frames=1, decay=False, variation=STILL, average=0.0),
     },
     variants={"dasr-large": {"size": "large"}, "dasr-small": {"size": "small"}},
-    engines=("onednn-bfloat16", "onnxruntime", "onednn"),
+    engines=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
 )
 def dasr(options: Options) -> Denoiser:
     """Adaptive sampling of single frames; it requests samples, from stored layers of 1, 2, 4, ... or from the renderer.

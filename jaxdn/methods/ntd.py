@@ -90,9 +90,9 @@ class Options:
     """Stop the gradient at the history."""
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Precision of the U-Net only; None is the images' dtype."""
-    implementation: Literal["reference", "onednn-bfloat16", "onnxruntime", "onednn"] | None = None
-    """Engine of the U-Net: XLA, or on CPUs ONNX Runtime (inference; the extra ``onnx``) or oneDNN, in bfloat16
-    (inference) or in float32 (training; both the extra ``onednn``). None is XLA."""
+    implementation: Literal["reference", "onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"] | None = None
+    """Engine of the U-Net: XLA, or on CPUs oneDNN in bfloat16 or float32 (the extra ``onednn``) or ONNX Runtime (the
+    extra ``onnx``) for inference, or oneDNN's convolutions for training. None is XLA."""
 
 
 AS_PUBLISHED: dict[str, Any] = {
@@ -191,7 +191,7 @@ def warped_history(
         ),
     },
     variants={"ntd-large": {"size": "large"}, "ntd-small": {"size": "small"}},
-    engines=("onednn-bfloat16", "onnxruntime", "onednn"),
+    engines=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
     earlier={
         "demodulate": "albedo",
         "kernels": "plain",

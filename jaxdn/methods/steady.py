@@ -80,9 +80,9 @@ class Options:
     """Largest effective number of samples of the running mean, in frames."""
     demodulate: Demodulation | bool = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
-    implementation: Literal["reference", "onednn-bfloat16", "onnxruntime", "onednn"] | None = None
-    """Engine of the U-Net: XLA, or on CPUs ONNX Runtime or oneDNN in bfloat16 (inference) or oneDNN (training). None is
-    XLA."""
+    implementation: Literal["reference", "onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"] | None = None
+    """Engine of the U-Net: XLA, or on CPUs oneDNN in bfloat16 or float32 or ONNX Runtime (inference) or oneDNN
+    (training). None is XLA."""
 
 
 class SteadyState(NamedTuple):
@@ -138,7 +138,7 @@ class _Decisions(NamedTuple):
     title="A steady recurrent filter guided by a network at half resolution",
     recipes={"usual": Recipe(pyramid_illumination())},
     variants={f"steady-{quality}": {"quality": quality} for quality in QUALITIES},
-    engines=("onednn-bfloat16", "onnxruntime", "onednn"),
+    engines=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
 )
 def steady(options: Options) -> Denoiser:
     """The denoiser.

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-from jaxdn.networks import bfloat16, onnx
+from jaxdn.networks import onednn, onnx
 from jaxdn.ops import onednn_library
 
 Purpose = Literal["inference", "training"]
@@ -20,7 +20,8 @@ class Engine(NamedTuple):
 
 
 ENGINES: dict[str, Engine] = {
-    "onednn-bfloat16": Engine("onednn-bfloat16", "inference", bfloat16.available),
+    "onednn-bfloat16": Engine("onednn-bfloat16", "inference", onednn.computes_bfloat16),
+    "onednn-float32": Engine("onednn-float32", "inference", onednn_library.available),
     "onnxruntime": Engine("onnxruntime", "inference", onnx.available),
     "onednn": Engine("onednn", "training", onednn_library.available),
 }

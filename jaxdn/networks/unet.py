@@ -16,7 +16,7 @@ from flax import nnx
 
 from jaxdn.checks import check_option
 from jaxdn.denoiser import Params
-from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, bfloat16, description, onnx
+from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, description, onednn, onnx
 from jaxdn.networks.description import FEATURES, Description, evaluate
 from jaxdn.networks.inference import Apply
 from jaxdn.ops import onednn_library
@@ -139,10 +139,16 @@ def convolved_by_onednn(network: Description) -> Apply:
     return by_xla(ONEDNN, network)
 
 
-@register("unet", "onednn-bfloat16", requires=bfloat16.check_available)
+@register("unet", "onednn-float32", requires=functools.partial(onednn.check, onednn.FLOAT32))
+def run_in_float32(network: Description) -> Apply:
+    """The whole network in oneDNN, for inference; the gradient is XLA's."""
+    return onednn.engine(network, by_xla(XLA, network), onednn.FLOAT32)
+
+
+@register("unet", "onednn-bfloat16", requires=functools.partial(onednn.check, onednn.BFLOAT16))
 def run_in_bfloat16(network: Description) -> Apply:
-    """The whole network in oneDNN in bfloat16, for inference; the gradient is XLA's."""
-    return bfloat16.engine(network, by_xla(XLA, network))
+    """The same in bfloat16."""
+    return onednn.engine(network, by_xla(XLA, network), onednn.BFLOAT16)
 
 
 @register("unet", "onnxruntime", requires=onnx.check_available)
@@ -167,10 +173,10 @@ def unet(
     of ``params`` never depend on it. H and W are multiples of 16. ``heads`` are the channel counts at full,
     half and quarter resolution; their outputs are raw (logits), by convolutions of ``head_size``. ``widths`` gives the
     channels of each convolution of each of the five levels; the decoder mirrors the first four. ``initialization``: see
-    :func:`initial`. Computes in the features' dtype. ``implementation``: None or "reference" (XLA), "onednn-bfloat16"
-    or "onnxruntime" (inference, see :mod:`jaxdn.networks.bfloat16` and :mod:`jaxdn.networks.onnx`) or "onednn"
-    (convolutions and their gradients, see :mod:`jaxdn.ops.onednn`). Raises ValueError when ``widths`` is not five
-    non-empty levels of positive integers, the features do not fit, or the implementation cannot run here.
+    :func:`initial`. Computes in the features' dtype. ``implementation``: None or "reference" (XLA), "onednn-bfloat16",
+    "onednn-float32" or "onnxruntime" (inference, see :mod:`jaxdn.networks.onednn` and :mod:`jaxdn.networks.onnx`) or
+    "onednn" (convolutions and their gradients, see :mod:`jaxdn.ops.onednn`). Raises ValueError when ``widths`` is not
+    five non-empty levels of positive integers, the features do not fit, or the implementation cannot run here.
     """
     run = resolve("unet", implementation)
     widths = tuple(tuple(level) for level in widths)

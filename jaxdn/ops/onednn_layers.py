@@ -1,7 +1,7 @@
-"""oneDNN's layers for inference in bfloat16: convolutions with all that follows them, pooling, enlarging.
+"""oneDNN's layers for inference: convolutions with all that follows them, pooling, enlarging.
 
-Activations are [N, H, W, C] in bfloat16, sums are float32. Each function describes a layer and converts its weights
-once; the result is placed on memory and called. The library: :mod:`jaxdn.ops.onednn_library`.
+Activations are [N, H, W, C] in float32 or bfloat16, sums are float32. Each function describes a layer and converts its
+weights once; the result is placed on memory and called. The library: :mod:`jaxdn.ops.onednn_library`.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,6 +25,7 @@ def convolution(
     kernel: np.ndarray,
     bias: np.ndarray | None,
     *,
+    kind: int,
     slope: float | None = None,
     adds: bool = False,
 ) -> Placed:
@@ -35,12 +36,13 @@ def convolution(
       writes: describes what it writes.
       kernel: [size, size, inputs, outputs] float32.
       bias: [outputs] float32, or None.
+      kind: the type in which the kernel is kept and multiplied, that of the images that are read.
       slope: that of a leaky rectifier of the result; None: none.
       adds: it adds to what is there.
     """
     size, _, inputs, outputs = kernel.shape
     ours, dims = dnnl.kernels(size, inputs, outputs)
-    free = dnnl.made("dnnl_memory_desc_create_with_tag", 4, dims, dnnl.BFLOAT16, dnnl.ANY_LAYOUT)
+    free = dnnl.made("dnnl_memory_desc_create_with_tag", 4, dims, kind, dnnl.ANY_LAYOUT)
     row = dnnl.made("dnnl_memory_desc_create_with_tag", 1, dnnl.Dims(outputs), dnnl.FLOAT32, dnnl.ROW)
     edge = dnnl.Dims(size // 2, size // 2)
     description = dnnl.made(

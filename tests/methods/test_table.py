@@ -280,6 +280,8 @@ def test_the_engine_is_the_fastest_for_the_purpose_and_none_for_half_precision(p
     assert svgf.engine(purpose, options) is None
     engines(monkeypatch, **{"onednn-bfloat16": True, "onnxruntime": True, "onednn": True})
     assert ntd.engine(purpose, options) == ("onednn-bfloat16" if expected == "onnxruntime" else expected)
+    engines(monkeypatch, **{"onednn-float32": True, "onnxruntime": True, "onednn": True})
+    assert ntd.engine(purpose, options) == ("onednn-float32" if expected == "onnxruntime" else expected)
     engines(monkeypatch)
     assert ntd.engine(purpose, options) is None
 

@@ -5,13 +5,16 @@ import json
 import pytest
 
 from experiments.speed.frames import OIDN, Settings, builds, main, parsed
+from jaxdn.compiled import strips
 from jaxdn.networks.engines import ENGINES
 
 
 def test_every_engine_for_inference_that_runs_here_is_timed():
-    engines = [name for name in ("onednn-bfloat16", "onnxruntime") if ENGINES[name].available()]
+    engines = [name for name in ("onednn-bfloat16", "onednn-float32", "onnxruntime") if ENGINES[name].available()]
     found = set(builds(["svgf", "steady-fast"], 32, 48)) - {OIDN}
-    assert found == {"svgf, xla", "steady-fast, xla", *(f"steady-fast, {name}" for name in engines)}
+    methods = ("svgf", "steady-fast")
+    without = [f"{name}, xla without compiled loops" for name in methods if strips.available()]
+    assert found == {*(f"{name}, xla" for name in methods), *without, *(f"steady-fast, {name}" for name in engines)}
 
 
 @pytest.mark.slow

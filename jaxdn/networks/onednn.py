@@ -1,12 +1,14 @@
-"""A network run by oneDNN in bfloat16, from inside a jitted program, on CPUs that compute with it.
+"""A network run by oneDNN as a whole, in float32 or in bfloat16, from inside a jitted program on CPUs.
 
-bfloat16 has the range of float32 and 8 bits of precision; sums are float32. A CPU with AVX-512 BF16 or AMX multiplies
-twice as many of them at a time or more, and activations are half as large. What networks decide are shares, features
-and logits, for which 8 bits are enough: images differ by 76 to 85 dB (``docs/performance.md``). It is for inference
-only: the gradient is that of the network in plain XLA, recomputed.
+Each convolution includes its bias, its sum and its rectifier, and activations lie as the library likes them: in
+float32, the U-Nets of ``steady`` take 0.4 to 0.65 of their time in XLA. bfloat16 has the range of float32 and 8 bits of
+precision; sums are float32. A CPU with AVX-512 BF16 or AMX multiplies twice as many of them at a time or more, and
+activations are half as large. What networks decide are shares, features and logits, for which 8 bits are enough: images
+differ by 76 to 85 dB (``docs/performance.md``). Both are for inference only: the gradient is that of the network in
+plain XLA, recomputed.
 
-All primitives are made once for a shape, on memory of their own, and run one after the other; a rectifier is a part of
-its convolution. The layers: :mod:`jaxdn.ops.onednn_layers`.
+All primitives are made once for a shape, on memory of their own, and run one after the other. The layers:
+:mod:`jaxdn.ops.onednn_layers`.
 """
 
 import math
@@ -26,21 +28,36 @@ from jaxdn.ops import onednn_layers
 from jaxdn.ops import onednn_library as dnnl
 
 
-def available() -> bool:
+class Precision(NamedTuple):
+    """Of activations and of the kernels."""
+
+    engine: str
+    """The name of the engine that computes in it."""
+    dtype: Any
+    """As jax knows it."""
+    kind: int
+    """As the library knows it."""
+
+
+FLOAT32 = Precision("onednn-float32", jnp.float32, dnnl.FLOAT32)
+BFLOAT16 = Precision("onednn-bfloat16", jnp.bfloat16, dnnl.BFLOAT16)
+
+
+def computes_bfloat16() -> bool:
     """Whether oneDNN can be loaded, jax computes on the CPU, and the CPU multiplies numbers in bfloat16."""
     return dnnl.available() and dnnl.computes_bfloat16()
 
 
-def check_available() -> None:
+def check(precision: Precision) -> None:
     """Raise ValueError, with what to do, where the engine cannot run."""
     try:
         dnnl.check_available()
     except ValueError as error:
-        raise ValueError(str(error).replace('"onednn"', '"onednn-bfloat16"', 1)) from error
-    if not dnnl.computes_bfloat16():
+        raise ValueError(str(error).replace('"onednn"', f'"{precision.engine}"', 1)) from error
+    if precision is BFLOAT16 and not dnnl.computes_bfloat16():
         raise ValueError(
-            'implementation: "onednn-bfloat16" needs a CPU with AVX-512 BF16 or AMX; leave it None, or take '
-            '"onnxruntime".'
+            f'implementation: "{precision.engine}" needs a CPU with AVX-512 BF16 or AMX; leave it None, or take '
+            f'"{FLOAT32.engine}".'
         )
 
 
@@ -100,11 +117,11 @@ class Draft:
 class Program:
     """The network with its weights, for one shape [N, H, W, c] of its features."""
 
-    def __init__(self, network: Description, weights: Weights, shape: Sequence[int]) -> None:
-        draft, self._count = Draft(), shape[0]
+    def __init__(self, network: Description, weights: Weights, shape: Sequence[int], precision: Precision) -> None:
+        draft, self._count, self._precision = Draft(), shape[0], precision
         given = Value(-1, shape[3], shape[1], shape[2])
         heads = evaluate(network, weights, {FEATURES: given}, draft)
-        self._memory: dict[int, c_void_p] = {-1: dnnl.memory(self._description(given, dnnl.BFLOAT16))}
+        self._memory: dict[int, c_void_p] = {-1: dnnl.memory(self._description(given))}
         self._free: list[np.ndarray] = []
         self.bytes = 0
         """Of all activations: what nobody reads any more is written over."""
@@ -123,12 +140,13 @@ class Program:
             dnnl.set_address(primitive.scratch, dnnl.address(self._scratch))
         self._ends = [self._memory[-1], *(self._memory[head.number] for head in heads)]
 
-    def _description(self, value: Value, dtype: int) -> c_void_p:
-        return dnnl.images(self._count, value.height, value.width, value.channels, dtype)
+    def _description(self, value: Value, kind: int | None = None) -> c_void_p:
+        kind = self._precision.kind if kind is None else kind
+        return dnnl.images(self._count, value.height, value.width, value.channels, kind)
 
     def _add(self, step: Step, *, output: bool) -> None:
         """The primitive of a step, on its memory: of what nobody reads any more, else new."""
-        result = self._description(step.result, dnnl.FLOAT32 if output else dnnl.BFLOAT16)
+        result = self._description(step.result, dnnl.FLOAT32 if output else None)
         if len(step.inputs) > 1:
             # The sum goes on in the memory of the sum so far.
             before = step.inputs[1].number
@@ -138,13 +156,14 @@ class Program:
         elif output:
             self._memory[step.result.number] = dnnl.memory(result)
         else:
-            array = self._room(2 * self._count * math.prod(step.result[1:]))
+            size = jnp.dtype(self._precision.dtype).itemsize * self._count * math.prod(step.result[1:])
+            array = self._room(size)
             self._arrays[step.result.number] = array
             self._memory[step.result.number] = dnnl.memory(result, dnnl.address(array))
         source, target = self._memory[step.inputs[0].number], self._memory[step.result.number]
-        reads = self._description(step.inputs[0], dnnl.BFLOAT16)
+        reads = self._description(step.inputs[0])
         if step.kind == "convolution":
-            after: Any = {"slope": step.slope, "adds": len(step.inputs) > 1}
+            after: Any = {"kind": self._precision.kind, "slope": step.slope, "adds": len(step.inputs) > 1}
             placed = onednn_layers.convolution(reads, result, step.kernel, step.bias, **after)
         else:
             layer = onednn_layers.pooling if step.kind == "pool" else onednn_layers.enlarging
@@ -162,7 +181,7 @@ class Program:
         return array
 
     def __call__(self, features: int, heads: Sequence[int]) -> None:
-        """Run on addresses: of the features in bfloat16, and of the heads in float32."""
+        """Run on addresses: of the features, and of the heads in float32."""
         for memory, place in zip(self._ends, (features, *heads), strict=True):
             dnnl.set_address(memory, place)
         for primitive in self._primitives:
@@ -193,15 +212,15 @@ class Session:
                 self._program(dnnl.address(np.asarray(features)), heads)
 
 
-def engine(network: Description, plain: Apply) -> Apply:
-    """``plain``, the network in XLA, run by oneDNN in bfloat16 (:func:`jaxdn.networks.inference.inference_only`)."""
+def engine(network: Description, plain: Apply, precision: Precision) -> Apply:
+    """``plain``, the network in XLA, run by oneDNN (:func:`jaxdn.networks.inference.inference_only`)."""
 
     def run(weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:
         leaves, tree = jax.tree.flatten(weights)
-        features = jnp.concatenate([group.astype(jnp.bfloat16) for group in groups], axis=-1)
+        features = jnp.concatenate([group.astype(precision.dtype) for group in groups], axis=-1)
         shape = features.shape
-        session = Session(lambda leaves: Program(network, jax.tree.unflatten(tree, leaves), shape))
+        session = Session(lambda leaves: Program(network, jax.tree.unflatten(tree, leaves), shape, precision))
         results = jax.eval_shape(plain, weights, groups)
         return tuple(buffer_callback(session, results, vmap_method="sequential")(features, *leaves))
 
-    return inference_only("onednn-bfloat16", run, plain)
+    return inference_only(precision.engine, run, plain)
