@@ -1,11 +1,11 @@
 """How loops are compiled, and functions of whole rows of numbers in them.
 
 Exponential and logarithm are written out: a call of the C library's functions would keep the loop from vectorising.
-
-Compiled loops are kept on disk, and compiled anew where their own file has changed. Who changes a function of this file
-deletes them (``rm jaxdn/compiled/__pycache__/*.nb?``).
 """
 
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,22 @@ from numba import njit
 _options: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy"}
 # Into the loop itself: passing arrays to a function counts references, which takes longer than a short row.
 inlined = njit(**_options, inline="always")
-loop = njit(**_options, nogil=True, cache=True)
+
+
+def loop(function: Callable[..., None]) -> Callable[..., None]:
+    """Compiled when it is first called, without Python's lock; kept on disk where that can be written."""
+    try:
+        kept = njit(**_options, nogil=True, cache=True)(function)
+    except RuntimeError:  # no folder can be written
+        return njit(**_options, nogil=True)(function)
+    # Numba compiles anew where the loop's own file has changed, and knows nothing of this one.
+    changed = Path(__file__).stat().st_mtime
+    for file in Path(kept.stats.cache_path).glob(f"*.{function.__name__}-*.nb?"):
+        with contextlib.suppress(FileNotFoundError):  # another process was faster
+            if file.stat().st_mtime < changed:
+                file.unlink()
+    return kept
+
 
 Array = np.ndarray
 

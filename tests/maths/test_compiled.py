@@ -1,5 +1,9 @@
 """The loops that Numba compiles against the operations in jax that they stand for, and when they are used."""
 
+import os
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -142,3 +146,26 @@ def test_every_row_belongs_to_one_strip():
     for rows in (1, 2, 7, 8, 9, 1000):
         (found,) = strips.call(counts, [(rows, 3)], [jnp.zeros((rows, 3))], rows=rows)
         np.testing.assert_array_equal(found, 1)
+
+
+def test_loops_are_compiled_where_no_folder_can_be_written():
+    script = "from jaxdn.compiled.rows import loop\nloop(lambda top, bottom: None)(0, 1)\nprint('compiled')"
+    nowhere = {**os.environ, "NUMBA_CACHE_DIR": f"{os.devnull}/folder"}
+    done = subprocess.run([sys.executable, "-c", script], env=nowhere, capture_output=True, text=True, check=False)
+    assert done.stdout == "compiled\n", done.stderr
+
+
+def test_what_was_compiled_before_functions_of_rows_changed_is_not_used(tmp_path):
+    script = "from jaxdn.compiled import affinities"
+    folder = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    subprocess.run(
+        [sys.executable, "-c", script + "; print(affinities.filtered.stats.cache_path)"], env=folder, check=True
+    )
+    (own,) = tmp_path.iterdir()
+    old, new = own / "affinities.filtered-1.py311.nbi", own / "affinities.enlarged-1.py311.nbi"
+    for file in (old, new):
+        file.touch()
+    os.utime(old, (0, 0))
+    subprocess.run([sys.executable, "-c", script], env=folder, check=True)
+    assert not old.exists()
+    assert new.exists()
