@@ -11,6 +11,7 @@ import itertools
 import os
 import shutil
 import tempfile
+import threading
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -28,6 +29,9 @@ from jaxdn.frame import BUFFERS, GUIDES, OF_SAMPLES, Buffer, Clip, Frame, presen
 
 _VERSION = 2  # of the cache's layout; caches of other versions are not used
 _LIGHT = BUFFERS["radiance"]
+_ONE_HEADER = threading.Lock()
+"""NumPy parses a file's header as Python, which in CPython 3.11 fails now and then in several threads at once
+(SystemError: AST constructor recursion depth mismatch)."""
 """How noisy layers and references are stored."""
 
 
@@ -133,8 +137,9 @@ def read_layers(clip: CachedClip, window: tuple[slice, ...], spp: int) -> np.nda
 
 def read_array(clip: CachedClip, name: str, window: tuple[Any, ...]) -> np.ndarray:
     """The part ``window`` of one stored array, in the dtype of its buffer."""
-    part = np.load(clip.home / f"{name}.npy", mmap_mode="r", allow_pickle=False)[window]
-    return np.array(part, BUFFERS.get(name, _LIGHT).dtype)
+    with _ONE_HEADER:
+        whole = np.load(clip.home / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+    return np.array(whole[window], BUFFERS.get(name, _LIGHT).dtype)
 
 
 def kept(

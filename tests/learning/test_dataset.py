@@ -1,6 +1,7 @@
 """The stream of training batches: contents, reproducibility, resuming, and refused input."""
 
 import os
+import time
 from pathlib import Path
 
 import jax
@@ -275,3 +276,21 @@ def test_unsuitable_clips_and_arguments_are_refused_by_name(folder: Path, tmp_pa
         training_batches([], batch=1, crop=4, seed=0)
     several = training_batches([folder / "clip0", folder / "clip1"], batch=2, crop=4, frames=2, seed=0)
     assert set(next(several).reference[..., 0].ravel()) <= {0.0, 1.0}
+
+
+def test_headers_are_parsed_by_one_thread_at_a_time(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """CPython 3.11 fails now and then where several threads parse Python at once."""
+    load, inside, most = np.load, [], []
+
+    def slow(*arguments: object, **options: object) -> object:
+        inside.append(1)
+        most.append(len(inside))
+        time.sleep(1e-3)
+        inside.pop()
+        return load(*arguments, **options)
+
+    monkeypatch.setattr(np, "load", slow)
+    batches = training_batches(folder, batch=2, crop=5, frames=2, seed=7, threads=4)
+    for _ in range(4):
+        next(batches)
+    assert max(most) == 1
