@@ -131,7 +131,8 @@ def _denoise(options: Denoise) -> None:
     from jaxdn.heap import keep_memory
     from jaxdn.options import numbers
 
-    keep_memory()
+    if options.max_memory is None:  # else freed memory goes back to the system at once
+        keep_memory()
     naming = _naming(options)
     budget = {} if options.budget is None else {"budget": options.budget}
     if (scene := _scene_of(options)) is not None:

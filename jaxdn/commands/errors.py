@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 
 from rich.console import Console
 
+from jaxdn.commands.interrupt import never_lost
 from jaxdn.extras import extra_of, install
 from jaxdn.render.errors import RenderError
 
@@ -22,7 +23,8 @@ def plain_errors() -> Iterator[None]:
     before = warnings.formatwarning
     warnings.formatwarning = _line
     try:
-        yield
+        with never_lost():
+            yield
     except (ValueError, RenderError) as error:
         _end(str(error))
     except OSError as error:

@@ -1,10 +1,15 @@
-"""Ctrl-C as a request to stop after the current piece of work, instead of an exception in the middle of it."""
+"""Ctrl-C: as a request to stop after the current piece of work, and never lost."""
 
+import _thread
 import signal
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
+
+_AGAIN_S = 0.05
 
 
 class Interrupt:
@@ -33,3 +38,32 @@ class Interrupt:
             raise KeyboardInterrupt
         self.asked = True
         self._say()
+
+
+@contextmanager
+def never_lost() -> Iterator[None]:
+    """While it is entered, a KeyboardInterrupt that would be dropped, or become another error, arrives all the same.
+
+    No exception leaves functions that Python calls between two lines of a program: callbacks of the garbage collector
+    (jax has one) and ``__del__``. Ctrl-C in one of them would be printed as "Exception ignored", and the work go on: it
+    is raised again a moment later. In a callback of a jitted program (:mod:`jaxdn.compiled.strips`) it becomes an error
+    of XLA that ends with its name.
+    """
+    before = sys.unraisablehook
+
+    def hook(dropped: "sys.UnraisableHookArgs") -> None:
+        if issubclass(dropped.exc_type, KeyboardInterrupt):
+            # From a thread, as here it would be dropped again.
+            threading.Timer(_AGAIN_S, _thread.interrupt_main).start()
+        else:
+            before(dropped)
+
+    sys.unraisablehook = hook
+    try:
+        yield
+    except (ValueError, RuntimeError) as error:
+        if str(error).rstrip().endswith("KeyboardInterrupt:"):
+            raise KeyboardInterrupt from error
+        raise
+    finally:
+        sys.unraisablehook = before

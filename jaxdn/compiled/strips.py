@@ -3,7 +3,7 @@
 import functools
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from importlib.util import find_spec
 from typing import Any
 
@@ -51,11 +51,14 @@ def call(
         pool, threads = _pool()
         # Several strips for each thread, as some take longer.
         height = max(least, -(-rows // (4 * threads)))
-        strips = [
-            pool.submit(loop, top, min(rows, top + height), *read, *written, *numbers) for top in range(0, rows, height)
-        ]
-        for strip in strips:
-            strip.result()
+        strips: list[Future[None]] = []
+        try:
+            for top in range(0, rows, height):
+                strips.append(pool.submit(loop, top, min(rows, top + height), *read, *written, *numbers))
+            for strip in strips:
+                strip.result()
+        finally:  # after Ctrl-C, too, nothing may write into results that XLA frees
+            wait(strips)
 
     kinds = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
     return list(buffer_callback(work, kinds)(*arrays))

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 
 import jax
 import jax.numpy as jnp
@@ -137,6 +138,23 @@ def test_an_error_in_a_loop_is_raised(rng):
 
     with pytest.raises(jax.errors.JaxRuntimeError, match="the strip is torn"):
         jax.block_until_ready(strips.call(fails, [(4, 4)], [jnp.ones((4, 4))], rows=4))
+
+
+def test_no_strip_is_written_any_more_after_an_error():
+    written = []
+
+    def fails_first(top, bottom, image, out):
+        if top == 0:
+            raise RuntimeError("the strip is torn")
+        time.sleep(0.1)
+        out[top:bottom] = 1
+        written.append(top)
+
+    with pytest.raises(jax.errors.JaxRuntimeError, match="the strip is torn"):
+        jax.block_until_ready(strips.call(fails_first, [(16, 4)], [jnp.ones((16, 4))], rows=16))
+    there = list(written)
+    time.sleep(0.5)
+    assert written == there != []
 
 
 def test_every_row_belongs_to_one_strip():

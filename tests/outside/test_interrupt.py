@@ -1,0 +1,82 @@
+"""Ctrl-C arrives where Python would drop it, and where XLA makes another error of it."""
+
+import gc
+import signal
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental.buffer_callback import buffer_callback
+
+from jaxdn.commands.errors import plain_errors
+
+
+@pytest.fixture
+def ctrl_c():
+    """Python's own handler: a shell lets processes in its background ignore Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield lambda: signal.raise_signal(signal.SIGINT)
+    signal.signal(signal.SIGINT, before)
+
+
+def during(work):
+    """The exit code of a command that does this and then waits, which is what Ctrl-C has to end."""
+    with pytest.raises(SystemExit) as ended:
+        _command(work)
+    return ended.value.code
+
+
+def _command(work):
+    with plain_errors():
+        work()
+        _wait()
+
+
+def _wait():
+    until = time.monotonic() + 20
+    while time.monotonic() < until:
+        time.sleep(0.01)
+
+
+def test_in_a_callback_of_the_garbage_collector(ctrl_c, capsys):
+    def interrupted(phase, info):
+        gc.callbacks.remove(interrupted)
+        ctrl_c()
+
+    gc.callbacks.append(interrupted)
+    assert during(gc.collect) == 130
+    assert capsys.readouterr().err == "jaxdn: interrupted; what is finished is kept.\n"
+
+
+def test_where_an_object_dies_twice(ctrl_c):
+    class Dying:
+        def __del__(self):
+            ctrl_c()
+
+    assert during(lambda: (Dying(), Dying())) == 130
+
+
+def test_in_a_callback_of_a_program(ctrl_c, capsys):
+    def work(context, result, given):
+        ctrl_c()
+
+    @jax.jit
+    def program(given):
+        return buffer_callback(work, jax.ShapeDtypeStruct((3,), jnp.float32))(given)
+
+    assert during(lambda: np.asarray(program(jnp.ones(3)))) == 130
+    assert capsys.readouterr().err == "jaxdn: interrupted; what is finished is kept.\n"
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_other_errors_stay_what_they_are():
+    class Dying:
+        def __del__(self):
+            raise ValueError("dropped as Python does")
+
+    with plain_errors():
+        Dying()
+    with pytest.raises(RuntimeError, match="a bug"), plain_errors():
+        raise RuntimeError("a bug")
