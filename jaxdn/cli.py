@@ -12,6 +12,7 @@ from rich.console import Console
 import jaxdn
 from jaxdn.arguments import COMMANDS, Compare, Denoise, Doctor, Export, Inspect, Pack, Render, Train
 from jaxdn.commands.errors import plain_errors
+from jaxdn.commands.interrupt import end_of_process
 
 
 def _folder(out: Path) -> Path:
@@ -294,5 +295,11 @@ def main(arguments: list[str] | None = None) -> None:
         run[type(options)](options)
 
 
+def program() -> None:
+    """The command ``jaxdn``: :func:`main` in a process that ends with it."""
+    with end_of_process():
+        main()
+
+
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    program()

@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 from rich.console import Console
 
-from jaxdn.commands.interrupt import never_lost
+from jaxdn.commands.interrupt import EXIT_CODE, never_lost
 from jaxdn.extras import extra_of, install
 from jaxdn.render.errors import RenderError
 
@@ -38,7 +38,7 @@ def plain_errors() -> Iterator[None]:
         _end(f"this needs the package {package!r}, which is not installed: {install(extra)}")
     except KeyboardInterrupt:
         Console(stderr=True).print("jaxdn: interrupted; what is finished is kept.", highlight=False)
-        sys.exit(130)
+        sys.exit(EXIT_CODE)
     finally:
         warnings.formatwarning = before
 

@@ -2,6 +2,8 @@
 
 import gc
 import signal
+import subprocess
+import sys
 import time
 
 import jax
@@ -80,3 +82,30 @@ def test_other_errors_stay_what_they_are():
         Dying()
     with pytest.raises(RuntimeError, match="a bug"), plain_errors():
         raise RuntimeError("a bug")
+
+
+_COMPILING = """
+import sys, threading, time
+import jax, jax.numpy as jnp
+from jaxdn.commands.errors import plain_errors
+from jaxdn.commands.interrupt import end_of_process
+
+def long(x):
+    for i in range(400):
+        x = jnp.sort(jnp.sin(x) @ x.T + i, axis=0)
+    return x
+
+given = jnp.ones((8, 8))
+with end_of_process(), plain_errors():
+    lowered = jax.jit(long).lower(given)
+    threading.Thread(target=lowered.compile, daemon=True).start()
+    time.sleep(0.5)
+    raise KeyboardInterrupt
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="exit codes of signals are those of Unix")
+def test_a_process_ends_while_a_program_is_compiled():
+    for _ in range(3):
+        done = subprocess.run([sys.executable, "-c", _COMPILING], capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (130, "jaxdn: interrupted; what is finished is kept.\n")
