@@ -88,10 +88,26 @@ def without_fireflies(color: jax.Array, same: jax.Array | None) -> jax.Array:
     return jnp.where(low <= high, jnp.clip(color, low, high), color)
 
 
-def _neighbours(planes: jax.Array) -> Iterator[jax.Array]:
-    """The eight neighbours of every pixel, 0 beyond the border."""
+def without_specks(brightness: jax.Array, hit: jax.Array, sure: jax.Array) -> jax.Array:
+    """[H, W] in [0, 1], the share of its light that a pixel keeps: none is brighter than all of its eight neighbours.
+
+    What is left of a firefly after filtering is one pixel that had nobody to share it with.
+
+    Args:
+      brightness: [H, W] >= 0.
+      hit: [H, W] bool, a surface is seen; other neighbours do not count, and a pixel without any keeps all.
+      sure: [H, W] the share that each pixel keeps in any case: a lamp may be as small as a pixel.
+    """
+    seen = jnp.where(hit, brightness, -1.0)[None]
+    limit = functools.reduce(jnp.maximum, _neighbours(seen, beyond=-1.0))[0]
+    over = (limit >= 0) & (brightness > limit)
+    return jnp.where(over, jnp.maximum(limit / jnp.where(over, brightness, 1.0), sure), 1.0)
+
+
+def _neighbours(planes: jax.Array, *, beyond: float = 0.0) -> Iterator[jax.Array]:
+    """The eight neighbours of every pixel, ``beyond`` outside the border."""
     height, width = planes.shape[1:]
-    wide = jnp.pad(planes, ((0, 0), (1, 1), (1, 1)))
+    wide = jnp.pad(planes, ((0, 0), (1, 1), (1, 1)), constant_values=beyond)
     for dy, dx in np.ndindex(3, 3):
         if (dy, dx) != (1, 1):
             yield wide[:, dy : dy + height, dx : dx + width]

@@ -2,7 +2,8 @@
 
 For each frame: divide by what surfaces reflect; fetch the history with a test of every tap; blend the noisy frame into
 a running mean whose effective number of samples is known per pixel; filter the mean by affinities, one or two levels at
-full resolution and four at half, each reaching twice as far as the one before; blend the result with the last output.
+full resolution and four at half, each reaching twice as far as the one before; take single bright pixels away; blend
+the result with the last output.
 
 What a hand-made filter leaves to constants, a U-Net at half resolution decides for every pixel: learned features that
 stop the filter beside albedo, normal and depth; how far a pixel can be trusted (a firefly is not); how fast both
@@ -23,6 +24,7 @@ import numpy as np
 from jaxdn import brdf, color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.blocks import light_of_blocks
+from jaxdn.filters.clamping import without_specks
 from jaxdn.filters.enlarge import enlarge
 from jaxdn.filters.guides import Guides, depth_feature, depth_slopes, guides_of, hit_mask
 from jaxdn.filters.recall import recall
@@ -185,6 +187,7 @@ def steady(options: Options) -> Denoiser:
         texture = None if texture is None else fill(pad(texture, _BLOCKS), surfaces.hit)
         slanted = _slanted(surfaces, whole)
         fine, image = _filtered(params["guide"], mean, texture, surfaces, slanted, decided, quality.full_levels)
+        image = image * _without_specks(image, surfaces.hit, mean, square, number)
         newest = jnp.where(past.valid, decided.shares["blend"], 1.0)
         shown = jnp.clip(past.shown + newest * (image - past.shown), 0.0, RADIANCE_MAX)
         kept = mean + decided.shares["feedback"] * (fine - mean)
@@ -202,7 +205,7 @@ def steady(options: Options) -> Denoiser:
 
 
 def _filters_reach(full_levels: int) -> int:
-    """That of the levels; in the rest are 2x2 and 4x4 blocks, what is enlarged and slopes."""
+    """That of the levels; in the rest are 2x2 and 4x4 blocks, what is enlarged, slopes and specks."""
     return 2 * (2**full_levels - 1) + 4 * (2**LEVELS - 1) + 16
 
 
@@ -289,6 +292,20 @@ def _accumulated(
     return mixed[..., :3], mixed[..., 3:], number
 
 
+def _without_specks(
+    image: jax.Array, hit: jax.Array, mean: jax.Array, square: jax.Array, number: jax.Array
+) -> jax.Array:
+    """[H, W, 1] the share of its light that each pixel keeps (:func:`jaxdn.filters.clamping.without_specks`).
+
+    Of what the history shows a pixel is sure but for two deviations of the mean; of a single frame, of nothing.
+    """
+    level = color.luminance(mean)
+    variance = jnp.maximum(square - level**2, 0.0) / jnp.maximum(number, 1.0)
+    deviation = jnp.sqrt(variance + 1e-12)  # with a slope at 0
+    sure = jnp.where(number > _SOME, 1.0 - 2.0 * deviation / jnp.maximum(level, 1e-6), 0.0)
+    return without_specks(jnp.mean(image, axis=-1), hit[..., 0], sure[..., 0])[..., None]
+
+
 def _filtered(
     guide: dict[str, Any],
     mean: jax.Array,
@@ -340,6 +357,8 @@ def _filtered(
     return fine, image
 
 
+_SOME = 1.5
+"""Effective number of frames from which on their deviation tells how sure a mean is."""
 _LIKENESS = 0.02
 """Weight of coarse pixels at which half of the enlarged image is taken."""
 _LEAST_TRUST = 1e-3

@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxdn.filters.atrous import edge_average, stencil
-from jaxdn.filters.clamping import clamp_to_fast, contradiction, neighbourhood, without_fireflies
+from jaxdn.filters.clamping import clamp_to_fast, contradiction, neighbourhood, without_fireflies, without_specks
 from jaxdn.filters.history_fix import fix_history
 from jaxdn.filters.virtual import closeness, diffuseness, virtual_motion
 from jaxdn.filters.weights import lobe_weight, normal_weight, roughness_weight
@@ -181,6 +181,19 @@ def test_fireflies_take_the_range_of_their_neighbours(rng):
         np.testing.assert_array_equal(found[:, y, x], expected)
 
 
+def test_no_pixel_is_brighter_than_all_of_its_neighbours_but_by_what_it_is_sure_of(rng):
+    brightness = (1e-9 * rng.random((8, 9))).astype(np.float32)  # no size of its own
+    hit, sure = rng.random((8, 9)) < 0.8, np.where(rng.random((8, 9)) < 0.5, rng.random((8, 9)), -1.0)
+    hit[:3, :3] = False
+    found = np.asarray(without_specks(brightness, hit, jnp.asarray(sure, jnp.float32)))
+    for y, x in np.ndindex(8, 9):
+        near = [brightness[v, u] for v, u in np.ndindex(8, 9) if max(abs(v - y), abs(u - x)) == 1 and hit[v, u]]
+        expected = min(1.0, max(max(near) / brightness[y, x], sure[y, x])) if near else 1.0
+        np.testing.assert_allclose(found[y, x], expected, rtol=1e-6)
+    assert 0.05 < np.mean(found < 1) < 0.5
+    assert np.all(without_specks(jnp.zeros((2, 2)), jnp.ones((2, 2), bool), jnp.zeros((2, 2))) == 1)
+
+
 @pytest.mark.parametrize(("widest", "strides"), [(14, (7, 4, 3)), (4, (2, 1, 1))])
 def test_short_histories_are_filled_from_sparse_taps(x64, rng, widest, strides):
     color = rng.random((3, 40, 44))
@@ -223,6 +236,8 @@ def test_gradients_of_every_part(x64, rng):
         jax.jit(lambda a, b: clamp_to_fast(a, b, None, sigma=0.5)), (slow, fast), order=1, modes=["rev"], eps=1e-6
     )
     check_grads(jax.jit(lambda a: without_fireflies(a, None)), (slow,), order=1, modes=["rev"], eps=1e-6)
+    sure, seen = rng.uniform(0.1, 0.9, (4, 5)), jnp.ones((4, 5), bool)
+    check_grads(jax.jit(lambda a: a * without_specks(a, seen, sure)), (slow[0],), order=1, modes=["rev"], eps=1e-6)
     motion, far = rng.normal(size=(2, 4, 5, 2))
     near = rng.uniform(0.1, 0.9, (4, 5))
     check_grads(jax.jit(lambda m, f, c: virtual_motion(m, f, c + 0.5, c)), (motion, far, near), order=1, modes=["rev"])

@@ -113,6 +113,19 @@ def test_the_sky_passes_through_and_gives_nothing(rng, key):
     np.testing.assert_allclose(denoised(frames, key=key), frames.radiance, rtol=1e-4)
 
 
+def test_a_firefly_leaves_no_speck_and_a_lamp_of_one_pixel_stays(rng):
+    """On surfaces of their own, where nothing is alike to share their light with; the lamp shines in all frames."""
+    frames = room(rng, 4)
+    firefly, lamp = (2, 8), (20, 30)
+    normal = frames.normal.at[:, *firefly].set(jnp.asarray([1.0, 0.0, 0.0])).at[:, *lamp].set(jnp.asarray([1.0, 0, 0]))
+    light = jnp.ones_like(frames.radiance).at[2, *firefly].set(1000.0).at[:, *lamp].set(1000.0)
+    frames = frames._replace(radiance=light, normal=normal, albedo=jnp.ones_like(frames.albedo))
+    images = denoised(frames, sharper=6.0)
+    assert np.all(images[2][firefly] < 1.2)
+    assert np.all(images[0][lamp] < 1.2), "in a single frame nothing tells it from a firefly"
+    assert np.all(images[1:, *lamp] > 400)
+
+
 def test_a_moving_history_is_followed(rng):
     """A camera that pans along a wall of boards, each lit in its own way: all stay in their place."""
     frames = room(rng, 6)
