@@ -149,7 +149,8 @@ class Train:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The run's folder: checkpoints, log, and finally weights.safetensors with its JSON."""
     validation: Path | None = None
-    """Folder of held-out clips, or a file of `jaxdn pack`, for validation, used whole."""
+    """Folder of held-out clips, or a file of `jaxdn pack`, for validation, used whole; its PSNR is free of the noise of
+    references that keep one half (those of `jaxdn render` do)."""
     method: str = "ntd"
     """Method to train; an unknown name lists the available ones."""
     variant: str | None = None

@@ -15,23 +15,30 @@ def noise_floor(reference: np.ndarray, reference_half: np.ndarray) -> float:
     With the halves ``a`` and ``b = 2 * reference - a``, which are independent, the reference ``(a + b) / 2`` has a
     quarter of the variance of ``a - b``; so its error is about ``mean((tonemap(a) - tonemap(b))^2) / 4``.
     """
-    other_half = np.maximum(2.0 * reference - reference_half, 0.0)
-    first, second = (np.asarray(color.tonemap(jnp.asarray(half))) for half in (reference_half, other_half))
+    halves = reference_half, other_half(reference, reference_half)
+    first, second = (np.asarray(color.tonemap(jnp.asarray(half))) for half in halves)
     return float(np.mean((first.astype(np.float64) - second) ** 2) / 4.0)
+
+
+def other_half(reference: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """The mean of the other half of a reference's samples: ``2 reference - first``.
+
+    It is 0 where rounding to half precision has made that negative.
+    """
+    return np.maximum(2.0 * reference - first, 0.0)
 
 
 def read_halves(folder: str | Path) -> tuple[np.ndarray, np.ndarray] | None:
     """Two independent references [T, H, W, 3] of a clip, of half the samples each; None where it does not keep one.
 
-    A clip keeps its reference and the mean ``a`` of the first half of its samples; the other is ``2 * reference - a``,
-    or 0 where rounding to half precision has made that negative.
+    A clip keeps its reference and the mean of the first half of its samples.
     """
     first, second = [], []
     for stored in read_frames(folder, spp=read_record(folder)["layers"][0]):
         if stored.reference is None or stored.reference_half is None:
             return None
         first.append(stored.reference_half)
-        second.append(np.maximum(2.0 * stored.reference - stored.reference_half, 0.0))
+        second.append(other_half(stored.reference, stored.reference_half))
     return (np.stack(first), np.stack(second)) if first else None
 
 

@@ -4,29 +4,24 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from jaxdn import color, metrics
 from jaxdn.checkpoint import Checkpoints
-from jaxdn.clips import find_clips, read_clip
-from jaxdn.clips.cache import read_window
-from jaxdn.clips.pack import open_pack
 from jaxdn.commands.interrupt import Interrupt
 from jaxdn.commands.log import Log
+from jaxdn.commands.validation import HeldOut, make_validation
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.files import write_json
 from jaxdn.frame import Clip
 from jaxdn.learning.step import TrainState, begun, initial_state, make_train_step
 from jaxdn.recipe import Recipe
-from jaxdn.rollout import denoise
 
 
 class Start(NamedTuple):
@@ -37,19 +32,6 @@ class Start(NamedTuple):
     params: Params
 
 
-def make_validation(denoiser: Denoiser, clips: Sequence[Clip]) -> Callable[[Params], float]:
-    """A function of the parameters: the mean over the clips of the PSNR of all their frames, tone-mapped, in dB.
-
-    Compiled once for clips of one size. NaN without clips.
-    """
-
-    @jax.jit
-    def score(params: Params, clip: Clip) -> jax.Array:
-        return metrics.psnr(color.tonemap(denoise(denoiser, params, clip)), color.tonemap(clip.reference))
-
-    return lambda params: float(np.mean([float(score(params, clip)) for clip in clips])) if clips else float("nan")
-
-
 def fit(
     denoiser: Denoiser,
     recipe: Recipe,
@@ -58,7 +40,7 @@ def fit(
     *,
     label: str,
     start: Start | None = None,
-    validation: Sequence[Clip] = (),
+    validation: Sequence[HeldOut] = (),
     log_every: int = 20,
     validate_every: int = 100,
     checkpoint_every: int = 100,
@@ -78,7 +60,7 @@ def fit(
       folder: gets recipe.json, log.jsonl and the checkpoints.
       label: the run's name in messages.
       start: what to begin with; None draws parameters with the recipe's seed.
-      validation: held-out clips.
+      validation: see :func:`jaxdn.commands.validation.load_validation`.
       log_every: updates between two log entries.
       validate_every: updates between two validations.
       checkpoint_every: updates between two checkpoints.
@@ -147,21 +129,6 @@ def fit(
             checkpoints.close()
             log.close()
     return state
-
-
-def load_validation(denoiser: Denoiser, places: Sequence[Path], *, spp: int = 1) -> list[Clip]:
-    """Held-out clips of folders, and windows of packed sets, each read whole, for validation."""
-    layers, everything = denoiser.samples is not None, (slice(None),) * 3
-    clips: list[Clip] = []
-    for place in places:
-        if place.is_file():
-            windows = open_pack(place)
-            clips += [
-                read_window(window, everything, spp=spp, buffers=denoiser.reads, layers=layers) for window in windows
-            ]
-        else:
-            clips += [read_clip(folder, spp=spp, layers=layers) for folder in find_clips(place)]
-    return clips
 
 
 def _is_whole(state: TrainState, step: int) -> bool:

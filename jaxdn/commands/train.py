@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxdn.clips import training_batches
-from jaxdn.commands.fit import Start, begun_with, fit, load_validation
+from jaxdn.commands.fit import Start, begun_with, fit
+from jaxdn.commands.validation import load_validation
 from jaxdn.methods.table import Method
 from jaxdn.recipe import Recipe
 from jaxdn.weights import save_weights, starting_params

@@ -13,9 +13,10 @@ import pytest
 from jaxdn.candidates import candidate
 from jaxdn.clips import read_clip, training_batches, write_clip
 from jaxdn.commands import fit as loop
-from jaxdn.commands.fit import Start, begun_with, fit, load_validation
+from jaxdn.commands.fit import Start, begun_with, fit
 from jaxdn.commands.log import Log, read_curve, read_log
 from jaxdn.commands.train import train
+from jaxdn.commands.validation import load_validation
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.denoisers import ntd
 from jaxdn.methods.table import method_named

@@ -17,7 +17,7 @@ from jaxdn.clips import ClipError, compact, training_batches
 from jaxdn.clips.cache import read_array, read_window
 from jaxdn.clips.draws import draw_light
 from jaxdn.clips.pack import Packing, open_clips, open_pack, write_pack
-from jaxdn.commands.fit import load_validation
+from jaxdn.commands.validation import load_validation
 from jaxdn.denoisers import svgf
 from jaxdn.frame import BUFFERS, FAR, Frame
 from jaxdn.variation import STILL
@@ -209,7 +209,9 @@ def test_indirect_light_alone_and_no_single_samples(folder: Path, tmp_path: Path
     write_pack(tmp_path / "b.pack", sources, size=2**22, packing=whole)
     held_out = load_validation(svgf(), [tmp_path / "b.pack", folder])
     assert len(held_out) == 6
-    assert held_out[0].frames.albedo.shape == held_out[0].reference.shape == (FRAMES, SIDE, SIDE, 3)
+    assert held_out[0].clip.frames.albedo.shape == held_out[0].clip.reference.shape == (FRAMES, SIDE, SIDE, 3)
+    packed, read = (sorted(float(np.mean(each.halves[1])) for each in some) for some in (held_out[:3], held_out[3:]))
+    np.testing.assert_allclose(packed, read, rtol=1e-2)
     with pytest.raises(ClipError, match=r"0000-clip\d: 2 samples a pixel are not available"):
         load_validation(svgf(), [tmp_path / "b.pack"], spp=2)
 
