@@ -73,20 +73,31 @@ def unbiased_illumination(*, hidden: float = 1.0, squared_from: float = 0.6) -> 
     return Objective(f"unbiased illumination, hidden {hidden:g}, squares from {squared_from:g}", loss, reads)
 
 
-def pyramid_illumination(*, temporal: float = 1.0) -> Objective:
+def pyramid_illumination(*, temporal: float = 1.0, logarithm: bool = False) -> Objective:
     """L1 in the bands of a Laplacian pyramid of each frame's error and of the error of the frames' differences.
 
     Errors are linear in the target (:func:`jaxdn.losses.unbiased`): robust as L1, and nearly without its bias.
+
+    With ``logarithm``, half of the logarithm of that, clip by clip, as decibels are: a clip's gradient is then relative
+    to its error. Otherwise clips with much of it, or with much noise in their references, outweigh smooth surfaces in
+    soft light, where small errors are seen best.
     """
 
-    def loss(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:
+    def distance(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:
         denoised, wanted = losses.unbiased(images, clip.reference)
         total = losses.pyramid(denoised, wanted)
         if images.shape[0] == 1:
             return total
         return total + temporal * losses.pyramid(denoised[1:] - denoised[:-1], wanted[1:] - wanted[:-1])
 
-    return Objective(f"pyramid illumination, changes {temporal:g}", loss)
+    name = f"pyramid illumination, changes {temporal:g}"
+    if not logarithm:
+        return Objective(name, distance)
+
+    def loss(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:
+        return 0.5 * jnp.log(distance(images, clip, progress) + _NO_ERROR)
+
+    return Objective(f"logarithm of {name}", loss)
 
 
 def recurrent_illumination(*, operator: str = "hfen") -> Objective:
@@ -134,6 +145,8 @@ def last_frames() -> Objective:
     return Objective("last frames", loss)
 
 
+_NO_ERROR = 1e-3
+"""Added to a distance before its logarithm, about that of two images of 8 bits."""
 _SQUARES = 8.0
 """The gradient of squares is then that of absolute values at an error of 1/16."""
 

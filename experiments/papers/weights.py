@@ -53,11 +53,11 @@ STAGES = (
     Stage("svgf-fitted", "svgf", {}, 300),
     Stage("relax-fitted", "relax", {}, 300),
     Stage("steady-begun", "steady", {"quality": "balanced"}, 8000, decay=False),
-    Stage("steady-balanced", "steady", {"quality": "balanced"}, 1000, start="steady-begun"),
+    Stage("steady-balanced", "steady", {"quality": "balanced"}, 1000, start="steady-begun", recipe="finish"),
     Stage("high-begun", "steady", {"quality": "high"}, 4000, start="steady-balanced", decay=False),
-    Stage("steady-high", "steady", {"quality": "high"}, 1000, start="high-begun"),
+    Stage("steady-high", "steady", {"quality": "high"}, 1000, start="high-begun", recipe="finish"),
     Stage("fast-begun", "steady", {"quality": "fast"}, 4000, decay=False),
-    Stage("steady-fast", "steady", {"quality": "fast"}, 1000, start="fast-begun"),
+    Stage("steady-fast", "steady", {"quality": "fast"}, 1000, start="fast-begun", recipe="finish"),
     Stage("small-begun", "ntd", {"size": "small"}, 4000, decay=False),
     Stage("ntd-small", "ntd", {"size": "small"}, 1000, start="small-begun", objective=SQUARES),
     Stage("large-begun", "ntd", {"size": "large"}, 2000, start="small-begun", decay=False, objective=SQUARES),
@@ -130,7 +130,7 @@ def train_stage(stage: Stage, settings: Settings) -> Path:
     method = method_named(stage.method)
     recipe = method.recipe_named(stage.recipe)
     # The few numbers of a filter are at rest sooner: its own recipe says over how many updates their mean is taken.
-    average = recipe.average if method.filter else 0.99
+    average = recipe.average if method.filter or stage.recipe == "finish" else 0.99
     recipe = recipe._replace(steps=stage.steps, decay=stage.decay, average=average, spp=(1, 1, 1, 2, 4, 16))
     if stage.objective is not None:
         recipe = recipe._replace(objective=stage.objective)

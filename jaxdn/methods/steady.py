@@ -72,6 +72,18 @@ PRECISIONS = {"albedo": 1.0, "normal": 1.0, "depth": 6.0, "learned": 0.0}
 """Guide of the filter -> the logarithm of its precision before training."""
 
 
+FINISH = Recipe(
+    pyramid_illumination(logarithm=True),
+    steps=800,
+    learning_rate=4e-4,
+    batch=2,
+    crop=128,
+    average=0.995,
+    spp=(1, 1, 1, 2, 4, 16),
+)
+"""For weights that have been trained: whole clips, in which the widest levels have something to reach for."""
+
+
 @dataclass(frozen=True)
 class Options:
     """The network's size and what it does not decide."""
@@ -138,7 +150,7 @@ class _Decisions(NamedTuple):
 @method(
     Options,
     title="A steady recurrent filter guided by a network at half resolution",
-    recipes={"usual": Recipe(pyramid_illumination())},
+    recipes={"usual": Recipe(pyramid_illumination()), "finish": FINISH},
     variants={f"steady-{quality}": {"quality": quality} for quality in QUALITIES},
     engines=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
 )

@@ -120,6 +120,11 @@ def test_pyramid_illumination_is_the_pyramid_of_frames_and_of_their_changes(imag
     )
     found = pyramid_illumination(temporal=0.5).loss(images, clip, jnp.asarray(0.0))
     np.testing.assert_allclose(found, frames + 0.5 * changes, rtol=1e-6)
+    relative = pyramid_illumination(temporal=0.5, logarithm=True)
+    assert relative.name == "logarithm of pyramid illumination, changes 0.5"
+    logarithm = relative.loss(images, clip, jnp.asarray(0.0))
+    np.testing.assert_allclose(logarithm, 0.5 * np.log(float(found) + 1e-3), rtol=1e-5)
+    assert np.all(np.isfinite(jax.grad(relative.loss)(clip.reference, clip, jnp.asarray(0.0))))
     one = jax.tree.map(lambda buffer: buffer[:1], clip)
     np.testing.assert_allclose(
         pyramid_illumination().loss(images[:1], one, jnp.asarray(0.0)),
