@@ -160,8 +160,8 @@ class Train:
     start: str | None = None
     """Shipped weights or a .safetensors file to continue from; default: new weights."""
     recipe: str | None = None
-    """One of the method's recipes; for ntd: usual, without-occlusion, paper, paper-without-occlusion, parity; for steady:
-    usual, finish (goes on from trained weights, in crops of 128). Default: the usual one."""
+    """One of the method's recipes; for ntd: usual, without-occlusion, paper, paper-without-occlusion, parity; for
+    steady: usual, finish (goes on from trained weights, in crops of 128). Default: the usual one."""
     steps: int | None = None
     """Parameter updates, more than before to go on with a finished run; default, as for the next seven options: as in
     the recipe."""
