@@ -191,7 +191,11 @@ def test_no_pixel_is_brighter_than_all_of_its_neighbours_but_by_what_it_is_sure_
         expected = min(1.0, max(max(near) / brightness[y, x], sure[y, x])) if near else 1.0
         np.testing.assert_allclose(found[y, x], expected, rtol=1e-6)
     assert 0.05 < np.mean(found < 1) < 0.5
-    assert np.all(without_specks(jnp.zeros((2, 2)), jnp.ones((2, 2), bool), jnp.zeros((2, 2))) == 1)
+    nothing, everywhere = jnp.zeros((3, 3)), jnp.ones((3, 3), bool)
+    assert np.all(without_specks(nothing, everywhere, nothing) == 1)
+    faint = jnp.full((3, 3), 1e-30).at[1, 1].set(2e-30)
+    slope = jax.grad(lambda light: jnp.sum(light * without_specks(light, everywhere, nothing)))(faint)
+    assert np.all(np.isfinite(slope))
 
 
 @pytest.mark.parametrize(("widest", "strides"), [(14, (7, 4, 3)), (4, (2, 1, 1))])
