@@ -129,7 +129,8 @@ def train_stage(stage: Stage, settings: Settings) -> Path:
     """The weights of a stage, trained if they do not exist."""
     method = method_named(stage.method)
     recipe = method.recipe_named(stage.recipe)
-    # The few numbers of a filter are at rest sooner: its own recipe says over how many updates their mean is taken.
+    # The few numbers of a filter are at rest sooner, and "finish" is as it was when the shipped weights were trained:
+    # their own recipes say over how many updates the mean is taken.
     average = recipe.average if method.filter or stage.recipe == "finish" else 0.99
     recipe = recipe._replace(steps=stage.steps, decay=stage.decay, average=average, spp=(1, 1, 1, 2, 4, 16))
     if stage.objective is not None:
