@@ -1,4 +1,4 @@
-"""Memory that a process frees and takes again for every frame, kept instead of given back to the system."""
+"""Memory that a process frees and takes again for every frame: kept, or given back to the system."""
 
 import ctypes
 import sys
@@ -21,3 +21,11 @@ def keep_memory() -> bool:
     except (AttributeError, OSError):  # another C library
         return False
     return all([option(_MMAP_MAX, 0), option(_TRIM_THRESHOLD, _NEVER), option(_ARENA_MAX, 1)])
+
+
+def give_back() -> None:
+    """Hand freed memory back to the system: small pieces stay with the process otherwise."""
+    if sys.platform.startswith("linux"):
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc
+        if trim is not None:
+            trim(0)

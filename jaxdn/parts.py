@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxdn.denoiser import Denoiser, Params, RecurrentStep
 from jaxdn.frame import BUFFERS, Frame, only, present
+from jaxdn.heap import give_back
 from jaxdn.whole import Whole
 
 GRID = 32
@@ -84,6 +85,8 @@ def by_parts(
             whole = jax.tree.map(lambda x: np.empty((*size, *x.shape[2:]), x.dtype), pictures)
         _paste(whole, pictures, rows, columns)
         others.append(other)
+        # The C library would keep the buffers of every window.
+        give_back()
     return whole, others
 
 
@@ -152,6 +155,7 @@ class Parted:
         """Denoise the next frame [H, W, C]; returns [H, W, 3]."""
         frame = jax.tree.map(np.asarray, only(frame, self._step.core.reads))
         height, width = frame.radiance.shape[:2]
+        new = present(frame) not in self.programs
         self.programs.add(present(frame))
         whole = self._measured(frame, (height, width))
         if self._state is None:
@@ -162,7 +166,13 @@ class Parted:
         first = jnp.asarray(self._first)
 
         def step(given: tuple[Any, Frame]) -> tuple[tuple[Any, jax.Array], Any]:
-            state, image, lost = _part(self._step, self._params, *given, first, whole)
+            nonlocal new
+            arguments = (self._step, self._params, *given, first, whole)
+            if new:  # compiled before it runs: compiling takes 200 MiB, which would be kept meanwhile
+                _part.lower(*arguments).compile()
+                give_back()
+                new = False
+            state, image, lost = _part(*arguments)
             return (state, image), lost
 
         (self._state, image), lost = by_parts(

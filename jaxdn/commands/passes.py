@@ -12,7 +12,7 @@ from jaxdn.candidates import Candidate
 from jaxdn.clips.exr import read_windows
 from jaxdn.clips.folder import frame_path
 from jaxdn.clips.frames import StoredFrame, doubling_layers
-from jaxdn.commands.room import GIB, give_back, memory_of_machine, needed, side_within
+from jaxdn.commands.room import GIB, memory_of_machine, needed, side_within
 from jaxdn.frame import Frame
 from jaxdn.parts import Parted, by_parts, parted
 from jaxdn.repair import repair_image
@@ -55,7 +55,6 @@ class Pass:
         if isinstance(self._step, Stream):
             return np.asarray(self._step(stored.frame, self._layers(stored)))
         image = self._step(stored.frame)
-        give_back()
         if self._step.out_of_reach > self._told:
             self._told = self._step.out_of_reach
             self._log(f"{self._told} pixels move too far for the parts and begin anew; give more --max-memory")
@@ -98,7 +97,6 @@ class Pass:
             side=self._step.side,
             margin=REACH,
         )
-        give_back()
         return found
 
     def _layers(self, stored: StoredFrame) -> Layers:

@@ -1,9 +1,7 @@
 """How a frame fits into memory: whole, or in parts whose image is the same."""
 
-import ctypes
 import math
 import os
-import sys
 
 from jaxdn.parts import GRID
 
@@ -41,14 +39,6 @@ def side_within(limit: float, height: int, width: int, channels: int) -> int | N
         return None
     left = limit - _beside_step(height, width, channels)
     return int(math.sqrt(max(left, 0) / STEP)) // GRID * GRID
-
-
-def give_back() -> None:
-    """Hand freed memory back to the system: pieces as large as a window's planes stay with the process otherwise."""
-    if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc
-        if trim is not None:
-            trim(0)
 
 
 def _beside_step(height: int, width: int, channels: int) -> float:
