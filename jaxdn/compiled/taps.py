@@ -16,7 +16,6 @@ def fetched(
     top: int,
     bottom: int,
     history: Array,
-    sound: Array,
     depth: Given,
     normal: Given,
     ids: Given,
@@ -29,20 +28,28 @@ def fetched(
     wanted_ids: Given,
     mean: Array,
     valid: Array,
+    unsound: Array,
     threshold: float,
     least: float,
     around: bool,
 ) -> None:
-    """Rows of ``mean`` [H, W, C] and ``valid`` [H, W] (1 or 0).
+    """Rows of ``mean`` [H, W, C], ``valid`` [H, W] (1 or 0) and ``unsound`` [H]: how many pixels of ``history`` are.
 
     As :func:`jaxdn.filters.recall.fetch` says: accepted taps of the target's cell, renormalised if their weights sum to
-    ``least``; else, with ``around``, the mean of those of the 3x3 pixels around the target. ``history`` is finite.
+    ``least``; else, with ``around``, the mean of those of the 3x3 pixels around the target.
     """
     height, width, channels = history.shape
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
-    weights = np.empty(4, np.float32)
+    largest = np.float32(np.finfo(np.float32).max)
+    total = np.empty(channels, np.float32)
     for i in range(top, bottom):
+        unsound[i] = zero
         for j in range(width):
+            sound = True
+            for channel in range(channels):
+                value = history[i, j, channel]
+                sound &= (value >= zero) & (value <= largest)
+            unsound[i] += zero if sound else one
             valid[i, j] = zero
             for channel in range(channels):
                 mean[i, j, channel] = zero
@@ -53,23 +60,23 @@ def fetched(
             right, lower = min(left + 1, width - 1), min(upper + 1, height - 1)
             fx, fy = x[i, j] - np.float32(left), y[i, j] - np.float32(upper)
             middle_x, middle_y = math.floor(x[i, j] + half), math.floor(y[i, j] + half)
-            mass, wide = zero, False
+            mass = zero
+            total[:] = zero
             # The four of the cell, then the nine around the target. No function tests them: passing it the arrays would
             # count references, which takes longer than the test.
             for tap in range(13 if around else 4):
                 if tap < 4:
                     row, column = lower if tap // 2 else upper, right if tap % 2 else left
-                    weights[tap] = zero
+                    share = (fy if tap // 2 else one - fy) * (fx if tap % 2 else one - fx)
                 else:
                     if tap == 4:
                         if mass >= least:
                             break
-                        mass, wide = zero, True
+                        mass, share = zero, one
+                        total[:] = zero
                     row, column = middle_y + (tap - 4) // 3 - 1, middle_x + (tap - 4) % 3 - 1
                     if row < 0 or row >= height or column < 0 or column >= width:
                         continue
-                if not sound[row, column, 0]:
-                    continue
                 # Numba leaves out what asks for an absent buffer if nothing else is asked in the same condition.
                 if depth is not None:  # noqa: SIM102
                     if not abs(depth[row, column, 0] - wanted_depth[i, j]) <= tolerance[i, j]:
@@ -85,23 +92,17 @@ def fetched(
                     absent = nx == 0 and ny == 0 and nz == 0 and mx == 0 and my == 0 and mz == 0
                     if not (nx * mx + ny * my + nz * mz > threshold or (absent and threshold < 1)):
                         continue
-                if tap < 4:
-                    weights[tap] = (fy if tap // 2 else one - fy) * (fx if tap % 2 else one - fx)
-                    mass += weights[tap]
-                else:
-                    mass += one
-                    for channel in range(channels):
-                        mean[i, j, channel] += history[row, column, channel]
+                sound = True
+                for channel in range(channels):
+                    value = history[row, column, channel]
+                    sound &= (value >= zero) & (value <= largest)
+                if not sound:
+                    continue
+                mass += share
+                for channel in range(channels):
+                    total[channel] += share * history[row, column, channel]
             if mass < least:
                 continue
             valid[i, j] = one
             for channel in range(channels):
-                if wide:
-                    mean[i, j, channel] /= mass
-                    continue
-                mean[i, j, channel] = (
-                    weights[0] * history[upper, left, channel]
-                    + weights[1] * history[upper, right, channel]
-                    + weights[2] * history[lower, left, channel]
-                    + weights[3] * history[lower, right, channel]
-                ) / mass
+                mean[i, j, channel] = total[channel] / mass

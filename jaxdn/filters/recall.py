@@ -86,17 +86,15 @@ def fetch(
     vectors. With ``around``, a pixel all of whose taps are rejected gets the mean of those among the 3x3 pixels around
     its target that are accepted.
     """
-    sound = jnp.all(jnp.isfinite(history) & (history >= 0), axis=-1, keepdims=True)
-    broken = jnp.sum(~sound & ~first, dtype=jnp.int32)
-    history = jnp.where(sound, history, 0.0)
     x, y, inside = _targets(history, motion, first)
-    given = _Given(history, sound, before, (x, y), inside, wanted)
+    given = _Given(history, before, (x, y), inside, wanted)
     plain = functools.partial(_found, _Rules(motion is not None, normal_threshold, around))
     if strips.available() and history.dtype == jnp.float32:
-        mean, valid = alone(plain, functools.partial(_found_by_compiled, *plain.args))(given)
+        found = alone(plain, functools.partial(_found_by_compiled, *plain.args))(given)
     else:
-        mean, valid = plain(given)
-    return Recalled(mean, valid[..., None], broken)
+        found = plain(given)
+    mean, valid, unsound = found
+    return Recalled(mean, valid[..., None], jnp.where(first, 0, unsound))
 
 
 class _Rules(NamedTuple):
@@ -111,9 +109,7 @@ class _Given(NamedTuple):
     """What they are chosen from."""
 
     history: jax.Array
-    """[H, W, C], 0 where a pixel is not sound."""
-    sound: jax.Array
-    """[H, W, 1] bool."""
+    """[H, W, C]."""
     before: Guides
     at: _Position
     inside: jax.Array
@@ -121,9 +117,14 @@ class _Given(NamedTuple):
     wanted: Expected
 
 
-def _found(rules: _Rules, given: _Given) -> tuple[jax.Array, jax.Array]:
-    """The mean [H, W, C] of the accepted taps, and bool [H, W], whether there is one."""
-    history, sound, before, at, inside, wanted = given
+_Found = tuple[jax.Array, jax.Array, jax.Array]
+"""The mean [H, W, C] of the accepted taps; bool [H, W], whether there is one; int32, pixels that are not sound."""
+
+
+def _found(rules: _Rules, given: _Given) -> _Found:
+    history, before, at, inside, wanted = given
+    sound = jnp.all(jnp.isfinite(history) & (history >= 0), axis=-1, keepdims=True)
+    history = jnp.where(sound, history, 0.0)
     packed = lax.stop_gradient(pack(jnp.concatenate([history, sound.astype(history.dtype)], axis=-1), before))
 
     def accepted(tap: jax.Array, wanted: Expected) -> jax.Array:
@@ -140,23 +141,23 @@ def _found(rules: _Rules, given: _Given) -> tuple[jax.Array, jax.Array]:
         search = history, packed, lost, wanted, accepted
         more, found = _around(at, *search) if rules.moving else _beside(*search)
         mean, valid = jnp.where(found[..., None], more, mean), valid | found
-    return mean, valid
+    return mean, valid, jnp.sum(~sound, dtype=jnp.int32)
 
 
-def _found_by_compiled(rules: _Rules, given: _Given) -> tuple[jax.Array, jax.Array]:
+def _found_by_compiled(rules: _Rules, given: _Given) -> _Found:
     from jaxdn.compiled.taps import fetched
 
-    history, sound, before, at, inside, wanted = given
+    history, before, at, inside, wanted = given
     tested = before._replace(
         depth=None if wanted.depth is None or wanted.tolerance is None else before.depth,
         normal=None if wanted.normal is None else before.normal,
         ids=None if wanted.ids is None else before.ids,
     )
-    arrays = [history, sound, *tested, *at, inside, wanted.depth, wanted.tolerance, wanted.normal, wanted.ids]
+    arrays = [history, *tested, *at, inside, wanted.depth, wanted.tolerance, wanted.normal, wanted.ids]
     numbers = np.float32(rules.normal_threshold), np.float32(WEIGHT_MIN), rules.around
     size = history.shape[:2]
-    mean, valid = strips.call(fetched, [history.shape, size], arrays, *numbers, rows=size[0])
-    return mean, valid > 0
+    mean, valid, unsound = strips.call(fetched, [history.shape, size, size[:1]], arrays, *numbers, rows=size[0])
+    return mean, valid > 0, jnp.sum(unsound.astype(jnp.int32), dtype=jnp.int32)
 
 
 def _targets(history: jax.Array, motion: jax.Array | None, first: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
