@@ -32,13 +32,17 @@ class Variation(NamedTuple):
     """Probability of each group of buffers (:data:`GROUPS`) to be absent."""
     beauty: Annotated[float, Range(0, 1)] = 0.25
     """Share of elements with all light in place of indirect light, of clips that have single samples of both."""
+    shadow: Annotated[float, Range(0, 1)] = 0.0
+    """Share of elements whose light changes while the surfaces stay as they are: the edge of a shadow crosses them, or, as
+    fast as the image is wide, a lamp is switched (:func:`_shadow`). Without it a network learns that histories are right
+    whenever surfaces are, and the light of a lamp that was switched off fades slowly."""
 
     def check(self) -> None:
         """Raise ValueError, naming the field and what is allowed, for a value out of range."""
         check(self._asdict(), get_type_hints(Variation, include_extras=True), of="variation")
 
 
-STILL = Variation(False, 1.0, 1.0, False, False, 0.0, 0.0)
+STILL = Variation(False, 1.0, 1.0, False, False, 0.0, 0.0, 0.0)
 
 GROUPS = (
     ("albedo", "reflectance", "specular_reflectance"),
@@ -53,15 +57,17 @@ GROUPS = (
 def varied(clip: Clip, variation: Variation, rng: np.random.Generator) -> Clip:
     """The clip (NumPy arrays ``[T, H, W, C]``) with everything but ``beauty`` drawn from ``rng``.
 
-    All its frames are varied alike. An absent buffer has its neutral value, which denoisers treat as they treat
+    All its frames are varied alike, but for a shadow that crosses them. An absent buffer has its neutral value, which denoisers treat as they treat
     ``None``, so that elements of one batch can be stacked.
     """
     # Everything is drawn, whatever is varied: one variation must not change the numbers of the next.
     brighter, tints = rng.uniform(-1, 1), rng.uniform(-1, 1, 3)
     order, rotation = rng.permutation(3), _rotation(rng.standard_normal(4))
     absent = rng.random(len(GROUPS)) < variation.missing
+    shaded, shadow = rng.random() < variation.shadow, _shadow(clip.frames.radiance.shape[:-1], rng)
     level = _leveling(clip.reference) if variation.level and clip.reference is not None else 1.0
     gain = (level * variation.exposure**brighter * variation.tint**tints).astype(np.float32)
+    gain = gain * shadow if shaded else gain
     order = order if variation.channels else np.arange(3)
 
     def light(image: np.ndarray) -> np.ndarray:
@@ -84,6 +90,24 @@ def varied(clip: Clip, variation: Variation, rng: np.random.Generator) -> Clip:
         None if clip.reference is None else light(clip.reference),
         None if clip.layers is None else {count: light(image) for count, image in clip.layers.items()},
     )
+
+
+def _shadow(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """[T, H, W, 1] float32: what a shadow leaves of the light, from 1 down to between 1/2 and 1/1000.
+
+    Its edge is a straight line of any direction, 2 to 32 pixels soft, that reaches a random point of the image in a random
+    frame, at 1 pixel a frame or up to as many as the image is wide, with the dark before it or behind it.
+    """
+    frames, height, width = shape
+    size = max(height, width)
+    dark = np.log(rng.uniform(2, 1000) if rng.random() < 0.5 else rng.uniform(2, 8))
+    angle, softness = rng.uniform(0, 2 * np.pi), 2.0 ** rng.uniform(1, 5)
+    speed = max(size, 2.0) ** rng.uniform(0, 1)
+    when, row, column = rng.uniform(0, frames), rng.uniform(0, height), rng.uniform(0, width)
+    time, rows, columns = np.ogrid[:frames, :height, :width]
+    ahead = np.cos(angle) * (columns - column) + np.sin(angle) * (rows - row) - speed * (time - when)
+    covered = 0.5 - 0.5 * np.tanh((1.0 if rng.random() < 0.5 else -1.0) * ahead / softness)
+    return np.exp(-dark * covered)[..., None].astype(np.float32)
 
 
 def _leveling(reference: np.ndarray) -> float:

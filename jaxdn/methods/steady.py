@@ -37,6 +37,7 @@ from jaxdn.ops.affinity_filter import Guide, affinity_filter
 from jaxdn.options import Range
 from jaxdn.recipe import Recipe
 from jaxdn.scales import downsample, fill, fold
+from jaxdn.variation import Variation
 from jaxdn.whole import Whole, measured
 
 LEVELS = 4
@@ -80,8 +81,10 @@ FINISH = Recipe(
     crop=128,
     average=0.995,
     spp=(1, 1, 1, 2, 4, 16),
+    variation=Variation(shadow=0.2),
 )
-"""For weights that have been trained: whole clips, in which the widest levels have something to reach for."""
+"""For weights that have been trained: whole clips, in which the widest levels have something to reach for; and light that
+changes, so that histories are given up as fast as it does."""
 
 
 @dataclass(frozen=True)

@@ -79,6 +79,35 @@ def test_normals_turn_rigidly_and_nothing_else_does(clip: Clip) -> None:
     unchanged(found, clip, "radiance", "albedo", "depth", "motion", "dual_motion")
 
 
+def test_a_shadow_crosses_all_light_alike_and_leaves_the_surfaces(rng: np.random.Generator) -> None:
+    wide = rng.exponential(size=(6, 24, 40, 3)).astype(np.float32) + 0.1
+    clip = Clip(Frame(radiance=wide, albedo=wide, depth=wide[..., :1]), 2 * wide, {1: wide})
+    changes, darkest = [], []
+    for seed in range(60):
+        found = one(STILL._replace(shadow=1.0), clip, seed)
+        left = found.reference / clip.reference
+        assert left.max() <= 1 + 1e-5 and left.min() >= 1e-3 * (1 - 1e-3)
+        for image in (found.frames.radiance, found.layers[1]):
+            np.testing.assert_allclose(image, wide * left, rtol=1e-5)
+        np.testing.assert_array_equal(left[..., 0] > 0, True)
+        np.testing.assert_allclose(left, left[..., :1].repeat(3, -1), rtol=1e-5)
+        unchanged(found, clip, "albedo", "depth")
+        # A straight edge: along any line the light only rises or only falls, in every frame and from frame to frame.
+        for axis in range(3):
+            steps = np.diff(left[..., 0], axis=axis)
+            assert (steps <= 1e-5).all() or (steps >= -1e-5).all()
+        changes.append(np.abs(np.diff(np.log(left[..., 0].mean((1, 2))))).max())
+        darkest.append(left.min())
+    assert max(changes) > 2.0, "lamps are switched"
+    assert 0.01 < np.median(changes) < 1.0, "and shadows creep"
+    assert np.min(darkest) < 0.01
+
+
+def test_of_few_elements_some_have_a_shadow(clip: Clip) -> None:
+    same = [np.array_equal(one(STILL._replace(shadow=0.3), clip, s).reference, clip.reference) for s in range(100)]
+    assert 0.55 < np.mean(same) < 0.85
+
+
 def test_absent_buffers_have_their_neutral_values_in_whole_groups(clip: Clip) -> None:
     found = one(STILL._replace(missing=1.0), clip)
     np.testing.assert_array_equal(found.frames.albedo, 1.0)
