@@ -33,9 +33,9 @@ class Variation(NamedTuple):
     beauty: Annotated[float, Range(0, 1)] = 0.25
     """Share of elements with all light in place of indirect light, of clips that have single samples of both."""
     shadow: Annotated[float, Range(0, 1)] = 0.0
-    """Share of elements whose light changes while the surfaces stay as they are: the edge of a shadow crosses them, or, as
-    fast as the image is wide, a lamp is switched (:func:`_shadow`). Without it a network learns that histories are right
-    whenever surfaces are, and the light of a lamp that was switched off fades slowly."""
+    """Share of elements whose light changes while the surfaces stay as they are: the edge of a shadow crosses them, or,
+    as fast as the image is wide, a lamp is switched (:func:`_shadow`). Without it a network learns that histories are
+    right whenever surfaces are, and the light of a lamp that was switched off fades slowly."""
 
     def check(self) -> None:
         """Raise ValueError, naming the field and what is allowed, for a value out of range."""
@@ -57,8 +57,8 @@ GROUPS = (
 def varied(clip: Clip, variation: Variation, rng: np.random.Generator) -> Clip:
     """The clip (NumPy arrays ``[T, H, W, C]``) with everything but ``beauty`` drawn from ``rng``.
 
-    All its frames are varied alike, but for a shadow that crosses them. An absent buffer has its neutral value, which denoisers treat as they treat
-    ``None``, so that elements of one batch can be stacked.
+    All its frames are varied alike, but for a shadow that crosses them. An absent buffer has its neutral value, which
+    denoisers treat as they treat ``None``, so that elements of one batch can be stacked.
     """
     # Everything is drawn, whatever is varied: one variation must not change the numbers of the next.
     brighter, tints = rng.uniform(-1, 1), rng.uniform(-1, 1, 3)
@@ -95,8 +95,8 @@ def varied(clip: Clip, variation: Variation, rng: np.random.Generator) -> Clip:
 def _shadow(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     """[T, H, W, 1] float32: what a shadow leaves of the light, from 1 down to between 1/2 and 1/1000.
 
-    Its edge is a straight line of any direction, 2 to 32 pixels soft, that reaches a random point of the image in a random
-    frame, at 1 pixel a frame or up to as many as the image is wide, with the dark before it or behind it.
+    Its edge is a straight line of any direction, 2 to 32 pixels soft, that reaches a random point of the image in a
+    random frame, at 1 pixel a frame or up to as many as the image is wide, with the dark before it or behind it.
     """
     frames, height, width = shape
     size = max(height, width)

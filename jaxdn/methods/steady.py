@@ -83,8 +83,8 @@ FINISH = Recipe(
     spp=(1, 1, 1, 2, 4, 16),
     variation=Variation(shadow=0.2),
 )
-"""For weights that have been trained: whole clips, in which the widest levels have something to reach for; and light that
-changes, so that histories are given up as fast as it does."""
+"""For weights that have been trained: whole clips, in which the widest levels have something to reach for; and
+light that changes, so that histories are given up as fast."""
 
 
 @dataclass(frozen=True)

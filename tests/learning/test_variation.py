@@ -86,10 +86,10 @@ def test_a_shadow_crosses_all_light_alike_and_leaves_the_surfaces(rng: np.random
     for seed in range(60):
         found = one(STILL._replace(shadow=1.0), clip, seed)
         left = found.reference / clip.reference
-        assert left.max() <= 1 + 1e-5 and left.min() >= 1e-3 * (1 - 1e-3)
+        assert left.max() <= 1 + 1e-5
+        assert left.min() >= 1e-3 * (1 - 1e-3)
         for image in (found.frames.radiance, found.layers[1]):
             np.testing.assert_allclose(image, wide * left, rtol=1e-5)
-        np.testing.assert_array_equal(left[..., 0] > 0, True)
         np.testing.assert_allclose(left, left[..., :1].repeat(3, -1), rtol=1e-5)
         unchanged(found, clip, "albedo", "depth")
         # A straight edge: along any line the light only rises or only falls, in every frame and from frame to frame.
