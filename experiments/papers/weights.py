@@ -18,15 +18,19 @@ from typing import Any, NamedTuple
 
 import tyro
 
+from jaxdn.clips.folder import is_clip, read_record
 from jaxdn.commands.errors import plain_errors
 from jaxdn.commands.render import render
 from jaxdn.commands.train import train
 from jaxdn.methods.table import method_named
 from jaxdn.objectives import Objective, unbiased_illumination
+from jaxdn.render.scene_file import SceneFile
 from jaxdn.weights import SHIPPED, shipped_names
 
 FAMILIES = {"parlour": 90, "fruit": 14, "mobile": 14, "pinkroom": 14, "robot": 14}
 """Clips of each procedural family."""
+CLIP: dict[str, Any] = {"width": 128, "height": 128, "frames": 10, "reference_spp": 32, "layers": [1], "draws": 6}
+"""What each of them is."""
 BLOCK = 10
 """Clips of each kind that are rendered before the next kind has its turn."""
 
@@ -102,27 +106,30 @@ def render_all(settings: Settings) -> None:
     # Block by block, so that what is there is a mixture of all kinds at any time.
     for part, seeds in [*blocks, ("validation", range(1000, 1001))]:
         for (source, clips, tours), odd in itertools.product(sources, (False, True)):
+            wanted = {**CLIP, "see_through": bool(odd)}
+            out, name = settings.data / part, SceneFile.name_of(source) if tours else source
             chosen = [seed for seed in seeds if seed % 2 == odd and (seed < clips or part == "validation")]
+            # A clip that is there is not opened again to plan it: that takes 20 seconds each.
+            chosen = [seed for seed in chosen if not _there(out / f"{name}-{seed}", wanted)]
             if not chosen:
                 continue
             render(
                 source,
-                settings.data / part,
+                out,
                 animation=None,
                 tours=tours,
                 seeds=chosen,
-                see_through=odd,
-                width=128,
-                height=128,
-                frames=10,
-                reference_spp=32,
-                layers=[1],
-                draws=6,
+                **wanted,
                 max_depth=None,
                 effects="auto",
                 denoiser=",".join({stage.method: None for stage in STAGES}),
                 workers=settings.workers,
             )
+
+
+def _there(folder: Path, wanted: Mapping[str, Any]) -> bool:
+    """Whether a folder is a finished clip that was rendered as wanted."""
+    return is_clip(folder) and wanted.items() <= read_record(folder).items()
 
 
 def train_stage(stage: Stage, settings: Settings) -> Path:
