@@ -9,8 +9,11 @@ from jaxdn.candidates import NOISY, filters
 
 
 @pytest.mark.slow
-def test_every_filter_is_scored_and_timed(tmp_path, capsys):
+@pytest.mark.usefixtures("plain_programs")
+def test_every_filter_is_scored_and_timed(tmp_path, capsys, monkeypatch):
     pytest.importorskip("mitsuba")
+    # The processes that are timed compile quickly, too.
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
     settings = classical.Settings(
         families=("fruit",),
         size=24,

@@ -13,6 +13,7 @@ from jaxdn.report import ClipResult, Results, Scores
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_programs")
 def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stages, "FAMILIES", ("fruit", "parlour"))
     monkeypatch.setattr(ntasd_holdout, "HELD_OUT", ("parlour",))
