@@ -82,12 +82,11 @@ def gbuffer(scene: Any, *, reflectance: bool = False, specular: bool = False, se
     ``see_through`` the buffers of flat mirrors and of glass are those of what they show
     (:mod:`jaxdn.render.replacement`), for which the variant has to be a vectorised one.
     """
-    names = shape_names(scene)
-    ranks = {name: rank for rank, name in enumerate(sorted(names))}
+    names = sorted(shape_names(scene))
     trace = _one_by_one if str(mi.variant()).startswith("scalar") else _vectorised
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     reflectances = Reflectances(scene) if reflectance or specular else None
-    traced, followed = trace(scene, names, ranks, reflectances, specular, see_through)
+    traced, followed = trace(scene, reflectances, specular, see_through)
     if followed is not None:
         traced = imaged(traced, followed)
     found = {name: buffer.reshape(height, width, -1) for name, buffer in traced.items()}
@@ -100,7 +99,7 @@ def gbuffer(scene: Any, *, reflectance: bool = False, specular: bool = False, se
     depth = (position - to_world[:3, 3]) @ forward[:, None]
     away = np.sum(normal * direction, axis=-1, keepdims=True) > 0
     albedo = np.where(hit, np.clip(np.nan_to_num(found["albedo"]), 0.0, 1.0), 1.0).astype(np.float32)
-    reflected = None if reflectances is None else _reflectance(found, albedo, sorted(names))
+    reflected = None if reflectances is None else _reflectance(found, albedo, names)
     images = None if followed is None else _images(scene, followed, traced["ids"])
     ids = found["ids"].astype(np.int32)
     if images is not None:
@@ -113,7 +112,7 @@ def gbuffer(scene: Any, *, reflectance: bool = False, specular: bool = False, se
         position=np.where(hit, position, 0.0),
         direction=direction,
         ids=ids,
-        names=tuple(sorted(names)),
+        names=tuple(names),
         reflectance=reflected,
         specular_reflectance=_specular(found, reflected) if specular and reflected is not None else None,
         images=images,
@@ -157,12 +156,7 @@ def _warn(shape: str) -> None:
 
 
 def _vectorised(
-    scene: Any,
-    names: Sequence[str],
-    ranks: dict[str, int],
-    reflectances: Reflectances | None,
-    specular: bool,
-    see_through: bool,
+    scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool
 ) -> tuple[dict[str, np.ndarray], Followed | None]:
     """All pixels at once; flat buffers of the hits of all rays, and how these were followed."""
     sensor = scene.sensors()[0]
@@ -214,30 +208,30 @@ def shape_of(hit: Any) -> Any:
 def ids_of(scene: Any, numbers: np.ndarray) -> np.ndarray:
     """The ids of shapes by their numbers of :func:`shape_of`: the positions of their sorted names, -1 for none."""
     # Registry numbers depend on the other existing objects; names do not.
-    names = shape_names(scene)
-    ranks = {name: rank for rank, name in enumerate(sorted(names))}
     lookup = {0: -1}
     reinterpret: Any = dr.reinterpret_array
-    for own, name in zip(scene.shapes(), names, strict=True):
-        lookup[int(reinterpret(mi.UInt32, mi.ShapePtr(own))[0])] = ranks[name]
+    for own, rank in zip(scene.shapes(), _ranks(scene), strict=True):
+        lookup[int(reinterpret(mi.UInt32, mi.ShapePtr(own))[0])] = rank
     different, inverse = np.unique(numbers.astype(np.int64), return_inverse=True)
     return np.array([lookup.get(int(number), -1) for number in different])[inverse]
 
 
+def _ranks(scene: Any) -> list[int]:
+    """The id of every shape, in the scene's order."""
+    names = shape_names(scene)
+    ranks = {name: rank for rank, name in enumerate(sorted(names))}
+    return [ranks[name] for name in names]
+
+
 def _one_by_one(
-    scene: Any,
-    names: Sequence[str],
-    ranks: dict[str, int],
-    reflectances: Reflectances | None,
-    specular: bool,
-    see_through: bool,
+    scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool
 ) -> tuple[dict[str, np.ndarray], None]:
     """The same buffers, a pixel at a time, for the variant without vectorisation, which follows no rays."""
     if see_through:
         raise ValueError(f"see_through: {mi.variant()} cannot follow rays past mirrors and glass; leave it out.")
     sensor = scene.sensors()[0]
     width, height = (int(size) for size in sensor.film().crop_size())
-    by_shape = {_address(own): ranks[name] for own, name in zip(scene.shapes(), names, strict=True)}
+    by_shape = {_address(own): rank for own, rank in zip(scene.shapes(), _ranks(scene), strict=True)}
     sizes = {"albedo": 3, "normal": 3, "position": 3, "direction": 3, "roughness": 1}
     arrays: dict[str, np.ndarray] = {name: np.zeros((width * height, size)) for name, size in sizes.items()}
     if reflectances is not None:
