@@ -159,7 +159,7 @@ def _denoise(options: Denoise) -> None:
             options.out,
             method,
             settings,
-            begin=lambda work: show_sources(work.source, reads=reads, **naming),
+            begin=lambda work: show_sources(work.source, reads=reads, alone=len(work.shot.files) == 1, **naming),
             say=report.say,
             log=report.log,
         )

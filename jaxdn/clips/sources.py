@@ -37,12 +37,14 @@ def sources_of(
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
     layer: str | None = None,
+    alone: bool = False,
     log: Callable[[str], None] = lambda line: None,
 ) -> list[Source]:
     """The sources of a clip's buffers, or of those of another renderer's files, from its first file.
 
     Takes what :func:`jaxdn.clips.import_exr.plain_frames` takes and raises as it does, except that motion vectors whose
-    convention nobody has stated are listed as such. ``log`` is called with lines about what is left unused.
+    convention nobody has stated are listed as such, unless the image is ``alone`` and needs none. ``log`` is called
+    with lines about what is left unused.
     """
     if is_clip(path):
         return _of_clip(read_names(frame_path(path, 0)))
@@ -53,10 +55,10 @@ def sources_of(
     unknown = False
     try:
         try:
-            motion_convention_of(detect_channels(list(there), **naming), there, motion_convention)
+            motion_convention_of(detect_channels(list(there), **naming), there, motion_convention, alone=alone)
         except UnknownMotion:
             unknown = True
-        chosen = choose(there, motion_convention=OWN if unknown else motion_convention, **naming)
+        chosen = choose(there, motion_convention=OWN if unknown else motion_convention, alone=alone, **naming)
     except ClipError as error:
         raise ClipError(f"{file}: {error}") from error
     for note in chosen.notes:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -36,13 +37,15 @@ def show_sources(
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
     layer: str | None = None,
+    alone: bool = False,
     log: Callable[[str], None] = lambda line: None,
 ) -> list[Source]:
     """Print the table for a sequence and a denoiser that reads some buffers (None: any denoiser); returns its sources.
 
-    Raises as :func:`jaxdn.clips.sources.sources_of` does.
+    An image that is ``alone`` needs no motion. Raises as :func:`jaxdn.clips.sources.sources_of` does.
     """
-    found = sources_of(path, motion_convention=motion_convention, channels=channels, layer=layer, log=log)
+    naming: Any = {"motion_convention": motion_convention, "channels": channels, "layer": layer}
+    found = sources_of(path, alone=alone, log=log, **naming)
     table = Table(title=f"{path}: what is read", title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for column in ("buffer", "from layer", "channels", "taken for"):
         table.add_column(column, overflow="fold")
@@ -52,6 +55,8 @@ def show_sources(
         letters = ", ".join(name.rpartition(".")[2] for name in source.channels)
         table.add_row(source.buffer + note, source.layer, letters, source.convention)
     for name, consequence in missing(found, reads).items():
+        if alone and name == "motion":
+            continue
         table.add_row(name, "missing", "", consequence, style="yellow")
     Console().print(table)
     return found

@@ -112,6 +112,17 @@ def test_denoise_begins_with_the_table(shot, tmp_path, capsys):
     assert "missing" not in text.partition("1 frame ")[0].replace("specular_reflectance missing", "")
 
 
+def test_a_single_image_is_not_asked_about_motion(tmp_path, capsys):
+    layers = ":RGB", "albedo:RGB", "normal:XYZ", "depth:Z"
+    for name, vectors in (("with", ("mvec:XY",)), ("without", ())):
+        image = write(tmp_path / f"{name}.exr", *layers, *vectors)
+        text = run(capsys, "denoise", image, "-o", tmp_path / "out", "--method", "svgf")
+        assert "1 frame denoised" in text
+        assert "motion missing" not in text
+        assert "nothing says: state" not in text
+        assert ("'mvec', as nothing says what these vectors mean; a single image needs none" in text) == bool(vectors)
+
+
 def test_what_is_missing_is_said_with_its_consequence(tmp_path, capsys):
     path = write(tmp_path / "a_1.exr", ":RGB", "diffuseFilter:RGB", "Paint:RGB", "mvec:XY")
     reads = methods()["svgf"].factory().reads
