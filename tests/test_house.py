@@ -25,13 +25,13 @@ MATHS = (
     "motion",
     "scales",
     "ops",
-    "compiled",
     "heap",
     "brdf",
     "microfacets",
     "glints",
 )
 LAYERS = {
+    **dict.fromkeys(("platform", "compiled"), 0),
     **dict.fromkeys((*MATHS, "ops", "losses", "metrics", "flip", "sampling", "objectives", "recipe", "variation"), 1),
     **dict.fromkeys(("shrinkage", "whole"), 1),
     **dict.fromkeys(("filters", "networks"), 2),

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-from jaxdn.ops.platform import platform
+from jaxdn.platform import platform
 
 Given = jax.Array | None
 

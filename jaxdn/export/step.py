@@ -15,7 +15,7 @@ from jax import export
 
 from jaxdn.denoiser import Denoiser, Params, Recurrent
 from jaxdn.frame import BUFFERS, GUIDES, Frame
-from jaxdn.ops.platform import portable
+from jaxdn.platform import portable
 
 Arrays = dict[str, Any]
 MULTIPLES = (1, 16, 32)

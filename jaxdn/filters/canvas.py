@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 
 from jaxdn.filters.weights import Offset, Planes, Weight
-from jaxdn.ops.platform import platform
+from jaxdn.platform import platform
 
 _STRIP_PIXELS = 16384
 NO_WEIGHT = 1e-10

@@ -17,7 +17,7 @@ from jax import lax
 from jaxdn.compiled import strips
 from jaxdn.ops.affinity_filter import Guide, affinity
 from jaxdn.ops.faster import alone
-from jaxdn.ops.platform import platform
+from jaxdn.platform import platform
 
 _SPREAD = 3.0
 """Twice the variance of the spatial weights, in pixels of the fine image."""

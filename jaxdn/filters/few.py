@@ -14,8 +14,8 @@ from jax import lax
 
 from jaxdn.filters.canvas import NO_WEIGHT
 from jaxdn.filters.weights import Offset, Weight
-from jaxdn.ops.platform import ANY, platform
 from jaxdn.ops.strips import where_needed
+from jaxdn.platform import ANY, platform
 
 _WORTH = 100_000
 """Pixels of an image from which on the two ways are compiled."""

@@ -28,7 +28,7 @@ from jax import lax
 
 from jaxdn.compiled import strips
 from jaxdn.ops.faster import alone
-from jaxdn.ops.platform import platform
+from jaxdn.platform import platform
 
 RADIUS = 2
 SPLINE = (0.375, 0.25, 0.0625)

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jaxdn.ops.platform import platform
+from jaxdn.platform import platform
 
 
 class _Implementation(NamedTuple):
@@ -37,7 +37,7 @@ def implementations(operation: str) -> tuple[str, ...]:
 
 
 def resolve(operation: str, implementation: str | None) -> Callable[..., Any]:
-    """The function that runs: the named one, or with None the one preferred on :func:`jaxdn.ops.platform.platform`.
+    """The function that runs: the named one, or with None the one preferred on :func:`jaxdn.platform.platform`.
 
     Resolved during tracing, so the choice costs nothing at run time. There is no fallback: ValueError for a name that
     does not exist or cannot run.

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdn.ops.platform import platform
+from jaxdn.platform import platform
 
 Arrays = Any
 """A pytree of arrays [H, ...]."""
