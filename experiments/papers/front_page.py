@@ -1,7 +1,7 @@
 """The picture of the README: a frame of a room before and after denoising, and its reference.
 
     jaxdn render living-room/scene.xml --animation experiments/papers/rooms/living-room.json \\
-        --frames 8 --width 320 --height 180 --reference-spp 64 --seeds 2000 -o data/rooms
+        --frames 8 --width 320 --height 180 --reference-spp 64 --seeds 2000 --see-through -o data/rooms
     python -m experiments.papers.front_page data/rooms/living-room-2000 --part 96,90,160,90
 
 Renders the last frame once more with many samples, to ``runs/front-page``, denoises the clip by the shipped weights
