@@ -1,4 +1,4 @@
-"""Compiled loops of the two filters by affinity: :mod:`jaxdn.ops.affinity_filter` and :mod:`jaxdn.filters.enlarge`.
+"""Compiled loops of the two filters by affinity, :mod:`jaxdn.ops.affinity_filter` and :mod:`jaxdn.filters.enlarge`.
 
 All work is on rows of one plane, which vectorises: a row of weights is summed up feature by feature, and multiplies row
 by row of the image. All rows that a pixel's taps lie in stay in the cache.
@@ -10,8 +10,8 @@ from jaxdn.compiled.rows import Array, exponential, inlined, loop
 
 
 @inlined
-def _residual(
-    total: Array,
+def _away(
+    away: Array,
     z: Array,
     slope_x: Array,
     slope_y: Array,
@@ -20,13 +20,17 @@ def _residual(
     other_y: Array,
     dy: float,
     dx: float,
-    factor: float,
 ) -> None:
-    """Set to the square of how far the slanted guide of the other pixels is from where a plane expects it."""
-    for x in range(total.shape[0]):
+    """Set to how far the slanted guide of the other pixels is from where a plane expects it."""
+    for x in range(away.shape[0]):
         expected = dx * (slope_x[x] + other_x[x]) + dy * (slope_y[x] + other_y[x])
-        away = other_z[x] - z[x] - np.float32(0.5) * expected
-        total[x] = (factor * away) * (factor * away)
+        away[x] = other_z[x] - z[x] - np.float32(0.5) * expected
+
+
+@inlined
+def _square(values: Array, factor: float) -> None:
+    for x in range(values.shape[0]):
+        values[x] = (factor * values[x]) * (factor * values[x])
 
 
 @inlined
@@ -70,11 +74,12 @@ def filtered(
     confidence: Array,
     scales: Array,
     out: Array,
+    masses: Array,
     step: int,
     spline: Array,
     least: float,
 ) -> None:
-    """Rows of ``out`` [C, H, W]: a level of the filter, taps ``step`` apart.
+    """Rows of ``out`` [C, H, W], a level of the filter, and of its sums of weights [H, W]; taps ``step`` apart.
 
     ``spline`` are the weights h from the centre outwards, ``least`` is a sum of weights that counts as none. The weight
     of p and p + o is that of p + o and p: it is computed once, with p the upper or the left one of both, and kept until
@@ -99,7 +104,7 @@ def filtered(
                     continue
                 first, last = left + shift, right + shift
                 weight = weights[y % kept, row, column + reach, left:right]
-                _residual(
+                _away(
                     weight,
                     slanted[0, y, left:right],
                     slanted[1, y, left:right],
@@ -109,8 +114,8 @@ def filtered(
                     slanted[2, there, first:last],
                     np.float32(row * step),
                     np.float32(shift),
-                    scales[-1],
                 )
+                _square(weight, scales[-1])
                 for index in range(features.shape[0]):
                     here, other = features[index, y, left:right], features[index, there, first:last]
                     _add_square(weight, here, other, scales[index])
@@ -147,6 +152,116 @@ def filtered(
             result, sums, own = out[index, y], total[index], image[index, y]
             for x in range(width):
                 result[x] = sums[x] / mass[x] if mass[x] > least else own[x]
+        masses[y] = mass
+
+
+@inlined
+def _by_distance(distance: Array, weight: Array, p_takes: Array, q_takes: Array, own: Array, other: Array) -> None:
+    """Set to the gradient by the distance of p and q, times -2; ``own`` and ``other`` are their confidences."""
+    for x in range(distance.shape[0]):
+        distance[x] = np.float32(-2.0) * weight[x] * (other[x] * p_takes[x] + own[x] * q_takes[x])
+
+
+@inlined
+def _negative(total: Array, one: Array) -> None:
+    for x in range(total.shape[0]):
+        total[x] = -one[x]
+
+
+@inlined
+def _add_difference(total: Array, factor: Array, one: Array, other: Array) -> None:
+    for x in range(total.shape[0]):
+        total[x] += factor[x] * (one[x] - other[x])
+
+
+@inlined
+def _add_scaled(total: Array, other: Array, factor: float) -> None:
+    for x in range(total.shape[0]):
+        total[x] += factor * other[x]
+
+
+@loop
+def filtered_gradient(
+    top: int,
+    bottom: int,
+    image: Array,
+    features: Array,
+    slanted: Array,
+    confidence: Array,
+    gains: Array,
+    level: Array,
+    by_image: Array,
+    by_features: Array,
+    by_slanted: Array,
+    by_confidence: Array,
+    step: int,
+    spline: Array,
+) -> None:
+    """Rows of the gradient by image and guide, whose scales have been multiplied into it.
+
+    Gathered: every pixel p collects what it gets as the centre and what it gets as a tap of its neighbours q. ``gains``
+    [C, H, W] are the gradient by the result over its sum of weights, ``level`` [H, W] their product with the result.
+    """
+    channels, height, width = image.shape
+    reach = spline.size - 1
+    work = np.empty((6, width), np.float32)
+    for y in range(top, bottom):
+        centre = spline[0] * spline[0]
+        by_features[:, y] = 0
+        by_slanted[:, y] = 0
+        for x in range(width):
+            taken = -level[y, x]
+            for index in range(channels):
+                taken += gains[index, y, x] * image[index, y, x]
+                by_image[index, y, x] = centre * confidence[y, x] * gains[index, y, x]
+            by_confidence[y, x] = centre * taken
+        for row in range(-reach, reach + 1):
+            there = y + row * step
+            if there < 0 or there >= height:
+                continue
+            for column in range(-reach, reach + 1):
+                shift = column * step
+                left, right = max(0, -shift), min(width, width - shift)
+                if right <= left or (row == 0 and column == 0):
+                    continue
+                first, last = left + shift, right + shift
+                count = right - left
+                weight, away, distance = work[0, :count], work[1, :count], work[2, :count]
+                p_takes, q_takes, share = work[3, :count], work[4, :count], work[5, :count]
+                dy, dx = np.float32(row * step), np.float32(shift)
+                _away(
+                    away,
+                    slanted[0, y, left:right],
+                    slanted[1, y, left:right],
+                    slanted[2, y, left:right],
+                    slanted[0, there, first:last],
+                    slanted[1, there, first:last],
+                    slanted[2, there, first:last],
+                    dy,
+                    dx,
+                )
+                _product(weight, away, away)
+                for index in range(features.shape[0]):
+                    here, other = features[index, y, left:right], features[index, there, first:last]
+                    _add_square(weight, here, other, np.float32(1.0))
+                exponential(weight, spline[abs(row)] * spline[abs(column)])
+                _negative(p_takes, level[y, left:right])
+                _negative(q_takes, level[there, first:last])
+                _product(share, weight, confidence[y, left:right])
+                for index in range(channels):
+                    _add_product(p_takes, gains[index, y, left:right], image[index, there, first:last])
+                    _add_product(q_takes, gains[index, there, first:last], image[index, y, left:right])
+                    _add_product(by_image[index, y, left:right], share, gains[index, there, first:last])
+                _add_product(by_confidence[y, left:right], weight, q_takes)
+                own, other_own = confidence[y, left:right], confidence[there, first:last]
+                _by_distance(distance, weight, p_takes, q_takes, own, other_own)
+                for index in range(features.shape[0]):
+                    here, other = features[index, y, left:right], features[index, there, first:last]
+                    _add_difference(by_features[index, y, left:right], distance, here, other)
+                _product(share, distance, away)
+                _add_scaled(by_slanted[0, y, left:right], share, np.float32(-1.0))
+                _add_scaled(by_slanted[1, y, left:right], share, np.float32(-0.5) * dx)
+                _add_scaled(by_slanted[2, y, left:right], share, np.float32(-0.5) * dy)
 
 
 @loop
@@ -192,7 +307,7 @@ def enlarged(
                         continue
                     first, last = left + column, right + column
                     weight = weights[: right - left]
-                    _residual(
+                    _away(
                         weight,
                         slant[0, left:right],
                         slant[1, left:right],
@@ -202,8 +317,8 @@ def enlarged(
                         slanted[2, there, first:last],
                         np.float32(2 * row - y % 2),
                         np.float32(2 * column - odd),
-                        scales[-1],
                     )
+                    _square(weight, scales[-1])
                     for index in range(count):
                         here, other = own[index, left:right], features[index, there, first:last]
                         _add_square(weight, here, other, scales[index])

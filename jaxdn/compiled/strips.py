@@ -33,7 +33,7 @@ def call(
     rows: int,
     least: int = 1,
 ) -> list[jax.Array]:
-    """Float32 arrays of ``shapes``, filled by ``loop``.
+    """Float32 arrays of ``shapes``, filled by ``loop``; one after the other under ``jax.vmap``.
 
     Args:
       loop: compiled without Python's lock; gets the first and the last row of a strip, the arrays, the results, and
@@ -61,7 +61,7 @@ def call(
             wait(strips)
 
     kinds = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
-    return list(buffer_callback(work, kinds)(*arrays))
+    return list(buffer_callback(work, kinds, vmap_method="sequential")(*arrays))
 
 
 @functools.cache

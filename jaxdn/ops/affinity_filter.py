@@ -12,10 +12,11 @@ is one surface. Both terms are those of q to p. Spacing the taps by ``step`` = 1
 a-trous filter (Dammertz et al. 2010); learned features: Isik et al. 2021, "Interactive Monte Carlo Denoising using
 Affinity of Neural Features".
 
-Arrays are planar, ``[C, H, W]``: the stencil then runs along contiguous rows and vectorises. The forward pass works on
-strips of rows that fit into the cache; the gradient keeps only the arguments and recomputes the weights. Both scan over
-pairs of opposite taps and compute the weights of one pair while they use those of the pair before: in one expression,
-XLA:CPU would compute every weight once for each channel that uses it.
+Arrays are planar, ``[C, H, W]``: the stencil then runs along contiguous rows and vectorises. On CPUs both passes are
+compiled loops (:mod:`jaxdn.compiled.affinities`) where these are available. Elsewhere the forward pass works on strips
+of rows that fit into the cache; the gradient keeps only the arguments and recomputes the weights. Both scan over pairs
+of opposite taps and compute the weights of one pair while they use those of the pair before: in one expression, XLA:CPU
+would compute every weight once for each channel that uses it.
 """
 
 import functools
@@ -27,7 +28,6 @@ import numpy as np
 from jax import lax
 
 from jaxdn.compiled import strips
-from jaxdn.ops.faster import alone
 from jaxdn.platform import platform
 
 RADIUS = 2
@@ -78,22 +78,37 @@ def affinity_filter(image: jax.Array, guide: Guide, *, step: int = 1) -> jax.Arr
             f"guide: expected features [F, H, W], slanted [3, H, W] and confidence [H, W] for an image [C, H, W], got "
             f"{guide.features.shape}, {guide.slanted.shape} and {guide.confidence.shape} for {image.shape}."
         )
-    plain = functools.partial(_filtered_once, step=step)
     if strips.available() and image.dtype == guide.features.dtype == jnp.float32:
-        return alone(plain, functools.partial(_filtered_by_compiled, step=step))(image, guide)
-    return plain(image, guide)
-
-
-def _filtered_once(image: jax.Array, guide: Guide, *, step: int) -> jax.Array:
+        return _by_loops(image, guide, step)
     return _filtered(image, guide.scaled(), step)
 
 
-def _filtered_by_compiled(image: jax.Array, guide: Guide, *, step: int) -> jax.Array:
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _by_loops(image: jax.Array, guide: Guide, step: int) -> jax.Array:
+    return _loops_forward(image, guide, step)[0]
+
+
+def _loops_forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, "_Residuals"]:
     from jaxdn.compiled.affinities import filtered
 
     arrays = [image, *guide[:3], guide.factors()]
     numbers = step, np.asarray(SPLINE, np.float32), np.float32(_NO_WEIGHT)
-    return strips.call(filtered, [image.shape], arrays, *numbers, rows=image.shape[1], least=8 * step)[0]
+    shapes = [image.shape, image.shape[1:]]
+    found, weight = strips.call(filtered, shapes, arrays, *numbers, rows=image.shape[1], least=8 * step)
+    return found, (image, guide, found, weight[None])
+
+
+def _loops_backward(step: int, residuals: "_Residuals", cotangent: jax.Array) -> tuple[jax.Array, Guide]:
+    from jaxdn.compiled.affinities import filtered_gradient
+
+    image, given, filtered, weight = residuals
+    some, gains, level = _gains(filtered, weight, cotangent)
+    guide, by_given = jax.vjp(Guide.scaled, given)
+    arrays = [image, *guide[:3], gains, level]
+    shapes = [each.shape for each in arrays[:4]]
+    spline = np.asarray(SPLINE, np.float32)
+    by_image, *by_guide = strips.call(filtered_gradient, shapes, arrays, step, spline, rows=image.shape[1])
+    return by_image + jnp.where(some, 0.0, cotangent), *by_given(Guide(*by_guide))
 
 
 class _Pair(NamedTuple):
@@ -214,6 +229,13 @@ def _forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, _Res
     return filtered, (image, guide, filtered, weight)
 
 
+def _gains(filtered: jax.Array, weight: jax.Array, cotangent: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Where there is weight [1, H, W], the cotangent over it [C, H, W], and the product of that and the result."""
+    some = weight > _NO_WEIGHT
+    scaled = jnp.where(some, cotangent / jnp.where(some, weight, 1.0), 0.0)
+    return some, scaled, jnp.sum(scaled * filtered, axis=0)
+
+
 def _backward(step: int, residuals: _Residuals, cotangent: jax.Array) -> tuple[jax.Array, Guide]:
     """Gathered: every pixel p collects what it gets as the centre and what it gets as a tap of its neighbours q.
 
@@ -222,9 +244,7 @@ def _backward(step: int, residuals: _Residuals, cotangent: jax.Array) -> tuple[j
     image, guide, filtered, weight = residuals
     _, height, width = image.shape
     dtype, margin = image.dtype, step * RADIUS
-    some = weight > _NO_WEIGHT
-    scaled = jnp.where(some, cotangent / jnp.where(some, weight, 1.0), 0.0)
-    level = jnp.sum(scaled * filtered, axis=0)
+    some, scaled, level = _gains(filtered, weight, cotangent)
 
     def around(planes: Planes | jax.Array) -> Planes:
         return [jnp.pad(plane, margin) for plane in planes]
@@ -280,11 +300,14 @@ def _backward(step: int, residuals: _Residuals, cotangent: jax.Array) -> tuple[j
     first, second = _one(pairs, 0), _one(pairs, 1)
     ready = weigh(first)
     carry: Carry = (begin, (first, ready, slopes(first, ready)), (second, weigh(second)))
-    (sums, oldest, (last, weights)), _ = lax.scan(body, carry, _from(pairs, 2))
-    sums = add(add(sums, *oldest), last, weights, slopes(last, weights))
+    # Two pairs without weight come last: whatever follows the scan is computed once for every one of the sums.
+    nothing = jax.tree.map(lambda each: jnp.zeros_like(each[:2]), pairs)
+    rest = jax.tree.map(lambda one, other: jnp.concatenate([one, other]), _from(pairs, 2), nothing)
+    (sums, _, _), _ = lax.scan(body, carry, rest)
     by_image = jnp.stack(sums[: len(x)]) + jnp.where(some, 0.0, cotangent)
     by_guides = sums[len(x) + 1 :]
     return by_image, Guide(jnp.stack(by_guides[:-3]), jnp.stack(by_guides[-3:]), sums[len(x)])
 
 
 _filtered.defvjp(_forward, _backward)
+_by_loops.defvjp(_loops_forward, _loops_backward)

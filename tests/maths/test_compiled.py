@@ -107,17 +107,46 @@ def test_light_of_blocks(gain, rng, both):
     assert wanted.max() > 1e-4
 
 
-def test_gradients_and_batches_are_those_of_jax(rng, both, monkeypatch):
-    image, guide = jnp.asarray(rng.random((2, 9, 12)), jnp.float32), drawn(rng, 9, 12)
-    coarse, there = image[:, :4, :6], drawn(rng, 4, 6)
-    fine = jax.tree.map(lambda plane: plane[..., :8, :], guide)
+@pytest.mark.parametrize("size", [(1, 1), (3, 40), (37, 5), (33, 70)])
+@pytest.mark.parametrize("step", [1, 2, 8])
+def test_the_gradient_of_a_level_of_the_filter(size, step, rng, both):
+    image, cotangent = (jnp.asarray(rng.uniform(-1, 1, (3, *size)), jnp.float32) for _ in range(2))
+    guide = drawn(rng, *size)._replace(scales=jnp.asarray([0.5, 1.0, 0.7, 0.1, 1.5]))
 
-    def loss(image, guide, coarse, there, fine):
+    def gradient(image, guide, cotangent):
+        return jax.vjp(lambda image, guide: affinity_filter(image, guide, step=step), image, guide)[1](cotangent)
+
+    found, wanted = both(gradient, image, guide, cotangent)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5 * max(np.abs(other).max(), 0.1))
+    assert size == (1, 1) or all(np.abs(each).max() > 0 for each in jax.tree.leaves(wanted))
+
+
+def test_gradients_of_batches_that_share_their_scales(rng, both):
+    images, guides = jnp.asarray(rng.random((2, 3, 9, 12)), jnp.float32), [drawn(rng, 9, 12) for _ in range(2)]
+    guides = jax.tree.map(lambda *each: jnp.stack(each), *guides)
+    scales = jnp.asarray([0.5, 1.0, 0.7, 0.1, 1.5])
+
+    def loss(scales, images, guides):
+        each = jax.vmap(lambda image, guide: affinity_filter(image, guide._replace(scales=scales)) ** 2)(images, guides)
+        return each.sum()
+
+    found, wanted = both(jax.grad(loss, argnums=(0, 1, 2)), scales, images, guides)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)
+    assert np.abs(wanted[0]).min() > 1e-3
+
+
+def test_what_has_no_loop_for_its_gradient_is_left_to_jax(rng, both, monkeypatch):
+    coarse, there = jnp.asarray(rng.random((2, 4, 6)), jnp.float32), drawn(rng, 4, 6)
+    fine = drawn(rng, 8, 12)
+
+    def loss(coarse, there, fine):
         enlarged, weight = enlarge(coarse, there, fine)
-        return (affinity_filter(image, guide) ** 2).sum() + (enlarged**2).sum() + weight.sum()
+        return (enlarged**2).sum() + weight.sum()
 
-    given = image, guide, coarse, there, fine
-    program = jax.grad(loss, argnums=(0, 1, 2, 3, 4))
+    given = coarse, there, fine
+    program = jax.grad(loss, argnums=(0, 1, 2))
     assert "callback[" not in str(jax.make_jaxpr(program)(*given))
     found = program(*given)
     monkeypatch.setenv("JAXDN_COMPILED", "0")
@@ -125,11 +154,11 @@ def test_gradients_and_batches_are_those_of_jax(rng, both, monkeypatch):
         np.testing.assert_array_equal(one, other)
     monkeypatch.delenv("JAXDN_COMPILED")
 
-    two = jax.tree.map(lambda each: jnp.stack([each, each[..., ::-1]]), (image, guide))
-    batched = jax.vmap(affinity_filter)
+    two = jax.tree.map(lambda each: jnp.stack([each, each[..., ::-1]]), given)
+    batched = jax.vmap(enlarge)
     assert "callback[" not in str(jax.make_jaxpr(batched)(*two))
-    alone = both(affinity_filter, *jax.tree.map(lambda each: each[1], two))[0]
-    np.testing.assert_allclose(batched(*two)[1], alone, rtol=3e-5)
+    alone = both(enlarge, *jax.tree.map(lambda each: each[1], two))[0]
+    np.testing.assert_allclose(batched(*two)[0][1], alone[0], rtol=3e-5)
 
 
 def test_an_error_in_a_loop_is_raised(rng):
