@@ -2,50 +2,45 @@
 
 For each frame: divide by what surfaces reflect; fetch the history with a test of every tap; blend the noisy frame into
 a running mean whose effective number of samples is known per pixel; filter the mean by affinities, one or two levels at
-full resolution and four at half, each reaching twice as far as the one before; take single bright pixels away; blend
-the result with the last output.
+full resolution and four at half, each reaching twice as far as the one before (:mod:`jaxdn.filters.levels`); take
+single bright pixels away; blend the result with the last output.
 
 What a hand-made filter leaves to constants, a U-Net at half resolution decides for every pixel: learned features that
 stop the filter beside albedo, normal and depth; how far a pixel can be trusted (a firefly is not); how fast both
-histories follow; how much of each level is taken. Its first decisions are plausible ones, so that training begins from
-a filter and not from noise.
+histories follow; how much of each level is taken, and given back. Its first decisions are plausible ones, so that
+training begins from a filter and not from noise.
 
 The filter is variance-guided filtering without its variance (Schied et al. 2017), with affinities of learned features
 (Isik et al. 2021) and a recurrent network's view of noisy frame, mean and last output (Zeng et al. 2021).
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn import brdf, color
+from jaxdn import color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.blocks import light_of_blocks
 from jaxdn.filters.clamping import without_specks
-from jaxdn.filters.enlarge import enlarge
-from jaxdn.filters.guides import Guides, depth_feature, depth_slopes, guides_of, hit_mask
+from jaxdn.filters.guides import Guides, depth_feature, guides_of
+from jaxdn.filters.levels import BLOCKS, LEVELS, Decisions, Surfaces, filtered, planar, reach, slanted, surfaces_of
 from jaxdn.filters.recall import recall
-from jaxdn.frame import FAR, RADIANCE_MAX, Frame
+from jaxdn.frame import RADIANCE_MAX, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
 from jaxdn.methods.table import method
 from jaxdn.networks import Widths, crop, description, pad
 from jaxdn.objectives import pyramid_illumination
-from jaxdn.ops.affinity_filter import Guide, affinity_filter
 from jaxdn.options import Range
 from jaxdn.recipe import Recipe
 from jaxdn.scales import downsample, fill, fold
 from jaxdn.variation import Variation
 from jaxdn.whole import Whole, measured
 
-LEVELS = 4
-"""Levels of the filter at half resolution, taps 2, 4, 8 and 16 pixels apart."""
 FEATURES, HALF_FEATURES = 5, 8
 """Learned features at full and at half resolution."""
-_BLOCKS = 4
-"""Height and width that the filters work on are multiples of this: blocks of 4x4 pixels are filled."""
 _MULTIPLE = 16
 """Height and width that the network works on, at half resolution, are multiples of this."""
 
@@ -57,18 +52,20 @@ class Quality(NamedTuple):
     """Channels of the U-Net's convolutions, from half resolution down."""
     full_levels: int = 2
     """Levels of the filter at full resolution, taps 1, 2 ... pixels apart."""
+    twice: bool = True
+    """What the levels at half resolution took away goes through them too, and a share of it is given back."""
 
 
 QUALITIES = {
     "high": Quality(((48,), (64,), (80,), (96,), (96,))),
     "balanced": Quality(((32,), (48,), (64,), (64,), (64,))),
-    "fast": Quality(((16,), (24,), (32,), (32,), (32,)), full_levels=1),
+    "fast": Quality(((16,), (24,), (32,), (32,), (32,)), full_levels=1, twice=False),
 }
 
 BEGIN = {"trust": 4.0, "follow": 0.0, "blend": 0.0, "coarse": 4.0, "feedback": -4.0}
 """Decisions for every pixel, one logit each, and what they are before training."""
-_TAKE = 4.0
-"""The same for how much of each level at half resolution is taken."""
+_TAKE, _BACK = 4.0, -2.0
+"""The same for how much of each level at half resolution is taken, and of what they took away is given back."""
 PRECISIONS = {"albedo": 1.0, "normal": 1.0, "depth": 6.0, "learned": 0.0}
 """Guide of the filter -> the logarithm of its precision before training."""
 
@@ -112,17 +109,6 @@ class SteadyState(NamedTuple):
     """Depth, normal and ids of the previous frame, as far as present."""
 
 
-class _Surfaces(NamedTuple):
-    """A frame's guides, padded; 0 is the neutral value."""
-
-    albedo: jax.Array
-    normal: jax.Array
-    roughness: jax.Array
-    depth: jax.Array | None
-    hit: jax.Array
-    """[H, W, 1] bool, there is a surface."""
-
-
 class _Past(NamedTuple):
     """What is recalled of the history, padded."""
 
@@ -131,23 +117,6 @@ class _Past(NamedTuple):
     number: jax.Array
     shown: jax.Array
     valid: jax.Array
-
-
-class _Decisions(NamedTuple):
-    """What the network decided; planar."""
-
-    features: jax.Array
-    """[FEATURES, H, W]."""
-    mean_features: jax.Array
-    """[FEATURES, H/2, W/2] their means over blocks."""
-    shares: dict[str, jax.Array]
-    """Name in :data:`BEGIN` -> [H, W, 1] in [0, 1]."""
-    half_features: jax.Array
-    """[HALF_FEATURES, H/2, W/2]."""
-    half_trust: jax.Array
-    """[H/2, W/2, 1] in [0, 1]."""
-    take: list[jax.Array]
-    """Level -> [H/2, W/2, 1] in [0, 1]."""
 
 
 @method(
@@ -168,16 +137,15 @@ def steady(options: Options) -> Denoiser:
     from jaxdn.networks.unet import unet
 
     quality = QUALITIES[options.quality] if isinstance(options.quality, str) else Quality(options.quality)
-    heads = (4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS,)
+    heads = (4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS + quality.twice,)
     network = unet((32, 20), heads, widths=quality.widths, head_size=1, implementation=options.implementation)
     reads = frozenset({"albedo", "normal", "roughness", "depth", "previous_depth", "motion", "ids"})
 
     def init(key: jax.Array, frame: Frame) -> Params:
         params = network.init(key)
         pixel = [0.0] * FEATURES + list(BEGIN.values())
-        bias = (
-            [value for value in pixel for _ in range(4)] + [0.0] * HALF_FEATURES + [BEGIN["trust"]] + [_TAKE] * LEVELS
-        )
+        bias = [value for value in pixel for _ in range(4)] + [0.0] * HALF_FEATURES
+        bias += [BEGIN["trust"]] + [_TAKE] * LEVELS + [_BACK] * quality.twice
         precisions = {name: jnp.full((1 + LEVELS,), value, jnp.float32) for name, value in PRECISIONS.items()}
         return {**params, "head_0": {**params["head_0"], "bias": jnp.asarray(bias, jnp.float32)}, "guide": precisions}
 
@@ -190,68 +158,47 @@ def steady(options: Options) -> Denoiser:
     ) -> tuple[SteadyState, jax.Array, jax.Array]:
         size = frame.radiance.shape[:2]
         found = recall(state.history, state.guides, frame, first)
-        surfaces, past = _surfaces(frame), _past(found.history, found.valid)
+        surfaces, past = surfaces_of(frame), _past(found.history, found.valid)
         noisy = _noisy(frame, surfaces)
         weights = {name: part for name, part in params.items() if name != "guide"}
         seen = _seen(noisy, past, surfaces, whole)
         head = network.apply(weights, [pad(group, _MULTIPLE)[None] for group in seen])[0][0]
         height, width = seen[0].shape[:2]
-        decided = _decisions(crop(head, (height, width)))
-        mean, square, number = _accumulated(noisy, past, decided.shares["follow"], options.history_max)
+        decided, shares = _decisions(crop(head, (height, width)))
+        mean, square, number = _accumulated(noisy, past, shares["follow"], options.history_max)
         texture = texture_left(frame, options.demodulate, whole)
-        texture = None if texture is None else fill(pad(texture, _BLOCKS), surfaces.hit)
-        slanted = _slanted(surfaces, whole)
-        fine, image = _filtered(params["guide"], mean, texture, surfaces, slanted, decided, quality.full_levels)
+        texture = None if texture is None else fill(pad(texture, BLOCKS), surfaces.hit)
+        depth = slanted(surfaces, whole)
+        fine, image = filtered(params["guide"], mean, texture, surfaces, depth, decided, quality.full_levels)
         image = image * _without_specks(image, surfaces.hit, mean, square, number)
-        newest = jnp.where(past.valid, decided.shares["blend"], 1.0)
+        newest = jnp.where(past.valid, shares["blend"], 1.0)
         shown = jnp.clip(past.shown + newest * (image - past.shown), 0.0, RADIANCE_MAX)
-        kept = mean + decided.shares["feedback"] * (fine - mean)
+        kept = mean + shares["feedback"] * (fine - mean)
         history = crop(jnp.concatenate([kept, square, number, shown], axis=-1), size)
         image = jnp.where(crop(surfaces.hit, size), history[..., 5:], frame.radiance)
         return SteadyState(history, guides_of(frame)), image, found.broken
 
     def measure(frame: Frame) -> Whole:
-        surfaces = _surfaces(frame)
+        surfaces = surfaces_of(frame)
         return measured(_noisy(frame, surfaces), surfaces.depth, frame)
 
     seen = 2 * description.reach(description.unet(1, heads, widths=quality.widths, head_size=1))
-    core = Core(start, step, reads, init, measure=measure, reach=seen + _filters_reach(quality.full_levels))
+    core = Core(start, step, reads, init, measure=measure, reach=seen + reach(quality.full_levels, twice=quality.twice))
     return demodulated(recurrent(core), by=options.demodulate)
 
 
-def _filters_reach(full_levels: int) -> int:
-    """That of the levels; in the rest are 2x2 and 4x4 blocks, what is enlarged, slopes and specks."""
-    return 2 * (2**full_levels - 1) + 4 * (2**LEVELS - 1) + 16
-
-
-def _noisy(frame: Frame, surfaces: _Surfaces) -> jax.Array:
+def _noisy(frame: Frame, surfaces: Surfaces) -> jax.Array:
     # Divided by a small reflectance it may be beyond what the network has ever seen.
-    return fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), _BLOCKS), surfaces.hit)
-
-
-def _surfaces(frame: Frame) -> _Surfaces:
-    nothing = jnp.zeros_like(frame.radiance)
-    height, width = nothing.shape[:2]
-    reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
-    hit = hit_mask(frame.depth, frame.ids)
-    hit = jnp.ones((height, width), bool) if hit is None else hit
-    return _Surfaces(
-        pad(nothing if reflectance is None else reflectance - 1.0, _BLOCKS),
-        pad(nothing if frame.normal is None else frame.normal, _BLOCKS),
-        pad(nothing[..., :1] if frame.roughness is None else frame.roughness - 1.0, _BLOCKS),
-        None if frame.depth is None else pad(frame.depth, _BLOCKS),
-        # What is padded is no surface: noise of the last row would count as often as it is repeated.
-        jnp.pad(hit, ((0, -height % _BLOCKS), (0, -width % _BLOCKS)))[..., None],
-    )
+    return fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), BLOCKS), surfaces.hit)
 
 
 def _past(history: jax.Array, valid: jax.Array) -> _Past:
-    wide = pad(history, _BLOCKS)
+    wide = pad(history, BLOCKS)
     mean, square, number, shown = jnp.split(wide, (3, 4, 5), axis=-1)
-    return _Past(mean, square, number, shown, pad(valid, _BLOCKS))
+    return _Past(mean, square, number, shown, pad(valid, BLOCKS))
 
 
-def _seen(noisy: jax.Array, past: _Past, surfaces: _Surfaces, whole: Whole) -> tuple[jax.Array, jax.Array]:
+def _seen(noisy: jax.Array, past: _Past, surfaces: Surfaces, whole: Whole) -> tuple[jax.Array, jax.Array]:
     """What the network sees at half resolution: surfaces, all four pixels of a block; light, mostly their mean.
 
     Light is seen at one brightness (:func:`jaxdn.color.exposure`) and compressed; where there is no history, in its
@@ -270,15 +217,18 @@ def _seen(noisy: jax.Array, past: _Past, surfaces: _Surfaces, whole: Whole) -> t
     return geometry, jnp.concatenate([*means, seen[..., 3:], shown[..., 3:]], axis=-1)
 
 
-def _decisions(head: jax.Array) -> _Decisions:
+def _decisions(head: jax.Array) -> tuple[Decisions, dict[str, jax.Array]]:
+    """What the head says: about the filter, and the shares [H, W, 1] in [0, 1] of the names in :data:`BEGIN`."""
     height, width = head.shape[:2]
     # Splits, not slices: the gradient of a slice is an array of the whole size, and all of them are added.
     own, logits, half, rest = jnp.split(head, np.cumsum([4 * FEATURES, 4 * len(BEGIN), HALF_FEATURES]), axis=-1)
     # Before they are unfolded, while they lie side by side in memory.
     shares = dict(zip(BEGIN, _unfolded(jax.nn.sigmoid(logits))[..., None], strict=True))
-    trust, *take = jnp.split(jax.nn.sigmoid(rest), 1 + LEVELS, axis=-1)
+    trust, *take = jnp.split(jax.nn.sigmoid(rest), rest.shape[-1], axis=-1)
+    back = take.pop() if len(take) > LEVELS else None
     means = jnp.mean(own.reshape(height, width, FEATURES, 4), axis=-1)
-    return _Decisions(_unfolded(own), _planar(means), shares, _planar(half), trust, take)
+    about = (_unfolded(own), planar(means), shares["trust"], shares["coarse"], planar(half), trust)
+    return Decisions(*about, take, back), shares
 
 
 def _unfolded(blocks: jax.Array) -> jax.Array:
@@ -321,74 +271,5 @@ def _without_specks(
     return without_specks(jnp.mean(image, axis=-1), hit[..., 0], sure[..., 0])[..., None]
 
 
-def _filtered(
-    guide: dict[str, Any],
-    mean: jax.Array,
-    texture: jax.Array | None,
-    surfaces: _Surfaces,
-    slanted: jax.Array,
-    decided: _Decisions,
-    full_levels: int,
-) -> tuple[jax.Array, jax.Array]:
-    """The mean after the levels at full resolution, and after all levels.
-
-    The image of the levels at half resolution is enlarged along the guides, and takes a share of every pixel. The
-    texture that the division left is filtered likewise, and given back (:func:`jaxdn.brdf.restore`).
-    """
-    factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in guide.items()}
-
-    def guided(parts: _Surfaces, slanted: jax.Array, own: jax.Array, trust: jax.Array) -> Guide:
-        surfaces = jnp.concatenate([parts.albedo, parts.normal], axis=-1)
-        confidence = ((trust + _LEAST_TRUST) * parts.hit)[..., 0]
-        return Guide(jnp.concatenate([_planar(surfaces), own]), slanted, confidence)
-
-    def at_level(guide: Guide, index: int) -> Guide:
-        count = {"albedo": 3, "normal": 3, "learned": guide.features.shape[0] - 6, "depth": 1}
-        return guide._replace(scales=jnp.concatenate([jnp.full(n, factors[name][index]) for name, n in count.items()]))
-
-    at_full = at_level(guided(surfaces, slanted, decided.features, decided.shares["trust"]), 0)
-    fine = _planar(mean if texture is None else jnp.concatenate([mean, texture], axis=-1))
-    for index in range(full_levels):
-        fine = affinity_filter(fine, at_full, step=2**index)
-    fine = fine.transpose(1, 2, 0)
-    half = surfaces._replace(
-        albedo=downsample(surfaces.albedo),
-        normal=downsample(surfaces.normal),
-        hit=downsample(surfaces.hit.astype(mean.dtype)) > 0,
-    )
-    slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
-    coarse = downsample(fill(fine, surfaces.hit))
-    at_half = guided(half, slanted_half, decided.half_features, decided.half_trust)
-    for index in range(LEVELS):
-        smoother = affinity_filter(_planar(coarse), at_level(at_half, 1 + index), step=2**index).transpose(1, 2, 0)
-        coarse = coarse + decided.take[index] * (smoother - coarse)
-    there = guided(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
-    enlarged, weight = enlarge(_planar(coarse), there, at_full)
-    share = decided.shares["coarse"] * (weight / (weight + _LIKENESS))[..., None]
-    image = fine + share * (enlarged.transpose(1, 2, 0) - fine)
-    if texture is None:
-        return fine, image
-    fine, image = (brdf.restore(light[..., :3], texture, light[..., 3:]) for light in (fine, image))
-    return fine, image
-
-
 _SOME = 1.5
 """Effective number of frames from which on their deviation tells how sure a mean is."""
-_LIKENESS = 0.02
-"""Weight of coarse pixels at which half of the enlarged image is taken."""
-_LEAST_TRUST = 1e-3
-"""So that a pixel is filtered even where none is trusted."""
-
-
-def _planar(image: jax.Array) -> jax.Array:
-    return image.transpose(2, 0, 1)
-
-
-def _slanted(surfaces: _Surfaces, whole: Whole) -> jax.Array:
-    """[3, H, W] inverse depth relative to its mean, which is affine on planes, and its slopes; 0 without a surface."""
-    depth = surfaces.depth
-    if depth is None:
-        return jnp.zeros_like(_planar(surfaces.normal))
-    known = (depth > 0) & (depth < FAR)
-    inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0) / whole.middle_inverse
-    return jnp.stack([inverse[..., 0], *depth_slopes(inverse, None)])

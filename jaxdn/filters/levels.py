@@ -1,0 +1,173 @@
+"""Light filtered by affinities at several levels: at full resolution, at half, and enlarged again along the guides.
+
+Every level is an :mod:`jaxdn.ops.affinity_filter` whose taps lie twice as far apart as those of the level before. How
+alike two pixels are is told by albedo, normal, depth and features that somebody has learned; how far each can be
+trusted and how much of each level it takes is decided for every pixel as well: by a network, in
+:mod:`jaxdn.methods.steady`.
+
+A mean over neighbours is wrong where light is not the same on both sides: it flattens what is curved, and at the edge
+of a surface it takes from inside alone. So what the levels at half resolution took away from the light is filtered in
+its turn, and a share of it is given back: for a linear filter S, ``S x + s S (x - S x)`` (s = 1: twicing, Tukey 1977),
+whose bias is of a higher order and whose noise is larger.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn import brdf
+from jaxdn.filters.enlarge import enlarge
+from jaxdn.filters.guides import depth_slopes, hit_mask
+from jaxdn.frame import FAR, Frame
+from jaxdn.networks import pad
+from jaxdn.ops.affinity_filter import Guide, affinity_filter
+from jaxdn.scales import downsample, fill
+from jaxdn.whole import Whole
+
+LEVELS = 4
+"""Levels at half resolution, taps 2, 4, 8 and 16 pixels apart."""
+BLOCKS = 4
+"""Height and width that the filters work on are multiples of this: blocks of 4x4 pixels are filled."""
+_LIKENESS = 0.02
+"""Weight of coarse pixels at which half of the enlarged image is taken."""
+_LEAST_TRUST = 1e-3
+"""So that a pixel is filtered even where none is trusted."""
+
+
+class Surfaces(NamedTuple):
+    """A frame's guides, padded; 0 is the neutral value."""
+
+    albedo: jax.Array
+    normal: jax.Array
+    roughness: jax.Array
+    depth: jax.Array | None
+    hit: jax.Array
+    """[H, W, 1] bool, there is a surface."""
+
+
+class Decisions(NamedTuple):
+    """What is decided about the pixels of a frame."""
+
+    features: jax.Array
+    """[F, H, W]."""
+    mean_features: jax.Array
+    """[F, H/2, W/2] their means over blocks."""
+    trust: jax.Array
+    """[H, W, 1] in [0, 1]."""
+    coarse: jax.Array
+    """[H, W, 1] in [0, 1], how much of the image of the levels at half resolution is taken."""
+    half_features: jax.Array
+    """[G, H/2, W/2]."""
+    half_trust: jax.Array
+    """[H/2, W/2, 1] in [0, 1]."""
+    take: list[jax.Array]
+    """Level at half resolution -> [H/2, W/2, 1] in [0, 1]."""
+    back: jax.Array | None
+    """[H/2, W/2, 1] in [0, 1], how much is given back of what these levels took away; None for nothing."""
+
+
+def surfaces_of(frame: Frame) -> Surfaces:
+    """The guides of a frame, its size padded to a multiple of :data:`BLOCKS`."""
+    nothing = jnp.zeros_like(frame.radiance)
+    height, width = nothing.shape[:2]
+    reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
+    hit = hit_mask(frame.depth, frame.ids)
+    hit = jnp.ones((height, width), bool) if hit is None else hit
+    return Surfaces(
+        pad(nothing if reflectance is None else reflectance - 1.0, BLOCKS),
+        pad(nothing if frame.normal is None else frame.normal, BLOCKS),
+        pad(nothing[..., :1] if frame.roughness is None else frame.roughness - 1.0, BLOCKS),
+        None if frame.depth is None else pad(frame.depth, BLOCKS),
+        # What is padded is no surface: noise of the last row would count as often as it is repeated.
+        jnp.pad(hit, ((0, -height % BLOCKS), (0, -width % BLOCKS)))[..., None],
+    )
+
+
+def slanted(surfaces: Surfaces, whole: Whole) -> jax.Array:
+    """[3, H, W] inverse depth relative to its mean, which is affine on planes, and its slopes; 0 without a surface."""
+    depth = surfaces.depth
+    if depth is None:
+        return jnp.zeros_like(planar(surfaces.normal))
+    known = (depth > 0) & (depth < FAR)
+    inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0) / whole.middle_inverse
+    return jnp.stack([inverse[..., 0], *depth_slopes(inverse, None)])
+
+
+def filtered(
+    precisions: Mapping[str, Any],
+    mean: jax.Array,
+    texture: jax.Array | None,
+    surfaces: Surfaces,
+    slanted: jax.Array,
+    decided: Decisions,
+    full_levels: int,
+) -> tuple[jax.Array, jax.Array]:
+    """The light [H, W, 3] ``mean`` after the levels at full resolution, and after all levels.
+
+    ``precisions`` are logarithms, one for full resolution and one for each level at half, of what the differences in
+    ``albedo``, ``normal``, ``depth`` and ``learned`` features are multiplied by. The image of the levels at half
+    resolution is enlarged along the guides, and takes a share of every pixel. The ``texture`` that a division of the
+    light left is filtered likewise, and given back (:func:`jaxdn.brdf.restore`).
+    """
+    factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items()}
+
+    def guided(parts: Surfaces, slanted: jax.Array, own: jax.Array, trust: jax.Array) -> Guide:
+        surfaces = jnp.concatenate([parts.albedo, parts.normal], axis=-1)
+        confidence = ((trust + _LEAST_TRUST) * parts.hit)[..., 0]
+        return Guide(jnp.concatenate([planar(surfaces), own]), slanted, confidence)
+
+    def at_level(guide: Guide, index: int) -> Guide:
+        count = {"albedo": 3, "normal": 3, "learned": guide.features.shape[0] - 6, "depth": 1}
+        return guide._replace(scales=jnp.concatenate([jnp.full(n, factors[name][index]) for name, n in count.items()]))
+
+    at_full = at_level(guided(surfaces, slanted, decided.features, decided.trust), 0)
+    fine = planar(mean if texture is None else jnp.concatenate([mean, texture], axis=-1))
+    for index in range(full_levels):
+        fine = affinity_filter(fine, at_full, step=2**index)
+    fine = fine.transpose(1, 2, 0)
+    half = surfaces._replace(
+        albedo=downsample(surfaces.albedo),
+        normal=downsample(surfaces.normal),
+        hit=downsample(surfaces.hit.astype(mean.dtype)) > 0,
+    )
+    slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
+    at_half = guided(half, slanted_half, decided.half_features, decided.half_trust)
+    guides = [at_level(at_half, 1 + index) for index in range(LEVELS)]
+    coarse = _coarse(downsample(fill(fine, surfaces.hit)), guides, decided)
+    there = guided(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
+    enlarged, weight = enlarge(planar(coarse), there, at_full)
+    share = decided.coarse * (weight / (weight + _LIKENESS))[..., None]
+    image = fine + share * (enlarged.transpose(1, 2, 0) - fine)
+    if texture is None:
+        return fine, image
+    fine, image = (brdf.restore(light[..., :3], texture, light[..., 3:]) for light in (fine, image))
+    return fine, image
+
+
+def _coarse(light: jax.Array, guides: list[Guide], decided: Decisions) -> jax.Array:
+    """The light (and texture) at half resolution after its levels, with what is given back of the light."""
+
+    def smoothed(light: jax.Array) -> jax.Array:
+        for index, (guide, take) in enumerate(zip(guides, decided.take, strict=True)):
+            smoother = affinity_filter(planar(light), guide, step=2**index).transpose(1, 2, 0)
+            light = light + take * (smoother - light)
+        return light
+
+    found = smoothed(light)
+    if decided.back is None:
+        return found
+    lost = smoothed(light[..., :3] - found[..., :3])
+    # A difference may be negative, light may not.
+    return jnp.concatenate([jnp.maximum(found[..., :3] + decided.back * lost, 0.0), found[..., 3:]], axis=-1)
+
+
+def reach(full_levels: int, *, twice: bool) -> int:
+    """How far, in pixels, :func:`filtered` sees; 16 of them for blocks, slopes and what is enlarged."""
+    return 2 * (2**full_levels - 1) + (1 + twice) * 4 * (2**LEVELS - 1) + 16
+
+
+def planar(image: jax.Array) -> jax.Array:
+    """[H, W, C] as [C, H, W]."""
+    return image.transpose(2, 0, 1)

@@ -1,0 +1,73 @@
+"""The levels of affinity filters: what is given back of what they took away."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdn.filters.levels import LEVELS, Decisions, Surfaces, filtered
+from jaxdn.methods.steady import PRECISIONS
+
+HEIGHT, WIDTH = 64, 96
+
+
+@functools.partial(jax.jit, static_argnames="full_levels")
+def through(light, back=None, *, edge=None, full_levels=1):
+    """The light of a wall, or of two that meet at the column ``edge``, after all levels, with nothing decided."""
+    height, width = light.shape[:2]
+    half = height // 2, width // 2
+    nothing = jnp.zeros((height, width, 3))
+    turned = jnp.zeros(width, bool) if edge is None else jnp.arange(width) >= edge
+    normal = jnp.where(turned[None, :, None], jnp.asarray([1.0, 0.0, 0.0]), jnp.asarray([0.0, 0.0, 1.0]))
+    hit = jnp.ones((height, width, 1), bool)
+    surfaces = Surfaces(nothing, jnp.broadcast_to(normal, nothing.shape), nothing[..., :1], None, hit)
+    whole, part = jnp.ones((height, width, 1)), jnp.ones((*half, 1))
+    decided = Decisions(
+        jnp.zeros((1, height, width)),
+        jnp.zeros((1, *half)),
+        whole,
+        whole,
+        jnp.zeros((1, *half)),
+        part,
+        [part] * LEVELS,
+        None if back is None else back * part,
+    )
+    precisions = {name: jnp.full(1 + LEVELS, 4.0 * value) for name, value in PRECISIONS.items()}
+    flat = jnp.zeros((3, height, width))
+    return filtered(precisions, light, None, surfaces, flat, decided, full_levels)[1]
+
+
+def shading(edge=None):
+    """Light that curves and rises, different on two walls."""
+    x = (np.arange(WIDTH) / WIDTH)[None, :]
+    y = (np.arange(HEIGHT) / HEIGHT)[:, None]
+    light = 0.5 + x**2 + 0.5 * y
+    if edge is not None:
+        light = np.where(np.arange(WIDTH) >= edge, 2.0 - light, light)
+    return jnp.asarray(np.repeat(light[..., None], 3, axis=-1), jnp.float32)
+
+
+@pytest.mark.parametrize("edge", [None, 37])
+def test_what_is_given_back_undoes_about_half_of_the_blur(edge):
+    """Light that curves, and light that ends at a border or at the edge of a wall, where neighbours are on one side."""
+    light = shading(edge)
+    without, twice = (np.abs(through(light, back, edge=edge) - light).mean() for back in (None, 1.0))
+    assert without > 0.01
+    assert twice < 0.6 * without
+
+
+def test_a_share_of_it_is_that_share(rng):
+    light = jnp.asarray(rng.uniform(0.5, 1.5, (HEIGHT, WIDTH, 3)), jnp.float32)
+    none, some, all_ = (np.asarray(through(light, back)) for back in (None, 0.3, 1.0))
+    np.testing.assert_allclose(some, none + 0.3 * (all_ - none), atol=2e-6)
+    np.testing.assert_array_equal(through(light, 0.0), none)
+
+
+def test_light_beside_a_spike_does_not_become_negative():
+    """What is given back is negative around it."""
+    light = jnp.zeros((HEIGHT, WIDTH, 3)).at[30:34, 40:44].set(1e3)
+    twice = np.asarray(through(light, 1.0))
+    assert twice.min() >= 0.0
+    assert twice.max() > np.asarray(through(light)).max()
