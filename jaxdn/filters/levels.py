@@ -1,7 +1,7 @@
 """Light filtered by affinities at several levels: at full resolution, at half, and enlarged again along the guides.
 
 Every level is an :mod:`jaxdn.ops.affinity_filter` whose taps lie twice as far apart as those of the level before. How
-alike two pixels are is told by albedo, normal, depth and features that somebody has learned; how far each can be
+alike two pixels are is told by albedo, gloss, normal, depth and features that somebody has learned; how far each can be
 trusted and how much of each level it takes is decided for every pixel as well: by a network, in
 :mod:`jaxdn.methods.steady`.
 
@@ -40,6 +40,9 @@ class Surfaces(NamedTuple):
     """A frame's guides, padded; 0 is the neutral value."""
 
     albedo: jax.Array
+    """[H, W, 3] what is reflected at all, less 1."""
+    gloss: jax.Array
+    """[H, W, 1] how much of that is not diffuse: a metal frame on a wall as bright as it shows other light."""
     normal: jax.Array
     roughness: jax.Array
     depth: jax.Array | None
@@ -73,10 +76,13 @@ def surfaces_of(frame: Frame) -> Surfaces:
     nothing = jnp.zeros_like(frame.radiance)
     height, width = nothing.shape[:2]
     reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
+    both = frame.albedo is not None and frame.reflectance is not None
+    gloss = jnp.mean(frame.reflectance - frame.albedo, axis=-1, keepdims=True) if both else nothing[..., :1]
     hit = hit_mask(frame.depth, frame.ids)
     hit = jnp.ones((height, width), bool) if hit is None else hit
     return Surfaces(
         pad(nothing if reflectance is None else reflectance - 1.0, BLOCKS),
+        pad(gloss, BLOCKS),
         pad(nothing if frame.normal is None else frame.normal, BLOCKS),
         pad(nothing[..., :1] if frame.roughness is None else frame.roughness - 1.0, BLOCKS),
         None if frame.depth is None else pad(frame.depth, BLOCKS),
@@ -106,20 +112,20 @@ def filtered(
 ) -> tuple[jax.Array, jax.Array]:
     """The light [H, W, 3] ``mean`` after the levels at full resolution, and after all levels.
 
-    ``precisions`` are logarithms, one for full resolution and one for each level at half, of what the differences in
-    ``albedo``, ``normal``, ``depth`` and ``learned`` features are multiplied by. The image of the levels at half
-    resolution is enlarged along the guides, and takes a share of every pixel. The ``texture`` that a division of the
-    light left is filtered likewise, and given back (:func:`jaxdn.brdf.restore`).
+    ``precisions`` are logarithms, one for full resolution and one for each level at half, of what the squares of
+    differences in ``albedo``, ``gloss``, ``normal``, ``depth`` and ``learned`` features are multiplied by. The image of
+    the levels at half resolution is enlarged along the guides, and takes a share of every pixel. The ``texture`` that a
+    division of the light left is filtered likewise, and given back (:func:`jaxdn.brdf.restore`).
     """
     factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items()}
 
     def guided(parts: Surfaces, slanted: jax.Array, own: jax.Array, trust: jax.Array) -> Guide:
-        surfaces = jnp.concatenate([parts.albedo, parts.normal], axis=-1)
+        surfaces = jnp.concatenate([parts.albedo, parts.gloss, parts.normal], axis=-1)
         confidence = ((trust + _LEAST_TRUST) * parts.hit)[..., 0]
         return Guide(jnp.concatenate([planar(surfaces), own]), slanted, confidence)
 
     def at_level(guide: Guide, index: int) -> Guide:
-        count = {"albedo": 3, "normal": 3, "learned": guide.features.shape[0] - 6, "depth": 1}
+        count = {"albedo": 3, "gloss": 1, "normal": 3, "learned": guide.features.shape[0] - 7, "depth": 1}
         return guide._replace(scales=jnp.concatenate([jnp.full(n, factors[name][index]) for name, n in count.items()]))
 
     at_full = at_level(guided(surfaces, slanted, decided.features, decided.trust), 0)
@@ -129,6 +135,7 @@ def filtered(
     fine = fine.transpose(1, 2, 0)
     half = surfaces._replace(
         albedo=downsample(surfaces.albedo),
+        gloss=downsample(surfaces.gloss),
         normal=downsample(surfaces.normal),
         hit=downsample(surfaces.hit.astype(mean.dtype)) > 0,
     )

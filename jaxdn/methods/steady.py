@@ -6,7 +6,7 @@ full resolution and four at half, each reaching twice as far as the one before (
 single bright pixels away; blend the result with the last output.
 
 What a hand-made filter leaves to constants, a U-Net at half resolution decides for every pixel: learned features that
-stop the filter beside albedo, normal and depth; how far a pixel can be trusted (a firefly is not); how fast both
+stop the filter beside albedo, gloss, normal and depth; how far a pixel can be trusted (a firefly is not); how fast both
 histories follow; how much of each level is taken, and given back. Its first decisions are plausible ones, so that
 training begins from a filter and not from noise.
 
@@ -66,7 +66,7 @@ BEGIN = {"trust": 4.0, "follow": 0.0, "blend": 0.0, "coarse": 4.0, "feedback": -
 """Decisions for every pixel, one logit each, and what they are before training."""
 _TAKE, _BACK = 4.0, -2.0
 """The same for how much of each level at half resolution is taken, and of what they took away is given back."""
-PRECISIONS = {"albedo": 1.0, "normal": 1.0, "depth": 6.0, "learned": 0.0}
+PRECISIONS = {"albedo": 1.0, "gloss": 2.0, "normal": 1.0, "depth": 6.0, "learned": 0.0}
 """Guide of the filter -> the logarithm of its precision before training."""
 
 

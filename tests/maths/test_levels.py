@@ -14,15 +14,20 @@ HEIGHT, WIDTH = 64, 96
 
 
 @functools.partial(jax.jit, static_argnames="full_levels")
-def through(light, back=None, *, edge=None, full_levels=1):
-    """The light of a wall, or of two that meet at the column ``edge``, after all levels, with nothing decided."""
+def through(light, back=None, *, edge=None, glossy=0.0, full_levels=1):
+    """The light of a wall, or of two that meet at the column ``edge``, after all levels, with nothing decided.
+
+    The second wall is turned, or ``glossy`` and not turned.
+    """
     height, width = light.shape[:2]
     half = height // 2, width // 2
     nothing = jnp.zeros((height, width, 3))
     turned = jnp.zeros(width, bool) if edge is None else jnp.arange(width) >= edge
     normal = jnp.where(turned[None, :, None], jnp.asarray([1.0, 0.0, 0.0]), jnp.asarray([0.0, 0.0, 1.0]))
     hit = jnp.ones((height, width, 1), bool)
-    surfaces = Surfaces(nothing, jnp.broadcast_to(normal, nothing.shape), nothing[..., :1], None, hit)
+    gloss = jnp.broadcast_to(glossy * turned[None, :, None], (height, width, 1))
+    normal = jnp.broadcast_to(jnp.where(glossy, jnp.asarray([0.0, 0.0, 1.0]), normal), nothing.shape)
+    surfaces = Surfaces(nothing, gloss, normal, nothing[..., :1], None, hit)
     whole, part = jnp.ones((height, width, 1)), jnp.ones((*half, 1))
     decided = Decisions(
         jnp.zeros((1, height, width)),
@@ -71,3 +76,15 @@ def test_light_beside_a_spike_does_not_become_negative():
     twice = np.asarray(through(light, 1.0))
     assert twice.min() >= 0.0
     assert twice.max() > np.asarray(through(light)).max()
+
+
+def test_gloss_keeps_its_light():
+    """Of a glossy frame on a wall, alike in all else, nothing runs over, as nothing does over the edge of two walls."""
+    light = jnp.ones((HEIGHT, WIDTH, 3)).at[:, 37:].set(4.0)
+    blurred, kept, turned = (
+        np.abs(through(light, edge=edge, glossy=glossy) - light).mean()
+        for edge, glossy in ((None, 0.0), (37, 0.7), (37, 0.0))
+    )
+    assert blurred > 0.1
+    assert kept < 0.01 * blurred
+    assert turned < 0.01 * blurred
