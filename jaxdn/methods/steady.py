@@ -35,7 +35,7 @@ from jaxdn.networks import Widths, crop, description, pad
 from jaxdn.objectives import pyramid_illumination
 from jaxdn.options import Range
 from jaxdn.recipe import Recipe
-from jaxdn.scales import downsample, fill, fold
+from jaxdn.scales import downsample, fill, fold, upsample
 from jaxdn.variation import Variation
 from jaxdn.whole import Whole, measured
 
@@ -224,6 +224,8 @@ def _decisions(head: jax.Array) -> tuple[Decisions, dict[str, jax.Array]]:
     own, logits, half, rest = jnp.split(head, np.cumsum([4 * FEATURES, 4 * len(BEGIN), HALF_FEATURES]), axis=-1)
     # Before they are unfolded, while they lie side by side in memory.
     shares = dict(zip(BEGIN, _unfolded(jax.nn.sigmoid(logits))[..., None], strict=True))
+    # A pixel whose share knows of its own noise, follows bright samples more: its mean becomes too bright.
+    shares["follow"] = upsample(downsample(shares["follow"]))
     trust, *take = jnp.split(jax.nn.sigmoid(rest), rest.shape[-1], axis=-1)
     back = take.pop() if len(take) > LEVELS else None
     means = jnp.mean(own.reshape(height, width, FEATURES, 4), axis=-1)
