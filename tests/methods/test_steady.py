@@ -10,9 +10,11 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxdn.denoiser import Denoiser
+from jaxdn.filters.levels import LEVELS
 from jaxdn.frame import FAR, Frame, frame_at
-from jaxdn.methods.steady import steady
+from jaxdn.methods.steady import BEGIN, FEATURES, HALF_FEATURES, _decisions, steady
 from jaxdn.rollout import unroll
+from jaxdn.scales import fold
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -161,6 +163,18 @@ def test_an_absent_buffer_equals_its_neutral_value(absent, rng, key):
 
 
 @pytest.mark.slow
+def test_the_share_of_the_newest_frame_hardly_knows_of_its_own_noise(rng):
+    """Else bright samples count for more than dark ones, and the mean becomes too bright."""
+    noise = rng.standard_normal((32, 32, 4))
+    where = 4 * (FEATURES + list(BEGIN).index("follow"))
+    head = np.zeros((32, 32, 4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS + 1))
+    head[..., where : where + 4] = 2.0 * noise
+    share = np.asarray(fold(_decisions(jnp.asarray(head, jnp.float32))[1]["follow"]))
+    alone = np.mean(noise / (1.0 + np.exp(-2.0 * noise)))
+    assert share.std() > 0.05
+    assert 0.0 < np.mean(noise * share) < 0.2 * alone
+
+
 def test_gradients_through_time(rng, x64):
     denoiser = tiny()
     frames = room(rng, 2, size=(32, 32))
