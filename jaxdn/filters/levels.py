@@ -7,11 +7,11 @@ trusted and how much of each level it takes is decided for every pixel as well: 
 
 A mean over neighbours is wrong where light is not the same on both sides: it flattens what is curved, and at the edge
 of a surface it takes from inside alone. So what the levels at half resolution took away from the light is filtered in
-its turn, and a share of it is given back: for a linear filter S, ``S x + s S (x - S x)`` (s = 1: twicing, Tukey 1977),
-whose bias is of a higher order and whose noise is larger.
+its turn, by two of them, and a share of it is given back: for linear filters S and T, ``S x + s T (x - S x)`` (S = T
+and s = 1: twicing, Tukey 1977), whose bias is of a higher order and whose noise is larger.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -28,6 +28,8 @@ from jaxdn.whole import Whole
 
 LEVELS = 4
 """Levels at half resolution, taps 2, 4, 8 and 16 pixels apart."""
+_AGAIN = (1, 2)
+"""Those that what was taken away goes through again: with all four, nothing changes but the time and the reach."""
 BLOCKS = 4
 """Height and width that the filters work on are multiples of this: blocks of 4x4 pixels are filled."""
 _LIKENESS = 0.02
@@ -156,23 +158,24 @@ def filtered(
 def _coarse(light: jax.Array, guides: list[Guide], decided: Decisions) -> jax.Array:
     """The light (and texture) at half resolution after its levels, with what is given back of the light."""
 
-    def smoothed(light: jax.Array) -> jax.Array:
-        for index, (guide, take) in enumerate(zip(guides, decided.take, strict=True)):
-            smoother = affinity_filter(planar(light), guide, step=2**index).transpose(1, 2, 0)
-            light = light + take * (smoother - light)
+    def smoothed(light: jax.Array, levels: Iterable[int]) -> jax.Array:
+        for index in levels:
+            smoother = affinity_filter(planar(light), guides[index], step=2**index).transpose(1, 2, 0)
+            light = light + decided.take[index] * (smoother - light)
         return light
 
-    found = smoothed(light)
+    found = smoothed(light, range(LEVELS))
     if decided.back is None:
         return found
-    lost = smoothed(light[..., :3] - found[..., :3])
+    lost = smoothed(light[..., :3] - found[..., :3], _AGAIN)
     # A difference may be negative, light may not.
     return jnp.concatenate([jnp.maximum(found[..., :3] + decided.back * lost, 0.0), found[..., 3:]], axis=-1)
 
 
 def reach(full_levels: int, *, twice: bool) -> int:
     """How far, in pixels, :func:`filtered` sees; 16 of them for blocks, slopes and what is enlarged."""
-    return 2 * (2**full_levels - 1) + (1 + twice) * 4 * (2**LEVELS - 1) + 16
+    half = [*range(LEVELS), *(_AGAIN if twice else ())]
+    return 2 * (2**full_levels - 1) + sum(4 * 2**index for index in half) + 16
 
 
 def planar(image: jax.Array) -> jax.Array:
