@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn import brdf
+from jaxdn.filters import lag
 from jaxdn.filters.enlarge import enlarge
 from jaxdn.filters.guides import depth_slopes, hit_mask
 from jaxdn.frame import FAR, Frame
@@ -50,6 +51,17 @@ class Surfaces(NamedTuple):
     depth: jax.Array | None
     hit: jax.Array
     """[H, W, 1] bool, there is a surface."""
+
+
+class Filtered(NamedTuple):
+    """Light [H, W, 3] after the levels."""
+
+    fine: jax.Array
+    """After those at full resolution."""
+    image: jax.Array
+    """After all of them, with the change."""
+    change: jax.Array
+    """What the mean lacked (:mod:`jaxdn.filters.lag`)."""
 
 
 class Decisions(NamedTuple):
@@ -106,13 +118,14 @@ def slanted(surfaces: Surfaces, whole: Whole) -> jax.Array:
 def filtered(
     precisions: Mapping[str, Any],
     mean: jax.Array,
+    missed: jax.Array,
     texture: jax.Array | None,
     surfaces: Surfaces,
     slanted: jax.Array,
     decided: Decisions,
     full_levels: int,
-) -> tuple[jax.Array, jax.Array]:
-    """The light [H, W, 3] ``mean`` after the levels at full resolution, and after all levels.
+) -> Filtered:
+    """The light [H, W, 3] ``mean`` after the levels; ``missed`` is how much more the newest frame shows than it.
 
     ``precisions`` are logarithms, one for full resolution and one for each level at half, of what the squares of
     differences in ``albedo``, ``gloss``, ``normal``, ``depth`` and ``learned`` features are multiplied by. The image of
@@ -144,19 +157,24 @@ def filtered(
     slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
     at_half = guided(half, slanted_half, decided.half_features, decided.half_trust)
     guides = [at_level(at_half, 1 + index) for index in range(LEVELS)]
-    coarse = _coarse(downsample(fill(fine, surfaces.hit)), guides, decided)
+    coarse, change = _coarse(downsample(fill(fine, surfaces.hit)), downsample(missed), guides, half.hit, decided)
     there = guided(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
-    enlarged, weight = enlarge(planar(coarse), there, at_full)
-    share = decided.coarse * (weight / (weight + _LIKENESS))[..., None]
-    image = fine + share * (enlarged.transpose(1, 2, 0) - fine)
+    enlarged, weight = enlarge(planar(jnp.concatenate([change, coarse], axis=-1)), there, at_full)
+    change, coarse = jnp.split(enlarged.transpose(1, 2, 0), (3,), axis=-1)
+    alike = (weight / (weight + _LIKENESS))[..., None]
+    change = alike * change
+    image = fine + decided.coarse * alike * (coarse - fine)
+    now = jnp.maximum(image[..., :3] + change, 0.0)
     if texture is None:
-        return fine, image
-    fine, image = (brdf.restore(light[..., :3], texture, light[..., 3:]) for light in (fine, image))
-    return fine, image
+        return Filtered(fine, now, change)
+    fine = brdf.restore(fine[..., :3], texture, fine[..., 3:])
+    return Filtered(fine, brdf.restore(now, texture, image[..., 3:]), change)
 
 
-def _coarse(light: jax.Array, guides: list[Guide], decided: Decisions) -> jax.Array:
-    """The light (and texture) at half resolution after its levels, with what is given back of the light."""
+def _coarse(
+    light: jax.Array, missed: jax.Array, guides: list[Guide], hit: jax.Array, decided: Decisions
+) -> tuple[jax.Array, jax.Array]:
+    """The light (and texture) at half resolution after its levels, with what is given back; the change of light."""
 
     def smoothed(light: jax.Array, levels: Iterable[int]) -> jax.Array:
         for index in levels:
@@ -165,17 +183,22 @@ def _coarse(light: jax.Array, guides: list[Guide], decided: Decisions) -> jax.Ar
         return light
 
     found = smoothed(light, range(LEVELS))
+    missed = lag.with_signs(missed)
+    for index in range(LEVELS):
+        missed = affinity_filter(planar(missed), guides[index], step=2**index).transpose(1, 2, 0)
+    change = lag.change(missed, found[..., :3], hit)
     if decided.back is None:
-        return found
+        return found, change
     lost = smoothed(light[..., :3] - found[..., :3], _AGAIN)
     # A difference may be negative, light may not.
-    return jnp.concatenate([jnp.maximum(found[..., :3] + decided.back * lost, 0.0), found[..., 3:]], axis=-1)
+    return jnp.concatenate([jnp.maximum(found[..., :3] + decided.back * lost, 0.0), found[..., 3:]], axis=-1), change
 
 
 def reach(full_levels: int, *, twice: bool) -> int:
     """How far, in pixels, :func:`filtered` sees; 16 of them for blocks, slopes and what is enlarged."""
-    half = [*range(LEVELS), *(_AGAIN if twice else ())]
-    return 2 * (2**full_levels - 1) + sum(4 * 2**index for index in half) + 16
+    half = sum(4 * 2**index for index in range(LEVELS))
+    again = sum(4 * 2**index for index in _AGAIN) if twice else 0
+    return 2 * (2**full_levels - 1) + half + max(again, 2 * lag.reach()) + 16
 
 
 def planar(image: jax.Array) -> jax.Array:

@@ -157,8 +157,8 @@ def steady(options: Options) -> Denoiser:
         params: Params, state: SteadyState, frame: Frame, first: jax.Array, whole: Whole
     ) -> tuple[SteadyState, jax.Array, jax.Array]:
         size = frame.radiance.shape[:2]
-        found = recall(state.history, state.guides, frame, first)
-        surfaces, past = surfaces_of(frame), _past(found.history, found.valid)
+        recalled = recall(state.history, state.guides, frame, first)
+        surfaces, past = surfaces_of(frame), _past(recalled.history, recalled.valid)
         noisy = _noisy(frame, surfaces)
         weights = {name: part for name, part in params.items() if name != "guide"}
         seen = _seen(noisy, past, surfaces, whole)
@@ -169,14 +169,15 @@ def steady(options: Options) -> Denoiser:
         texture = texture_left(frame, options.demodulate, whole)
         texture = None if texture is None else fill(pad(texture, BLOCKS), surfaces.hit)
         depth = slanted(surfaces, whole)
-        fine, image = filtered(params["guide"], mean, texture, surfaces, depth, decided, quality.full_levels)
-        image = image * _without_specks(image, surfaces.hit, mean, square, number)
+        missed = jnp.where(surfaces.hit, noisy - mean, 0.0)
+        found = filtered(params["guide"], mean, missed, texture, surfaces, depth, decided, quality.full_levels)
+        image = found.image * _without_specks(found.image, surfaces.hit, mean, square, number)
         newest = jnp.where(past.valid, shares["blend"], 1.0)
         shown = jnp.clip(past.shown + newest * (image - past.shown), 0.0, RADIANCE_MAX)
-        kept = mean + shares["feedback"] * (fine - mean)
+        kept = jnp.maximum(mean + shares["feedback"] * (found.fine - mean) + found.change, 0.0)
         history = crop(jnp.concatenate([kept, square, number, shown], axis=-1), size)
         image = jnp.where(crop(surfaces.hit, size), history[..., 5:], frame.radiance)
-        return SteadyState(history, guides_of(frame)), image, found.broken
+        return SteadyState(history, guides_of(frame)), image, recalled.broken
 
     def measure(frame: Frame) -> Whole:
         surfaces = surfaces_of(frame)
