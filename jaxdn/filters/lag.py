@@ -5,12 +5,12 @@ blend new frames in faster would bring back the noise that the mean has got rid 
 and what is smooth can be told from one noisy frame: the frame's difference from the mean, filtered along surfaces, is
 added to the mean at once; details stay those of the mean.
 
-How much of it is noise is told by the same difference under signs that alternate like the squares of a checkerboard: a
-filter leaves as much of noise that no two pixels share, and nothing of an even change. Where D is the filtered
-difference and E that with signs, a share ``max(0, 1 - k <E^2> / <D^2>)`` of D is added, with means over a wide window
-of squares relative to the light: for k = 1 the positive part of the estimator of James and Stein (1961), here per
-region. Schied et al. 2018 ("Gradient Estimation for Real-Time Adaptive Temporal Filtering") ask the same of samples
-that are traced twice.
+How much of it is noise is told by the same difference under signs that alternate, like the squares of a checkerboard: of
+noise that no two pixels share a filter leaves as much with signs as without, of an even change nothing. Where D is the
+filtered difference and E that with signs, a share ``max(0, 1 - k <E^2> / <D^2>)`` of D is added, with means over a wide
+window of squares relative to the light: for k = 1 the positive part of the estimator of James and Stein (1961), here
+for a region. Schied et al. 2018 ("Gradient Estimation for Real-Time Adaptive Temporal Filtering") ask the same question
+of samples that are traced twice.
 """
 
 import jax
@@ -20,17 +20,18 @@ from jaxdn import color
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
 
 _SURE = 1.5
-"""k. More takes less for a change: with 1 smooth walls flicker, with 2 a third of what a change brings is lost."""
-_WINDOW = 4, 8
-"""Distances of the taps of the two filters that are the window: 24 pixels to either side."""
+"""k. More takes less for a change, which loses a part of it; less lets smooth walls flicker."""
+_WINDOW = 8, 16
+"""Distances of the taps of the two filters that are the window: 48 pixels to either side. What noise leaves after the
+filter are clouds some 25 pixels wide: a smaller window, which knows few of them, takes more of them for changes."""
 _NOTHING = 1e-12
 
 
 def with_signs(difference: jax.Array) -> jax.Array:
-    """[H, W, 4] the difference [H, W, 3], and its luminance under alternating signs."""
-    rows, columns = (jnp.arange(count) for count in difference.shape[:2])
-    odd = (rows[:, None, None] + columns[:, None]) % 2 == 1
-    level = color.luminance(difference)
+    """[H, W, 6] the difference [H, W, 3], and its luminance under signs that alternate by row, by column and by both."""
+    rows, columns = jnp.indices(difference.shape[:2])
+    odd = jnp.stack([rows, columns, rows + columns], axis=-1) % 2 == 1
+    level = jnp.repeat(color.luminance(difference), 3, axis=-1)
     return jnp.concatenate([difference, jnp.where(odd, -level, level)], axis=-1)
 
 
@@ -38,13 +39,15 @@ def change(filtered: jax.Array, light: jax.Array, hit: jax.Array) -> jax.Array:
     """[H, W, 3] the part of a filtered difference that is a change of light, between 0 and all of it.
 
     Args:
-      filtered: [H, W, 4] what :func:`with_signs` made, after a filter.
+      filtered: [H, W, 6] what :func:`with_signs` made, after a filter.
       light: [H, W, 3] >= 0 what the difference is one from, filtered likewise.
       hit: [H, W, 1] bool, there is a surface; other pixels say nothing of noise.
     """
     found = color.luminance(filtered[..., :3])
     level = color.luminance(light) + jnp.abs(found)
-    squares = jnp.square(jnp.concatenate([found, filtered[..., 3:]], axis=-1) / (level + _NOTHING))
+    relative = 1.0 / (level + _NOTHING)
+    noise = jnp.mean(jnp.square(filtered[..., 3:] * relative), axis=-1, keepdims=True)
+    squares = jnp.concatenate([jnp.square(found * relative), noise], axis=-1)
     squares = squares.transpose(2, 0, 1)
     size = squares.shape[1:]
     alike = Guide(jnp.zeros((1, *size), squares.dtype), jnp.zeros((3, *size), squares.dtype), hit[..., 0] * 1.0)

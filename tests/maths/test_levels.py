@@ -14,7 +14,7 @@ HEIGHT, WIDTH = 64, 96
 
 
 @functools.partial(jax.jit, static_argnames="full_levels")
-def through(light, back=None, *, edge=None, glossy=0.0, full_levels=1):
+def through(light, back=None, *, missed=0.0, edge=None, glossy=0.0, full_levels=1):
     """The light of a wall, or of two that meet at the column ``edge``, after all levels, with nothing decided.
 
     The second wall is turned, or ``glossy`` and not turned.
@@ -41,7 +41,8 @@ def through(light, back=None, *, edge=None, glossy=0.0, full_levels=1):
     )
     precisions = {name: jnp.full(1 + LEVELS, 4.0 * value) for name, value in PRECISIONS.items()}
     flat = jnp.zeros((3, height, width))
-    return filtered(precisions, light, None, surfaces, flat, decided, full_levels)[1]
+    missed = jnp.broadcast_to(missed, light.shape)
+    return filtered(precisions, light, missed, None, surfaces, flat, decided, full_levels).image
 
 
 def shading(edge=None):

@@ -1,0 +1,113 @@
+"""The light that a history lacks: a change is told from noise."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from jaxdn.filters.lag import change, reach, with_signs
+from jaxdn.ops.affinity_filter import Guide, affinity_filter
+
+SIZE = 96, 128
+
+
+@jax.jit
+def noticed(difference, light=None, hit=None):
+    """The change after four levels of a filter that knows one even wall."""
+    size = difference.shape[:2]
+    light = jnp.ones_like(difference) if light is None else light
+    hit = jnp.ones((*size, 1), bool) if hit is None else hit
+    alike = Guide(jnp.zeros((1, *size)), jnp.zeros((3, *size)), hit[..., 0] * 1.0)
+    planes = with_signs(difference).transpose(2, 0, 1)
+    for step in (1, 2, 4, 8):
+        planes = affinity_filter(planes, alike, step=step)
+    return change(planes.transpose(1, 2, 0), light, hit)
+
+
+def noise(rng, strength=1.0):
+    """Light of single samples less its mean, which many pixels have nothing of and some much."""
+    light = rng.exponential(size=(*SIZE, 1)) * (rng.uniform(size=(*SIZE, 1)) < 0.3) / 0.3
+    return jnp.asarray(strength * (light - 1.0) * np.ones(3), jnp.float32)
+
+
+def test_signs_alternate_by_row_by_column_and_by_both():
+    difference = jnp.asarray([[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], [[7.0, 8.0, 9.0], [1.0, 1.0, 1.0]]])
+    rec709 = np.asarray(difference) @ np.float32([0.2126, 0.7152, 0.0722])
+    found = np.asarray(with_signs(difference))
+    np.testing.assert_array_equal(found[..., :3], difference)
+    signs = np.stack([[[1, 1], [-1, -1]], [[1, -1], [1, -1]], [[1, -1], [-1, 1]]], axis=-1)
+    np.testing.assert_allclose(found[..., 3:], rec709[..., None] * signs, rtol=1e-6)
+
+
+@pytest.mark.parametrize("rise", [-0.5, 0.3, 4.0])
+def test_an_even_change_is_found_in_the_noise_of_single_samples(rise, rng):
+    found = np.asarray(noticed(noise(rng) + rise))[24:-24, 24:-24]
+    np.testing.assert_allclose(found.mean(), rise, rtol=0.25)
+    assert (np.sign(found) == np.sign(rise)).mean() > 0.97
+
+
+def test_noise_is_no_change(rng):
+    """Of the power that a filter alone would leave of it, less than a fifth is added."""
+    added, plain = [], []
+    for _ in range(8):
+        given = noise(rng)
+        added.append(np.square(noticed(given)).mean())
+        size = given.shape[:2]
+        alike = Guide(jnp.zeros((1, *size)), jnp.zeros((3, *size)), jnp.ones(size))
+        planes = given.transpose(2, 0, 1)
+        for step in (1, 2, 4, 8):
+            planes = affinity_filter(planes, alike, step=step)
+        plain.append(np.square(planes).mean())
+    assert np.mean(added) < 0.2 * np.mean(plain)
+
+
+def test_nothing_new_adds_nothing_and_an_exact_change_is_taken_whole():
+    np.testing.assert_array_equal(noticed(jnp.zeros((*SIZE, 3))), 0.0)
+    whole = np.asarray(noticed(jnp.full((*SIZE, 3), 0.25)))
+    # At the border the signs do not cancel.
+    np.testing.assert_allclose(whole[40:-40, 40:-40], 0.25, rtol=1e-3)
+
+
+def test_brightness_does_not_matter(rng):
+    given = noise(rng) + 0.3
+    plain = np.asarray(noticed(given))
+    for gain in (2.0**-12, 2.0**10):
+        scaled = noticed(gain * given, jnp.full((*SIZE, 3), gain))
+        np.testing.assert_allclose(np.asarray(scaled) / gain, plain, rtol=1e-4, atol=1e-6)
+
+
+def test_the_sky_says_nothing_of_noise(rng):
+    """What lies in it changes nothing at a surface."""
+    hit = np.ones((*SIZE, 1), bool)
+    hit[:, 64:] = False
+    given = np.array(noise(rng) + 0.3)
+    one, other = given.copy(), given.copy()
+    one[:, 64:], other[:, 64:] = 0.0, 1e3
+    one, other = (np.asarray(noticed(jnp.asarray(each), hit=jnp.asarray(hit))) for each in (one, other))
+    np.testing.assert_allclose(one[:, :64], other[:, :64], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1e30, 65504.0, 1e-30])
+def test_any_light_is_bounded_by_what_came_in(size, rng):
+    given = size * noise(rng)
+    found = np.asarray(noticed(given, jnp.full((*SIZE, 3), size)))
+    assert np.isfinite(found).all()
+    assert np.abs(found).max() <= 1.001 * np.abs(given).max()
+
+
+def test_no_further_than_it_says(rng):
+    """Filtered differences beyond its reach change nothing."""
+    filtered = jnp.asarray(rng.uniform(0.5, 1.5, (*SIZE, 6)) * [1, 1, 1, 0.5, 0.5, 0.5], jnp.float32)
+    light, hit = jnp.ones((*SIZE, 3)), jnp.ones((*SIZE, 1), bool)
+    plain, changed = (np.asarray(change(each, light, hit)) for each in (filtered, filtered.at[:, 64].mul(3.0)))
+    differs = np.flatnonzero((plain != changed).any(axis=(0, 2)))
+    assert differs.min() == 64 - reach()
+    assert differs.max() == 64 + reach()
+
+
+def test_gradients(rng, x64):
+    filtered = jnp.asarray(rng.uniform(0.5, 1.5, (12, 14, 6)) * [1, 1, 1, 0.4, 0.4, 0.4])
+    light, hit = jnp.asarray(rng.uniform(0.5, 1.5, (12, 14, 3))), jnp.ones((12, 14, 1), bool)
+    assert np.asarray(change(filtered, light, hit)).min() > 0
+    check_grads(lambda *given: change(*given, hit), (filtered, light), order=1, modes=["rev"], rtol=1e-5)
