@@ -7,7 +7,7 @@ derivatives follow (:func:`_differentiable`).
 
 XLA:CPU runs plain NHWC/HWIO convolutions fast, but not those of automatic differentiation inside ``lax.scan`` (28 times
 slower in a test with two layers, jax 0.10). The ``"blocked"`` implementation has the gradient by the kernel as a few
-matrix products. The ``"onednn"`` implementation runs all in oneDNN.
+matrix products, and in double precision the convolution too. The ``"onednn"`` implementation runs all in oneDNN.
 """
 
 from collections.abc import Callable
@@ -27,6 +27,7 @@ Product = Callable[[jax.Array, jax.Array], jax.Array]
 _LAYOUT = ("NHWC", "HWIO", "NHWC")
 _BLOCK_BYTES = 4 << 20
 """Patches are gathered in blocks of about this size: they stay in the cache, and a 720p frame takes little memory."""
+_BORDER = ((0, 0), (1, 1), (1, 1), (0, 0))
 
 
 def convolve(x: jax.Array, kernel: jax.Array, *, implementation: str | None = None) -> jax.Array:
@@ -116,17 +117,41 @@ def _patches(image: jax.Array, first: jax.Array | int, rows: int) -> jax.Array:
     return jnp.concatenate(taps, axis=-1).reshape(-1, 9 * image.shape[3])
 
 
+def _rows(image: jax.Array) -> int:
+    """How many rows of patches make a block."""
+    count, rows, width, channels = image.shape
+    while rows % 2 == 0 and count * rows * width * 9 * channels * image.dtype.itemsize > _BLOCK_BYTES:
+        rows //= 2
+    return rows
+
+
+def _forward(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """XLA's convolution; matrix products in double precision, for which XLA:CPU has nothing but plain loops.
+
+    With the channels of a U-Net these take ten times as long.
+    """
+    if x.dtype != jnp.float64:
+        return reference(x, kernel)
+    count, height, width, _ = x.shape
+    padded, flat, rows = jnp.pad(x, _BORDER), kernel.reshape(-1, kernel.shape[3]), _rows(x)
+
+    def block(first: jax.Array | int) -> jax.Array:
+        return (_patches(padded, first, rows) @ flat).reshape(count, rows, width, -1)
+
+    if rows == height:
+        return block(0)
+    blocks = lax.map(block, jnp.arange(0, height, rows))
+    return blocks.swapaxes(0, 1).reshape(count, height, width, -1)
+
+
 def _kernel_gradient(x: jax.Array, cotangent: jax.Array) -> jax.Array:
     """``sum_p x(p + offset) cotangent(p)`` with patches of the side with fewer channels."""
-    count, height, width, inputs = x.shape
-    outputs = cotangent.shape[3]
+    height, inputs, outputs = x.shape[1], x.shape[3], cotangent.shape[3]
     around_output = outputs <= inputs
     thin, wide = (cotangent, x) if around_output else (x, cotangent)
-    padded = jnp.pad(thin, ((0, 0), (1, 1), (1, 1), (0, 0)))
+    padded = jnp.pad(thin, _BORDER)
     exact = jnp.promote_types(x.dtype, jnp.float32)  # a sum over all pixels needs more digits than bfloat16 has
-    rows = height
-    while rows % 2 == 0 and count * rows * width * 9 * thin.shape[3] * x.dtype.itemsize > _BLOCK_BYTES:
-        rows //= 2
+    rows = _rows(thin)
 
     def strip(first: jax.Array | int) -> jax.Array:
         flat = lax.dynamic_slice_in_dim(wide, first, rows, 1).reshape(-1, wide.shape[3])
@@ -145,7 +170,7 @@ def _kernel_gradient(x: jax.Array, cotangent: jax.Array) -> jax.Array:
     return total.transpose(1, 2, 3, 0)
 
 
-_blocked = _differentiable("blocked", reference, _kernel_gradient)
+_blocked = _differentiable("blocked", _forward, _kernel_gradient)
 _by_engine = _differentiable("onednn", onednn.forward, onednn.kernel_gradient)
 
 

@@ -72,6 +72,15 @@ def test_training_form_agrees_with_automatic_gradient(inputs, outputs):
             np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("size", [(5, 6), (64, 128)], ids=["one block", "several"])
+def test_products_of_double_precision_are_the_convolution(size):
+    with jax.enable_x64(True):
+        x, kernel = _operands(14, 3, size, dtype=jnp.float64)
+        ours, theirs = (convolve(x, kernel, implementation=one) for one in ("blocked", "reference"))
+        assert ours.dtype == jnp.float64
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-13 * float(np.abs(theirs).max()))
+
+
 def test_bfloat16_kernel_gradient_is_summed_in_float32():
     x, kernel = jnp.ones((1, 40, 40, 1), jnp.bfloat16), jnp.zeros((3, 3, 1, 1), jnp.bfloat16)
     gradient = jax.grad(lambda k: jnp.sum(convolve(x, k, implementation="blocked").astype(jnp.float32)))(kernel)
