@@ -35,7 +35,8 @@ class Subject(NamedTuple):
     name: str
     run: Callable[[Any, Inputs], Any]
     """(params, inputs) -> array."""
-    params: Any = ()
+    begin: Callable[[], Any] = tuple
+    """Makes its parameters: by default none."""
     repairs: bool = False
     """Its result must always be finite; the others may pass on NaN or infinity of their input."""
     bounds: tuple[float, float] = (-np.inf, np.inf)
@@ -55,11 +56,11 @@ def denoiser_subjects() -> list[Subject]:
     for name, method in methods().items():
         options = method.variant_named(None)
         denoiser = method.factory(**options)
-        params = denoiser.init(jax.random.key(0), Frame(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
+        begin = _beginning(denoiser)
         usual = Subject(
             name,
             _on_clips(denoiser),
-            params,
+            begin,
             repairs=True,
             bounds=(0.0, RADIANCE_MAX),
             pictured=True,
@@ -77,9 +78,17 @@ def denoiser_subjects() -> list[Subject]:
             subjects.append(usual._replace(name=f"{name} after svgf", run=_on_clips(after)))
         if method.knows("kernels"):
             alone = method.factory(**{**options, "kernels": "plain", "background": "filter"})
-            weights = {part: layers for part, layers in params.items() if part != "guide"}
-            subjects.append(usual._replace(name=f"{name} unguided", run=_on_clips(alone), params=weights))
+            subjects.append(usual._replace(name=f"{name} unguided", run=_on_clips(alone), begin=_beginning(alone)))
     return subjects
+
+
+def _beginning(denoiser: jaxdn.Denoiser) -> Callable[[], Any]:
+    """Makes its weights when they are asked for, in one program: pytest lists the subjects and runs few of them."""
+
+    def begin() -> Any:
+        return jax.jit(denoiser.init)(jax.random.key(0), Frame(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
+
+    return begin
 
 
 def _on_clips(denoiser: jaxdn.Denoiser) -> Callable[[Any, Inputs], jax.Array]:

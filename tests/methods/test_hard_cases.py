@@ -114,6 +114,21 @@ def test_a_wrong_result_in_single_precision_is_red():
     assert all(row.error > 2e-3 for row in table)
 
 
+@pytest.mark.parametrize("buffer", ["depth", "albedo"])
+def test_a_case_runs_again_for_all_that_a_function_reads_and_for_nothing_else(buffer):
+    runs = []
+
+    def in_a_scan(params, inputs):
+        jax.debug.callback(lambda: runs.append(1))
+        return jax.lax.scan(jax.jit(lambda carry, image: (carry, image)), 0, getattr(inputs.clip.frames, buffer))[1]
+
+    chosen = [CASES[name] for name in ("control", "depth not a number", "albedo not a number", "normal not a number")]
+    table = list(rows(chosen, [Subject("read", in_a_scan)], precisions=("float32",), directions=("forward",)))
+    jax.effects_barrier()
+    assert [row.case for row in table if row.verdict == "input"] == [f"{buffer} not a number"]
+    assert len(runs) == 2 * 2, "for valid and for broken values, in single and in double precision"
+
+
 def test_cells_are_linked_to_their_case_and_its_picture(tmp_path):
     double = Subject("double", lambda params, inputs: 2 * inputs.clip.frames.radiance, pictured=True)
     images = {}
