@@ -13,6 +13,8 @@ import jax
 import numpy as np
 import pytest
 
+from tests.compiling import FLAGS
+
 hypothesis.settings.register_profile(
     "jaxdn",
     deadline=None,  # the first example compiles
@@ -34,20 +36,17 @@ def pytest_configure(config: pytest.Config) -> None:
     # Most of a test's time is compilation, and most of it is the same as in the last run.
     jax.config.update("jax_compilation_cache_dir", str(config.rootpath / ".pytest_cache" / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-    if "not slow" in config.option.markexpr:
-        _compile_quickly()
+    _compile_quickly()
 
 
 def _compile_quickly() -> None:
-    """XLA compiles this process's programs without fusion emitters, in half of the time.
+    """XLA compiles this process's programs without fusion emitters, in less than half of the time.
 
-    The slow tests, hard cases among them, and real processes compile as users do. XLA reads its flags once, and ends
-    the process for one that it does not know: hence the version.
+    Hard cases, in which every method and operation is compared with itself in double precision, ask for them, and real
+    processes compile as users do. XLA reads its flags once.
     """
-    if jax.__version_info__ >= (0, 11):
-        return
     before = os.environ.get("XLA_FLAGS")
-    os.environ["XLA_FLAGS"] = f"{before or ''} --xla_cpu_use_fusion_emitters=false"
+    os.environ["XLA_FLAGS"] = f"{before or ''} {FLAGS}"
     jax.jit(lambda x: x + 1)(1.0)
     if before is None:
         del os.environ["XLA_FLAGS"]
@@ -89,8 +88,8 @@ def key() -> jax.Array:
 def plain_programs() -> Iterator[None]:
     """XLA compiles this module's programs without optimisation: operations the same, in half of the time.
 
-    For modules whose tests run large programs once or twice. What users run is optimised: the slow tests, real
-    processes and all other modules compile so.
+    For modules whose tests run large programs once or twice. What users run is optimised: real processes and all other
+    modules compile so.
     """
     jax.config.update("jax_disable_most_optimizations", True)
     yield

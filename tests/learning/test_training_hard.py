@@ -16,6 +16,7 @@ from jaxdn.denoiser import Denoiser
 from jaxdn.frame import RADIANCE_MAX
 from jaxdn.learning.step import clip_loss, initial_state
 from jaxdn.repair import repair_image
+from tests.compiling import FLAGS
 from tests.learning import test_fit
 from tests.learning.test_checkpoint import torn
 from tests.learning.test_training import make_clip
@@ -111,7 +112,10 @@ def test_with_the_newest_checkpoint_truncated_it_continues_from_the_previous_one
 
 
 @pytest.mark.slow
-def test_a_killed_process_loses_only_the_steps_since_its_last_checkpoint(tmp_path):
+def test_a_killed_process_loses_only_the_steps_since_its_last_checkpoint(tmp_path, monkeypatch):
+    # Each of the three processes compiles the step anew: without optimisation, in a third of the time.
+    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    monkeypatch.setenv("XLA_FLAGS", FLAGS)
     kills.make_clips(tmp_path / "clips")
     sizes = kills.Sizes(steps=60, checkpoint_every=5)
     kills.start(tmp_path / "clips", tmp_path / "calm", sizes).communicate()
