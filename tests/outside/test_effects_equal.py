@@ -1,20 +1,19 @@
 """Leaving out an absent effect gives the same buffers and denoised images as simulating it, at a lower cost."""
 
 import contextlib
-import functools
 import io
+import os
+import re
 
 import jax
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 import jaxdn
 from experiments.speed.small_rooms import ANIMATIONS, BEHIND, CASES, MATERIALS, SEEN, room
 from jaxdn import effects
 from jaxdn.clips import read_clip, read_exr, read_frame
-from jaxdn.clips.folder import frame_path, read_record
+from jaxdn.clips.folder import frame_path, is_clip, read_record
 from jaxdn.frame import Frame, only, present, written_out
 from jaxdn.methods.table import methods
 from jaxdn.render.clip import render_clip
@@ -27,6 +26,16 @@ LAYERS = [1, 2, 4]
 """Some methods request samples, four by default."""
 
 
+def random_rooms(count):
+    """Rooms of any material, animation and lamp; the same in every run."""
+    rng = np.random.default_rng(20210629)
+    drawn = [[str(rng.choice(sorted(names))) for names in (MATERIALS, ANIMATIONS)] for _ in range(count)]
+    return {", ".join(names): room(*names, lamp=(BEHIND, SEEN)[rng.integers(2)]) for names in drawn}
+
+
+ROOMS = {name: case for name, case in CASES.items() if name != "fog"} | random_rooms(8)
+
+
 def rendered(case, folder):
     """The same clip with every effect, and with only those of the scene."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -37,23 +46,44 @@ def rendered(case, folder):
     return everything, render_clip(scene, folder / "auto", plan=effects.plan(found), **options)
 
 
-@functools.cache
+@pytest.fixture(scope="session")
+def clips(tmp_path_factory):
+    """The two clips of a room by its name, rendered once for all tests, and for all processes of pytest-xdist."""
+    fcntl = pytest.importorskip("fcntl")
+    base = tmp_path_factory.getbasetemp()
+    place = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "rooms"
+    place.mkdir(exist_ok=True)
+
+    def both(name):
+        folder = place / re.sub(r"\W+", "-", name)
+        with open(folder.with_suffix(".lock"), "w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            found = folder / "all", folder / "auto"
+            return found if all(map(is_clip, found)) else rendered(ROOMS[name], folder)
+
+    return both
+
+
+def both_read(clips):
+    return tuple(read_clip(folder, layers=True) for folder in clips)
+
+
 def compiled(name):
-    """A denoiser as a function of clips, compiled once for every distinct set of buffers among those that it reads."""
+    """A denoiser as a function of clips, compiled for every distinct set of buffers among those that it reads."""
     denoiser = getattr(jaxdn.denoisers, name)(**methods()[name].variant_named(None))
     params = denoiser.init(jax.random.key(0), Frame(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
     program = jax.jit(lambda clip: jaxdn.denoise(denoiser, params, clip))
 
     def run(clip):
         layers = clip.layers if denoiser.samples is not None else None
-        return program(clip._replace(frames=only(clip.frames, denoiser.reads), layers=layers, reference=None))
+        frames = only(clip.frames, denoiser.reads)
+        return np.asarray(program(clip._replace(frames=frames, layers=layers, reference=None)))
 
     return run
 
 
-def assert_the_same(everything, auto, names=jaxdn.denoisers.NAMES):
-    """Present buffers are equal, absent ones were neutral, and so the images are equal."""
-    whole, lean = (read_clip(folder, layers=True) for folder in (everything, auto))
+def assert_the_same_buffers(whole, lean):
+    """Present buffers are equal, absent ones were neutral."""
     rendered_without_a_plan = present(whole.frames)
     assert set(present(lean.frames)) <= set(rendered_without_a_plan)
     spelled = written_out(lean.frames, rendered_without_a_plan)
@@ -61,29 +91,33 @@ def assert_the_same(everything, auto, names=jaxdn.denoisers.NAMES):
         if name == "direct" and getattr(lean.frames, name) is not None:
             continue  # its few samples are shared by frames that show the same
         np.testing.assert_array_equal(getattr(spelled, name), getattr(whole.frames, name), err_msg=name)
-    for name in names:
-        run = compiled(name)
-        first, second = (np.asarray(run(each)) for each in (whole, lean))
-        np.testing.assert_allclose(first, second, rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+def assert_the_same_images(run, whole, lean, message):
+    np.testing.assert_allclose(run(whole), run(lean), rtol=1e-5, atol=1e-6, err_msg=message)
 
 
 def test_what_is_left_out_was_neutral(tmp_path):
     """For a filter, a network and the running mean: each denoiser is compiled twice, and all take a minute."""
-    assert_the_same(*rendered(CASES["static grey box"], tmp_path), ["svgf", "steady", "taa"])
+    both = both_read(rendered(CASES["static grey box"], tmp_path))
+    assert_the_same_buffers(*both)
+    for name in ("svgf", "steady", "taa"):
+        assert_the_same_images(compiled(name), *both, name)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in CASES if name != "fog"])
-def test_what_is_left_out_was_neutral_everywhere(name, tmp_path):
-    assert_the_same(*rendered(CASES[name], tmp_path))
+@pytest.mark.parametrize("case", ROOMS)
+def test_what_is_left_out_was_neutral_everywhere(case, clips):
+    assert_the_same_buffers(*both_read(clips(case)))
 
 
 @pytest.mark.slow
-@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.sampled_from(sorted(MATERIALS)), st.sampled_from(sorted(ANIMATIONS)), st.sampled_from([BEHIND, SEEN]))
-def test_what_is_left_out_was_neutral_in_random_rooms(tmp_path_factory, material, animation, lamp):
-    case = room(material, animation, lamp=lamp)
-    assert_the_same(*rendered(case, tmp_path_factory.mktemp("room")))
+@pytest.mark.parametrize("name", jaxdn.denoisers.NAMES)
+def test_what_is_left_out_changes_no_image(name, clips):
+    """In every room: a denoiser has few sets of buffers among them, and compiling it takes most of the time."""
+    run = compiled(name)
+    for case in ROOMS:
+        assert_the_same_images(run, *both_read(clips(case)), f"{name}, {case}")
 
 
 def test_a_frame_that_shows_the_same_stores_only_the_noise(tmp_path):
