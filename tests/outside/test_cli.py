@@ -198,6 +198,7 @@ def test_a_layer_named_on_the_command_line_is_the_buffer(shot, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_processes")
 def test_train_denoise_and_compare_with_new_weights(tmp_path):
     write_clip(make_clip(0, frames=10, size=20), tmp_path / "clips" / "square")
     few = ("--steps", "2", "--batch", "1", "--crop", "16")
