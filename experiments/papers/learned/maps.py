@@ -53,13 +53,14 @@ def save_maps(asking: list[Candidate], folders: list[Path], out: Path) -> str:
     The noise is that of compressed radiance (:func:`variance_of`); it is saved as a picture too.
     """
     lines = ["| clip | " + " | ".join(one.label for one in asking) + " |", "|---" * (len(asking) + 1) + "|"]
+    requests = [jax.jit(partial(counts_of, one)) for one in asking]
     for folder in folders:
         clip = jax.tree.map(jnp.asarray, read_clip(folder, layers=True))
         noise = variance_of(clip)
         save_png(out / folder.name / "noise.png", np.sqrt(noise / noise.max()))
         cells = []
-        for one in asking:
-            counts = np.asarray(jax.jit(partial(counts_of, one))(clip))[-1, ..., 0]
+        for one, request in zip(asking, requests, strict=True):
+            counts = np.asarray(request(clip))[-1, ..., 0]
             save_png(out / folder.name / f"{file_name(one.label)}-samples.png", np.sqrt(counts / counts.max()))
             few, many = counts.min(), counts.max()
             cells.append("even" if few == many else f"{correlation(counts, noise):.2f}, {few:.0f} to {many:.0f}")

@@ -5,7 +5,7 @@ a sample, and the true error of the image from uniform samples. Adaptive samplin
 such maps do, unless training changes the denoiser with it.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import jax
@@ -17,7 +17,7 @@ from experiments.papers.learned.scores import read
 from experiments.papers.learned.stages import BUDGET, LAYERS
 from jaxdn.candidates import Candidate
 from jaxdn.commands.compare import Footage
-from jaxdn.frame import Clip
+from jaxdn.frame import Clip, Frame
 from jaxdn.metrics import unbiased_relative_mse
 from jaxdn.rollout import unroll
 from jaxdn.sampling import from_layers, sample_map
@@ -34,23 +34,30 @@ def table(methods: list[Candidate], folders: list[Path]) -> str:
     lines = [f"| relative MSE / that of uniform {BUDGET} | {' | '.join(titles)} |", "|---" * (len(titles) + 1) + "|"]
     footage = [jax.tree.map(jnp.asarray, read(folder, spp=BUDGET, layers=True)) for folder in folders]
     for method in methods:
-        errors = np.mean([list(errors_of(method, one)) for one in footage], axis=0)
+        denoise = denoises(method)
+        errors = np.mean([list(errors_of(method, denoise, one)) for one in footage], axis=0)
         lines.append(f"| {method.label} | " + " | ".join(f"{value:.2f}" for value in errors[1:] / errors[0]) + " |")
     return "\n".join(lines)
 
 
-def errors_of(method: Candidate, footage: Footage) -> Iterator[float]:
+def denoises(method: Candidate) -> Callable[[Frame], jax.Array]:
+    """Frames -> images: one program for all clips with the same buffers."""
+    denoiser = method.denoiser
+    assert denoiser is not None
+    return jax.jit(lambda frames: unroll(denoiser, method.params, frames))
+
+
+def errors_of(method: Candidate, denoise: Callable[[Frame], jax.Array], footage: Footage) -> Iterator[float]:
     """Relative MSE with each of the uniform counts, and with the two maps."""
     clip, halves, near = footage.clip, footage.halves, footage.relative_to
     denoiser = method.denoiser
     assert denoiser is not None
     assert halves is not None
-    run = jax.jit(lambda frames: unroll(denoiser, method.params, frames))
 
     def image(counts: jax.Array) -> jax.Array:
         light, got = with_counts(clip, counts)
         told = got if "sample_count" in denoiser.reads else None
-        return run(clip.frames._replace(radiance=light, sample_count=told))
+        return denoise(clip.frames._replace(radiance=light, sample_count=told))
 
     def error(made: jax.Array) -> float:
         return float(unbiased_relative_mse(made, *halves, relative_to=near))
