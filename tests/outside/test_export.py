@@ -14,6 +14,7 @@ from jax import export as jax_export
 from jax import lax
 
 import jaxdn
+from jaxdn import cli
 from jaxdn.candidates import candidate
 from jaxdn.clips import write_clip
 from jaxdn.clips.exr import read_exr
@@ -23,6 +24,8 @@ from jaxdn.export.step import Step
 from jaxdn.frame import BUFFERS, Clip, frame_at, written_out
 from jaxdn.rollout import stream
 from tests.learning.test_training import make_clip
+
+pytestmark = pytest.mark.usefixtures("plain_programs")
 
 pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")
@@ -168,13 +171,14 @@ def test_each_rule_computes_what_jax_does(rule, rng):
     np.testing.assert_allclose(session.run(None, {"radiance": np.asarray(x)})[0], RULES[rule](x), rtol=1e-5, atol=1e-30)
 
 
-def fails(*arguments):
-    """Run a command with a user error; returns its message."""
-    command = [sys.executable, "-m", "jaxdn.cli", "export", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 2, done.stderr
-    assert "Traceback" not in done.stderr
-    return " ".join(done.stderr.split())
+def fails(capsys, *arguments):
+    """A user error in this process, as another one needs seconds to begin; returns its message."""
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["export", *map(str, arguments)])
+    told = capsys.readouterr().err
+    assert ended.value.code == 2, told
+    assert "Traceback" not in told
+    return " ".join(told.split())
 
 
 def test_a_method_whose_step_needs_a_size_is_named(tmp_path):
@@ -184,14 +188,18 @@ def test_a_method_whose_step_needs_a_size_is_named(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_cannot_be_exported_is_an_error_that_says_what_to_do(tmp_path):
+def test_what_cannot_be_exported_is_an_error_that_says_what_to_do(tmp_path, capsys):
     out = tmp_path / "out"
-    assert "expected some of depth, motion" in fails("taa", "-o", out, "--buffers", "albedo")
-    assert "give the other too" in fails("taa", "-o", out, "--width", "64")
-    assert "at least 16" in fails("taa", "-o", out, "--width", "8", "--height", "8")
-    assert "one that denoises" in fails("noisy", "-o", out)
-    assert "give --width and --height" in fails("asvgf", "-o", out)
-    message = fails("asvgf", "-o", out, "--width", "24", "--height", "24")
+    command = [sys.executable, "-m", "jaxdn.cli", "export", "taa", "-o", out, "--buffers", "albedo"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 2, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "expected some of depth, motion" in " ".join(done.stderr.split())
+    assert "give the other too" in fails(capsys, "taa", "-o", out, "--width", "64")
+    assert "at least 16" in fails(capsys, "taa", "-o", out, "--width", "8", "--height", "8")
+    assert "one that denoises" in fails(capsys, "noisy", "-o", out)
+    assert "give --width and --height" in fails(capsys, "asvgf", "-o", out)
+    message = fails(capsys, "asvgf", "-o", out, "--width", "24", "--height", "24")
     assert "operations that have a translation" in message
     assert "--format stablehlo" in message
     assert not out.exists()

@@ -11,7 +11,7 @@ import pytest
 from render_scenes import HEIGHT, WIDTH, Stage, fast_variants
 
 import jaxdn as library
-from jaxdn import effects
+from jaxdn import cli, effects
 from jaxdn.clips.exr import read_exr
 from jaxdn.frame import Frame
 from jaxdn.render import render_frame
@@ -28,6 +28,16 @@ SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
 def jaxdn(*arguments: Any) -> "subprocess.CompletedProcess[str]":
     command = [sys.executable, "-m", "jaxdn.cli", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+
+
+def told(capsys: pytest.CaptureFixture[str], *arguments: Any) -> str:
+    """What is told about wrong arguments, in this process: another one needs seconds to begin."""
+    with pytest.raises(SystemExit) as ended:
+        cli.main([*map(str, arguments)])
+    shown = capsys.readouterr().err
+    assert ended.value.code == 2, shown
+    assert "Traceback" not in shown
+    return " ".join(shown.split())
 
 
 def planned(light="reflected"):
@@ -124,26 +134,31 @@ WRONG = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wrong", WRONG)
-def test_what_cannot_be_rendered_is_told(wrong, weights, tmp_path):
-    arguments, told = WRONG[wrong]
-    done = jaxdn("denoise", *arguments, "-o", tmp_path / "out", "--method", weights, "--width", "32", "--height", "16")
+def test_wrong_arguments_end_a_process_with_a_message(weights, tmp_path):
+    done = jaxdn("denoise", "fruit", "robot", "-o", tmp_path / "out", "--method", weights)
     assert done.returncode == 2
-    assert told in done.stderr
+    assert "expected one scene and nothing else, got 2 sources" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", WRONG)
+def test_what_cannot_be_rendered_is_told(wrong, weights, tmp_path, capsys):
+    arguments, words = WRONG[wrong]
+    size = ("--width", "32", "--height", "16")
+    assert words in told(capsys, "denoise", *arguments, "-o", tmp_path / "out", "--method", weights, *size)
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("budget", ["2.5", "0"])
-def test_a_filter_that_does_not_ask_has_whole_samples(budget, tmp_path):
-    done = jaxdn("denoise", "fruit", "-o", tmp_path / "out", "--method", "svgf", "--frames", "0", "--budget", budget)
-    assert done.returncode == 2
-    assert f"--budget {budget}: expected a whole number of at least 1, as svgf" in " ".join(done.stderr.split())
+def test_a_filter_that_does_not_ask_has_whole_samples(budget, tmp_path, capsys):
+    options = ("--method", "svgf", "--frames", "0", "--budget", budget)
+    words = told(capsys, "denoise", "fruit", "-o", tmp_path / "out", *options)
+    assert f"--budget {budget}: expected a whole number of at least 1, as svgf" in words
 
 
 @pytest.mark.slow
-def test_options_of_a_scene_do_not_fit_clips(weights, tmp_path):
-    done = jaxdn("denoise", tmp_path, "-o", tmp_path / "out", "--method", weights, "--width", "32")
-    assert done.returncode == 2
-    assert "--width: expected a scene to render, got frames that are there" in done.stderr
+def test_options_of_a_scene_do_not_fit_clips(weights, tmp_path, capsys):
+    words = told(capsys, "denoise", tmp_path, "-o", tmp_path / "out", "--method", weights, "--width", "32")
+    assert "--width: expected a scene to render, got frames that are there" in words
