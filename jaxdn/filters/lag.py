@@ -5,12 +5,12 @@ blend new frames in faster would bring back the noise that the mean has got rid 
 and what is smooth can be told from one noisy frame: the frame's difference from the mean, filtered along surfaces, is
 added to the mean at once; details stay those of the mean.
 
-How much of it is noise is told by the same difference under signs that alternate, like the squares of a checkerboard: of
-noise that no two pixels share a filter leaves as much with signs as without, of an even change nothing. Where D is the
-filtered difference and E that with signs, a share ``max(0, 1 - k <E^2> / <D^2>)`` of D is added, with means over a wide
-window of squares relative to the light: for k = 1 the positive part of the estimator of James and Stein (1961), here
-for a region. Schied et al. 2018 ("Gradient Estimation for Real-Time Adaptive Temporal Filtering") ask the same question
-of samples that are traced twice.
+How much of it is noise is told by the same difference under signs that alternate, like the squares of a checkerboard:
+of noise that no two pixels share a filter leaves as much with signs as without, of an even change nothing. Where D is
+the filtered difference and E that with signs, a share ``max(0, 1 - k <E^2> / <D^2>)`` of D is added, with means over a
+wide window of squares relative to the light: for k = 1 the positive part of the estimator of James and Stein (1961),
+here for a region. Schied et al. 2018 ("Gradient Estimation for Real-Time Adaptive Temporal Filtering") ask the same
+question of samples that are traced twice.
 """
 
 import jax
@@ -28,7 +28,7 @@ _NOTHING = 1e-12
 
 
 def with_signs(difference: jax.Array) -> jax.Array:
-    """[H, W, 6] the difference [H, W, 3], and its luminance under signs that alternate by row, by column and by both."""
+    """[H, W, 6] the difference [H, W, 3]; its luminance under signs that alternate by row, by column and by both."""
     rows, columns = jnp.indices(difference.shape[:2])
     odd = jnp.stack([rows, columns, rows + columns], axis=-1) % 2 == 1
     level = jnp.repeat(color.luminance(difference), 3, axis=-1)

@@ -174,24 +174,29 @@ def filtered(
 def _coarse(
     light: jax.Array, missed: jax.Array, guides: list[Guide], hit: jax.Array, decided: Decisions
 ) -> tuple[jax.Array, jax.Array]:
-    """The light (and texture) at half resolution after its levels, with what is given back; the change of light."""
+    """The light (and texture) at half resolution after its levels, with what is given back; the change of light.
 
-    def smoothed(light: jax.Array, levels: Iterable[int]) -> jax.Array:
+    Of ``missed`` every level is taken whole: what the mean needs less of when it has many frames, a single one needs.
+    """
+
+    def smoothed(light: jax.Array, missed: jax.Array, levels: Iterable[int]) -> tuple[jax.Array, jax.Array]:
+        channels = light.shape[-1]
         for index in levels:
-            smoother = affinity_filter(planar(light), guides[index], step=2**index).transpose(1, 2, 0)
-            light = light + decided.take[index] * (smoother - light)
-        return light
+            # Side by side, as every level weighs pixels once for all channels.
+            both = planar(jnp.concatenate([light, missed], axis=-1))
+            smoother = affinity_filter(both, guides[index], step=2**index).transpose(1, 2, 0)
+            light = light + decided.take[index] * (smoother[..., :channels] - light)
+            missed = smoother[..., channels:]
+        return light, missed
 
-    found = smoothed(light, range(LEVELS))
-    missed = lag.with_signs(missed)
-    for index in range(LEVELS):
-        missed = affinity_filter(planar(missed), guides[index], step=2**index).transpose(1, 2, 0)
+    found, missed = smoothed(light, lag.with_signs(missed), range(LEVELS))
     change = lag.change(missed, found[..., :3], hit)
     if decided.back is None:
         return found, change
-    lost = smoothed(light[..., :3] - found[..., :3], _AGAIN)
+    lost, _ = smoothed(light[..., :3] - found[..., :3], missed[..., :0], _AGAIN)
     # A difference may be negative, light may not.
-    return jnp.concatenate([jnp.maximum(found[..., :3] + decided.back * lost, 0.0), found[..., 3:]], axis=-1), change
+    given = jnp.maximum(found[..., :3] + decided.back * lost, 0.0)
+    return jnp.concatenate([given, found[..., 3:]], axis=-1), change
 
 
 def reach(full_levels: int, *, twice: bool) -> int:

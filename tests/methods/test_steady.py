@@ -129,6 +129,16 @@ def test_a_firefly_leaves_no_speck_and_a_lamp_of_one_pixel_stays(rng):
     assert np.all(images[1:, *lamp] > 400)
 
 
+@pytest.mark.parametrize("gain", [0.5, 3.0])
+def test_a_change_of_light_is_seen_in_the_frame_it_happens_in(gain, rng):
+    """After seven frames the newest has an eighth of the weight; light that changes evenly does not wait for more."""
+    frames = room(rng, 8, size=(96, 160))
+    frames = frames._replace(radiance=frames.radiance.at[7].multiply(gain))
+    before, after = (float(jnp.median(image / frames.albedo[0])) for image in denoised(frames)[6:])
+    assert before == pytest.approx(1.0, rel=0.02)
+    assert after == pytest.approx(gain, rel=0.2)
+
+
 def test_a_moving_history_is_followed(rng):
     """A camera that pans along a wall of boards, each lit in its own way: all stay in their place."""
     frames = room(rng, 6)
