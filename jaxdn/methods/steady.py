@@ -2,8 +2,9 @@
 
 For each frame: divide by what surfaces reflect; fetch the history with a test of every tap; blend the noisy frame into
 a running mean whose effective number of samples is known per pixel; filter the mean by affinities, one or two levels at
-full resolution and four at half, each reaching twice as far as the one before (:mod:`jaxdn.filters.levels`); take
-single bright pixels away; blend the result with the last output.
+full resolution and four at half, each reaching twice as far as the one before (:mod:`jaxdn.filters.levels`); add what
+the mean lacks of a change of light (:mod:`jaxdn.filters.lag`); take single bright pixels away; blend the result with
+the last output.
 
 What a hand-made filter leaves to constants, a U-Net at half resolution decides for every pixel: learned features that
 stop the filter beside albedo, gloss, normal and depth; how far a pixel can be trusted (a firefly is not); how fast both
@@ -173,7 +174,8 @@ def steady(options: Options) -> Denoiser:
         found = filtered(params["guide"], mean, missed, texture, surfaces, depth, decided, quality.full_levels)
         image = found.image * _without_specks(found.image, surfaces.hit, mean, square, number)
         newest = jnp.where(past.valid, shares["blend"], 1.0)
-        shown = jnp.clip(past.shown + newest * (image - past.shown), 0.0, RADIANCE_MAX)
+        before = past.shown + found.change
+        shown = jnp.clip(before + newest * (image - before), 0.0, RADIANCE_MAX)
         kept = jnp.maximum(mean + shares["feedback"] * (found.fine - mean) + found.change, 0.0)
         history = crop(jnp.concatenate([kept, square, number, shown], axis=-1), size)
         image = jnp.where(crop(surfaces.hit, size), history[..., 5:], frame.radiance)
