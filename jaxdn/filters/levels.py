@@ -157,7 +157,11 @@ def filtered(
     slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
     at_half = guided(half, slanted_half, decided.half_features, decided.half_trust)
     guides = [at_level(at_half, 1 + index) for index in range(LEVELS)]
-    coarse, change = _coarse(downsample(fill(fine, surfaces.hit)), downsample(missed), guides, half.hit, decided)
+    coarse = _coarse(downsample(fill(fine, surfaces.hit)), guides, decided)
+    # By surfaces alone: what is learned knows a pixel's noise, and lets a bright sample count for less.
+    plain = guided(half, slanted_half, decided.half_features[:0], jnp.ones_like(decided.half_trust))
+    levels = [at_level(plain, 1 + index) for index in range(LEVELS)]
+    change = _change(downsample(missed), levels, coarse[..., :3], half.hit)
     there = guided(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
     enlarged, weight = enlarge(planar(jnp.concatenate([change, coarse], axis=-1)), there, at_full)
     change, coarse = jnp.split(enlarged.transpose(1, 2, 0), (3,), axis=-1)
@@ -171,32 +175,32 @@ def filtered(
     return Filtered(fine, brdf.restore(now, texture, image[..., 3:]), change)
 
 
-def _coarse(
-    light: jax.Array, missed: jax.Array, guides: list[Guide], hit: jax.Array, decided: Decisions
-) -> tuple[jax.Array, jax.Array]:
-    """The light (and texture) at half resolution after its levels, with what is given back; the change of light.
+def _coarse(light: jax.Array, guides: list[Guide], decided: Decisions) -> jax.Array:
+    """The light (and texture) at half resolution after its levels, with what is given back of the light."""
 
-    Of ``missed`` every level is taken whole: what the mean needs less of when it has many frames, a single one needs.
-    """
-
-    def smoothed(light: jax.Array, missed: jax.Array, levels: Iterable[int]) -> tuple[jax.Array, jax.Array]:
-        channels = light.shape[-1]
+    def smoothed(light: jax.Array, levels: Iterable[int]) -> jax.Array:
         for index in levels:
-            # Side by side, as every level weighs pixels once for all channels.
-            both = planar(jnp.concatenate([light, missed], axis=-1))
-            smoother = affinity_filter(both, guides[index], step=2**index).transpose(1, 2, 0)
-            light = light + decided.take[index] * (smoother[..., :channels] - light)
-            missed = smoother[..., channels:]
-        return light, missed
+            smoother = affinity_filter(planar(light), guides[index], step=2**index).transpose(1, 2, 0)
+            light = light + decided.take[index] * (smoother - light)
+        return light
 
-    found, missed = smoothed(light, lag.with_signs(missed), range(LEVELS))
-    change = lag.change(missed, found[..., :3], hit)
+    found = smoothed(light, range(LEVELS))
     if decided.back is None:
-        return found, change
-    lost, _ = smoothed(light[..., :3] - found[..., :3], missed[..., :0], _AGAIN)
+        return found
+    lost = smoothed(light[..., :3] - found[..., :3], _AGAIN)
     # A difference may be negative, light may not.
-    given = jnp.maximum(found[..., :3] + decided.back * lost, 0.0)
-    return jnp.concatenate([given, found[..., 3:]], axis=-1), change
+    return jnp.concatenate([jnp.maximum(found[..., :3] + decided.back * lost, 0.0), found[..., 3:]], axis=-1)
+
+
+def _change(missed: jax.Array, guides: list[Guide], light: jax.Array, hit: jax.Array) -> jax.Array:
+    """The change of light [H/2, W/2, 3], told from what the mean lacks of the newest frame.
+
+    Every level is taken whole: a single frame needs all of them, where a mean of many needs few.
+    """
+    planes = planar(lag.halves(missed))
+    for index, guide in enumerate(guides):
+        planes = affinity_filter(planes, guide, step=2**index)
+    return lag.change(planes.transpose(1, 2, 0), light, hit)
 
 
 def reach(full_levels: int, *, twice: bool) -> int:
