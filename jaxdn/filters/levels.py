@@ -118,14 +118,15 @@ def slanted(surfaces: Surfaces, whole: Whole) -> jax.Array:
 def filtered(
     precisions: Mapping[str, Any],
     mean: jax.Array,
-    missed: jax.Array,
+    missed: jax.Array | None,
     texture: jax.Array | None,
     surfaces: Surfaces,
     slanted: jax.Array,
     decided: Decisions,
     full_levels: int,
 ) -> Filtered:
-    """The light [H, W, 3] ``mean`` after the levels; ``missed`` is how much more the newest frame shows than it.
+    """The light [H, W, 3] ``mean`` after the levels; ``missed`` is how much more the newest frame shows than it, of
+    which a change of light is told, or None for no change.
 
     ``precisions`` are logarithms, one for full resolution and one for each level at half, of what the squares of
     differences in ``albedo``, ``gloss``, ``normal``, ``depth`` and ``learned`` features are multiplied by. The image of
@@ -158,16 +159,19 @@ def filtered(
     at_half = guided(half, slanted_half, decided.half_features, decided.half_trust)
     guides = [at_level(at_half, 1 + index) for index in range(LEVELS)]
     coarse = _coarse(downsample(fill(fine, surfaces.hit)), guides, decided)
-    # By surfaces alone: what is learned knows a pixel's noise, and lets a bright sample count for less.
-    plain = guided(half, slanted_half, decided.half_features[:0], jnp.ones_like(decided.half_trust))
-    levels = [at_level(plain, 1 + index) for index in range(LEVELS)]
-    change = _change(downsample(missed), levels, coarse[..., :3], half.hit)
+    both = coarse
+    if missed is not None:
+        # By surfaces alone: what is learned knows a pixel's noise, and lets a bright sample count for less.
+        plain = guided(half, slanted_half, decided.half_features[:0], jnp.ones_like(decided.half_trust))
+        levels = [at_level(plain, 1 + index) for index in range(LEVELS)]
+        change = _change(downsample(missed), levels, coarse[..., :3], half.hit)
+        both = jnp.concatenate([coarse, change], axis=-1)
     there = guided(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
-    enlarged, weight = enlarge(planar(jnp.concatenate([change, coarse], axis=-1)), there, at_full)
-    change, coarse = jnp.split(enlarged.transpose(1, 2, 0), (3,), axis=-1)
+    enlarged, weight = enlarge(planar(both), there, at_full)
     alike = (weight / (weight + _LIKENESS))[..., None]
-    change = alike * change
+    coarse, change = jnp.split(enlarged.transpose(1, 2, 0), (coarse.shape[-1],), axis=-1)
     image = fine + decided.coarse * alike * (coarse - fine)
+    change = jnp.zeros_like(mean) if missed is None else alike * change
     now = jnp.maximum(image[..., :3] + change, 0.0)
     if texture is None:
         return Filtered(fine, now, change)
@@ -203,11 +207,11 @@ def _change(missed: jax.Array, guides: list[Guide], light: jax.Array, hit: jax.A
     return lag.change(planes.transpose(1, 2, 0), light, hit)
 
 
-def reach(full_levels: int, *, twice: bool) -> int:
+def reach(full_levels: int, *, twice: bool, at_once: bool) -> int:
     """How far, in pixels, :func:`filtered` sees; 16 of them for blocks, slopes and what is enlarged."""
     half = sum(4 * 2**index for index in range(LEVELS))
     again = sum(4 * 2**index for index in _AGAIN) if twice else 0
-    return 2 * (2**full_levels - 1) + half + max(again, 2 * lag.reach()) + 16
+    return 2 * (2**full_levels - 1) + half + max(again, 2 * lag.reach() if at_once else 0) + 16
 
 
 def planar(image: jax.Array) -> jax.Array:

@@ -55,12 +55,14 @@ class Quality(NamedTuple):
     """Levels of the filter at full resolution, taps 1, 2 ... pixels apart."""
     twice: bool = True
     """What the levels at half resolution took away goes through them too, and a share of it is given back."""
+    at_once: bool = True
+    """What the mean lacks of a change of light is added in the frame that shows it."""
 
 
 QUALITIES = {
     "high": Quality(((48,), (64,), (80,), (96,), (96,))),
     "balanced": Quality(((32,), (48,), (64,), (64,), (64,))),
-    "fast": Quality(((16,), (24,), (32,), (32,), (32,)), full_levels=1, twice=False),
+    "fast": Quality(((16,), (24,), (32,), (32,), (32,)), full_levels=1, twice=False, at_once=False),
 }
 
 BEGIN = {"trust": 4.0, "follow": 0.0, "blend": 0.0, "coarse": 4.0, "feedback": -4.0}
@@ -170,7 +172,7 @@ def steady(options: Options) -> Denoiser:
         texture = texture_left(frame, options.demodulate, whole)
         texture = None if texture is None else fill(pad(texture, BLOCKS), surfaces.hit)
         depth = slanted(surfaces, whole)
-        missed = jnp.where(surfaces.hit, noisy - mean, 0.0)
+        missed = jnp.where(surfaces.hit, noisy - mean, 0.0) if quality.at_once else None
         found = filtered(params["guide"], mean, missed, texture, surfaces, depth, decided, quality.full_levels)
         image = found.image * _without_specks(found.image, surfaces.hit, mean, square, number)
         newest = jnp.where(past.valid, shares["blend"], 1.0)
@@ -186,7 +188,8 @@ def steady(options: Options) -> Denoiser:
         return measured(_noisy(frame, surfaces), surfaces.depth, frame)
 
     seen = 2 * description.reach(description.unet(1, heads, widths=quality.widths, head_size=1))
-    core = Core(start, step, reads, init, measure=measure, reach=seen + reach(quality.full_levels, twice=quality.twice))
+    far = reach(quality.full_levels, twice=quality.twice, at_once=quality.at_once)
+    core = Core(start, step, reads, init, measure=measure, reach=seen + far)
     return demodulated(recurrent(core), by=options.demodulate)
 
 
