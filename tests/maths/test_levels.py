@@ -14,10 +14,10 @@ HEIGHT, WIDTH = 64, 96
 
 
 @functools.partial(jax.jit, static_argnames="full_levels")
-def through(light, back=None, *, missed=0.0, edge=None, glossy=0.0, full_levels=1):
+def through(light, back=None, *, missed=0.0, learned=0.0, edge=None, glossy=0.0, full_levels=1):
     """The light of a wall, or of two that meet at the column ``edge``, after all levels, with nothing decided.
 
-    The second wall is turned, or ``glossy`` and not turned.
+    The second wall is turned, or ``glossy`` and not turned. ``learned`` is a feature at half resolution.
     """
     height, width = light.shape[:2]
     half = height // 2, width // 2
@@ -34,7 +34,7 @@ def through(light, back=None, *, missed=0.0, edge=None, glossy=0.0, full_levels=
         jnp.zeros((1, *half)),
         whole,
         whole,
-        jnp.zeros((1, *half)),
+        jnp.broadcast_to(learned, (1, *half)),
         part,
         [part] * LEVELS,
         None if back is None else back * part,
@@ -42,7 +42,7 @@ def through(light, back=None, *, missed=0.0, edge=None, glossy=0.0, full_levels=
     precisions = {name: jnp.full(1 + LEVELS, 4.0 * value) for name, value in PRECISIONS.items()}
     flat = jnp.zeros((3, height, width))
     missed = jnp.broadcast_to(missed, light.shape)
-    return filtered(precisions, light, missed, None, surfaces, flat, decided, full_levels).image
+    return filtered(precisions, light, missed, None, surfaces, flat, decided, full_levels)
 
 
 def shading(edge=None):
@@ -59,33 +59,45 @@ def shading(edge=None):
 def test_what_is_given_back_undoes_about_half_of_the_blur(edge):
     """Light that curves, and light that ends at a border or at the edge of a wall, where neighbours are on one side."""
     light = shading(edge)
-    without, twice = (np.abs(through(light, back, edge=edge) - light).mean() for back in (None, 1.0))
+    without, twice = (np.abs(through(light, back, edge=edge).image - light).mean() for back in (None, 1.0))
     assert without > 0.01
     assert twice < 0.6 * without
 
 
 def test_a_share_of_it_is_that_share(rng):
     light = jnp.asarray(rng.uniform(0.5, 1.5, (HEIGHT, WIDTH, 3)), jnp.float32)
-    none, some, all_ = (np.asarray(through(light, back)) for back in (None, 0.3, 1.0))
+    none, some, all_ = (np.asarray(through(light, back).image) for back in (None, 0.3, 1.0))
     np.testing.assert_allclose(some, none + 0.3 * (all_ - none), atol=2e-6)
-    np.testing.assert_array_equal(through(light, 0.0), none)
+    np.testing.assert_array_equal(through(light, 0.0).image, none)
 
 
 def test_light_beside_a_spike_does_not_become_negative():
     """What is given back is negative around it."""
     light = jnp.zeros((HEIGHT, WIDTH, 3)).at[30:34, 40:44].set(1e3)
-    twice = np.asarray(through(light, 1.0))
+    twice = np.asarray(through(light, 1.0).image)
     assert twice.min() >= 0.0
-    assert twice.max() > np.asarray(through(light)).max()
+    assert twice.max() > np.asarray(through(light).image).max()
 
 
 def test_gloss_keeps_its_light():
     """Of a glossy frame on a wall, alike in all else, nothing runs over, as nothing does over the edge of two walls."""
     light = jnp.ones((HEIGHT, WIDTH, 3)).at[:, 37:].set(4.0)
     blurred, kept, turned = (
-        np.abs(through(light, edge=edge, glossy=glossy) - light).mean()
+        np.abs(through(light, edge=edge, glossy=glossy).image - light).mean()
         for edge, glossy in ((None, 0.0), (37, 0.7), (37, 0.0))
     )
     assert blurred > 0.1
     assert kept < 0.01 * blurred
     assert turned < 0.01 * blurred
+
+
+def test_what_is_learned_does_not_darken_a_change(rng):
+    """A feature that knows which samples are bright makes them count for less in an image, and not in a change."""
+    light = jnp.ones((HEIGHT, WIDTH, 3))
+    bright = jnp.asarray(rng.uniform(size=(HEIGHT // 2, WIDTH // 2, 1)) < 0.1, jnp.float32)
+    missed = 0.5 + 2.0 * (bright - 0.1)
+    missed = jnp.repeat(jnp.repeat(missed, 2, axis=0), 2, axis=1)
+    plain, known = (through(light, missed=missed, learned=feature) for feature in (0.0, 3.0 * bright[None, ..., 0]))
+    assert plain.change.mean() == pytest.approx(0.5, rel=0.1)
+    np.testing.assert_allclose(known.change.mean(), plain.change.mean(), rtol=0.03)
+    np.testing.assert_allclose(plain.image, 1.0 + plain.change, rtol=1e-5)
