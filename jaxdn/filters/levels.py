@@ -125,48 +125,33 @@ def filtered(
     decided: Decisions,
     full_levels: int,
 ) -> Filtered:
-    """The light [H, W, 3] ``mean`` after the levels; ``missed`` is how much more the newest frame shows than it, of
-    which a change of light is told, or None for no change.
+    """The light [H, W, 3] ``mean`` after the levels, and with a change of light.
 
-    ``precisions`` are logarithms, one for full resolution and one for each level at half, of what the squares of
-    differences in ``albedo``, ``gloss``, ``normal``, ``depth`` and ``learned`` features are multiplied by. The image of
-    the levels at half resolution is enlarged along the guides, and takes a share of every pixel. The ``texture`` that a
-    division of the light left is filtered likewise, and given back (:func:`jaxdn.brdf.restore`).
+    ``missed`` is how much more the newest frame shows than the mean; None leaves a change out. ``precisions`` are
+    logarithms, one for full resolution and one for each level at half, of what the squares of differences in
+    ``albedo``, ``gloss``, ``normal``, ``depth`` and ``learned`` features are multiplied by. The image of the levels at
+    half resolution is enlarged along the guides, and takes a share of every pixel. The ``texture`` that a division of
+    the light left is filtered likewise, and given back (:func:`jaxdn.brdf.restore`).
     """
     factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items()}
-
-    def guided(parts: Surfaces, slanted: jax.Array, own: jax.Array, trust: jax.Array) -> Guide:
-        surfaces = jnp.concatenate([parts.albedo, parts.gloss, parts.normal], axis=-1)
-        confidence = ((trust + _LEAST_TRUST) * parts.hit)[..., 0]
-        return Guide(jnp.concatenate([planar(surfaces), own]), slanted, confidence)
-
-    def at_level(guide: Guide, index: int) -> Guide:
-        count = {"albedo": 3, "gloss": 1, "normal": 3, "learned": guide.features.shape[0] - 7, "depth": 1}
-        return guide._replace(scales=jnp.concatenate([jnp.full(n, factors[name][index]) for name, n in count.items()]))
-
-    at_full = at_level(guided(surfaces, slanted, decided.features, decided.trust), 0)
+    at_full = _at_level(_guide(surfaces, slanted, decided.features, decided.trust), factors, 0)
     fine = planar(mean if texture is None else jnp.concatenate([mean, texture], axis=-1))
     for index in range(full_levels):
         fine = affinity_filter(fine, at_full, step=2**index)
     fine = fine.transpose(1, 2, 0)
-    half = surfaces._replace(
-        albedo=downsample(surfaces.albedo),
-        gloss=downsample(surfaces.gloss),
-        normal=downsample(surfaces.normal),
-        hit=downsample(surfaces.hit.astype(mean.dtype)) > 0,
-    )
+    half = _halved(surfaces)
     slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
-    at_half = guided(half, slanted_half, decided.half_features, decided.half_trust)
-    guides = [at_level(at_half, 1 + index) for index in range(LEVELS)]
-    coarse = _coarse(downsample(fill(fine, surfaces.hit)), guides, decided)
+    at_half = _guide(half, slanted_half, decided.half_features, decided.half_trust)
+    levels = [_at_level(at_half, factors, 1 + index) for index in range(LEVELS)]
+    coarse = _coarse(downsample(fill(fine, surfaces.hit)), levels, decided)
     both = coarse
     if missed is not None:
         # By surfaces alone: what is learned knows a pixel's noise, and lets a bright sample count for less.
-        plain = guided(half, slanted_half, decided.half_features[:0], jnp.ones_like(decided.half_trust))
-        levels = [at_level(plain, 1 + index) for index in range(LEVELS)]
+        plain = _guide(half, slanted_half, decided.half_features[:0], jnp.ones_like(decided.half_trust))
+        levels = [_at_level(plain, factors, 1 + index) for index in range(LEVELS)]
         change = _change(downsample(missed), levels, coarse[..., :3], half.hit)
         both = jnp.concatenate([coarse, change], axis=-1)
-    there = guided(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
+    there = _guide(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
     enlarged, weight = enlarge(planar(both), there, at_full)
     alike = (weight / (weight + _LIKENESS))[..., None]
     coarse, change = jnp.split(enlarged.transpose(1, 2, 0), (coarse.shape[-1],), axis=-1)
@@ -177,6 +162,29 @@ def filtered(
         return Filtered(fine, now, change)
     fine = brdf.restore(fine[..., :3], texture, fine[..., 3:])
     return Filtered(fine, brdf.restore(now, texture, image[..., 3:]), change)
+
+
+def _halved(surfaces: Surfaces) -> Surfaces:
+    """The surfaces at half resolution, but roughness and depth, which no level reads."""
+    return surfaces._replace(
+        albedo=downsample(surfaces.albedo),
+        gloss=downsample(surfaces.gloss),
+        normal=downsample(surfaces.normal),
+        hit=downsample(surfaces.hit.astype(surfaces.albedo.dtype)) > 0,
+    )
+
+
+def _guide(surfaces: Surfaces, slanted: jax.Array, own: jax.Array, trust: jax.Array) -> Guide:
+    """Surfaces and ``own`` features [F, H, W], not yet scaled; what is no surface gives nothing."""
+    given = jnp.concatenate([surfaces.albedo, surfaces.gloss, surfaces.normal], axis=-1)
+    confidence = ((trust + _LEAST_TRUST) * surfaces.hit)[..., 0]
+    return Guide(jnp.concatenate([planar(given), own]), slanted, confidence)
+
+
+def _at_level(guide: Guide, factors: Mapping[str, jax.Array], index: int) -> Guide:
+    """The guide with the factors of one level."""
+    count = {"albedo": 3, "gloss": 1, "normal": 3, "learned": guide.features.shape[0] - 7, "depth": 1}
+    return guide._replace(scales=jnp.concatenate([jnp.full(n, factors[name][index]) for name, n in count.items()]))
 
 
 def _coarse(light: jax.Array, guides: list[Guide], decided: Decisions) -> jax.Array:
