@@ -19,6 +19,7 @@ that are traced twice.
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from jaxdn import color
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
@@ -33,11 +34,17 @@ _NOTHING = 1e-12
 
 def halves(difference: jax.Array) -> jax.Array:
     """[H, W, 8] the difference [H, W, 3] at black squares; at white; luminance of both, its sign new in each row."""
-    rows, columns = jnp.indices(difference.shape[:2])
-    white = ((rows + columns) % 2 == 1)[..., None]
+    # Not jnp.indices, which has to know the size: an exported step serves all.
+    rows, columns = (lax.broadcasted_iota(jnp.int32, difference.shape[:2], axis) for axis in (0, 1))
+    white = _odd(rows + columns)[..., None]
     black, white = jnp.where(white, 0.0, difference), jnp.where(white, difference, 0.0)
-    sign = (1.0 - 2.0 * (rows % 2))[..., None].astype(difference.dtype)
-    return jnp.concatenate([black, white, sign * color.luminance(black), sign * color.luminance(white)], axis=-1)
+    level = jnp.concatenate([color.luminance(black), color.luminance(white)], axis=-1)
+    return jnp.concatenate([black, white, jnp.where(_odd(rows)[..., None], -level, level)], axis=-1)
+
+
+def _odd(numbers: jax.Array) -> jax.Array:
+    """Of integers >= 0; by a shift, as ONNX is not made from remainders."""
+    return 2 * lax.shift_right_logical(numbers, 1) != numbers
 
 
 def change(filtered: jax.Array, light: jax.Array, hit: jax.Array) -> jax.Array:
