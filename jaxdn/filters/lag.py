@@ -44,7 +44,7 @@ def halves(difference: jax.Array) -> jax.Array:
 
 def _odd(numbers: jax.Array) -> jax.Array:
     """Of integers >= 0; by a shift, as ONNX is not made from remainders."""
-    return 2 * lax.shift_right_logical(numbers, 1) != numbers
+    return 2 * lax.shift_right_logical(numbers, jnp.ones_like(numbers)) != numbers
 
 
 def change(filtered: jax.Array, light: jax.Array, hit: jax.Array) -> jax.Array:
