@@ -11,7 +11,7 @@ with signs, a share ``max(0, 1 - k <E^2> / <D^2>)`` of D is taken, with means ov
 the light: for k = 1 the positive part of the estimator of James and Stein (1961), here for a region. The share is one
 half of the pixels', the black squares of a checkerboard, and what it is taken of is the other's, and the other way
 round. For light is skewed, many dark samples and few bright ones: a share that knows the bright ones, and is 0 where
-they are, takes the dark ones for a change, and the image darkens by 2 %.
+they are, takes the dark ones for a change, and darkens the image.
 
 Schied et al. 2018 ("Gradient Estimation for Real-Time Adaptive Temporal Filtering") ask the same question of samples
 that are traced twice.
