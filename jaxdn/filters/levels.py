@@ -5,32 +5,28 @@ alike two pixels are is told by albedo, gloss, normal, depth and features that s
 trusted and how much of each level it takes is decided for every pixel as well: by a network, in
 :mod:`jaxdn.methods.steady`.
 
-A mean over neighbours is wrong where light is not the same on both sides: it flattens what is curved, and at the edge
-of a surface it takes from inside alone. So what the levels at half resolution took away from the light is filtered in
-its turn, by two of them, and a share of it is given back: for linear filters S and T, ``S x + s T (x - S x)`` (S = T
-and s = 1: twicing, Tukey 1977), whose bias is of a higher order and whose noise is larger.
+What all levels together take away where light follows the guides is found by regression, and a share of it is given
+back (:mod:`jaxdn.filters.regression`).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxdn import brdf
-from jaxdn.filters import lag
+from jaxdn.filters import lag, regression
 from jaxdn.filters.enlarge import enlarge
 from jaxdn.filters.guides import depth_slopes, hit_mask
 from jaxdn.frame import FAR, Frame
 from jaxdn.networks import pad
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
-from jaxdn.scales import downsample, fill
+from jaxdn.scales import downsample, fill, upsample
 from jaxdn.whole import Whole
 
 LEVELS = 4
 """Levels at half resolution, taps 2, 4, 8 and 16 pixels apart."""
-_AGAIN = (1, 2)
-"""Those that what was taken away goes through again: with all four, nothing changes but the time and the reach."""
 BLOCKS = 4
 """Height and width that the filters work on are multiples of this: blocks of 4x4 pixels are filled."""
 _LIKENESS = 0.02
@@ -82,7 +78,7 @@ class Decisions(NamedTuple):
     take: list[jax.Array]
     """Level at half resolution -> [H/2, W/2, 1] in [0, 1]."""
     back: jax.Array | None
-    """[H/2, W/2, 1] in [0, 1], how much is given back of what these levels took away; None for nothing."""
+    """[H/2, W/2, 1] in [0, 1], how much is given back of what all levels took away; None for nothing."""
 
 
 def surfaces_of(frame: Frame) -> Surfaces:
@@ -124,44 +120,51 @@ def filtered(
     slanted: jax.Array,
     decided: Decisions,
     full_levels: int,
+    floor: jax.Array,
 ) -> Filtered:
     """The light [H, W, 3] ``mean`` after the levels, and with a change of light.
 
     ``missed`` is how much more the newest frame shows than the mean; None leaves a change out. ``precisions`` are
     logarithms, one for full resolution and one for each level at half, of what the squares of differences in
-    ``albedo``, ``gloss``, ``normal``, ``depth`` and ``learned`` features are multiplied by. The image of the levels at
+    ``albedo``, ``gloss``, ``normal``, ``depth`` and ``learned`` features are multiplied by; and, as ``regression``,
+    the scales of :func:`jaxdn.filters.regression.given_back`, whose ``floor`` is that here. The image of the levels at
     half resolution is enlarged along the guides, and takes a share of every pixel. The ``texture`` that a division of
     the light left is filtered likewise, and given back (:func:`jaxdn.brdf.restore`).
     """
-    factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items()}
+    factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items() if name != "regression"}
     at_full = _at_level(_guide(surfaces, slanted, decided.features, decided.trust), factors, 0)
-    fine = planar(mean if texture is None else jnp.concatenate([mean, texture], axis=-1))
-    for index in range(full_levels):
-        fine = affinity_filter(fine, at_full, step=2**index)
-    fine = fine.transpose(1, 2, 0)
     half = _halved(surfaces)
     slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
     at_half = _guide(half, slanted_half, decided.half_features, decided.half_trust)
-    levels = [_at_level(at_half, factors, 1 + index) for index in range(LEVELS)]
-    coarse = _coarse(downsample(fill(fine, surfaces.hit)), levels, decided)
-    both = coarse
+    # Guides that light may follow go through the same filters as light, and so does texture.
+    followed = None if decided.back is None else regression.guides_of(surfaces.normal, surfaces.gloss, slanted[0])
+    parts = [planar(mean), followed, None if texture is None else planar(texture)]
+    fine = jnp.concatenate([part for part in parts if part is not None])
+    for index in range(full_levels):
+        fine = affinity_filter(fine, at_full, step=2**index)
+    fine = fine.transpose(1, 2, 0)
+    coarse = _coarse(downsample(fill(fine, surfaces.hit)), _at_levels(at_half, factors), decided.take)
+    change = coarse[..., :0]
     if missed is not None:
         # By surfaces alone: what is learned knows a pixel's noise, and lets a bright sample count for less.
         plain = _guide(half, slanted_half, decided.half_features[:0], jnp.ones_like(decided.half_trust))
-        levels = [_at_level(plain, factors, 1 + index) for index in range(LEVELS)]
-        change = _change(downsample(missed), levels, coarse[..., :3], half.hit)
-        both = jnp.concatenate([coarse, change], axis=-1)
+        change = _change(downsample(missed), _at_levels(plain, factors), coarse[..., :3], half.hit)
     there = _guide(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
-    enlarged, weight = enlarge(planar(both), there, at_full)
+    enlarged, weight = enlarge(planar(jnp.concatenate([coarse, change], axis=-1)), there, at_full)
     alike = (weight / (weight + _LIKENESS))[..., None]
     coarse, change = jnp.split(enlarged.transpose(1, 2, 0), (coarse.shape[-1],), axis=-1)
     image = fine + decided.coarse * alike * (coarse - fine)
     change = jnp.zeros_like(mean) if missed is None else alike * change
-    now = jnp.maximum(image[..., :3] + change, 0.0)
+    light = image[..., :3]
+    if followed is not None:
+        smooth = planar(image[..., 3 : 3 + regression.GUIDES])
+        given = regression.given_back(precisions["regression"], mean, light, followed, smooth, surfaces.hit, floor)
+        light = light + upsample(decided.back) * given
+    now = jnp.maximum(light + change, 0.0)
     if texture is None:
-        return Filtered(fine, now, change)
-    fine = brdf.restore(fine[..., :3], texture, fine[..., 3:])
-    return Filtered(fine, brdf.restore(now, texture, image[..., 3:]), change)
+        return Filtered(fine[..., :3], now, change)
+    fine = brdf.restore(fine[..., :3], texture, fine[..., -3:])
+    return Filtered(fine, brdf.restore(now, texture, image[..., -3:]), change)
 
 
 def _halved(surfaces: Surfaces) -> Surfaces:
@@ -187,21 +190,17 @@ def _at_level(guide: Guide, factors: Mapping[str, jax.Array], index: int) -> Gui
     return guide._replace(scales=jnp.concatenate([jnp.full(n, factors[name][index]) for name, n in count.items()]))
 
 
-def _coarse(light: jax.Array, guides: list[Guide], decided: Decisions) -> jax.Array:
-    """The light (and texture) at half resolution after its levels, with what is given back of the light."""
+def _at_levels(guide: Guide, factors: Mapping[str, jax.Array]) -> list[Guide]:
+    """The guide of every level at half resolution."""
+    return [_at_level(guide, factors, 1 + index) for index in range(LEVELS)]
 
-    def smoothed(light: jax.Array, levels: Iterable[int]) -> jax.Array:
-        for index in levels:
-            smoother = affinity_filter(planar(light), guides[index], step=2**index).transpose(1, 2, 0)
-            light = light + decided.take[index] * (smoother - light)
-        return light
 
-    found = smoothed(light, range(LEVELS))
-    if decided.back is None:
-        return found
-    lost = smoothed(light[..., :3] - found[..., :3], _AGAIN)
-    # A difference may be negative, light may not.
-    return jnp.concatenate([jnp.maximum(found[..., :3] + decided.back * lost, 0.0), found[..., 3:]], axis=-1)
+def _coarse(light: jax.Array, guides: list[Guide], take: list[jax.Array]) -> jax.Array:
+    """Light, and what else goes the same way, [H/2, W/2, C] after the levels at half resolution."""
+    for index, guide in enumerate(guides):
+        smoother = affinity_filter(planar(light), guide, step=2**index).transpose(1, 2, 0)
+        light = light + take[index] * (smoother - light)
+    return light
 
 
 def _change(missed: jax.Array, guides: list[Guide], light: jax.Array, hit: jax.Array) -> jax.Array:
@@ -215,11 +214,11 @@ def _change(missed: jax.Array, guides: list[Guide], light: jax.Array, hit: jax.A
     return lag.change(planes.transpose(1, 2, 0), light, hit)
 
 
-def reach(full_levels: int, *, twice: bool, at_once: bool) -> int:
+def reach(full_levels: int, *, back: bool, at_once: bool) -> int:
     """How far, in pixels, :func:`filtered` sees; 16 of them for blocks, slopes and what is enlarged."""
     half = sum(4 * 2**index for index in range(LEVELS))
-    again = sum(4 * 2**index for index in _AGAIN) if twice else 0
-    return 2 * (2**full_levels - 1) + half + max(again, 2 * lag.reach() if at_once else 0) + 16
+    more = max(regression.reach() if back else 0, 2 * lag.reach() if at_once else 0)
+    return 2 * (2**full_levels - 1) + half + more + 16
 
 
 def planar(image: jax.Array) -> jax.Array:

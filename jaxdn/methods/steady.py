@@ -24,6 +24,7 @@ import numpy as np
 
 from jaxdn import color
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.filters import regression
 from jaxdn.filters.blocks import light_of_blocks
 from jaxdn.filters.clamping import without_specks
 from jaxdn.filters.guides import Guides, depth_feature, guides_of
@@ -42,6 +43,8 @@ from jaxdn.whole import Whole, measured
 
 FEATURES, HALF_FEATURES = 5, 8
 """Learned features at full and at half resolution."""
+_DARK = 1e-3
+"""Light at the network's brightness that is as good as dark."""
 _MULTIPLE = 16
 """Height and width that the network works on, at half resolution, are multiples of this."""
 
@@ -53,8 +56,8 @@ class Quality(NamedTuple):
     """Channels of the U-Net's convolutions, from half resolution down."""
     full_levels: int = 2
     """Levels of the filter at full resolution, taps 1, 2 ... pixels apart."""
-    twice: bool = True
-    """What the levels at half resolution took away goes through them too, and a share of it is given back."""
+    back: bool = True
+    """What the filter took away where light follows the guides is found by regression, and a share is given back."""
     at_once: bool = True
     """What the mean lacks of a change of light is added in the frame that shows it."""
 
@@ -62,13 +65,13 @@ class Quality(NamedTuple):
 QUALITIES = {
     "high": Quality(((48,), (64,), (80,), (96,), (96,))),
     "balanced": Quality(((32,), (48,), (64,), (64,), (64,))),
-    "fast": Quality(((16,), (24,), (32,), (32,), (32,)), full_levels=1, twice=False, at_once=False),
+    "fast": Quality(((16,), (24,), (32,), (32,), (32,)), full_levels=1, back=False, at_once=False),
 }
 
 BEGIN = {"trust": 4.0, "follow": 0.0, "blend": 0.0, "coarse": 4.0, "feedback": -4.0}
 """Decisions for every pixel, one logit each, and what they are before training."""
-_TAKE, _BACK = 4.0, -2.0
-"""The same for how much of each level at half resolution is taken, and of what they took away is given back."""
+_TAKE, _BACK = 4.0, 3.0
+"""The same for how much of each level at half resolution is taken, and of what the filter took away is given back."""
 PRECISIONS = {"albedo": 1.0, "gloss": 2.0, "normal": 1.0, "depth": 6.0, "learned": 0.0}
 """Guide of the filter -> the logarithm of its precision before training."""
 
@@ -140,7 +143,7 @@ def steady(options: Options) -> Denoiser:
     from jaxdn.networks.unet import unet
 
     quality = QUALITIES[options.quality] if isinstance(options.quality, str) else Quality(options.quality)
-    heads = (4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS + quality.twice,)
+    heads = (4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS + quality.back,)
     network = unet((32, 20), heads, widths=quality.widths, head_size=1, implementation=options.implementation)
     reads = frozenset({"albedo", "normal", "roughness", "depth", "previous_depth", "motion", "ids"})
 
@@ -148,8 +151,12 @@ def steady(options: Options) -> Denoiser:
         params = network.init(key)
         pixel = [0.0] * FEATURES + list(BEGIN.values())
         bias = [value for value in pixel for _ in range(4)] + [0.0] * HALF_FEATURES
-        bias += [BEGIN["trust"]] + [_TAKE] * LEVELS + [_BACK] * quality.twice
-        precisions = {name: jnp.full((1 + LEVELS,), value, jnp.float32) for name, value in PRECISIONS.items()}
+        bias += [BEGIN["trust"]] + [_TAKE] * LEVELS + [_BACK] * quality.back
+        precisions: Params = {
+            name: jnp.full((1 + LEVELS,), value, jnp.float32) for name, value in PRECISIONS.items()
+        }
+        if quality.back:
+            precisions["regression"] = jax.tree.map(jnp.float32, regression.SCALES)
         return {**params, "head_0": {**params["head_0"], "bias": jnp.asarray(bias, jnp.float32)}, "guide": precisions}
 
     def start(params: Params, frame: Frame) -> SteadyState:
@@ -173,7 +180,8 @@ def steady(options: Options) -> Denoiser:
         texture = None if texture is None else fill(pad(texture, BLOCKS), surfaces.hit)
         depth = slanted(surfaces, whole)
         missed = jnp.where(surfaces.hit, noisy - mean, 0.0) if quality.at_once else None
-        found = filtered(params["guide"], mean, missed, texture, surfaces, depth, decided, quality.full_levels)
+        floor = _DARK / whole.exposure
+        found = filtered(params["guide"], mean, missed, texture, surfaces, depth, decided, quality.full_levels, floor)
         image = found.image * _without_specks(found.image, surfaces.hit, mean, square, number)
         newest = jnp.where(past.valid, shares["blend"], 1.0)
         before = past.shown + found.change
@@ -188,7 +196,7 @@ def steady(options: Options) -> Denoiser:
         return measured(_noisy(frame, surfaces), surfaces.depth, frame)
 
     seen = 2 * description.reach(description.unet(1, heads, widths=quality.widths, head_size=1))
-    far = reach(quality.full_levels, twice=quality.twice, at_once=quality.at_once)
+    far = reach(quality.full_levels, back=quality.back, at_once=quality.at_once)
     core = Core(start, step, reads, init, measure=measure, reach=seen + far)
     return demodulated(recurrent(core), by=options.demodulate)
 
@@ -214,7 +222,7 @@ def _seen(noisy: jax.Array, past: _Past, surfaces: Surfaces, whole: Whole) -> tu
     closeness = jnp.zeros_like(past.number) if depth is None else depth_feature(depth, middle=whole.middle_depth)
     geometry = fold(jnp.concatenate([surfaces.albedo, surfaces.normal, closeness, surfaces.roughness], axis=-1))
     level = color.luminance(past.mean)
-    spread = jnp.sqrt(jnp.maximum(past.square - level**2, 0.0) + 1e-12) / (level + 1e-3 / gain)
+    spread = jnp.sqrt(jnp.maximum(past.square - level**2, 0.0) + 1e-12) / (level + _DARK / gain)
     facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + past.number), surfaces.hit.astype(noisy.dtype)]
     recent = (jnp.where(past.valid, one, noisy) for one in (past.mean, past.shown))
     seen, mean, shown = (light_of_blocks(light, gain) for light in (noisy, *recent))

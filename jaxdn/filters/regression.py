@@ -1,0 +1,192 @@
+"""What a filter takes away where light follows the guides: found by regression, and given back.
+
+A mean over neighbours is wrong where light is not the same on both sides: it flattens a ball, whose light follows its
+normal, and at the edge of a surface it takes from inside alone. Were light ``a + b . g`` with guides g (normal, position
+in the image, gloss, inverse depth), a linear filter S that keeps constants would err by ``b . (g - S g)``. Both g and
+S g are known, and b is what explains best, in a window, what the filter took away: x - S x, mostly noise, by g - S g.
+On an even wall g is S g: it says nothing about b, and nothing is added to it.
+
+A small window knows too little, a large one mixes too much. So there are three, each about twice as wide as the one
+before, and each b is expected to be that of the next larger window, b' (0 for the largest). With d = g - S g, with
+r = (x - S x) / l relative to the brightness l of S x, both 0 without a surface, and with means E over the window
+
+    b = (E[d d'] + u I)^-1 (E[d r'] + u b'),    u = k E[r r] / n,
+
+where n is the number of pixels in the window and k a constant: the more noise, the less is believed. For k = 1 that is
+the estimate of greatest probability if b differs from b' by one or so and r is white noise; light is far from that.
+
+Bitterli et al. 2016, "Nonlinearly Weighted First-order Regression for Denoising Monte Carlo Renderings", fit light to
+guides in the neighbourhood of each pixel. Here one filter serves both light and guides, and the fits are few.
+
+Planes are [C, H, W].
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from jaxdn.compiled import strips
+from jaxdn.ops.affinity_filter import SPLINE
+from jaxdn.ops.faster import alone
+
+SCALES = {"normal": 0.0, "position": 0.0, "gloss": 0.0, "depth": 0.0}
+"""Logarithms of what the guides are multiplied by before training: more, and their slope is believed sooner."""
+_CHANNELS = {"normal": 3, "position": 2, "gloss": 1, "depth": 1}
+GUIDES = sum(_CHANNELS.values())
+_POSITION = 1 / 32
+"""A position in pixels is multiplied by this."""
+CELL = 8
+"""Moments are means over cells of CELL x CELL pixels, and slopes are interpolated between their centres."""
+_WINDOWS = 1, 2, 4
+"""Distances, in cells, of the taps of the filter that makes each window from the one before."""
+_DOUBT = 64.0
+"""k. With 1 or 4, what is given back is noise itself at one sample a pixel."""
+_LEAST = 1e-4
+"""Added to u: a guide that hardly varies explains nothing. It is 1 % of a guide's unit, squared."""
+_TINY = 1e-8
+"""Added too, where there is no surface."""
+
+
+def guides_of(normal: jax.Array, gloss: jax.Array, inverse: jax.Array) -> jax.Array:
+    """[7, H, W] what light may follow, from [H, W, 3] normals, [H, W, 1] gloss and [H, W] inverse depth."""
+    size = inverse.shape
+    rows, columns = (_POSITION * lax.broadcasted_iota(inverse.dtype, size, axis) for axis in (0, 1))
+    return jnp.concatenate([normal.transpose(2, 0, 1), jnp.stack([columns, rows, gloss[..., 0], inverse])])
+
+
+def given_back(
+    scales: dict[str, jax.Array],
+    light: jax.Array,
+    smooth: jax.Array,
+    guides: jax.Array,
+    smooth_guides: jax.Array,
+    hit: jax.Array,
+    floor: jax.Array,
+) -> jax.Array:
+    """[H, W, 3] what to add to the filtered light; it may be negative.
+
+    Args:
+      scales: logarithms, see :data:`SCALES`.
+      light: [H, W, 3] before the filter.
+      smooth: [H, W, 3] >= 0 after it.
+      guides: [7, H, W] of :func:`guides_of`.
+      smooth_guides: the same after the filter.
+      hit: [H, W, 1] bool, there is a surface.
+      floor: scalar > 0, light that is dark: brightness is relative to no less.
+    """
+    factors = jnp.concatenate([jnp.full(n, jnp.exp(scales[name])) for name, n in _CHANNELS.items()])
+    level = jnp.mean(smooth, axis=-1) + floor
+    away = factors[:, None, None] * jnp.where(hit[..., 0], guides - smooth_guides, 0.0)
+    rest = jnp.where(hit, light - smooth, 0.0).transpose(2, 0, 1) / level
+    if strips.available() and light.dtype == jnp.float32:
+        moments = alone(_moments, _moments_by_compiled)(away, rest, hit[..., 0] * 1.0)
+        share = alone(_explained, _explained_by_compiled)(_slopes(moments), away)
+    else:
+        share = _explained(_slopes(_moments(away, rest, hit[..., 0] * 1.0)), away)
+    return (level * share).transpose(1, 2, 0)
+
+
+def _pairs() -> list[tuple[int, int]]:
+    """Of d and of d and r, whose products are moments: those of each guide with itself and all that follow."""
+    return [(one, other) for one in range(GUIDES) for other in range(one, GUIDES + 3)]
+
+
+def _moments(away: jax.Array, rest: jax.Array, hit: jax.Array) -> jax.Array:
+    """[P + 2, h, w] means over cells: the products of :func:`_pairs`, r r (of three channels), surfaces."""
+    both = [*away, *rest]
+    products = [both[one] * both[other] for one, other in _pairs()]
+    return jnp.stack([_cells(each) for each in (*products, jnp.mean(jnp.square(rest), axis=0), hit)])
+
+
+def _cells(plane: jax.Array) -> jax.Array:
+    height, width = plane.shape
+    wide = jnp.pad(plane, ((0, -height % CELL), (0, -width % CELL)))
+    rows, columns = (size // CELL for size in wide.shape)
+    return jnp.mean(wide.reshape(rows, CELL, columns, CELL), axis=(1, 3))
+
+
+def _moments_by_compiled(away: jax.Array, rest: jax.Array, hit: jax.Array) -> jax.Array:
+    from jaxdn.compiled.regression import moments
+
+    rows, columns = (-(-size // CELL) for size in hit.shape)
+    shape = (len(_pairs()) + 2, rows, columns)
+    return strips.call(moments, [shape], [away, rest, hit], np.asarray(_pairs(), np.int32), CELL, rows=rows)[0]
+
+
+def _slopes(moments: jax.Array) -> jax.Array:
+    """[7, 3, h, w] b of the smallest window, by the unit of each guide."""
+    windows, pixels, wide = [], [], moments
+    for step in _WINDOWS:
+        wide = _blurred(wide, step)
+        windows.append(wide)
+        # That of independent pixels whose mean is as sure, for the one filter; those before add little.
+        pixels.append((CELL * step / sum(np.square([SPLINE[abs(tap)] for tap in range(-2, 3)]))) ** 2)
+    slopes = jnp.zeros((GUIDES, 3, *moments.shape[1:]), moments.dtype)
+    for window, number in zip(reversed(windows), reversed(pixels), strict=True):
+        doubt = _DOUBT / number * window[-2] + _LEAST * window[-1] + _TINY
+        slopes = _solved(_system(window), doubt, slopes)
+    return slopes
+
+
+def _system(window: jax.Array) -> jax.Array:
+    """[7, 10, h, w] E[d d'] and E[d r'] side by side."""
+    where = {pair: index for index, pair in enumerate(_pairs())}
+    order = [[where[min(row, column), max(row, column)] for column in range(GUIDES + 3)] for row in range(GUIDES)]
+    return jnp.stack([jnp.stack([window[index] for index in row]) for row in order])
+
+
+def _solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Array:
+    """b [7, 3, h, w] for all cells at once: Gauss and Jordan's elimination, which needs no pivots as E[d d'] + u I is
+    positive definite.
+    """
+    units = np.eye(GUIDES, dtype=system.dtype)[..., None, None]
+    system = system + doubt * jnp.concatenate([jnp.broadcast_to(units, (GUIDES, GUIDES, *doubt.shape)), expected], 1)
+    for index in range(GUIDES):
+        row = system[index] / system[index, index]
+        # Less the unit, so that what is left of the row itself is the row.
+        system = system - (system[:, index] - units[:, index])[:, None] * row
+    return system[:, GUIDES:]
+
+
+def _blurred(planes: jax.Array, step: int) -> jax.Array:
+    """By the B3 spline, taps ``step`` apart; 0 beyond the border."""
+    for axis in (1, 2):
+        size = planes.shape[axis]
+        wide = jnp.pad(planes, [(2 * step, 2 * step) if each == axis else (0, 0) for each in range(3)])
+        taps = [lax.slice_in_dim(wide, (2 + tap) * step, (2 + tap) * step + size, axis=axis) for tap in range(-2, 3)]
+        planes = sum(SPLINE[abs(tap)] * part for tap, part in zip(range(-2, 3), taps, strict=True))
+    return planes
+
+
+def _explained(slopes: jax.Array, away: jax.Array) -> jax.Array:
+    """[3, H, W] b . d, slopes interpolated between the centres of cells."""
+    height, width = away.shape[1:]
+    between = _between(_between(slopes, 2), 3)[..., :height, :width]
+    return jnp.sum(between * away[:, None], axis=0)
+
+
+def _between(cells: jax.Array, axis: int) -> jax.Array:
+    """CELL times the size along an axis, linear, with edge clamp."""
+    size = cells.shape[axis]
+    first, last = (lax.slice_in_dim(cells, at, at + 1, axis=axis) for at in (0, size - 1))
+    before = jnp.concatenate([first, lax.slice_in_dim(cells, 0, size - 1, axis=axis)], axis)
+    after = jnp.concatenate([lax.slice_in_dim(cells, 1, size, axis=axis), last], axis)
+    parts = []
+    for offset in (np.arange(CELL) + 0.5) / CELL - 0.5:
+        other = before if offset < 0 else after
+        parts.append(cells + abs(offset) * (other - cells))
+    found = jnp.stack(parts, axis + 1)
+    return found.reshape(*cells.shape[:axis], CELL * size, *cells.shape[axis + 1 :])
+
+
+def _explained_by_compiled(slopes: jax.Array, away: jax.Array) -> jax.Array:
+    from jaxdn.compiled.regression import explained
+
+    size = away.shape[1:]
+    return strips.call(explained, [(3, *size)], [slopes, away], CELL, rows=size[0])[0]
+
+
+def reach() -> int:
+    """How far :func:`given_back` sees, in pixels: the windows, and the cells that are interpolated."""
+    return CELL * (2 * sum(_WINDOWS) + 2)
