@@ -54,31 +54,23 @@ def moments(
         _means(out[-1, y], sums, cell)
 
 
+@inlined
+def _add_between(total: Array, above: Array, below: Array, share: float, away: Array) -> None:
+    for x in range(total.shape[0]):
+        total[x] += (above[x] + share * (below[x] - above[x])) * away[x]
+
+
 @loop
 def explained(top: int, bottom: int, slopes: Array, away: Array, out: Array, cell: int) -> None:
-    """Rows of ``out`` [3, H, W]: slopes [K, 3, h, w], interpolated between the centres of cells, times away [K, H, W]."""
-    count, _, rows, columns = slopes.shape
+    """Rows of ``out`` [3, H, W]: slopes [K, 3, h, W], interpolated between rows of cells, times away [K, H, W]."""
+    count, _, rows, _ = slopes.shape
     width = away.shape[2]
-    between = np.empty(columns, np.float32)
     for y in range(top, bottom):
         place = max(np.float32(0.0), (np.float32(y) + np.float32(0.5)) / np.float32(cell) - np.float32(0.5))
         above = min(int(place), rows - 1)
         below, share = min(above + 1, rows - 1), place - np.float32(above)
-        for channel in range(3):
-            total = out[channel, y]
-            total[:] = 0
-            for index in range(count):
-                one, other, own = slopes[index, channel, above], slopes[index, channel, below], away[index, y]
-                for x in range(columns):
-                    between[x] = one[x] + share * (other[x] - one[x])
-                # From the border to the first centre, between centres, and beyond the last one.
-                half = cell // 2
-                for x in range(min(half, width)):
-                    total[x] += between[0] * own[x]
-                for column in range(columns - 1):
-                    first = half + column * cell
-                    start, rise = between[column], (between[column + 1] - between[column]) / np.float32(cell)
-                    for x in range(first, min(first + cell, width)):
-                        total[x] += (start + (np.float32(x - first) + np.float32(0.5)) * rise) * own[x]
-                for x in range(half + (columns - 1) * cell, width):
-                    total[x] += between[columns - 1] * own[x]
+        out[:, y] = 0
+        for index in range(count):
+            for channel in range(3):
+                one, other = slopes[index, channel, above, :width], slopes[index, channel, below, :width]
+                _add_between(out[channel, y], one, other, share, away[index, y])

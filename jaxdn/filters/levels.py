@@ -142,29 +142,27 @@ def filtered(
     fine = jnp.concatenate([part for part in parts if part is not None])
     for index in range(full_levels):
         fine = affinity_filter(fine, at_full, step=2**index)
-    fine = fine.transpose(1, 2, 0)
-    coarse = _coarse(downsample(fill(fine, surfaces.hit)), _at_levels(at_half, factors), decided.take)
-    change = coarse[..., :0]
+    coarse = _coarse(_half(fine, surfaces.hit[..., 0]), _at_levels(at_half, factors), decided.take)
+    change = coarse[:0]
     if missed is not None:
         # By surfaces alone: what is learned knows a pixel's noise, and lets a bright sample count for less.
         plain = _guide(half, slanted_half, decided.half_features[:0], jnp.ones_like(decided.half_trust))
-        change = _change(downsample(missed), _at_levels(plain, factors), coarse[..., :3], half.hit)
+        change = _change(downsample(missed), _at_levels(plain, factors), pixels(coarse[:3]), half.hit)
     there = _guide(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
-    enlarged, weight = enlarge(planar(jnp.concatenate([coarse, change], axis=-1)), there, at_full)
-    alike = (weight / (weight + _LIKENESS))[..., None]
-    coarse, change = jnp.split(enlarged.transpose(1, 2, 0), (coarse.shape[-1],), axis=-1)
-    image = fine + decided.coarse * alike * (coarse - fine)
-    change = jnp.zeros_like(mean) if missed is None else alike * change
-    light = image[..., :3]
+    enlarged, weight = enlarge(jnp.concatenate([coarse, change]), there, at_full)
+    alike = weight / (weight + _LIKENESS)
+    image = fine + decided.coarse[..., 0] * alike * (enlarged[: fine.shape[0]] - fine)
+    change = jnp.zeros_like(mean) if missed is None else pixels(alike * enlarged[fine.shape[0] :])
+    light = pixels(image[:3])
     if followed is not None:
-        smooth = planar(image[..., 3 : 3 + regression.GUIDES])
+        smooth = image[3 : 3 + regression.GUIDES]
         given = regression.given_back(precisions["regression"], mean, light, followed, smooth, surfaces.hit, floor)
         light = light + upsample(decided.back) * given
-    now = jnp.maximum(light + change, 0.0)
+    now, fine_light = jnp.maximum(light + change, 0.0), pixels(fine[:3])
     if texture is None:
-        return Filtered(fine[..., :3], now, change)
-    fine = brdf.restore(fine[..., :3], texture, fine[..., -3:])
-    return Filtered(fine, brdf.restore(now, texture, image[..., -3:]), change)
+        return Filtered(fine_light, now, change)
+    fine_light = brdf.restore(fine_light, texture, pixels(fine[-3:]))
+    return Filtered(fine_light, brdf.restore(now, texture, pixels(image[-3:])), change)
 
 
 def _halved(surfaces: Surfaces) -> Surfaces:
@@ -195,23 +193,32 @@ def _at_levels(guide: Guide, factors: Mapping[str, jax.Array]) -> list[Guide]:
     return [_at_level(guide, factors, 1 + index) for index in range(LEVELS)]
 
 
-def _coarse(light: jax.Array, guides: list[Guide], take: list[jax.Array]) -> jax.Array:
-    """Light, and what else goes the same way, [H/2, W/2, C] after the levels at half resolution."""
+def _half(planes: jax.Array, hit: jax.Array) -> jax.Array:
+    """[C, H/2, W/2] the means of those of four pixels that have a surface; 0 without any."""
+
+    def four(planes: jax.Array) -> jax.Array:
+        corners = [planes[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]
+        return corners[0] + corners[1] + corners[2] + corners[3]
+
+    return four(jnp.where(hit, planes, 0.0)) / jnp.maximum(four(hit.astype(planes.dtype)), 1.0)
+
+
+def _coarse(planes: jax.Array, guides: list[Guide], take: list[jax.Array]) -> jax.Array:
+    """Light, and what else goes the same way, [C, H/2, W/2] after the levels at half resolution."""
     for index, guide in enumerate(guides):
-        smoother = affinity_filter(planar(light), guide, step=2**index).transpose(1, 2, 0)
-        light = light + take[index] * (smoother - light)
-    return light
+        planes = planes + take[index][..., 0] * (affinity_filter(planes, guide, step=2**index) - planes)
+    return planes
 
 
 def _change(missed: jax.Array, guides: list[Guide], light: jax.Array, hit: jax.Array) -> jax.Array:
-    """The change of light [H/2, W/2, 3], told from what the mean lacks of the newest frame.
+    """The change of light [3, H/2, W/2], told from what the mean lacks of the newest frame.
 
     Every level is taken whole: a single frame needs all of them, where a mean of many needs few.
     """
     planes = planar(lag.halves(missed))
     for index, guide in enumerate(guides):
         planes = affinity_filter(planes, guide, step=2**index)
-    return lag.change(planes.transpose(1, 2, 0), light, hit)
+    return planar(lag.change(pixels(planes), light, hit))
 
 
 def reach(full_levels: int, *, back: bool, at_once: bool) -> int:
@@ -224,3 +231,8 @@ def reach(full_levels: int, *, back: bool, at_once: bool) -> int:
 def planar(image: jax.Array) -> jax.Array:
     """[H, W, C] as [C, H, W]."""
     return image.transpose(2, 0, 1)
+
+
+def pixels(planes: jax.Array) -> jax.Array:
+    """[C, H, W] as [H, W, C]."""
+    return planes.transpose(1, 2, 0)

@@ -6,8 +6,8 @@ in the image, gloss, inverse depth), a linear filter S that keeps constants woul
 S g are known, and b is what explains best, in a window, what the filter took away: x - S x, mostly noise, by g - S g.
 On an even wall g is S g: it says nothing about b, and nothing is added to it.
 
-A small window knows too little, a large one mixes too much. So there are three, each about twice as wide as the one
-before, and each b is expected to be that of the next larger window, b' (0 for the largest). With d = g - S g, with
+A small window knows too little, a large one mixes too much. So there are two, one about twice as wide as the other, and
+the b of the small one is expected to be that of the large one, b' (and that to be 0). With d = g - S g, with
 r = (x - S x) / l relative to the brightness l of S x, both 0 without a surface, and with means E over the window
 
     b = (E[d d'] + u I)^-1 (E[d r'] + u b'),    u = k E[r r] / n,
@@ -36,9 +36,9 @@ _CHANNELS = {"normal": 3, "position": 2, "gloss": 1, "depth": 1}
 GUIDES = sum(_CHANNELS.values())
 _POSITION = 1 / 32
 """A position in pixels is multiplied by this."""
-CELL = 8
+CELL = 16
 """Moments are means over cells of CELL x CELL pixels, and slopes are interpolated between their centres."""
-_WINDOWS = 1, 2, 4
+_WINDOWS = 1, 2
 """Distances, in cells, of the taps of the filter that makes each window from the one before."""
 _DOUBT = 64.0
 """k. With 1 or 4, what is given back is noise itself at one sample a pixel."""
@@ -184,7 +184,7 @@ def _explained_by_compiled(slopes: jax.Array, away: jax.Array) -> jax.Array:
     from jaxdn.compiled.regression import explained
 
     size = away.shape[1:]
-    return strips.call(explained, [(3, *size)], [slopes, away], CELL, rows=size[0])[0]
+    return strips.call(explained, [(3, *size)], [_between(slopes, 3), away], CELL, rows=size[0])[0]
 
 
 def reach() -> int:
