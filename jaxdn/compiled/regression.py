@@ -22,9 +22,7 @@ def _means(means: Array, sums: Array, cell: int) -> None:
 
 
 @loop
-def moments(
-    top: int, bottom: int, away: Array, rest: Array, hit: Array, out: Array, pairs: Array, cell: int
-) -> None:
+def moments(top: int, bottom: int, away: Array, rest: Array, hit: Array, out: Array, pairs: Array, cell: int) -> None:
     """Rows of cells of ``out`` [P + 2, h, w]: means of the P products of ``pairs`` of away [K, H, W] and rest
     [3, H, W], of the mean of squares of rest, and of ``hit`` [H, W].
     """

@@ -22,7 +22,7 @@ from jaxdn.filters.guides import depth_slopes, hit_mask
 from jaxdn.frame import FAR, Frame
 from jaxdn.networks import pad
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
-from jaxdn.scales import downsample, fill, upsample
+from jaxdn.scales import downsample, upsample
 from jaxdn.whole import Whole
 
 LEVELS = 4
@@ -151,10 +151,10 @@ def filtered(
     there = _guide(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
     enlarged, weight = enlarge(jnp.concatenate([coarse, change]), there, at_full)
     alike = weight / (weight + _LIKENESS)
-    image = fine + decided.coarse[..., 0] * alike * (enlarged[: fine.shape[0]] - fine)
-    change = jnp.zeros_like(mean) if missed is None else pixels(alike * enlarged[fine.shape[0] :])
+    image = fine + (decided.coarse[..., 0] * alike)[None] * (enlarged[: fine.shape[0]] - fine)
+    change = jnp.zeros_like(mean) if missed is None else pixels(alike[None] * enlarged[fine.shape[0] :])
     light = pixels(image[:3])
-    if followed is not None:
+    if followed is not None and decided.back is not None:
         smooth = image[3 : 3 + regression.GUIDES]
         given = regression.given_back(precisions["regression"], mean, light, followed, smooth, surfaces.hit, floor)
         light = light + upsample(decided.back) * given
@@ -200,13 +200,13 @@ def _half(planes: jax.Array, hit: jax.Array) -> jax.Array:
         corners = [planes[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]
         return corners[0] + corners[1] + corners[2] + corners[3]
 
-    return four(jnp.where(hit, planes, 0.0)) / jnp.maximum(four(hit.astype(planes.dtype)), 1.0)
+    return four(jnp.where(hit[None], planes, 0.0)) / jnp.maximum(four(hit.astype(planes.dtype)), 1.0)[None]
 
 
 def _coarse(planes: jax.Array, guides: list[Guide], take: list[jax.Array]) -> jax.Array:
     """Light, and what else goes the same way, [C, H/2, W/2] after the levels at half resolution."""
     for index, guide in enumerate(guides):
-        planes = planes + take[index][..., 0] * (affinity_filter(planes, guide, step=2**index) - planes)
+        planes = planes + take[index][..., 0][None] * (affinity_filter(planes, guide, step=2**index) - planes)
     return planes
 
 

@@ -1,10 +1,10 @@
 """What a filter takes away where light follows the guides: found by regression, and given back.
 
 A mean over neighbours is wrong where light is not the same on both sides: it flattens a ball, whose light follows its
-normal, and at the edge of a surface it takes from inside alone. Were light ``a + b . g`` with guides g (normal, position
-in the image, gloss, inverse depth), a linear filter S that keeps constants would err by ``b . (g - S g)``. Both g and
-S g are known, and b is what explains best, in a window, what the filter took away: x - S x, mostly noise, by g - S g.
-On an even wall g is S g: it says nothing about b, and nothing is added to it.
+normal, and at the edge of a surface it takes from inside alone. Were light ``a + b . g`` with guides g (normal,
+position in the image, gloss, inverse depth), a linear filter S that keeps constants would err by ``b . (g - S g)``.
+Both g and S g are known, and b is what explains best, in a window, what the filter took away: x - S x, mostly noise, by
+g - S g. On an even wall g is S g: it says nothing about b, and nothing is added to it.
 
 A small window knows too little, a large one mixes too much. So there are two, one about twice as wide as the other, and
 the b of the small one is expected to be that of the large one, b' (and that to be 0). With d = g - S g, with
@@ -77,14 +77,14 @@ def given_back(
     """
     factors = jnp.concatenate([jnp.full(n, jnp.exp(scales[name])) for name, n in _CHANNELS.items()])
     level = jnp.mean(smooth, axis=-1) + floor
-    away = factors[:, None, None] * jnp.where(hit[..., 0], guides - smooth_guides, 0.0)
-    rest = jnp.where(hit, light - smooth, 0.0).transpose(2, 0, 1) / level
+    away = factors[:, None, None] * jnp.where(hit[..., 0][None], guides - smooth_guides, 0.0)
+    rest = jnp.where(hit, light - smooth, 0.0).transpose(2, 0, 1) / level[None]
     if strips.available() and light.dtype == jnp.float32:
         moments = alone(_moments, _moments_by_compiled)(away, rest, hit[..., 0] * 1.0)
         share = alone(_explained, _explained_by_compiled)(_slopes(moments), away)
     else:
         share = _explained(_slopes(_moments(away, rest, hit[..., 0] * 1.0)), away)
-    return (level * share).transpose(1, 2, 0)
+    return (level[None] * share).transpose(1, 2, 0)
 
 
 def _pairs() -> list[tuple[int, int]]:
@@ -96,7 +96,8 @@ def _moments(away: jax.Array, rest: jax.Array, hit: jax.Array) -> jax.Array:
     """[P + 2, h, w] means over cells: the products of :func:`_pairs`, r r (of three channels), surfaces."""
     both = [*away, *rest]
     products = [both[one] * both[other] for one, other in _pairs()]
-    return jnp.stack([_cells(each) for each in (*products, jnp.mean(jnp.square(rest), axis=0), hit)])
+    # Not jnp.stack: the axis of a batch would come second, and jax.custom_vjp (jax 0.10) confuses it in a scan.
+    return jnp.concatenate([_cells(each)[None] for each in (*products, jnp.mean(jnp.square(rest), axis=0), hit)])
 
 
 def _cells(plane: jax.Array) -> jax.Array:
@@ -141,11 +142,12 @@ def _solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Arr
     positive definite.
     """
     units = np.eye(GUIDES, dtype=system.dtype)[..., None, None]
-    system = system + doubt * jnp.concatenate([jnp.broadcast_to(units, (GUIDES, GUIDES, *doubt.shape)), expected], 1)
+    believed = jnp.concatenate([jnp.broadcast_to(units, (GUIDES, GUIDES, *doubt.shape)), expected], axis=1)
+    system = system + doubt[None, None] * believed
     for index in range(GUIDES):
-        row = system[index] / system[index, index]
+        row = system[index] / system[index, index][None]
         # Less the unit, so that what is left of the row itself is the row.
-        system = system - (system[:, index] - units[:, index])[:, None] * row
+        system = system - (system[:, index] - units[:, index])[:, None] * row[None]
     return system[:, GUIDES:]
 
 
@@ -155,7 +157,7 @@ def _blurred(planes: jax.Array, step: int) -> jax.Array:
         size = planes.shape[axis]
         wide = jnp.pad(planes, [(2 * step, 2 * step) if each == axis else (0, 0) for each in range(3)])
         taps = [lax.slice_in_dim(wide, (2 + tap) * step, (2 + tap) * step + size, axis=axis) for tap in range(-2, 3)]
-        planes = sum(SPLINE[abs(tap)] * part for tap, part in zip(range(-2, 3), taps, strict=True))
+        planes = jnp.sum(jnp.stack([SPLINE[abs(tap)] * part for tap, part in zip(range(-2, 3), taps, strict=True)]), 0)
     return planes
 
 

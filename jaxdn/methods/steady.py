@@ -152,9 +152,7 @@ def steady(options: Options) -> Denoiser:
         pixel = [0.0] * FEATURES + list(BEGIN.values())
         bias = [value for value in pixel for _ in range(4)] + [0.0] * HALF_FEATURES
         bias += [BEGIN["trust"]] + [_TAKE] * LEVELS + [_BACK] * quality.back
-        precisions: Params = {
-            name: jnp.full((1 + LEVELS,), value, jnp.float32) for name, value in PRECISIONS.items()
-        }
+        precisions: Params = {name: jnp.full((1 + LEVELS,), value, jnp.float32) for name, value in PRECISIONS.items()}
         if quality.back:
             precisions["regression"] = jax.tree.map(jnp.float32, regression.SCALES)
         return {**params, "head_0": {**params["head_0"], "bias": jnp.asarray(bias, jnp.float32)}, "guide": precisions}
