@@ -3,9 +3,9 @@
     python -m experiments.papers.results CLIP ... --spp 1 4 16 [--weights A.safetensors ...]
 
 Filters, shipped and given weights, and Open Image Denoise frame by frame where it is installed, on clips with a
-reference and both its halves, rendered with as many single samples as the largest sample count of the other views
-(``--draws``). For every view and count: a table, ``runs/results/VIEW-SPP/report.html``, and every method's image of
-every clip as ``pictures/CLIP/METHOD.png``, to be looked at at 100 %.
+reference and both its halves, rendered with as many single samples as the largest sample count (``--draws``). For every
+view and count: a table, ``runs/results/VIEW-SPP/report.html``, and every method's image of every clip as
+``pictures/CLIP/METHOD.png``, to be looked at at 100 %.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -24,6 +24,7 @@ from jaxdn.clips import find_clips
 from jaxdn.clips.folder import read_frames
 from jaxdn.commands.compare import Footage, compare, read_footage
 from jaxdn.commands.errors import plain_errors
+from jaxdn.frame import Frame
 from jaxdn.report import Results, write_report
 from jaxdn.report.results import mean_scores
 from jaxdn.weights import shipped_names
@@ -32,18 +33,31 @@ Read = Callable[..., Footage]
 _NOTHING: Mapping[str, Mapping[str, str]] = MappingProxyType({})
 
 
-def beauty(folder: Path, *, spp: int, layers: bool = False) -> Footage:
-    """All light in place of indirect light: direct light as noisy, and emitted light, as in other renderers' frames.
+def single_samples(folder: Path, spp: int) -> Iterator[tuple[Frame, np.ndarray]]:
+    """Every frame of a clip, and [H, W, 6] the mean of its first ``spp`` single samples, of indirect and direct light.
 
-    Raises ValueError for a clip with fewer than ``spp`` single samples.
+    Raises ValueError for a clip with fewer.
     """
-    footage, light, rest = read_footage(folder, layers=layers), [], []
     for stored in read_frames(folder):
         if stored.draws is None or len(stored.draws) < spp:
             raise ValueError(f"{folder}: expected at least {spp} single samples; render the clip with --draws {spp}.")
-        emission = 0.0 if stored.frame.emission is None else stored.frame.emission
-        direct = 0.0 if stored.frame.direct is None else stored.frame.direct
-        light.append((stored.draws[:spp, ..., :3] + stored.draws[:spp, ..., 3:]).mean(0) + emission)
+        yield stored.frame, stored.draws[:spp].mean(0, dtype=np.float32)
+
+
+def indirect(folder: Path, *, spp: int, layers: bool = False) -> Footage:
+    """Indirect light as rendered, its noise that of ``spp`` single samples."""
+    footage = read_footage(folder, layers=layers)
+    light = np.stack([mean[..., :3] for _, mean in single_samples(folder, spp)])
+    return footage._replace(clip=footage.clip._replace(frames=footage.clip.frames._replace(radiance=light)))
+
+
+def beauty(folder: Path, *, spp: int, layers: bool = False) -> Footage:
+    """All light in place of indirect light: direct light as noisy, and emitted light, as in other renderers' frames."""
+    footage, light, rest = read_footage(folder, layers=layers), [], []
+    for frame, mean in single_samples(folder, spp):
+        emission = 0.0 if frame.emission is None else frame.emission
+        direct = 0.0 if frame.direct is None else frame.direct
+        light.append(mean[..., :3] + mean[..., 3:] + emission)
         rest.append(direct + emission)
     added = np.stack(rest)
     frames = footage.clip.frames._replace(radiance=np.stack(light).astype(np.float32))
@@ -65,12 +79,12 @@ def without(read: Read, *names: str) -> Read:
 
 
 VIEWS: dict[str, Read] = {
-    "indirect": read_footage,
+    "indirect": indirect,
     "beauty": beauty,
     "beauty-without-depth": without(beauty, "depth", "previous_depth", "ids", "roughness", "reflectance"),
     "beauty-without-motion": without(beauty, "motion", "dual_motion", "previous_depth", "ids", "reflectance"),
 }
-"""Name -> how clips are read: as they are, and as three kinds of foreign frames."""
+"""Name -> how clips are read: indirect light alone, and three kinds of foreign frames."""
 
 
 @dataclass

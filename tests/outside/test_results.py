@@ -39,6 +39,15 @@ def test_all_light_has_the_noise_of_its_samples_and_halves_of_its_own(folder: Pa
         VIEWS["beauty"](folder, spp=3)
 
 
+def test_indirect_light_has_the_noise_of_its_samples(folder: Path) -> None:
+    for spp, noisy in ((1, 0.1), (2, 0.25)):
+        footage = VIEWS["indirect"](folder, spp=spp)
+        np.testing.assert_allclose(footage.clip.frames.radiance, noisy, rtol=1e-3)
+        np.testing.assert_allclose(footage.clip.reference, 0.2, rtol=1e-3)
+    with pytest.raises(ValueError, match="at least 3 single samples; render the clip with --draws 3"):
+        VIEWS["indirect"](folder, spp=3)
+
+
 def test_buffers_that_a_renderer_does_not_write_are_absent(folder: Path) -> None:
     frames = VIEWS["beauty-without-depth"](folder, spp=1).clip.frames
     assert frames.depth is None
