@@ -22,34 +22,18 @@ def _means(means: Array, sums: Array, cell: int) -> None:
 
 
 @loop
-def moments(top: int, bottom: int, away: Array, rest: Array, hit: Array, out: Array, pairs: Array, cell: int) -> None:
-    """Rows of cells of ``out`` [P + 2, h, w]: means of the P products of ``pairs`` of away [K, H, W] and rest
-    [3, H, W], of the mean of squares of rest, and of ``hit`` [H, W].
-    """
-    count, height, width = away.shape
+def moments(top: int, bottom: int, planes: Array, out: Array, cell: int) -> None:
+    """Rows of cells of ``out`` [C, C, h, w]: means of the products of all ``planes`` [C, H, W] with each other."""
+    count, height, width = planes.shape
     sums = np.empty(width, np.float32)
     for y in range(top, bottom):
-        rows = range(y * cell, min(height, (y + 1) * cell))
-        for index in range(pairs.shape[0]):
-            one, other = pairs[index]
-            sums[:] = 0
-            for row in rows:
-                if other < count:
-                    _add_product(sums, away[one, row], away[other, row])
-                else:
-                    _add_product(sums, away[one, row], rest[other - count, row])
-            _means(out[index, y], sums, cell)
-        sums[:] = 0
-        for row in rows:
-            for channel in range(3):
-                _add_product(sums, rest[channel, row], rest[channel, row])
-        for x in range(width):
-            sums[x] /= np.float32(3.0)
-        _means(out[-2, y], sums, cell)
-        sums[:] = 0
-        for row in rows:
-            _add_product(sums, hit[row], hit[row])
-        _means(out[-1, y], sums, cell)
+        for one in range(count):
+            for other in range(one, count):
+                sums[:] = 0
+                for row in range(y * cell, min(height, (y + 1) * cell)):
+                    _add_product(sums, planes[one, row], planes[other, row])
+                _means(out[one, other, y], sums, cell)
+                out[other, one, y] = out[one, other, y]
 
 
 @inlined

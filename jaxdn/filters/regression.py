@@ -87,59 +87,44 @@ def given_back(
     return (level[None] * share).transpose(1, 2, 0)
 
 
-def _pairs() -> list[tuple[int, int]]:
-    """Of d and of d and r, whose products are moments: those of each guide with itself and all that follow."""
-    return [(one, other) for one in range(GUIDES) for other in range(one, GUIDES + 3)]
-
-
 def _moments(away: jax.Array, rest: jax.Array, hit: jax.Array) -> jax.Array:
-    """[P + 2, h, w] means over cells: the products of :func:`_pairs`, r r (of three channels), surfaces."""
-    both = [*away, *rest]
-    products = [both[one] * both[other] for one, other in _pairs()]
-    # Not jnp.stack: the axis of a batch would come second, and jax.custom_vjp (jax 0.10) confuses it in a scan.
-    return jnp.concatenate([_cells(each)[None] for each in (*products, jnp.mean(jnp.square(rest), axis=0), hit)])
-
-
-def _cells(plane: jax.Array) -> jax.Array:
-    height, width = plane.shape
-    wide = jnp.pad(plane, ((0, -height % CELL), (0, -width % CELL)))
-    rows, columns = (size // CELL for size in wide.shape)
-    return jnp.mean(wide.reshape(rows, CELL, columns, CELL), axis=(1, 3))
+    """[11, 11, h, w] means over cells of the products of d, r, and whether there is a surface, with each other."""
+    both = jnp.concatenate([away, rest, hit[None]])
+    rows, columns = (-(-size // CELL) for size in hit.shape)
+    wide = jnp.pad(both, ((0, 0), *((0, -size % CELL) for size in hit.shape)))
+    cells = wide.reshape(-1, rows, CELL, columns, CELL).transpose(1, 3, 0, 2, 4).reshape(rows, columns, -1, CELL**2)
+    found = jnp.einsum("yxip,yxjp->ijyx", cells, cells, precision=lax.Precision.HIGHEST)
+    return found / CELL**2
 
 
 def _moments_by_compiled(away: jax.Array, rest: jax.Array, hit: jax.Array) -> jax.Array:
     from jaxdn.compiled.regression import moments
 
+    both = jnp.concatenate([away, rest, hit[None]])
     rows, columns = (-(-size // CELL) for size in hit.shape)
-    shape = (len(_pairs()) + 2, rows, columns)
-    return strips.call(moments, [shape], [away, rest, hit], np.asarray(_pairs(), np.int32), CELL, rows=rows)[0]
+    return strips.call(moments, [(len(both), len(both), rows, columns)], [both], CELL, rows=rows)[0]
 
 
 def _slopes(moments: jax.Array) -> jax.Array:
-    """[7, 3, h, w] b of the smallest window, by the unit of each guide."""
+    """[7, 3, h, w] b of the smaller window, by the unit of each guide."""
     windows, pixels, wide = [], [], moments
     for step in _WINDOWS:
         wide = _blurred(wide, step)
         windows.append(wide)
         # That of independent pixels whose mean is as sure, for the one filter; those before add little.
         pixels.append((CELL * step / sum(np.square([SPLINE[abs(tap)] for tap in range(-2, 3)]))) ** 2)
-    slopes = jnp.zeros((GUIDES, 3, *moments.shape[1:]), moments.dtype)
+    slopes = jnp.zeros((GUIDES, 3, *moments.shape[2:]), moments.dtype)
     for window, number in zip(reversed(windows), reversed(pixels), strict=True):
-        doubt = _DOUBT / number * window[-2] + _LEAST * window[-1] + _TINY
-        slopes = _solved(_system(window), doubt, slopes)
+        variance = sum(window[index, index] for index in range(GUIDES, GUIDES + 3)) / 3.0
+        doubt = _DOUBT / number * variance + _LEAST * window[-1, -1] + _TINY
+        slopes = _solved(window[:GUIDES, :-1], doubt, slopes)
     return slopes
 
 
-def _system(window: jax.Array) -> jax.Array:
-    """[7, 10, h, w] E[d d'] and E[d r'] side by side."""
-    where = {pair: index for index, pair in enumerate(_pairs())}
-    order = [[where[min(row, column), max(row, column)] for column in range(GUIDES + 3)] for row in range(GUIDES)]
-    return jnp.stack([jnp.stack([window[index] for index in row]) for row in order])
-
-
 def _solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Array:
-    """b [7, 3, h, w] for all cells at once: Gauss and Jordan's elimination, which needs no pivots as E[d d'] + u I is
-    positive definite.
+    """b [7, 3, h, w] for all cells at once, from E[d d'] and E[d r'] side by side [7, 10, h, w], u [h, w] and b'.
+
+    Gauss and Jordan's elimination, which needs no pivots as E[d d'] + u I is positive definite.
     """
     units = np.eye(GUIDES, dtype=system.dtype)[..., None, None]
     believed = jnp.concatenate([jnp.broadcast_to(units, (GUIDES, GUIDES, *doubt.shape)), expected], axis=1)
@@ -153,9 +138,9 @@ def _solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Arr
 
 def _blurred(planes: jax.Array, step: int) -> jax.Array:
     """By the B3 spline, taps ``step`` apart; 0 beyond the border."""
-    for axis in (1, 2):
+    for axis in (-2, -1):
         size = planes.shape[axis]
-        wide = jnp.pad(planes, [(2 * step, 2 * step) if each == axis else (0, 0) for each in range(3)])
+        wide = jnp.pad(planes, [(2 * step, 2 * step) if each == axis else (0, 0) for each in range(-planes.ndim, 0)])
         taps = [lax.slice_in_dim(wide, (2 + tap) * step, (2 + tap) * step + size, axis=axis) for tap in range(-2, 3)]
         planes = jnp.sum(jnp.stack([SPLINE[abs(tap)] * part for tap, part in zip(range(-2, 3), taps, strict=True)]), 0)
     return planes
