@@ -133,26 +133,15 @@ def filtered(
     """
     factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items() if name != "regression"}
     at_full = _at_level(_guide(surfaces, slanted, decided.features, decided.trust), factors, 0)
-    half = _halved(surfaces)
-    slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
-    at_half = _guide(half, slanted_half, decided.half_features, decided.half_trust)
     # Guides that light may follow go through the same filters as light, and so does texture.
     followed = None if decided.back is None else regression.guides_of(surfaces.normal, surfaces.gloss, slanted[0])
     parts = [planar(mean), followed, None if texture is None else planar(texture)]
     fine = jnp.concatenate([part for part in parts if part is not None])
     for index in range(full_levels):
         fine = affinity_filter(fine, at_full, step=2**index)
-    coarse = _coarse(_half(fine, surfaces.hit[..., 0]), _at_levels(at_half, factors), decided.take)
-    change = coarse[:0]
-    if missed is not None:
-        # By surfaces alone: what is learned knows a pixel's noise, and lets a bright sample count for less.
-        plain = _guide(half, slanted_half, decided.half_features[:0], jnp.ones_like(decided.half_trust))
-        change = _change(downsample(missed), _at_levels(plain, factors), pixels(coarse[:3]), half.hit)
-    there = _guide(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
-    enlarged, weight = enlarge(jnp.concatenate([coarse, change]), there, at_full)
-    alike = weight / (weight + _LIKENESS)
-    image = fine + (decided.coarse[..., 0] * alike)[None] * (enlarged[: fine.shape[0]] - fine)
-    change = jnp.zeros_like(mean) if missed is None else pixels(alike[None] * enlarged[fine.shape[0] :])
+    found, alike = _from_half(fine, missed, surfaces, slanted, decided, factors, at_full)
+    image = fine + (decided.coarse[..., 0] * alike)[None] * (found[: fine.shape[0]] - fine)
+    change = jnp.zeros_like(mean) if missed is None else pixels(alike[None] * found[fine.shape[0] :])
     light = pixels(image[:3])
     if followed is not None and decided.back is not None:
         smooth = image[3 : 3 + regression.GUIDES]
@@ -163,6 +152,33 @@ def filtered(
         return Filtered(fine_light, now, change)
     fine_light = brdf.restore(fine_light, texture, pixels(fine[-3:]))
     return Filtered(fine_light, brdf.restore(now, texture, pixels(image[-3:])), change)
+
+
+def _from_half(
+    fine: jax.Array,
+    missed: jax.Array | None,
+    surfaces: Surfaces,
+    slanted: jax.Array,
+    decided: Decisions,
+    factors: Mapping[str, jax.Array],
+    at_full: Guide,
+) -> tuple[jax.Array, jax.Array]:
+    """Planes [C, H, W] after the levels at half resolution, enlarged again, and [H, W] how alike what they show is.
+
+    They are followed by the three of the change, if there may be one.
+    """
+    half = _halved(surfaces)
+    slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
+    at_half = _guide(half, slanted_half, decided.half_features, decided.half_trust)
+    found = _coarse(_half(fine, surfaces.hit[..., 0]), _at_levels(at_half, factors), decided.take)
+    if missed is not None:
+        # By surfaces alone: what is learned knows a pixel's noise, and lets a bright sample count for less.
+        plain = _guide(half, slanted_half, decided.half_features[:0], jnp.ones_like(decided.half_trust))
+        change = _change(downsample(missed), _at_levels(plain, factors), pixels(found[:3]), half.hit)
+        found = jnp.concatenate([found, change])
+    there = _guide(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
+    enlarged, weight = enlarge(found, there, at_full)
+    return enlarged, weight / (weight + _LIKENESS)
 
 
 def _halved(surfaces: Surfaces) -> Surfaces:

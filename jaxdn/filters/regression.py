@@ -39,9 +39,9 @@ _POSITION = 1 / 32
 CELL = 16
 """Moments are means over cells of CELL x CELL pixels, and slopes are interpolated between their centres."""
 _WINDOWS = 1, 2
-"""Distances, in cells, of the taps of the filter that makes each window from the one before."""
+"""Distances, in cells, of the taps of the filters: the first makes the smaller window, the second the larger of it."""
 _DOUBT = 64.0
-"""k. With 1 or 4, what is given back is noise itself at one sample a pixel."""
+"""k, by measurement: with less, noise is given back at one sample a pixel; with more, less of all."""
 _LEAST = 1e-4
 """Added to u: a guide that hardly varies explains nothing. It is 1 % of a guide's unit, squared."""
 _TINY = 1e-8

@@ -2,9 +2,9 @@
 
 For each frame: divide by what surfaces reflect; fetch the history with a test of every tap; blend the noisy frame into
 a running mean whose effective number of samples is known per pixel; filter the mean by affinities, one or two levels at
-full resolution and four at half, each reaching twice as far as the one before (:mod:`jaxdn.filters.levels`); add what
-the mean lacks of a change of light (:mod:`jaxdn.filters.lag`); take single bright pixels away; blend the result with
-the last output.
+full resolution and four at half, each reaching twice as far as the one before (:mod:`jaxdn.filters.levels`); give back
+what that took away where light follows the guides (:mod:`jaxdn.filters.regression`); add what the mean lacks of a
+change of light (:mod:`jaxdn.filters.lag`); take single bright pixels away; blend the result with the last output.
 
 What a hand-made filter leaves to constants, a U-Net at half resolution decides for every pixel: learned features that
 stop the filter beside albedo, gloss, normal and depth; how far a pixel can be trusted (a firefly is not); how fast both
