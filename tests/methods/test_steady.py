@@ -49,7 +49,9 @@ def denoised(frames, *, key=None, sharper=0.0):
     """With the same decisions for all pixels, or (``key``) with random ones; guides that stop the filter more."""
     denoiser, run = compiled()
     params = denoiser.init(jax.random.key(0), frame_at(frames, 0))
-    params["guide"] = {name: value + sharper for name, value in params["guide"].items()}
+    # Not the scales of the regression, which stop nothing.
+    sharpened = {name: value + sharper for name, value in params["guide"].items() if name != "regression"}
+    params["guide"] = params["guide"] | sharpened
     if key is None:
         params["head_0"]["kernel"] = 0.0 * params["head_0"]["kernel"]
     else:
