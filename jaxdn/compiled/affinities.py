@@ -6,7 +6,7 @@ by row of the image. All rows that a pixel's taps lie in stay in the cache.
 
 import numpy as np
 
-from jaxdn.compiled.rows import Array, exponential, inlined, loop
+from jaxdn.compiled.rows import Array, add_product, exponential, inlined, loop
 
 
 @inlined
@@ -38,12 +38,6 @@ def _add_square(total: Array, one: Array, other: Array, factor: float) -> None:
     for x in range(total.shape[0]):
         away = factor * (one[x] - other[x])
         total[x] += away * away
-
-
-@inlined
-def _add_product(total: Array, one: Array, other: Array) -> None:
-    for x in range(total.shape[0]):
-        total[x] += one[x] * other[x]
 
 
 @inlined
@@ -145,7 +139,7 @@ def filtered(
                     opposite = weights[there % kept, -row, reach - column, first:last]
                     _product(part, opposite, confidence[there, first:last])
                 for index in range(channels):
-                    _add_product(total[index, left:right], part, image[index, there, first:last])
+                    add_product(total[index, left:right], part, image[index, there, first:last])
                 _add(total[channels, left:right], part)
         mass = total[channels]
         for index in range(channels):
@@ -249,10 +243,10 @@ def filtered_gradient(
                 _negative(q_takes, level[there, first:last])
                 _product(share, weight, confidence[y, left:right])
                 for index in range(channels):
-                    _add_product(p_takes, gains[index, y, left:right], image[index, there, first:last])
-                    _add_product(q_takes, gains[index, there, first:last], image[index, y, left:right])
-                    _add_product(by_image[index, y, left:right], share, gains[index, there, first:last])
-                _add_product(by_confidence[y, left:right], weight, q_takes)
+                    add_product(p_takes, gains[index, y, left:right], image[index, there, first:last])
+                    add_product(q_takes, gains[index, there, first:last], image[index, y, left:right])
+                    add_product(by_image[index, y, left:right], share, gains[index, there, first:last])
+                add_product(by_confidence[y, left:right], weight, q_takes)
                 own, other_own = confidence[y, left:right], confidence[there, first:last]
                 _by_distance(distance, weight, p_takes, q_takes, own, other_own)
                 for index in range(features.shape[0]):
@@ -325,7 +319,7 @@ def enlarged(
                     exponential(weight, spatial[row + 1, column + 1, y % 2, odd])
                     _multiply(weight, confidence[there, first:last])
                     for index in range(channels):
-                        _add_product(total[index, left:right], weight, coarse[index, there, first:last])
+                        add_product(total[index, left:right], weight, coarse[index, there, first:last])
                     _add(total[channels, left:right], weight)
             for x in range(width):
                 some = total[channels, x] > least

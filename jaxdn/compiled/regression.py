@@ -2,13 +2,7 @@
 
 import numpy as np
 
-from jaxdn.compiled.rows import Array, inlined, loop
-
-
-@inlined
-def _add_product(total: Array, one: Array, other: Array) -> None:
-    for x in range(total.shape[0]):
-        total[x] += one[x] * other[x]
+from jaxdn.compiled.rows import Array, add_product, inlined, loop
 
 
 @inlined
@@ -31,7 +25,7 @@ def moments(top: int, bottom: int, planes: Array, out: Array, cell: int) -> None
             for other in range(one, count):
                 sums[:] = 0
                 for row in range(y * cell, min(height, (y + 1) * cell)):
-                    _add_product(sums, planes[one, row], planes[other, row])
+                    add_product(sums, planes[one, row], planes[other, row])
                 _means(out[one, other, y], sums, cell)
                 out[other, one, y] = out[one, other, y]
 

@@ -36,6 +36,13 @@ Array = np.ndarray
 
 
 @inlined
+def add_product(total: Array, one: Array, other: Array) -> None:
+    """In place total + one * other."""
+    for x in range(total.shape[0]):
+        total[x] += one[x] * other[x]
+
+
+@inlined
 def exponential(values: Array, factor: float) -> None:
     """In place ``factor * exp(-values)``, for values above -87: a power of two times a polynomial, error 2e-7."""
     for x in range(values.shape[0]):
