@@ -125,6 +125,12 @@ def luminance(image: jax.Array) -> jax.Array:
     return red * image[..., 0:1] + green * image[..., 1:2] + blue * image[..., 2:3]
 
 
+def luminance_of_planes(planes: jax.Array) -> jax.Array:
+    """The same of planes [3, H, W], as [H, W]."""
+    red, green, blue = (weight * plane for weight, plane in zip(LUMINANCE, planes, strict=True))
+    return red + green + blue
+
+
 def tonemap(image: jax.Array, *, operator: str = "srgb") -> jax.Array:
     """Linear radiance [..., 3] to display-encoded values in [0, 1] of the same shape, for metrics and for display.
 

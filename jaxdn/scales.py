@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn.checks import check_image, check_option
+from jaxdn.compiled import strips
+from jaxdn.ops.faster import alone
 
 
 def downsample(image: jax.Array, *, down: str = "mean") -> jax.Array:
@@ -39,7 +41,13 @@ def fill(image: jax.Array, known: jax.Array) -> jax.Array:
     there. Sizes that are not multiples of 4 raise ValueError.
     """
     check_image(image, "image")
-    image = jnp.asarray(image)
+    image, known = jnp.asarray(image), jnp.asarray(known)
+    if strips.available() and image.dtype == jnp.float32 and not (image.shape[0] % 4 or image.shape[1] % 4):
+        return alone(_filled, _filled_by_compiled)(image, known)
+    return _filled(image, known)
+
+
+def _filled(image: jax.Array, known: jax.Array) -> jax.Array:
     weight = jnp.asarray(known, image.dtype)
     total, means = jnp.where(known, image, 0.0), []
     for level in (1, 2):
@@ -50,6 +58,12 @@ def fill(image: jax.Array, known: jax.Array) -> jax.Array:
         means.append((mean, weight))
     near = upsample(means[0][1], up="nearest") > 0
     return jnp.where(known, image, jnp.where(near, means[0][0], means[1][0]))
+
+
+def _filled_by_compiled(image: jax.Array, known: jax.Array) -> jax.Array:
+    from jaxdn.compiled.arrange import filled
+
+    return strips.call(filled, [image.shape], [image, known[..., 0]], rows=image.shape[0] // 4)[0]
 
 
 def upsample(image: jax.Array, *, up: str = "bilinear") -> jax.Array:

@@ -53,6 +53,18 @@ def _product(total: Array, one: Array, other: Array) -> None:
 
 
 @inlined
+def _add_two(total: Array, one: Array, other: Array, third: Array, fourth: Array) -> None:
+    for x in range(total.shape[0]):
+        total[x] += one[x] * other[x] + third[x] * fourth[x]
+
+
+@inlined
+def _add_three(total: Array, one: Array, other: Array, third: Array, fourth: Array, fifth: Array, sixth: Array) -> None:
+    for x in range(total.shape[0]):
+        total[x] += one[x] * other[x] + third[x] * fourth[x] + fifth[x] * sixth[x]
+
+
+@inlined
 def _add(total: Array, other: Array) -> None:
     for x in range(total.shape[0]):
         total[x] += other[x]
@@ -75,29 +87,29 @@ def filtered(
 ) -> None:
     """Rows of ``out`` [C, H, W], a level of the filter, and of its sums of weights [H, W]; taps ``step`` apart.
 
-    ``spline`` are the weights h from the centre outwards, ``least`` is a sum of weights that counts as none. The weight
-    of p and p + o is that of p + o and p: it is computed once, with p the upper or the left one of both, and kept until
-    the row of the other has had its turn.
+    ``spline`` are the 3 weights h from the centre outwards, ``least`` is a sum of weights that counts as none. The
+    weight of p and p + o is that of p + o and p: it is computed once, with p the upper or the left one of both, and
+    kept until the row of the other has had its turn.
     """
     channels, height, width = image.shape
-    reach = spline.size - 1
-    columns = 2 * reach + 1
-    kept = reach * step + 1
-    weights = np.empty((kept, reach + 1, columns, width), np.float32)
-    total, tap = np.empty((channels + 1, width), np.float32), np.empty(width, np.float32)
-    for y in range(max(0, top - reach * step), bottom):
+    beside, kept = 2 * step, 2 * step + 1
+    # Beyond the border weights are 0, and so is light.
+    weights = np.zeros((kept, 3, 5, width + 2 * beside), np.float32)
+    weights[:, 0, 2] = spline[0] * spline[0]
+    light, total = np.zeros(width + 2 * beside, np.float32), np.empty(width, np.float32)
+    for y in range(max(0, top - beside), bottom):
         # Towards rows below, and to the right.
-        for row in range(reach + 1):
+        for row in range(3):
             there = y + row * step
             if there >= height or there < top:
                 continue
-            for column in range(-reach, reach + 1):
+            for column in range(-2, 3):
                 shift = column * step
                 left, right = max(0, -shift), min(width, width - shift)
                 if right <= left or (row == 0 and column <= 0):
                     continue
                 first, last = left + shift, right + shift
-                weight = weights[y % kept, row, column + reach, left:right]
+                weight = weights[y % kept, row, column + 2, beside + left : beside + right]
                 _away(
                     weight,
                     slanted[0, y, left:right],
@@ -116,37 +128,35 @@ def filtered(
                 exponential(weight, spline[row] * spline[abs(column)])
         if y < top:
             continue
-        for index in range(channels + 1):
-            sums, own = total[index], confidence[y]
-            for x in range(width):
-                sums[x] = spline[0] * spline[0] * own[x]
-        for index in range(channels):
-            _multiply(total[index], image[index, y])
-        for row in range(-reach, reach + 1):
-            there = y + row * step
-            if there < 0 or there >= height:
-                continue
-            for column in range(-reach, reach + 1):
-                shift = column * step
-                left, right = max(0, -shift), min(width, width - shift)
-                if right <= left or (row == 0 and column == 0):
+        # The sum of weights first, then channel by channel: the sums of one stay in the nearest cache.
+        for channel in range(-1, channels):
+            total[:] = 0
+            for row in range(-2, 3):
+                there = y + row * step
+                if there < 0 or there >= height:
                     continue
-                first, last = left + shift, right + shift
-                part = tap[: right - left]
-                if row > 0 or (row == 0 and column > 0):
-                    _product(part, weights[y % kept, row, column + reach, left:right], confidence[there, first:last])
+                inside = light[beside : beside + width]
+                if channel < 0:
+                    inside[:] = confidence[there]
                 else:
-                    opposite = weights[there % kept, -row, reach - column, first:last]
-                    _product(part, opposite, confidence[there, first:last])
-                for index in range(channels):
-                    add_product(total[index, left:right], part, image[index, there, first:last])
-                _add(total[channels, left:right], part)
-        mass = total[channels]
-        for index in range(channels):
-            result, sums, own = out[index, y], total[index], image[index, y]
+                    _product(inside, image[channel, there], confidence[there])
+                found = weights[(y if row > 0 else there) % kept, abs(row)]
+                if row > 0:
+                    far, near = found[0, beside:], found[1, beside:]
+                else:
+                    far, near = found[4], found[3, beside - step :]
+                _add_two(total, far, light, near, light[step:])
+                if row < 0:
+                    near, far = found[1, beside + step :], found[0, 2 * beside :]
+                else:
+                    near, far = found[3, beside:], found[4, beside:]
+                _add_three(total, found[2, beside:], inside, near, light[beside + step :], far, light[2 * beside :])
+            if channel < 0:
+                masses[y] = total
+                continue
+            result, own, mass = out[channel, y], image[channel, y], masses[y]
             for x in range(width):
-                result[x] = sums[x] / mass[x] if mass[x] > least else own[x]
-        masses[y] = mass
+                result[x] = total[x] / mass[x] if mass[x] > least else own[x]
 
 
 @inlined
@@ -258,6 +268,25 @@ def filtered_gradient(
                 _add_scaled(by_slanted[2, y, left:right], share, np.float32(-0.5) * dy)
 
 
+@inlined
+def _shares(shares: Array, mass: Array, total: Array, least: float) -> None:
+    """Sums of weights of both columns of the blocks side by side, 0 where they are too small, and their inverse."""
+    for x in range(total.shape[1]):
+        for odd in range(2):
+            some = total[odd, x] > least
+            mass[2 * x + odd] = total[odd, x] if some else np.float32(0.0)
+            shares[odd, x] = np.float32(1.0) / total[odd, x] if some else np.float32(0.0)
+
+
+@inlined
+def _side_by_side(row: Array, total: Array, shares: Array) -> None:
+    """Set to the products for both columns of the blocks."""
+    one, other, share, other_share = total[0], total[1], shares[0], shares[1]
+    for x in range(one.shape[0]):
+        row[2 * x] = one[x] * share[x]
+        row[2 * x + 1] = other[x] * other_share[x]
+
+
 @loop
 def enlarged(
     top: int,
@@ -282,7 +311,9 @@ def enlarged(
     channels, height, width = coarse.shape
     count = features.shape[0]
     own, slant = np.empty((count, width), np.float32), np.empty((3, width), np.float32)
-    total, weights = np.empty((channels + 1, width), np.float32), np.empty(width, np.float32)
+    # Beyond the border weights are 0, and so is light.
+    weights, light = np.zeros((2, 3, 3, width), np.float32), np.zeros(width + 2, np.float32)
+    total, masses = np.empty((2, width), np.float32), np.empty((2, width), np.float32)
     for y in range(top, bottom):
         for odd in range(2):
             # Pixels of one column of the blocks, side by side.
@@ -290,17 +321,16 @@ def enlarged(
                 own[index] = fine_features[index, y, odd::2]
             for index in range(3):
                 slant[index] = fine_slanted[index, y, odd::2]
-            total[:] = 0
-            for row in range(-1, 2):
-                there = y // 2 + row
+            for row in range(3):
+                there = y // 2 + row - 1
                 if there < 0 or there >= height:
                     continue
-                for column in range(-1, 2):
-                    left, right = max(0, -column), min(width, width - column)
+                for column in range(3):
+                    left, right = max(0, 1 - column), min(width, width + 1 - column)
                     if right <= left:
                         continue
-                    first, last = left + column, right + column
-                    weight = weights[: right - left]
+                    first, last = left + column - 1, right + column - 1
+                    weight = weights[odd, row, column, left:right]
                     _away(
                         weight,
                         slant[0, left:right],
@@ -309,21 +339,29 @@ def enlarged(
                         slanted[0, there, first:last],
                         slanted[1, there, first:last],
                         slanted[2, there, first:last],
-                        np.float32(2 * row - y % 2),
-                        np.float32(2 * column - odd),
+                        np.float32(2 * row - 2 - y % 2),
+                        np.float32(2 * column - 2 - odd),
                     )
                     _square(weight, scales[-1])
                     for index in range(count):
                         here, other = own[index, left:right], features[index, there, first:last]
                         _add_square(weight, here, other, scales[index])
-                    exponential(weight, spatial[row + 1, column + 1, y % 2, odd])
-                    _multiply(weight, confidence[there, first:last])
-                    for index in range(channels):
-                        add_product(total[index, left:right], weight, coarse[index, there, first:last])
-                    _add(total[channels, left:right], weight)
-            for x in range(width):
-                some = total[channels, x] > least
-                mass[y, 2 * x + odd] = total[channels, x] if some else np.float32(0.0)
-                share = np.float32(1.0) / total[channels, x] if some else np.float32(0.0)
-                for index in range(channels):
-                    image[index, y, 2 * x + odd] = share * total[index, x]
+                    exponential(weight, spatial[row, column, y % 2, odd])
+        # The sum of weights first, then channel by channel.
+        for channel in range(-1, channels):
+            total[:] = 0
+            for row in range(3):
+                there = y // 2 + row - 1
+                if there < 0 or there >= height:
+                    continue
+                if channel < 0:
+                    light[1 : width + 1] = confidence[there]
+                else:
+                    _product(light[1 : width + 1], coarse[channel, there], confidence[there])
+                for odd in range(2):
+                    found = weights[odd, row]
+                    _add_three(total[odd], found[0], light, found[1], light[1:], found[2], light[2:])
+            if channel < 0:
+                _shares(masses, mass[y], total, least)
+            else:
+                _side_by_side(image[channel, y], total, masses)

@@ -4,30 +4,70 @@ import numpy as np
 
 from jaxdn.compiled.rows import Array, add_product, inlined, loop
 
+_BLOCK = 16
+"""Cells side by side whose pixels stay in the cache together."""
+
 
 @inlined
 def _means(means: Array, sums: Array, cell: int) -> None:
-    """Set to sums over ``cell`` neighbours, over ``cell`` squared; beyond the border there is nothing."""
-    for x in range(means.shape[0]):
+    """Set to sums over ``cell`` neighbours, over ``cell`` squared."""
+    for x in range(means.size):
         total = np.float32(0.0)
-        for column in range(x * cell, min(sums.shape[0], (x + 1) * cell)):
+        for column in range(x * cell, (x + 1) * cell):
             total += sums[column]
         means[x] = total / np.float32(cell * cell)
 
 
 @loop
-def moments(top: int, bottom: int, planes: Array, out: Array, cell: int) -> None:
-    """Rows of cells of ``out`` [C, C, h, w]: means of the products of all ``planes`` [C, H, W] with each other."""
-    count, height, width = planes.shape
-    sums = np.empty(width, np.float32)
+def moments(
+    top: int,
+    bottom: int,
+    before: Array,
+    after: Array,
+    hit: Array,
+    floor: Array,
+    factors: Array,
+    out: Array,
+    cell: int,
+) -> None:
+    """Rows of cells of ``out`` [K + 4, K + 4, h, w]: means of the products of d (K), r (3) and ``hit`` with each other.
+
+    ``before`` and ``after`` [C, H, W] are light (3) and guides (K); ``factors`` [K] multiply the guides.
+    """
+    height, width = hit.shape
+    guides, count, columns = factors.size, factors.size + 4, out.shape[3]
+    both, sums = np.empty((count, cell, _BLOCK * cell), np.float32), np.empty(_BLOCK * cell, np.float32)
     for y in range(top, bottom):
-        for one in range(count):
-            for other in range(one, count):
-                sums[:] = 0
-                for row in range(y * cell, min(height, (y + 1) * cell)):
-                    add_product(sums, planes[one, row], planes[other, row])
-                _means(out[one, other, y], sums, cell)
-                out[other, one, y] = out[one, other, y]
+        for x in range(0, columns, _BLOCK):
+            left, right = x * cell, min(width, (x + _BLOCK) * cell)
+            if (y + 1) * cell > height or right - left < _BLOCK * cell:
+                both[:] = 0  # beyond the border there is nothing
+            for row in range(y * cell, min(height, (y + 1) * cell)):
+                pixels, seen = both[:, row - y * cell, : right - left], hit[row, left:right]
+                surface = pixels[guides + 3]
+                for place in range(right - left):
+                    surface[place] = np.float32(1.0) if seen[place] else np.float32(0.0)
+                red, green, blue = after[0, row, left:right], after[1, row, left:right], after[2, row, left:right]
+                for index in range(3):
+                    rest = pixels[guides + index]
+                    here, there = before[index, row, left:right], after[index, row, left:right]
+                    for place in range(right - left):
+                        level = np.float32(1 / 3) * (red[place] + green[place] + blue[place]) + floor[0]
+                        away = (here[place] - there[place]) / level
+                        rest[place] = away if seen[place] else np.float32(0.0)
+                for index in range(guides):
+                    guide = pixels[index]
+                    here, there = before[index + 3, row, left:right], after[index + 3, row, left:right]
+                    for place in range(right - left):
+                        away = factors[index] * (here[place] - there[place])
+                        guide[place] = away if seen[place] else np.float32(0.0)
+            for one in range(count):
+                for other in range(one, count):
+                    sums[:] = 0
+                    for row in range(cell):
+                        add_product(sums, both[one, row], both[other, row])
+                    _means(out[one, other, y, x : x + _BLOCK], sums, cell)
+                    out[other, one, y, x : x + _BLOCK] = out[one, other, y, x : x + _BLOCK]
 
 
 @inlined
@@ -37,16 +77,37 @@ def _add_between(total: Array, above: Array, below: Array, share: float, away: A
 
 
 @loop
-def explained(top: int, bottom: int, slopes: Array, away: Array, out: Array, cell: int) -> None:
-    """Rows of ``out`` [3, H, W]: slopes [K, 3, h, W], interpolated between rows of cells, times away [K, H, W]."""
+def explained(
+    top: int,
+    bottom: int,
+    slopes: Array,
+    before: Array,
+    after: Array,
+    hit: Array,
+    floor: Array,
+    factors: Array,
+    out: Array,
+    cell: int,
+) -> None:
+    """Rows of ``out`` [3, H, W]: slopes [K, 3, h, W], interpolated between rows of cells, times d, by brightness."""
     count, _, rows, _ = slopes.shape
-    width = away.shape[2]
+    width = hit.shape[1]
+    away = np.empty(width, np.float32)
     for y in range(top, bottom):
         place = max(np.float32(0.0), (np.float32(y) + np.float32(0.5)) / np.float32(cell) - np.float32(0.5))
         above = min(int(place), rows - 1)
         below, share = min(above + 1, rows - 1), place - np.float32(above)
         out[:, y] = 0
         for index in range(count):
+            for x in range(width):
+                distance = factors[index] * (before[index + 3, y, x] - after[index + 3, y, x])
+                away[x] = distance if hit[y, x] else np.float32(0.0)
             for channel in range(3):
                 one, other = slopes[index, channel, above, :width], slopes[index, channel, below, :width]
-                _add_between(out[channel, y], one, other, share, away[index, y])
+                _add_between(out[channel, y], one, other, share, away)
+        for x in range(width):
+            away[x] = (after[0, y, x] + after[1, y, x] + after[2, y, x]) * np.float32(1 / 3) + floor[0]
+        for channel in range(3):
+            row = out[channel, y]
+            for x in range(width):
+                row[x] *= away[x]

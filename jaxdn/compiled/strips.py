@@ -14,7 +14,7 @@ from jax.experimental.buffer_callback import buffer_callback
 
 from jaxdn.platform import platform
 
-Given = jax.Array | None
+Given = jax.Array | tuple[jax.Array, ...] | None
 
 
 def available() -> bool:
@@ -39,14 +39,14 @@ def call(
       loop: compiled without Python's lock; gets the first and the last row of a strip, the arrays, the results, and
         ``numbers``, and fills those rows of the results.
       shapes: of the results.
-      arrays: what is read; None for what is absent.
+      arrays: what is read; None for what is absent, a tuple for what the loop gets as a tuple.
       numbers: constants of the program.
       rows: height of the image, of which strips are made.
       least: rows of a strip, where a loop does more for its first ones.
     """
 
     def work(context: Any, results: Any, *given: Any) -> None:
-        read = [None if each is None else np.asarray(each) for each in given]
+        read = jax.tree.map(np.asarray, given)
         written = [np.asarray(each) for each in results]
         pool, threads = _pool()
         # Several strips for each thread, as some take longer.

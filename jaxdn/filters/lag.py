@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdn import color
+from jaxdn.color import luminance_of_planes
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
 
 _SURE = 1.5
@@ -33,13 +33,13 @@ _NOTHING = 1e-12
 
 
 def halves(difference: jax.Array) -> jax.Array:
-    """[H, W, 8] the difference [H, W, 3] at black squares; at white; luminance of both, its sign new in each row."""
+    """[8, H, W] the difference [3, H, W] at black squares; at white; luminance of both, its sign new in each row."""
     # Not jnp.indices, which has to know the size: an exported step serves all.
-    rows, columns = (lax.broadcasted_iota(jnp.int32, difference.shape[:2], axis) for axis in (0, 1))
-    white = _odd(rows + columns)[..., None]
-    black, white = jnp.where(white, 0.0, difference), jnp.where(white, difference, 0.0)
-    level = jnp.concatenate([color.luminance(black), color.luminance(white)], axis=-1)
-    return jnp.concatenate([black, white, jnp.where(_odd(rows)[..., None], -level, level)], axis=-1)
+    rows, columns = (lax.broadcasted_iota(jnp.int32, difference.shape[1:], axis) for axis in (0, 1))
+    white, down = _odd(rows + columns), _odd(rows)
+    black, white = jnp.where(white[None], 0.0, difference), jnp.where(white[None], difference, 0.0)
+    level = jnp.stack([luminance_of_planes(black), luminance_of_planes(white)])
+    return jnp.concatenate([black, white, jnp.where(down[None], -level, level)])
 
 
 def _odd(numbers: jax.Array) -> jax.Array:
@@ -48,23 +48,23 @@ def _odd(numbers: jax.Array) -> jax.Array:
 
 
 def change(filtered: jax.Array, light: jax.Array, hit: jax.Array) -> jax.Array:
-    """[H, W, 3] the part of a filtered difference that is a change of light, between 0 and all of it.
+    """[3, H, W] the part of a filtered difference that is a change of light, between 0 and all of it.
 
     Args:
-      filtered: [H, W, 8] what :func:`halves` made, after a filter.
-      light: [H, W, 3] >= 0 what the difference is one from, filtered likewise.
-      hit: [H, W, 1] bool, there is a surface; other pixels say nothing of noise.
+      filtered: [8, H, W] what :func:`halves` made, after a filter.
+      light: [3, H, W] >= 0 what the difference is one from, filtered likewise.
+      hit: [H, W] bool, there is a surface; other pixels say nothing of noise.
     """
-    black, white, signed = jnp.split(filtered, (3, 6), axis=-1)
-    found = [color.luminance(black), color.luminance(white)]
-    level = color.luminance(light) + sum(map(jnp.abs, found)) + _NOTHING
-    squares = jnp.square(jnp.concatenate([*found, signed], axis=-1) / level).transpose(2, 0, 1)
+    black, white, signed = jnp.split(filtered, (3, 6))
+    found = jnp.stack([luminance_of_planes(black), luminance_of_planes(white)])
+    level = luminance_of_planes(light) + jnp.abs(found[0]) + jnp.abs(found[1]) + _NOTHING
+    squares = jnp.square(jnp.concatenate([found, signed]) / level[None])
     size = squares.shape[1:]
-    alike = Guide(jnp.zeros((1, *size), squares.dtype), jnp.zeros((3, *size), squares.dtype), hit[..., 0] * 1.0)
+    alike = Guide(jnp.zeros((1, *size), squares.dtype), jnp.zeros((3, *size), squares.dtype), hit * 1.0)
     for step in _WINDOW:
         squares = affinity_filter(squares, alike, step=step)
-    of_black, of_white = jnp.maximum(1.0 - _SURE * squares[2:] / (squares[:2] + _NOTHING), 0.0)[..., None]
-    return of_white * black + of_black * white
+    of_black, of_white = jnp.maximum(1.0 - _SURE * squares[2:] / (squares[:2] + _NOTHING), 0.0)
+    return of_white[None] * black + of_black[None] * white
 
 
 def reach() -> int:

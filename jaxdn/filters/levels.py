@@ -9,7 +9,7 @@ What all levels together take away where light follows the guides is found by re
 back (:mod:`jaxdn.filters.regression`).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,12 +17,13 @@ import jax.numpy as jnp
 
 from jaxdn import brdf
 from jaxdn.filters import lag, regression
+from jaxdn.filters.arrange import Part, planes_of
 from jaxdn.filters.enlarge import enlarge
 from jaxdn.filters.guides import depth_slopes, hit_mask
 from jaxdn.frame import FAR, Frame
 from jaxdn.networks import pad
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
-from jaxdn.scales import downsample, upsample
+from jaxdn.scales import upsample
 from jaxdn.whole import Whole
 
 LEVELS = 4
@@ -36,7 +37,7 @@ _LEAST_TRUST = 1e-3
 
 
 class Surfaces(NamedTuple):
-    """A frame's guides, padded; 0 is the neutral value."""
+    """A frame's guides [H, W, C], padded; 0 is the neutral value."""
 
     albedo: jax.Array
     """[H, W, 3] what is reflected at all, less 1."""
@@ -46,11 +47,15 @@ class Surfaces(NamedTuple):
     roughness: jax.Array
     depth: jax.Array | None
     hit: jax.Array
-    """[H, W, 1] bool, there is a surface."""
+    """[H, W] bool, there is a surface."""
+
+    def guides(self, layout: str = "pixels") -> list[Part]:
+        """Albedo, gloss and normal, parts of planes (:mod:`jaxdn.filters.arrange`)."""
+        return [(layout, self.albedo), (layout, self.gloss), (layout, self.normal)]
 
 
 class Filtered(NamedTuple):
-    """Light [H, W, 3] after the levels."""
+    """Light [3, H, W] after the levels."""
 
     fine: jax.Array
     """After those at full resolution."""
@@ -64,21 +69,19 @@ class Decisions(NamedTuple):
     """What is decided about the pixels of a frame."""
 
     features: jax.Array
-    """[F, H, W]."""
-    mean_features: jax.Array
-    """[F, H/2, W/2] their means over blocks."""
+    """[H/2, W/2, 4F] of all four pixels of a block (:func:`jaxdn.scales.fold`)."""
     trust: jax.Array
-    """[H, W, 1] in [0, 1]."""
+    """[H, W] in [0, 1]."""
     coarse: jax.Array
-    """[H, W, 1] in [0, 1], how much of the image of the levels at half resolution is taken."""
+    """[H, W] in [0, 1], how much of the image of the levels at half resolution is taken."""
     half_features: jax.Array
-    """[G, H/2, W/2]."""
+    """[H/2, W/2, G]."""
     half_trust: jax.Array
-    """[H/2, W/2, 1] in [0, 1]."""
+    """[H/2, W/2] in [0, 1]."""
     take: list[jax.Array]
-    """Level at half resolution -> [H/2, W/2, 1] in [0, 1]."""
+    """Level at half resolution -> [H/2, W/2] in [0, 1]."""
     back: jax.Array | None
-    """[H/2, W/2, 1] in [0, 1], how much is given back of what all levels took away; None for nothing."""
+    """[H/2, W/2] in [0, 1], how much is given back of what all levels took away; None for nothing."""
 
 
 def surfaces_of(frame: Frame) -> Surfaces:
@@ -97,7 +100,7 @@ def surfaces_of(frame: Frame) -> Surfaces:
         pad(nothing[..., :1] if frame.roughness is None else frame.roughness - 1.0, BLOCKS),
         None if frame.depth is None else pad(frame.depth, BLOCKS),
         # What is padded is no surface: noise of the last row would count as often as it is repeated.
-        jnp.pad(hit, ((0, -height % BLOCKS), (0, -width % BLOCKS)))[..., None],
+        jnp.pad(hit, ((0, -height % BLOCKS), (0, -width % BLOCKS))),
     )
 
 
@@ -105,7 +108,7 @@ def slanted(surfaces: Surfaces, whole: Whole) -> jax.Array:
     """[3, H, W] inverse depth relative to its mean, which is affine on planes, and its slopes; 0 without a surface."""
     depth = surfaces.depth
     if depth is None:
-        return jnp.zeros_like(planar(surfaces.normal))
+        return jnp.zeros((3, *surfaces.hit.shape), surfaces.normal.dtype)
     known = (depth > 0) & (depth < FAR)
     inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0) / whole.middle_inverse
     return jnp.stack([inverse[..., 0], *depth_slopes(inverse, None)])
@@ -122,36 +125,39 @@ def filtered(
     full_levels: int,
     floor: jax.Array,
 ) -> Filtered:
-    """The light [H, W, 3] ``mean`` after the levels, and with a change of light.
+    """The light [3, H, W] ``mean`` after the levels, and with a change of light.
 
-    ``missed`` is how much more the newest frame shows than the mean; None leaves a change out. ``precisions`` are
-    logarithms, one for full resolution and one for each level at half, of what the squares of differences in
-    ``albedo``, ``gloss``, ``normal``, ``depth`` and ``learned`` features are multiplied by; and, as ``regression``,
-    the scales of :func:`jaxdn.filters.regression.given_back`, whose ``floor`` is that here. The image of the levels at
-    half resolution is enlarged along the guides, and takes a share of every pixel. The ``texture`` that a division of
-    the light left is filtered likewise, and given back (:func:`jaxdn.brdf.restore`).
+    ``missed`` [3, H/2, W/2] is how much more the newest frame shows than the mean; None leaves a change out.
+    ``precisions`` are logarithms, one for full resolution and one for each level at half, of what the squares of
+    differences in ``albedo``, ``gloss``, ``normal``, ``depth`` and ``learned`` features are multiplied by; and, as
+    ``regression``, the scales of :func:`jaxdn.filters.regression.given_back`, whose ``floor`` is that here. The image
+    of the levels at half resolution is enlarged along the guides, and takes a share of every pixel. The ``texture``
+    [H, W, 3] that a division of the light left is filtered likewise, and given back (:func:`jaxdn.brdf.restore`).
     """
     factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items() if name != "regression"}
-    at_full = _at_level(_guide(surfaces, slanted, decided.features, decided.trust), factors, 0)
-    # Guides that light may follow go through the same filters as light, and so does texture.
-    followed = None if decided.back is None else regression.guides_of(surfaces.normal, surfaces.gloss, slanted[0])
-    parts = [planar(mean), followed, None if texture is None else planar(texture)]
-    fine = jnp.concatenate([part for part in parts if part is not None])
+    at_full = _guide([*surfaces.guides(), ("blocks", decided.features)], slanted, decided.trust, surfaces.hit)
+    at_full = _at_level(at_full, factors, 0)
+    parts = [("planes", mean)]
+    if decided.back is not None:
+        # Guides that light may follow go through the same filters as light, and so does texture.
+        parts.append(("planes", regression.guides_of(surfaces.normal, surfaces.gloss, slanted[0])))
+    if texture is not None:
+        parts.append(("pixels", texture))
+    before = fine = planes_of(parts)
     for index in range(full_levels):
         fine = affinity_filter(fine, at_full, step=2**index)
     found, alike = _from_half(fine, missed, surfaces, slanted, decided, factors, at_full)
-    image = fine + (decided.coarse[..., 0] * alike)[None] * (found[: fine.shape[0]] - fine)
-    change = jnp.zeros_like(mean) if missed is None else pixels(alike[None] * found[fine.shape[0] :])
-    light = pixels(image[:3])
-    if followed is not None and decided.back is not None:
-        smooth = image[3 : 3 + regression.GUIDES]
-        given = regression.given_back(precisions["regression"], mean, light, followed, smooth, surfaces.hit, floor)
-        light = light + upsample(decided.back) * given
-    now, fine_light = jnp.maximum(light + change, 0.0), pixels(fine[:3])
+    image = fine + (decided.coarse * alike)[None] * (found[: fine.shape[0]] - fine)
+    change = jnp.zeros_like(mean) if missed is None else alike[None] * found[fine.shape[0] :]
+    light = image[:3]
+    if decided.back is not None:
+        given = regression.given_back(precisions["regression"], before, image, surfaces.hit, floor)
+        light = light + upsample(decided.back[..., None])[None, ..., 0] * given
+    now = jnp.maximum(light + change, 0.0)
     if texture is None:
-        return Filtered(fine_light, now, change)
-    fine_light = brdf.restore(fine_light, texture, pixels(fine[-3:]))
-    return Filtered(fine_light, brdf.restore(now, texture, pixels(image[-3:])), change)
+        return Filtered(fine[:3], now, change)
+    left = before[-3:]
+    return Filtered(brdf.restore(fine[:3], left, fine[-3:]), brdf.restore(now, left, image[-3:]), change)
 
 
 def _from_half(
@@ -167,35 +173,30 @@ def _from_half(
 
     They are followed by the three of the change, if there may be one.
     """
-    half = _halved(surfaces)
     slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
-    at_half = _guide(half, slanted_half, decided.half_features, decided.half_trust)
-    found = _coarse(_half(fine, surfaces.hit[..., 0]), _at_levels(at_half, factors), decided.take)
+    hit, own = _any_of_four(surfaces.hit), decided.half_features
+    halved = planes_of(surfaces.guides("means"))
+    at_half = _guide([("planes", halved), ("pixels", own)], slanted_half, decided.half_trust, hit)
+    found = _coarse(_half(fine, surfaces.hit), _at_levels(at_half, factors), decided.take)
     if missed is not None:
         # By surfaces alone: what is learned knows a pixel's noise, and lets a bright sample count for less.
-        plain = _guide(half, slanted_half, decided.half_features[:0], jnp.ones_like(decided.half_trust))
-        change = _change(downsample(missed), _at_levels(plain, factors), pixels(found[:3]), half.hit)
+        plain = _guide([("planes", halved)], slanted_half, jnp.ones_like(decided.half_trust), hit)
+        change = _change(missed, _at_levels(plain, factors), found[:3], hit)
         found = jnp.concatenate([found, change])
-    there = _guide(half, slanted[:, ::2, ::2], decided.mean_features, decided.half_trust)
+    features = [("planes", halved), ("corners", decided.features)]
+    there = _guide(features, slanted[:, ::2, ::2], decided.half_trust, hit)
     enlarged, weight = enlarge(found, there, at_full)
     return enlarged, weight / (weight + _LIKENESS)
 
 
-def _halved(surfaces: Surfaces) -> Surfaces:
-    """The surfaces at half resolution, but roughness and depth, which no level reads."""
-    return surfaces._replace(
-        albedo=downsample(surfaces.albedo),
-        gloss=downsample(surfaces.gloss),
-        normal=downsample(surfaces.normal),
-        hit=downsample(surfaces.hit.astype(surfaces.albedo.dtype)) > 0,
-    )
+def _any_of_four(hit: jax.Array) -> jax.Array:
+    """[H/2, W/2] bool, whether any of four pixels is set."""
+    return hit[::2, ::2] | hit[::2, 1::2] | hit[1::2, ::2] | hit[1::2, 1::2]
 
 
-def _guide(surfaces: Surfaces, slanted: jax.Array, own: jax.Array, trust: jax.Array) -> Guide:
-    """Surfaces and ``own`` features [F, H, W], not yet scaled; what is no surface gives nothing."""
-    given = jnp.concatenate([surfaces.albedo, surfaces.gloss, surfaces.normal], axis=-1)
-    confidence = ((trust + _LEAST_TRUST) * surfaces.hit)[..., 0]
-    return Guide(jnp.concatenate([planar(given), own]), slanted, confidence)
+def _guide(features: Sequence[Part], slanted: jax.Array, trust: jax.Array, hit: jax.Array) -> Guide:
+    """Surfaces and what else is learned, not yet scaled; what is no surface gives nothing."""
+    return Guide(planes_of(features), slanted, (trust + _LEAST_TRUST) * hit)
 
 
 def _at_level(guide: Guide, factors: Mapping[str, jax.Array], index: int) -> Guide:
@@ -222,7 +223,7 @@ def _half(planes: jax.Array, hit: jax.Array) -> jax.Array:
 def _coarse(planes: jax.Array, guides: list[Guide], take: list[jax.Array]) -> jax.Array:
     """Light, and what else goes the same way, [C, H/2, W/2] after the levels at half resolution."""
     for index, guide in enumerate(guides):
-        planes = planes + take[index][..., 0][None] * (affinity_filter(planes, guide, step=2**index) - planes)
+        planes = planes + take[index][None] * (affinity_filter(planes, guide, step=2**index) - planes)
     return planes
 
 
@@ -231,10 +232,10 @@ def _change(missed: jax.Array, guides: list[Guide], light: jax.Array, hit: jax.A
 
     Every level is taken whole: a single frame needs all of them, where a mean of many needs few.
     """
-    planes = planar(lag.halves(missed))
+    planes = lag.halves(missed)
     for index, guide in enumerate(guides):
         planes = affinity_filter(planes, guide, step=2**index)
-    return planar(lag.change(pixels(planes), light, hit))
+    return lag.change(planes, light, hit)
 
 
 def reach(full_levels: int, *, back: bool, at_once: bool) -> int:
@@ -242,13 +243,3 @@ def reach(full_levels: int, *, back: bool, at_once: bool) -> int:
     half = sum(4 * 2**index for index in range(LEVELS))
     more = max(regression.reach() if back else 0, 2 * lag.reach() if at_once else 0)
     return 2 * (2**full_levels - 1) + half + more + 16
-
-
-def planar(image: jax.Array) -> jax.Array:
-    """[H, W, C] as [C, H, W]."""
-    return image.transpose(2, 0, 1)
-
-
-def pixels(planes: jax.Array) -> jax.Array:
-    """[C, H, W] as [H, W, C]."""
-    return planes.transpose(1, 2, 0)

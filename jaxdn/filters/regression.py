@@ -27,6 +27,7 @@ import numpy as np
 from jax import lax
 
 from jaxdn.compiled import strips
+from jaxdn.filters.arrange import planes_of
 from jaxdn.ops.affinity_filter import SPLINE
 from jaxdn.ops.faster import alone
 
@@ -50,46 +51,46 @@ _TINY = 1e-8
 
 def guides_of(normal: jax.Array, gloss: jax.Array, inverse: jax.Array) -> jax.Array:
     """[7, H, W] what light may follow, from [H, W, 3] normals, [H, W, 1] gloss and [H, W] inverse depth."""
-    size = inverse.shape
-    rows, columns = (_POSITION * lax.broadcasted_iota(inverse.dtype, size, axis) for axis in (0, 1))
-    return jnp.concatenate([normal.transpose(2, 0, 1), jnp.stack([columns, rows, gloss[..., 0], inverse])])
+    rows, columns = (_POSITION * lax.broadcasted_iota(inverse.dtype, inverse.shape, axis) for axis in (0, 1))
+    rest = jnp.stack([columns, rows])
+    return planes_of([("pixels", normal), ("planes", rest), ("pixels", gloss), ("planes", inverse[None])])
 
 
 def given_back(
-    scales: dict[str, jax.Array],
-    light: jax.Array,
-    smooth: jax.Array,
-    guides: jax.Array,
-    smooth_guides: jax.Array,
-    hit: jax.Array,
-    floor: jax.Array,
+    scales: dict[str, jax.Array], before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array
 ) -> jax.Array:
-    """[H, W, 3] what to add to the filtered light; it may be negative.
+    """[3, H, W] what to add to the filtered light; it may be negative.
 
     Args:
       scales: logarithms, see :data:`SCALES`.
-      light: [H, W, 3] before the filter.
-      smooth: [H, W, 3] >= 0 after it.
-      guides: [7, H, W] of :func:`guides_of`.
-      smooth_guides: the same after the filter.
-      hit: [H, W, 1] bool, there is a surface.
+      before: [C, H, W] light >= 0 (3 planes) and guides of :func:`guides_of` (7); others are not read.
+      after: the same after the filter.
+      hit: [H, W] bool, there is a surface.
       floor: scalar > 0, light that is dark: brightness is relative to no less.
     """
     factors = jnp.concatenate([jnp.full(n, jnp.exp(scales[name])) for name, n in _CHANNELS.items()])
-    level = jnp.mean(smooth, axis=-1) + floor
-    away = factors[:, None, None] * jnp.where(hit[..., 0][None], guides - smooth_guides, 0.0)
-    rest = jnp.where(hit, light - smooth, 0.0).transpose(2, 0, 1) / level[None]
-    if strips.available() and light.dtype == jnp.float32:
-        moments = alone(_moments, _moments_by_compiled)(away, rest, hit[..., 0] * 1.0)
-        share = alone(_explained, _explained_by_compiled)(_slopes(moments), away)
-    else:
-        share = _explained(_slopes(_moments(away, rest, hit[..., 0] * 1.0)), away)
-    return (level[None] * share).transpose(1, 2, 0)
+    given = before, after, hit, jnp.asarray(floor, before.dtype), factors
+    if strips.available() and before.dtype == jnp.float32:
+        slopes = _slopes(alone(_moments, _moments_by_compiled)(*given))
+        return alone(_explained, _explained_by_compiled)(slopes, *given)
+    return _explained(_slopes(_moments(*given)), *given)
 
 
-def _moments(away: jax.Array, rest: jax.Array, hit: jax.Array) -> jax.Array:
+def _level(after: jax.Array, floor: jax.Array) -> jax.Array:
+    """[H, W] the brightness that light is relative to."""
+    return jnp.mean(after[:3], axis=0) + floor
+
+
+def _away(before: jax.Array, after: jax.Array, hit: jax.Array, factors: jax.Array) -> jax.Array:
+    """[7, H, W] d."""
+    guides = slice(3, 3 + GUIDES)
+    return factors[:, None, None] * jnp.where(hit[None], before[guides] - after[guides], 0.0)
+
+
+def _moments(before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array, factors: jax.Array) -> jax.Array:
     """[11, 11, h, w] means over cells of the products of d, r, and whether there is a surface, with each other."""
-    both = jnp.concatenate([away, rest, hit[None]])
+    rest = jnp.where(hit[None], before[:3] - after[:3], 0.0) / _level(after, floor)[None]
+    both = jnp.concatenate([_away(before, after, hit, factors), rest, hit[None].astype(rest.dtype)])
     rows, columns = (-(-size // CELL) for size in hit.shape)
     wide = jnp.pad(both, ((0, 0), *((0, -size % CELL) for size in hit.shape)))
     cells = wide.reshape(-1, rows, CELL, columns, CELL).transpose(1, 3, 0, 2, 4).reshape(rows, columns, -1, CELL**2)
@@ -97,12 +98,14 @@ def _moments(away: jax.Array, rest: jax.Array, hit: jax.Array) -> jax.Array:
     return found / CELL**2
 
 
-def _moments_by_compiled(away: jax.Array, rest: jax.Array, hit: jax.Array) -> jax.Array:
+def _moments_by_compiled(
+    before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array, factors: jax.Array
+) -> jax.Array:
     from jaxdn.compiled.regression import moments
 
-    both = jnp.concatenate([away, rest, hit[None]])
     rows, columns = (-(-size // CELL) for size in hit.shape)
-    return strips.call(moments, [(len(both), len(both), rows, columns)], [both], CELL, rows=rows)[0]
+    shape = GUIDES + 4, GUIDES + 4, rows, columns
+    return strips.call(moments, [shape], [before, after, hit, floor.reshape(1), factors], CELL, rows=rows)[0]
 
 
 def _slopes(moments: jax.Array) -> jax.Array:
@@ -146,11 +149,14 @@ def _blurred(planes: jax.Array, step: int) -> jax.Array:
     return planes
 
 
-def _explained(slopes: jax.Array, away: jax.Array) -> jax.Array:
-    """[3, H, W] b . d, slopes interpolated between the centres of cells."""
-    height, width = away.shape[1:]
+def _explained(
+    slopes: jax.Array, before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array, factors: jax.Array
+) -> jax.Array:
+    """[3, H, W] b . d, slopes interpolated between the centres of cells, times the brightness."""
+    height, width = hit.shape
     between = _between(_between(slopes, 2), 3)[..., :height, :width]
-    return jnp.sum(between * away[:, None], axis=0)
+    found = jnp.sum(between * _away(before, after, hit, factors)[:, None], axis=0)
+    return _level(after, floor)[None] * found
 
 
 def _between(cells: jax.Array, axis: int) -> jax.Array:
@@ -167,11 +173,13 @@ def _between(cells: jax.Array, axis: int) -> jax.Array:
     return found.reshape(*cells.shape[:axis], CELL * size, *cells.shape[axis + 1 :])
 
 
-def _explained_by_compiled(slopes: jax.Array, away: jax.Array) -> jax.Array:
+def _explained_by_compiled(
+    slopes: jax.Array, before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array, factors: jax.Array
+) -> jax.Array:
     from jaxdn.compiled.regression import explained
 
-    size = away.shape[1:]
-    return strips.call(explained, [(3, *size)], [_between(slopes, 3), away], CELL, rows=size[0])[0]
+    arrays = [_between(slopes, 3), before, after, hit, floor.reshape(1), factors]
+    return strips.call(explained, [(3, *hit.shape)], arrays, CELL, rows=hit.shape[0])[0]
 
 
 def reach() -> int:

@@ -22,14 +22,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn import color
+from jaxdn.color import luminance_of_planes
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters import regression
-from jaxdn.filters.blocks import light_of_blocks
+from jaxdn.filters.arrange import pixels, planar, planes_of
 from jaxdn.filters.clamping import without_specks
 from jaxdn.filters.guides import Guides, depth_feature, guides_of
-from jaxdn.filters.levels import BLOCKS, LEVELS, Decisions, Surfaces, filtered, planar, reach, slanted, surfaces_of
+from jaxdn.filters.levels import BLOCKS, LEVELS, Decisions, Surfaces, filtered, reach, slanted, surfaces_of
 from jaxdn.filters.recall import recall
+from jaxdn.filters.running_mean import Mean, accumulated
+from jaxdn.filters.seen import DARK, History, seen
 from jaxdn.frame import RADIANCE_MAX, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
 from jaxdn.methods.table import method
@@ -37,14 +39,12 @@ from jaxdn.networks import Widths, crop, description, pad
 from jaxdn.objectives import pyramid_illumination
 from jaxdn.options import Range
 from jaxdn.recipe import Recipe
-from jaxdn.scales import downsample, fill, fold, upsample
+from jaxdn.scales import downsample, fill, upsample
 from jaxdn.variation import Variation
 from jaxdn.whole import Whole, measured
 
 FEATURES, HALF_FEATURES = 5, 8
 """Learned features at full and at half resolution."""
-_DARK = 1e-3
-"""Light at the network's brightness that is as good as dark."""
 _MULTIPLE = 16
 """Height and width that the network works on, at half resolution, are multiples of this."""
 
@@ -115,16 +115,6 @@ class SteadyState(NamedTuple):
     """Depth, normal and ids of the previous frame, as far as present."""
 
 
-class _Past(NamedTuple):
-    """What is recalled of the history, padded."""
-
-    mean: jax.Array
-    square: jax.Array
-    number: jax.Array
-    shown: jax.Array
-    valid: jax.Array
-
-
 @method(
     Options,
     title="A steady recurrent filter guided by a network at half resolution",
@@ -144,7 +134,7 @@ def steady(options: Options) -> Denoiser:
 
     quality = QUALITIES[options.quality] if isinstance(options.quality, str) else Quality(options.quality)
     heads = (4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS + quality.back,)
-    network = unet((32, 20), heads, widths=quality.widths, head_size=1, implementation=options.implementation)
+    network = unet((52,), heads, widths=quality.widths, head_size=1, implementation=options.implementation)
     reads = frozenset({"albedo", "normal", "roughness", "depth", "previous_depth", "motion", "ids"})
 
     def init(key: jax.Array, frame: Frame) -> Params:
@@ -166,123 +156,73 @@ def steady(options: Options) -> Denoiser:
     ) -> tuple[SteadyState, jax.Array, jax.Array]:
         size = frame.radiance.shape[:2]
         recalled = recall(state.history, state.guides, frame, first)
-        surfaces, past = surfaces_of(frame), _past(recalled.history, recalled.valid)
-        noisy = _noisy(frame, surfaces)
+        surfaces = surfaces_of(frame)
+        past = History(pad(recalled.history, BLOCKS), pad(recalled.valid, BLOCKS)[..., 0])
+        noisy, hit = _noisy(frame, surfaces), surfaces.hit
         weights = {name: part for name, part in params.items() if name != "guide"}
-        seen = _seen(noisy, past, surfaces, whole)
-        head = network.apply(weights, [pad(group, _MULTIPLE)[None] for group in seen])[0][0]
-        height, width = seen[0].shape[:2]
-        decided, shares = _decisions(crop(head, (height, width)))
-        mean, square, number = _accumulated(noisy, past, shares["follow"], options.history_max)
+        head = network.apply(weights, [_seen(noisy, past, surfaces, whole)[None]])[0][0]
+        decided, shares = _decisions(crop(head, (hit.shape[0] // 2, hit.shape[1] // 2)))
+        mean = accumulated(noisy, past, hit, shares["follow"], most=options.history_max)
         texture = texture_left(frame, options.demodulate, whole)
-        texture = None if texture is None else fill(pad(texture, BLOCKS), surfaces.hit)
-        depth = slanted(surfaces, whole)
-        missed = jnp.where(surfaces.hit, noisy - mean, 0.0) if quality.at_once else None
-        floor = _DARK / whole.exposure
-        found = filtered(params["guide"], mean, missed, texture, surfaces, depth, decided, quality.full_levels, floor)
-        image = found.image * _without_specks(found.image, surfaces.hit, mean, square, number)
-        newest = jnp.where(past.valid, shares["blend"], 1.0)
-        before = past.shown + found.change
+        texture = None if texture is None else fill(pad(texture, BLOCKS), hit[..., None])
+        given = mean.light, mean.missed if quality.at_once else None, texture, surfaces, slanted(surfaces, whole)
+        found = filtered(params["guide"], *given, decided, quality.full_levels, DARK / whole.exposure)
+        image = found.image * _without_specks(found.image, hit, mean)[None]
+        newest = jnp.where(past.valid, shares["blend"], 1.0)[None]
+        before = planes_of([("pixels", past.values)])[5:] + found.change
         shown = jnp.clip(before + newest * (image - before), 0.0, RADIANCE_MAX)
-        kept = jnp.maximum(mean + shares["feedback"] * (found.fine - mean) + found.change, 0.0)
-        history = crop(jnp.concatenate([kept, square, number, shown], axis=-1), size)
-        image = jnp.where(crop(surfaces.hit, size), history[..., 5:], frame.radiance)
+        kept = mean.light + shares["feedback"][None] * (found.fine - mean.light) + found.change
+        planes = jnp.concatenate([jnp.maximum(kept, 0.0), mean.square[None], mean.number[None], shown])
+        history = crop(pixels(planes), size)
+        image = jnp.where(crop(hit, size)[..., None], history[..., 5:], frame.radiance)
         return SteadyState(history, guides_of(frame)), image, recalled.broken
 
     def measure(frame: Frame) -> Whole:
         surfaces = surfaces_of(frame)
         return measured(_noisy(frame, surfaces), surfaces.depth, frame)
 
-    seen = 2 * description.reach(description.unet(1, heads, widths=quality.widths, head_size=1))
+    network_sees = 2 * description.reach(description.unet(1, heads, widths=quality.widths, head_size=1))
     far = reach(quality.full_levels, back=quality.back, at_once=quality.at_once)
-    core = Core(start, step, reads, init, measure=measure, reach=seen + far)
+    core = Core(start, step, reads, init, measure=measure, reach=network_sees + far)
     return demodulated(recurrent(core), by=options.demodulate)
 
 
 def _noisy(frame: Frame, surfaces: Surfaces) -> jax.Array:
     # Divided by a small reflectance it may be beyond what the network has ever seen.
-    return fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), BLOCKS), surfaces.hit)
+    return fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), BLOCKS), surfaces.hit[..., None])
 
 
-def _past(history: jax.Array, valid: jax.Array) -> _Past:
-    wide = pad(history, BLOCKS)
-    mean, square, number, shown = jnp.split(wide, (3, 4, 5), axis=-1)
-    return _Past(mean, square, number, shown, pad(valid, BLOCKS))
-
-
-def _seen(noisy: jax.Array, past: _Past, surfaces: Surfaces, whole: Whole) -> tuple[jax.Array, jax.Array]:
-    """What the network sees at half resolution: surfaces, all four pixels of a block; light, mostly their mean.
-
-    Light is seen at one brightness (:func:`jaxdn.color.exposure`) and compressed; where there is no history, in its
-    place the noisy frame. Spread is the standard deviation of luminance relative to its mean.
-    """
-    gain, depth = whole.exposure, surfaces.depth
-    closeness = jnp.zeros_like(past.number) if depth is None else depth_feature(depth, middle=whole.middle_depth)
-    geometry = fold(jnp.concatenate([surfaces.albedo, surfaces.normal, closeness, surfaces.roughness], axis=-1))
-    level = color.luminance(past.mean)
-    spread = jnp.sqrt(jnp.maximum(past.square - level**2, 0.0) + 1e-12) / (level + _DARK / gain)
-    facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + past.number), surfaces.hit.astype(noisy.dtype)]
-    recent = (jnp.where(past.valid, one, noisy) for one in (past.mean, past.shown))
-    seen, mean, shown = (light_of_blocks(light, gain) for light in (noisy, *recent))
-    # One by one: XLA:CPU does not vectorise what it writes side by side.
-    means = [seen[..., :3], mean[..., :3], shown[..., :3], *map(downsample, facts)]
-    return geometry, jnp.concatenate([*means, seen[..., 3:], shown[..., 3:]], axis=-1)
+def _seen(noisy: jax.Array, past: History, surfaces: Surfaces, whole: Whole) -> jax.Array:
+    """What the network sees: light at one brightness (:func:`jaxdn.color.exposure`), and depth of any unit."""
+    depth = surfaces.depth
+    closeness = jnp.zeros_like(noisy[..., :1]) if depth is None else depth_feature(depth, middle=whole.middle_depth)
+    geometry = surfaces.albedo, surfaces.normal, closeness, surfaces.roughness
+    return seen(geometry, noisy, past, surfaces.hit, whole.exposure, _MULTIPLE)
 
 
 def _decisions(head: jax.Array) -> tuple[Decisions, dict[str, jax.Array]]:
-    """What the head says: about the filter, and the shares [H, W, 1] in [0, 1] of the names in :data:`BEGIN`."""
-    height, width = head.shape[:2]
+    """What the head says: about the filter, and the shares [H, W] in [0, 1] of the names in :data:`BEGIN`."""
     # Splits, not slices: the gradient of a slice is an array of the whole size, and all of them are added.
     own, logits, half, rest = jnp.split(head, np.cumsum([4 * FEATURES, 4 * len(BEGIN), HALF_FEATURES]), axis=-1)
     # Before they are unfolded, while they lie side by side in memory.
-    shares = dict(zip(BEGIN, _unfolded(jax.nn.sigmoid(logits))[..., None], strict=True))
+    shares = dict(zip(BEGIN, planes_of([("blocks", jax.nn.sigmoid(logits))]), strict=True))
     # A pixel whose share knows of its own noise, follows bright samples more: its mean becomes too bright.
-    shares["follow"] = upsample(downsample(shares["follow"]))
-    trust, *take = jnp.split(jax.nn.sigmoid(rest), rest.shape[-1], axis=-1)
+    shares["follow"] = upsample(downsample(shares["follow"][..., None]))[..., 0]
+    trust, *take = planar(jax.nn.sigmoid(rest))
     back = take.pop() if len(take) > LEVELS else None
-    means = jnp.mean(own.reshape(height, width, FEATURES, 4), axis=-1)
-    about = (_unfolded(own), planar(means), shares["trust"], shares["coarse"], planar(half), trust)
-    return Decisions(*about, take, back), shares
+    return Decisions(own, shares["trust"], shares["coarse"], half, trust, take, back), shares
 
 
-def _unfolded(blocks: jax.Array) -> jax.Array:
-    """[H/2, W/2, 4C], made by :func:`jaxdn.scales.fold`, as planes [C, H, W]."""
-    height, width, channels = blocks.shape
-    parts = blocks.reshape(height, width, channels // 4, 2, 2).transpose(2, 0, 3, 1, 4)
-    return parts.reshape(channels // 4, 2 * height, 2 * width)
-
-
-def _accumulated(
-    noisy: jax.Array, past: _Past, follow: jax.Array, history_max: float
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The running mean of the radiance and of its luminance's square, and their effective number of samples.
-
-    In the mean of N frames and a new one, the new one has the weight 1 / (N + 1); ``follow`` = 1/2 keeps that, and
-    its logit is added to that of the weight. With weights 1 - a and a, the variance is ``(1 - a)^2 / N + a^2`` of a
-    frame's: the effective number is its inverse.
-    """
-    # The odds of 1 / (N + 1) are 1 to N.
-    share = jnp.where(past.valid, follow / (follow + jnp.maximum(past.number, 1e-6) * (1.0 - follow)), 1.0)
-    now = jnp.concatenate([noisy, color.luminance(noisy) ** 2], axis=-1)
-    then = jnp.where(past.valid, jnp.concatenate([past.mean, past.square], axis=-1), now)
-    mixed = then + share * (now - then)
-    variance = jnp.square(1.0 - share) / jnp.maximum(past.number, 1e-6) + share**2
-    number = jnp.where(past.valid, jnp.minimum(1.0 / variance, history_max), 1.0)
-    return mixed[..., :3], mixed[..., 3:], number
-
-
-def _without_specks(
-    image: jax.Array, hit: jax.Array, mean: jax.Array, square: jax.Array, number: jax.Array
-) -> jax.Array:
-    """[H, W, 1] the share of its light that each pixel keeps (:func:`jaxdn.filters.clamping.without_specks`).
+def _without_specks(image: jax.Array, hit: jax.Array, mean: Mean) -> jax.Array:
+    """[H, W] the share of its light that each pixel keeps (:func:`jaxdn.filters.clamping.without_specks`).
 
     Of what the history shows a pixel is sure but for two deviations of the mean; of a single frame, of nothing.
     """
-    level = color.luminance(mean)
-    variance = jnp.maximum(square - level**2, 0.0) / jnp.maximum(number, 1.0)
+    level = luminance_of_planes(mean.light)
+    variance = jnp.maximum(mean.square - level**2, 0.0) / jnp.maximum(mean.number, 1.0)
     deviation = jnp.sqrt(variance + 1e-12)  # with a slope at 0
-    sure = jnp.where(number > _SOME, 1.0 - 2.0 * deviation / jnp.maximum(level, 1e-6), 0.0)
-    return without_specks(jnp.mean(image, axis=-1), hit[..., 0], sure[..., 0])[..., None]
+    sure = jnp.where(mean.number > _SOME, 1.0 - 2.0 * deviation / jnp.maximum(level, 1e-6), 0.0)
+    return without_specks((image[0] + image[1] + image[2]) / 3.0, hit, sure)
 
 
 _SOME = 1.5

@@ -96,8 +96,13 @@ class Draft:
         """Inputs are added one after the other; the bias comes with the last."""
         total: list[Value] = []
         for x, kernel in zip(inputs, kernels, strict=True):
-            last = bias if x is inputs[-1] else None
-            total = [self._add("convolution", [x, *total], kernel.shape[3], kernel=kernel, bias=last)]
+            weights: dict[str, Any] = {"kernel": kernel, "bias": bias if x is inputs[-1] else None}
+            before = self.steps[x.number] if x.number >= 0 else None
+            if before is not None and before.kind == "enlarge" and kernel.shape[0] == 3:
+                read = [before.inputs[0], *total]
+                total = [self._add("enlarging convolution", read, kernel.shape[3], 2.0, **weights)]
+            else:
+                total = [self._add("convolution", [x, *total], kernel.shape[3], **weights)]
         return total[0]
 
     def rectifier(self, x: Value, slope: float) -> Value:
@@ -110,8 +115,13 @@ class Draft:
         return self._add("pool", [x], x.channels, 0.5)
 
     def enlarge(self, x: Value) -> Value:
-        """A step of its own."""
+        """A step of its own, which a 3x3 convolution does without."""
         return self._add("enlarge", [x], x.channels, 2.0)
+
+    def needed(self, outputs: set[int]) -> list[Step]:
+        """The steps whose results are outputs, by number, or read."""
+        read = outputs | {value.number for step in self.steps if step.kind != "enlarge" for value in step.inputs}
+        return [step for step in self.steps if step.result.number in read]
 
 
 class Program:
@@ -128,9 +138,10 @@ class Program:
         self._arrays: dict[int, np.ndarray] = {}
         self._kept: list[np.ndarray] = []
         outputs = {head.number for head in heads}
-        last_use = {value.number: step.result.number for step in draft.steps for value in step.inputs}
+        steps = draft.needed(outputs)
+        last_use = {value.number: step.result.number for step in steps for value in step.inputs}
         self._primitives: list[dnnl.Primitive] = []
-        for step in draft.steps:
+        for step in steps:
             self._add(step, output=step.result.number in outputs)
             for value in step.inputs:
                 if last_use[value.number] == step.result.number and value.number in self._arrays:
@@ -162,12 +173,13 @@ class Program:
             self._memory[step.result.number] = dnnl.memory(result, dnnl.address(array))
         source, target = self._memory[step.inputs[0].number], self._memory[step.result.number]
         reads = self._description(step.inputs[0])
-        if step.kind == "convolution":
+        if step.kernel is not None:
+            weighted = step.kind == "convolution"
+            layer = onednn_layers.convolution if weighted else onednn_layers.enlarging_convolution
             after: Any = {"kind": self._precision.kind, "slope": step.slope, "adds": len(step.inputs) > 1}
-            placed = onednn_layers.convolution(reads, result, step.kernel, step.bias, **after)
+            placed = layer(reads, result, step.kernel, step.bias, **after)
         else:
-            layer = onednn_layers.pooling if step.kind == "pool" else onednn_layers.enlarging
-            placed = layer(reads, result)
+            placed = (onednn_layers.pooling if step.kind == "pool" else onednn_layers.enlarging)(reads, result)
         self._primitives.append(placed(source, target))
 
     def _room(self, size: int) -> np.ndarray:

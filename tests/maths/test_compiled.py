@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 
 from jaxdn.compiled import strips
-from jaxdn.filters.blocks import light_of_blocks
+from jaxdn.filters.arrange import pixels, planes_of
 from jaxdn.filters.enlarge import enlarge
 from jaxdn.filters.guides import guides_of
 from jaxdn.filters.recall import recall
+from jaxdn.filters.running_mean import accumulated
+from jaxdn.filters.seen import History, seen
 from jaxdn.frame import FAR, Frame
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
+from jaxdn.scales import fill
 
 pytestmark = pytest.mark.skipif(not strips.available(), reason="no Numba, or jax computes on another device")
 
@@ -98,13 +101,75 @@ def test_the_recalled_history(left_out, around, rng, both):
         assert first == (not found.valid.any())
 
 
+def of_earlier_frames(rng, height, width, light=1.0):
+    """A history of steady, a fifth of which is not known."""
+    valid = rng.random((height, width)) > 0.2
+    mean, shown = (light * rng.uniform(0, 1, (height, width, 3)) for _ in range(2))
+    square = light**2 * rng.uniform(0, 2, (height, width, 1))
+    values = np.concatenate([mean, square, rng.uniform(1, 32, (height, width, 1)), shown], axis=-1)
+    return History(jnp.asarray(np.where(valid[..., None], values, 0.0), jnp.float32), jnp.asarray(valid))
+
+
 @pytest.mark.parametrize("gain", [1e-6, 1.0, 1e6, 1e30])
-def test_light_of_blocks(gain, rng, both):
-    light = 10.0 ** rng.uniform(-12, 4.8, (14, 38, 3))
+@pytest.mark.parametrize("size", [(14, 38), (32, 64)])
+def test_what_a_network_sees(gain, size, rng, both):
+    light = 10.0 ** rng.uniform(-12, 4.8, (*size, 3))
     light[:2], light[2:4] = 0.0, 65504.0
-    found, wanted = both(light_of_blocks, jnp.asarray(light, jnp.float32), jnp.float32(gain))
-    np.testing.assert_allclose(found, wanted, rtol=3e-6, atol=1e-12)
-    assert wanted.max() > 1e-4
+    geometry = tuple(jnp.asarray(rng.normal(size=(*size, count)), jnp.float32) for count in (3, 1))
+    history, hit = of_earlier_frames(rng, *size), jnp.asarray(rng.random(size) > 0.1)
+    given = geometry, jnp.asarray(light, jnp.float32), history, hit, jnp.float32(gain)
+    found, wanted = both(lambda *given: seen(*given, 16), *given)
+    assert found.shape[0] % 16 == found.shape[1] % 16 == 0
+    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(found[..., 16:19], wanted[..., 16:19], rtol=3e-6, atol=1e-12)  # light
+    assert wanted[..., 16:19].max() > 1e-4
+
+
+def test_the_running_mean(rng, both):
+    light = jnp.asarray(10.0 ** rng.uniform(-4, 4, (14, 38, 3)), jnp.float32)
+    history, hit = of_earlier_frames(rng, 14, 38), jnp.asarray(rng.random((14, 38)) > 0.1)
+    follow = jnp.asarray(rng.uniform(0, 1, (14, 38)).round(1), jnp.float32)
+    found, wanted = both(lambda *given: accumulated(*given, most=20.0), light, history, hit, follow)
+    for one, other in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(one, other, rtol=2e-5, atol=2e-3)
+    assert np.all(found.number[~np.asarray(history.valid)] == 1)
+    assert 19.0 < found.number.max() <= 20.0
+
+
+def test_arrays_of_all_layouts_as_planes_and_back(rng, both):
+    shapes = {
+        "planes": (2, 8, 12),
+        "pixels": (8, 12, 3),
+        "blocks": (4, 6, 8),
+        "corners": (8, 12, 4),
+        "means": (16, 24, 2),
+    }
+    arrays = [jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes.values()]
+    found, wanted = both(lambda *arrays: planes_of(list(zip(shapes, arrays, strict=True))), *arrays)
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6)
+    assert found.shape == (2 + 3 + 2 + 1 + 2, 8, 12)
+    np.testing.assert_array_equal(found[5:7], np.asarray(unfolded(arrays[2])))
+    back, plain = both(pixels, jnp.asarray(found))
+    np.testing.assert_array_equal(back, found.transpose(1, 2, 0))
+    np.testing.assert_array_equal(back, plain)
+
+
+def unfolded(blocks):
+    """Planes of which :func:`jaxdn.scales.fold` made the blocks."""
+    height, width, channels = blocks.shape
+    planes = np.zeros((channels // 4, 2 * height, 2 * width), np.float32)
+    for channel, row, column in np.ndindex(channels // 4, 2, 2):
+        planes[channel, row::2, column::2] = blocks[..., 4 * channel + 2 * row + column]
+    return planes
+
+
+def test_pixels_that_are_not_known(rng, both):
+    image = jnp.asarray(rng.uniform(0, 1, (12, 24, 3)), jnp.float32)
+    known = rng.random((12, 24, 1)) > 0.5
+    known[4:8, :8], known[8:, 8:10] = False, False
+    found, wanted = both(fill, image, jnp.asarray(known))
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
+    assert np.all(found[4:8, :8] == 0)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 40), (37, 5), (33, 70)])

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxdn.filters.regression import CELL, GUIDES, SCALES, given_back, guides_of, reach
+from jaxdn.filters import regression
+from jaxdn.filters.regression import CELL, GUIDES, SCALES, guides_of, reach
 
 SIZE = 96, 128
 PLAIN = {name: jnp.zeros(()) for name in SCALES}
@@ -54,6 +55,14 @@ def given(rng, light=None, size=SIZE):
         light = np.exp(rng.normal(size=(*size, 3))) * (1.0 + 0.5 * normal[..., :1])
     smooth = np.stack([blurred(light[..., channel]) for channel in range(3)], -1)
     return [jnp.asarray(each, jnp.float32) for each in (light, smooth, guides, blurred(guides))]
+
+
+def given_back(scales, light, smooth, guides, smooth_guides, hit, floor):
+    """The function under test, of pixels [H, W, 3]."""
+    before, after = (
+        jnp.concatenate([one.transpose(2, 0, 1), others]) for one, others in ((light, guides), (smooth, smooth_guides))
+    )
+    return regression.given_back(scales, before, after, hit[..., 0], floor).transpose(1, 2, 0)
 
 
 def added(arrays, *, scales=PLAIN, hit=None, floor=1e-3):

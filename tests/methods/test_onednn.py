@@ -61,6 +61,23 @@ def test_a_convolution_is_exact_for_small_whole_numbers(precision, rng, size, sl
     np.testing.assert_array_equal(found, wanted)
 
 
+@pytest.mark.parametrize("adds", [False, True])
+def test_a_convolution_of_an_enlarged_image_is_exact_for_small_whole_numbers(precision, rng, adds):
+    x, kernel = rng.integers(0, 4, (2, 5, 6, 20)) * 1.0, rng.integers(-2, 3, (3, 3, 20, 24)) * 1.0
+    bias, before = rng.integers(-5, 6, 24) * 1.0, rng.integers(-9, 9, (2, 10, 12, 24)) * 1.0
+    wanted = convolved(x.repeat(2, axis=1).repeat(2, axis=2), kernel) + bias + before * adds
+    wanted = np.where(wanted >= 0, wanted, 0.25 * wanted)
+    options = {"kind": precision.kind, "slope": 0.25, "adds": adds}
+    found = run(
+        lambda *ends: onednn_layers.enlarging_convolution(*ends, kernel, bias, **options),
+        precision,
+        x,
+        wanted.shape,
+        before=before.astype(np.float32),
+    )
+    np.testing.assert_array_equal(found, wanted)
+
+
 def test_pooling_and_enlarging(precision, rng):
     x = rng.integers(-99, 99, (2, 8, 6, 16)) * 1.0
     pooled = run(onednn_layers.pooling, precision, x, (2, 4, 3, 16))
