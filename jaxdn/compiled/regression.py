@@ -70,6 +70,33 @@ def moments(
                     out[other, one, y, x : x + _BLOCK] = out[one, other, y, x : x + _BLOCK]
 
 
+@loop
+def solved(top: int, bottom: int, system: Array, doubt: Array, expected: Array, out: Array) -> None:
+    """Rows of cells of ``out`` [K, 3, h, w]: see :func:`jaxdn.filters.regression.solved`."""
+    count, columns = system.shape[0], system.shape[1]
+    rows = np.empty((count, columns), np.float32)
+    for y in range(top, bottom):
+        for x in range(doubt.shape[1]):
+            for row in range(count):
+                for column in range(columns):
+                    rows[row, column] = system[row, column, y, x]
+                rows[row, row] += doubt[y, x]
+                for channel in range(columns - count):
+                    rows[row, count + channel] += doubt[y, x] * expected[row, channel, y, x]
+            for pivot in range(count):
+                share = np.float32(1.0) / rows[pivot, pivot]
+                for column in range(columns):
+                    rows[pivot, column] *= share
+                for row in range(count):
+                    if row != pivot:
+                        factor = rows[row, pivot]
+                        for column in range(columns):
+                            rows[row, column] -= factor * rows[pivot, column]
+            for row in range(count):
+                for channel in range(columns - count):
+                    out[row, channel, y, x] = rows[row, count + channel]
+
+
 @inlined
 def _add_between(total: Array, above: Array, below: Array, share: float, away: Array) -> None:
     for x in range(total.shape[0]):

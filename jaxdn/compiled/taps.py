@@ -62,6 +62,14 @@ def fetched(
             middle_x, middle_y = math.floor(x[i, j] + half), math.floor(y[i, j] + half)
             mass = zero
             total[:] = zero
+            # Read once: for all that the compiler knows, what is written below may change them.
+            if depth is not None:
+                right_depth, away = wanted_depth[i, j], tolerance[i, j]
+            if ids is not None:
+                right_id = wanted_ids[i, j]
+            if normal is not None:
+                mx, my, mz = wanted_normal[i, j, 0], wanted_normal[i, j, 1], wanted_normal[i, j, 2]
+                nowhere = mx == 0 and my == 0 and mz == 0 and threshold < 1
             # The four of the cell, then the nine around the target. No function tests them: passing it the arrays would
             # count references, which takes longer than the test.
             for tap in range(13 if around else 4):
@@ -79,19 +87,18 @@ def fetched(
                         continue
                 # Numba leaves out what asks for an absent buffer if nothing else is asked in the same condition.
                 if depth is not None:  # noqa: SIM102
-                    if not abs(depth[row, column, 0] - wanted_depth[i, j]) <= tolerance[i, j]:
+                    if not abs(depth[row, column, 0] - right_depth) <= away:
                         continue
                 if ids is not None:  # noqa: SIM102
                     # Any id is right where none is wanted.
-                    if ids[row, column, 0] != wanted_ids[i, j] and wanted_ids[i, j] == wanted_ids[i, j]:
+                    if ids[row, column, 0] != right_id and right_id == right_id:
                         continue
                 if normal is not None:
                     nx, ny, nz = normal[row, column, 0], normal[row, column, 1], normal[row, column, 2]
-                    mx, my, mz = wanted_normal[i, j, 0], wanted_normal[i, j, 1], wanted_normal[i, j, 2]
                     # Where there is no surface in both, they are alike.
-                    absent = nx == 0 and ny == 0 and nz == 0 and mx == 0 and my == 0 and mz == 0
-                    if not (nx * mx + ny * my + nz * mz > threshold or (absent and threshold < 1)):
-                        continue
+                    if not nx * mx + ny * my + nz * mz > threshold:  # noqa: SIM102
+                        if not (nowhere and nx == 0 and ny == 0 and nz == 0):
+                            continue
                 sound = True
                 for channel in range(channels):
                     value = history[row, column, channel]

@@ -120,15 +120,21 @@ def _slopes(moments: jax.Array) -> jax.Array:
     for window, number in zip(reversed(windows), reversed(pixels), strict=True):
         variance = sum(window[index, index] for index in range(GUIDES, GUIDES + 3)) / 3.0
         doubt = _DOUBT / number * variance + _LEAST * window[-1, -1] + _TINY
-        slopes = _solved(window[:GUIDES, :-1], doubt, slopes)
+        slopes = solved(window[:GUIDES, :-1], doubt, slopes)
     return slopes
 
 
-def _solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Array:
+def solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Array:
     """b [7, 3, h, w] for all cells at once, from E[d d'] and E[d r'] side by side [7, 10, h, w], u [h, w] and b'.
 
     Gauss and Jordan's elimination, which needs no pivots as E[d d'] + u I is positive definite.
     """
+    if strips.available() and system.dtype == jnp.float32:
+        return alone(_solved, _solved_by_compiled)(system, doubt, expected)
+    return _solved(system, doubt, expected)
+
+
+def _solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Array:
     units = np.eye(GUIDES, dtype=system.dtype)[..., None, None]
     believed = jnp.concatenate([jnp.broadcast_to(units, (GUIDES, GUIDES, *doubt.shape)), expected], axis=1)
     system = system + doubt[None, None] * believed
@@ -137,6 +143,12 @@ def _solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Arr
         # Less the unit, so that what is left of the row itself is the row.
         system = system - (system[:, index] - units[:, index])[:, None] * row[None]
     return system[:, GUIDES:]
+
+
+def _solved_by_compiled(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Array:
+    from jaxdn.compiled.regression import solved
+
+    return strips.call(solved, [expected.shape], [system, doubt, expected], rows=doubt.shape[0])[0]
 
 
 def _blurred(planes: jax.Array, step: int) -> jax.Array:

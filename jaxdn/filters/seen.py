@@ -30,7 +30,13 @@ class History(NamedTuple):
 
 
 def seen(
-    geometry: tuple[jax.Array, ...], noisy: jax.Array, history: History, hit: jax.Array, gain: jax.Array, multiple: int
+    geometry: tuple[jax.Array, ...],
+    noisy: jax.Array,
+    history: History,
+    hit: jax.Array,
+    gain: jax.Array,
+    *,
+    multiple: int,
 ) -> jax.Array:
     """[h, w, C] by blocks of 2x2 pixels, its sides padded by the edge to multiples of ``multiple``.
 

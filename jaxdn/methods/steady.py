@@ -197,7 +197,7 @@ def _seen(noisy: jax.Array, past: History, surfaces: Surfaces, whole: Whole) -> 
     depth = surfaces.depth
     closeness = jnp.zeros_like(noisy[..., :1]) if depth is None else depth_feature(depth, middle=whole.middle_depth)
     geometry = surfaces.albedo, surfaces.normal, closeness, surfaces.roughness
-    return seen(geometry, noisy, past, surfaces.hit, whole.exposure, _MULTIPLE)
+    return seen(geometry, noisy, past, surfaces.hit, whole.exposure, multiple=_MULTIPLE)
 
 
 def _decisions(head: jax.Array) -> tuple[Decisions, dict[str, jax.Array]]:

@@ -1,5 +1,6 @@
 """The loops that Numba compiles against the operations in jax that they stand for, and when they are used."""
 
+import functools
 import os
 import subprocess
 import sys
@@ -118,7 +119,7 @@ def test_what_a_network_sees(gain, size, rng, both):
     geometry = tuple(jnp.asarray(rng.normal(size=(*size, count)), jnp.float32) for count in (3, 1))
     history, hit = of_earlier_frames(rng, *size), jnp.asarray(rng.random(size) > 0.1)
     given = geometry, jnp.asarray(light, jnp.float32), history, hit, jnp.float32(gain)
-    found, wanted = both(lambda *given: seen(*given, 16), *given)
+    found, wanted = both(functools.partial(seen, multiple=16), *given)
     assert found.shape[0] % 16 == found.shape[1] % 16 == 0
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(found[..., 16:19], wanted[..., 16:19], rtol=3e-6, atol=1e-12)  # light
@@ -129,7 +130,7 @@ def test_the_running_mean(rng, both):
     light = jnp.asarray(10.0 ** rng.uniform(-4, 4, (14, 38, 3)), jnp.float32)
     history, hit = of_earlier_frames(rng, 14, 38), jnp.asarray(rng.random((14, 38)) > 0.1)
     follow = jnp.asarray(rng.uniform(0, 1, (14, 38)).round(1), jnp.float32)
-    found, wanted = both(lambda *given: accumulated(*given, most=20.0), light, history, hit, follow)
+    found, wanted = both(functools.partial(accumulated, most=20.0), light, history, hit, follow)
     for one, other in zip(found, wanted, strict=True):
         np.testing.assert_allclose(one, other, rtol=2e-5, atol=2e-3)
     assert np.all(found.number[~np.asarray(history.valid)] == 1)

@@ -1,0 +1,108 @@
+"""What compiled loops save: each operation that has one (:mod:`jaxdn.compiled`), as a loop and in XLA, in turns.
+
+    python -m experiments.speed.loops [--size 1280x720]
+
+Memory is kept between calls as in `jaxdn denoise`. Prints a table of the medians in milliseconds.
+"""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from experiments.speed.frames import parsed
+from experiments.speed.timing import Call, measure
+from jaxdn.commands.errors import plain_errors
+from jaxdn.compiled import strips
+from jaxdn.filters import regression
+from jaxdn.filters.arrange import planes_of
+from jaxdn.filters.enlarge import enlarge
+from jaxdn.filters.guides import guides_of
+from jaxdn.filters.recall import recall
+from jaxdn.filters.running_mean import accumulated
+from jaxdn.filters.seen import History, seen
+from jaxdn.frame import Frame
+from jaxdn.heap import keep_memory
+from jaxdn.ops.affinity_filter import Guide, affinity_filter
+from jaxdn.scales import fill
+
+Work = tuple[Callable[..., Any], tuple[Any, ...]]
+"""A function and its arguments."""
+
+
+@dataclass
+class Settings:
+    """Time operations as compiled loops and in XLA."""
+
+    size: str = "1280x720"
+    """WIDTHxHEIGHT in pixels, multiples of 4."""
+    rounds: int = 9
+
+
+def works(height: int, width: int) -> dict[str, Work]:
+    """Name -> what steady-high does in a frame, on noise: costs hardly depend on values."""
+    rng = np.random.default_rng(0)
+    half = height // 2, width // 2
+
+    def noise(*shape: int) -> jax.Array:
+        return jnp.asarray(rng.random(shape), jnp.float32)
+
+    def guide(size: tuple[int, int]) -> Guide:
+        return Guide(noise(12, *size), 0.1 * noise(3, *size), noise(*size), jnp.ones(13))
+
+    image, light = noise(13, height, width), noise(height, width, 3)
+    hit = jnp.broadcast_to(jnp.arange(width) > width // 10, (height, width))
+    history = History(noise(height, width, 8), noise(height, width) > 0.1)
+    albedo, normal, depth, roughness = (noise(height, width, count) for count in (3, 3, 1, 1))
+    frame = Frame(light, albedo, normal, depth, previous_depth=depth, motion=4 * noise(height, width, 2) - 2)
+    seen_light, gain = (light, history, hit), jnp.float32(1.0)
+    scales = {name: jnp.float32(value) for name, value in regression.SCALES.items()}
+    layouts, learned = ("pixels", "pixels", "blocks"), noise(*half, 20)
+    return {
+        "a level of the affinity filter, 13 channels, 12 features": (affinity_filter, (image, guide((height, width)))),
+        "16 channels enlarged along 12 features": (enlarge, (noise(16, *half), guide(half), guide((height, width)))),
+        "the history recalled, 8 channels": (recall, (history.values, guides_of(frame), frame, jnp.asarray(False))),
+        "what the network sees": (partial(seen, multiple=16), ((albedo, normal, depth, roughness), *seen_light, gain)),
+        "the running mean": (partial(accumulated, most=32.0), (*seen_light, noise(height, width))),
+        "what light follows": (regression.given_back, (scales, image, image + 0.1, hit, gain)),
+        "11 channels as planes": (
+            lambda *arrays: planes_of(list(zip(layouts, arrays, strict=True))),
+            (albedo, normal, learned),
+        ),
+        "unknown pixels filled": (fill, (light, hit[..., None])),
+    }
+
+
+def call(work: Work, *, loops: bool) -> Call:
+    """The jitted function, with or without loops."""
+    os.environ["JAXDN_COMPILED"] = "1" if loops else "0"
+    function, arguments = work
+    program = jax.jit(lambda *given: function(*given)).lower(*arguments).compile()
+    return lambda: jax.block_until_ready(program(*arguments))
+
+
+def main(settings: Settings) -> None:
+    """Measure, and print a table."""
+    if not strips.available():
+        raise ValueError("loops: jax computes on another device than the CPU, or Numba is not installed.")
+    keep_memory()
+    height, width = parsed(settings.size)
+    table = Table("operation", "XLA ms", "compiled ms", "ratio")
+    for name, work in works(height, width).items():
+        found = measure({kind: call(work, loops=kind == "loops") for kind in ("xla", "loops")}, rounds=settings.rounds)
+        plain, fast = (found[kind].median_ms for kind in ("xla", "loops"))
+        table.add_row(name, f"{plain:.1f}", f"{fast:.1f}", f"{fast / plain:.2f}")
+    Console(width=120).print(table)
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Settings, description=__doc__))
