@@ -9,9 +9,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxdn import color
+from jaxdn.compiled import strips
 from jaxdn.frame import FAR, Array, Frame
+from jaxdn.ops.faster import alone
 
 
 class Whole(NamedTuple):
@@ -68,7 +71,19 @@ def geometric_mean(depth: jax.Array) -> jax.Array:
 
 def sums_of_depth(depth: jax.Array) -> jax.Array:
     """:attr:`Whole.depth` of a depth [H, W, 1]; no surface is at 0 or at ``FAR``."""
+    if strips.available() and depth.dtype == jnp.float32:
+        return alone(_sums_of_depth, _sums_by_compiled)(depth)
+    return _sums_of_depth(depth)
+
+
+def _sums_of_depth(depth: jax.Array) -> jax.Array:
     known = (depth > 0) & (depth < FAR)
     there = jnp.where(known, depth, 1.0)
     logarithms, inverses = jnp.log(there), jnp.where(known, 1.0 / there, 0.0)
     return jnp.stack([jnp.sum(logarithms), jnp.sum(inverses), jnp.sum(known, dtype=depth.dtype)])
+
+
+def _sums_by_compiled(depth: jax.Array) -> jax.Array:
+    from jaxdn.compiled.whole import depths
+
+    return strips.call(depths, [(depth.shape[0], 3)], [depth], np.float32(FAR), rows=depth.shape[0])[0].sum(axis=0)

@@ -1,4 +1,4 @@
-"""Compiled loops of :mod:`jaxdn.filters.arrange`: arrays of several layouts as planes, and planes as pixels."""
+"""Compiled loops: arrays of several layouts as planes (:mod:`jaxdn.filters.arrange`), unknown pixels filled."""
 
 import numpy as np
 
@@ -50,15 +50,6 @@ def planes(top: int, bottom: int, arrays: tuple[Array, ...], out: Array, layouts
                         other = below[2 * x, channel] + below[2 * x + 1, channel]
                         row[x] = np.float32(0.25) * (one + other)
             first += count
-
-
-@loop
-def pixels(top: int, bottom: int, planes: Array, out: Array) -> None:
-    """Rows of ``out`` [H, W, C] from ``planes`` [C, H, W]."""
-    for y in range(top, bottom):
-        for x in range(out.shape[1]):
-            for channel in range(out.shape[2]):
-                out[y, x, channel] = planes[channel, y, x]
 
 
 @loop

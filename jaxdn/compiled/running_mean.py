@@ -1,4 +1,4 @@
-"""A compiled loop of :mod:`jaxdn.filters.running_mean`."""
+"""Compiled loops of :mod:`jaxdn.filters.running_mean`."""
 
 import numpy as np
 
@@ -55,3 +55,40 @@ def accumulated(
             for x in range(width // 2):
                 total = above[2 * x] + above[2 * x + 1] + under[2 * x] + under[2 * x + 1]
                 missed[channel, block, x] = np.float32(0.25) * total
+
+
+@loop
+def remembered(
+    top: int,
+    bottom: int,
+    light: Array,
+    square: Array,
+    number: Array,
+    fine: Array,
+    image: Array,
+    change: Array | None,
+    history: Array,
+    valid: Array,
+    feedback: Array,
+    blend: Array,
+    out: Array,
+    most: float,
+) -> None:
+    """Rows of ``out`` [H, W, 8]; ``most`` is the largest light that is shown."""
+    width, zero, one = valid.shape[1], np.float32(0.0), np.float32(1.0)
+    newest = np.empty(width, np.float32)
+    for y in range(top, bottom):
+        for x in range(width):
+            newest[x] = blend[y, x] if valid[y, x] else one
+        for channel in range(3):
+            for x in range(width):
+                mean, before = light[channel, y, x], history[y, x, 5 + channel]
+                kept = mean + feedback[y, x] * (fine[channel, y, x] - mean)
+                if change is not None:
+                    before += change[channel, y, x]
+                    kept += change[channel, y, x]
+                out[y, x, channel] = max(kept, zero)
+                shown = before + newest[x] * (image[channel, y, x] - before)
+                out[y, x, 5 + channel] = min(max(shown, zero), most)
+        for x in range(width):
+            out[y, x, 3], out[y, x, 4] = square[y, x], number[y, x]

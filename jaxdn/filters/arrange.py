@@ -44,24 +44,6 @@ def planar(image: jax.Array) -> jax.Array:
     return image.transpose(2, 0, 1)
 
 
-def pixels(planes: jax.Array) -> jax.Array:
-    """[C, H, W] as [H, W, C]."""
-    if strips.available() and planes.dtype == jnp.float32:
-        return alone(_pixels, _pixels_by_compiled)(planes)
-    return _pixels(planes)
-
-
-def _pixels(planes: jax.Array) -> jax.Array:
-    return planes.transpose(1, 2, 0)
-
-
-def _pixels_by_compiled(planes: jax.Array) -> jax.Array:
-    from jaxdn.compiled.arrange import pixels
-
-    channels, height, width = planes.shape
-    return strips.call(pixels, [(height, width, channels)], [planes], rows=height)[0]
-
-
 def _unfolded(blocks: jax.Array) -> jax.Array:
     height, width, channels = blocks.shape
     parts = blocks.reshape(height, width, channels // 4, 2, 2).transpose(2, 0, 3, 1, 4)

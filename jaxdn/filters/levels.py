@@ -20,6 +20,7 @@ from jaxdn.filters import lag, regression
 from jaxdn.filters.arrange import Part, planes_of
 from jaxdn.filters.enlarge import enlarge
 from jaxdn.filters.guides import depth_slopes, hit_mask
+from jaxdn.filters.running_mean import Shown
 from jaxdn.frame import FAR, Frame
 from jaxdn.networks import pad
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
@@ -52,17 +53,6 @@ class Surfaces(NamedTuple):
     def guides(self, layout: str = "pixels") -> list[Part]:
         """Albedo, gloss and normal, parts of planes (:mod:`jaxdn.filters.arrange`)."""
         return [(layout, self.albedo), (layout, self.gloss), (layout, self.normal)]
-
-
-class Filtered(NamedTuple):
-    """Light [3, H, W] after the levels."""
-
-    fine: jax.Array
-    """After those at full resolution."""
-    image: jax.Array
-    """After all of them, with the change."""
-    change: jax.Array
-    """What the mean lacked (:mod:`jaxdn.filters.lag`)."""
 
 
 class Decisions(NamedTuple):
@@ -124,8 +114,8 @@ def filtered(
     decided: Decisions,
     full_levels: int,
     floor: jax.Array,
-) -> Filtered:
-    """The light [3, H, W] ``mean`` after the levels, and with a change of light.
+) -> Shown:
+    """The light [3, H, W] ``mean`` after the levels at full resolution, and after all with a change, and the change.
 
     ``missed`` [3, H/2, W/2] is how much more the newest frame shows than the mean; None leaves a change out.
     ``precisions`` are logarithms, one for full resolution and one for each level at half, of what the squares of
@@ -148,16 +138,16 @@ def filtered(
         fine = affinity_filter(fine, at_full, step=2**index)
     found, alike = _from_half(fine, missed, surfaces, slanted, decided, factors, at_full)
     image = fine + (decided.coarse * alike)[None] * (found[: fine.shape[0]] - fine)
-    change = jnp.zeros_like(mean) if missed is None else alike[None] * found[fine.shape[0] :]
+    change = None if missed is None else alike[None] * found[fine.shape[0] :]
     light = image[:3]
     if decided.back is not None:
         given = regression.given_back(precisions["regression"], before, image, surfaces.hit, floor)
         light = light + upsample(decided.back[..., None])[None, ..., 0] * given
-    now = jnp.maximum(light + change, 0.0)
+    now = jnp.maximum(light if change is None else light + change, 0.0)
     if texture is None:
-        return Filtered(fine[:3], now, change)
+        return Shown(fine[:3], now, change)
     left = before[-3:]
-    return Filtered(brdf.restore(fine[:3], left, fine[-3:]), brdf.restore(now, left, image[-3:]), change)
+    return Shown(brdf.restore(fine[:3], left, fine[-3:]), brdf.restore(now, left, image[-3:]), change)
 
 
 def _from_half(

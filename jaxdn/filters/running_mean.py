@@ -1,4 +1,4 @@
-"""The running mean of light, and how many frames it is worth."""
+"""The running mean of light, how many frames it is worth, and what is remembered of a frame."""
 
 import functools
 from typing import NamedTuple
@@ -62,3 +62,48 @@ def _by_compiled(most: float, noisy: jax.Array, history: History, hit: jax.Array
     shapes = [(3, height, width), (height, width), (height, width), (3, height // 2, width // 2)]
     numbers = np.asarray(color.LUMINANCE, np.float32), np.float32(most)
     return Mean(*strips.call(accumulated, shapes, [noisy, *history, hit, follow], *numbers, rows=height // 2))
+
+
+class Shown(NamedTuple):
+    """What a filter made of the mean, as planes [3, H, W]."""
+
+    fine: jax.Array
+    """Of which the mean takes a share."""
+    image: jax.Array
+    """Of which the last output takes a share."""
+    change: jax.Array | None
+    """What is added to both, as they were; None for nothing."""
+
+
+def remembered(
+    mean: Mean, shown: Shown, history: History, feedback: jax.Array, blend: jax.Array, *, most: float
+) -> jax.Array:
+    """The values of the next frame's :class:`History`, [H, W, 8].
+
+    The mean takes the share ``feedback`` [H, W] of the fine image; the last output, between 0 and ``most``, the share
+    ``blend`` [H, W] of the image, all of it where there was no history.
+    """
+    plain = functools.partial(_remembered, most)
+    if strips.available() and mean.light.dtype == jnp.float32:
+        return alone(plain, functools.partial(_remembered_by_compiled, most))(mean, shown, history, feedback, blend)
+    return plain(mean, shown, history, feedback, blend)
+
+
+def _remembered(
+    most: float, mean: Mean, shown: Shown, history: History, feedback: jax.Array, blend: jax.Array
+) -> jax.Array:
+    change = jnp.zeros_like(shown.image) if shown.change is None else shown.change
+    before = planar(history.values)[5:] + change
+    newest = jnp.where(history.valid, blend, 1.0)[None]
+    output = jnp.clip(before + newest * (shown.image - before), 0.0, most)
+    kept = jnp.maximum(mean.light + feedback[None] * (shown.fine - mean.light) + change, 0.0)
+    return jnp.concatenate([kept, mean.square[None], mean.number[None], output]).transpose(1, 2, 0)
+
+
+def _remembered_by_compiled(
+    most: float, mean: Mean, shown: Shown, history: History, feedback: jax.Array, blend: jax.Array
+) -> jax.Array:
+    from jaxdn.compiled.running_mean import remembered
+
+    arrays = [*mean[:3], *shown, *history, feedback, blend]
+    return strips.call(remembered, [history.values.shape], arrays, np.float32(most), rows=feedback.shape[0])[0]

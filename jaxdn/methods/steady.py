@@ -25,12 +25,12 @@ import numpy as np
 from jaxdn.color import luminance_of_planes
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters import regression
-from jaxdn.filters.arrange import pixels, planar, planes_of
+from jaxdn.filters.arrange import planar, planes_of
 from jaxdn.filters.clamping import without_specks
 from jaxdn.filters.guides import Guides, depth_feature, guides_of
 from jaxdn.filters.levels import BLOCKS, LEVELS, Decisions, Surfaces, filtered, reach, slanted, surfaces_of
 from jaxdn.filters.recall import recall
-from jaxdn.filters.running_mean import Mean, accumulated
+from jaxdn.filters.running_mean import Mean, accumulated, remembered
 from jaxdn.filters.seen import DARK, History, seen
 from jaxdn.frame import RADIANCE_MAX, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
@@ -167,13 +167,9 @@ def steady(options: Options) -> Denoiser:
         texture = None if texture is None else fill(pad(texture, BLOCKS), hit[..., None])
         given = mean.light, mean.missed if quality.at_once else None, texture, surfaces, slanted(surfaces, whole)
         found = filtered(params["guide"], *given, decided, quality.full_levels, DARK / whole.exposure)
-        image = found.image * _without_specks(found.image, hit, mean)[None]
-        newest = jnp.where(past.valid, shares["blend"], 1.0)[None]
-        before = planes_of([("pixels", past.values)])[5:] + found.change
-        shown = jnp.clip(before + newest * (image - before), 0.0, RADIANCE_MAX)
-        kept = mean.light + shares["feedback"][None] * (found.fine - mean.light) + found.change
-        planes = jnp.concatenate([jnp.maximum(kept, 0.0), mean.square[None], mean.number[None], shown])
-        history = crop(pixels(planes), size)
+        found = found._replace(image=found.image * _without_specks(found.image, hit, mean)[None])
+        kept = remembered(mean, found, past, shares["feedback"], shares["blend"], most=RADIANCE_MAX)
+        history = crop(kept, size)
         image = jnp.where(crop(hit, size)[..., None], history[..., 5:], frame.radiance)
         return SteadyState(history, guides_of(frame)), image, recalled.broken
 

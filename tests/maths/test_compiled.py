@@ -12,15 +12,16 @@ import numpy as np
 import pytest
 
 from jaxdn.compiled import strips
-from jaxdn.filters.arrange import pixels, planes_of
+from jaxdn.filters.arrange import planes_of
 from jaxdn.filters.enlarge import enlarge
 from jaxdn.filters.guides import guides_of
 from jaxdn.filters.recall import recall
-from jaxdn.filters.running_mean import accumulated
+from jaxdn.filters.running_mean import Mean, Shown, accumulated, remembered
 from jaxdn.filters.seen import History, seen
 from jaxdn.frame import FAR, Frame
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
 from jaxdn.scales import fill
+from jaxdn.whole import sums_of_depth
 
 pytestmark = pytest.mark.skipif(not strips.available(), reason="no Numba, or jax computes on another device")
 
@@ -137,7 +138,31 @@ def test_the_running_mean(rng, both):
     assert 19.0 < found.number.max() <= 20.0
 
 
-def test_arrays_of_all_layouts_as_planes_and_back(rng, both):
+@pytest.mark.parametrize("changed", [False, True])
+def test_what_is_remembered(changed, rng, both):
+    planes = [jnp.asarray(rng.uniform(-0.1, 2, (3, 14, 38)), jnp.float32) for _ in range(4)]
+    square, number, feedback, blend = (jnp.asarray(rng.uniform(0, 1, (14, 38)), jnp.float32) for _ in range(4))
+    mean = Mean(planes[0], square, number, jnp.zeros((3, 7, 19)))
+    shown, history = Shown(*planes[1:3], planes[3] if changed else None), of_earlier_frames(rng, 14, 38)
+    program = functools.partial(remembered, most=1.5)
+    found, wanted = both(program, mean, shown, history, feedback, blend)
+    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(found[..., 3], square)
+    assert found.min() == 0
+    assert found[..., 5:].max() == 1.5
+
+
+def test_the_sums_of_depth(rng, both):
+    depth = 10.0 ** rng.uniform(-3, 3, (14, 38, 1))
+    depth[rng.random(depth.shape) < 0.1] = FAR
+    depth[0], depth[1] = 0.0, -1.0
+    found, wanted = both(sums_of_depth, jnp.asarray(depth, jnp.float32))
+    known = depth[(depth > 0) & (depth < FAR)]
+    np.testing.assert_allclose(found, [np.log(known).sum(), (1 / known).sum(), known.size], rtol=1e-5)
+    np.testing.assert_allclose(wanted, found, rtol=1e-5)
+
+
+def test_arrays_of_all_layouts_as_planes(rng, both):
     shapes = {
         "planes": (2, 8, 12),
         "pixels": (8, 12, 3),
@@ -150,9 +175,6 @@ def test_arrays_of_all_layouts_as_planes_and_back(rng, both):
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6)
     assert found.shape == (2 + 3 + 2 + 1 + 2, 8, 12)
     np.testing.assert_array_equal(found[5:7], np.asarray(unfolded(arrays[2])))
-    back, plain = both(pixels, jnp.asarray(found))
-    np.testing.assert_array_equal(back, found.transpose(1, 2, 0))
-    np.testing.assert_array_equal(back, plain)
 
 
 def unfolded(blocks):
