@@ -16,7 +16,7 @@ def depths(top: int, bottom: int, depth: Array, out: Array, far: float) -> None:
             z = depth[y, x, 0]
             known = (z > zero) & (z < far)
             row[x] = z if known else one
-            inverses += one / row[x] if known else zero
+            inverses += float(one / row[x]) if known else 0.0
             number += known
         logarithm(row)
         logarithms = 0.0
