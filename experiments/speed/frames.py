@@ -63,6 +63,9 @@ def ours(name: str, engine: str | None, height: int, width: int, *, compiled: bo
 def builds(names: list[str], height: int, width: int) -> dict[str, Callable[[], Call]]:
     """Label -> its call, for every engine for inference that a method has and that runs here. Raises ValueError."""
     found: dict[str, Callable[[], Call]] = {}
+    # First, as ratios are to it: what is started last may find too little memory.
+    if "pyoidn" not in peers.missing():
+        found[OIDN] = partial(oidn_high, height, width)
     for name in names:
         one = candidate(name)
         if one.denoiser is None or one.method is None:
@@ -72,8 +75,6 @@ def builds(names: list[str], height: int, width: int) -> dict[str, Callable[[], 
             found[f"{name}, {engine or 'xla'}"] = partial(ours, name, engine, height, width)
         if strips.available():
             found[f"{name}, xla without compiled loops"] = partial(ours, name, None, height, width, compiled=False)
-    if "pyoidn" not in peers.missing():
-        found[OIDN] = partial(oidn_high, height, width)
     return found
 
 
