@@ -6,7 +6,7 @@ by row of the image. All rows that a pixel's taps lie in stay in the cache.
 
 import numpy as np
 
-from jaxdn.compiled.rows import Array, add_product, exponential, inlined, loop
+from jaxdn.compiled.rows import Array, add_product, copy, exponential, inlined, loop
 
 
 @inlined
@@ -137,7 +137,7 @@ def filtered(
                     continue
                 inside = light[beside : beside + width]
                 if channel < 0:
-                    inside[:] = confidence[there]
+                    copy(inside, confidence[there])
                 else:
                     _product(inside, image[channel, there], confidence[there])
                 found = weights[(y if row > 0 else there) % kept, abs(row)]
@@ -152,7 +152,7 @@ def filtered(
                     near, far = found[3, beside:], found[4, beside:]
                 _add_three(total, found[2, beside:], inside, near, light[beside + step :], far, light[2 * beside :])
             if channel < 0:
-                masses[y] = total
+                copy(masses[y], total)
                 continue
             result, own, mass = out[channel, y], image[channel, y], masses[y]
             for x in range(width):
@@ -318,9 +318,9 @@ def enlarged(
         for odd in range(2):
             # Pixels of one column of the blocks, side by side.
             for index in range(count):
-                own[index] = fine_features[index, y, odd::2]
+                copy(own[index], fine_features[index, y, odd::2])
             for index in range(3):
-                slant[index] = fine_slanted[index, y, odd::2]
+                copy(slant[index], fine_slanted[index, y, odd::2])
             for row in range(3):
                 there = y // 2 + row - 1
                 if there < 0 or there >= height:
@@ -355,7 +355,7 @@ def enlarged(
                 if there < 0 or there >= height:
                     continue
                 if channel < 0:
-                    light[1 : width + 1] = confidence[there]
+                    copy(light[1 : width + 1], confidence[there])
                 else:
                     _product(light[1 : width + 1], coarse[channel, there], confidence[there])
                 for odd in range(2):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxdn.compiled.rows import Array, loop
+from jaxdn.compiled.rows import Array, copy, loop
 
 PLANES, PIXELS, BLOCKS, CORNERS, MEANS = range(5)
 """Layouts of an array, see :mod:`jaxdn.filters.arrange`."""
@@ -19,7 +19,7 @@ def planes(top: int, bottom: int, arrays: tuple[Array, ...], out: Array, layouts
             if layout == PLANES:
                 count = array.shape[0]
                 for channel in range(count):
-                    out[first + channel, y] = array[channel, y]
+                    copy(out[first + channel, y], array[channel, y])
             elif layout == PIXELS:
                 count = array.shape[2]
                 for channel in range(count):
@@ -58,7 +58,10 @@ def filled(top: int, bottom: int, image: Array, known: Array, out: Array) -> Non
     width, zero, one = known.shape[1], np.float32(0.0), np.float32(1.0)
     for block in range(top, bottom):
         y = 4 * block
-        out[y : y + 4] = image[y : y + 4]
+        for row in range(y, y + 4):
+            for x in range(width):
+                for channel in range(image.shape[2]):
+                    out[row, x, channel] = image[row, x, channel]
         for x in range(0, width, 4):
             missing = 0
             for place in range(16):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxdn.compiled.rows import Array, add_product, inlined, loop
+from jaxdn.compiled.rows import Array, add_product, copy, inlined, loop
 
 _BLOCK = 16
 """Cells side by side whose pixels stay in the cache together."""
@@ -67,7 +67,7 @@ def moments(
                     for row in range(cell):
                         add_product(sums, both[one, row], both[other, row])
                     _means(out[one, other, y, x : x + _BLOCK], sums, cell)
-                    out[other, one, y, x : x + _BLOCK] = out[one, other, y, x : x + _BLOCK]
+                    copy(out[other, one, y, x : x + _BLOCK], out[one, other, y, x : x + _BLOCK])
 
 
 @loop

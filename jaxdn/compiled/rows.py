@@ -36,6 +36,13 @@ Array = np.ndarray
 
 
 @inlined
+def copy(row: Array, other: Array) -> None:
+    """In place of ``row[:] = other``, which takes Numba seconds to compile."""
+    for x in range(row.shape[0]):
+        row[x] = other[x]
+
+
+@inlined
 def add_product(total: Array, one: Array, other: Array) -> None:
     """In place total + one * other."""
     for x in range(total.shape[0]):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxdn.compiled.rows import Array, exponential, inlined, logarithm, loop
+from jaxdn.compiled.rows import Array, copy, exponential, inlined, logarithm, loop
 
 
 @inlined
@@ -106,4 +106,4 @@ def seen(
             for x in range(half):
                 pixels[x, first + 9 + fact] = means[x]
         for x in range(half, out.shape[1]):
-            pixels[x] = pixels[half - 1]
+            copy(pixels[x], pixels[half - 1])
