@@ -174,10 +174,9 @@ class Program:
         source, target = self._memory[step.inputs[0].number], self._memory[step.result.number]
         reads = self._description(step.inputs[0])
         if step.kernel is not None:
-            weighted = step.kind == "convolution"
-            layer = onednn_layers.convolution if weighted else onednn_layers.enlarging_convolution
             after: Any = {"kind": self._precision.kind, "slope": step.slope, "adds": len(step.inputs) > 1}
-            placed = layer(reads, result, step.kernel, step.bias, **after)
+            enlarges = step.kind == "enlarging convolution"
+            placed = onednn_layers.convolution(reads, result, step.kernel, step.bias, enlarges=enlarges, **after)
         else:
             placed = (onednn_layers.pooling if step.kind == "pool" else onednn_layers.enlarging)(reads, result)
         self._primitives.append(placed(source, target))

@@ -28,6 +28,7 @@ def convolution(
     kind: int,
     slope: float | None = None,
     adds: bool = False,
+    enlarges: bool = False,
 ) -> Placed:
     """A convolution, stride 1, zeros outside.
 
@@ -39,54 +40,22 @@ def convolution(
       kind: the type in which the kernel is kept and multiplied, that of the images that are read.
       slope: that of a leaky rectifier of the result; None: none.
       adds: it adds to what is there.
+      enlarges: it is one by a 3x3 kernel of the images after :func:`enlarging`, with 4/9 of the operations.
     """
-    edge = dnnl.Dims(kernel.shape[0] // 2, kernel.shape[0] // 2)
-    how = "dnnl_convolution_forward", dnnl.DIRECT, 1, edge
-    return _weighted(how, reads, writes, kernel, bias, kind, _followed_by(slope, adds))
-
-
-def enlarging_convolution(
-    reads: c_void_p,
-    writes: c_void_p,
-    kernel: np.ndarray,
-    bias: np.ndarray | None,
-    *,
-    kind: int,
-    slope: float | None = None,
-    adds: bool = False,
-) -> Placed:
-    """A convolution by a 3x3 kernel of the images after :func:`enlarging`, with 4/9 of its operations.
-
-    Three enlarged pixels in a row are two of before: the weights of those that are equal are added first. That makes a
-    transposed convolution of stride 2, whose kernel is the 3x3 kernel, turned, summed over windows of 2x2. The
-    arguments are those of :func:`convolution`; ``reads`` describes the images before they are enlarged.
-    """
-    for axis in (0, 1):
-        after, middle, before = (np.take(kernel, [index], axis) for index in (2, 1, 0))
-        kernel = np.concatenate([after, after + middle, middle + before, before], axis)
-    how = "dnnl_deconvolution_forward", _TRANSPOSED, 2, dnnl.Dims(1, 1)
-    return _weighted(how, reads, writes, kernel, bias, kind, _followed_by(slope, adds))
-
-
-def _weighted(
-    how: tuple[str, int, int, Any],
-    reads: c_void_p,
-    writes: c_void_p,
-    kernel: np.ndarray,
-    bias: np.ndarray | None,
-    kind: int,
-    after: c_void_p,
-) -> Placed:
-    """A layer with a kernel: its name, algorithm, stride and what is added at each edge; its arguments; attributes."""
-    name, algorithm, stride, edge = how
+    if enlarges:
+        kernel, name, algorithm = _of_enlarged(kernel), "dnnl_deconvolution_forward", _TRANSPOSED
+    else:
+        name, algorithm = "dnnl_convolution_forward", dnnl.DIRECT
     size, _, inputs, outputs = kernel.shape
+    stride, edge = (2, 1) if enlarges else (1, size // 2)
     ours, dims = dnnl.kernels(size, inputs, outputs)
     free = dnnl.made("dnnl_memory_desc_create_with_tag", 4, dims, kind, dnnl.ANY_LAYOUT)
     row = dnnl.made("dnnl_memory_desc_create_with_tag", 1, dnnl.Dims(outputs), dnnl.FLOAT32, dnnl.ROW)
+    edges = dnnl.Dims(edge, edge)
     description = dnnl.made(
         f"{name}_primitive_desc_create",
         *(dnnl.engine()[0], dnnl.INFERENCE, algorithm, reads, free, None if bias is None else row, writes),
-        *(dnnl.Dims(stride, stride), dnnl.Dims(0, 0), edge, edge, after),
+        *(dnnl.Dims(stride, stride), dnnl.Dims(0, 0), edges, edges, _followed_by(slope, adds)),
     )
     theirs = dnnl.asked(description, dnnl.ASK_WEIGHTS)
     given = np.ascontiguousarray(kernel, np.float32)
@@ -100,6 +69,18 @@ def _weighted(
         dnnl.Primitive(dnnl.reorder(row, row), (dnnl.SOURCE, outside), (dnnl.DESTINATION, own))()
         weights.append((dnnl.BIAS, own))
     return _placed(description, weights)
+
+
+def _of_enlarged(kernel: np.ndarray) -> np.ndarray:
+    """[4, 4, inputs, outputs] of a transposed convolution of stride 2, which is one by a 3x3 kernel of enlarged images.
+
+    Three enlarged pixels in a row are two of before: the weights of those that are equal are added. The result is the
+    3x3 kernel, turned, summed over windows of 2x2.
+    """
+    for axis in (0, 1):
+        before, middle, after = (np.take(kernel, [index], axis) for index in range(3))
+        kernel = np.concatenate([after, after + middle, middle + before, before], axis)
+    return kernel
 
 
 def pooling(reads: c_void_p, writes: c_void_p) -> Placed:
