@@ -236,6 +236,9 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "color.compress": of_light(color.compress),
         "color.expand": lambda inputs: color.expand(jnp.minimum(inputs.clip.frames.radiance, 2.0)),
         "color.luminance": of_light(color.luminance),
+        "color.luminance_of_planes": of_light(
+            lambda light: color.luminance_of_planes(jnp.moveaxis(light, -1, 0))[..., None]
+        ),
         **{f"color.tonemap, {one}": of_light(color.tonemap, operator=one) for one in color.OPERATORS},
         "color.exposure": lambda inputs: jnp.reshape(color.exposure(inputs.clip.frames.radiance[-1]), (1, 1, 1)),
         "color.brightness": lambda inputs: color.brightness(inputs.clip.frames.radiance[-1])[None, None],
