@@ -41,12 +41,6 @@ def _add_square(total: Array, one: Array, other: Array, factor: float) -> None:
 
 
 @inlined
-def _multiply(total: Array, other: Array) -> None:
-    for x in range(total.shape[0]):
-        total[x] *= other[x]
-
-
-@inlined
 def _product(total: Array, one: Array, other: Array) -> None:
     for x in range(total.shape[0]):
         total[x] = one[x] * other[x]
@@ -62,12 +56,6 @@ def _add_two(total: Array, one: Array, other: Array, third: Array, fourth: Array
 def _add_three(total: Array, one: Array, other: Array, third: Array, fourth: Array, fifth: Array, sixth: Array) -> None:
     for x in range(total.shape[0]):
         total[x] += one[x] * other[x] + third[x] * fourth[x] + fifth[x] * sixth[x]
-
-
-@inlined
-def _add(total: Array, other: Array) -> None:
-    for x in range(total.shape[0]):
-        total[x] += other[x]
 
 
 @loop

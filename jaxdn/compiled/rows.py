@@ -43,6 +43,13 @@ def copy(row: Array, other: Array) -> None:
 
 
 @inlined
+def mean_of_blocks(row: Array, above: Array, below: Array) -> None:
+    """Set to the means of the blocks of 2x2 pixels of two rows."""
+    for x in range(row.shape[0]):
+        row[x] = np.float32(0.25) * (above[2 * x] + above[2 * x + 1] + below[2 * x] + below[2 * x + 1])
+
+
+@inlined
 def add_product(total: Array, one: Array, other: Array) -> None:
     """In place total + one * other."""
     for x in range(total.shape[0]):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxdn.compiled.rows import Array, loop
+from jaxdn.compiled.rows import Array, loop, mean_of_blocks
 
 
 @loop
@@ -51,10 +51,7 @@ def accumulated(
                 then = history[y, x, 3] if valid[y, x] else level * level
                 square[y, x] = then + shares[x] * (level * level - then)
         for channel in range(3):
-            above, under = lacking[0, channel], lacking[1, channel]
-            for x in range(width // 2):
-                total = above[2 * x] + above[2 * x + 1] + under[2 * x] + under[2 * x + 1]
-                missed[channel, block, x] = np.float32(0.25) * total
+            mean_of_blocks(missed[channel, block], lacking[0, channel], lacking[1, channel])
 
 
 @loop

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxdn.compiled.rows import Array, copy, exponential, inlined, logarithm, loop
+from jaxdn.compiled.rows import Array, copy, exponential, inlined, logarithm, loop, mean_of_blocks
 
 
 @inlined
@@ -25,13 +25,6 @@ def _compress(light: Array, sums: Array, logarithms: Array, gamma: float, toe: f
     exponential(light, np.float32(1.0))
     for x in range(light.shape[0]):
         light[x] = light[x] if sums[x] > toe else slope * sums[x]
-
-
-@inlined
-def _four(row: Array, above: Array, below: Array) -> None:
-    """Set to the means of blocks of two rows."""
-    for x in range(row.shape[0]):
-        row[x] = np.float32(0.25) * (above[2 * x] + above[2 * x + 1] + below[2 * x] + below[2 * x + 1])
 
 
 @loop
@@ -89,7 +82,7 @@ def seen(
                     for x in range(half):
                         pixels[x, place], pixels[x, place + 1] = sums[2 * x], sums[2 * x + 1]
             for channel in range(3):
-                _four(means, rows[0, channel], rows[1, channel])
+                mean_of_blocks(means, rows[0, channel], rows[1, channel])
                 for x in range(half):
                     pixels[x, first + 3 * image + channel] = means[x]
         # How much the history varies, its number of samples, whether there is a surface.
@@ -102,7 +95,7 @@ def seen(
                 rows[below, 1, x] = np.float32(1.0) / (np.float32(1.0) + then[4])
                 rows[below, 2, x] = np.float32(hit[y + below, x])
         for fact in range(3):
-            _four(means, rows[0, fact], rows[1, fact])
+            mean_of_blocks(means, rows[0, fact], rows[1, fact])
             for x in range(half):
                 pixels[x, first + 9 + fact] = means[x]
         for x in range(half, out.shape[1]):

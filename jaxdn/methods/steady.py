@@ -31,7 +31,7 @@ from jaxdn.filters.guides import Guides, depth_feature, guides_of
 from jaxdn.filters.levels import BLOCKS, LEVELS, Decisions, Surfaces, filtered, reach, slanted, surfaces_of
 from jaxdn.filters.recall import recall
 from jaxdn.filters.running_mean import Mean, accumulated, remembered
-from jaxdn.filters.seen import DARK, History, seen
+from jaxdn.filters.seen import CHANNELS, DARK, History, seen
 from jaxdn.frame import RADIANCE_MAX, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
 from jaxdn.methods.table import method
@@ -134,7 +134,9 @@ def steady(options: Options) -> Denoiser:
 
     quality = QUALITIES[options.quality] if isinstance(options.quality, str) else Quality(options.quality)
     heads = (4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS + quality.back,)
-    network = unet((52,), heads, widths=quality.widths, head_size=1, implementation=options.implementation)
+    network = unet(
+        (4 * 8 + CHANNELS,), heads, widths=quality.widths, head_size=1, implementation=options.implementation
+    )
     reads = frozenset({"albedo", "normal", "roughness", "depth", "previous_depth", "motion", "ids"})
 
     def init(key: jax.Array, frame: Frame) -> Params:
