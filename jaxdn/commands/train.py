@@ -1,5 +1,6 @@
 """``jaxdn train``: a learned method, trained on rendered clips."""
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,7 @@ def train(
         spp=recipe.spp,
         layers=denoiser.samples is not None,
         variation=recipe.variation,
+        threads=max(1, (os.cpu_count() or 1) // 2),  # a GPU takes a hundred elements a second, a thread makes twelve
     )
     held_out = load_validation(denoiser, validation, spp=min(recipe.spp))
     first = None if start is None else Start(str(start), starting_params(start, denoiser))

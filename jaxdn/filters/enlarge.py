@@ -3,8 +3,8 @@
 Kopf et al. 2007, "Joint Bilateral Upsampling". Bilinear enlarging carries light across silhouettes, and adding only
 what the coarse image changed leaves noise of two to four pixels in the fine one.
 
-The four fine pixels of a block are four planes of the coarse image's size: all work runs along contiguous rows, in
-strips that fit into the cache, over a scan of the nine taps (as in :mod:`jaxdn.ops.affinity_filter`).
+The four fine pixels of a block are four planes of the coarse image's size: all work runs along contiguous rows, on CPUs
+in strips that fit into the cache, over a scan of the nine taps (as in :mod:`jaxdn.ops.affinity_filter`).
 """
 
 from typing import NamedTuple
@@ -43,7 +43,8 @@ def enlarge(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, ja
 
 
 def _enlarged(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, jax.Array]:
-    totals = _totals(coarse, there._replace(scales=here.scales).scaled(), here.scaled())
+    at_once = platform() == "gpu"
+    totals = (_at_once if at_once else _totals)(coarse, there._replace(scales=here.scales).scaled(), here.scaled())
     weight = totals[-1:]
     some = weight > _NO_WEIGHT
     return jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), 0.0), jnp.where(some, weight, 0.0)[0]
@@ -58,6 +59,27 @@ def _enlarged_by_compiled(coarse: jax.Array, there: Guide, here: Guide) -> tuple
     numbers = _spatial()[1].reshape(3, 3, 2, 2).astype(np.float32), np.float32(_NO_WEIGHT)
     image, weight = strips.call(enlarged, [(channels, *fine), fine], arrays, *numbers, rows=fine[0])
     return image, weight
+
+
+def _at_once(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
+    """As :func:`_totals`, without a scan: a GPU would start hundreds of small kernels, and scatter in the gradient."""
+    height, width = coarse.shape[1:]
+    guides = jnp.pad(jnp.concatenate([there.features, there.slanted]), ((0, 0), (1, 1), (1, 1)), mode="edge")
+    mass = jnp.concatenate([coarse * there.confidence[None], there.confidence[None]])
+    mass = jnp.pad(mass, ((0, 0), (1, 1), (1, 1)))
+    fine = jnp.concatenate([here.features, here.slanted]).reshape(-1, height, 2, width, 2)
+    offsets, spatial = _spatial()
+    found = []
+    for phase, (row, column) in enumerate(np.ndindex(2, 2)):
+        own = list(fine[:, :, row, :, column])
+        total = jnp.zeros_like(mass[:, 1:-1, 1:-1])
+        for (top, left), offset, near in zip(np.ndindex(3, 3), offsets[:, phase], spatial[:, phase], strict=True):
+            at = slice(top, top + height), slice(left, left + width)
+            dy, dx = (jnp.asarray(each, coarse.dtype) for each in offset)
+            weight = jnp.asarray(near, coarse.dtype) * affinity(own, list(guides[:, *at]), dy, dx)
+            total = total + weight[None] * mass[:, *at]
+        found.append(total)
+    return jnp.stack(found).reshape(2, 2, -1, height, width).transpose(2, 3, 0, 4, 1).reshape(-1, 2 * height, 2 * width)
 
 
 def _totals(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:

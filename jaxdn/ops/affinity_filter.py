@@ -13,7 +13,8 @@ a-trous filter (Dammertz et al. 2010); learned features: Isik et al. 2021, "Inte
 Affinity of Neural Features".
 
 Arrays are planar, ``[C, H, W]``: the stencil then runs along contiguous rows and vectorises. On CPUs both passes are
-compiled loops (:mod:`jaxdn.compiled.affinities`) where these are available. Elsewhere the forward pass works on strips
+compiled loops (:mod:`jaxdn.compiled.affinities`) where these are available, on GPUs one kernel each
+(:mod:`jaxdn.compiled.affinities_gpu`). Elsewhere the forward pass works on strips
 of rows that fit into the cache; the gradient keeps only the arguments and recomputes the weights. Both scan over pairs
 of opposite taps and compute the weights of one pair while they use those of the pair before: in one expression, XLA:CPU
 would compute every weight once for each channel that uses it.
@@ -27,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.compiled import strips
+from jaxdn.compiled import affinities_gpu, strips
 from jaxdn.platform import platform
 
 RADIUS = 2
@@ -176,6 +177,23 @@ _Residuals = tuple[jax.Array, Guide, jax.Array, jax.Array]
 
 
 def _forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, _Residuals]:
+    if affinities_gpu.available() and image.dtype == guide.features.dtype == jnp.float32:
+        mass = jnp.concatenate([image * guide.confidence[None], guide.confidence[None]])
+        totals = affinities_gpu.totals(_planes(guide), mass, step=step)
+    else:
+        totals = _totals(image, guide, step)
+    weight = totals[-1:]
+    some = weight > _NO_WEIGHT
+    filtered = jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), image)
+    return filtered, (image, guide, filtered, weight)
+
+
+def _planes(guide: Guide) -> jax.Array:
+    return jnp.concatenate([guide.features, guide.slanted])
+
+
+def _totals(image: jax.Array, guide: Guide, step: int) -> jax.Array:
+    """[C + 1, H, W] the weighted sums of light, and of weights."""
     channels, height, width = image.shape
     dtype, margin = image.dtype, step * RADIUS
     rows = height if platform() != "cpu" else min(height, max(8 * step, _STRIP // width))
@@ -223,10 +241,7 @@ def _forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, _Res
     else:
         totals = lax.map(strip, rows * jnp.arange(count, dtype=jnp.int32))
         totals = totals.transpose(1, 0, 2, 3).reshape(channels + 1, count * rows, width)[:, :height]
-    weight = totals[-1:]
-    some = weight > _NO_WEIGHT
-    filtered = jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), image)
-    return filtered, (image, guide, filtered, weight)
+    return totals
 
 
 def _gains(filtered: jax.Array, weight: jax.Array, cotangent: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -242,9 +257,22 @@ def _backward(step: int, residuals: _Residuals, cotangent: jax.Array) -> tuple[j
     With g = cotangent / W and s = <g, out>, the gradient by the weight of q in p is ``<g(p), x(q)> - s(p)``.
     """
     image, guide, filtered, weight = residuals
+    some, scaled, level = _gains(filtered, weight, cotangent)
+    if affinities_gpu.available() and image.dtype == guide.features.dtype == jnp.float32:
+        given = _planes(guide), guide.confidence, image, scaled, level
+        by_image, by_confidence, by_planes = affinities_gpu.gradients(*given, step=step)
+        by_guide = Guide(by_planes[:-3], by_planes[-3:], by_confidence)
+    else:
+        by_image, by_guide = _gathered(image, guide, scaled, level, step)
+    return by_image + jnp.where(some, 0.0, cotangent), by_guide
+
+
+def _gathered(
+    image: jax.Array, guide: Guide, scaled: jax.Array, level: jax.Array, step: int
+) -> tuple[jax.Array, Guide]:
+    """By the image and by the guide, where there is weight."""
     _, height, width = image.shape
     dtype, margin = image.dtype, step * RADIUS
-    some, scaled, level = _gains(filtered, weight, cotangent)
 
     def around(planes: Planes | jax.Array) -> Planes:
         return [jnp.pad(plane, margin) for plane in planes]
@@ -304,9 +332,8 @@ def _backward(step: int, residuals: _Residuals, cotangent: jax.Array) -> tuple[j
     nothing = jax.tree.map(lambda each: jnp.zeros_like(each[:2]), pairs)
     rest = jax.tree.map(lambda one, other: jnp.concatenate([one, other]), _from(pairs, 2), nothing)
     (sums, _, _), _ = lax.scan(body, carry, rest)
-    by_image = jnp.stack(sums[: len(x)]) + jnp.where(some, 0.0, cotangent)
     by_guides = sums[len(x) + 1 :]
-    return by_image, Guide(jnp.stack(by_guides[:-3]), jnp.stack(by_guides[-3:]), sums[len(x)])
+    return jnp.stack(sums[: len(x)]), Guide(jnp.stack(by_guides[:-3]), jnp.stack(by_guides[-3:]), sums[len(x)])
 
 
 _filtered.defvjp(_forward, _backward)

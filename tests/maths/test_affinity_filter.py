@@ -54,6 +54,28 @@ def test_gradients(step, rng, x64):
     check_grads(jax.jit(filtered), tuple(map(jnp.asarray, drawn(rng))), order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("step", "size"), [(1, (9, 11)), (2, (5, 130)), (3, (20, 64))])
+def test_kernels_for_gpus_are_the_formula_and_have_its_gradient(step, size, rng, monkeypatch):
+    """Interpreted where there is no GPU; gradients against those of the program that has no kernels."""
+    image, *guide = (np.float32(each) for each in drawn(rng, *size))
+    wanted = by_formula(image, *guide, step)
+
+    def total(image, *guide):
+        filtered = affinity_filter(image, Guide(*guide), step=step)
+        return jnp.sum(jnp.sin(filtered)), filtered
+
+    differentiated = jax.grad(total, argnums=(0, 1, 2, 3), has_aux=True)
+    by_xla, _ = differentiated(image, *guide)
+    monkeypatch.setattr(module.affinities_gpu, "available", lambda: True)
+    by_kernels, filtered = differentiated(image, *guide)
+    np.testing.assert_allclose(filtered, wanted, rtol=2e-5, atol=2e-6)
+    for found, known in zip(by_kernels, by_xla, strict=True):
+        np.testing.assert_allclose(found, known, rtol=2e-4, atol=1e-5)
+    both, _ = jax.vmap(differentiated)(*(np.stack([each, 2 * each]) for each in (image, *guide)))
+    for found, known in zip(both, by_kernels, strict=True):
+        np.testing.assert_allclose(found[0], known, rtol=2e-4, atol=1e-5)
+
+
 def test_a_plane_that_recedes_is_one_surface_and_two_planes_are_not(rng):
     """Inverse depth is affine on a plane; noise is averaged there as without the guide, and nothing crosses an edge."""
     rows, columns = np.mgrid[:16, :32].astype(np.float32)

@@ -41,8 +41,9 @@ def by_formula(coarse, there, here):
     return out, sums
 
 
-@pytest.mark.parametrize("strip", [4096, 12])
-def test_it_is_the_formula(strip, rng, x64, monkeypatch):
+@pytest.mark.parametrize(("platform", "strip"), [("cpu", 4096), ("cpu", 12), ("gpu", 4096)])
+def test_it_is_the_formula(platform, strip, rng, x64, monkeypatch):
+    monkeypatch.setattr(module, "platform", lambda: platform)
     monkeypatch.setattr(module, "_STRIP", strip)
     coarse, there, here = drawn(rng)
     found, weight = enlarge(jnp.asarray(coarse), *jax.tree.map(jnp.asarray, (there, here)))
@@ -51,7 +52,9 @@ def test_it_is_the_formula(strip, rng, x64, monkeypatch):
     np.testing.assert_allclose(weight, sums, rtol=1e-10)
 
 
-def test_gradients(rng, x64):
+@pytest.mark.parametrize("platform", ["cpu", "gpu"])
+def test_gradients(platform, rng, x64, monkeypatch):
+    monkeypatch.setattr(module, "platform", lambda: platform)
     coarse, there, here = drawn(rng, 3, 4)
 
     def enlarged(coarse, *parts):
