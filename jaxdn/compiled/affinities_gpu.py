@@ -28,7 +28,10 @@ Planes = list[jax.Array]
 
 @functools.cache
 def _installed() -> bool:
-    return find_spec("jax.experimental.pallas.triton") is not None
+    try:
+        return find_spec("jax.experimental.pallas.triton") is not None
+    except ModuleNotFoundError:  # without Pallas altogether
+        return False
 
 
 def available() -> bool:
@@ -93,8 +96,9 @@ def gradients(
                 old + by_distance * (one - other)
                 for old, one, other in zip(by_guides[:-3], here[:-3], there[:-3], strict=True)
             ]
-            slopes = 1.0, 0.5 * dx.astype(jnp.float32), 0.5 * dy.astype(jnp.float32)
-            slanted = [old - slope * by_residual for old, slope in zip(by_guides[-3:], slopes, strict=True)]
+            z, slope_x, slope_y = by_guides[-3:]
+            right, down = (0.5 * by_residual * each.astype(jnp.float32) for each in (dx, dy))
+            slanted = [z - by_residual, slope_x - right, slope_y - down]
             return [*by_image, by_trust + weight * q_takes, *features, *slanted]
 
         nothing = [jnp.zeros((_BLOCK,), jnp.float32)] * out.shape[0]
