@@ -92,6 +92,7 @@ def test_a_finished_run_is_not_trained_again(clips, tmp_path):
     jax.tree.map(np.testing.assert_array_equal, first.params, again.params)
 
 
+@pytest.mark.slow
 def test_the_options_of_a_filter_are_fitted_and_its_weights_denoise(clips, tmp_path):
     method = method_named("svgf")
     recipe = method.recipe_named(None)._replace(steps=4, batch=2, crop=16, frames=3)

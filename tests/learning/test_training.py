@@ -63,6 +63,7 @@ def state(denoiser):
     return initial_state(denoiser, RECIPE, batch_of(make_clip(0), make_clip(1)))
 
 
+@pytest.mark.slow
 def test_the_loss_is_the_papers_sum_on_all_frames_but_the_last(denoiser, state):
     clip = make_clip(0)
     images = denoise(denoiser, state.params, clip)
@@ -123,6 +124,7 @@ def valid(state):
 POISONS = [np.nan, np.inf, -np.inf, 1e30, -1e30, 1e38]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("buffer", ["radiance", "albedo", "normal", "depth", "motion", "dual_motion", "reference"])
 def test_a_poisoned_buffer_never_makes_an_invalid_weight_and_training_continues(step, state, buffer):
     batch = batch_of(make_clip(0), make_clip(1))

@@ -225,6 +225,7 @@ def test_gradients_of_batches_that_share_their_scales(rng, both):
     assert np.abs(wanted[0]).min() > 1e-3
 
 
+@pytest.mark.slow
 def test_what_has_no_loop_for_its_gradient_is_left_to_jax(rng, both, monkeypatch):
     coarse, there = jnp.asarray(rng.random((2, 4, 6)), jnp.float32), drawn(rng, 4, 6)
     fine = drawn(rng, 8, 12)

@@ -51,6 +51,7 @@ def test_every_pixel_may_have_a_step_of_its_own(rng, x64):
         np.testing.assert_allclose(found[:, own], every[:, own], rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_large_images_get_what_small_ones_get(rng, x64, monkeypatch):
     """Variance and history fix, with few short histories and with many; the gradient too."""
     planes, hit, weights = drawn(rng)

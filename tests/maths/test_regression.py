@@ -248,6 +248,7 @@ def test_its_gradient_in_single_precision_is_that_of_the_plain_form(rng):
         assert any(np.abs(each).max() > 0 for each in jax.tree.leaves(found)) == bool(hit.all())
 
 
+@pytest.mark.slow
 def test_gradients_of_a_batch_through_time(rng):
     """As in training: a scan of frames of a batch, with one set of scales."""
     arrays = [jnp.stack([each, 0.5 * each]) for each in given(rng, size=(32, 48))]

@@ -104,6 +104,7 @@ def test_dasr_sees_the_first_sample_and_no_other_frame(rng, key):
     assert np.any(plain != moved)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 def test_samples_learn_to_go_where_noise_is(name, rng, key):
     """The error of the image teaches the sampler, through the reference, which half of the wall is noisy."""
@@ -127,6 +128,7 @@ def test_samples_learn_to_go_where_noise_is(name, rng, key):
     assert counts[:, 16:].mean() > 1.5 * counts[:, :16].mean()
 
 
+@pytest.mark.slow
 def test_the_amplitude_slope_is_half_of_the_mixing_slope(rng, key):
     clip = clip_of(rng, 2)
     slopes = []

@@ -139,6 +139,7 @@ def test_blending_by_the_share_that_changed_matches_the_formula(rng):
     np.testing.assert_array_equal(*plain)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_formulas(rng, x64):
     change = gradients.Change(jnp.asarray(rng.normal(size=(4, 5))), jnp.asarray(rng.uniform(3, 4, (4, 5))))
     depth = jnp.asarray(rng.uniform(4, 5, (4, 5, 1)))

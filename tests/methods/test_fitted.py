@@ -65,6 +65,7 @@ def test_an_option_that_is_not_learned_is_refused():
         moved(Toy(), {"fixed": jnp.zeros(())})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name, row in methods().items() if row.filter and row.learns])
 def test_filters_begin_at_their_options_and_have_gradients(name, rng):
     denoiser = methods()[name].factory()

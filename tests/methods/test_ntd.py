@@ -159,6 +159,7 @@ def test_less_than_all_kernels_with_known_heads(prediction: Any, rng: np.random.
     np.testing.assert_allclose(image, wanted, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("prediction", ["three-scales", "one-scale", "direct"])
 def test_less_than_all_kernels_begins_plausibly_and_learns(prediction: Any, rng: np.random.Generator) -> None:
     denoiser, frames = tiny(prediction=prediction), random_frames(rng)

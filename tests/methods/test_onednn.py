@@ -122,6 +122,7 @@ def test_other_weights_other_images_and_a_group_that_is_missing(pair, precision)
         np.testing.assert_array_equal(one, again)
 
 
+@pytest.mark.slow
 def test_under_vmap_and_with_the_gradient_of_xla(pair, precision):
     plain, fast, params, groups = pair
     stacked = [jnp.stack([group, 0.5 * group]) for group in groups]

@@ -93,6 +93,9 @@ def test_windows_cover_all_and_have_their_margins(length: int, margin: int, more
         windows(length + 2 * margin + 2 * GRID, 2 * margin + GRID, margin)
 
 
+WITH_SLOW_ONES = [pytest.param(name, marks=[pytest.mark.slow] * (name in {"steady", "ntd"})) for name in METHODS]
+
+
 @pytest.mark.parametrize(
     "without",
     [
@@ -102,7 +105,7 @@ def test_windows_cover_all_and_have_their_margins(length: int, margin: int, more
     ],
     ids=["all buffers", "no materials", "no geometry"],
 )
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", WITH_SLOW_ONES)
 def test_parts_make_the_image_of_the_whole_frame(name: str, without: tuple[str, ...], x64: None) -> None:
     """With fewer buffers too: then other guides are compared. In float64: what is left is rounding alone."""
     denoiser = METHODS[name]()
@@ -120,7 +123,7 @@ def test_parts_make_the_image_of_the_whole_frame(name: str, without: tuple[str, 
     assert len(parts.programs) == 1
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", WITH_SLOW_ONES)
 def test_nothing_beyond_the_reach_decides_about_a_pixel(name: str, x64: None) -> None:
     """Everything to the right of a column is other than it was, but not what is measured of the frame."""
     denoiser = METHODS[name]()

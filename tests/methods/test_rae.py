@@ -191,6 +191,7 @@ def test_a_hidden_state_that_overflows_does_not_stay(rng, key):
     assert kept.repaired > 0
 
 
+@pytest.mark.slow
 def test_gradients_flow_through_the_hidden_states(rng, key):
     frames, denoiser = clip_of(rng, 2, (4, 8)), plain()
     with jax.enable_x64(True):

@@ -15,6 +15,7 @@ MEANS = relax(fix_frames=0, clamp_sigma=1e6, lag_sigma=1e6, short_history=0, lev
 """Nothing but running means."""
 
 
+@pytest.mark.slow
 def test_metal_darkens_no_diffuse_neighbour():
     """It has no diffuse light, and no diffuse texture either: all that is seen there is reflected by another lobe."""
     metal = np.zeros((1, 8, 1), bool)

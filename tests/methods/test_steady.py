@@ -188,6 +188,7 @@ def test_the_share_of_the_newest_frame_hardly_knows_of_its_own_noise(rng):
     assert 0.0 < np.mean(noise * share) < 0.2 * alone
 
 
+@pytest.mark.slow
 def test_gradients_through_time(rng, x64):
     denoiser = tiny()
     frames = room(rng, 2, size=(32, 32))

@@ -459,6 +459,7 @@ def compiled_denoise(denoiser):
     return jax.jit(functools.partial(denoise, denoiser))
 
 
+@pytest.mark.slow
 def test_a_lamp_that_reflects_nothing_stays_bright(rng):
     """Its reflectance is 0: averaged with the wall's, that texture would make the lamp black."""
     lamp = np.zeros((24, 32, 1), bool)
@@ -503,6 +504,7 @@ def test_every_level_has_its_own_params(rng):
             assert float(jnp.max(jnp.abs(image - plain))) > 1e-4, (name, level)
 
 
+@pytest.mark.slow
 def test_gradients_of_params(rng, x64):
     clip = clip_of(moving_frames(rng), np.float64)
     denoiser = svgf(levels=2)

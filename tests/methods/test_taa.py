@@ -179,6 +179,7 @@ def test_a_step_matches_a_loop(options, first, rng):
         np.testing.assert_array_equal(found[..., :3], image)
 
 
+@pytest.mark.slow
 def test_gradients_of_a_step(rng, x64):
     image, history, frame = moving(rng)
     frame = frame._replace(motion=np.nan_to_num(frame.motion))

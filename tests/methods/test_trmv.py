@@ -80,6 +80,7 @@ def test_none_is_the_neutral_value_written_out(rng, names):
         np.testing.assert_allclose(first, second, rtol=5e-5, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_no_buffer_has_to_be_there(rng):
     frames = all_light(rng)
 
@@ -233,6 +234,7 @@ def trail_error(denoiser, clip):
     return np.mean(found[-4:])
 
 
+@pytest.mark.slow
 def test_a_shadow_that_moves_leaves_no_trail(rng):
     clip = passing_shadow(rng)
     mine, theirs = trail_error(trmv(), clip), trail_error(svgf(), clip)

@@ -116,6 +116,7 @@ def test_parameters_are_plain_and_uniform_within_the_limits_of_the_scheme(key: j
     assert not np.array_equal(params["head_0"]["kernel"], other["head_0"]["kernel"])
 
 
+@pytest.mark.slow
 def test_every_level_begins_to_learn_at_the_same_pace(key: jax.Array, rng: np.random.Generator) -> None:
     """With Xavier's limits the deepest levels get a hundredth of the others' gradient, relative to their weights."""
     network, inputs = unet(GROUPS, HEADS, widths=SMALL), features(rng, GROUPS)

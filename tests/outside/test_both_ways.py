@@ -158,6 +158,7 @@ def test_the_first_frame_is_as_good_as_the_last_and_time_has_no_direction(tmp_pa
         np.testing.assert_allclose(image, other, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_clip_of_ours_and_the_other_ways_to_denoise_go_together(tmp_path: Path) -> None:
     clips.write_clip(make_clip(0, frames=4, size=20), tmp_path / "clip")
     assert len(denoised(tmp_path / "clip", tmp_path / "out", "ntd-small")) == 4

@@ -97,6 +97,7 @@ def assert_the_same_images(run, whole, lean, message):
     np.testing.assert_allclose(run(whole), run(lean), rtol=1e-5, atol=1e-6, err_msg=message)
 
 
+@pytest.mark.slow
 def test_what_is_left_out_was_neutral(tmp_path):
     """For a filter, a network and the running mean: each denoiser is compiled twice, and all take a minute."""
     both = both_read(rendered(CASES["static grey box"], tmp_path))

@@ -33,6 +33,7 @@ def test_memory_does_not_grow_with_the_frames_of_a_foreign_sequence(tmp_path):
     assert peaks[long] - peaks[short] < 0.2 * everything
 
 
+@pytest.mark.slow
 def test_frames_in_parts_are_the_same_files(tmp_path):
     """Half the frame fits into the memory that is allowed; the safe mixture and the previews are made in parts too."""
     height, width = 300, 520
@@ -57,6 +58,7 @@ def test_too_little_memory_is_refused_before_anything_is_written(tmp_path):
     assert not list((tmp_path / "out").glob("**/*.exr"))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="the peak memory of a child process is only available on Unix")
 def test_the_peak_is_that_of_the_child_alone(tmp_path):
     """Not that of this process, which after a thousand tests is larger."""

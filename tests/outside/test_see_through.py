@@ -240,6 +240,7 @@ CHECKS = """<scene version="3.0.0">
 </scene>"""
 
 
+@pytest.mark.slow
 def test_what_a_mirror_shows_stays_sharp(tmp_path):
     """The picture of a checked wall in a mirror: svgf blurs it with the mirror's guides, and keeps it with its own."""
     (tmp_path / "checks.xml").write_text(CHECKS)
@@ -254,6 +255,7 @@ def test_what_a_mirror_shows_stays_sharp(tmp_path):
     assert error[True] < 0.1 * error[False]
 
 
+@pytest.mark.slow
 def test_a_scene_is_denoised_with_the_guides_of_what_is_seen(tmp_path):
     (tmp_path / "checks.xml").write_text(CHECKS)
     told: dict[str, list[str]] = {"svgf": [], "trmv": []}
