@@ -5,6 +5,7 @@ import math
 import re
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -310,11 +311,18 @@ def test_steps_with_known_parts_are_broken_down(denoisers):
     assert len(parts) == 5
 
 
+def number_of_programs():
+    """Compiled by XLA, in this process, not yet forgotten."""
+    return len(jax.local_devices()[0].client.live_executables())
+
+
 @pytest.mark.slow
 def test_a_quick_chart_and_resuming_it(tmp_path, monkeypatch, capsys):
     """From the command line to the page, of a filter, shipped weights and new ones: others differ in their step."""
     pytest.importorskip("mitsuba")
     monkeypatch.setattr(chart, "chosen", lambda **how: [each for each in chosen(**how) if each.label in DRAWN])
+    programs, breakdowns = [], chart.Run.breakdowns
+    monkeypatch.setattr(chart.Run, "breakdowns", lambda run: (programs.append(number_of_programs()), breakdowns(run)))
     out = tmp_path / "chart-quick"
     settings = tyro.cli(chart.Settings, args=["--quick", "--out", str(out)])
     chart.main(settings)
@@ -324,6 +332,7 @@ def test_a_quick_chart_and_resuming_it(tmp_path, monkeypatch, capsys):
     assert {"renderer @ 1", "renderer @ 16"} <= set(raw["errors"])
     assert set(DRAWN) <= set(raw["times"])
     assert (out / "chart.html").is_file()
+    assert programs[0] < 20, "programs of all methods together are more than a process may hold"
     chart.main(settings)
     assert "resuming the earlier measurements" in capsys.readouterr().out
     assert json.loads((out / "chart.json").read_text()) == raw

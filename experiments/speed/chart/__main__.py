@@ -8,9 +8,11 @@ Writes ``runs/chart/chart.json`` (raw measurements) and ``runs/chart/chart.html`
 point is saved when it is measured: an interrupted run is resumed and measures only what is missing.
 """
 
+import gc
 import hashlib
+import itertools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,16 +114,22 @@ class Run:
             self.store.put("clips", clip.name, facts)
             save_png(self._picture("reference", clip), picture(clip.reference[clip.shown]))
         with self.counted("errors", len(todo)) as done:
-            for name, spp in todo:
-                key, found = point_key(name, spp), {}
-                for clip in self.clips:
-                    denoise = scored[name]
-                    noisy = clip.frames._replace(radiance=clip.noisy[spp])
-                    images = noisy.radiance if denoise is None else denoise(noisy)
-                    found[clip.name] = score(images, clip)
-                    save_png(self._picture(key, clip), picture(images[clip.shown]))
-                self.store.put("errors", key, found)
-                done(f"{key}: {np.mean([scores['psnr'] for scores in found.values()]):.2f} dB")
+            for name, points in itertools.groupby(todo, key=lambda point: point[0]):
+                for _, spp in points:
+                    mean = self._scored(name, spp, scored[name])
+                    done(f"{point_key(name, spp)}: {mean:.2f} dB")
+                _forget_programs()
+
+    def _scored(self, name: str, spp: int, denoise: Callable[[Frame], np.ndarray] | None) -> float:
+        """Store a point's errors on every clip and its pictures; its mean PSNR. ``denoise``: None leaves the noise."""
+        key, found = point_key(name, spp), {}
+        for clip in self.clips:
+            noisy = clip.frames._replace(radiance=clip.noisy[spp])
+            images = noisy.radiance if denoise is None else denoise(noisy)
+            found[clip.name] = score(images, clip)
+            save_png(self._picture(key, clip), picture(images[clip.shown]))
+        self.store.put("errors", key, found)
+        return float(np.mean([scores["psnr"] for scores in found.values()]))
 
     def _picture(self, key: str, clip: Footage) -> Path:
         folder = self.folder / "images" / clip.name
@@ -169,6 +177,7 @@ class Run:
                 for name, sizes in found.items():
                     if sizes:
                         self.store.put("times", name, sizes)
+                _forget_programs()
                 done(group)
 
     def _timed(self, members: Sequence[Way], frame: Frame, size: str) -> dict[str, dict[str, Any]]:
@@ -193,6 +202,16 @@ class Run:
                 self.store.put("breakdown", subject.name, parts)
                 figures = ", ".join(f"{part} {timing.median_ms:.0f} ms" for part, timing in parts.items())
                 self.say(f"one frame of {subject.name}: {figures}")
+
+
+def _forget_programs() -> None:
+    """Compiled programs are forgotten, all of this process.
+
+    Each maps some twenty pieces of memory, and those of all methods together are more than Linux allows a process
+    (65,530 by default): the next one that is compiled ends it.
+    """
+    jax.clear_caches()
+    gc.collect()
 
 
 def _digest(path: Path) -> str:
