@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.checks import check_image, check_option, check_same_size
+from jaxdn.compiled import strips
+from jaxdn.ops.faster import alone
 
 Lobe = Literal["ggx", "ggx-correlated", "beckmann"]
 """GGX with Smith's separable shadowing (as in Mitsuba) or the height-correlated one, Beckmann (separable)."""
@@ -219,6 +221,29 @@ def _largest(colour: jax.Array) -> jax.Array:
     """[..., 1] the largest of three channels; XLA:CPU takes four times as long for a maximum over so short an axis."""
     red, green, blue = (colour[..., index : index + 1] for index in range(3))
     return jnp.maximum(jnp.maximum(red, green), blue)
+
+
+def texture_or_hue(reflectance: jax.Array, light: jax.Array, hue: jax.Array) -> jax.Array:
+    """The texture [H, W, 3] that dividing ``light`` by :func:`divisor` leaves of a reflectance, or its colour alone.
+
+    :func:`texture_left` where ``hue``, a bool scalar, is false, else :func:`hue_left` of it.
+    """
+    if strips.available() and reflectance.dtype == light.dtype == jnp.float32:
+        return alone(_texture_or_hue, _texture_by_compiled)(reflectance, light, hue)
+    return _texture_or_hue(reflectance, light, hue)
+
+
+def _texture_or_hue(reflectance: jax.Array, light: jax.Array, hue: jax.Array) -> jax.Array:
+    texture = texture_left(reflectance, divisor(reflectance), light)
+    return jnp.where(hue, hue_left(texture), texture)
+
+
+def _texture_by_compiled(reflectance: jax.Array, light: jax.Array, hue: jax.Array) -> jax.Array:
+    from jaxdn.compiled.brdf import texture
+
+    numbers = (np.float32(number) for number in (FLOOR, (1 + FLOOR**4) ** -0.25, _BLACK, _FAINT))
+    arrays = [reflectance, light, jnp.reshape(hue, (1,))]
+    return strips.call(texture, [reflectance.shape], arrays, *numbers, rows=reflectance.shape[0])[0]
 
 
 def restore(filtered: jax.Array, texture: jax.Array, filtered_texture: jax.Array) -> jax.Array:

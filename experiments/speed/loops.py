@@ -20,17 +20,21 @@ from rich.table import Table
 
 from experiments.speed.frames import parsed
 from experiments.speed.timing import Call, measure
+from jaxdn import brdf
 from jaxdn.commands.errors import plain_errors
 from jaxdn.compiled import strips
 from jaxdn.filters import regression
 from jaxdn.filters.arrange import planes_of
 from jaxdn.filters.enlarge import enlarge
 from jaxdn.filters.guides import guides_of
+from jaxdn.filters.levels import LEVELS
 from jaxdn.filters.recall import recall
-from jaxdn.filters.running_mean import accumulated
+from jaxdn.filters.running_mean import Mean, accumulated
 from jaxdn.filters.seen import History, seen
+from jaxdn.filters.specks import dimmed
 from jaxdn.frame import Frame
 from jaxdn.heap import keep_memory
+from jaxdn.methods.steady import BEGIN, FEATURES, HALF_FEATURES, decisions
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
 from jaxdn.scales import fill
 
@@ -72,6 +76,12 @@ def works(height: int, width: int) -> dict[str, Work]:
         "the history recalled, 8 channels": (recall, (history.values, guides_of(frame), frame, jnp.asarray(False))),
         "what the network sees": (partial(seen, multiple=16), ((albedo, normal, depth, roughness), *seen_light, gain)),
         "the running mean": (partial(accumulated, most=32.0), (*seen_light, noise(height, width))),
+        "what is decided": (
+            partial(decisions, size=half),
+            (noise(*half, 4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + LEVELS + 2),),
+        ),
+        "the texture that a division leaves": (brdf.texture_or_hue, (albedo, light, jnp.asarray(True))),
+        "single bright pixels": (dimmed, (image[:3], hit, Mean(image[3:6], image[6], image[7], image[:3]))),
         "what light follows": (regression.given_back, (scales, image, image + 0.1, hit, gain)),
         "11 channels as planes": (
             lambda *arrays: planes_of(list(zip(layouts, arrays, strict=True))),

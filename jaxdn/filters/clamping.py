@@ -14,7 +14,7 @@ from jaxdn.filters.neighbourhood import from_ycocg, to_ycocg
 
 _NO_SPREAD = 1e-10
 """Least variance of a neighbourhood: the square root has no slope at 0."""
-_DARK = 1e-12
+DARK = 1e-12
 """Nothing is told from darkness below it: the slope of a quotient is finite there in single precision."""
 _ROUNDING = 1e-4
 """Relative difference of two means in single precision that says nothing."""
@@ -103,7 +103,7 @@ def without_specks(brightness: jax.Array, hit: jax.Array, sure: jax.Array) -> ja
     seen = jnp.where(hit, brightness, -1.0)[None]
     limit = functools.reduce(jnp.maximum, _neighbours(seen, beyond=-1.0))[0]
     over = (limit >= 0) & (brightness > limit)
-    share = limit / jnp.where(over, jnp.maximum(brightness, _DARK), 1.0)
+    share = limit / jnp.where(over, jnp.maximum(brightness, DARK), 1.0)
     return jnp.where(over, jnp.maximum(share, sure), 1.0)
 
 

@@ -154,7 +154,8 @@ def _found_by_compiled(rules: _Rules, given: _Given) -> _Found:
         ids=None if wanted.ids is None else before.ids,
     )
     arrays = [history, *tested, *at, inside, wanted.depth, wanted.tolerance, wanted.normal, wanted.ids]
-    numbers = np.float32(rules.normal_threshold), np.float32(WEIGHT_MIN), rules.around
+    lanes = tuple(range(history.shape[2]))
+    numbers = np.float32(rules.normal_threshold), np.float32(WEIGHT_MIN), rules.around, lanes
     size = history.shape[:2]
     mean, valid, unsound = strips.call(fetched, [history.shape, size, size[:1]], arrays, *numbers, rows=size[0])
     return mean, valid > 0, jnp.sum(unsound.astype(jnp.int32), dtype=jnp.int32)

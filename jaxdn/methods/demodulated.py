@@ -85,14 +85,10 @@ def texture_of(reflectance: jax.Array, frame: Frame, light: jax.Array, whole: Wh
 
     As in :func:`texture_left`. ``light`` [H, W, 3] is what is divided by it, or was.
     """
-    texture = brdf.texture_left(reflectance, brdf.divisor(reflectance), light)
-    if frame.albedo is None:
-        return texture
-    colours = brdf.hue_left(texture)
-    if frame.reflectance is None:
-        return colours
+    if frame.albedo is None or frame.reflectance is None:
+        return brdf.texture_or_hue(reflectance, light, jnp.asarray(frame.albedo is not None))
     other = jnp.any(frame.reflectance != frame.albedo) if whole is None else whole.other > 0
-    return jnp.where(other, texture, colours)
+    return brdf.texture_or_hue(reflectance, light, ~other)
 
 
 def _divided(frame: Frame, by: Demodulation) -> tuple[Frame, jax.Array | None]:

@@ -15,6 +15,7 @@ The filter is variance-guided filtering without its variance (Schied et al. 2017
 (Isik et al. 2021) and a recurrent network's view of noisy frame, mean and last output (Zeng et al. 2021).
 """
 
+import functools
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
@@ -22,21 +23,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn.color import luminance_of_planes
+from jaxdn.compiled import strips
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters import regression
 from jaxdn.filters.arrange import planar, planes_of
-from jaxdn.filters.clamping import without_specks
 from jaxdn.filters.guides import Guides, depth_feature, guides_of
 from jaxdn.filters.levels import BLOCKS, LEVELS, Decisions, Surfaces, filtered, reach, slanted, surfaces_of
 from jaxdn.filters.recall import recall
-from jaxdn.filters.running_mean import Mean, accumulated, remembered
+from jaxdn.filters.running_mean import accumulated, remembered
 from jaxdn.filters.seen import CHANNELS, DARK, History, seen
+from jaxdn.filters.specks import dimmed
 from jaxdn.frame import RADIANCE_MAX, Frame
 from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
 from jaxdn.methods.table import method
 from jaxdn.networks import Widths, crop, description, pad
 from jaxdn.objectives import pyramid_illumination
+from jaxdn.ops.faster import alone
 from jaxdn.options import Range
 from jaxdn.recipe import Recipe
 from jaxdn.scales import downsample, fill, upsample
@@ -70,6 +72,8 @@ QUALITIES = {
 
 BEGIN = {"trust": 4.0, "follow": 0.0, "blend": 0.0, "coarse": 4.0, "feedback": -4.0}
 """Decisions for every pixel, one logit each, and what they are before training."""
+_PLACES = np.cumsum([4 * FEATURES, 4 * len(BEGIN), HALF_FEATURES]).tolist()
+"""Channels of the head from which on it says something else."""
 _TAKE, _BACK = 4.0, 3.0
 """The same for how much of each level at half resolution is taken, and of what the filter took away is given back."""
 PRECISIONS = {"albedo": 1.0, "gloss": 2.0, "normal": 1.0, "depth": 6.0, "learned": 0.0}
@@ -163,13 +167,13 @@ def steady(options: Options) -> Denoiser:
         noisy, hit = _noisy(frame, surfaces), surfaces.hit
         weights = {name: part for name, part in params.items() if name != "guide"}
         head = network.apply(weights, [_seen(noisy, past, surfaces, whole)[None]])[0][0]
-        decided, shares = _decisions(crop(head, (hit.shape[0] // 2, hit.shape[1] // 2)))
+        decided, shares = decisions(head, (hit.shape[0] // 2, hit.shape[1] // 2))
         mean = accumulated(noisy, past, hit, shares["follow"], most=options.history_max)
         texture = texture_left(frame, options.demodulate, whole)
         texture = None if texture is None else fill(pad(texture, BLOCKS), hit[..., None])
         given = mean.light, mean.missed if quality.at_once else None, texture, surfaces, slanted(surfaces, whole)
         found = filtered(params["guide"], *given, decided, quality.full_levels, DARK / whole.exposure)
-        found = found._replace(image=found.image * _without_specks(found.image, hit, mean)[None])
+        found = found._replace(image=dimmed(found.image, hit, mean))
         kept = remembered(mean, found, past, shares["feedback"], shares["blend"], most=RADIANCE_MAX)
         history = crop(kept, size)
         image = jnp.where(crop(hit, size)[..., None], history[..., 5:], frame.radiance)
@@ -198,30 +202,34 @@ def _seen(noisy: jax.Array, past: History, surfaces: Surfaces, whole: Whole) -> 
     return seen(geometry, noisy, past, surfaces.hit, whole.exposure, multiple=_MULTIPLE)
 
 
-def _decisions(head: jax.Array) -> tuple[Decisions, dict[str, jax.Array]]:
-    """What the head says: about the filter, and the shares [H, W] in [0, 1] of the names in :data:`BEGIN`."""
-    # Splits, not slices: the gradient of a slice is an array of the whole size, and all of them are added.
-    own, logits, half, rest = jnp.split(head, np.cumsum([4 * FEATURES, 4 * len(BEGIN), HALF_FEATURES]), axis=-1)
-    # Before they are unfolded, while they lie side by side in memory.
-    shares = dict(zip(BEGIN, planes_of([("blocks", jax.nn.sigmoid(logits))]), strict=True))
+def decisions(head: jax.Array, size: tuple[int, int]) -> tuple[Decisions, dict[str, jax.Array]]:
+    """What the head says about as many blocks: about the filter, and the shares [H, W] in [0, 1] of :data:`BEGIN`."""
+    plain, compiled = (functools.partial(function, size) for function in (_apart, _apart_by_compiled))
+    apart = alone(plain, compiled) if strips.available() and head.dtype == jnp.float32 else plain
+    own, planes, half, (trust, *take) = apart(head)
+    shares = dict(zip(BEGIN, planes, strict=True))
     # A pixel whose share knows of its own noise, follows bright samples more: its mean becomes too bright.
     shares["follow"] = upsample(downsample(shares["follow"][..., None]))[..., 0]
-    trust, *take = planar(jax.nn.sigmoid(rest))
     back = take.pop() if len(take) > LEVELS else None
     return Decisions(own, shares["trust"], shares["coarse"], half, trust, take, back), shares
 
 
-def _without_specks(image: jax.Array, hit: jax.Array, mean: Mean) -> jax.Array:
-    """[H, W] the share of its light that each pixel keeps (:func:`jaxdn.filters.clamping.without_specks`).
-
-    Of what the history shows a pixel is sure but for two deviations of the mean; of a single frame, of nothing.
-    """
-    level = luminance_of_planes(mean.light)
-    variance = jnp.maximum(mean.square - level**2, 0.0) / jnp.maximum(mean.number, 1.0)
-    deviation = jnp.sqrt(variance + 1e-12)  # with a slope at 0
-    sure = jnp.where(mean.number > _SOME, 1.0 - 2.0 * deviation / jnp.maximum(level, 1e-6), 0.0)
-    return without_specks((image[0] + image[1] + image[2]) / 3.0, hit, sure)
+_Apart = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+"""Features [H/2, W/2, 4F], shares of all pixels [len(BEGIN), H, W], features and shares [.., H/2, W/2] of blocks."""
 
 
-_SOME = 1.5
-"""Effective number of frames from which on their deviation tells how sure a mean is."""
+def _apart(size: tuple[int, int], head: jax.Array) -> _Apart:
+    # Splits, not slices: the gradient of a slice is an array of the whole size, and all of them are added.
+    own, logits, half, rest = jnp.split(crop(head, size), _PLACES, axis=-1)
+    # Before they are unfolded, while they lie side by side in memory.
+    return own, planes_of([("blocks", jax.nn.sigmoid(logits))]), half, planar(jax.nn.sigmoid(rest))
+
+
+def _apart_by_compiled(size: tuple[int, int], head: jax.Array) -> _Apart:
+    from jaxdn.compiled.steady import decided
+
+    (height, width), (first, _, last) = size, _PLACES
+    shapes = [(*size, first), (len(BEGIN), 2 * height, 2 * width), (*size, HALF_FEATURES)]
+    shapes.append((head.shape[-1] - last, height, width))
+    own, planes, half, rest = strips.call(decided, shapes, [head], rows=height)
+    return own, planes, half, rest

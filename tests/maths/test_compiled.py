@@ -11,14 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxdn import brdf, color
 from jaxdn.compiled import strips
 from jaxdn.filters.arrange import planes_of
 from jaxdn.filters.enlarge import enlarge
 from jaxdn.filters.guides import guides_of
+from jaxdn.filters.levels import LEVELS
 from jaxdn.filters.recall import recall
 from jaxdn.filters.running_mean import Mean, Shown, accumulated, remembered
 from jaxdn.filters.seen import History, seen
+from jaxdn.filters.specks import dimmed
 from jaxdn.frame import FAR, Frame
+from jaxdn.methods.steady import BEGIN, FEATURES, HALF_FEATURES, decisions
 from jaxdn.ops.affinity_filter import Guide, affinity_filter
 from jaxdn.scales import fill
 from jaxdn.whole import sums_of_depth
@@ -90,7 +94,7 @@ def test_the_recalled_history(left_out, around, rng, both):
     )._replace(**dict.fromkeys(left_out.split()))
     frame = jax.tree.map(lambda each: jnp.asarray(each, jnp.int32 if each.dtype == np.int64 else jnp.float32), frame)
     history = rng.uniform(0, 1, (height, width, 8)).astype(np.float32)
-    history[3, 4, 2], history[5, 6, 0], history[7, 7, 7] = np.nan, -1.0, np.inf
+    history[3, 4, 2], history[5, 6, 0], history[7, 7, 7], history[9, 9] = np.nan, -1.0, np.inf, -0.0
 
     def recalled(history, frame, first):
         return recall(history, guides_of(frame), frame, first, around=around)
@@ -150,6 +154,44 @@ def test_what_is_remembered(changed, rng, both):
     np.testing.assert_array_equal(found[..., 3], square)
     assert found.min() == 0
     assert found[..., 5:].max() == 1.5
+
+
+@pytest.mark.parametrize("hue", [False, True])
+def test_the_texture_that_a_division_leaves(hue, rng, both):
+    reflectance = rng.uniform(0, 1, (14, 38, 3)) ** 4
+    reflectance[0], reflectance[1, :, 1:], reflectance[2] = 0.0, 0.0, 1.0
+    light = rng.uniform(0, 9, (14, 38, 3)) * (rng.random((14, 38, 1)) > 0.3)
+    light[3] *= [1.0, 0.0, 0.0]
+    given = jnp.asarray(reflectance, jnp.float32), jnp.asarray(light, jnp.float32), jnp.asarray(hue)
+    found, wanted = both(brdf.texture_or_hue, *given)
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
+    assert wanted.min() < 0.3
+    assert (wanted[0] == 1).any()  # a lamp that reflects nothing
+
+
+def test_single_bright_pixels(rng, both):
+    height, width = 19, 38
+    light = rng.uniform(0, 1, (3, height, width)) ** 8
+    light[:, 9:12] = 0.0
+    level = np.einsum("c,cyx->yx", color.LUMINANCE, light)
+    mean = Mean(light, level**2 * rng.uniform(0.9, 1.5, level.shape), rng.choice([1.0, 2.0, 30.0], level.shape), light)
+    hit = rng.random((height, width)) > 0.2
+    hit[4:7, 4:7] = np.eye(3)[1] * np.eye(3)[1][:, None] > 0  # a pixel without neighbours
+    image = jnp.asarray(light * rng.uniform(0.5, 2, light.shape), jnp.float32)
+    found, wanted = both(dimmed, image, jnp.asarray(hit), jax.tree.map(jnp.float32, mean))
+    np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-9)
+    kept = wanted.sum(0) / np.maximum(image.sum(0), 1e-30)
+    assert kept[5, 5] == 1
+    assert (kept < 0.9).mean() > 0.03
+
+
+def test_what_is_decided(rng, both):
+    blocks, channels = (7, 19), 4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS + 1
+    head = jnp.asarray(rng.normal(scale=30.0, size=(16, 32, channels)), jnp.float32)
+    found, wanted = both(lambda head: decisions(head, blocks), head)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-12)
+    np.testing.assert_array_equal(wanted[0].features, head[:7, :19, : 4 * FEATURES])
 
 
 def test_the_sums_of_depth(rng, both):

@@ -12,7 +12,7 @@ from jax.test_util import check_grads
 from jaxdn.denoiser import Denoiser
 from jaxdn.filters.levels import LEVELS
 from jaxdn.frame import FAR, Frame, frame_at
-from jaxdn.methods.steady import BEGIN, FEATURES, HALF_FEATURES, _decisions, steady
+from jaxdn.methods.steady import BEGIN, FEATURES, HALF_FEATURES, decisions, steady
 from jaxdn.rollout import unroll
 from jaxdn.scales import fold
 
@@ -182,7 +182,7 @@ def test_the_share_of_the_newest_frame_hardly_knows_of_its_own_noise(rng):
     where = 4 * (FEATURES + list(BEGIN).index("follow"))
     head = np.zeros((32, 32, 4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS + 1))
     head[..., where : where + 4] = 2.0 * noise
-    share = np.asarray(fold(_decisions(jnp.asarray(head, jnp.float32))[1]["follow"][..., None]))
+    share = np.asarray(fold(decisions(jnp.asarray(head, jnp.float32), (32, 32))[1]["follow"][..., None]))
     alone = np.mean(noise / (1.0 + np.exp(-2.0 * noise)))
     assert share.std() > 0.05
     assert 0.0 < np.mean(noise * share) < 0.2 * alone
