@@ -47,8 +47,10 @@ def _findings() -> Iterator[Finding]:
     yield Finding("jaxdn", f"{jaxdn.__version__}, Python {platform.python_version()}, {os.cpu_count()} cores")
     yield _device()
     for engine in ENGINES.values():
-        if engine.available():
+        if engine.available() and engine.faster():
             yield Finding(f"engine for {engine.purpose}", engine.name)
+        elif engine.available():
+            yield Finding(f"engine for {engine.purpose}", f"XLA: {engine.name} is slower on this CPU")
         elif engine.name == "onednn-bfloat16" and onednn_library.available():
             yield Finding(f"engine for {engine.purpose}", "no onednn-bfloat16: this CPU does not compute with it")
         elif jax.default_backend() == "cpu":

@@ -87,8 +87,8 @@ class Method:
         """The engine that runs it fastest here, for the option ``implementation``; None is XLA."""
         if options.get("compute_dtype") not in (None, "float32"):
             return None
-        fitting = (name for name in self.engines if ENGINES[name].purpose == purpose and ENGINES[name].available())
-        return next(fitting, None)
+        fitting = (ENGINES[name] for name in self.engines if ENGINES[name].purpose == purpose)
+        return next((each.name for each in fitting if each.available() and each.faster()), None)
 
 
 _METHODS: dict[str, Method] = {}

@@ -14,14 +14,16 @@ class Engine(NamedTuple):
 
     name: str
     purpose: Purpose
-    """The work at which it is faster than XLA, and for which it is the default."""
+    """The work for which it is the default, where it is faster than XLA."""
     available: Callable[[], bool]
     """Whether it can run here: it is installed and supports jax's device."""
+    faster: Callable[[], bool] = lambda: True
+    """Whether it is faster than XLA here, if it can run: else it is used only on request."""
 
 
 ENGINES: dict[str, Engine] = {
     "onednn-bfloat16": Engine("onednn-bfloat16", "inference", onednn.computes_bfloat16),
     "onednn-float32": Engine("onednn-float32", "inference", onednn_library.available),
     "onnxruntime": Engine("onnxruntime", "inference", onnx.available),
-    "onednn": Engine("onednn", "training", onednn_library.available),
+    "onednn": Engine("onednn", "training", onednn_library.available, onednn_library.trains_faster),
 }

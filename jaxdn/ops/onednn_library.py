@@ -30,8 +30,8 @@ DESTINATION_GRADIENT, WEIGHTS_GRADIENT = 145, 161
 _CPU, _IN_ORDER, _USER_SCRATCHPAD = 1, 1, 1
 _LINE = 64
 """Bytes of a cache line."""
-_HAS_BFLOAT16 = 0x80
-"""The bit of ``dnnl_get_effective_cpu_isa`` that CPUs with AVX-512 BF16 have, and those with AMX."""
+_HAS_AVX512, _HAS_BFLOAT16 = 0x20, 0x80
+"""Bits of ``dnnl_get_effective_cpu_isa``: of CPUs with AVX-512, and of those with AVX-512 BF16 or AMX."""
 OWN_MEMORY, NO_MEMORY = c_void_p(-1), c_void_p(None)
 
 Dims = c_int64 * 12
@@ -83,6 +83,15 @@ def available() -> bool:
 def computes_bfloat16() -> bool:
     """Whether the CPU multiplies numbers in bfloat16, as the library sees it."""
     return bool(library().dnnl_get_effective_cpu_isa() & _HAS_BFLOAT16)
+
+
+def trains_faster() -> bool:
+    """Whether training with oneDNN's convolutions takes less time than in XLA, which it does on CPUs with AVX-512.
+
+    A step takes 0.7 to 0.9 of XLA's time there, and 1.02 to 1.5 times as long with AVX2 alone. False where the library
+    cannot be loaded.
+    """
+    return available() and bool(library().dnnl_get_effective_cpu_isa() & _HAS_AVX512)
 
 
 def check_available() -> None:

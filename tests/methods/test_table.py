@@ -21,6 +21,7 @@ from jaxdn.methods.ntd import PARITY, Options
 from jaxdn.methods.table import method, method_named, methods
 from jaxdn.networks.engines import ENGINES, Engine
 from jaxdn.objectives import indirect_illumination
+from jaxdn.ops import onednn_library
 from jaxdn.options import Range, describe, make, parse
 from jaxdn.recipe import Recipe
 from jaxdn.weights import save_weights
@@ -284,6 +285,22 @@ def test_the_engine_is_the_fastest_for_the_purpose_and_none_for_half_precision(p
     assert ntd.engine(purpose, options) == ("onednn-float32" if expected == "onnxruntime" else expected)
     engines(monkeypatch)
     assert ntd.engine(purpose, options) is None
+
+
+def test_an_engine_that_is_slower_here_is_used_on_request_alone(monkeypatch):
+    for faster in (True, False):
+        monkeypatch.setitem(ENGINES, "onednn", Engine("onednn", "training", lambda: True, lambda faster=faster: faster))
+        assert method_named("ntd").engine("training") == ("onednn" if faster else None)
+
+
+@pytest.mark.parametrize(("isa", "faster"), [(0x7, False), (0x1F, False), (0x27, True), (0xFEF, True)])
+def test_onednn_trains_faster_with_avx512(isa, faster, monkeypatch):
+    """AVX2, AVX2 with VNNI, AVX-512, AMX, as the library numbers them."""
+    monkeypatch.setattr(onednn_library, "available", lambda: True)
+    library = types.SimpleNamespace(dnnl_get_effective_cpu_isa=lambda: isa)
+    monkeypatch.setattr(onednn_library, "library", lambda: library)
+    assert onednn_library.trains_faster() == faster
+    assert ENGINES["onednn"].faster() == faster
 
 
 # A method from outside the package.
