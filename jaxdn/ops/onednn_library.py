@@ -88,7 +88,7 @@ def computes_bfloat16() -> bool:
 def trains_faster() -> bool:
     """Whether training with oneDNN's convolutions takes less time than in XLA, which it does on CPUs with AVX-512.
 
-    A step takes 0.7 to 0.9 of XLA's time there, and 1.02 to 1.5 times as long with AVX2 alone. False where the library
+    A step takes 0.7 to 1.0 of XLA's time there, and 1.02 to 1.5 times as long with AVX2 alone. False where the library
     cannot be loaded.
     """
     return available() and bool(library().dnnl_get_effective_cpu_isa() & _HAS_AVX512)
