@@ -178,6 +178,10 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
     def restored(inputs: Inputs) -> jax.Array:
         return brdf.restore(inputs.clip.frames.radiance, texture(inputs), brdf.hue_left(texture(inputs)))
 
+    def left(inputs: Inputs, hue: bool) -> jax.Array:
+        frames = inputs.clip.frames
+        return brdf.texture_or_hue(frames.reflectance[-1], frames.radiance[-1], jnp.asarray(hue))
+
     def of_light(function: Callable[..., jax.Array], **options: Any) -> Callable[[Inputs], jax.Array]:
         return lambda inputs: function(inputs.clip.frames.radiance, **options)
 
@@ -232,6 +236,8 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "brdf.remodulate": partial(divided, way=brdf.remodulate),
         "brdf.texture_left": texture,
         "brdf.hue_left": lambda inputs: brdf.hue_left(texture(inputs)),
+        "brdf.texture_or_hue": partial(left, hue=False),
+        "brdf.texture_or_hue, hue": partial(left, hue=True),
         "brdf.restore": restored,
         "color.compress": of_light(color.compress),
         "color.expand": lambda inputs: color.expand(jnp.minimum(inputs.clip.frames.radiance, 2.0)),
