@@ -193,7 +193,8 @@ def _vectorised(
         # Not evaluated unless it is named here.
         buffers |= {"reflectance": whole} | ({"specular_reflectance": part} if specular else {})
     dr.eval(buffers)
-    arrays = {name: np.array(buffer).T.astype(np.float64) for name, buffer in buffers.items()}
+    arrays = {name: np.array(buffer).T for name, buffer in buffers.items()}
+    arrays |= {name: arrays[name].astype(np.float64) for name in ("position", "direction")}
     arrays["ids"] = ids_of(scene, arrays.pop("shape"))
     return arrays, followed
 
@@ -207,13 +208,12 @@ def shape_of(hit: Any) -> Any:
 
 def ids_of(scene: Any, numbers: np.ndarray) -> np.ndarray:
     """The ids of shapes by their numbers of :func:`shape_of`: the positions of their sorted names, -1 for none."""
-    # Registry numbers depend on the other existing objects; names do not.
-    lookup = {0: -1}
+    # Registry numbers depend on the other existing objects; names do not. They count objects: a table holds them all.
     reinterpret: Any = dr.reinterpret_array
-    for own, rank in zip(scene.shapes(), _ranks(scene), strict=True):
-        lookup[int(reinterpret(mi.UInt32, mi.ShapePtr(own))[0])] = rank
-    different, inverse = np.unique(numbers.astype(np.int64), return_inverse=True)
-    return np.array([lookup.get(int(number), -1) for number in different])[inverse]
+    own = [int(reinterpret(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in scene.shapes()]
+    table = np.full(max([0, *own, int(numbers.max(initial=0))]) + 1, -1)
+    table[own] = _ranks(scene)
+    return table[numbers]
 
 
 def _ranks(scene: Any) -> list[int]:

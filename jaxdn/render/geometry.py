@@ -51,16 +51,18 @@ def project(points: np.ndarray, camera: Camera, size: tuple[int, int]) -> tuple[
     """
     height, width = size
     inverse = np.linalg.inv(np.asarray(camera.to_world, np.float64))
-    if points.shape[-1] == 3:
-        local = points @ inverse[:3, :3].T + inverse[:3, 3]
-    else:
-        local = (points @ inverse.T)[..., :3]
-    z = local[..., 2:3]
-    front = z > _BEHIND
+    planes = _planes(points)
+    local = inverse[:3, : len(planes)] @ planes.reshape(len(planes), -1)
+    if len(planes) == 3:
+        local += inverse[:3, 3:]
+    local = local.reshape(3, *points.shape[:-1])
+    z = local[2]
     scale = 0.5 * width / np.tan(np.radians(camera.x_fov) / 2)
     with np.errstate(invalid="ignore"):
-        offset = -scale * local[..., :2] / np.where(front, z, np.nan)
-    return offset + np.array([width / 2, height / 2]), z
+        pixels = -scale * local[:2] / np.where(z > _BEHIND, z, np.nan)
+    pixels[0] += width / 2
+    pixels[1] += height / 2
+    return np.moveaxis(pixels, 0, -1), z[..., None]
 
 
 def relative_poses(
@@ -97,62 +99,92 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
     if now.names != before.names or now.ids.shape != before.ids.shape:
         raise ValueError("motion: expected two frames of one size with the same shapes; none may appear or disappear.")
     size = now.ids.shape[:2]
-    back = _carried(now, relative_poses(now.names, current.pose, previous.pose))
+    back = _moves(now, relative_poses(now.names, current.pose, previous.pose))
     fixed = same_camera(current.camera, previous.camera)
 
     points = _homogeneous(now)
-    old_points = np.einsum("hwij,hwj->hwi", back, points)
+    old_points = _carried(points, back)
     target, z = project(old_points, previous.camera, size)
     motion = target - project(points, current.camera, size)[0]
-    motion[fixed & unmoved(back)] = 0.0
+    if fixed:
+        motion[_still(size, back)] = 0.0
     sky = now.ids < 0
     previous_depth = np.where(sky, FAR, np.maximum(z, 0.0)).astype(np.float32)
     if not disocclusion:
         return Motion(motion, None, None, previous_depth)
 
-    there = _carried(before, relative_poses(now.names, previous.pose, current.pose))
+    there = _moves(before, relative_poses(now.names, previous.pose, current.pose))
     old_surface = _homogeneous(before)
-    moved, _ = project(np.einsum("hwij,hwj->hwi", there, old_surface), current.camera, size)
+    moved, _ = project(_carried(old_surface, there), current.camera, size)
     forward = moved - project(old_surface, previous.camera, size)[0]
-    forward[fixed & unmoved(there)] = 0.0
+    if fixed:
+        forward[_still(size, there)] = 0.0
 
-    normals = np.einsum("hwij,hwj->hwi", back[..., :3, :3], now.normal)
-    lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
-    normals = normals / np.where(lengths > 0, lengths, 1.0)
+    turned = _carried(now.normal.astype(np.float64), back)
+    lengths = np.linalg.norm(turned, axis=-1, keepdims=True)
+    normals = turned / np.where(lengths > 0, lengths, 1.0)
     # In float32 from the pixel index: this must be the same pixel as the stored vector gives.
     pixels = np.stack(np.meshgrid(np.arange(size[1]), np.arange(size[0])), axis=-1).astype(np.float32)
     landing = pixels + motion.astype(np.float32) + np.float32(0.5)
     # The image's border belongs to the outermost pixel.
     tap = np.where(landing == [size[1], size[0]], landing - 1, np.floor(landing))
-    seen, nearest = _matches(now, before, tap, old_points, normals, z)
-    on_sky = (nearest == -1) & ~sky
+    shown = (now.ids, old_points, normals, z)
+    seen, nearest = _matches(before, tap, *shown)
+    on_sky = ((nearest == -1) & ~sky)[..., 0]
+    landing, *shown = (each[on_sky] for each in (landing, *shown))
     for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
         tap = np.floor(landing - np.float32(0.5)) + corner
-        seen |= on_sky & _matches(now, before, tap, old_points, normals, z)[0]
+        seen[on_sky] |= _matches(before, tap, *shown)[0]
     return Motion(motion, forward, seen, previous_depth)
 
 
-def _carried(gbuffer: GBuffer, motions: np.ndarray) -> np.ndarray:
-    """[H, W, 4, 4] the motion of what every pixel shows, from those of the shapes.
+class _Moves(NamedTuple):
+    """The motion of what some pixels show, the identity for all others."""
+
+    pixels: np.ndarray
+    """[n] flat indices of the pixels that show something that moves."""
+    motions: np.ndarray
+    """[n, 4, 4]"""
+
+
+def _moves(gbuffer: GBuffer, motions: np.ndarray) -> _Moves:
+    """The motion of what every pixel shows, from those of the shapes.
 
     An image in mirrors with the reflections M = M_1 ... M_k moves by ``M' T M^-1``, where T is the motion of the thing
     and M' are the reflections at the moved mirrors, ``B M_i B^-1`` with the mirror's motion B.
     """
-    images, size = gbuffer.images, gbuffer.ids.shape[:2]
+    images, shapes = gbuffer.images, gbuffer.ids.reshape(-1)
+    moves = ~unmoved(motions)
     if images is None:
-        return motions[gbuffer.ids[..., 0]]
-    shapes = gbuffer.ids.reshape(-1).copy()
-    shapes[images.pixels] = images.shapes
-    found = motions[shapes]
-    now = then = np.broadcast_to(np.eye(4), (len(images.pixels), 4, 4))
-    moves = ~unmoved(found[images.pixels])
+        pixels = np.flatnonzero(moves[shapes])
+        return _Moves(pixels, motions[shapes[pixels]])
+    moved = moves[images.shapes] | np.any(moves[images.mirrors], axis=-1)
+    now = then = np.broadcast_to(np.eye(4), (int(moved.sum()), 4, 4))
     for index in range(images.mirrors.shape[1]):
-        plane, motion = images.planes[:, index], motions[images.mirrors[:, index]]
+        plane, motion = images.planes[moved, index], motions[images.mirrors[moved, index]]
         now, then = now @ plane, then @ motion @ plane @ np.linalg.inv(motion)
-        moves |= ~unmoved(motion)
-    whole = then @ found[images.pixels] @ np.linalg.inv(now)
-    found[images.pixels] = np.where(moves[:, None, None], whole, np.eye(4))
-    return found.reshape(*size, 4, 4)
+    whole = then @ motions[images.shapes[moved]] @ np.linalg.inv(now)
+    plain = np.ones(len(shapes), bool)
+    plain[images.pixels] = False
+    pixels = np.flatnonzero(plain)
+    pixels = pixels[moves[shapes[pixels]]]
+    return _Moves(np.concatenate([pixels, images.pixels[moved]]), np.concatenate([motions[shapes[pixels]], whole]))
+
+
+def _carried(points: np.ndarray, moves: _Moves) -> np.ndarray:
+    """Homogeneous points [H, W, 4], or directions [H, W, 3], of all pixels after their motion."""
+    found = points.copy()
+    row, column = np.unravel_index(moves.pixels, points.shape[:2])
+    size = points.shape[-1]
+    found[row, column] = np.einsum("nij,nj->ni", moves.motions[:, :size, :size], points[row, column])
+    return found
+
+
+def _still(size: tuple[int, int], moves: _Moves) -> np.ndarray:
+    """[H, W] bool, the pixels that show nothing that moves."""
+    found = np.ones(size, bool)
+    found.reshape(-1)[moves.pixels] = False
+    return found
 
 
 def ray_length(view: View) -> np.ndarray:
@@ -185,32 +217,40 @@ def unmoved(motions: np.ndarray) -> np.ndarray:
     return np.all(motions == np.eye(4), axis=(-2, -1))
 
 
+def _planes(points: np.ndarray) -> np.ndarray:
+    """Points [..., C] as planes [C, ...]: as they lie in memory if they are those of a G-buffer."""
+    return np.moveaxis(points, -1, 0)
+
+
 def _homogeneous(gbuffer: GBuffer) -> np.ndarray:
-    """World positions with 1, directions of the sky with 0: [H, W, 4]."""
-    hit = gbuffer.ids >= 0
-    return np.concatenate([np.where(hit, gbuffer.position, gbuffer.direction), hit], axis=-1).astype(np.float64)
+    """World positions with 1, directions of the sky with 0: [H, W, 4] float64."""
+    hit = gbuffer.ids[..., 0] >= 0
+    planes = np.empty((4, *hit.shape))
+    planes[:3] = np.where(hit, _planes(gbuffer.position), _planes(gbuffer.direction))
+    planes[3] = hit
+    return np.moveaxis(planes, 0, -1)
 
 
 def _matches(
-    now: GBuffer, before: GBuffer, tap: np.ndarray, points: np.ndarray, normals: np.ndarray, z: np.ndarray
+    before: GBuffer, tap: np.ndarray, ids: np.ndarray, points: np.ndarray, normals: np.ndarray, z: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether the previous frame's pixel ``tap`` shows the same point, and the id it shows (-2: none).
+    """Whether the previous frame's pixel ``tap`` shows the same point [..., 1], and the id it shows (-2: none).
 
     Args:
-      now: G-buffer of the current frame.
       before: G-buffer of the previous frame.
-      tap: (column, row) in the previous frame.
-      points: the current points in the previous frame's world.
-      normals: the current normals there.
-      z: view-space depths of the points in the previous frame.
+      tap: [..., 2] (column, row) in the previous frame.
+      ids: [..., 1] of the current points.
+      points: [..., 4] the current points in the previous frame's world.
+      normals: [..., 3] the current normals there.
+      z: [..., 1] view-space depths of the points in the previous frame.
     """
     height, width = before.ids.shape[:2]
     with np.errstate(invalid="ignore"):
         inside = (tap >= 0) & (tap <= [width - 1, height - 1])
     inside = np.all(inside, axis=-1, keepdims=True)
     column, row = np.moveaxis(np.where(inside, tap, 0.0).astype(int), -1, 0)
-    ids = np.where(inside, before.ids[row, column], -2)
+    there = np.where(inside, before.ids[row, column], -2)
     cosine = np.sum(normals * before.normal[row, column], axis=-1, keepdims=True)
     offset = np.sum(normals * (points[..., :3] - before.position[row, column]), axis=-1, keepdims=True)
     same_surface = (cosine > SAME_NORMAL) & (np.abs(offset) <= SAME_PLANE * z)
-    return (ids == now.ids) & (same_surface | (now.ids < 0)), ids
+    return (there == ids) & (same_surface | (ids < 0)), there

@@ -45,13 +45,14 @@ pytestmark = pytest.mark.usefixtures("plain_programs")
 DRAWN = ("taa", "ntd-small", "rae")
 """The methods of the chart that is really made."""
 SIZE, OWN = "1280x720", "64x64"
+MOTION = "albedo, motion, normal"
 PSNR = MEASURES[0]
 TIMING = {"median_ms": 30.0, "min_ms": 29.0, "max_ms": 33.0, "first_ms": 4000.0, "rounds": 3, "peak_mib": 100.0}
 
 
 def point(name, spp, psnr, milliseconds, family="a"):
     errors = {measure.field: psnr if measure.better > 0 else 1 / psnr for measure in MEASURES}
-    return Point(point_key(name, spp), name, family, "plain", spp, errors, {SIZE: milliseconds}, {SIZE: 10.0 * spp})
+    return Point(point_key(name, spp), name, family, "plain", "", spp, errors, {SIZE: milliseconds}, {SIZE: 10.0 * spp})
 
 
 def scores(psnr):
@@ -63,7 +64,7 @@ def data():
     """Raw measurements as a run stores them."""
     errors = {point_key(RENDERER, spp): {"room": scores(20 + 3 * math.log2(spp))} for spp in (1, 2, 4, 8)}
     errors |= {point_key("filter", spp): {"room": scores(24.5 + 3 * math.log2(spp))} for spp in (1, 2)}
-    cost = {"seconds": {"fixed": 0.1, "sample": 0.5, "features": 0.05, "motion": 0.2}}
+    cost = {"seconds": {"fixed": 0.1, "sample": 0.5, "buffers": {"": 0.0, "albedo, normal": 0.05, MOTION: 0.25}}}
     return {
         "fingerprint": "0123",
         "settings": {"scored frames": 4},
@@ -78,9 +79,9 @@ def data():
 
 
 LABELS = {
-    RENDERER: (RENDERER, "plain", "none"),
-    "filter": ("filter", "plain", "motion"),
-    "wide net": ("untrained widths", "untrained", "motion"),
+    RENDERER: (RENDERER, "plain", ""),
+    "filter": ("filter", "plain", MOTION),
+    "wide net": ("untrained widths", "untrained", MOTION),
 }
 
 
@@ -137,7 +138,7 @@ def test_a_dip_in_the_curve_counts_for_fewer_samples():
 
 def test_equal_quality_gives_samples_and_seconds(data):
     found = points(data, LABELS)
-    equals = equal_quality(found, Cost(0.1, 0.5, 0.05, 0.2))
+    equals = equal_quality(found, Cost(0.1, 0.5, {}))
     assert equals["filter @ 1"].spp == pytest.approx(2**1.5)
     assert equals["filter @ 1"].seconds == pytest.approx(0.1 + 0.5 * 2**1.5)
     assert set(equals) == {"filter @ 1", "filter @ 2"}
@@ -199,9 +200,11 @@ def test_the_page_has_every_point_and_needs_no_network(data):
 
 
 def test_the_fit_gives_back_the_cost():
-    cost = Cost(0.3, 0.2, 0.05, 0.1)
+    cost = Cost(0.3, 0.2, {"albedo": 0.05, "albedo, motion": 0.1})
     light = {spp: cost.at(spp) for spp in (1, 2, 4)}
-    assert fit(light, cost.at(1, "features"), cost.at(1, "motion")) == pytest.approx(cost)
+    found = fit(light, {reads: cost.at(1, reads) for reads in cost.buffers})
+    assert found[:2] == pytest.approx(cost[:2])
+    assert found.buffers == pytest.approx(cost.buffers)
 
 
 def test_energy_counters_wrap(tmp_path):
@@ -227,7 +230,8 @@ def test_every_registered_method_is_there_with_its_variants(denoisers):
         assert f"{name}, not demodulated" in found
         assert found[f"{name}, effects all"].images is not None
         assert found[f"{name}, still scene"].images is None
-        assert found[name].guides == "motion"
+        assert "motion" in found[name].reads
+        assert "luminance_gradient" not in found[name].reads, "it would be charged for what it does not read"
     assert "ntd-large, bfloat16" in found
     assert ("ntd-large, onnxruntime" in found) == ENGINES["onnxruntime"].available()
     assert found["ntd tiny"].images is None
@@ -274,7 +278,7 @@ def test_a_new_method_without_weights_is_only_timed(monkeypatch):
     denoisers = [each for each in chosen() if each.label == "newcomer"]
     found = {each.name: each for each in registered(denoisers)}
     assert set(found) == {"newcomer", "newcomer, effects all", "newcomer, still scene"}
-    assert all(each.images is None and each.guides == "none" for each in found.values())
+    assert all(each.images is None and each.reads == "" for each in found.values())
     frame = frame_at(scene.clip(1, 16, 32).frames, 0)
     np.testing.assert_array_equal(found["newcomer"].timed(frame)(), frame.radiance)
     assert list(subjects(denoisers)) == []

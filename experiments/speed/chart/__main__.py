@@ -65,8 +65,9 @@ class Run:
         self.sizes, self.clips, self.folder, self.console = sizes, clips, folder, console
         self.denoisers = chosen(quick=sizes.quick)
         self.ways = ways(self.denoisers, quick=sizes.quick)
-        self.labels = {each.name: (each.family, each.variant, each.guides) for each in self.ways}
-        self.labels[RENDERER] = (RENDERER, "plain", "none")
+        self.labels = {each.name: (each.family, each.variant, each.reads) for each in self.ways}
+        self.labels[RENDERER] = (RENDERER, "plain", "")
+        self.reads = sorted({each.reads for each in self.ways})
         self.layers = footage.common_layers(clips)
         self.meter: Meter | None = find_meter()
         height, width = clips[0].reference.shape[1:3]
@@ -75,6 +76,7 @@ class Run:
             "clips": {clip.name: clip.record for clip in clips},
             "sizes": sizes._asdict(),
             "scored frames": footage.SCORED,
+            "buffers read": self.reads,
             "measures": [measure.field for measure in MEASURES],
             "weights": {path.name: _digest(path) for path in sorted(SHIPPED.glob("*.safetensors"))},
         }
@@ -153,7 +155,8 @@ class Run:
                         except ValueError as error:
                             self.say(f"{clip.name}: its rendering cost cannot be measured: {error}")
                             continue
-                        costs[clip.name] = measure_cost(animated, height, width, self.meter)
+                        there = [name for name in Frame._fields if getattr(clip.frames, name) is not None]
+                        costs[clip.name] = measure_cost(animated, height, width, self.reads, there, self.meter)
                         self.store.put("render", size, costs)
                     done(f"{clip.name} at {size}")
 

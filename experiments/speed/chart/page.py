@@ -255,23 +255,26 @@ def _joules(data: Mapping[str, Any], point: Point, timing: Mapping[str, Any], si
     """Joules of denoising, and with rendering."""
     cost = render_cost(data, size, "joules")
     alone = timing.get("joules", 0.0)
-    guides = "none" if point.method == RENDERER else "motion"
-    whole = "" if cost is None or point.spp is None else f" ({number(alone + cost.at(point.spp, guides), 1)})"
+    whole = "" if cost is None or point.spp is None else f" ({number(alone + cost.at(point.spp, point.reads), 1)})"
     return f"{number(alone, 1)}{whole}"
 
 
 def _costs(data: Mapping[str, Any], sizes: tuple[str, str]) -> str:
     """What rendering costs."""
-    rows = []
-    for size in sizes:
-        for clip, costs in data["render"].get(size, {}).items():
-            rows.append([f"{escape(clip)}, {size}", *(number(1e3 * value, 1) for value in costs["seconds"].values())])
-    if not rows:
+    columns = [
+        (f"{clip}, {size}", costs["seconds"]) for size in sizes for clip, costs in data["render"].get(size, {}).items()
+    ]
+    if not columns:
         return ""
-    head = ["Clip and size", "building the scene", "each sample per pixel", "albedo, normals, depth", "motion vectors"]
+    lines = {"building the scene": [cost["fixed"] for _, cost in columns]}
+    lines["each sample per pixel"] = [cost["sample"] for _, cost in columns]
+    for reads in columns[0][1]["buffers"]:
+        lines[reads or "no buffers"] = [cost["buffers"][reads] for _, cost in columns]
+    rows = [[escape(name), *(number(1e3 * value, 1) for value in values)] for name, values in lines.items()]
+    head = ["ms", *(name for name, _ in columns)]
     return (
         '<section id="rendering"><h2>Rendering one frame, ms</h2><p class="note">The first two are the bare renderer. '
-        "A denoiser that is not temporal needs the third too, a temporal one all four.</p>"
+        "The other rows are the buffers that denoisers read, each with the time that they add to a frame.</p>"
         f"{_rows(head, rows)}</section>"
     )
 

@@ -20,6 +20,8 @@ class Point(NamedTuple):
     method: str
     family: str
     variant: str
+    reads: str
+    """The buffers that it needs of the renderer besides radiance."""
     spp: int | None
     """None where only the time is known."""
     errors: Mapping[str, float]
@@ -58,7 +60,7 @@ class Equal(NamedTuple):
 
 
 def points(data: Mapping[str, Any], labels: Mapping[str, tuple[str, str, str]]) -> list[Point]:
-    """The points of the raw data; ``labels``: method -> (family, variant, guides).
+    """The points of the raw data; ``labels``: method -> (family, variant, what it reads).
 
     Methods without a label are left out: they were measured with an installation that is no longer there.
     """
@@ -68,20 +70,20 @@ def points(data: Mapping[str, Any], labels: Mapping[str, tuple[str, str, str]]) 
         method, _, spp = key.rpartition(" @ ")
         if method not in labels:
             continue
-        family, variant, guides = labels[method]
+        family, variant, reads = labels[method]
         errors = {measure.field: _mean([scores[measure.field] for scores in clips.values()]) for measure in MEASURES}
-        rendered = {size: 1e3 * cost.at(int(spp), guides) for size, cost in costs.items() if cost}
+        rendered = {size: 1e3 * cost.at(int(spp), reads) for size, cost in costs.items() if cost}
         times = {size: timing["median_ms"] for size, timing in data["times"].get(method, {}).items()}
         if method == RENDERER:
             times = dict.fromkeys(rendered, 0.0)
-        found.append(Point(key, method, family, variant, int(spp), errors, times, rendered))
+        found.append(Point(key, method, family, variant, reads, int(spp), errors, times, rendered))
     scored = {point.method for point in found}
     for method, sizes in data["times"].items():
         if method not in scored and method in labels:
-            family, variant, guides = labels[method]
+            family, variant, reads = labels[method]
             times = {size: timing["median_ms"] for size, timing in sizes.items()}
-            rendered = {size: 1e3 * cost.at(1, guides) for size, cost in costs.items() if cost}
-            found.append(Point(method, method, family, variant, None, {}, times, rendered))
+            rendered = {size: 1e3 * cost.at(1, reads) for size, cost in costs.items() if cost}
+            found.append(Point(method, method, family, variant, reads, None, {}, times, rendered))
     return found
 
 

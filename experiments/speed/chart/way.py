@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.speed.chart.render_cost import named
 from experiments.speed.timing import Call
 from experiments.speed.works import steps
 from jaxdn.candidates import Candidate
@@ -24,8 +25,6 @@ PLAIN = "plain"
 ALL = "effects all"
 """The variant with every buffer explicit: the image is that of the plain form, only the time differs."""
 
-_FEATURES = frozenset({"albedo", "normal", "depth"})
-
 Prepare = Callable[[Frame, frozenset[str]], Frame]
 """(frame, the buffers that the denoiser reads) -> the frame that it gets."""
 
@@ -38,8 +37,8 @@ class Way(NamedTuple):
     """The method that it is a variant of: one colour in the plot."""
     variant: str
     """How it differs from the plain form: one marker in the plot."""
-    guides: str
-    """Renderer output that it needs besides radiance: "none", "features" (albedo, normals, depth), or also "motion"."""
+    reads: str
+    """The buffers that it needs of the renderer besides radiance, as :func:`render_cost.named` names them."""
     timed: Callable[[Frame], Call]
     """A call that denoises one frame [H, W, C], for timing."""
     images: Callable[[Frame], np.ndarray] | None
@@ -80,7 +79,6 @@ def way(candidate: Candidate, variant: str = PLAIN, *, prepare: Prepare = as_it_
         single = (frame_at(frames, index) for index in range(frames.radiance.shape[0]))
         return np.stack([np.asarray(image) for image in stream(denoiser, params).each(single)])
 
-    guides = "none" if not denoiser.reads else "features" if denoiser.reads <= _FEATURES else "motion"
     family = candidate.label
     name = family if variant == PLAIN else f"{family}, {variant}"
-    return Way(name, family, variant, guides, timed, images if scored else None, family)
+    return Way(name, family, variant, named(denoiser.reads), timed, images if scored else None, family)

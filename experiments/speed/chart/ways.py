@@ -7,6 +7,7 @@ import numpy as np
 
 from experiments.speed import peers
 from experiments.speed.chart import of_ntd
+from experiments.speed.chart.render_cost import named
 from experiments.speed.chart.way import ALL, PLAIN, Way, all_written_out, standing_still, way
 from experiments.speed.timing import Call
 from experiments.speed.works import steps
@@ -89,10 +90,11 @@ def open_image_denoise() -> Iterator[Way]:
 
     # Interleaved with our weights, so that both are measured under the same machine conditions.
     group = next(iter(candidates.shipped_names()), "Open Image Denoise")
+    guides = ("albedo", "normal")
     for quality in ("high", "balanced", "fast"):
 
         def images(frames: Frame, quality: str = quality) -> np.ndarray:
-            frames = written_out(frames, ("albedo", "normal"))
+            frames = written_out(frames, guides)
             arrays = [np.asarray(buffer, np.float32) for buffer in (frames.radiance, frames.albedo, frames.normal)]
             denoise = oidn(*arrays[0].shape[1:3], quality=quality)
             return np.stack([denoise(*frame).copy() for frame in zip(*arrays, strict=True)])
@@ -101,7 +103,7 @@ def open_image_denoise() -> Iterator[Way]:
             return steps.open_image_denoise(frame, quality)
 
         variant = PLAIN if quality == "high" else quality
-        yield Way(f"oidn {quality}", "Open Image Denoise", variant, "features", timed, images, group)
+        yield Way(f"oidn {quality}", "Open Image Denoise", variant, named(guides), timed, images, group)
 
 
 def ways(denoisers: Sequence[Candidate], *, quick: bool = False) -> list[Way]:
