@@ -120,22 +120,29 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
     if fixed:
         forward[_still(size, there)] = 0.0
 
-    turned = _carried(now.normal.astype(np.float64), back)
-    lengths = np.linalg.norm(turned, axis=-1, keepdims=True)
-    normals = turned / np.where(lengths > 0, lengths, 1.0)
+    normals = _carried(now.normal.astype(np.float64), back)
+    return Motion(motion, forward, _seen(now, before, motion, old_points, normals, z), previous_depth)
+
+
+def _seen(
+    now: GBuffer, before: GBuffer, motion: np.ndarray, points: np.ndarray, normals: np.ndarray, z: np.ndarray
+) -> np.ndarray:
+    """[H, W, 1] bool, the points that the previous frame shows; ``points`` and what follows as in :func:`_matches`."""
+    size, sky = now.ids.shape[:2], now.ids < 0
+    lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
+    shown = (now.ids, points, normals / np.where(lengths > 0, lengths, 1.0), z)
     # In float32 from the pixel index: this must be the same pixel as the stored vector gives.
     pixels = np.stack(np.meshgrid(np.arange(size[1]), np.arange(size[0])), axis=-1).astype(np.float32)
     landing = pixels + motion.astype(np.float32) + np.float32(0.5)
     # The image's border belongs to the outermost pixel.
     tap = np.where(landing == [size[1], size[0]], landing - 1, np.floor(landing))
-    shown = (now.ids, old_points, normals, z)
     seen, nearest = _matches(before, tap, *shown)
     on_sky = ((nearest == -1) & ~sky)[..., 0]
-    landing, *shown = (each[on_sky] for each in (landing, *shown))
+    of_those = [each[on_sky] for each in shown]
     for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        tap = np.floor(landing - np.float32(0.5)) + corner
-        seen[on_sky] |= _matches(before, tap, *shown)[0]
-    return Motion(motion, forward, seen, previous_depth)
+        tap = np.floor(landing[on_sky] - np.float32(0.5)) + corner
+        seen[on_sky] |= _matches(before, tap, *of_those)[0]
+    return seen
 
 
 class _Moves(NamedTuple):
