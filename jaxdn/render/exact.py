@@ -61,6 +61,11 @@ def accumulate(
     return total
 
 
+def accumulate_sets(scene: Any, sets: int, *, first: int, count: int, **same: Any) -> list[Accumulated]:
+    """The sums of ``sets`` sets of ``count`` passes, one after the other; see :func:`wavefront.accumulate_sets`."""
+    return [accumulate(scene, first=first + index * count, count=count, **same) for index in range(sets)]
+
+
 def replay(
     scene: Any, target: np.ndarray, pixel: np.ndarray, *, key: tuple[int, int], sample: int, max_depth: int
 ) -> Replayed:

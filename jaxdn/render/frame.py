@@ -140,6 +140,12 @@ def render_frame(
         numbers = {"seed": seed, "frame": frame, "stream": stream}
         return use.accumulate(built, **numbers, first=first, count=count, max_depth=depth, **there)
 
+    def traced_sets(stream: int, count: int, sets: int) -> list[Accumulated]:
+        if dark:
+            return [traced(stream, 0, count)] * sets
+        numbers = {"seed": seed, "frame": frame, "stream": stream}
+        return use.accumulate_sets(built, sets, **numbers, first=0, count=count, max_depth=depth)
+
     def noise(part: Accumulated) -> np.ndarray:
         return part.indirect if light == "indirect" else part.indirect + part.direct
 
@@ -149,15 +155,20 @@ def render_frame(
     noisy = {count: traced(NOISY, count - 1, count, request if count == fewest else None) for count in sorted(layers)}
     halves = []
     if reference_spp and not repeated:
-        halves = _halves(partial(traced, REFERENCE), reference_spp, built if jitter else None)
         if jitter:
+            halves = _spread_halves(partial(traced, REFERENCE), reference_spp, built)
             jitters.look_through(built, jitters.of_frame(frame))
+        elif reference_spp % 2:
+            middle = (reference_spp + 1) // 2
+            halves = [traced(REFERENCE, 0, middle), traced(REFERENCE, middle, reference_spp - middle)]
+        else:
+            halves = traced_sets(REFERENCE, reference_spp // 2, 2)
     sums = halves or list(noisy.values())
     total = sums[0]
     for part in sums[1:]:
         total = total.plus(part)
     samples = reference_spp or sum(layers)
-    singles = [traced(DRAWS, index, 1) for index in range(draws)]
+    singles = traced_sets(DRAWS, 1, draws) if draws else []
 
     images = {count: _single(noise(part) / count) for count, part in noisy.items()}
     found: dict[str, Any] = {"direct": _single(total.direct / samples), "emission": _single(total.emitted / samples)}
@@ -189,14 +200,12 @@ def render_frame(
     )
 
 
-def _halves(traced: Callable[[int, int], Accumulated], samples: int, jittered: Any) -> list[Accumulated]:
-    """The sums over the two halves of a reference's samples; through the whole of the pixels of a ``jittered`` scene.
+def _spread_halves(traced: Callable[[int, int], Accumulated], samples: int, jittered: Any) -> list[Accumulated]:
+    """The sums over the two halves of a reference's samples, through the whole of the pixels of a jittered scene.
 
     ``traced(first, count)`` gives the sums of some samples; the scene is left at another point of its pixels.
     """
     middle = (samples + 1) // 2
-    if jittered is None:
-        return [traced(0, middle), traced(middle, samples - middle)]
 
     def spread(first: int, count: int) -> Accumulated:
         edges = first + np.arange(jitters.POSITIONS + 1) * count // jitters.POSITIONS
@@ -221,6 +230,7 @@ class Tracer(NamedTuple):
     """How a variant traces paths."""
 
     accumulate: Callable[..., Accumulated]
+    accumulate_sets: Callable[..., list[Accumulated]]
     replay: Replay
     jittered: bool
     """It distributes its samples over the pixel."""
@@ -231,10 +241,10 @@ def tracer(variant: str) -> Tracer:
     if variant.startswith("scalar"):
         from jaxdn.render import exact
 
-        return Tracer(exact.accumulate, exact.replay, True)
+        return Tracer(exact.accumulate, exact.accumulate_sets, exact.replay, True)
     from jaxdn.render import wavefront
 
-    return Tracer(wavefront.accumulate, wavefront.replay, False)
+    return Tracer(wavefront.accumulate, wavefront.accumulate_sets, wavefront.replay, False)
 
 
 def _of_samples(noisy: Accumulated, samples: int) -> dict[str, Any]:

@@ -186,17 +186,27 @@ def _chunk(
       depth: path length.
       request: what else is told of the samples.
     """
+    pixel, sample = _lanes(first_pixel, pixels, first, count)
+    ray, parts, finite, bad = _traced(scene, pixel, sample, key, depth)
+    images = _sums(parts, count)
+    found = _apart(scene, ray, lambda: generator(pixel, sample, key), parts, finite, count, request)
+    return Accumulated(images[0], images[1], images[2], int(dr.sum(bad)[0]), *found)
+
+
+def _lanes(first_pixel: int, pixels: int, first: int, count: int) -> tuple[Any, Any]:
+    """The pixel and the sample of every lane: ``count`` samples of a pixel, then those of the next."""
     lane = dr.arange(mi.UInt32, pixels * count)
     block = dr.opaque(mi.UInt32, count)
     offset = lane // block
     sample = lane - offset * block + dr.opaque(mi.UInt32, first)
-    pixel = offset + dr.opaque(mi.UInt32, first_pixel)
-    ray, parts, finite, bad = _traced(scene, pixel, sample, key, depth)
+    return offset + dr.opaque(mi.UInt32, first_pixel), sample
+
+
+def _sums(parts: list[Any], count: int) -> list[np.ndarray]:
+    """Each part summed up over every ``count`` lanes, [lanes / count, 3]."""
     sums = [[dr.block_sum(part[channel], count) for channel in range(3)] for part in parts]
     dr.eval(sums)
-    images = [np.stack([np.array(channel, np.float64) for channel in part], axis=-1) for part in sums]
-    found = _apart(scene, ray, lambda: generator(pixel, sample, key), parts, finite, count, request)
-    return Accumulated(images[0], images[1], images[2], int(dr.sum(bad)[0]), *found)
+    return [np.stack([np.array(channel, np.float64) for channel in part], axis=-1) for part in sums]
 
 
 def _traced(scene: Any, pixel: Any, sample: Any, key: tuple[int, int], depth: int) -> tuple[Any, list[Any], Any, Any]:
@@ -282,6 +292,34 @@ def accumulate(
     lamps = [run.shadows for run in runs if run.shadows is not None]
     shadows = Shadows(*(_whole(part, height, width) for part in zip(*lamps, strict=True))) if lamps else None
     return Accumulated(images[0], images[1], images[2], sum(run.bad for run in runs), lobes, shadows)
+
+
+def accumulate_sets(
+    scene: Any,
+    sets: int,
+    *,
+    seed: int,
+    frame: int,
+    stream: int,
+    first: int,
+    count: int,
+    max_depth: int,
+    max_lanes: int = MAX_LANES,
+) -> list[Accumulated]:
+    """The sums of ``sets`` sets of ``count`` samples, one after the other, each as :func:`accumulate` gives it.
+
+    All at once where they fit into ``max_lanes``: for small images, to record the program takes longer than to run it.
+    """
+    same: dict[str, Any] = {"seed": seed, "frame": frame, "stream": stream, "count": count, "max_depth": max_depth}
+    width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
+    if sets * count * width * height > max_lanes:
+        each = (accumulate(scene, first=first + index * count, **same, max_lanes=max_lanes) for index in range(sets))
+        return list(each)
+    pixel, sample = _lanes(0, width * height, first, sets * count)
+    _, parts, _, bad = _traced(scene, pixel, sample, frame_key(seed, frame, stream), max_depth)
+    images = np.moveaxis(np.reshape(_sums(parts, count), (3, height, width, sets, 3)), 3, 0)
+    wrong = np.array(dr.block_sum(bad, count)).reshape(-1, sets).sum(axis=0)
+    return [Accumulated(part[0], part[1], part[2], int(number)) for part, number in zip(images, wrong, strict=True)]
 
 
 def accumulate_each(

@@ -20,7 +20,7 @@ from jaxdn.frame import present
 from jaxdn.render import farm
 from jaxdn.render.clip import render_clip
 from jaxdn.render.errors import RenderError
-from jaxdn.render.frame import Rendered, render_frame
+from jaxdn.render.frame import Rendered, render_frame, tracer
 from jaxdn.render.opening import scene_from_record
 from jaxdn.render.scene import AnimatedScene
 from jaxdn.render.seeds import NOISY, REFERENCE, frame_key, pass_seed, tea
@@ -127,6 +127,21 @@ def test_the_reference_shares_no_sample_with_the_noise(variant: str) -> None:
     assert not np.array_equal(found.layers[2], found.reference_half)
     # The halves differ too, and the reference is their mean.
     assert not np.array_equal(found.reference, found.reference_half)
+
+
+@pytest.mark.parametrize("room", ["all at once", "one set at a time"])
+def test_sets_of_samples_are_those_that_are_traced_alone(variant: str, room: str) -> None:
+    trace, scene = tracer(variant), Stage().build(0, WIDTH, HEIGHT)
+    numbers: dict[str, Any] = {"seed": 3, "frame": 1, "stream": REFERENCE, "max_depth": Stage.max_depth, "count": 2}
+    few = {} if room == "all at once" or trace.jittered else {"max_lanes": 3 * WIDTH * HEIGHT}
+    found = trace.accumulate_sets(scene, 3, first=4, **numbers, **few)
+    assert len(found) == 3
+    for index, one in enumerate(found):
+        alone = trace.accumulate(scene, first=4 + 2 * index, **numbers)
+        assert one.bad == alone.bad
+        for mine, other in zip(one[:3], alone[:3], strict=True):
+            np.testing.assert_array_equal(mine, other)
+    assert np.any(found[0].indirect != found[1].indirect)
 
 
 def test_half_of_the_reference_measures_its_noise(variant: str) -> None:
