@@ -41,6 +41,7 @@ from experiments.speed.works import scene
 from jaxdn.commands.compare import describe_machine
 from jaxdn.commands.errors import plain_errors
 from jaxdn.frame import Frame, frame_at, written_out
+from jaxdn.heap import keep_memory
 from jaxdn.render import scene_from_record, use_variant
 from jaxdn.report import save_png
 from jaxdn.weights import SHIPPED
@@ -223,6 +224,7 @@ def _digest(path: Path) -> str:
 
 def main(settings: Settings) -> None:
     """Render, score, time, draw."""
+    keep_memory()  # as `jaxdn denoise` does
     began = time.monotonic()
     console = Console()
     sizes = footage.QUICK if settings.quick else footage.FULL

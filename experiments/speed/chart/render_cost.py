@@ -8,10 +8,12 @@ import numpy as np
 from experiments.speed.chart.energy import Meter
 from experiments.speed.timing import measure
 from jaxdn import effects
+from jaxdn.frame import OF_SAMPLES
 from jaxdn.render import AnimatedScene, render_frame
 
 SAMPLES = (1, 2, 4)
 FRAME = 2
+ROUNDS = 7
 
 
 class Cost(NamedTuple):
@@ -34,13 +36,12 @@ def named(reads: Collection[str]) -> str:
     return ", ".join(sorted(reads))
 
 
-def fit(light: Mapping[int, float], buffers: Mapping[str, float]) -> Cost:
-    """The cost from the times of frames: ``light`` (samples -> without buffers), and 1 sample with ``buffers``."""
+def fit(light: Mapping[int, float], more: Mapping[str, float]) -> Cost:
+    """The cost from the times of frames without buffers, ``light`` (samples -> time), and what buffers add to them."""
     samples = np.asarray(sorted(light), float)
     slope, fixed = np.polyfit(samples, [light[int(spp)] for spp in samples], 1)
     # Measurement noise must not make the cost of a buffer, or of the scene, negative.
-    more = {reads: max(seconds - light[1], 0.0) for reads, seconds in buffers.items()}
-    return Cost(max(float(fixed), 0.0), max(float(slope), 0.0), more)
+    return Cost(max(float(fixed), 0.0), max(float(slope), 0.0), {one: max(time, 0.0) for one, time in more.items()})
 
 
 def measure_cost(
@@ -48,30 +49,36 @@ def measure_cost(
 ) -> dict[str, dict[str, Any]]:
     """``{"seconds": ..., "joules": ...}`` of a scene's frame at this size; joules only where there is a meter.
 
-    ``reads`` are what denoisers read (:func:`named`), of which the clip has the buffers ``there``.
+    ``reads`` are what denoisers read (:func:`named`), of which the clip has the buffers ``there``. Buffers that need no
+    paths are measured without any: a path tracer's time varies by more than they take.
     """
     everything = effects.plan(effects.everything(FRAME + 1))
     before = render_frame(scene, FRAME - 1, width=width, height=height).view
 
-    def frame(spp: int, buffers: Sequence[str]) -> Callable[[], Any]:
+    def frame(spp: int, buffers: Sequence[str], *, paths: bool = True) -> Callable[[], Any]:
         plan = everything._replace(frames=(tuple(buffers),) * (FRAME + 1))
+        plan = plan if paths else plan._replace(integrator="none")
         return lambda: render_frame(scene, FRAME, width=width, height=height, layers=(spp,), previous=before, plan=plan)
 
     made = {one: [name for name in one.split(", ") if name in there and name in everything.buffers] for one in reads}
-    calls = {f"light {spp}": frame(spp, ()) for spp in SAMPLES}
-    calls |= {named(buffers): frame(1, buffers) for buffers in made.values() if buffers}
-    names = {one: named(buffers) or "light 1" for one, buffers in made.items()}
-    seconds = {name: timing.median_ms / 1e3 for name, timing in measure(calls, rounds=3, budget_s=90).items()}
-    costs = {"seconds": _fitted(seconds, names)._asdict()}
+    calls = {f"light {spp}": frame(spp, ()) for spp in SAMPLES} | {"": frame(1, (), paths=False)}
+    calls |= {named(buffers): frame(1, buffers, paths=_paths(buffers)) for buffers in made.values()}
+
+    def fitted(found: Mapping[str, float]) -> dict[str, Any]:
+        base = {True: found["light 1"], False: found[""]}
+        more = {one: found[named(buffers)] - base[_paths(buffers)] for one, buffers in made.items()}
+        return fit({spp: found[f"light {spp}"] for spp in SAMPLES}, more)._asdict()
+
+    timings = measure(calls, rounds=ROUNDS, budget_s=120)
+    costs = {"seconds": fitted({name: timing.median_ms / 1e3 for name, timing in timings.items()})}
     if meter is not None:
-        joules = {name: meter.joules(call) for name, call in calls.items()}
-        costs["joules"] = _fitted(joules, names)._asdict()
+        costs["joules"] = fitted({name: meter.joules(call) for name, call in calls.items()})
     return costs
 
 
-def _fitted(found: Mapping[str, float], names: Mapping[str, str]) -> Cost:
-    light = {spp: found[f"light {spp}"] for spp in SAMPLES}
-    return fit(light, {one: found[name] for one, name in names.items()})
+def _paths(buffers: Collection[str]) -> bool:
+    """Whether some of the buffers are made of paths."""
+    return bool({"luminance_gradient", *OF_SAMPLES} & set(buffers))
 
 
 def mean_cost(costs: Sequence[Mapping[str, Any]]) -> Cost:
