@@ -3,7 +3,7 @@
     python -m experiments.papers.weights --rooms rooms/*/scene.xml    # `make weights`: hours; resumable
 
 Clips: tours of furnished Mitsuba scenes and the procedural families, 128 x 128 pixels, 10 frames, references of 32
-samples and six more single samples, 25 to 50 seconds of one core each. The rooms that the shipped weights saw are six
+samples and six more single samples, 16 to 48 seconds of one core each. The rooms that the shipped weights saw are six
 of Benedikt Bitterli's rendering resources (bathroom, kitchen, living-room-2, spaceship, veach-ajar, veach-lamp);
 without ``--rooms`` the families are all there is. Finished clips and stages are reused, interrupted ones go on. Each
 network is trained at a constant rate first, so that it can always be continued, and with a falling rate at the end;
