@@ -31,7 +31,7 @@ FAMILIES = {"parlour": 90, "fruit": 14, "mobile": 14, "pinkroom": 14, "robot": 1
 """Clips of each procedural family."""
 CLIP: dict[str, Any] = {"width": 128, "height": 128, "frames": 10, "reference_spp": 32, "layers": [1], "draws": 6}
 """What each of them is."""
-BLOCK = 10
+BLOCK = 4
 """Clips of each kind that are rendered before the next kind has its turn."""
 
 

@@ -1,33 +1,109 @@
 """What choices in training bring: every row changes one thing, and clips in another form are what they are called."""
 
+import contextlib
+import json
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.papers.learning import BRANCHES, LADDER, Settings, main, rows
+from experiments.papers import choices, learning
+from experiments.papers.equal_time import Settings, run
 from experiments.papers.other_clips import every_other, half_reference, three_of_four, without_draws
 from experiments.papers.weights import STAGES
 from jaxdn import clips
 from jaxdn.clips.cache import open_cached
 from jaxdn.clips.noise_floor import read_halves
-from jaxdn.frame import Frame
+from jaxdn.frame import Clip, Frame
 from jaxdn.methods.table import method_named
+from jaxdn.rollout import denoise
 from jaxdn.weights import shipped_names
 
 
-def test_every_row_changes_its_own_and_what_it_stands_on():
-    found = rows()
-    assert list(found) == [row.name for row in (*LADDER, *BRANCHES)]
-    method = method_named("ntd")
+@pytest.mark.parametrize("study", [learning.study, choices.study])
+def test_every_row_changes_its_own_and_what_it_stands_on(study):
+    found, method = study().resolved(), method_named(study().method)
+    assert list(found) == [row.name for row in study().rows]  # no name twice, nothing before what it stands on
     for row, options, recipe in found.values():
         method.made(options)  # raises if an option does not exist
         recipe.check()
-        assert not row.on or row.on in found
         assert options.items() >= dict(row.options).items()
-    last, first = found[LADDER[-1].name], found[LADDER[0].name]
+        assert recipe == recipe._replace(**row.recipe, decay=False)
+    assert [row.name for row in study().rows if not row.on] == [study().rows[0].name]
+
+
+def test_rows_of_ntd_are_a_ladder_and_its_branches():
+    found = learning.study().resolved()
+    last = found[learning.LADDER[-1].name]
+    taken = {"kernels": "guided", "background": "pass", "initialization": "he", "exposure": "measured"}
+    assert last[1] == {"size": "small", **taken}
     assert found["materials seen"][1] == last[1] | {"guides": "materials"}
-    assert found["as in version 0.1, for the time of guided kernels"][1:] == first[1:]
+    assert found["materials seen"][2] == last[2]
+
+
+def _image(clip: Clip) -> np.ndarray:
+    denoiser = method_named("steady").factory(quality="balanced")
+    params = denoiser.init(jax.random.key(0), jax.tree.map(lambda buffer: buffer[0], clip.frames))
+    keys = jax.random.key(1)
+    params = jax.tree.map(lambda x: x + 0.1 * jax.random.normal(keys, jnp.shape(x)), params)
+    return np.asarray(denoise(denoiser, params, clip))
+
+
+@pytest.fixture(scope="module")
+def clip() -> Clip:
+    """Three frames in which every buffer varies."""
+    rng = np.random.default_rng(0)
+    sizes = {"radiance": 3, "albedo": 3, "reflectance": 3, "normal": 3, "roughness": 1, "depth": 1, "motion": 2}
+    buffers = {name: rng.random((3, 32, 32, size), np.float32) for name, size in sizes.items()}
+    buffers["reflectance"] = np.minimum(buffers["albedo"] + 0.3 * buffers["reflectance"], 1.0)
+    buffers["depth"], buffers["motion"] = 2.0 + 0.1 * buffers["depth"], 4.0 * buffers["motion"] - 2.0
+    buffers["radiance"][:, ::7, ::5] *= 50.0
+    return Clip(Frame(**{name: jnp.asarray(buffer) for name, buffer in buffers.items()}), None)
+
+
+@pytest.fixture(scope="module")
+def as_it_is(clip: Clip) -> np.ndarray:
+    return _image(clip)
+
+
+_REPLACED = {row.name: row for row in choices.DESIGN if row.change is not contextlib.nullcontext}
+
+
+@pytest.mark.slow  # a program for every row
+@pytest.mark.parametrize("name", _REPLACED)
+def test_what_a_row_replaces_in_steady_changes_its_image(name: str, clip: Clip, as_it_is: np.ndarray):
+    with _REPLACED[name].change():
+        found = _image(clip)
+    assert np.isfinite(found).all()
+    assert np.abs(found - as_it_is).max() > 1e-4 * as_it_is.max()
+
+
+@pytest.mark.slow
+def test_nothing_replaced_is_left_behind(clip: Clip, as_it_is: np.ndarray):
+    for row in _REPLACED.values():
+        with row.change():
+            pass
+    np.testing.assert_array_equal(_image(clip), as_it_is)
+
+
+@pytest.mark.slow  # trains two networks, each in a process of its own
+def test_rows_are_trained_for_as_long_scored_and_not_trained_again(folder: Path, tmp_path: Path, capsys):
+    wanted = ["as in version 0.1", "guided kernels"]
+    settings = Settings(folder, [folder], minutes=0.02, crop=8, batch=1, frames=1, rows=wanted, out=tmp_path / "runs")
+    run(learning.study, settings)
+    first = capsys.readouterr().out
+    lines = [line.split(" | ") for line in first.splitlines() if line.startswith("| ")]
+    assert [line[0].strip("| ") for line in lines[1:]] == wanted
+    assert [int(line[2]) > 1 for line in lines[1:]] == [True, True]
+    scores = json.loads((tmp_path / "runs" / "guided-kernels" / "scores.json").read_text())
+    assert scores["seconds"] >= 1.2
+    assert list(scores["scores"]) == ["clips"]
+    assert list(scores["scores"]["clips"]) == ["1"]
+    written = (tmp_path / "runs" / "guided-kernels" / "weights.safetensors").stat().st_mtime_ns
+    run(learning.study, settings)
+    assert (tmp_path / "runs" / "guided-kernels" / "weights.safetensors").stat().st_mtime_ns == written
 
 
 def test_stages_of_the_shipped_weights_exist():
@@ -70,4 +146,4 @@ def test_clips_in_another_form(folder: Path, tmp_path: Path):
 
 def test_unknown_rows_are_named(folder: Path):
     with pytest.raises(ValueError, match=r"--rows: expected some of .*guided kernels.*; got guided kernel"):
-        main(Settings(folder, folder, folder, rows=["guided kernel"]))
+        run(learning.study, Settings(folder, [folder], rows=["guided kernel"]))
