@@ -22,8 +22,9 @@ import tyro
 
 from experiments.papers.results import indirect
 from jaxdn.candidates import candidate
-from jaxdn.clips import find_clips, training_batches
+from jaxdn.clips import find_clips
 from jaxdn.commands.compare import compare
+from jaxdn.commands.train import recipe_batches
 from jaxdn.files import write_json
 from jaxdn.learning.step import begun, initial_state, make_train_step
 from jaxdn.methods.table import Method, method_named
@@ -151,18 +152,7 @@ def _trained(
     """The weights after so many seconds of updates, and how many updates and seconds there were."""
     engine = method.engine("training", options)
     denoiser = method.factory(**options) if engine is None else method.factory(**options, implementation=engine)
-    batches = training_batches(
-        [clips],
-        buffers=denoiser.reads | recipe.objective.reads,
-        batch=recipe.batch,
-        crop=recipe.crop,
-        frames=recipe.frames,
-        seed=recipe.seed,
-        spp=recipe.spp,
-        layers=denoiser.samples is not None,
-        variation=recipe.variation,
-        threads=1,
-    )
+    batches = recipe_batches(denoiser, recipe, [clips])
     state = initial_state(denoiser, recipe, next(batches))
     if start is not None:
         state = begun(jax.tree.map(jax.numpy.array, starting_params(start, denoiser)), recipe)
@@ -173,10 +163,9 @@ def _trained(
         state, _ = jax.block_until_ready(update(state, next(batches)))
     about = {"updates": int(state.step), "skipped": int(state.skipped), "seconds": time.monotonic() - began}
     print(f"{out.name}: {about}", flush=True)
-    plain = {**options}
     record = {"recipe": recipe.record(), **about}
-    path = save_weights(out / "weights.safetensors", state.average, factory=method.name, options=plain, record=record)
-    return path, about
+    path = out / "weights.safetensors"
+    return save_weights(path, state.average, factory=method.name, options=dict(options), record=record), about
 
 
 def folder_name(label: str) -> str:

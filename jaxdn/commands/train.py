@@ -1,13 +1,15 @@
 """``jaxdn train``: a learned method, trained on rendered clips."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxdn.clips import training_batches
 from jaxdn.commands.fit import Start, begun_with, fit
 from jaxdn.commands.validation import load_validation
+from jaxdn.denoiser import Denoiser
+from jaxdn.frame import Clip
 from jaxdn.methods.table import Method
 from jaxdn.recipe import Recipe
 from jaxdn.weights import save_weights, starting_params
@@ -57,18 +59,7 @@ def train(
     else:
         denoiser = method.factory(**options)
         print(f"{label}: everything runs on XLA", flush=True)
-    batches = training_batches(
-        clips,
-        buffers=denoiser.reads | recipe.objective.reads,
-        batch=recipe.batch,
-        crop=recipe.crop,
-        frames=recipe.frames,
-        seed=recipe.seed,
-        spp=recipe.spp,
-        layers=denoiser.samples is not None,
-        variation=recipe.variation,
-        threads=max(1, (os.cpu_count() or 1) // 2),  # a GPU takes a hundred elements a second, a thread makes twelve
-    )
+    batches = recipe_batches(denoiser, recipe, clips)
     held_out = load_validation(denoiser, validation, spp=min(recipe.spp))
     first = None if start is None else Start(str(start), starting_params(start, denoiser))
     state = fit(denoiser, recipe, batches, out, label=label, start=first, validation=held_out, time_limit=time_limit)
@@ -85,4 +76,23 @@ def train(
     }
     return save_weights(
         out / "weights.safetensors", state.average, factory=method.name, options=dict(options), record=about
+    )
+
+
+def recipe_batches(denoiser: Denoiser, recipe: Recipe, clips: Sequence[Path]) -> Iterator[Clip]:
+    """The batches that a recipe asks for, with the buffers that the denoiser and the objective read, without end.
+
+    ``clips`` are folders of clips, or packed sets.
+    """
+    return training_batches(
+        clips,
+        buffers=denoiser.reads | recipe.objective.reads,
+        batch=recipe.batch,
+        crop=recipe.crop,
+        frames=recipe.frames,
+        seed=recipe.seed,
+        spp=recipe.spp,
+        layers=denoiser.samples is not None,
+        variation=recipe.variation,
+        threads=max(1, (os.cpu_count() or 1) // 2),  # a GPU takes a hundred elements a second, a thread makes twelve
     )
