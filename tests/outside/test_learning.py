@@ -91,7 +91,7 @@ def test_nothing_replaced_is_left_behind(clip: Clip, as_it_is: np.ndarray):
 @pytest.mark.slow  # trains two networks, each in a process of its own
 def test_rows_are_trained_for_as_long_scored_and_not_trained_again(folder: Path, tmp_path: Path, capsys):
     wanted = ["as in version 0.1", "guided kernels"]
-    settings = Settings(folder, [folder], minutes=0.02, crop=8, batch=1, frames=1, rows=wanted, out=tmp_path / "runs")
+    settings = Settings(folder, [folder], minutes=0.02, crop=8, batch=1, frames=2, rows=wanted, out=tmp_path / "runs")
     run(learning.study, settings)
     first = capsys.readouterr().out
     lines = [line.split(" | ") for line in first.splitlines() if line.startswith("| ")]
@@ -118,13 +118,15 @@ def test_stages_of_the_shipped_weights_exist():
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Three clips: reference 0.2, its first half 0.1, two draws."""
+    """Three clips of two frames: reference 0.2, its first half 0.1, two draws, twice as bright in the second frame."""
     for number in range(3):
         home, flat = tmp_path / "clips" / f"room-{number}", np.ones((8, 8, 3), np.float32)
         home.mkdir(parents=True)
-        light = {"reference": 0.2 * flat, "reference_half": 0.1 * flat, "draws": np.ones((2, 8, 8, 6), np.float32)}
-        clips.write_frame(clips.frame_path(home, 0), Frame(0.5 * flat), layers={1: 0.5 * flat}, **light)
-        record = {"frames": 1, "width": 8, "height": 8, "layers": [1], "draws": 2, "reference_spp": 32}
+        for index in range(2):
+            draws = np.full((2, 8, 8, 6), 1.0 + index, np.float32)
+            light = {"reference": 0.2 * flat, "reference_half": 0.1 * flat, "draws": draws}
+            clips.write_frame(clips.frame_path(home, index), Frame(0.5 * flat), layers={1: 0.5 * flat}, **light)
+        record = {"frames": 2, "width": 8, "height": 8, "layers": [1], "draws": 2, "reference_spp": 32}
         clips.finish_record(record, home)
     return tmp_path / "clips"
 
