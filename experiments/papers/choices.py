@@ -30,7 +30,7 @@ from jaxdn.variation import STILL
 _Shares = dict[str, jax.Array]
 _Change = Callable[[], AbstractContextManager[Any]]
 
-_AS_IT_IS = "steady-balanced as it is"
+_AS_IT_IS, _ONE = "steady-balanced as it is", "1 sample alone"
 
 
 def _quality(**changed: Any) -> _Change:
@@ -139,10 +139,10 @@ TRAINING = (
     _row("the paper's loss", recipe={"objective": indirect_illumination()}),
     _row("squares", recipe={"objective": unbiased_illumination(squared_from=0.0)}),
     _row("the logarithm of the loss", recipe={"objective": pyramid_illumination(logarithm=True)}),
-    _row("1 sample alone", recipe={"spp": (1,)}),
+    _row(_ONE, recipe={"spp": (1,)}),
     _row("nothing varied", recipe={"variation": STILL}),
     _row("the newest weights, no mean", recipe={"average": 0.0}),
-    _row("one noisy image a frame", clips=without_draws),
+    Row("one noisy image a frame", _ONE, clips=without_draws),
     _row("references of half the samples", clips=half_reference, recipe={"spp": (1, 1, 1, 2, 4)}),
     _row("windows of half as many frames", batch=(2.0, 1.0, 0.5)),
     _row("a quarter as many crops, twice as wide", batch=(0.25, 2.0, 1.0)),

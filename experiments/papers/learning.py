@@ -36,7 +36,7 @@ _LAST = LADDER[-1].name
 BRANCHES = (
     Row("bands of a pyramid", _LAST, recipe={"objective": pyramid_illumination()}),
     Row("hidden pixels not weighted", _LAST, recipe={"objective": unbiased_illumination(hidden=0.0, squared_from=0.0)}),
-    Row("one noisy image a frame", _LAST, clips=without_draws),
+    Row("one noisy image a frame", "varied clips", clips=without_draws),
     Row("half the clips", _LAST, clips=every_other),
     Row("three quarters of the clips", _LAST, clips=three_of_four),
     Row("half the samples in references", _LAST, recipe={"spp": (1, 1, 1, 2, 4)}, clips=half_reference),

@@ -31,6 +31,8 @@ def test_every_row_changes_its_own_and_what_it_stands_on(study):
         recipe.check()
         assert options.items() >= dict(row.options).items()
         assert recipe == recipe._replace(**row.recipe, decay=False)
+        # One noisy image is one of 1 sample, and there is no other to add to it.
+        assert row.clips is not without_draws or recipe.spp == (1,)
     assert [row.name for row in study().rows if not row.on] == [study().rows[0].name]
 
 
