@@ -115,7 +115,7 @@ DESIGN = (
     _row("the same decisions for all pixels", _decided_alike),
     _row("all pixels are trusted", _decided(_no_trust)),
     _row("every level is taken whole", _decided(_levels_whole)),
-    _row("the newest frame has the weight 1 / (N + 1)", _decided(_one_over_n)),
+    _row("the newest frame counts as one of N + 1", _decided(_one_over_n)),
     _row("the last output is not blended with", _decided(_newest_output)),
     _row("nothing filtered enters the mean", _decided(_nothing_fed_back)),
     _row("taps of the history are not tested", _untested),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.papers import choices, learning
-from experiments.papers.equal_time import Settings, run
+from experiments.papers.equal_time import Settings, folder_name, run
 from experiments.papers.other_clips import every_other, half_reference, three_of_four, without_draws
 from experiments.papers.weights import STAGES
 from jaxdn import clips
@@ -29,6 +29,7 @@ def test_every_row_changes_its_own_and_what_it_stands_on(study):
     for row, options, recipe in found.values():
         method.made(options)  # raises if an option does not exist
         recipe.check()
+        assert folder_name(row.name) == Path(folder_name(row.name)).name
         assert options.items() >= dict(row.options).items()
         assert recipe == recipe._replace(**row.recipe, decay=False)
         # One noisy image is one of 1 sample, and there is no other to add to it.
