@@ -56,13 +56,17 @@ def _image(clip: Clip) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def clip() -> Clip:
-    """Three frames in which every buffer varies."""
+    """Three frames of two walls, one behind the other, that vary a little, the last in three times the light."""
     rng = np.random.default_rng(0)
     sizes = {"radiance": 3, "albedo": 3, "reflectance": 3, "normal": 3, "roughness": 1, "depth": 1, "motion": 2}
     buffers = {name: rng.random((3, 32, 32, size), np.float32) for name, size in sizes.items()}
+    for name in ("albedo", "normal", "roughness"):
+        buffers[name] = 0.5 + 0.1 * buffers[name]
     buffers["reflectance"] = np.minimum(buffers["albedo"] + 0.3 * buffers["reflectance"], 1.0)
-    buffers["depth"], buffers["motion"] = 2.0 + 0.1 * buffers["depth"], 4.0 * buffers["motion"] - 2.0
+    buffers["depth"], buffers["motion"] = 2.0 + 0.01 * buffers["depth"], 4.0 * buffers["motion"] - 2.0
+    buffers["depth"][:, :, 16:] += 2.0
     buffers["radiance"][:, ::7, ::5] *= 50.0
+    buffers["radiance"][2] *= 3.0
     return Clip(Frame(**{name: jnp.asarray(buffer) for name, buffer in buffers.items()}), None)
 
 
@@ -80,7 +84,8 @@ def test_what_a_row_replaces_in_steady_changes_its_image(name: str, clip: Clip, 
     with _REPLACED[name].change():
         found = _image(clip)
     assert np.isfinite(found).all()
-    assert np.abs(found - as_it_is).max() > 1e-4 * as_it_is.max()
+    # A program of another shape differs by its rounding, some millionths.
+    assert np.abs(found - as_it_is).max() > 1e-3 * np.median(as_it_is)
 
 
 @pytest.mark.slow
