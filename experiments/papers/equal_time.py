@@ -96,7 +96,8 @@ class Study(NamedTuple):
 
 
 def run(study: Callable[[], Study], settings: Settings) -> None:
-    """Train and score the rows, and print the table. Raises ValueError for an unknown row.
+    """Train and score the rows, and print the table. Raises ValueError for an unknown row, and for one that is there
+    with other settings.
 
     ``study`` is a function of a module, for the processes to call: objectives cannot be sent to them.
     """
@@ -105,7 +106,7 @@ def run(study: Callable[[], Study], settings: Settings) -> None:
         raise ValueError(f"--rows: expected some of {', '.join(every)}; got {', '.join(unknown)}.")
     chosen = [name for name in every if not settings.rows or name in settings.rows]
     for name in chosen:
-        if not _scores_of(settings, name).is_file():
+        if not _trained_before(settings, name):
             # A process of its own: a row that changes code must not leave programs behind for the next.
             with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as process:
                 process.submit(_train_and_score, study, settings, name).result()
@@ -137,7 +138,7 @@ def _train_and_score(study: Callable[[], Study], settings: Settings, name: str) 
                 mean = mean_scores(results)[name]
                 found = {"psnr": mean.unbiased_psnr, "temporal": mean.unbiased_temporal_psnr, "flip": mean.flip}
                 scores.setdefault(place.name, {})[str(spp)] = found
-    write_json(_scores_of(settings, name), {**about, "scores": scores})
+    write_json(_scores_of(settings, name), {**about, "settings": _asked(settings), "scores": scores})
 
 
 def _trained(
@@ -177,12 +178,27 @@ def _scores_of(settings: Settings, name: str) -> Path:
     return settings.out / folder_name(name) / "scores.json"
 
 
+def _asked(settings: Settings) -> dict[str, Any]:
+    """What rows must have in common to be compared."""
+    places = {"clips": str(settings.clips), "tests": [str(place) for place in settings.tests]}
+    numbers = {name: getattr(settings, name) for name in ("minutes", "crop", "batch", "frames", "spp")}
+    return {**places, **numbers}
+
+
+def _trained_before(settings: Settings, name: str) -> bool:
+    path = _scores_of(settings, name)
+    if not path.is_file():
+        return False
+    there = json.loads(path.read_text())["settings"]
+    if there != _asked(settings):
+        raise ValueError(f"{path}: expected a row of {_asked(settings)}, got one of {there}; give another --out.")
+    return True
+
+
 def table(every: Mapping[str, tuple[Row, Any, Any]], settings: Settings) -> str:
     """One line of Markdown per row: updates, then PSNR / temporal PSNR of each place and sample count, and the gain."""
     done = {
-        name: json.loads(_scores_of(settings, name).read_text())
-        for name in every
-        if _scores_of(settings, name).is_file()
+        name: json.loads(_scores_of(settings, name).read_text()) for name in every if _trained_before(settings, name)
     }
     columns = [(place.name, str(spp)) for place in settings.tests for spp in settings.spp]
     titles = ["row", "changes", "updates", *(f"{place}, {spp} spp | gain" for place, spp in columns)]

@@ -112,6 +112,9 @@ def test_rows_are_trained_for_as_long_scored_and_not_trained_again(folder: Path,
     written = (tmp_path / "runs" / "guided-kernels" / "weights.safetensors").stat().st_mtime_ns
     run(learning.study, settings)
     assert (tmp_path / "runs" / "guided-kernels" / "weights.safetensors").stat().st_mtime_ns == written
+    settings.minutes = 1.0
+    with pytest.raises(ValueError, match=r"'minutes': 1.0.*'minutes': 0.02.*another --out"):
+        run(learning.study, settings)
 
 
 def test_stages_of_the_shipped_weights_exist():
