@@ -189,7 +189,7 @@ def _trained_before(settings: Settings, name: str) -> bool:
     path = _scores_of(settings, name)
     if not path.is_file():
         return False
-    there = json.loads(path.read_text())["settings"]
+    there = json.loads(path.read_text()).get("settings")
     if there != _asked(settings):
         raise ValueError(f"{path}: expected a row of {_asked(settings)}, got one of {there}; give another --out.")
     return True
