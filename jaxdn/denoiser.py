@@ -61,6 +61,9 @@ class Core(NamedTuple):
     reach: int | None = None
     """In pixels: what is farther away decides nothing about a pixel, apart from the history, which may come from as
     much farther as vectors are long, and from what is measured. None: not known, and frames cannot be parted."""
+    counted: bool = False
+    """Its frames always have a ``sample_count``, whether or not it reads one: 0 where the radiance is no measurement,
+    because a value was not finite, and 1 elsewhere. Without it such pixels look like pixels without light."""
 
 
 class Recurrent(NamedTuple):
@@ -88,7 +91,11 @@ class RecurrentStep:
 
     def measured(self, frame: Frame) -> tuple[Frame, Whole | None, jax.Array]:
         """The repaired frame, what is measured of it, and the number of values that were replaced."""
-        frame, replaced = repair(checked(frame, self.core.reads))
+        frame = checked(frame, self.core.reads)
+        if self.core.counted:
+            finite = jnp.all(jnp.isfinite(frame.radiance), axis=-1, keepdims=True)
+            frame = frame._replace(sample_count=finite.astype(jnp.float32))
+        frame, replaced = repair(frame)
         return frame, None if self.core.measure is None else self.core.measure(frame), replaced
 
     def part(

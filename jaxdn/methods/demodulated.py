@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jaxdn import brdf
 from jaxdn.checks import check_option
-from jaxdn.denoiser import Core, Denoiser, Params, RecurrentStep, State, recurrent
+from jaxdn.denoiser import Denoiser, Params, RecurrentStep, State, recurrent
 from jaxdn.frame import Frame
 from jaxdn.whole import Whole
 
@@ -62,7 +62,8 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "brdf") -> Deno
     requests = None if core.samples is None else samples
     measuring = None if core.measure is None else measure
     reads = {"albedo", "reflectance"} if by == "brdf" else {"albedo"}
-    return recurrent(Core(start, step, core.reads | reads, core.init, requests, measuring, core.reach))
+    changed = core._replace(start=start, step=step, reads=core.reads | reads, samples=requests, measure=measuring)
+    return recurrent(changed)
 
 
 def texture_left(frame: Frame, by: Demodulation | bool, whole: Whole | None = None) -> jax.Array | None:

@@ -164,7 +164,10 @@ def steady(options: Options) -> Denoiser:
         recalled = recall(state.history, state.guides, frame, first)
         surfaces = surfaces_of(frame)
         past = History(pad(recalled.history, BLOCKS), pad(recalled.valid, BLOCKS)[..., 0])
-        noisy, hit = _noisy(frame, surfaces), surfaces.hit
+        hit, known = surfaces.hit, _known(frame, surfaces)
+        # What was not measured is as it was: no light would be taken for a lamp that is switched off.
+        lost = hit & ~known & past.valid
+        noisy = jnp.where(lost[..., None], past.values[..., :3], _noisy(frame, known))
         weights = {name: part for name, part in params.items() if name != "guide"}
         head = network.apply(weights, [_seen(noisy, past, surfaces, whole)[None]])[0][0]
         decided, shares = decisions(head, (hit.shape[0] // 2, hit.shape[1] // 2))
@@ -181,17 +184,24 @@ def steady(options: Options) -> Denoiser:
 
     def measure(frame: Frame) -> Whole:
         surfaces = surfaces_of(frame)
-        return measured(_noisy(frame, surfaces), surfaces.depth, frame)
+        return measured(_noisy(frame, _known(frame, surfaces)), surfaces.depth, frame)
 
     network_sees = 2 * description.reach(description.unet(1, heads, widths=quality.widths, head_size=1))
     far = reach(quality.full_levels, back=quality.back, at_once=quality.at_once)
-    core = Core(start, step, reads, init, measure=measure, reach=network_sees + far)
+    core = Core(start, step, reads, init, measure=measure, reach=network_sees + far, counted=True)
     return demodulated(recurrent(core), by=options.demodulate)
 
 
-def _noisy(frame: Frame, surfaces: Surfaces) -> jax.Array:
+def _known(frame: Frame, surfaces: Surfaces) -> jax.Array:
+    """[H, W] bool, there is a surface whose light was measured."""
+    if frame.sample_count is None:
+        return surfaces.hit
+    return surfaces.hit & pad(frame.sample_count > 0, BLOCKS)[..., 0]
+
+
+def _noisy(frame: Frame, known: jax.Array) -> jax.Array:
     # Divided by a small reflectance it may be beyond what the network has ever seen.
-    return fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), BLOCKS), surfaces.hit[..., None])
+    return fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), BLOCKS), known[..., None])
 
 
 def _seen(noisy: jax.Array, past: History, surfaces: Surfaces, whole: Whole) -> jax.Array:

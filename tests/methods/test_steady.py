@@ -141,6 +141,37 @@ def test_a_change_of_light_is_seen_in_the_frame_it_happens_in(gain, rng):
     assert after == pytest.approx(gain, rel=0.2)
 
 
+@pytest.mark.parametrize("invalid", [np.nan, np.inf])
+@pytest.mark.parametrize("gain", [0.01, 1.0, 100.0])
+def test_a_frame_without_a_valid_value_shows_what_was_known(gain, invalid, rng):
+    """No light is no measurement: it is not taken for lamps that were switched off."""
+    frames = room(rng, 8, size=(96, 160))
+    frames = frames._replace(radiance=gain * frames.radiance)
+    frames = frames._replace(radiance=frames.radiance.at[6].set(invalid))
+    images = denoised(frames) / gain
+    before, lost, after = (float(jnp.median(image / frames.albedo[0])) for image in images[5:])
+    assert lost == pytest.approx(before, rel=0.02)
+    assert after == pytest.approx(before, rel=0.05)
+
+
+def test_a_part_of_a_frame_without_a_valid_value_shows_what_was_known(rng):
+    """A tile that was not rendered; the rest of the frame hardly differs."""
+    frames = room(rng, 8, size=(96, 160))
+    tile = np.s_[32:64, 64:128]
+    whole = denoised(frames)[7]
+    lost = denoised(frames._replace(radiance=frames.radiance.at[7, *tile].set(jnp.nan)))[7]
+    assert np.median(lost[tile] / whole[tile]) == pytest.approx(1.0, rel=0.05)
+    assert np.mean(np.abs(lost / whole - 1.0)) < 0.05
+
+
+def test_invalid_pixels_of_the_first_frame_are_filled_from_their_neighbours(rng, key):
+    frames = room(rng)
+    invalid = jnp.asarray(rng.random((*SIZE, 1)) < 0.1)
+    flat = frames._replace(radiance=jnp.full_like(frames.radiance, 0.5), albedo=None)
+    broken = flat._replace(radiance=flat.radiance.at[0].set(jnp.where(invalid, jnp.nan, flat.radiance[0])))
+    np.testing.assert_allclose(denoised(broken, key=key), flat.radiance, rtol=1e-4)
+
+
 def test_a_moving_history_is_followed(rng):
     """A camera that pans along a wall of boards, each lit in its own way: all stay in their place."""
     frames = room(rng, 6)
