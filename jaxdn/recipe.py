@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
-from jaxdn.objectives import Objective
+from jaxdn.objectives import Objective, pyramid_illumination
 from jaxdn.options import Range, check
 from jaxdn.variation import Variation
 
@@ -43,3 +43,17 @@ class Recipe(NamedTuple):
         """The recipe as JSON; the objective by its name."""
         plain = {"objective": self.objective.name, "spp": list(self.spp), "variation": self.variation._asdict()}
         return {**self._asdict(), **plain}
+
+
+FINISH = Recipe(
+    pyramid_illumination(logarithm=True),
+    steps=800,
+    learning_rate=4e-4,
+    batch=2,
+    crop=128,
+    average=0.995,
+    spp=(1, 1, 1, 2, 4, 16),
+    variation=Variation(shadow=0.2),
+)
+"""For weights that have been trained: whole clips, in which the widest filters have something to reach for; and
+light that changes, so that histories are given up as fast."""

@@ -30,7 +30,7 @@ from jaxdn.motion import on_screen
 from jaxdn.networks import LARGE, SMALL, Widths, crop, description, pad
 from jaxdn.objectives import indirect_illumination, unbiased_illumination
 from jaxdn.ops.warp import warp
-from jaxdn.recipe import Recipe
+from jaxdn.recipe import FINISH, Recipe
 from jaxdn.repair import repair_image
 from jaxdn.scales import downsample, fill
 from jaxdn.variation import STILL
@@ -183,6 +183,7 @@ def warped_history(
     presets={"parity": PARITY},
     recipes={
         "usual": Recipe(unbiased_illumination()),
+        "finish": FINISH,
         "without-occlusion": Recipe(unbiased_illumination(hidden=0.0)),
         "paper": Recipe(indirect_illumination(), variation=STILL, average=0.0),
         "paper-without-occlusion": Recipe(indirect_illumination(occlusion=False), variation=STILL, average=0.0),

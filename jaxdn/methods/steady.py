@@ -40,9 +40,8 @@ from jaxdn.networks import Widths, crop, description, pad
 from jaxdn.objectives import pyramid_illumination
 from jaxdn.ops.faster import alone
 from jaxdn.options import Range
-from jaxdn.recipe import Recipe
+from jaxdn.recipe import FINISH, Recipe
 from jaxdn.scales import downsample, fill, upsample
-from jaxdn.variation import Variation
 from jaxdn.whole import Whole, measured
 
 FEATURES, HALF_FEATURES = 5, 8
@@ -78,20 +77,6 @@ _TAKE, _BACK = 4.0, 3.0
 """The same for how much of each level at half resolution is taken, and of what the filter took away is given back."""
 PRECISIONS = {"albedo": 1.0, "gloss": 2.0, "normal": 1.0, "depth": 6.0, "learned": 0.0}
 """Guide of the filter -> the logarithm of its precision before training."""
-
-
-FINISH = Recipe(
-    pyramid_illumination(logarithm=True),
-    steps=800,
-    learning_rate=4e-4,
-    batch=2,
-    crop=128,
-    average=0.995,
-    spp=(1, 1, 1, 2, 4, 16),
-    variation=Variation(shadow=0.2),
-)
-"""For weights that have been trained: whole clips, in which the widest levels have something to reach for; and
-light that changes, so that histories are given up as fast."""
 
 
 @dataclass(frozen=True)
