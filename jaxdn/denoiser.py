@@ -63,7 +63,8 @@ class Core(NamedTuple):
     much farther as vectors are long, and from what is measured. None: not known, and frames cannot be parted."""
     counted: bool = False
     """Its frames always have a ``sample_count``, whether or not it reads one: 0 where the radiance is no measurement,
-    because a value was not finite, and 1 elsewhere. Without it such pixels look like pixels without light."""
+    because a value was not finite, elsewhere the given one if it reads that, else 1. Without it such pixels look like
+    pixels without light."""
 
 
 class Recurrent(NamedTuple):
@@ -94,7 +95,8 @@ class RecurrentStep:
         frame = checked(frame, self.core.reads)
         if self.core.counted:
             finite = jnp.all(jnp.isfinite(frame.radiance), axis=-1, keepdims=True)
-            frame = frame._replace(sample_count=finite.astype(jnp.float32))
+            given = 1.0 if frame.sample_count is None else frame.sample_count
+            frame = frame._replace(sample_count=jnp.where(finite, given, 0.0))
         frame, replaced = repair(frame)
         return frame, None if self.core.measure is None else self.core.measure(frame), replaced
 

@@ -78,6 +78,20 @@ def test_the_core_sees_repaired_buffers_and_only_those_that_it_reads(rng):
     assert int(state.repaired) == 3 + 24 * 3 + 24
 
 
+@pytest.mark.parametrize("wrap", [lambda denoiser: denoiser, demodulated])
+@pytest.mark.parametrize("reads", [frozenset(), frozenset({"sample_count"})])
+def test_a_core_is_told_which_pixels_were_not_measured(reads, wrap):
+    def step(params, state, frame, first):
+        return frame.sample_count, frame.radiance, 0
+
+    core = Core(lambda params, frame: frame.radiance[..., :1], step, reads, counted=True)
+    light = np.ones((1, 5, 3), np.float32)
+    light[0, 1:4, 1] = np.nan, np.inf, -1.0
+    frame = Frame(light, albedo=np.full_like(light, 0.5), sample_count=np.full((1, 5, 1), 3.0, np.float32))
+    state, _ = (denoiser := wrap(recurrent(core))).step({}, denoiser.start({}, frame), frame)
+    np.testing.assert_array_equal(state.core[0, :, 0], np.float32([1, 0, 0, 1, 1]) * (3 if reads else 1))
+
+
 def test_start_sees_repaired_buffers_and_counts_nothing(rng):
     frame = frame_of(rng)._replace(radiance=jnp.full((*SIZE, 3), jnp.inf))
     denoiser = recurrent(core_of(identity().step, start=lambda params, frame: frame.radiance))
