@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from jaxdn.methods.table import methods
+from jaxdn.methods.registry import methods
 
 PLACE = "<!-- the table of methods -->"
 

@@ -10,18 +10,18 @@ from typing import Any
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Frame": "frame",
-    "Clip": "frame",
+    "Frame": "core.frame",
+    "Clip": "core.frame",
     "Denoiser": "denoiser",
     "warp": "ops.warp",
-    "dual_motion": "motion",
-    "occlusion_mask": "motion",
-    "normalize_kernels": "ops.kernels",
-    "apply_kernels": "ops.kernels",
-    "compose_scales": "scales",
-    "denoise": "rollout",
-    "stream": "rollout",
-    "load_weights": "weights",
+    "dual_motion": "ops.motion",
+    "occlusion_mask": "ops.motion",
+    "normalize_kernels": "ops.kernel_prediction.apply",
+    "apply_kernels": "ops.kernel_prediction.apply",
+    "compose_scales": "ops.scales",
+    "denoise": "denoiser.rollout",
+    "stream": "denoiser.rollout",
+    "load_weights": "zoo.weights",
     "read_clip": "clips",
     "write_clip": "clips",
 }

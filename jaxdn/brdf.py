@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn.checks import check_image, check_option, check_same_size
-from jaxdn.compiled import strips
-from jaxdn.ops.faster import alone
+from jaxdn.core.checks import check_image, check_option, check_same_size
+from jaxdn.ops.dispatch import numba_call
+from jaxdn.ops.dispatch.inference_path import alone
 
 Lobe = Literal["ggx", "ggx-correlated", "beckmann"]
 """GGX with Smith's separable shadowing (as in Mitsuba) or the height-correlated one, Beckmann (separable)."""
@@ -36,7 +36,7 @@ FLOOR = 0.15
 have (``python -m experiments.papers.demodulation``).
 """
 
-_STORED = Path(__file__).parent / "shipped" / "directional-albedo.npz"
+_STORED = Path(__file__).parent / "materials" / "directional-albedo.npz"
 
 
 def ggx_albedo_table(*, lobe: Lobe = "ggx", size: int = SIZE, samples: int = SAMPLES) -> np.ndarray:
@@ -228,7 +228,7 @@ def texture_or_hue(reflectance: jax.Array, light: jax.Array, hue: jax.Array) -> 
 
     :func:`texture_left` where ``hue``, a bool scalar, is false, else :func:`hue_left` of it.
     """
-    if strips.available() and reflectance.dtype == light.dtype == jnp.float32:
+    if numba_call.available() and reflectance.dtype == light.dtype == jnp.float32:
         return alone(_texture_or_hue, _texture_by_compiled)(reflectance, light, hue)
     return _texture_or_hue(reflectance, light, hue)
 
@@ -239,11 +239,11 @@ def _texture_or_hue(reflectance: jax.Array, light: jax.Array, hue: jax.Array) ->
 
 
 def _texture_by_compiled(reflectance: jax.Array, light: jax.Array, hue: jax.Array) -> jax.Array:
-    from jaxdn.compiled.brdf import texture
+    from jaxdn.materials.numba_brdf import texture
 
     numbers = (np.float32(number) for number in (FLOOR, (1 + FLOOR**4) ** -0.25, _BLACK, _FAINT))
     arrays = [reflectance, light, jnp.reshape(hue, (1,))]
-    return strips.call(texture, [reflectance.shape], arrays, *numbers, rows=reflectance.shape[0])[0]
+    return numba_call.call(texture, [reflectance.shape], arrays, *numbers, rows=reflectance.shape[0])[0]
 
 
 def restore(filtered: jax.Array, texture: jax.Array, filtered_texture: jax.Array) -> jax.Array:

@@ -6,9 +6,9 @@ import math
 import jax
 import jax.numpy as jnp
 
-from jaxdn.checks import check_option
-from jaxdn.frame import RADIANCE_MAX
-from jaxdn.numerics import safe_norm
+from jaxdn.core.checks import check_option
+from jaxdn.core.frame import RADIANCE_MAX
+from jaxdn.core.numerics import safe_norm
 
 _GAMMA = 2.2
 _TOE = 1e-4

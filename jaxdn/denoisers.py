@@ -1,13 +1,13 @@
 """The factories of all methods, by name: ``jaxdn.denoisers.ntd(size="small")`` returns a :class:`jaxdn.Denoiser`.
 
-The factories come from the table of methods (:mod:`jaxdn.methods.table`); :data:`NAMES` lists them. ``demodulated``
+The factories come from the table of methods (:mod:`jaxdn.methods.registry`); :data:`NAMES` lists them. ``demodulated``
 wraps any denoiser. The methods are implemented in :mod:`jaxdn.methods`, one file each.
 """
 
 from typing import Any
 
-from jaxdn.methods.demodulated import demodulated as demodulated
-from jaxdn.methods.table import methods
+from jaxdn.methods.demodulation import demodulated as demodulated
+from jaxdn.methods.registry import methods
 
 
 def __getattr__(name: str) -> Any:

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn import color
-from jaxdn.checks import check_image, check_option, check_same_size
-from jaxdn.frame import RADIANCE_MAX
-from jaxdn.numerics import absolute
-from jaxdn.stencils import correlate, pad_edge
+from jaxdn.core.checks import check_image, check_option, check_same_size
+from jaxdn.core.frame import RADIANCE_MAX
+from jaxdn.core.numerics import absolute
+from jaxdn.core.separable import correlate, pad_edge
 
 
 def unbiased(denoised: jax.Array, reference: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import jaxdn
-from jaxdn import cli
 from jaxdn.clips import read_exr, write_clip
-from jaxdn.methods import table
-from jaxdn.weights import describe
+from jaxdn.commands import main
+from jaxdn.methods import registry
+from jaxdn.zoo.weights import describe
 from tests.hard_cases.cases import CASES
 from tests.hard_cases.subjects import denoiser_subjects
 from tests.hard_cases.table import rows
@@ -31,10 +31,10 @@ from typing import Annotated
 import jax.numpy as jnp
 
 from jaxdn.denoiser import Core, recurrent
-from jaxdn.methods.table import method
-from jaxdn.objectives import Objective
-from jaxdn.options import Range
-from jaxdn.recipe import Recipe
+from jaxdn.methods.registry import method
+from jaxdn.recipes.objectives import Objective
+from jaxdn.core.options import Range
+from jaxdn.recipes.recipe import Recipe
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def toy(tmp_path: Path) -> Iterator[None]:
     sys.modules["toy_method"] = module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     yield
-    table._METHODS.pop("toy")
+    registry._METHODS.pop("toy")
     sys.modules.pop("toy_method")
 
 
@@ -90,7 +90,7 @@ def clips(tmp_path: Path) -> Path:
 
 def test_a_new_method_is_trained_denoises_and_is_compared(toy, clips, tmp_path, capsys):
     run = tmp_path / "run"
-    cli.main(
+    main.main(
         ["train", str(clips), "-o", str(run), "--method", "toy", "--set", "gain=0.5"]
         + ["--steps", "2", "--batch", "1", "--crop", "16", "--frames", "3"]
     )
@@ -99,17 +99,17 @@ def test_a_new_method_is_trained_denoises_and_is_compared(toy, clips, tmp_path, 
     assert describe(weights)["recipe"]["objective"] == "last frame"
     _, params = jaxdn.load_weights(weights)
     assert np.asarray(params["gain"]) != 0.5  # two updates moved it
-    cli.main(["denoise", str(clips / "clip-0"), "-o", str(tmp_path / "out"), "--method", str(weights), "--no-safe"])
+    main.main(["denoise", str(clips / "clip-0"), "-o", str(tmp_path / "out"), "--method", str(weights), "--no-safe"])
     found = read_exr(tmp_path / "out" / "frame_0000.exr")
     noisy = jaxdn.read_clip(clips / "clip-0").frames.radiance[0]
     expected = float(params["gain"]) * np.where(np.isfinite(noisy), noisy, 0)
     np.testing.assert_allclose(found["denoised.R"], expected[..., 0], rtol=1e-3, atol=1e-6)
-    cli.main(["compare", str(clips), "-o", str(tmp_path / "report"), "--methods", "noisy", str(weights)])
+    main.main(["compare", str(clips), "-o", str(tmp_path / "report"), "--methods", "noisy", str(weights)])
     scores = json.loads((tmp_path / "report" / "metrics.json").read_text())
     assert scores["methods"] == ["noisy", "run"]
     capsys.readouterr()
     with pytest.raises(SystemExit) as stopped:
-        cli.main(["train", str(clips), "-o", str(tmp_path / "no"), "--method", "toy", "--set", "gains=1"])
+        main.main(["train", str(clips), "-o", str(tmp_path / "no"), "--method", "toy", "--set", "gains=1"])
     assert stopped.value.code == 2
     assert "gain" in capsys.readouterr().err
 
@@ -132,8 +132,8 @@ import jax, numpy as np
 import jaxdn
 from jaxdn.clips import training_batches, write_clip
 from jaxdn.commands import inspect
-from jaxdn.frame import BUFFERS, Frame, present, written_out
-from jaxdn.repair import repair
+from jaxdn.core.frame import BUFFERS, Frame, present, written_out
+from jaxdn.denoiser.sanitize import repair
 from tests.hard_cases.inputs import good
 
 folder = sys.argv[1]

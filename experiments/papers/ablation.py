@@ -19,16 +19,16 @@ from typing import Any, Literal, NamedTuple
 
 import tyro
 
-from jaxdn.candidates import NOISY, candidate, filters
-from jaxdn.commands.compare import compare
 from jaxdn.commands.errors import plain_errors
-from jaxdn.commands.log import read_curve
-from jaxdn.commands.train import train
-from jaxdn.methods.table import Method, method_named
-from jaxdn.recipe import Recipe
+from jaxdn.evaluation.compare import compare
+from jaxdn.evaluation.report import Results, TrainingCurve, text_table, write_report
+from jaxdn.methods.registry import Method, method_named
+from jaxdn.recipes.recipe import Recipe
 from jaxdn.render import ClipJob, choose_variant, render_clips
-from jaxdn.report import Results, TrainingCurve, text_table, write_report
-from jaxdn.weights import describe, shipped_names
+from jaxdn.training.log import read_curve
+from jaxdn.training.train import train
+from jaxdn.zoo.ready import NOISY, candidate, filters
+from jaxdn.zoo.weights import describe, shipped_names
 
 FAMILIES = ("fruit", "robot", "pinkroom", "mobile")
 METHOD = "ntd"

@@ -21,11 +21,10 @@ import tyro
 from experiments.papers.equal_time import Row, Settings, Study, run
 from experiments.papers.other_clips import half_reference, without_draws
 from jaxdn.commands.errors import plain_errors
-from jaxdn.filters import levels
-from jaxdn.filters.levels import Decisions
-from jaxdn.methods import steady
-from jaxdn.objectives import indirect_illumination, pyramid_illumination, unbiased_illumination
-from jaxdn.variation import STILL
+from jaxdn.methods.steady import levels, method
+from jaxdn.methods.steady.levels import Decisions
+from jaxdn.recipes.augmentation import STILL
+from jaxdn.recipes.objectives import indirect_illumination, pyramid_illumination, unbiased_illumination
 
 _Shares = dict[str, jax.Array]
 _Change = Callable[[], AbstractContextManager[Any]]
@@ -35,8 +34,8 @@ _AS_IT_IS, _ONE = "steady-balanced as it is", "1 sample alone"
 
 def _quality(**changed: Any) -> _Change:
     """The quality "balanced" with other fields."""
-    balanced = steady.QUALITIES["balanced"]._replace(**changed)
-    return functools.partial(mock.patch.dict, steady.QUALITIES, balanced=balanced)
+    balanced = method.QUALITIES["balanced"]._replace(**changed)
+    return functools.partial(mock.patch.dict, method.QUALITIES, balanced=balanced)
 
 
 def _unguided(*names: str) -> _Change:
@@ -52,8 +51,8 @@ def _unguided(*names: str) -> _Change:
 
 def _decided(change: Callable[[Decisions, _Shares], tuple[Decisions, _Shares]]) -> _Change:
     """Some decisions are replaced by others."""
-    plain = steady.decisions
-    return functools.partial(mock.patch.object, steady, "decisions", lambda head, size: change(*plain(head, size)))
+    plain = method.decisions
+    return functools.partial(mock.patch.object, method, "decisions", lambda head, size: change(*plain(head, size)))
 
 
 def _no_trust(decided: Decisions, shares: _Shares) -> tuple[Decisions, _Shares]:
@@ -79,28 +78,28 @@ def _nothing_fed_back(decided: Decisions, shares: _Shares) -> tuple[Decisions, _
 
 def _decided_alike() -> AbstractContextManager[Any]:
     """All pixels get the mean of what the network says."""
-    plain = steady.decisions
+    plain = method.decisions
 
     def decisions(head: jax.Array, size: tuple[int, int]) -> Any:
         return plain(jnp.broadcast_to(head.mean((0, 1), keepdims=True), head.shape), size)
 
-    return mock.patch.object(steady, "decisions", decisions)
+    return mock.patch.object(method, "decisions", decisions)
 
 
 @contextlib.contextmanager
 def _number_of_levels(number: int) -> Iterator[None]:
-    with mock.patch.object(levels, "LEVELS", number), mock.patch.object(steady, "LEVELS", number):
+    with mock.patch.object(levels, "LEVELS", number), mock.patch.object(method, "LEVELS", number):
         yield
 
 
 def _untested() -> AbstractContextManager[Any]:
     """Every tap of the history counts."""
-    plain = steady.recall
+    plain = method.recall
 
     def recall(history: jax.Array, before: Any, *rest: Any) -> Any:
         return plain(history, before._replace(depth=None, normal=None, ids=None), *rest)
 
-    return mock.patch.object(steady, "recall", recall)
+    return mock.patch.object(method, "recall", recall)
 
 
 def _row(name: str, change: _Change = contextlib.nullcontext, **more: Any) -> Row:
@@ -124,14 +123,14 @@ DESIGN = (
     _row("changes of light wait", _quality(at_once=False)),
     _row("one level at full resolution", _quality(full_levels=1)),
     _row("three levels at half resolution", functools.partial(_number_of_levels, 3)),
-    _row("textures are not given back", functools.partial(mock.patch.object, steady, "texture_left", lambda *_: None)),
+    _row("textures are not given back", functools.partial(mock.patch.object, method, "texture_left", lambda *_: None)),
     _row("light is not divided", options={"demodulate": False}),
     _row(
         "single bright pixels stay",
-        functools.partial(mock.patch.object, steady, "dimmed", lambda image, hit, mean: image),
+        functools.partial(mock.patch.object, method, "dimmed", lambda image, hit, mean: image),
     ),
-    _row("the network of high", options={"quality": steady.QUALITIES["high"].widths}),
-    _row("the network of fast", options={"quality": steady.QUALITIES["fast"].widths}),
+    _row("the network of high", options={"quality": method.QUALITIES["high"].widths}),
+    _row("the network of fast", options={"quality": method.QUALITIES["fast"].widths}),
 )
 """Of the denoiser."""
 

@@ -26,16 +26,16 @@ from experiments.speed import peers
 from experiments.speed.timing import Call
 from experiments.speed.workers import Team
 from experiments.speed.works import steps
-from jaxdn.candidates import NOISY, candidate, filters
 from jaxdn.clips import read_clip
-from jaxdn.commands.compare import compare
 from jaxdn.commands.errors import plain_errors
-from jaxdn.commands.render import clips_of
-from jaxdn.frame import frame_at
+from jaxdn.core.frame import frame_at
+from jaxdn.evaluation.compare import compare
+from jaxdn.evaluation.report import write_report
 from jaxdn.planning.catalogue import NoisyLight
 from jaxdn.render import ClipJob, render_clips
-from jaxdn.report import write_report
-from jaxdn.weights import shipped_names
+from jaxdn.sequence.render_jobs import clips_of
+from jaxdn.zoo.ready import NOISY, candidate, filters
+from jaxdn.zoo.weights import shipped_names
 
 FAMILIES = ("fruit", "robot", "mobile", "pinkroom", "parlour")
 SEED = 2000

@@ -18,9 +18,9 @@ import numpy as np
 
 from experiments.speed.small_rooms import CASES
 from jaxdn import brdf, color, metrics
+from jaxdn.core.frame import Clip, Frame
+from jaxdn.denoiser.rollout import denoise
 from jaxdn.denoisers import svgf
-from jaxdn.frame import Clip, Frame
-from jaxdn.rollout import denoise
 
 WIDTH, HEIGHT, FRAMES, REFERENCE = 160, 90, 5, 256
 ROOMS = ("a ball: textured roughness", "a ball: smooth plastic", "static textured box")
@@ -54,7 +54,7 @@ def ways() -> dict[str, Divisor]:
 def clip_of(path: Path) -> tuple[Clip, np.ndarray]:
     """Frames of a scene at rest, with other noise each; its reference, and the first half of that."""
     from jaxdn.render.frame import render_frame
-    from jaxdn.render.opening import open_scene
+    from jaxdn.render.scenes.opening import open_scene
 
     scene = open_scene(str(path))
     first = render_frame(scene, 0, width=WIDTH, height=HEIGHT, reference_spp=REFERENCE)

@@ -21,16 +21,16 @@ import jax
 import tyro
 
 from experiments.papers.results import indirect
-from jaxdn.candidates import candidate
 from jaxdn.clips import find_clips
-from jaxdn.commands.compare import compare
-from jaxdn.commands.train import recipe_batches
-from jaxdn.files import write_json
-from jaxdn.learning.step import begun, initial_state, make_train_step
-from jaxdn.methods.table import Method, method_named
-from jaxdn.recipe import Recipe
-from jaxdn.report.results import mean_scores
-from jaxdn.weights import save_weights, starting_params
+from jaxdn.evaluation.compare import compare
+from jaxdn.evaluation.report.results import mean_scores
+from jaxdn.methods.registry import Method, method_named
+from jaxdn.recipes.recipe import Recipe
+from jaxdn.runtime.atomic_files import write_json
+from jaxdn.training.step import begun, initial_state, make_train_step
+from jaxdn.training.train import recipe_batches
+from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.weights import save_weights, starting_params
 
 
 @dataclass

@@ -20,15 +20,15 @@ from PIL import Image, ImageDraw, ImageFont
 
 from experiments.papers.places import parsed
 from jaxdn import color
-from jaxdn.candidates import OURS
 from jaxdn.clips import read_clip
-from jaxdn.clips.folder import read_record
 from jaxdn.commands.errors import plain_errors
-from jaxdn.frame import Clip
+from jaxdn.core.frame import Clip
+from jaxdn.data.clip.folder import read_record
+from jaxdn.denoiser.rollout import denoise
+from jaxdn.evaluation.report.images import displayed_bytes
 from jaxdn.render import ClipJob, render_clips
-from jaxdn.report.images import displayed_bytes
-from jaxdn.rollout import denoise
-from jaxdn.weights import load_weights
+from jaxdn.zoo.ready import OURS
+from jaxdn.zoo.weights import load_weights
 
 _GAP = 4
 """Pixels between the pictures."""

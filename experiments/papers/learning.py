@@ -11,8 +11,8 @@ import tyro
 from experiments.papers.equal_time import Row, Settings, Study, run
 from experiments.papers.other_clips import every_other, half_reference, three_of_four, without_draws
 from jaxdn.commands.errors import plain_errors
-from jaxdn.objectives import indirect_illumination, pyramid_illumination, unbiased_illumination
-from jaxdn.variation import STILL, Variation
+from jaxdn.recipes.augmentation import STILL, Variation
+from jaxdn.recipes.objectives import indirect_illumination, pyramid_illumination, unbiased_illumination
 
 _STEPS = (
     Row(

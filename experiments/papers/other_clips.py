@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from jaxdn.clips import find_clips
-from jaxdn.clips.exr import read_exr, write_exr
-from jaxdn.clips.files import read_json
-from jaxdn.files import write_json
+from jaxdn.data.clip.files import read_json
+from jaxdn.data.exr.exr import read_exr, write_exr
+from jaxdn.runtime.atomic_files import write_json
 
 Channels = dict[str, np.ndarray]
 

@@ -18,7 +18,7 @@ import tyro
 from PIL import Image, ImageDraw
 
 from jaxdn.commands.errors import plain_errors
-from jaxdn.report.images import save_png
+from jaxdn.evaluation.report.images import save_png
 
 SCALE = 4
 """Times as large as the image."""

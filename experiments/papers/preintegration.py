@@ -17,15 +17,15 @@ import numpy as np
 import tyro
 
 from experiments.speed import peers
-from jaxdn.candidates import NOISY, Candidate, candidate, filters
 from jaxdn.clips import find_clips
-from jaxdn.commands.compare import compare
 from jaxdn.commands.errors import plain_errors
-from jaxdn.methods.demodulated import Demodulation
-from jaxdn.methods.table import method_named
-from jaxdn.report import Results, text_table, write_report
-from jaxdn.report.images import save_png
-from jaxdn.weights import shipped_names
+from jaxdn.evaluation.compare import compare
+from jaxdn.evaluation.report import Results, text_table, write_report
+from jaxdn.evaluation.report.images import save_png
+from jaxdn.methods.demodulation import Demodulation
+from jaxdn.methods.registry import method_named
+from jaxdn.zoo.ready import NOISY, Candidate, candidate, filters
+from jaxdn.zoo.weights import shipped_names
 
 
 @dataclass

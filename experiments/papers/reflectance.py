@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdn.render.variant import use_variant
+from jaxdn.render.tracing.variant import use_variant
 
 SIZE = 24
 """Width and height of the picture in pixels: a ball that nearly fills it."""
@@ -93,7 +93,7 @@ def monte_carlo(scene: Any, samples: int = SAMPLES) -> np.ndarray:
     import drjit as dr
     import mitsuba as mi
 
-    from jaxdn.render.wavefront import camera_rays
+    from jaxdn.render.tracing.wavefront import camera_rays
 
     lane = dr.arange(mi.UInt32, SIZE * SIZE * samples)
     pixel = lane // samples
@@ -121,8 +121,8 @@ class Found(NamedTuple):
 
 def measure(material: dict[str, Any], *, furnace_samples: int = 1024) -> Found:
     """How far the renderer's F_b is from Monte Carlo's on a ball of a material, and the furnace from 1."""
-    from jaxdn.render.gbuffer import gbuffer
-    from jaxdn.render.wavefront import accumulate
+    from jaxdn.render.buffers.gbuffer import gbuffer
+    from jaxdn.render.tracing.wavefront import accumulate
 
     scene = ball(material)
     there = gbuffer(scene, reflectance=True)

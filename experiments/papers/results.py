@@ -19,15 +19,15 @@ import tyro
 
 from experiments.papers.preintegration import save_pictures
 from experiments.speed import peers
-from jaxdn.candidates import NOISY, Candidate, candidate, filters
 from jaxdn.clips import find_clips
-from jaxdn.clips.folder import read_frames
-from jaxdn.commands.compare import Footage, compare, read_footage
 from jaxdn.commands.errors import plain_errors
-from jaxdn.frame import Frame
-from jaxdn.report import Results, write_report
-from jaxdn.report.results import mean_scores
-from jaxdn.weights import shipped_names
+from jaxdn.core.frame import Frame
+from jaxdn.data.clip.folder import read_frames
+from jaxdn.evaluation.compare import Footage, compare, read_footage
+from jaxdn.evaluation.report import Results, write_report
+from jaxdn.evaluation.report.results import mean_scores
+from jaxdn.zoo.ready import NOISY, Candidate, candidate, filters
+from jaxdn.zoo.weights import shipped_names
 
 Read = Callable[..., Footage]
 _NOTHING: Mapping[str, Mapping[str, str]] = MappingProxyType({})

@@ -14,13 +14,13 @@ from typing import Annotated
 
 import tyro
 
-from jaxdn.candidates import NOISY, Candidate, all_names, candidate, filters
-from jaxdn.commands.compare import compare
 from jaxdn.commands.errors import plain_errors
+from jaxdn.evaluation.compare import compare
+from jaxdn.evaluation.report import text_table, write_report
 from jaxdn.render import ClipJob, choose_variant, render_clips
 from jaxdn.render.errors import RenderError
-from jaxdn.render.scene_file import SceneFile
-from jaxdn.report import text_table, write_report
+from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.zoo.ready import NOISY, Candidate, all_names, candidate, filters
 
 ANIMATIONS = Path(__file__).parent / "rooms"
 

@@ -19,7 +19,7 @@ from PIL import Image
 from jaxdn import color, occlusion_mask, warp
 from jaxdn.clips import read_clip
 from jaxdn.commands.errors import plain_errors
-from jaxdn.frame import Clip
+from jaxdn.core.frame import Clip
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

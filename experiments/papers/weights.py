@@ -18,14 +18,14 @@ from typing import Any, NamedTuple
 
 import tyro
 
-from jaxdn.clips.folder import is_clip, read_record
 from jaxdn.commands.errors import plain_errors
-from jaxdn.commands.render import render
-from jaxdn.commands.train import train
-from jaxdn.methods.table import method_named
-from jaxdn.objectives import Objective, unbiased_illumination
-from jaxdn.render.scene_file import SceneFile
-from jaxdn.weights import SHIPPED, shipped_names
+from jaxdn.data.clip.folder import is_clip, read_record
+from jaxdn.methods.registry import method_named
+from jaxdn.recipes.objectives import Objective, unbiased_illumination
+from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.sequence.render_jobs import render
+from jaxdn.training.train import train
+from jaxdn.zoo.weights import SHIPPED, shipped_names
 
 FAMILIES = {"parlour": 90, "fruit": 14, "mobile": 14, "pinkroom": 14, "robot": 14}
 """Clips of each procedural family."""

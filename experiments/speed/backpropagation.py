@@ -13,9 +13,9 @@ import jax
 import numpy as np
 import tyro
 
-from jaxdn.frame import Clip, Frame
-from jaxdn.learning.step import initial_state, make_train_step
-from jaxdn.methods.table import method_named
+from jaxdn.core.frame import Clip, Frame
+from jaxdn.methods.registry import method_named
+from jaxdn.training.step import initial_state, make_train_step
 
 
 @dataclass

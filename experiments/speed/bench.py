@@ -31,7 +31,7 @@ from experiments.speed.timing import Timing, summary
 from experiments.speed.workers import Team, WorkerError, apart
 from experiments.speed.works import Work, compilation, input_share, operations, steps, train_steps
 from jaxdn.commands.errors import plain_errors
-from jaxdn.files import write_json
+from jaxdn.runtime.atomic_files import write_json
 
 Row = dict[str, Any]
 

@@ -29,13 +29,13 @@ from experiments.speed.small_rooms import CASES, FRAMES, Case
 from jaxdn import effects
 from jaxdn.clips import read_frames
 from jaxdn.commands.errors import plain_errors
+from jaxdn.core.frame import Frame, only
 from jaxdn.denoiser import Params
 from jaxdn.effects import Plan
-from jaxdn.frame import Frame, only
 from jaxdn.render import use_variant
 from jaxdn.render.clip import render_clip
-from jaxdn.render.depth import measure_depth
-from jaxdn.render.scene_file import SceneFile
+from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.render.tracing.depth import measure_depth
 
 SCENES = (
     "static grey box",

@@ -1,6 +1,6 @@
 """What a frame costs: shipped methods in each of their engines, and Open Image Denoise, at one or several sizes.
 
-Memory is kept between frames as in `jaxdn denoise` (:mod:`jaxdn.heap`).
+Memory is kept between frames as in `jaxdn denoise` (:mod:`jaxdn.runtime.malloc`).
 
     python -m experiments.speed.frames                                             # 1280 x 720
     python -m experiments.speed.frames --sizes 256x144 1280x720 3840x2160 --methods steady-balanced svgf
@@ -25,12 +25,12 @@ from experiments.speed import peers
 from experiments.speed.timing import Call
 from experiments.speed.workers import Team
 from experiments.speed.works.steps import frame_of, oidn_high, recurrent
-from jaxdn.candidates import candidate
 from jaxdn.commands.errors import plain_errors
-from jaxdn.compiled import strips
-from jaxdn.files import write_json
-from jaxdn.heap import keep_memory
 from jaxdn.networks.engines import ENGINES
+from jaxdn.ops.dispatch import numba_call
+from jaxdn.runtime.atomic_files import write_json
+from jaxdn.runtime.malloc import keep_memory
+from jaxdn.zoo.ready import candidate
 
 OIDN = "Open Image Denoise high"
 
@@ -50,7 +50,7 @@ class Settings:
 def ours(name: str, engine: str | None, height: int, width: int, *, compiled: bool = True) -> Call:
     """The compiled step of a method, with its own state, on an engine; None is XLA.
 
-    To be called once in a process. Without ``compiled`` no loops of :mod:`jaxdn.compiled` are used.
+    To be called once in a process. Without ``compiled`` no loops compiled by Numba are used.
     """
     keep_memory()
     if not compiled:
@@ -73,7 +73,7 @@ def builds(names: list[str], height: int, width: int) -> dict[str, Callable[[], 
         engines = [each for each in one.method.engines if ENGINES[each].purpose == "inference"]
         for engine in [None, *(each for each in engines if ENGINES[each].available())]:
             found[f"{name}, {engine or 'xla'}"] = partial(ours, name, engine, height, width)
-        if strips.available():
+        if numba_call.available():
             found[f"{name}, xla without compiled loops"] = partial(ours, name, None, height, width, compiled=False)
     return found
 

@@ -1,4 +1,4 @@
-"""What compiled loops save: each operation that has one (:mod:`jaxdn.compiled`), as a loop and in XLA, in turns.
+"""What compiled loops save: each operation that has one, as a loop and in XLA, in turns.
 
     python -m experiments.speed.loops [--size 1280x720]
 
@@ -22,21 +22,21 @@ from experiments.speed.frames import parsed
 from experiments.speed.timing import Call, measure
 from jaxdn import brdf
 from jaxdn.commands.errors import plain_errors
-from jaxdn.compiled import strips
-from jaxdn.filters import regression
-from jaxdn.filters.arrange import planes_of
-from jaxdn.filters.enlarge import enlarge
-from jaxdn.filters.guides import guides_of
-from jaxdn.filters.levels import LEVELS
-from jaxdn.filters.recall import recall
-from jaxdn.filters.running_mean import Mean, accumulated
-from jaxdn.filters.seen import History, seen
-from jaxdn.filters.specks import dimmed
-from jaxdn.frame import Frame
-from jaxdn.heap import keep_memory
-from jaxdn.methods.steady import BEGIN, FEATURES, HALF_FEATURES, decisions
-from jaxdn.ops.affinity_filter import Guide, affinity_filter
-from jaxdn.scales import fill
+from jaxdn.core.frame import Frame
+from jaxdn.filters.reproject import recall
+from jaxdn.filters.surface_test import guides_of
+from jaxdn.methods.steady import regression
+from jaxdn.methods.steady.accumulation import Mean, accumulated
+from jaxdn.methods.steady.fireflies import dimmed
+from jaxdn.methods.steady.levels import LEVELS
+from jaxdn.methods.steady.method import BEGIN, FEATURES, HALF_FEATURES, decisions
+from jaxdn.methods.steady.network_input import History, seen
+from jaxdn.ops.affinity.filter import Guide, affinity_filter
+from jaxdn.ops.affinity.joint_upsample import enlarge
+from jaxdn.ops.dispatch import numba_call
+from jaxdn.ops.layout.planar import planes_of
+from jaxdn.ops.scales import fill
+from jaxdn.runtime.malloc import keep_memory
 
 Work = tuple[Callable[..., Any], tuple[Any, ...]]
 """A function and its arguments."""
@@ -101,7 +101,7 @@ def call(work: Work, *, loops: bool) -> Call:
 
 def main(settings: Settings) -> None:
     """Measure, and print a table."""
-    if not strips.available():
+    if not numba_call.available():
         raise ValueError("loops: jax computes on another device than the CPU, or Numba is not installed.")
     keep_memory()
     height, width = parsed(settings.size)

@@ -28,7 +28,7 @@ import tyro
 
 from experiments.stability.fuzz_inputs import KINDS, broken, good_files
 from jaxdn.commands.errors import plain_errors
-from jaxdn.files import write_json
+from jaxdn.runtime.atomic_files import write_json
 
 DOCUMENTED = (ValueError, OSError)
 """The errors that a broken file may raise: ClipError is a ValueError; an empty file may not open."""
@@ -71,10 +71,10 @@ class Counts(NamedTuple):
 def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
     """For each kind a function that writes the bytes to the expected path and reads them as a user would."""
     from jaxdn.clips import read_clip, read_frame
-    from jaxdn.clips.cache import open_cached
-    from jaxdn.clips.evidence import read_facts
-    from jaxdn.render.animation import CameraKeys, RigidKeys, check_animation, light_scale, read_animation
-    from jaxdn.weights import load_weights
+    from jaxdn.data.clip.evidence import read_facts
+    from jaxdn.data.training.cache import open_cached
+    from jaxdn.render.scenes.animation import CameraKeys, RigidKeys, check_animation, light_scale, read_animation
+    from jaxdn.zoo.weights import load_weights
 
     clip, foreign, weights = folder / "clip", folder / "foreign", folder / "weights.safetensors"
 

@@ -30,10 +30,10 @@ def good_files(folder: Path) -> dict[str, list[bytes]]:
     import jax
 
     from jaxdn.clips import write_clip
-    from jaxdn.clips.exr import read_exr
+    from jaxdn.core.frame import Clip, Frame
+    from jaxdn.data.exr.exr import read_exr
     from jaxdn.denoisers import ntd
-    from jaxdn.frame import Clip, Frame
-    from jaxdn.weights import save_weights
+    from jaxdn.zoo.weights import save_weights
 
     rng = np.random.default_rng(0)
     light = rng.random((2, 6, 8, 3), np.float32)

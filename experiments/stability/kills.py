@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 
 from jaxdn.commands.errors import plain_errors
-from jaxdn.files import write_json
+from jaxdn.runtime.atomic_files import write_json
 
 WIDTHS = ((4,), (4,), (4,), (4,), (4,))
 
@@ -46,7 +46,7 @@ class Settings:
 def make_clips(folder: Path) -> None:
     """Three small clips of noise around a slope."""
     from jaxdn.clips import write_clip
-    from jaxdn.frame import Clip, Frame
+    from jaxdn.core.frame import Clip, Frame
 
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -60,9 +60,9 @@ def train(clips: Path, folder: Path, sizes: Sizes) -> None:
     import jax
 
     from jaxdn.clips import training_batches
-    from jaxdn.commands.fit import fit
-    from jaxdn.methods.table import method_named
-    from jaxdn.weights import save_weights
+    from jaxdn.methods.registry import method_named
+    from jaxdn.training.loop import fit
+    from jaxdn.zoo.weights import save_weights
 
     jax.config.update("jax_compilation_cache_dir", str(clips.parent / "programs"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -18,13 +18,13 @@ import numpy as np
 import tyro
 
 from jaxdn import color
-from jaxdn.candidates import NOISY, all_names, candidate
 from jaxdn.clips import find_clips, read_clip
-from jaxdn.clips.augment import transform_clip, transform_image
 from jaxdn.commands.errors import plain_errors
+from jaxdn.core.frame import BUFFERS, Clip
+from jaxdn.data.training.symmetries import transform_clip, transform_image
 from jaxdn.denoiser import Denoiser, Params
-from jaxdn.frame import BUFFERS, Clip
-from jaxdn.rollout import denoise
+from jaxdn.denoiser.rollout import denoise
+from jaxdn.zoo.ready import NOISY, all_names, candidate
 
 Image = np.ndarray
 

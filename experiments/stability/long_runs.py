@@ -21,12 +21,12 @@ import numpy as np
 import tyro
 from jax import lax
 
-from jaxdn.candidates import NOISY, all_names, candidate
 from jaxdn.commands.errors import plain_errors
+from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Denoiser
-from jaxdn.files import write_whole
-from jaxdn.frame import Frame
-from jaxdn.rollout import sampled
+from jaxdn.denoiser.rollout import sampled
+from jaxdn.runtime.atomic_files import write_whole
+from jaxdn.zoo.ready import NOISY, all_names, candidate
 
 SIZE, TURN = 48, 16
 """Width and height in pixels, and frames after which the clip is reversed."""

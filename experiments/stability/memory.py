@@ -18,7 +18,7 @@ import tyro
 
 from jaxdn.clips import write_exr
 from jaxdn.commands.errors import plain_errors
-from jaxdn.files import write_json
+from jaxdn.runtime.atomic_files import write_json
 
 
 @dataclass
@@ -52,7 +52,7 @@ def write_sequence(folder: Path, frames: int, height: int, width: int) -> None:
 
 def peak_mib(source: Path, out: Path, method: str, max_memory: float | None = None) -> float:
     """The peak resident set of one `jaxdn denoise`, in MiB. Raises RuntimeError where it fails."""
-    command = [sys.executable, "-m", "jaxdn.cli", "denoise", str(source), "-o", str(out), "--method", method]
+    command = [sys.executable, "-m", "jaxdn.commands.main", "denoise", str(source), "-o", str(out), "--method", method]
     command += ["--motion-convention", "previous-current"]
     command += [] if max_memory is None else ["--max-memory", f"{max_memory:g}"]
     told = subprocess.run([sys.executable, "-c", _LAUNCHER, *command], stdout=subprocess.PIPE, text=True, check=False)

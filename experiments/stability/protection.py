@@ -4,8 +4,8 @@
 
 Both programs run interleaved in one process, so that other load affects both. The result is the median of the ratios of
 all pairs, for wall time and for CPU time, which other load affects less. The program without repair lacks every
-``repair`` and ``repair_image`` of :mod:`jaxdn.repair` that a denoiser calls. The safe powers and lengths of
-:mod:`jaxdn.numerics` are part of both: without them gradients would not be finite.
+``repair`` and ``repair_image`` of :mod:`jaxdn.denoiser.sanitize` that a denoiser calls. The safe powers and lengths of
+:mod:`jaxdn.core.numerics` are part of both: without them gradients would not be finite.
 """
 
 import contextlib
@@ -22,10 +22,10 @@ import numpy as np
 import tyro
 
 from jaxdn.commands.errors import plain_errors
-from jaxdn.files import write_json
-from jaxdn.frame import BUFFERS, Buffer, Frame
-from jaxdn.methods.table import Method, methods
-from jaxdn.repair import repair, repair_image
+from jaxdn.core.frame import BUFFERS, Buffer, Frame
+from jaxdn.denoiser.sanitize import repair, repair_image
+from jaxdn.methods.registry import Method, methods
+from jaxdn.runtime.atomic_files import write_json
 
 _RANGES = {
     "light": (0.0, 2.0),

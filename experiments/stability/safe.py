@@ -5,8 +5,8 @@
 Clips with a reference and with the layers that are asked for, such as `jaxdn render pinkroom --layers 1 4 16 64
 --reference-spp 1024 -o data/safe` makes. Their indirect, direct and emitted light are added, as other renderers do.
 Prints PSNR in dB (tone-mapped, means of the frames) of the input, of the denoised frame, and of the safe mixture of
-both (:mod:`jaxdn.shrinkage`, what `jaxdn denoise` writes); ``reference`` is the reference itself as the input, to be
-returned as it is.
+both (:mod:`jaxdn.sequence.safe_blend`, what `jaxdn denoise` writes); ``reference`` is the reference itself as the
+input, to be returned as it is.
 """
 
 from collections.abc import Iterator
@@ -20,14 +20,14 @@ import numpy as np
 import tyro
 
 from jaxdn import color
-from jaxdn.candidates import Candidate, candidate
 from jaxdn.clips import find_clips
-from jaxdn.clips.folder import open_frames
-from jaxdn.clips.frames import StoredFrame
 from jaxdn.commands.errors import plain_errors
-from jaxdn.commands.passes import Pass
-from jaxdn.frame import Frame
+from jaxdn.core.frame import Frame
+from jaxdn.data.clip.folder import open_frames
+from jaxdn.data.clip.frames import StoredFrame
 from jaxdn.metrics import psnr
+from jaxdn.sequence.denoise_frames import Pass
+from jaxdn.zoo.ready import Candidate, candidate
 
 GUIDES = ("all", "none", "turned")
 """All guides, light alone, and guides turned by 180 degrees."""

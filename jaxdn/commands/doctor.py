@@ -12,11 +12,11 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxdn
-from jaxdn.compiled import strips
-from jaxdn.extras import EXTRAS, install
 from jaxdn.networks.engines import ENGINES
-from jaxdn.ops import onednn_library
-from jaxdn.render.variant import choose_variant, has_cuda
+from jaxdn.ops.dispatch import numba_call
+from jaxdn.ops.onednn import library
+from jaxdn.render.tracing.variant import choose_variant, has_cuda
+from jaxdn.runtime.optional import EXTRAS, install
 
 _EXTRA_OF = {"onednn-bfloat16": "onednn", "onednn-float32": "onednn", "onnxruntime": "onnx", "onednn": "onednn"}
 """Engine -> the extra that brings it."""
@@ -51,7 +51,7 @@ def _findings() -> Iterator[Finding]:
             yield Finding(f"engine for {engine.purpose}", engine.name)
         elif engine.available():
             yield Finding(f"engine for {engine.purpose}", f"XLA: {engine.name} is slower on this CPU")
-        elif engine.name == "onednn-bfloat16" and onednn_library.available():
+        elif engine.name == "onednn-bfloat16" and library.available():
             yield Finding(f"engine for {engine.purpose}", "no onednn-bfloat16: this CPU does not compute with it")
         elif jax.default_backend() == "cpu":
             yield Finding(f"engine for {engine.purpose}", "XLA alone", f"faster: {install(_EXTRA_OF[engine.name])}")
@@ -75,7 +75,7 @@ def _device() -> Finding:
 
 def _loops() -> Finding:
     """Numba, which compiles the loops of filters."""
-    if strips.available():
+    if numba_call.available():
         return Finding("filters", f"loops compiled by numba {metadata.version('numba')}")
     if find_spec("numba") is None:
         return Finding("filters", "XLA alone", "twice as fast: pip install numba")

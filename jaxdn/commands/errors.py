@@ -8,9 +8,9 @@ from typing import Any, NoReturn
 
 from rich.console import Console
 
-from jaxdn.commands.interrupt import EXIT_CODE, never_lost
-from jaxdn.extras import extra_of, install
 from jaxdn.render.errors import RenderError
+from jaxdn.runtime.interrupt import EXIT_CODE, never_lost
+from jaxdn.runtime.optional import extra_of, install
 
 
 @contextmanager

@@ -4,10 +4,10 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from jaxdn.candidates import candidate
 from jaxdn.export.formats import onnx_model, stablehlo
 from jaxdn.export.step import Step, exported_step
-from jaxdn.files import write_whole
+from jaxdn.runtime.atomic_files import write_whole
+from jaxdn.zoo.ready import candidate
 
 Format = Literal["both", "stablehlo", "onnx"]
 

@@ -14,16 +14,16 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from jaxdn.clips.folder import is_clip
-from jaxdn.clips.shots import ranges
-from jaxdn.clips.sources import sources_of
 from jaxdn.commands.inspect_files import inspect_files
-from jaxdn.commands.render import Planned, denoiser_named, plan_clip
 from jaxdn.commands.sources import show_sources
+from jaxdn.core.frame import BUFFERS, OF_SAMPLES
+from jaxdn.data.clip.folder import is_clip
+from jaxdn.data.foreign.shots import ranges
+from jaxdn.data.foreign.sources import sources_of
 from jaxdn.denoiser import Denoiser
 from jaxdn.effects import EFFECTS, Plan, everything, inspect, plan
-from jaxdn.frame import BUFFERS, OF_SAMPLES
-from jaxdn.render.opening import open_scene
+from jaxdn.render.scenes.opening import open_scene
+from jaxdn.sequence.render_jobs import Planned, denoiser_named, plan_clip
 
 EVERYTHING = plan(everything(1))
 """The plan that corresponds to rendering everything."""

@@ -5,12 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxdn.clips.folder import refuse_unfinished
-from jaxdn.clips.import_exr import canvas_of, fitting_files
-from jaxdn.clips.shots import sequence_files
-from jaxdn.clips.sources import UNSTATED, sources_of
-from jaxdn.clips.vectors import CHOICES
 from jaxdn.commands.sources import missing, show_sources
+from jaxdn.data.clip.folder import refuse_unfinished
+from jaxdn.data.foreign.import_exr import canvas_of, fitting_files
+from jaxdn.data.foreign.shots import sequence_files
+from jaxdn.data.foreign.sources import UNSTATED, sources_of
+from jaxdn.data.foreign.vectors import CHOICES
 
 
 def inspect_files(
@@ -25,8 +25,8 @@ def inspect_files(
     """Print what is read of a sequence, what is missing, and which conventions motion vectors may have.
 
     Only the first two files are read, of the others the headers. Raises ClipError as
-    :func:`jaxdn.clips.sources.sources_of` and :func:`jaxdn.clips.import_exr.fitting_files` do, for files of different
-    sizes, and for a clip of ours that was not finished.
+    :func:`jaxdn.data.foreign.sources.sources_of` and :func:`jaxdn.data.foreign.import_exr.fitting_files` do, for files
+    of different sizes, and for a clip of ours that was not finished.
 
     Args:
       source: a folder of, a pattern for, or the name of EXR files.

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from jaxdn.clips.files import ClipError
-from jaxdn.clips.pack import Packed, Packing, open_clips, write_pack
+from jaxdn.data.clip.files import ClipError
+from jaxdn.data.training.pack import Packed, Packing, open_clips, write_pack
 
 
 def pack(
@@ -17,8 +17,8 @@ def pack(
 ) -> Packed:
     """Pack random windows of clips into the file ``out`` of at most ``mib`` MiB, in a folder that is made if missing.
 
-    ``places`` are as for :func:`jaxdn.clips.training_batches`. Raises as :func:`jaxdn.clips.pack.write_pack` does, and
-    ValueError for a size that is not positive.
+    ``places`` are as for :func:`jaxdn.clips.training_batches`. Raises as :func:`jaxdn.data.training.pack.write_pack`
+    does, and ValueError for a size that is not positive.
     """
     if not 0 < mib < 2**20:
         raise ValueError(f"--mib: expected more than 0 MiB and less than 2^20, got {mib:g}.")

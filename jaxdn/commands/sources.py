@@ -7,8 +7,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from jaxdn.clips.layers import LAYERS
-from jaxdn.clips.sources import Source, sources_of
+from jaxdn.data.foreign.layers import LAYERS
+from jaxdn.data.foreign.sources import Source, sources_of
 from jaxdn.planning.plan import COMPOSED
 
 CONSEQUENCES: dict[str, str] = {
@@ -42,7 +42,7 @@ def show_sources(
 ) -> list[Source]:
     """Print the table for a sequence and a denoiser that reads some buffers (None: any denoiser); returns its sources.
 
-    An image that is ``alone`` needs no motion. Raises as :func:`jaxdn.clips.sources.sources_of` does.
+    An image that is ``alone`` needs no motion. Raises as :func:`jaxdn.data.foreign.sources.sources_of` does.
     """
     naming: Any = {"motion_convention": motion_convention, "channels": channels, "layer": layer}
     found = sources_of(path, alone=alone, log=log, **naming)

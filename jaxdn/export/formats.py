@@ -7,10 +7,10 @@ import numpy as np
 from jax import export
 
 import jaxdn
+from jaxdn.core.frame import BUFFERS
 from jaxdn.export.graph import IR_VERSION, OPSET, Graph, element_type
 from jaxdn.export.step import Step, channels
 from jaxdn.export.translate import translate
-from jaxdn.frame import BUFFERS
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 """Where the StableHLO runs."""

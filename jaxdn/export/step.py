@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import export
 
+from jaxdn.core.frame import BUFFERS, GUIDES, Frame
+from jaxdn.core.platform import portable
 from jaxdn.denoiser import Denoiser, Params, Recurrent
-from jaxdn.frame import BUFFERS, GUIDES, Frame
-from jaxdn.platform import portable
 
 Arrays = dict[str, Any]
 MULTIPLES = (1, 16, 32)

@@ -3,7 +3,7 @@
 The weight of a tap q at pixel p is its stencil weight h times edge-stopping weights that the caller chooses (Dammertz
 et al., "Edge-Avoiding A-Trous Wavelet Transform for fast Global Illumination Filtering", 2010; Schied et al. 2017).
 
-Arrays here are planar, ``[C, H, W]``; the work is done strip by strip (:mod:`jaxdn.filters.canvas`).
+Arrays here are planar, ``[C, H, W]``; the work is done strip by strip (:mod:`jaxdn.filters.stencil_tiles`).
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.filters.canvas import canvas_for, guiding, weighted_sums
-from jaxdn.filters.weights import Weight
+from jaxdn.filters.edge_stopping import Weight
+from jaxdn.filters.stencil_tiles import canvas_for, guiding, weighted_sums
 
 B3_SPLINE = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
 GAUSSIAN = np.array([0.279, 0.442, 0.279])
@@ -53,7 +53,7 @@ def edge_average(
       values: planes to average.
       hit: [H, W] bool, a surface is seen; other pixels are never taps. Or numbers in [0, 1]: how much each
         pixel counts. None: all count.
-      weights: edge-stopping weights, see :mod:`jaxdn.filters.weights`.
+      weights: edge-stopping weights, see :mod:`jaxdn.filters.edge_stopping`.
       taps: rows of (dy, dx, h), see :func:`stencil`.
       step: spacing of the taps; it may be traced, so that all levels share one compiled loop, up to ``step_max``.
       step_max: the largest ``step``.

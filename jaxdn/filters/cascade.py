@@ -10,8 +10,8 @@ from jax import lax
 from jaxdn import brdf
 from jaxdn.filters.accumulation import luminance
 from jaxdn.filters.blur import blur_variance
-from jaxdn.filters.canvas import Guiding, canvas_for, guiding, weighted_sums
-from jaxdn.filters.weights import Weight, luminance_weight
+from jaxdn.filters.edge_stopping import Weight, luminance_weight
+from jaxdn.filters.stencil_tiles import Guiding, canvas_for, guiding, weighted_sums
 
 _Planes = tuple[list[jax.Array], list[jax.Array]]
 

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.filters.weights import Offset, Weight
-from jaxdn.ops.strips import by_strips
+from jaxdn.filters.edge_stopping import Offset, Weight
+from jaxdn.ops.dispatch.row_tiles import by_strips
 
 _PLACES = [(r, turn + 0.5 * np.pi * k) for r, turn in ((1.0, 0.0), (0.5, 0.25 * np.pi)) for k in range(4)]
 TAPS = np.array([(r * np.cos(angle), r * np.sin(angle), np.exp(-0.66 * r * r)) for r, angle in _PLACES])
@@ -45,7 +45,7 @@ def disc_average(
     Args:
       values: planes to average.
       hit: [H, W] bool, a surface is seen; other pixels are never taps. None: everywhere.
-      weights: edge-stopping weights, see :mod:`jaxdn.filters.weights`.
+      weights: edge-stopping weights, see :mod:`jaxdn.filters.edge_stopping`.
       radius: [H, W] of the disc in pixels.
       angle: [H, W] by which it is rotated.
       taps: rows of (x, y, h) in the unit disc.

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxdn.core.frame import Array
+from jaxdn.core.numerics import absolute
 from jaxdn.filters.atrous import edge_average, stencil
-from jaxdn.filters.weights import Weight
-from jaxdn.frame import Array
-from jaxdn.numerics import absolute
+from jaxdn.filters.edge_stopping import Weight
 
 STRATUM = 3
 """Pixels along one side of a stratum."""

@@ -10,9 +10,9 @@ from jax import lax
 
 from jaxdn import brdf
 from jaxdn.filters.atrous import edge_average, stencil
-from jaxdn.filters.beside import alone, with_those_beside
-from jaxdn.filters.few import average_of_few, few_or_all
-from jaxdn.filters.weights import Weight
+from jaxdn.filters.edge_stopping import Weight
+from jaxdn.filters.isolated import alone, with_those_beside
+from jaxdn.filters.sparse import average_of_few, few_or_all
 
 _TAPS = np.array([tap for tap in stencil(2) if abs(tap[0] * tap[1]) < 4])
 """5x5 without the corners."""
@@ -41,7 +41,7 @@ def fix_history(
       frames: longest history that is fixed; 0: none.
       widest: twice the distance of the taps, in pixels, for a history of one frame.
       texture: [3, H, W] what a division left, averaged likewise and given back (:func:`jaxdn.brdf.restore`).
-      beside: a pixel that is alone gets the mean of those beside it (:mod:`jaxdn.filters.beside`); not for
+      beside: a pixel that is alone gets the mean of those beside it (:mod:`jaxdn.filters.isolated`); not for
         reflections.
     """
     if not frames:

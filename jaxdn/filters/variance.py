@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jaxdn import brdf
 from jaxdn.filters.accumulation import luminance
 from jaxdn.filters.atrous import edge_average, stencil
-from jaxdn.filters.beside import alone, with_those_beside
-from jaxdn.filters.few import average_of_few, few_or_all
-from jaxdn.filters.weights import Weight
+from jaxdn.filters.edge_stopping import Weight
+from jaxdn.filters.isolated import alone, with_those_beside
+from jaxdn.filters.sparse import average_of_few, few_or_all
 
 _ROUNDING = 1e-3
 """Frames that a length may lack through rounding: the mean of lengths of 4 is seldom exactly 4."""
@@ -32,7 +32,7 @@ def estimate_variance(
     division left is averaged likewise and given back to this colour (:func:`jaxdn.brdf.restore`); the deviation changes
     as grey light would.
 
-    ``beside`` gives a pixel that is alone the mean of those beside it (:mod:`jaxdn.filters.beside`); not for
+    ``beside`` gives a pixel that is alone the mean of those beside it (:mod:`jaxdn.filters.isolated`); not for
     reflections, which are sharp where they are alone.
     """
     color, moments, length = history[:3], history[3:5], history[5]

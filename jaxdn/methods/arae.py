@@ -12,12 +12,12 @@ from typing import NamedTuple
 
 import jax
 
+from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.filters.guides import guides_of
-from jaxdn.frame import Frame
+from jaxdn.filters.surface_test import guides_of
 from jaxdn.methods import asvgf, rae, svgf
-from jaxdn.methods.demodulated import demodulated
-from jaxdn.methods.table import method
+from jaxdn.methods.demodulation import demodulated
+from jaxdn.methods.registry import method
 
 _ACCUMULATION = asvgf.Options()
 """How the history is fetched, tested and blended."""

@@ -18,6 +18,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxdn.core.frame import Frame
+from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.accumulation import luminance
 from jaxdn.filters.gradients import (
@@ -28,13 +30,11 @@ from jaxdn.filters.gradients import (
     stratum_centers,
     to_pixels,
 )
-from jaxdn.filters.guides import hit_mask
-from jaxdn.frame import Frame
+from jaxdn.filters.surface_test import hit_mask
 from jaxdn.methods import svgf
-from jaxdn.methods.demodulated import demodulated
-from jaxdn.methods.fitted import FITTING, LEARNED, moved, unmoved
-from jaxdn.methods.table import method
-from jaxdn.options import Range
+from jaxdn.methods.demodulation import demodulated
+from jaxdn.methods.learnable_options import FITTING, LEARNED, moved, unmoved
+from jaxdn.methods.registry import method
 
 
 @dataclass(frozen=True)

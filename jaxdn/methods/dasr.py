@@ -14,17 +14,17 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
+from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.filters.guides import depth_feature
-from jaxdn.frame import Frame
+from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods import direct
-from jaxdn.methods.demodulated import Demodulation, demodulated
+from jaxdn.methods.demodulation import Demodulation, demodulated
+from jaxdn.methods.registry import method
 from jaxdn.methods.sampler import Sampling, mapped, sampler
-from jaxdn.methods.table import method
 from jaxdn.networks import LARGE, MULTIPLE, SMALL, Widths, pad
-from jaxdn.objectives import compressed_illumination, pyramid_illumination
-from jaxdn.recipe import Recipe
-from jaxdn.variation import STILL
+from jaxdn.recipes.augmentation import STILL
+from jaxdn.recipes.objectives import compressed_illumination, pyramid_illumination
+from jaxdn.recipes.recipe import Recipe
 
 
 @dataclass(frozen=True)

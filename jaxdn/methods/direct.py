@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn import color
+from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.denoiser import Params
-from jaxdn.filters.guides import hit_mask
-from jaxdn.frame import RADIANCE_MAX, Frame
+from jaxdn.filters.surface_test import hit_mask
 from jaxdn.networks import crop, pad
-from jaxdn.scales import fill
+from jaxdn.ops.scales import fill
 
 
 class Light(NamedTuple):

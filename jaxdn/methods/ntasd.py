@@ -3,7 +3,7 @@
 Before a frame is rendered, one network sees the last image, warped to where its surfaces are now, and the surfaces'
 buffers, and says where samples go; the frame is rendered with as many samples as it says, and a second network denoises
 it with kernels at three scales and one on the warped image, as in ``ntd``. Both are trained together, through the
-renderer: what one more sample would have changed is known from the reference (:func:`jaxdn.sampling.more_samples`).
+renderer: what one more sample would have changed is known from the reference (:func:`jaxdn.ops.sampling.more_samples`).
 
 Jon Hasselgren, Jacob Munkberg, Marco Salvi, Anjul Patney, Aaron Lefohn, "Neural Temporal Adaptive Sampling and
 Denoising", 2020 ("Hasselgren et al. 2020" here).
@@ -16,17 +16,17 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn import color
+from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.filters.guides import depth_feature
-from jaxdn.frame import Frame
+from jaxdn.denoiser.statistics import Whole
+from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods import ntd
-from jaxdn.methods.demodulated import demodulated
+from jaxdn.methods.demodulation import demodulated
+from jaxdn.methods.registry import method
 from jaxdn.methods.sampler import Sampling, gray, mapped, motion_feature, sampler
-from jaxdn.methods.table import method
-from jaxdn.objectives import last_frames, unbiased_illumination
-from jaxdn.recipe import Recipe
-from jaxdn.variation import STILL
-from jaxdn.whole import Whole
+from jaxdn.recipes.augmentation import STILL
+from jaxdn.recipes.objectives import last_frames, unbiased_illumination
+from jaxdn.recipes.recipe import Recipe
 
 
 @dataclass(frozen=True)

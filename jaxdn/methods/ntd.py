@@ -5,7 +5,7 @@ previous output warped by *dual* motion vectors, and how to blend them. Details 
 ``preset="parity"`` takes the exact paper settings.
 
 Beyond the paper, the kernels are guided: what the buffers show of two surfaces is compared before the network's logits,
-so that it need not learn where edges are (:func:`jaxdn.ops.softmax_filter.softmax_filter`).
+so that it need not learn where edges are (:func:`jaxdn.ops.kernel_prediction.softmax.softmax_filter`).
 
 Yan Zeng, Lu Wang, Yanning Xu, Xiangxu Meng, "Neural Temporal Denoising for Indirect Illumination", 2021 ("Zeng et al.
 2021" here). Dual motion vectors: Zheng Zeng et al., "Temporally Reliable Motion Vectors for Better Use of Temporal
@@ -20,21 +20,21 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn import color
+from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.filters.guides import depth_feature, hit_mask
-from jaxdn.frame import RADIANCE_MAX, Frame
-from jaxdn.methods.demodulated import Demodulation, demodulated
+from jaxdn.denoiser.sanitize import repair_image
+from jaxdn.denoiser.statistics import Whole, measured
+from jaxdn.filters.surface_test import depth_feature, hit_mask
+from jaxdn.methods.demodulation import Demodulation, demodulated
 from jaxdn.methods.reconstruction import SCALES, Prediction, begin_blending, blend, heads_of
-from jaxdn.methods.table import method
-from jaxdn.motion import on_screen
+from jaxdn.methods.registry import method
 from jaxdn.networks import LARGE, SMALL, Widths, crop, description, pad
-from jaxdn.objectives import indirect_illumination, unbiased_illumination
+from jaxdn.ops.motion import on_screen
+from jaxdn.ops.scales import downsample, fill
 from jaxdn.ops.warp import warp
-from jaxdn.recipe import FINISH, Recipe
-from jaxdn.repair import repair_image
-from jaxdn.scales import downsample, fill
-from jaxdn.variation import STILL
-from jaxdn.whole import Whole, measured
+from jaxdn.recipes.augmentation import STILL
+from jaxdn.recipes.objectives import indirect_illumination, unbiased_illumination
+from jaxdn.recipes.recipe import FINISH, Recipe
 
 PRECISIONS = {"albedo": (3, 3.0), "normal": (3, 3.0), "depth": (1, 6.0), "reflectance": (3, 3.0), "roughness": (1, 3.0)}
 """Guide of the kernels -> its channels, and the logarithm of its precision at the start of training."""
@@ -59,7 +59,7 @@ class Options:
     domain: Literal["linear", "compressed"] = "linear"
     """Kernels filter radiance, or compressed radiance (robust to fireflies, but it darkens)."""
     depth_scale: Literal["geometric", "unit"] = "geometric"
-    """Scaling of the depth feature, see :func:`jaxdn.filters.guides.depth_feature`."""
+    """Scaling of the depth feature, see :func:`jaxdn.filters.surface_test.depth_feature`."""
     border: Literal["clamp", "zeros"] = "clamp"
     """Border of the warp."""
     first_frame: Literal["none", "noisy"] = "none"

@@ -14,16 +14,16 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
+from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.filters.guides import depth_feature
-from jaxdn.frame import RADIANCE_MAX, Frame
+from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods import direct
-from jaxdn.methods.demodulated import Demodulation, demodulated
-from jaxdn.methods.table import method
+from jaxdn.methods.demodulation import Demodulation, demodulated
+from jaxdn.methods.registry import method
 from jaxdn.networks import Widths, pad
-from jaxdn.objectives import pyramid_illumination, recurrent_illumination
-from jaxdn.recipe import Recipe
-from jaxdn.variation import STILL
+from jaxdn.recipes.augmentation import STILL
+from jaxdn.recipes.objectives import pyramid_illumination, recurrent_illumination
+from jaxdn.recipes.recipe import Recipe
 
 LARGE: Widths = ((32, 43, 57, 76, 101, 101), (76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
 """Channels of the encoder's stages, then of the decoder's convolutions from coarse to fine: 1.95 million weights. The

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 
 from jaxdn.denoiser import Params
 from jaxdn.methods.direct import beginning_grey
-from jaxdn.ops.softmax_filter import softmax_filter
-from jaxdn.scales import compose_scales, downsample
+from jaxdn.ops.kernel_prediction.softmax import softmax_filter
+from jaxdn.ops.scales import compose_scales, downsample
 
 TAPS = 25
 SCALES = 3

@@ -1,7 +1,7 @@
 """A network that says where samples go, shared by the methods that request samples.
 
 It sees what is known before a frame is rendered, one number a pixel comes out, and one softmax over the image turns
-these into numbers of samples that keep a budget (:func:`jaxdn.sampling.sample_map`).
+these into numbers of samples that keep a budget (:func:`jaxdn.ops.sampling.sample_map`).
 
 Hasselgren et al. 2020, "Neural Temporal Adaptive Sampling and Denoising"; Kuznetsov et al. 2018, "Deep Adaptive
 Sampling for Low Sample Count Rendering".
@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from jaxdn.core.options import Range
 from jaxdn.denoiser import Params
 from jaxdn.networks import LARGE, Widths, crop, pad
-from jaxdn.options import Range
-from jaxdn.sampling import sample_map
+from jaxdn.ops.sampling import sample_map
 
 SMALL: Widths = ((8,), (16, 16), (24, 24), (32, 32), (32, 32))
 """Half of the widths of the denoiser's: it only has to find where noise will be."""
@@ -37,9 +37,9 @@ class Sampling:
     least: Annotated[int, Range(0)] = 1
     """Every pixel has at least this many samples; 0 in the paper."""
     rounding: Literal["exact", "nearest"] = "exact"
-    """The budget is kept exactly, or about (as in the paper), see :func:`jaxdn.sampling.sample_map`."""
+    """The budget is kept exactly, or about (as in the paper), see :func:`jaxdn.ops.sampling.sample_map`."""
     slope: Literal["mixing", "amplitude"] = "mixing"
-    """What one more sample does to the image, in training, see :func:`jaxdn.sampling.more_samples`: a sample without
+    """What one more sample does to the image in training, see :func:`jaxdn.ops.sampling.more_samples`: a sample without
     noise is mixed in, or the noise falls as the root of the number."""
 
 

@@ -18,20 +18,20 @@ from typing import Annotated, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxdn.core.frame import Array, Frame
+from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.denoiser.statistics import Whole, measured
 from jaxdn.filters.accumulation import accumulate
 from jaxdn.filters.atrous import B3_SPLINE, stencil
 from jaxdn.filters.cascade import cascade
-from jaxdn.filters.guides import Guides, guides_of, hit_mask
-from jaxdn.filters.recall import recall
+from jaxdn.filters.edge_stopping import Weight, depth_weight, normal_weight
+from jaxdn.filters.reproject import recall
+from jaxdn.filters.surface_test import Guides, guides_of, hit_mask
 from jaxdn.filters.variance import estimate_variance
-from jaxdn.filters.weights import Weight, depth_weight, normal_weight
-from jaxdn.frame import Array, Frame
-from jaxdn.methods.demodulated import Demodulation, demodulated, texture_left
-from jaxdn.methods.fitted import FITTING, LEARNED, LEARNED_PER_LEVEL, at_level, moved, unmoved
-from jaxdn.methods.table import method
-from jaxdn.options import Range
-from jaxdn.whole import Whole, measured
+from jaxdn.methods.demodulation import Demodulation, demodulated, texture_left
+from jaxdn.methods.learnable_options import FITTING, LEARNED, LEARNED_PER_LEVEL, at_level, moved, unmoved
+from jaxdn.methods.registry import method
 
 READS = frozenset({"normal", "depth", "previous_depth", "motion", "ids"})
 _TAPS = stencil(2, kernel=B3_SPLINE)

@@ -19,8 +19,11 @@ from typing import Annotated, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxdn.core.frame import RADIANCE_MAX, Frame
+from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, RecurrentStep, State, recurrent
-from jaxdn.filters.cubic import warp_cubic
+from jaxdn.denoiser.statistics import Whole
+from jaxdn.filters.catmull_rom import warp_cubic
 from jaxdn.filters.neighbourhood import (
     Box,
     box_around,
@@ -31,10 +34,7 @@ from jaxdn.filters.neighbourhood import (
     nearest_motion,
     to_ycocg,
 )
-from jaxdn.frame import RADIANCE_MAX, Frame
-from jaxdn.methods.table import method
-from jaxdn.options import Range
-from jaxdn.whole import Whole
+from jaxdn.methods.registry import method
 
 READS = frozenset({"motion", "depth"})
 

@@ -26,22 +26,22 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn import brdf
+from jaxdn.core.frame import Array, Frame
+from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.filters.accumulation import after_shift, luminance
 from jaxdn.filters.atrous import GAUSSIAN, stencil
 from jaxdn.filters.cascade import cascade
 from jaxdn.filters.clamping import clamp_to_fast
-from jaxdn.filters.guides import Guides, expected, guides_of, hit_mask, shared
-from jaxdn.filters.recall import fetch
+from jaxdn.filters.edge_stopping import Weight, depth_weight, lobe_weight, luminance_weight, roughness_weight
+from jaxdn.filters.reproject import fetch
+from jaxdn.filters.surface_test import Guides, expected, guides_of, hit_mask, shared
 from jaxdn.filters.variance import estimate_variance
-from jaxdn.filters.weights import Weight, depth_weight, lobe_weight, luminance_weight, roughness_weight
-from jaxdn.frame import Array, Frame
 from jaxdn.methods import svgf
-from jaxdn.methods.demodulated import Demodulation
-from jaxdn.methods.fitted import FITTING, LEARNED, at_level, moved, unmoved
-from jaxdn.methods.lobes import Light, apart, reflectances
-from jaxdn.methods.table import method
-from jaxdn.options import Range
+from jaxdn.methods.demodulation import Demodulation
+from jaxdn.methods.learnable_options import FITTING, LEARNED, at_level, moved, unmoved
+from jaxdn.methods.registry import method
+from jaxdn.methods.two_lobes.lobes import Light, apart, reflectances
 
 READS = svgf.READS | {
     *("albedo", "reflectance", "specular_reflectance", "roughness", "dual_motion"),

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 from jaxdn.networks import onednn, onnx
-from jaxdn.ops import onednn_library
+from jaxdn.ops.onednn import library
 
 Purpose = Literal["inference", "training"]
 
@@ -23,7 +23,7 @@ class Engine(NamedTuple):
 
 ENGINES: dict[str, Engine] = {
     "onednn-bfloat16": Engine("onednn-bfloat16", "inference", onednn.computes_bfloat16),
-    "onednn-float32": Engine("onednn-float32", "inference", onednn_library.available),
+    "onednn-float32": Engine("onednn-float32", "inference", library.available),
     "onnxruntime": Engine("onnxruntime", "inference", onnx.available),
-    "onednn": Engine("onednn", "training", onednn_library.available, onednn_library.trains_faster),
+    "onednn": Engine("onednn", "training", library.available, library.trains_faster),
 }

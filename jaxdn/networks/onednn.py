@@ -8,7 +8,7 @@ differ by 76 to 85 dB (``docs/performance.md``). Both are for inference only: th
 plain XLA, recomputed.
 
 All primitives are made once for a shape, on memory of their own, and run one after the other. The layers:
-:mod:`jaxdn.ops.onednn_layers`.
+:mod:`jaxdn.ops.onednn.layers`.
 """
 
 import math
@@ -24,8 +24,8 @@ from jax.experimental.buffer_callback import buffer_callback
 
 from jaxdn.networks.description import FEATURES, Description, Weights, evaluate
 from jaxdn.networks.inference import Apply, inference_only, same
-from jaxdn.ops import onednn_layers
-from jaxdn.ops import onednn_library as dnnl
+from jaxdn.ops.onednn import layers
+from jaxdn.ops.onednn import library as dnnl
 
 
 class Precision(NamedTuple):
@@ -176,9 +176,9 @@ class Program:
         if step.kernel is not None:
             after: Any = {"kind": self._precision.kind, "slope": step.slope, "adds": len(step.inputs) > 1}
             enlarges = step.kind == "enlarging convolution"
-            placed = onednn_layers.convolution(reads, result, step.kernel, step.bias, enlarges=enlarges, **after)
+            placed = layers.convolution(reads, result, step.kernel, step.bias, enlarges=enlarges, **after)
         else:
-            placed = (onednn_layers.pooling if step.kind == "pool" else onednn_layers.enlarging)(reads, result)
+            placed = (layers.pooling if step.kind == "pool" else layers.enlarging)(reads, result)
         self._primitives.append(placed(source, target))
 
     def _room(self, size: int) -> np.ndarray:

@@ -16,9 +16,9 @@ import jax
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-from jaxdn.extras import install
 from jaxdn.networks.description import FEATURES, Description, Weights, evaluate
 from jaxdn.networks.inference import Apply, inference_only, same
+from jaxdn.runtime.optional import install
 
 OPSET = 17
 BLOCK = 16

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxdn.networks import Widths, description
 from jaxdn.networks.description import FEATURES, Description, Weights, evaluate, hidden
 from jaxdn.networks.unet import ONEDNN, XLA, Layers, initial, present_groups, storage, weights_for
-from jaxdn.ops import onednn_library
-from jaxdn.ops.registry import register, resolve
+from jaxdn.ops.dispatch.registry import register, resolve
+from jaxdn.ops.onednn import library
 
 Apply = Callable[[Weights, dict[str, jax.Array]], tuple[jax.Array, ...]]
 """(weights, inputs by name [N, H, W, c]) -> outputs."""
@@ -42,7 +42,7 @@ def reference(network: Description) -> Apply:
     return by_xla(XLA, network)
 
 
-@register("recurrent_unet", "onednn", requires=onednn_library.check_available)
+@register("recurrent_unet", "onednn", requires=library.check_available)
 def convolved_by_onednn(network: Description) -> Apply:
     """XLA with oneDNN's convolutions and their gradients: for training on CPUs."""
     return by_xla(ONEDNN, network)
@@ -56,8 +56,8 @@ def recurrent_unet(
     ``groups`` are the channel counts of the feature groups; an absent one, None, equals zeros, as in
     :func:`jaxdn.networks.unet.unet`. H and W are multiples of ``2^(stages - 1)``. The output is raw.
     ``implementation``: None or "reference" (XLA), or "onednn" (convolutions and their gradients, see
-    :mod:`jaxdn.ops.onednn`). Raises ValueError unless ``widths`` has one decoder level less than encoder stages, when
-    the features do not fit, and when the implementation cannot run here.
+    :mod:`jaxdn.ops.convolution.onednn`). Raises ValueError unless ``widths`` has one decoder level less than encoder
+    stages, when the features do not fit, and when the implementation cannot run here.
     """
     run = resolve("recurrent_unet", implementation)
     stages = widths[0]

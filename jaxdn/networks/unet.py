@@ -14,14 +14,14 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from jaxdn.checks import check_option
+from jaxdn.core.checks import check_option
 from jaxdn.denoiser import Params
 from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, description, onednn, onnx
 from jaxdn.networks.description import FEATURES, Description, evaluate
 from jaxdn.networks.inference import Apply
-from jaxdn.ops import onednn_library
-from jaxdn.ops.convolution import convolve
-from jaxdn.ops.registry import register, resolve
+from jaxdn.ops.convolution.api import convolve
+from jaxdn.ops.dispatch.registry import register, resolve
+from jaxdn.ops.onednn import library
 
 
 class Network(NamedTuple):
@@ -133,7 +133,7 @@ def reference(network: Description) -> Apply:
     return by_xla(XLA, network)
 
 
-@register("unet", "onednn", requires=onednn_library.check_available)
+@register("unet", "onednn", requires=library.check_available)
 def convolved_by_onednn(network: Description) -> Apply:
     """XLA with oneDNN's convolutions and their gradients: for training on CPUs."""
     return by_xla(ONEDNN, network)
@@ -170,13 +170,14 @@ def unet(
 
     ``groups`` are the channel counts of the feature groups; ``apply`` takes one array ``[N, H, W, c]`` for each, or
     ``None`` where it is absent, which equals an array of zeros but skips its part of the first convolution: the shapes
-    of ``params`` never depend on it. H and W are multiples of 16. ``heads`` are the channel counts at full,
-    half and quarter resolution; their outputs are raw (logits), by convolutions of ``head_size``. ``widths`` gives the
-    channels of each convolution of each of the five levels; the decoder mirrors the first four. ``initialization``: see
+    of ``params`` never depend on it. H and W are multiples of 16. ``heads`` are the channel counts at full, half and
+    quarter resolution; their outputs are raw (logits), by convolutions of ``head_size``. ``widths`` gives the channels
+    of each convolution of each of the five levels; the decoder mirrors the first four. ``initialization``: see
     :func:`initial`. Computes in the features' dtype. ``implementation``: None or "reference" (XLA), "onednn-bfloat16",
     "onednn-float32" or "onnxruntime" (inference, see :mod:`jaxdn.networks.onednn` and :mod:`jaxdn.networks.onnx`) or
-    "onednn" (convolutions and their gradients, see :mod:`jaxdn.ops.onednn`). Raises ValueError when ``widths`` is not
-    five non-empty levels of positive integers, the features do not fit, or the implementation cannot run here.
+    "onednn" (convolutions and their gradients, see :mod:`jaxdn.ops.convolution.onednn`). Raises ValueError when
+    ``widths`` is not five non-empty levels of positive integers, the features do not fit, or the implementation cannot
+    run here.
     """
     run = resolve("unet", implementation)
     widths = tuple(tuple(level) for level in widths)

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdn.checks import check_image, check_option, check_same_size
-from jaxdn.motion import targets
-from jaxdn.ops.registry import register, resolve
+from jaxdn.core.checks import check_image, check_option, check_same_size
+from jaxdn.ops.dispatch.registry import register, resolve
+from jaxdn.ops.motion import targets
 
 
 def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implementation: str | None = None) -> jax.Array:

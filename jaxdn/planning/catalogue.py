@@ -2,7 +2,7 @@
 
 Effects are data, and the planner treats all of them equally: for a method that reads a new buffer, add the buffer to
 the effects that produce it, or add an effect. The absence of an effect equals the neutral value of its buffers
-(:data:`jaxdn.frame.BUFFERS`).
+(:data:`jaxdn.core.frame.BUFFERS`).
 """
 
 from collections.abc import Callable, Iterable

@@ -1,7 +1,8 @@
 """Plain facts about an animated scene, as far as they decide what has to be simulated.
 
-The data passed from the readers of facts (:mod:`jaxdn.render.scene_facts` for a scene, :mod:`jaxdn.clips.evidence` for
-a finished clip) to the catalogue of effects, which depends neither on Mitsuba nor on files.
+The data passed from the readers of facts (:mod:`jaxdn.render.scenes.scene_facts` for a scene,
+:mod:`jaxdn.data.clip.evidence` for a finished clip) to the catalogue of effects, which depends neither on Mitsuba nor
+on files.
 """
 
 from collections.abc import Mapping

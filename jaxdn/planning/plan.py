@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from jaxdn.core.frame import GUIDES, ON_REQUEST
 from jaxdn.denoiser import Denoiser
-from jaxdn.frame import GUIDES, ON_REQUEST
 from jaxdn.planning.catalogue import (
     DIRECT,
     EFFECTS,
@@ -87,11 +87,11 @@ def plan(
     """The intersection of the effects of a scene and the buffers that a denoiser reads.
 
     Without a denoiser these are all buffers but those that are rendered on request alone
-    (:data:`jaxdn.frame.ON_REQUEST`).
+    (:data:`jaxdn.core.frame.ON_REQUEST`).
 
     ``max_depth`` is the path length to render with, by default the scene's
-    (:func:`jaxdn.render.depth.measure_depth` measures it). With ``light="reflected"`` direct light is a part of the
-    noisy radiance, and its shadows have buffers, instead of a buffer of its own. With ``jitter`` no frame shows the
+    (:func:`jaxdn.render.tracing.depth.measure_depth` measures it). With ``light="reflected"`` direct light is a part of
+    the noisy radiance, and its shadows have buffers, instead of a buffer of its own. With ``jitter`` no frame shows the
     same as another, and what is found through the centres of pixels (``THROUGH_CENTRES``) is left out. With
     ``see_through`` the guides are those of what mirrors and glass show: what belongs to the first surface
     (``OF_FIRST_HITS``) is left out, and what moves in a mirror moves on screen.

@@ -7,11 +7,11 @@ import importlib
 from typing import Any
 
 _HOMES = {
-    "AnimatedScene": "scene",
-    "Camera": "scene",
-    "scene_from_record": "opening",
-    "choose_variant": "variant",
-    "use_variant": "variant",
+    "AnimatedScene": "scenes.scene",
+    "Camera": "scenes.scene",
+    "scene_from_record": "scenes.opening",
+    "choose_variant": "tracing.variant",
+    "use_variant": "tracing.variant",
     "ClipJob": "farm",
     "render_clips": "farm",
     "render_clip": "clip",

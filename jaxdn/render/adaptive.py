@@ -5,14 +5,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdn.frame import OF_SAMPLES, Frame
+from jaxdn.core.frame import OF_SAMPLES, Frame
 from jaxdn.planning.catalogue import NoisyLight
 from jaxdn.planning.plan import Plan
+from jaxdn.render.buffers.geometry import View
 from jaxdn.render.frame import path_length, render_frame
-from jaxdn.render.geometry import View
-from jaxdn.render.scene import AnimatedScene
-from jaxdn.render.seeds import NOISY
-from jaxdn.render.variant import advice, use_variant
+from jaxdn.render.scenes.scene import AnimatedScene
+from jaxdn.render.tracing.seeds import NOISY
+from jaxdn.render.tracing.variant import advice, use_variant
 
 Ask = Callable[[Frame], np.ndarray]
 """A frame with its buffers, and one sample as radiance -> [H, W, 1] whole numbers of samples."""
@@ -44,7 +44,7 @@ def render_sampled(
     """Render a frame's buffers and one sample, ask how many samples each pixel gets, and render the rest of these.
 
     The first sample counts: a pixel that gets n has the samples 0 ... n - 1 of its frame, the same as in a frame that
-    has n of them everywhere. Buffers that describe one noisy image (:data:`jaxdn.frame.OF_SAMPLES`) are left out.
+    has n of them everywhere. Buffers that describe one noisy image (:data:`jaxdn.core.frame.OF_SAMPLES`) are left out.
     Raises ValueError with a scalar variant of Mitsuba, which renders whole images only.
 
     Args:
@@ -63,7 +63,7 @@ def render_sampled(
         raise ValueError(
             f"samples for each pixel: expected an LLVM or CUDA variant of Mitsuba, got a scalar one. {advice()}"
         )
-    from jaxdn.render.wavefront import accumulate_each
+    from jaxdn.render.tracing.wavefront import accumulate_each
 
     alone = alone_in_each_frame(plan)
     settings: dict[str, Any] = {"width": width, "height": height, "seed": seed, "light": light, "plan": alone}

@@ -8,17 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from jaxdn.checks import check_at_least
-from jaxdn.clips import ClipError, read_frame, write_frame
-from jaxdn.clips.folder import begin_record, begun_record, finish_record, frame_path
+from jaxdn.core.checks import check_at_least
+from jaxdn.data.clip.files import ClipError
+from jaxdn.data.clip.folder import begin_record, begun_record, finish_record, frame_path
+from jaxdn.data.clip.frames import read_frame, write_frame
 from jaxdn.planning.catalogue import NoisyLight
 from jaxdn.planning.plan import Plan
+from jaxdn.render.buffers.geometry import View
 from jaxdn.render.errors import RenderError
 from jaxdn.render.frame import Rendered, check_options, path_length, render_frame, tracer
-from jaxdn.render.geometry import View
-from jaxdn.render.scene import AnimatedScene
+from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.settings import check_settings
-from jaxdn.render.variant import use_variant
+from jaxdn.render.tracing.variant import use_variant
 
 
 def render_clip(
@@ -44,8 +45,8 @@ def render_clip(
 
     Existing complete frames are kept, so that an interrupted rendering is resumed; the folder must have been started
     with the same settings (ClipError otherwise). It only becomes a clip when all frames exist
-    (:func:`jaxdn.clips.folder.begin_record`). Returns the folder. Raises RenderError, naming the clip and the frame, if
-    a frame cannot be rendered or written.
+    (:func:`jaxdn.data.clip.folder.begin_record`). Returns the folder. Raises RenderError, naming the clip and the
+    frame, if a frame cannot be rendered or written.
 
     Args:
       scene: to render.

@@ -8,21 +8,21 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn.checks import check_at_least, check_option
-from jaxdn.frame import GUIDES, OF_SAMPLES, ON_REQUEST, Frame
-from jaxdn.motion import dual_motion
+from jaxdn.core.checks import check_at_least, check_option
+from jaxdn.core.frame import GUIDES, OF_SAMPLES, ON_REQUEST, Frame
+from jaxdn.ops.motion import dual_motion
 from jaxdn.planning.catalogue import OF_FIRST_HITS, OF_SHADOWS, THROUGH_CENTRES, NoisyLight
 from jaxdn.planning.plan import Plan
-from jaxdn.render import jitter as jitters
-from jaxdn.render.gbuffer import check_scene, gbuffer
-from jaxdn.render.geometry import View, far_motion, motion_between, ray_length
-from jaxdn.render.glossy_vectors import glossy_motion
-from jaxdn.render.gradient_samples import Replay, luminance_gradient
-from jaxdn.render.scene import AnimatedScene
-from jaxdn.render.seeds import DRAWS, NOISY, REFERENCE
-from jaxdn.render.shadow_vectors import shadow_motion
-from jaxdn.render.variant import advice, tells_lobes, use_variant
-from jaxdn.render.wavefront import Accumulated, Request, no_light
+from jaxdn.render.buffers.gbuffer import check_scene, gbuffer
+from jaxdn.render.buffers.geometry import View, far_motion, motion_between, ray_length
+from jaxdn.render.buffers.glossy_vectors import glossy_motion
+from jaxdn.render.buffers.shadow_vectors import shadow_motion
+from jaxdn.render.scenes.scene import AnimatedScene
+from jaxdn.render.tracing import jitter as jitters
+from jaxdn.render.tracing.gradient_samples import Replay, luminance_gradient
+from jaxdn.render.tracing.seeds import DRAWS, NOISY, REFERENCE
+from jaxdn.render.tracing.variant import advice, tells_lobes, use_variant
+from jaxdn.render.tracing.wavefront import Accumulated, Request, no_light
 
 _SURFACE = ("albedo", "normal", "depth", "roughness", "reflectance", "specular_reflectance", "ids")
 _DISOCCLUSION = frozenset({"dual_motion", "visible"})
@@ -74,7 +74,7 @@ def render_frame(
     ``direct`` and ``emission`` are means over the reference's samples, or over the noisy ones if ``reference_spp`` is
     0. The result depends only on the arguments: the same frame rendered again, alone or in another process, is the same
     bit for bit. Raises ValueError for options out of range, scenes with unsupported effects, and, with the scalar
-    variant, for a plan with buffers of samples (:data:`jaxdn.frame.OF_SAMPLES`), which it cannot render.
+    variant, for a plan with buffers of samples (:data:`jaxdn.core.frame.OF_SAMPLES`), which it cannot render.
 
     Args:
       scene: to render.
@@ -89,14 +89,15 @@ def render_frame(
       draws: further images of one sample each, for training on noise that rarely repeats.
       light: what the radiance holds: ``"indirect"`` light, beside which there is ``direct``, or all that is
         ``"reflected"``, without ``direct``.
-      jitter: rays go through another point of the pixels in every frame (:mod:`jaxdn.render.jitter`), and the reference
+      jitter: rays go through another point of the pixels in every frame (:mod:`jaxdn.render.tracing.jitter`), and the
+      reference
         is the mean over each pixel, instead of everything through the centres.
       see_through: the guides of flat mirrors and of glass are those of what they show
-        (:mod:`jaxdn.render.replacement`); not with the scalar variant.
+        (:mod:`jaxdn.render.buffers.replacement`); not with the scalar variant.
       previous: the ``view`` of the frame before, computed if it is not given; frame 0 has none, and its motion is 0.
       plan: what to leave out: buffers (None then), paths longer than its ``max_depth``, and, in a frame that shows the
         same as an earlier one (``plan.held``), everything except the noise. The rest is the same as without a plan, bit
-        for bit. Without one there are all buffers but those on request (:data:`jaxdn.frame.ON_REQUEST`).
+        for bit. Without one there are all buffers but those on request (:data:`jaxdn.core.frame.ON_REQUEST`).
     """
     check_options(width, height, layers, reference_spp, draws, light, jitter, see_through, plan)
     chosen = use_variant(variant)
@@ -239,10 +240,10 @@ class Tracer(NamedTuple):
 def tracer(variant: str) -> Tracer:
     """The tracer of a variant."""
     if variant.startswith("scalar"):
-        from jaxdn.render import exact
+        from jaxdn.render.tracing import exact
 
         return Tracer(exact.accumulate, exact.accumulate_sets, exact.replay, True)
-    from jaxdn.render import wavefront
+    from jaxdn.render.tracing import wavefront
 
     return Tracer(wavefront.accumulate, wavefront.accumulate_sets, wavefront.replay, False)
 

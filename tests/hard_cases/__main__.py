@@ -23,8 +23,8 @@ import tyro
 
 from jaxdn import color
 from jaxdn.commands.errors import plain_errors
-from jaxdn.files import write_whole
-from jaxdn.report.images import data_address, encode_png
+from jaxdn.evaluation.report.images import data_address, encode_png
+from jaxdn.runtime.atomic_files import write_whole
 from tests.hard_cases import laws
 from tests.hard_cases.cases import CASES
 from tests.hard_cases.inputs import good

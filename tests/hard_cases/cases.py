@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdn.frame import BUFFERS, FAR, Frame, Kind
-from jaxdn.methods.table import methods
+from jaxdn.core.frame import BUFFERS, FAR, Frame, Kind
+from jaxdn.methods.registry import methods
 from tests.hard_cases.inputs import BY_HAND, WIDTH, Inputs, dotted, filled, good, replaced
 
 WITHOUT_NAN: tuple[Kind, ...] = ("flag", "id")

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdn.frame import BUFFERS, Buffer, Clip, Frame
+from jaxdn.core.frame import BUFFERS, Buffer, Clip, Frame
 
 FRAMES, HEIGHT, WIDTH = 3, 16, 24
 BY_HAND = frozenset({

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from experiments.stability.laws import deviations
-from jaxdn.candidates import candidate, filters
-from jaxdn.weights import shipped_names
+from jaxdn.zoo.ready import candidate, filters
+from jaxdn.zoo.weights import shipped_names
 from tests.hard_cases.inputs import good
 
 FRAMES, HEIGHT, WIDTH = 8, 64, 96

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 
-from jaxdn.files import write_whole
+from jaxdn.runtime.atomic_files import write_whole
 from tests.hard_cases.cases import CASES
 from tests.hard_cases.laws import Law
 from tests.hard_cases.table import DIRECTIONS, PRECISIONS, Row

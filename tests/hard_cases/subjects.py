@@ -9,14 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdn
-from jaxdn import brdf, color, glints, losses, metrics, microfacets, numerics, scales
-from jaxdn.frame import FAR, RADIANCE_MAX, Clip, Frame
-from jaxdn.methods.table import methods
-from jaxdn.motion import on_screen
+from jaxdn import brdf, color, losses, metrics
+from jaxdn.core import numerics
+from jaxdn.core.frame import FAR, RADIANCE_MAX, Clip, Frame
+from jaxdn.denoiser.sanitize import repair
+from jaxdn.materials import glints, microfacets
+from jaxdn.methods.registry import methods
 from jaxdn.networks import pad
-from jaxdn.ops.affinity_filter import Guide, affinity_filter
-from jaxdn.ops.softmax_filter import softmax_filter
-from jaxdn.repair import repair
+from jaxdn.ops import scales
+from jaxdn.ops.affinity.filter import Guide, affinity_filter
+from jaxdn.ops.kernel_prediction.softmax import softmax_filter
+from jaxdn.ops.motion import on_screen
 from tests.hard_cases.inputs import HEIGHT, WIDTH, Inputs
 
 _BORDERS = ("clamp", "zeros")

@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from jaxdn.clips.augment import transform_clip, transform_image, transform_motion
-from jaxdn.frame import BUFFERS, Clip, Frame, present
+from jaxdn.core.frame import BUFFERS, Clip, Frame, present
+from jaxdn.data.training.symmetries import transform_clip, transform_image, transform_motion
 
 SYMMETRIES = list(itertools.product([False, True], range(4)))
 

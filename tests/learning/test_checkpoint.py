@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.checkpoint import Checkpoints
-from jaxdn.learning.step import TrainState
+from jaxdn.training.checkpoint import Checkpoints
+from jaxdn.training.step import TrainState
 
 
 def state(step, *, width=3000):

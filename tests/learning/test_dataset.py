@@ -10,8 +10,8 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.clips import ClipError, training_batches
-from jaxdn.clips.cache import open_cached, read_window
-from jaxdn.frame import BUFFERS, Clip, Frame
+from jaxdn.core.frame import BUFFERS, Clip, Frame
+from jaxdn.data.training.cache import open_cached, read_window
 
 HEIGHT, WIDTH = 12, 15
 

@@ -7,10 +7,10 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.clips import ClipError, training_batches
-from jaxdn.clips.cache import open_cached
-from jaxdn.clips.draws import check_samples, draw_light
-from jaxdn.frame import Frame
-from jaxdn.variation import STILL
+from jaxdn.core.frame import Frame
+from jaxdn.data.training.cache import open_cached
+from jaxdn.data.training.draws import check_samples, draw_light
+from jaxdn.recipes.augmentation import STILL
 
 COUNT, FRAMES, SIDE = 4, 3, 6
 EVERYTHING = (slice(None),) * 3

@@ -10,19 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.candidates import candidate
 from jaxdn.clips import read_clip, training_batches, write_clip
-from jaxdn.commands import fit as loop
-from jaxdn.commands.fit import Start, begun_with, fit
-from jaxdn.commands.log import Log, read_curve, read_log
-from jaxdn.commands.train import train
-from jaxdn.commands.validation import load_validation
 from jaxdn.denoiser import Core, recurrent
+from jaxdn.denoiser.rollout import denoise
 from jaxdn.denoisers import ntd
-from jaxdn.methods.table import method_named
-from jaxdn.objectives import Objective
-from jaxdn.recipe import Recipe
-from jaxdn.rollout import denoise
+from jaxdn.methods.registry import method_named
+from jaxdn.recipes.objectives import Objective
+from jaxdn.recipes.recipe import Recipe
+from jaxdn.training import loop as loop
+from jaxdn.training.log import Log, read_curve, read_log
+from jaxdn.training.loop import Start, begun_with, fit
+from jaxdn.training.train import train
+from jaxdn.training.validation import load_validation
+from jaxdn.zoo.ready import candidate
 from tests.learning.test_training import TINY, make_clip
 
 pytestmark = pytest.mark.usefixtures("plain_programs")

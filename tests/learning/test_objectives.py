@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jaxdn import losses
-from jaxdn.frame import Clip, Frame
-from jaxdn.methods.table import methods
-from jaxdn.objectives import disocclusions, indirect_illumination, pyramid_illumination, recurrent_illumination
+from jaxdn.core.frame import Clip, Frame
+from jaxdn.methods.registry import methods
+from jaxdn.recipes.objectives import disocclusions, indirect_illumination, pyramid_illumination, recurrent_illumination
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

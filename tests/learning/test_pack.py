@@ -13,14 +13,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from jaxdn import clips
-from jaxdn.clips import ClipError, compact, training_batches
-from jaxdn.clips.cache import read_array, read_window
-from jaxdn.clips.draws import draw_light
-from jaxdn.clips.pack import Packing, open_clips, open_pack, write_pack
-from jaxdn.commands.validation import load_validation
+from jaxdn.clips import ClipError, training_batches
+from jaxdn.core.frame import BUFFERS, FAR, Frame
+from jaxdn.data.training import compact
+from jaxdn.data.training.cache import read_array, read_window
+from jaxdn.data.training.draws import draw_light
+from jaxdn.data.training.pack import Packing, open_clips, open_pack, write_pack
 from jaxdn.denoisers import svgf
-from jaxdn.frame import BUFFERS, FAR, Frame
-from jaxdn.variation import STILL
+from jaxdn.recipes.augmentation import STILL
+from jaxdn.training.validation import load_validation
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -269,7 +270,7 @@ def test_clips_that_lack_what_is_asked_for_are_named(folder: Path, tmp_path: Pat
 
 def test_the_command_packs_and_fails_plainly(folder: Path, tmp_path: Path) -> None:
     def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "jaxdn.cli", "pack", *map(str, arguments)]
+        command = [sys.executable, "-m", "jaxdn.commands.main", "pack", *map(str, arguments)]
         return subprocess.run(command, capture_output=True, text=True, check=False)
 
     out = tmp_path / "packs" / "train.pack"

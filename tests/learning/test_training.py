@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from jaxdn import color, losses
+from jaxdn.core.frame import Clip, Frame
+from jaxdn.denoiser.rollout import denoise
 from jaxdn.denoisers import ntd
-from jaxdn.frame import Clip, Frame
-from jaxdn.learning.step import clip_loss, initial_state, make_train_step
-from jaxdn.methods.table import method_named
-from jaxdn.motion import occlusion_mask
-from jaxdn.objectives import unbiased_illumination
-from jaxdn.rollout import denoise
-from jaxdn.variation import STILL
+from jaxdn.methods.registry import method_named
+from jaxdn.ops.motion import occlusion_mask
+from jaxdn.recipes.augmentation import STILL
+from jaxdn.recipes.objectives import unbiased_illumination
+from jaxdn.training.step import clip_loss, initial_state, make_train_step
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from experiments.stability import kills
-from jaxdn.checkpoint import Checkpoints
-from jaxdn.commands.fit import fit
-from jaxdn.commands.log import Log, read_curve
+from jaxdn.core.frame import RADIANCE_MAX
 from jaxdn.denoiser import Denoiser
-from jaxdn.frame import RADIANCE_MAX
-from jaxdn.learning.step import clip_loss, initial_state
-from jaxdn.repair import repair_image
+from jaxdn.denoiser.sanitize import repair_image
+from jaxdn.training.checkpoint import Checkpoints
+from jaxdn.training.log import Log, read_curve
+from jaxdn.training.loop import fit
+from jaxdn.training.step import clip_loss, initial_state
 from tests.compiling import FLAGS
 from tests.learning import test_fit
 from tests.learning.test_checkpoint import torn

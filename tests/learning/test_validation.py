@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from jaxdn import color, metrics
-from jaxdn.commands.validation import HeldOut, make_validation
+from jaxdn.core.frame import Clip, Frame
 from jaxdn.denoiser import Core, recurrent
-from jaxdn.frame import Clip, Frame
+from jaxdn.training.validation import HeldOut, make_validation
 
 
 def identity():

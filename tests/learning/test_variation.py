@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxdn.frame import Clip, Frame
-from jaxdn.variation import GROUPS, STILL, Variation, varied
+from jaxdn.core.frame import Clip, Frame
+from jaxdn.recipes.augmentation import GROUPS, STILL, Variation, varied
 
 SHAPE = (2, 4, 5)
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import jaxdn
+from jaxdn.core.frame import FAR, Frame
 from jaxdn.denoisers import ntd
-from jaxdn.frame import FAR, Frame
-from jaxdn.weights import flatten, save_weights, shipped_names, starting_params, unflatten
+from jaxdn.zoo.weights import flatten, save_weights, shipped_names, starting_params, unflatten
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -71,7 +71,7 @@ def test_a_preset_of_an_earlier_version_keeps_what_it_divides_by(tmp_path):
     params = ntd(**options).init(jax.random.key(0), FRAME)
     saved = saved_earlier(tmp_path / "w", params, options)
     assert jaxdn.load_weights(saved)[0].reads == ntd(**options).reads
-    assert "demodulate" not in jaxdn.weights.describe(saved)["options"]
+    assert "demodulate" not in jaxdn.zoo.weights.describe(saved)["options"]
 
 
 def test_defaults_are_recorded(tmp_path):
@@ -79,7 +79,7 @@ def test_defaults_are_recorded(tmp_path):
     options = {"size": TINY}
     params = ntd(**options).init(jax.random.key(0), FRAME)
     path = save_weights(tmp_path / "w", params, factory="ntd", options=options, record={})
-    assert jaxdn.weights.describe(path)["options"]["kernels"] == "guided"
+    assert jaxdn.zoo.weights.describe(path)["options"]["kernels"] == "guided"
     assert set(jaxdn.load_weights(path)[1]) == set(params)
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxdn.ops import affinity_filter as module
-from jaxdn.ops.affinity_filter import SPLINE, Guide, affinity_filter
+from jaxdn.ops.affinity import filter as module
+from jaxdn.ops.affinity.filter import SPLINE, Guide, affinity_filter
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import jaxdn.networks.unet  # noqa: F401  (registers the networks' implementations)
-from jaxdn.ops.convolution import convolve
-from jaxdn.ops.kernels import apply_kernels
-from jaxdn.ops.registry import implementations, resolve
-from jaxdn.ops.softmax_filter import softmax_filter
+from jaxdn.ops.convolution.api import convolve
+from jaxdn.ops.dispatch.registry import implementations, resolve
+from jaxdn.ops.kernel_prediction.apply import apply_kernels
+from jaxdn.ops.kernel_prediction.softmax import softmax_filter
 from jaxdn.ops.warp import warp
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -276,7 +276,7 @@ def test_a_named_implementation_runs_or_raises(op):
 @pytest.mark.parametrize("height", [5, 7, 8])
 def test_strips_of_any_number_of_rows_are_the_whole_image(height, guided, rng, monkeypatch):
     """Two rows a strip: heights that they divide and others, whose last strip computes a row again."""
-    monkeypatch.setattr("jaxdn.ops.softmax_filter._STRIP", 2 * 6 * 51)
+    monkeypatch.setattr("jaxdn.ops.kernel_prediction.softmax._STRIP", 2 * 6 * 51)
     images, logits = rng.standard_normal((2, height, 6, 3)), rng.standard_normal((height, 6, 51))
     features = rng.standard_normal((height, 6, 7)) if guided else None
     cotangent = rng.standard_normal(images.shape)

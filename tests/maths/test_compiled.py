@@ -12,22 +12,22 @@ import numpy as np
 import pytest
 
 from jaxdn import brdf, color
-from jaxdn.compiled import strips
-from jaxdn.filters.arrange import planes_of
-from jaxdn.filters.enlarge import enlarge
-from jaxdn.filters.guides import guides_of
-from jaxdn.filters.levels import LEVELS
-from jaxdn.filters.recall import recall
-from jaxdn.filters.running_mean import Mean, Shown, accumulated, remembered
-from jaxdn.filters.seen import History, seen
-from jaxdn.filters.specks import dimmed
-from jaxdn.frame import FAR, Frame
-from jaxdn.methods.steady import BEGIN, FEATURES, HALF_FEATURES, decisions
-from jaxdn.ops.affinity_filter import Guide, affinity_filter
-from jaxdn.scales import fill
-from jaxdn.whole import sums_of_depth
+from jaxdn.core.frame import FAR, Frame
+from jaxdn.denoiser.statistics import sums_of_depth
+from jaxdn.filters.reproject import recall
+from jaxdn.filters.surface_test import guides_of
+from jaxdn.methods.steady.accumulation import Mean, Shown, accumulated, remembered
+from jaxdn.methods.steady.fireflies import dimmed
+from jaxdn.methods.steady.levels import LEVELS
+from jaxdn.methods.steady.method import BEGIN, FEATURES, HALF_FEATURES, decisions
+from jaxdn.methods.steady.network_input import History, seen
+from jaxdn.ops.affinity.filter import Guide, affinity_filter
+from jaxdn.ops.affinity.joint_upsample import enlarge
+from jaxdn.ops.dispatch import numba_call
+from jaxdn.ops.layout.planar import planes_of
+from jaxdn.ops.scales import fill
 
-pytestmark = pytest.mark.skipif(not strips.available(), reason="no Numba, or jax computes on another device")
+pytestmark = pytest.mark.skipif(not numba_call.available(), reason="no Numba, or jax computes on another device")
 
 
 @pytest.fixture
@@ -220,7 +220,7 @@ def test_arrays_of_all_layouts_as_planes(rng, both):
 
 
 def unfolded(blocks):
-    """Planes of which :func:`jaxdn.scales.fold` made the blocks."""
+    """Planes of which :func:`jaxdn.ops.scales.fold` made the blocks."""
     height, width, channels = blocks.shape
     planes = np.zeros((channels // 4, 2 * height, 2 * width), np.float32)
     for channel, row, column in np.ndindex(channels // 4, 2, 2):
@@ -297,7 +297,7 @@ def test_an_error_in_a_loop_is_raised(rng):
         raise RuntimeError("the strip is torn")
 
     with pytest.raises(jax.errors.JaxRuntimeError, match="the strip is torn"):
-        jax.block_until_ready(strips.call(fails, [(4, 4)], [jnp.ones((4, 4))], rows=4))
+        jax.block_until_ready(numba_call.call(fails, [(4, 4)], [jnp.ones((4, 4))], rows=4))
 
 
 def test_no_strip_is_written_any_more_after_an_error():
@@ -311,7 +311,7 @@ def test_no_strip_is_written_any_more_after_an_error():
         written.append(top)
 
     with pytest.raises(jax.errors.JaxRuntimeError, match="the strip is torn"):
-        jax.block_until_ready(strips.call(fails_first, [(16, 4)], [jnp.ones((16, 4))], rows=16))
+        jax.block_until_ready(numba_call.call(fails_first, [(16, 4)], [jnp.ones((16, 4))], rows=16))
     there = list(written)
     time.sleep(0.5)
     assert written == there != []
@@ -322,19 +322,19 @@ def test_every_row_belongs_to_one_strip():
         out[top:bottom] = image[top:bottom] + 1
 
     for rows in (1, 2, 7, 8, 9, 1000):
-        (found,) = strips.call(counts, [(rows, 3)], [jnp.zeros((rows, 3))], rows=rows)
+        (found,) = numba_call.call(counts, [(rows, 3)], [jnp.zeros((rows, 3))], rows=rows)
         np.testing.assert_array_equal(found, 1)
 
 
 def test_loops_are_compiled_where_no_folder_can_be_written():
-    script = "from jaxdn.compiled.rows import loop\nloop(lambda top, bottom: None)(0, 1)\nprint('compiled')"
+    script = "from jaxdn.ops.dispatch.numba_rows import loop\nloop(lambda top, bottom: None)(0, 1)\nprint('compiled')"
     nowhere = {**os.environ, "NUMBA_CACHE_DIR": f"{os.devnull}/folder"}
     done = subprocess.run([sys.executable, "-c", script], env=nowhere, capture_output=True, text=True, check=False)
     assert done.stdout == "compiled\n", done.stderr
 
 
 def test_what_was_compiled_before_functions_of_rows_changed_is_not_used(tmp_path):
-    script = "from jaxdn.compiled import affinities"
+    script = "from jaxdn.ops.affinity import numba_kernels"
     folder = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     subprocess.run(
         [sys.executable, "-c", script + "; print(affinities.filtered.stats.cache_path)"], env=folder, check=True

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxdn.ops import onednn_library
-from jaxdn.ops.convolution import convolve
+from jaxdn.ops.convolution.api import convolve
+from jaxdn.ops.onednn import library
 
-needs_onednn = pytest.mark.skipif(not onednn_library.available(), reason="the extra onednn is not installed")
+needs_onednn = pytest.mark.skipif(not library.available(), reason="the extra onednn is not installed")
 
 
 def _operands(inputs, outputs, size=(5, 6), count=2, dtype=jnp.float32):
@@ -151,8 +151,8 @@ def test_onednn_keeps_nan_within_its_3x3_neighbourhood():
 
 
 def test_onednn_that_is_not_installed_says_what_to_install(monkeypatch):
-    monkeypatch.setattr("jaxdn.ops.onednn_library.PACKAGE", "no-such-package")
-    assert not onednn_library.available()
+    monkeypatch.setattr("jaxdn.ops.onednn.library.PACKAGE", "no-such-package")
+    assert not library.available()
     with pytest.raises(ValueError, match=r"pip install onednn-cpu-gomp"):
         convolve(*_operands(2, 3), implementation="onednn")
 
@@ -160,7 +160,8 @@ def test_onednn_that_is_not_installed_says_what_to_install(monkeypatch):
 MADE_AND_RUN = """
 import threading
 import numpy as np
-from jaxdn.ops import onednn, onednn_library
+from jaxdn.ops.convolution import onednn
+from jaxdn.ops.onednn import library
 
 rng = np.random.default_rng(0)
 for size, inputs, outputs in (((1, 1), 4, 4), ((16, 16), 14, 4), ((64, 64), 14, 32)):
@@ -172,7 +173,7 @@ for size, inputs, outputs in (((1, 1), 4, 4), ((16, 16), 14, 4), ((64, 64), 14, 
     }.items():
         made, found = [], out if direction != "kernel gradient" else second
         make = lambda: made.append(onednn._Convolution(direction, 1, *size, inputs, outputs))
-        run = lambda: made[0](*(onednn_library.address(array) for array in (first, second, out)))
+        run = lambda: made[0](*(library.address(array) for array in (first, second, out)))
         for task in (make, run):
             thread = threading.Thread(target=task)
             thread.start()

@@ -7,8 +7,8 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxdn.filters.disc import TAPS, disc_average, rotations
+from jaxdn.filters.edge_stopping import closeness_weight, depth_weight, normal_weight
 from jaxdn.filters.stabilisation import stabilise
-from jaxdn.filters.weights import closeness_weight, depth_weight, normal_weight
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

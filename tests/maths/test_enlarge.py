@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxdn.filters import enlarge as module
-from jaxdn.filters.enlarge import enlarge
-from jaxdn.ops.affinity_filter import Guide
+from jaxdn.ops.affinity import joint_upsample as module
+from jaxdn.ops.affinity.filter import Guide
+from jaxdn.ops.affinity.joint_upsample import enlarge
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

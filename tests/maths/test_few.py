@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.filters import few
+from jaxdn.filters import sparse
 from jaxdn.filters.atrous import edge_average, stencil
+from jaxdn.filters.edge_stopping import depth_weight, luminance_weight, normal_weight
 from jaxdn.filters.history_fix import fix_history
 from jaxdn.filters.variance import estimate_variance
-from jaxdn.filters.weights import depth_weight, luminance_weight, normal_weight
-from jaxdn.ops.strips import where_needed
+from jaxdn.ops.dispatch.row_tiles import where_needed
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -37,14 +37,14 @@ def test_few_pixels_get_what_all_get(share, step, rng, x64):
     planes, hit, weights = drawn(rng)
     needed = jnp.asarray(rng.random((HEIGHT, WIDTH)) < share)
     every, _ = edge_average(planes, hit, weights, stencil(2), step=step, step_max=step, counted=True)
-    found = jax.jit(lambda: few.average_of_few(planes, hit, weights, stencil(2), needed, step=step))()
+    found = jax.jit(lambda: sparse.average_of_few(planes, hit, weights, stencil(2), needed, step=step))()
     np.testing.assert_allclose(found, np.where(needed, every, 0.0), rtol=1e-12, atol=1e-14)
 
 
 def test_every_pixel_may_have_a_step_of_its_own(rng, x64):
     planes, hit, weights = drawn(rng)
     step = jnp.asarray(rng.integers(1, 4, (HEIGHT, WIDTH)))
-    found = few.average_of_few(planes, hit, weights, stencil(1), jnp.ones((HEIGHT, WIDTH), bool), step=step)[:-1]
+    found = sparse.average_of_few(planes, hit, weights, stencil(1), jnp.ones((HEIGHT, WIDTH), bool), step=step)[:-1]
     for each in (1, 2, 3):
         every, _ = edge_average(planes, hit, weights, stencil(1), step=each, step_max=3)
         own = step == each
@@ -75,7 +75,7 @@ def test_large_images_get_what_small_ones_get(rng, x64, monkeypatch):
         return [run(planes, length) for length in lengths]
 
     small = found()
-    monkeypatch.setattr(few, "_WORTH", 0)
+    monkeypatch.setattr(sparse, "_WORTH", 0)
     jax.tree.map(lambda one, two: np.testing.assert_allclose(one, two, rtol=1e-9, atol=1e-12), small, found())
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.frame import BUFFERS, GUIDES, Frame, frame_at, only, present, written_out
+from jaxdn.core.frame import BUFFERS, GUIDES, Frame, frame_at, only, present, written_out
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

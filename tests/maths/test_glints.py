@@ -9,7 +9,7 @@ import pytest
 from jax.test_util import check_grads
 from scipy import stats
 
-from jaxdn import glints, microfacets
+from jaxdn.materials import glints, microfacets
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -8,7 +8,7 @@ import pytest
 SCRIPT = """
 import resource, sys
 import numpy as np
-from jaxdn.heap import keep_memory
+from jaxdn.runtime.malloc import keep_memory
 
 kept = sys.argv[1] == "keep" and keep_memory()
 for _ in range(3):

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from jaxdn.ops.kernels import apply_kernels, normalize_kernels
-from jaxdn.ops.softmax_filter import softmax_filter
-from jaxdn.scales import compose_scales, downsample, fill, upsample
+from jaxdn.ops.kernel_prediction.apply import apply_kernels, normalize_kernels
+from jaxdn.ops.kernel_prediction.softmax import softmax_filter
+from jaxdn.ops.scales import compose_scales, downsample, fill, upsample
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

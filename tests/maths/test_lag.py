@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxdn.filters.lag import change, halves, reach
-from jaxdn.ops.affinity_filter import Guide, affinity_filter
+from jaxdn.methods.steady.lighting_change import change, halves, reach
+from jaxdn.ops.affinity.filter import Guide, affinity_filter
 
 SIZE = 96, 128
 

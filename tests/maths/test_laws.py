@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 
 import jaxdn
 from jaxdn import color, losses, metrics
-from jaxdn.frame import Clip, Frame
-from jaxdn.motion import on_screen
-from jaxdn.scales import downsample, upsample
+from jaxdn.core.frame import Clip, Frame
+from jaxdn.ops.motion import on_screen
+from jaxdn.ops.scales import downsample, upsample
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.filters.levels import LEVELS, Decisions, Surfaces, filtered
-from jaxdn.filters.regression import SCALES
-from jaxdn.methods.steady import PRECISIONS
+from jaxdn.methods.steady.levels import LEVELS, Decisions, Surfaces, filtered
+from jaxdn.methods.steady.method import PRECISIONS
+from jaxdn.methods.steady.regression import SCALES
 
 HEIGHT, WIDTH = 64, 96
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 
 from jaxdn import metrics
-from jaxdn.flip import flip_map
+from jaxdn.metrics.flip import flip_map
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

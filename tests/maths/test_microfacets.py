@@ -7,7 +7,7 @@ import pytest
 from jax.test_util import check_grads
 from scipy.special import erfc
 
-from jaxdn import microfacets
+from jaxdn.materials import microfacets
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

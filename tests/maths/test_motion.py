@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.motion import dual_motion, occlusion_mask
+from jaxdn.ops.motion import dual_motion, occlusion_mask
 from jaxdn.ops.warp import warp
 
 pytestmark = pytest.mark.usefixtures("plain_programs")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxdn.numerics import absolute, safe_norm, safe_power
+from jaxdn.core.numerics import absolute, safe_norm, safe_power
 
 power = jax.jit(safe_power)
 length = jax.jit(safe_norm)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxdn.filters import recall as module
-from jaxdn.filters.guides import Guides, guides_of
-from jaxdn.filters.recall import recall
-from jaxdn.frame import Frame
-from jaxdn.ops.strips import by_strips
+from jaxdn.core.frame import Frame
+from jaxdn.filters import reproject as module
+from jaxdn.filters.reproject import recall
+from jaxdn.filters.surface_test import Guides, guides_of
+from jaxdn.ops.dispatch.row_tiles import by_strips
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxdn.filters import regression
-from jaxdn.filters.regression import CELL, GUIDES, SCALES, guides_of, reach
+from jaxdn.methods.steady import regression
+from jaxdn.methods.steady.regression import CELL, GUIDES, SCALES, guides_of, reach
 
 SIZE = 96, 128
 PLAIN = {name: jnp.zeros(()) for name in SCALES}

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxdn.frame import BUFFERS, FAR, RADIANCE_MAX, Frame
-from jaxdn.repair import repair
+from jaxdn.core.frame import BUFFERS, FAR, RADIANCE_MAX, Frame
+from jaxdn.denoiser.sanitize import repair
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.sampling import from_layers, sample_map
+from jaxdn.ops.sampling import from_layers, sample_map
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -8,9 +8,9 @@ from jax.test_util import check_grads
 
 from jaxdn.filters.atrous import edge_average, stencil
 from jaxdn.filters.clamping import clamp_to_fast, contradiction, neighbourhood, without_fireflies, without_specks
+from jaxdn.filters.edge_stopping import lobe_weight, normal_weight, roughness_weight
 from jaxdn.filters.history_fix import fix_history
-from jaxdn.filters.virtual import closeness, diffuseness, virtual_motion
-from jaxdn.filters.weights import lobe_weight, normal_weight, roughness_weight
+from jaxdn.filters.virtual_motion import closeness, diffuseness, virtual_motion
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.filters import few
+from jaxdn.filters import sparse
+from jaxdn.filters.edge_stopping import normal_weight
 from jaxdn.filters.variance import estimate_variance
-from jaxdn.filters.weights import normal_weight
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -60,8 +60,8 @@ def expected(history, hit, normal):
 @pytest.mark.parametrize("large", [False, True])
 def test_means_are_those_of_a_plain_loop(large, rng, x64, monkeypatch):
     if large:
-        monkeypatch.setattr(few, "_WORTH", 0)
-        monkeypatch.setattr(few, "_FEW", 1.1)
+        monkeypatch.setattr(sparse, "_WORTH", 0)
+        monkeypatch.setattr(sparse, "_FEW", 1.1)
     history, hit, normal = drawn(rng)
     weights = [normal_weight(jnp.asarray(normal), sigma=SIGMA)]
     color, variance = estimate_variance(jnp.asarray(history), jnp.asarray(hit), weights, short_history=SHORT)

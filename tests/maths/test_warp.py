@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from jaxdn.motion import on_screen
+from jaxdn.ops.motion import on_screen
 from jaxdn.ops.warp import warp
 
 pytestmark = pytest.mark.usefixtures("plain_programs")

@@ -5,7 +5,7 @@ import functools
 import jax
 import numpy as np
 
-from jaxdn.frame import FAR, Frame, written_out
+from jaxdn.core.frame import FAR, Frame, written_out
 
 HEIGHT, WIDTH = 12, 14
 

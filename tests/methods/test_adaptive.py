@@ -8,13 +8,13 @@ import numpy as np
 import optax
 import pytest
 
+from jaxdn.core.frame import Clip, Frame, frame_at, only
 from jaxdn.denoiser import Denoiser, State
-from jaxdn.frame import Clip, Frame, frame_at, only
+from jaxdn.denoiser.rollout import denoise, sampled, unroll
 from jaxdn.methods.dasr import dasr
 from jaxdn.methods.ntasd import ntasd
-from jaxdn.methods.table import methods
-from jaxdn.rollout import denoise, sampled, unroll
-from jaxdn.sampling import from_layers
+from jaxdn.methods.registry import methods
+from jaxdn.ops.sampling import from_layers
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from jaxdn.core.frame import Frame
 from jaxdn.denoisers import asvgf, svgf
 from jaxdn.filters import gradients
 from jaxdn.filters.accumulation import accumulate
 from jaxdn.filters.atrous import stencil
-from jaxdn.filters.weights import depth_weight, normal_weight
-from jaxdn.frame import Frame
+from jaxdn.filters.edge_stopping import depth_weight, normal_weight
 from tests.methods.test_svgf import LUMINANCE, moving_frames, reference_average, reference_slopes
 
 pytestmark = pytest.mark.usefixtures("plain_programs")

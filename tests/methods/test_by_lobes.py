@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxdn.core.frame import FAR, Frame
 from jaxdn.denoiser import Denoiser
-from jaxdn.frame import FAR, Frame
-from jaxdn.methods.lobes import apart
-from jaxdn.methods.reblur import reblur
-from jaxdn.methods.relax import relax
+from jaxdn.methods.two_lobes.lobes import apart
+from jaxdn.methods.two_lobes.reblur import reblur
+from jaxdn.methods.two_lobes.relax import relax
 from tests.methods.lobe_scenes import HEIGHT, WIDTH, compiled, mirror_frames, neutral, run, scene
 
 pytestmark = pytest.mark.usefixtures("plain_programs")

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxdn.frame import Clip, Frame, frame_at
-from jaxdn.methods.fitted import LEARNED, LEARNED_PER_LEVEL, at_level, moved, unmoved
-from jaxdn.methods.table import methods
-from jaxdn.options import Range
-from jaxdn.rollout import denoise
+from jaxdn.core.frame import Clip, Frame, frame_at
+from jaxdn.core.options import Range
+from jaxdn.denoiser.rollout import denoise
+from jaxdn.methods.learnable_options import LEARNED, LEARNED_PER_LEVEL, at_level, moved, unmoved
+from jaxdn.methods.registry import methods
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

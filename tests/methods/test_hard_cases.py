@@ -10,13 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn import brdf, color, glints, losses, metrics, microfacets, motion, numerics, scales
+from jaxdn import brdf, color, losses, metrics
+from jaxdn.core import numerics
 from jaxdn.denoiser import Core, recurrent
-from jaxdn.methods import table as methods_table
-from jaxdn.methods.table import method, methods
-from jaxdn.ops import affinity_filter, kernels, softmax_filter, warp
-from jaxdn.ops.registry import implementations
-from jaxdn.recipe import Recipe
+from jaxdn.materials import glints, microfacets
+from jaxdn.methods import registry as methods_table
+from jaxdn.methods.registry import method, methods
+from jaxdn.ops import motion, scales, warp
+from jaxdn.ops.affinity import filter
+from jaxdn.ops.dispatch.registry import implementations
+from jaxdn.ops.kernel_prediction import apply, softmax
+from jaxdn.recipes.recipe import Recipe
 from tests.hard_cases import __main__ as whole
 from tests.hard_cases.cases import CASES
 from tests.hard_cases.inputs import good
@@ -85,7 +89,7 @@ def test_every_denoiser_and_every_public_operation_is_tested():
     tried = {subject.name.split(",")[0].split(".")[-1] for subject in operation_subjects()}
     modules = (
         *(brdf, color, glints, losses, metrics, microfacets, motion, numerics, scales),
-        *(affinity_filter, kernels, softmax_filter, warp),
+        *(filter, apply, softmax, warp),
     )
     for module in modules:
         functions = inspect.getmembers(module, inspect.isfunction)

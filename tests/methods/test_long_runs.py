@@ -12,11 +12,11 @@ import pytest
 from jax import lax
 
 from experiments.stability import long_runs
-from jaxdn.candidates import candidate, filters
+from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.denoiser import Core, recurrent
-from jaxdn.frame import RADIANCE_MAX, Frame
-from jaxdn.methods.table import methods
-from jaxdn.weights import shipped_names
+from jaxdn.methods.registry import methods
+from jaxdn.zoo.ready import candidate, filters
+from jaxdn.zoo.weights import shipped_names
 
 SIZE = 32
 LONG, SHORT = 2000, 250

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from jaxdn import brdf
+from jaxdn.core.frame import FAR, Frame, frame_at
 from jaxdn.denoiser import Denoiser, Recurrent
-from jaxdn.filters.guides import depth_feature
-from jaxdn.frame import FAR, Frame, frame_at
+from jaxdn.denoiser.rollout import unroll
+from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods.ntd import guided_features, ntd
-from jaxdn.rollout import unroll
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

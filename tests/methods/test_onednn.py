@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.methods.table import method_named
+from jaxdn.methods.registry import method_named
 from jaxdn.networks import LARGE, description, onednn
 from jaxdn.networks.engines import ENGINES
 from jaxdn.networks.unet import unet
-from jaxdn.ops import onednn_layers
-from jaxdn.ops import onednn_library as dnnl
+from jaxdn.ops.onednn import layers
+from jaxdn.ops.onednn import library as dnnl
 
 WIDTHS = ((16,), (24,), (32,), (32,), (32,))
 
@@ -52,7 +52,7 @@ def test_a_convolution_is_exact_for_small_whole_numbers(precision, rng, size, sl
     wanted = convolved(x, kernel) + bias + before * adds
     wanted = wanted if slope is None else np.where(wanted >= 0, wanted, slope * wanted)
     found = run(
-        lambda *ends: onednn_layers.convolution(*ends, kernel, bias, kind=precision.kind, slope=slope, adds=adds),
+        lambda *ends: layers.convolution(*ends, kernel, bias, kind=precision.kind, slope=slope, adds=adds),
         precision,
         x,
         wanted.shape,
@@ -69,7 +69,7 @@ def test_a_convolution_of_an_enlarged_image_is_exact_for_small_whole_numbers(pre
     wanted = np.where(wanted >= 0, wanted, 0.25 * wanted)
     options = {"kind": precision.kind, "slope": 0.25, "adds": adds, "enlarges": True}
     found = run(
-        lambda *ends: onednn_layers.convolution(*ends, kernel, bias, **options),
+        lambda *ends: layers.convolution(*ends, kernel, bias, **options),
         precision,
         x,
         wanted.shape,
@@ -80,8 +80,8 @@ def test_a_convolution_of_an_enlarged_image_is_exact_for_small_whole_numbers(pre
 
 def test_pooling_and_enlarging(precision, rng):
     x = rng.integers(-99, 99, (2, 8, 6, 16)) * 1.0
-    pooled = run(onednn_layers.pooling, precision, x, (2, 4, 3, 16))
-    enlarged = run(onednn_layers.enlarging, precision, x, (2, 16, 12, 16))
+    pooled = run(layers.pooling, precision, x, (2, 4, 3, 16))
+    enlarged = run(layers.enlarging, precision, x, (2, 16, 12, 16))
     as_numbers = [np.asarray(each, np.float64) for each in (pooled, enlarged)]
     np.testing.assert_array_equal(as_numbers[0], x.reshape(2, 4, 2, 3, 2, 16).max(axis=(2, 4)))
     np.testing.assert_array_equal(as_numbers[1], x.repeat(2, axis=1).repeat(2, axis=2))

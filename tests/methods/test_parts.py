@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxdn import color
+from jaxdn.core.frame import FAR, Frame, only
 from jaxdn.denoiser import Denoiser
+from jaxdn.denoiser.rollout import stream
+from jaxdn.denoiser.statistics import Whole, measured
+from jaxdn.denoiser.tiles import GRID, by_parts, farthest_history, parted, windows
 from jaxdn.denoisers import asvgf, ntasd, ntd, steady, svgf, taa
-from jaxdn.filters.guides import depth_feature
-from jaxdn.frame import FAR, Frame, only
-from jaxdn.parts import GRID, by_parts, farthest_history, parted, windows
-from jaxdn.rollout import stream
-from jaxdn.shrinkage import REACH, combine
-from jaxdn.whole import Whole, measured
+from jaxdn.filters.surface_test import depth_feature
+from jaxdn.sequence.safe_blend import REACH, combine
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from jaxdn.core.frame import FAR, Frame, frame_at
 from jaxdn.denoiser import Denoiser
-from jaxdn.filters.guides import depth_feature
-from jaxdn.frame import FAR, Frame, frame_at
+from jaxdn.denoiser.rollout import unroll
+from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods.arae import arae
 from jaxdn.methods.rae import LARGE, SMALL, rae
-from jaxdn.methods.table import methods
+from jaxdn.methods.registry import methods
 from jaxdn.networks.recurrent import recurrent_unet
 from jaxdn.networks.unet import count
-from jaxdn.rollout import unroll
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jaxdn.frame import Frame
-from jaxdn.methods.reblur import reblur
+from jaxdn.core.frame import Frame
+from jaxdn.methods.two_lobes.reblur import reblur
 from tests.methods.lobe_scenes import mirror_frames, run
 
 pytestmark = pytest.mark.usefixtures("plain_programs")

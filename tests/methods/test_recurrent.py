@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxdn.core.frame import RADIANCE_MAX, Clip, Frame, frame_at, present
 from jaxdn.denoiser import Core, Denoiser, Recurrent, RecurrentStep, recurrent
-from jaxdn.frame import RADIANCE_MAX, Clip, Frame, frame_at, present
-from jaxdn.methods.demodulated import demodulated
-from jaxdn.rollout import denoise, stream, unroll
-from jaxdn.sampling import from_layers
+from jaxdn.denoiser.rollout import denoise, stream, unroll
+from jaxdn.methods.demodulation import demodulated
+from jaxdn.ops.sampling import from_layers
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from jaxdn.core.frame import FAR, Frame, frame_at
 from jaxdn.denoiser import Denoiser
-from jaxdn.filters.levels import LEVELS
-from jaxdn.frame import FAR, Frame, frame_at
-from jaxdn.methods.steady import BEGIN, FEATURES, HALF_FEATURES, decisions, steady
-from jaxdn.rollout import unroll
-from jaxdn.scales import fold
+from jaxdn.denoiser.rollout import unroll
+from jaxdn.methods.steady.levels import LEVELS
+from jaxdn.methods.steady.method import BEGIN, FEATURES, HALF_FEATURES, decisions, steady
+from jaxdn.ops.scales import fold
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxdn.core.frame import Clip, Frame, frame_at
 from jaxdn.denoiser import Core, recurrent
+from jaxdn.denoiser.rollout import denoise, stream
 from jaxdn.denoisers import ntd, svgf
-from jaxdn.frame import Clip, Frame, frame_at
-from jaxdn.rollout import denoise, stream
 from tests.hard_cases.inputs import good
 from tests.methods.test_ntd import TINY
 

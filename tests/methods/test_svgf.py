@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from jaxdn.core.frame import FAR, Clip, Frame, frame_at
+from jaxdn.denoiser.rollout import denoise
 from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
 from jaxdn.filters.cascade import cascade
-from jaxdn.filters.weights import Weight, depth_weight, luminance_weight
-from jaxdn.frame import FAR, Clip, Frame, frame_at
+from jaxdn.filters.edge_stopping import Weight, depth_weight, luminance_weight
+from jaxdn.methods.registry import methods
 from jaxdn.methods.svgf import svgf
-from jaxdn.methods.table import methods
-from jaxdn.rollout import denoise
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -276,7 +276,7 @@ def test_strips_do_not_show(rng, monkeypatch):
     needed[9, 4] = True
     arguments = (values, None, [depth_weight(jnp.asarray(depth), None, sigma=1.0)], stencil(3))
     whole, _ = edge_average(*arguments)
-    monkeypatch.setattr("jaxdn.filters.canvas._STRIP_PIXELS", 1)
+    monkeypatch.setattr("jaxdn.filters.stencil_tiles._STRIP_PIXELS", 1)
     strips, _ = edge_average(*arguments)
     some, _ = edge_average(*arguments, needed=jnp.asarray(needed))
     np.testing.assert_allclose(strips, whole, rtol=1e-6)
@@ -303,7 +303,7 @@ def test_strips_of_a_cascade_do_not_show(rng, monkeypatch, masked):
 
     away = jnp.asarray(rng.random(jax.eval_shape(filtered, color).shape), jnp.float32)
     whole, slope = jax.jit(lambda *given: with_slope(*given))(color, away)
-    monkeypatch.setattr("jaxdn.filters.canvas._STRIP_PIXELS", 1)
+    monkeypatch.setattr("jaxdn.filters.stencil_tiles._STRIP_PIXELS", 1)
     strips, slope_of_strips = jax.jit(lambda *given: with_slope(*given))(color, away)
     np.testing.assert_allclose(strips, whole, rtol=1e-5, atol=1e-7)
     np.testing.assert_allclose(slope_of_strips, slope, rtol=1e-4, atol=1e-5)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
+from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.denoisers import svgf, taa
 from jaxdn.filters import neighbourhood
-from jaxdn.filters.cubic import warp_cubic
-from jaxdn.frame import Frame
+from jaxdn.filters.catmull_rom import warp_cubic
 from jaxdn.methods.taa import Options, resolve, sharpened
 from tests.methods.test_svgf import moving_frames
 

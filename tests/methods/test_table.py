@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 import jaxdn
-from jaxdn.commands.denoise import candidate_on
+from jaxdn.core.frame import Frame
+from jaxdn.core.options import Range, describe, make, parse
 from jaxdn.denoiser import Core, Denoiser, recurrent
-from jaxdn.frame import Frame
-from jaxdn.methods import table
+from jaxdn.methods import registry
 from jaxdn.methods.ntd import PARITY, Options
-from jaxdn.methods.table import method, method_named, methods
+from jaxdn.methods.registry import method, method_named, methods
 from jaxdn.networks.engines import ENGINES, Engine
-from jaxdn.objectives import indirect_illumination
-from jaxdn.ops import onednn_library
-from jaxdn.options import Range, describe, make, parse
-from jaxdn.recipe import Recipe
-from jaxdn.weights import save_weights
+from jaxdn.ops.onednn import library
+from jaxdn.recipes.objectives import indirect_illumination
+from jaxdn.recipes.recipe import Recipe
+from jaxdn.sequence.run import candidate_on
+from jaxdn.zoo.weights import save_weights
 from tests.methods.test_ntd import TINY
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -128,7 +128,7 @@ def test_command_line_words_become_values():
 def built(monkeypatch, factory_of_ntd):
     """The options that a factory builds from its arguments."""
     seen = []
-    monkeypatch.setattr(table, "_METHODS", dict(table._METHODS))
+    monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
 
     @method(Options, title="A spy", presets={"parity": PARITY})
     def spy(options):
@@ -296,10 +296,10 @@ def test_an_engine_that_is_slower_here_is_used_on_request_alone(monkeypatch):
 @pytest.mark.parametrize(("isa", "faster"), [(0x7, False), (0x1F, False), (0x27, True), (0xFEF, True)])
 def test_onednn_trains_faster_with_avx512(isa, faster, monkeypatch):
     """AVX2, AVX2 with VNNI, AVX-512, AMX, as the library numbers them."""
-    monkeypatch.setattr(onednn_library, "available", lambda: True)
-    library = types.SimpleNamespace(dnnl_get_effective_cpu_isa=lambda: isa)
-    monkeypatch.setattr(onednn_library, "library", lambda: library)
-    assert onednn_library.trains_faster() == faster
+    monkeypatch.setattr(library, "available", lambda: True)
+    fake = types.SimpleNamespace(dnnl_get_effective_cpu_isa=lambda: isa)
+    monkeypatch.setattr(library, "library", lambda: fake)
+    assert library.trains_faster() == faster
     assert ENGINES["onednn"].faster() == faster
 
 
@@ -316,7 +316,7 @@ class Gains:
 @pytest.fixture
 def toy(monkeypatch):
     """A learned method that has neither a network nor engines, in the table for one test."""
-    monkeypatch.setattr(table, "_METHODS", dict(table._METHODS))
+    monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
 
     @method(Gains, title="A toy", recipes={"usual": Recipe(indirect_illumination())})
     def toy(options):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.frame import Frame, written_out
+from jaxdn.core.frame import Frame, written_out
 from jaxdn.methods.svgf import svgf
 from jaxdn.methods.trmv import trmv
 from tests.methods.lobe_scenes import compiled, run

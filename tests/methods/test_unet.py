@@ -11,8 +11,8 @@ import pytest
 from jaxdn.networks import LARGE, LEVELS, SMALL, description, onnx
 from jaxdn.networks.description import FEATURES, NEGATIVE_SLOPE, Description, Layer
 from jaxdn.networks.unet import XLA, Network, by_xla, count, unet
-from jaxdn.ops import onednn_library
-from jaxdn.weights import flatten, load_weights
+from jaxdn.ops.onednn import library
+from jaxdn.zoo.weights import flatten, load_weights
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -219,7 +219,7 @@ def test_every_engine_runs_whatever_network_is_described(engine: str, rng: np.ra
 
 
 @pytest.mark.parametrize("absent", [(), (1, 3)])
-@pytest.mark.parametrize(("name", "installed"), [("onnxruntime", onnx.available), ("onednn", onednn_library.available)])
+@pytest.mark.parametrize(("name", "installed"), [("onnxruntime", onnx.available), ("onednn", library.available)])
 def test_an_engine_runs_the_same_network(
     name: str, installed: Callable[[], bool], absent: tuple[int, ...], rng: np.random.Generator, key: jax.Array
 ) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from jaxdn.networks.unet import unet
 from jaxdn.networks.widen import widen
-from jaxdn.weights import flatten, unflatten
+from jaxdn.zoo.weights import flatten, unflatten
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

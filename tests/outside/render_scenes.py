@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxdn.render.scene import Camera
-from jaxdn.render.variant import choose_variant
+from jaxdn.render.scenes.scene import Camera
+from jaxdn.render.tracing.variant import choose_variant
 
 WIDTH, HEIGHT = 24, 16
 NEAR = 0.5

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from experiments.papers import ablation
-from jaxdn.methods.table import method_named
-from jaxdn.weights import load_weights, starting_params
+from jaxdn.methods.registry import method_named
+from jaxdn.zoo.weights import load_weights, starting_params
 
 
 @pytest.mark.parametrize("name", ablation.PRESETS)

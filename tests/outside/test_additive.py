@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from jaxdn import clips
-from jaxdn.additive import share, start_shares
-from jaxdn.candidates import candidate
-from jaxdn.clips.lighting import parts_of
-from jaxdn.commands.denoise import Settings, denoise_files
-from jaxdn.frame import Frame
+from jaxdn.core.frame import Frame
+from jaxdn.data.foreign.lighting import parts_of
+from jaxdn.sequence.aov_shares import share, start_shares
+from jaxdn.sequence.run import Settings, denoise_files
+from jaxdn.zoo.ready import candidate
 from tests.outside import programs
 from tests.outside.programs import PROGRAMS, truth, write_shot
 from tests.outside.test_kept import assert_same_but, box_blur

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from jaxdn import clips
-from jaxdn.candidates import candidate
-from jaxdn.clips.folder import open_frames
-from jaxdn.commands.denoise import Settings, denoise_files
-from jaxdn.commands.work import LEAD_IN
-from jaxdn.filters.both_ways import SEEN_MOST, blend, seen, turned
-from jaxdn.frame import FAR, Frame
-from jaxdn.motion import on_screen
+from jaxdn.core.frame import FAR, Frame
+from jaxdn.data.clip.folder import open_frames
+from jaxdn.filters.time_reversal import SEEN_MOST, blend, seen, turned
+from jaxdn.ops.motion import on_screen
+from jaxdn.sequence.jobs import LEAD_IN
+from jaxdn.sequence.run import Settings, denoise_files
+from jaxdn.zoo.ready import candidate
 from tests.learning.test_training import make_clip
 from tests.outside.programs import PROGRAMS, truth, write_shot
 from tests.outside.test_frames import part_of
@@ -187,7 +187,18 @@ def test_an_error_and_an_interrupt_leave_nothing_behind(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_ctrl_c_in_the_backward_pass_leaves_nothing_behind(tmp_path: Path) -> None:
     source, out = noisy_wall(tmp_path / "in", 400), tmp_path / "out"
-    command = [sys.executable, "-m", "jaxdn.cli", "denoise", source, "-o", out, "--method", "svgf", "--bidirectional"]
+    command = [
+        sys.executable,
+        "-m",
+        "jaxdn.commands.main",
+        "denoise",
+        source,
+        "-o",
+        out,
+        "--method",
+        "svgf",
+        "--bidirectional",
+    ]
     # A shell lets processes that it puts into the background ignore Ctrl-C, and theirs inherit that.
     process = subprocess.Popen(
         [*map(str, command)],

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from jaxdn.clips import ClipError, read_clip, write_clip
-from jaxdn.clips.cache import open_cached
-from jaxdn.clips.evidence import read_facts
-from jaxdn.frame import Clip, Frame
-from jaxdn.render.animation import check_animation, read_animation
-from jaxdn.weights import load_weights
+from jaxdn.core.frame import Clip, Frame
+from jaxdn.data.clip.evidence import read_facts
+from jaxdn.data.training.cache import open_cached
+from jaxdn.render.scenes.animation import check_animation, read_animation
+from jaxdn.zoo.weights import load_weights
 
 DEEP = "[" * 20_000 + "]" * 20_000
 

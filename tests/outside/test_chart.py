@@ -32,13 +32,13 @@ from experiments.speed.chart.summary import (
 from experiments.speed.chart.way import way
 from experiments.speed.chart.ways import chosen, left_out, registered, ways
 from experiments.speed.works import scene
-from jaxdn.candidates import Candidate, untrained
+from jaxdn.core.frame import Clip, frame_at
 from jaxdn.denoiser import Core, recurrent
-from jaxdn.frame import Clip, frame_at
-from jaxdn.methods import table
-from jaxdn.methods.table import method, method_named, methods
+from jaxdn.denoiser.rollout import denoise
+from jaxdn.methods import registry
+from jaxdn.methods.registry import method, method_named, methods
 from jaxdn.networks.engines import ENGINES
-from jaxdn.rollout import denoise
+from jaxdn.zoo.ready import Candidate, untrained
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -249,7 +249,7 @@ def test_quick_measures_the_fastest_of_each_method():
 
 def entered(monkeypatch, factory, name, **columns):
     """A method in the table during one test."""
-    monkeypatch.setattr(table, "_METHODS", dict(table._METHODS))
+    monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
     factory.__name__ = name
     return method(NoOptions, title=name, **columns)(factory)
 

@@ -5,7 +5,7 @@ import re
 import pytest
 
 from experiments.papers import classical
-from jaxdn.candidates import NOISY, filters
+from jaxdn.zoo.ready import NOISY, filters
 
 WEIGHTS = "ntd-small"
 

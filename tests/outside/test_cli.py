@@ -16,13 +16,13 @@ import OpenEXR
 import pytest
 from safetensors.numpy import load_file
 
-from jaxdn import cli
-from jaxdn.candidates import all_names
 from jaxdn.clips import write_clip
-from jaxdn.frame import Clip, Frame
+from jaxdn.commands import main
+from jaxdn.core.frame import Clip, Frame
 from jaxdn.methods.ntd import Options
-from jaxdn.methods.table import methods
-from jaxdn.weights import shipped_names
+from jaxdn.methods.registry import methods
+from jaxdn.zoo.ready import all_names
+from jaxdn.zoo.weights import shipped_names
 from tests.learning.test_training import make_clip
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.usefixtures("plain_programs")
 
 def jaxdn(*arguments, timeout=300):
     return subprocess.run(
-        [sys.executable, "-m", "jaxdn.cli", *map(str, arguments)],
+        [sys.executable, "-m", "jaxdn.commands.main", *map(str, arguments)],
         capture_output=True,
         text=True,
         timeout=timeout,
@@ -49,7 +49,7 @@ def fails(*arguments):
 def told_here(capsys, *arguments):
     """The same in this process, which an error that the command does not catch would leave."""
     with pytest.raises(SystemExit) as ended:
-        cli.main([*map(str, arguments)])
+        main.main([*map(str, arguments)])
     shown = capsys.readouterr()
     assert ended.value.code == 2, shown.err
     assert "Traceback" not in shown.out + shown.err
@@ -93,7 +93,7 @@ def test_help_of_the_program():
 @pytest.mark.parametrize("verb", ["inspect", "render", "train", "denoise", "compare"])
 def test_help_shows_examples(verb, capsys):
     with pytest.raises(SystemExit) as ended:
-        cli.main([verb, "--help"])
+        main.main([verb, "--help"])
     assert ended.value.code == 0
     shown = capsys.readouterr().out
     assert "jaxdn" in shown
@@ -114,7 +114,7 @@ def test_denoise_adds_direct_and_emitted_light_back(clip, tmp_path):
 
 def test_one_frame_becomes_the_file_that_is_named(shot, tmp_path, capsys):
     one, out = shot / "shot_0000.exr", tmp_path / "new" / "clean.exr"
-    cli.main(["denoise", str(one), "-o", str(out), "--method", "svgf", "--preview"])
+    main.main(["denoise", str(one), "-o", str(out), "--method", "svgf", "--preview"])
     assert sorted(path.name for path in out.parent.iterdir()) == ["clean.exr", "clean.png"]
     assert out.is_file()
     for source, place, words in (
@@ -122,7 +122,7 @@ def test_one_frame_becomes_the_file_that_is_named(shot, tmp_path, capsys):
         (one, one, "expected another place than the input's"),
     ):
         with pytest.raises(SystemExit) as ended:
-            cli.main(["denoise", str(source), "-o", str(place), "--method", "svgf"])
+            main.main(["denoise", str(source), "-o", str(place), "--method", "svgf"])
         assert ended.value.code == 2
         assert words in capsys.readouterr().err
     assert not (tmp_path / "x.exr").exists()
@@ -140,7 +140,7 @@ def test_one_frame_becomes_the_file_that_is_named(shot, tmp_path, capsys):
 )
 def test_a_clip_of_ours_refuses_what_is_for_files_of_others(clip, tmp_path, capsys, options):
     with pytest.raises(SystemExit) as ended:
-        cli.main(["denoise", str(clip), "-o", str(tmp_path / "out"), "--method", "noisy", *options])
+        main.main(["denoise", str(clip), "-o", str(tmp_path / "out"), "--method", "noisy", *options])
     assert ended.value.code == 2
     shown = capsys.readouterr()
     assert f"{options[0]}: expected files of other renderers, got {clip}, a clip of jaxdn's own" in shown.err
@@ -151,7 +151,7 @@ def test_a_clip_of_ours_refuses_what_is_for_files_of_others(clip, tmp_path, caps
 def test_the_help_names_the_shipped_weights(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "400")
     with pytest.raises(SystemExit):
-        cli.main(["denoise", "--help"])
+        main.main(["denoise", "--help"])
     text = capsys.readouterr().out
     assert f"Shipped weights ({', '.join(shipped_names())})" in text
     assert "an unknown name lists all" in text.partition("--method")[2].partition("--bidirectional")[0]
@@ -160,9 +160,9 @@ def test_the_help_names_the_shipped_weights(capsys, monkeypatch):
 def test_short_and_small_clips_name_the_options_that_fit_them(clip, tmp_path, capsys):
     for options, advice in (([], "--frames 3"), (["--frames", "3"], "--crop 20")):
         with pytest.raises(SystemExit):
-            cli.main(["train", str(clip), "-o", str(tmp_path / "run"), *options])
+            main.main(["train", str(clip), "-o", str(tmp_path / "run"), *options])
         assert f"({advice})" in capsys.readouterr().err
-        assert advice.split()[0][2:] in cli.Train.__dataclass_fields__
+        assert advice.split()[0][2:] in main.Train.__dataclass_fields__
 
 
 def test_denoise_plain_exr_files_with_the_shipped_network(tmp_path):
@@ -192,7 +192,7 @@ def test_a_layer_named_on_the_command_line_is_the_buffer(shot, tmp_path):
     checks = np.where(np.indices((24, 32)).sum(axis=0) // 3 % 2 == 0, 0.9, 0.1)
     errors = []
     for name, options in (("without", ()), ("with", ("--channels", "albedo=Paint"))):
-        cli.main(["denoise", str(shot), "-o", str(tmp_path / name), "--method", "svgf", *options])
+        main.main(["denoise", str(shot), "-o", str(tmp_path / name), "--method", "svgf", *options])
         with OpenEXR.File(str(tmp_path / name / "shot_0001.exr"), separate_channels=True) as file:
             errors.append(np.abs(file.channels()["G"].pixels - checks).mean())
     assert errors[1] < 0.5 * errors[0]

@@ -11,10 +11,10 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.clips import ClipError
-from jaxdn.clips.evidence import read_facts
-from jaxdn.clips.exr import to_half
-from jaxdn.clips.vectors import convert_motion
-from jaxdn.frame import BUFFERS, FAR, Clip, Frame
+from jaxdn.core.frame import BUFFERS, FAR, Clip, Frame
+from jaxdn.data.clip.evidence import read_facts
+from jaxdn.data.exr.exr import to_half
+from jaxdn.data.foreign.vectors import convert_motion
 
 HALF = tuple(name for name, row in BUFFERS.items() if row.stored == "half")
 
@@ -178,7 +178,7 @@ FULL_DISK = """
 import resource, sys
 import numpy as np
 from jaxdn import clips
-from jaxdn.frame import Frame
+from jaxdn.core.frame import Frame
 for limit, side in ((300, 2), (600, 4), (20000, 99)):
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
     image = np.random.default_rng(0).random((side, side, 3), np.float32)
@@ -324,7 +324,7 @@ def test_an_interrupted_clip_is_not_a_clip(tmp_path: Path, rng: np.random.Genera
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("jaxdn.clips.folder.write_frame", interrupted)
+    monkeypatch.setattr("jaxdn.data.clip.folder.write_frame", interrupted)
     with pytest.raises(KeyboardInterrupt):
         clips.write_clip(make_clip(rng, 3), tmp_path / "c")
     assert not clips.is_clip(tmp_path / "c")
@@ -460,7 +460,7 @@ def test_foreign_frames_are_read_one_at_a_time(tmp_path: Path, rng: np.random.Ge
         read.append(path)
         return clips.read_exr(path)
 
-    monkeypatch.setattr("jaxdn.clips.import_exr.read_exr", counted)
+    monkeypatch.setattr("jaxdn.data.foreign.import_exr.read_exr", counted)
     files, frames = clips.plain_frames(tmp_path, motion_convention="uv", channels={"albedo": "Albedo"})
     assert [file.name for file in files] == [f"a{index}.exr" for index in range(5)]
     assert not read

@@ -2,8 +2,8 @@
 
 import pytest
 
-from jaxdn.render.depth import measure_depth
-from jaxdn.render.opening import open_scene
+from jaxdn.render.scenes.opening import open_scene
+from jaxdn.render.tracing.depth import measure_depth
 
 
 def furnace(reflectance, max_depth=30):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from experiments.stability.laws import LAWS, deviations
+from jaxdn.core.frame import Clip, Frame
 from jaxdn.denoiser import Core, recurrent
-from jaxdn.frame import Clip, Frame
 
 
 @pytest.fixture

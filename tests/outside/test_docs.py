@@ -10,9 +10,9 @@ import tyro
 from PIL import Image
 
 from experiments.papers import before_after, front_page, vectors
-from jaxdn.arguments import COMMANDS, Denoise
-from jaxdn.candidates import OURS
 from jaxdn.clips import write_clip
+from jaxdn.commands.arguments import COMMANDS, Denoise
+from jaxdn.zoo.ready import OURS
 from tests.learning.test_training import make_clip
 
 ROOT = Path(__file__).parents[2]

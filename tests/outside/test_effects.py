@@ -14,8 +14,8 @@ import jaxdn
 from experiments.speed.small_rooms import CASES, FRAMES
 from jaxdn import effects
 from jaxdn.commands import inspect as command
+from jaxdn.core.frame import BUFFERS, ON_REQUEST, Frame
 from jaxdn.effects import EFFECTS, Effect, Effects, Facts, Light, Moment, Surface
-from jaxdn.frame import BUFFERS, ON_REQUEST, Frame
 
 SIZE = {"width": 24, "height": 16}
 PLANNING = Path(effects.__file__).parent / "planning"
@@ -50,7 +50,7 @@ def test_two_sets_of_effects_are_two_programs(tmp_path):
 
 
 def test_a_loaded_scene_is_inspected_with_its_animation(tmp_path):
-    from jaxdn.render.variant import use_variant
+    from jaxdn.render.tracing.variant import use_variant
 
     use_variant()
     import mitsuba as mi
@@ -64,7 +64,7 @@ def test_a_loaded_scene_is_inspected_with_its_animation(tmp_path):
 
 
 def test_a_constant_animation_has_constant_poses(tmp_path):
-    from jaxdn.render.scene_file import SceneFile
+    from jaxdn.render.scenes.scene_file import SceneFile
 
     scene = SceneFile(CASES["moving: nothing moves"].write(tmp_path))
     poses = [scene.pose(frame)["ball"] for frame in (0, 0.3, 1, 2, 3)]
@@ -198,7 +198,7 @@ def test_an_unknown_method_is_refused():
 def test_only_json_is_printed(tmp_path):
     path = CASES["a ball: textured roughness"].write(tmp_path)
     done = subprocess.run(
-        [sys.executable, "-m", "jaxdn.cli", "inspect", str(path), "--json", "--denoiser", "svgf"],
+        [sys.executable, "-m", "jaxdn.commands.main", "inspect", str(path), "--json", "--denoiser", "svgf"],
         capture_output=True,
         text=True,
         check=True,
@@ -214,7 +214,7 @@ def test_only_json_is_printed(tmp_path):
 
 def test_a_user_error_ends_with_one_message(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-m", "jaxdn.cli", "inspect", str(tmp_path / "none.xml"), "--json"],
+        [sys.executable, "-m", "jaxdn.commands.main", "inspect", str(tmp_path / "none.xml"), "--json"],
         capture_output=True,
         text=True,
         check=False,

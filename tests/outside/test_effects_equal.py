@@ -13,11 +13,11 @@ import jaxdn
 from experiments.speed.small_rooms import ANIMATIONS, BEHIND, CASES, MATERIALS, SEEN, room
 from jaxdn import effects
 from jaxdn.clips import read_clip, read_exr, read_frame
-from jaxdn.clips.folder import frame_path, is_clip, read_record
-from jaxdn.frame import Frame, only, present, written_out
-from jaxdn.methods.table import methods
+from jaxdn.core.frame import Frame, only, present, written_out
+from jaxdn.data.clip.folder import frame_path, is_clip, read_record
+from jaxdn.methods.registry import methods
 from jaxdn.render.clip import render_clip
-from jaxdn.render.scene_file import SceneFile
+from jaxdn.render.scenes.scene_file import SceneFile
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -181,7 +181,7 @@ def test_a_finished_clip_is_inspected_without_its_scene(tmp_path):
 
 @pytest.mark.slow
 def test_a_clip_whose_effects_change_is_denoised_by_two_programs(tmp_path):
-    from jaxdn.cli import main
+    from jaxdn.commands.main import main
 
     everything, auto = rendered(CASES["moving: ball, later"], tmp_path)
     images = {}

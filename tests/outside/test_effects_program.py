@@ -9,7 +9,7 @@ import pytest
 
 import jaxdn
 from jaxdn import effects
-from jaxdn.frame import Frame
+from jaxdn.core.frame import Frame
 
 SIZE = (32, 48)
 CHANNELS = {"depth": 1, "roughness": 1, "motion": 2, "dual_motion": 2, "visible": 1, "previous_depth": 1, "ids": 1}
@@ -28,7 +28,7 @@ def frame_for(*names):
 
 
 def lowered_step(denoiser, frame):
-    used = jaxdn.frame.only(frame, denoiser.reads)
+    used = jaxdn.core.frame.only(frame, denoiser.reads)
     params = jax.eval_shape(lambda: denoiser.init(jax.random.key(0), used))
     state = jax.eval_shape(denoiser.start, params, used)
     return jax.jit(denoiser.step).lower(params, state, used).as_text()

@@ -14,15 +14,15 @@ from jax import export as jax_export
 from jax import lax
 
 import jaxdn
-from jaxdn import cli
-from jaxdn.candidates import candidate
 from jaxdn.clips import write_clip
-from jaxdn.clips.exr import read_exr
+from jaxdn.commands import main
 from jaxdn.commands.export import export
+from jaxdn.core.frame import BUFFERS, Clip, frame_at, written_out
+from jaxdn.data.exr.exr import read_exr
+from jaxdn.denoiser.rollout import stream
 from jaxdn.export.formats import onnx_model
 from jaxdn.export.step import Step
-from jaxdn.frame import BUFFERS, Clip, frame_at, written_out
-from jaxdn.rollout import stream
+from jaxdn.zoo.ready import candidate
 from tests.learning.test_training import make_clip
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -174,7 +174,7 @@ def test_each_rule_computes_what_jax_does(rule, rng):
 def fails(capsys, *arguments):
     """A user error in this process, as another one needs seconds to begin; returns its message."""
     with pytest.raises(SystemExit) as ended:
-        cli.main(["export", *map(str, arguments)])
+        main.main(["export", *map(str, arguments)])
     told = capsys.readouterr().err
     assert ended.value.code == 2, told
     assert "Traceback" not in told
@@ -190,7 +190,7 @@ def test_a_method_whose_step_needs_a_size_is_named(tmp_path):
 @pytest.mark.slow
 def test_what_cannot_be_exported_is_an_error_that_says_what_to_do(tmp_path, capsys):
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "jaxdn.cli", "export", "taa", "-o", out, "--buffers", "albedo"]
+    command = [sys.executable, "-m", "jaxdn.commands.main", "export", "taa", "-o", out, "--buffers", "albedo"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 2, done.stderr
     assert "Traceback" not in done.stderr

@@ -8,8 +8,8 @@ import pytest
 
 from jaxdn.render.families import FAMILIES, family_scene, furniture, shapes, textures
 from jaxdn.render.families.staging import Stage, glass, look_at, matte, rod, scale, shift, shuttle, turn
-from jaxdn.render.opening import scene_from_record
-from jaxdn.render.scene import AnimatedScene, Camera, brightness
+from jaxdn.render.scenes.opening import scene_from_record
+from jaxdn.render.scenes.scene import AnimatedScene, Camera, brightness
 
 NAMES = sorted(FAMILIES)
 SEEDS = (0, 1, 7)

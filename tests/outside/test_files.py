@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxdn import files
-from jaxdn.files import whole, write_json, write_whole
+from jaxdn.runtime import atomic_files
+from jaxdn.runtime.atomic_files import whole, write_json, write_whole
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -58,7 +58,7 @@ def test_a_late_disk_error_leaves_the_old_file(folder: Path, monkeypatch, name: 
     def refuse(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(files.os, name, refuse)
+    monkeypatch.setattr(atomic_files.os, name, refuse)
     with pytest.raises(OSError, match="No space left"):
         write_whole({folder / "a": "new"})
     assert contents(folder) == OLD
@@ -74,7 +74,7 @@ def test_a_disk_error_for_one_of_several_files_replaces_none(folder: Path, monke
             raise OSError(28, "No space left on device")
         sync(handle)
 
-    monkeypatch.setattr(files.os, "fsync", refuse_the_second)
+    monkeypatch.setattr(atomic_files.os, "fsync", refuse_the_second)
     with pytest.raises(OSError, match="No space left"):
         write_whole({folder / "a": "new", folder / "b": "new"})
     assert contents(folder) == OLD
@@ -89,7 +89,7 @@ def test_several_files_are_renamed_in_their_order_and_after_all_are_written(fold
         renamed.append(path.name)
         replace(temporary, path)
 
-    monkeypatch.setattr(files.os, "replace", noted)
+    monkeypatch.setattr(atomic_files.os, "replace", noted)
     write_whole({folder / "b": "é", folder / "a": b"\x00"})
     assert renamed == ["b", "a"]
     assert (folder / "b").read_bytes() == "é".encode()

@@ -11,7 +11,7 @@ import pytest
 from jaxdn import clips
 from jaxdn.brdf import directional_albedo
 from jaxdn.clips import ClipError
-from jaxdn.clips.evidence import read_facts
+from jaxdn.data.clip.evidence import read_facts
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -222,7 +222,7 @@ def test_the_command_prints_what_it_read_and_derived(tmp_path, scene):
     for index in range(2):
         layers = [layer("", scene["light"]), layer("diffuse_albedo", scene["diffuse"])]
         write(folder / f"shot_{index:04d}.exr", *layers, layer("specular_albedo", scene["specular"]))
-    command = [sys.executable, "-m", "jaxdn.cli", "denoise", str(folder), "-o", str(tmp_path / "out")]
+    command = [sys.executable, "-m", "jaxdn.commands.main", "denoise", str(folder), "-o", str(tmp_path / "out")]
     done = subprocess.run([*command, "--method", "svgf"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("derived: reflectance = 'diffuse_albedo' + 'specular_albedo'") == 1

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jaxdn import cli, clips
-from jaxdn.candidates import candidate
-from jaxdn.clips.shots import Shot, find_shots, ranges
-from jaxdn.commands.denoise import Settings, denoise_files
+from jaxdn import clips
+from jaxdn.commands import main
 from jaxdn.commands.progress import reporter
-from jaxdn.commands.work import LEAD_IN, Work, work_on
+from jaxdn.data.foreign.shots import Shot, find_shots, ranges
+from jaxdn.sequence.jobs import LEAD_IN, Work, work_on
+from jaxdn.sequence.run import Settings, denoise_files
+from jaxdn.zoo.ready import candidate
 from tests.learning.test_training import make_clip
 
 SIZE = (8, 8)
@@ -174,7 +175,7 @@ def test_no_input_is_overwritten(tmp_path: Path) -> None:
 def refused(capsys: Any, *arguments: Any) -> str:
     """The message of a `jaxdn denoise` that ends with exit code 2."""
     with pytest.raises(SystemExit) as ended:
-        cli.main(["denoise", *map(str, arguments)])
+        main.main(["denoise", *map(str, arguments)])
     assert ended.value.code == 2
     return " ".join(capsys.readouterr().err.split())
 
@@ -217,9 +218,9 @@ def test_sample_counts_of_files_name_the_shot_in_words(tmp_path: Path, capsys: A
 def test_what_was_done_is_said_in_the_right_number(tmp_path: Path, capsys: Any) -> None:
     source = numbered(tmp_path / "in", [1])
     command = ["denoise", str(source), "-o", str(tmp_path / "out"), "--method", "noisy", "--skip-existing"]
-    cli.main(command)
+    main.main(command)
     assert f"\n1 frame denoised by noisy in {tmp_path}/out" in capsys.readouterr().out
-    cli.main(command)
+    main.main(command)
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2].endswith("1 frame is there already and stays as it is")
     assert lines[-1] == f"nothing to do in {tmp_path}/out"
@@ -230,7 +231,7 @@ def test_a_broken_frame_ends_in_words_and_leaves_no_incomplete_file(tmp_path: Pa
     broken = (source / "a.0003.exr").read_bytes()
     (source / "a.0003.exr").write_bytes(broken[: len(broken) // 2])
     with pytest.raises(SystemExit) as ended:
-        cli.main(["denoise", str(source), "-o", str(tmp_path / "out"), "--method", "noisy"])
+        main.main(["denoise", str(source), "-o", str(tmp_path / "out"), "--method", "noisy"])
     assert ended.value.code == 2
     assert "a.0003.exr" in capsys.readouterr().err
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["a.0001.exr", "a.0002.exr"]
@@ -238,7 +239,7 @@ def test_a_broken_frame_ends_in_words_and_leaves_no_incomplete_file(tmp_path: Pa
 
 def test_the_command_line(tmp_path: Path, capsys: Any) -> None:
     source, out = numbered(tmp_path / "in", range(1, 6)), tmp_path / "out"
-    cli.main(["denoise", str(source), "-o", str(out), "--method", "noisy", "--frames", "2-3", "5", "--skip-existing"])
+    main.main(["denoise", str(source), "-o", str(out), "--method", "noisy", "--frames", "2-3", "5", "--skip-existing"])
     lines = capsys.readouterr().out
     assert "\x1b" not in lines
     assert "\r" not in lines
@@ -246,7 +247,7 @@ def test_the_command_line(tmp_path: Path, capsys: Any) -> None:
     assert re.search(r"^frame 2 of 3: \S+a\.0003\.exr, \d+\.\d s, about \d+ s left$", lines, re.MULTILINE)
     assert re.search(r"^frame 3 of 3: \S+a\.0005\.exr, \d+\.\d s$", lines, re.MULTILINE)
     with pytest.raises(SystemExit) as ended:
-        cli.main(["denoise", str(source), "-o", str(out), "--frames", "3-x"])
+        main.main(["denoise", str(source), "-o", str(out), "--frames", "3-x"])
     assert ended.value.code == 2
     assert "--frames: expected whole numbers" in " ".join(capsys.readouterr().err.split())
 

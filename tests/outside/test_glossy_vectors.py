@@ -5,8 +5,8 @@ import pytest
 from render_scenes import grey, shift
 from vector_scenes import FAST, HEIGHT, WIDTH, Places, floor, look, rendered
 
-from jaxdn.render.geometry import project
-from jaxdn.render.glossy_vectors import ROUGHEST
+from jaxdn.render.buffers.geometry import project
+from jaxdn.render.buffers.glossy_vectors import ROUGHEST
 
 needs_fast = pytest.mark.skipif(FAST == "scalar_rgb", reason="only vectorised variants sample lobes")
 

@@ -9,9 +9,9 @@ from render_scenes import HEIGHT, PIXEL, SQUARE_Z, WIDTH, Stage, fast_variants, 
 from jaxdn import effects
 from jaxdn.color import LUMINANCE
 from jaxdn.render.frame import render_frame, tracer
-from jaxdn.render.gradient_samples import luminance_gradient, pick, scattered
-from jaxdn.render.seeds import NOISY, frame_key
-from jaxdn.render.variant import choose_variant, use_variant
+from jaxdn.render.tracing.gradient_samples import luminance_gradient, pick, scattered
+from jaxdn.render.tracing.seeds import NOISY, frame_key
+from jaxdn.render.tracing.variant import choose_variant, use_variant
 
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "max_depth": 4, "seed": 5}
 STRATA = (-(-HEIGHT // 3), -(-WIDTH // 3))

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxdn import cli, clips
-from jaxdn.clips.sources import sources_of
-from jaxdn.clips.vectors import MOTION_CONVENTIONS
+from jaxdn import clips
+from jaxdn.commands import main
 from jaxdn.commands.sources import CONSEQUENCES
-from jaxdn.methods.table import methods
+from jaxdn.data.foreign.sources import sources_of
+from jaxdn.data.foreign.vectors import MOTION_CONVENTIONS
+from jaxdn.methods.registry import methods
 from tests.learning.test_training import make_clip
 from tests.outside.programs import HEIGHT, PROGRAMS, WIDTH, write_shot
 
@@ -36,7 +37,7 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setenv("COLUMNS", "250")  # no line is broken
 
     def inspect(*arguments: Any) -> str:
-        cli.main(["inspect", *map(str, arguments)])
+        main.main(["inspect", *map(str, arguments)])
         return capsys.readouterr().out
 
     return inspect
@@ -48,7 +49,7 @@ def fails(capsys: pytest.CaptureFixture[str]) -> Any:
 
     def ended(*arguments: Any) -> str:
         with pytest.raises(SystemExit) as error:
-            cli.main([*map(str, arguments)])
+            main.main([*map(str, arguments)])
         assert error.value.code == 2
         return capsys.readouterr().err
 
@@ -177,7 +178,7 @@ def test_a_finished_clip_needs_no_options_of_files(option: tuple[str, str], tmp_
 
 def test_the_help_says_that_files_are_read(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        cli.main(["inspect", "--help"])
+        main.main(["inspect", "--help"])
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "files of other renderers, what is read from which layer" in text
     assert "fitting_conventions" in text

@@ -88,7 +88,7 @@ _COMPILING = """
 import sys, threading, time
 import jax, jax.numpy as jnp
 from jaxdn.commands.errors import plain_errors
-from jaxdn.commands.interrupt import end_of_process
+from jaxdn.runtime.interrupt import end_of_process
 
 def long(x):
     for i in range(400):

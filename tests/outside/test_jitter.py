@@ -11,16 +11,16 @@ from render_scenes import HEIGHT, SQUARE_Z, WIDTH, Stage, shift, turn
 import jaxdn
 from jaxdn import Clip, effects
 from jaxdn.clips import ClipError
-from jaxdn.clips.folder import read_record
-from jaxdn.commands.render import clips_of
+from jaxdn.core.frame import Frame
+from jaxdn.data.clip.folder import read_record
 from jaxdn.effects import plan
-from jaxdn.frame import Frame
-from jaxdn.render import jitter
+from jaxdn.render.buffers.geometry import project
 from jaxdn.render.clip import render_clip
 from jaxdn.render.frame import render_frame
-from jaxdn.render.geometry import project
-from jaxdn.render.scene import Camera
-from jaxdn.render.variant import choose_variant, use_variant
+from jaxdn.render.scenes.scene import Camera
+from jaxdn.render.tracing import jitter
+from jaxdn.render.tracing.variant import choose_variant, use_variant
+from jaxdn.sequence.render_jobs import clips_of
 
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
 FAST = choose_variant().variant
@@ -42,7 +42,7 @@ def test_offsets_repeat_and_spread_over_the_pixel():
 @pytest.mark.parametrize("variant", sorted({FAST, "scalar_rgb"}))
 def test_rays_go_through_the_offset_point(variant):
     use_variant(variant)
-    from jaxdn.render.wavefront import camera_rays
+    from jaxdn.render.tracing.wavefront import camera_rays
 
     point = (0.3, -0.2)
     plain, moved = Stage().build(0, WIDTH, HEIGHT), jitter.look_through(Stage().build(0, WIDTH, HEIGHT), point)

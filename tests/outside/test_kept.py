@@ -10,13 +10,13 @@ import OpenEXR
 import pytest
 
 from jaxdn import clips
-from jaxdn.candidates import Candidate
-from jaxdn.clips.exr import rewrite_exr
-from jaxdn.clips.import_exr import canvas_of
-from jaxdn.clips.windows import Window
-from jaxdn.commands.denoise import Settings, denoise_files
+from jaxdn.core.frame import Frame
+from jaxdn.data.exr.exr import rewrite_exr
+from jaxdn.data.exr.windows import Window
+from jaxdn.data.foreign.import_exr import canvas_of
 from jaxdn.denoiser import Core, recurrent
-from jaxdn.frame import Frame
+from jaxdn.sequence.run import Settings, denoise_files
+from jaxdn.zoo.ready import Candidate
 from tests.outside import programs
 from tests.outside.programs import PROGRAMS, truth, write_shot
 

@@ -9,8 +9,8 @@ import pytest
 
 from experiments.papers.learned import __main__ as learned
 from experiments.papers.learned import maps, ntasd_holdout, ntasd_methods, ntasd_sizes, reach, scores, stages
-from jaxdn.commands.render import render
-from jaxdn.report import ClipResult, Results, Scores
+from jaxdn.evaluation.report import ClipResult, Results, Scores
+from jaxdn.sequence.render_jobs import render
 
 
 @pytest.mark.slow

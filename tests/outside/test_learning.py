@@ -14,12 +14,12 @@ from experiments.papers.equal_time import Settings, folder_name, run
 from experiments.papers.other_clips import every_other, half_reference, three_of_four, without_draws
 from experiments.papers.weights import STAGES
 from jaxdn import clips
-from jaxdn.clips.cache import open_cached
-from jaxdn.clips.noise_floor import read_halves
-from jaxdn.frame import Clip, Frame
-from jaxdn.methods.table import method_named
-from jaxdn.rollout import denoise
-from jaxdn.weights import shipped_names
+from jaxdn.core.frame import Clip, Frame
+from jaxdn.data.clip.noise_floor import read_halves
+from jaxdn.data.training.cache import open_cached
+from jaxdn.denoiser.rollout import denoise
+from jaxdn.methods.registry import method_named
+from jaxdn.zoo.weights import shipped_names
 
 
 @pytest.mark.parametrize("study", [learning.study, choices.study])

@@ -9,12 +9,12 @@ from render_scenes import HEIGHT, WALL_Z, WIDTH, Stage, grey, shift, turn
 import jaxdn
 from jaxdn import effects
 from jaxdn.clips import read_clip
-from jaxdn.clips.cache import open_cached, read_window
-from jaxdn.frame import FAR, GUIDES, OF_SAMPLES, ON_REQUEST, present
+from jaxdn.core.frame import FAR, GUIDES, OF_SAMPLES, ON_REQUEST, present
+from jaxdn.data.training.cache import open_cached, read_window
 from jaxdn.planning.catalogue import OF_SHADOWS
 from jaxdn.render.clip import render_clip
 from jaxdn.render.frame import render_frame
-from jaxdn.render.variant import choose_variant
+from jaxdn.render.tracing.variant import choose_variant
 
 FAST = choose_variant().variant
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}

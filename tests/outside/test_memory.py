@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from experiments.stability.memory import peak_mib, write_sequence
-from jaxdn.candidates import candidate
 from jaxdn.clips import read_exr
-from jaxdn.clips.exr import read_windows
-from jaxdn.commands.denoise import Settings, denoise_files
-from jaxdn.commands.room import STEP, needed
+from jaxdn.data.exr.exr import read_windows
+from jaxdn.sequence.memory_budget import STEP, needed
+from jaxdn.sequence.run import Settings, denoise_files
+from jaxdn.zoo.ready import candidate
 
 pytestmark = pytest.mark.usefixtures("compiled_anew")  # loading a program takes less memory than compiling it
 

@@ -7,12 +7,12 @@ import pytest
 
 from experiments.speed import peers
 from experiments.speed.works import scene
+from jaxdn.core.frame import Clip, Frame, frame_at
+from jaxdn.denoiser.rollout import denoise, stream
 from jaxdn.denoisers import ntd
-from jaxdn.frame import Clip, Frame, frame_at
-from jaxdn.learning.step import clip_loss, initial_state
-from jaxdn.methods.table import method_named
+from jaxdn.methods.registry import method_named
 from jaxdn.ops.warp import warp
-from jaxdn.rollout import denoise, stream
+from jaxdn.training.step import clip_loss, initial_state
 
 TINY = ((4,), (4,), (5,), (5,), (6,))
 RECIPE = method_named("ntd").recipe_named(None)._replace(decay=False)

@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 
 from experiments.papers.places import SCALE, Settings, main, parsed
-from jaxdn.report.images import save_png
+from jaxdn.evaluation.report.images import save_png
 
 
 def test_places_are_the_pixels_of_each_method(tmp_path, rng):

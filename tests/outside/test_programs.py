@@ -6,12 +6,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxdn import cli, clips
+from jaxdn import clips
 from jaxdn.clips import ClipError
-from jaxdn.clips.import_exr import canvas_of
-from jaxdn.clips.measured_motion import fitting_conventions
-from jaxdn.clips.sources import sources_of
-from jaxdn.frame import Frame
+from jaxdn.commands import main
+from jaxdn.core.frame import Frame
+from jaxdn.data.foreign.import_exr import canvas_of
+from jaxdn.data.foreign.measured_motion import fitting_conventions
+from jaxdn.data.foreign.sources import sources_of
 from jaxdn.ops.warp import warp
 from tests.outside import programs
 from tests.outside.programs import FULL, HEIGHT, PROGRAMS, STEP, WIDTH, Truth, corner, truth, write_shot
@@ -115,7 +116,7 @@ def test_the_table_names_the_layers(
     found = sources_of(shots[name], motion_convention=PROGRAMS[name].motion_convention)
     assert {source.buffer: source.layer for source in found} == PROGRAMS[name].buffers
     options = ["--motion-convention", PROGRAMS[name].motion_convention] if PROGRAMS[name].motion_convention else []
-    cli.main(["inspect", str(shots[name]), *options])
+    main.main(["inspect", str(shots[name]), *options])
     text = " ".join(capsys.readouterr().out.split())
     for source in found:
         assert f"{source.buffer} {source.layer} {', '.join(c.rpartition('.')[2] for c in source.channels)} " in text

@@ -9,8 +9,8 @@ from experiments.papers import reflectance as paper
 from experiments.speed.small_rooms import CASES
 from jaxdn import effects
 from jaxdn.render.frame import render_frame
-from jaxdn.render.opening import open_scene
-from jaxdn.render.variant import choose_variant, use_variant
+from jaxdn.render.scenes.opening import open_scene
+from jaxdn.render.tracing.variant import choose_variant, use_variant
 
 FAST = choose_variant().variant
 NAMES = (
@@ -36,7 +36,7 @@ def scalar():
 
 
 def found(name):
-    from jaxdn.render.gbuffer import gbuffer
+    from jaxdn.render.buffers.gbuffer import gbuffer
 
     there = gbuffer(paper.ball(paper.materials()[name]), reflectance=True)
     assert there.reflectance is not None
@@ -102,7 +102,7 @@ def test_it_does_not_depend_on_the_seed(fast, tmp_path):
 
 
 def test_a_table_is_made_once_for_a_material_and_again_for_another(fast, monkeypatch):
-    from jaxdn.render import reflectance
+    from jaxdn.render.buffers import reflectance
 
     made = []
     make = reflectance._table_at_once if FAST != "scalar_rgb" else reflectance._table_one_by_one
@@ -117,7 +117,7 @@ def test_a_table_is_made_once_for_a_material_and_again_for_another(fast, monkeyp
 
 
 def test_a_material_that_cannot_be_averaged_is_named_once_and_its_albedo_used(fast, monkeypatch):
-    from jaxdn.render import reflectance
+    from jaxdn.render.buffers import reflectance
 
     monkeypatch.setattr(reflectance, "_KNOWN", frozenset())
     monkeypatch.setattr(reflectance, "_samples", lambda bsdf: False)
@@ -132,7 +132,7 @@ def test_a_material_that_cannot_be_averaged_is_named_once_and_its_albedo_used(fa
 def test_a_material_that_cannot_be_sampled_is_detected(fast):
     import mitsuba as mi
 
-    from jaxdn.render.reflectance import _samples
+    from jaxdn.render.buffers.reflectance import _samples
 
     class Broken:
         def sample(self, *args):

@@ -15,16 +15,16 @@ from render_scenes import HEIGHT, PIXEL, SQUARE_Z, WIDTH, Stage, fast_variants, 
 
 from jaxdn import effects
 from jaxdn.clips import ClipError, read_frame
-from jaxdn.clips.folder import begun_record, is_clip, read_record
-from jaxdn.frame import present
+from jaxdn.core.frame import present
+from jaxdn.data.clip.folder import begun_record, is_clip, read_record
 from jaxdn.render import farm
 from jaxdn.render.clip import render_clip
 from jaxdn.render.errors import RenderError
 from jaxdn.render.frame import Rendered, render_frame, tracer
-from jaxdn.render.opening import scene_from_record
-from jaxdn.render.scene import AnimatedScene
-from jaxdn.render.seeds import NOISY, REFERENCE, frame_key, pass_seed, tea
-from jaxdn.render.variant import choose_variant, llvm_candidates, use_variant
+from jaxdn.render.scenes.opening import scene_from_record
+from jaxdn.render.scenes.scene import AnimatedScene
+from jaxdn.render.tracing.seeds import NOISY, REFERENCE, frame_key, pass_seed, tea
+from jaxdn.render.tracing.variant import choose_variant, llvm_candidates, use_variant
 
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
 SAMPLES = 64
@@ -398,7 +398,7 @@ def test_seeds_are_all_different() -> None:
     assert len(passes) == 2 * 4096
 
 
-SAY = "from jaxdn.render.variant import choose_variant; print(*choose_variant(), sep='|')"
+SAY = "from jaxdn.render.tracing.variant import choose_variant; print(*choose_variant(), sep='|')"
 
 
 def chosen(**environment: str) -> str:

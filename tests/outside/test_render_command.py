@@ -3,12 +3,12 @@
 import pytest
 
 from experiments.speed.small_rooms import CASES
-from jaxdn import cli
 from jaxdn.clips import ClipError
-from jaxdn.clips.folder import is_clip, read_record
-from jaxdn.commands import render as command
+from jaxdn.commands import main
+from jaxdn.data.clip.folder import is_clip, read_record
 from jaxdn.render.clip import render_clip
-from jaxdn.render.scene_file import SceneFile
+from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.sequence import render_jobs as command
 
 OPTIONS = {
     "animation": None,
@@ -107,7 +107,7 @@ def test_clips_are_rendered(tmp_path):
 def test_an_empty_size_is_refused_in_words(verb, option, tmp_path, capsys):
     out = tmp_path / "out"
     with pytest.raises(SystemExit) as ended:
-        cli.main([*(word.format(out=out) for word in verb), option, "0"])
+        main.main([*(word.format(out=out) for word in verb), option, "0"])
     assert ended.value.code == 2
     assert f"{option[2:]}: expected at least 1, got 0" in capsys.readouterr().err
     assert not out.exists()
@@ -121,7 +121,7 @@ def test_an_empty_size_is_refused_in_words(verb, option, tmp_path, capsys):
 )  # fmt: skip
 def test_sample_counts_out_of_range_are_refused_before_planning(option, value, told, counted, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
-        cli.main(["render", "edge", "-o", str(tmp_path / "out"), option, value])
+        main.main(["render", "edge", "-o", str(tmp_path / "out"), option, value])
     assert ended.value.code == 2
     assert told in capsys.readouterr().err
     assert (counted["opened"], counted["planned"]) == (0, 0)
@@ -154,7 +154,7 @@ def test_a_clip_gets_more_frames_and_other_settings_are_said_in_words(tmp_path):
 @pytest.mark.parametrize("words", [["render", "edge"], ["train", "clips"], ["compare", "clips"], ["export", "svgf"]])
 def test_a_folder_is_not_named_like_a_file(words, name, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
-        cli.main([*words, "-o", str(tmp_path / name)])
+        main.main([*words, "-o", str(tmp_path / name)])
     assert ended.value.code == 2
     assert "expected a folder" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
@@ -163,6 +163,6 @@ def test_a_folder_is_not_named_like_a_file(words, name, tmp_path, capsys):
 def test_a_folder_is_no_file_that_is_there(tmp_path, capsys):
     (tmp_path / "taken").write_text("mine")
     with pytest.raises(SystemExit) as ended:
-        cli.main(["render", "edge", "-o", str(tmp_path / "taken")])
+        main.main(["render", "edge", "-o", str(tmp_path / "taken")])
     assert ended.value.code == 2
     assert "expected a folder, got the name of a file" in capsys.readouterr().err

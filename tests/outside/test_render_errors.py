@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from jaxdn.commands.errors import plain_errors
-from jaxdn.extras import EXTRAS, install
+from jaxdn.runtime.optional import EXTRAS, install
 
 WITHOUT_RENDERER = """
 import importlib.abc, sys
@@ -51,7 +51,7 @@ def test_without_the_renderer_rendering_says_what_to_install(tmp_path):
 
 
 def test_without_the_renderer_llvm_is_not_blamed(tmp_path):
-    done = run(f"from jaxdn.cli import main; main(['render', 'edge', '-o', {str(tmp_path / 'out')!r}])")
+    done = run(f"from jaxdn.commands.main import main; main(['render', 'edge', '-o', {str(tmp_path / 'out')!r}])")
     assert done.returncode == 2
     assert done.stderr.strip().endswith("pip install mitsuba")
     assert "LLVM" not in done.stdout + done.stderr

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from render_scenes import HEIGHT, NEAR, PIXEL, SQUARE_Z, WALL_Z, WIDTH, Stage, fast_variants, grey, shift, turn
 
-from jaxdn.frame import FAR
-from jaxdn.motion import dual_motion, occlusion_mask
-from jaxdn.render.gbuffer import GBuffer, gbuffer
-from jaxdn.render.geometry import Motion, View, motion_between, project, relative_poses
-from jaxdn.render.scene import Camera
-from jaxdn.render.variant import use_variant
+from jaxdn.core.frame import FAR
+from jaxdn.ops.motion import dual_motion, occlusion_mask
+from jaxdn.render.buffers.gbuffer import GBuffer, gbuffer
+from jaxdn.render.buffers.geometry import Motion, View, motion_between, project, relative_poses
+from jaxdn.render.scenes.scene import Camera
+from jaxdn.render.tracing.variant import use_variant
 
 COLUMN, ROW = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
 CENTRES = np.stack([COLUMN, ROW], axis=-1) + 0.5

@@ -11,12 +11,13 @@ import pytest
 from render_scenes import HEIGHT, WIDTH, Stage, fast_variants
 
 import jaxdn as library
-from jaxdn import cli, effects
-from jaxdn.clips.exr import read_exr
-from jaxdn.frame import Frame
+from jaxdn import effects
+from jaxdn.commands import main
+from jaxdn.core.frame import Frame
+from jaxdn.data.exr.exr import read_exr
 from jaxdn.render import render_frame
 from jaxdn.render.adaptive import render_sampled
-from jaxdn.weights import save_weights
+from jaxdn.zoo.weights import save_weights
 
 VECTORISED = [variant for variant in fast_variants() if not variant.startswith("scalar")]
 pytestmark = pytest.mark.skipif(not VECTORISED, reason="scalar variants render whole images only")
@@ -26,14 +27,14 @@ SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
 
 
 def jaxdn(*arguments: Any) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "jaxdn.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "jaxdn.commands.main", *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
 
 
 def told(capsys: pytest.CaptureFixture[str], *arguments: Any) -> str:
     """What is told about wrong arguments, in this process: another one needs seconds to begin."""
     with pytest.raises(SystemExit) as ended:
-        cli.main([*map(str, arguments)])
+        main.main([*map(str, arguments)])
     shown = capsys.readouterr().err
     assert ended.value.code == 2, shown
     assert "Traceback" not in shown

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jaxdn import microfacets
+from jaxdn.materials import microfacets
 
 ETA, K = 0.2, 3.9
 

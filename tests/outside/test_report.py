@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxdn.report import ClipResult, Results, Scores, TrainingCurve, mean_scores, save_png, write_report
-from jaxdn.report import film as films
-from jaxdn.report import images as pictures
-from jaxdn.report import page as page_module
-from jaxdn.report.summary import headline, sentences, show, text_table
+from jaxdn.evaluation.report import ClipResult, Results, Scores, TrainingCurve, mean_scores, save_png, write_report
+from jaxdn.evaluation.report import film as films
+from jaxdn.evaluation.report import images as pictures
+from jaxdn.evaluation.report import page as page_module
+from jaxdn.evaluation.report.summary import headline, sentences, show, text_table
 
 METHODS = ["noisy", "svgf", "ntd A", "ntd B", "ntd C"]
 QUALITY = {"noisy": 0.22, "svgf": 0.055, "ntd A": 0.034, "ntd B": 0.03, "ntd C": 0.026}

@@ -7,9 +7,9 @@ import pytest
 
 from experiments.papers.results import VIEWS, table
 from jaxdn import clips
-from jaxdn.candidates import candidate
-from jaxdn.commands.compare import compare
-from jaxdn.frame import Frame
+from jaxdn.core.frame import Frame
+from jaxdn.evaluation.compare import compare
+from jaxdn.zoo.ready import candidate
 
 SIDE = 8
 

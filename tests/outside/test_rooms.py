@@ -6,11 +6,11 @@ import json
 import numpy as np
 import pytest
 
-from jaxdn.clips.folder import is_clip, read_record
-from jaxdn.render.animation import check_animation
-from jaxdn.render.opening import scene_from_record
-from jaxdn.render.scene_file import SceneFile
-from jaxdn.render.variant import choose_variant
+from jaxdn.data.clip.folder import is_clip, read_record
+from jaxdn.render.scenes.animation import check_animation
+from jaxdn.render.scenes.opening import scene_from_record
+from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.render.tracing.variant import choose_variant
 
 mi = pytest.importorskip("mitsuba")
 
@@ -75,13 +75,13 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def tours(folder):
-    from jaxdn.render.rooms import tour
+    from jaxdn.render.tours.rooms import tour
 
     return [tour(folder / "scene.xml", seed, FRAMES) for seed in SEEDS]
 
 
 def test_a_seed_always_gives_the_same_tour_and_another_seed_another(tours, folder):
-    from jaxdn.render.rooms import tour
+    from jaxdn.render.tours.rooms import tour
 
     again = tour(folder / "scene.xml", 1, FRAMES)
     assert again.record == tours[1].record
@@ -114,7 +114,7 @@ def test_cameras_move_within_bounds(tours):
 
 
 def test_things_thrown_in_are_seen_and_those_of_the_room_are_not_its_lights(tours):
-    from jaxdn.render.gbuffer import gbuffer
+    from jaxdn.render.buffers.gbuffer import gbuffer
 
     for scene in tours:
         inserted = {shape["id"] for shape in scene.record["animation"]["inserted"]}
@@ -136,7 +136,7 @@ def test_the_record_rebuilds_the_scene_bit_for_bit(tours):
 
 
 def test_changed_materials_and_tinted_lights(folder):
-    from jaxdn.render.repaint import named_materials
+    from jaxdn.render.scenes.repaint import named_materials
 
     def colors(animation):
         scene = SceneFile.from_record({"file": str(folder / "scene.xml"), "animation": animation})
@@ -192,7 +192,7 @@ def test_a_wrong_scale_of_a_light_is_refused(scale):
 
 
 def test_motion_to_and_fro_has_its_speed_and_passes_its_place():
-    from jaxdn.render.tour_things import _bounce
+    from jaxdn.render.tours.tour_things import _bounce
 
     times, places = np.array(_bounce(-1.0, 2.0, 0.7, 5.0, 20)).T
     assert np.interp(5.0, times, places) == pytest.approx(0)
@@ -203,8 +203,8 @@ def test_motion_to_and_fro_has_its_speed_and_passes_its_place():
 
 
 def test_the_command_renders_tours_and_does_not_search_again(tours, folder, tmp_path, monkeypatch):
-    from jaxdn.cli import main
-    from jaxdn.render import rooms
+    from jaxdn.commands.main import main
+    from jaxdn.render.tours import rooms
 
     # Searching has tests above; what counts here is that every seed has its own tour.
     monkeypatch.setattr(rooms, "tour", lambda path, seed, frames: tours[seed])
@@ -243,7 +243,7 @@ def test_the_command_renders_tours_and_does_not_search_again(tours, folder, tmp_
     ],
 )
 def test_the_command_refuses_what_it_cannot_do(folder, tmp_path, capsys, words, message):
-    from jaxdn.cli import main
+    from jaxdn.commands.main import main
 
     words = [word.format(scene=folder / "scene.xml") for word in words]
     with pytest.raises(SystemExit) as ended:
@@ -255,7 +255,7 @@ def test_the_command_refuses_what_it_cannot_do(folder, tmp_path, capsys, words, 
 
 
 def test_a_scene_without_free_space_or_with_fog_is_refused(folder, tmp_path):
-    from jaxdn.render.rooms import tour
+    from jaxdn.render.tours.rooms import tour
 
     (tmp_path / "wood.png").write_bytes((folder / "wood.png").read_bytes())
     path = tmp_path / "scene.xml"

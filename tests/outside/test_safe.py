@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from jaxdn import clips, color
-from jaxdn.candidates import candidate
-from jaxdn.clips.folder import open_frames
-from jaxdn.commands.denoise import Settings, denoise_files
+from jaxdn.data.clip.folder import open_frames
 from jaxdn.metrics import psnr
 from jaxdn.render import ClipJob, render_clips
+from jaxdn.sequence.run import Settings, denoise_files
+from jaxdn.zoo.ready import candidate
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from jaxdn.render.scene_file import SceneFile
-from jaxdn.render.variant import use_variant
+from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.render.tracing.variant import use_variant
 from tests.outside.render_scenes import fast_variants
 
 mi = pytest.importorskip("mitsuba")
@@ -214,7 +214,7 @@ def test_a_crop_and_hidden_lights_are_not_ignored_in_silence(folder):
 
 
 def test_a_scene_that_begins_in_the_dark_keeps_its_light(folder):
-    from jaxdn.render.depth import measure_depth
+    from jaxdn.render.tracing.depth import measure_depth
 
     # All light of the later frames is indirect: the lamp stands under a lid and shines on the wall.
     path = write(folder, BULB.format(emitter=GLOW) + box("lid", 0))
@@ -260,7 +260,7 @@ def test_glass_that_absorbs_has_the_light_of_mitsubas_integrator_for_media(varia
 
 
 def test_fog_is_refused_by_the_name_of_what_bounds_it(folder):
-    from jaxdn.render.gbuffer import check_scene
+    from jaxdn.render.buffers.gbuffer import check_scene
 
     fog = GLASS.format(x=0, bsdf="dielectric").replace('name="albedo" value="0"', 'name="albedo" value="0.5"')
     scene = SceneFile(write(folder, LAMP.format(x=0, power=20) + fog))

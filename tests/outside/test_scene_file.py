@@ -7,9 +7,9 @@ import sys
 import numpy as np
 import pytest
 
-from jaxdn.render.animation import RigidKeys, rotation_matrix, slerp
-from jaxdn.render.scene import AnimatedScene
-from jaxdn.render.scene_file import SceneFile
+from jaxdn.render.scenes.animation import RigidKeys, rotation_matrix, slerp
+from jaxdn.render.scenes.scene import AnimatedScene
+from jaxdn.render.scenes.scene_file import SceneFile
 
 mi = pytest.importorskip("mitsuba")
 
@@ -281,6 +281,6 @@ def test_a_scene_opens_before_a_variant_was_chosen(tmp_path):
         '<scene version="3.0.0"><sensor type="perspective"><float name="fov" value="40"/></sensor>'
         '<shape type="sphere" id="ball"/></scene>'
     )
-    code = f"from jaxdn.render.scene_file import SceneFile; print(SceneFile({str(path)!r}).frames)"
+    code = f"from jaxdn.render.scenes.scene_file import SceneFile; print(SceneFile({str(path)!r}).frames)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "1", done.stderr

@@ -10,17 +10,17 @@ from render_scenes import HEIGHT, SQUARE_Z, WIDTH, Stage, grey, shift, turn
 
 import jaxdn
 from jaxdn import Clip, effects
-from jaxdn.candidates import candidate
 from jaxdn.clips import ClipError
-from jaxdn.commands.denoise_scene import Settings, denoise_scene
-from jaxdn.commands.render import clips_of
 from jaxdn.effects import plan
 from jaxdn.planning.catalogue import OF_FIRST_HITS
 from jaxdn.render.clip import render_clip
 from jaxdn.render.farm import render_clips
 from jaxdn.render.frame import render_frame
-from jaxdn.render.scene_file import SceneFile
-from jaxdn.render.variant import choose_variant
+from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.render.tracing.variant import choose_variant
+from jaxdn.sequence.render_and_denoise import Settings, denoise_scene
+from jaxdn.sequence.render_jobs import clips_of
+from jaxdn.zoo.ready import candidate
 
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
 FAST = choose_variant().variant

@@ -9,11 +9,11 @@ from vector_scenes import FAST, HEIGHT, WIDTH, Places, floor, look, rendered
 
 import jaxdn
 from jaxdn import effects
-from jaxdn.frame import GUIDES, OF_SAMPLES, present
+from jaxdn.core.frame import GUIDES, OF_SAMPLES, present
 from jaxdn.planning.catalogue import OF_SHADOWS
+from jaxdn.render.buffers.geometry import project
+from jaxdn.render.buffers.shadow_vectors import meets_plane
 from jaxdn.render.frame import render_frame
-from jaxdn.render.geometry import project
-from jaxdn.render.shadow_vectors import meets_plane
 
 needs_fast = pytest.mark.skipif(FAST == "scalar_rgb", reason="only vectorised variants tell light apart")
 

@@ -7,15 +7,15 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from jaxdn import cli
 from jaxdn.clips import MOTION_CONVENTIONS, ClipError, read_clip, write_clip
-from jaxdn.clips.exr import read_exr, read_names
-from jaxdn.clips.layers import LAYERS
-from jaxdn.clips.sources import sources_of
+from jaxdn.commands import main
 from jaxdn.commands.doctor import doctor
 from jaxdn.commands.sources import CONSEQUENCES, missing
-from jaxdn.extras import install
-from jaxdn.methods.table import methods
+from jaxdn.data.exr.exr import read_exr, read_names
+from jaxdn.data.foreign.layers import LAYERS
+from jaxdn.data.foreign.sources import sources_of
+from jaxdn.methods.registry import methods
+from jaxdn.runtime.optional import install
 from tests.learning.test_training import make_clip
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -87,7 +87,7 @@ def test_only_what_can_be_named_is_listed_as_a_layer(tmp_path):
 @pytest.mark.parametrize("command", [["inspect", "nowhere"], ["denoise", "nowhere", "-o", "out"]])
 def test_an_unknown_convention_is_refused_before_anything_is_read(command, capsys):
     with pytest.raises(SystemExit) as ended:
-        cli.main([*command, "--motion-convention", "sideways"])
+        main.main([*command, "--motion-convention", "sideways"])
     assert ended.value.code == 2
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "jaxdn: --motion-convention: expected one of the names below, got 'sideways'."
@@ -95,7 +95,7 @@ def test_an_unknown_convention_is_refused_before_anything_is_read(command, capsy
 
 
 def run(capsys, *arguments):
-    cli.main([str(argument) for argument in arguments])
+    main.main([str(argument) for argument in arguments])
     return " ".join(capsys.readouterr().out.split())
 
 
@@ -145,7 +145,7 @@ def test_inspect_prints_the_same_and_gives_it_as_json(tmp_path, capsys):
     sources = json.loads(run(capsys, "inspect", path, "--json", "--channels", "albedo=none"))["sources"]
     assert [source["buffer"] for source in sources] == ["radiance", "motion"]
     with pytest.raises(SystemExit) as ended:
-        cli.main(["inspect", "edge", "--layer", "Hall"])
+        main.main(["inspect", "edge", "--layer", "Hall"])
     assert ended.value.code == 2
     assert "expected none of --channels, --layer, --motion-convention" in capsys.readouterr().err
 
@@ -165,7 +165,7 @@ def test_every_buffer_that_other_renderers_have_has_a_consequence():
 
 
 def test_the_version_and_what_is_installed(capsys, monkeypatch):
-    assert run(capsys, "--version") == f"jaxdn {cli.jaxdn.__version__}"
+    assert run(capsys, "--version") == f"jaxdn {main.jaxdn.__version__}"
     text = run(capsys, "doctor")
     for word in ("jax ", " on ", "engine for inference", "engine for training", "optax", "mitsuba", "Python"):
         assert word in text

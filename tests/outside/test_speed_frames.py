@@ -5,15 +5,15 @@ import json
 import pytest
 
 from experiments.speed.frames import OIDN, Settings, builds, main, parsed
-from jaxdn.compiled import strips
 from jaxdn.networks.engines import ENGINES
+from jaxdn.ops.dispatch import numba_call
 
 
 def test_every_engine_for_inference_that_runs_here_is_timed():
     engines = [name for name in ("onednn-bfloat16", "onednn-float32", "onnxruntime") if ENGINES[name].available()]
     found = set(builds(["svgf", "steady-fast"], 32, 48)) - {OIDN}
     methods = ("svgf", "steady-fast")
-    without = [f"{name}, xla without compiled loops" for name in methods if strips.available()]
+    without = [f"{name}, xla without compiled loops" for name in methods if numba_call.available()]
     assert found == {*(f"{name}, xla" for name in methods), *without, *(f"steady-fast, {name}" for name in engines)}
 
 

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from jaxdn.candidates import Candidate
-from jaxdn.clips.folder import begin_record, finish_record, frame_path
-from jaxdn.clips.frames import write_frame
-from jaxdn.clips.noise_floor import read_halves
-from jaxdn.commands.compare import compare
-from jaxdn.frame import Frame
-from jaxdn.report import sentences, text_table, write_report
-from jaxdn.report.summary import headline
+from jaxdn.core.frame import Frame
+from jaxdn.data.clip.folder import begin_record, finish_record, frame_path
+from jaxdn.data.clip.frames import write_frame
+from jaxdn.data.clip.noise_floor import read_halves
+from jaxdn.evaluation.compare import compare
+from jaxdn.evaluation.report import sentences, text_table, write_report
+from jaxdn.evaluation.report.summary import headline
+from jaxdn.zoo.ready import Candidate
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

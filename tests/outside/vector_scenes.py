@@ -8,10 +8,10 @@ from render_scenes import grey
 
 import jaxdn
 from jaxdn import effects
-from jaxdn.frame import GUIDES
+from jaxdn.core.frame import GUIDES
 from jaxdn.render.frame import Rendered, render_frame
-from jaxdn.render.scene import Camera
-from jaxdn.render.variant import choose_variant
+from jaxdn.render.scenes.scene import Camera
+from jaxdn.render.tracing.variant import choose_variant
 
 WIDTH, HEIGHT = 48, 32
 FAST = choose_variant().variant

@@ -21,10 +21,10 @@ from experiments.papers.learned.maps import asks, save_maps
 from experiments.papers.learned.scores import Table, claims_table, read
 from experiments.papers.learned.stages import BUDGET, STAGES, Settings, render_all, trained
 from experiments.papers.preintegration import save_pictures
-from jaxdn.candidates import candidate
-from jaxdn.commands.compare import compare
 from jaxdn.commands.errors import plain_errors
-from jaxdn.report import Results, write_report
+from jaxdn.evaluation.compare import compare
+from jaxdn.evaluation.report import Results, write_report
+from jaxdn.zoo.ready import candidate
 
 TABLES = {
     file.__name__.rpartition(".")[2]: file.TABLE

@@ -13,11 +13,11 @@ from scipy.stats import rankdata
 from experiments.papers.learned.stages import BUDGET
 from experiments.papers.preintegration import file_name
 from jaxdn import color
-from jaxdn.candidates import Candidate
 from jaxdn.clips import read_clip
-from jaxdn.frame import Clip, frame_at, only
-from jaxdn.report.images import save_png
-from jaxdn.rollout import sampled
+from jaxdn.core.frame import Clip, frame_at, only
+from jaxdn.denoiser.rollout import sampled
+from jaxdn.evaluation.report.images import save_png
+from jaxdn.zoo.ready import Candidate
 
 
 def asks(one: Candidate) -> bool:

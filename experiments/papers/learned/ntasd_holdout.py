@@ -4,7 +4,7 @@ import numpy as np
 
 from experiments.papers.learned.scores import Claim, Table
 from experiments.papers.learned.stages import HELD_OUT
-from jaxdn.report import Results
+from jaxdn.evaluation.report import Results
 
 SEEN = "ntasd, uniform"
 ROWS = (SEEN, *(f"{SEEN}, without {family}" for family in HELD_OUT))

@@ -4,8 +4,8 @@ The numbers of the paper are relative MSE at four samples of SunTemple, Classroo
 """
 
 from experiments.papers.learned.scores import Claim, Table, error_ratio, ordinary, over_frames, psnr_gain
-from jaxdn.report import Results
-from jaxdn.report.results import mean_scores
+from jaxdn.evaluation.report import Results
+from jaxdn.evaluation.report.results import mean_scores
 
 ROWS = ("noisy", "svgf", "ntasd", "ntasd, uniform", "ntasd, direct", "dasr", "dasr, uniform", "rae")
 

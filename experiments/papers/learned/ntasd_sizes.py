@@ -3,8 +3,8 @@
 from itertools import pairwise
 
 from experiments.papers.learned.scores import Claim, Table, ordinary, psnr_gain
-from jaxdn.report import Results
-from jaxdn.report.results import mean_scores
+from jaxdn.evaluation.report import Results
+from jaxdn.evaluation.report.results import mean_scores
 
 SMALL, LARGE = "ntasd, uniform", "ntasd, uniform, large"
 LADDER = ("ntasd, direct", "ntasd, one scale", "ntasd, three scales", "ntasd")

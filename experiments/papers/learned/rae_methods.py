@@ -3,8 +3,8 @@ accumulation.
 """
 
 from experiments.papers.learned.scores import Claim, Table, ordinary, over_frames, psnr_gain
-from jaxdn.report import Results
-from jaxdn.report.results import mean_scores
+from jaxdn.evaluation.report import Results
+from jaxdn.evaluation.report.results import mean_scores
 
 ROWS = ("svgf", "asvgf", "rae", "arae")
 

@@ -15,12 +15,12 @@ import numpy as np
 from experiments.papers.learned.maps import windowed
 from experiments.papers.learned.scores import read
 from experiments.papers.learned.stages import BUDGET, LAYERS
-from jaxdn.candidates import Candidate
-from jaxdn.commands.compare import Footage
-from jaxdn.frame import Clip, Frame
+from jaxdn.core.frame import Clip, Frame
+from jaxdn.denoiser.rollout import unroll
+from jaxdn.evaluation.compare import Footage
 from jaxdn.metrics import unbiased_relative_mse
-from jaxdn.rollout import unroll
-from jaxdn.sampling import from_layers, sample_map
+from jaxdn.ops.sampling import from_layers, sample_map
+from jaxdn.zoo.ready import Candidate
 
 UNIFORM = (BUDGET, 2 * BUDGET, 4 * BUDGET)
 DENOISERS = ("svgf", "steady-balanced", "ntasd, uniform")

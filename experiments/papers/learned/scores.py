@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.papers import results
-from jaxdn.candidates import candidate
-from jaxdn.commands.compare import Footage, read_footage
-from jaxdn.frame import Frame
-from jaxdn.report import Results
-from jaxdn.report.results import mean_scores
-from jaxdn.rollout import unroll
+from jaxdn.core.frame import Frame
+from jaxdn.denoiser.rollout import unroll
+from jaxdn.evaluation.compare import Footage, read_footage
+from jaxdn.evaluation.report import Results
+from jaxdn.evaluation.report.results import mean_scores
+from jaxdn.zoo.ready import candidate
 
 
 class Claim(NamedTuple):

@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 
 from experiments.papers import rooms
 from experiments.papers.preintegration import file_name
-from jaxdn.candidates import Candidate, candidate
 from jaxdn.clips import find_clips
-from jaxdn.commands.render import render
-from jaxdn.commands.train import train
-from jaxdn.methods.table import method_named
+from jaxdn.methods.registry import method_named
+from jaxdn.sequence.render_jobs import render
+from jaxdn.training.train import train
+from jaxdn.zoo.ready import Candidate, candidate
 
 FAMILIES = ("parlour", "fruit", "mobile", "pinkroom", "robot")
 HELD_OUT = ("parlour", "mobile", "pinkroom", "robot")

@@ -4,7 +4,7 @@ Their PSNR has a peak of 255 on images in [0, 1]; the gaps below do not depend o
 """
 
 from experiments.papers.learned.scores import Claim, Table, ordinary, psnr_gain
-from jaxdn.report import Results
+from jaxdn.evaluation.report import Results
 
 ROWS = ("svgf", "ntasd, uniform", "trmv", "ntd")
 GAPS = {"svgf": 10.48, "ntasd, uniform": 2.42, "trmv": 1.76}

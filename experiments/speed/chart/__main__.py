@@ -38,13 +38,13 @@ from experiments.speed.chart.way import DENOISED_SPP, Way
 from experiments.speed.chart.ways import chosen, left_out, ways
 from experiments.speed.timing import measure, peak_mib
 from experiments.speed.works import scene
-from jaxdn.commands.compare import describe_machine
 from jaxdn.commands.errors import plain_errors
-from jaxdn.frame import Frame, frame_at, written_out
-from jaxdn.heap import keep_memory
+from jaxdn.core.frame import Frame, frame_at, written_out
+from jaxdn.evaluation.compare import describe_machine
+from jaxdn.evaluation.report import save_png
 from jaxdn.render import scene_from_record, use_variant
-from jaxdn.report import save_png
-from jaxdn.weights import SHIPPED
+from jaxdn.runtime.malloc import keep_memory
+from jaxdn.zoo.weights import SHIPPED
 
 
 @dataclass

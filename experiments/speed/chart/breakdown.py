@@ -13,21 +13,21 @@ import jax.numpy as jnp
 from experiments.speed.timing import Call, Timing, measure
 from experiments.speed.works import steps
 from jaxdn import brdf, color
-from jaxdn.candidates import Candidate
+from jaxdn.core.frame import FAR, Frame
+from jaxdn.core.options import make
 from jaxdn.denoiser import Denoiser, Params
-from jaxdn.filters.guides import depth_feature
-from jaxdn.frame import FAR, Frame
+from jaxdn.denoiser.sanitize import repair, repair_image
+from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods.ntd import guided_features
 from jaxdn.methods.reconstruction import TAPS
-from jaxdn.motion import on_screen
 from jaxdn.networks import MULTIPLE, Widths
 from jaxdn.networks.engines import ENGINES
 from jaxdn.networks.unet import unet
-from jaxdn.ops.softmax_filter import softmax_filter
+from jaxdn.ops.kernel_prediction.softmax import softmax_filter
+from jaxdn.ops.motion import on_screen
+from jaxdn.ops.scales import compose_scales, downsample, fill
 from jaxdn.ops.warp import warp
-from jaxdn.options import make
-from jaxdn.repair import repair, repair_image
-from jaxdn.scales import compose_scales, downsample, fill
+from jaxdn.zoo.ready import Candidate
 
 GROUPS = (3, 3, 3, 1, 3, 1)
 HEADS = (2 * TAPS + 1, TAPS + 1, TAPS + 1)

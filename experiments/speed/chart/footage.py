@@ -8,8 +8,8 @@ import numpy as np
 
 from jaxdn import effects
 from jaxdn.clips import ClipError, read_clip, read_record
-from jaxdn.clips.noise_floor import read_halves, read_noise_floor
-from jaxdn.frame import Frame
+from jaxdn.core.frame import Frame
+from jaxdn.data.clip.noise_floor import read_halves, read_noise_floor
 from jaxdn.render import ClipJob, render_clips
 
 

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 from experiments.speed.chart.way import Way, way
 from experiments.speed.works import steps
-from jaxdn import candidates
 from jaxdn.networks import Widths
+from jaxdn.zoo import ready
 
 UNTRAINED: dict[str, Widths] = {
     "ntd medium": ((24, 24), (48, 48), (48, 48), (64, 64), (80, 80)),
@@ -17,6 +17,6 @@ UNTRAINED: dict[str, Widths] = {
 def untrained() -> Iterator[Way]:
     """Networks of other widths with random weights: only time."""
     for name, widths in UNTRAINED.items():
-        made = way(candidates.untrained(steps.METHOD, size=widths), scored=False)
+        made = way(ready.untrained(steps.METHOD, size=widths), scored=False)
         family = "untrained widths"
         yield made._replace(name=name, family=family, variant="untrained", group=family)

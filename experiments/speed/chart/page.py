@@ -16,9 +16,9 @@ from experiments.speed.chart.breakdown import WHOLE
 from experiments.speed.chart.scores import MEASURES
 from experiments.speed.chart.summary import RENDERER, Equal, Point, headline, in_words, pareto, render_cost
 from experiments.speed.chart.way import ALL
-from jaxdn.files import write_whole
-from jaxdn.report import images
-from jaxdn.report.results import json_ready
+from jaxdn.evaluation.report import images
+from jaxdn.evaluation.report.results import json_ready
+from jaxdn.runtime.atomic_files import write_whole
 
 Pictures = dict[str, dict[str, np.ndarray]]
 """Clip -> point, or "reference" -> [H, W, 3] in 0..1."""
@@ -75,7 +75,9 @@ def page(
       pictures: clip -> point -> image.
     """
     here = files("experiments.speed.chart")
-    style = files("jaxdn.report").joinpath("page.css").read_text("utf-8") + here.joinpath("page.css").read_text("utf-8")
+    style = files("jaxdn.evaluation.report").joinpath("page.css").read_text("utf-8") + here.joinpath(
+        "page.css"
+    ).read_text("utf-8")
     errors = {
         clip: {key: images.error_map(image, shown["reference"]) for key, image in shown.items() if key != "reference"}
         for clip, shown in pictures.items()

@@ -8,7 +8,7 @@ import numpy as np
 from experiments.speed.chart.energy import Meter
 from experiments.speed.timing import measure
 from jaxdn import effects
-from jaxdn.frame import OF_SAMPLES
+from jaxdn.core.frame import OF_SAMPLES
 from jaxdn.render import AnimatedScene, render_frame
 
 SAMPLES = (1, 2, 4)

@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.speed.chart.footage import SCORED, Footage
 from jaxdn import color, metrics
-from jaxdn.commands.compare import unbiased_scores
+from jaxdn.evaluation.compare import unbiased_scores
 
 
 class Measure(NamedTuple):

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from jaxdn.clips.files import read_json
-from jaxdn.files import write_json
-from jaxdn.report.results import json_ready
+from jaxdn.data.clip.files import read_json
+from jaxdn.evaluation.report.results import json_ready
+from jaxdn.runtime.atomic_files import write_json
 
 PARTS = ("clips", "errors", "times", "render", "breakdown", "left_out")
 """errors: "method @ spp" -> clip -> measure -> number. times: method -> size -> what was measured. render: size ->

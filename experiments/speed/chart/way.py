@@ -10,9 +10,9 @@ import numpy as np
 from experiments.speed.chart.render_cost import named
 from experiments.speed.timing import Call
 from experiments.speed.works import steps
-from jaxdn.candidates import Candidate
-from jaxdn.frame import BUFFERS, Frame, frame_at, only, written_out
-from jaxdn.rollout import stream
+from jaxdn.core.frame import BUFFERS, Frame, frame_at, only, written_out
+from jaxdn.denoiser.rollout import stream
+from jaxdn.zoo.ready import Candidate
 
 DENOISED_SPP = (1, 2, 4, 8)
 """Samples per pixel of the denoised images."""

@@ -11,11 +11,11 @@ from experiments.speed.chart.render_cost import named
 from experiments.speed.chart.way import ALL, PLAIN, Way, all_written_out, standing_still, way
 from experiments.speed.timing import Call
 from experiments.speed.works import steps
-from jaxdn import candidates
-from jaxdn.candidates import Candidate
-from jaxdn.frame import Frame, written_out
-from jaxdn.methods.table import Method, methods
+from jaxdn.core.frame import Frame, written_out
+from jaxdn.methods.registry import Method, methods
 from jaxdn.networks.engines import ENGINES
+from jaxdn.zoo import ready
+from jaxdn.zoo.ready import Candidate
 
 
 def chosen(*, quick: bool = False) -> list[Candidate]:
@@ -23,7 +23,7 @@ def chosen(*, quick: bool = False) -> list[Candidate]:
 
     Those that request samples from the renderer are left out, see :func:`left_out`.
     """
-    found = [each for each in candidates.everything() if not _requests_samples(each)]
+    found = [each for each in ready.everything() if not _requests_samples(each)]
     if not quick:
         return found
     fastest = {_row(each).name: each.label for each in sorted(found, key=_place)}
@@ -36,7 +36,7 @@ def registered(denoisers: Sequence[Candidate]) -> Iterator[Way]:
     Untrained methods are timed with initial weights and not scored.
     """
     for each in denoisers:
-        trained = each.label in candidates.all_names()
+        trained = each.label in ready.all_names()
         yield way(each, scored=trained)
         for name, options in _alternatives(_row(each)).items():
             yield way(_remade(each, options), name, scored=trained)
@@ -89,7 +89,7 @@ def open_image_denoise() -> Iterator[Way]:
     from experiments.speed.peers.oidn import oidn
 
     # Interleaved with our weights, so that both are measured under the same machine conditions.
-    group = next(iter(candidates.shipped_names()), "Open Image Denoise")
+    group = next(iter(ready.shipped_names()), "Open Image Denoise")
     guides = ("albedo", "normal")
     for quality in ("high", "balanced", "fast"):
 
@@ -121,7 +121,7 @@ def left_out() -> list[str]:
     for name, engine in ENGINES.items():
         if name in wanted and engine.purpose == "inference" and not engine.available():
             sentences.append(f"{name} is not installed or does not run on jax's device: its rows are left out.")
-    for each in candidates.everything():
+    for each in ready.everything():
         if _requests_samples(each):
             sentences.append(
                 f"{each.label} requests samples from the renderer per pixel, but the compared images have the same "

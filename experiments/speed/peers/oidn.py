@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pyoidn
 
+from jaxdn.core.frame import Frame, written_out
 from jaxdn.denoiser import Denoiser, Params, State
-from jaxdn.frame import Frame, written_out
 
 QUALITIES = {
     "high": pyoidn.OIDN_QUALITY_HIGH,

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from jaxdn.brdf import FLOOR
-from jaxdn.frame import FAR, RADIANCE_MAX, Frame
+from jaxdn.core.frame import FAR, RADIANCE_MAX, Frame
 from jaxdn.methods.reconstruction import TAPS
 from jaxdn.networks import LEVELS, Widths
 from jaxdn.networks.description import NEGATIVE_SLOPE

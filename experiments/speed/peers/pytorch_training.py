@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from experiments.speed.peers.pytorch import BUFFERS, NTD, apply_kernels_unfold, compress, start
-from jaxdn.frame import Clip
+from jaxdn.core.frame import Clip
 from jaxdn.networks import Widths
-from jaxdn.recipe import Recipe
+from jaxdn.recipes.recipe import Recipe
 
 WEIGHTS = (1.0, 0.8, 0.6)
 """Weights of the newest three disocclusion masks."""
@@ -33,7 +33,7 @@ def batch_tensors(batch: Clip) -> tuple[dict[str, Tensor], Tensor]:
 def clip_loss(
     step: NTD, frames: dict[str, Tensor], reference: Tensor, *, occlusion: float = 1.0
 ) -> tuple[Tensor, Tensor]:
-    """Mean loss of a batch of clips [T, B, C, H, W] (``jaxdn.objectives``), and the PSNR of their last frames."""
+    """Mean loss of a batch of clips [T, B, C, H, W] (``recipes.objectives``), and the PSNR of their last frames."""
     state, images = start(frames["radiance"][0]), []
     for index in range(len(reference)):
         state, image = step(state, {name: buffer[index] for name, buffer in frames.items()})

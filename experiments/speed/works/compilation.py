@@ -59,7 +59,7 @@ def _xla(program: str) -> float:
     import jax
 
     from experiments.speed.works import steps, train_steps
-    from jaxdn.learning.step import initial_state, make_train_step
+    from jaxdn.training.step import initial_state, make_train_step
 
     kind, size, detail, *remat = program.split("-")
     denoiser = steps.METHOD.factory(size=size, **steps.PLAIN)

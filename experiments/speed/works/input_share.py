@@ -16,8 +16,8 @@ import numpy as np
 from experiments.speed.timing import Timing
 from experiments.speed.works import scene, steps
 from jaxdn.clips import training_batches, write_clip
-from jaxdn.learning.step import initial_state, make_train_step
-from jaxdn.recipe import Recipe
+from jaxdn.recipes.recipe import Recipe
+from jaxdn.training.step import initial_state, make_train_step
 
 WINDOWS, STEPS = 3, 4
 """Each figure is measured this many times, over this many updates."""

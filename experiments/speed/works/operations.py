@@ -15,10 +15,10 @@ import numpy as np
 from experiments.speed import peers, roofline
 from experiments.speed.timing import Call
 from experiments.speed.works import Work
-from jaxdn.ops import onednn_library
-from jaxdn.ops.convolution import convolve
-from jaxdn.ops.registry import implementations, resolve
-from jaxdn.ops.softmax_filter import softmax_filter
+from jaxdn.ops.convolution.api import convolve
+from jaxdn.ops.dispatch.registry import implementations, resolve
+from jaxdn.ops.kernel_prediction.softmax import softmax_filter
+from jaxdn.ops.onednn import library
 from jaxdn.ops.warp import warp
 
 CONVOLUTIONS = ((1, 720, 1280, 32, 32), (1, 360, 640, 128, 64), (4, 128, 128, 96, 64), (4, 64, 64, 64, 64))
@@ -31,7 +31,7 @@ Arrays = Callable[[], list[np.ndarray]]
 
 def forms(operation: str) -> dict[str, str | None]:
     """Name in the results -> name in the registry; the default is ``xla``."""
-    engines = ["onednn"] if operation == "convolution" and onednn_library.available() else []
+    engines = ["onednn"] if operation == "convolution" and library.available() else []
     ways = [name for name in implementations(operation) if name not in ("reference", "onednn")]
     others = [name for name in ways if resolve(operation, name) is not resolve(operation, None)]
     return {"xla": None, **{f"xla-{name}": name for name in others}, **{name: name for name in engines}}

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxdn.frame import Clip, Frame
+from jaxdn.core.frame import Clip, Frame
 
 
 def clip(frames: int, height: int, width: int, *, seed: int = 0) -> Clip:

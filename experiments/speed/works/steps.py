@@ -11,9 +11,9 @@ import numpy as np
 from experiments.speed import peers, roofline
 from experiments.speed.timing import Call
 from experiments.speed.works import Work, scene
+from jaxdn.core.frame import Frame, frame_at
 from jaxdn.denoiser import Denoiser
-from jaxdn.frame import Frame, frame_at
-from jaxdn.methods.table import method_named
+from jaxdn.methods.registry import method_named
 from jaxdn.networks import LARGE, SMALL
 from jaxdn.networks.engines import ENGINES, Purpose
 
@@ -34,8 +34,8 @@ def implementations(purpose: Purpose) -> dict[str, dict[str, Any]]:
 def program(denoiser: Denoiser) -> Callable[..., Any]:
     """The jitted step ``(params, state, frame) -> (state, image)`` whose state's memory is reused.
 
-    The step itself and not :func:`jaxdn.rollout.stream`, as the timed programs are compiled by other processes, which
-    have to lower the same program (:mod:`experiments.speed.works.compilation`).
+    The step itself and not :func:`jaxdn.denoiser.rollout.stream`, as the timed programs are compiled by other
+    processes, which have to lower the same program (:mod:`experiments.speed.works.compilation`).
     """
     return jax.jit(denoiser.step, donate_argnums=1)
 

@@ -12,10 +12,10 @@ from experiments.speed import peers, roofline
 from experiments.speed.timing import Call
 from experiments.speed.works import Work, scene
 from experiments.speed.works.steps import METHOD, PLAIN, WIDTHS, implementations
-from jaxdn.frame import Clip
-from jaxdn.learning.step import initial_state, make_train_step
+from jaxdn.core.frame import Clip
 from jaxdn.networks.engines import ENGINES
-from jaxdn.recipe import Recipe
+from jaxdn.recipes.recipe import Recipe
+from jaxdn.training.step import initial_state, make_train_step
 
 RECIPE = METHOD.recipe_named(None)._replace(decay=False)
 CASES = (("large", 64), ("large", 128))

@@ -2,7 +2,7 @@
 
 Each flake reflects the lamp in one direction only, covers about a pixel or less, and is lit for a frame or two as its
 surface moves. To a denoiser that is noise, but the reference has it too: what is real and what is a firefly cannot be
-told from one pixel of one frame. The flakes are those of :mod:`jaxdn.glints`, rendered as a normal map.
+told from one pixel of one frame. The flakes are those of :mod:`jaxdn.materials.glints`, rendered as a normal map.
 """
 
 from functools import partial
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn.glints import flake_normals
+from jaxdn.materials.glints import flake_normals
 from jaxdn.render.families import textures
 from jaxdn.render.families.fruit import moving_still_life
 from jaxdn.render.families.staging import Material, Stage

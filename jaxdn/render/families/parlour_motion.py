@@ -7,7 +7,7 @@ import numpy as np
 from jaxdn.render.families import finishes, furniture, shapes
 from jaxdn.render.families.rooms import Room
 from jaxdn.render.families.staging import look_at, matte, rod, scale, shift, shuttle, swing, turn
-from jaxdn.render.scene import Camera
+from jaxdn.render.scenes.scene import Camera
 
 LEAST = 4
 """Moving parts that every room has at least."""

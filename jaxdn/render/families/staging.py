@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxdn.render.families import textures
 from jaxdn.render.families.shapes import Mesh, boxes, dish, drum, holed_wall, ply_path
-from jaxdn.render.scene import Camera
+from jaxdn.render.scenes.scene import Camera
 
 Motion = Callable[[float], np.ndarray]
 """The world pose [4,4] at a frame: one fixed scale, then rotations and shifts, so that two poses differ rigidly."""

@@ -1,0 +1,1 @@
+"""Clips on disk: folders of multi-layer OpenEXR frames plus one ``clip.json``."""

@@ -1,0 +1,322 @@
+"""A clip as a folder: ``clip.json`` and ``frame_0000.exr``, ``frame_0001.exr`` ... in it.
+
+``clip.json`` is the clip's record: how it was made and what it contains. It is written last. While frames are being
+written the folder has ``clip.unfinished.json`` instead, from which an interrupted rendering is resumed; such a folder
+is not a clip yet.
+"""
+
+import itertools
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxdn.core.frame import OF_SAMPLES, Clip, Frame, frame_at, only, present, written_out
+from jaxdn.data.clip.files import ClipError, read_json
+from jaxdn.data.clip.frames import StoredFrame, doubling_layers, layers_for, read_frame, stored_layers, write_frame
+from jaxdn.data.clip.record import FORMAT, checked, held_frames, is_planned
+from jaxdn.data.exr.exr import read_exr
+from jaxdn.data.foreign.import_exr import plain_frames
+from jaxdn.filters.time_reversal import turned
+from jaxdn.runtime.atomic_files import write_json
+
+_RECORD = "clip.json"
+_UNFINISHED = "clip.unfinished.json"
+
+
+def frame_path(folder: str | Path, index: int) -> Path:
+    """The path of frame ``index`` of a clip."""
+    return Path(folder) / f"frame_{index:04d}.exr"
+
+
+def is_clip(path: str | Path) -> bool:
+    """Whether ``path`` is a folder with a finished clip in it."""
+    return (Path(path) / _RECORD).is_file()
+
+
+def begin_record(record: Mapping[str, Any], folder: str | Path) -> None:
+    """Start or extend a clip in a folder, which is created if it is missing, with the record of its future contents.
+
+    Writes ``record`` as ``clip.unfinished.json`` and removes ``clip.json``: a finished clip that gets more frames is
+    unfinished until :func:`finish_record`. Call it again when an entry changes in between. Raises ClipError if an
+    entry is missing or wrong and ValueError if one is not JSON, without changing the folder; OSError if it cannot be
+    written.
+    """
+    folder = Path(folder)
+    record = checked({"format": FORMAT, **record}, folder / _UNFINISHED)
+    folder.mkdir(parents=True, exist_ok=True)
+    # In this order there is always a record, however this is interrupted; until the second step, the finished clip's.
+    write_json(folder / _UNFINISHED, record)
+    (folder / _RECORD).unlink(missing_ok=True)
+
+
+def finish_record(record: Mapping[str, Any], folder: str | Path) -> None:
+    """Make a folder whose frames are all written a clip: writes ``clip.json``, removes ``clip.unfinished.json``.
+
+    Raises as :func:`begin_record` does.
+    """
+    folder = Path(folder)
+    write_json(folder / _RECORD, checked({"format": FORMAT, **record}, folder / _RECORD))
+    (folder / _UNFINISHED).unlink(missing_ok=True)
+
+
+def begun_record(folder: str | Path) -> dict[str, Any] | None:
+    """The record of a clip that is finished or was interrupted; None where there is none.
+
+    Raises ClipError if the record is broken or of another version.
+    """
+    for file in (Path(folder) / _RECORD, Path(folder) / _UNFINISHED):  # where both exist, the clip is finished
+        if file.is_file():
+            return checked(read_json(file), file)
+    return None
+
+
+def read_record(path: str | Path) -> dict[str, Any]:
+    """The record of the finished clip in folder ``path``.
+
+    Raises ClipError if it is missing, broken or of another version, or if rendering the clip was interrupted.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise ClipError(f"{folder}: there is no such folder.")
+    if not is_clip(folder):
+        raise _unfinished(folder)
+    return checked(read_json(folder / _RECORD), folder / _RECORD)
+
+
+def find_clips(path: str | Path) -> list[Path]:
+    """The finished clips in a folder (or the folder itself if it is one), by name.
+
+    Warns of those that are left out because their rendering was interrupted. Raises ClipError if there is no finished
+    one.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise ClipError(f"{folder}: there is no such folder.")
+    if is_clip(folder):
+        return [folder]
+    if (folder / _UNFINISHED).is_file():
+        raise _unfinished(folder)
+    inside = sorted(folder.iterdir())
+    found = [sub for sub in inside if is_clip(sub)]
+    interrupted = [sub for sub in inside if (sub / _UNFINISHED).is_file() and sub not in found]
+    if not found and interrupted:
+        raise _unfinished(interrupted[0])
+    if not found:
+        raise ClipError(f"{folder}: expected a clip (a folder with {_RECORD}) or a folder of clips, found none.")
+    for sub in interrupted:
+        warnings.warn(f"{_unfinished(sub)} It is left out.", stacklevel=2)
+    return found
+
+
+def write_clip(clip: Clip, path: str | Path, *, record: Mapping[str, Any] | None = None, spp: int = 1) -> None:
+    """Write a clip into the folder ``path``, which is created if it is missing; an existing clip is replaced.
+
+    The clip's radiance becomes its one noisy layer of ``spp`` samples a pixel. ``record`` is stored as ``clip.json``
+    with the entries that follow from the frames (format, frames, width, height, layers) filled in. Light, fractions and
+    directions keep half precision (:attr:`jaxdn.core.frame.Buffer.stored`). Raises ValueError for shapes that do not
+    fit each other or a record that is not JSON, before anything is written; OSError if a file cannot be written.
+    """
+    folder = Path(path)
+    if np.ndim(clip.frames.radiance) != 4:
+        raise ValueError(f"{folder}: expected radiance [T, H, W, 3], got shape {np.shape(clip.frames.radiance)}.")
+    clip = jax.tree.map(np.asarray, clip._replace(layers=None))
+    count, height, width = clip.frames.radiance.shape[:3]
+    lengths = {np.shape(leaf)[0] for leaf in jax.tree.leaves(clip)}
+    if lengths != {count}:
+        raise ValueError(f"{folder}: expected {count} frames in every buffer, got {sorted(lengths)}.")
+    facts = {"format": FORMAT, "frames": count, "width": width, "height": height, "layers": [spp]}
+    whole_record = {"name": folder.name, **(record or {}), **facts}
+    begin_record(whole_record, folder)
+    for index in range(count):
+        frame = frame_at(clip.frames, index)
+        reference = None if clip.reference is None else clip.reference[index]
+        write_frame(frame_path(folder, index), frame, layers={spp: frame.radiance}, reference=reference)
+    for number, stale in _numbered(folder):
+        if number >= count:
+            stale.unlink()
+    finish_record(whole_record, folder)
+
+
+def read_frames(path: str | Path, *, spp: int = 1, order: Iterable[int] | None = None) -> Iterator[StoredFrame]:
+    """The frames of a clip one by one, for clips that do not fit into memory. Raises as :func:`read_clip` does.
+
+    ``order`` are the indices of those to read; None: all.
+
+    Frames of a clip that was rendered by a plan may have different buffers (an object starts to move): absent ones are
+    ``None``. A frame that shows the same as an earlier one takes its buffers and its reference from there, except for
+    those of its own samples.
+    """
+    folder = Path(path)
+    record = read_record(folder)
+    own_samples = layers_for(spp, record["layers"], folder) == [min(record["layers"])]
+    count, size = record["frames"], (record["height"], record["width"])
+    _all_there(folder, count)
+    held = held_frames(record)
+
+    def frames() -> Iterator[StoredFrame]:
+        first: set[str] | None = None
+        source: tuple[int, StoredFrame] | None = None
+        for index in range(count) if order is None else order:
+            file = frame_path(folder, index)
+            stored = read_frame(file, spp=spp)
+            found = stored.frame.radiance.shape[:2]
+            if found != size:
+                raise ClipError(
+                    f"{file}: expected {size[1]} x {size[0]} pixels as {_RECORD} says, got {found[1]} x {found[0]}."
+                )
+            if held[index] == index:
+                source = index, stored
+            elif source is None or source[0] != held[index]:
+                source = held[index], read_frame(frame_path(folder, held[index]), spp=spp)
+            if held[index] != index:
+                stored = _from(stored, source[1])
+            if is_planned(record):
+                wanted = set(record["plan"]["frames"][index]) - (frozenset() if own_samples else OF_SAMPLES)
+                stored = _checked_buffers(stored, wanted, file)
+            names = _names(stored, planned=is_planned(record))
+            first = names if first is None else first
+            if names != first:
+                differing = ", ".join(sorted(names ^ first))
+                raise ClipError(f"{file}: expected the same channels as in the other frames, but {differing} differs.")
+            yield stored
+
+    return frames()
+
+
+def _all_there(folder: Path, count: int) -> None:
+    """Raise ClipError unless there are ``count`` frames; as fast for a record that claims any number of them."""
+    there = {index for index, _ in _numbered(folder) if index < count and frame_path(folder, index).is_file()}
+    if len(there) < count:
+        first = list(itertools.islice((index for index in range(count) if index not in there), 9))
+        shown = ", ".join(map(str, first[:8])) + (" ..." if len(first) > 8 else "")
+        raise ClipError(f"{folder}: {count - len(there)} of {count} frames are missing ({shown}); render them again.")
+
+
+def _from(stored: StoredFrame, source: StoredFrame) -> StoredFrame:
+    """The noise of one frame with everything else of another."""
+    noise = {name: getattr(stored.frame, name) for name in ("radiance", *OF_SAMPLES)}
+    frame = source.frame._replace(**noise)
+    return stored._replace(frame=frame, reference=source.reference, reference_half=source.reference_half)
+
+
+def _checked_buffers(stored: StoredFrame, wanted: set[str], file: Path) -> StoredFrame:
+    missing = wanted - set(present(stored.frame))
+    if missing:
+        raise ClipError(f"{file}: expected the buffers {', '.join(sorted(missing))}; render the frame again.")
+    return stored._replace(frame=only(stored.frame, frozenset(wanted)))
+
+
+def open_frames(
+    path: str | Path | Sequence[Path],
+    *,
+    spp: int = 1,
+    motion_convention: str | None = None,
+    channels: Mapping[str, str] | None = None,
+    layer: str | None = None,
+    part: range | None = None,
+    backwards: bool = False,
+    log: Callable[[str], None] = lambda line: None,
+) -> tuple[list[Path], Iterator[StoredFrame]]:
+    """The files of a clip, or of another renderer's sequence, and their frames, each read when it is requested.
+
+    Takes what :func:`read_clip` takes, or a list of another renderer's files, and raises as it does; ``part`` are the
+    indices to read of a clip, None: all. ``backwards`` and ``log`` as in
+    :func:`jaxdn.data.foreign.import_exr.plain_frames`. The frames of another renderer have no ``layers`` and no
+    reference.
+    """
+    if isinstance(path, str | Path):
+        if is_clip(path):
+            part = range(read_record(path)["frames"]) if part is None else part
+            # First checks that all frames of the record exist.
+            frames = read_frames(path, spp=spp, order=part[::-1] if backwards else part)
+            return [frame_path(path, index) for index in part], _turned(frames) if backwards else frames
+        refuse_unfinished(path)
+    if spp != 1:
+        where = path if isinstance(path, str | Path) else f"{path[0]} ({len(path)} file{'s' * (len(path) != 1)})"
+        raise ClipError(f"{where}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
+    naming: dict[str, Any] = {"motion_convention": motion_convention, "channels": channels, "layer": layer}
+    files, plain = plain_frames(path, **naming, backwards=backwards, log=log)
+    # Unlike the variable of a loop, this does not keep a frame while the next one is read.
+    return files, map(_of_another, plain)
+
+
+def _of_another(frame: Frame) -> StoredFrame:
+    return StoredFrame(frame, {}, None, None)
+
+
+def _turned(frames: Iterator[StoredFrame]) -> Iterator[StoredFrame]:
+    """Frames that come from the last to the first, with time turned around."""
+    after: Frame | None = None
+    for stored in frames:
+        yield stored._replace(frame=turned(stored.frame, after))
+        after = stored.frame
+
+
+def read_clip(
+    path: str | Path,
+    *,
+    spp: int = 1,
+    layers: bool = False,
+    motion_convention: str | None = None,
+    channels: Mapping[str, str] | None = None,
+    layer: str | None = None,
+) -> Clip:
+    """Read a clip as NumPy arrays, with the dtypes of :attr:`jaxdn.core.frame.Buffer.dtype`.
+
+    A buffer that only some frames have is written out in the others (:func:`jaxdn.core.frame.written_out`).
+
+    ``path`` is the folder of a clip, of which ``spp`` samples a pixel are read, and with ``layers`` the independent
+    noisy layers of 1, 2, 4, ... samples too (``Clip.layers``); or a folder of, or a glob pattern for, the EXR files of
+    another renderer, whose channels are found by their names (``motion_convention``, ``channels`` and ``layer``: see
+    :func:`jaxdn.data.foreign.import_exr.plain_frames`).
+
+    Raises ClipError, naming the file and the reason: no such folder, no ``clip.json``, another format version, missing
+    or unreadable frames, missing channels, frames that differ in size or channels, ``spp`` or ``layers`` not available.
+    """
+    _, opened = open_frames(path, spp=spp, motion_convention=motion_convention, channels=channels, layer=layer)
+    stored = list(opened)
+    counts = doubling_layers(stored[0].layers, path) if layers else []
+    named = {name for one in stored for name in present(one.frame)}
+    frames = jax.tree.map(lambda *buffers: np.stack(buffers), *(written_out(one.frame, named) for one in stored))
+    references = [one.reference for one in stored if one.reference is not None]
+    return Clip(
+        frames,
+        np.stack(references) if references else None,
+        {count: np.stack([one.layers[count] for one in stored]) for count in counts} if layers else None,
+    )
+
+
+def refuse_unfinished(path: str | Path) -> None:
+    """Raise ClipError if a folder is one of our clips whose rendering was interrupted."""
+    if _looks_unfinished(path):
+        raise _unfinished(Path(path))
+
+
+def _unfinished(folder: Path) -> ClipError:
+    """Why a folder is not a clip."""
+    if (folder / _UNFINISHED).is_file():
+        return ClipError(f"{folder}: rendering this clip was interrupted; run the same command again to finish it.")
+    return ClipError(f"{folder}: there is no {_RECORD} in it; the clip was not finished. Render it again.")
+
+
+def _looks_unfinished(path: str | Path) -> bool:
+    first = frame_path(path, 0)
+    return (Path(path) / _UNFINISHED).is_file() or (first.is_file() and bool(stored_layers(read_exr(first))))
+
+
+def _names(stored: StoredFrame, *, planned: bool) -> set[str]:
+    """What all frames of a clip must have; with a plan, buffers may differ."""
+    light = {f"noisy_{samples}spp" for samples in stored.layers}
+    light |= {name for name in ("reference", "reference_half") if getattr(stored, name) is not None}
+    light |= set() if stored.draws is None else {f"{len(stored.draws)} draws"}
+    return light if planned else light | set(present(stored.frame))
+
+
+def _numbered(folder: Path) -> list[tuple[int, Path]]:
+    """The frames' files in a folder with their numbers."""
+    files = folder.glob("frame_*.exr")
+    return [(int(file.stem[6:]), file) for file in files if file.stem[6:].isdecimal()]

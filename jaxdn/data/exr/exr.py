@@ -1,0 +1,222 @@
+"""One OpenEXR file: named 2-D channels in, named 2-D channels out.
+
+All EXR files are read and written here, because the Python bindings fail silently: they scramble non-contiguous arrays,
+turn ``[H, W, 1]`` into R, G, B, overflow float16 to infinity, do not notice a full disk while a file is small, and
+print a warning instead of raising an error for a truncated file.
+"""
+
+import errno
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+
+from jaxdn.data.clip.files import ClipError
+from jaxdn.data.exr.windows import Window, window_of
+from jaxdn.runtime.atomic_files import whole
+
+HALF_MAX = 65504.0
+"""The largest float16."""
+
+_NAME_LIMIT = 255  # longer channel names are cut off silently
+_SIDE_LIMIT = 1 << 16  # a larger size in a header counts as damaged, before memory is allocated for it
+_STORABLE = (np.float16, np.float32, np.uint32)
+_WRITERS_OWN = ("channels", "chunkCount")  # attributes that the writer makes
+_ABOUT_LAYERS = ("cryptomatte", "name", "view")
+_LOSSY = (OpenEXR.B44_COMPRESSION, OpenEXR.B44A_COMPRESSION, OpenEXR.DWAA_COMPRESSION, OpenEXR.DWAB_COMPRESSION)
+
+
+def to_half(values: np.ndarray) -> np.ndarray:
+    """float16, finite values clamped to +-65504 instead of overflowing; NaN and infinities stay unchanged."""
+    values = np.asarray(values)
+    clamped = np.clip(values, -HALF_MAX, HALF_MAX)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.where(np.isinf(values), values, clamped).astype(np.float16)
+
+
+def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
+    """Write 2-D channels (float16, float32 or uint32, all of one size) as one ZIP-compressed scanline file.
+
+    The file is written under a temporary name, read back, and then renamed: it is complete or absent. Raises ValueError
+    for channels that OpenEXR cannot store and OSError (``errno.ENOSPC`` for a full disk) if the file cannot be written.
+    """
+    path = Path(path)
+    prepared = {name: _storable(path, name, pixels) for name, pixels in channels.items()}
+    sizes = {pixels.shape for pixels in prepared.values()}
+    if len(sizes) != 1:
+        raise ValueError(f"{path}: expected at least one channel and all of one size, got {sorted(sizes)}.")
+    _write(path, [({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, prepared)])
+
+
+def _write(path: Path, parts: Sequence[tuple[dict[str, Any], dict[str, np.ndarray]]]) -> None:
+    """Write parts of a header and channels each, read them back, and rename; raises OSError as :func:`write_exr`."""
+    wanted = [len(channels) for _, channels in parts]
+    with whole(path) as temporary:
+        try:
+            # The dicts are changed by the call.
+            OpenEXR.File([OpenEXR.Part(header, dict(channels)) for header, channels in parts]).write(str(temporary))
+        except RuntimeError as error:
+            code = errno.ENOSPC if "No space left" in str(error) else errno.EIO
+            raise OSError(code, f"could not write the frame ({error})", str(path)) from error
+        # The writer does not notice a disk that fills up within the last buffer: check what was written.
+        try:
+            read_exr(temporary)
+        except ClipError as error:
+            raise OSError(errno.ENOSPC, "the file is incomplete after writing; is the disk full?", str(path)) from error
+        if [len(header["channels"]) for header in _headers(temporary)] != wanted:
+            raise OSError(errno.EIO, "the file lacks some of its channels after writing", str(path))
+
+
+def read_exr(path: str | Path) -> dict[str, np.ndarray]:
+    """All channels of a file by their full names, 2-D, in the precision they are stored in.
+
+    Of a file with several parts, each channel is named ``part.channel`` unless it already begins with its part's name.
+    Subsampled channels are left out. Raises ClipError, naming the file and the reason, if the file is missing, not an
+    OpenEXR file, truncated or damaged, or has deep data.
+    """
+    found = {name: pixels for _, channels in _parts(Path(path)) for name, _, pixels in channels if pixels is not None}
+    if not found:
+        raise ClipError(f"{path}: the file has no channels.")
+    return found
+
+
+def _parts(path: Path) -> list[tuple[dict[str, Any], list[tuple[str, str, np.ndarray | None]]]]:
+    """The header of each part, and the full name, the own name and the pixels of its channels, None if subsampled."""
+    _headers(path)
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            parts = list(file.parts)
+            if not parts:
+                raise ClipError(f"{path}: the pixel data is truncated or damaged; write the frame again.")
+            found = []
+            for part in parts:
+                channels = []
+                for name, channel in part.channels.items():
+                    full, pixels = _full_name(part.header, name, len(parts)), channel.pixels
+                    if (channel.xSampling, channel.ySampling) != (1, 1):
+                        pixels = None
+                    elif not isinstance(pixels, np.ndarray) or pixels.ndim != 2 or pixels.dtype == object:
+                        raise ClipError(f"{path}: channel {name} is not a flat image; deep data cannot be read.")
+                    channels.append((full, name, pixels))
+                found.append((dict(part.header), channels))
+            return found
+    except ClipError:
+        raise
+    except (RuntimeError, ValueError, KeyError, TypeError, MemoryError, UnicodeDecodeError) as error:
+        raise ClipError(f"{path}: not readable as OpenEXR ({error}); write the frame again.") from error
+
+
+def read_header(path: str | Path) -> dict[str, Any]:
+    """The attributes of a file's first part, such as ``worldToCamera``. Raises ClipError if it is not readable."""
+    return _headers(path)[0]
+
+
+def read_names(path: str | Path) -> list[str]:
+    """The names of a file's channels as :func:`read_exr` gives them, from its header alone. Raises as that does."""
+    return list(read_windows(path)[1])
+
+
+def read_windows(path: str | Path) -> tuple[Window, dict[str, Window]]:
+    """The display window of a file, and the data window of each channel that :func:`read_exr` gives.
+
+    From the header alone. Raises as that does.
+    """
+    headers = _headers(path)
+    return window_of(headers[0], "displayWindow"), {
+        _full_name(header, channel.name, len(headers)): window_of(header, "dataWindow")
+        for header in headers
+        for channel in header["channels"]
+        if (channel.xSampling, channel.ySampling) == (1, 1)
+    }
+
+
+def _headers(path: str | Path) -> list[dict[str, Any]]:
+    """The header of each part."""
+    path = Path(path)
+    if not path.is_file():
+        raise ClipError(f"{path}: there is no such file.")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
+            headers = [dict(part.header) for part in file.parts]
+    except (RuntimeError, ValueError, KeyError, TypeError, IndexError, UnicodeDecodeError) as error:
+        raise ClipError(f"{path}: not readable as OpenEXR ({error}); write the frame again.") from error
+    for header in headers:
+        _check_header(path, header)
+    return headers
+
+
+def rewrite_exr(
+    source: str | Path, target: str | Path, replaced: Mapping[str, np.ndarray], *, only: Mapping[str, str] | None = None
+) -> list[str]:
+    """Write a file again with other pixels in some channels, and everything else as it was.
+
+    What stays: parts, the other channels and their order, half or float of each, data and display windows, compression,
+    tiles, and all other attributes of the headers. Returns what cannot stay, in sentences. Raises as :func:`read_exr`
+    and :func:`write_exr` do.
+
+    Args:
+      source: the file.
+      target: the file to write.
+      replaced: full name of a channel, as :func:`read_exr` gives it -> pixels of the size of its data window.
+      only: full name -> new name of the channels to write, all of one part; None: all.
+    """
+    notes: dict[str, None] = {}
+    written = []
+    for header, channels in _parts(Path(source)):
+        kept = {}
+        for full, name, pixels in channels:
+            if pixels is None:
+                notes[f"not kept: channel {full!r}, which has less than one value for each pixel"] = None
+            elif only is None or full in only:
+                pixels = _as_type(replaced[full], pixels.dtype) if full in replaced else pixels
+                kept[name if only is None else only[full]] = np.ascontiguousarray(pixels)
+        if only is None and header["compression"] in _LOSSY:
+            notes["the file's compression loses precision: its other layers are compressed once more"] = None
+        gone = _WRITERS_OWN if only is None else (*_WRITERS_OWN, *_ABOUT_LAYERS)
+        if kept:
+            # "cryptomatte/1a2b3c4/manifest" is about a layer, too
+            written.append(({key: value for key, value in header.items() if key.partition("/")[0] not in gone}, kept))
+    _write(Path(target), written)
+    return list(notes)
+
+
+def _as_type(pixels: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    return to_half(pixels) if dtype == np.float16 else np.asarray(pixels).astype(dtype)
+
+
+def write_image(path: str | Path, image: np.ndarray) -> None:
+    """Write ``[H, W, 3]`` as plain R, G, B in float32. Raises as :func:`write_exr` does."""
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[-1] != 3 or 0 in image.shape:
+        raise ValueError(f"{path}: expected an image [H, W, 3], got shape {image.shape}.")
+    write_exr(path, {name: image[..., i].astype(np.float32) for i, name in enumerate("RGB")})
+
+
+def _storable(path: Path, name: str, pixels: np.ndarray) -> np.ndarray:
+    if not name or len(name.encode()) > _NAME_LIMIT:
+        raise ValueError(f"{path}: expected a channel name of 1 to {_NAME_LIMIT} bytes, got {name[:40]!r}.")
+    if not isinstance(pixels, np.ndarray) or pixels.ndim != 2 or 0 in pixels.shape:
+        raise ValueError(f"{path}: channel {name}: expected an array [H, W], got shape {np.shape(pixels)}.")
+    if pixels.dtype not in _STORABLE:
+        raise ValueError(f"{path}: channel {name}: expected float16, float32 or uint32, got {pixels.dtype}.")
+    return np.ascontiguousarray(pixels)
+
+
+def _check_header(path: Path, header: Mapping[str, Any]) -> None:
+    window = header.get("dataWindow")
+    if not isinstance(window, tuple) or len(window) != 2:
+        raise ClipError(f"{path}: the header has no data window; the file is damaged.")
+    low, high = (np.asarray(corner, np.int64) for corner in window)
+    sides = high - low + 1
+    tiles = header.get("tiles")
+    if tiles is not None and tiles.mode != OpenEXR.ONE_LEVEL:
+        raise ClipError(f"{path}: tiles in several levels (a mipmap) cannot be read; save it with one level.")
+    if sides.min() < 1 or sides.max() > _SIDE_LIMIT:
+        raise ClipError(f"{path}: the header claims {sides[0]} x {sides[1]} pixels; the file is damaged.")
+
+
+def _full_name(header: Mapping[str, object], name: str, parts: int) -> str:
+    part = str(header.get("name", ""))
+    return name if parts == 1 or not part or name == part or name.startswith(part + ".") else f"{part}.{name}"

@@ -1,0 +1,1 @@
+"""EXR sequences of other renderers: which layer is which buffer, and what its numbers mean."""

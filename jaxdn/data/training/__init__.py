@@ -1,0 +1,1 @@
+"""Training data made from clips: caches, packs, batches of windows."""

@@ -1,0 +1,65 @@
+"""The noise of a training element: drawn anew for every crop from what a clip stores.
+
+A clip has at most one image of each sample count in its layers, but may have many single samples (``draws``), of
+indirect and of direct light. ``n`` samples a pixel are the mean of ``n`` of them, chosen at random, so that a crop
+rarely has the same noise twice. More samples come from the layers, and as many as half of the reference's from its
+first half, whose target is then the other half: independent, and nearly clean.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxdn.data.clip.files import ClipError
+from jaxdn.data.clip.frames import layers_for
+from jaxdn.data.training.cache import CachedClip, read_array, read_layers
+
+Window = tuple[slice, ...]
+_BEAUTY = ("direct", "emission")
+
+
+class Light(NamedTuple):
+    """Noisy radiance and what it converges to, [T, H, W, 3]; their noise is independent."""
+
+    noisy: np.ndarray
+    reference: np.ndarray
+
+
+def check_samples(clip: CachedClip, spp: int) -> None:
+    """Raise ClipError, saying what there is, unless ``spp`` samples a pixel can be had from the clip."""
+    if type(spp) is int and (1 <= spp <= clip.draws or spp == clip.half_spp):
+        return
+    try:
+        layers_for(spp, clip.layers, clip.path)
+    except ClipError as error:
+        half = f", or {clip.half_spp} (half of the reference)" if clip.half_spp else ""
+        raise ClipError(
+            f"{error} Its single samples give 1 to {clip.draws}{half}." if clip.draws else str(error)
+        ) from error
+
+
+def draw_light(clip: CachedClip, window: Window, spp: int, rng: np.random.Generator, *, beauty: bool = False) -> Light:
+    """Light of ``spp`` samples a pixel in a window (frames, rows, columns) of a clip.
+
+    Args:
+      clip: to read.
+      window: the part of it.
+      spp: as :func:`check_samples` allows.
+      rng: chooses among the single samples.
+      beauty: all light instead of the indirect part, if the clip has that many single samples; their direct light is
+        noisy too. Emitted light is added to both.
+    """
+    if spp <= clip.draws:
+        chosen = np.sort(rng.permutation(clip.draws)[:spp])
+        samples = read_array(clip, "draws", (window[0], chosen, *window[1:])).astype(np.float32).mean(axis=1)
+        reference = read_array(clip, "reference", window)
+        if not beauty or samples.shape[-1] == 3:  # a packed set may have indirect light alone
+            return Light(samples[..., :3], reference)
+        direct, emission = (read_array(clip, name, window) if name in clip.arrays else 0.0 for name in _BEAUTY)
+        return Light(samples[..., :3] + samples[..., 3:] + emission, reference + direct + emission)
+    if spp == clip.half_spp:
+        half, both = (read_array(clip, name, window) for name in ("reference_half", "reference"))
+        shares = np.float32(spp), np.float32(clip.reference_spp)
+        other = (both * shares[1] - half * shares[0]) / (shares[1] - shares[0])
+        return Light(half, np.maximum(other, 0.0, dtype=np.float32))
+    return Light(read_layers(clip, window, spp), read_array(clip, "reference", window))

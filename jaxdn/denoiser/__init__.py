@@ -1,0 +1,11 @@
+"""What a denoiser is, and what is done with any: valid frames in, one image a frame out, whole clips, tiles."""
+
+from jaxdn.denoiser.interface import Core as Core
+from jaxdn.denoiser.interface import Denoiser as Denoiser
+from jaxdn.denoiser.interface import Params as Params
+from jaxdn.denoiser.interface import Recurrent as Recurrent
+from jaxdn.denoiser.interface import RecurrentStep as RecurrentStep
+from jaxdn.denoiser.interface import State as State
+from jaxdn.denoiser.interface import Step as Step
+from jaxdn.denoiser.interface import checked as checked
+from jaxdn.denoiser.interface import recurrent as recurrent

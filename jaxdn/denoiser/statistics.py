@@ -1,0 +1,89 @@
+"""What of a whole frame decides about each of its parts: its brightness, its depths, its height.
+
+A frame that is denoised part by part (:mod:`jaxdn.denoiser.tiles`) must be measured as a whole first. Everything here
+is a sum over pixels, or over blocks of 16x16 of them, so that the sums of parts that lie side by side add up to those
+of the frame.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdn import color
+from jaxdn.core.frame import FAR, Array, Frame
+from jaxdn.ops.dispatch import numba_call
+from jaxdn.ops.dispatch.inference_path import alone
+
+
+class Whole(NamedTuple):
+    """Sums over a frame, all scalars."""
+
+    brightness: jax.Array
+    """[2] of :func:`jaxdn.color.brightness`."""
+    depth: jax.Array
+    """[3] the sums of log z and of 1 / z over surfaces, and their number of pixels."""
+    other: jax.Array
+    """Number of pixels whose reflectance is not their albedo."""
+    height: jax.Array
+    """Rows of the frame; no sum."""
+
+    @property
+    def exposure(self) -> jax.Array:
+        """As :func:`jaxdn.color.exposure`."""
+        return color.exposure_of(self.brightness)
+
+    @property
+    def middle_depth(self) -> jax.Array:
+        """The geometric mean of depth over surfaces; 1 without any."""
+        return geometric_mean(self.depth)
+
+    @property
+    def middle_inverse(self) -> jax.Array:
+        """The mean of inverse depth over surfaces; 1 without any."""
+        mean = self.depth[1] / jnp.maximum(self.depth[2], 1.0)
+        return jnp.where(mean > 0, mean, 1.0)
+
+
+def measured(light: jax.Array, depth: Array, frame: Frame) -> Whole:
+    """The sums of a frame.
+
+    Args:
+      light: [H, W, 3] the light whose brightness counts.
+      depth: [H, W, 1], or None.
+      frame: for reflectance and albedo, and its height.
+    """
+    either = frame.reflectance is None or frame.albedo is None
+    other = 0.0 if either else jnp.sum(jnp.any(frame.reflectance != frame.albedo, axis=-1), dtype=light.dtype)
+    return Whole(
+        color.brightness(light),
+        jnp.zeros(3, light.dtype) if depth is None else sums_of_depth(depth),
+        jnp.asarray(other, light.dtype),
+        jnp.asarray(frame.radiance.shape[0], light.dtype),
+    )
+
+
+def geometric_mean(depth: jax.Array) -> jax.Array:
+    """The geometric mean of depth over surfaces, from :attr:`Whole.depth`; 1 without any."""
+    return jnp.exp(depth[0] / jnp.maximum(depth[2], 1.0))
+
+
+def sums_of_depth(depth: jax.Array) -> jax.Array:
+    """:attr:`Whole.depth` of a depth [H, W, 1]; no surface is at 0 or at ``FAR``."""
+    if numba_call.available() and depth.dtype == jnp.float32:
+        return alone(_sums_of_depth, _sums_by_compiled)(depth)
+    return _sums_of_depth(depth)
+
+
+def _sums_of_depth(depth: jax.Array) -> jax.Array:
+    known = (depth > 0) & (depth < FAR)
+    there = jnp.where(known, depth, 1.0)
+    logarithms, inverses = jnp.log(there), jnp.where(known, 1.0 / there, 0.0)
+    return jnp.stack([jnp.sum(logarithms), jnp.sum(inverses), jnp.sum(known, dtype=depth.dtype)])
+
+
+def _sums_by_compiled(depth: jax.Array) -> jax.Array:
+    from jaxdn.denoiser.numba_statistics import depths
+
+    return numba_call.call(depths, [(depth.shape[0], 3)], [depth], np.float32(FAR), rows=depth.shape[0])[0].sum(axis=0)

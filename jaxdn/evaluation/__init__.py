@@ -1,0 +1,1 @@
+"""Evaluation: denoisers compared on clips, and the report of it."""

@@ -1,0 +1,263 @@
+"""``jaxdn compare``: every method on the same clips, scored, timed and shown next to each other in one report."""
+
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxdn import __version__, color, metrics
+from jaxdn.core.frame import Clip
+from jaxdn.data.clip.folder import read_clip
+from jaxdn.data.clip.noise_floor import read_halves, read_noise_floor
+from jaxdn.denoiser import Denoiser, Params
+from jaxdn.denoiser.rollout import denoise
+from jaxdn.evaluation.report import ClipResult, Results, Scores, TrainingCurve
+from jaxdn.evaluation.report.film import FRAMES, film
+from jaxdn.evaluation.report.results import headline_psnr
+from jaxdn.zoo.ready import OURS, Candidate
+
+Halves = tuple[Any, Any]
+
+
+class Footage(NamedTuple):
+    """A clip to score images by."""
+
+    clip: Clip
+    """With a reference."""
+    halves: Halves | None
+    """Two independent references [T, H, W, 3] of half the samples each; None if they are not known."""
+    noise_floor: float
+    """dB, the PSNR of a perfect image against the reference; not a number without halves."""
+    relative_to: Any = None
+    """[T, H, W, 3] what relative MSE without the reference's noise is relative to; None: to the reference."""
+
+
+def read_footage(folder: Path, *, spp: int = 1, layers: bool = False) -> Footage:
+    """A clip of a folder with ``spp`` samples a pixel. Raises ValueError for one without a reference.
+
+    ``layers`` reads the independent noisy layers too, for denoisers that request samples.
+    """
+    clip = read_clip(folder, spp=spp, layers=layers)
+    if clip.reference is None:
+        raise ValueError(f"{folder}: expected a clip with a reference to compare with, got none; render one.")
+    return Footage(clip, read_halves(folder), read_noise_floor(folder))
+
+
+@jax.jit
+def _clip_scores(
+    denoised: jax.Array,
+    reference: jax.Array,
+    hidden: jax.Array,
+    halves: Halves | None,
+    relative_to: jax.Array | None = None,
+) -> dict[str, jax.Array]:
+    """Every score of a linear clip, and the curves over its frames; those without the noise of the reference too.
+
+    Args:
+      denoised: [T, H, W, 3].
+      reference: [T, H, W, 3].
+      hidden: [T, H, W, 1], above 0 where a point was hidden one frame earlier.
+      halves: two independent references of half the samples each, where the clip has them.
+      relative_to: [T, H, W, 3] that of :func:`jaxdn.metrics.unbiased_relative_mse`.
+    """
+    image, wanted = color.tonemap(denoised), color.tonemap(reference)
+    found = {
+        "psnr": metrics.psnr(image, wanted),
+        "ssim": metrics.ssim(image, wanted),
+        "l1": metrics.l1(image, wanted),
+        "mse": metrics.mse(image, wanted),
+        "temporal_psnr": metrics.temporal_psnr(image, wanted),
+        "relative_mse": metrics.relative_mse(denoised, reference),
+        "flip": metrics.flip(image, wanted),
+        "disoccluded_l1": metrics.l1(image, wanted, mask=hidden),
+        "disoccluded_mse": metrics.mse(image, wanted, mask=hidden),
+        "frame_psnr": jax.vmap(metrics.psnr)(image, wanted),
+        "frame_l1": jax.vmap(metrics.l1)(image, wanted),
+        "frame_disoccluded_l1": jax.vmap(lambda a, b, m: metrics.l1(a, b, mask=m))(image, wanted, hidden),
+    }
+    return found if halves is None else found | unbiased_scores(denoised, hidden, halves, relative_to)
+
+
+def unbiased_scores(
+    denoised: jax.Array, hidden: jax.Array, halves: Halves, relative_to: jax.Array | None = None
+) -> dict[str, jax.Array]:
+    """The scores of a linear clip without the noise of the reference; the arguments are those of ``_clip_scores``."""
+    image, shown = color.tonemap(denoised), color.tonemap_halves(*halves)
+    return {
+        "unbiased_psnr": metrics.unbiased_psnr(image, *shown),
+        "unbiased_temporal_psnr": metrics.unbiased_temporal_psnr(image, *shown),
+        "unbiased_mse": metrics.unbiased_mse(image, *shown),
+        "unbiased_disoccluded_mse": metrics.unbiased_mse(image, *shown, mask=hidden),
+        "unbiased_relative_mse": metrics.unbiased_relative_mse(denoised, *halves, relative_to=relative_to),
+    }
+
+
+def compare(
+    methods: Sequence[Candidate],
+    folders: Sequence[Path],
+    *,
+    title: str,
+    settings: dict[str, Any],
+    training: dict[str, TrainingCurve] | None = None,
+    about: Mapping[str, str] | None = None,
+    spp: int = 1,
+    read: Callable[..., Footage] = read_footage,
+    say: Callable[[str], None] = print,
+) -> Results:
+    """Denoise every clip by every method and score it against the clip's reference.
+
+    Images are tone-mapped (sRGB, clipped to [0, 1]) before they are scored, except for relative MSE. Where a clip keeps
+    one half of the samples of its reference, PSNR, temporal PSNR, MSE and relative MSE are given without the noise of
+    the reference too (:func:`jaxdn.metrics.unbiased_mse`). Disoccluded pixels are those whose point was hidden in the
+    previous frame (``visible`` is false). Milliseconds are the median of three runs of the compiled clip, divided by
+    its frames, without compilation. Raises ValueError for a clip without a reference.
+
+    Args:
+      methods: what to compare.
+      folders: the clips, each with a reference.
+      title: of the report.
+      settings: shown in the report.
+      training: label of a method -> its training curve, for the report.
+      about: label of a method -> what it is, in a few words, where that is not the title of the method.
+      spp: samples per pixel to take from the clips' layers.
+      read: (folder, spp, layers) -> what to score by.
+      say: prints one line per clip.
+    """
+    compiled: dict[str, Callable[[Params, Clip], jax.Array]] = {}
+    for method in methods:
+        if method.denoiser is not None:
+            compiled[method.label] = _compile(method.denoiser)
+    needs_layers = any(method.denoiser is not None and method.denoiser.samples is not None for method in methods)
+    clips = []
+    for count, folder in enumerate(folders):
+        footage = read(folder, spp=spp, layers=needs_layers)
+        began = time.monotonic()
+        result = _compare_on(footage, folder.name, methods, compiled, spp)
+        field = headline_psnr([result.scores])
+        psnr = "  ".join(f"{label} {getattr(scores, field):.2f}" for label, scores in result.scores.items())
+        free = "" if field == "psnr" else " without the reference's noise"
+        say(
+            f"[{count + 1}/{len(folders)}] {result.name}: PSNR{free} {psnr} dB (reference good to "
+            f"{result.noise_floor_psnr:.1f} dB)  {time.monotonic() - began:.0f} s"
+        )
+        clips.append(result)
+    labels = [method.label for method in methods]
+    known = {method.label: method.method.title for method in methods if method.method is not None}
+    opens_on = OURS if OURS in labels else _last_network(methods)
+    told = {**known, **(about or {})}
+    return Results(title, settings, describe_machine(), labels, clips, training or {}, told, opens_on)
+
+
+def _last_network(methods: Sequence[Candidate]) -> str | None:
+    """The last label of a network, which is what somebody brought to compare; None without any."""
+    networks = [method.label for method in methods if method.method is not None and not method.method.filter]
+    return networks[-1] if networks else None
+
+
+def _compile(denoiser: Denoiser) -> Callable[[Params, Clip], jax.Array]:
+    return jax.jit(lambda params, clip: denoise(denoiser, params, clip))
+
+
+def _compare_on(
+    footage: Footage,
+    name: str,
+    methods: Sequence[Candidate],
+    compiled: dict[str, Callable[[Params, Clip], jax.Array]],
+    spp: int,
+) -> ClipResult:
+    """The scores and images of one clip.
+
+    Args:
+      footage: the clip and its references.
+      name: of the clip.
+      methods: what to compare.
+      compiled: label of a method -> its compiled function.
+      spp: samples per pixel of the clip's radiance.
+    """
+    clip, halves = footage.clip, footage.halves
+    frames = clip.frames
+    inputs = jax.tree.map(jax.numpy.asarray, clip._replace(reference=None))
+    reference = jax.numpy.asarray(clip.reference)
+    shape = (*np.shape(frames.radiance)[:3], 1)
+    hidden = ~np.asarray(frames.visible, bool) if frames.visible is not None else np.zeros(shape, bool)
+    # At a clip's first frame no method has a history, so no pixel counts as disoccluded.
+    hidden = np.concatenate([np.zeros_like(hidden[:1]), hidden[1:]])
+    shown = int(np.argmax(hidden.sum((1, 2, 3)))) if hidden.any() else shape[0] - 1
+    scores, per_frame = {}, {}
+    images = {"reference": np.asarray(color.tonemap(reference[shown]))}
+    wanted = np.asarray(color.tonemap(reference[:FRAMES]))
+    films = {"reference": film(wanted, None)}
+    for method in methods:
+        if method.denoiser is None:
+            denoised, milliseconds = inputs.frames.radiance, 0.0
+        else:
+            denoised, milliseconds = _timed(compiled[method.label], method.params, inputs, shape[0])
+        scored = _clip_scores(denoised, reference, hidden * 1.0, halves, footage.relative_to)
+        found = {name: np.asarray(value) for name, value in scored.items()}
+        scores[method.label] = _as_scores(found, hidden, milliseconds, spp)
+        per_frame[method.label] = {
+            "psnr": found["frame_psnr"].tolist(),
+            "l1": found["frame_l1"].tolist(),
+            "disoccluded_l1": np.where(hidden.any((1, 2, 3)), found["frame_disoccluded_l1"], np.nan).tolist(),
+        }
+        images[method.label] = np.asarray(color.tonemap(denoised[shown]))
+        films[method.label] = film(np.asarray(color.tonemap(denoised[:FRAMES])), wanted)
+    return ClipResult(name, footage.noise_floor, scores, per_frame, shown, images, hidden[shown, ..., 0], films)
+
+
+def _as_scores(found: dict[str, np.ndarray], hidden: np.ndarray, milliseconds: float, spp: int) -> Scores:
+    any_hidden = bool(hidden.any())
+    with np.errstate(divide="ignore"):
+        hidden_psnr = float(-10.0 * np.log10(found["disoccluded_mse"]))
+    nothing = () if any_hidden else ("disoccluded_l1", "unbiased_disoccluded_mse")
+    return Scores(
+        **{name: float("nan") if name in nothing else float(found[name]) for name in Scores._fields if name in found},
+        disoccluded_psnr=hidden_psnr if any_hidden else float("nan"),
+        ms_per_frame=milliseconds,
+        spp=float(spp),
+    )
+
+
+def _timed(
+    run: Callable[[Params, Clip], jax.Array], params: Params, clip: Clip, frames: int
+) -> tuple[jax.Array, float]:
+    """The denoised clip and the median milliseconds per frame of three runs after a first one that compiles."""
+    denoised = jax.block_until_ready(run(params, clip))
+    seconds = []
+    for _ in range(3):
+        began = time.perf_counter()
+        jax.block_until_ready(run(params, clip))
+        seconds.append(time.perf_counter() - began)
+    return denoised, 1000.0 * float(np.median(seconds)) / frames
+
+
+def describe_machine() -> dict[str, Any]:
+    """The machine of a measurement: processor, cores, device, versions."""
+    return {
+        "processor": _processor(),
+        "cores": _cores(),
+        "device": jax.devices()[0].device_kind,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "jaxdn": __version__,
+    }
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,4 +1,0 @@
-"""Learning to denoise: one step of back-propagation through time. Pure functions, no files.
-
-The loop with data, progress and checkpoints is :mod:`jaxdn.commands.train`.
-"""

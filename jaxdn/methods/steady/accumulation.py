@@ -1,0 +1,109 @@
+"""The running mean of light, how many frames it is worth, and what is remembered of a frame."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdn import color
+from jaxdn.methods.steady.network_input import History
+from jaxdn.ops.dispatch import numba_call
+from jaxdn.ops.dispatch.inference_path import alone
+from jaxdn.ops.layout.planar import planar
+from jaxdn.ops.scales import downsample
+
+
+class Mean(NamedTuple):
+    """The mean with the newest frame in it, as planes."""
+
+    light: jax.Array
+    """[3, H, W]."""
+    square: jax.Array
+    """[H, W] the mean of the luminance's square."""
+    number: jax.Array
+    """[H, W] effective number of samples, in frames."""
+    missed: jax.Array
+    """[3, H/2, W/2] how much more the newest frame shows than the mean, by blocks; 0 where there is no surface."""
+
+
+def accumulated(noisy: jax.Array, history: History, hit: jax.Array, follow: jax.Array, *, most: float) -> Mean:
+    """The mean of the history and the noisy frame [H, W, 3], whose sides are even.
+
+    In the mean of N frames and a new one, the new one has the weight 1 / (N + 1); ``follow`` [H, W] = 1/2 keeps that,
+    and its logit is added to that of the weight. With weights 1 - a and a, the variance is ``(1 - a)^2 / N + a^2`` of a
+    frame's: the effective number is its inverse, but at most ``most``. ``hit`` [H, W] bool: there is a surface.
+    """
+    plain = functools.partial(_accumulated, most)
+    if numba_call.available() and noisy.dtype == jnp.float32:
+        return alone(plain, functools.partial(_by_compiled, most))(noisy, history, hit, follow)
+    return plain(noisy, history, hit, follow)
+
+
+def _accumulated(most: float, noisy: jax.Array, history: History, hit: jax.Array, follow: jax.Array) -> Mean:
+    values, valid = planar(history.values), history.valid
+    # The odds of 1 / (N + 1) are 1 to N.
+    count = jnp.maximum(values[4], 1e-6)
+    share = jnp.where(valid, follow / (follow + count * (1.0 - follow)), 1.0)
+    now = jnp.concatenate([planar(noisy), color.luminance(noisy)[None, ..., 0] ** 2])
+    then = jnp.where(valid[None], values[:4], now)
+    mixed = then + share[None] * (now - then)
+    variance = jnp.square(1.0 - share) / count + share**2
+    number = jnp.where(valid, jnp.minimum(1.0 / variance, most), 1.0)
+    missed = jnp.where(hit[None], now[:3] - mixed[:3], 0.0)
+    return Mean(mixed[:3], mixed[3], number, planar(downsample(missed.transpose(1, 2, 0))))
+
+
+def _by_compiled(most: float, noisy: jax.Array, history: History, hit: jax.Array, follow: jax.Array) -> Mean:
+    from jaxdn.methods.steady.numba_accumulation import accumulated
+
+    height, width = hit.shape
+    shapes = [(3, height, width), (height, width), (height, width), (3, height // 2, width // 2)]
+    numbers = np.asarray(color.LUMINANCE, np.float32), np.float32(most)
+    return Mean(*numba_call.call(accumulated, shapes, [noisy, *history, hit, follow], *numbers, rows=height // 2))
+
+
+class Shown(NamedTuple):
+    """What a filter made of the mean, as planes [3, H, W]."""
+
+    fine: jax.Array
+    """Of which the mean takes a share."""
+    image: jax.Array
+    """Of which the last output takes a share."""
+    change: jax.Array | None
+    """What is added to both, as they were; None for nothing."""
+
+
+def remembered(
+    mean: Mean, shown: Shown, history: History, feedback: jax.Array, blend: jax.Array, *, most: float
+) -> jax.Array:
+    """The values of the next frame's :class:`History`, [H, W, 8].
+
+    The mean takes the share ``feedback`` [H, W] of the fine image; the last output, between 0 and ``most``, the share
+    ``blend`` [H, W] of the image, all of it where there was no history.
+    """
+    plain = functools.partial(_remembered, most)
+    if numba_call.available() and mean.light.dtype == jnp.float32:
+        return alone(plain, functools.partial(_remembered_by_compiled, most))(mean, shown, history, feedback, blend)
+    return plain(mean, shown, history, feedback, blend)
+
+
+def _remembered(
+    most: float, mean: Mean, shown: Shown, history: History, feedback: jax.Array, blend: jax.Array
+) -> jax.Array:
+    change = jnp.zeros_like(shown.image) if shown.change is None else shown.change
+    before = planar(history.values)[5:] + change
+    newest = jnp.where(history.valid, blend, 1.0)[None]
+    output = jnp.clip(before + newest * (shown.image - before), 0.0, most)
+    kept = jnp.maximum(mean.light + feedback[None] * (shown.fine - mean.light) + change, 0.0)
+    return jnp.concatenate([kept, mean.square[None], mean.number[None], output]).transpose(1, 2, 0)
+
+
+def _remembered_by_compiled(
+    most: float, mean: Mean, shown: Shown, history: History, feedback: jax.Array, blend: jax.Array
+) -> jax.Array:
+    from jaxdn.methods.steady.numba_accumulation import remembered
+
+    arrays = [*mean[:3], *shown, *history, feedback, blend]
+    return numba_call.call(remembered, [history.values.shape], arrays, np.float32(most), rows=feedback.shape[0])[0]

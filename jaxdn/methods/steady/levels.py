@@ -1,0 +1,236 @@
+"""Light filtered by affinities at several levels: at full resolution, at half, and enlarged again along the guides.
+
+Every level is an :mod:`jaxdn.ops.affinity.filter` whose taps lie twice as far apart as those of the level before. How
+alike two pixels are is told by albedo, gloss, normal, depth and features that somebody has learned; how far each can be
+trusted and how much of each level it takes is decided for every pixel as well: by a network, in
+:mod:`jaxdn.methods.steady.method`.
+
+What all levels together take away where light follows the guides is found by regression, and a share of it is given
+back (:mod:`jaxdn.methods.steady.regression`).
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn import brdf
+from jaxdn.core.frame import FAR, Frame
+from jaxdn.denoiser.statistics import Whole
+from jaxdn.filters.surface_test import depth_slopes, hit_mask
+from jaxdn.methods.steady import lighting_change, regression
+from jaxdn.methods.steady.accumulation import Shown
+from jaxdn.networks import pad
+from jaxdn.ops.affinity.filter import Guide, affinity_filter
+from jaxdn.ops.affinity.joint_upsample import enlarge
+from jaxdn.ops.layout.planar import Part, planes_of
+from jaxdn.ops.scales import upsample
+
+LEVELS = 4
+"""Levels at half resolution, taps 2, 4, 8 and 16 pixels apart."""
+BLOCKS = 4
+"""Height and width that the filters work on are multiples of this: blocks of 4x4 pixels are filled."""
+_LIKENESS = 0.02
+"""Weight of coarse pixels at which half of the enlarged image is taken."""
+_LEAST_TRUST = 1e-3
+"""So that a pixel is filtered even where none is trusted."""
+
+
+class Surfaces(NamedTuple):
+    """A frame's guides [H, W, C], padded; 0 is the neutral value."""
+
+    albedo: jax.Array
+    """[H, W, 3] what is reflected at all, less 1."""
+    gloss: jax.Array
+    """[H, W, 1] how much of that is not diffuse: a metal frame on a wall as bright as it shows other light."""
+    normal: jax.Array
+    roughness: jax.Array
+    depth: jax.Array | None
+    hit: jax.Array
+    """[H, W] bool, there is a surface."""
+
+    def guides(self, layout: str = "pixels") -> list[Part]:
+        """Albedo, gloss and normal, parts of planes (:mod:`jaxdn.ops.layout.planar`)."""
+        return [(layout, self.albedo), (layout, self.gloss), (layout, self.normal)]
+
+
+class Decisions(NamedTuple):
+    """What is decided about the pixels of a frame."""
+
+    features: jax.Array
+    """[H/2, W/2, 4F] of all four pixels of a block (:func:`jaxdn.ops.scales.fold`)."""
+    trust: jax.Array
+    """[H, W] in [0, 1]."""
+    coarse: jax.Array
+    """[H, W] in [0, 1], how much of the image of the levels at half resolution is taken."""
+    half_features: jax.Array
+    """[H/2, W/2, G]."""
+    half_trust: jax.Array
+    """[H/2, W/2] in [0, 1]."""
+    take: list[jax.Array]
+    """Level at half resolution -> [H/2, W/2] in [0, 1]."""
+    back: jax.Array | None
+    """[H/2, W/2] in [0, 1], how much is given back of what all levels took away; None for nothing."""
+
+
+def surfaces_of(frame: Frame) -> Surfaces:
+    """The guides of a frame, its size padded to a multiple of :data:`BLOCKS`."""
+    nothing = jnp.zeros_like(frame.radiance)
+    height, width = nothing.shape[:2]
+    reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
+    both = frame.albedo is not None and frame.reflectance is not None
+    gloss = jnp.mean(frame.reflectance - frame.albedo, axis=-1, keepdims=True) if both else nothing[..., :1]
+    hit = hit_mask(frame.depth, frame.ids)
+    hit = jnp.ones((height, width), bool) if hit is None else hit
+    return Surfaces(
+        pad(nothing if reflectance is None else reflectance - 1.0, BLOCKS),
+        pad(gloss, BLOCKS),
+        pad(nothing if frame.normal is None else frame.normal, BLOCKS),
+        pad(nothing[..., :1] if frame.roughness is None else frame.roughness - 1.0, BLOCKS),
+        None if frame.depth is None else pad(frame.depth, BLOCKS),
+        # What is padded is no surface: noise of the last row would count as often as it is repeated.
+        jnp.pad(hit, ((0, -height % BLOCKS), (0, -width % BLOCKS))),
+    )
+
+
+def slanted(surfaces: Surfaces, whole: Whole) -> jax.Array:
+    """[3, H, W] inverse depth relative to its mean, which is affine on planes, and its slopes; 0 without a surface."""
+    depth = surfaces.depth
+    if depth is None:
+        return jnp.zeros((3, *surfaces.hit.shape), surfaces.normal.dtype)
+    known = (depth > 0) & (depth < FAR)
+    inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0) / whole.middle_inverse
+    return jnp.stack([inverse[..., 0], *depth_slopes(inverse, None)])
+
+
+def filtered(
+    precisions: Mapping[str, Any],
+    mean: jax.Array,
+    missed: jax.Array | None,
+    texture: jax.Array | None,
+    surfaces: Surfaces,
+    slanted: jax.Array,
+    decided: Decisions,
+    full_levels: int,
+    floor: jax.Array,
+) -> Shown:
+    """The light [3, H, W] ``mean`` after the levels at full resolution, and after all with a change, and the change.
+
+    ``missed`` [3, H/2, W/2] is how much more the newest frame shows than the mean; None leaves a change out.
+    ``precisions`` are logarithms, one for full resolution and one for each level at half, of what the squares of
+    differences in ``albedo``, ``gloss``, ``normal``, ``depth`` and ``learned`` features are multiplied by; and, as
+    ``regression``, the scales of :func:`jaxdn.methods.steady.regression.given_back`, whose ``floor`` is that here. The
+    image of the levels at half resolution is enlarged along the guides, and takes a share of every pixel. The
+    ``texture`` [H, W, 3] that a division of the light left is filtered likewise, and given back
+    (:func:`jaxdn.brdf.restore`).
+    """
+    factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items() if name != "regression"}
+    at_full = _guide([*surfaces.guides(), ("blocks", decided.features)], slanted, decided.trust, surfaces.hit)
+    at_full = _at_level(at_full, factors, 0)
+    parts = [("planes", mean)]
+    if decided.back is not None:
+        # Guides that light may follow go through the same filters as light, and so does texture.
+        parts.append(("planes", regression.guides_of(surfaces.normal, surfaces.gloss, slanted[0])))
+    if texture is not None:
+        parts.append(("pixels", texture))
+    before = fine = planes_of(parts)
+    for index in range(full_levels):
+        fine = affinity_filter(fine, at_full, step=2**index)
+    found, alike = _from_half(fine, missed, surfaces, slanted, decided, factors, at_full)
+    image = fine + (decided.coarse * alike)[None] * (found[: fine.shape[0]] - fine)
+    change = None if missed is None else alike[None] * found[fine.shape[0] :]
+    light = image[:3]
+    if decided.back is not None:
+        given = regression.given_back(precisions["regression"], before, image, surfaces.hit, floor)
+        light = light + upsample(decided.back[..., None])[None, ..., 0] * given
+    now = jnp.maximum(light if change is None else light + change, 0.0)
+    if texture is None:
+        return Shown(fine[:3], now, change)
+    left = before[-3:]
+    return Shown(brdf.restore(fine[:3], left, fine[-3:]), brdf.restore(now, left, image[-3:]), change)
+
+
+def _from_half(
+    fine: jax.Array,
+    missed: jax.Array | None,
+    surfaces: Surfaces,
+    slanted: jax.Array,
+    decided: Decisions,
+    factors: Mapping[str, jax.Array],
+    at_full: Guide,
+) -> tuple[jax.Array, jax.Array]:
+    """Planes [C, H, W] after the levels at half resolution, enlarged again, and [H, W] how alike what they show is.
+
+    They are followed by the three of the change, if there may be one.
+    """
+    slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
+    hit, own = _any_of_four(surfaces.hit), decided.half_features
+    halved = planes_of(surfaces.guides("means"))
+    at_half = _guide([("planes", halved), ("pixels", own)], slanted_half, decided.half_trust, hit)
+    found = _coarse(_half(fine, surfaces.hit), _at_levels(at_half, factors), decided.take)
+    if missed is not None:
+        # By surfaces alone: what is learned knows a pixel's noise, and lets a bright sample count for less.
+        plain = _guide([("planes", halved)], slanted_half, jnp.ones_like(decided.half_trust), hit)
+        change = _change(missed, _at_levels(plain, factors), found[:3], hit)
+        found = jnp.concatenate([found, change])
+    features = [("planes", halved), ("corners", decided.features)]
+    there = _guide(features, slanted[:, ::2, ::2], decided.half_trust, hit)
+    enlarged, weight = enlarge(found, there, at_full)
+    return enlarged, weight / (weight + _LIKENESS)
+
+
+def _any_of_four(hit: jax.Array) -> jax.Array:
+    """[H/2, W/2] bool, whether any of four pixels is set."""
+    return hit[::2, ::2] | hit[::2, 1::2] | hit[1::2, ::2] | hit[1::2, 1::2]
+
+
+def _guide(features: Sequence[Part], slanted: jax.Array, trust: jax.Array, hit: jax.Array) -> Guide:
+    """Surfaces and what else is learned, not yet scaled; what is no surface gives nothing."""
+    return Guide(planes_of(features), slanted, (trust + _LEAST_TRUST) * hit)
+
+
+def _at_level(guide: Guide, factors: Mapping[str, jax.Array], index: int) -> Guide:
+    """The guide with the factors of one level."""
+    count = {"albedo": 3, "gloss": 1, "normal": 3, "learned": guide.features.shape[0] - 7, "depth": 1}
+    return guide._replace(scales=jnp.concatenate([jnp.full(n, factors[name][index]) for name, n in count.items()]))
+
+
+def _at_levels(guide: Guide, factors: Mapping[str, jax.Array]) -> list[Guide]:
+    """The guide of every level at half resolution."""
+    return [_at_level(guide, factors, 1 + index) for index in range(LEVELS)]
+
+
+def _half(planes: jax.Array, hit: jax.Array) -> jax.Array:
+    """[C, H/2, W/2] the means of those of four pixels that have a surface; 0 without any."""
+
+    def four(planes: jax.Array) -> jax.Array:
+        corners = [planes[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]
+        return corners[0] + corners[1] + corners[2] + corners[3]
+
+    return four(jnp.where(hit[None], planes, 0.0)) / jnp.maximum(four(hit.astype(planes.dtype)), 1.0)[None]
+
+
+def _coarse(planes: jax.Array, guides: list[Guide], take: list[jax.Array]) -> jax.Array:
+    """Light, and what else goes the same way, [C, H/2, W/2] after the levels at half resolution."""
+    for index, guide in enumerate(guides):
+        planes = planes + take[index][None] * (affinity_filter(planes, guide, step=2**index) - planes)
+    return planes
+
+
+def _change(missed: jax.Array, guides: list[Guide], light: jax.Array, hit: jax.Array) -> jax.Array:
+    """The change of light [3, H/2, W/2], told from what the mean lacks of the newest frame.
+
+    Every level is taken whole: a single frame needs all of them, where a mean of many needs few.
+    """
+    planes = lighting_change.halves(missed)
+    for index, guide in enumerate(guides):
+        planes = affinity_filter(planes, guide, step=2**index)
+    return lighting_change.change(planes, light, hit)
+
+
+def reach(full_levels: int, *, back: bool, at_once: bool) -> int:
+    """How far, in pixels, :func:`filtered` sees; 16 of them for blocks, slopes and what is enlarged."""
+    half = sum(4 * 2**index for index in range(LEVELS))
+    more = max(regression.reach() if back else 0, 2 * lighting_change.reach() if at_once else 0)
+    return 2 * (2**full_levels - 1) + half + more + 16

@@ -1,0 +1,98 @@
+"""What a network at half resolution sees of a frame: surfaces, all four pixels of a block; light, mostly their mean."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdn import color
+from jaxdn.networks import pad
+from jaxdn.ops.dispatch import numba_call
+from jaxdn.ops.dispatch.inference_path import alone
+from jaxdn.ops.scales import downsample, fold
+
+CHANNELS = 20
+"""Of light; those of surfaces come first, four for each."""
+DARK = 1e-3
+"""Light at the network's brightness that is as good as dark."""
+
+
+class History(NamedTuple):
+    """What is known of earlier frames."""
+
+    values: jax.Array
+    """[H, W, 8] the running mean of light (3) and of its luminance's square, the effective number of samples, the last
+    output (3); 0 where nothing is known."""
+    valid: jax.Array
+    """[H, W] bool, something is."""
+
+
+def seen(
+    geometry: tuple[jax.Array, ...],
+    noisy: jax.Array,
+    history: History,
+    hit: jax.Array,
+    gain: jax.Array,
+    *,
+    multiple: int,
+) -> jax.Array:
+    """[h, w, C] by blocks of 2x2 pixels, its sides padded by the edge to multiples of ``multiple``.
+
+    Light, times ``gain`` and compressed (:func:`jaxdn.color.compress`), is that of the noisy frame, of the mean and of
+    the last output, the noisy one where there is no history: means of blocks, then the four luminances of the first and
+    the last. Between these stand the means of the standard deviation of luminance relative to its mean, of
+    1 / (1 + N), and of whether there is a surface.
+
+    Args:
+      geometry: [H, W, c] each; all four pixels of a block are seen.
+      noisy: [H, W, 3] linear light >= 0; H and W are even.
+      history: of earlier frames.
+      hit: [H, W] bool, there is a surface.
+      gain: scalar.
+      multiple: see above.
+    """
+    given = geometry, noisy, history, hit, jnp.asarray(gain, noisy.dtype)
+    plain = functools.partial(_seen, multiple)
+    if numba_call.available() and noisy.dtype == jnp.float32:
+        return alone(plain, functools.partial(_seen_by_compiled, multiple))(*given)
+    return plain(*given)
+
+
+def _seen(
+    multiple: int,
+    geometry: tuple[jax.Array, ...],
+    noisy: jax.Array,
+    history: History,
+    hit: jax.Array,
+    gain: jax.Array,
+) -> jax.Array:
+    mean, square, number, shown = jnp.split(history.values, (3, 4, 5), axis=-1)
+    level = color.luminance(mean)
+    spread = jnp.sqrt(jnp.maximum(square - level**2, 0.0) + 1e-12) / (level + DARK / gain)
+    facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + number), hit[..., None].astype(noisy.dtype)]
+    recent = (jnp.where(history.valid[..., None], one, noisy) for one in (mean, shown))
+    light = [color.compress(gain * one) for one in (noisy, *recent)]
+    corners = [fold(color.luminance(light[index])) for index in (0, 2)]
+    # One by one: XLA:CPU does not vectorise what it writes side by side.
+    found = [*map(fold, geometry), *map(downsample, [*light, *facts]), *corners]
+    return pad(jnp.concatenate(found, axis=-1), multiple)
+
+
+def _seen_by_compiled(
+    multiple: int,
+    geometry: tuple[jax.Array, ...],
+    noisy: jax.Array,
+    history: History,
+    hit: jax.Array,
+    gain: jax.Array,
+) -> jax.Array:
+    from jaxdn.methods.steady.numba_network_input import seen
+
+    height, width = (side // 2 + -(side // 2) % multiple for side in noisy.shape[:2])
+    channels = 4 * sum(each.shape[-1] for each in geometry) + CHANNELS
+    numbers = (np.float32(value) for value in (DARK, *color.CURVE))
+    arrays: list[numba_call.Given] = [geometry, noisy, *history, hit, jnp.reshape(gain, (1,))]
+    weights = np.asarray(color.LUMINANCE, np.float32)
+    return numba_call.call(seen, [(height, width, channels)], arrays, weights, *numbers, rows=height)[0]

@@ -1,0 +1,103 @@
+"""``relax``: a variance-guided filter for diffuse and specular light apart, whose fast history holds the slow one.
+
+For each frame and for both kinds of light, divided by what their lobes reflect: fetch the history, for reflections
+along the motion of their virtual image; blend the frame into a slow and into a fast running mean; fill what has hardly
+any history from far around; where the fast mean contradicts the slow one, go on from the fast one, and clamp the slow
+mean to what the fast one shows near by, so that light that changed does not linger; on request, remove fireflies;
+estimate the variance, and apply a-trous levels guided by it, for reflections as narrow in normals and roughness as
+their lobe is.
+
+The history is the clamped mean, before the spatial filter: unlike in ``svgf``, nothing filtered is fed back.
+
+After descriptions of ReLAX, a denoiser of NVIDIA's library NRD (2021 to 2025), and derived anew; simpler, as the
+documentation says.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn.core.frame import Frame
+from jaxdn.core.options import Range
+from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.filters.accumulation import accumulate, after_shift
+from jaxdn.filters.atrous import GAUSSIAN, stencil
+from jaxdn.filters.cascade import cascade
+from jaxdn.filters.clamping import without_fireflies
+from jaxdn.filters.variance import estimate_variance
+from jaxdn.methods.learnable_options import FITTING, LEARNED_PER_LEVEL, moved, unmoved
+from jaxdn.methods.registry import method
+from jaxdn.methods.two_lobes import histories
+from jaxdn.methods.two_lobes.histories import Kind, LobeState
+from jaxdn.methods.two_lobes.lobes import READS
+
+_PLANES = 9
+"""Planes of a history: colour (3), two moments of its luminance, length in frames, fast colour (3)."""
+_LENGTH = 5
+_TAPS = stencil(1, kernel=GAUSSIAN)
+_POSITIVE = Range(0, without_low=True)
+
+
+@dataclass(frozen=True)
+class Options(histories.Options):
+    """The options that filters of light by lobes share, and those of the a-trous filter."""
+
+    short_history: Annotated[int, Range(0)] = 4
+    """For N below this the variance is estimated from the 7x7 neighbourhood."""
+    levels: Annotated[int, Range(0, 10)] = 5
+    """Levels of the a-trous filter."""
+    sigma_diffuse: Annotated[float, _POSITIVE, LEARNED_PER_LEVEL] = 2.0
+    """Edge-stopping parameter for differences in luminance, in standard deviations, of diffuse light."""
+    sigma_specular: Annotated[float, _POSITIVE, LEARNED_PER_LEVEL] = 2.0
+    """The same of specular light."""
+
+
+@method(
+    Options,
+    title="Diffuse and specular light apart, a slow history clamped to a fast one (after ReLAX)",
+    recipes={"usual": FITTING},
+    variants={"relax-fitted": {}},
+    filter=True,
+)
+def relax(options: Options) -> Denoiser:
+    """The filter; ``params`` are ``{}``, or move its sigmas and fractions.
+
+    Reads specular, reflectance, specular_reflectance, albedo, normal, depth, previous_depth, roughness, motion, ids,
+    specular_hit_distance, ray_length and far_motion. Without ``specular`` all light is filtered as diffuse; without
+    ``specular_hit_distance`` or ``far_motion`` reflections are fetched where their surface was; without ``roughness``
+    they are as wide as diffuse light; without any other buffer its test or weight is left out. Pixels without a surface
+    (depth at ``FAR`` or id -1) pass through. Raises ValueError for options out of range and radiance that is not
+    [H, W, 3].
+    """
+
+    def start(params: Params, frame: Frame) -> LobeState:
+        return histories.start(frame, _PLANES)
+
+    def step(
+        params: Params, state: LobeState, frame: Frame, first: jax.Array
+    ) -> tuple[LobeState, jax.Array, jax.Array]:
+        fitted = moved(options, params)
+        return histories.step(fitted, lambda kind: _denoised(fitted, kind), state, frame, first, length_plane=_LENGTH)
+
+    return recurrent(Core(start, step, READS, lambda key, frame: unmoved(options)))
+
+
+def _denoised(options: Options, kind: Kind) -> tuple[jax.Array, jax.Array]:
+    """The new history [9, H, W] of one kind of light, and its image [3, H, W]."""
+    now = kind.now.light
+    slow = accumulate(kind.past[:6], now, alpha=0.0, alpha_moments=0.0, history_max=options.history_max)
+    fast = histories.fast_mean(options, kind.past[6:9], now, slow[_LENGTH])
+    held, length, moved = histories.respond(options, kind, slow[:3], fast, slow[_LENGTH])
+    moments = after_shift(slow[3:5], moved)
+    history = jnp.concatenate([held, moments, length[None], fast])
+    calm = without_fireflies(held, kind.same) if options.anti_firefly else held
+    seen = jnp.concatenate([calm, moments, length[None]])
+    own: dict[str, Any] = {"texture": kind.now.texture}
+    short: dict[str, Any] = {"short_history": options.short_history, "beside": kind.sticks is None}
+    calm, variance = estimate_variance(seen, kind.hit, kind.weights, **short, **own)
+    sigma = options.sigma_diffuse if kind.sticks is None else options.sigma_specular
+    own |= {"levels": options.levels, "sigma_luminance": sigma}
+    image, _ = cascade(calm, variance, kind.hit, lambda level: kind.weights, _TAPS, **own)
+    return history, image

@@ -1,0 +1,1 @@
+"""Convolutions with gradients: XLA, and oneDNN for training on CPUs."""

@@ -1,0 +1,79 @@
+"""Compiled loops called from inside a jitted program, strip by strip of rows, on all cores."""
+
+import functools
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from importlib.util import find_spec
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+
+from jaxdn.core.platform import platform
+
+Given = jax.Array | tuple[jax.Array, ...] | None
+
+
+def available() -> bool:
+    """Whether programs are made for this CPU, and Numba is there to compile loops for it.
+
+    With the environment variable ``JAXDN_COMPILED=0`` all of them are plain XLA.
+    """
+    return platform() == "cpu" and os.environ.get("JAXDN_COMPILED") != "0" and _installed()
+
+
+def call(
+    loop: Callable[..., None],
+    shapes: Sequence[tuple[int, ...]],
+    arrays: Sequence[Given],
+    *numbers: Any,
+    rows: int,
+    least: int = 1,
+) -> list[jax.Array]:
+    """Float32 arrays of ``shapes``, filled by ``loop``; one after the other under ``jax.vmap``.
+
+    Args:
+      loop: compiled without Python's lock; gets the first and the last row of a strip, the arrays, the results, and
+        ``numbers``, and fills those rows of the results.
+      shapes: of the results.
+      arrays: what is read; None for what is absent, a tuple for what the loop gets as a tuple.
+      numbers: constants of the program.
+      rows: height of the image, of which strips are made.
+      least: rows of a strip, where a loop does more for its first ones.
+    """
+
+    def work(context: Any, results: Any, *given: Any) -> None:
+        read = jax.tree.map(np.asarray, given)
+        written = [np.asarray(each) for each in results]
+        pool, threads = _pool()
+        # Several strips for each thread, as some take longer.
+        height = max(least, -(-rows // (4 * threads)))
+        strips: list[Future[None]] = []
+        try:
+            for top in range(0, rows, height):
+                strips.append(pool.submit(loop, top, min(rows, top + height), *read, *written, *numbers))
+            for strip in strips:
+                strip.result()
+        finally:  # after Ctrl-C, too, nothing may write into results that XLA frees
+            wait(strips)
+
+    kinds = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    return list(buffer_callback(work, kinds, vmap_method="sequential")(*arrays))
+
+
+@functools.cache
+def _installed() -> bool:
+    try:
+        return find_spec("numba") is not None
+    except ModuleNotFoundError:  # where imports are forbidden
+        return False
+
+
+@functools.cache
+def _pool() -> tuple[ThreadPoolExecutor, int]:
+    """Threads, one for each core that this process may use, and their number."""
+    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return ThreadPoolExecutor(threads, "jaxdn-strips"), threads

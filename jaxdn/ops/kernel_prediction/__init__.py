@@ -1,0 +1,1 @@
+"""Kernels predicted for each pixel: normalisation, application, softmax filters and distances of guides."""

@@ -1,0 +1,1 @@
+"""Conversions of memory layout: planes, and blocks of pixels as channels."""

@@ -1,0 +1,1 @@
+"""Bindings to the oneDNN library, and the layers of networks that it computes."""

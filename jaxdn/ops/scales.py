@@ -1,0 +1,138 @@
+"""Images at several scales: halving, doubling, and composing filtered scales."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn.core.checks import check_image, check_option
+from jaxdn.ops.dispatch import numba_call
+from jaxdn.ops.dispatch.inference_path import alone
+
+
+def downsample(image: jax.Array, *, down: str = "mean") -> jax.Array:
+    """Halve [H, W, C] to [H/2, W/2, C] by the mean or the maximum of 2x2 blocks; odd sizes raise ValueError."""
+    check_image(image, "image")
+    check_option(down, "down", ("mean", "max"))
+    image = jnp.asarray(image)
+    height, width, channels = image.shape
+    _check_even(height, width, "image")
+    blocks = image.reshape(height // 2, 2, width // 2, 2, channels)
+    corners = [blocks[:, i, :, j] for i in (0, 1) for j in (0, 1)]
+    if down == "mean":
+        return (corners[0] + corners[1] + corners[2] + corners[3]) * 0.25
+    return jnp.maximum(jnp.maximum(corners[0], corners[1]), jnp.maximum(corners[2], corners[3]))
+
+
+def fold(image: jax.Array) -> jax.Array:
+    """[H, W, C] -> [H/2, W/2, 4C]: the pixels of each 2x2 block side by side, channel by channel.
+
+    Odd sizes raise ValueError.
+    """
+    check_image(image, "image")
+    height, width, channels = image.shape
+    _check_even(height, width, "image")
+    blocks = image.reshape(height // 2, 2, width // 2, 2, channels)
+    return blocks.transpose(0, 2, 4, 1, 3).reshape(height // 2, width // 2, 4 * channels)
+
+
+def fill(image: jax.Array, known: jax.Array) -> jax.Array:
+    """[H, W, C] with the mean of the known pixels of the same 2x2 block, else 4x4 block, where a pixel is not known.
+
+    ``known`` [H, W, 1] is bool. Blocks without a known pixel are 0. Means of the result thus hold nothing of what was
+    there. Sizes that are not multiples of 4 raise ValueError.
+    """
+    check_image(image, "image")
+    image, known = jnp.asarray(image), jnp.asarray(known)
+    if numba_call.available() and image.dtype == jnp.float32 and not (image.shape[0] % 4 or image.shape[1] % 4):
+        return alone(_filled, _filled_by_compiled)(image, known)
+    return _filled(image, known)
+
+
+def _filled(image: jax.Array, known: jax.Array) -> jax.Array:
+    weight = jnp.asarray(known, image.dtype)
+    total, means = jnp.where(known, image, 0.0), []
+    for level in (1, 2):
+        total, weight = downsample(total), downsample(weight)
+        mean = total / jnp.where(weight > 0, weight, 1.0)
+        for _ in range(level):
+            mean = upsample(mean, up="nearest")
+        means.append((mean, weight))
+    near = upsample(means[0][1], up="nearest") > 0
+    return jnp.where(known, image, jnp.where(near, means[0][0], means[1][0]))
+
+
+def _filled_by_compiled(image: jax.Array, known: jax.Array) -> jax.Array:
+    from jaxdn.ops.layout.numba_kernels import filled
+
+    return numba_call.call(filled, [image.shape], [image, known[..., 0]], rows=image.shape[0] // 4)[0]
+
+
+def upsample(image: jax.Array, *, up: str = "bilinear") -> jax.Array:
+    """Double [H, W, C] to [2H, 2W, C]: bilinear with half-pixel centres and edge clamp, or nearest.
+
+    Bilinear at twice the size has two weights only, 0.75 of the pixel that holds the sample and 0.25 of its neighbour,
+    so each axis is two interleaved shifted sums (``jax.image.resize`` uses matrix products).
+    """
+    check_image(image, "image")
+    check_option(up, "up", ("bilinear", "nearest"))
+    image = jnp.asarray(image)
+    if up == "nearest":
+        return jnp.repeat(jnp.repeat(image, 2, axis=0), 2, axis=1)
+    return _double(_double(image, 0), 1)
+
+
+def _double(image: jax.Array, axis: int) -> jax.Array:
+    """Twice the size along one axis, bilinear, half-pixel centres, edge clamp."""
+    size = image.shape[axis]
+    first = jax.lax.slice_in_dim(image, 0, 1, axis=axis)
+    last = jax.lax.slice_in_dim(image, size - 1, size, axis=axis)
+    before = jnp.concatenate([first, jax.lax.slice_in_dim(image, 0, size - 1, axis=axis)], axis)
+    after = jnp.concatenate([jax.lax.slice_in_dim(image, 1, size, axis=axis), last], axis)
+    halves = jnp.stack([0.75 * image + 0.25 * before, 0.75 * image + 0.25 * after], axis + 1)
+    return halves.reshape(*image.shape[:axis], 2 * size, *image.shape[axis + 1 :])
+
+
+def compose_scales(
+    fine: jax.Array, coarse: jax.Array, alpha: jax.Array, *, down: str = "mean", up: str = "bilinear"
+) -> jax.Array:
+    """Replace the low frequencies of ``fine`` [H, W, C] by ``coarse`` [H/2, W/2, C] with weight ``alpha`` in [0, 1].
+
+    With D the 2x2 ``down``-sampling and U the ``up``-sampling of this module:
+
+    - alpha [H/2, W/2, 1] (Zeng et al. 2021, eq. 4): ``fine - U(alpha * D(fine)) + U(alpha * coarse)``
+    - alpha [H, W, 1] (Hasselgren et al. 2020, eq. 3): ``fine - alpha * U(D(fine)) + alpha * U(coarse)``
+
+    The result, of fine's shape, is not clamped and may be negative. U is linear, so both forms upsample once. Raises
+    ValueError for odd sizes (pad by edge to a multiple of 16 and crop) and for other shapes.
+
+    Args:
+      fine: [H, W, C].
+      coarse: [H/2, W/2, C].
+      alpha: [H/2, W/2, 1] or [H, W, 1].
+      down: ``"mean"`` keeps constant images unchanged; ``"max"`` (the paper's) darkens positive ones where alpha > 0.
+      up: ``"bilinear"`` or ``"nearest"``.
+    """
+    for name, array, channels in (("fine", fine, None), ("coarse", coarse, None), ("alpha", alpha, 1)):
+        check_image(array, name, channels=channels)
+    fine, coarse, alpha = jnp.asarray(fine), jnp.asarray(coarse), jnp.asarray(alpha)
+    height, width, channels = fine.shape
+    _check_even(height, width, "fine")
+    if coarse.shape != (height // 2, width // 2, channels):
+        raise ValueError(
+            f"coarse: expected half of fine, {(height // 2, width // 2, channels)}, got {coarse.shape}; downsample it."
+        )
+    correction = coarse - downsample(fine, down=down)
+    if alpha.shape[:2] == coarse.shape[:2]:
+        return fine + upsample(alpha * correction, up=up)
+    if alpha.shape[:2] == fine.shape[:2]:
+        return fine + alpha * upsample(correction, up=up)
+    raise ValueError(
+        f"alpha: expected the size of fine or of coarse, {fine.shape[:2]} or {coarse.shape[:2]}, got {alpha.shape[:2]}."
+    )
+
+
+def _check_even(height: int, width: int, name: str) -> None:
+    if height % 2 or width % 2:
+        raise ValueError(
+            f"{name}: expected an even height and width, got {height} x {width}; "
+            "pad by edge to a multiple of 16 and crop the result."
+        )

@@ -1,0 +1,1 @@
+"""Auxiliary buffers: G-buffers, motion vectors, reflectance, and surfaces behind mirrors and glass."""

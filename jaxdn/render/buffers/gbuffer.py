@@ -1,0 +1,280 @@
+"""G-buffers at pixel centres: albedo, normal, depth, roughness, position and shape ids.
+
+They are free of noise, as there is exactly one ray through each pixel centre. Mitsuba's own albedo buffer is no
+reflectance for rough conductors and blends (it evaluates the BSDF at normal incidence), and its depth starts at the
+near plane, so these are taken from the BSDFs and positions directly.
+"""
+
+import functools
+import warnings
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from jaxdn.core.frame import FAR
+from jaxdn.render.buffers.reflectance import Reflectances
+from jaxdn.render.buffers.replacement import Followed, Images, follow, imaged
+from jaxdn.render.scenes.media import absorbs, media_of
+from jaxdn.render.tracing.light_samples import diffuse_reflectance
+from jaxdn.render.tracing.wavefront import camera_rays
+
+
+class GBuffer(NamedTuple):
+    """One ray per pixel; every buffer [H, W, C]."""
+
+    albedo: np.ndarray
+    """[H, W, 3] float32 diffuse reflectance in [0, 1]: 0 for purely glossy or specular surfaces, white on a miss."""
+    normal: np.ndarray
+    """[H, W, 3] float32 unit shading normal turned to the viewer, world space, 0 on a miss."""
+    depth: np.ndarray
+    """[H, W, 1] float32 view-space z, ``FAR`` on a miss."""
+    roughness: np.ndarray
+    """[H, W, 1] float32 linear roughness: 1 diffuse, 0 perfectly specular, GGX alpha = roughness^2."""
+    position: np.ndarray
+    """[H, W, 3] float64 world position, 0 on a miss."""
+    direction: np.ndarray
+    """[H, W, 3] float64 direction of the camera ray."""
+    ids: np.ndarray
+    """[H, W, 1] int32 position of the shape's name in ``names``, -1 on a miss."""
+    names: tuple[str, ...]
+    """The names of the scene's shapes, sorted: the same shape has the same id in every frame."""
+    reflectance: np.ndarray | None = None
+    """[H, W, 3] float32 share of uniform incident light that is reflected to the camera, in [0, 1], 1 on a miss; None
+    if it was not requested."""
+    specular_reflectance: np.ndarray | None = None
+    """[H, W, 3] float32 the part of it that lobes other than diffuse ones reflect, 0 on a miss; None as above."""
+    images: Images | None = None
+    """The pixels whose buffers are those of an image in mirrors or of what is seen through glass, if they were
+    requested and there are any. Their ids are of no shape: each pair of shapes, seen and met first, has its own."""
+
+
+def shape_names(scene: Any) -> list[str]:
+    """The name of every shape in the scene's order; unnamed shapes are named by their index."""
+    names = [shape.id() or f"shape_{index:04d}" for index, shape in enumerate(scene.shapes())]
+    if len(set(names)) != len(names):
+        raise ValueError("scene: expected every shape to have a unique id; load it with optimize=False.")
+    return names
+
+
+def check_scene(scene: Any) -> None:
+    """Raise ValueError for effects that the tracers would otherwise silently ignore."""
+    sensor = scene.sensors()[0]
+    scattering = [name for name, medium in media_of(scene).items() if not absorbs(medium)]
+    if scattering:
+        raise ValueError(
+            f"scene: participating media that scatter light (fog, smoke) are not supported yet, but {scattering[0]!r} "
+            "has one; remove it, or set its albedo to 0."
+        )
+    if sensor.needs_aperture_sample():
+        raise ValueError("scene: depth of field is not supported yet; expected a 'perspective' (pinhole) camera.")
+    if sensor.shutter_open_time() > 0:
+        raise ValueError("scene: motion blur is not supported yet; expected an instantaneous shutter.")
+
+
+def gbuffer(scene: Any, *, reflectance: bool = False, specular: bool = False, see_through: bool = False) -> GBuffer:
+    """Trace one ray through the centre of every pixel of the scene's first sensor, with the current variant.
+
+    With ``reflectance`` (:mod:`jaxdn.render.buffers.reflectance`) a material that cannot be averaged gives one warning
+    with the name of its shape, and its albedo is used; with ``specular`` there is its specular part as well. With
+    ``see_through`` the buffers of flat mirrors and of glass are those of what they show
+    (:mod:`jaxdn.render.buffers.replacement`), for which the variant has to be a vectorised one.
+    """
+    names = sorted(shape_names(scene))
+    trace = _one_by_one if str(mi.variant()).startswith("scalar") else _vectorised
+    width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
+    reflectances = Reflectances(scene) if reflectance or specular else None
+    traced, followed = trace(scene, reflectances, specular, see_through)
+    if followed is not None:
+        traced = imaged(traced, followed)
+    found = {name: buffer.reshape(height, width, -1) for name, buffer in traced.items()}
+
+    hit = found["ids"] >= 0
+    direction, normal, position = found["direction"], found["normal"], found["position"]
+    to_world = np.array(scene.sensors()[0].world_transform().matrix, np.float64).reshape(4, 4)
+    forward = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2])
+    # Distances along the ray begin at the near plane; the position is independent of it.
+    depth = (position - to_world[:3, 3]) @ forward[:, None]
+    away = np.sum(normal * direction, axis=-1, keepdims=True) > 0
+    albedo = np.where(hit, np.clip(np.nan_to_num(found["albedo"]), 0.0, 1.0), 1.0).astype(np.float32)
+    reflected = None if reflectances is None else _reflectance(found, albedo, names)
+    images = None if followed is None else _images(scene, followed, traced["ids"])
+    ids = found["ids"].astype(np.int32)
+    if images is not None:
+        ids.reshape(-1)[images.pixels] = _of_pairs(images, len(names))
+    return GBuffer(
+        albedo=albedo,
+        normal=np.where(hit, np.where(away, -normal, normal), 0.0).astype(np.float32),
+        depth=np.where(hit, depth, FAR).astype(np.float32),
+        roughness=np.where(hit, np.clip(np.nan_to_num(found["roughness"], nan=1.0), 0.0, 1.0), 1.0).astype(np.float32),
+        position=np.where(hit, position, 0.0),
+        direction=direction,
+        ids=ids,
+        names=tuple(names),
+        reflectance=reflected,
+        specular_reflectance=_specular(found, reflected) if specular and reflected is not None else None,
+        images=images,
+    )
+
+
+def _images(scene: Any, followed: Followed, shapes: np.ndarray) -> Images | None:
+    """The replaced pixels with ids of shapes, from those of all pixels' surfaces; None if there are none."""
+    pixels = np.flatnonzero(followed.replaced)
+    if not len(pixels):
+        return None
+    mirrors = ids_of(scene, followed.mirrors[pixels].ravel()).reshape(len(pixels), -1)
+    first = ids_of(scene, followed.first[pixels])
+    return Images(pixels, shapes.reshape(-1)[pixels].astype(int), first, mirrors, followed.planes[pixels])
+
+
+def _of_pairs(images: Images, count: int) -> np.ndarray:
+    """Ids, the same in every frame, beyond those of the ``count`` shapes: one for each pair of shapes seen and met."""
+    return ((1 + images.first) * count + images.shapes).astype(np.int32)
+
+
+def _reflectance(found: dict[str, np.ndarray], albedo: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """The averaged reflectance in [0, 1], and the albedo where that is NaN."""
+    broken = (found["ids"] >= 0) & ~np.all(np.isfinite(found["reflectance"]), axis=-1, keepdims=True)
+    for number in np.unique(found["ids"][broken]):
+        _warn(names[int(number)])
+    known = (found["ids"] >= 0) & ~broken
+    return np.where(known, np.clip(found["reflectance"], 0.0, 1.0), albedo).astype(np.float32)
+
+
+def _specular(found: dict[str, np.ndarray], whole: np.ndarray) -> np.ndarray:
+    """The specular part of the averaged reflectance, at most ``whole``; 0 where it is not known."""
+    known = (found["ids"] >= 0) & np.all(np.isfinite(found["specular_reflectance"]), axis=-1, keepdims=True)
+    return np.minimum(np.where(known, np.maximum(found["specular_reflectance"], 0.0), 0.0), whole).astype(np.float32)
+
+
+@functools.cache
+def _warn(shape: str) -> None:
+    """Warn once for each shape, not for each frame."""
+    warnings.warn(f"{shape}: the reflectance of its material cannot be averaged; its albedo is used.", stacklevel=2)
+
+
+def _vectorised(
+    scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool
+) -> tuple[dict[str, np.ndarray], Followed | None]:
+    """All pixels at once; flat buffers of the hits of all rays, and how these were followed."""
+    sensor = scene.sensors()[0]
+    width, height = (int(size) for size in sensor.film().crop_size())
+    pixel = dr.arange(mi.UInt32, width * height)
+    across = dr.opaque(mi.UInt32, width)
+    ray = camera_rays(sensor, pixel % across, pixel // across)
+    direction = ray.d
+    followed = follow(scene, ray, shape_of) if see_through else None
+    if followed is not None:
+        ray = followed.ray
+    hit = scene.ray_intersect(ray)
+    valid = hit.is_valid()
+    bsdf = hit.bsdf(ray)
+
+    flags = bsdf.flags()
+    albedo = diffuse_reflectance(bsdf, hit, valid)
+    roughness = dr.select(mi.has_flag(flags, mi.BSDFFlags.Smooth), mi.Float(1.0), 0.0)
+    there = valid & bsdf.has_attribute("alpha", valid)
+    roughness = dr.select(there, dr.sqrt(dr.maximum(bsdf.eval_attribute_1("alpha", hit, there), 0.0)), roughness)
+    there = valid & bsdf.has_attribute("roughness", valid)
+    roughness = dr.select(there, bsdf.eval_attribute_1("roughness", hit, there), roughness)
+
+    buffers: dict[str, Any] = {
+        "albedo": albedo,
+        "normal": hit.sh_frame.n,
+        "position": hit.p,
+        "direction": direction,
+        "roughness": roughness,
+        "shape": shape_of(hit),
+    }
+    if reflectances is not None:
+        whole, part = reflectances.of_pixels(hit, bsdf, valid, albedo)
+        # Not evaluated unless it is named here.
+        buffers |= {"reflectance": whole} | ({"specular_reflectance": part} if specular else {})
+    dr.eval(buffers)
+    arrays = {name: np.array(buffer).T for name, buffer in buffers.items()}
+    arrays |= {name: arrays[name].astype(np.float64) for name in ("position", "direction")}
+    arrays["ids"] = ids_of(scene, arrays.pop("shape"))
+    return arrays, followed
+
+
+def shape_of(hit: Any) -> Any:
+    """Mitsuba's number of the shape, or instance, of every hit; 0 where there is none."""
+    instance = dr.reinterpret_array(mi.UInt32, hit.instance)
+    shape = dr.select(instance != 0, instance, dr.reinterpret_array(mi.UInt32, hit.shape))
+    return dr.select(hit.is_valid(), shape, 0)
+
+
+def ids_of(scene: Any, numbers: np.ndarray) -> np.ndarray:
+    """The ids of shapes by their numbers of :func:`shape_of`: the positions of their sorted names, -1 for none."""
+    # Registry numbers depend on the other existing objects; names do not. They count objects: a table holds them all.
+    reinterpret: Any = dr.reinterpret_array
+    own = [int(reinterpret(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in scene.shapes()]
+    table = np.full(max([0, *own, int(numbers.max(initial=0))]) + 1, -1)
+    table[own] = _ranks(scene)
+    return table[numbers]
+
+
+def _ranks(scene: Any) -> list[int]:
+    """The id of every shape, in the scene's order."""
+    names = shape_names(scene)
+    ranks = {name: rank for rank, name in enumerate(sorted(names))}
+    return [ranks[name] for name in names]
+
+
+def _one_by_one(
+    scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool
+) -> tuple[dict[str, np.ndarray], None]:
+    """The same buffers, a pixel at a time, for the variant without vectorisation, which follows no rays."""
+    if see_through:
+        raise ValueError(f"see_through: {mi.variant()} cannot follow rays past mirrors and glass; leave it out.")
+    sensor = scene.sensors()[0]
+    width, height = (int(size) for size in sensor.film().crop_size())
+    by_shape = {_address(own): rank for own, rank in zip(scene.shapes(), _ranks(scene), strict=True)}
+    sizes = {"albedo": 3, "normal": 3, "position": 3, "direction": 3, "roughness": 1}
+    arrays: dict[str, np.ndarray] = {name: np.zeros((width * height, size)) for name, size in sizes.items()}
+    if reflectances is not None:
+        arrays |= {name: np.zeros((width * height, 3)) for name in ("reflectance", "specular_reflectance")}
+    arrays["ids"] = np.full(width * height, -1)
+    for pixel in range(width * height):
+        row, column = divmod(pixel, width)
+        ray, _ = sensor.sample_ray(0.0, 0.5, [(column + 0.5) / width, (row + 0.5) / height], [0.5, 0.5])
+        arrays["direction"][pixel] = ray.d
+        hit = scene.ray_intersect(ray)
+        if not hit.is_valid():
+            continue
+        owner = hit.instance if hit.instance is not None else hit.shape
+        arrays["ids"][pixel] = by_shape.get(_address(owner), -1)
+        arrays["position"][pixel] = hit.p
+        arrays["normal"][pixel] = hit.sh_frame.n
+        albedo, arrays["roughness"][pixel] = _surface(hit)
+        arrays["albedo"][pixel] = albedo
+        if reflectances is not None:
+            found = reflectances.of_one(hit, hit.bsdf(), albedo)
+            arrays["reflectance"][pixel], arrays["specular_reflectance"][pixel] = found
+    return arrays, None
+
+
+def _address(shape: Any) -> str:
+    """Python wrappers of a shape are temporary; its id is not."""
+    return str(shape.id())
+
+
+def _surface(hit: Any) -> tuple[np.ndarray, float]:
+    """Albedo and roughness of one hit."""
+    bsdf = hit.bsdf()
+    if bsdf is None:
+        return np.zeros(3), 1.0
+    flags = int(bsdf.flags())
+    albedo = np.zeros(3)
+    if flags & int(mi.BSDFFlags.Diffuse):
+        albedo = np.array(bsdf.eval_diffuse_reflectance(hit), np.float64)
+        for part in ("metallic", "spec_trans"):
+            if bsdf.has_attribute(part):
+                albedo = albedo * (1.0 - bsdf.eval_attribute_1(part, hit))
+    if bsdf.has_attribute("roughness"):
+        return albedo, bsdf.eval_attribute_1("roughness", hit)
+    if bsdf.has_attribute("alpha"):
+        return albedo, max(bsdf.eval_attribute_1("alpha", hit), 0.0) ** 0.5
+    return albedo, 1.0 if flags & int(mi.BSDFFlags.Smooth) else 0.0

@@ -1,0 +1,1 @@
+"""Randomised camera paths through rooms, with objects inserted and collisions avoided."""

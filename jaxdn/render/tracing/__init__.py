@@ -1,0 +1,1 @@
+"""Path tracing: vectorised and scalar, sample streams, seeds and Mitsuba's variants."""

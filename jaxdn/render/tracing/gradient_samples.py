@@ -1,0 +1,124 @@
+"""Gradient samples: a few points of the previous frame, shaded again with the random numbers that they had there.
+
+One pixel of every stratum of 3x3 pixels of the previous frame is carried along with its surface into the current frame,
+and its path is traced in both. Where neither light nor surface has changed, both paths are the same and so is their
+light: the difference is free of noise (Schied et al. 2018). These are extra paths, one in nine pixels for each
+of the two frames; the noisy image itself is left as it is.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdn.color import LUMINANCE
+from jaxdn.render.buffers.geometry import SAME_PLANE, View, project, relative_poses, same_camera, unmoved
+from jaxdn.render.tracing.seeds import NOISY, frame_key, tea
+from jaxdn.render.tracing.wavefront import Replayed
+
+STRATUM = 3
+"""Pixels along one side of a stratum."""
+Replay = Callable[..., Replayed]
+""":func:`jaxdn.render.tracing.wavefront.replay`, or that of :mod:`jaxdn.render.tracing.exact`."""
+
+
+class Picked(NamedTuple):
+    """Points of the previous frame, one for each stratum that saw a surface there, and where they are now."""
+
+    pixel: np.ndarray
+    """[n] index of the pixel in the previous frame."""
+    target: np.ndarray
+    """[n, 2] (x, y) in the current frame; pixel centres are at 0.5."""
+    position: np.ndarray
+    """[n, 3] where the point is in the world of the current frame."""
+    depth: np.ndarray
+    """[n] view-space z there."""
+
+
+def luminance_gradient(
+    replay: Replay,
+    previous: tuple[Any, View],
+    current: tuple[Any, View],
+    *,
+    seed: int,
+    frame: int,
+    sample: int,
+    max_depth: int,
+) -> np.ndarray:
+    """The buffer of this name [H, W, 2]: change of the samples' luminance, and the larger luminance of both frames.
+
+    It is scattered to the pixels that the points have reached, at most one in each stratum, and 0 elsewhere: where
+    nothing landed, or something else is seen now. If no sample at all has changed the whole buffer is 0, which is its
+    neutral value and means the same.
+
+    Args:
+      replay: of the tracer.
+      previous: the ``mi.Scene`` and the geometry of the previous frame.
+      current: those of the current frame.
+      seed: of the clip.
+      frame: index of the current frame.
+      sample: index of the sample of the previous frame's noisy image that is replayed.
+      max_depth: path length.
+    """
+    height, width = current[1].gbuffer.ids.shape[:2]
+    picked = pick(previous[1], current[1], seed=seed, frame=frame)
+    if not len(picked.pixel):
+        return np.zeros((height, width, 2), np.float32)
+    start = np.stack([picked.pixel % width, picked.pixel // width], -1) + 0.5
+    options: dict[str, Any] = {"key": frame_key(seed, frame - 1, NOISY), "sample": sample, "max_depth": max_depth}
+    old = replay(previous[0], start, picked.pixel, **options)
+    new = replay(current[0], picked.target, picked.pixel, **options)
+    # Through the same point the ray hits this point, unless something is in between now.
+    seen = np.linalg.norm(new.position - picked.position, axis=-1) <= SAME_PLANE * picked.depth
+    first, second = old.light @ LUMINANCE, new.light @ LUMINANCE
+    samples = np.stack([second - first, np.maximum(first, second)], -1)
+    return scattered(samples[seen], picked.target[seen], picked.depth[seen], (height, width))
+
+
+def pick(previous: View, current: View, *, seed: int, frame: int) -> Picked:
+    """One pixel of each stratum of the previous frame, at random among those that see a surface; those now off screen
+    are left out."""
+    then = previous.gbuffer
+    size = then.ids.shape[:2]
+    pixel = _random_in_strata(then.ids[..., 0] >= 0, seed, frame)
+    row, column = np.divmod(pixel, size[1])
+    motion = relative_poses(then.names, previous.pose, current.pose)[then.ids[row, column, 0]]
+    old = then.position[row, column]
+    position = np.einsum("nij,nj->ni", motion[:, :3, :3], old) + motion[:, :3, 3]
+    target, depth = project(position, current.camera, size)
+    # Rounding must not move what stands still: a ray elsewhere would hit another triangle, texel or edge.
+    still = unmoved(motion) & same_camera(previous.camera, current.camera)
+    target = np.where(still[:, None], np.stack([column, row], -1) + 0.5, target)
+    with np.errstate(invalid="ignore"):
+        inside = np.all((target >= 0) & (target < [size[1], size[0]]), axis=-1)
+    return Picked(pixel[inside], target[inside], position[inside], depth[inside, 0])
+
+
+def _random_in_strata(there: np.ndarray, seed: int, frame: int) -> np.ndarray:
+    """The indices of pixels, one for each stratum of ``there`` [H, W] that has a true one."""
+    height, width = there.shape
+    index = np.arange(height * width, dtype=np.int64)
+    score = tea(index, np.full_like(index, tea(frame, seed)[0]))[0].reshape(height, width)
+    wide = np.pad(np.where(there, score, -1), ((0, -height % STRATUM), (0, -width % STRATUM)), constant_values=-1)
+    rows, columns = (size // STRATUM for size in wide.shape)
+    strata = wide.reshape(rows, STRATUM, columns, STRATUM).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
+    place = np.argmax(strata, axis=-1)
+    row = STRATUM * np.arange(rows)[:, None] + place // STRATUM
+    column = STRATUM * np.arange(columns) + place % STRATUM
+    return (row * width + column)[strata.max(axis=-1) >= 0]
+
+
+def scattered(samples: np.ndarray, target: np.ndarray, depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """The buffer [H, W, 2] of samples [n, 2] at ``target`` [n, 2]; of several in one stratum the nearest one is kept.
+
+    All 0 if no sample has changed.
+    """
+    buffer = np.zeros((*size, 2), np.float32)
+    if not np.any(samples[:, 0]):
+        return buffer
+    column, row = np.floor(target).astype(int).T
+    stratum = row // STRATUM * (size[1] // STRATUM + 1) + column // STRATUM
+    order = np.lexsort((np.arange(len(depth)), depth, stratum))
+    chosen = order[np.unique(stratum[order], return_index=True)[1]]
+    buffer[row[chosen], column[chosen]] = samples[chosen]
+    return buffer

@@ -1,0 +1,1 @@
+"""The process and its files: atomic writes, memory of the allocator, optional packages, interruption."""

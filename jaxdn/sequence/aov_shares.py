@@ -1,0 +1,123 @@
+"""Additive parts of an image (diffuse and specular light, light groups), denoised so that they still add up to it.
+
+Whatever a denoiser made of the beauty, each part gets its share of it:
+
+    part_i' = E(part_i) * beauty' / E(beauty),
+
+per pixel and colour, where ``E`` is a filter whose weights do not depend on the parts: surfaces seen in the frame,
+their motion, and edges of the denoised beauty'. ``E`` is therefore linear in the light: parts that add up to the beauty
+before do so afterwards, to rounding, for every set of parts at once, without knowing which of them belong together.
+It is not the denoiser's own kernel: where the denoiser divides by albedos, clamps and predicts weights from the light,
+there is no one kernel to apply to a part.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxdn.core.frame import Frame
+from jaxdn.denoiser.sanitize import repair, repair_image
+from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
+from jaxdn.filters.edge_stopping import Offset, Planes, Weight, depth_weight, normal_weight
+from jaxdn.filters.reproject import recall
+from jaxdn.filters.surface_test import Guides, guides_of, hit_mask
+
+_TAPS = stencil(2, kernel=B3_SPLINE)
+_LEVELS = 4
+_ALPHA = 0.1
+"""Smallest weight of a new frame in the history."""
+_DEPTH_TOLERANCE, _SIGMA_DEPTH = 0.02, 1.0
+_NORMAL_THRESHOLD, _SIGMA_NORMAL = 0.9, 64.0
+_EDGE = 0.2
+"""Relative difference of the denoised beauty's colours that counts as an edge."""
+_DARK = 1e-6
+"""Where the filtered beauty is below this, a part keeps the share that it has of all colours together."""
+
+
+class Shares(NamedTuple):
+    """What is carried from one frame to the next."""
+
+    history: jax.Array
+    """[H, W, 3 n + 4] the light of n parts and of the beauty, and the number of frames in it."""
+    guides: Guides
+
+
+def start_shares(frame: Frame, count: int) -> Shares:
+    """No history, for ``count`` parts."""
+    nothing = jnp.zeros((*frame.radiance.shape[:2], 3 * count + 4), jnp.float32)
+    return Shares(nothing, jax.tree.map(jnp.zeros_like, guides_of(repair(frame)[0])))
+
+
+@jax.jit
+def share(state: Shares, frame: Frame, beauty: jax.Array, parts: jax.Array) -> tuple[Shares, jax.Array]:
+    """The parts [n, H, W, 3] of a denoised beauty [H, W, 3].
+
+    Args:
+      state: after the frame before; :func:`start_shares` before the first.
+      frame: the noisy frame; its radiance is what the parts are parts of.
+      beauty: the denoised radiance.
+      parts: [n, H, W, 3] noisy.
+    """
+    frame, _ = repair(frame)
+    parts = repair_image(parts).astype(jnp.float32)
+    noisy = jnp.concatenate([*parts, frame.radiance], axis=-1)
+    blended = _blend(state, frame, noisy)
+    filtered = _filter(frame, beauty, blended[..., :-1])
+    hit = hit_mask(frame.depth, frame.ids)
+    if hit is not None:  # what has no surface is not filtered
+        filtered = jnp.where(hit[..., None], filtered, noisy)
+    whole = filtered[..., -3:]
+    dark = whole <= _DARK
+    level = jnp.sum(whole, axis=-1, keepdims=True)
+
+    def of(part: jax.Array) -> jax.Array:
+        grey = jnp.sum(part, axis=-1, keepdims=True) / jnp.where(level > 0, level, 1.0)
+        return beauty * jnp.where(dark, grey, part / jnp.where(dark, 1.0, whole))
+
+    images = jnp.stack([of(filtered[..., 3 * i : 3 * i + 3]) for i in range(parts.shape[0])])
+    return Shares(blended, guides_of(frame)), images
+
+
+def _blend(state: Shares, frame: Frame, noisy: jax.Array) -> jax.Array:
+    """The history with a frame's light blended in: a mean over the frames in which a point was seen."""
+    past = recall(
+        state.history,
+        state.guides,
+        frame,
+        jnp.asarray(False),
+        depth_tolerance=_DEPTH_TOLERANCE,
+        normal_threshold=_NORMAL_THRESHOLD,
+        around=True,
+    ).history
+    length = past[..., -1:] + 1
+    weight = jnp.maximum(_ALPHA, 1 / length)
+    return jnp.concatenate([past[..., :-1] + weight * (noisy - past[..., :-1]), length], axis=-1)
+
+
+def _filter(frame: Frame, beauty: jax.Array, light: jax.Array) -> jax.Array:
+    """An a-trous cascade over [H, W, C], whose weights stop at surfaces and at edges of the denoised beauty."""
+    hit = hit_mask(frame.depth, frame.ids)
+    weights = [_color_weight(beauty)]
+    if frame.depth is not None:
+        weights.append(depth_weight(frame.depth, frame.ids, sigma=_SIGMA_DEPTH))
+    if frame.normal is not None:
+        weights.append(normal_weight(frame.normal, sigma=_SIGMA_NORMAL))
+
+    def level(planes: jax.Array, index: jax.Array) -> tuple[jax.Array, None]:
+        return edge_average(planes, hit, weights, _TAPS, step=2**index, step_max=2 ** (_LEVELS - 1))[0], None
+
+    planes, _ = lax.scan(level, light.transpose(2, 0, 1), jnp.arange(_LEVELS, dtype=jnp.int32))
+    return planes.transpose(1, 2, 0)
+
+
+def _color_weight(image: jax.Array) -> Weight:
+    """``exp(-sum_c |i_c(p) - i_c(q)| / (_EDGE i_c(p) + 1e-4))`` of a noise-free image [H, W, 3]."""
+    planes = image.transpose(2, 0, 1)
+    here = jnp.concatenate([planes, 1.0 / (_EDGE * planes + 1e-4)])
+
+    def exponent(there: Planes, here: Planes, offset: Offset) -> jax.Array:
+        return sum((jnp.abs(there[c] - here[c]) * here[c + 3] for c in range(3)), start=jnp.zeros((), image.dtype))
+
+    return Weight(planes, here, exponent)

@@ -1,0 +1,71 @@
+"""The first of two passes of ``jaxdn denoise --bidirectional``, from the last frame to the first, and its images."""
+
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from jaxdn.core.frame import Frame
+from jaxdn.data.clip.frames import StoredFrame
+from jaxdn.data.exr.exr import to_half
+from jaxdn.filters.time_reversal import Seen, blend, seen
+
+
+class Backwards:
+    """The images of the backward pass of consecutive frames, and how they are blended with those of the forward one."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._seen: Seen | None = None
+
+    def keep(self, index: int, image: np.ndarray, number: np.ndarray) -> None:
+        """Store the image [H, W, 3] of a frame and for how many frames its points have been seen, [H, W, 1]."""
+        np.save(self._file(index), to_half(np.concatenate([image, number], axis=-1)))
+
+    def blended(self, index: int, frame: Frame, image: np.ndarray) -> np.ndarray:
+        """The image of the forward pass blended with that of the backward one, which is removed.
+
+        To be called for every frame in order; a frame that was not kept only counts as seen.
+        """
+        self._seen = seen(self._seen, frame)
+        file = self._file(index)
+        if not file.is_file():
+            return image
+        stored = np.load(file).astype(np.float32)
+        file.unlink()
+        return np.asarray(blend(image, stored[..., :3], np.asarray(self._seen.number), stored[..., 3:]))
+
+    def _file(self, index: int) -> Path:
+        return self._folder / f"{index}.npy"
+
+
+@contextmanager
+def backward_pass(
+    frames: Iterable[tuple[int, StoredFrame]],
+    denoise: Callable[[StoredFrame], np.ndarray],
+    wanted: Collection[int],
+    folder: Path,
+) -> Iterator[Backwards]:
+    """Denoise frames from the last to the first, and give their images for as long as the block lasts.
+
+    They wait in half precision in a hidden folder below ``folder``, 8 bytes a pixel, which is removed however the block
+    ends. The memory is that of one frame.
+
+    Args:
+      frames: indices and frames, with time turned around (:func:`jaxdn.filters.time_reversal.turned`).
+      denoise: the image [H, W, 3] of each frame.
+      wanted: indices of the frames whose images are kept; the others are for the history.
+      folder: created if it is missing.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=".backwards-", dir=folder) as place:
+        images = Backwards(Path(place))
+        state: Seen | None = None
+        for index, stored in frames:
+            image = denoise(stored)
+            state = seen(state, stored.frame)
+            if index in wanted:
+                images.keep(index, image, np.asarray(state.number))
+        yield images

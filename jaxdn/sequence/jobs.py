@@ -1,0 +1,157 @@
+"""What ``jaxdn denoise`` has to do: which frames of which shots, where they are written, and what is there already."""
+
+from collections.abc import Collection, Iterator, Sequence
+from itertools import pairwise
+from os.path import commonpath
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxdn.data.clip.folder import frame_path, is_clip, read_record, refuse_unfinished
+from jaxdn.data.foreign.shots import Shot, find_shots, missing, ranges
+
+LEAD_IN = 16
+"""Frames before a wanted one that are read for its history where only a part of a shot is denoised. After so many,
+what the history of svgf lacks makes a tenth of the noise that is left (tests/outside/test_frames.py)."""
+
+
+_OTHER_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".hdr", ".bmp", ".webp")
+"""What somebody may want to write, and no folder is called."""
+
+
+class Work(NamedTuple):
+    """A shot, and what to write of it."""
+
+    shot: Shot
+    clip: Path | None
+    """Its folder, if it is a clip of ours."""
+    targets: tuple[Path, ...]
+    """The file to write for each frame."""
+    wanted: frozenset[int]
+    """Indices of the frames to write."""
+    notes: tuple[str, ...]
+    """What a user should know, in sentences."""
+
+    @property
+    def source(self) -> Path:
+        """What tells of which layers it consists: the clip's folder, or the first file."""
+        return self.clip or self.shot.files[0]
+
+    def stretches(self, *, both_ways: bool = False) -> Iterator[range]:
+        """Indices of consecutive frames, each after the first with a history: the wanted ones and their lead-in.
+
+        With ``both_ways`` there are as many frames after the last wanted one.
+        """
+        last = len(self.shot.files) - 1
+        breaks = {index + 1 for index, (one, next_) in enumerate(pairwise(self.shot.numbers)) if next_ != one + 1}
+        begun: int | None = None
+        for index in range(last + 1):
+            if begun is not None and index in breaks:
+                yield range(begun, index)
+                begun = None
+            ahead = range(index, min(index + LEAD_IN, last) + 1)
+            end = next((later for later in ahead if later > index and later in breaks), last + 1)
+            needed = any(later in self.wanted for later in ahead if later < end)
+            if both_ways and begun is not None:
+                needed |= any(earlier in self.wanted for earlier in range(max(begun, index - LEAD_IN), index))
+            if needed and begun is None:
+                begun = index
+            elif not needed and begun is not None:
+                yield range(begun, index)
+                begun = None
+        if begun is not None:
+            yield range(begun, last + 1)
+
+
+def work_on(
+    sources: Sequence[Path], out: Path, *, frames: Collection[int] | None = None, skip_existing: bool = False
+) -> list[Work]:
+    """The shots of folders, patterns and files; several sequences in a folder are several shots.
+
+    Results have the names of their files. With inputs in several folders, they lie in folders of the same names below
+    ``out``. Raises ValueError for no sources and sources without frames, for ``frames`` of which none has any (one that
+    is missing between others is no error), for a frame that is there twice, where a file of the input would be
+    overwritten or lies in the place of a folder, for the name of one file for several frames, and for that of an image
+    which is no EXR file.
+
+    Args:
+      sources: folders of clips, folders of EXR files, patterns, or files.
+      out: a folder; for a single frame also the name of an EXR file.
+      frames: numbers of the frames to denoise; None: all.
+      skip_existing: leave out what is there already.
+    """
+    if not sources:
+        raise ValueError("expected a folder, a pattern or a file to denoise, got none; name one.")
+    found = [shot for source in sources for shot in _shots(source)]
+    together = Path(commonpath([str(file.resolve().parent) for shot, _ in found for file in shot.files]))
+    single = out.suffix.lower() == ".exr"
+    if out.suffix.lower() in _OTHER_IMAGES:
+        raise ValueError(
+            f"-o {out}: expected a folder or the name of an EXR file; --preview writes a PNG next to every EXR."
+        )
+    count = sum(len(shot.files) for shot, _ in found)
+    if single and count > 1:
+        raise ValueError(f"{out}: expected a folder for {count} frames, got the name of one EXR file.")
+    _refuse_file(out.parent if single else out)
+    works = []
+    named = frames is None
+    for shot, clip in found:
+        below = [out / file.resolve().relative_to(together) for file in shot.files]
+        targets = (out,) if single else tuple(path.with_suffix(".exr") for path in below)
+        chosen = [
+            index
+            for index in range(len(targets))
+            if frames is None or set(shot.numbers[index : index + 1]) & set(frames)
+        ]
+        wanted = frozenset(index for index in chosen if not (skip_existing and targets[index].is_file()))
+        named |= bool(chosen) or not set(missing(shot.numbers)).isdisjoint(frames or ())
+        notes = _notes(shot, lone=len(found) > 1, there=len(chosen) - len(wanted))
+        works.append(Work(shot, clip, targets, wanted, notes))
+    _refuse_twice(works)
+    inputs = {file.resolve() for shot, _ in found for file in shot.files}
+    if {target.resolve() for work in works for target in work.targets} & inputs or out.resolve() in inputs:
+        raise ValueError(f"{out}: expected another place than the input's, whose frames would be overwritten.")
+    if frames is not None and not named:
+        there = "; ".join(f"{work.shot.label}" for work in works)
+        raise ValueError(f"--frames {ranges(sorted(frames))}: expected frames that are there, got none of {there}.")
+    return works
+
+
+def _shots(source: Path) -> list[tuple[Shot, Path | None]]:
+    if is_clip(source):
+        count = read_record(source)["frames"]
+        return [(Shot(tuple(frame_path(source, index) for index in range(count)), tuple(range(count))), source)]
+    refuse_unfinished(source)
+    return [(shot, None) for shot in find_shots(source)]
+
+
+def _refuse_file(folder: Path) -> None:
+    """Raise ValueError where a folder, or one that it is to lie in, is a file."""
+    taken = next((path for path in (folder, *folder.parents) if path.is_file()), None)
+    if taken is not None:
+        raise ValueError(f"-o {folder}: expected a folder, but {taken} is a file; name another.")
+
+
+def _refuse_twice(works: Sequence[Work]) -> None:
+    """Raise ValueError where two frames would be written into one file."""
+    frames: dict[Path, Path] = {}
+    for work in works:
+        for file, target in zip(work.shot.files, work.targets, strict=True):
+            other = frames.setdefault(target, file)
+            if other is file:
+                continue
+            if other.resolve() == file.resolve():
+                raise ValueError(f"{file}: expected every frame once, got it twice; name it once.")
+            raise ValueError(f"{target}: expected the result of one frame, got {other} and {file}; rename one of them.")
+
+
+def _notes(shot: Shot, *, lone: bool, there: int) -> tuple[str, ...]:
+    notes = []
+    gaps = missing(shot.numbers)
+    if gaps:
+        notes.append(f"{shot.label}: {ranges(gaps)} missing; after a gap there is no history at first")
+    if lone and not shot.numbers:
+        notes.append(f"{shot.label}: no frame number in its name, so it is denoised as an image of its own")
+    if there:
+        they = f"{there} frames are there already and stay as they are"
+        notes.append(f"{shot.label}: {they if there > 1 else '1 frame is there already and stays as it is'}")
+    return tuple(notes)

@@ -1,0 +1,105 @@
+"""``jaxdn denoise SCENE``: render and denoise frame by frame, with samples where the denoiser wants them."""
+
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdn import color
+from jaxdn.core.frame import OF_SAMPLES, Frame
+from jaxdn.data.exr.exr import write_exr
+from jaxdn.denoiser.rollout import stream
+from jaxdn.evaluation.report.images import save_png
+from jaxdn.planning.catalogue import OF_FIRST_HITS
+from jaxdn.render.adaptive import render_sampled
+from jaxdn.render.scenes.opening import open_scene
+from jaxdn.sequence.denoise_frames import light_of
+from jaxdn.sequence.render_jobs import plan_clip
+from jaxdn.sequence.run import Written, lettered
+from jaxdn.zoo.ready import Candidate
+
+MOST = 64
+"""Samples that one pixel may have, in budgets; at least this many."""
+
+
+class Settings(NamedTuple):
+    """What is rendered and written."""
+
+    width: int = 128
+    height: int = 128
+    frames: Collection[int] | None = None
+    """Numbers of the frames to denoise; None: all of the scene."""
+    budget: float = 4.0
+    """Mean number of samples per pixel."""
+    seed: int = 0
+    """Of the samples."""
+    preview: bool = False
+    """Write a PNG next to each frame, and one of its samples."""
+
+
+def denoise_scene(
+    source: str,
+    animation: Path | None,
+    out: Path,
+    method: Candidate,
+    settings: Settings,
+    *,
+    say: Callable[[Path, int, int], None] = lambda path, done, total: None,
+    log: Callable[[str], None] = lambda line: None,
+) -> Written:
+    """Render an animated scene as the method asks for samples, and denoise it; returns the files written.
+
+    A method that does not ask has the budget in every pixel. All reflected light is noisy. A file has the channels
+    ``R, G, B``, the picture, ``denoised.R/G/B``, the reflected light alone, and ``samples.Y``, the number of samples of
+    each pixel. Frames before the first that is wanted are rendered for their history. Flat mirrors and glass are seen
+    through, unless the method follows reflections itself. Raises ValueError for what is not
+    a scene, for a budget that is out of range, and where Mitsuba has only scalar variants.
+    """
+    scene = open_scene(source, animation)
+    wanted = sorted(range(scene.frames) if settings.frames is None else settings.frames)
+    if not wanted or wanted[-1] >= scene.frames:
+        raise ValueError(f"--frames: expected some of 0 to {scene.frames - 1}, which {source} has, got {wanted}.")
+    if method.denoiser is None:
+        raise ValueError(f"--method {method.label}: expected a denoiser for a scene, got the noisy image itself.")
+    reads = method.denoiser._replace(reads=method.denoiser.reads - OF_SAMPLES)
+    size: dict[str, Any] = {"width": settings.width, "height": settings.height}
+    through = not reads.reads & OF_FIRST_HITS
+    wished: dict[str, Any] = {"light": "reflected", "see_through": through}
+    planned = plan_clip(scene, denoiser=reads, frames=wanted[-1] + 1, **wished, **size)
+    assert planned is not None
+    if method.denoiser.samples is None and (settings.budget < 1 or settings.budget % 1):
+        raise ValueError(
+            f"--budget {settings.budget:g}: expected a whole number of at least 1, as {method.label} does not say "
+            "where samples go."
+        )
+    step = stream(method.denoiser, method.params)
+    most = max(MOST, round(settings.budget * MOST))
+
+    def ask(frame: Frame) -> np.ndarray:
+        asked = step.ask(frame, most)
+        return np.full((*frame.radiance.shape[:2], 1), round(settings.budget)) if asked is None else np.asarray(asked)
+
+    if through and {"mirror", "transmission"} & set(planned.effects):
+        log("guides of flat mirrors and glass are those of what they show")
+    files: list[Path] = []
+    view = None
+    for index in range(wanted[-1] + 1):
+        found = render_sampled(
+            scene, index, ask, plan=planned.plan, seed=settings.seed, previous=view, **wished, **size
+        )
+        view, counts = found.view, np.asarray(found.frame.sample_count)
+        image = np.asarray(step(found.frame))
+        if index not in wanted:
+            continue
+        path = out / f"frame_{index:04d}.exr"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        picture = image + light_of(found.frame.emission)
+        write_exr(path, lettered("", picture) | lettered("denoised.", image) | {"samples.Y": counts[..., 0]})
+        if settings.preview:
+            save_png(path.with_suffix(".png"), color.tonemap(picture))
+            save_png(path.with_suffix(".samples.png"), np.sqrt(counts[..., 0] / max(counts.max(), 1)))
+        files.append(path)
+        log(f"{path.name}: {counts.mean():.3g} samples per pixel, {counts.min():g} to {counts.max():g}")
+        say(path, len(files), len(wanted))
+    return Written(files, len(step.programs), step.repaired)

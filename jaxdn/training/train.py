@@ -1,0 +1,98 @@
+"""``jaxdn train``: a learned method, trained on rendered clips."""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxdn.core.frame import Clip
+from jaxdn.data.training.dataset import training_batches
+from jaxdn.denoiser import Denoiser
+from jaxdn.methods.registry import Method
+from jaxdn.recipes.recipe import Recipe
+from jaxdn.training.loop import Start, begun_with, fit
+from jaxdn.training.validation import load_validation
+from jaxdn.zoo.weights import save_weights, starting_params
+
+
+def train(
+    method: Method,
+    recipe: Recipe,
+    clips: Sequence[Path],
+    out: Path,
+    *,
+    options: Mapping[str, Any],
+    start: str | Path | None = None,
+    validation: Sequence[Path] = (),
+    implementation: str = "auto",
+    time_limit: float | None = None,
+    label: str | None = None,
+    record: Mapping[str, Any] | None = None,
+) -> Path:
+    """Train a method to the end, unless it is trained already, and return the path of its weights.
+
+    The weights are the running mean that the recipe asks for. A second call resumes from the newest checkpoint in
+    ``out``. Raises ValueError for options that the method does not have, unsuitable clips, and an engine that cannot
+    run here.
+
+    Args:
+      method: a row of the table of methods.
+      recipe: objective, optimiser, batches.
+      clips: folders of clips, or packed sets, to train on.
+      out: the run's folder: checkpoints, log.jsonl, recipe.json, and finally weights.safetensors with its JSON.
+      options: the method's; they are stored with the weights, and so are the defaults of all others.
+      start: shipped weights or a .safetensors file to continue from (:func:`jaxdn.zoo.weights.starting_params`); None:
+        new ones.
+      validation: folders of held-out clips, or packed sets, used whole.
+      implementation: the engine for training; "auto" is the method's fastest that is available here.
+      time_limit: seconds after which training stops; the weights of that moment are written all the same.
+      label: the run's name in messages; default: that of its folder.
+      record: further entries of the weights' JSON.
+    """
+    if time_limit is not None and not time_limit > 0:
+        raise ValueError(f"time limit: expected more than 0, got {time_limit:g} s; leave it out for no limit.")
+    label = out.name if label is None else label
+    engine = method.engine("training", options) if implementation == "auto" else implementation
+    if engine not in (None, "reference"):
+        denoiser = method.factory(**{**options, "implementation": engine})
+        print(f"{label}: convolutions run on {engine}", flush=True)
+    else:
+        denoiser = method.factory(**options)
+        print(f"{label}: everything runs on XLA", flush=True)
+    batches = recipe_batches(denoiser, recipe, clips)
+    held_out = load_validation(denoiser, validation, spp=min(recipe.spp))
+    first = None if start is None else Start(str(start), starting_params(start, denoiser))
+    state = fit(denoiser, recipe, batches, out, label=label, start=first, validation=held_out, time_limit=time_limit)
+    begun: dict[str, Any] = {} if first is None else {"start": first.name}
+    shorter = begun_with(out)
+    if shorter:
+        begun["begun_with"] = shorter
+    about = {
+        "recipe": recipe.record(),
+        "updates": int(state.step),
+        "skipped": int(state.skipped),
+        **begun,
+        **(record or {}),
+    }
+    return save_weights(
+        out / "weights.safetensors", state.average, factory=method.name, options=dict(options), record=about
+    )
+
+
+def recipe_batches(denoiser: Denoiser, recipe: Recipe, clips: Sequence[Path]) -> Iterator[Clip]:
+    """The batches that a recipe asks for, with the buffers that the denoiser and the objective read, without end.
+
+    ``clips`` are folders of clips, or packed sets.
+    """
+    return training_batches(
+        clips,
+        buffers=denoiser.reads | recipe.objective.reads,
+        batch=recipe.batch,
+        crop=recipe.crop,
+        frames=recipe.frames,
+        seed=recipe.seed,
+        spp=recipe.spp,
+        layers=denoiser.samples is not None,
+        variation=recipe.variation,
+        threads=max(1, (os.cpu_count() or 1) // 2),  # a GPU takes a hundred elements a second, a thread makes twelve
+    )

@@ -1,0 +1,1 @@
+"""Ready denoisers: methods with their shipped or trained weights."""

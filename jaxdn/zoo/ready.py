@@ -1,0 +1,100 @@
+"""Denoisers that are ready to run: filters, shipped weights, weights in a file, and the noisy image itself.
+
+The command line, comparisons, the chart, long runs and the hard cases look up names of methods here.
+"""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxdn.core.frame import Frame
+from jaxdn.denoiser import Denoiser, Params
+from jaxdn.methods.registry import Method, method_named, methods
+from jaxdn.networks.engines import Purpose
+from jaxdn.zoo.weights import describe, load_weights, shipped_names
+
+NOISY = "noisy"
+"""The name of the noisy image itself."""
+
+OURS = "steady-balanced"
+"""The shipped weights that reports open on: those that `jaxdn denoise` uses."""
+
+
+class Candidate(NamedTuple):
+    """A denoiser that is ready to run."""
+
+    label: str
+    """The name in tables."""
+    denoiser: Denoiser | None
+    """None is the noisy image itself."""
+    params: Params
+    method: Method | None = None
+    """Its row in the table of methods."""
+    options: Mapping[str, Any] = {}
+    """The options given to its factory."""
+
+    def engine(self, purpose: Purpose = "inference") -> str | None:
+        """The engine that runs it fastest here (:meth:`jaxdn.methods.registry.Method.engine`); None is XLA."""
+        return None if self.method is None else self.method.engine(purpose, self.options)
+
+
+def candidate(name: str, **options: Any) -> Candidate:
+    """``noisy``, a filter (``svgf``), shipped weights (``ntd-large``) or the path of a .safetensors file.
+
+    ``options`` are passed to the factory and replace those that the weights were saved with. Raises ValueError for any
+    other name, for a learned method without weights, and for options that the method does not have.
+    """
+    if name == NOISY:
+        if options:
+            raise ValueError(f"{', '.join(options)}: expected a method, got {name!r}, which has no options.")
+        return Candidate(name, None, {})
+    if name in methods():
+        method = method_named(name)
+        if not method.filter:
+            trained = [each for each in shipped_names() if describe(each)["factory"] == name]
+            raise ValueError(
+                f"method {name!r}: expected its weights, {', '.join([*trained, 'the path of a .safetensors file'])}; "
+                "`jaxdn train` makes some."
+            )
+        return Candidate(name, method.factory(**options), {}, method, options)
+    if not name.endswith(".safetensors") and name not in shipped_names():
+        raise ValueError(
+            f"method {name!r}: expected one of {', '.join(all_names())} or the path of a .safetensors file."
+        )
+    denoiser, params = load_weights(name, **options)
+    description = describe(name)
+    path = Path(name)
+    # A run's folder is a better label than the file name, which is the same for all runs.
+    label = path.parent.name if path.stem == "weights" else path.stem
+    return Candidate(label, denoiser, params, method_named(description["factory"]), description["options"] | options)
+
+
+def untrained(method: Method, **options: Any) -> Candidate:
+    """A learned method in its smallest variant, with initial weights."""
+    given = {**method.variant_named(None), **options}
+    denoiser = method.factory(**given)
+    return Candidate(method.name, denoiser, denoiser.init(jax.random.key(0), _smallest()), method, given)
+
+
+def filters() -> list[str]:
+    """The names of the methods that denoise without training."""
+    return [name for name, method in methods().items() if method.filter]
+
+
+def all_names() -> list[str]:
+    """Every name that :func:`candidate` knows: the noisy image, filters, and shipped weights."""
+    return [NOISY, *filters(), *shipped_names()]
+
+
+def everything() -> Iterator[Candidate]:
+    """Filters, shipped weights, and learned methods without shipped weights, with initial weights."""
+    yield from (candidate(name) for name in all_names() if name != NOISY)
+    trained = {describe(name)["factory"] for name in shipped_names()}
+    yield from (untrained(method) for name, method in methods().items() if not method.filter and name not in trained)
+
+
+def _smallest() -> Frame:
+    return Frame(jnp.zeros((16, 16, 3), jnp.float32))
