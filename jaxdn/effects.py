@@ -56,12 +56,12 @@ def inspect(
     if isinstance(scene, Facts):
         return find(scene._replace(moments=scene.moments[:frames]))
     if _is_footage(scene):
-        from jaxdn.data.clip.evidence import read_facts
+        from jaxdn.data.evidence import read_facts
 
         facts = read_facts(scene, animation, channels=channels, layer=layer)
         return find(facts._replace(moments=facts.moments[:frames]))
-    from jaxdn.render.scenes.opening import open_scene
-    from jaxdn.render.scenes.scene_facts import facts_of
+    from jaxdn.render.opening import open_scene
+    from jaxdn.render.scene_facts import facts_of
 
     return find(facts_of(open_scene(scene, animation), width=width, height=height, frames=frames))
 

@@ -9,52 +9,9 @@ from pathlib import Path
 import pytest
 
 import jaxdn
+from tests.house import PACKAGES, ROOMS, ROOT, with_table
 
 PACKAGE = Path(jaxdn.__file__).parent
-
-MATHS = (
-    "checks",
-    "extras",
-    "options",
-    "frame",
-    "repair",
-    "denoiser",
-    "numerics",
-    "stencils",
-    "color",
-    "motion",
-    "scales",
-    "ops",
-    "heap",
-    "brdf",
-    "microfacets",
-    "glints",
-)
-LAYERS = {
-    **dict.fromkeys(("platform", "compiled"), 0),
-    **dict.fromkeys((*MATHS, "ops", "losses", "metrics", "flip", "sampling", "objectives", "recipe", "variation"), 1),
-    **dict.fromkeys(("shrinkage", "whole"), 1),
-    **dict.fromkeys(("filters", "networks"), 2),
-    **dict.fromkeys(("methods", "denoisers"), 3),
-    **dict.fromkeys(("rollout", "parts", "additive", "learning", "planning"), 4),
-    **dict.fromkeys(("files", "render", "clips", "checkpoint", "report", "weights", "candidates", "export"), 5),
-    "effects": 6,
-    **dict.fromkeys(("cli", "arguments", "commands"), 7),
-}
-OUTSIDE = {
-    "flax": {"networks"},
-    "numba": {"compiled"},
-    "optax": {"learning"},
-    "mitsuba": {"render"},
-    "drjit": {"render"},
-    "OpenEXR": {"clips"},
-    "grain": {"clips"},
-    "orbax": {"checkpoint"},
-    "matplotlib": {"report"},
-    "PIL": {"report"},
-    "safetensors": {"weights"},
-    "tyro": {"cli", "arguments"},
-}
 
 
 def _imports(path: Path) -> set[str]:
@@ -74,8 +31,24 @@ def _imported_by_name(path: Path) -> list[ast.expr]:
     return [call.args[0] for name, call in names if name == "import_module"]
 
 
-def _package(path: Path) -> str:
-    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+def _room(module: str) -> str | None:
+    """The room of ``a.b.c`` in jaxdn: itself, if it is on the map, else its folder; None for jaxdn itself."""
+    if module in ROOMS or (PACKAGE / Path(*module.split("."))).is_dir():
+        return module
+    return module.rpartition(".")[0] or None
+
+
+def _own(path: Path) -> str:
+    relative = path.relative_to(PACKAGE).with_suffix("")
+    return ".".join(relative.parts[:-1] if relative.name == "__init__" else relative.parts)
+
+
+def _imported(name: str) -> str:
+    """The room that ``jaxdn.a.b.c``, a module or something in it, is imported from."""
+    parts = name.split(".")[1:]
+    while parts and not any((PACKAGE.joinpath(*parts)).with_suffix(end).exists() for end in ("", ".py")):
+        parts.pop()
+    return _room(".".join(parts)) or ""
 
 
 MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "__init__.py"]
@@ -83,15 +56,28 @@ MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_imports_point_down(path):
-    layer = LAYERS[_package(path)]
+    room = _room(_own(path))
+    assert room in ROOMS, f"{path}: its folder {room!r} is not on the map (tests/house.py)"
     for name in _imports(path):
-        top, _, rest = name.partition(".")
+        top = name.partition(".")[0]
         if top == "jaxdn":
-            package = rest.partition(".")[0]
-            if package in LAYERS:
-                assert LAYERS[package] <= layer, f"{path} (layer {layer}) imports {name} (layer {LAYERS[package]})"
-        elif top in OUTSIDE:
-            assert _package(path) in OUTSIDE[top], f"{path} imports {top}"
+            below = _imported(name)
+            known = below in ("", room) or (below in ROOMS and ROOMS[below].floor < ROOMS[room].floor)
+            assert known, f"{path} ({room}) imports {name} ({below}), which is not on a lower floor"
+        elif top in PACKAGES:
+            allowed = PACKAGES[top]
+            assert any(room == each or room.startswith(f"{each}.") for each in allowed), f"{path} imports {top}"
+
+
+def test_every_room_of_the_map_exists():
+    for name in ROOMS:
+        place = PACKAGE.joinpath(*name.split("."))
+        assert place.is_dir() or place.with_suffix(".py").is_file(), name
+
+
+def test_contributing_has_the_map():
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    assert text == with_table(text), "run python -m tests.house"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
@@ -99,7 +85,7 @@ def test_packages_import_by_name_only_from_themselves(path):
     """An import without an import statement would bypass the test above."""
     for argument in _imported_by_name(path):
         written = ast.unparse(argument)
-        package = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts[:2])
+        package = ".".join(path.parent.relative_to(PACKAGE.parent).parts)
         own = written.startswith(("__package__", "f'{__package__}", f"f'{package}.", f"'{package}."))
         outside = isinstance(argument, ast.Constant) and not str(argument.value).startswith("jaxdn")
         assert own or outside, f"{path} imports {written}; write an import statement"

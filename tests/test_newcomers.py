@@ -19,7 +19,7 @@ from jaxdn.zoo.weights import describe
 from tests.hard_cases.cases import CASES
 from tests.hard_cases.subjects import denoiser_subjects
 from tests.hard_cases.table import rows
-from tests.learning.test_training import make_clip
+from tests.training.test_training import make_clip
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

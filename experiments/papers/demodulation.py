@@ -54,7 +54,7 @@ def ways() -> dict[str, Divisor]:
 def clip_of(path: Path) -> tuple[Clip, np.ndarray]:
     """Frames of a scene at rest, with other noise each; its reference, and the first half of that."""
     from jaxdn.render.frame import render_frame
-    from jaxdn.render.scenes.opening import open_scene
+    from jaxdn.render.opening import open_scene
 
     scene = open_scene(str(path))
     first = render_frame(scene, 0, width=WIDTH, height=HEIGHT, reference_spp=REFERENCE)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxdn.clips import find_clips
-from jaxdn.data.clip.files import read_json
+from jaxdn.data.errors import read_json
 from jaxdn.data.exr.exr import read_exr, write_exr
 from jaxdn.runtime.atomic_files import write_json
 

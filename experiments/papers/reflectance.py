@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdn.render.tracing.variant import use_variant
+from jaxdn.render.mitsuba.variant import use_variant
 
 SIZE = 24
 """Width and height of the picture in pixels: a ball that nearly fills it."""

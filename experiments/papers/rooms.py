@@ -18,7 +18,7 @@ from jaxdn.commands.errors import plain_errors
 from jaxdn.evaluation.compare import compare
 from jaxdn.evaluation.report import text_table, write_report
 from jaxdn.render import ClipJob, choose_variant, render_clips
-from jaxdn.render.errors import RenderError
+from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.render.scenes.scene_file import SceneFile
 from jaxdn.zoo.ready import NOISY, Candidate, all_names, candidate, filters
 

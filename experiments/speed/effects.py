@@ -34,8 +34,8 @@ from jaxdn.denoiser import Params
 from jaxdn.effects import Plan
 from jaxdn.render import use_variant
 from jaxdn.render.clip import render_clip
+from jaxdn.render.path_depth import measure_depth
 from jaxdn.render.scenes.scene_file import SceneFile
-from jaxdn.render.tracing.depth import measure_depth
 
 SCENES = (
     "static grey box",

@@ -71,7 +71,7 @@ class Counts(NamedTuple):
 def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
     """For each kind a function that writes the bytes to the expected path and reads them as a user would."""
     from jaxdn.clips import read_clip, read_frame
-    from jaxdn.data.clip.evidence import read_facts
+    from jaxdn.data.evidence import read_facts
     from jaxdn.data.training.cache import open_cached
     from jaxdn.render.scenes.animation import CameraKeys, RigidKeys, check_animation, light_scale, read_animation
     from jaxdn.zoo.weights import load_weights

@@ -23,8 +23,8 @@ from jaxdn import color
 from jaxdn.clips import find_clips
 from jaxdn.commands.errors import plain_errors
 from jaxdn.core.frame import Frame
-from jaxdn.data.clip.folder import open_frames
 from jaxdn.data.clip.frames import StoredFrame
+from jaxdn.data.read import open_frames
 from jaxdn.metrics import psnr
 from jaxdn.sequence.denoise_frames import Pass
 from jaxdn.zoo.ready import Candidate, candidate

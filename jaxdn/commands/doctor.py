@@ -15,7 +15,7 @@ import jaxdn
 from jaxdn.networks.engines import ENGINES
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.onednn import library
-from jaxdn.render.tracing.variant import choose_variant, has_cuda
+from jaxdn.render.mitsuba.variant import choose_variant, has_cuda
 from jaxdn.runtime.optional import EXTRAS, install
 
 _EXTRA_OF = {"onednn-bfloat16": "onednn", "onednn-float32": "onednn", "onnxruntime": "onnx", "onednn": "onednn"}

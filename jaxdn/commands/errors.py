@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 
 from rich.console import Console
 
-from jaxdn.render.errors import RenderError
+from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.runtime.interrupt import EXIT_CODE, never_lost
 from jaxdn.runtime.optional import extra_of, install
 

@@ -22,7 +22,7 @@ from jaxdn.data.foreign.shots import ranges
 from jaxdn.data.foreign.sources import sources_of
 from jaxdn.denoiser import Denoiser
 from jaxdn.effects import EFFECTS, Plan, everything, inspect, plan
-from jaxdn.render.scenes.opening import open_scene
+from jaxdn.render.opening import open_scene
 from jaxdn.sequence.render_jobs import Planned, denoiser_named, plan_clip
 
 EVERYTHING = plan(everything(1))

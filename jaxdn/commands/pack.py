@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from jaxdn.data.clip.files import ClipError
+from jaxdn.data.errors import ClipError
 from jaxdn.data.training.pack import Packed, Packing, open_clips, write_pack
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from jaxdn import __version__, color, metrics
 from jaxdn.core.frame import Clip
-from jaxdn.data.clip.folder import read_clip
 from jaxdn.data.clip.noise_floor import read_halves, read_noise_floor
+from jaxdn.data.read import read_clip
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.denoiser.rollout import denoise
 from jaxdn.evaluation.report import ClipResult, Results, Scores, TrainingCurve

@@ -40,8 +40,8 @@ from jaxdn.filters.variance import estimate_variance
 from jaxdn.methods import svgf
 from jaxdn.methods.demodulation import Demodulation
 from jaxdn.methods.learnable_options import FITTING, LEARNED, at_level, moved, unmoved
+from jaxdn.methods.lobes import Light, apart, reflectances
 from jaxdn.methods.registry import method
-from jaxdn.methods.two_lobes.lobes import Light, apart, reflectances
 
 READS = svgf.READS | {
     *("albedo", "reflectance", "specular_reflectance", "roughness", "dual_motion"),

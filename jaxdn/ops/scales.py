@@ -61,7 +61,7 @@ def _filled(image: jax.Array, known: jax.Array) -> jax.Array:
 
 
 def _filled_by_compiled(image: jax.Array, known: jax.Array) -> jax.Array:
-    from jaxdn.ops.layout.numba_kernels import filled
+    from jaxdn.ops.numba_fill import filled
 
     return numba_call.call(filled, [image.shape], [image, known[..., 0]], rows=image.shape[0] // 4)[0]
 

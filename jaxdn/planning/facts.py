@@ -1,7 +1,7 @@
 """Plain facts about an animated scene, as far as they decide what has to be simulated.
 
-The data passed from the readers of facts (:mod:`jaxdn.render.scenes.scene_facts` for a scene,
-:mod:`jaxdn.data.clip.evidence` for a finished clip) to the catalogue of effects, which depends neither on Mitsuba nor
+The data passed from the readers of facts (:mod:`jaxdn.render.scene_facts` for a scene,
+:mod:`jaxdn.data.evidence` for a finished clip) to the catalogue of effects, which depends neither on Mitsuba nor
 on files.
 """
 

@@ -90,7 +90,7 @@ def plan(
     (:data:`jaxdn.core.frame.ON_REQUEST`).
 
     ``max_depth`` is the path length to render with, by default the scene's
-    (:func:`jaxdn.render.tracing.depth.measure_depth` measures it). With ``light="reflected"`` direct light is a part of
+    (:func:`jaxdn.render.path_depth.measure_depth` measures it). With ``light="reflected"`` direct light is a part of
     the noisy radiance, and its shadows have buffers, instead of a buffer of its own. With ``jitter`` no frame shows the
     same as another, and what is found through the centres of pixels (``THROUGH_CENTRES``) is left out. With
     ``see_through`` the guides are those of what mirrors and glass show: what belongs to the first surface

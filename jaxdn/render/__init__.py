@@ -9,9 +9,9 @@ from typing import Any
 _HOMES = {
     "AnimatedScene": "scenes.scene",
     "Camera": "scenes.scene",
-    "scene_from_record": "scenes.opening",
-    "choose_variant": "tracing.variant",
-    "use_variant": "tracing.variant",
+    "scene_from_record": "opening",
+    "choose_variant": "mitsuba.variant",
+    "use_variant": "mitsuba.variant",
     "ClipJob": "farm",
     "render_clips": "farm",
     "render_clip": "clip",

@@ -10,9 +10,9 @@ from jaxdn.planning.catalogue import NoisyLight
 from jaxdn.planning.plan import Plan
 from jaxdn.render.buffers.geometry import View
 from jaxdn.render.frame import path_length, render_frame
+from jaxdn.render.mitsuba.variant import advice, use_variant
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.tracing.seeds import NOISY
-from jaxdn.render.tracing.variant import advice, use_variant
 
 Ask = Callable[[Frame], np.ndarray]
 """A frame with its buffers, and one sample as radiance -> [H, W, 1] whole numbers of samples."""

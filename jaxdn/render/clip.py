@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 
 from jaxdn.core.checks import check_at_least
-from jaxdn.data.clip.files import ClipError
 from jaxdn.data.clip.folder import begin_record, begun_record, finish_record, frame_path
 from jaxdn.data.clip.frames import read_frame, write_frame
+from jaxdn.data.errors import ClipError
 from jaxdn.planning.catalogue import NoisyLight
 from jaxdn.planning.plan import Plan
 from jaxdn.render.buffers.geometry import View
-from jaxdn.render.errors import RenderError
 from jaxdn.render.frame import Rendered, check_options, path_length, render_frame, tracer
+from jaxdn.render.mitsuba.errors import RenderError
+from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.settings import check_settings
-from jaxdn.render.tracing.variant import use_variant
 
 
 def render_clip(

@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 from jaxdn.data.clip.folder import begun_record, frame_path, is_clip, read_record
 from jaxdn.planning.catalogue import NoisyLight
 from jaxdn.planning.plan import entries, plan_from_record
-from jaxdn.render.errors import RenderError
-from jaxdn.render.scenes.opening import scene_from_record
+from jaxdn.render.mitsuba.errors import RenderError
+from jaxdn.render.mitsuba.variant import choose_variant
+from jaxdn.render.opening import scene_from_record
 from jaxdn.render.settings import UNSAID
-from jaxdn.render.tracing.variant import choose_variant
 
 _THREADS = 2
 """Renderer threads of each process. With only one, Mitsuba's loader waits forever for some scenes' textures."""
@@ -156,7 +156,7 @@ def _work(job: ClipJob, messages: Connection, threads: int) -> None:
     warnings.filterwarnings("ignore", message="scene ")  # whoever opened the scene has been warned
     try:
         from jaxdn.render.clip import render_clip
-        from jaxdn.render.tracing.variant import use_variant
+        from jaxdn.render.mitsuba.variant import use_variant
 
         use_variant(job.variant)
         if threads:

@@ -16,12 +16,12 @@ from jaxdn.planning.plan import Plan
 from jaxdn.render.buffers.gbuffer import check_scene, gbuffer
 from jaxdn.render.buffers.geometry import View, far_motion, motion_between, ray_length
 from jaxdn.render.buffers.glossy_vectors import glossy_motion
+from jaxdn.render.buffers.gradient_samples import Replay, luminance_gradient
 from jaxdn.render.buffers.shadow_vectors import shadow_motion
+from jaxdn.render.mitsuba.variant import advice, tells_lobes, use_variant
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.tracing import jitter as jitters
-from jaxdn.render.tracing.gradient_samples import Replay, luminance_gradient
 from jaxdn.render.tracing.seeds import DRAWS, NOISY, REFERENCE
-from jaxdn.render.tracing.variant import advice, tells_lobes, use_variant
 from jaxdn.render.tracing.wavefront import Accumulated, Request, no_light
 
 _SURFACE = ("albedo", "normal", "depth", "roughness", "reflectance", "specular_reflectance", "ids")

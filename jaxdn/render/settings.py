@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from jaxdn.data.clip.files import ClipError
+from jaxdn.data.errors import ClipError
 from jaxdn.planning.plan import entries
 
 _FREE = ("frames", "cameras", "versions", "bad_samples")

@@ -11,7 +11,7 @@ from jaxdn.data.foreign.shots import Shot, find_shots, missing, ranges
 
 LEAD_IN = 16
 """Frames before a wanted one that are read for its history where only a part of a shot is denoised. After so many,
-what the history of svgf lacks makes a tenth of the noise that is left (tests/outside/test_frames.py)."""
+what the history of svgf lacks makes a tenth of the noise that is left (tests/sequence/test_frames.py)."""
 
 
 _OTHER_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".hdr", ".bmp", ".webp")

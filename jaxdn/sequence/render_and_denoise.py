@@ -13,7 +13,7 @@ from jaxdn.denoiser.rollout import stream
 from jaxdn.evaluation.report.images import save_png
 from jaxdn.planning.catalogue import OF_FIRST_HITS
 from jaxdn.render.adaptive import render_sampled
-from jaxdn.render.scenes.opening import open_scene
+from jaxdn.render.opening import open_scene
 from jaxdn.sequence.denoise_frames import light_of
 from jaxdn.sequence.render_jobs import plan_clip
 from jaxdn.sequence.run import Written, lettered

@@ -15,11 +15,11 @@ from jaxdn.planning.plan import SCORED
 from jaxdn.render.families import FAMILIES
 from jaxdn.render.farm import ClipJob, render_clips
 from jaxdn.render.frame import check_options
-from jaxdn.render.scenes.opening import family_scene
+from jaxdn.render.mitsuba.variant import choose_variant, tells_lobes, use_variant
+from jaxdn.render.opening import family_scene
+from jaxdn.render.path_depth import PathDepth, measure_depth
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.scenes.scene_file import SceneFile
-from jaxdn.render.tracing.depth import PathDepth, measure_depth
-from jaxdn.render.tracing.variant import choose_variant, tells_lobes, use_variant
 from jaxdn.zoo.ready import candidate
 
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from jaxdn import color
 from jaxdn.core.frame import Frame
-from jaxdn.data.clip.folder import open_frames
 from jaxdn.data.clip.frames import StoredFrame
 from jaxdn.data.exr.exr import write_exr
-from jaxdn.data.exr.result import write_result
 from jaxdn.data.foreign.import_exr import canvas_of
+from jaxdn.data.foreign.result import write_result
+from jaxdn.data.read import open_frames
 from jaxdn.evaluation.report.images import save_png
 from jaxdn.sequence.additive_layers import Aovs
 from jaxdn.sequence.backward_pass import Backwards, backward_pass
@@ -93,12 +93,12 @@ def denoise_files(
     """Denoise clips' folders, and EXR files of other renderers; returns the files written.
 
     A frame of another renderer is its own file with the denoised beauty in place of the noisy one
-    (:func:`jaxdn.data.exr.result.write_result`). A frame of one of our clips has the channels ``R, G, B``, the denoised
-    radiance with the directly reflected and the emitted light added back, and ``denoised.R/G/B``, the denoised part
-    alone. What is no noise is kept as it was (``settings.safe``). Frames are read, denoised and written one at a time,
-    so that a sequence of any length takes the memory of one. Files are never left incomplete. Where frames are missing,
-    the history begins anew. Raises ValueError for input that cannot be read or is inconsistent, before the frame
-    concerned is written.
+    (:func:`jaxdn.data.foreign.result.write_result`). A frame of one of our clips has the channels ``R, G, B``, the
+    denoised radiance with the directly reflected and the emitted light added back, and ``denoised.R/G/B``, the denoised
+    part alone. What is no noise is kept as it was (``settings.safe``). Frames are read, denoised and written one at a
+    time, so that a sequence of any length takes the memory of one. Files are never left incomplete. Where frames are
+    missing, the history begins anew. Raises ValueError for input that cannot be read or is inconsistent, before the
+    frame concerned is written.
 
     Args:
       sources: folders of clips, and folders of, patterns for, or names of EXR files.

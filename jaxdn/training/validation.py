@@ -10,8 +10,9 @@ import numpy as np
 
 from jaxdn import color, metrics
 from jaxdn.core.frame import Clip
-from jaxdn.data.clip.folder import find_clips, read_clip
+from jaxdn.data.clip.folder import find_clips
 from jaxdn.data.clip.noise_floor import other_half, read_halves
+from jaxdn.data.read import read_clip
 from jaxdn.data.training.cache import read_array, read_window
 from jaxdn.data.training.pack import open_pack
 from jaxdn.denoiser import Denoiser, Params

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxdn.core.frame import Frame
-from jaxdn.methods.two_lobes.lobes import apart
+from jaxdn.methods.lobes import apart
 from jaxdn.methods.two_lobes.relax import relax
 from tests.methods.lobe_scenes import HEIGHT, WIDTH, mirror_frames, run
 

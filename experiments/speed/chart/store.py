@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from jaxdn.data.clip.files import read_json
+from jaxdn.data.errors import read_json
 from jaxdn.evaluation.report.results import json_ready
 from jaxdn.runtime.atomic_files import write_json
 

@@ -7,23 +7,21 @@ is not a clip yet.
 
 import itertools
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxdn.core.frame import OF_SAMPLES, Clip, Frame, frame_at, only, present, written_out
-from jaxdn.data.clip.files import ClipError, read_json
-from jaxdn.data.clip.frames import StoredFrame, doubling_layers, layers_for, read_frame, stored_layers, write_frame
+from jaxdn.core.frame import OF_SAMPLES, Clip, frame_at, only, present
+from jaxdn.data.clip.frames import StoredFrame, layers_for, read_frame, stored_layers, write_frame
 from jaxdn.data.clip.record import FORMAT, checked, held_frames, is_planned
+from jaxdn.data.errors import ClipError, read_json
 from jaxdn.data.exr.exr import read_exr
-from jaxdn.data.foreign.import_exr import plain_frames
-from jaxdn.filters.time_reversal import turned
 from jaxdn.runtime.atomic_files import write_json
 
-_RECORD = "clip.json"
+RECORD = "clip.json"
 _UNFINISHED = "clip.unfinished.json"
 
 
@@ -34,7 +32,7 @@ def frame_path(folder: str | Path, index: int) -> Path:
 
 def is_clip(path: str | Path) -> bool:
     """Whether ``path`` is a folder with a finished clip in it."""
-    return (Path(path) / _RECORD).is_file()
+    return (Path(path) / RECORD).is_file()
 
 
 def begin_record(record: Mapping[str, Any], folder: str | Path) -> None:
@@ -50,7 +48,7 @@ def begin_record(record: Mapping[str, Any], folder: str | Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     # In this order there is always a record, however this is interrupted; until the second step, the finished clip's.
     write_json(folder / _UNFINISHED, record)
-    (folder / _RECORD).unlink(missing_ok=True)
+    (folder / RECORD).unlink(missing_ok=True)
 
 
 def finish_record(record: Mapping[str, Any], folder: str | Path) -> None:
@@ -59,7 +57,7 @@ def finish_record(record: Mapping[str, Any], folder: str | Path) -> None:
     Raises as :func:`begin_record` does.
     """
     folder = Path(folder)
-    write_json(folder / _RECORD, checked({"format": FORMAT, **record}, folder / _RECORD))
+    write_json(folder / RECORD, checked({"format": FORMAT, **record}, folder / RECORD))
     (folder / _UNFINISHED).unlink(missing_ok=True)
 
 
@@ -68,7 +66,7 @@ def begun_record(folder: str | Path) -> dict[str, Any] | None:
 
     Raises ClipError if the record is broken or of another version.
     """
-    for file in (Path(folder) / _RECORD, Path(folder) / _UNFINISHED):  # where both exist, the clip is finished
+    for file in (Path(folder) / RECORD, Path(folder) / _UNFINISHED):  # where both exist, the clip is finished
         if file.is_file():
             return checked(read_json(file), file)
     return None
@@ -84,7 +82,7 @@ def read_record(path: str | Path) -> dict[str, Any]:
         raise ClipError(f"{folder}: there is no such folder.")
     if not is_clip(folder):
         raise _unfinished(folder)
-    return checked(read_json(folder / _RECORD), folder / _RECORD)
+    return checked(read_json(folder / RECORD), folder / RECORD)
 
 
 def find_clips(path: str | Path) -> list[Path]:
@@ -106,7 +104,7 @@ def find_clips(path: str | Path) -> list[Path]:
     if not found and interrupted:
         raise _unfinished(interrupted[0])
     if not found:
-        raise ClipError(f"{folder}: expected a clip (a folder with {_RECORD}) or a folder of clips, found none.")
+        raise ClipError(f"{folder}: expected a clip (a folder with {RECORD}) or a folder of clips, found none.")
     for sub in interrupted:
         warnings.warn(f"{_unfinished(sub)} It is left out.", stacklevel=2)
     return found
@@ -166,7 +164,7 @@ def read_frames(path: str | Path, *, spp: int = 1, order: Iterable[int] | None =
             found = stored.frame.radiance.shape[:2]
             if found != size:
                 raise ClipError(
-                    f"{file}: expected {size[1]} x {size[0]} pixels as {_RECORD} says, got {found[1]} x {found[0]}."
+                    f"{file}: expected {size[1]} x {size[0]} pixels as {RECORD} says, got {found[1]} x {found[0]}."
                 )
             if held[index] == index:
                 source = index, stored
@@ -210,86 +208,6 @@ def _checked_buffers(stored: StoredFrame, wanted: set[str], file: Path) -> Store
     return stored._replace(frame=only(stored.frame, frozenset(wanted)))
 
 
-def open_frames(
-    path: str | Path | Sequence[Path],
-    *,
-    spp: int = 1,
-    motion_convention: str | None = None,
-    channels: Mapping[str, str] | None = None,
-    layer: str | None = None,
-    part: range | None = None,
-    backwards: bool = False,
-    log: Callable[[str], None] = lambda line: None,
-) -> tuple[list[Path], Iterator[StoredFrame]]:
-    """The files of a clip, or of another renderer's sequence, and their frames, each read when it is requested.
-
-    Takes what :func:`read_clip` takes, or a list of another renderer's files, and raises as it does; ``part`` are the
-    indices to read of a clip, None: all. ``backwards`` and ``log`` as in
-    :func:`jaxdn.data.foreign.import_exr.plain_frames`. The frames of another renderer have no ``layers`` and no
-    reference.
-    """
-    if isinstance(path, str | Path):
-        if is_clip(path):
-            part = range(read_record(path)["frames"]) if part is None else part
-            # First checks that all frames of the record exist.
-            frames = read_frames(path, spp=spp, order=part[::-1] if backwards else part)
-            return [frame_path(path, index) for index in part], _turned(frames) if backwards else frames
-        refuse_unfinished(path)
-    if spp != 1:
-        where = path if isinstance(path, str | Path) else f"{path[0]} ({len(path)} file{'s' * (len(path) != 1)})"
-        raise ClipError(f"{where}: expected spp 1, got {spp}; only a clip with a {_RECORD} has several sample counts.")
-    naming: dict[str, Any] = {"motion_convention": motion_convention, "channels": channels, "layer": layer}
-    files, plain = plain_frames(path, **naming, backwards=backwards, log=log)
-    # Unlike the variable of a loop, this does not keep a frame while the next one is read.
-    return files, map(_of_another, plain)
-
-
-def _of_another(frame: Frame) -> StoredFrame:
-    return StoredFrame(frame, {}, None, None)
-
-
-def _turned(frames: Iterator[StoredFrame]) -> Iterator[StoredFrame]:
-    """Frames that come from the last to the first, with time turned around."""
-    after: Frame | None = None
-    for stored in frames:
-        yield stored._replace(frame=turned(stored.frame, after))
-        after = stored.frame
-
-
-def read_clip(
-    path: str | Path,
-    *,
-    spp: int = 1,
-    layers: bool = False,
-    motion_convention: str | None = None,
-    channels: Mapping[str, str] | None = None,
-    layer: str | None = None,
-) -> Clip:
-    """Read a clip as NumPy arrays, with the dtypes of :attr:`jaxdn.core.frame.Buffer.dtype`.
-
-    A buffer that only some frames have is written out in the others (:func:`jaxdn.core.frame.written_out`).
-
-    ``path`` is the folder of a clip, of which ``spp`` samples a pixel are read, and with ``layers`` the independent
-    noisy layers of 1, 2, 4, ... samples too (``Clip.layers``); or a folder of, or a glob pattern for, the EXR files of
-    another renderer, whose channels are found by their names (``motion_convention``, ``channels`` and ``layer``: see
-    :func:`jaxdn.data.foreign.import_exr.plain_frames`).
-
-    Raises ClipError, naming the file and the reason: no such folder, no ``clip.json``, another format version, missing
-    or unreadable frames, missing channels, frames that differ in size or channels, ``spp`` or ``layers`` not available.
-    """
-    _, opened = open_frames(path, spp=spp, motion_convention=motion_convention, channels=channels, layer=layer)
-    stored = list(opened)
-    counts = doubling_layers(stored[0].layers, path) if layers else []
-    named = {name for one in stored for name in present(one.frame)}
-    frames = jax.tree.map(lambda *buffers: np.stack(buffers), *(written_out(one.frame, named) for one in stored))
-    references = [one.reference for one in stored if one.reference is not None]
-    return Clip(
-        frames,
-        np.stack(references) if references else None,
-        {count: np.stack([one.layers[count] for one in stored]) for count in counts} if layers else None,
-    )
-
-
 def refuse_unfinished(path: str | Path) -> None:
     """Raise ClipError if a folder is one of our clips whose rendering was interrupted."""
     if _looks_unfinished(path):
@@ -300,7 +218,7 @@ def _unfinished(folder: Path) -> ClipError:
     """Why a folder is not a clip."""
     if (folder / _UNFINISHED).is_file():
         return ClipError(f"{folder}: rendering this clip was interrupted; run the same command again to finish it.")
-    return ClipError(f"{folder}: there is no {_RECORD} in it; the clip was not finished. Render it again.")
+    return ClipError(f"{folder}: there is no {RECORD} in it; the clip was not finished. Render it again.")
 
 
 def _looks_unfinished(path: str | Path) -> bool:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdn.core.frame import BUFFERS, GUIDES, OF_SAMPLES, Buffer, Frame
-from jaxdn.data.clip.files import ClipError
+from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.exr import read_exr, to_half, write_exr
 
 _LIGHT = BUFFERS["radiance"]

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdn.core.frame import GUIDES
-from jaxdn.data.clip.files import ClipError
+from jaxdn.data.errors import ClipError
 
 FORMAT = 1
 """The version of the layout that this code writes and reads."""

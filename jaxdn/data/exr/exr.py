@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import OpenEXR
 
-from jaxdn.data.clip.files import ClipError
+from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.windows import Window, window_of
 from jaxdn.runtime.atomic_files import whole
 

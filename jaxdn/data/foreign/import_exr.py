@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdn.core.frame import BUFFERS, FAR, Buffer, Frame, present
-from jaxdn.data.clip.files import ClipError
+from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.exr import read_exr, read_header, read_windows
 from jaxdn.data.exr.windows import Window, place, union
 from jaxdn.data.foreign.layers import (

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 from jaxdn.core.frame import BUFFERS, Buffer
-from jaxdn.data.clip.files import ClipError
+from jaxdn.data.errors import ClipError
 
 Channels = tuple[str, ...]
 """The full names of the channels that make up one buffer, in order."""

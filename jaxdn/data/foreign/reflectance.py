@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxdn.brdf import directional_albedo
 from jaxdn.core.frame import BUFFERS, Frame
-from jaxdn.data.clip.files import ClipError
+from jaxdn.data.errors import ClipError
 from jaxdn.data.foreign.layers import NOT_WANTED, Channels, find, grouped, layer_of, name_it
 from jaxdn.data.foreign.lighting import SLACK
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxdn.data.clip.files import ClipError
+from jaxdn.data.errors import ClipError
 
 
 class Shot(NamedTuple):

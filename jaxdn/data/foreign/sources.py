@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxdn.core.frame import BUFFERS, GUIDES, Buffer
-from jaxdn.data.clip.files import ClipError
 from jaxdn.data.clip.folder import frame_path, is_clip
 from jaxdn.data.clip.frames import stored_layers
+from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.exr import read_exr, read_names
 from jaxdn.data.foreign.import_exr import choose
 from jaxdn.data.foreign.layers import Channels, detect_channels, is_cryptomatte, last_name, layer_of

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn.data.clip.files import ClipError
+from jaxdn.data.errors import ClipError
 from jaxdn.data.foreign.layers import Channels, last_name
 from jaxdn.ops.motion import dual_motion, occlusion_mask
 

@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdn.core.frame import BUFFERS, GUIDES, OF_SAMPLES, Buffer, Clip, Frame, present, written_out
-from jaxdn.data.clip.files import ClipError, read_json
 from jaxdn.data.clip.folder import frame_path, read_frames, read_record
 from jaxdn.data.clip.frames import StoredFrame, combine, doubling_layers, layers_for
 from jaxdn.data.clip.record import is_planned
+from jaxdn.data.errors import ClipError, read_json
 from jaxdn.data.exr.exr import to_half
 from jaxdn.runtime.atomic_files import write_json
 

@@ -14,8 +14,8 @@ import jax
 import numpy as np
 
 from jaxdn.core.frame import OF_SAMPLES, Clip, written_out
-from jaxdn.data.clip.files import ClipError
 from jaxdn.data.clip.frames import doubling_layers
+from jaxdn.data.errors import ClipError
 from jaxdn.data.training.cache import CachedClip, read_window
 from jaxdn.data.training.draws import check_samples, draw_light
 from jaxdn.data.training.pack import open_clips

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdn.data.clip.files import ClipError
 from jaxdn.data.clip.frames import layers_for
+from jaxdn.data.errors import ClipError
 from jaxdn.data.training.cache import CachedClip, read_array, read_layers
 
 Window = tuple[slice, ...]

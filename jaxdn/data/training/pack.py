@@ -18,8 +18,8 @@ import numpy as np
 
 from jaxdn.core.checks import check_at_least
 from jaxdn.core.frame import BUFFERS, GUIDES
-from jaxdn.data.clip.files import ClipError, read_json
 from jaxdn.data.clip.folder import find_clips
+from jaxdn.data.errors import ClipError, read_json
 from jaxdn.data.training.cache import CachedClip, kept, open_cached, read_array
 from jaxdn.data.training.compact import CODES, squeeze, unsqueeze
 from jaxdn.runtime.atomic_files import write_whole

@@ -20,7 +20,7 @@ from jaxdn.filters.surface_test import Guides, guides_of, hit_mask
 from jaxdn.filters.virtual_motion import diffuseness
 from jaxdn.methods.demodulation import Demodulation
 from jaxdn.methods.learnable_options import LEARNED
-from jaxdn.methods.two_lobes.lobes import Light, apart, kept_closeness, previous_guides, recall_both
+from jaxdn.methods.lobes import Light, apart, kept_closeness, previous_guides, recall_both
 
 _POSITIVE = Range(0, without_low=True)
 _AROUND = 3

@@ -29,10 +29,10 @@ from jaxdn.filters.edge_stopping import closeness_weight
 from jaxdn.filters.stabilisation import stabilise
 from jaxdn.filters.virtual_motion import closeness_of
 from jaxdn.methods.learnable_options import FITTING, LEARNED, moved, unmoved
+from jaxdn.methods.lobes import READS
 from jaxdn.methods.registry import method
 from jaxdn.methods.two_lobes import histories
 from jaxdn.methods.two_lobes.histories import Kind, LobeState
-from jaxdn.methods.two_lobes.lobes import READS
 
 _PLANES = 9
 """Planes of a history: colour (3), length in frames, fast colour (3), steady luminance, closeness of diffuse hits."""

@@ -28,10 +28,10 @@ from jaxdn.filters.cascade import cascade
 from jaxdn.filters.clamping import without_fireflies
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.methods.learnable_options import FITTING, LEARNED_PER_LEVEL, moved, unmoved
+from jaxdn.methods.lobes import READS
 from jaxdn.methods.registry import method
 from jaxdn.methods.two_lobes import histories
 from jaxdn.methods.two_lobes.histories import Kind, LobeState
-from jaxdn.methods.two_lobes.lobes import READS
 
 _PLANES = 9
 """Planes of a history: colour (3), two moments of its luminance, length in frames, fast colour (3)."""

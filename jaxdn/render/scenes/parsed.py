@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from jaxdn.render.tracing.variant import use_variant
+from jaxdn.render.mitsuba.variant import use_variant
 
 
 class Parsed:

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import mitsuba as mi
 import numpy as np
 
+from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.animation import CameraKeys, rotation_matrix
 from jaxdn.render.scenes.repaint import changeable, named_materials
 from jaxdn.render.scenes.scene import Camera
 from jaxdn.render.scenes.scene_file import SceneFile
 from jaxdn.render.tours.free_space import FreeSpace
 from jaxdn.render.tours.tour_things import focal, moved_shapes, thrown_things
-from jaxdn.render.tracing.variant import use_variant
 
 _ATTEMPTS = 32
 _VIEWS = 48

@@ -1,0 +1,1 @@
+"""Mitsuba itself: which variant computes, and the errors that say what to do."""

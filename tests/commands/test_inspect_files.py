@@ -1,0 +1,184 @@
+"""``jaxdn inspect`` on files of other renderers: what is read, what is missing, what to state, and nothing else."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxdn import clips
+from jaxdn.commands import main
+from jaxdn.commands.sources import CONSEQUENCES
+from jaxdn.data.foreign.sources import sources_of
+from jaxdn.data.foreign.vectors import MOTION_CONVENTIONS
+from jaxdn.methods.registry import methods
+from tests.programs import HEIGHT, PROGRAMS, WIDTH, write_shot
+from tests.training.test_training import make_clip
+
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
+PLAN = ("integrator", "compiled", "rendered once", "on disk", "left out", "emission", "dual ", "uncertain", "effect")
+"""Words of the effects and the plan of a scene."""
+UNSTATED = [name for name, program in PROGRAMS.items() if program.motion_convention]
+"""Programs with motion vectors that their files do not explain."""
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Three frames of every program."""
+    folder = tmp_path_factory.mktemp("programs")
+    return {name: write_shot(name, folder / name) for name in PROGRAMS}
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Any:
+    """``run(path, *options)``: what ``jaxdn inspect`` prints."""
+    monkeypatch.setenv("COLUMNS", "250")  # no line is broken
+
+    def inspect(*arguments: Any) -> str:
+        main.main(["inspect", *map(str, arguments)])
+        return capsys.readouterr().out
+
+    return inspect
+
+
+@pytest.fixture
+def fails(capsys: pytest.CaptureFixture[str]) -> Any:
+    """``fails(verb, path, *options)``: the message with which a command ends."""
+
+    def ended(*arguments: Any) -> str:
+        with pytest.raises(SystemExit) as error:
+            main.main([*map(str, arguments)])
+        assert error.value.code == 2
+        return capsys.readouterr().err
+
+    return ended
+
+
+def proposed(text: str) -> list[str]:
+    """The conventions in the list that is printed."""
+    lines = [line.split() for line in text.splitlines()]
+    return [line[1] for line in lines if line[:1] == ["--motion-convention"]]
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_no_plan_is_printed_and_the_convention_is_named(name: str, shots: dict[str, Path], run: Any) -> None:
+    text, program = run(shots[name]), PROGRAMS[name]
+    assert [word for word in PLAN if word in text] == []
+    assert proposed(text) == ([program.motion_convention] if program.motion_convention else [])
+    if program.motion_convention:
+        assert MOTION_CONVENTIONS[program.motion_convention] in text
+        assert "shot.0001.exr and shot.0002.exr" in text
+    elif "motion" in program.buffers:
+        assert MOTION_CONVENTIONS["cycles"].partition(" (")[0] in text
+    else:
+        assert CONSEQUENCES["motion"] in text
+    assert "3 frames of " in text
+
+
+@pytest.mark.parametrize("name", UNSTATED)
+def test_what_is_stated_is_not_asked_for(name: str, shots: dict[str, Path], run: Any) -> None:
+    text = run(shots[name], "--motion-convention", PROGRAMS[name].motion_convention)
+    assert proposed(text) == []
+    assert "nothing says" not in text.lower()
+    assert proposed(run(shots[name], "--motion-convention", "none")) == []
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_json_says_the_same_as_the_text(name: str, shots: dict[str, Path], run: Any) -> None:
+    text, record = run(shots[name]), json.loads(run(shots[name], "--json"))
+    assert set(record) == {"frames", "width", "height", "sources", "missing", "notes", "fitting_conventions"}
+    assert record["sources"] == [{**one._asdict(), "channels": list(one.channels)} for one in sources_of(shots[name])]
+    for source in record["sources"]:
+        assert source["convention"] in text
+    for buffer, consequence in record["missing"].items():
+        assert [buffer, "missing", *consequence.split()] in [line.split() for line in text.splitlines()]
+    assert text.count(" missing ") == len(record["missing"])
+    for note in record["notes"]:
+        assert note in text
+    assert (record["fitting_conventions"] or []) == proposed(text)
+    assert (record["fitting_conventions"] is None) == (name not in UNSTATED)
+    assert f"{record['frames']} frames of {record['width']} x {record['height']} pixels" in text
+
+
+def test_notes_and_what_a_denoiser_lacks_are_in_both(shots: dict[str, Path], run: Any) -> None:
+    record = json.loads(run(shots["RenderMan"], "--json", "--denoiser", "svgf", "--motion-convention", "cycles"))
+    assert set(record["missing"]) <= methods()["svgf"].factory().reads
+    stated = ("--motion-convention", "previous-current")
+    note = "'View Layer.Vector' looks like Blender's, whose convention is 'cycles'; read as stated"
+    assert json.loads(run(shots["Blender"], "--json", *stated))["notes"] == [note]
+    assert note in run(shots["Blender"], *stated)
+
+
+def test_one_frame_cannot_tell_and_all_conventions_are_listed(shots: dict[str, Path], run: Any) -> None:
+    alone = shots["Arnold"] / "shot.0001.exr"
+    text = run(alone)
+    assert proposed(text) == [*MOTION_CONVENTIONS, "none"]
+    assert "One frame alone does not tell, and needs no motion" in text
+    assert f"1 frame of {WIDTH - 2} x {HEIGHT - 2} pixels" in text
+    assert json.loads(run(alone, "--json"))["fitting_conventions"] == []
+
+
+def test_where_nothing_moves_that_is_said(tmp_path: Path, run: Any) -> None:
+    for frame in (1, 2):
+        PROGRAMS["RenderMan"].write(tmp_path / f"shot.{frame:04d}.exr", 0)
+    text = run(tmp_path)
+    assert proposed(text) == [*MOTION_CONVENTIONS, "none"]
+    assert "None brings shot.0001.exr and shot.0002.exr onto each other" in text
+
+
+@pytest.mark.parametrize("command", [("inspect",), ("denoise", "-o", "out", "--method", "svgf")])
+def test_a_second_frame_with_other_channels_is_named(command: tuple[str, ...], tmp_path: Path, fails: Any) -> None:
+    PROGRAMS["RenderMan"].write(tmp_path / "shot.0001.exr", 0)
+    PROGRAMS["RenderMan"].write(tmp_path / "all.exr", 1)
+    there = clips.read_exr(tmp_path / "all.exr")
+    left = {name: np.ascontiguousarray(pixels) for name, pixels in there.items() if not name.startswith("albedo")}
+    clips.write_exr(tmp_path / "shot.0002.exr", left)
+    message = fails(*command, tmp_path / "shot.*.exr")
+    assert "shot.0002.exr: expected the channels of the first frame, but albedo.b, albedo.g, albedo.r" in message
+
+
+def test_a_convention_that_does_not_exist_lists_those_that_do(shots: dict[str, Path], fails: Any) -> None:
+    message = fails("inspect", shots["Arnold"], "--motion-convention", "backwards")
+    assert "got 'backwards'" in message
+    assert all(f"  {name} " in message for name in MOTION_CONVENTIONS)
+
+
+@pytest.mark.parametrize("option", [("--frames", 2), ("--animation", "moves.json")])
+def test_options_of_scenes_are_refused(option: tuple[str, Any], shots: dict[str, Path], fails: Any) -> None:
+    assert "expected none of --animation, --frames" in fails("inspect", shots["Arnold"], *option)
+
+
+@pytest.mark.parametrize("more", [(), ("--json",)])
+def test_an_unfinished_clip_is_no_folder_of_files(more: tuple[str, ...], tmp_path: Path, fails: Any) -> None:
+    clips.write_clip(make_clip(0), tmp_path)
+    (tmp_path / "clip.json").unlink()
+    assert "the clip was not finished" in fails("inspect", tmp_path, *more)
+
+
+def test_a_finished_clip_keeps_its_effects_and_plan(tmp_path: Path, run: Any) -> None:
+    clips.write_clip(make_clip(0), tmp_path / "clip")
+    text = run(tmp_path / "clip")
+    assert all(words in text for words in ("integrator", "rendered once", "on disk", "motion        dual"))
+    record = json.loads(run(tmp_path / "clip", "--json"))
+    assert set(record) == {"effects", "plan", "uncertain", "sources"}
+
+
+FIRST = next(iter(MOTION_CONVENTIONS))
+
+
+@pytest.mark.parametrize("option", [("--channels", "albedo=a"), ("--layer", "a"), ("--motion-convention", FIRST)])
+def test_a_finished_clip_needs_no_options_of_files(option: tuple[str, str], tmp_path: Path, fails: Any) -> None:
+    clips.write_clip(make_clip(0), tmp_path / "clip")
+    message = fails("inspect", tmp_path / "clip", *option)
+    assert "expected none of --channels, --layer, --motion-convention" in message
+    assert "a clip of jaxdn's own" in message
+
+
+def test_the_help_says_that_files_are_read(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main.main(["inspect", "--help"])
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "files of other renderers, what is read from which layer" in text
+    assert "fitting_conventions" in text

@@ -1,0 +1,93 @@
+"""README and docs: their links lead somewhere, their commands parse, their code runs, their pictures are small."""
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tyro
+from PIL import Image
+
+from experiments.papers import before_after, front_page, vectors
+from jaxdn.clips import write_clip
+from jaxdn.commands.arguments import COMMANDS, Denoise
+from jaxdn.zoo.ready import OURS
+from tests.training.test_training import make_clip
+
+ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def pytest_id(path):
+    return str(path.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=pytest_id)
+def test_links_to_files_lead_to_files(page):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+    targets = re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text)
+    missing = [link for link in targets if "://" not in link and not (page.parent / link).exists()]
+    assert missing == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=pytest_id)
+def test_commands_parse(page):
+    blocks = re.findall(r"```(?:text)?\n(.*?)```", page.read_text(), flags=re.S)
+    lines = [line.strip() for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    for line in lines:
+        if line.startswith("jaxdn ") and "|" not in line:
+            tyro.cli(COMMANDS, args=shlex.split(line, comments=True)[1:])
+
+
+def test_the_pictures_are_small():
+    sizes = {path.name: path.stat().st_size for path in (ROOT / "docs" / "images").iterdir()}
+    assert sizes
+    assert max(sizes.values()) < 300_000
+    assert sum(sizes.values()) < 1_500_000
+
+
+def test_the_default_of_denoise_is_what_reports_open_on():
+    assert Denoise.__dataclass_fields__["method"].default == OURS
+
+
+def test_the_tutorials_denoiser_runs_and_learns(tmp_path, monkeypatch, capsys):
+    write_clip(make_clip(0, frames=8), tmp_path / "data" / "demo" / "test" / "robot-200")
+    monkeypatch.chdir(tmp_path)
+    page = (ROOT / "docs" / "tutorials" / "own-denoiser.md").read_text()
+    found: dict[str, object] = {}
+    exec("\n".join(re.findall(r"```python\n(.*?)```", page, re.S)), found)
+    assert "dB, running mean" in capsys.readouterr().out
+    assert float(found["noisy"]) < float(found["before"])
+    assert float(found["before"]) < float(found["after"])
+
+
+def test_the_pictures_of_motion_vectors_are_drawn(tmp_path, capsys):
+    clip = make_clip(1, frames=3)
+    frames = clip.frames._replace(motion=np.full_like(clip.frames.motion, 2.0), visible=np.zeros((3, 16, 16, 1), bool))
+    folder = tmp_path / "clip"
+    write_clip(clip._replace(frames=frames), folder)
+    vectors.main(vectors.Settings(folder, 1, out=tmp_path))
+    for name in ("motion.webp", "dual-motion.webp"):
+        with Image.open(tmp_path / name) as picture:
+            assert np.asarray(picture).std() > 10
+    with pytest.raises(ValueError, match="frame before it, 1 to 2"):
+        vectors.main(vectors.Settings(folder, 0, out=tmp_path))
+    write_clip(clip._replace(frames=frames._replace(visible=None)), tmp_path / "other")
+    with pytest.raises(ValueError, match="expected a clip with visible"):
+        vectors.main(vectors.Settings(tmp_path / "other", 1, out=tmp_path))
+
+
+def test_frames_stand_side_by_side_with_a_part_enlarged(tmp_path):
+    pictures = {"a": np.zeros((18, 32, 3)), "b": np.full((18, 32, 3), 0.5)}
+    pictures["a"][4:6, 8:10] = 1.0
+    whole = np.asarray(front_page.sheet(pictures, (8, 4, 2, 2)))
+    assert whole.shape == (front_page._LABEL + 18 + front_page._GAP + 32, 2 * 32 + front_page._GAP, 3)
+    assert (whole[-30:, :32] == 255).all()  # the enlarged part of the first
+    assert (whole[-30:, -32:] == 128).all()
+    assert front_page.sheet(pictures, None).height == front_page._LABEL + 18
+    for seed, name in enumerate(("before", "after")):
+        write_clip(make_clip(seed), tmp_path / name)
+    settings = before_after.Settings(tmp_path / "before", tmp_path / "after", 1, out=tmp_path / "x.webp")
+    before_after.main(settings)
+    assert (tmp_path / "x.webp").stat().st_size > 100

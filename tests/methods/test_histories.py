@@ -1,0 +1,243 @@
+"""Filters that keep the light of lobes apart, ``relax`` and ``reblur``: what must hold for each of them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdn.core.frame import FAR, Frame
+from jaxdn.denoiser import Denoiser
+from jaxdn.methods.lobes import apart
+from jaxdn.methods.two_lobes.reblur import reblur
+from jaxdn.methods.two_lobes.relax import relax
+from tests.methods.lobe_scenes import HEIGHT, WIDTH, compiled, mirror_frames, neutral, run, scene
+
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One of the filters, and where its state has what the tests look at."""
+
+    method: Callable[..., Denoiser]
+    small: dict[str, Any]
+    """Options with which it does all of its work on a small image."""
+    plain: dict[str, Any]
+    """Options with which it is nothing but running means."""
+    inside: bool
+    """Its histories are in ``core.light``, not in ``core`` itself."""
+    length: int
+    """Channel of the length of a history; the fast one begins behind it."""
+
+    # Once each: a step is compiled anew for every denoiser.
+    @cached_property
+    def denoiser(self) -> Denoiser:
+        return self.method(**self.small)
+
+    @cached_property
+    def default(self) -> Denoiser:
+        return self.method()
+
+    @cached_property
+    def means(self) -> Denoiser:
+        return self.method(**self.plain)
+
+    def histories(self, state: Any) -> Any:
+        """The histories, ``diffuse`` and ``specular``."""
+        return state.core.light if self.inside else state.core
+
+    def with_histories(self, state: Any, light: Any) -> Any:
+        return state._replace(core=state.core._replace(light=light) if self.inside else light)
+
+    def stepped(self, state: Any, frame: Frame) -> tuple[Any, jax.Array]:
+        return compiled(self.denoiser)({}, state, frame)
+
+
+MEANS = {"fix_frames": 0, "clamp_sigma": 1e6, "lag_sigma": 1e6, "demodulate": "none"}
+KINDS = {
+    "relax": Kind(
+        relax,
+        small={"levels": 1, "anti_firefly": True},
+        plain={**MEANS, "anti_firefly": False, "short_history": 0, "levels": 0},
+        inside=False,
+        length=5,
+    ),
+    "reblur": Kind(
+        reblur,
+        small={"pre_radius": 3.0, "radius": 3.0, "anti_firefly": True},
+        plain={**MEANS, "pre_radius": 0.0, "radius": 0.0, "stable_max": 1},
+        inside=True,
+        length=3,
+    ),
+}
+
+
+@pytest.fixture(params=KINDS.values(), ids=KINDS)
+def kind(request: pytest.FixtureRequest) -> Kind:
+    return request.param
+
+
+def test_a_constant_image_stays_with_all_of_its_border(kind, rng):
+    frames = [
+        frame._replace(
+            radiance=np.full_like(frame.radiance, 0.37),
+            specular=np.full_like(frame.specular, 0.12),
+            **{name: np.full_like(getattr(frame, name), 0.4) for name in ("reflectance", "albedo")},
+            specular_reflectance=np.full_like(frame.specular_reflectance, 0.1),
+        )
+        for frame in scene(rng, 4)
+    ]
+    for image in run(kind.denoiser, frames)[1]:
+        np.testing.assert_allclose(image, 0.37, rtol=2e-5)
+
+
+def test_static_histories_are_the_means_until_their_caps(kind, rng):
+    denoiser = kind.method(**kind.plain, history_max=10, fast_max=3)
+    noise = rng.gamma(0.5, 1.0, (14, 60, 60, 3)).astype(np.float32)
+    share = rng.random((14, 60, 60, 1)).astype(np.float32)
+    step, state = jax.jit(denoiser.step), denoiser.start({}, Frame(noise[0], specular=noise[0] * share[0]))
+    spread = []
+    for index, (radiance, part) in enumerate(zip(noise, share, strict=True)):
+        state, image = step({}, state, Frame(radiance, specular=radiance * part))
+        seen, shares = noise[: index + 1].astype(np.float64), share[: index + 1]
+        kept = kind.histories(state)
+        history = np.asarray(kept.diffuse), np.asarray(kept.specular)
+        for found, lights in zip(history, (seen * (1 - shares), seen * shares), strict=True):
+            np.testing.assert_array_equal(found[..., kind.length], min(index + 1, 10))
+            if index < 10:
+                np.testing.assert_allclose(found[..., :3], lights.mean(0), rtol=2e-4, atol=1e-6)
+            if index < 3:
+                np.testing.assert_allclose(
+                    found[..., kind.length + 1 : kind.length + 4], lights.mean(0), rtol=2e-4, atol=1e-6
+                )
+        spread.append(np.var(image))
+    single = np.var(noise)
+    np.testing.assert_allclose(np.array(spread[:10]) * np.arange(1, 11), single, rtol=0.1)
+    # From the cap on, a mean with the weight 1/N tends to a variance of 1 / (2 N - 1).
+    assert single / 19 * 0.9 < spread[-1] < single / 10 * 1.1
+
+
+def test_by_default_the_error_of_a_static_scene_falls(kind, rng):
+    noise = rng.gamma(0.5, 2.0, (24, 24, 24, 3)).astype(np.float32)
+    _, images = run(kind.default, [Frame(each) for each in noise])
+    errors = [np.mean((image - 1.0) ** 2) for image in images]
+    assert np.mean(errors[20:]) < np.mean(errors[6:10]) < np.mean(errors[:3]) < np.var(noise) / 20
+
+
+@pytest.mark.parametrize("missing", [(), ("far_motion",), ("specular_hit_distance",), ("roughness",)])
+def test_a_reflection_is_fetched_where_it_was(kind, rng, missing):
+    sky, frames = mirror_frames(rng)
+    frames = [frame._replace(**dict.fromkeys(missing)) for frame in frames]
+    state, _ = run(kind.means, frames)
+    inner = np.asarray(kind.histories(state).specular)[4:-4, 4:-8]
+    error = np.mean((inner[..., :3] - sky[4:-4, 4:-8]) ** 2) / np.mean(sky**2)
+    if missing:
+        assert error > 0.1
+    else:
+        np.testing.assert_allclose(inner[..., kind.length], len(frames), rtol=1e-3)
+        assert error < 0.06  # a single frame has 0.5, a mean of twelve 0.042
+
+
+def test_the_first_frame_reads_no_history_and_no_motion(kind, rng):
+    frame = scene(rng, 1)[0]
+    clean = kind.denoiser.start({}, frame)
+    nothing = jax.tree.map(lambda leaf: leaf * np.nan, kind.histories(clean))
+    poisoned = kind.with_histories(clean, nothing)
+    elsewhere = frame._replace(motion=np.full_like(frame.motion, 3.3))
+    expected_state, expected = kind.stepped(clean, frame)
+    for state, given in ((poisoned, frame), (clean, elsewhere)):
+        after, image = kind.stepped(state, given)
+        np.testing.assert_array_equal(image, expected)
+        np.testing.assert_array_equal(kind.histories(after).specular, kind.histories(expected_state).specular)
+
+
+@pytest.mark.parametrize("which", ["diffuse", "specular"])
+def test_broken_history_is_dropped_where_it_is_broken(kind, rng, which):
+    frames = scene(rng, 2)
+    state, _ = kind.stepped(kind.denoiser.start({}, frames[0]), frames[0])
+    light = kind.histories(state)
+    broken = kind.with_histories(state, light._replace(**{which: getattr(light, which).at[6, 4, 1].set(np.nan)}))
+    after, image = kind.stepped(broken, frames[1])
+    assert np.isfinite(image).all()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after.core))
+    assert int(after.repaired) > int(kind.stepped(state, frames[1])[0].repaired)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("specular",),
+        ("specular_hit_distance", "hit_distance"),
+        ("far_motion",),
+        ("roughness",),
+        ("motion", "far_motion", "previous_depth"),
+        ("ray_length", "reflectance", "albedo", "specular_reflectance"),
+    ],
+    ids="-".join,
+)
+def test_none_is_the_neutral_value_written_out(kind, rng, names):
+    frames = scene(rng, 3)
+    absent = [frame._replace(**dict.fromkeys(names)) for frame in frames]
+    written = [neutral(frame, names) for frame in frames]
+    for first, second in zip(run(kind.denoiser, absent)[1], run(kind.denoiser, written)[1], strict=True):
+        np.testing.assert_allclose(first, second, rtol=2e-5, atol=1e-6)
+
+
+def test_specular_light_may_come_and_go_within_a_clip(kind, rng):
+    frames = scene(rng, 4)
+    frames[0] = frames[0]._replace(specular=None)
+    frames[2] = frames[2]._replace(specular=None)
+    state, images = run(kind.denoiser, frames)
+    assert all(np.isfinite(image).all() for image in images)
+    assert np.isfinite(kind.histories(state).specular).all()
+
+
+def test_pixels_without_a_surface_pass_through(kind, rng):
+    frame = scene(rng, 1)[0]
+    np.testing.assert_array_equal(run(kind.denoiser, [frame])[1][0][0], frame.radiance[0])
+    sky = frame._replace(depth=np.full_like(frame.depth, FAR), ids=np.full_like(frame.ids, -1))
+    np.testing.assert_array_equal(run(kind.denoiser, [sky])[1][0], frame.radiance)
+
+
+@pytest.mark.slow  # test_fitted.py has the gradient by params of both
+def test_gradients_reach_both_kinds_of_light(kind, x64, rng):
+    frames = scene(rng, 2, np.float64)
+    weights = np.cos(np.arange(HEIGHT * WIDTH * 3)).reshape(HEIGHT, WIDTH, 3)
+
+    def loss(radiance, part):
+        state = kind.denoiser.start({}, frames[0])
+        for frame in frames:
+            lit = frame._replace(radiance=frame.radiance + radiance, specular=(frame.radiance + radiance) * part)
+            state, image = kind.denoiser.step({}, state, lit)
+        return jnp.mean(image * weights)
+
+    both = jax.jit(jax.value_and_grad(loss, (0, 1)))
+    zero, half = np.zeros((HEIGHT, WIDTH, 3)), np.full((HEIGHT, WIDTH, 1), 0.4)
+    found = both(zero, half)[1]
+    for each in found:
+        assert each.dtype == np.float64
+        assert np.isfinite(each).all()
+        assert np.abs(each).max() > 1e-6
+    direction = rng.normal(size=zero.shape) * 1e-6
+    slope = (both(direction, half)[0] - both(-direction, half)[0]) / 2
+    np.testing.assert_allclose(np.sum(found[0] * direction), slope, rtol=2e-2)
+
+
+@pytest.mark.parametrize("by", ["brdf", "albedo", "none"])
+def test_both_kinds_of_light_add_up(rng, by):
+    frame = scene(rng, 1)[0]
+    diffuse, specular = apart(frame, by)
+    np.testing.assert_allclose(diffuse.whole(diffuse.light) + specular.whole(specular.light), frame.radiance, rtol=1e-6)
+    np.testing.assert_allclose(specular.whole(specular.light), frame.specular, rtol=1e-6)
+
+
+def test_specular_light_beyond_all_light_is_cut_off(rng):
+    frame = scene(rng, 1)[0]
+    diffuse, specular = apart(frame._replace(specular=2 * frame.radiance + 1), "none")
+    assert not np.any(diffuse.light)
+    np.testing.assert_array_equal(specular.light.transpose(1, 2, 0), frame.radiance)

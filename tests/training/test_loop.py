@@ -1,0 +1,238 @@
+"""The training loop: stopped at any moment and started again, it continues as if never stopped."""
+
+import json
+import os
+import signal
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdn.clips import read_clip, training_batches, write_clip
+from jaxdn.denoiser import Core, recurrent
+from jaxdn.denoiser.rollout import denoise
+from jaxdn.denoisers import ntd
+from jaxdn.methods.registry import method_named
+from jaxdn.recipes.objectives import Objective
+from jaxdn.recipes.recipe import Recipe
+from jaxdn.training import loop as loop
+from jaxdn.training.log import Log, read_curve, read_log
+from jaxdn.training.loop import Start, begun_with, fit
+from jaxdn.training.train import train
+from jaxdn.training.validation import load_validation
+from jaxdn.zoo.ready import candidate
+from tests.training.test_training import TINY, make_clip
+
+pytestmark = pytest.mark.usefixtures("plain_programs")
+
+METHOD = method_named("ntd")
+PLAIN = {"kernels": "plain", "background": "filter"}
+"""Compiles sooner, and the loop is the same."""
+RECIPE = METHOD.recipe_named(None)._replace(steps=6, batch=2, crop=16, frames=4)
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("clips")
+    for seed in range(3):
+        write_clip(make_clip(seed, size=20, frames=5), folder / f"clip-{seed}")
+    return sorted(folder.iterdir())
+
+
+def batches(clips):
+    return training_batches(clips, batch=2, crop=16, frames=4, seed=0)
+
+
+class Stopping:
+    """Batches that end in Ctrl-C after so many."""
+
+    def __init__(self, source, after):
+        self.source, self.left = source, after
+
+    def __next__(self):
+        if self.left == 0:
+            raise KeyboardInterrupt
+        self.left -= 1
+        return next(self.source)
+
+    def get_state(self):
+        return self.source.get_state()
+
+    def set_state(self, state):
+        self.source.set_state(state)
+
+
+def run_on(engine, clips, folder, **options):
+    denoiser, source = ntd(size=TINY, **PLAIN, implementation=engine), options.pop("source", batches(clips))
+    return fit(denoiser, RECIPE, source, folder, label="t", log_every=1, **options)
+
+
+run = partial(run_on, None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", dict.fromkeys(("reference", METHOD.engine("training") or "reference")))
+def test_interrupted_training_ends_in_bit_identical_weights(engine, clips, tmp_path):
+    run = partial(run_on, engine)
+    whole = run(clips, tmp_path / "whole", checkpoint_every=100)
+    with pytest.raises(KeyboardInterrupt):
+        run(clips, tmp_path / "stopped", source=Stopping(batches(clips), 4), checkpoint_every=2)
+    assert read_curve(tmp_path / "stopped").step == [1, 2, 3]  # one batch of the four only gave the shapes
+    continued = run(clips, tmp_path / "stopped", checkpoint_every=2)
+    jax.tree.map(np.testing.assert_array_equal, whole.params, continued.params)
+    assert read_curve(tmp_path / "whole") == read_curve(tmp_path / "stopped")
+
+
+@pytest.mark.slow
+def test_a_finished_run_is_not_trained_again(clips, tmp_path):
+    first = run(clips, tmp_path)
+    again = run(clips, tmp_path, source=Stopping(batches(clips), 1))
+    jax.tree.map(np.testing.assert_array_equal, first.params, again.params)
+
+
+@pytest.mark.slow
+def test_the_options_of_a_filter_are_fitted_and_its_weights_denoise(clips, tmp_path):
+    method = method_named("svgf")
+    recipe = method.recipe_named(None)._replace(steps=4, batch=2, crop=16, frames=3)
+    weights = train(method, recipe, clips, tmp_path, options={"levels": 2})
+    fitted = candidate(str(weights))
+    assert {name: array.shape for name, array in fitted.params.items()} == {
+        **dict.fromkeys(("alpha", "alpha_moments"), ()),
+        **dict.fromkeys(("sigma_depth", "sigma_normal", "sigma_luminance"), (2,)),
+    }
+    assert 0 < float(jnp.max(jnp.abs(fitted.params["sigma_luminance"]))) < 1
+    clip = read_clip(clips[0])._replace(reference=None)
+    image, plain = (denoise(fitted.denoiser, params, clip) for params in (fitted.params, {}))
+    assert jnp.isfinite(image).all()
+    assert float(jnp.max(jnp.abs(image - plain))) > 1e-5
+
+
+def test_another_recipe_in_the_same_folder_is_refused(clips, tmp_path):
+    (tmp_path / "recipe.json").write_text(json.dumps({**RECIPE.record(), "learning_rate": 7.0}))
+    with pytest.raises(ValueError, match=r"learning_rate 7.0 -> 0.001"):
+        run(clips, tmp_path)
+
+
+def test_a_torn_log_line_is_left_out(tmp_path):
+    (tmp_path / "log.jsonl").write_text('{"step": 1, "loss": 2.0}\n{"step": 2, "lo')
+    assert read_log(tmp_path / "log.jsonl") == [{"step": 1, "loss": 2.0}]
+
+
+@pytest.mark.slow
+def test_training_begins_with_given_weights_and_refuses_others_for_the_same_run(clips, tmp_path):
+    one = run(clips, tmp_path / "one")
+    # The warm-up's first update has a learning rate of zero.
+    short = RECIPE._replace(steps=1)
+    again = partial(fit, ntd(size=TINY, **PLAIN), short, folder=tmp_path / "two", label="t")
+    state = again(batches(clips), start=Start("one", one.params))
+    jax.tree.map(np.testing.assert_array_equal, state.params, one.params)
+    with pytest.raises(ValueError, match="start 'one' -> 'another'"):
+        again(batches(clips), start=Start("another", one.params))
+
+
+@pytest.mark.slow
+def test_training_stops_at_its_time_limit_and_goes_on_from_there(clips, tmp_path, capsys):
+    stopped = run(clips, tmp_path / "limited", time_limit=1e-9)
+    assert int(stopped.step) == 0
+    assert "time is over after 0 of 6 steps" in capsys.readouterr().out
+    whole, continued = run(clips, tmp_path / "whole"), run(clips, tmp_path / "limited")
+    assert int(continued.step) == 6
+    jax.tree.map(np.testing.assert_array_equal, whole.average, continued.average)
+
+
+def gain():
+    """The frame times a learned number: compiles at once, and the loop is the same."""
+
+    def step(params, state, frame, first):
+        image = params["gain"] * frame.radiance
+        return image, image, 0
+
+    return recurrent(
+        Core(lambda params, frame: frame.radiance, step, frozenset(), lambda key, frame: {"gain": jnp.float32(0.5)})
+    )
+
+
+SQUARES = Objective("squares", lambda images, clip, progress: jnp.mean((images - clip.reference) ** 2))
+SHORT = Recipe(SQUARES, steps=4, batch=2, crop=16, frames=4)
+
+
+def run_gain(clips, folder, recipe=SHORT, source=None, **options):
+    return fit(gain(), recipe, source or batches(clips), folder, label="gain", log_every=2, **options)
+
+
+def test_ctrl_c_on_a_logging_step_keeps_its_log_entry(clips, tmp_path, monkeypatch):
+    before = signal.getsignal(signal.SIGINT)  # ignored in a process that a shell put into the background
+    whole = run_gain(clips, tmp_path / "whole")
+    write = Log.write
+
+    def interrupted(log, **entry):
+        if entry["step"] == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        write(log, **entry)
+
+    monkeypatch.setattr(Log, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_gain(clips, tmp_path / "stopped")
+    assert read_curve(tmp_path / "stopped").step == [2]
+    monkeypatch.undo()
+    continued = run_gain(clips, tmp_path / "stopped")
+    assert read_curve(tmp_path / "stopped") == read_curve(tmp_path / "whole")
+    np.testing.assert_array_equal(continued.params["gain"], whole.params["gain"])
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_second_ctrl_c_stops_at_once_and_the_run_still_ends_the_same(clips, tmp_path, monkeypatch):
+    whole = run_gain(clips, tmp_path / "whole")
+    make = loop.make_train_step
+
+    def interrupting(denoiser, recipe):
+        step = make(denoiser, recipe)
+
+        def twice(state, batch):
+            given = int(state.step)
+            found = step(state, batch)  # the old state's memory is gone from here on
+            if given == 2:
+                os.kill(os.getpid(), signal.SIGINT)
+                os.kill(os.getpid(), signal.SIGINT)
+            return found
+
+        return twice
+
+    monkeypatch.setattr(loop, "make_train_step", interrupting)
+    with pytest.raises(KeyboardInterrupt):
+        run_gain(clips, tmp_path / "stopped", checkpoint_every=1)
+    monkeypatch.undo()
+    continued = run_gain(clips, tmp_path / "stopped")
+    assert read_curve(tmp_path / "stopped") == read_curve(tmp_path / "whole")
+    np.testing.assert_array_equal(continued.params["gain"], whole.params["gain"])
+
+
+def test_a_finished_run_goes_on_with_more_steps_and_says_so(clips, tmp_path, capsys):
+    first = run_gain(clips, tmp_path)
+    assert begun_with(tmp_path) == []
+    longer = run_gain(clips, tmp_path, SHORT._replace(steps=8))
+    assert "begun with 4 steps, goes on to 8" in capsys.readouterr().out
+    assert int(longer.step) == 8
+    assert read_curve(tmp_path).step == [2, 4, 6, 8]
+    assert begun_with(tmp_path) == [4]
+    assert float(longer.params["gain"]) != float(first.params["gain"])
+    run_gain(clips, tmp_path, SHORT._replace(steps=8))
+    assert begun_with(tmp_path) == [4]
+    for other in (SHORT, SHORT._replace(steps=9, learning_rate=0.5)):
+        with pytest.raises(ValueError, match="steps 8 -> "):
+            run_gain(clips, tmp_path, other)
+    assert begun_with(tmp_path) == [4]
+
+
+def test_the_validation_reaches_the_terminal(clips, tmp_path, capsys):
+    run_gain(clips, tmp_path, validation=load_validation(gain(), [clips[0]]))
+    psnr = read_curve(tmp_path).validation_psnr[-1]
+    assert f"validation {psnr:.2f} dB" in capsys.readouterr().out
+
+
+def test_training_without_a_step_is_refused_before_anything_is_written(clips, tmp_path):
+    with pytest.raises(ValueError, match=r"steps: expected a whole number >= 1, got 0"):
+        run_gain(clips, tmp_path / "run", SHORT._replace(steps=0))
+    assert not (tmp_path / "run").exists()
