@@ -9,7 +9,7 @@ import pytest
 import tyro
 from PIL import Image
 
-from experiments.papers import before_after, front_page, vectors
+from docs.figures import before_after, front_page, vectors
 from jaxdn.clips import write_clip
 from jaxdn.commands.arguments import COMMANDS, Denoise
 from jaxdn.zoo.ready import OURS

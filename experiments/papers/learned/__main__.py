@@ -14,7 +14,6 @@ from experiments.papers.learned import (
     ntasd_methods,
     ntasd_sizes,
     rae_methods,
-    reach,
     zeng_methods,
 )
 from experiments.papers.learned.maps import asks, save_maps
@@ -62,8 +61,6 @@ def main(settings: Settings) -> None:
     if asking := [one for one in methods if asks(one)]:
         maps = save_maps(asking, folders, pictures)
         text.append(f"## Where samples go: rank correlation with the noise, fewest to most\n\n{maps}")
-    known = [one for one in methods if one.label in reach.DENOISERS]
-    text.append(f"## How much well-placed samples could save\n\n{reach.table(known, folders)}")
     report = settings.out / "report.md"
     report.write_text("\n\n".join(text) + "\n")
     print("\n\n".join(text))

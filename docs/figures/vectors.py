@@ -1,6 +1,6 @@
 """Pictures of motion vectors for the documentation, drawn from the buffers of a rendered clip.
 
-    python -m experiments.papers.vectors data/demo/test/mobile-200 --frame 4
+    python -m docs.figures.vectors data/demo/test/mobile-200 --frame 4
 
 Writes ``motion.webp`` (where the history of a pixel lies) and ``dual-motion.webp`` (what the previous frame becomes if
 it is warped by traditional and by dual vectors). Both show references, so that no noise hides what the vectors do.

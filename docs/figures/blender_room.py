@@ -1,9 +1,9 @@
 """The scene of the Blender tutorial: a room with a rolling ball and a moving camera, rendered by Cycles.
 
-    blender -b -P experiments/papers/blender_room.py -- runs/blender/noisy
-    blender -b -P experiments/papers/blender_room.py -- runs/blender/reference 256
+    blender -b -P docs/figures/blender_room.py -- runs/blender/noisy
+    blender -b -P docs/figures/blender_room.py -- runs/blender/reference 256
     jaxdn denoise "runs/blender/noisy/*.exr" -o runs/blender/clean
-    python -m experiments.papers.before_after runs/blender/noisy runs/blender/clean --frame 7
+    python -m docs.figures.before_after runs/blender/noisy runs/blender/clean --frame 7
 
 Runs in Blender's own Python, or in one with ``bpy``. The passes are those that the tutorial's script sets.
 """

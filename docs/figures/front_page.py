@@ -2,7 +2,7 @@
 
     jaxdn render living-room/scene.xml --animation experiments/papers/rooms/living-room.json \\
         --frames 8 --width 320 --height 180 --reference-spp 64 --seeds 2000 --see-through -o data/rooms
-    python -m experiments.papers.front_page data/rooms/living-room-2000 --part 96,90,160,90
+    python -m docs.figures.front_page data/rooms/living-room-2000 --part 96 90 160 90
 
 Renders the last frame once more with many samples, to ``runs/front-page``, denoises the clip by the shipped weights
 that `jaxdn denoise` uses, and writes a WebP: whole frames above, a part of each, enlarged without smoothing, below.
@@ -18,7 +18,6 @@ import numpy as np
 import tyro
 from PIL import Image, ImageDraw, ImageFont
 
-from experiments.papers.places import parsed
 from jaxdn import color
 from jaxdn.clips import read_clip
 from jaxdn.commands.errors import plain_errors
@@ -42,7 +41,7 @@ class Settings:
 
     clip: Annotated[Path, tyro.conf.Positional]
     """A rendered clip."""
-    part: str
+    part: tuple[int, int, int, int]
     """X,Y,WIDTH,HEIGHT of the part that is enlarged, in pixels."""
     reference_spp: int = 1024
     out: Annotated[Path, tyro.conf.arg(aliases=("-o",))] = Path("docs/images/room.webp")
@@ -91,7 +90,6 @@ def sheet(pictures: dict[str, np.ndarray], part: tuple[int, int, int, int] | Non
 
 def main(settings: Settings) -> None:
     """Render what is missing, denoise, draw."""
-    _, part = parsed(f":{settings.part}")
     clip = read_clip(settings.clip)
     last = len(clip.frames.radiance) - 1
     clean = clean_frame(settings.clip, last, settings.reference_spp)
@@ -103,7 +101,7 @@ def main(settings: Settings) -> None:
         f"reference: {settings.reference_spp} samples": lit(clean.reference[0], clean, 0),
     }
     settings.out.parent.mkdir(parents=True, exist_ok=True)
-    sheet(pictures, part).save(settings.out, quality=90, method=6)
+    sheet(pictures, settings.part).save(settings.out, quality=90, method=6)
     print(f"{settings.out}: {settings.out.stat().st_size / 1e3:.0f} kB")
 
 

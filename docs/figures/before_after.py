@@ -1,6 +1,6 @@
 """A frame of two sequences side by side, as a small picture for the documentation.
 
-python -m experiments.papers.before_after runs/blender/noisy runs/blender/clean --frame 7 -o docs/images/blender.webp
+python -m docs.figures.before_after runs/blender/noisy runs/blender/clean --frame 7 -o docs/images/blender.webp
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from experiments.papers.front_page import sheet
+from docs.figures.front_page import sheet
 from jaxdn import color
 from jaxdn.clips import read_clip
 from jaxdn.commands.errors import plain_errors
