@@ -319,7 +319,7 @@ def test_sizes_that_differ_are_refused(clip, tmp_path, capsys):
 
 def test_the_compilers_alarm_is_silenced_before_jax_reads_the_setting():
     # The alarm itself comes after two minutes of compiling.
-    lines = "import os, sys; from jaxdn import cli; cli.main(['--version'])"
+    lines = "import os, sys; from jaxdn.commands import main; main.main(['--version'])"
     code = f"{lines}; print('jax' in sys.modules, os.environ['TF_CPP_MIN_LOG_LEVEL'])"
     environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)

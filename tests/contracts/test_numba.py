@@ -337,10 +337,10 @@ def test_what_was_compiled_before_functions_of_rows_changed_is_not_used(tmp_path
     script = "from jaxdn.ops.affinity import numba_kernels"
     folder = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     subprocess.run(
-        [sys.executable, "-c", script + "; print(affinities.filtered.stats.cache_path)"], env=folder, check=True
+        [sys.executable, "-c", script + "; print(numba_kernels.filtered.stats.cache_path)"], env=folder, check=True
     )
     (own,) = tmp_path.iterdir()
-    old, new = own / "affinities.filtered-1.py311.nbi", own / "affinities.enlarged-1.py311.nbi"
+    old, new = own / "numba_kernels.filtered-1.py311.nbi", own / "numba_kernels.enlarged-1.py311.nbi"
     for file in (old, new):
         file.touch()
     os.utime(old, (0, 0))

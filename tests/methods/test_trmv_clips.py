@@ -6,13 +6,13 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from render_scenes import grey, shift
-from vector_scenes import FAST, Places, floor, look
 
 import jaxdn
 from jaxdn import color, effects
 from jaxdn.clips import read_clip
 from jaxdn.render.clip import render_clip
+from tests.render.render_scenes import grey, shift
+from tests.render.vector_scenes import FAST, Places, floor, look
 
 pytestmark = [
     pytest.mark.slow,

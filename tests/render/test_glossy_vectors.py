@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from render_scenes import grey, shift
-from vector_scenes import FAST, HEIGHT, WIDTH, Places, floor, look, rendered
 
 from jaxdn.render.buffers.geometry import project
 from jaxdn.render.buffers.glossy_vectors import ROUGHEST
+from tests.render.render_scenes import grey, shift
+from tests.render.vector_scenes import FAST, HEIGHT, WIDTH, Places, floor, look, rendered
 
 needs_fast = pytest.mark.skipif(FAST == "scalar_rgb", reason="only vectorised variants sample lobes")
 

@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from render_scenes import HEIGHT, PIXEL, SQUARE_Z, WIDTH, Stage, fast_variants, grey, shift
 
 from jaxdn import effects
 from jaxdn.color import LUMINANCE
@@ -12,6 +11,7 @@ from jaxdn.render.buffers.gradient_samples import luminance_gradient, pick, scat
 from jaxdn.render.frame import render_frame, tracer
 from jaxdn.render.mitsuba.variant import choose_variant, use_variant
 from jaxdn.render.tracing.seeds import NOISY, frame_key
+from tests.render.render_scenes import HEIGHT, PIXEL, SQUARE_Z, WIDTH, Stage, fast_variants, grey, shift
 
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "max_depth": 4, "seed": 5}
 STRATA = (-(-HEIGHT // 3), -(-WIDTH // 3))

@@ -6,7 +6,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from render_scenes import HEIGHT, SQUARE_Z, WIDTH, Stage, shift, turn
 
 import jaxdn
 from jaxdn import Clip, effects
@@ -21,6 +20,7 @@ from jaxdn.render.mitsuba.variant import choose_variant, use_variant
 from jaxdn.render.scenes.scene import Camera
 from jaxdn.render.tracing import jitter
 from jaxdn.sequence.render_jobs import clips_of
+from tests.render.render_scenes import HEIGHT, SQUARE_Z, WIDTH, Stage, shift, turn
 
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
 FAST = choose_variant().variant

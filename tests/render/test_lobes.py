@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from render_scenes import HEIGHT, WALL_Z, WIDTH, Stage, grey, shift, turn
 
 import jaxdn
 from jaxdn import effects
@@ -15,6 +14,7 @@ from jaxdn.planning.catalogue import OF_SHADOWS
 from jaxdn.render.clip import render_clip
 from jaxdn.render.frame import render_frame
 from jaxdn.render.mitsuba.variant import choose_variant
+from tests.render.render_scenes import HEIGHT, WALL_Z, WIDTH, Stage, grey, shift, turn
 
 FAST = choose_variant().variant
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from render_scenes import HEIGHT, PIXEL, SQUARE_Z, WIDTH, Stage, fast_variants, shift
 
 from jaxdn import effects
 from jaxdn.clips import ClipError, read_frame
@@ -25,6 +24,7 @@ from jaxdn.render.mitsuba.variant import choose_variant, llvm_candidates, use_va
 from jaxdn.render.opening import scene_from_record
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.tracing.seeds import NOISY, REFERENCE, frame_key, pass_seed, tea
+from tests.render.render_scenes import HEIGHT, PIXEL, SQUARE_Z, WIDTH, Stage, fast_variants, shift
 
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
 SAMPLES = 64
@@ -232,7 +232,7 @@ def test_a_clip_is_written_and_resumes_where_it_was_interrupted(variant: str, tm
 KILLED = """
 import os, signal, sys
 sys.path.insert(0, sys.argv[2])
-from render_scenes import HEIGHT, WIDTH, Stage
+from tests.render.render_scenes import HEIGHT, WIDTH, Stage
 from jaxdn.render.clip import render_clip
 def kill(frame):
     if frame == 1:
@@ -245,7 +245,7 @@ render_clip(Stage(), sys.argv[1], frames=3, reference_spp=2, variant="scalar_rgb
 def test_a_killed_rendering_leaves_no_clip_and_resumes(tmp_path: Path) -> None:
     options: dict[str, Any] = {"frames": 3, "reference_spp": 2, "variant": "scalar_rgb", **SIZE}
     parts = tmp_path / "parts"
-    done = subprocess.run([sys.executable, "-c", KILLED, str(parts), str(Path(__file__).parent)], check=False)
+    done = subprocess.run([sys.executable, "-c", KILLED, str(parts), str(Path(__file__).parents[2])], check=False)
     assert done.returncode == -signal.SIGKILL
     assert (parts / "frame_0001.exr").exists()
     assert not is_clip(parts)

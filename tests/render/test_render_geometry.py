@@ -5,7 +5,6 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from render_scenes import HEIGHT, NEAR, PIXEL, SQUARE_Z, WALL_Z, WIDTH, Stage, fast_variants, grey, shift, turn
 
 from jaxdn.core.frame import FAR
 from jaxdn.ops.motion import dual_motion, occlusion_mask
@@ -13,6 +12,19 @@ from jaxdn.render.buffers.gbuffer import GBuffer, gbuffer
 from jaxdn.render.buffers.geometry import Motion, View, motion_between, project, relative_poses
 from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.scene import Camera
+from tests.render.render_scenes import (
+    HEIGHT,
+    NEAR,
+    PIXEL,
+    SQUARE_Z,
+    WALL_Z,
+    WIDTH,
+    Stage,
+    fast_variants,
+    grey,
+    shift,
+    turn,
+)
 
 COLUMN, ROW = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
 CENTRES = np.stack([COLUMN, ROW], axis=-1) + 0.5

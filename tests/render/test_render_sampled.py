@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from render_scenes import HEIGHT, WIDTH, Stage, fast_variants
 
 import jaxdn as library
 from jaxdn import effects
@@ -18,6 +17,7 @@ from jaxdn.data.exr.exr import read_exr
 from jaxdn.render import render_frame
 from jaxdn.render.adaptive import render_sampled
 from jaxdn.zoo.weights import save_weights
+from tests.render.render_scenes import HEIGHT, WIDTH, Stage, fast_variants
 
 VECTORISED = [variant for variant in fast_variants() if not variant.startswith("scalar")]
 pytestmark = pytest.mark.skipif(not VECTORISED, reason="scalar variants render whole images only")

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from render_scenes import HEIGHT, SQUARE_Z, WIDTH, Stage, grey, shift, turn
 
 import jaxdn
 from jaxdn import Clip, effects
@@ -21,6 +20,7 @@ from jaxdn.render.scenes.scene_file import SceneFile
 from jaxdn.sequence.render_and_denoise import Settings, denoise_scene
 from jaxdn.sequence.render_jobs import clips_of
 from jaxdn.zoo.ready import candidate
+from tests.render.render_scenes import HEIGHT, SQUARE_Z, WIDTH, Stage, grey, shift, turn
 
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
 FAST = choose_variant().variant

@@ -4,8 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from render_scenes import grey, shift
-from vector_scenes import FAST, HEIGHT, WIDTH, Places, floor, look, rendered
 
 import jaxdn
 from jaxdn import effects
@@ -14,6 +12,8 @@ from jaxdn.planning.catalogue import OF_SHADOWS
 from jaxdn.render.buffers.geometry import project
 from jaxdn.render.buffers.shadow_vectors import meets_plane
 from jaxdn.render.frame import render_frame
+from tests.render.render_scenes import grey, shift
+from tests.render.vector_scenes import FAST, HEIGHT, WIDTH, Places, floor, look, rendered
 
 needs_fast = pytest.mark.skipif(FAST == "scalar_rgb", reason="only vectorised variants tell light apart")
 

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-from render_scenes import grey
 
 import jaxdn
 from jaxdn import effects
@@ -12,6 +11,7 @@ from jaxdn.core.frame import GUIDES
 from jaxdn.render.frame import Rendered, render_frame
 from jaxdn.render.mitsuba.variant import choose_variant
 from jaxdn.render.scenes.scene import Camera
+from tests.render.render_scenes import grey
 
 WIDTH, HEIGHT = 48, 32
 FAST = choose_variant().variant

@@ -13,7 +13,7 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.core.frame import FAR, Frame
-from jaxdn.data.clip.folder import open_frames
+from jaxdn.data.read import open_frames
 from jaxdn.filters.time_reversal import SEEN_MOST, blend, seen, turned
 from jaxdn.ops.motion import on_screen
 from jaxdn.sequence.jobs import LEAD_IN
