@@ -1,7 +1,10 @@
 """Transfer curves of linear radiance for networks, losses, metrics and display, and the luminance."""
 
+from __future__ import annotations
+
 import functools
 import math
+from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +12,10 @@ import jax.numpy as jnp
 from jaxdn.core.checks import check_option
 from jaxdn.core.frame import RADIANCE_MAX
 from jaxdn.core.numerics import safe_norm
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
+
 
 _GAMMA = 2.2
 _TOE = 1e-4
@@ -26,9 +33,10 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 OPERATORS = ("srgb", "aces", "reinhard", "compress")
 """The operators of ``tonemap``."""
+Operator = Literal["srgb", "compress", "aces", "reinhard"]
 
 
-def compress(x: jax.Array) -> jax.Array:
+def compress(x: Float[Array, ...]) -> Float[Array, ...]:
     """Compress radiance for networks and losses: ``log(1 + x)^(1 / 2.2)``, elementwise.
 
     Below log(1 + x) = 1e-4 it is the line ``152 log(1 + x)`` through the origin that meets the curve there: continuous,
@@ -47,7 +55,7 @@ def compress(x: jax.Array) -> jax.Array:
     return jnp.where(x >= 0, y, -y)
 
 
-def expand(y: jax.Array) -> jax.Array:
+def expand(y: Float[Array, ...]) -> Float[Array, ...]:
     """The inverse of ``compress``, elementwise: ``exp(y^2.2) - 1``, linear in the toe, odd.
 
     Value and slope are finite for every float: it saturates at 1/64 of the largest finite number (5e36 in float32).
@@ -77,7 +85,7 @@ def _power_slope(exponent: float, primals: tuple[jax.Array], tangents: tuple[jax
     return _power(x, exponent), exponent * _power(x, exponent - 1) * tangent
 
 
-def exposure(radiance: jax.Array) -> jax.Array:
+def exposure(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
     """The factor (a scalar) that makes linear radiance [H, W, 3] as bright as a photograph: 0.18 in the mean.
 
     ``0.18 / exp(mean(log L))`` over the mean luminances L of blocks of 16x16 pixels that are not black; 1 for a black
@@ -116,7 +124,7 @@ def exposure_of(brightness: jax.Array) -> jax.Array:
 _MIDDLE_GREY = 0.18
 
 
-def luminance(image: jax.Array) -> jax.Array:
+def luminance(image: Float[Array, "... 3"]) -> Float[Array, "... 1"]:
     """Rec.709 luminance ``0.2126 R + 0.7152 G + 0.0722 B`` of linear radiance [..., 3], as [..., 1]."""
     image = _floating(image)
     if image.ndim == 0 or image.shape[-1] != 3:
@@ -131,7 +139,7 @@ def luminance_of_planes(planes: jax.Array) -> jax.Array:
     return red + green + blue
 
 
-def tonemap(image: jax.Array, *, operator: str = "srgb") -> jax.Array:
+def tonemap(image: Float[Array, "... 3"], *, operator: Operator = "srgb") -> Float[Array, "... 3"]:
     """Linear radiance [..., 3] to display-encoded values in [0, 1] of the same shape, for metrics and for display.
 
     Radiance is first clamped to [0, 65504]; a NaN stays NaN. ``operator``:
@@ -155,7 +163,7 @@ def tonemap(image: jax.Array, *, operator: str = "srgb") -> jax.Array:
     return srgb_encode(jnp.minimum(x, 1.0))
 
 
-def tonemap_halves(first: jax.Array, second: jax.Array, *, operator: str = "srgb") -> tuple[jax.Array, jax.Array]:
+def tonemap_halves(first: jax.Array, second: jax.Array, *, operator: Operator = "srgb") -> tuple[jax.Array, jax.Array]:
     """Two halves of a reference, such that errors of tone-mapped images against them are free of the reference's noise.
 
     ``first`` and ``second`` [..., 3] are independent noisy radiance with the same expectation r. Tone-mapped one by
@@ -180,13 +188,13 @@ def tonemap_halves(first: jax.Array, second: jax.Array, *, operator: str = "srgb
     return center + apart, center - apart
 
 
-def srgb_encode(x: jax.Array) -> jax.Array:
+def srgb_encode(x: Float[Array, ...]) -> Float[Array, ...]:
     """Linear light in [0, 1] to sRGB code values, elementwise (IEC 61966-2-1)."""
     toe = x <= 0.0031308
     return jnp.where(toe, 12.92 * x, 1.055 * jnp.where(toe, 1.0, x) ** (1 / 2.4) - 0.055)
 
 
-def srgb_decode(y: jax.Array) -> jax.Array:
+def srgb_decode(y: Float[Array, ...]) -> Float[Array, ...]:
     """sRGB code values in [0, 1] to linear light, elementwise (IEC 61966-2-1)."""
     toe = y <= 0.04045
     return jnp.where(toe, y / 12.92, ((jnp.where(toe, 1.0, y) + 0.055) / 1.055) ** 2.4)

@@ -8,6 +8,10 @@ The images are not transformed here: compress them first (``color.compress``), o
 the two agree).
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +21,16 @@ from jaxdn.core.checks import check_image, check_option, check_same_size
 from jaxdn.core.frame import RADIANCE_MAX
 from jaxdn.core.numerics import absolute
 from jaxdn.core.separable import correlate, pad_edge
+
+if TYPE_CHECKING:
+    from typing import TypeAlias
+
+    from jaxtyping import Array, Float
+
+    Clip: TypeAlias = Float[Array, "T H W C"]
+    Masks: TypeAlias = Float[Array, "T H W 1"]
+    Operator = Literal["difference", "hfen"]
+    Scalar: TypeAlias = Float[Array, ""]
 
 
 def unbiased(denoised: jax.Array, reference: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -36,12 +50,12 @@ def unbiased(denoised: jax.Array, reference: jax.Array) -> tuple[jax.Array, jax.
     return denoised * slope, jnp.minimum(reference, 10.0 * (fixed + 0.1)) * slope
 
 
-def spatial(denoised: jax.Array, reference: jax.Array, *, squared: bool = False) -> jax.Array:
+def spatial(denoised: Clip, reference: Clip, *, squared: bool = False) -> Scalar:
     """Mean of ``|denoised - reference|`` over all elements (Zeng et al. 2021, eq. 6, first term)."""
     return _mean_size(_difference(denoised, reference), squared=squared)
 
 
-def temporal(denoised: jax.Array, reference: jax.Array, *, squared: bool = False) -> jax.Array:
+def temporal(denoised: Clip, reference: Clip, *, squared: bool = False) -> Scalar:
     """Mean of ``|(I_i - I_{i-1}) - (R_i - R_{i-1})|`` over the T - 1 differences of frames; 0 for a clip of one frame.
 
     Frames are compared at the same pixel, not along the motion (Zeng et al. 2021, eq. 6, second term; Chaitanya et al.
@@ -52,7 +66,7 @@ def temporal(denoised: jax.Array, reference: jax.Array, *, squared: bool = False
     return _mean_size(error[1:] - error[:-1], squared=squared)
 
 
-def pyramid(denoised: jax.Array, reference: jax.Array, *, levels: int = 4) -> jax.Array:
+def pyramid(denoised: Clip, reference: Clip, *, levels: int = 4) -> Scalar:
     """The sum of the mean absolute errors in the bands of a Laplacian pyramid.
 
     A band is what remains of the error after the means of 2x2 blocks are taken from it; the next band is made of these
@@ -73,7 +87,12 @@ def pyramid(denoised: jax.Array, reference: jax.Array, *, levels: int = 4) -> ja
     return total + _mean_size(error)
 
 
-def gradient(denoised: jax.Array, reference: jax.Array, *, operator: str = "difference") -> jax.Array:
+def gradient(
+    denoised: Clip,
+    reference: Clip,
+    *,
+    operator: Operator = "difference",
+) -> Scalar:
     """Mean absolute difference of the image gradients; constant offsets do not count.
 
     ``operator="difference"``: forward differences in x and in y, inside the image; the mean is over both together (0
@@ -94,13 +113,13 @@ def gradient(denoised: jax.Array, reference: jax.Array, *, operator: str = "diff
 
 
 def occlusion(
-    denoised: jax.Array,
-    reference: jax.Array,
-    masks: jax.Array,
+    denoised: Clip,
+    reference: Clip,
+    masks: Masks,
     *,
     weights: tuple[float, ...] = (1.0, 0.8, 0.6),
     squared: bool = False,
-) -> jax.Array:
+) -> Scalar:
     """Mean over all elements of ``|(denoised - reference) S|``: errors where something was disoccluded recently.
 
     ``S_i = sum_k weights[k] M_{i-k}`` with ``masks`` M [T, H, W, 1] in {0, 1} (``jaxdn.occlusion_mask`` of each frame),

@@ -12,7 +12,10 @@ Averages: MSE, L1, relative MSE, SSIM and FLIP are means over all pixels of all 
 the frames' PSNRs, so one perfect frame makes it infinite: ``average="mse"`` gives the PSNR of the mean MSE instead.
 """
 
+from __future__ import annotations
+
 import math
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -22,22 +25,31 @@ from jaxdn.core.numerics import safe_norm
 from jaxdn.core.separable import correlate, gaussian_taps
 from jaxdn.metrics.flip import PIXELS_PER_DEGREE, flip_map
 
+if TYPE_CHECKING:
+    from typing import TypeAlias
+
+    from jaxtyping import Array, Float, Shaped
+
+    Clips: TypeAlias = Float[Array, "... H W C"]
+    Mask: TypeAlias = Shaped[Array, "... H W 1"]
+    Scalar: TypeAlias = Float[Array, ""]
+
 _SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
 
 
-def mse(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = None) -> jax.Array:
+def mse(image: Clips, reference: Clips, *, mask: Mask | None = None) -> Scalar:
     """Mean squared error over pixels and channels; 0 for an empty mask."""
     image, reference, inside = _prepare(image, reference, mask)
     return _mean((image - reference) ** 2, inside)
 
 
-def l1(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = None) -> jax.Array:
+def l1(image: Clips, reference: Clips, *, mask: Mask | None = None) -> Scalar:
     """Mean absolute error over pixels and channels; 0 for an empty mask. ``l1 ** 2 <= mse``."""
     image, reference, inside = _prepare(image, reference, mask)
     return _mean(jnp.abs(image - reference), inside)
 
 
-def relative_mse(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = None) -> jax.Array:
+def relative_mse(image: Clips, reference: Clips, *, mask: Mask | None = None) -> Scalar:
     """Mean of ``(image - reference)^2 / (reference^2 + 0.01)`` on linear radiance; 0 for an empty mask.
 
     Rousselle et al. 2011, eq. 10; the constant varies in the literature.
@@ -46,7 +58,7 @@ def relative_mse(image: jax.Array, reference: jax.Array, *, mask: jax.Array | No
     return _mean(_relative(image - reference, _relative_scale(reference)) ** 2, inside)
 
 
-def unbiased_mse(image: jax.Array, first: jax.Array, second: jax.Array, *, mask: jax.Array | None = None) -> jax.Array:
+def unbiased_mse(image: Clips, first: Clips, second: Clips, *, mask: Mask | None = None) -> Scalar:
     """Mean of ``(image - first) (image - second)``: the squared error without the noise of the reference; 0 if empty.
 
     ``first`` and ``second`` are independent noisy references with the same expectation r, such as the means of the two
@@ -61,13 +73,13 @@ def unbiased_mse(image: jax.Array, first: jax.Array, second: jax.Array, *, mask:
 
 
 def unbiased_psnr(
-    image: jax.Array,
-    first: jax.Array,
-    second: jax.Array,
+    image: Clips,
+    first: Clips,
+    second: Clips,
     *,
-    mask: jax.Array | None = None,
+    mask: Mask | None = None,
     peak: float = 1.0,
-) -> jax.Array:
+) -> Scalar:
     """``10 log10(peak^2 / MSE)`` in dB of :func:`unbiased_mse`, of a clip that of all its pixels together.
 
     Infinite where the estimate is not above 0: the image is as good as can be told.
@@ -76,13 +88,13 @@ def unbiased_psnr(
 
 
 def unbiased_temporal_psnr(
-    image: jax.Array,
-    first: jax.Array,
-    second: jax.Array,
+    image: Clips,
+    first: Clips,
+    second: Clips,
     *,
-    mask: jax.Array | None = None,
+    mask: Mask | None = None,
     peak: float = 1.0,
-) -> jax.Array:
+) -> Scalar:
     """:func:`temporal_psnr` without the reference's own noise, of all frame-to-frame differences together.
 
     :func:`unbiased_psnr` of ``x_i - x_{i-1}`` against the same differences of the two halves, which are as independent
@@ -102,13 +114,13 @@ def unbiased_temporal_psnr(
 
 
 def unbiased_relative_mse(
-    image: jax.Array,
-    first: jax.Array,
-    second: jax.Array,
+    image: Clips,
+    first: Clips,
+    second: Clips,
     *,
-    relative_to: jax.Array | None = None,
-    mask: jax.Array | None = None,
-) -> jax.Array:
+    relative_to: Clips | None = None,
+    mask: Mask | None = None,
+) -> Scalar:
     """:func:`relative_mse` without the noise of the reference, from two independent halves of it; 0 if empty.
 
     The mean of ``w (image - first) (image - second) + 2 w' (image - m) d^2`` on linear radiance, with the mean m of the
@@ -137,13 +149,13 @@ def unbiased_relative_mse(
 
 
 def psnr(
-    image: jax.Array,
-    reference: jax.Array,
+    image: Clips,
+    reference: Clips,
     *,
-    mask: jax.Array | None = None,
+    mask: Mask | None = None,
     peak: float = 1.0,
     average: str = "frames",
-) -> jax.Array:
+) -> Scalar:
     """Peak signal-to-noise ratio in dB, ``10 log10(peak^2 / MSE)``; of a clip, the mean of its frames' PSNRs.
 
     Infinite where the two are identical, for a frame and so for its clip, with derivative 0.
@@ -161,13 +173,13 @@ def psnr(
 
 
 def temporal_psnr(
-    image: jax.Array,
-    reference: jax.Array,
+    image: Clips,
+    reference: Clips,
     *,
-    mask: jax.Array | None = None,
+    mask: Mask | None = None,
     peak: float = 1.0,
     average: str = "frames",
-) -> jax.Array:
+) -> Scalar:
     """PSNR of the frame-to-frame differences of two clips: measures flicker, independent of a constant error.
 
     Compares ``x_i - x_{i-1}`` with ``y_i - y_{i-1}`` at the same pixel, with sign, peak 1 although they span [-1, 1];
@@ -190,7 +202,7 @@ def temporal_psnr(
     return _psnr((changes[0] - changes[1]) ** 2, later, peak=peak, average=average)
 
 
-def ssim(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = None) -> jax.Array:
+def ssim(image: Clips, reference: Clips, *, mask: Mask | None = None) -> Scalar:
     """Structural similarity, at most 1: the mean of its map over pixels and channels, each channel separately.
 
     11 x 11 Gaussian window of sigma 1.5, population covariance, K1 = 0.01, K2 = 0.03, data range 1 (Wang et al. 2004).
@@ -220,12 +232,12 @@ def ssim(image: jax.Array, reference: jax.Array, *, mask: jax.Array | None = Non
 
 
 def flip(
-    image: jax.Array,
-    reference: jax.Array,
+    image: Clips,
+    reference: Clips,
     *,
-    mask: jax.Array | None = None,
+    mask: Mask | None = None,
     pixels_per_degree: float = PIXELS_PER_DEGREE,
-) -> jax.Array:
+) -> Scalar:
     """Mean LDR-FLIP error, 0 to 1 (Andersson et al. 2020); see ``metrics.flip.flip_map`` for the map and the units.
 
     Three channels, display-encoded in [0, 1]. 0 for an empty mask.

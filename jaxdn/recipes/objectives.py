@@ -6,7 +6,7 @@ in one compiled program).
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -100,7 +100,7 @@ def pyramid_illumination(*, temporal: float = 1.0, logarithm: bool = False) -> O
     return Objective(f"logarithm of {name}", loss)
 
 
-def recurrent_illumination(*, operator: str = "hfen") -> Objective:
+def recurrent_illumination(*, operator: Literal["difference", "hfen"] = "hfen") -> Objective:
     """``0.8 spatial + 0.1 gradient + 0.1 temporal`` on compressed radiance, later frames more (Chaitanya et al. 2017).
 
     The k-th frame before the last has the weight ``exp(-k^2 / 8)``: 1, 0.88, 0.61, 0.32, 0.14, 0.04, 0.01 for seven
