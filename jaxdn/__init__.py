@@ -7,7 +7,7 @@ Mitsuba, OpenEXR, Orbax and Grain are imported only by the subpackages that use 
 import importlib
 from typing import Any
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "Frame": "core.frame",
