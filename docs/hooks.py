@@ -17,7 +17,6 @@ from typing import Any
 from unittest import mock
 
 import tyro
-
 from jaxdn.commands.arguments import COMMANDS
 from jaxdn.core.frame import BUFFERS
 from jaxdn.core.options import describe

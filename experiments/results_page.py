@@ -43,8 +43,8 @@ HEAD = """# Results
 
 `make results` writes this page and the tables of the README from `docs/results/*.json`. Do not edit it.
 PSNR is in dB and higher is better. Lower is better for FLIP, L1 and relative MSE. *Disoccluded* pixels are those that
-the previous frame did not see. The revision is that of the commit that recorded the numbers. The best value of a column,
-or of a row of the first table, is bold.
+the previous frame did not see. The revision is that of the commit that recorded the numbers. The best value of a
+column, or of a row of the first table, is bold.
 """
 
 Result = Mapping[str, Any]
@@ -94,7 +94,9 @@ def readme_block(results: Sequence[Result]) -> str:
         if "readme" in result:
             chosen = _choose(result, **result["readme"])
             measured = result["measured"]
-            head = f"**{result['title']}** ({measured['date']}, revision {measured['revision']}). {result['what']}\n"
+            head = f"**{result['title']}** ({measured['date']}, revision {measured['revision']}). {result['what']}"
+            where = result["readme"].get("where", {})
+            head += "".join(f" Here {name}: {value}." for name, value in where.items()) + "\n"
             parts += [head, *_TABLES[result["kind"]](chosen), _notes(chosen)]
     return "\n".join(part for part in parts if part)
 
