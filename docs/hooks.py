@@ -17,6 +17,7 @@ from typing import Any
 from unittest import mock
 
 import tyro
+
 from jaxdn.commands.arguments import COMMANDS
 from jaxdn.core.frame import BUFFERS
 from jaxdn.core.options import describe
@@ -73,7 +74,7 @@ def _buffers(_: re.Match[str]) -> str:
 
 def _help(match: re.Match[str]) -> str:
     text = io.StringIO()
-    plain = mock.patch.dict(os.environ, {"COLUMNS": "100", "NO_COLOR": "1"})
+    plain = mock.patch.dict(os.environ, {"COLUMNS": "80", "NO_COLOR": "1"})
     with plain, contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
         tyro.cli(COMMANDS, prog="jaxdn", args=[match[1], "--help"])
     return f"```text\n{text.getvalue().strip()}\n```"

@@ -96,7 +96,7 @@ def readme_block(results: Sequence[Result]) -> str:
             measured = result["measured"]
             head = f"**{result['title']}** ({measured['date']}, revision {measured['revision']}). {result['what']}"
             where = result["readme"].get("where", {})
-            head += "".join(f" Here {name}: {value}." for name, value in where.items()) + "\n"
+            head += "".join(f" Shown: {name} = {value}." for name, value in where.items()) + "\n"
             parts += [head, *_TABLES[result["kind"]](chosen), _notes(chosen)]
     return "\n".join(part for part in parts if part)
 

@@ -68,9 +68,7 @@ def test_the_reference_pages_follow_from_the_code():
     assert spec.loader is not None
     hooks = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(hooks)
-    pages = {
-        page.stem: hooks.on_page_markdown(page.read_text()) for page in (ROOT / "docs" / "reference").glob("*.md")
-    }
+    pages = {page.stem: hooks.on_page_markdown(page.read_text()) for page in (ROOT / "docs" / "reference").glob("*.md")}
     assert not [name for name, text in pages.items() if "<!--" in text]
     assert "::: jaxdn.ops.warp\n" in pages["operations"]
     assert "| `radiance` | 3 | light |" in pages["formats"]

@@ -15,7 +15,11 @@ TABLE = {
     "order": 1,
     "measured": {"revision": "a5d75e0", "date": "2026-11-27", "machine": "two cores"},
     "what": "Two methods.",
-    "columns": [{"name": "method"}, {"name": "PSNR", "decimals": 1, "best": "higher"}, {"name": "FLIP", "best": "lower"}],
+    "columns": [
+        {"name": "method"},
+        {"name": "PSNR", "decimals": 1, "best": "higher"},
+        {"name": "FLIP", "best": "lower"},
+    ],
     "rows": [["a", 30.0, 0.25], ["b", 31.5, None]],
 }
 
@@ -73,12 +77,14 @@ def test_the_best_of_a_column_is_bold(tmp_path):
 
 def test_the_best_is_that_of_its_group(tmp_path):
     grouped = {**TABLE, "group": "method", "rows": [["a", 30.0, 0.5], ["a", 29.0, 0.4], ["b", 20.0, 0.6]]}
-    bold = [[cell.startswith("**") for cell in row] for row in rows_of(results_page.results_page(written(tmp_path, grouped)))]
+    page = results_page.results_page(written(tmp_path, grouped))
+    bold = [[cell.startswith("**") for cell in row] for row in rows_of(page)]
     assert bold[2:] == [[False, True, False], [False, False, True], [False, True, True]]
 
 
 def test_the_best_of_a_row_is_bold(tmp_path):
-    across = {**TABLE, "best_in_row": "higher", "columns": [{"name": "clip"}, *({"name": n, "decimals": 1} for n in "ab")]}
+    columns = [{"name": "clip"}, {"name": "a", "decimals": 1}, {"name": "b", "decimals": 1}]
+    across = {**TABLE, "best_in_row": "higher", "columns": columns}
     page = results_page.results_page(written(tmp_path, {**across, "rows": [["x", 1.0, 2.0], ["y", None, 3.0]]}))
     assert rows_of(page)[2:] == [["x", "1.0", "**2.0**"], ["y", "", "**3.0**"]]
 
