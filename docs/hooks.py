@@ -6,6 +6,8 @@ A page asks for a part by a comment on a line of its own:
 * ``<!-- options of methods -->``: every method of the registry with its options;
 * ``<!-- buffers -->``: the table of buffers;
 * ``<!-- help: denoise -->``: what ``jaxdn denoise --help`` prints.
+
+Roles in docstrings (``:func:`jaxdn.warp```) become links where the page of that name exists.
 """
 
 import contextlib
@@ -31,6 +33,12 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     for pattern, part in PARTS.items():
         markdown = re.sub(rf"^<!-- {pattern} -->$", part, markdown, flags=re.M)
     return markdown
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """The page with the roles of its docstrings as links, which mkdocs-autorefs resolves."""
+    link = r'<autoref identifier="\1" optional><code>\1</code></autoref>'
+    return re.sub(r":(?:mod|func|class|data|meth|attr):<code>~?([\w.]+)</code>", link, html)
 
 
 def modules(name: str) -> list[str]:

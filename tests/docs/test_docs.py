@@ -74,6 +74,7 @@ def test_the_reference_pages_follow_from_the_code():
     assert "| `radiance` | 3 | light |" in pages["formats"]
     assert "| `sigma_normal` | a number >= 0 | `16.0` |" in pages["options"]
     assert "--max-memory" in pages["command-line"]
+    assert hooks.on_page_content("see :func:<code>jaxdn.warp</code>").count('<autoref identifier="jaxdn.warp"') == 1
     with pytest.raises(ValueError, match=r"expected a module or package of jaxdn, got jaxdn\.nothing"):
         hooks.on_page_markdown("<!-- api: jaxdn.nothing -->")
 
