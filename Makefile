@@ -7,7 +7,7 @@ train weights: export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 # XLA raises its errors; what it logs besides is an alarm at every compilation of more than two minutes.
 export TF_CPP_MIN_LOG_LEVEL ?= 3
 
-.PHONY: help setup train test test-slow bench chart compare papers hard-cases lint format docs weights clean
+.PHONY: help setup train test test-slow bench chart compare papers hard-cases results lint format docs weights clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -64,6 +64,9 @@ papers: setup  ## the tables of the papers on learned denoisers, on small settin
 
 compare: .venv/tools  ## the filters side by side, errors and times: runs/compare/table.md (SETTINGS="SCENES" adds rooms)
 	$(BIN)/python -m experiments.papers.classical $(SETTINGS)
+
+results: setup  ## docs/results/index.md and the tables of the README, from docs/results/*.json
+	$(BIN)/python -m experiments.results_page
 
 lint: setup  ## ruff and the type checker
 	$(BIN)/ruff check .

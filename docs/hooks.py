@@ -1,21 +1,100 @@
-"""Pages that follow from the table of methods: run by MkDocs (``hooks`` in mkdocs.yml)."""
+"""Reference pages that follow from the code, made by MkDocs (``hooks`` in mkdocs.yml).
 
+A page asks for a part by a comment on a line of its own:
+
+* ``<!-- api: jaxdn.filters -->``: every module of a package, or one module;
+* ``<!-- options of methods -->``: every method of the registry with its options;
+* ``<!-- buffers -->``: the table of buffers;
+* ``<!-- help: denoise -->``: what ``jaxdn denoise --help`` prints.
+
+Roles in docstrings (``:func:`jaxdn.warp```) become links where the page of that name exists.
+"""
+
+import contextlib
+import io
+import os
+import re
+from pathlib import Path
 from typing import Any
+from unittest import mock
 
+import tyro
+
+from jaxdn.commands.arguments import COMMANDS
+from jaxdn.core.frame import BUFFERS
+from jaxdn.core.options import describe
 from jaxdn.methods.registry import methods
 
-PLACE = "<!-- the table of methods -->"
+ROOT = Path(__file__).parents[1]
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Every method with its title, variants, recipes and options, in the page that asks for them."""
-    if PLACE not in markdown:
-        return markdown
+    """The page with what its comments ask for."""
+    for pattern, part in PARTS.items():
+        markdown = re.sub(rf"^<!-- {pattern} -->$", part, markdown, flags=re.M)
+    return markdown
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """The page with the roles of its docstrings as links, which mkdocs-autorefs resolves."""
+    link = r'<autoref identifier="\1" optional><code>\1</code></autoref>'
+    return re.sub(r":(?:mod|func|class|data|meth|attr):<code>~?([\w.]+)</code>", link, html)
+
+
+def modules(name: str) -> list[str]:
+    """The module ``name``, or the package and all modules in it, by the names to import them by.
+
+    Raises ValueError if there is neither.
+    """
+    path = ROOT / name.replace(".", "/")
+    if path.with_suffix(".py").is_file():
+        return [name]
+    files = sorted(path.rglob("*.py"), key=lambda file: (file.parent, file.stem != "__init__", file.stem))
+    if not files:
+        raise ValueError(f"docs: expected a module or package of jaxdn, got {name}; mend the page that names it.")
+    parts = [file.relative_to(ROOT).with_suffix("").parts for file in files]
+    return [".".join(part[:-1] if part[-1] == "__init__" else part) for part in parts]
+
+
+def _api(match: re.Match[str]) -> str:
+    return "\n".join(f"::: {module}" for module in modules(match[1]))
+
+
+def _options(_: re.Match[str]) -> str:
     parts = []
     for name, method in methods().items():
-        parts.append(f"## {name}: {method.title}\n")
-        if method.learns:
-            variants, recipes = ", ".join(method.variants) or "none", ", ".join(method.recipes)
-            parts.append(f"Learns. Variants: {variants}; recipes: {recipes}.\n")
-        parts.append(f"::: {method.factory.__module__}\n")
-    return markdown.replace(PLACE, "\n".join(parts))
+        parts.append(f"## {name}\n\n{method.title}.\n")
+        for label, values in (("Variants", method.variants), ("Presets", method.presets), ("Recipes", method.recipes)):
+            if values:
+                parts.append(f"{label}: {', '.join(f'`{value}`' for value in values)}.\n")
+        rows = re.findall(r"^\* ``(\w+)``: (.*); default (.*)$", describe(method.options), flags=re.M)
+        parts.append(_table(["Option", "Values", "Default"], [[f"`{n}`", allowed, f"`{d}`"] for n, allowed, d in rows]))
+    return "\n".join(parts)
+
+
+def _buffers(_: re.Match[str]) -> str:
+    rows = [
+        [f"`{name}`", str(row.channels), row.kind, str(row.neutral), row.stored, "yes" if row.on_request else ""]
+        for name, row in BUFFERS.items()
+    ]
+    return _table(["Buffer", "Channels", "Kind", "`None` means", "Stored as", "On request"], rows)
+
+
+def _help(match: re.Match[str]) -> str:
+    text = io.StringIO()
+    plain = mock.patch.dict(os.environ, {"COLUMNS": "80", "NO_COLOR": "1"})
+    with plain, contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+        tyro.cli(COMMANDS, prog="jaxdn", args=[match[1], "--help"])
+    return f"```text\n{text.getvalue().strip()}\n```"
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows]) + "\n"
+
+
+PARTS = {
+    r"api: (jaxdn[\w.]*)": _api,
+    r"options of methods": _options,
+    r"buffers": _buffers,
+    r"help: (\w+)": _help,
+}

@@ -37,7 +37,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name i
     from jaxdn.zoo.weights import load_weights as load_weights
     from jaxdn.zoo.weights import save_weights as save_weights
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {
     "Frame": "core.frame",

@@ -1,5 +1,6 @@
 """README and docs: their links lead somewhere, their commands parse, their code runs, their pictures are small."""
 
+import importlib.util
 import re
 import shlex
 from pathlib import Path
@@ -12,6 +13,7 @@ from PIL import Image
 from docs.figures import before_after, front_page, vectors
 from jaxdn.clips import write_clip
 from jaxdn.commands.arguments import COMMANDS, Denoise
+from jaxdn.methods.registry import methods
 from jaxdn.zoo.ready import OURS
 from tests.training.test_training import make_clip
 
@@ -40,6 +42,43 @@ def test_commands_parse(page):
             tyro.cli(COMMANDS, args=shlex.split(line, comments=True)[1:])
 
 
+@pytest.mark.parametrize("name", sorted(methods()))
+def test_every_method_has_a_page_with_the_same_headings(name):
+    page = (ROOT / "docs" / "concepts" / "methods" / f"{name}.md").read_text()
+    headings = ["What it does", "Inputs", "Cost", "Where it fails", "Paper"]
+    assert re.findall(r"^#+ (.*)$", page, flags=re.M) == [name, *headings]
+
+
+def test_every_page_is_in_the_navigation():
+    navigation = set(re.findall(r"^ +- .*: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), flags=re.M))
+    assert navigation == {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")}
+
+
+def test_every_package_and_module_is_in_the_reference():
+    pages = [page.read_text() for page in (ROOT / "docs" / "reference").glob("*.md")]
+    named = {name for page in pages for name in re.findall(r"^<!-- api: (jaxdn\.\w+) -->$", page, flags=re.M)}
+    there = {path.relative_to(ROOT).with_suffix("").parts for path in (ROOT / "jaxdn").rglob("*.py")}
+    public = {f"jaxdn.{parts[1]}" for parts in there if not parts[1].startswith("_")}
+    assert named == public - {"jaxdn.clips"}  # another name of jaxdn.data.clip
+
+
+def test_the_reference_pages_follow_from_the_code():
+    spec = importlib.util.spec_from_file_location("hooks", ROOT / "docs" / "hooks.py")
+    assert spec is not None
+    assert spec.loader is not None
+    hooks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    pages = {page.stem: hooks.on_page_markdown(page.read_text()) for page in (ROOT / "docs" / "reference").glob("*.md")}
+    assert not [name for name, text in pages.items() if "<!--" in text]
+    assert "::: jaxdn.ops.warp\n" in pages["operations"]
+    assert "| `radiance` | 3 | light |" in pages["formats"]
+    assert "| `sigma_normal` | a number >= 0 | `16.0` |" in pages["options"]
+    assert "--max-memory" in pages["command-line"]
+    assert hooks.on_page_content("see :func:<code>jaxdn.warp</code>").count('<autoref identifier="jaxdn.warp"') == 1
+    with pytest.raises(ValueError, match=r"expected a module or package of jaxdn, got jaxdn\.nothing"):
+        hooks.on_page_markdown("<!-- api: jaxdn.nothing -->")
+
+
 def test_the_pictures_are_small():
     sizes = {path.name: path.stat().st_size for path in (ROOT / "docs" / "images").iterdir()}
     assert sizes
@@ -54,7 +93,7 @@ def test_the_default_of_denoise_is_what_reports_open_on():
 def test_the_tutorials_denoiser_runs_and_learns(tmp_path, monkeypatch, capsys):
     write_clip(make_clip(0, frames=8), tmp_path / "data" / "demo" / "test" / "robot-200")
     monkeypatch.chdir(tmp_path)
-    page = (ROOT / "docs" / "tutorials" / "own-denoiser.md").read_text()
+    page = (ROOT / "docs" / "how-to" / "own-denoiser.md").read_text()
     found: dict[str, object] = {}
     exec("\n".join(re.findall(r"```python\n(.*?)```", page, re.S)), found)
     assert "dB, running mean" in capsys.readouterr().out
