@@ -17,7 +17,7 @@ from jaxdn.filters.surface_test import Guides, expected, guides_of, same_surface
 from jaxdn.ops.motion import targets
 
 SEEN_MOST = 8.0
-"""More frames than this hardly make a history better: each new one counts a fifth or so (docs/files.md)."""
+"""More frames than this hardly make a history better: each new one counts a fifth or so (docs/how-to/two-passes.md)."""
 _DEPTH_TOLERANCE, _NORMAL_THRESHOLD = 0.02, 0.9
 _READS = frozenset({"normal", "depth", "previous_depth", "motion", "ids"})
 _ONE_WAY = ("dual_motion", "visible", "luminance_gradient", "shadow_motion", "glossy_motion", "far_motion")

@@ -4,7 +4,7 @@ Each convolution includes its bias, its sum and its rectifier, and activations l
 float32, the U-Nets of ``steady`` take 0.4 to 0.65 of their time in XLA. bfloat16 has the range of float32 and 8 bits of
 precision; sums are float32. A CPU with AVX-512 BF16 or AMX multiplies twice as many of them at a time or more, and
 activations are half as large. What networks decide are shares, features and logits, for which 8 bits are enough: images
-differ by 76 to 85 dB (``docs/performance.md``). Both are for inference only: the gradient is that of the network in
+differ by 76 to 85 dB (``docs/results/index.md``). Both are for inference only: the gradient is that of the network in
 plain XLA, recomputed.
 
 All primitives are made once for a shape, on memory of their own, and run one after the other. The layers:

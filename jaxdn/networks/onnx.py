@@ -1,7 +1,7 @@
 """A network run by ONNX Runtime, an inference engine for CPUs, from inside a jitted program.
 
 XLA:CPU's convolutions reach about two thirds of the machine's peak. ONNX Runtime keeps activations in blocks of 16
-channels from one convolution to the next; a 720p step takes 0.77 to 1.03 of XLA's time (``docs/performance.md``). It
+channels from one convolution to the next; a 720p step takes 0.77 to 1.03 of XLA's time (``docs/results/index.md``). It
 is an extra (``pip install onnxruntime onnx``) and for inference only: the gradient is that of the network in plain XLA,
 recomputed. None of this is visible outside: ``unet(..., implementation="onnxruntime")`` is the same pure function.
 """

@@ -90,8 +90,7 @@ def render_frame(
       light: what the radiance holds: ``"indirect"`` light, beside which there is ``direct``, or all that is
         ``"reflected"``, without ``direct``.
       jitter: rays go through another point of the pixels in every frame (:mod:`jaxdn.render.tracing.jitter`), and the
-      reference
-        is the mean over each pixel, instead of everything through the centres.
+        reference is the mean over each pixel, instead of everything through the centres.
       see_through: the guides of flat mirrors and of glass are those of what they show
         (:mod:`jaxdn.render.buffers.replacement`); not with the scalar variant.
       previous: the ``view`` of the frame before, computed if it is not given; frame 0 has none, and its motion is 0.

@@ -126,7 +126,7 @@ def clips_of(
       out: the folder for the clips.
       animation: animation file for a scene file; default: the one next to it.
       tours: every seed gives another tour of the scene file (:func:`jaxdn.render.tours.rooms.tour`) instead of its
-      animation.
+        animation.
       seeds: one clip each.
       width: in pixels.
       height: in pixels.

@@ -46,8 +46,7 @@ def training_batches(
       frames: consecutive frames of each element.
       seed: decides the order, windows, crops and symmetries; from 0 to 2^32 - 1.
       spp: samples per pixel of the noisy radiance (:func:`jaxdn.data.training.draws.draw_light`); of several numbers,
-      each
-        element takes one at random.
+        each element takes one at random.
       buffers: Frame buffers to read, usually ``denoiser.reads`` (default: all that the clips have).
       layers: add the independent noisy layers of 1, 2, 4, ... samples that every clip has (``Clip.layers``), for a
         denoiser that requests samples; then no element has all light (``variation.beauty``), as layers have not.
