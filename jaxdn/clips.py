@@ -4,7 +4,7 @@ Reading and writing needs OpenEXR alone; ``training_batches`` loads Grain on fir
 """
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxdn.data.clip.folder import begin_record as begin_record
 from jaxdn.data.clip.folder import begun_record as begun_record
@@ -27,6 +27,9 @@ from jaxdn.data.foreign.layers import detect_channels as detect_channels
 from jaxdn.data.foreign.vectors import MOTION_CONVENTIONS as MOTION_CONVENTIONS
 from jaxdn.data.read import open_frames as open_frames
 from jaxdn.data.read import read_clip as read_clip
+
+if TYPE_CHECKING:
+    from jaxdn.data.training.dataset import training_batches as training_batches
 
 
 def __getattr__(name: str) -> Any:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import jaxdn
+from jaxdn import denoisers, render
 from tests.house import PACKAGES, ROOMS, ROOT, with_table
 
 PACKAGE = Path(jaxdn.__file__).parent
@@ -180,3 +181,17 @@ except ModuleNotFoundError:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "no such module", done.stderr
+
+
+def _names_for_type_checkers(path: Path) -> set[str]:
+    """Names that a module imports where only type checkers look."""
+    blocks = [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.If)]
+    checked = [node for node in blocks if isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"]
+    imports = [each for block in checked for each in block.body if isinstance(each, ast.ImportFrom)]
+    return {name.asname for each in imports for name in each.names if name.asname}
+
+
+def test_type_checkers_see_all_public_names():
+    assert _names_for_type_checkers(PACKAGE / "__init__.py") == set(jaxdn.__all__) - {"__version__"}
+    assert _names_for_type_checkers(PACKAGE / "denoisers.py") == set(denoisers.NAMES)
+    assert _names_for_type_checkers(PACKAGE / "render" / "__init__.py") == set(render.__all__)

@@ -18,7 +18,7 @@ from jaxdn.core.frame import RADIANCE_MAX, Frame, only
 from jaxdn.denoiser.sanitize import repair
 from jaxdn.denoiser.statistics import Whole
 
-Params = Any
+Params = dict[str, Any]
 """Nested dicts of arrays; ``{}`` for a filter without weights."""
 State = Any
 """What is carried from one frame to the next: a flat pytree of few, large arrays."""

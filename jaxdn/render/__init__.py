@@ -4,7 +4,18 @@ The only subpackage that imports Mitsuba, and only when something is rendered.
 """
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxdn.render.clip import render_clip as render_clip
+    from jaxdn.render.farm import ClipJob as ClipJob
+    from jaxdn.render.farm import render_clips as render_clips
+    from jaxdn.render.frame import render_frame as render_frame
+    from jaxdn.render.mitsuba.variant import choose_variant as choose_variant
+    from jaxdn.render.mitsuba.variant import use_variant as use_variant
+    from jaxdn.render.opening import scene_from_record as scene_from_record
+    from jaxdn.render.scenes.scene import AnimatedScene as AnimatedScene
+    from jaxdn.render.scenes.scene import Camera as Camera
 
 _HOMES = {
     "AnimatedScene": "scenes.scene",

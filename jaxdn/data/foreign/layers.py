@@ -1,7 +1,8 @@
 """Which channels of another renderer's EXR file make up which buffer, by their names.
 
 The names are those that Blender Cycles, pbrt, Arnold, V-Ray, RenderMan, Houdini, Mitsuba, Corona, Falcor and the tools
-of Open Image Denoise use, a view layer's name in front or not. ``docs/how-to/denoise-sequence.md`` has what is read of each program.
+of Open Image Denoise use, a view layer's name in front or not. ``docs/how-to/denoise-sequence.md`` has what is read of
+each program.
 """
 
 import re
