@@ -133,7 +133,7 @@ import jaxdn
 from jaxdn.clips import training_batches, write_clip
 from jaxdn.commands import inspect
 from jaxdn.core.frame import BUFFERS, Frame, present, written_out
-from jaxdn.denoiser.sanitize import repair
+from jaxdn.denoiser.sanitize import sanitize
 from tests.hard_cases.inputs import good
 
 folder = sys.argv[1]
@@ -152,9 +152,9 @@ for batch in (next(batches) for _ in range(4)):
     np.testing.assert_array_equal(found, batch.frames.motion)  # flipped and turned as motion is
 assert not np.array_equal(found[0], found[1])
 broken = Frame(clip.frames.radiance[0], toy=np.where(toy[0] > 2, np.nan, toy[0]))
-mended, count = repair(broken)
+mended, count = sanitize(broken)
 lost = (toy[0] > 2).any(-1)
-assert count == lost.sum() > 0 and np.isnan(np.asarray(mended.toy)[lost]).all()  # repaired
+assert count == lost.sum() > 0 and np.isnan(np.asarray(mended.toy)[lost]).all()  # sanitized
 assert present(written_out(Frame(clip.frames.radiance), ["toy"])) == ("toy",)
 assert inspect.channels(("toy",)) == ["toy.X", "toy.Y"] and BUFFERS["toy"].bytes == 8  # inspected
 print("found everywhere")
@@ -163,11 +163,11 @@ print("found everywhere")
 
 @pytest.mark.slow
 def test_a_new_buffer_is_one_declaration(tmp_path):
-    """Stored, cropped, flipped, repaired and inspected, in a copy of the package with one field more."""
+    """Stored, cropped, flipped, sanitized and inspected, in a copy of the package with one field more."""
     home = Path(__file__).parents[1]
     shutil.copytree(home / "jaxdn", tmp_path / "jaxdn", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(home / "tests" / "hard_cases", tmp_path / "tests" / "hard_cases")
-    vocabulary = tmp_path / "jaxdn" / "frame.py"
+    vocabulary = tmp_path / "jaxdn" / "core" / "frame.py"
     marker = "    emission: Annotated"
     declaration = '    toy: Annotated[Array, Buffer(2, "vector", "motion")] = None\n    """[H, W, 2] px, a toy."""\n'
     source = vocabulary.read_text()

@@ -23,7 +23,7 @@ from experiments.speed.timing import Call, measure
 from jaxdn import brdf
 from jaxdn.commands.errors import plain_errors
 from jaxdn.core.frame import Frame
-from jaxdn.filters.reproject import recall
+from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import guides_of
 from jaxdn.methods.steady import regression
 from jaxdn.methods.steady.accumulation import Mean, accumulated
@@ -73,7 +73,10 @@ def works(height: int, width: int) -> dict[str, Work]:
     return {
         "a level of the affinity filter, 13 channels, 12 features": (affinity_filter, (image, guide((height, width)))),
         "16 channels enlarged along 12 features": (enlarge, (noise(16, *half), guide(half), guide((height, width)))),
-        "the history recalled, 8 channels": (recall, (history.values, guides_of(frame), frame, jnp.asarray(False))),
+        "the history reprojected, 8 channels": (
+            reproject,
+            (history.values, guides_of(frame), frame, jnp.asarray(False)),
+        ),
         "what the network sees": (partial(seen, multiple=16), ((albedo, normal, depth, roughness), *seen_light, gain)),
         "the running mean": (partial(accumulated, most=32.0), (*seen_light, noise(height, width))),
         "what is decided": (

@@ -24,7 +24,7 @@ from jax import lax
 from jaxdn.commands.errors import plain_errors
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Denoiser
-from jaxdn.denoiser.rollout import sampled
+from jaxdn.denoiser.rollout import render_requested
 from jaxdn.runtime.atomic_files import write_whole
 from jaxdn.zoo.ready import NOISY, all_names, candidate
 
@@ -92,7 +92,9 @@ def compiled(denoiser: Denoiser, params: Any, frames: int) -> Callable[[Any], An
         noisy = jnp.where(index == poisoned, poison, clean.radiance * noise)
         motion = jnp.broadcast_to(jnp.stack([moved, jnp.zeros(())]), (SIZE, SIZE, 2))
         frame = clean._replace(radiance=noisy, motion=motion)
-        state, image = denoiser.step(params, state, sampled(denoiser, params, state, frame, layers(noisy, clean)))
+        state, image = denoiser.step(
+            params, state, render_requested(denoiser, params, state, frame, layers(noisy, clean))
+        )
         leaves = [leaf for leaf in jax.tree.leaves(state) if jnp.issubdtype(leaf.dtype, jnp.floating)]
         largest = jnp.max(jnp.stack([jnp.zeros(()), *(jnp.max(jnp.abs(leaf), initial=0.0) for leaf in leaves)]))
         error = jnp.mean(jnp.abs(image - clean.radiance)) / jnp.mean(clean.radiance)

@@ -168,8 +168,8 @@ def _denoise(options: Denoise) -> None:
         return
     frames, compiled = _count(len(written.files), "frame"), _count(written.programs, "program")
     print(f"{frames} denoised by {options.method} in {options.out} ({engine}, {compiled} compiled)")
-    if written.repaired:
-        print(f"{_count(written.repaired, 'value')} repaired: not usable numbers (NaN, infinite, negative ...)")
+    if written.sanitized:
+        print(f"{_count(written.sanitized, 'value')} sanitized: not usable numbers (NaN, infinite, negative ...)")
 
 
 def _count(number: int, noun: str) -> str:

@@ -5,7 +5,7 @@ exactly as the explicit neutral value (no motion is zero motion, no albedo is wh
 no depth is 0). Because ``None`` is part of the pytree's structure, jit specialises on it, and an absent effect adds
 nothing to the compiled program.
 
-A buffer is declared once, as a field of :class:`Frame` annotated with its :class:`Buffer`. Repair, files, caches,
+A buffer is declared once, as a field of :class:`Frame` annotated with its :class:`Buffer`. Sanitizing, files, caches,
 augmentation, byte counts and the hard cases of the tests all follow from :data:`BUFFERS`.
 """
 
@@ -26,7 +26,7 @@ Array = Any
 """A jax or NumPy array, or None where the effect is absent."""
 
 Kind = Literal["light", "signed", "fraction", "direction", "distance", "vector", "count", "flag", "id"]
-"""The kind of values in a buffer; it decides how they are repaired, stored and transformed:
+"""The kind of values in a buffer; it decides how they are sanitized, stored and transformed:
 
 * ``light``: radiance >= 0; ``signed``: a difference of radiances, of either sign;
 * ``fraction``: in [0, 1]; ``count``: a number of samples >= 0;

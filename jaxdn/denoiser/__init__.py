@@ -7,5 +7,5 @@ from jaxdn.denoiser.interface import Recurrent as Recurrent
 from jaxdn.denoiser.interface import RecurrentStep as RecurrentStep
 from jaxdn.denoiser.interface import State as State
 from jaxdn.denoiser.interface import Step as Step
-from jaxdn.denoiser.interface import checked as checked
+from jaxdn.denoiser.interface import check_frame as check_frame
 from jaxdn.denoiser.interface import recurrent as recurrent

@@ -2,7 +2,7 @@
 
 :class:`Denoiser` is the one interface that training, evaluation, the planner, the chart and the command line use. A
 method is written as a :class:`Core`, which gets only valid frames. :func:`recurrent` turns it into a denoiser and adds
-what every method needs: it checks shapes, repairs frames and counts repaired values, keeps the age of the state, and
+what every method needs: it checks shapes, sanitizes frames and counts sanitized values, keeps the age of the state, and
 clamps the image to values from 0 to the largest that a file holds.
 """
 
@@ -15,8 +15,8 @@ import jax.numpy as jnp
 
 from jaxdn.core.checks import check_image, check_same_size
 from jaxdn.core.frame import RADIANCE_MAX, Frame, only
-from jaxdn.denoiser.sanitize import repair
-from jaxdn.denoiser.statistics import Whole
+from jaxdn.denoiser.sanitize import sanitize
+from jaxdn.denoiser.statistics import FrameStatistics
 
 Params = dict[str, Any]
 """Nested dicts of arrays; ``{}`` for a filter without weights."""
@@ -44,7 +44,7 @@ class Denoiser(NamedTuple):
 
 
 class Core(NamedTuple):
-    """A method without the shared processing. Frames hold only what it reads, already repaired."""
+    """A method without the shared processing. Frames hold only what it reads, already sanitized."""
 
     start: Callable[[Params, Frame], State]
     """(params, frame) -> its own state."""
@@ -56,7 +56,7 @@ class Core(NamedTuple):
     init: Callable[[jax.Array, Frame], Params] = lambda key, frame: {}
     samples: Callable[[Params, State, Frame, jax.Array, int], jax.Array] | None = None
     """(params, state, frame, first, most) -> [H, W, 1]."""
-    measure: Callable[[Frame], Whole] | None = None
+    measure: Callable[[Frame], FrameStatistics] | None = None
     """(frame) -> what ``step`` must know of the whole frame; None: nothing."""
     reach: int | None = None
     """In pixels: what is farther away decides nothing about a pixel, apart from the history, which may come from as
@@ -74,7 +74,7 @@ class Recurrent(NamedTuple):
     """The method's own."""
     age: jax.Array
     """int32, frames processed; at 0 there is no history."""
-    repaired: jax.Array
+    sanitized: jax.Array
     """int32, values of frames and histories that had to be replaced so far."""
 
 
@@ -85,25 +85,25 @@ class RecurrentStep:
     core: Core
 
     def __call__(self, params: Params, state: Recurrent, frame: Frame) -> tuple[Recurrent, jax.Array]:
-        """Check, repair, step, clamp, count."""
+        """Check, sanitize, step, clamp, count."""
         frame, whole, replaced = self.measured(frame)
         own, image, lost = self.part(params, state.core, frame, state.age == 0, whole)
-        return Recurrent(own, state.age + 1, state.repaired + replaced + lost), image
+        return Recurrent(own, state.age + 1, state.sanitized + replaced + lost), image
 
-    def measured(self, frame: Frame) -> tuple[Frame, Whole | None, jax.Array]:
-        """The repaired frame, what is measured of it, and the number of values that were replaced."""
-        frame = checked(frame, self.core.reads)
+    def measured(self, frame: Frame) -> tuple[Frame, FrameStatistics | None, jax.Array]:
+        """The sanitized frame, what is measured of it, and the number of values that were replaced."""
+        frame = check_frame(frame, self.core.reads)
         if self.core.counted:
             finite = jnp.all(jnp.isfinite(frame.radiance), axis=-1, keepdims=True)
             given = 1.0 if frame.sample_count is None else frame.sample_count
             frame = frame._replace(sample_count=jnp.where(finite, given, 0.0))
-        frame, replaced = repair(frame)
+        frame, replaced = sanitize(frame)
         return frame, None if self.core.measure is None else self.core.measure(frame), replaced
 
     def part(
-        self, params: Params, state: State, frame: Frame, first: jax.Array, whole: Whole | None
+        self, params: Params, state: State, frame: Frame, first: jax.Array, whole: FrameStatistics | None
     ) -> tuple[State, jax.Array, jax.Array | int]:
-        """The step of the core, its image clamped, of a repaired frame or of a part of the frame that was measured."""
+        """The step of the core, its image clamped, of a sanitized frame or of a part of the frame that was measured."""
         given = () if whole is None else (whole,)
         state, image, lost = self.core.step(params, state, frame, first, *given)
         return state, jnp.clip(image, 0.0, RADIANCE_MAX), lost
@@ -113,7 +113,7 @@ def recurrent(core: Core) -> Denoiser:
     """The denoiser of a core. Its functions raise ValueError for wrong shapes, never for pixel values."""
 
     def start(params: Params, frame: Frame) -> Recurrent:
-        frame, _ = repair(checked(frame, core.reads))
+        frame, _ = sanitize(check_frame(frame, core.reads))
         zero = jnp.zeros((), jnp.int32)
         return Recurrent(core.start(params, frame), zero, zero)
 
@@ -122,12 +122,12 @@ def recurrent(core: Core) -> Denoiser:
         core_samples = core.samples
 
         def samples(params: Params, state: Recurrent, frame: Frame, most: int) -> jax.Array:
-            return core_samples(params, state.core, repair(checked(frame, core.reads))[0], state.age == 0, most)
+            return core_samples(params, state.core, sanitize(check_frame(frame, core.reads))[0], state.age == 0, most)
 
     return Denoiser(core.init, start, RecurrentStep(core), core.reads, samples)
 
 
-def checked(frame: Frame, reads: frozenset[str]) -> Frame:
+def check_frame(frame: Frame, reads: frozenset[str]) -> Frame:
     """The buffers of a frame that a denoiser reads. Raises ValueError unless they are [H, W, C], all of one size."""
     frame = only(frame, reads)
     check_image(frame.radiance, "frame.radiance", channels=3)

@@ -17,7 +17,7 @@ Layers = Mapping[int, Any] | None
 """Samples per pixel -> independent noisy radiance; see :class:`jaxdn.Clip`."""
 
 
-def sampled(
+def render_requested(
     denoiser: Denoiser, params: Params, state: State, frame: Frame, layers: Layers, reference: jax.Array | None = None
 ) -> Frame:
     """The frame with the samples that the denoiser requests, taken from stored layers; unchanged without a request.
@@ -41,7 +41,7 @@ def sampled(
             "rendered as requested, with sample_count; got neither."
         )
     wanted = denoiser.samples(params, state, only(frame, denoiser.reads), sum(layers))
-    # Their sum must not overflow; what is not a number stays, to be repaired and counted in the step.
+    # Their sum must not overflow; what is not a number stays, to be sanitized and counted in the step.
     bounded = {
         n: jnp.where(jnp.isfinite(layer), jnp.minimum(layer, RADIANCE_MAX), layer) for n, layer in layers.items()
     }
@@ -76,7 +76,7 @@ def unroll(
     layers, reference = (layers, reference) if denoiser.samples is not None else (None, None)
 
     def step(state: State, given: tuple[Frame, Layers, jax.Array | None]) -> tuple[State, jax.Array]:
-        return denoiser.step(params, state, sampled(denoiser, params, state, *given))
+        return denoiser.step(params, state, render_requested(denoiser, params, state, *given))
 
     body = jax.checkpoint(step, prevent_cse=False) if rematerialize else step
     _, images = lax.scan(body, denoiser.start(params, frame_at(frames, 0)), (frames, layers, reference))
@@ -109,7 +109,7 @@ def _start(denoiser: Denoiser, params: Params, frame: Frame) -> State:
 
 @functools.partial(jax.jit, static_argnums=0, donate_argnums=2)
 def _step(denoiser: Denoiser, params: Params, state: State, frame: Frame, layers: Layers) -> tuple[State, jax.Array]:
-    return denoiser.step(params, state, sampled(denoiser, params, state, frame, layers))
+    return denoiser.step(params, state, render_requested(denoiser, params, state, frame, layers))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 4))
@@ -161,9 +161,9 @@ class Stream:
         return (self(frame) for frame in frames)
 
     @property
-    def repaired(self) -> int:
+    def sanitized(self) -> int:
         """Values of frames and histories that had to be replaced so far."""
-        return int(getattr(self._state, "repaired", 0))
+        return int(getattr(self._state, "sanitized", 0))
 
 
 def stream(denoiser: Denoiser, params: Params) -> Stream:

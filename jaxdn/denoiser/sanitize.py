@@ -1,6 +1,6 @@
-"""Repair of frames and histories, the first step of every denoiser.
+"""Sanitizing of frames and histories, the first step of every denoiser.
 
-The repair depends only on the kind of a buffer (:data:`jaxdn.core.frame.BUFFERS`).
+The sanitizing depends only on the kind of a buffer (:data:`jaxdn.core.frame.BUFFERS`).
 """
 
 from collections.abc import Callable
@@ -13,11 +13,11 @@ from jaxdn.core.frame import BUFFERS, RADIANCE_MAX, Buffer, Frame
 FARTHEST = 1e9
 """Larger distances are replaced by this."""
 
-Repaired = tuple[jax.Array, jax.Array]
-"""The repaired buffer, and which of its values were replaced (bool)."""
+Sanitized = tuple[jax.Array, jax.Array]
+"""The sanitized buffer, and which of its values were replaced (bool)."""
 
 
-def repair(frame: Frame) -> tuple[Frame, jax.Array]:
+def sanitize(frame: Frame) -> tuple[Frame, jax.Array]:
     """Replace invalid values of a frame; returns it with the number of replaced values (int32).
 
     By the kind of each buffer:
@@ -35,10 +35,10 @@ def repair(frame: Frame) -> tuple[Frame, jax.Array]:
     safe = {}
     for name, buffer in BUFFERS.items():
         values = getattr(frame, name)
-        if values is None or buffer.kind not in _REPAIRS:
+        if values is None or buffer.kind not in _SANITIZERS:
             continue
         # Half precisions and integers become float32; float64 stays.
-        safe[name], bad = _REPAIRS[buffer.kind](
+        safe[name], bad = _SANITIZERS[buffer.kind](
             jnp.asarray(values, jnp.promote_types(values.dtype, jnp.float32)), buffer
         )
         # Summed to one array per shape first: every reduction to a scalar is a separate pass over memory.
@@ -49,28 +49,28 @@ def repair(frame: Frame) -> tuple[Frame, jax.Array]:
     return frame._replace(**safe), jnp.sum(counts, dtype=jnp.int32)
 
 
-def _light(values: jax.Array, buffer: Buffer) -> Repaired:
+def _light(values: jax.Array, buffer: Buffer) -> Sanitized:
     bad = ~(jnp.isfinite(values) & (values >= 0))
     return jnp.minimum(jnp.where(bad, 0.0, values), RADIANCE_MAX), bad | (values > RADIANCE_MAX)
 
 
-def _signed(values: jax.Array, buffer: Buffer) -> Repaired:
+def _signed(values: jax.Array, buffer: Buffer) -> Sanitized:
     bad = ~jnp.isfinite(values)
     return jnp.clip(jnp.where(bad, 0.0, values), -RADIANCE_MAX, RADIANCE_MAX), bad | (jnp.abs(values) > RADIANCE_MAX)
 
 
-def _fraction(values: jax.Array, buffer: Buffer) -> Repaired:
+def _fraction(values: jax.Array, buffer: Buffer) -> Sanitized:
     neutral = 1.0 if isinstance(buffer.neutral, str) else buffer.neutral
     bad = ~((values >= 0) & (values <= 1))
     return jnp.clip(jnp.where(jnp.isfinite(values), values, neutral), 0.0, 1.0), bad
 
 
-def _count(values: jax.Array, buffer: Buffer) -> Repaired:
+def _count(values: jax.Array, buffer: Buffer) -> Sanitized:
     bad = ~(jnp.isfinite(values) & (values >= 0))
     return jnp.where(bad, 0.0, values), bad
 
 
-def _direction(values: jax.Array, buffer: Buffer) -> Repaired:
+def _direction(values: jax.Array, buffer: Buffer) -> Sanitized:
     # Explicit for three components: XLA:CPU takes four times as long for reductions over such a short axis.
     sizes = [jnp.abs(values[..., i : i + 1]) for i in range(3)]
     largest = jnp.maximum(jnp.maximum(sizes[0], sizes[1]), sizes[2])
@@ -82,17 +82,17 @@ def _direction(values: jax.Array, buffer: Buffer) -> Repaired:
     return jnp.where(usable, unit, 0.0), ~jnp.isfinite(values)
 
 
-def _distance(values: jax.Array, buffer: Buffer) -> Repaired:
+def _distance(values: jax.Array, buffer: Buffer) -> Sanitized:
     bad = ~(values >= 0)
     return jnp.minimum(jnp.where(bad, 0.0, values), FARTHEST), bad | (values > FARTHEST)
 
 
-def _vector(values: jax.Array, buffer: Buffer) -> Repaired:
+def _vector(values: jax.Array, buffer: Buffer) -> Sanitized:
     known = jnp.all(jnp.isfinite(values), axis=-1, keepdims=True)
     return jnp.where(known, values, jnp.nan), ~known
 
 
-_REPAIRS: dict[str, Callable[[jax.Array, Buffer], Repaired]] = {
+_SANITIZERS: dict[str, Callable[[jax.Array, Buffer], Sanitized]] = {
     "light": _light,
     "signed": _signed,
     "fraction": _fraction,
@@ -103,7 +103,7 @@ _REPAIRS: dict[str, Callable[[jax.Array, Buffer], Repaired]] = {
 }
 
 
-def repair_image(image: jax.typing.ArrayLike) -> jax.Array:
+def sanitize_image(image: jax.typing.ArrayLike) -> jax.Array:
     """An image without invalid values: not finite or negative -> 0, at most ``RADIANCE_MAX``."""
     image = jnp.asarray(image)
     bad = ~(jnp.isfinite(image) & (image >= 0))

@@ -17,14 +17,14 @@ from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.inference_path import alone
 
 
-class Whole(NamedTuple):
+class FrameStatistics(NamedTuple):
     """Sums over a frame, all scalars."""
 
     brightness: jax.Array
     """[2] of :func:`jaxdn.color.brightness`."""
     depth: jax.Array
     """[3] the sums of log z and of 1 / z over surfaces, and their number of pixels."""
-    other: jax.Array
+    reflectance_differs: jax.Array
     """Number of pixels whose reflectance is not their albedo."""
     height: jax.Array
     """Rows of the frame; no sum."""
@@ -35,18 +35,18 @@ class Whole(NamedTuple):
         return color.exposure_of(self.brightness)
 
     @property
-    def middle_depth(self) -> jax.Array:
+    def mean_depth(self) -> jax.Array:
         """The geometric mean of depth over surfaces; 1 without any."""
-        return geometric_mean(self.depth)
+        return geometric_mean_depth(self.depth)
 
     @property
-    def middle_inverse(self) -> jax.Array:
+    def mean_inverse_depth(self) -> jax.Array:
         """The mean of inverse depth over surfaces; 1 without any."""
         mean = self.depth[1] / jnp.maximum(self.depth[2], 1.0)
         return jnp.where(mean > 0, mean, 1.0)
 
 
-def measured(light: jax.Array, depth: Array, frame: Frame) -> Whole:
+def measure_frame(light: jax.Array, depth: Array, frame: Frame) -> FrameStatistics:
     """The sums of a frame.
 
     Args:
@@ -56,27 +56,27 @@ def measured(light: jax.Array, depth: Array, frame: Frame) -> Whole:
     """
     either = frame.reflectance is None or frame.albedo is None
     other = 0.0 if either else jnp.sum(jnp.any(frame.reflectance != frame.albedo, axis=-1), dtype=light.dtype)
-    return Whole(
+    return FrameStatistics(
         color.brightness(light),
-        jnp.zeros(3, light.dtype) if depth is None else sums_of_depth(depth),
+        jnp.zeros(3, light.dtype) if depth is None else sum_depths(depth),
         jnp.asarray(other, light.dtype),
         jnp.asarray(frame.radiance.shape[0], light.dtype),
     )
 
 
-def geometric_mean(depth: jax.Array) -> jax.Array:
+def geometric_mean_depth(depth: jax.Array) -> jax.Array:
     """The geometric mean of depth over surfaces, from :attr:`Whole.depth`; 1 without any."""
     return jnp.exp(depth[0] / jnp.maximum(depth[2], 1.0))
 
 
-def sums_of_depth(depth: jax.Array) -> jax.Array:
+def sum_depths(depth: jax.Array) -> jax.Array:
     """:attr:`Whole.depth` of a depth [H, W, 1]; no surface is at 0 or at ``FAR``."""
     if numba_call.available() and depth.dtype == jnp.float32:
-        return alone(_sums_of_depth, _sums_by_compiled)(depth)
-    return _sums_of_depth(depth)
+        return alone(_sum_depths, _sums_by_compiled)(depth)
+    return _sum_depths(depth)
 
 
-def _sums_of_depth(depth: jax.Array) -> jax.Array:
+def _sum_depths(depth: jax.Array) -> jax.Array:
     known = (depth > 0) & (depth < FAR)
     there = jnp.where(known, depth, 1.0)
     logarithms, inverses = jnp.log(there), jnp.where(known, 1.0 / there, 0.0)

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxdn.core.frame import BUFFERS, Frame, only, present
 from jaxdn.denoiser import Denoiser, Params, RecurrentStep
-from jaxdn.denoiser.statistics import Whole
+from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.runtime.malloc import give_back
 
 GRID = 32
@@ -35,7 +35,7 @@ class Window(NamedTuple):
     """The one after them."""
 
 
-def windows(length: int, side: int, margin: int) -> list[Window]:
+def split_axis(length: int, side: int, margin: int) -> list[Window]:
     """Windows of one size, at most ``side``, that cover ``length`` pixels; what is kept of them lies side by side.
 
     At least ``margin`` pixels lie between what is kept and a window's end that is not the frame's. Raises ValueError
@@ -58,7 +58,7 @@ def windows(length: int, side: int, margin: int) -> list[Window]:
     return found
 
 
-def by_parts(
+def map_tiles(
     function: Callable[[Any], Any], given: Any, size: tuple[int, int], *, side: int, margin: int
 ) -> tuple[Any, list[Any]]:
     """A function of pictures, window by window.
@@ -75,7 +75,7 @@ def by_parts(
     """
     whole: Any = None
     others = []
-    for rows, columns in _crossed(*(windows(length, side, margin) for length in size)):
+    for rows, columns in _crossed(*(split_axis(length, side, margin) for length in size)):
         # Copied: a view of a NumPy array would be copied to a new buffer at every use.
         cut = jax.tree.map(
             lambda x, r=rows, c=columns: np.ascontiguousarray(x[r.start : r.stop, c.start : c.stop]), given
@@ -108,19 +108,19 @@ def _paste(whole: Any, pictures: Any, rows: Window, columns: Window) -> None:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _measure(step: RecurrentStep, frame: Frame) -> tuple[Whole | None, jax.Array]:
+def _measure(step: RecurrentStep, frame: Frame) -> tuple[FrameStatistics | None, jax.Array]:
     _, whole, replaced = step.measured(frame)
     return whole, replaced
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _part(
-    step: RecurrentStep, params: Params, state: Any, frame: Frame, first: jax.Array, whole: Whole | None
+    step: RecurrentStep, params: Params, state: Any, frame: Frame, first: jax.Array, whole: FrameStatistics | None
 ) -> tuple[Any, jax.Array, Any]:
     return step.part(params, state, step.measured(frame)[0], first, whole)
 
 
-def parted(denoiser: Denoiser, params: Params, side: int, size: tuple[int, int]) -> "Parted":
+def stream_tiled(denoiser: Denoiser, params: Params, side: int, size: tuple[int, int]) -> "TiledStream":
     """As :func:`jaxdn.stream`, for frames of ``size`` (height, width), in windows of at most ``side`` pixels.
 
     The images are those of whole frames, up to rounding. A vector may fetch the history from at most half a window's
@@ -131,12 +131,12 @@ def parted(denoiser: Denoiser, params: Params, side: int, size: tuple[int, int])
     if not isinstance(step, RecurrentStep) or step.core.reach is None or denoiser.samples is not None:
         raise ValueError("this method cannot denoise a frame in parts; take another, or smaller frames.")
     for length in size:
-        windows(length, side, step.core.reach + _AROUND)
-    return Parted(step, params, side, step.core.reach)
+        split_axis(length, side, step.core.reach + _AROUND)
+    return TiledStream(step, params, side, step.core.reach)
 
 
-class Parted:
-    """Frames in, images out, one at a time; made by :func:`parted`. State and images are NumPy arrays."""
+class TiledStream:
+    """Frames in, images out, one at a time; made by :func:`stream_tiled`. State and images are NumPy arrays."""
 
     def __init__(self, step: RecurrentStep, params: Params, side: int, reach: int) -> None:
         self._step, self._params, self._reach = step, params, reach
@@ -146,9 +146,9 @@ class Parted:
         self._first = True
         self.programs: set[tuple[str, ...]] = set()
         """The sets of buffers, without radiance, that a step was compiled for."""
-        self.repaired = 0
+        self.sanitized = 0
         """Values of frames and histories that had to be replaced; of histories, in every window that sees them."""
-        self.out_of_reach = 0
+        self.beyond_halo = 0
         """Pixels of the last frame whose vector was too long for the windows."""
 
     def __call__(self, frame: Frame) -> np.ndarray:
@@ -162,7 +162,7 @@ class Parted:
             start = functools.partial(self._step.core.start, self._params)
             self._state = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(start, frame))
         room = (self.side - GRID) // 2 - GRID - self._reach
-        farthest, self.out_of_reach = farthest_history(frame, room)
+        farthest, self.beyond_halo = find_history_halo(frame, room)
         first = jnp.asarray(self._first)
 
         def step(given: tuple[Any, Frame]) -> tuple[tuple[Any, jax.Array], Any]:
@@ -175,21 +175,21 @@ class Parted:
             state, image, lost = _part(*arguments)
             return (state, image), lost
 
-        (self._state, image), lost = by_parts(
+        (self._state, image), lost = map_tiles(
             step, (self._state, frame), (height, width), side=self.side, margin=self._reach + farthest
         )
-        self.repaired += sum(int(each) for each in lost)
+        self.sanitized += sum(int(each) for each in lost)
         self._first = False
         return image
 
-    def _measured(self, frame: Frame, size: tuple[int, int]) -> Whole | None:
+    def _measured(self, frame: Frame, size: tuple[int, int]) -> FrameStatistics | None:
         """What is measured of a frame, window by window; values that are replaced are counted."""
         total: Any = None
         for row in range(0, size[0], step := max(self.side // GRID, 1) * GRID):
             for column in range(0, size[1], step):
                 part = jax.tree.map(lambda x, r=row, c=column: x[r : r + step, c : c + step], frame)
                 sums, replaced = _measure(self._step, part)
-                self.repaired += int(replaced)
+                self.sanitized += int(replaced)
                 total = sums if total is None else jax.tree.map(jnp.add, total, sums)
         return None if total is None else total._replace(height=jnp.asarray(size[0], total.height.dtype))
 
@@ -198,7 +198,7 @@ _AROUND = 3
 """Pixels around a target that are fetched with it."""
 
 
-def farthest_history(frame: Frame, most: int) -> tuple[int, int]:
+def find_history_halo(frame: Frame, most: int) -> tuple[int, int]:
     """How far away history is fetched, in pixels, if no farther than ``most``; and how many pixels would need more.
 
     Vectors that leave the frame fetch nothing.

@@ -28,7 +28,7 @@ class Step(NamedTuple):
     """A step that can be exported."""
 
     function: Callable[[Arrays], Arrays]
-    """Inputs by their names -> ``image``, the next state, and ``repaired``, how many values were not usable numbers."""
+    """Inputs by their names -> ``image``, the next state, and ``sanitized``, how many values were no usable numbers."""
     inputs: dict[str, jax.ShapeDtypeStruct]
     """Buffers, state, ``first``; their lengths may be expressions of ``h`` and ``w``."""
     program: Any
@@ -100,12 +100,12 @@ def _traced(
             with portable():
                 after, image = denoiser.step(params, before, Frame(**{name: inputs[name] for name in buffers}))
             follow = dict(zip(places, jax.tree.leaves(after.core), strict=True))
-            return {"image": image, **{f"next{place}": follow[place] for place in places}, "repaired": after.repaired}
+            return {"image": image, **{f"next{place}": follow[place] for place in places}, "sanitized": after.sanitized}
 
         specs = {f"state{place}": _spec(leaf.shape, leaf.dtype) for place, leaf in zip(places, leaves, strict=True)}
         inputs = {**frame, **specs, "first": _spec((), np.dtype(bool))}
         names = list(inputs)
-        outputs = ("image", *(f"next{place}" for place in places), "repaired")
+        outputs = ("image", *(f"next{place}" for place in places), "sanitized")
 
         def ordered(*values: Any) -> list[Any]:
             made = function(dict(zip(names, values, strict=True)))

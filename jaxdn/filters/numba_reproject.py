@@ -12,7 +12,7 @@ Given = Any
 
 
 @loop
-def fetched(
+def reproject(
     top: int,
     bottom: int,
     history: Array,
@@ -36,9 +36,10 @@ def fetched(
 ) -> None:
     """Rows of ``mean`` [H, W, C], ``valid`` [H, W] (1 or 0) and ``unsound`` [H]: how many pixels of ``history`` are.
 
-    As :func:`jaxdn.filters.reproject.fetch` says: accepted taps of the target's cell, renormalised if their weights sum
-    to ``least``; else, with ``around``, the mean of those of the 3x3 pixels around the target. ``lanes`` has an element
-    for each channel: their number is known when the loop is compiled, so that all of them are worked on at once.
+    As :func:`jaxdn.filters.reproject.reproject_along` says: accepted taps of the target's cell, renormalised if their
+    weights sum to ``least``; else, with ``around``, the mean of those of the 3x3 pixels around the target. ``lanes``
+    has an element for each channel: their number is known when the loop is compiled, so that all of them are worked on
+    at once.
     """
     height, width, channels = history.shape[0], history.shape[1], len(lanes)
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)

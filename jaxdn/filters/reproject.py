@@ -1,4 +1,4 @@
-"""The history of every pixel, from the taps of the previous frame that show the same surface.
+"""Temporal reprojection: the history of every pixel, from the taps of the previous frame that show the same surface.
 
 A plain bilinear warp mixes all four taps. Here each is accepted or rejected, and the accepted ones are renormalised;
 where none is, the 3x3 pixels around the target are tried on request (Schied et al. 2017). What is fetched and with
@@ -16,7 +16,16 @@ import numpy as np
 from jax import lax
 
 from jaxdn.core.frame import Frame
-from jaxdn.filters.surface_test import Expected, Guides, expected, guides_of, pack, same_surface, shared, unpack
+from jaxdn.filters.surface_test import (
+    ExpectedSurface,
+    Guides,
+    expect_surface,
+    guides_of,
+    keep_shared,
+    pack,
+    same_surface,
+    unpack,
+)
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.inference_path import alone
 from jaxdn.ops.dispatch.row_tiles import by_strips, where_needed
@@ -33,18 +42,18 @@ _Position = tuple[jax.Array, jax.Array]
 """x and y [H, W], in pixels."""
 
 
-class Recalled(NamedTuple):
-    """What is left of the history."""
+class Reprojection(NamedTuple):
+    """The history where it is now; no history where its surface was not visible before."""
 
     history: jax.Array
     """[H, W, C] the renormalised mean of the accepted taps; 0 where there is none."""
     valid: jax.Array
     """[H, W, 1] bool."""
-    broken: jax.Array
+    invalid: jax.Array
     """How many pixels of the history were not finite or negative."""
 
 
-def recall(
+def reproject(
     history: jax.Array,
     before: Guides,
     frame: Frame,
@@ -52,8 +61,8 @@ def recall(
     *,
     depth_tolerance: float = 0.02,
     normal_threshold: float = 0.9,
-    around: bool = False,
-) -> Recalled:
+    search_neighbours: bool = False,
+) -> Reprojection:
     """Fetch ``history`` [H, W, C] >= 0 of the previous frame at ``p + motion(p)``.
 
     Args:
@@ -61,40 +70,48 @@ def recall(
       before: the guides of the previous frame.
       frame: the current frame; no motion is zero motion.
       first: bool scalar, there is no history.
-      depth_tolerance: see :func:`jaxdn.filters.surface_test.expected`.
+      depth_tolerance: see :func:`jaxdn.filters.surface_test.expect_surface`.
       normal_threshold: see :func:`jaxdn.filters.surface_test.same_surface`.
-      around: see :func:`fetch`.
+      search_neighbours: see :func:`reproject_along`.
     """
-    wanted = expected(frame, before, depth_tolerance=depth_tolerance)
-    before = shared(before, guides_of(frame))
-    return fetch(history, before, frame.motion, wanted, first, normal_threshold=normal_threshold, around=around)
+    expected = expect_surface(frame, before, depth_tolerance=depth_tolerance)
+    before = keep_shared(before, guides_of(frame))
+    return reproject_along(
+        history,
+        before,
+        frame.motion,
+        expected,
+        first,
+        normal_threshold=normal_threshold,
+        search_neighbours=search_neighbours,
+    )
 
 
-def fetch(
+def reproject_along(
     history: jax.Array,
     before: Guides,
     motion: jax.Array | None,
-    wanted: Expected,
+    expected: ExpectedSurface,
     first: jax.Array,
     *,
     normal_threshold: float,
-    around: bool,
-) -> Recalled:
-    """The same along any vectors [H, W, 2], for taps that show what is ``wanted``.
+    search_neighbours: bool,
+) -> Reprojection:
+    """The same along any vectors [H, W, 2], for taps that show what is ``expected``.
 
     Taps outside the image are rejected; where the vector is not finite there is no history; no gradient flows into the
-    vectors. With ``around``, a pixel all of whose taps are rejected gets the mean of those among the 3x3 pixels around
-    its target that are accepted.
+    vectors. With ``search_neighbours``, a pixel all of whose taps are rejected gets the mean of the accepted ones among
+    the 3x3 pixels around its target.
     """
-    x, y, inside = _targets(history, motion, first)
-    given = _Given(history, before, (x, y), inside, wanted)
-    plain = functools.partial(_found, _Rules(motion is not None, normal_threshold, around))
+    x, y, inside = _find_targets(history, motion, first)
+    given = _Request(history, before, (x, y), inside, expected)
+    plain = functools.partial(_reproject, _Rules(motion is not None, normal_threshold, search_neighbours))
     if numba_call.available() and history.dtype == jnp.float32:
-        found = alone(plain, functools.partial(_found_by_compiled, *plain.args))(given)
+        found = alone(plain, functools.partial(_reproject_by_compiled, *plain.args))(given)
     else:
         found = plain(given)
-    mean, valid, unsound = found
-    return Recalled(mean, valid[..., None], jnp.where(first, 0, unsound))
+    mean, valid, invalid = found
+    return Reprojection(mean, valid[..., None], jnp.where(first, 0, invalid))
 
 
 class _Rules(NamedTuple):
@@ -102,10 +119,10 @@ class _Rules(NamedTuple):
 
     moving: bool
     normal_threshold: float
-    around: bool
+    search_neighbours: bool
 
 
-class _Given(NamedTuple):
+class _Request(NamedTuple):
     """What they are chosen from."""
 
     history: jax.Array
@@ -114,54 +131,56 @@ class _Given(NamedTuple):
     at: _Position
     inside: jax.Array
     """[H, W] bool, the target is in the image."""
-    wanted: Expected
+    expected: ExpectedSurface
 
 
-_Found = tuple[jax.Array, jax.Array, jax.Array]
+_Output = tuple[jax.Array, jax.Array, jax.Array]
 """The mean [H, W, C] of the accepted taps; bool [H, W], whether there is one; int32, pixels that are not sound."""
 
 
-def _found(rules: _Rules, given: _Given) -> _Found:
-    history, before, at, inside, wanted = given
-    sound = jnp.all(jnp.isfinite(history) & (history >= 0), axis=-1, keepdims=True)
-    history = jnp.where(sound, history, 0.0)
-    packed = lax.stop_gradient(pack(jnp.concatenate([history, sound.astype(history.dtype)], axis=-1), before))
+def _reproject(rules: _Rules, given: _Request) -> _Output:
+    history, before, at, inside, expected = given
+    valid_history = jnp.all(jnp.isfinite(history) & (history >= 0), axis=-1, keepdims=True)
+    history = jnp.where(valid_history, history, 0.0)
+    packed = lax.stop_gradient(pack(jnp.concatenate([history, valid_history.astype(history.dtype)], axis=-1), before))
 
-    def accepted(tap: jax.Array, wanted: Expected) -> jax.Array:
+    def accepted(tap: jax.Array, expected: ExpectedSurface) -> jax.Array:
         whole, guides = unpack(tap, before)
-        return (whole[..., -1] > 0) & same_surface(guides, wanted, normal_threshold=rules.normal_threshold)
+        return (whole[..., -1] > 0) & same_surface(guides, expected, normal_threshold=rules.normal_threshold)
 
     if rules.moving:
-        mean, valid = _of_cells(history, packed, at, inside, wanted, accepted)
+        mean, valid = _average_cells(history, packed, at, inside, expected, accepted)
     else:
-        valid = inside & accepted(packed, wanted)
+        valid = inside & accepted(packed, expected)
         mean = jnp.where(valid[..., None], history, 0.0)
-    if rules.around:
+    if rules.search_neighbours:
         lost = inside & ~valid
-        search = history, packed, lost, wanted, accepted
-        more, found = _around(at, *search) if rules.moving else _beside(*search)
+        search = history, packed, lost, expected, accepted
+        more, found = _search_target(at, *search) if rules.moving else _search_pixel(*search)
         mean, valid = jnp.where(found[..., None], more, mean), valid | found
-    return mean, valid, jnp.sum(~sound, dtype=jnp.int32)
+    return mean, valid, jnp.sum(~valid_history, dtype=jnp.int32)
 
 
-def _found_by_compiled(rules: _Rules, given: _Given) -> _Found:
-    from jaxdn.filters.numba_reproject import fetched
+def _reproject_by_compiled(rules: _Rules, given: _Request) -> _Output:
+    from jaxdn.filters.numba_reproject import reproject
 
-    history, before, at, inside, wanted = given
+    history, before, at, inside, expected = given
     tested = before._replace(
-        depth=None if wanted.depth is None or wanted.tolerance is None else before.depth,
-        normal=None if wanted.normal is None else before.normal,
-        ids=None if wanted.ids is None else before.ids,
+        depth=None if expected.depth is None or expected.tolerance is None else before.depth,
+        normal=None if expected.normal is None else before.normal,
+        ids=None if expected.ids is None else before.ids,
     )
-    arrays = [history, *tested, *at, inside, wanted.depth, wanted.tolerance, wanted.normal, wanted.ids]
+    arrays = [history, *tested, *at, inside, expected.depth, expected.tolerance, expected.normal, expected.ids]
     lanes = tuple(range(history.shape[2]))
-    numbers = np.float32(rules.normal_threshold), np.float32(WEIGHT_MIN), rules.around, lanes
+    numbers = np.float32(rules.normal_threshold), np.float32(WEIGHT_MIN), rules.search_neighbours, lanes
     size = history.shape[:2]
-    mean, valid, unsound = numba_call.call(fetched, [history.shape, size, size[:1]], arrays, *numbers, rows=size[0])
-    return mean, valid > 0, jnp.sum(unsound.astype(jnp.int32), dtype=jnp.int32)
+    mean, valid, invalid = numba_call.call(reproject, [history.shape, size, size[:1]], arrays, *numbers, rows=size[0])
+    return mean, valid > 0, jnp.sum(invalid.astype(jnp.int32), dtype=jnp.int32)
 
 
-def _targets(history: jax.Array, motion: jax.Array | None, first: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _find_targets(
+    history: jax.Array, motion: jax.Array | None, first: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Where every pixel's history is: positions x and y [H, W] within the image, and bool [H, W], whether it has one.
 
     Less than a pixel outside there are taps of the outermost pixels alone, as at their centres.
@@ -174,41 +193,42 @@ def _targets(history: jax.Array, motion: jax.Array | None, first: jax.Array) -> 
     return jnp.clip(x, 0, width - 1), jnp.clip(y, 0, height - 1), inside
 
 
-_Accepted = Callable[[jax.Array, Expected], jax.Array]
+_Accepted = Callable[[jax.Array, ExpectedSurface], jax.Array]
 """(tap [..., C], what it must show [...]) -> bool [...]."""
 
 
-def _of_cells(
+def _average_cells(
     history: jax.Array,
     packed: jax.Array,
     at: _Position,
     inside: jax.Array,
-    wanted: Expected,
+    expected: ExpectedSurface,
     accepted: _Accepted,
 ) -> tuple[jax.Array, jax.Array]:
     """The mean [H, W, C] of the accepted taps of each target's cell, and bool [H, W], whether there is one."""
     cell = cells(*at, *history.shape[:2])
 
-    def strip(part: tuple[tuple[jax.Array, ...], jax.Array, Expected]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        (left, top, fx, fy), inside, wanted = part
+    def strip(part: tuple[tuple[jax.Array, ...], jax.Array, ExpectedSurface]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        (left, top, fx, fy), inside, expected = part
         taps = windows(packed, top, left, 2)
         shares = ((wy * wx)[..., 0] for wy in (1 - fy, fy) for wx in (1 - fx, fx))
         weights = [
-            jnp.where(inside & accepted(taps[..., index, :], wanted), share, 0.0) for index, share in enumerate(shares)
+            jnp.where(inside & accepted(taps[..., index, :], expected), share, 0.0)
+            for index, share in enumerate(shares)
         ]
         return _mean(taps, weights, history.shape[-1], least=WEIGHT_MIN)
 
     # The weights are for the gradient; where none is taken, they are not computed.
-    mean, valid, weights = by_strips(strip, (cell, inside, wanted), pixels=_STRIP)
+    mean, valid, weights = by_strips(strip, (cell, inside, expected), pixels=_STRIP)
     return differentiable_mean(mean, history, cell[1], cell[0], weights), valid
 
 
-def _around(
+def _search_target(
     at: _Position,
     history: jax.Array,
     packed: jax.Array,
     lost: jax.Array,
-    wanted: Expected,
+    expected: ExpectedSurface,
     accepted: _Accepted,
 ) -> tuple[jax.Array, jax.Array]:
     """The same for ``lost`` pixels alone, of the 3x3 pixels around their targets, which count alike."""
@@ -217,22 +237,22 @@ def _around(
     # At the border the window lies inside the image, and the pixels of it that are too far away do not count.
     top, left = jnp.clip(row - 1, 0, max(height - 3, 0)), jnp.clip(column - 1, 0, max(width - 3, 0))
 
-    def search(part: tuple[tuple[jax.Array, ...], Expected]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        (row, column, top, left), wanted = part
+    def search(part: tuple[tuple[jax.Array, ...], ExpectedSurface]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        (row, column, top, left), expected = part
         taps = windows(packed, top, left, 3)
         weights = []
         for index, (dy, dx) in enumerate(np.ndindex(3, 3)):
             y, x = top + dy, left + dx
             near = (jnp.abs(y - row) <= 1) & (jnp.abs(x - column) <= 1) & (y < height) & (x < width)
-            weights.append((near & accepted(taps[..., index, :], wanted)).astype(history.dtype))
+            weights.append((near & accepted(taps[..., index, :], expected)).astype(history.dtype))
         return _mean(taps, weights, channels, least=1.0)
 
-    mean, found, weights = where_needed(search, lost, ((row, column, top, left), wanted))
+    mean, found, weights = where_needed(search, lost, ((row, column, top, left), expected))
     return differentiable_mean(mean, history, top, left, weights), found
 
 
-def _beside(
-    history: jax.Array, packed: jax.Array, lost: jax.Array, wanted: Expected, accepted: _Accepted
+def _search_pixel(
+    history: jax.Array, packed: jax.Array, lost: jax.Array, expected: ExpectedSurface, accepted: _Accepted
 ) -> tuple[jax.Array, jax.Array]:
     """The same where nothing moves: around the pixels themselves, without a gather."""
     height, width, _ = history.shape
@@ -244,7 +264,7 @@ def _beside(
     def search(history: jax.Array) -> tuple[jax.Array, jax.Array]:
         total, count = jnp.zeros_like(history), jnp.zeros((height, width), history.dtype)
         for dy, dx in np.ndindex(3, 3):  # beyond the border there are zeros, which are not accepted
-            taken = lost & accepted(shifted(packed, dy, dx), wanted)
+            taken = lost & accepted(shifted(packed, dy, dx), expected)
             total = total + jnp.where(taken[..., None], shifted(history, dy, dx), 0.0)
             count = count + taken
         found = count > 0

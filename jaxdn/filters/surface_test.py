@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn.core.frame import FAR, Frame
-from jaxdn.denoiser.statistics import geometric_mean, sums_of_depth
+from jaxdn.denoiser.statistics import geometric_mean_depth, sum_depths
 
 
 class Guides(NamedTuple):
@@ -26,7 +26,7 @@ def guides_of(frame: Frame) -> Guides:
     return Guides(frame.depth, frame.normal, None if frame.ids is None else frame.ids.astype(frame.radiance.dtype))
 
 
-def shared(guides: Guides, other: Guides) -> Guides:
+def keep_shared(guides: Guides, other: Guides) -> Guides:
     """Of ``guides`` those that both have: only these can be compared."""
     return Guides(*(one if two is not None else None for one, two in zip(guides, other, strict=True)))
 
@@ -47,7 +47,7 @@ def unpack(packed: jax.Array, like: Guides) -> tuple[jax.Array, Guides]:
     return history, Guides(*found)
 
 
-def hit_mask(depth: jax.Array | None, ids: jax.Array | None) -> jax.Array | None:
+def surface_mask(depth: jax.Array | None, ids: jax.Array | None) -> jax.Array | None:
     """[H, W] bool: the camera ray hit a surface; ``None`` (everywhere) without either buffer."""
     known = []
     if depth is not None:
@@ -65,7 +65,7 @@ def depth_feature(depth: jax.Array, *, scale: str = "geometric", middle: jax.Arr
     """
     if scale == "unit":
         return depth / (depth + 1.0)
-    return depth / (depth + (geometric_mean(sums_of_depth(depth)) if middle is None else middle))
+    return depth / (depth + (geometric_mean_depth(sum_depths(depth)) if middle is None else middle))
 
 
 def cosine(first: jax.Array, second: jax.Array) -> jax.Array:
@@ -99,7 +99,7 @@ def depth_slopes(depth: jax.Array, ids: jax.Array | None) -> tuple[jax.Array, ja
     return along(1), along(0)
 
 
-class Expected(NamedTuple):
+class ExpectedSurface(NamedTuple):
     """What a tap of the previous frame must show, for every pixel; ``None`` for what one of the frames lacks."""
 
     depth: jax.Array | None
@@ -112,32 +112,34 @@ class Expected(NamedTuple):
     """[H, W]; not a number where any id is right."""
 
 
-def expected(frame: Frame, before: Guides, *, depth_tolerance: float) -> Expected:
+def expect_surface(frame: Frame, before: Guides, *, depth_tolerance: float) -> ExpectedSurface:
     """What a tap must show, for a previous frame with the guides ``before``.
 
     The depth at the target and ``depth_tolerance z + 2 (|dz/dx| + |dz/dy|)``, the normal and the id of the pixel.
     """
-    tested = shared(guides_of(frame), before)
+    tested = keep_shared(guides_of(frame), before)
     ids = None if tested.ids is None else tested.ids[..., 0]
     if tested.depth is None:
-        return Expected(None, None, tested.normal, ids)
+        return ExpectedSurface(None, None, tested.normal, ids)
     depth = (tested.depth if frame.previous_depth is None else frame.previous_depth)[..., 0]
     slope_x, slope_y = depth_slopes(tested.depth, frame.ids)
-    return Expected(depth, depth_tolerance * depth + 2 * (jnp.abs(slope_x) + jnp.abs(slope_y)), tested.normal, ids)
+    return ExpectedSurface(
+        depth, depth_tolerance * depth + 2 * (jnp.abs(slope_x) + jnp.abs(slope_y)), tested.normal, ids
+    )
 
 
-def same_surface(tap: Guides, wanted: Expected, *, normal_threshold: float) -> jax.Array:
+def same_surface(tap: Guides, expected: ExpectedSurface, *, normal_threshold: float) -> jax.Array:
     """The test of one tap for every pixel, bool [...]: does it show the same surface?
 
     It does where ids agree, its depth is the expected one within the tolerance and the cosine of the normals exceeds
     ``normal_threshold``; what one of the two lacks is not tested (Schied et al. 2017, sec. 4.1). ``tap`` are the guides
-    [..., C] of the taps, ``wanted`` what is expected [...].
+    [..., C] of the taps, ``expected`` what is expected [...].
     """
     passed: list[jax.Array] = []
-    if tap.depth is not None and wanted.depth is not None and wanted.tolerance is not None:
-        passed.append(jnp.abs(tap.depth[..., 0] - wanted.depth) <= wanted.tolerance)
-    if tap.normal is not None and wanted.normal is not None:
-        passed.append(cosine(tap.normal, wanted.normal) > normal_threshold)
-    if tap.ids is not None and wanted.ids is not None:
-        passed.append((tap.ids[..., 0] == wanted.ids) | jnp.isnan(wanted.ids))
+    if tap.depth is not None and expected.depth is not None and expected.tolerance is not None:
+        passed.append(jnp.abs(tap.depth[..., 0] - expected.depth) <= expected.tolerance)
+    if tap.normal is not None and expected.normal is not None:
+        passed.append(cosine(tap.normal, expected.normal) > normal_threshold)
+    if tap.ids is not None and expected.ids is not None:
+        passed.append((tap.ids[..., 0] == expected.ids) | jnp.isnan(expected.ids))
     return functools.reduce(jnp.logical_and, passed, jnp.asarray(True))

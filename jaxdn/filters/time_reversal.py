@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.core.frame import Array, Frame, only
-from jaxdn.denoiser.sanitize import repair
-from jaxdn.filters.reproject import recall
-from jaxdn.filters.surface_test import Guides, expected, guides_of, same_surface
+from jaxdn.denoiser.sanitize import sanitize
+from jaxdn.filters.reproject import reproject
+from jaxdn.filters.surface_test import Guides, expect_surface, guides_of, same_surface
 from jaxdn.ops.motion import targets
 
 SEEN_MOST = 8.0
@@ -53,7 +53,7 @@ def turned(frame: Frame, after: Frame | None, forward: Array = None) -> Frame:
 @jax.jit
 def _derived(frame: Frame, after: Frame) -> tuple[jax.Array, jax.Array | None]:
     """Motion [H, W, 2] to the frame after, NaN for what is hidden there, and the depth [H, W, 1] of the point then."""
-    frame, after = repair(frame)[0], repair(after)[0]
+    frame, after = sanitize(frame)[0], sanitize(after)[0]
     height, width = frame.radiance.shape[:2]
     count = height * width
     motion = jnp.zeros((height, width, 2)) if after.motion is None else after.motion
@@ -61,7 +61,7 @@ def _derived(frame: Frame, after: Frame) -> tuple[jax.Array, jax.Array | None]:
     known = jnp.isfinite(x) & jnp.isfinite(y)
     x, y = jnp.where(known, x, 0.0), jnp.where(known, y, 0.0)
     guides = guides_of(frame)
-    wanted = expected(after, guides, depth_tolerance=_DEPTH_TOLERANCE)
+    expected = expect_surface(after, guides, depth_tolerance=_DEPTH_TOLERANCE)
     best = jnp.full(count + 1, jnp.inf)  # the last entry takes what belongs nowhere
     taps = []
     for dy, dx in np.ndindex(2, 2):
@@ -69,7 +69,7 @@ def _derived(frame: Frame, after: Frame) -> tuple[jax.Array, jax.Array | None]:
         inside = known & (column >= 0) & (column < width) & (row >= 0) & (row < height)
         place = jnp.where(inside, row * width + column, 0).astype(jnp.int32)
         tap = Guides(*(None if each is None else each.reshape(count, -1)[place] for each in guides))
-        fits = inside & same_surface(tap, wanted, normal_threshold=_NORMAL_THRESHOLD)
+        fits = inside & same_surface(tap, expected, normal_threshold=_NORMAL_THRESHOLD)
         distance = (x - column) ** 2 + (y - row) ** 2
         place = jnp.where(fits & (distance < 1), place, count)
         best = best.at[place].min(distance)
@@ -99,11 +99,11 @@ class Seen(NamedTuple):
 @jax.jit
 def seen(before: Seen | None, frame: Frame) -> Seen:
     """The same after one more frame; ``before`` is None at the first. Taps are tested as those of a history."""
-    frame, _ = repair(only(frame, _READS))
+    frame, _ = sanitize(only(frame, _READS))
     guides = guides_of(frame)
     if before is None:
         return Seen(jnp.ones((*frame.radiance.shape[:2], 1), frame.radiance.dtype), guides)
-    past = recall(
+    past = reproject(
         before.number,
         before.guides,
         frame,

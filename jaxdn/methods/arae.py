@@ -52,11 +52,11 @@ def arae(options: rae.Options) -> Denoiser:
     def step(
         params: Params, state: AraeState, frame: Frame, first: jax.Array
     ) -> tuple[AraeState, jax.Array, jax.Array]:
-        planes, broken = asvgf.accumulated(_ACCUMULATION, state.light, frame, first)
+        planes, invalid = asvgf.accumulated(_ACCUMULATION, state.light, frame, first)
         history = planes.transpose(1, 2, 0)
         light = svgf.SvgfState(history, guides_of(frame))
         hidden, image, lost = inner.step(params, state.hidden, frame._replace(radiance=history[..., :3]), first)
-        return AraeState(light, hidden), image, broken + lost
+        return AraeState(light, hidden), image, invalid + lost
 
     reads = inner.reads | svgf.READS | {"luminance_gradient"}
     return demodulated(recurrent(Core(start, step, reads, inner.init)), by=options.demodulate)

@@ -30,7 +30,7 @@ from jaxdn.filters.gradients import (
     stratum_centers,
     to_pixels,
 )
-from jaxdn.filters.surface_test import hit_mask
+from jaxdn.filters.surface_test import surface_mask
 from jaxdn.methods import svgf
 from jaxdn.methods.demodulation import demodulated
 from jaxdn.methods.learnable_options import FITTING, LEARNED, moved, unmoved
@@ -72,8 +72,8 @@ def asvgf(options: Options) -> Denoiser:
         params: Params, state: svgf.SvgfState, frame: Frame, first: jax.Array
     ) -> tuple[svgf.SvgfState, jax.Array, jax.Array]:
         fitted = moved(options, params)
-        history, broken = accumulated(fitted, state, frame, first)
-        return (*svgf.filter_history(fitted, history, frame), broken)
+        history, invalid = accumulated(fitted, state, frame, first)
+        return (*svgf.filter_history(fitted, history, frame), invalid)
 
     reads = svgf.READS | {"luminance_gradient"}
     plain = recurrent(Core(svgf.start, step, reads, lambda key, frame: unmoved(options)))
@@ -82,9 +82,9 @@ def asvgf(options: Options) -> Denoiser:
 
 def accumulated(options: Options, state: svgf.SvgfState, frame: Frame, first: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The history [6, H, W] with the frame blended in, faster where light has changed; the number of invalid pixels."""
-    past, broken = svgf.recall_history(options, state, frame, first)
+    past, invalid = svgf.recall_history(options, state, frame, first)
     change = 1.0 - (1.0 - changed(options, past, frame)) ** options.antilag
-    return svgf.blend(options, past, frame.radiance.transpose(2, 0, 1), change), broken
+    return svgf.blend(options, past, frame.radiance.transpose(2, 0, 1), change), invalid
 
 
 def changed(options: Options, past: jax.Array, frame: Frame) -> jax.Array:
@@ -93,14 +93,14 @@ def changed(options: Options, past: jax.Array, frame: Frame) -> jax.Array:
     ``past`` is the fetched history [6, H, W].
     """
     now = frame.radiance.transpose(2, 0, 1)
-    hit = hit_mask(frame.depth, frame.ids)
+    hit = surface_mask(frame.depth, frame.ids)
     depth, normal, ids = (stratum_centers(buffer) for buffer in (frame.depth, frame.normal, frame.ids))
     weights = svgf.surface_weights(options, depth, normal, ids)
 
     def filtered(change: Change) -> jax.Array:
         return reconstruct(
             change,
-            hit_mask(depth, ids),
+            surface_mask(depth, ids),
             weights,
             levels=options.gradient_levels,
             significance=options.significance,

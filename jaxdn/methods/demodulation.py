@@ -9,7 +9,7 @@ from jaxdn import brdf
 from jaxdn.core.checks import check_option
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Denoiser, Params, RecurrentStep, State, recurrent
-from jaxdn.denoiser.statistics import Whole
+from jaxdn.denoiser.statistics import FrameStatistics
 
 SMALLEST_ALBEDO = 0.01
 """Radiance is not divided by an albedo below this (``by="albedo"``)."""
@@ -32,7 +32,7 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "brdf") -> Deno
     Divided radiance may exceed 65504: a clamp there would make the result depend on the exposure. ``True`` is
     ``"albedo"`` and ``False`` is ``"none"``. Frames with neither buffer are not divided. The parameters are those of
     the denoiser. Raises ValueError for another ``by``, and for a denoiser that :func:`jaxdn.denoiser.recurrent` did not
-    make, because invalid values have to be repaired before the division.
+    make, because invalid values have to be sanitized before the division.
     """
     by = _chosen(by)
     if by == "none":
@@ -45,7 +45,7 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "brdf") -> Deno
         return core.start(params, _divided(frame, by)[0])
 
     def step(
-        params: Params, state: State, frame: Frame, first: jax.Array, *whole: Whole
+        params: Params, state: State, frame: Frame, first: jax.Array, *whole: FrameStatistics
     ) -> tuple[State, jax.Array, jax.Array | int]:
         frame, divisor = _divided(frame, by)
         state, image, lost = core.step(params, state, frame, first, *whole)
@@ -55,7 +55,7 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "brdf") -> Deno
         assert core.samples is not None
         return core.samples(params, state, _divided(frame, by)[0], first, most)
 
-    def measure(frame: Frame) -> Whole:
+    def measure(frame: Frame) -> FrameStatistics:
         assert core.measure is not None
         return core.measure(_divided(frame, by)[0])
 
@@ -66,7 +66,7 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation | bool = "brdf") -> Deno
     return recurrent(changed)
 
 
-def texture_left(frame: Frame, by: Demodulation | bool, whole: Whole | None = None) -> jax.Array | None:
+def texture_left(frame: Frame, by: Demodulation | bool, whole: FrameStatistics | None = None) -> jax.Array | None:
     """The texture [H, W, 3] that the division leaves in a frame inside :func:`demodulated`; None if it leaves none.
 
     A filter that averages it with the weights of the light can give it back (:func:`jaxdn.brdf.restore`). If the
@@ -81,14 +81,16 @@ def texture_left(frame: Frame, by: Demodulation | bool, whole: Whole | None = No
     return texture_of(reflectance, frame, frame.radiance, whole)
 
 
-def texture_of(reflectance: jax.Array, frame: Frame, light: jax.Array, whole: Whole | None = None) -> jax.Array:
+def texture_of(
+    reflectance: jax.Array, frame: Frame, light: jax.Array, whole: FrameStatistics | None = None
+) -> jax.Array:
     """The texture [H, W, 3] that a division leaves of a reflectance of the frame, whole or without its specular part.
 
     As in :func:`texture_left`. ``light`` [H, W, 3] is what is divided by it, or was.
     """
     if frame.albedo is None or frame.reflectance is None:
         return brdf.texture_or_hue(reflectance, light, jnp.asarray(frame.albedo is not None))
-    other = jnp.any(frame.reflectance != frame.albedo) if whole is None else whole.other > 0
+    other = jnp.any(frame.reflectance != frame.albedo) if whole is None else whole.reflectance_differs > 0
     return brdf.texture_or_hue(reflectance, light, ~other)
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxdn import color
 from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.denoiser import Params
-from jaxdn.filters.surface_test import hit_mask
+from jaxdn.filters.surface_test import surface_mask
 from jaxdn.networks import crop, pad
 from jaxdn.ops.scales import fill
 
@@ -36,7 +36,7 @@ def seen(frame: Frame, *, background: str, exposure: str, multiple: int) -> Ligh
     """
     # Divided by a small albedo it may be beyond what the network has ever seen.
     noisy = pad(jnp.minimum(frame.radiance, RADIANCE_MAX), multiple)
-    hit = hit_mask(frame.depth, None) if background == "pass" else None
+    hit = surface_mask(frame.depth, None) if background == "pass" else None
     if hit is not None:
         noisy = fill(noisy, pad(hit[..., None], multiple))
     gain = color.exposure(noisy) if exposure == "measured" else 1.0

@@ -8,7 +8,7 @@ from jax import lax
 
 from jaxdn import brdf
 from jaxdn.core.frame import Frame
-from jaxdn.filters.reproject import recall
+from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, guides_of
 from jaxdn.filters.virtual_motion import closeness_of, diffuseness, virtual_motion
 from jaxdn.methods.demodulation import SMALLEST_ALBEDO, Demodulation, texture_of
@@ -87,7 +87,7 @@ class Histories(NamedTuple):
     """[D, H, W]; its planes of history length are shortened where little of it fits."""
     closeness: jax.Array | None
     """[H, W] of the reflected thing, to be kept; 0 where it is unknown; None without hit distances."""
-    broken: jax.Array
+    invalid: jax.Array
     """How many pixels of the histories were not valid."""
 
 
@@ -112,22 +112,24 @@ def recall_both(
     ``length_plane``.
     """
     packed = diffuse if specular is None else jnp.concatenate([diffuse, specular], axis=-1)
-    surface = recall(packed, before, frame, first, depth_tolerance=depth_tolerance, normal_threshold=normal_threshold)
+    surface = reproject(
+        packed, before, frame, first, depth_tolerance=depth_tolerance, normal_threshold=normal_threshold
+    )
     planes = surface.history.transpose(2, 0, 1)
     if specular is None:
-        return Histories(planes, None, None, surface.broken)
+        return Histories(planes, None, None, surface.invalid)
     channels = diffuse.shape[-1]
     past, seen = planes[channels:], surface.valid[..., 0]
     now = closeness_of(frame.specular_hit_distance, frame)
     near = None if now is None else _tracked(now, past, frame, length_plane)
     if near is None or frame.roughness is None or frame.far_motion is None or frame.motion is None:
-        return Histories(planes[:channels], past, near, surface.broken)
+        return Histories(planes[:channels], past, near, surface.invalid)
 
     # A constant, as motion is: where it is not finite, its gradient would not be either.
     target = lax.stop_gradient(virtual_motion(frame.motion, frame.far_motion, _stretch(frame), near))
     # A mirror's depth at the virtual image is that of another of its points.
     flat = Guides(None, before.normal, before.ids)
-    found = recall(specular, flat, frame._replace(motion=target), first, normal_threshold=SAME_MIRROR)
+    found = reproject(specular, flat, frame._replace(motion=target), first, normal_threshold=SAME_MIRROR)
     virtual = found.history.transpose(2, 0, 1)
     alike = jnp.abs(virtual[-1] - frame.roughness[..., 0]) < _ALIKE_ROUGHNESS
     alike = alike & (jnp.abs(virtual[-2] - near) < _ALIKE_CLOSENESS) & found.valid[..., 0]
@@ -140,7 +142,7 @@ def recall_both(
     mixed = (shares[0][None] * past + shares[1][None] * virtual) / jnp.where(some, total, 1.0)[None]
     mixed = jnp.where(some[None], mixed, 0.0)
     mixed = mixed.at[length_plane].multiply(jnp.minimum(total, 1.0))
-    return Histories(planes[:channels], mixed, near, surface.broken)
+    return Histories(planes[:channels], mixed, near, surface.invalid)
 
 
 def _tracked(now: jax.Array, past: jax.Array, frame: Frame, length_plane: int) -> jax.Array:

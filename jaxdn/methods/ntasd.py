@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxdn import color
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.denoiser.statistics import Whole
+from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods import ntd
 from jaxdn.methods.demodulation import demodulated
@@ -78,7 +78,7 @@ def ntasd(options: Options) -> Denoiser:
         return inner.start(params["denoiser"], frame)
 
     def step(
-        params: Params, state: jax.Array, frame: Frame, first: jax.Array, whole: Whole
+        params: Params, state: jax.Array, frame: Frame, first: jax.Array, whole: FrameStatistics
     ) -> tuple[jax.Array, jax.Array, jax.Array | int]:
         return inner.step(params["denoiser"], state, frame, first, whole)
 

@@ -22,9 +22,9 @@ import jax.numpy as jnp
 from jaxdn import color
 from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.denoiser.sanitize import repair_image
-from jaxdn.denoiser.statistics import Whole, measured
-from jaxdn.filters.surface_test import depth_feature, hit_mask
+from jaxdn.denoiser.sanitize import sanitize_image
+from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
+from jaxdn.filters.surface_test import depth_feature, surface_mask
 from jaxdn.methods.demodulation import Demodulation, demodulated
 from jaxdn.methods.reconstruction import SCALES, Prediction, begin_blending, blend, heads_of
 from jaxdn.methods.registry import method
@@ -141,10 +141,10 @@ def guided_features(precisions: Params, guides: dict[str, jax.Array | None]) -> 
     return features
 
 
-def _guides(options: Options, frame: Frame, whole: Whole) -> dict[str, jax.Array | None]:
+def _guides(options: Options, frame: Frame, whole: FrameStatistics) -> dict[str, jax.Array | None]:
     """The guides as the network and the prior see them, padded; 0 is the neutral value, None where one is absent."""
     reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
-    middle, scale = whole.middle_depth, options.depth_scale
+    middle, scale = whole.mean_depth, options.depth_scale
     depth = None if frame.depth is None else depth_feature(frame.depth, scale=scale, middle=middle)
     fractions = {"albedo": frame.albedo, "reflectance": reflectance, "roughness": frame.roughness}
     guides = {name: None if guide is None else guide - 1.0 for name, guide in fractions.items()}
@@ -167,14 +167,14 @@ def warped_history(
     if vectors is not None:
         vectors = jax.lax.stop_gradient(vectors)
         history = warp(history, vectors, border=options.border)
-    sound = repair_image(history)
-    broken = jnp.sum((sound != history) & ~first, dtype=jnp.int32)
+    sound = sanitize_image(history)
+    invalid = jnp.sum((sound != history) & ~first, dtype=jnp.int32)
     recalled = jnp.where(first, noisy, sound)
     if vectors is not None and options.missing_history == "current":
         lost = ~on_screen(vectors) & ~first
         recalled = jnp.where(lost, noisy, recalled)
         absent = absent | lost
-    return recalled, absent, broken
+    return recalled, absent, invalid
 
 
 @method(
@@ -273,7 +273,7 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
 
     def light(frame: Frame) -> tuple[jax.Array, jax.Array | None]:
         """The noisy light, padded, without that of pixels that do not count; bool [H, W], where a surface is."""
-        hit = hit_mask(frame.depth, None) if options.background == "pass" else None
+        hit = surface_mask(frame.depth, None) if options.background == "pass" else None
         noisy = pad(frame.radiance)
         if hit is not None:
             noisy = fill(noisy, pad(hit[..., None]))
@@ -281,17 +281,17 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
             noisy = fill(noisy, pad(frame.sample_count > 0))
         return noisy, hit
 
-    def measure(frame: Frame) -> Whole:
+    def measure(frame: Frame) -> FrameStatistics:
         bounded = frame._replace(radiance=jnp.minimum(frame.radiance, RADIANCE_MAX))
-        return measured(light(bounded)[0], frame.depth, frame)
+        return measure_frame(light(bounded)[0], frame.depth, frame)
 
     def step(
-        params: Params, state: jax.Array, frame: Frame, first: jax.Array, whole: Whole
+        params: Params, state: jax.Array, frame: Frame, first: jax.Array, whole: FrameStatistics
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         size = frame.radiance.shape[:2]
         # Divided by a small albedo it may be beyond what the network has ever seen.
         frame = frame._replace(radiance=jnp.minimum(frame.radiance, RADIANCE_MAX))
-        recalled, absent, broken = warped_history(options, state, frame, first)
+        recalled, absent, invalid = warped_history(options, state, frame, first)
         seen = _guides(options, frame, whole)
         (noisy, hit), recalled, absent = light(frame), pad(recalled), pad(absent)
         if hit is not None:
@@ -316,7 +316,7 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
             image = blend(options, predicted, guiding, noisy, recalled, absent)
         image = jnp.clip(crop(image, size), 0.0, RADIANCE_MAX)
         shown = image if hit is None else jnp.where(hit[..., None], image, frame.radiance)
-        return image, shown, broken
+        return image, shown, invalid
 
     seen = description.reach(description.unet(1, heads, widths=widths, head_size=3))
     return Core(start, step, reads, init, measure=measure, reach=seen + _FILTERS_REACH)

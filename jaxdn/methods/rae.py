@@ -114,9 +114,9 @@ def core_of(options: Options) -> Core:
         if materials:
             surfaces.append(None if frame.albedo is None else frame.albedo - 1.0)
         padded = [None if group is None else pad(group, multiple)[None] for group in surfaces]
-        remembered, broken = _sound(state)
+        remembered, invalid = _sound(state)
         output, kept = network.apply(params, [light.compressed[None], *padded], remembered)
-        return kept, direct.image_of(output[0], light, frame), broken
+        return kept, direct.image_of(output[0], light, frame), invalid
 
     guides = {"normal", "depth", "roughness"} | ({"albedo"} if materials else set())
     return Core(start, step, frozenset(guides), init)

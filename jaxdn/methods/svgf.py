@@ -21,13 +21,13 @@ import jax.numpy as jnp
 from jaxdn.core.frame import Array, Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.denoiser.statistics import Whole, measured
+from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.filters.accumulation import accumulate
 from jaxdn.filters.atrous import B3_SPLINE, stencil
 from jaxdn.filters.cascade import cascade
 from jaxdn.filters.edge_stopping import Weight, depth_weight, normal_weight
-from jaxdn.filters.reproject import recall
-from jaxdn.filters.surface_test import Guides, guides_of, hit_mask
+from jaxdn.filters.reproject import reproject
+from jaxdn.filters.surface_test import Guides, guides_of, surface_mask
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.methods.demodulation import Demodulation, demodulated, texture_left
 from jaxdn.methods.learnable_options import FITTING, LEARNED, LEARNED_PER_LEVEL, at_level, moved, unmoved
@@ -104,15 +104,15 @@ def svgf(options: Options) -> Denoiser:
     """
 
     def step(
-        params: Params, state: SvgfState, frame: Frame, first: jax.Array, whole: Whole
+        params: Params, state: SvgfState, frame: Frame, first: jax.Array, whole: FrameStatistics
     ) -> tuple[SvgfState, jax.Array, jax.Array]:
         fitted = moved(options, params)
-        past, broken = recall_history(fitted, state, frame, first)
+        past, invalid = recall_history(fitted, state, frame, first)
         history = blend(fitted, past, frame.radiance.transpose(2, 0, 1))
-        return (*filter_history(fitted, history, frame, whole), broken)
+        return (*filter_history(fitted, history, frame, whole), invalid)
 
-    def measure(frame: Frame) -> Whole:
-        return measured(frame.radiance, None, frame)
+    def measure(frame: Frame) -> FrameStatistics:
+        return measure_frame(frame.radiance, None, frame)
 
     def init(key: jax.Array, frame: Frame) -> Params:
         return unmoved(options)
@@ -134,16 +134,16 @@ def start(params: Params, frame: Frame) -> SvgfState:
 
 def recall_history(options: Options, state: SvgfState, frame: Frame, first: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The fetched history [6, H, W], 0 where missing; the number of invalid history pixels."""
-    found = recall(
+    found = reproject(
         state.history,
         state.guides,
         frame,
         first,
         depth_tolerance=options.depth_tolerance,
         normal_threshold=options.normal_threshold,
-        around=True,
+        search_neighbours=True,
     )
-    return found.history.transpose(2, 0, 1), found.broken
+    return found.history.transpose(2, 0, 1), found.invalid
 
 
 def blend(options: Options, past: jax.Array, now: jax.Array, change: jax.Array | None = None) -> jax.Array:
@@ -174,13 +174,13 @@ def surface_weights(
 
 
 def filter_history(
-    options: Options, history: jax.Array, frame: Frame, whole: Whole | None = None
+    options: Options, history: jax.Array, frame: Frame, whole: FrameStatistics | None = None
 ) -> tuple[SvgfState, jax.Array]:
     """The state after a frame and its image [H, W, 3], from the blended history [6, H, W].
 
     ``whole`` is what was measured of the frame that this one is a part of.
     """
-    hit = hit_mask(frame.depth, frame.ids)
+    hit = surface_mask(frame.depth, frame.ids)
     texture = texture_left(frame, options.demodulate, whole)
     texture = None if texture is None else texture.transpose(2, 0, 1)
 

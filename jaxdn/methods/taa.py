@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, RecurrentStep, State, recurrent
-from jaxdn.denoiser.statistics import Whole
+from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.catmull_rom import warp_cubic
 from jaxdn.filters.neighbourhood import (
     Box,
@@ -89,13 +89,13 @@ def taa(options: Options) -> Denoiser:
         return TaaState(before.start(params, frame), nothing)
 
     def step(
-        params: Params, state: TaaState, frame: Frame, first: jax.Array, *whole: Whole
+        params: Params, state: TaaState, frame: Frame, first: jax.Array, *whole: FrameStatistics
     ) -> tuple[TaaState, jax.Array, jax.Array | int]:
         inner, image, lost = before.step(params, state.after, frame, first, *whole)
         image = jnp.clip(image, 0.0, RADIANCE_MAX)
-        history, broken = resolve(options, image, state.history, frame, first)
+        history, invalid = resolve(options, image, state.history, frame, first)
         kept = history[..., :3]
-        return TaaState(inner, history), sharpened(kept, options.sharpening), lost + broken
+        return TaaState(inner, history), sharpened(kept, options.sharpening), lost + invalid
 
     samples = None
     if before.samples is not None:
@@ -125,7 +125,7 @@ def resolve(
     image's 3x3 neighbourhood in YCoCg.
     """
     sound = jnp.all(jnp.isfinite(history) & (history >= 0), axis=-1, keepdims=True)
-    broken = jnp.sum(~sound & ~first, dtype=jnp.int32)
+    invalid = jnp.sum(~sound & ~first, dtype=jnp.int32)
     past = jnp.where(sound & ~first, history, 0.0)
     if frame.motion is not None:
         motion = frame.motion if frame.depth is None else nearest_motion(frame.motion, frame.depth)
@@ -135,7 +135,7 @@ def resolve(
     clipped = jnp.maximum(from_ycocg(clip_to_box(to_ycocg(past[..., :3]), center, size)), 0.0)
     share = jnp.maximum(options.alpha, 1.0 / length)
     # In this form the image itself, to the last bit, where there is no history.
-    return jnp.concatenate([share * image + (1.0 - share) * clipped, length], axis=-1), broken
+    return jnp.concatenate([share * image + (1.0 - share) * clipped, length], axis=-1), invalid
 
 
 def sharpened(image: jax.Array, strength: float) -> jax.Array:

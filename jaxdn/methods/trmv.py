@@ -34,8 +34,8 @@ from jaxdn.filters.atrous import GAUSSIAN, stencil
 from jaxdn.filters.cascade import cascade
 from jaxdn.filters.clamping import clamp_to_fast
 from jaxdn.filters.edge_stopping import Weight, depth_weight, lobe_weight, luminance_weight, roughness_weight
-from jaxdn.filters.reproject import fetch
-from jaxdn.filters.surface_test import Guides, expected, guides_of, hit_mask, shared
+from jaxdn.filters.reproject import reproject_along
+from jaxdn.filters.surface_test import Guides, expect_surface, guides_of, keep_shared, surface_mask
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.methods import svgf
 from jaxdn.methods.demodulation import Demodulation
@@ -130,12 +130,12 @@ def trmv(given: Options) -> Denoiser:
         parts = _split(frame, options.demodulate)
         state = _fitting(state, start(params, frame))
         along = frame.motion if frame.dual_motion is None else frame.dual_motion
-        past, broken = _recalled(options, state.rest, state.guides, frame, along, first)
+        past, invalid = _recalled(options, state.rest, state.guides, frame, along, first)
         diffuse = frame._replace(radiance=parts.rest.transpose(1, 2, 0), reflectance=reflectances(frame)[0])
         # As in a wrapper by `demodulated`: the light is divided, and the reflectance is what it was divided by.
         kept, image = svgf.filter_history(options, svgf.blend(options, past[:6], parts.rest), diffuse)
         rest, shadows, specular = kept.history, None, None
-        hit = hit_mask(frame.depth, frame.ids)
+        hit = surface_mask(frame.depth, frame.ids)
 
         if parts.shadowed is not None and parts.unshadowed is not None and state.shadows is not None:
             free = _mean(options, past[6:], parts.unshadowed, past[_LENGTH])
@@ -143,7 +143,7 @@ def trmv(given: Options) -> Denoiser:
             past, lost = _recalled(options, state.shadows, state.guides, frame, along, first, any_surface=True)
             shadows, lit = _shaded(options, past, parts, free, frame, hit)
             rest = jnp.concatenate([rest, free.transpose(1, 2, 0)], axis=-1)
-            image, broken = image + lit, broken + lost
+            image, invalid = image + lit, invalid + lost
         image = parts.diffuse.whole(image.transpose(2, 0, 1))
 
         if parts.shine is not None and state.specular is not None:
@@ -152,10 +152,10 @@ def trmv(given: Options) -> Denoiser:
             history = svgf.blend(options, past, parts.shine.light)
             image = image + parts.shine.whole(_mirrored(options, history, parts.shine.texture, frame, hit))
             specular = history.transpose(1, 2, 0)
-            broken = broken + lost
+            invalid = invalid + lost
         if hit is not None:
             image = jnp.where(hit[..., None], image, frame.radiance)
-        return TrmvState(rest, shadows, specular, guides_of(frame)), image, broken
+        return TrmvState(rest, shadows, specular, guides_of(frame)), image, invalid
 
     return recurrent(Core(start, step, READS, lambda key, frame: unmoved(given)))
 
@@ -199,17 +199,19 @@ def _recalled(
     Where the vector is that of the surface, taps must show the same surface, as in ``svgf``. Elsewhere they show
     another place of it, whose depth tells nothing, or with ``any_surface`` one beside it: normals must agree there.
     """
-    wanted = expected(frame, before, depth_tolerance=options.depth_tolerance)
+    expected = expect_surface(frame, before, depth_tolerance=options.depth_tolerance)
     if vector is not None:
         still = 0.0 if frame.motion is None else frame.motion
         elsewhere = jnp.any(jnp.isfinite(vector) & (vector != still), axis=-1)
-        if wanted.tolerance is not None:
-            wanted = wanted._replace(tolerance=jnp.where(elsewhere, jnp.inf, wanted.tolerance))
-        if any_surface and wanted.ids is not None:
-            wanted = wanted._replace(ids=jnp.where(elsewhere, jnp.nan, wanted.ids))
-    before = shared(before, guides_of(frame))
-    found = fetch(history, before, vector, wanted, first, normal_threshold=options.normal_threshold, around=True)
-    return found.history.transpose(2, 0, 1), found.broken
+        if expected.tolerance is not None:
+            expected = expected._replace(tolerance=jnp.where(elsewhere, jnp.inf, expected.tolerance))
+        if any_surface and expected.ids is not None:
+            expected = expected._replace(ids=jnp.where(elsewhere, jnp.nan, expected.ids))
+    before = keep_shared(before, guides_of(frame))
+    found = reproject_along(
+        history, before, vector, expected, first, normal_threshold=options.normal_threshold, search_neighbours=True
+    )
+    return found.history.transpose(2, 0, 1), found.invalid
 
 
 def _mean(options: Options, past: jax.Array, now: jax.Array, length: jax.Array) -> jax.Array:

@@ -18,11 +18,11 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxdn.core.frame import Frame
-from jaxdn.denoiser.sanitize import repair, repair_image
+from jaxdn.denoiser.sanitize import sanitize, sanitize_image
 from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
 from jaxdn.filters.edge_stopping import Offset, Planes, Weight, depth_weight, normal_weight
-from jaxdn.filters.reproject import recall
-from jaxdn.filters.surface_test import Guides, guides_of, hit_mask
+from jaxdn.filters.reproject import reproject
+from jaxdn.filters.surface_test import Guides, guides_of, surface_mask
 
 _TAPS = stencil(2, kernel=B3_SPLINE)
 _LEVELS = 4
@@ -47,7 +47,7 @@ class Shares(NamedTuple):
 def start_shares(frame: Frame, count: int) -> Shares:
     """No history, for ``count`` parts."""
     nothing = jnp.zeros((*frame.radiance.shape[:2], 3 * count + 4), jnp.float32)
-    return Shares(nothing, jax.tree.map(jnp.zeros_like, guides_of(repair(frame)[0])))
+    return Shares(nothing, jax.tree.map(jnp.zeros_like, guides_of(sanitize(frame)[0])))
 
 
 @jax.jit
@@ -60,12 +60,12 @@ def share(state: Shares, frame: Frame, beauty: jax.Array, parts: jax.Array) -> t
       beauty: the denoised radiance.
       parts: [n, H, W, 3] noisy.
     """
-    frame, _ = repair(frame)
-    parts = repair_image(parts).astype(jnp.float32)
+    frame, _ = sanitize(frame)
+    parts = sanitize_image(parts).astype(jnp.float32)
     noisy = jnp.concatenate([*parts, frame.radiance], axis=-1)
     blended = _blend(state, frame, noisy)
     filtered = _filter(frame, beauty, blended[..., :-1])
-    hit = hit_mask(frame.depth, frame.ids)
+    hit = surface_mask(frame.depth, frame.ids)
     if hit is not None:  # what has no surface is not filtered
         filtered = jnp.where(hit[..., None], filtered, noisy)
     whole = filtered[..., -3:]
@@ -82,14 +82,14 @@ def share(state: Shares, frame: Frame, beauty: jax.Array, parts: jax.Array) -> t
 
 def _blend(state: Shares, frame: Frame, noisy: jax.Array) -> jax.Array:
     """The history with a frame's light blended in: a mean over the frames in which a point was seen."""
-    past = recall(
+    past = reproject(
         state.history,
         state.guides,
         frame,
         jnp.asarray(False),
         depth_tolerance=_DEPTH_TOLERANCE,
         normal_threshold=_NORMAL_THRESHOLD,
-        around=True,
+        search_neighbours=True,
     ).history
     length = past[..., -1:] + 1
     weight = jnp.maximum(_ALPHA, 1 / length)
@@ -98,7 +98,7 @@ def _blend(state: Shares, frame: Frame, noisy: jax.Array) -> jax.Array:
 
 def _filter(frame: Frame, beauty: jax.Array, light: jax.Array) -> jax.Array:
     """An a-trous cascade over [H, W, C], whose weights stop at surfaces and at edges of the denoised beauty."""
-    hit = hit_mask(frame.depth, frame.ids)
+    hit = surface_mask(frame.depth, frame.ids)
     weights = [_color_weight(beauty)]
     if frame.depth is not None:
         weights.append(depth_weight(frame.depth, frame.ids, sigma=_SIGMA_DEPTH))

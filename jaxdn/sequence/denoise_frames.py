@@ -13,8 +13,8 @@ from jaxdn.data.clip.folder import frame_path
 from jaxdn.data.clip.frames import StoredFrame, doubling_layers
 from jaxdn.data.exr.exr import read_windows
 from jaxdn.denoiser.rollout import Layers, Stream, stream
-from jaxdn.denoiser.sanitize import repair_image
-from jaxdn.denoiser.tiles import Parted, by_parts, parted
+from jaxdn.denoiser.sanitize import sanitize_image
+from jaxdn.denoiser.tiles import TiledStream, map_tiles, stream_tiled
 from jaxdn.sequence.memory_budget import GIB, memory_of_machine, needed, side_within
 from jaxdn.sequence.safe_blend import REACH, Combined, Judged, combine, judge
 from jaxdn.zoo.ready import Candidate
@@ -43,7 +43,7 @@ class Pass:
         self, source: Path, method: Candidate, *, limit: float | None = None, log: Callable[[str], None]
     ) -> None:
         self._source, self._method, self._limit, self._log = source, method, limit, log
-        self._step: Stream | Parted | None = None
+        self._step: Stream | TiledStream | None = None
         self._told = 0
 
     def __call__(self, stored: StoredFrame) -> np.ndarray:
@@ -55,8 +55,8 @@ class Pass:
         if isinstance(self._step, Stream):
             return np.asarray(self._step(stored.frame, self._layers(stored)))
         image = self._step(stored.frame)
-        if self._step.out_of_reach > self._told:
-            self._told = self._step.out_of_reach
+        if self._step.beyond_halo > self._told:
+            self._told = self._step.beyond_halo
             self._log(f"{self._told} pixels move too far for the parts and begin anew; give more --max-memory")
         return image
 
@@ -71,9 +71,9 @@ class Pass:
         return set() if self._step is None else self._step.programs
 
     @property
-    def repaired(self) -> int:
+    def sanitized(self) -> int:
         """Invalid values that were replaced."""
-        return 0 if self._step is None else self._step.repaired
+        return 0 if self._step is None else self._step.sanitized
 
     def safe(self, frame: Frame, image: np.ndarray) -> tuple[np.ndarray, Safe]:
         """The image of a frame with what is no noise as it was (:mod:`jaxdn.sequence.safe_blend`), and what decided."""
@@ -87,10 +87,10 @@ class Pass:
         return image, Safe(judged, float(np.mean(found.share)), blind)
 
     def _combined(self, noisy: np.ndarray, image: np.ndarray, *, blind: bool) -> Combined:
-        if not isinstance(self._step, Parted):
+        if not isinstance(self._step, TiledStream):
             return _combine(noisy, image, blind=blind)
         level = jnp.asarray(np.mean(image, dtype=np.float64), jnp.float32)
-        found, _ = by_parts(
+        found, _ = map_tiles(
             lambda given: (_combine(*given, level, blind=blind), None),
             (noisy, image),
             image.shape[:2],
@@ -106,7 +106,7 @@ class Pass:
             return None
         return {count: stored.layers[count] for count in doubling_layers(stored.layers, self._source)}
 
-    def _chosen(self, height: int, width: int) -> Stream | Parted:
+    def _chosen(self, height: int, width: int) -> Stream | TiledStream:
         denoiser, params = self._method.denoiser, self._method.params
         assert denoiser is not None
         limit = memory_of_machine() / 2 if self._limit is None else self._limit
@@ -117,7 +117,7 @@ class Pass:
             return stream(denoiser, params)
         whole = f"whole frames of {width} x {height} need about {needed(*size) / GIB:.1f} GiB"
         try:
-            step = parted(denoiser, params, side, (height, width))
+            step = stream_tiled(denoiser, params, side, (height, width))
         except ValueError as error:
             if self._limit is not None:
                 raise ValueError(f"--max-memory {limit / GIB:g}: {whole}; {error}") from None
@@ -129,4 +129,4 @@ class Pass:
 
 def light_of(radiance: np.ndarray | None) -> Any:
     """Radiance that can be added: non-finite or negative values become 0, an absent part is 0."""
-    return 0.0 if radiance is None else np.asarray(repair_image(radiance), np.float32)
+    return 0.0 if radiance is None else np.asarray(sanitize_image(radiance), np.float32)

@@ -102,4 +102,4 @@ def denoise_scene(
         files.append(path)
         log(f"{path.name}: {counts.mean():.3g} samples per pixel, {counts.min():g} to {counts.max():g}")
         say(path, len(files), len(wanted))
-    return Written(files, len(step.programs), step.repaired)
+    return Written(files, len(step.programs), step.sanitized)

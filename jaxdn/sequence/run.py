@@ -59,7 +59,7 @@ class Written(NamedTuple):
     files: list[Path]
     programs: int
     """Steps that were compiled: one for each distinct set of buffers among the frames."""
-    repaired: int
+    sanitized: int
     """Invalid values (NaN, infinite, negative ...) of frames and histories that were replaced."""
 
 
@@ -116,7 +116,7 @@ def denoise_files(
     total = sum(len(work.wanted) for work in works)
     files: list[Path] = []
     programs: set[tuple[str, ...]] = set()
-    repaired = 0
+    sanitized = 0
     for work in works:
         for note in work.notes:
             log(note)
@@ -137,8 +137,8 @@ def denoise_files(
                     files.append(path)
                     say(path, len(files), total)
             programs |= {program for each in passes for program in each.programs}
-            repaired += passes[0].repaired  # the other pass repairs the same frames
-    return Written(files, len(programs), repaired)
+            sanitized += passes[0].sanitized  # the other pass sanitizes the same frames
+    return Written(files, len(programs), sanitized)
 
 
 def _refuse_unused(works: Sequence[Work], settings: Settings) -> None:

@@ -13,7 +13,7 @@ from jaxdn import color, metrics
 from jaxdn.core.frame import Clip
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.denoiser.rollout import unroll
-from jaxdn.denoiser.sanitize import repair_image
+from jaxdn.denoiser.sanitize import sanitize_image
 from jaxdn.recipes.objectives import Objective
 from jaxdn.recipes.recipe import Recipe
 from jaxdn.training.xla_flags import training_options
@@ -74,7 +74,7 @@ def clip_loss(
       progress: fraction of the updates done.
       rematerialize: recompute each step in the backward pass, see :func:`jaxdn.denoiser.rollout.unroll`.
     """
-    clip = clip._replace(reference=repair_image(clip.reference))
+    clip = clip._replace(reference=sanitize_image(clip.reference))
     images = unroll(denoiser, params, clip.frames, clip.layers, clip.reference, rematerialize=rematerialize)
     loss = objective.loss(images, clip, jnp.asarray(progress))
     last = jax.lax.stop_gradient(images[-1])

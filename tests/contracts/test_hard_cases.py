@@ -99,7 +99,7 @@ def test_every_denoiser_and_every_public_operation_is_tested():
 
 def test_the_table_shows_errors(tmp_path):
     # A filter that divides by its input is red only where there is a zero or NaN.
-    careless = Subject("careless", lambda params, inputs: 1.0 / inputs.clip.frames.radiance, repairs=True)
+    careless = Subject("careless", lambda params, inputs: 1.0 / inputs.clip.frames.radiance, sanitizes=True)
     chosen = [CASES[name] for name in ("control", "black", "radiance not a number", "size 1x1")]
     table = list(rows(chosen, [careless], precisions=("float32",), directions=("forward",)))
     verdicts = {row.case: row.verdict for row in table}

@@ -13,8 +13,8 @@ import pytest
 
 from jaxdn import brdf, color
 from jaxdn.core.frame import FAR, Frame
-from jaxdn.denoiser.statistics import sums_of_depth
-from jaxdn.filters.reproject import recall
+from jaxdn.denoiser.statistics import sum_depths
+from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import guides_of
 from jaxdn.methods.steady.accumulation import Mean, Shown, accumulated, remembered
 from jaxdn.methods.steady.fireflies import dimmed
@@ -80,8 +80,8 @@ def test_the_enlarged_image(size, rng, both):
 
 
 @pytest.mark.parametrize("left_out", ["", "depth", "normal", "ids", "motion", "previous_depth", "depth normal ids"])
-@pytest.mark.parametrize("around", [False, True])
-def test_the_recalled_history(left_out, around, rng, both):
+@pytest.mark.parametrize("search_neighbours", [False, True])
+def test_the_recalled_history(left_out, search_neighbours, rng, both):
     height, width = 23, 31
     normal = rng.normal(size=(height, width, 3)).round()
     frame = Frame(
@@ -97,13 +97,13 @@ def test_the_recalled_history(left_out, around, rng, both):
     history[3, 4, 2], history[5, 6, 0], history[7, 7, 7], history[9, 9] = np.nan, -1.0, np.inf, -0.0
 
     def recalled(history, frame, first):
-        return recall(history, guides_of(frame), frame, first, around=around)
+        return reproject(history, guides_of(frame), frame, first, search_neighbours=search_neighbours)
 
     for first in (False, True):
         found, wanted = both(recalled, jnp.asarray(history), frame, jnp.asarray(first))
         np.testing.assert_array_equal(found.valid, wanted.valid)
         np.testing.assert_allclose(found.history, wanted.history, rtol=1e-5, atol=1e-7)
-        assert found.broken == wanted.broken
+        assert found.invalid == wanted.invalid
         assert first == (not found.valid.any())
 
 
@@ -198,7 +198,7 @@ def test_the_sums_of_depth(rng, both):
     depth = 10.0 ** rng.uniform(-3, 3, (14, 38, 1))
     depth[rng.random(depth.shape) < 0.1] = FAR
     depth[0], depth[1] = 0.0, -1.0
-    found, wanted = both(sums_of_depth, jnp.asarray(depth, jnp.float32))
+    found, wanted = both(sum_depths, jnp.asarray(depth, jnp.float32))
     known = depth[(depth > 0) & (depth < FAR)]
     np.testing.assert_allclose(found, [np.log(known).sum(), (1 / known).sum(), known.size], rtol=1e-5)
     np.testing.assert_allclose(wanted, found, rtol=1e-5)

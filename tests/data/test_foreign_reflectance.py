@@ -213,7 +213,7 @@ def test_overshoot_of_a_pixel_filter_and_broken_pixels_are_no_reason_to_refuse(t
     frame, _ = read(write(tmp_path / "a.exr", layer("", scene["light"]), roughness))
     assert frame.roughness[1, 1] == 1
     assert frame.roughness[2, 2] == 0
-    assert np.isnan(frame.roughness[3, 3])  # repaired, and counted, by the step
+    assert np.isnan(frame.roughness[3, 3])  # sanitized, and counted, by the step
 
 
 def test_the_command_prints_what_it_read_and_derived(tmp_path, scene):

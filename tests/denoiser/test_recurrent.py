@@ -1,4 +1,4 @@
-"""The processing that all denoisers share, on toy cores: checks, repair, age, bounds, demodulation, samples."""
+"""The processing that all denoisers share, on toy cores: checks, sanitizing, age, bounds, demodulation, samples."""
 
 from functools import partial
 
@@ -43,12 +43,12 @@ def test_first_is_passed_once_and_age_counts_frames(rng):
     assert denoiser.step.core is core
     state = denoiser.start({}, frame)
     assert isinstance(state, Recurrent)
-    assert (int(state.age), int(state.repaired)) == (0, 0)
+    assert (int(state.age), int(state.sanitized)) == (0, 0)
     for index in range(4):
         state, _ = denoiser.step({}, state, frame)
         assert bool(state.core) == (index == 0)
         assert int(state.age) == index + 1
-    assert state.age.dtype == state.repaired.dtype == jnp.int32
+    assert state.age.dtype == state.sanitized.dtype == jnp.int32
 
 
 def test_first_is_passed_under_scan_too(rng):
@@ -58,7 +58,7 @@ def test_first_is_passed_under_scan_too(rng):
     np.testing.assert_array_equal(images[:, 0, 0, 0], [1, 2, 2])
 
 
-def test_the_core_sees_repaired_buffers_and_only_those_that_it_reads(rng):
+def test_the_core_sees_sanitized_buffers_and_only_those_that_it_reads(rng):
     seen = []
 
     def step(params, state, frame, first):
@@ -75,7 +75,7 @@ def test_the_core_sees_repaired_buffers_and_only_those_that_it_reads(rng):
     np.testing.assert_array_equal(seen[0].depth, 0)
     np.testing.assert_array_equal(seen[0].radiance[0, 0], [0, 0, RADIANCE_MAX])
     # Buffers that are not read are not counted: 3 values of the radiance, all of albedo and depth.
-    assert int(state.repaired) == 3 + 24 * 3 + 24
+    assert int(state.sanitized) == 3 + 24 * 3 + 24
 
 
 @pytest.mark.parametrize("wrap", [lambda denoiser: denoiser, demodulated])
@@ -92,23 +92,23 @@ def test_a_core_is_told_which_pixels_were_not_measured(reads, wrap):
     np.testing.assert_array_equal(state.core[0, :, 0], np.float32([1, 0, 0, 1, 1]) * (3 if reads else 1))
 
 
-def test_start_sees_repaired_buffers_and_counts_nothing(rng):
+def test_start_sees_sanitized_buffers_and_counts_nothing(rng):
     frame = frame_of(rng)._replace(radiance=jnp.full((*SIZE, 3), jnp.inf))
     denoiser = recurrent(core_of(identity().step, start=lambda params, frame: frame.radiance))
     state = denoiser.start({}, frame)
     np.testing.assert_array_equal(state.core, 0)
-    assert int(state.repaired) == 0
+    assert int(state.sanitized) == 0
 
 
 @pytest.mark.parametrize("lost", [2, jnp.asarray(2, jnp.int32)])
-def test_repairs_of_frames_and_of_the_history_add_up(lost, rng):
+def test_sanitized_values_of_frames_and_of_the_history_add_up(lost, rng):
     core = core_of(lambda params, state, frame, first: (state, frame.radiance, lost))
     denoiser, frame = recurrent(core), frame_of(rng)
     broken = frame._replace(radiance=frame.radiance.at[1, 2].set(jnp.nan))
     state = denoiser.start({}, frame)
     for given, expected in ((broken, 5), (frame, 7), (broken, 12)):
         state, _ = denoiser.step({}, state, given)
-        assert int(state.repaired) == expected
+        assert int(state.sanitized) == expected
 
 
 def test_images_are_clamped_to_their_bounds(rng):
@@ -119,7 +119,7 @@ def test_images_are_clamped_to_their_bounds(rng):
     np.testing.assert_array_equal(image, np.clip(values, 0, RADIANCE_MAX))
     assert float(image.min()) == 0
     assert float(image.max()) == RADIANCE_MAX
-    assert int(state.repaired) == 0  # a method's own overshoot is not a repaired value
+    assert int(state.sanitized) == 0  # a method's own overshoot is not a sanitized value
 
 
 def test_the_state_is_the_cores_own_and_is_not_clamped(rng):
@@ -185,7 +185,7 @@ def test_demodulating_an_identity_gives_the_radiance_back(rng):
     expected = np.asarray(frame.radiance, np.float64) / np.where(albedo > np.float32(0.01), albedo, 1)
     np.testing.assert_allclose(state.core, expected, rtol=1e-6)
     assert int(state.age) == 1
-    assert int(state.repaired) == 0
+    assert int(state.sanitized) == 0
 
 
 def test_demodulated_start_gets_divided_radiance_too(rng):
@@ -196,13 +196,13 @@ def test_demodulated_start_gets_divided_radiance_too(rng):
     )
 
 
-def test_values_are_repaired_and_counted_once_before_they_are_divided(rng):
+def test_values_are_sanitized_and_counted_once_before_they_are_divided(rng):
     albedo = jnp.full((*SIZE, 3), 0.5).at[0, 0, 0].set(jnp.nan)
     frame = frame_of(rng, albedo=albedo)
     frame = frame._replace(radiance=frame.radiance.at[2, 3, 1].set(jnp.inf))
     denoiser = demodulated(recurrent(identity()), by="albedo")
     state, image = denoiser.step({}, denoiser.start({}, frame), frame)
-    assert int(state.repaired) == 2
+    assert int(state.sanitized) == 2
     np.testing.assert_allclose(image, frame.radiance.at[2, 3, 1].set(0), rtol=1e-6)
 
 
@@ -381,7 +381,7 @@ def test_the_step_gets_the_actual_number_of_samples(rng):
     np.testing.assert_allclose(image, from_layers(layers, told[0])[0], rtol=1e-6)
 
 
-def test_layers_are_bounded_and_what_is_no_number_in_them_is_repaired_and_counted(rng):
+def test_layers_are_bounded_and_what_is_no_number_in_them_is_sanitized_and_counted(rng):
     """The largest number in every layer: eight of it are more than float32 has."""
     core = core_of(lambda params, state, frame, first: (state, frame.radiance, 0), samples=lambda *given: 7.0 * ONES)
     clip = layered(rng, count=1)
@@ -390,7 +390,7 @@ def test_layers_are_bounded_and_what_is_no_number_in_them_is_repaired_and_counte
     image = one(frame_at(clip.frames, 0), {n: layer[0] for n, layer in bright.items()})
     np.testing.assert_array_equal(image[0, 0], RADIANCE_MAX)
     np.testing.assert_array_equal(image[0, 1], 0)
-    assert one.repaired >= 3  # the mean of the largest may be larger by a rounding
+    assert one.sanitized >= 3  # the mean of the largest may be larger by a rounding
 
 
 @pytest.mark.parametrize("rematerialize", [False, True])

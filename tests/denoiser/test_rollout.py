@@ -1,4 +1,4 @@
-"""Streams: the images of the whole clip frame by frame, one program per set of buffers, and the repaired values."""
+"""Streams: the images of the whole clip frame by frame, one program per set of buffers, and the sanitized values."""
 
 import jax
 import jax.numpy as jnp
@@ -46,7 +46,7 @@ def test_a_stream_gives_the_images_of_the_whole_clip(method, clip, numbers):
     for image, wanted in zip(images, expected, strict=True):
         np.testing.assert_allclose(image, wanted, rtol=2e-4, atol=1e-5)
     assert one.programs == {tuple(name for name in Frame._fields[1:] if name in denoiser.reads)}
-    assert one.repaired == 0
+    assert one.sanitized == 0
 
 
 def test_every_stream_starts_without_history_and_keeps_its_arguments_unchanged(method, clip):
@@ -112,20 +112,20 @@ def test_buffers_that_come_and_go_are_their_neutral_values(method, clip):
     assert len(other.programs) == 2
 
 
-def test_what_was_repaired_is_counted_over_all_frames(method, clip):
+def test_what_was_sanitized_is_counted_over_all_frames(method, clip):
     denoiser, params, _ = method
     one = stream(denoiser, params)
-    assert one.repaired == 0
+    assert one.sanitized == 0
     for count, frame in enumerate(frames_of(clip)):
         radiance = np.array(frame.radiance)
         radiance[3, 4] = np.nan
         radiance[5, 6, 0] = -1
         image = one(frame._replace(radiance=radiance))
         assert np.isfinite(image).all()
-        assert one.repaired == 4 * (count + 1)
+        assert one.sanitized == 4 * (count + 1)
 
 
-def test_a_denoiser_without_a_count_has_repaired_nothing(clip):
+def test_a_denoiser_without_a_count_has_sanitized_nothing(clip):
     from jaxdn.denoiser import Denoiser
 
     def step(params, state, frame):
@@ -134,7 +134,7 @@ def test_a_denoiser_without_a_count_has_repaired_nothing(clip):
     bare = Denoiser(lambda key, frame: {}, lambda params, frame: jnp.zeros(()), step, frozenset())
     one = stream(bare, {})
     images = [one(frame) for frame in frames_of(clip)]
-    assert one.repaired == 0
+    assert one.sanitized == 0
     for index, image in enumerate(images):
         np.testing.assert_allclose(image, index * clip.frames.radiance[index], rtol=1e-6)
 

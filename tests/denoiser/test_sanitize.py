@@ -1,4 +1,4 @@
-"""The repair of a frame, by the kind of each buffer, and the count of what was replaced."""
+"""The sanitizing of a frame, by the kind of each buffer, and the count of what was replaced."""
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxdn.core.frame import BUFFERS, FAR, RADIANCE_MAX, Frame
-from jaxdn.denoiser.sanitize import repair
+from jaxdn.denoiser.sanitize import sanitize
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
-repaired = jax.jit(repair)
+sanitized = jax.jit(sanitize)
 
 
 def frame(size=4, **buffers):
@@ -25,7 +25,7 @@ def test_normals_of_every_length_become_unit_and_keep_their_direction():
     directions = np.float32([[1, 0, 0], [1, 1, 1], [0.2, -0.9, 0.1]])
     normal = lengths[:, None, None] * directions
     light = np.zeros(normal.shape, np.float32)
-    found, count = repaired(Frame(radiance=light, normal=normal))
+    found, count = sanitized(Frame(radiance=light, normal=normal))
     exact = directions / np.linalg.norm(directions.astype(np.float64), axis=-1, keepdims=True)
     np.testing.assert_allclose(found.normal, np.broadcast_to(exact, normal.shape), atol=3e-7)
     assert count == 0
@@ -35,13 +35,13 @@ def test_normals_of_every_length_become_unit_and_keep_their_direction():
 def test_a_normal_with_a_non_finite_component_becomes_zero(bad):
     normal = np.broadcast_to(np.float32([0, 0, 1]), (4, 4, 3)).copy()
     normal[1, 2, 0] = bad
-    found, count = repaired(frame(normal=normal))
+    found, count = sanitized(frame(normal=normal))
     np.testing.assert_array_equal(found.normal[1, 2], 0)
     np.testing.assert_array_equal(found.normal[0, 0], [0, 0, 1])
     assert count == 1
 
 
-def test_every_repaired_buffer_is_counted():
+def test_every_sanitized_buffer_is_counted():
     rng = np.random.default_rng(0)
     shape = (6, 5)
     buffers = {
@@ -52,7 +52,7 @@ def test_every_repaired_buffer_is_counted():
         "roughness": rng.choice(np.float32([0.5, -0.5]), (*shape, 1)),
         "motion": rng.choice(np.float32([0.5, np.nan]), (*shape, 2)),
     }
-    found, count = repaired(Frame(**buffers))
+    found, count = sanitized(Frame(**buffers))
     light = sum(
         int(np.sum(~((buffers[name] >= 0) & (buffers[name] <= RADIANCE_MAX)))) for name in ("radiance", "direct")
     )
@@ -66,7 +66,7 @@ def test_every_repaired_buffer_is_counted():
 
 
 def test_the_count_is_of_one_type_in_double_precision_too(x64):
-    found, count = repaired(frame(depth=np.full((4, 4, 1), np.nan)))
+    found, count = sanitized(frame(depth=np.full((4, 4, 1), np.nan)))
     assert found.depth.dtype == jnp.float64
     assert count.dtype == jnp.int32
     assert count == 16
@@ -85,7 +85,7 @@ BOUNDS = {
 }
 
 
-def numpy_repair(values, name):
+def numpy_sanitize(values, name):
     """In float64: the result, and how many values were replaced."""
     values, kind = np.asarray(values, np.float64), BUFFERS[name].kind
     finite = np.isfinite(values)
@@ -115,10 +115,10 @@ def partly_broken(seed, name, dtype=np.float32):
         return np.where(rng.random(shape) < 0.4, rng.choice(SPECIAL, shape), values).astype(dtype)
 
 
-def repaired_alone(name, values):
-    """One buffer repaired, and the count; radiance is valid unless it is that buffer."""
+def sanitized_buffer(name, values):
+    """One buffer sanitized, and the count; radiance is valid unless it is that buffer."""
     given = frame(6) if name == "radiance" else Frame(np.full((6, 5, 3), 0.5, np.float32))
-    found, count = repaired(given._replace(**{name: values}))
+    found, count = sanitized(given._replace(**{name: values}))
     return np.asarray(getattr(found, name)), int(count)
 
 
@@ -134,21 +134,21 @@ def test_every_kind_is_tested():
 
 @pytest.mark.parametrize("name", NUMBERS)
 @given(seed=st.integers(0, 2**16))
-def test_repair_is_the_numpy_one(name, seed):
+def test_sanitize_is_the_numpy_one(name, seed):
     values = partly_broken(seed, name)
-    found, count = repaired_alone(name, values)
-    expected, replaced = numpy_repair(values, name)
+    found, count = sanitized_buffer(name, values)
+    expected, replaced = numpy_sanitize(values, name)
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7 if BUFFERS[name].kind == "direction" else 1e-37)
     assert count == replaced
 
 
 @pytest.mark.parametrize("name", NUMBERS)
 @given(seed=st.integers(0, 2**16))
-def test_repaired_values_are_in_bounds_and_stable(name, seed):
-    """A second repair counts nothing, except non-finite vectors: they stay and mean that there is no history."""
+def test_sanitized_values_are_in_bounds_and_stable(name, seed):
+    """A second sanitizing counts nothing, except non-finite vectors: they stay and mean that there is no history."""
     kind = BUFFERS[name].kind
-    found, count = repaired_alone(name, partly_broken(seed, name))
-    again, recount = repaired_alone(name, found)
+    found, count = sanitized_buffer(name, partly_broken(seed, name))
+    again, recount = sanitized_buffer(name, found)
     if kind == "direction":
         np.testing.assert_allclose(again, found, atol=2e-7)
         length = np.linalg.norm(found.astype(np.float64), axis=-1)
@@ -176,7 +176,7 @@ def test_valid_values_stay_bit_for_bit_and_are_not_counted(name, rng):
         low = {"signed": -5, "vector": -5}.get(kind, 0)
         values = rng.uniform(low, 1 if kind == "fraction" else 5, shape)
         values[0, 0] = BOUNDS.get(kind, (0, 0))[0]
-    found, count = repaired_alone(name, values.astype(np.float32))
+    found, count = sanitized_buffer(name, values.astype(np.float32))
     np.testing.assert_array_equal(found, values.astype(np.float32))
     assert count == 0
 
@@ -185,7 +185,7 @@ def test_valid_values_stay_bit_for_bit_and_are_not_counted(name, rng):
 @pytest.mark.parametrize("name", ["radiance", "luminance_gradient", "sample_count", "albedo"])
 def test_narrow_numbers_are_widened(name, dtype, rng):
     values = rng.integers(0, 2, (6, 5, BUFFERS[name].channels)).astype(dtype)
-    found, count = repaired_alone(name, values)
+    found, count = sanitized_buffer(name, values)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, values.astype(np.float32))
     assert count == 0
@@ -193,19 +193,19 @@ def test_narrow_numbers_are_widened(name, dtype, rng):
 
 def test_flags_and_ids_stay_unchanged(rng):
     ids, visible = rng.integers(-5, 2**24, (4, 4, 1)).astype(np.int32), rng.random((4, 4, 1)) < 0.5
-    found, count = repaired(frame(ids=ids, visible=visible))
+    found, count = sanitized(frame(ids=ids, visible=visible))
     np.testing.assert_array_equal(found.ids, ids)
     np.testing.assert_array_equal(found.visible, visible)
     assert (found.ids.dtype, found.visible.dtype, int(count)) == (jnp.int32, jnp.bool_, 0)
 
 
-def test_gradients_through_the_repair_are_finite_and_zero_where_it_replaced():
+def test_gradients_through_the_sanitize_are_finite_and_zero_where_it_replaced():
     for name in NUMBERS:
         values = jnp.asarray(partly_broken(0, name))
         valid = Frame(jnp.full((6, 5, 3), 0.5))
 
         def total(values, name=name, valid=valid):
-            return jnp.nansum(getattr(repair(valid._replace(**{name: values}))[0], name))
+            return jnp.nansum(getattr(sanitize(valid._replace(**{name: values}))[0], name))
 
         slope = np.asarray(jax.jit(jax.grad(total))(values))
         assert np.isfinite(slope).all(), name

@@ -14,8 +14,8 @@ from jaxdn import color
 from jaxdn.core.frame import FAR, Frame, only
 from jaxdn.denoiser import Denoiser
 from jaxdn.denoiser.rollout import stream
-from jaxdn.denoiser.statistics import Whole, measured
-from jaxdn.denoiser.tiles import GRID, by_parts, farthest_history, parted, windows
+from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
+from jaxdn.denoiser.tiles import GRID, find_history_halo, map_tiles, split_axis, stream_tiled
 from jaxdn.denoisers import asvgf, ntasd, ntd, steady, svgf, taa
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.sequence.safe_blend import REACH, combine
@@ -78,7 +78,7 @@ def random_params(denoiser: Denoiser, frame: Frame) -> Any:
 @settings(max_examples=300, deadline=None)
 def test_windows_cover_all_and_have_their_margins(length: int, margin: int, more: int) -> None:
     side = 2 * (margin + GRID) + GRID + more
-    found = windows(length, side, margin)
+    found = split_axis(length, side, margin)
     assert found[0].first == 0
     assert found[-1].last == length
     for one, following in itertools.pairwise(found):
@@ -90,7 +90,7 @@ def test_windows_cover_all_and_have_their_margins(length: int, margin: int, more
         assert one.start == 0 or one.first - one.start >= margin
         assert one.stop == length or one.stop - one.last >= margin
     with pytest.raises(ValueError, match=f"there is room for {2 * margin + GRID}"):
-        windows(length + 2 * margin + 2 * GRID, 2 * margin + GRID, margin)
+        split_axis(length + 2 * margin + 2 * GRID, 2 * margin + GRID, margin)
 
 
 WITH_SLOW_ONES = [pytest.param(name, marks=[pytest.mark.slow] * (name in {"steady", "ntd"})) for name in METHODS]
@@ -114,12 +114,12 @@ def test_parts_make_the_image_of_the_whole_frame(name: str, without: tuple[str, 
     width = side + 5 * GRID + 7
     some = [doubled(only(frame, frozenset(Frame._fields) - set(without))) for frame in frames(2, width)]
     params = random_params(denoiser, some[0])
-    whole, parts = stream(denoiser, params), parted(denoiser, params, side, (HEIGHT, width))
+    whole, parts = stream(denoiser, params), stream_tiled(denoiser, params, side, (HEIGHT, width))
     for frame in some:
         expected, image = np.asarray(whole(frame)), parts(frame)
         np.testing.assert_allclose(image, expected, rtol=1e-9, atol=1e-12)
-    assert parts.repaired == whole.repaired
-    assert parts.out_of_reach == 0
+    assert parts.sanitized == whole.sanitized
+    assert parts.beyond_halo == 0
     assert len(parts.programs) == 1
 
 
@@ -155,11 +155,11 @@ def test_history_from_too_far_away_is_counted_and_begins_anew() -> None:
         frame.motion[10:14, 100:120] = (170.0, 0.0)
         frame.previous_depth[10:14, 100:120] = frame.depth[10:14, 270:290]
         frame.motion[20:24, 480:490] = (170.0, 0.0)  # leaves the frame: has no history anyway
-    parts = parted(denoiser, {}, side, (HEIGHT, 500))
+    parts = stream_tiled(denoiser, {}, side, (HEIGHT, 500))
     whole = stream(denoiser, {})
     for frame in clip:
         image, expected = parts(frame), np.asarray(whole(frame))
-    assert parts.out_of_reach == 4 * 20
+    assert parts.beyond_halo == 4 * 20
     far = denoiser.step.core.reach
     apart = np.abs(image - expected).max(axis=-1) > 1e-3 * expected.mean()
     assert apart[10:14, 100:120].any()
@@ -169,42 +169,42 @@ def test_history_from_too_far_away_is_counted_and_begins_anew() -> None:
 
 def test_how_far_history_is_fetched() -> None:
     frame = only(frames(1, 200)[0], frozenset({"albedo"}))
-    assert farthest_history(frame, 100) == (3, 0)
+    assert find_history_halo(frame, 100) == (3, 0)
     motion = np.zeros((HEIGHT, 200, 2), np.float32)
     motion[5, 50], motion[6, 60], motion[7, 10], motion[8, 8] = (-17.5, 0), (0, 12), (-60, 0), (np.inf, 0)
     frame = frame._replace(motion=motion)
-    assert farthest_history(frame, 100) == (21, 0)
-    assert farthest_history(frame, 20) == (15, 1)
-    assert farthest_history(frame._replace(shadow_motion=2 * motion), 100) == (38, 0)
+    assert find_history_halo(frame, 100) == (21, 0)
+    assert find_history_halo(frame, 20) == (15, 1)
+    assert find_history_halo(frame._replace(shadow_motion=2 * motion), 100) == (38, 0)
 
 
 def test_what_cannot_be_parted_is_refused() -> None:
     for denoiser in (asvgf(), ntasd(size=TINY, budget=2.0)):
         with pytest.raises(ValueError, match="cannot denoise a frame in parts"):
-            parted(denoiser, {}, 1024, (HEIGHT, 2000))
+            stream_tiled(denoiser, {}, 1024, (HEIGHT, 2000))
     with pytest.raises(ValueError, match="there is room for 128"):
-        parted(svgf(), {}, 128, (HEIGHT, 2000))
-    parted(svgf(), {}, 128, (HEIGHT, 128))
+        stream_tiled(svgf(), {}, 128, (HEIGHT, 2000))
+    stream_tiled(svgf(), {}, 128, (HEIGHT, 128))
 
 
 def test_sums_of_parts_are_those_of_the_frame() -> None:
     frame = frames(1, 4 * GRID, height=2 * GRID)[0]
     parts = [jax.tree.map(lambda x, c=c: x[:, c : c + GRID], frame) for c in range(0, 4 * GRID, GRID)]
-    sums = [measured(jnp.asarray(one.radiance), jnp.asarray(one.depth), one) for one in (frame, *parts)]
-    total: Whole = jax.tree.map(lambda *each: sum(each), *sums[1:])
+    sums = [measure_frame(jnp.asarray(one.radiance), jnp.asarray(one.depth), one) for one in (frame, *parts)]
+    total: FrameStatistics = jax.tree.map(lambda *each: sum(each), *sums[1:])
     whole = sums[0]
     for name in ("exposure", "middle_depth", "middle_inverse", "other"):
         np.testing.assert_allclose(getattr(total, name), getattr(whole, name), rtol=1e-5)
     np.testing.assert_allclose(whole.exposure, color.exposure(frame.radiance), rtol=1e-6)
     known = frame.depth[frame.depth < FAR].astype(np.float64)
-    np.testing.assert_allclose(whole.middle_depth, np.exp(np.log(known).mean()), rtol=1e-5)
-    np.testing.assert_allclose(whole.middle_inverse, (1 / known).mean(), rtol=1e-5)
+    np.testing.assert_allclose(whole.mean_depth, np.exp(np.log(known).mean()), rtol=1e-5)
+    np.testing.assert_allclose(whole.mean_inverse_depth, (1 / known).mean(), rtol=1e-5)
     np.testing.assert_allclose(
-        depth_feature(frame.depth, middle=whole.middle_depth), depth_feature(frame.depth), rtol=1e-5
+        depth_feature(frame.depth, middle=whole.mean_depth), depth_feature(frame.depth), rtol=1e-5
     )
     differs = np.any(frame.reflectance != frame.albedo, axis=-1)
-    assert whole.other == differs.sum() > 0
-    assert measured(frame.radiance, None, frame._replace(albedo=None)).other == 0
+    assert whole.reflectance_differs == differs.sum() > 0
+    assert measure_frame(frame.radiance, None, frame._replace(albedo=None)).reflectance_differs == 0
 
 
 @pytest.mark.parametrize("samples", [4, 4096])
@@ -216,7 +216,7 @@ def test_the_safe_mixture_in_parts_is_that_of_the_whole_frame(samples: int) -> N
     noisy = (truth * rng.gamma(samples, 1 / samples, truth.shape)).astype(np.float32)
     denoised = (truth + 0.05 * np.cos(columns / 50)[None, :, None]).astype(np.float32)
     level = jnp.mean(jnp.asarray(denoised))
-    found, others = by_parts(
+    found, others = map_tiles(
         lambda given: (combine(*given, level), None), (noisy, denoised), (height, width), side=288, margin=REACH
     )
     assert len(others) == 4

@@ -48,7 +48,7 @@ def moving_clip(frames, size):
 
 
 def run_onnx(file, frames, count):
-    """The images of an exported step, and how many values it repaired."""
+    """The images of an exported step, and how many values it sanitized."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level, options.intra_op_num_threads = 3, 2
     session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])

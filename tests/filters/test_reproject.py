@@ -10,7 +10,7 @@ from jax.test_util import check_grads
 
 from jaxdn.core.frame import Frame
 from jaxdn.filters import reproject as module
-from jaxdn.filters.reproject import recall
+from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, guides_of
 from jaxdn.ops.dispatch.row_tiles import by_strips
 
@@ -33,7 +33,7 @@ def drawn(rng):
     return rng.uniform(0.1, 1, (HEIGHT, WIDTH, 2)), frame
 
 
-def by_loops(history, frame, *, around=False):
+def by_loops(history, frame, *, search_neighbours=False):
     """The definition, pixel by pixel."""
     out, valid = np.zeros(history.shape), np.zeros((HEIGHT, WIDTH, 1), bool)
 
@@ -48,7 +48,7 @@ def by_loops(history, frame, *, around=False):
         left, top = int(x), int(y)
         taps = {(top + b, left + a): abs(1 - b - (y - top)) * abs(1 - a - (x - left)) for b, a in np.ndindex(2, 2)}
         taps = {at: share for at, share in taps.items() if share > 0 and accepted(*at, (row, column))}
-        if around and sum(taps.values()) < 0.01:
+        if search_neighbours and sum(taps.values()) < 0.01:
             middle = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
             near = [(middle[0] + b - 1, middle[1] + a - 1) for b, a in np.ndindex(3, 3)]
             taps = {at: 1.0 for at in near if accepted(*at, (row, column))}
@@ -58,39 +58,41 @@ def by_loops(history, frame, *, around=False):
     return out, valid
 
 
-def recalled(history, frame, *, first=False, around=False):
+def recalled(history, frame, *, first=False, search_neighbours=False):
     frame = jax.tree.map(jnp.asarray, frame)
-    return program(around, module._STRIP)(jnp.asarray(history), guides_of(frame), frame, jnp.asarray(first))
+    return program(search_neighbours, module._STRIP)(jnp.asarray(history), guides_of(frame), frame, jnp.asarray(first))
 
 
 @functools.cache
-def program(around, strip):
+def program(search_neighbours, strip):
     """``recall``, compiled once for each set of buffers while a strip has so many pixels."""
-    return jax.jit(lambda *given: recall(*given, around=around))
+    return jax.jit(lambda *given: reproject(*given, search_neighbours=search_neighbours))
 
 
-@pytest.mark.parametrize("around", [False, True])
+@pytest.mark.parametrize("search_neighbours", [False, True])
 @pytest.mark.parametrize("strip", [5_000, 20])
 @pytest.mark.parametrize("guide", ["ids", "normal", "depth"])
-def test_it_is_the_mean_of_the_taps_of_the_same_surface(guide, strip, around, rng, x64, monkeypatch):
+def test_it_is_the_mean_of_the_taps_of_the_same_surface(guide, strip, search_neighbours, rng, x64, monkeypatch):
     monkeypatch.setattr(module, "_STRIP", strip)
     history, frame = drawn(rng)
     one = Frame(radiance=frame.radiance, motion=frame.motion, **{guide: getattr(frame, guide)})
-    found = recalled(history, one, around=around)
-    wanted, valid = by_loops(history, frame, around=around)
+    found = recalled(history, one, search_neighbours=search_neighbours)
+    wanted, valid = by_loops(history, frame, search_neighbours=search_neighbours)
     np.testing.assert_array_equal(found.valid, valid)
     np.testing.assert_allclose(found.history, wanted, rtol=1e-12)
     assert 0 < valid.sum() < valid.size
-    assert around == (valid.sum() > by_loops(history, frame)[1].sum())
+    assert search_neighbours == (valid.sum() > by_loops(history, frame)[1].sum())
 
 
-@pytest.mark.parametrize("around", [False, True])
-def test_its_gradient(around, rng, x64):
+@pytest.mark.parametrize("search_neighbours", [False, True])
+def test_its_gradient(search_neighbours, rng, x64):
     history, frame = drawn(rng)
-    function = jax.jit(lambda x: recalled(x, frame, around=around).history)
+    function = jax.jit(lambda x: recalled(x, frame, search_neighbours=search_neighbours).history)
     check_grads(function, (jnp.asarray(history),), order=1, modes=["rev"])
     gradient = jax.grad(lambda x: function(x).sum())(jnp.asarray(history))
-    np.testing.assert_allclose(gradient.sum(), 2 * recalled(history, frame, around=around).valid.sum())
+    np.testing.assert_allclose(
+        gradient.sum(), 2 * recalled(history, frame, search_neighbours=search_neighbours).valid.sum()
+    )
 
 
 def test_an_image_smaller_than_the_places_around(rng, x64):
@@ -100,7 +102,7 @@ def test_an_image_smaller_than_the_places_around(rng, x64):
     @jax.jit
     @functools.partial(jax.grad, has_aux=True)
     def summed(history, *rest):
-        found = recall(history, *rest, around=True)
+        found = reproject(history, *rest, search_neighbours=True)
         return found.history.sum(), found
 
     for vector in ([0.0, 0.0], [0.4, 0.0], [-0.6, 0.7]):
@@ -122,13 +124,13 @@ def test_around_a_pixel_that_shows_something_else(rng, x64):
 
     def found(before, frame, **options):
         given = jnp.asarray(history), Guides(None, None, jnp.asarray(before)), jax.tree.map(jnp.asarray, frame)
-        return recall(*given, jnp.asarray(False), **options)
+        return reproject(*given, jnp.asarray(False), **options)
 
     assert not found(before, changed).valid[3, 5]
-    assert not found(before, changed, around=True).valid[3, 5]
+    assert not found(before, changed, search_neighbours=True).valid[3, 5]
     before[2, 4] = 1
-    np.testing.assert_array_equal(found(before, changed, around=True).history[3, 5], history[2, 4])
-    still, moving = (found(before, changed._replace(motion=m), around=True) for m in (None, changed.motion))
+    np.testing.assert_array_equal(found(before, changed, search_neighbours=True).history[3, 5], history[2, 4])
+    still, moving = (found(before, changed._replace(motion=m), search_neighbours=True) for m in (None, changed.motion))
     np.testing.assert_array_equal(still.valid, moving.valid)
     np.testing.assert_allclose(still.history, moving.history, rtol=1e-12)
 
@@ -145,11 +147,11 @@ def test_a_broken_pixel_is_no_tap(rng, x64):
     history, frame = drawn(rng)
     history[3, 2], history[2, 6] = np.nan, -1.0
     found = recalled(history, frame._replace(motion=np.full((HEIGHT, WIDTH, 2), 0.25)))
-    assert int(found.broken) == 2
+    assert int(found.invalid) == 2
     assert np.isfinite(found.history).all()
     assert found.valid[3, 2]  # from the taps beside it
     still = recalled(history, frame._replace(motion=None))
-    assert int(still.broken) == 2
+    assert int(still.invalid) == 2
     assert not still.valid[3, 2]
     assert not still.valid[2, 6]
 
@@ -159,7 +161,7 @@ def test_the_first_frame_has_none(rng):
     for motion in (None, frame.motion):
         found = recalled(np.full_like(history, np.nan), frame._replace(motion=motion), first=True)
         assert not found.valid.any()
-        assert int(found.broken) == 0
+        assert int(found.invalid) == 0
         np.testing.assert_array_equal(found.history, 0)
 
 

@@ -12,7 +12,7 @@ import jaxdn
 from jaxdn import brdf, color, losses, metrics
 from jaxdn.core import numerics
 from jaxdn.core.frame import FAR, RADIANCE_MAX, Clip, Frame
-from jaxdn.denoiser.sanitize import repair
+from jaxdn.denoiser.sanitize import sanitize
 from jaxdn.materials import glints, microfacets
 from jaxdn.methods.registry import methods
 from jaxdn.networks import pad
@@ -40,7 +40,7 @@ class Subject(NamedTuple):
     """(params, inputs) -> array."""
     begin: Callable[[], Any] = tuple
     """Makes its parameters: by default none."""
-    repairs: bool = False
+    sanitizes: bool = False
     """Its result must always be finite; the others may pass on NaN or infinity of their input."""
     bounds: tuple[float, float] = (-np.inf, np.inf)
     truth: Callable[[Any, Inputs], Any] | None = None
@@ -64,7 +64,7 @@ def denoiser_subjects() -> list[Subject]:
             name,
             _on_clips(denoiser),
             begin,
-            repairs=True,
+            sanitizes=True,
             bounds=(0.0, RADIANCE_MAX),
             pictured=True,
             kind="denoiser",
@@ -130,12 +130,12 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         return softmax_filter(inputs.clip.frames.radiance[-1:], inputs.logits)[0]
 
     def guided_by_features(inputs: Inputs) -> jax.Array:
-        frame = repair(jax.tree.map(lambda buffer: buffer[-1], inputs.clip.frames))[0]
+        frame = sanitize(jax.tree.map(lambda buffer: buffer[-1], inputs.clip.frames))[0]
         features = 20 * jnp.concatenate([frame.albedo, frame.normal], axis=-1)
         return softmax_filter(frame.radiance[None], inputs.logits, features=features)[0]
 
     def by_affinity(inputs: Inputs) -> jax.Array:
-        frame = repair(jax.tree.map(lambda buffer: buffer[-1], inputs.clip.frames))[0]
+        frame = sanitize(jax.tree.map(lambda buffer: buffer[-1], inputs.clip.frames))[0]
         features = 20 * jnp.concatenate([frame.albedo, frame.normal], axis=-1).transpose(2, 0, 1)
         flat = jnp.zeros((3, *features.shape[1:]), features.dtype)
         guide = Guide(features, flat, jnp.ones_like(flat[0]))
@@ -285,16 +285,16 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
 
 
 def operation_subjects() -> list[Subject]:
-    """Every public operation, and the repair of a frame, the first step of every denoiser."""
+    """Every public operation, and the sanitizing of a frame, the first step of every denoiser."""
     pure = [
         Subject(name, lambda params, inputs, run=run: run(inputs), pictured=name in _PICTURED)
         for name, run in _operations().items()
     ]
 
-    def repaired(params: Any, inputs: Inputs) -> jax.Array:
-        return repair(inputs.clip.frames)[0].radiance
+    def sanitized(params: Any, inputs: Inputs) -> jax.Array:
+        return sanitize(inputs.clip.frames)[0].radiance
 
-    mended = Subject("repair", repaired, repairs=True, bounds=(0.0, RADIANCE_MAX), pictured=True)
+    mended = Subject("sanitize", sanitized, sanitizes=True, bounds=(0.0, RADIANCE_MAX), pictured=True)
     return [*pure, mended]
 
 

@@ -150,7 +150,7 @@ def _judge(case: str, subject: Subject, precision: str, direction: str, result: 
     lowest = float(np.min(found[finite], initial=0.0))
     error = None
     # A pure function of infinity saturates at the largest number of its own precision: nothing to compare there.
-    if subject.repairs or not _infinite(inputs):
+    if subject.sanitizes or not _infinite(inputs):
         # Below the smallest normal number XLA:CPU rounds to 0, as most hardware does.
         scale = max(float(np.max(np.abs(truth[both]), initial=0.0)), 1e3 * _LEAST)
         size = min(1.0, float(np.max(np.abs(_leaves(inputs.clip.frames.radiance)), initial=0.0)))
@@ -161,11 +161,11 @@ def _judge(case: str, subject: Subject, precision: str, direction: str, result: 
     bound = ERROR_BOUND["half" if reduced else "single"]
 
     # Not finite in double precision either: it comes from the input or is the true value (an infinite PSNR).
-    excused = np.zeros_like(finite) if subject.repairs else ~representable
+    excused = np.zeros_like(finite) if subject.sanitizes else ~representable
     verdict, reason = "green", ""
     if not np.all(finite | excused):
         verdict, reason = "red", f"{int(np.sum(~finite & ~excused))} values are not finite"
-    elif direction == "gradient" and largest > STEEPEST and subject.repairs:
+    elif direction == "gradient" and largest > STEEPEST and subject.sanitizes:
         verdict, reason = "red", f"a gradient of {largest:.1e}"
     elif direction == "forward" and lowest < subject.bounds[0] - 1e-6:
         verdict, reason = "red", f"{lowest:.3g} is below {subject.bounds[0]:g}"

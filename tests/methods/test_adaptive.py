@@ -10,7 +10,7 @@ import pytest
 
 from jaxdn.core.frame import Clip, Frame, frame_at, only
 from jaxdn.denoiser import Denoiser, State
-from jaxdn.denoiser.rollout import denoise, sampled, unroll
+from jaxdn.denoiser.rollout import denoise, render_requested, unroll
 from jaxdn.methods.dasr import dasr
 from jaxdn.methods.ntasd import ntasd
 from jaxdn.methods.registry import methods
@@ -53,7 +53,7 @@ def counts_of(denoiser: Denoiser, params: Any, clip: Clip) -> list[np.ndarray]:
     """The numbers of samples that each frame was given."""
 
     def step(state: State, frame: Frame, layers: Any) -> Any:
-        given = sampled(denoiser, params, state, frame, layers)
+        given = render_requested(denoiser, params, state, frame, layers)
         return denoiser.step(params, state, given)[0], given.sample_count
 
     state, found = denoiser.start(params, only(frame_at(clip.frames, 0), denoiser.reads)), []

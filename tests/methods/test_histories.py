@@ -165,7 +165,7 @@ def test_broken_history_is_dropped_where_it_is_broken(kind, rng, which):
     after, image = kind.stepped(broken, frames[1])
     assert np.isfinite(image).all()
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after.core))
-    assert int(after.repaired) > int(kind.stepped(state, frames[1])[0].repaired)
+    assert int(after.sanitized) > int(kind.stepped(state, frames[1])[0].sanitized)
 
 
 @pytest.mark.parametrize(

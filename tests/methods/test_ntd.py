@@ -308,7 +308,7 @@ def test_poison_stays_finite_and_is_counted(rng: np.random.Generator, key: jax.A
     first = frame_at(frames, 0)
     broken = first._replace(radiance=first.radiance.at[3, 4].set(jnp.nan))
     state, image = step(params, denoiser.start(params, broken), broken)
-    assert state.repaired == 3
+    assert state.sanitized == 3
     assert np.all(np.isfinite(image))
     state = state._replace(core=state.core.at[2, 2].set(jnp.nan).at[3, 3].set(jnp.inf))
     state, image = step(params, state, first)

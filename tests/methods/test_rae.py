@@ -188,7 +188,7 @@ def test_a_hidden_state_that_overflows_does_not_stay(rng, key):
     broken = state._replace(core=tuple(jnp.full_like(each, value) for each, value in worst))
     kept, image = jax.jit(denoiser.step)(params, broken, first)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((kept.core, image)))
-    assert kept.repaired > 0
+    assert kept.sanitized > 0
 
 
 @pytest.mark.slow

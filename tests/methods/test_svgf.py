@@ -330,7 +330,7 @@ def test_broken_history_is_dropped_where_it_is_broken(rng):
     after, image = STEP({}, broken, frames[1])
     assert np.isfinite(image).all()
     assert np.isfinite(after.core.history).all()
-    assert int(after.repaired) > int(STEP({}, state, frames[1])[0].repaired)
+    assert int(after.sanitized) > int(STEP({}, state, frames[1])[0].sanitized)
 
 
 NEUTRAL = {"albedo": 1.0, "motion": 0.0, "depth": 0.0, "normal": 0.0}

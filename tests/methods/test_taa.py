@@ -231,10 +231,10 @@ def test_what_leaves_the_screen_has_no_history(rng):
 def test_a_broken_history_is_dropped_and_counted(rng):
     frame = Frame(rng.random((5, 6, 3)).astype(np.float32))
     state, _ = run(taa(), [frame])
-    broken = state._replace(core=state.core._replace(history=state.core.history.at[2, 3, 1].set(np.nan)))
-    after, image = taa().step({}, broken, frame)
+    invalid = state._replace(core=state.core._replace(history=state.core.history.at[2, 3, 1].set(np.nan)))
+    after, image = taa().step({}, invalid, frame)
     assert np.isfinite(image).all()
-    assert int(after.repaired) == 1
+    assert int(after.sanitized) == 1
     assert float(after.core.history[2, 3, 3]) == 1.0
 
 
@@ -272,7 +272,7 @@ def test_after_a_denoiser_it_smooths_that_ones_images(rng):
     assert state.core.after.history.shape[-1] == 6
 
 
-def test_after_a_denoiser_its_parameters_samples_and_repairs_stay_its_own(rng):
+def test_after_a_denoiser_its_parameters_samples_and_sanitizing_stay_its_own(rng):
     def step(params, state, frame, first):
         return state + 1, params["gain"] * frame.radiance, 2
 
@@ -292,7 +292,7 @@ def test_after_a_denoiser_its_parameters_samples_and_repairs_stay_its_own(rng):
     np.testing.assert_allclose(images[-1], 3 * np.nan_to_num(frame.radiance), rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(denoiser.samples(params, state, frame, 7), 6)
     # Two frames: 12 values of each, and two that the denoiser before has lost in each.
-    assert int(state.repaired) == 2 * 12 + 2 * 2
+    assert int(state.sanitized) == 2 * 12 + 2 * 2
 
 
 def test_options_that_cannot_be_raise():

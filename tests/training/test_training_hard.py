@@ -11,7 +11,7 @@ import pytest
 from experiments.stability import kills
 from jaxdn.core.frame import RADIANCE_MAX
 from jaxdn.denoiser import Denoiser
-from jaxdn.denoiser.sanitize import repair_image
+from jaxdn.denoiser.sanitize import sanitize_image
 from jaxdn.training.checkpoint import Checkpoints
 from jaxdn.training.log import Log, read_curve
 from jaxdn.training.loop import fit
@@ -26,12 +26,12 @@ clips = test_loop.clips
 
 def test_a_reference_is_bounded_like_the_denoised_image():
     bad = jnp.asarray([np.nan, np.inf, -np.inf, -1.0, 1e30, 0.25], jnp.float32)
-    safe = repair_image(bad)
+    safe = sanitize_image(bad)
     np.testing.assert_array_equal(safe, [0, 0, 0, 0, RADIANCE_MAX, 0.25])
     clip = make_clip(0)
     reference = clip.reference.copy()
     reference.reshape(-1)[: bad.size] = bad
-    mended = clip._replace(reference=np.asarray(repair_image(reference)))
+    mended = clip._replace(reference=np.asarray(sanitize_image(reference)))
     params, objective = {"gain": jnp.full((), 0.1)}, test_loop.RECIPE.objective
     losses = [
         clip_loss(brighter(), params, each, objective)[0] for each in (clip._replace(reference=reference), mended)

@@ -15,7 +15,7 @@ from experiments.papers.preintegration import file_name
 from jaxdn import color
 from jaxdn.clips import read_clip
 from jaxdn.core.frame import Clip, frame_at, only
-from jaxdn.denoiser.rollout import sampled
+from jaxdn.denoiser.rollout import render_requested
 from jaxdn.evaluation.report.images import save_png
 from jaxdn.zoo.ready import Candidate
 
@@ -32,7 +32,7 @@ def counts_of(one: Candidate, clip: Clip) -> jax.Array:
     assert denoiser is not None
 
     def step(state: Any, given: Any) -> tuple[Any, jax.Array]:
-        frame = sampled(denoiser, params, state, *given)
+        frame = render_requested(denoiser, params, state, *given)
         return denoiser.step(params, state, frame)[0], frame.sample_count
 
     frames = only(clip.frames, denoiser.reads)

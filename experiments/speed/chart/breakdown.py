@@ -16,7 +16,7 @@ from jaxdn import brdf, color
 from jaxdn.core.frame import FAR, Frame
 from jaxdn.core.options import make
 from jaxdn.denoiser import Denoiser, Params
-from jaxdn.denoiser.sanitize import repair, repair_image
+from jaxdn.denoiser.sanitize import sanitize, sanitize_image
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods.ntd import guided_features
 from jaxdn.methods.reconstruction import TAPS
@@ -72,7 +72,7 @@ def subjects(denoisers: Sequence[Candidate], *, quick: bool = False) -> Iterator
 def reproject(history: jax.Array, frame: Frame, noisy: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The warped history, with the noisy pixel where it is missing, and a mask of the missing pixels."""
     lost = ~on_screen(frame.dual_motion)
-    return jnp.where(lost, noisy, repair_image(warp(history, frame.dual_motion))), lost
+    return jnp.where(lost, noisy, sanitize_image(warp(history, frame.dual_motion))), lost
 
 
 Images = tuple[jax.Array, ...]
@@ -107,7 +107,7 @@ def breakdown(subject: Subject, frame: Frame, *, rounds: int) -> dict[str, Timin
     network = unet(GROUPS, HEADS, widths=subject.widths, implementation=subject.engine)
 
     def predict(params: Params, frame: Frame, noisy: jax.Array, recalled: jax.Array, lost: jax.Array) -> Any:
-        frame, _ = repair(frame)
+        frame, _ = sanitize(frame)
         known = frame.depth < FAR
         noisy, recalled = fill(noisy, known), fill(recalled, known)
         gain = color.exposure(noisy)

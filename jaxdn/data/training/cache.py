@@ -74,7 +74,7 @@ def open_cached(path: str | Path, *, cache: str | Path | None = None) -> CachedC
     """Open a clip through its cache (default: ``.cache`` next to the clip's folder), which is created if it is missing.
 
     Reference values that are not finite or negative are 0 in the cache, and a UserWarning names the clip and how many
-    there are; noisy images stay as they are, as denoisers repair their own input. Raises ClipError as
+    there are; noisy images stay as they are, as denoisers sanitize their own input. Raises ClipError as
     :func:`jaxdn.clips.read_clip` does, and OSError if the cache cannot be written.
     """
     path = Path(path)

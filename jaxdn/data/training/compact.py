@@ -32,7 +32,7 @@ def encode_light(values: np.ndarray, bits: int = 9) -> np.ndarray:
     ``mantissa_c * 2^(exponent - 15 - bits)``, mantissas in the lowest bits (red first), the exponent (5 bits) above.
     The error of each channel is at most 2^-bits of the largest one, and at most 2^-(16 + bits) for small light. With
     fewer bits each mantissa has a byte of its own. Values that are negative or not finite are 0 (as in
-    :func:`jaxdn.denoiser.sanitize.repair`), those beyond ``2^16 (1 - 2^-bits)``, for RGB9E5 65408, are clamped.
+    :func:`jaxdn.denoiser.sanitize.sanitize`), those beyond ``2^16 (1 - 2^-bits)``, for RGB9E5 65408, are clamped.
     """
     values = np.clip(np.where(np.isfinite(values), values, 0), 0, 2.0**16 * (1 - 2.0**-bits)).astype(np.float32)
     largest = values.max(axis=-1)

@@ -17,8 +17,8 @@ import jax.numpy as jnp
 
 from jaxdn import brdf
 from jaxdn.core.frame import FAR, Frame
-from jaxdn.denoiser.statistics import Whole
-from jaxdn.filters.surface_test import depth_slopes, hit_mask
+from jaxdn.denoiser.statistics import FrameStatistics
+from jaxdn.filters.surface_test import depth_slopes, surface_mask
 from jaxdn.methods.steady import lighting_change, regression
 from jaxdn.methods.steady.accumulation import Shown
 from jaxdn.networks import pad
@@ -81,7 +81,7 @@ def surfaces_of(frame: Frame) -> Surfaces:
     reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
     both = frame.albedo is not None and frame.reflectance is not None
     gloss = jnp.mean(frame.reflectance - frame.albedo, axis=-1, keepdims=True) if both else nothing[..., :1]
-    hit = hit_mask(frame.depth, frame.ids)
+    hit = surface_mask(frame.depth, frame.ids)
     hit = jnp.ones((height, width), bool) if hit is None else hit
     return Surfaces(
         pad(nothing if reflectance is None else reflectance - 1.0, BLOCKS),
@@ -94,13 +94,13 @@ def surfaces_of(frame: Frame) -> Surfaces:
     )
 
 
-def slanted(surfaces: Surfaces, whole: Whole) -> jax.Array:
+def slanted(surfaces: Surfaces, whole: FrameStatistics) -> jax.Array:
     """[3, H, W] inverse depth relative to its mean, which is affine on planes, and its slopes; 0 without a surface."""
     depth = surfaces.depth
     if depth is None:
         return jnp.zeros((3, *surfaces.hit.shape), surfaces.normal.dtype)
     known = (depth > 0) & (depth < FAR)
-    inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0) / whole.middle_inverse
+    inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0) / whole.mean_inverse_depth
     return jnp.stack([inverse[..., 0], *depth_slopes(inverse, None)])
 
 

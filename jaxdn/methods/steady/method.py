@@ -27,8 +27,8 @@ import numpy as np
 from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.denoiser.statistics import Whole, measured
-from jaxdn.filters.reproject import recall
+from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
+from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, depth_feature, guides_of
 from jaxdn.methods.demodulation import Demodulation, demodulated, texture_left
 from jaxdn.methods.registry import method
@@ -144,10 +144,10 @@ def steady(options: Options) -> Denoiser:
         return SteadyState(nothing, jax.tree.map(jnp.zeros_like, guides_of(frame)))
 
     def step(
-        params: Params, state: SteadyState, frame: Frame, first: jax.Array, whole: Whole
+        params: Params, state: SteadyState, frame: Frame, first: jax.Array, whole: FrameStatistics
     ) -> tuple[SteadyState, jax.Array, jax.Array]:
         size = frame.radiance.shape[:2]
-        recalled = recall(state.history, state.guides, frame, first)
+        recalled = reproject(state.history, state.guides, frame, first)
         surfaces = surfaces_of(frame)
         past = History(pad(recalled.history, BLOCKS), pad(recalled.valid, BLOCKS)[..., 0])
         hit, known = surfaces.hit, _known(frame, surfaces)
@@ -166,11 +166,11 @@ def steady(options: Options) -> Denoiser:
         kept = remembered(mean, found, past, shares["feedback"], shares["blend"], most=RADIANCE_MAX)
         history = crop(kept, size)
         image = jnp.where(crop(hit, size)[..., None], history[..., 5:], frame.radiance)
-        return SteadyState(history, guides_of(frame)), image, recalled.broken
+        return SteadyState(history, guides_of(frame)), image, recalled.invalid
 
-    def measure(frame: Frame) -> Whole:
+    def measure(frame: Frame) -> FrameStatistics:
         surfaces = surfaces_of(frame)
-        return measured(_noisy(frame, _known(frame, surfaces)), surfaces.depth, frame)
+        return measure_frame(_noisy(frame, _known(frame, surfaces)), surfaces.depth, frame)
 
     network_sees = 2 * description.reach(description.unet(1, heads, widths=quality.widths, head_size=1))
     far = reach(quality.full_levels, back=quality.back, at_once=quality.at_once)
@@ -190,10 +190,10 @@ def _noisy(frame: Frame, known: jax.Array) -> jax.Array:
     return fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), BLOCKS), known[..., None])
 
 
-def _seen(noisy: jax.Array, past: History, surfaces: Surfaces, whole: Whole) -> jax.Array:
+def _seen(noisy: jax.Array, past: History, surfaces: Surfaces, whole: FrameStatistics) -> jax.Array:
     """What the network sees: light at one brightness (:func:`jaxdn.color.exposure`), and depth of any unit."""
     depth = surfaces.depth
-    closeness = jnp.zeros_like(noisy[..., :1]) if depth is None else depth_feature(depth, middle=whole.middle_depth)
+    closeness = jnp.zeros_like(noisy[..., :1]) if depth is None else depth_feature(depth, middle=whole.mean_depth)
     geometry = surfaces.albedo, surfaces.normal, closeness, surfaces.roughness
     return seen(geometry, noisy, past, surfaces.hit, whole.exposure, multiple=_MULTIPLE)
 

@@ -16,7 +16,7 @@ from jaxdn.filters.accumulation import luminance
 from jaxdn.filters.clamping import clamp_to_fast, contradiction
 from jaxdn.filters.edge_stopping import Weight, depth_weight, lobe_weight, normal_weight, roughness_weight
 from jaxdn.filters.history_fix import fix_history
-from jaxdn.filters.surface_test import Guides, guides_of, hit_mask
+from jaxdn.filters.surface_test import Guides, guides_of, surface_mask
 from jaxdn.filters.virtual_motion import diffuseness
 from jaxdn.methods.demodulation import Demodulation
 from jaxdn.methods.learnable_options import LEARNED
@@ -126,7 +126,7 @@ def step(
         depth_tolerance=options.depth_tolerance,
         normal_threshold=options.normal_threshold,
     )
-    hit = hit_mask(frame.depth, frame.ids)
+    hit = surface_mask(frame.depth, frame.ids)
     equal = [] if hit is None else [hit]
     if frame.ids is not None:
         equal.append(frame.ids[..., 0])
@@ -143,7 +143,7 @@ def step(
         kept = kept._replace(specular=planes.transpose(1, 2, 0))
     if hit is not None:
         image = jnp.where(hit[..., None], image, frame.radiance)
-    return kept, image, past.broken
+    return kept, image, past.invalid
 
 
 def _roughness(frame: Frame) -> jax.Array:

@@ -96,8 +96,8 @@ def reblur(options: Options) -> Denoiser:
         def one(kind: Kind) -> tuple[jax.Array, jax.Array]:
             return _denoised(fitted, kind, near, number)
 
-        light, image, broken = histories.step(fitted, one, state.light, frame, first, length_plane=_LENGTH)
-        return ReblurState(light, number + 1), image, broken
+        light, image, invalid = histories.step(fitted, one, state.light, frame, first, length_plane=_LENGTH)
+        return ReblurState(light, number + 1), image, invalid
 
     return recurrent(Core(start, step, READS | {"hit_distance"}, lambda key, frame: unmoved(options)))
 
