@@ -1,6 +1,6 @@
 """The settings of every test: strict broadcasting, full float32 precision, fixed seeds, a compilation cache.
 
-Markers: ``slow`` (more than 10 s), ``browser`` (needs Chromium through Playwright).
+Markers: ``slow`` (more than 10 s), ``browser`` (opens a page in one), ``needs("llvm")`` (:mod:`tests.needs`).
 """
 
 import gc
@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.compiling import FLAGS
+from tests.needs import require
 
 hypothesis.settings.register_profile(
     "jaxdn",
@@ -26,9 +27,6 @@ hypothesis.settings.load_profile("jaxdn")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "slow: takes more than ten seconds")
-    config.addinivalue_line("markers", "browser: needs Chromium through Playwright")
-
     # [3] against [H, W, 3] has to be written out: silent broadcasting hides a swapped axis.
     jax.config.update("jax_numpy_rank_promotion", "raise")
     # NVIDIA devices compute float32 products as TF32 by default; the references here are float64.
@@ -37,6 +35,11 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_compilation_cache_dir", str(config.rootpath / ".pytest_cache" / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
     _compile_quickly()
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    for mark in item.iter_markers("needs"):
+        require(*mark.args)
 
 
 def _compile_quickly() -> None:

@@ -11,6 +11,7 @@ from jaxdn.ops.dispatch.registry import implementations, resolve
 from jaxdn.ops.kernel_prediction.apply import apply_kernels
 from jaxdn.ops.kernel_prediction.softmax import softmax_filter
 from jaxdn.ops.warp import warp
+from tests.needs import NEEDS
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -166,14 +167,14 @@ def runnable(op):
 
 
 CASES = [
-    (case, name)
+    pytest.param(case, name, marks=[pytest.mark.needs(name)] if name in NEEDS else [])
     for op, cases in {
         "warp": ("warp_clamp", "warp_zeros"),
         "apply_kernels": ("apply_kernels_1", "apply_kernels_25"),
         "convolution": ("convolution_2_3", "convolution_3_2"),
     }.items()
     for case in cases
-    for name in runnable(op)
+    for name in implementations(op)
 ]
 
 

@@ -27,7 +27,7 @@ from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.layout.planar import planes_of
 from jaxdn.ops.scales import fill
 
-pytestmark = pytest.mark.skipif(not numba_call.available(), reason="no Numba, or jax computes on another device")
+pytestmark = pytest.mark.needs("numba")
 
 
 @pytest.fixture

@@ -321,9 +321,9 @@ def number_of_programs():
 
 
 @pytest.mark.slow
+@pytest.mark.needs("mitsuba")
 def test_a_quick_chart_and_resuming_it(tmp_path, monkeypatch, capsys):
     """From the command line to the page, of a filter, shipped weights and new ones: others differ in their step."""
-    pytest.importorskip("mitsuba")
     monkeypatch.setattr(chart, "chosen", lambda **how: [each for each in chosen(**how) if each.label in DRAWN])
     programs, breakdowns = [], chart.Run.breakdowns
     monkeypatch.setattr(chart.Run, "breakdowns", lambda run: (programs.append(number_of_programs()), breakdowns(run)))

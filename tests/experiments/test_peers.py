@@ -13,14 +13,10 @@ from jaxdn.denoisers import ntd
 from jaxdn.methods.registry import method_named
 from jaxdn.ops.warp import warp
 from jaxdn.training.step import clip_loss, initial_state
+from tests.needs import require
 
 TINY = ((4,), (4,), (5,), (5,), (6,))
 RECIPE = method_named("ntd").recipe_named(None)._replace(decay=False)
-
-
-def skip_without(package: str) -> None:
-    if package in peers.missing():
-        pytest.skip(peers.missing()[package])
 
 
 def double(tree):
@@ -41,7 +37,7 @@ def relative(a, b):
 
 
 def test_pytorch_gives_the_same_images(key, x64):
-    skip_without("torch")
+    require("torch")
     import torch
 
     from experiments.speed.peers import pytorch
@@ -64,7 +60,7 @@ def test_pytorch_gives_the_same_images(key, x64):
 
 
 def test_pytorch_has_the_same_loss_and_gradients(key, x64):
-    skip_without("torch")
+    require("torch")
     from experiments.speed.peers.pytorch_training import Trainer, batch_tensors
     from experiments.speed.peers.pytorch_training import clip_loss as peer_loss
 
@@ -93,7 +89,7 @@ def test_pytorch_has_the_same_loss_and_gradients(key, x64):
 
 
 def test_pytorch_trains():
-    skip_without("torch")
+    require("torch")
     from experiments.speed.works import train_steps
 
     recipe = RECIPE._replace(batch=1, frames=2)
@@ -103,7 +99,7 @@ def test_pytorch_trains():
 
 
 def test_pytorch_warps_off_screen_as_jaxdn_does(rng):
-    skip_without("torch")
+    require("torch")
     from experiments.speed.peers import pytorch
 
     image = rng.exponential(size=(9, 12, 3)).astype(np.float32)
@@ -114,7 +110,7 @@ def test_pytorch_warps_off_screen_as_jaxdn_does(rng):
 
 @pytest.mark.parametrize("quality", ["high", "balanced", "fast"])
 def test_open_image_denoise_removes_noise(quality, rng):
-    skip_without("pyoidn")
+    require("pyoidn")
     from experiments.speed.peers.oidn import oidn
 
     clean = np.full((48, 64, 3), (2.0, 1.0, 0.5), np.float32)
@@ -128,7 +124,7 @@ def test_open_image_denoise_removes_noise(quality, rng):
 
 
 def test_open_image_denoise_says_what_it_expects():
-    skip_without("pyoidn")
+    require("pyoidn")
     from experiments.speed.peers.oidn import oidn
 
     with pytest.raises(ValueError, match="balanced"):
@@ -150,7 +146,7 @@ def test_missing_peers_are_reported(monkeypatch):
 
 
 def test_open_image_denoise_runs_a_clip_as_any_denoiser_does(rng):
-    skip_without("pyoidn")
+    require("pyoidn")
     from experiments.speed.peers.oidn import frame_by_frame, oidn
 
     frames = Frame(

@@ -1,7 +1,6 @@
 """Exported steps run by others: ONNX Runtime, StableHLO without its Python code, and the example in C++."""
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -23,12 +22,13 @@ from jaxdn.denoiser.rollout import stream
 from jaxdn.export.formats import onnx_model
 from jaxdn.export.step import Step
 from jaxdn.zoo.ready import candidate
+from tests.needs import require, require_module
 from tests.training.test_training import make_clip
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
-pytest.importorskip("onnx")
-onnxruntime = pytest.importorskip("onnxruntime")
+require("onnx")
+onnxruntime = require_module("onnxruntime")
 
 EXAMPLE = Path(__file__).parents[2] / "examples/cpp/denoise.cpp"
 
@@ -206,16 +206,9 @@ def test_what_cannot_be_exported_is_an_error_that_says_what_to_do(tmp_path, caps
 
 
 def compiled(folder):
-    """The example; skips where there is no compiler, or no headers of ONNX Runtime and OpenEXR."""
-    if shutil.which("g++") is None or shutil.which("pkg-config") is None:
-        pytest.skip("no g++ or no pkg-config")
-    flags = subprocess.run(["pkg-config", "--cflags", "--libs", "OpenEXR"], capture_output=True, text=True, check=False)
-    if flags.returncode:
-        pytest.skip("no headers of OpenEXR (libopenexr-dev)")
-    headers = "#include <onnxruntime_cxx_api.h>\n"
-    probe = subprocess.run(["g++", "-E", "-xc++", "-"], input=headers, capture_output=True, text=True, check=False)
-    if probe.returncode:
-        pytest.skip("no headers of ONNX Runtime: set CPATH to the folder of onnxruntime_cxx_api.h")
+    """The example."""
+    require("g++", "headers of OpenEXR", "headers of ONNX Runtime")
+    flags = subprocess.run(["pkg-config", "--cflags", "--libs", "OpenEXR"], capture_output=True, text=True, check=True)
     library = next((Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so.*"))
     for name in ("libonnxruntime.so", "libonnxruntime.so.1"):
         (folder / name).symlink_to(library)

@@ -26,6 +26,7 @@ from jaxdn.recipes.recipe import Recipe
 from jaxdn.sequence.run import candidate_on
 from jaxdn.zoo.weights import save_weights
 from tests.methods.test_ntd import TINY
+from tests.needs import require
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -367,8 +368,8 @@ def test_a_learned_method_needs_weights(toy):
 
 @pytest.mark.parametrize(("installed", "engine"), [(True, "onnxruntime"), (False, "reference")])
 def test_weights_of_a_network_run_on_the_available_engine(installed, engine, monkeypatch, tmp_path):
-    if installed and not ENGINES["onnxruntime"].available():
-        pytest.skip("onnxruntime is not installed")
+    if installed:
+        require("onnxruntime")
     engines(monkeypatch, onnxruntime=installed, onednn=True)
     denoiser = jaxdn.denoisers.ntd(size=TINY, kernels="plain")
     params = denoiser.init(jax.random.key(0), Frame(jnp.ones((16, 16, 3))))

@@ -16,7 +16,7 @@ from tests.render.vector_scenes import FAST, Places, floor, look
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.skipif(FAST == "scalar_rgb", reason="only vectorised variants tell light apart"),
+    pytest.mark.needs("llvm"),  # only vectorised variants tell light apart
 ]
 
 FRAMES = 8

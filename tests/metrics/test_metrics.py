@@ -10,6 +10,7 @@ from jax.test_util import check_grads
 
 from jaxdn import metrics
 from jaxdn.metrics.flip import flip_map
+from tests.needs import require_module
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -106,7 +107,7 @@ def test_temporal_psnr_is_infinite_without_change(rng: np.random.Generator) -> N
 
 
 def structural_similarity(x: np.ndarray, y: np.ndarray, **options) -> float:
-    skimage = pytest.importorskip("skimage.metrics", reason="the oracle is scikit-image")
+    skimage = require_module("skimage.metrics")  # the oracle
     return skimage.structural_similarity(
         x, y, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1, channel_axis=-1, **options
     )
@@ -154,7 +155,7 @@ def test_ssim_of_a_small_image_uses_the_largest_odd_window(rng: np.random.Genera
 
 
 def evaluator_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    evaluator = pytest.importorskip("flip_evaluator", reason="the oracle is the authors' flip-evaluator")
+    evaluator = require_module("flip_evaluator")  # the oracle, by the authors
     return evaluator.evaluate(reference, image, "LDR", applyMagma=False)[0].reshape(*image.shape[:2], 1)
 
 

@@ -11,14 +11,16 @@ from jaxdn.networks.engines import ENGINES
 from jaxdn.networks.unet import unet
 from jaxdn.ops.onednn import layers
 from jaxdn.ops.onednn import library as dnnl
+from tests.needs import require
 
 WIDTHS = ((16,), (24,), (32,), (32,), (32,))
 
 
 @pytest.fixture(params=[onednn.FLOAT32, onednn.BFLOAT16], ids=lambda each: each.engine, scope="module")
 def precision(request):
-    if not ENGINES[request.param.engine].available():
-        pytest.skip("no oneDNN, or a CPU without bfloat16")
+    require("onednn")
+    if request.param is onednn.BFLOAT16:
+        require("bfloat16")
     return request.param
 
 

@@ -1,7 +1,5 @@
 """The U-Net against a NumPy one, and its guarantees: plain dicts, fixed shapes, absent groups at a lower cost."""
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,8 +9,8 @@ import pytest
 from jaxdn.networks import LARGE, LEVELS, SMALL, description, onnx
 from jaxdn.networks.description import FEATURES, NEGATIVE_SLOPE, Description, Layer
 from jaxdn.networks.unet import XLA, Network, by_xla, count, unet
-from jaxdn.ops.onednn import library
 from jaxdn.zoo.weights import flatten, load_weights
+from tests.needs import require
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -199,8 +197,8 @@ OTHER = Description(
 
 @pytest.mark.parametrize("engine", ["xla", "onnxruntime"])
 def test_every_engine_runs_whatever_network_is_described(engine: str, rng: np.random.Generator) -> None:
-    if engine == "onnxruntime" and not onnx.available():
-        pytest.skip("onnxruntime is not installed")
+    if engine == "onnxruntime":
+        require("onnxruntime")
     weights = {
         name: {"kernel": 0.2 * rng.normal(size=shape), "bias": rng.normal(size=shape[3:])}
         for name, shape in OTHER.kernels().items()
@@ -219,13 +217,12 @@ def test_every_engine_runs_whatever_network_is_described(engine: str, rng: np.ra
 
 
 @pytest.mark.parametrize("absent", [(), (1, 3)])
-@pytest.mark.parametrize(("name", "installed"), [("onnxruntime", onnx.available), ("onednn", library.available)])
+@pytest.mark.parametrize("name", ["onnxruntime", "onednn"])
 def test_an_engine_runs_the_same_network(
-    name: str, installed: Callable[[], bool], absent: tuple[int, ...], rng: np.random.Generator, key: jax.Array
+    name: str, absent: tuple[int, ...], rng: np.random.Generator, key: jax.Array
 ) -> None:
     """Values of the engine and its gradient, with all features and without some."""
-    if not installed():
-        pytest.skip(f"{name} is not installed")
+    require(name)
     plain, engine = (unet(GROUPS, HEADS, widths=TINY, implementation=each) for each in (None, name))
     params = jax.tree.map(lambda leaf: leaf + 0.01, plain.init(key))
     inputs = [None if index in absent else group for index, group in enumerate(features(rng, GROUPS))]
@@ -243,7 +240,7 @@ def test_an_engine_runs_the_same_network(
 
 def test_onnxruntime_follows_the_weights_under_scan_and_vmap(rng: np.random.Generator, key: jax.Array) -> None:
     """The engine keeps weights in its own layout; new weights in the next call give the new image."""
-    pytest.importorskip("onnxruntime")
+    require("onnxruntime")
     plain, engine = (unet((3, 2), (5, 3, 2), widths=TINY, implementation=name) for name in (None, "onnxruntime"))
     inputs = [jnp.stack([group, 2 * group]) for group in features(rng, (3, 2))]
     run = jax.jit(engine.apply)
@@ -260,7 +257,7 @@ def test_onnxruntime_follows_the_weights_under_scan_and_vmap(rng: np.random.Gene
 
 
 def test_onnxruntime_takes_only_float32(rng: np.random.Generator, key: jax.Array) -> None:
-    pytest.importorskip("onnxruntime")
+    require("onnxruntime")
     network = unet((3, 2), (5, 3, 2), widths=TINY, implementation="onnxruntime")
     inputs = [group.astype(jnp.bfloat16) for group in features(rng, (3, 2))]
     with pytest.raises(ValueError, match="float32"):

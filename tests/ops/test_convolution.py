@@ -12,7 +12,7 @@ from jax.test_util import check_grads
 from jaxdn.ops.convolution.api import convolve
 from jaxdn.ops.onednn import library
 
-needs_onednn = pytest.mark.skipif(not library.available(), reason="the extra onednn is not installed")
+needs_onednn = pytest.mark.needs("onednn")
 
 
 def _operands(inputs, outputs, size=(5, 6), count=2, dtype=jnp.float32):

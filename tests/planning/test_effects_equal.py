@@ -18,6 +18,7 @@ from jaxdn.data.clip.folder import frame_path, is_clip, read_record
 from jaxdn.methods.registry import methods
 from jaxdn.render.clip import render_clip
 from jaxdn.render.scenes.scene_file import SceneFile
+from tests.needs import require_module
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -49,7 +50,7 @@ def rendered(case, folder):
 @pytest.fixture(scope="session")
 def clips(tmp_path_factory):
     """The two clips of a room by its name, rendered once for all tests, and for all processes of pytest-xdist."""
-    fcntl = pytest.importorskip("fcntl")
+    fcntl = require_module("fcntl")
     base = tmp_path_factory.getbasetemp()
     place = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "rooms"
     place.mkdir(exist_ok=True)

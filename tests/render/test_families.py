@@ -10,6 +10,7 @@ from jaxdn.render.families import FAMILIES, family_scene, furniture, shapes, tex
 from jaxdn.render.families.staging import Stage, glass, look_at, matte, rod, scale, shift, shuttle, turn
 from jaxdn.render.opening import scene_from_record
 from jaxdn.render.scenes.scene import AnimatedScene, Camera, brightness
+from tests.needs import require_module
 
 NAMES = sorted(FAMILIES)
 SEEDS = (0, 1, 7)
@@ -18,7 +19,7 @@ SEEDS = (0, 1, 7)
 @pytest.fixture
 def mitsuba() -> Any:
     """Mitsuba in its scalar variant, which runs everywhere; the variant that was active is put back."""
-    mi = pytest.importorskip("mitsuba")
+    mi = require_module("mitsuba")
     before = mi.variant()
     mi.set_variant("scalar_rgb")
     yield mi

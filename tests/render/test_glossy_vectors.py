@@ -6,9 +6,9 @@ import pytest
 from jaxdn.render.buffers.geometry import project
 from jaxdn.render.buffers.glossy_vectors import ROUGHEST
 from tests.render.render_scenes import grey, shift
-from tests.render.vector_scenes import FAST, HEIGHT, WIDTH, Places, floor, look, rendered
+from tests.render.vector_scenes import HEIGHT, WIDTH, Places, floor, look, rendered
 
-needs_fast = pytest.mark.skipif(FAST == "scalar_rgb", reason="only vectorised variants sample lobes")
+needs_fast = pytest.mark.needs("llvm")  # only vectorised variants sample lobes
 
 MIRROR = {"type": "conductor"}
 LAMP = {

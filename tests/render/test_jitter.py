@@ -24,7 +24,7 @@ from tests.render.render_scenes import HEIGHT, SQUARE_Z, WIDTH, Stage, shift, tu
 
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
 FAST = choose_variant().variant
-pytestmark = pytest.mark.skipif(FAST.startswith("scalar"), reason="only scalar_rgb works on this machine")
+pytestmark = pytest.mark.needs("llvm")
 
 
 def test_offsets_repeat_and_spread_over_the_pixel():

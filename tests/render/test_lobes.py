@@ -25,7 +25,7 @@ USUAL = ON_REQUEST - OF_SHADOWS
 READER = jaxdn.denoisers.svgf()._replace(reads=frozenset(GUIDES))
 """Reads every buffer."""
 
-needs_fast = pytest.mark.skipif(FAST == "scalar_rgb", reason="only vectorised variants tell lobes apart")
+needs_fast = pytest.mark.needs("llvm")  # only vectorised variants tell lobes apart
 
 MIRROR = {"type": "conductor"}
 METAL = {"type": "roughconductor", "alpha": 0.2, "distribution": "ggx"}

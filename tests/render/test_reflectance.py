@@ -20,7 +20,7 @@ NAMES = (
     *("bumpmap", "normalmap", "twosided", "dielectric", "thindielectric", "roughdielectric"),
 )
 AVERAGED = {name for name in NAMES if "textured" in name or "anisotropic" in name or name in ("bumpmap", "normalmap")}
-needs_fast = pytest.mark.skipif(FAST == "scalar_rgb", reason="scalar_rgb takes minutes")
+needs_fast = pytest.mark.needs("llvm")  # scalar_rgb takes minutes
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from jaxdn.zoo.weights import save_weights
 from tests.render.render_scenes import HEIGHT, WIDTH, Stage, fast_variants
 
 VECTORISED = [variant for variant in fast_variants() if not variant.startswith("scalar")]
-pytestmark = pytest.mark.skipif(not VECTORISED, reason="scalar variants render whole images only")
+pytestmark = pytest.mark.needs("llvm")  # scalar variants render whole images only
 
 TINY = ((4,), (4,), (5,), (5,), (6,))
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}

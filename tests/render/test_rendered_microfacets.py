@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxdn.materials import microfacets
+from tests.needs import require_module
 
 ETA, K = 0.2, 3.9
 
@@ -13,7 +14,7 @@ ETA, K = 0.2, 3.9
 @pytest.fixture
 def mitsuba() -> Any:
     """Mitsuba in its scalar variant; the variant that was active is put back."""
-    mi = pytest.importorskip("mitsuba")
+    mi = require_module("mitsuba")
     before = mi.variant()
     mi.set_variant("scalar_rgb")
     yield mi

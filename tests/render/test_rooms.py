@@ -11,8 +11,9 @@ from jaxdn.render.mitsuba.variant import choose_variant
 from jaxdn.render.opening import scene_from_record
 from jaxdn.render.scenes.animation import check_animation
 from jaxdn.render.scenes.scene_file import SceneFile
+from tests.needs import require_module
 
-mi = pytest.importorskip("mitsuba")
+mi = require_module("mitsuba")
 
 FRAMES = 6
 SEEDS = range(3)

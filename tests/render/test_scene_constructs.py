@@ -7,9 +7,10 @@ import pytest
 
 from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.scene_file import SceneFile
+from tests.needs import require_module
 from tests.render.render_scenes import fast_variants
 
-mi = pytest.importorskip("mitsuba")
+mi = require_module("mitsuba")
 
 WIDTH, HEIGHT, DEPTH = 24, 16, 4
 

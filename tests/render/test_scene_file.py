@@ -10,8 +10,9 @@ import pytest
 from jaxdn.render.scenes.animation import RigidKeys, rotation_matrix, slerp
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.scenes.scene_file import SceneFile
+from tests.needs import require_module
 
-mi = pytest.importorskip("mitsuba")
+mi = require_module("mitsuba")
 
 OLD = """<scene version="0.6.0">
   <default name="angle" value="50"/>

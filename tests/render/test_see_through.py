@@ -24,7 +24,7 @@ from tests.render.render_scenes import HEIGHT, SQUARE_Z, WIDTH, Stage, grey, shi
 
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
 FAST = choose_variant().variant
-pytestmark = pytest.mark.skipif(FAST.startswith("scalar"), reason="only scalar_rgb works on this machine")
+pytestmark = pytest.mark.needs("llvm")
 
 MIRROR_Z = 2.0
 FACE = np.diag([-1.0, 1.0, -1.0, 1.0])

@@ -15,7 +15,7 @@ from jaxdn.render.frame import render_frame
 from tests.render.render_scenes import grey, shift
 from tests.render.vector_scenes import FAST, HEIGHT, WIDTH, Places, floor, look, rendered
 
-needs_fast = pytest.mark.skipif(FAST == "scalar_rgb", reason="only vectorised variants tell light apart")
+needs_fast = pytest.mark.needs("llvm")  # only vectorised variants tell light apart
 
 RADIUS = 0.6
 BALL, LAMP = np.array([0.0, 1.5, 0.0]), np.array([0.5, 5.0, 0.3])
