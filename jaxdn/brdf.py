@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxdn.core.checks import check_image, check_option, check_same_size
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.inference_path import alone
+from jaxdn.ops.dispatch.operation import operation
 
 Lobe = Literal["ggx", "ggx-correlated", "beckmann"]
 """GGX with Smith's separable shadowing (as in Mitsuba) or the height-correlated one, Beckmann (separable)."""
@@ -223,22 +223,18 @@ def _largest(colour: jax.Array) -> jax.Array:
     return jnp.maximum(jnp.maximum(red, green), blue)
 
 
+@operation
 def texture_or_hue(reflectance: jax.Array, light: jax.Array, hue: jax.Array) -> jax.Array:
     """The texture [H, W, 3] that dividing ``light`` by :func:`divisor` leaves of a reflectance, or its colour alone.
 
     :func:`texture_left` where ``hue``, a bool scalar, is false, else :func:`hue_left` of it.
     """
-    if numba_call.available() and reflectance.dtype == light.dtype == jnp.float32:
-        return alone(_texture_or_hue, _texture_by_compiled)(reflectance, light, hue)
-    return _texture_or_hue(reflectance, light, hue)
-
-
-def _texture_or_hue(reflectance: jax.Array, light: jax.Array, hue: jax.Array) -> jax.Array:
     texture = texture_left(reflectance, divisor(reflectance), light)
     return jnp.where(hue, hue_left(texture), texture)
 
 
-def _texture_by_compiled(reflectance: jax.Array, light: jax.Array, hue: jax.Array) -> jax.Array:
+@numba_call.implements(texture_or_hue)
+def _texture_or_hue_by_numba(reflectance: jax.Array, light: jax.Array, hue: jax.Array) -> jax.Array:
     from jaxdn.materials.numba_brdf import texture
 
     numbers = (np.float32(number) for number in (FLOOR, (1 + FLOOR**4) ** -0.25, _BLACK, _FAINT))

@@ -47,7 +47,7 @@ def _fast_variant() -> bool:
 def _numba() -> bool:
     from jaxdn.ops.dispatch import numba_call
 
-    return numba_call.available()
+    return not numba_call.unavailable()
 
 
 def _onednn() -> bool:

@@ -28,6 +28,7 @@ from experiments.speed.works.steps import frame_of, oidn_high, recurrent
 from jaxdn.commands.errors import plain_errors
 from jaxdn.networks.engines import ENGINES
 from jaxdn.ops.dispatch import numba_call
+from jaxdn.ops.dispatch.operation import REFERENCE, VARIABLE
 from jaxdn.runtime.atomic_files import write_json
 from jaxdn.runtime.malloc import keep_memory
 from jaxdn.zoo.ready import candidate
@@ -50,11 +51,11 @@ class Settings:
 def ours(name: str, engine: str | None, height: int, width: int, *, compiled: bool = True) -> Call:
     """The compiled step of a method, with its own state, on an engine; None is XLA.
 
-    To be called once in a process. Without ``compiled`` no loops compiled by Numba are used.
+    To be called once in a process. Without ``compiled`` every operation is its reference.
     """
     keep_memory()
     if not compiled:
-        os.environ["JAXDN_COMPILED"] = "0"
+        os.environ[VARIABLE] = REFERENCE
     found, frame = candidate(name, **({} if engine is None else {"implementation": engine})), frame_of(height, width)
     assert found.denoiser is not None
     return recurrent(found.denoiser, found.params, frame)
@@ -73,8 +74,8 @@ def builds(names: list[str], height: int, width: int) -> dict[str, Callable[[], 
         engines = [each for each in one.method.engines if ENGINES[each].purpose == "inference"]
         for engine in [None, *(each for each in engines if ENGINES[each].available())]:
             found[f"{name}, {engine or 'xla'}"] = partial(ours, name, engine, height, width)
-        if numba_call.available():
-            found[f"{name}, xla without compiled loops"] = partial(ours, name, None, height, width, compiled=False)
+        if not numba_call.unavailable():
+            found[f"{name}, reference"] = partial(ours, name, None, height, width, compiled=False)
     return found
 
 

@@ -5,7 +5,6 @@
 Memory is kept between calls as in `jaxdn denoise`. Prints a table of the medians in milliseconds.
 """
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -32,10 +31,11 @@ from jaxdn.methods.steady.levels import LEVELS
 from jaxdn.methods.steady.method import BEGIN, FEATURES, HALF_FEATURES, decisions
 from jaxdn.methods.steady.network_input import History, seen
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
-from jaxdn.ops.affinity.joint_upsample import enlarge
+from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.layout.planar import planes_of
-from jaxdn.ops.scales import fill
+from jaxdn.ops.dispatch.operation import implementation
+from jaxdn.ops.layout.planar import join_planes
+from jaxdn.ops.scales import fill_holes
 from jaxdn.runtime.malloc import keep_memory
 
 Work = tuple[Callable[..., Any], tuple[Any, ...]]
@@ -72,7 +72,10 @@ def works(height: int, width: int) -> dict[str, Work]:
     layouts, learned = ("pixels", "pixels", "blocks"), noise(*half, 20)
     return {
         "a level of the affinity filter, 13 channels, 12 features": (affinity_filter, (image, guide((height, width)))),
-        "16 channels enlarged along 12 features": (enlarge, (noise(16, *half), guide(half), guide((height, width)))),
+        "16 channels enlarged along 12 features": (
+            joint_bilateral_upsample,
+            (noise(16, *half), guide(half), guide((height, width))),
+        ),
         "the history reprojected, 8 channels": (
             reproject,
             (history.values, guides_of(frame), frame, jnp.asarray(False)),
@@ -87,25 +90,25 @@ def works(height: int, width: int) -> dict[str, Work]:
         "single bright pixels": (dimmed, (image[:3], hit, Mean(image[3:6], image[6], image[7], image[:3]))),
         "what light follows": (regression.given_back, (scales, image, image + 0.1, hit, gain)),
         "11 channels as planes": (
-            lambda *arrays: planes_of(list(zip(layouts, arrays, strict=True))),
+            lambda *arrays: join_planes(list(zip(layouts, arrays, strict=True))),
             (albedo, normal, learned),
         ),
-        "unknown pixels filled": (fill, (light, hit[..., None])),
+        "unknown pixels filled": (fill_holes, (light, hit[..., None])),
     }
 
 
 def call(work: Work, *, loops: bool) -> Call:
     """The jitted function, with or without loops."""
-    os.environ["JAXDN_COMPILED"] = "1" if loops else "0"
     function, arguments = work
-    program = jax.jit(lambda *given: function(*given)).lower(*arguments).compile()
+    with implementation("auto" if loops else "reference"):
+        program = jax.jit(lambda *given: function(*given)).lower(*arguments).compile()
     return lambda: jax.block_until_ready(program(*arguments))
 
 
 def main(settings: Settings) -> None:
     """Measure, and print a table."""
-    if not numba_call.available():
-        raise ValueError("loops: jax computes on another device than the CPU, or Numba is not installed.")
+    if reason := numba_call.unavailable():
+        raise ValueError(f"loops: numba {reason}.")
     keep_memory()
     height, width = parsed(settings.size)
     table = Table("operation", "XLA ms", "compiled ms", "ratio")

@@ -75,11 +75,11 @@ def _device() -> Finding:
 
 def _loops() -> Finding:
     """Numba, which compiles the loops of filters."""
-    if numba_call.available():
+    if not numba_call.unavailable():
         return Finding("filters", f"loops compiled by numba {metadata.version('numba')}")
     if find_spec("numba") is None:
         return Finding("filters", "XLA alone", "twice as fast: pip install numba")
-    return Finding("filters", "XLA alone", "JAXDN_COMPILED=0 is set; without it they are twice as fast")
+    return Finding("filters", "XLA alone")
 
 
 def _packages(what: str, extra: str) -> Finding:

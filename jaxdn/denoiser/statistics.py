@@ -14,7 +14,7 @@ import numpy as np
 from jaxdn import color
 from jaxdn.core.frame import FAR, Array, Frame
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.inference_path import alone
+from jaxdn.ops.dispatch.operation import operation
 
 
 class FrameStatistics(NamedTuple):
@@ -69,21 +69,17 @@ def geometric_mean_depth(depth: jax.Array) -> jax.Array:
     return jnp.exp(depth[0] / jnp.maximum(depth[2], 1.0))
 
 
+@operation
 def sum_depths(depth: jax.Array) -> jax.Array:
-    """:attr:`Whole.depth` of a depth [H, W, 1]; no surface is at 0 or at ``FAR``."""
-    if numba_call.available() and depth.dtype == jnp.float32:
-        return alone(_sum_depths, _sums_by_compiled)(depth)
-    return _sum_depths(depth)
-
-
-def _sum_depths(depth: jax.Array) -> jax.Array:
+    """:attr:`FrameStatistics.depth` of a depth [H, W, 1]; no surface is at 0 or at ``FAR``."""
     known = (depth > 0) & (depth < FAR)
     there = jnp.where(known, depth, 1.0)
     logarithms, inverses = jnp.log(there), jnp.where(known, 1.0 / there, 0.0)
     return jnp.stack([jnp.sum(logarithms), jnp.sum(inverses), jnp.sum(known, dtype=depth.dtype)])
 
 
-def _sums_by_compiled(depth: jax.Array) -> jax.Array:
+@numba_call.implements(sum_depths)
+def _sum_depths_by_numba(depth: jax.Array) -> jax.Array:
     from jaxdn.denoiser.numba_statistics import depths
 
     return numba_call.call(depths, [(depth.shape[0], 3)], [depth], np.float32(FAR), rows=depth.shape[0])[0].sum(axis=0)

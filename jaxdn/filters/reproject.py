@@ -27,7 +27,7 @@ from jaxdn.filters.surface_test import (
     unpack,
 )
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.inference_path import alone
+from jaxdn.ops.dispatch.operation import operation
 from jaxdn.ops.dispatch.row_tiles import by_strips, where_needed
 from jaxdn.ops.motion import targets
 from jaxdn.ops.warp import cells, differentiable_mean, windows
@@ -62,6 +62,7 @@ def reproject(
     depth_tolerance: float = 0.02,
     normal_threshold: float = 0.9,
     search_neighbours: bool = False,
+    implementation: str | None = None,
 ) -> Reprojection:
     """Fetch ``history`` [H, W, C] >= 0 of the previous frame at ``p + motion(p)``.
 
@@ -73,6 +74,7 @@ def reproject(
       depth_tolerance: see :func:`jaxdn.filters.surface_test.expect_surface`.
       normal_threshold: see :func:`jaxdn.filters.surface_test.same_surface`.
       search_neighbours: see :func:`reproject_along`.
+      implementation: "reference" or "numba"; None is the fastest.
     """
     expected = expect_surface(frame, before, depth_tolerance=depth_tolerance)
     before = keep_shared(before, guides_of(frame))
@@ -84,6 +86,7 @@ def reproject(
         first,
         normal_threshold=normal_threshold,
         search_neighbours=search_neighbours,
+        implementation=implementation,
     )
 
 
@@ -96,6 +99,7 @@ def reproject_along(
     *,
     normal_threshold: float,
     search_neighbours: bool,
+    implementation: str | None = None,
 ) -> Reprojection:
     """The same along any vectors [H, W, 2], for taps that show what is ``expected``.
 
@@ -104,13 +108,10 @@ def reproject_along(
     the 3x3 pixels around its target.
     """
     x, y, inside = _find_targets(history, motion, first)
-    given = _Request(history, before, (x, y), inside, expected)
-    plain = functools.partial(_reproject, _Rules(motion is not None, normal_threshold, search_neighbours))
-    if numba_call.available() and history.dtype == jnp.float32:
-        found = alone(plain, functools.partial(_reproject_by_compiled, *plain.args))(given)
-    else:
-        found = plain(given)
-    mean, valid, invalid = found
+    rules = _Rules(motion is not None, normal_threshold, search_neighbours)
+    mean, valid, invalid = _average_taps(
+        _Request(history, before, (x, y), inside, expected), rules=rules, implementation=implementation
+    )
     return Reprojection(mean, valid[..., None], jnp.where(first, 0, invalid))
 
 
@@ -138,7 +139,8 @@ _Output = tuple[jax.Array, jax.Array, jax.Array]
 """The mean [H, W, C] of the accepted taps; bool [H, W], whether there is one; int32, pixels that are not sound."""
 
 
-def _reproject(rules: _Rules, given: _Request) -> _Output:
+@operation(name="reproject")
+def _average_taps(given: _Request, *, rules: _Rules) -> _Output:
     history, before, at, inside, expected = given
     valid_history = jnp.all(jnp.isfinite(history) & (history >= 0), axis=-1, keepdims=True)
     history = jnp.where(valid_history, history, 0.0)
@@ -161,7 +163,8 @@ def _reproject(rules: _Rules, given: _Request) -> _Output:
     return mean, valid, jnp.sum(~valid_history, dtype=jnp.int32)
 
 
-def _reproject_by_compiled(rules: _Rules, given: _Request) -> _Output:
+@numba_call.implements(_average_taps)
+def _average_taps_by_numba(given: _Request, *, rules: _Rules) -> _Output:
     from jaxdn.filters.numba_reproject import reproject
 
     history, before, at, inside, expected = given

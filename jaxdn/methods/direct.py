@@ -14,7 +14,7 @@ from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.denoiser import Params
 from jaxdn.filters.surface_test import surface_mask
 from jaxdn.networks import crop, pad
-from jaxdn.ops.scales import fill
+from jaxdn.ops.scales import fill_holes
 
 
 class Light(NamedTuple):
@@ -38,7 +38,7 @@ def seen(frame: Frame, *, background: str, exposure: str, multiple: int) -> Ligh
     noisy = pad(jnp.minimum(frame.radiance, RADIANCE_MAX), multiple)
     hit = surface_mask(frame.depth, None) if background == "pass" else None
     if hit is not None:
-        noisy = fill(noisy, pad(hit[..., None], multiple))
+        noisy = fill_holes(noisy, pad(hit[..., None], multiple))
     gain = color.exposure(noisy) if exposure == "measured" else 1.0
     return Light(color.compress(gain * noisy), gain, hit)
 

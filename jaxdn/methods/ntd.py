@@ -30,7 +30,7 @@ from jaxdn.methods.reconstruction import SCALES, Prediction, begin_blending, ble
 from jaxdn.methods.registry import method
 from jaxdn.networks import LARGE, SMALL, Widths, crop, description, pad
 from jaxdn.ops.motion import on_screen
-from jaxdn.ops.scales import downsample, fill
+from jaxdn.ops.scales import downsample, fill_holes
 from jaxdn.ops.warp import warp
 from jaxdn.recipes.augmentation import STILL
 from jaxdn.recipes.objectives import indirect_illumination, unbiased_illumination
@@ -276,9 +276,9 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
         hit = surface_mask(frame.depth, None) if options.background == "pass" else None
         noisy = pad(frame.radiance)
         if hit is not None:
-            noisy = fill(noisy, pad(hit[..., None]))
+            noisy = fill_holes(noisy, pad(hit[..., None]))
         if frame.sample_count is not None:
-            noisy = fill(noisy, pad(frame.sample_count > 0))
+            noisy = fill_holes(noisy, pad(frame.sample_count > 0))
         return noisy, hit
 
     def measure(frame: Frame) -> FrameStatistics:
@@ -295,7 +295,7 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
         seen = _guides(options, frame, whole)
         (noisy, hit), recalled, absent = light(frame), pad(recalled), pad(absent)
         if hit is not None:
-            recalled = fill(recalled, pad(hit[..., None]))
+            recalled = fill_holes(recalled, pad(hit[..., None]))
         gain = whole.exposure if options.exposure == "measured" else 1.0
         squeezed, squeezed_history = color.compress(gain * noisy), color.compress(gain * recalled)
         features = [squeezed, seen["albedo"], seen["normal"], seen["depth"], squeezed_history]

@@ -46,6 +46,12 @@ class Description(NamedTuple):
         }
 
 
+def output_shapes(network: Description, shape: Sequence[int]) -> list[tuple[int, ...]]:
+    """Of the outputs [N, H >> depth, W >> depth, channels], for features of ``shape`` [N, H, W, c]."""
+    ends = [network.layers[name] for name in network.outputs]
+    return [(shape[0], shape[1] >> end.depth, shape[2] >> end.depth, end.channels) for end in ends]
+
+
 def reach(network: Description) -> int:
     """How many pixels away the outputs see, on each side, at the resolution of the input."""
     found: dict[str, int] = {}

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-from jaxdn.networks.description import FEATURES, Description, Weights, evaluate
-from jaxdn.networks.inference import Apply, inference_only, same
+from jaxdn.networks.description import FEATURES, Description, Weights, evaluate, output_shapes
+from jaxdn.networks.inference import same
 from jaxdn.ops.onednn import layers
 from jaxdn.ops.onednn import library as dnnl
 
@@ -48,17 +48,11 @@ def computes_bfloat16() -> bool:
     return dnnl.available() and dnnl.computes_bfloat16()
 
 
-def check(precision: Precision) -> None:
-    """Raise ValueError, with what to do, where the engine cannot run."""
-    try:
-        dnnl.check_available()
-    except ValueError as error:
-        raise ValueError(str(error).replace('"onednn"', f'"{precision.engine}"', 1)) from error
-    if precision is BFLOAT16 and not dnnl.computes_bfloat16():
-        raise ValueError(
-            f'implementation: "{precision.engine}" needs a CPU with AVX-512 BF16 or AMX; leave it None, or take '
-            f'"{FLOAT32.engine}".'
-        )
+def unavailable_in_bfloat16() -> str:
+    """Why oneDNN cannot compute in bfloat16 here, and what to do; empty if it can."""
+    if reason := dnnl.unavailable():
+        return reason
+    return "" if dnnl.computes_bfloat16() else f'needs a CPU with AVX-512 BF16 or AMX; take "{FLOAT32.engine}"'
 
 
 class Value(NamedTuple):
@@ -223,15 +217,13 @@ class Session:
                 self._program(dnnl.address(np.asarray(features)), heads)
 
 
-def engine(network: Description, plain: Apply, precision: Precision) -> Apply:
-    """``plain``, the network in XLA, run by oneDNN (:func:`jaxdn.networks.inference.inference_only`)."""
-
-    def run(weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:
-        leaves, tree = jax.tree.flatten(weights)
-        features = jnp.concatenate([group.astype(precision.dtype) for group in groups], axis=-1)
-        shape = features.shape
-        session = Session(lambda leaves: Program(network, jax.tree.unflatten(tree, leaves), shape, precision))
-        results = jax.eval_shape(plain, weights, groups)
-        return tuple(buffer_callback(session, results, vmap_method="sequential")(features, *leaves))
-
-    return inference_only(precision.engine, run, plain)
+def run(
+    network: Description, weights: Weights, groups: list[jax.Array], *, precision: Precision
+) -> tuple[jax.Array, ...]:
+    """The outputs of the network, in float32, for the feature groups [N, H, W, c] that are present."""
+    leaves, tree = jax.tree.flatten(weights)
+    features = jnp.concatenate([group.astype(precision.dtype) for group in groups], axis=-1)
+    shape = features.shape
+    session = Session(lambda leaves: Program(network, jax.tree.unflatten(tree, leaves), shape, precision))
+    results = [jax.ShapeDtypeStruct(each, jnp.float32) for each in output_shapes(network, shape)]
+    return tuple(buffer_callback(session, results, vmap_method="sequential")(features, *leaves))

@@ -16,8 +16,8 @@ import jax
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-from jaxdn.networks.description import FEATURES, Description, Weights, evaluate
-from jaxdn.networks.inference import Apply, inference_only, same
+from jaxdn.networks.description import FEATURES, Description, Weights, evaluate, output_shapes
+from jaxdn.networks.inference import same
 from jaxdn.runtime.optional import install
 
 OPSET = 17
@@ -32,15 +32,11 @@ def available() -> bool:
     return jax.default_backend() == "cpu" and all(find_spec(name) is not None for name in ("onnxruntime", "onnx"))
 
 
-def check_available() -> None:
-    """Raise ValueError, with what to do, where the engine cannot run."""
-    if jax.default_backend() != "cpu":
-        raise ValueError(
-            f'implementation: "onnxruntime" runs on the CPU, and jax computes on {jax.default_backend()!r}; '
-            "leave it None, or set JAX_PLATFORMS=cpu."
-        )
-    if not available():
-        raise ValueError(f'implementation: "onnxruntime" needs the packages onnxruntime and onnx: {install("onnx")}')
+def unavailable() -> str:
+    """Why the engine cannot run here, and what to do; empty if it can."""
+    if (backend := jax.default_backend()) != "cpu":
+        return f"runs on the CPU, and jax computes on {backend!r}; leave it None, or set JAX_PLATFORMS=cpu"
+    return "" if available() else f"needs the packages onnxruntime and onnx: {install('onnx')}"
 
 
 class Graph:
@@ -153,18 +149,14 @@ class Session:
         )
 
 
-def engine(network: Description, plain: Apply) -> Apply:
-    """``plain``, the network in XLA, run by ONNX Runtime (:func:`jaxdn.networks.inference.inference_only`)."""
-
-    def run(weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:
-        channels = network.layers[FEATURES].channels
-        shape = (groups[0].shape[0], channels + -channels % BLOCK, *groups[0].shape[1:3])
-        leaves, tree = jax.tree.flatten(weights)
-        session = Session(
-            shape, len(groups), network.outputs, lambda leaves: model(network, jax.tree.unflatten(tree, leaves), shape)
-        )
-        results = jax.eval_shape(plain, weights, groups)
-        # The groups are passed separately: XLA would concatenate them into newly allocated memory first.
-        return tuple(buffer_callback(session, results, vmap_method="sequential")(*groups, *leaves))
-
-    return inference_only("onnxruntime", run, plain)
+def run(network: Description, weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:
+    """The outputs of the network for the feature groups [N, H, W, c] that are present, float32."""
+    channels = network.layers[FEATURES].channels
+    shape = (groups[0].shape[0], channels + -channels % BLOCK, *groups[0].shape[1:3])
+    leaves, tree = jax.tree.flatten(weights)
+    session = Session(
+        shape, len(groups), network.outputs, lambda leaves: model(network, jax.tree.unflatten(tree, leaves), shape)
+    )
+    results = [jax.ShapeDtypeStruct(each, np.float32) for each in output_shapes(network, groups[0].shape)]
+    # The groups are passed separately: XLA would concatenate them into newly allocated memory first.
+    return tuple(buffer_callback(session, results, vmap_method="sequential")(*groups, *leaves))

@@ -12,12 +12,9 @@ import jax.numpy as jnp
 
 from jaxdn.networks import Widths, description
 from jaxdn.networks.description import FEATURES, Description, Weights, evaluate, hidden
-from jaxdn.networks.unet import ONEDNN, XLA, Layers, initial, present_groups, storage, weights_for
-from jaxdn.ops.dispatch.registry import register, resolve
+from jaxdn.networks.unet import ONEDNN, XLA, initial, present_groups, storage, weights_for
+from jaxdn.ops.dispatch.operation import operation
 from jaxdn.ops.onednn import library
-
-Apply = Callable[[Weights, dict[str, jax.Array]], tuple[jax.Array, ...]]
-"""(weights, inputs by name [N, H, W, c]) -> outputs."""
 
 
 class RecurrentNetwork(NamedTuple):
@@ -31,21 +28,20 @@ class RecurrentNetwork(NamedTuple):
     """(params, feature groups [N, H, W, c] or None, hidden states) -> (output [N, H, W, outputs], hidden states)."""
 
 
-def by_xla(layers: Layers, network: Description) -> Apply:
-    """The network as XLA compiles it."""
-    return lambda weights, inputs: evaluate(network, weights, inputs, layers)
+@operation(name="recurrent_unet")
+def run_recurrent_unet(
+    weights: Weights, inputs: dict[str, jax.Array], *, network: Description
+) -> tuple[jax.Array, ...]:
+    """The outputs of the network for its inputs by name [N, H, W, c]; XLA alone."""
+    return evaluate(network, weights, inputs, XLA)
 
 
-@register("recurrent_unet", "reference")
-def reference(network: Description) -> Apply:
-    """XLA alone."""
-    return by_xla(XLA, network)
-
-
-@register("recurrent_unet", "onednn", requires=library.check_available)
-def convolved_by_onednn(network: Description) -> Apply:
+@run_recurrent_unet.implementation("onednn", dtypes=(jnp.float32,), unavailable=library.unavailable)
+def _run_with_onednn_convolutions(
+    weights: Weights, inputs: dict[str, jax.Array], *, network: Description
+) -> tuple[jax.Array, ...]:
     """XLA with oneDNN's convolutions and their gradients: for training on CPUs."""
-    return by_xla(ONEDNN, network)
+    return evaluate(network, weights, inputs, ONEDNN)
 
 
 def recurrent_unet(
@@ -59,7 +55,8 @@ def recurrent_unet(
     :mod:`jaxdn.ops.convolution.onednn`). Raises ValueError unless ``widths`` has one decoder level less than encoder
     stages, when the features do not fit, and when the implementation cannot run here.
     """
-    run = resolve("recurrent_unet", implementation)
+    if implementation is not None:
+        run_recurrent_unet.named(implementation)
     stages = widths[0]
     if len(widths) != len(stages) or not all(level and all(channels > 0 for channels in level) for level in widths):
         raise ValueError(
@@ -87,7 +84,8 @@ def recurrent_unet(
         network = described(sum(group.shape[-1] for group in present))
         inputs = {FEATURES: jnp.concatenate(present, axis=-1)}
         inputs |= {hidden(stage): state for stage, state in enumerate(states)}
-        output, *kept = run(network)(weights_for(network, graph, params, features, groups), inputs)
+        weights = weights_for(network, graph, params, features, groups)
+        output, *kept = run_recurrent_unet(weights, inputs, network=network, implementation=implementation)
         return output, tuple(kept)
 
     return RecurrentNetwork(init, start, apply)

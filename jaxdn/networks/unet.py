@@ -17,10 +17,9 @@ from flax import nnx
 from jaxdn.core.checks import check_option
 from jaxdn.denoiser import Params
 from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, description, onednn, onnx
-from jaxdn.networks.description import FEATURES, Description, evaluate
-from jaxdn.networks.inference import Apply
+from jaxdn.networks.description import FEATURES, Description, Weights, evaluate
 from jaxdn.ops.convolution.api import convolve
-from jaxdn.ops.dispatch.registry import register, resolve
+from jaxdn.ops.dispatch.operation import operation
 from jaxdn.ops.onednn import library
 
 
@@ -122,39 +121,42 @@ def initial(key: jax.Array, network: Description, *, scheme: str) -> dict[str, A
     return params
 
 
-def by_xla(layers: Layers, network: Description) -> Apply:
-    """The network as XLA compiles it."""
-    return lambda weights, groups: evaluate(network, weights, {FEATURES: jnp.concatenate(groups, axis=-1)}, layers)
+Heads = tuple[jax.Array, ...]
 
 
-@register("unet", "reference")
-def reference(network: Description) -> Apply:
-    """XLA alone."""
-    return by_xla(XLA, network)
+@operation(name="unet")
+def run_unet(weights: Weights, groups: list[jax.Array], *, network: Description) -> Heads:
+    """The heads of the network for the feature groups [N, H, W, c] that are present; XLA alone."""
+    return evaluate(network, weights, {FEATURES: jnp.concatenate(groups, axis=-1)}, XLA)
 
 
-@register("unet", "onednn", requires=library.check_available)
-def convolved_by_onednn(network: Description) -> Apply:
+@run_unet.implementation("onednn", dtypes=(jnp.float32,), unavailable=library.unavailable)
+def _run_with_onednn_convolutions(weights: Weights, groups: list[jax.Array], *, network: Description) -> Heads:
     """XLA with oneDNN's convolutions and their gradients: for training on CPUs."""
-    return by_xla(ONEDNN, network)
+    return evaluate(network, weights, {FEATURES: jnp.concatenate(groups, axis=-1)}, ONEDNN)
 
 
-@register("unet", "onednn-float32", requires=functools.partial(onednn.check, onednn.FLOAT32))
-def run_in_float32(network: Description) -> Apply:
-    """The whole network in oneDNN, for inference; the gradient is XLA's."""
-    return onednn.engine(network, by_xla(XLA, network), onednn.FLOAT32)
+_INFERENCE: Any = {"dtypes": (jnp.float32,), "differentiable": False}
 
 
-@register("unet", "onednn-bfloat16", requires=functools.partial(onednn.check, onednn.BFLOAT16))
-def run_in_bfloat16(network: Description) -> Apply:
+@run_unet.implementation("onednn-float32", **_INFERENCE, unavailable=library.unavailable)
+def _run_in_float32(weights: Weights, groups: list[jax.Array], *, network: Description) -> Heads:
+    """The whole network in oneDNN."""
+    return onednn.run(network, weights, groups, precision=onednn.FLOAT32)
+
+
+@run_unet.implementation(
+    "onednn-bfloat16", **_INFERENCE, unavailable=onednn.unavailable_in_bfloat16, precision=jnp.bfloat16
+)
+def _run_in_bfloat16(weights: Weights, groups: list[jax.Array], *, network: Description) -> Heads:
     """The same in bfloat16."""
-    return onednn.engine(network, by_xla(XLA, network), onednn.BFLOAT16)
+    return onednn.run(network, weights, groups, precision=onednn.BFLOAT16)
 
 
-@register("unet", "onnxruntime", requires=onnx.check_available)
-def run_by_onnxruntime(network: Description) -> Apply:
-    """The whole network in ONNX Runtime, for inference; the gradient is XLA's."""
-    return onnx.engine(network, by_xla(XLA, network))
+@run_unet.implementation("onnxruntime", **_INFERENCE, unavailable=onnx.unavailable)
+def _run_by_onnxruntime(weights: Weights, groups: list[jax.Array], *, network: Description) -> Heads:
+    """The whole network in ONNX Runtime."""
+    return onnx.run(network, weights, groups)
 
 
 def unet(
@@ -179,7 +181,8 @@ def unet(
     ``widths`` is not five non-empty levels of positive integers, the features do not fit, or the implementation cannot
     run here.
     """
-    run = resolve("unet", implementation)
+    if implementation is not None:
+        run_unet.named(implementation)
     widths = tuple(tuple(level) for level in widths)
     if len(widths) != LEVELS or not all(level and all(channels > 0 for channels in level) for level in widths):
         raise ValueError(
@@ -198,7 +201,8 @@ def unet(
     def apply(params: dict[str, Any], features: Sequence[jax.Array | None]) -> tuple[jax.Array, ...]:
         present = present_groups(features, groups, MULTIPLE)
         network = described(sum(group.shape[-1] for group in present))
-        return run(network)(weights_for(network, graph, params, features, groups), present)
+        weights = weights_for(network, graph, params, features, groups)
+        return run_unet(weights, present, network=network, implementation=implementation)
 
     return Network(init, apply)
 

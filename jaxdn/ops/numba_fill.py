@@ -1,4 +1,4 @@
-"""Numba loop of :func:`jaxdn.ops.scales.fill`."""
+"""Numba loop of :func:`jaxdn.ops.scales.fill_holes`."""
 
 import numpy as np
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from jaxdn.core.checks import check_image, check_option
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.inference_path import alone
+from jaxdn.ops.dispatch.operation import operation
 
 
 def downsample(image: jax.Array, *, down: str = "mean") -> jax.Array:
@@ -22,7 +22,7 @@ def downsample(image: jax.Array, *, down: str = "mean") -> jax.Array:
     return jnp.maximum(jnp.maximum(corners[0], corners[1]), jnp.maximum(corners[2], corners[3]))
 
 
-def fold(image: jax.Array) -> jax.Array:
+def space_to_depth(image: jax.Array) -> jax.Array:
     """[H, W, C] -> [H/2, W/2, 4C]: the pixels of each 2x2 block side by side, channel by channel.
 
     Odd sizes raise ValueError.
@@ -34,20 +34,23 @@ def fold(image: jax.Array) -> jax.Array:
     return blocks.transpose(0, 2, 4, 1, 3).reshape(height // 2, width // 2, 4 * channels)
 
 
-def fill(image: jax.Array, known: jax.Array) -> jax.Array:
+def fill_holes(image: jax.Array, known: jax.Array, *, implementation: str | None = None) -> jax.Array:
     """[H, W, C] with the mean of the known pixels of the same 2x2 block, else 4x4 block, where a pixel is not known.
 
     ``known`` [H, W, 1] is bool. Blocks without a known pixel are 0. Means of the result thus hold nothing of what was
     there. Sizes that are not multiples of 4 raise ValueError.
     """
     check_image(image, "image")
-    image, known = jnp.asarray(image), jnp.asarray(known)
-    if numba_call.available() and image.dtype == jnp.float32 and not (image.shape[0] % 4 or image.shape[1] % 4):
-        return alone(_filled, _filled_by_compiled)(image, known)
-    return _filled(image, known)
+    if image.shape[0] % 4 or image.shape[1] % 4:
+        raise ValueError(
+            f"image: expected a height and width that are multiples of 4, got {image.shape[0]} x {image.shape[1]}; "
+            "pad by edge and crop the result."
+        )
+    return _fill_holes(jnp.asarray(image), jnp.asarray(known), implementation=implementation)
 
 
-def _filled(image: jax.Array, known: jax.Array) -> jax.Array:
+@operation(name="fill_holes")
+def _fill_holes(image: jax.Array, known: jax.Array) -> jax.Array:
     weight = jnp.asarray(known, image.dtype)
     total, means = jnp.where(known, image, 0.0), []
     for level in (1, 2):
@@ -60,7 +63,8 @@ def _filled(image: jax.Array, known: jax.Array) -> jax.Array:
     return jnp.where(known, image, jnp.where(near, means[0][0], means[1][0]))
 
 
-def _filled_by_compiled(image: jax.Array, known: jax.Array) -> jax.Array:
+@numba_call.implements(_fill_holes)
+def _fill_holes_by_numba(image: jax.Array, known: jax.Array) -> jax.Array:
     from jaxdn.ops.numba_fill import filled
 
     return numba_call.call(filled, [image.shape], [image, known[..., 0]], rows=image.shape[0] // 4)[0]

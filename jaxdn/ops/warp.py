@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxdn.core.checks import check_image, check_option, check_same_size
-from jaxdn.ops.dispatch.registry import register, resolve
+from jaxdn.ops.dispatch.operation import operation
 from jaxdn.ops.motion import targets
 
 
@@ -42,7 +42,7 @@ def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implemen
         x, y = jnp.clip(x, 0, width - 1), jnp.clip(y, 0, height - 1)
     x, y = x.astype(_position_dtype(image)), y.astype(_position_dtype(image))
     x, y = lax.stop_gradient(x), lax.stop_gradient(y)
-    warped = resolve("warp", implementation)(image, x, y).astype(image.dtype)
+    warped = _sample_bilinearly(image, x, y, implementation=implementation).astype(image.dtype)
     return jnp.where(known[..., None], warped, 0.0)
 
 
@@ -58,8 +58,8 @@ def cells(x: jax.Array, y: jax.Array, height: int, width: int) -> tuple[jax.Arra
     return left.astype(jnp.int32), top.astype(jnp.int32), (x - left)[..., None], (y - top)[..., None]
 
 
-@register("warp", "reference")
-def reference(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+@operation(name="warp")
+def _sample_bilinearly(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     """Four fetches and their weighted sum."""
     height, width = image.shape[:2]
     left, top, fx, fy = cells(x, y, height, width)
@@ -175,7 +175,7 @@ def _backward(residuals: tuple[jax.Array, ...], cotangent: jax.Array) -> tuple[j
 _pairs.defvjp(_forward, _backward)
 
 
-@register("warp", "pairs", preferred_on=("cpu", "gpu", "tpu"))
-def pairs(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+@_sample_bilinearly.implementation("pairs", platforms=("cpu", "gpu", "tpu"))
+def _sample_by_pairs(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     """Two gathers of neighbouring pairs, and a VJP that scatters 2 x 2 blocks."""
     return _pairs(image, x, y)

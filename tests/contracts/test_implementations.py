@@ -7,7 +7,7 @@ import pytest
 
 import jaxdn.networks.unet  # noqa: F401  (registers the networks' implementations)
 from jaxdn.ops.convolution.api import convolve
-from jaxdn.ops.dispatch.registry import implementations, resolve
+from jaxdn.ops.dispatch.operation import OPERATIONS
 from jaxdn.ops.kernel_prediction.apply import apply_kernels
 from jaxdn.ops.kernel_prediction.softmax import softmax_filter
 from jaxdn.ops.warp import warp
@@ -135,7 +135,7 @@ def _case(op, size, rng):
             ),
             lambda images, logits, features: numpy_softmax_filter(images, logits, features, taps),
         )
-    inputs, outputs = map(int, op.removeprefix("convolution_").split("_"))
+    inputs, outputs = map(int, op.removeprefix("convolve_").split("_"))
     return (
         (rng.standard_normal((2, *size, inputs)), rng.standard_normal((3, 3, inputs, outputs))),
         lambda implementation, x, kernel: convolve(x, kernel, implementation=implementation),
@@ -155,15 +155,7 @@ def _pull_back(function, name):
 
 def runnable(op):
     """The implementations that can run here: engines are extras."""
-
-    def runs(name):
-        try:
-            resolve(op, name)
-        except ValueError:
-            return False
-        return True
-
-    return tuple(filter(runs, implementations(op)))
+    return tuple(name for name, one in OPERATIONS[op].implementations.items() if not one.refuses(()))
 
 
 CASES = [
@@ -171,10 +163,11 @@ CASES = [
     for op, cases in {
         "warp": ("warp_clamp", "warp_zeros"),
         "apply_kernels": ("apply_kernels_1", "apply_kernels_25"),
-        "convolution": ("convolution_2_3", "convolution_3_2"),
+        "convolve": ("convolve_2_3", "convolve_3_2"),
     }.items()
     for case in cases
-    for name in implementations(op)
+    for name, one in OPERATIONS[op].implementations.items()
+    if not one.refuses(np.float64(0))
 ]
 
 
@@ -184,7 +177,7 @@ FILTERS = [
         *("softmax_filter_25_1_0", "softmax_filter_9_2_1"),
         *("guided_filter_25_2_1_7", "guided_filter_9_1_0_1", "guided_filter_1_1_0_2"),
     )
-    for name in implementations("softmax_filter")
+    for name in OPERATIONS["softmax_filter"].implementations
 ]
 """Not linear in its logits, so that its gradient has a test of its own."""
 
@@ -261,15 +254,16 @@ def test_keeps_the_dtype(case, name, dtype, rng):
     np.testing.assert_allclose(np.asarray(out, np.float64), values, atol=40 * float(jnp.finfo(dtype).eps))
 
 
-@pytest.mark.parametrize("op", ["warp", "apply_kernels", "softmax_filter", "convolution", "unet"])
+@pytest.mark.parametrize("op", ["warp", "apply_kernels", "softmax_filter", "convolve", "unet"])
 def test_a_named_implementation_runs_or_raises(op):
-    assert len(implementations(op)) > 1
+    known = OPERATIONS[op]
+    assert len(known.implementations) > 1
     assert "reference" in runnable(op)
     # Engines are extras, and one of them needs instructions that not every CPU has.
-    assert set(implementations(op)) - set(runnable(op)) <= {"onednn", "onnxruntime", "onednn-bfloat16"}
-    assert resolve(op, None) in [resolve(op, name) for name in runnable(op)]
+    assert set(known.implementations) - set(runnable(op)) <= {"onednn", "onnxruntime", "onednn-bfloat16"}
+    assert known.automatic()[0].name in runnable(op)
     with pytest.raises(ValueError, match=r"'reference'.*'no such'"):
-        resolve(op, "no such")
+        known.named("no such")
 
 
 @pytest.mark.usefixtures("x64")
@@ -293,5 +287,5 @@ def test_strips_of_any_number_of_rows_are_the_whole_image(height, guided, rng, m
         return jax.jit(value_and_slopes)(cotangent, images, logits, features)
 
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), both("strips"), both("reference")
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), both("row_tiles"), both("reference")
     )

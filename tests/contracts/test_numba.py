@@ -22,25 +22,26 @@ from jaxdn.methods.steady.levels import LEVELS
 from jaxdn.methods.steady.method import BEGIN, FEATURES, HALF_FEATURES, decisions
 from jaxdn.methods.steady.network_input import History, seen
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
-from jaxdn.ops.affinity.joint_upsample import enlarge
+from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.layout.planar import planes_of
-from jaxdn.ops.scales import fill
+from jaxdn.ops.dispatch.operation import implementation
+from jaxdn.ops.layout.planar import join_planes
+from jaxdn.ops.scales import fill_holes
 
 pytestmark = pytest.mark.needs("numba")
 
 
 @pytest.fixture
-def both(monkeypatch):
+def both():
     """The results of a function of arrays, once with the loops and once without, jitted anew."""
 
     def run(function, *arguments):
         found = []
-        for value, callbacks in (("1", 1), ("0", 0)):
-            monkeypatch.setenv("JAXDN_COMPILED", value)
-            program = jax.jit(lambda *given: function(*given))
-            assert (str(jax.make_jaxpr(program)(*arguments)).count("callback[") > 0) == callbacks
-            found.append(jax.tree.map(np.asarray, program(*arguments)))
+        for name, callbacks in (("auto", 1), ("reference", 0)):
+            with implementation(name):
+                program = jax.jit(lambda *given: function(*given))
+                assert (str(jax.make_jaxpr(program)(*arguments)).count("callback[") > 0) == callbacks
+                found.append(jax.tree.map(np.asarray, program(*arguments)))
         return found
 
     return run
@@ -73,7 +74,7 @@ def test_the_enlarged_image(size, rng, both):
     coarse = jnp.asarray(10.0 ** rng.uniform(-4, 4, (3, *size)), jnp.float32)
     there, here = drawn(rng, *size), drawn(rng, 2 * size[0], 2 * size[1])
     here = here._replace(scales=jnp.asarray([0.5, 1.0, 2.0, 0.1, 3.0]))
-    (image, weight), (wanted, sums) = both(enlarge, coarse, there, here)
+    (image, weight), (wanted, sums) = both(joint_bilateral_upsample, coarse, there, here)
     np.testing.assert_allclose(weight, sums, rtol=3e-6, atol=1e-7)
     np.testing.assert_allclose(image, wanted, rtol=1e-5)
     assert ((weight == 0) == (sums == 0)).all()
@@ -213,14 +214,14 @@ def test_arrays_of_all_layouts_as_planes(rng, both):
         "means": (16, 24, 2),
     }
     arrays = [jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in shapes.values()]
-    found, wanted = both(lambda *arrays: planes_of(list(zip(shapes, arrays, strict=True))), *arrays)
+    found, wanted = both(lambda *arrays: join_planes(list(zip(shapes, arrays, strict=True))), *arrays)
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6)
     assert found.shape == (2 + 3 + 2 + 1 + 2, 8, 12)
     np.testing.assert_array_equal(found[5:7], np.asarray(unfolded(arrays[2])))
 
 
 def unfolded(blocks):
-    """Planes of which :func:`jaxdn.ops.scales.fold` made the blocks."""
+    """Planes of which :func:`jaxdn.ops.scales.space_to_depth` made the blocks."""
     height, width, channels = blocks.shape
     planes = np.zeros((channels // 4, 2 * height, 2 * width), np.float32)
     for channel, row, column in np.ndindex(channels // 4, 2, 2):
@@ -232,7 +233,7 @@ def test_pixels_that_are_not_known(rng, both):
     image = jnp.asarray(rng.uniform(0, 1, (12, 24, 3)), jnp.float32)
     known = rng.random((12, 24, 1)) > 0.5
     known[4:8, :8], known[8:, 8:10] = False, False
-    found, wanted = both(fill, image, jnp.asarray(known))
+    found, wanted = both(fill_holes, image, jnp.asarray(known))
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
     assert np.all(found[4:8, :8] == 0)
 
@@ -268,27 +269,27 @@ def test_gradients_of_batches_that_share_their_scales(rng, both):
 
 
 @pytest.mark.slow
-def test_what_has_no_loop_for_its_gradient_is_left_to_jax(rng, both, monkeypatch):
+def test_what_has_no_loop_for_its_gradient_is_left_to_jax(rng, both):
     coarse, there = jnp.asarray(rng.random((2, 4, 6)), jnp.float32), drawn(rng, 4, 6)
     fine = drawn(rng, 8, 12)
 
     def loss(coarse, there, fine):
-        enlarged, weight = enlarge(coarse, there, fine)
+        enlarged, weight = joint_bilateral_upsample(coarse, there, fine)
         return (enlarged**2).sum() + weight.sum()
 
     given = coarse, there, fine
     program = jax.grad(loss, argnums=(0, 1, 2))
     assert "callback[" not in str(jax.make_jaxpr(program)(*given))
     found = program(*given)
-    monkeypatch.setenv("JAXDN_COMPILED", "0")
-    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(program(*given)), strict=True):
+    with implementation("reference"):
+        expected = program(*given)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
         np.testing.assert_array_equal(one, other)
-    monkeypatch.delenv("JAXDN_COMPILED")
 
     two = jax.tree.map(lambda each: jnp.stack([each, each[..., ::-1]]), given)
-    batched = jax.vmap(enlarge)
+    batched = jax.vmap(joint_bilateral_upsample)
     assert "callback[" not in str(jax.make_jaxpr(batched)(*two))
-    alone = both(enlarge, *jax.tree.map(lambda each: each[1], two))[0]
+    alone = both(joint_bilateral_upsample, *jax.tree.map(lambda each: each[1], two))[0]
     np.testing.assert_allclose(batched(*two)[0][1], alone[0], rtol=3e-5)
 
 

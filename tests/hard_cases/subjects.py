@@ -216,7 +216,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
     def filled(inputs: Inputs) -> jax.Array:
         frames = inputs.clip.frames
         known = frames.depth[-1] < FAR
-        return scales.fill(pad(frames.radiance[-1]), pad(known))
+        return scales.fill_holes(pad(frames.radiance[-1]), pad(known))
 
     return {
         **{f"warp, {border}": partial(warped, border=border) for border in _BORDERS},
@@ -230,8 +230,8 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         "affinity_filter": by_affinity,
         "compose_scales": composed,
         "downsample": lambda inputs: scales.downsample(even(inputs)),
-        "fold": lambda inputs: scales.fold(even(inputs)),
-        "fill": filled,
+        "space_to_depth": lambda inputs: scales.space_to_depth(even(inputs)),
+        "fill_holes": filled,
         "upsample": lambda inputs: scales.upsample(inputs.clip.frames.radiance[-1]),
         "brdf.directional_albedo": reflected,
         "brdf.divisor": lambda inputs: brdf.divisor(inputs.clip.frames.reflectance),

@@ -165,7 +165,7 @@ def test_memory_is_used_again(precision):
 
 def test_other_types_are_refused(pair, precision):
     _, fast, params, groups = pair
-    with pytest.raises(ValueError, match=f'"{precision.engine}" takes features in float32, got bfloat16'):
+    with pytest.raises(ValueError, match=f'"{precision.engine}" takes float32, got bfloat16'):
         fast(params, [group.astype(jnp.bfloat16) for group in groups])
 
 

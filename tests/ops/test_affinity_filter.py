@@ -8,6 +8,7 @@ from jax.test_util import check_grads
 
 from jaxdn.ops.affinity import filter as module
 from jaxdn.ops.affinity.filter import SPLINE, Guide, affinity_filter
+from jaxdn.ops.dispatch.operation import OPERATIONS
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -66,7 +67,10 @@ def test_kernels_for_gpus_are_the_formula_and_have_its_gradient(step, size, rng,
 
     differentiated = jax.grad(total, argnums=(0, 1, 2, 3), has_aux=True)
     by_xla, _ = differentiated(image, *guide)
-    monkeypatch.setattr(module.affinities_gpu, "available", lambda: True)
+    declared = OPERATIONS["affinity_filter"].implementations
+    here = declared["pallas"]._replace(platforms=("cpu",), unavailable=lambda: "")
+    monkeypatch.setitem(declared, "pallas", here)
+    monkeypatch.delitem(declared, "numba")
     by_kernels, filtered = differentiated(image, *guide)
     np.testing.assert_allclose(filtered, wanted, rtol=2e-5, atol=2e-6)
     for found, known in zip(by_kernels, by_xla, strict=True):

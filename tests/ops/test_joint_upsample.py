@@ -8,7 +8,7 @@ from jax.test_util import check_grads
 
 from jaxdn.ops.affinity import joint_upsample as module
 from jaxdn.ops.affinity.filter import Guide
-from jaxdn.ops.affinity.joint_upsample import enlarge
+from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -46,7 +46,7 @@ def test_it_is_the_formula(platform, strip, rng, x64, monkeypatch):
     monkeypatch.setattr(module, "platform", lambda: platform)
     monkeypatch.setattr(module, "_STRIP", strip)
     coarse, there, here = drawn(rng)
-    found, weight = enlarge(jnp.asarray(coarse), *jax.tree.map(jnp.asarray, (there, here)))
+    found, weight = joint_bilateral_upsample(jnp.asarray(coarse), *jax.tree.map(jnp.asarray, (there, here)))
     wanted, sums = by_formula(coarse, there, here)
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
     np.testing.assert_allclose(weight, sums, rtol=1e-10)
@@ -58,7 +58,7 @@ def test_gradients(platform, rng, x64, monkeypatch):
     coarse, there, here = drawn(rng, 3, 4)
 
     def enlarged(coarse, *parts):
-        return enlarge(coarse, Guide(*parts[:3]), Guide(*parts[3:], jnp.ones(here.confidence.shape)))
+        return joint_bilateral_upsample(coarse, Guide(*parts[:3]), Guide(*parts[3:], jnp.ones(here.confidence.shape)))
 
     arguments = tuple(map(jnp.asarray, (coarse, *there[:3], *here[:2])))
     check_grads(jax.jit(enlarged), arguments, order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
@@ -67,7 +67,7 @@ def test_gradients(platform, rng, x64, monkeypatch):
 def test_a_fine_pixel_that_nothing_resembles_has_no_weight(rng):
     coarse, there, here = drawn(rng)
     here.features[:, 4, 5] = 100.0
-    found, weight = enlarge(jnp.asarray(coarse), *jax.tree.map(jnp.asarray, (there, here)))
+    found, weight = joint_bilateral_upsample(jnp.asarray(coarse), *jax.tree.map(jnp.asarray, (there, here)))
     assert weight[4, 5] == 0
     assert (found[:, 4, 5] == 0).all()
     assert (weight > 0).sum() == weight.size - 1
@@ -80,5 +80,5 @@ def test_light_does_not_cross_a_silhouette():
     flat = np.zeros((3, 8, 16), np.float32)
     here = Guide(jnp.asarray(features), jnp.asarray(flat), jnp.ones((8, 16)))
     there = Guide(here.features[:, ::2, ::2], here.slanted[:, ::2, ::2], jnp.ones((4, 8)))
-    found, _ = enlarge(1.0 + there.features, there, here)
+    found, _ = joint_bilateral_upsample(1.0 + there.features, there, here)
     np.testing.assert_allclose(found, 1.0 + features, rtol=1e-6)

@@ -10,7 +10,7 @@ from jax.test_util import check_grads
 
 from jaxdn.ops.kernel_prediction.apply import apply_kernels, normalize_kernels
 from jaxdn.ops.kernel_prediction.softmax import softmax_filter
-from jaxdn.ops.scales import compose_scales, downsample, fill, upsample
+from jaxdn.ops.scales import compose_scales, downsample, fill_holes, upsample
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -38,7 +38,7 @@ def test_softmax_filter_is_normalizing_and_applying(rng):
     np.testing.assert_allclose(softmax_filter(images, head), expected, rtol=1e-6)
 
 
-@pytest.mark.parametrize("implementation", ["reference", "strips"])
+@pytest.mark.parametrize("implementation", ["reference", "row_tiles"])
 @pytest.mark.parametrize("size", [(4, 3), (1, 1), (1, 6)])
 @pytest.mark.usefixtures("x64")
 def test_gradients_of_guided_kernels(size, implementation, rng):
@@ -53,7 +53,7 @@ def test_gradients_of_guided_kernels(size, implementation, rng):
     check_grads(jax.jit(filtered), (images, logits, features), order=1, modes=["rev"])
 
 
-@pytest.mark.parametrize("implementation", ["reference", "strips"])
+@pytest.mark.parametrize("implementation", ["reference", "row_tiles"])
 def test_constant_features_change_nothing(implementation, rng):
     images, logits = rng.random((2, 6, 5, 3)).astype(np.float32), rng.standard_normal((6, 5, 51)).astype(np.float32)
     run = jax.jit(softmax_filter, static_argnames="implementation")
@@ -61,7 +61,7 @@ def test_constant_features_change_nothing(implementation, rng):
     np.testing.assert_allclose(guided, run(images, logits, implementation=implementation), rtol=1e-6)
 
 
-@pytest.mark.parametrize("implementation", ["reference", "strips"])
+@pytest.mark.parametrize("implementation", ["reference", "row_tiles"])
 @pytest.mark.parametrize("step", [4.0, 20.0, 1e4, 1e25])
 def test_no_light_crosses_a_step_of_the_features(step, implementation, rng):
     """An image of 1 on one side and 0 on the other: what crosses is the sum of the weights across the edge."""
@@ -80,7 +80,7 @@ def test_no_light_crosses_a_step_of_the_features(step, implementation, rng):
     assert all(np.all(np.isfinite(slope)) for slope in slopes)
 
 
-@pytest.mark.parametrize("implementation", ["reference", "strips"])
+@pytest.mark.parametrize("implementation", ["reference", "row_tiles"])
 def test_large_features_keep_their_small_differences(implementation, rng):
     """Features around 20 differ by 0.1: the weights are those of the differences alone."""
     images, logits = rng.random((1, 6, 5, 3)).astype(np.float32), rng.standard_normal((6, 5, 25)).astype(np.float32)
@@ -211,7 +211,7 @@ def test_fill_takes_the_mean_of_known_neighbours(rng: np.random.Generator) -> No
     known[:4, :4] = False  # a block without any
     known[4:6, 4:6] = False
     known[6, 4] = True  # known only in the 4x4 block
-    found = np.asarray(jax.jit(fill)(np.where(known, image, np.nan), known))
+    found = np.asarray(jax.jit(fill_holes)(np.where(known, image, np.nan), known))
     for y, x in np.ndindex(8, 12):
         if known[y, x, 0]:
             expected = image[y, x]
@@ -223,7 +223,7 @@ def test_fill_takes_the_mean_of_known_neighbours(rng: np.random.Generator) -> No
                 means += [image[block][inside].astype(np.float64).mean(0)] if inside.any() else []
             expected = means[0] if means else 0.0
         np.testing.assert_allclose(found[y, x], expected, rtol=1e-5)
-    slope = jax.jit(jax.grad(lambda x: jnp.sum(fill(x, known) ** 2)))(jnp.asarray(image))
+    slope = jax.jit(jax.grad(lambda x: jnp.sum(fill_holes(x, known) ** 2)))(jnp.asarray(image))
     np.testing.assert_array_equal(np.where(known, 0, slope), 0)  # what is not known has no say
     with pytest.raises(ValueError, match="even"):
-        fill(np.zeros((6, 8, 3), np.float32), np.ones((6, 8, 1), bool))
+        fill_holes(np.zeros((6, 8, 3), np.float32), np.ones((6, 8, 1), bool))

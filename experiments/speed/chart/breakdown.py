@@ -25,7 +25,7 @@ from jaxdn.networks.engines import ENGINES
 from jaxdn.networks.unet import unet
 from jaxdn.ops.kernel_prediction.softmax import softmax_filter
 from jaxdn.ops.motion import on_screen
-from jaxdn.ops.scales import compose_scales, downsample, fill
+from jaxdn.ops.scales import compose_scales, downsample, fill_holes
 from jaxdn.ops.warp import warp
 from jaxdn.zoo.ready import Candidate
 
@@ -109,7 +109,7 @@ def breakdown(subject: Subject, frame: Frame, *, rounds: int) -> dict[str, Timin
     def predict(params: Params, frame: Frame, noisy: jax.Array, recalled: jax.Array, lost: jax.Array) -> Any:
         frame, _ = sanitize(frame)
         known = frame.depth < FAR
-        noisy, recalled = fill(noisy, known), fill(recalled, known)
+        noisy, recalled = fill_holes(noisy, known), fill_holes(recalled, known)
         gain = color.exposure(noisy)
         seen = {"albedo": frame.albedo - 1.0, "normal": frame.normal, "depth": depth_feature(frame.depth)}
         history = color.compress(gain * recalled)

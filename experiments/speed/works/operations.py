@@ -16,7 +16,7 @@ from experiments.speed import peers, roofline
 from experiments.speed.timing import Call
 from experiments.speed.works import Work
 from jaxdn.ops.convolution.api import convolve
-from jaxdn.ops.dispatch.registry import implementations, resolve
+from jaxdn.ops.dispatch.operation import OPERATIONS, REFERENCE
 from jaxdn.ops.kernel_prediction.softmax import softmax_filter
 from jaxdn.ops.onednn import library
 from jaxdn.ops.warp import warp
@@ -30,10 +30,10 @@ Arrays = Callable[[], list[np.ndarray]]
 
 
 def forms(operation: str) -> dict[str, str | None]:
-    """Name in the results -> name in the registry; the default is ``xla``."""
-    engines = ["onednn"] if operation == "convolution" and library.available() else []
-    ways = [name for name in implementations(operation) if name not in ("reference", "onednn")]
-    others = [name for name in ways if resolve(operation, name) is not resolve(operation, None)]
+    """Name in the results -> implementation; the default is ``xla``."""
+    engines = ["onednn"] if operation == "convolve" and library.available() else []
+    known, default = OPERATIONS[operation].implementations, OPERATIONS[operation].automatic()[0].name
+    others = [name for name in known if name not in (REFERENCE, "onednn", default)]
     return {"xla": None, **{f"xla-{name}": name for name in others}, **{name: name for name in engines}}
 
 
@@ -230,7 +230,7 @@ def convolution_works(shape: tuple[int, int, int, int, int]) -> Iterator[Work]:
     for direction in ("forward", "image", "kernel"):
         yield Work(
             title if direction == "forward" else f"{title}-gradient-by-{direction}",
-            ours(partial(convolved, direction=direction), "convolution", arrays, ()),
+            ours(partial(convolved, direction=direction), "convolve", arrays, ()),
             {} if "torch" in peers.missing() else {"torch-eager": partial(torch_convolved, direction, arrays)},
             [roofline.convolution(*shape)],
         )

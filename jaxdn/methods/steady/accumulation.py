@@ -1,6 +1,5 @@
 """The running mean of light, how many frames it is worth, and what is remembered of a frame."""
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -10,7 +9,7 @@ import numpy as np
 from jaxdn import color
 from jaxdn.methods.steady.network_input import History
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.inference_path import alone
+from jaxdn.ops.dispatch.operation import operation
 from jaxdn.ops.layout.planar import planar
 from jaxdn.ops.scales import downsample
 
@@ -28,6 +27,7 @@ class Mean(NamedTuple):
     """[3, H/2, W/2] how much more the newest frame shows than the mean, by blocks; 0 where there is no surface."""
 
 
+@operation
 def accumulated(noisy: jax.Array, history: History, hit: jax.Array, follow: jax.Array, *, most: float) -> Mean:
     """The mean of the history and the noisy frame [H, W, 3], whose sides are even.
 
@@ -35,13 +35,6 @@ def accumulated(noisy: jax.Array, history: History, hit: jax.Array, follow: jax.
     and its logit is added to that of the weight. With weights 1 - a and a, the variance is ``(1 - a)^2 / N + a^2`` of a
     frame's: the effective number is its inverse, but at most ``most``. ``hit`` [H, W] bool: there is a surface.
     """
-    plain = functools.partial(_accumulated, most)
-    if numba_call.available() and noisy.dtype == jnp.float32:
-        return alone(plain, functools.partial(_by_compiled, most))(noisy, history, hit, follow)
-    return plain(noisy, history, hit, follow)
-
-
-def _accumulated(most: float, noisy: jax.Array, history: History, hit: jax.Array, follow: jax.Array) -> Mean:
     values, valid = planar(history.values), history.valid
     # The odds of 1 / (N + 1) are 1 to N.
     count = jnp.maximum(values[4], 1e-6)
@@ -55,7 +48,8 @@ def _accumulated(most: float, noisy: jax.Array, history: History, hit: jax.Array
     return Mean(mixed[:3], mixed[3], number, planar(downsample(missed.transpose(1, 2, 0))))
 
 
-def _by_compiled(most: float, noisy: jax.Array, history: History, hit: jax.Array, follow: jax.Array) -> Mean:
+@numba_call.implements(accumulated)
+def _accumulate_by_numba(noisy: jax.Array, history: History, hit: jax.Array, follow: jax.Array, *, most: float) -> Mean:
     from jaxdn.methods.steady.numba_accumulation import accumulated
 
     height, width = hit.shape
@@ -75,6 +69,7 @@ class Shown(NamedTuple):
     """What is added to both, as they were; None for nothing."""
 
 
+@operation
 def remembered(
     mean: Mean, shown: Shown, history: History, feedback: jax.Array, blend: jax.Array, *, most: float
 ) -> jax.Array:
@@ -83,15 +78,6 @@ def remembered(
     The mean takes the share ``feedback`` [H, W] of the fine image; the last output, between 0 and ``most``, the share
     ``blend`` [H, W] of the image, all of it where there was no history.
     """
-    plain = functools.partial(_remembered, most)
-    if numba_call.available() and mean.light.dtype == jnp.float32:
-        return alone(plain, functools.partial(_remembered_by_compiled, most))(mean, shown, history, feedback, blend)
-    return plain(mean, shown, history, feedback, blend)
-
-
-def _remembered(
-    most: float, mean: Mean, shown: Shown, history: History, feedback: jax.Array, blend: jax.Array
-) -> jax.Array:
     change = jnp.zeros_like(shown.image) if shown.change is None else shown.change
     before = planar(history.values)[5:] + change
     newest = jnp.where(history.valid, blend, 1.0)[None]
@@ -100,8 +86,9 @@ def _remembered(
     return jnp.concatenate([kept, mean.square[None], mean.number[None], output]).transpose(1, 2, 0)
 
 
-def _remembered_by_compiled(
-    most: float, mean: Mean, shown: Shown, history: History, feedback: jax.Array, blend: jax.Array
+@numba_call.implements(remembered)
+def _remember_by_numba(
+    mean: Mean, shown: Shown, history: History, feedback: jax.Array, blend: jax.Array, *, most: float
 ) -> jax.Array:
     from jaxdn.methods.steady.numba_accumulation import remembered
 

@@ -8,7 +8,7 @@ from jaxdn.color import LUMINANCE, luminance_of_planes
 from jaxdn.filters.clamping import DARK, without_specks
 from jaxdn.methods.steady.accumulation import Mean
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.inference_path import alone
+from jaxdn.ops.dispatch.operation import operation
 
 _SOME = 1.5
 """Effective number of frames from which on their deviation tells how sure a mean is."""
@@ -20,18 +20,13 @@ _LEAST_VARIANCE = 1e-12
 """With a slope of the deviation at 0."""
 
 
+@operation
 def dimmed(image: jax.Array, hit: jax.Array, mean: Mean) -> jax.Array:
     """The image [3, H, W] >= 0 with :func:`jaxdn.filters.clamping.without_specks` by the mean of its channels.
 
     Of what the history shows a pixel is sure but for two deviations of the mean; of a single frame, of nothing. ``hit``
     [H, W] bool: a surface is seen.
     """
-    if numba_call.available() and image.dtype == jnp.float32:
-        return alone(_dimmed, _dimmed_by_compiled)(image, hit, mean)
-    return _dimmed(image, hit, mean)
-
-
-def _dimmed(image: jax.Array, hit: jax.Array, mean: Mean) -> jax.Array:
     level = luminance_of_planes(mean.light)
     variance = jnp.maximum(mean.square - level**2, 0.0) / jnp.maximum(mean.number, 1.0)
     deviation = jnp.sqrt(variance + _LEAST_VARIANCE)
@@ -39,7 +34,8 @@ def _dimmed(image: jax.Array, hit: jax.Array, mean: Mean) -> jax.Array:
     return image * without_specks((image[0] + image[1] + image[2]) / 3.0, hit, sure)[None]
 
 
-def _dimmed_by_compiled(image: jax.Array, hit: jax.Array, mean: Mean) -> jax.Array:
+@numba_call.implements(dimmed)
+def _dim_by_numba(image: jax.Array, hit: jax.Array, mean: Mean) -> jax.Array:
     from jaxdn.methods.steady.numba_fireflies import dimmed
 
     weights = np.asarray(LUMINANCE, np.float32)

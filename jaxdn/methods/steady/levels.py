@@ -23,8 +23,8 @@ from jaxdn.methods.steady import lighting_change, regression
 from jaxdn.methods.steady.accumulation import Shown
 from jaxdn.networks import pad
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
-from jaxdn.ops.affinity.joint_upsample import enlarge
-from jaxdn.ops.layout.planar import Part, planes_of
+from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
+from jaxdn.ops.layout.planar import Part, join_planes
 from jaxdn.ops.scales import upsample
 
 LEVELS = 4
@@ -59,7 +59,7 @@ class Decisions(NamedTuple):
     """What is decided about the pixels of a frame."""
 
     features: jax.Array
-    """[H/2, W/2, 4F] of all four pixels of a block (:func:`jaxdn.ops.scales.fold`)."""
+    """[H/2, W/2, 4F] of all four pixels of a block (:func:`jaxdn.ops.scales.space_to_depth`)."""
     trust: jax.Array
     """[H, W] in [0, 1]."""
     coarse: jax.Array
@@ -134,7 +134,7 @@ def filtered(
         parts.append(("planes", regression.guides_of(surfaces.normal, surfaces.gloss, slanted[0])))
     if texture is not None:
         parts.append(("pixels", texture))
-    before = fine = planes_of(parts)
+    before = fine = join_planes(parts)
     for index in range(full_levels):
         fine = affinity_filter(fine, at_full, step=2**index)
     found, alike = _from_half(fine, missed, surfaces, slanted, decided, factors, at_full)
@@ -166,7 +166,7 @@ def _from_half(
     """
     slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
     hit, own = _any_of_four(surfaces.hit), decided.half_features
-    halved = planes_of(surfaces.guides("means"))
+    halved = join_planes(surfaces.guides("means"))
     at_half = _guide([("planes", halved), ("pixels", own)], slanted_half, decided.half_trust, hit)
     found = _coarse(_half(fine, surfaces.hit), _at_levels(at_half, factors), decided.take)
     if missed is not None:
@@ -176,7 +176,7 @@ def _from_half(
         found = jnp.concatenate([found, change])
     features = [("planes", halved), ("corners", decided.features)]
     there = _guide(features, slanted[:, ::2, ::2], decided.half_trust, hit)
-    enlarged, weight = enlarge(found, there, at_full)
+    enlarged, weight = joint_bilateral_upsample(found, there, at_full)
     return enlarged, weight / (weight + _LIKENESS)
 
 
@@ -187,7 +187,7 @@ def _any_of_four(hit: jax.Array) -> jax.Array:
 
 def _guide(features: Sequence[Part], slanted: jax.Array, trust: jax.Array, hit: jax.Array) -> Guide:
     """Surfaces and what else is learned, not yet scaled; what is no surface gives nothing."""
-    return Guide(planes_of(features), slanted, (trust + _LEAST_TRUST) * hit)
+    return Guide(join_planes(features), slanted, (trust + _LEAST_TRUST) * hit)
 
 
 def _at_level(guide: Guide, factors: Mapping[str, jax.Array], index: int) -> Guide:

@@ -16,7 +16,6 @@ The filter is variance-guided filtering without its variance (Schied et al. 2017
 (Isik et al. 2021) and a recurrent network's view of noisy frame, mean and last output (Zeng et al. 2021).
 """
 
-import functools
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
@@ -39,9 +38,9 @@ from jaxdn.methods.steady.levels import BLOCKS, LEVELS, Decisions, Surfaces, fil
 from jaxdn.methods.steady.network_input import CHANNELS, DARK, History, seen
 from jaxdn.networks import Widths, crop, description, pad
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.inference_path import alone
-from jaxdn.ops.layout.planar import planar, planes_of
-from jaxdn.ops.scales import downsample, fill, upsample
+from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.layout.planar import join_planes, planar
+from jaxdn.ops.scales import downsample, fill_holes, upsample
 from jaxdn.recipes.objectives import pyramid_illumination
 from jaxdn.recipes.recipe import FINISH, Recipe
 
@@ -159,7 +158,7 @@ def steady(options: Options) -> Denoiser:
         decided, shares = decisions(head, (hit.shape[0] // 2, hit.shape[1] // 2))
         mean = accumulated(noisy, past, hit, shares["follow"], most=options.history_max)
         texture = texture_left(frame, options.demodulate, whole)
-        texture = None if texture is None else fill(pad(texture, BLOCKS), hit[..., None])
+        texture = None if texture is None else fill_holes(pad(texture, BLOCKS), hit[..., None])
         given = mean.light, mean.missed if quality.at_once else None, texture, surfaces, slanted(surfaces, whole)
         found = filtered(params["guide"], *given, decided, quality.full_levels, DARK / whole.exposure)
         found = found._replace(image=dimmed(found.image, hit, mean))
@@ -187,7 +186,7 @@ def _known(frame: Frame, surfaces: Surfaces) -> jax.Array:
 
 def _noisy(frame: Frame, known: jax.Array) -> jax.Array:
     # Divided by a small reflectance it may be beyond what the network has ever seen.
-    return fill(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), BLOCKS), known[..., None])
+    return fill_holes(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), BLOCKS), known[..., None])
 
 
 def _seen(noisy: jax.Array, past: History, surfaces: Surfaces, whole: FrameStatistics) -> jax.Array:
@@ -200,9 +199,7 @@ def _seen(noisy: jax.Array, past: History, surfaces: Surfaces, whole: FrameStati
 
 def decisions(head: jax.Array, size: tuple[int, int]) -> tuple[Decisions, dict[str, jax.Array]]:
     """What the head says about as many blocks: about the filter, and the shares [H, W] in [0, 1] of :data:`BEGIN`."""
-    plain, compiled = (functools.partial(function, size) for function in (_apart, _apart_by_compiled))
-    apart = alone(plain, compiled) if numba_call.available() and head.dtype == jnp.float32 else plain
-    own, planes, half, (trust, *take) = apart(head)
+    own, planes, half, (trust, *take) = _apart(head, size=size)
     shares = dict(zip(BEGIN, planes, strict=True))
     # A pixel whose share knows of its own noise, follows bright samples more: its mean becomes too bright.
     shares["follow"] = upsample(downsample(shares["follow"][..., None]))[..., 0]
@@ -214,14 +211,16 @@ _Apart = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 """Features [H/2, W/2, 4F], shares of all pixels [len(BEGIN), H, W], features and shares [.., H/2, W/2] of blocks."""
 
 
-def _apart(size: tuple[int, int], head: jax.Array) -> _Apart:
+@operation(name="split_decisions")
+def _apart(head: jax.Array, *, size: tuple[int, int]) -> _Apart:
     # Splits, not slices: the gradient of a slice is an array of the whole size, and all of them are added.
     own, logits, half, rest = jnp.split(crop(head, size), _PLACES, axis=-1)
     # Before they are unfolded, while they lie side by side in memory.
-    return own, planes_of([("blocks", jax.nn.sigmoid(logits))]), half, planar(jax.nn.sigmoid(rest))
+    return own, join_planes([("blocks", jax.nn.sigmoid(logits))]), half, planar(jax.nn.sigmoid(rest))
 
 
-def _apart_by_compiled(size: tuple[int, int], head: jax.Array) -> _Apart:
+@numba_call.implements(_apart)
+def _apart_by_numba(head: jax.Array, *, size: tuple[int, int]) -> _Apart:
     from jaxdn.methods.steady.numba_heads import decided
 
     (height, width), (first, _, last) = size, _PLACES

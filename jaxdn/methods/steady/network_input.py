@@ -1,6 +1,5 @@
 """What a network at half resolution sees of a frame: surfaces, all four pixels of a block; light, mostly their mean."""
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -10,8 +9,8 @@ import numpy as np
 from jaxdn import color
 from jaxdn.networks import pad
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.inference_path import alone
-from jaxdn.ops.scales import downsample, fold
+from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.scales import downsample, space_to_depth
 
 CHANNELS = 20
 """Of light; those of surfaces come first, four for each."""
@@ -29,6 +28,7 @@ class History(NamedTuple):
     """[H, W] bool, something is."""
 
 
+@operation
 def seen(
     geometry: tuple[jax.Array, ...],
     noisy: jax.Array,
@@ -53,40 +53,27 @@ def seen(
       gain: scalar.
       multiple: see above.
     """
-    given = geometry, noisy, history, hit, jnp.asarray(gain, noisy.dtype)
-    plain = functools.partial(_seen, multiple)
-    if numba_call.available() and noisy.dtype == jnp.float32:
-        return alone(plain, functools.partial(_seen_by_compiled, multiple))(*given)
-    return plain(*given)
-
-
-def _seen(
-    multiple: int,
-    geometry: tuple[jax.Array, ...],
-    noisy: jax.Array,
-    history: History,
-    hit: jax.Array,
-    gain: jax.Array,
-) -> jax.Array:
     mean, square, number, shown = jnp.split(history.values, (3, 4, 5), axis=-1)
     level = color.luminance(mean)
     spread = jnp.sqrt(jnp.maximum(square - level**2, 0.0) + 1e-12) / (level + DARK / gain)
     facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + number), hit[..., None].astype(noisy.dtype)]
     recent = (jnp.where(history.valid[..., None], one, noisy) for one in (mean, shown))
     light = [color.compress(gain * one) for one in (noisy, *recent)]
-    corners = [fold(color.luminance(light[index])) for index in (0, 2)]
+    corners = [space_to_depth(color.luminance(light[index])) for index in (0, 2)]
     # One by one: XLA:CPU does not vectorise what it writes side by side.
-    found = [*map(fold, geometry), *map(downsample, [*light, *facts]), *corners]
+    found = [*map(space_to_depth, geometry), *map(downsample, [*light, *facts]), *corners]
     return pad(jnp.concatenate(found, axis=-1), multiple)
 
 
-def _seen_by_compiled(
-    multiple: int,
+@numba_call.implements(seen)
+def _see_by_numba(
     geometry: tuple[jax.Array, ...],
     noisy: jax.Array,
     history: History,
     hit: jax.Array,
     gain: jax.Array,
+    *,
+    multiple: int,
 ) -> jax.Array:
     from jaxdn.methods.steady.numba_network_input import seen
 

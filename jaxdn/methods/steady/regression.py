@@ -28,8 +28,8 @@ from jax import lax
 
 from jaxdn.ops.affinity.filter import SPLINE
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.inference_path import alone
-from jaxdn.ops.layout.planar import planes_of
+from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.layout.planar import join_planes
 
 SCALES = {"normal": 0.0, "position": 0.0, "gloss": 0.0, "depth": 0.0}
 """Logarithms of what the guides are multiplied by before training: more, and their slope is believed sooner."""
@@ -53,7 +53,7 @@ def guides_of(normal: jax.Array, gloss: jax.Array, inverse: jax.Array) -> jax.Ar
     """[7, H, W] what light may follow, from [H, W, 3] normals, [H, W, 1] gloss and [H, W] inverse depth."""
     rows, columns = (_POSITION * lax.broadcasted_iota(inverse.dtype, inverse.shape, axis) for axis in (0, 1))
     rest = jnp.stack([columns, rows])
-    return planes_of([("pixels", normal), ("planes", rest), ("pixels", gloss), ("planes", inverse[None])])
+    return join_planes([("pixels", normal), ("planes", rest), ("pixels", gloss), ("planes", inverse[None])])
 
 
 def given_back(
@@ -70,9 +70,6 @@ def given_back(
     """
     factors = jnp.concatenate([jnp.full(n, jnp.exp(scales[name])) for name, n in _CHANNELS.items()])
     given = before, after, hit, jnp.asarray(floor, before.dtype), factors
-    if numba_call.available() and before.dtype == jnp.float32:
-        slopes = _slopes(alone(_moments, _moments_by_compiled)(*given))
-        return alone(_explained, _explained_by_compiled)(slopes, *given)
     return _explained(_slopes(_moments(*given)), *given)
 
 
@@ -87,6 +84,7 @@ def _away(before: jax.Array, after: jax.Array, hit: jax.Array, factors: jax.Arra
     return factors[:, None, None] * jnp.where(hit[None], before[guides] - after[guides], 0.0)
 
 
+@operation(name="regression_moments")
 def _moments(before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array, factors: jax.Array) -> jax.Array:
     """[11, 11, h, w] means over cells of the products of d, r, and whether there is a surface, with each other."""
     rest = jnp.where(hit[None], before[:3] - after[:3], 0.0) / _level(after, floor)[None]
@@ -98,7 +96,8 @@ def _moments(before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Arr
     return found / CELL**2
 
 
-def _moments_by_compiled(
+@numba_call.implements(_moments)
+def _moments_by_numba(
     before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array, factors: jax.Array
 ) -> jax.Array:
     from jaxdn.methods.steady.numba_regression import moments
@@ -124,17 +123,12 @@ def _slopes(moments: jax.Array) -> jax.Array:
     return slopes
 
 
+@operation(name="regression_solve")
 def solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Array:
     """b [7, 3, h, w] for all cells at once, from E[d d'] and E[d r'] side by side [7, 10, h, w], u [h, w] and b'.
 
     Gauss and Jordan's elimination, which needs no pivots as E[d d'] + u I is positive definite.
     """
-    if numba_call.available() and system.dtype == jnp.float32:
-        return alone(_solved, _solved_by_compiled)(system, doubt, expected)
-    return _solved(system, doubt, expected)
-
-
-def _solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Array:
     units = np.eye(GUIDES, dtype=system.dtype)[..., None, None]
     believed = jnp.concatenate([jnp.broadcast_to(units, (GUIDES, GUIDES, *doubt.shape)), expected], axis=1)
     system = system + doubt[None, None] * believed
@@ -145,7 +139,8 @@ def _solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Arr
     return system[:, GUIDES:]
 
 
-def _solved_by_compiled(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Array:
+@numba_call.implements(solved)
+def _solve_by_numba(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Array:
     from jaxdn.methods.steady.numba_regression import solved
 
     return numba_call.call(solved, [expected.shape], [system, doubt, expected], rows=doubt.shape[0])[0]
@@ -161,6 +156,7 @@ def _blurred(planes: jax.Array, step: int) -> jax.Array:
     return planes
 
 
+@operation(name="regression_explain")
 def _explained(
     slopes: jax.Array, before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array, factors: jax.Array
 ) -> jax.Array:
@@ -185,7 +181,8 @@ def _between(cells: jax.Array, axis: int) -> jax.Array:
     return found.reshape(*cells.shape[:axis], CELL * size, *cells.shape[axis + 1 :])
 
 
-def _explained_by_compiled(
+@numba_call.implements(_explained)
+def _explain_by_numba(
     slopes: jax.Array, before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array, factors: jax.Array
 ) -> jax.Array:
     from jaxdn.methods.steady.numba_regression import explained

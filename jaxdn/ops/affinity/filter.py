@@ -21,6 +21,7 @@ would compute every weight once for each channel that uses it.
 """
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -31,6 +32,7 @@ from jax import lax
 from jaxdn.core.platform import platform
 from jaxdn.ops.affinity import pallas_kernels
 from jaxdn.ops.dispatch import numba_call
+from jaxdn.ops.dispatch.operation import operation
 
 RADIUS = 2
 SPLINE = (0.375, 0.25, 0.0625)
@@ -66,7 +68,7 @@ class Guide(NamedTuple):
         return Guide(factors[:-1] * self.features, factors[-1:] * self.slanted, self.confidence)
 
 
-def affinity_filter(image: jax.Array, guide: Guide, *, step: int = 1) -> jax.Array:
+def affinity_filter(image: jax.Array, guide: Guide, *, step: int = 1, implementation: str | None = None) -> jax.Array:
     """The filtered image [C, H, W], any colour space; taps are ``step`` pixels apart.
 
     Taps beyond the border do not count. A pixel whose weights sum to nothing keeps its value. Differentiable by the
@@ -80,17 +82,33 @@ def affinity_filter(image: jax.Array, guide: Guide, *, step: int = 1) -> jax.Arr
             f"guide: expected features [F, H, W], slanted [3, H, W] and confidence [H, W] for an image [C, H, W], got "
             f"{guide.features.shape}, {guide.slanted.shape} and {guide.confidence.shape} for {image.shape}."
         )
-    if numba_call.available() and image.dtype == guide.features.dtype == jnp.float32:
-        return _by_loops(image, guide, step)
-    return _filtered(image, guide.scaled(), step)
+    return _filter_by_affinity(image, guide, step=step, implementation=implementation)
+
+
+@operation(name="affinity_filter")
+def _filter_by_affinity(image: jax.Array, guide: Guide, *, step: int) -> jax.Array:
+    """The reference, on CPUs in row tiles."""
+    return _by_xla(image, guide.scaled(), step)
+
+
+@_filter_by_affinity.implementation(
+    "pallas", platforms=("gpu",), dtypes=(jnp.float32,), unavailable=pallas_kernels.unavailable
+)
+def _filter_by_pallas(image: jax.Array, guide: Guide, *, step: int) -> jax.Array:
+    return _by_pallas(image, guide.scaled(), step)
+
+
+@numba_call.implements(_filter_by_affinity, differentiable=True)
+def _filter_by_numba(image: jax.Array, guide: Guide, *, step: int) -> jax.Array:
+    return _by_numba(image, guide, step)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _by_loops(image: jax.Array, guide: Guide, step: int) -> jax.Array:
-    return _loops_forward(image, guide, step)[0]
+def _by_numba(image: jax.Array, guide: Guide, step: int) -> jax.Array:
+    return _numba_forward(image, guide, step)[0]
 
 
-def _loops_forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, "_Residuals"]:
+def _numba_forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, "_Residuals"]:
     from jaxdn.ops.affinity.numba_kernels import filtered
 
     arrays = [image, *guide[:3], guide.factors()]
@@ -100,7 +118,7 @@ def _loops_forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array
     return found, (image, guide, found, weight[None])
 
 
-def _loops_backward(step: int, residuals: "_Residuals", cotangent: jax.Array) -> tuple[jax.Array, Guide]:
+def _numba_backward(step: int, residuals: "_Residuals", cotangent: jax.Array) -> tuple[jax.Array, Guide]:
     from jaxdn.ops.affinity.numba_kernels import filtered_gradient
 
     image, given, filtered, weight = residuals
@@ -169,32 +187,60 @@ def _dot(one: Planes, other: Planes) -> jax.Array:
     return functools.reduce(jnp.add, [a * b for a, b in zip(one, other, strict=True)])
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _filtered(image: jax.Array, guide: Guide, step: int) -> jax.Array:
-    return _forward(image, guide, step)[0]
-
-
 _Residuals = tuple[jax.Array, Guide, jax.Array, jax.Array]
+_Sums = Callable[[jax.Array, Guide, int], jax.Array]
+"""(image, guide without scales, step) -> [C + 1, H, W] the weighted sums of light, and of weights."""
+_Gradients = Callable[[jax.Array, Guide, jax.Array, jax.Array, int], tuple[jax.Array, Guide]]
+"""(image, guide, gains and level of :func:`_gains`, step) -> gradients by image and guide, where there is weight."""
 
 
-def _forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, _Residuals]:
-    if pallas_kernels.available() and image.dtype == guide.features.dtype == jnp.float32:
-        mass = jnp.concatenate([image * guide.confidence[None], guide.confidence[None]])
-        totals = pallas_kernels.totals(_planes(guide), mass, step=step)
-    else:
-        totals = _totals(image, guide, step)
-    weight = totals[-1:]
-    some = weight > _NO_WEIGHT
-    filtered = jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), image)
-    return filtered, (image, guide, filtered, weight)
+def _differentiable(sum_taps: _Sums, gather_gradients: _Gradients) -> Callable[[jax.Array, Guide, int], jax.Array]:
+    """The filter of an image by a guide without scales, from the sums over its taps and their gradients.
+
+    The gradients are gathered: every pixel p collects what it gets as the centre and what it gets as a tap of its
+    neighbours q. With g = cotangent / W and s = <g, out>, the gradient by the weight of q in p is
+    ``<g(p), x(q)> - s(p)``.
+    """
+
+    @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+    def run(image: jax.Array, guide: Guide, step: int) -> jax.Array:
+        return forward(image, guide, step)[0]
+
+    def forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, _Residuals]:
+        totals = sum_taps(image, guide, step)
+        weight = totals[-1:]
+        some = weight > _NO_WEIGHT
+        filtered = jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), image)
+        return filtered, (image, guide, filtered, weight)
+
+    def backward(step: int, residuals: _Residuals, cotangent: jax.Array) -> tuple[jax.Array, Guide]:
+        image, guide, filtered, weight = residuals
+        some, gains, level = _gains(filtered, weight, cotangent)
+        by_image, by_guide = gather_gradients(image, guide, gains, level, step)
+        return by_image + jnp.where(some, 0.0, cotangent), by_guide
+
+    run.defvjp(forward, backward)
+    return run
+
+
+def _sum_by_pallas(image: jax.Array, guide: Guide, step: int) -> jax.Array:
+    mass = jnp.concatenate([image * guide.confidence[None], guide.confidence[None]])
+    return pallas_kernels.totals(_planes(guide), mass, step=step)
+
+
+def _gather_by_pallas(
+    image: jax.Array, guide: Guide, gains: jax.Array, level: jax.Array, step: int
+) -> tuple[jax.Array, Guide]:
+    given = _planes(guide), guide.confidence, image, gains, level
+    by_image, by_confidence, by_planes = pallas_kernels.gradients(*given, step=step)
+    return by_image, Guide(by_planes[:-3], by_planes[-3:], by_confidence)
 
 
 def _planes(guide: Guide) -> jax.Array:
     return jnp.concatenate([guide.features, guide.slanted])
 
 
-def _totals(image: jax.Array, guide: Guide, step: int) -> jax.Array:
-    """[C + 1, H, W] the weighted sums of light, and of weights."""
+def _sum_taps(image: jax.Array, guide: Guide, step: int) -> jax.Array:
     channels, height, width = image.shape
     dtype, margin = image.dtype, step * RADIUS
     rows = height if platform() != "cpu" else min(height, max(8 * step, _STRIP // width))
@@ -252,26 +298,9 @@ def _gains(filtered: jax.Array, weight: jax.Array, cotangent: jax.Array) -> tupl
     return some, scaled, jnp.sum(scaled * filtered, axis=0)
 
 
-def _backward(step: int, residuals: _Residuals, cotangent: jax.Array) -> tuple[jax.Array, Guide]:
-    """Gathered: every pixel p collects what it gets as the centre and what it gets as a tap of its neighbours q.
-
-    With g = cotangent / W and s = <g, out>, the gradient by the weight of q in p is ``<g(p), x(q)> - s(p)``.
-    """
-    image, guide, filtered, weight = residuals
-    some, scaled, level = _gains(filtered, weight, cotangent)
-    if pallas_kernels.available() and image.dtype == guide.features.dtype == jnp.float32:
-        given = _planes(guide), guide.confidence, image, scaled, level
-        by_image, by_confidence, by_planes = pallas_kernels.gradients(*given, step=step)
-        by_guide = Guide(by_planes[:-3], by_planes[-3:], by_confidence)
-    else:
-        by_image, by_guide = _gathered(image, guide, scaled, level, step)
-    return by_image + jnp.where(some, 0.0, cotangent), by_guide
-
-
-def _gathered(
+def _gather_gradients(
     image: jax.Array, guide: Guide, scaled: jax.Array, level: jax.Array, step: int
 ) -> tuple[jax.Array, Guide]:
-    """By the image and by the guide, where there is weight."""
     _, height, width = image.shape
     dtype, margin = image.dtype, step * RADIUS
 
@@ -337,5 +366,6 @@ def _gathered(
     return jnp.stack(sums[: len(x)]), Guide(jnp.stack(by_guides[:-3]), jnp.stack(by_guides[-3:]), sums[len(x)])
 
 
-_filtered.defvjp(_forward, _backward)
-_by_loops.defvjp(_loops_forward, _loops_backward)
+_by_xla = _differentiable(_sum_taps, _gather_gradients)
+_by_pallas = _differentiable(_sum_by_pallas, _gather_by_pallas)
+_by_numba.defvjp(_numba_forward, _numba_backward)

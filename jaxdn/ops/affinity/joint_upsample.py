@@ -17,7 +17,7 @@ from jax import lax
 from jaxdn.core.platform import platform
 from jaxdn.ops.affinity.filter import Guide, affinity
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.inference_path import alone
+from jaxdn.ops.dispatch.operation import operation
 
 _SPREAD = 3.0
 """Twice the variance of the spatial weights, in pixels of the fine image."""
@@ -28,7 +28,8 @@ _NO_WEIGHT = 1e-6
 Planes = list[jax.Array]
 
 
-def enlarge(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, jax.Array]:
+@operation
+def joint_bilateral_upsample(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, jax.Array]:
     """The coarse image [C, h, w] as [C, 2h, 2w], and the sum of weights [2h, 2w] in [0, 1].
 
     Every fine pixel takes the mean of the 3x3 coarse pixels around it, weighted by their distance, confidence and
@@ -37,20 +38,24 @@ def enlarge(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, ja
     left of its four pixels, and its slopes are those per fine pixel. Where no coarse pixel is alike, the sum of weights
     is 0 and so is the image.
     """
-    if numba_call.available() and coarse.dtype == here.features.dtype == jnp.float32:
-        return alone(_enlarged, _enlarged_by_compiled)(coarse, there, here)
-    return _enlarged(coarse, there, here)
+    return _normalize(_sum_taps(coarse, there._replace(scales=here.scales).scaled(), here.scaled()))
 
 
-def _enlarged(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, jax.Array]:
-    at_once = platform() == "gpu"
-    totals = (_at_once if at_once else _totals)(coarse, there._replace(scales=here.scales).scaled(), here.scaled())
+@joint_bilateral_upsample.implementation("unrolled", platforms=("gpu",))
+def _upsample_unrolled(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, jax.Array]:
+    """Without a scan: a GPU would start hundreds of small kernels, and scatter in the gradient."""
+    return _normalize(_sum_unrolled_taps(coarse, there._replace(scales=here.scales).scaled(), here.scaled()))
+
+
+def _normalize(totals: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The image and the sum of weights, from the sums of the taps."""
     weight = totals[-1:]
     some = weight > _NO_WEIGHT
     return jnp.where(some, totals[:-1] / jnp.where(some, weight, 1.0), 0.0), jnp.where(some, weight, 0.0)[0]
 
 
-def _enlarged_by_compiled(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, jax.Array]:
+@numba_call.implements(joint_bilateral_upsample)
+def _upsample_by_numba(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, jax.Array]:
     from jaxdn.ops.affinity.numba_kernels import enlarged
 
     channels, height, width = coarse.shape
@@ -61,8 +66,8 @@ def _enlarged_by_compiled(coarse: jax.Array, there: Guide, here: Guide) -> tuple
     return image, weight
 
 
-def _at_once(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
-    """As :func:`_totals`, without a scan: a GPU would start hundreds of small kernels, and scatter in the gradient."""
+def _sum_unrolled_taps(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
+    """As :func:`_sum_taps`, without a scan."""
     height, width = coarse.shape[1:]
     guides = jnp.pad(jnp.concatenate([there.features, there.slanted]), ((0, 0), (1, 1), (1, 1)), mode="edge")
     mass = jnp.concatenate([coarse * there.confidence[None], there.confidence[None]])
@@ -82,7 +87,7 @@ def _at_once(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
     return jnp.stack(found).reshape(2, 2, -1, height, width).transpose(2, 3, 0, 4, 1).reshape(-1, 2 * height, 2 * width)
 
 
-def _totals(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
+def _sum_taps(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
     """[C + 1, 2h, 2w] the weighted sum of every fine pixel's taps and of their weights."""
     channels, height, width = coarse.shape
     rows = height if platform() != "cpu" else min(height, max(1, _STRIP // width))

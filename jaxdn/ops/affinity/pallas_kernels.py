@@ -9,7 +9,6 @@ import functools
 import warnings
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
-from os import environ
 from typing import Any
 
 import jax
@@ -34,9 +33,11 @@ def _installed() -> bool:
         return False
 
 
-def available() -> bool:
-    """Whether programs are made for a GPU, and jax can compile kernels for it; ``JAXDN_COMPILED=0`` forbids it."""
-    return platform() == "gpu" and environ.get("JAXDN_COMPILED") != "0" and _installed()
+def unavailable() -> str:
+    """Why programs cannot call these kernels, and what to do; empty if they can."""
+    if platform() != "gpu":
+        return f"runs on GPUs, and the program is for {platform()!r}"
+    return "" if _installed() else "needs jax.experimental.pallas.triton, which this version of jax lacks"
 
 
 def totals(guides: jax.Array, mass: jax.Array, *, step: int) -> jax.Array:

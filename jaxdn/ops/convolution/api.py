@@ -20,7 +20,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jaxdn.ops.convolution import onednn
-from jaxdn.ops.dispatch.registry import register, resolve
+from jaxdn.ops.dispatch.operation import operation
 from jaxdn.ops.onednn import library
 
 Product = Callable[[jax.Array, jax.Array], jax.Array]
@@ -31,14 +31,12 @@ _BLOCK_BYTES = 4 << 20
 _BORDER = ((0, 0), (1, 1), (1, 1), (0, 0))
 
 
-def convolve(x: jax.Array, kernel: jax.Array, *, implementation: str | None = None) -> jax.Array:
-    """Convolve ``x`` [N, H, W, Ci] with ``kernel`` [3, 3, Ci, Co], stride 1, zeros outside: [N, H, W, Co]."""
-    return resolve("convolution", implementation)(x, kernel)
+@operation
+def convolve(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """Convolve ``x`` [N, H, W, Ci] with ``kernel`` [3, 3, Ci, Co], stride 1, zeros outside: [N, H, W, Co].
 
-
-@register("convolution", "reference", preferred_on=("gpu", "tpu"))
-def reference(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    """XLA's own convolution with automatic gradients."""
+    The reference is XLA's own convolution with automatic gradients.
+    """
     return lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=_LAYOUT)
 
 
@@ -132,7 +130,7 @@ def _forward(x: jax.Array, kernel: jax.Array) -> jax.Array:
     With the channels of a U-Net these take ten times as long.
     """
     if x.dtype != jnp.float64:
-        return reference(x, kernel)
+        return convolve(x, kernel, implementation="reference")
     count, height, width, _ = x.shape
     padded, flat, rows = jnp.pad(x, _BORDER), kernel.reshape(-1, kernel.shape[3]), _rows(x)
 
@@ -172,18 +170,16 @@ def _kernel_gradient(x: jax.Array, cotangent: jax.Array) -> jax.Array:
 
 
 _blocked = _differentiable("blocked", _forward, _kernel_gradient)
-_by_engine = _differentiable("onednn", onednn.forward, onednn.kernel_gradient)
+_by_onednn = _differentiable("onednn", onednn.forward, onednn.kernel_gradient)
 
 
-@register("convolution", "blocked", preferred_on=("cpu",))
-def blocked(x: jax.Array, kernel: jax.Array) -> jax.Array:
+@convolve.implementation("blocked", platforms=("cpu",))
+def _convolve_blocked(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """XLA's convolution with gradients that are plain convolutions and blocked matrix products."""
     return _blocked(x, kernel)
 
 
-@register("convolution", "onednn", requires=library.check_available)
-def engine(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    """oneDNN for float32, value and gradients; ``"blocked"`` for other types, which oneDNN does not run fast."""
-    if x.dtype == kernel.dtype == jnp.float32:
-        return _by_engine(x, kernel)
-    return _blocked(x, kernel)
+@convolve.implementation("onednn", dtypes=(jnp.float32,), unavailable=library.unavailable)
+def _convolve_by_onednn(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """Value and gradients in oneDNN, which runs other types no faster than XLA."""
+    return _by_onednn(x, kernel)

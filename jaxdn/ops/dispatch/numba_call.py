@@ -13,16 +13,29 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
 from jaxdn.core.platform import platform
+from jaxdn.ops.dispatch.operation import Operation
 
 Given = jax.Array | tuple[jax.Array, ...] | None
 
 
-def available() -> bool:
-    """Whether programs are made for this CPU, and Numba is there to compile loops for it.
+def unavailable() -> str:
+    """Why programs cannot call compiled loops, and what to do; empty if they can."""
+    if platform() != "cpu":
+        return f"runs on the CPU, and the program is for {platform()!r}"
+    return "" if _installed() else "needs the package numba: pip install numba"
 
-    With the environment variable ``JAXDN_COMPILED=0`` all of them are plain XLA.
-    """
-    return platform() == "cpu" and os.environ.get("JAXDN_COMPILED") != "0" and _installed()
+
+def implements(
+    operation: Operation[..., Any], *, differentiable: bool = False
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Decorator: declare a function of compiled loops as the implementation ``"numba"``, for float32 on CPUs."""
+    return operation.implementation(
+        "numba",
+        platforms=("cpu",),
+        dtypes=(jnp.float32,),
+        differentiable=differentiable,
+        unavailable=unavailable,
+    )
 
 
 def call(

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn.core.checks import check_image, check_same_size
-from jaxdn.ops.dispatch.registry import register, resolve
+from jaxdn.ops.dispatch.operation import operation
 
 
 def normalize_kernels(logits: jax.Array) -> jax.Array:
@@ -40,7 +40,7 @@ def apply_kernels(image: jax.Array, kernels: jax.Array, *, implementation: str |
     check_taps(jnp.shape(kernels)[-1], "kernels")
     image, kernels = jnp.asarray(image), jnp.asarray(kernels)
     dtype = jnp.promote_types(image.dtype, kernels.dtype)
-    return resolve("apply_kernels", implementation)(image.astype(dtype), kernels.astype(dtype))
+    return _sum_taps(image.astype(dtype), kernels.astype(dtype), implementation=implementation)
 
 
 def check_taps(taps: int, name: str) -> None:
@@ -67,8 +67,8 @@ def offsets(radius: int) -> list[tuple[int, int]]:
     return [(row, column) for row in range(size) for column in range(size)]
 
 
-@register("apply_kernels", "reference")
-def reference(image: jax.Array, kernels: jax.Array) -> jax.Array:
+@operation(name="apply_kernels")
+def _sum_taps(image: jax.Array, kernels: jax.Array) -> jax.Array:
     """Shifted multiply-adds with automatic gradients."""
     height, width, _ = image.shape
     radius = _radius(kernels)
@@ -81,11 +81,11 @@ def reference(image: jax.Array, kernels: jax.Array) -> jax.Array:
 
 @jax.custom_vjp
 def _recompute(image: jax.Array, kernels: jax.Array) -> jax.Array:
-    return reference(image, kernels)
+    return _sum_taps(image, kernels, implementation="reference")
 
 
 def _forward(image: jax.Array, kernels: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-    return reference(image, kernels), (image, kernels)
+    return _sum_taps(image, kernels, implementation="reference"), (image, kernels)
 
 
 def _backward(residuals: tuple[jax.Array, jax.Array], cotangent: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -116,7 +116,7 @@ def _backward(residuals: tuple[jax.Array, jax.Array], cotangent: jax.Array) -> t
 _recompute.defvjp(_forward, _backward)
 
 
-@register("apply_kernels", "recompute", preferred_on=("cpu",))
-def recompute(image: jax.Array, kernels: jax.Array) -> jax.Array:
+@_sum_taps.implementation("recompute", platforms=("cpu",))
+def _sum_taps_recomputed(image: jax.Array, kernels: jax.Array) -> jax.Array:
     """The same multiply-adds; the gradients are recomputed from the arguments."""
     return _recompute(image, kernels)

@@ -1,7 +1,7 @@
 """Filtering with kernels given as logits: the softmax over the taps and the filter combined, strip by strip.
 
 The 25 logits per pixel of a 720p frame are 92 MB. For softmax, filter and each use of the result, XLA:CPU writes and
-reads them again, and it recomputes the filter for each of its users, because it fuses it into them. ``"strips"``
+reads them again, and it recomputes the filter for each of its users, because it fuses it into them. ``"row_tiles"``
 processes some rows at a time, so that the weights stay in the cache and the result is computed once. Its gradient
 keeps only the arguments and recomputes the weights.
 
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxdn.core.checks import check_image, check_same_size
-from jaxdn.ops.dispatch.registry import register, resolve
+from jaxdn.ops.dispatch.operation import operation
 from jaxdn.ops.kernel_prediction import apply, guide_distances
 from jaxdn.ops.kernel_prediction.apply import check_taps
 
@@ -41,7 +41,7 @@ def softmax_filter(
 
     images: [n, H, W, C], any colour space. logits: [H, W, m] with m >= n * taps; image i has the ``taps`` = K*K, K odd,
     from ``i * taps`` on; further channels are not read, so a network's head can be passed whole. Returns [n, H, W, C]
-    in float32 at least. ``implementation``: "reference" or "strips"; None selects the fastest. Raises ValueError for
+    in float32 at least. ``implementation``: "reference" or "row_tiles"; None selects the fastest. Raises ValueError for
     different sizes, too few logits, and taps that are not the square of an odd number.
 
     ``features`` [H, W, F] guide the kernels of all images: the logit of the tap at pixel q of pixel p gets
@@ -67,7 +67,8 @@ def softmax_filter(
         check_image(features, "features")
         check_same_size(logits, features, ("logits", "features"))
         features = jnp.asarray(features, dtype)
-    return resolve("softmax_filter", implementation)(images.astype(dtype), logits.astype(dtype), features, taps)
+    images, logits = images.astype(dtype), logits.astype(dtype)
+    return _filter_by_softmax(images, logits, features, taps=taps, implementation=implementation)
 
 
 def _weights(logits: jax.Array, count: int, taps: int, prior: jax.Array | None) -> list[jax.Array]:
@@ -84,8 +85,8 @@ def _prior(features: jax.Array, radius: int) -> jax.Array:
     return jnp.stack([jnp.sum(jnp.square(features - one), axis=-1) for one in shifted], axis=-1)
 
 
-@register("softmax_filter", "reference", preferred_on=("gpu", "tpu"))
-def reference(images: jax.Array, logits: jax.Array, features: jax.Array | None, taps: int) -> jax.Array:
+@operation(name="softmax_filter")
+def _filter_by_softmax(images: jax.Array, logits: jax.Array, features: jax.Array | None, *, taps: int) -> jax.Array:
     """The softmax, then the filter, with the gradients of the filter's default implementation."""
     prior = None if features is None else _prior(features, _radius(taps))
     kernels_of = _weights(logits, images.shape[0], taps, prior)
@@ -237,7 +238,7 @@ def _backward(taps: int, residuals: _Arguments, cotangent: jax.Array) -> _Argume
 _by_strips.defvjp(_forward, _backward)
 
 
-@register("softmax_filter", "strips", preferred_on=("cpu",))
-def strips(images: jax.Array, logits: jax.Array, features: jax.Array | None, taps: int) -> jax.Array:
+@_filter_by_softmax.implementation("row_tiles", platforms=("cpu",))
+def _filter_by_row_tiles(images: jax.Array, logits: jax.Array, features: jax.Array | None, *, taps: int) -> jax.Array:
     """Some rows at a time; the gradients recompute the weights."""
     return _by_strips(images, logits, features, taps)

@@ -4,13 +4,14 @@ XLA:CPU does not vectorise what it transposes, and computes what it fuses into a
 channels: a compiled loop keeps both apart.
 """
 
+import functools
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.inference_path import alone
+from jaxdn.ops.dispatch.operation import operation
 from jaxdn.ops.scales import downsample
 
 LAYOUTS = ("planes", "pixels", "blocks", "corners", "means")
@@ -18,26 +19,28 @@ LAYOUTS = ("planes", "pixels", "blocks", "corners", "means")
 
 Part = tuple[str, jax.Array]
 """A layout and an array: ``"planes"`` [C, H, W], ``"pixels"`` [H, W, C], ``"blocks"`` [H/2, W/2, 4C] made as by
-:func:`jaxdn.ops.scales.fold`; or what is averaged over blocks of 2x2 pixels: ``"corners"`` [H, W, 4C] made likewise, or
-``"means"`` [2H, 2W, C]."""
+:func:`jaxdn.ops.scales.space_to_depth`; or what is averaged over blocks of 2x2 pixels: ``"corners"`` [H, W, 4C] made
+likewise, or ``"means"`` [2H, 2W, C]."""
 
 
-def planes_of(parts: Sequence[Part]) -> jax.Array:
+def join_planes(parts: Sequence[Part], *, implementation: str | None = None) -> jax.Array:
     """[C, H, W] the channels of all parts, in their order; all parts have to be of one size."""
     layouts, arrays = zip(*parts, strict=True)
+    return _join_planes(*arrays, layouts=layouts, implementation=implementation)
 
-    def plain(*arrays: jax.Array) -> jax.Array:
-        return jnp.concatenate([_LAYOUTS[layout](array) for layout, array in zip(layouts, arrays, strict=True)])
 
-    def compiled(*arrays: jax.Array) -> jax.Array:
-        from jaxdn.ops.layout.numba_kernels import planes
+@operation(name="join_planes")
+def _join_planes(*arrays: jax.Array, layouts: tuple[str, ...]) -> jax.Array:
+    return jnp.concatenate([_TO_PLANES[layout](array) for layout, array in zip(layouts, arrays, strict=True)])
 
-        shape = jax.eval_shape(plain, *arrays).shape
-        return numba_call.call(planes, [shape], [arrays], tuple(map(LAYOUTS.index, layouts)), rows=shape[1])[0]
 
-    if numba_call.available() and all(array.dtype == jnp.float32 for array in arrays):
-        return alone(plain, compiled)(*arrays)
-    return plain(*arrays)
+@numba_call.implements(_join_planes)
+def _join_planes_by_numba(*arrays: jax.Array, layouts: tuple[str, ...]) -> jax.Array:
+    from jaxdn.ops.layout.numba_kernels import planes
+
+    reference = functools.partial(_join_planes, layouts=layouts, implementation="reference")
+    shape = jax.eval_shape(reference, *arrays).shape
+    return numba_call.call(planes, [shape], [arrays], tuple(map(LAYOUTS.index, layouts)), rows=shape[1])[0]
 
 
 def planar(image: jax.Array) -> jax.Array:
@@ -55,7 +58,7 @@ def _mean_of_corners(blocks: jax.Array) -> jax.Array:
     return jnp.mean(blocks.reshape(*blocks.shape[:2], -1, 4), axis=-1)
 
 
-_LAYOUTS = {
+_TO_PLANES = {
     "planes": lambda array: array,
     "pixels": planar,
     "blocks": _unfolded,

@@ -94,15 +94,11 @@ def trains_faster() -> bool:
     return available() and bool(library().dnnl_get_effective_cpu_isa() & _HAS_AVX512)
 
 
-def check_available() -> None:
-    """Raise ValueError, with what to do, where oneDNN cannot run."""
-    if jax.default_backend() != "cpu":
-        raise ValueError(
-            f'implementation: "onednn" runs on the CPU, and jax computes on {jax.default_backend()!r}; '
-            "leave it None, or set JAX_PLATFORMS=cpu."
-        )
-    if not available():
-        raise ValueError(f'implementation: "onednn" needs the package {PACKAGE} (Linux, x86-64): {install("onednn")}')
+def unavailable() -> str:
+    """Why oneDNN cannot run here, and what to do; empty if it can."""
+    if (backend := jax.default_backend()) != "cpu":
+        return f"runs on the CPU, and jax computes on {backend!r}; leave it None, or set JAX_PLATFORMS=cpu"
+    return "" if available() else f"needs the package {PACKAGE} (Linux, x86-64): {install('onednn')}"
 
 
 def call(function: str, *arguments: Any) -> None:

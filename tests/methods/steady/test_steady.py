@@ -14,7 +14,7 @@ from jaxdn.denoiser import Denoiser
 from jaxdn.denoiser.rollout import unroll
 from jaxdn.methods.steady.levels import LEVELS
 from jaxdn.methods.steady.method import BEGIN, FEATURES, HALF_FEATURES, decisions, steady
-from jaxdn.ops.scales import fold
+from jaxdn.ops.scales import space_to_depth
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -213,7 +213,7 @@ def test_the_share_of_the_newest_frame_hardly_knows_of_its_own_noise(rng):
     where = 4 * (FEATURES + list(BEGIN).index("follow"))
     head = np.zeros((32, 32, 4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS + 1))
     head[..., where : where + 4] = 2.0 * noise
-    share = np.asarray(fold(decisions(jnp.asarray(head, jnp.float32), (32, 32))[1]["follow"][..., None]))
+    share = np.asarray(space_to_depth(decisions(jnp.asarray(head, jnp.float32), (32, 32))[1]["follow"][..., None]))
     alone = np.mean(noise / (1.0 + np.exp(-2.0 * noise)))
     assert share.std() > 0.05
     assert 0.0 < np.mean(noise * share) < 0.2 * alone
