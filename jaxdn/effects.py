@@ -57,8 +57,9 @@ def inspect(
         return find(scene._replace(moments=scene.moments[:frames]))
     if _is_footage(scene):
         from jaxdn.data.evidence import read_facts
+        from jaxdn.data.foreign.naming import ChannelNaming
 
-        facts = read_facts(scene, animation, channels=channels, layer=layer)
+        facts = read_facts(scene, animation, ChannelNaming(channels=channels, layer=layer))
         return find(facts._replace(moments=facts.moments[:frames]))
     from jaxdn.render.opening import open_scene
     from jaxdn.render.scene_facts import facts_of

@@ -30,7 +30,7 @@ from jaxdn.networks.engines import ENGINES
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import REFERENCE, VARIABLE
 from jaxdn.runtime.atomic_files import write_json
-from jaxdn.runtime.malloc import keep_memory
+from jaxdn.runtime.malloc import tune_malloc
 from jaxdn.zoo.ready import candidate
 
 OIDN = "Open Image Denoise high"
@@ -53,7 +53,7 @@ def ours(name: str, engine: str | None, height: int, width: int, *, compiled: bo
 
     To be called once in a process. Without ``compiled`` every operation is its reference.
     """
-    keep_memory()
+    tune_malloc()
     if not compiled:
         os.environ[VARIABLE] = REFERENCE
     found, frame = candidate(name, **({} if engine is None else {"implementation": engine})), frame_of(height, width)

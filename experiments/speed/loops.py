@@ -36,7 +36,7 @@ from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import implementation
 from jaxdn.ops.layout.planar import join_planes
 from jaxdn.ops.scales import fill_holes
-from jaxdn.runtime.malloc import keep_memory
+from jaxdn.runtime.malloc import tune_malloc
 
 Work = tuple[Callable[..., Any], tuple[Any, ...]]
 """A function and its arguments."""
@@ -109,7 +109,7 @@ def main(settings: Settings) -> None:
     """Measure, and print a table."""
     if reason := numba_call.unavailable():
         raise ValueError(f"loops: numba {reason}.")
-    keep_memory()
+    tune_malloc()
     height, width = parsed(settings.size)
     table = Table("operation", "XLA ms", "compiled ms", "ratio")
     for name, work in works(height, width).items():

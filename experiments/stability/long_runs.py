@@ -25,7 +25,7 @@ from jaxdn.commands.errors import plain_errors
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Denoiser
 from jaxdn.denoiser.rollout import render_requested
-from jaxdn.runtime.atomic_files import write_whole
+from jaxdn.runtime.atomic_files import write_atomically
 from jaxdn.zoo.ready import NOISY, all_names, candidate
 
 SIZE, TURN = 48, 16
@@ -186,7 +186,7 @@ def main(settings: Settings) -> None:
         for name, lines in curves.items()
     }
     report = {"frames": settings.frames, "size": SIZE, "subjects": outcomes, "curves": per_frame}
-    write_whole({settings.out / "curves.json": json.dumps(report) + "\n"})
+    write_atomically({settings.out / "curves.json": json.dumps(report) + "\n"})
     draw(curves, settings.out / "curves.png")
     print(f"{settings.out / 'curves.json'}, {settings.out / 'curves.png'}")
 

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 from jaxdn.export.formats import onnx_model, stablehlo
 from jaxdn.export.step import Step, exported_step
-from jaxdn.runtime.atomic_files import write_whole
+from jaxdn.runtime.atomic_files import write_atomically
 from jaxdn.zoo.ready import candidate
 
 Format = Literal["both", "stablehlo", "onnx"]
@@ -58,5 +58,5 @@ def export(
         say("lowering it to StableHLO")
         contents[out / f"{method.label}.stablehlo"] = stablehlo(step)
     out.mkdir(parents=True, exist_ok=True)
-    write_whole(contents)
+    write_atomically(contents)
     return Exported(list(contents), step)

@@ -6,7 +6,7 @@ Of files of other renderers: what is read from them (:mod:`jaxdn.commands.inspec
 import json
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,13 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from jaxdn.commands.channel_table import show_channel_mapping
 from jaxdn.commands.inspect_files import inspect_files
-from jaxdn.commands.sources import show_sources
 from jaxdn.core.frame import BUFFERS, OF_SAMPLES
 from jaxdn.data.clip.folder import is_clip
+from jaxdn.data.foreign.channel_mapping import read_channel_mapping
+from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.data.foreign.shots import ranges
-from jaxdn.data.foreign.sources import sources_of
 from jaxdn.denoiser import Denoiser
 from jaxdn.effects import EFFECTS, Plan, everything, inspect, plan
 from jaxdn.render.opening import open_scene
@@ -38,9 +39,7 @@ def inspect_to_terminal(
     height: int,
     frames: int | None,
     as_json: bool,
-    motion_convention: str | None = None,
-    channels: Mapping[str, str] | None = None,
-    layer: str | None = None,
+    naming: ChannelNaming,
 ) -> None:
     """Print the table of effects and the plan for a scene, a family or a finished clip.
 
@@ -54,31 +53,28 @@ def inspect_to_terminal(
       height: in pixels.
       frames: number of frames to inspect; None: all.
       as_json: print only one JSON object.
-      motion_convention: of files of other renderers, as in :func:`jaxdn.clips.open_frames`.
-      channels: the same.
-      layer: the same.
+      naming: what is stated about the channels of other renderers' files.
     """
     reader = None if denoiser is None else denoiser_named(denoiser)
-    naming: dict[str, Any] = {"channels": channels or None, "layer": layer}
     clip = is_clip(source)
     if not clip and (Path(source).is_dir() or source.endswith(".exr")):
         if animation is not None or frames is not None:
             raise ValueError(f"{source}: expected none of --animation, --frames, which are for scenes and own clips.")
         reads = None if reader is None else reader.reads
-        inspect_files(source, reads=reads, as_json=as_json, motion_convention=motion_convention, **naming)
+        inspect_files(source, reads=reads, as_json=as_json, naming=naming)
         return
-    if not clip and (motion_convention or any(naming.values())):
+    if not clip and naming.options:
         raise ValueError(
             f"scene {source!r}: expected none of --channels, --layer, --motion-convention, which are for EXR files."
         )
-    if clip and (motion_convention or any(naming.values())):
+    if clip and naming.options:
         raise ValueError(
             f"{source}: expected none of --channels, --layer, --motion-convention, which are for files of other "
             "renderers; it is a clip of jaxdn's own."
         )
     if clip and not as_json:
         reads = None if reader is None else reader.reads
-        show_sources(source, reads=reads, log=print)
+        show_channel_mapping(source, read_channel_mapping(source), reads=reads)
     with _nothing_else_on_stdout():
         planned = _planned(source, animation, reader, width=width, height=height, frames=frames)
     if as_json:
@@ -89,7 +85,7 @@ def inspect_to_terminal(
             "uncertain": sorted(found.uncertain),
         }
         if clip:
-            record["sources"] = [one._asdict() for one in sources_of(source)]
+            record["sources"] = [mapped._asdict() for mapped in read_channel_mapping(source)]
         print(json.dumps(record, indent=1))
         return
     _show(source, planned, reader, denoiser)

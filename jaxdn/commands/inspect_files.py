@@ -1,53 +1,43 @@
 """``jaxdn inspect`` on files of other renderers: what is read from where, what is missing, and what is to be stated."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from jaxdn.commands.sources import missing, show_sources
+from jaxdn.commands.channel_table import missing, show_channel_mapping
 from jaxdn.data.clip.folder import refuse_unfinished
-from jaxdn.data.foreign.import_exr import canvas_of, fitting_files
+from jaxdn.data.exr.file import ExrFile
+from jaxdn.data.foreign.channel_mapping import UNSTATED, read_channel_mapping
+from jaxdn.data.foreign.import_exr import ForeignSequence
+from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.data.foreign.shots import sequence_files
-from jaxdn.data.foreign.sources import UNSTATED, sources_of
 from jaxdn.data.foreign.vectors import CHOICES
 
 
-def inspect_files(
-    source: str,
-    *,
-    reads: frozenset[str] | None,
-    as_json: bool,
-    motion_convention: str | None,
-    channels: Mapping[str, str] | None,
-    layer: str | None,
-) -> None:
+def inspect_files(source: str, *, reads: frozenset[str] | None, as_json: bool, naming: ChannelNaming) -> None:
     """Print what is read of a sequence, what is missing, and which conventions motion vectors may have.
 
     Only the first two files are read, of the others the headers. Raises ClipError as
-    :func:`jaxdn.data.foreign.sources.sources_of` and :func:`jaxdn.data.foreign.import_exr.fitting_files` do, for files
-    of different sizes, and for a clip of ours that was not finished.
+    :func:`jaxdn.data.foreign.channel_mapping.read_channel_mapping` and
+    :meth:`jaxdn.data.foreign.import_exr.ForeignSequence.fitting_conventions` do, for files of different sizes, and for
+    a clip of ours that was not finished.
 
     Args:
       source: a folder of, a pattern for, or the name of EXR files.
       reads: what a denoiser reads; None: any.
       as_json: print only one JSON object, with the same.
-      motion_convention: as in :func:`jaxdn.clips.open_frames`.
-      channels: the same.
-      layer: the same.
+      naming: what is stated about the channels.
     """
     refuse_unfinished(source)
-    naming: dict[str, Any] = {"channels": channels, "layer": layer}
-    notes: list[str] = []
-    if as_json:
-        found = sources_of(source, motion_convention=motion_convention, log=notes.append, **naming)
-    else:
-        found = show_sources(source, reads=reads, motion_convention=motion_convention, log=print, **naming)
     files = sequence_files(source)
-    canvas = canvas_of(files)
-    unstated = any(one.convention == UNSTATED for one in found)
-    fitting = fitting_files(files, canvas, **naming) if unstated else None
-    height, width = canvas.size
+    sequence = ForeignSequence([ExrFile(file) for file in files], naming)
+    notes: list[str] = []
+    mapping = read_channel_mapping(sequence.files[0], naming, log=notes.append if as_json else print)
+    if not as_json:
+        show_channel_mapping(source, mapping, reads=reads)
+    height, width = sequence.window.size
+    unstated = any(mapped.convention == UNSTATED for mapped in mapping)
+    fitting = sequence.fitting_conventions() if unstated else None
     if not as_json:
         print(f"{len(files)} {'frame' if len(files) == 1 else 'frames'} of {width} x {height} pixels")
         if fitting is not None:
@@ -57,8 +47,8 @@ def inspect_files(
         "frames": len(files),
         "width": width,
         "height": height,
-        "sources": [one._asdict() for one in found],
-        "missing": missing(found, reads),
+        "sources": [mapped._asdict() for mapped in mapping],
+        "missing": missing(mapping, reads),
         "notes": notes,
         "fitting_conventions": fitting,
     }

@@ -3,7 +3,6 @@
 
 import os
 import sys
-from pathlib import Path
 from typing import Any
 
 import tyro
@@ -12,15 +11,8 @@ from rich.console import Console
 import jaxdn
 from jaxdn.commands.arguments import COMMANDS, Compare, Denoise, Doctor, Export, Inspect, Pack, Render, Train
 from jaxdn.commands.errors import plain_errors
+from jaxdn.commands.options import check_folder, name_channels
 from jaxdn.runtime.interrupt import end_of_process
-
-
-def _folder(out: Path) -> Path:
-    """``-o`` of a command that writes into a folder. Raises ValueError for a file, and for what is plainly its name."""
-    names = (".exr", ".png", ".safetensors", ".json", ".html", ".onnx", ".mlir", ".stablehlo")
-    if out.is_file() or out.suffix.lower() in names:
-        raise ValueError(f"-o {out}: expected a folder, got the name of a file.")
-    return out
 
 
 def _inspect(options: Inspect) -> None:
@@ -34,21 +26,8 @@ def _inspect(options: Inspect) -> None:
         height=options.height,
         frames=options.frames,
         as_json=options.json,
-        **_naming(options),
+        naming=name_channels(options),
     )
-
-
-def _naming(options: Inspect | Denoise) -> dict[str, Any]:
-    """How the buffers of other renderers' files are found."""
-    from jaxdn.core.options import parse
-    from jaxdn.data.foreign.vectors import check_convention
-
-    check_convention(options.motion_convention)
-    return {
-        "motion_convention": options.motion_convention,
-        "channels": parse(options.channels, option="--channels", words=True),
-        "layer": options.layer,
-    }
 
 
 def _render(options: Render) -> None:
@@ -57,7 +36,7 @@ def _render(options: Render) -> None:
 
     render(
         options.scene,
-        _folder(options.out),
+        check_folder(options.out),
         animation=options.animation,
         tours=options.tour,
         seeds=numbers(options.seeds, "--seeds"),
@@ -115,7 +94,7 @@ def _train(options: Train) -> None:
         method,
         recipe,
         options.clips,
-        _folder(options.out),
+        check_folder(options.out),
         options={**method.variant_named(options.variant), **parse(options.set)},
         start=options.start,
         validation=[options.validation] if options.validation else [],
@@ -126,101 +105,9 @@ def _train(options: Train) -> None:
 
 
 def _denoise(options: Denoise) -> None:
-    from jaxdn.commands.progress import reporter
-    from jaxdn.commands.sources import show_sources
-    from jaxdn.core.options import numbers
-    from jaxdn.runtime.malloc import keep_memory
-    from jaxdn.sequence.run import Settings, candidate_on, denoise_files
+    from jaxdn.commands.denoise import run_denoise
 
-    if options.max_memory is None:  # else freed memory goes back to the system at once
-        keep_memory()
-    naming = _naming(options)
-    budget = {} if options.budget is None else {"budget": options.budget}
-    if (scene := _scene_of(options)) is not None:
-        _denoise_scene(options, scene, budget)
-        return
-    method, engine = candidate_on(options.method, options.implementation, **budget)
-    reads = frozenset[str]() if method.denoiser is None else method.denoiser.reads
-    settings = Settings(
-        spp=options.spp,
-        frames=numbers(options.frames, "--frames") if options.frames else None,
-        skip_existing=options.skip_existing,
-        only_beauty=options.only_beauty,
-        aovs=options.aovs,
-        preview=options.preview,
-        bidirectional=options.bidirectional,
-        safe=options.safe,
-        max_memory=None if options.max_memory is None else options.max_memory * 2**30,
-        **naming,
-    )
-    with reporter(options.method) as report:
-        written = denoise_files(
-            options.clips,
-            options.out,
-            method,
-            settings,
-            begin=lambda work: show_sources(work.source, reads=reads, alone=len(work.shot.files) == 1, **naming),
-            say=report.say,
-            log=report.log,
-        )
-    if not written.files:
-        print(f"nothing to do in {options.out}")
-        return
-    frames, compiled = _count(len(written.files), "frame"), _count(written.programs, "program")
-    print(f"{frames} denoised by {options.method} in {options.out} ({engine}, {compiled} compiled)")
-    if written.sanitized:
-        print(f"{_count(written.sanitized, 'value')} sanitized: not usable numbers (NaN, infinite, negative ...)")
-
-
-def _count(number: int, noun: str) -> str:
-    """``1 frame``, ``2 frames``."""
-    return f"{number} {noun}{'s' * (number != 1)}"
-
-
-_OF_SCENES = ("width", "height", "animation", "seed")
-
-
-def _scene_of(options: Denoise) -> str | None:
-    """The scene to render, if there is one. Raises ValueError for options that only one of scene and clips has."""
-    from jaxdn.render.families import FAMILIES
-
-    scenes = [path for path in options.clips if path.suffix == ".xml" or (str(path) in FAMILIES and not path.exists())]
-    if not scenes:
-        if given := [name for name in _OF_SCENES if getattr(options, name) is not None]:
-            raise ValueError(f"--{given[0]}: expected a scene to render, got frames that are there; leave it out.")
-        return None
-    if len(options.clips) > 1:
-        raise ValueError(f"{scenes[0]}: expected one scene and nothing else, got {len(options.clips)} sources.")
-    usual = Denoise(options.clips, options.out)
-    kept = {"clips", "out", "method", "implementation", "frames", "preview", "budget", *_OF_SCENES}
-    other = [name for name in vars(usual) if name not in kept and getattr(options, name) != getattr(usual, name)]
-    if other:
-        raise ValueError(f"--{other[0].replace('_', '-')}: expected frames that are there, got a scene; leave it out.")
-    return str(scenes[0])
-
-
-def _denoise_scene(options: Denoise, scene: str, budget: dict[str, Any]) -> None:
-    from jaxdn.commands.progress import reporter
-    from jaxdn.core.options import numbers
-    from jaxdn.sequence.render_and_denoise import Settings, denoise_scene
-    from jaxdn.sequence.run import candidate_on
-    from jaxdn.zoo.ready import candidate
-
-    asks = getattr(candidate(options.method).denoiser, "samples", None) is not None
-    method, engine = candidate_on(options.method, options.implementation, **(budget if asks else {}))
-    size = {name: value for name in ("width", "height", "seed") if (value := getattr(options, name)) is not None}
-    settings = Settings(
-        frames=numbers(options.frames, "--frames") if options.frames else None,
-        preview=options.preview,
-        **size,
-        **budget,
-    )
-    with reporter(options.method) as report:
-        written = denoise_scene(
-            scene, options.animation, _folder(options.out), method, settings, say=report.say, log=report.log
-        )
-    frames = _count(len(written.files), "frame")
-    print(f"{frames} rendered, and denoised by {options.method}, in {options.out} ({engine})")
+    run_denoise(options)
 
 
 def _compare(options: Compare) -> None:
@@ -229,7 +116,7 @@ def _compare(options: Compare) -> None:
     from jaxdn.evaluation.report import text_table, write_report
     from jaxdn.zoo.ready import all_names, candidate
 
-    out, names = _folder(options.out), options.methods or all_names()
+    out, names = check_folder(options.out), options.methods or all_names()
     methods = [candidate(name) for name in names]
     folders = find_clips(options.clips)
     settings = {"clips": len(folders), "spp": options.spp, "methods": names}
@@ -248,7 +135,7 @@ def _export(options: Export) -> None:
     with Console(stderr=True).status("") as status:
         exported = export(
             options.method,
-            _folder(options.out),
+            check_folder(options.out),
             buffers=options.buffers,
             size=(sides[0], sides[1]) if sides else None,
             format=options.format,

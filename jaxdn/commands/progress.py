@@ -18,7 +18,7 @@ _RECENT = 9
 class Reporter(NamedTuple):
     """What a command tells while it works."""
 
-    say: Callable[[Path, int, int], None]
+    on_frame: Callable[[Path, int, int], None]
     """A file was written: the file, how many are done, of how many."""
     log: Callable[[str], None]
     """Any other line."""

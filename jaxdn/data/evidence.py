@@ -13,9 +13,12 @@ import numpy as np
 from jaxdn.core.frame import BUFFERS, FAR, Frame
 from jaxdn.data.clip.folder import is_clip, read_record
 from jaxdn.data.clip.record import is_planned
+from jaxdn.data.foreign.naming import UNNAMED, ChannelNaming
 from jaxdn.data.read import open_frames
 from jaxdn.planning.facts import NO_NAMES, Facts, Light, Moment, Surface
 
+_ANY_CONVENTION = "previous-current"
+"""Whether anything moves is the same in every convention of motion vectors."""
 _ANYTHING = frozenset({"what moves"})
 _HIDDEN = {
     "transmission": "a buffer of the first surface does not show what lies behind it",
@@ -27,10 +30,10 @@ _HIDDEN = {
 """Effects that no buffer can rule out."""
 
 
-def read_facts(path: str | Path, animation: Any = None, **naming: Any) -> Facts:
+def read_facts(path: str | Path, animation: Any = None, naming: ChannelNaming = UNNAMED) -> Facts:
     """Facts about a clip's folder, or EXR files of any renderer; frames are read one at a time.
 
-    ``naming``: ``channels`` and ``layer`` of :func:`jaxdn.clips.open_frames`, for files of other renderers.
+    ``naming``: ``channels`` and ``layer`` of files of other renderers.
     Raises ClipError as :func:`jaxdn.clips.read_clip` does, and ValueError for an ``animation``, which a finished clip
     does not need.
     """
@@ -38,9 +41,10 @@ def read_facts(path: str | Path, animation: Any = None, **naming: Any) -> Facts:
         raise ValueError(f"animation {animation}: expected none, as {path} is a finished clip; leave it out.")
     record: Mapping[str, Any] = read_record(path) if is_clip(path) else {}
     look = _Look(record)
-    # Whether anything moves is the same in every convention of motion vectors.
     spp = record["layers"][0] if record else 1
-    _, frames = open_frames(path, spp=spp, motion_convention="previous-current", **naming)
+    _, frames = open_frames(
+        path, spp=spp, motion_convention=_ANY_CONVENTION, channels=naming.channels, layer=naming.layer
+    )
     for stored in frames:
         look.at(stored.frame)
     return look.facts()

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -43,13 +42,15 @@ def open_frames(
     if spp != 1:
         where = path if isinstance(path, str | Path) else f"{path[0]} ({len(path)} file{'s' * (len(path) != 1)})"
         raise ClipError(f"{where}: expected spp 1, got {spp}; only a clip with a {RECORD} has several sample counts.")
-    naming: dict[str, Any] = {"motion_convention": motion_convention, "channels": channels, "layer": layer}
-    files, plain = plain_frames(path, **naming, backwards=backwards, log=log)
+    files, plain = plain_frames(
+        path, motion_convention=motion_convention, channels=channels, layer=layer, backwards=backwards, log=log
+    )
     # Unlike the variable of a loop, this does not keep a frame while the next one is read.
-    return files, map(_of_another, plain)
+    return files, map(store_frame, plain)
 
 
-def _of_another(frame: Frame) -> StoredFrame:
+def store_frame(frame: Frame) -> StoredFrame:
+    """A frame of another renderer: without layers and reference."""
     return StoredFrame(frame, {}, None, None)
 
 

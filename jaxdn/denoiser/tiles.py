@@ -18,7 +18,7 @@ import numpy as np
 from jaxdn.core.frame import BUFFERS, Frame, only, present
 from jaxdn.denoiser import Denoiser, Params, RecurrentStep
 from jaxdn.denoiser.statistics import FrameStatistics
-from jaxdn.runtime.malloc import give_back
+from jaxdn.runtime.malloc import trim_malloc
 
 GRID = 32
 """Windows begin at multiples of this."""
@@ -86,7 +86,7 @@ def map_tiles(
         _paste(whole, pictures, rows, columns)
         others.append(other)
         # The C library would keep the buffers of every window.
-        give_back()
+        trim_malloc()
     return whole, others
 
 
@@ -170,7 +170,7 @@ class TiledStream:
             arguments = (self._step, self._params, *given, first, whole)
             if new:  # compiled before it runs: compiling takes 200 MiB, which would be kept meanwhile
                 _part.lower(*arguments).compile()
-                give_back()
+                trim_malloc()
                 new = False
             state, image, lost = _part(*arguments)
             return (state, image), lost

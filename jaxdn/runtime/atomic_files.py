@@ -10,7 +10,7 @@ from typing import Any
 
 
 @contextmanager
-def whole(path: str | Path) -> Iterator[Path]:
+def atomic_write(path: str | Path) -> Iterator[Path]:
     """Give a temporary path next to ``path``; rename it to ``path`` if the block succeeds, remove it if it does not.
 
     Readers therefore see the old file or the new one, never an incomplete one, however the writer is interrupted
@@ -21,11 +21,11 @@ def whole(path: str | Path) -> Iterator[Path]:
         yield temporary
 
 
-def write_whole(contents: Mapping[Path, bytes | str]) -> None:
+def write_atomically(contents: Mapping[Path, bytes | str]) -> None:
     """Write files, text as UTF-8, and rename them in this order when all are on disk.
 
-    On an error while writing none is replaced and nothing is left behind. Raises as :func:`whole` does, TypeError for
-    contents that are neither bytes nor text, and ValueError for text that UTF-8 cannot encode.
+    On an error while writing none is replaced and nothing is left behind. Raises as :func:`atomic_write` does,
+    TypeError for contents that are neither bytes nor text, and ValueError for text that UTF-8 cannot encode.
     """
     with _renamed(list(contents)) as temporaries:
         for temporary, content in zip(temporaries, contents.values(), strict=True):
@@ -35,8 +35,8 @@ def write_whole(contents: Mapping[Path, bytes | str]) -> None:
 def write_json(path: str | Path, value: Any) -> None:
     """Write strict JSON (no NaN, no Infinity), indented, complete or not at all.
 
-    Raises ValueError, naming the file, if ``value`` holds something that JSON cannot represent, and as :func:`whole`
-    does.
+    Raises ValueError, naming the file, if ``value`` holds something that JSON cannot represent, and as
+    :func:`atomic_write` does.
     """
     try:
         text = json.dumps(value, indent=1, allow_nan=False)
@@ -44,7 +44,7 @@ def write_json(path: str | Path, value: Any) -> None:
         raise ValueError(
             f"{path}: cannot be written as JSON ({error}); use plain lists, strings and finite numbers."
         ) from error
-    write_whole({Path(path): text + "\n"})
+    write_atomically({Path(path): text + "\n"})
 
 
 @contextmanager

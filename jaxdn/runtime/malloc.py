@@ -8,7 +8,7 @@ _TRIM_THRESHOLD, _MMAP_MAX, _ARENA_MAX = -1, -4, -8
 _NEVER = -1
 
 
-def keep_memory() -> bool:
+def tune_malloc() -> bool:
     """Let this process keep the memory that it has freed; whether the C library can (glibc on Linux).
 
     XLA allocates the arrays of a program anew at every call. Large ones come from the system, which clears every page
@@ -23,7 +23,7 @@ def keep_memory() -> bool:
     return all([option(_MMAP_MAX, 0), option(_TRIM_THRESHOLD, _NEVER), option(_ARENA_MAX, 1)])
 
 
-def give_back() -> None:
+def trim_malloc() -> None:
     """Hand freed memory back to the system: small pieces stay with the process otherwise."""
     if sys.platform.startswith("linux"):
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc

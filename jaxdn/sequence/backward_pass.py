@@ -10,10 +10,11 @@ import numpy as np
 from jaxdn.core.frame import Frame
 from jaxdn.data.clip.frames import StoredFrame
 from jaxdn.data.exr.exr import to_half
-from jaxdn.filters.time_reversal import Seen, blend, seen
+from jaxdn.filters.time_reversal import Seen, seen
+from jaxdn.filters.time_reversal import blend as blend_directions
 
 
-class Backwards:
+class BackwardImages:
     """The images of the backward pass of consecutive frames, and how they are blended with those of the forward one."""
 
     def __init__(self, folder: Path) -> None:
@@ -24,7 +25,7 @@ class Backwards:
         """Store the image [H, W, 3] of a frame and for how many frames its points have been seen, [H, W, 1]."""
         np.save(self._file(index), to_half(np.concatenate([image, number], axis=-1)))
 
-    def blended(self, index: int, frame: Frame, image: np.ndarray) -> np.ndarray:
+    def blend(self, index: int, frame: Frame, image: np.ndarray) -> np.ndarray:
         """The image of the forward pass blended with that of the backward one, which is removed.
 
         To be called for every frame in order; a frame that was not kept only counts as seen.
@@ -35,7 +36,7 @@ class Backwards:
             return image
         stored = np.load(file).astype(np.float32)
         file.unlink()
-        return np.asarray(blend(image, stored[..., :3], np.asarray(self._seen.number), stored[..., 3:]))
+        return np.asarray(blend_directions(image, stored[..., :3], np.asarray(self._seen.number), stored[..., 3:]))
 
     def _file(self, index: int) -> Path:
         return self._folder / f"{index}.npy"
@@ -47,7 +48,7 @@ def backward_pass(
     denoise: Callable[[StoredFrame], np.ndarray],
     wanted: Collection[int],
     folder: Path,
-) -> Iterator[Backwards]:
+) -> Iterator[BackwardImages]:
     """Denoise frames from the last to the first, and give their images for as long as the block lasts.
 
     They wait in half precision in a hidden folder below ``folder``, 8 bytes a pixel, which is removed however the block
@@ -61,7 +62,7 @@ def backward_pass(
     """
     folder.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=".backwards-", dir=folder) as place:
-        images = Backwards(Path(place))
+        images = BackwardImages(Path(place))
         state: Seen | None = None
         for index, stored in frames:
             image = denoise(stored)

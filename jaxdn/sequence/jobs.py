@@ -1,15 +1,17 @@
 """What ``jaxdn denoise`` has to do: which frames of which shots, where they are written, and what is there already."""
 
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from os.path import commonpath
 from pathlib import Path
-from typing import NamedTuple
 
 from jaxdn.data.clip.folder import frame_path, is_clip, read_record, refuse_unfinished
+from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.shots import Shot, find_shots, missing, ranges
 
-LEAD_IN = 16
+WARM_UP = 16
 """Frames before a wanted one that are read for its history where only a part of a shot is denoised. After so many,
 what the history of svgf lacks makes a tenth of the noise that is left (tests/sequence/test_frames.py)."""
 
@@ -18,7 +20,8 @@ _OTHER_IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".hdr", ".bmp", ".web
 """What somebody may want to write, and no folder is called."""
 
 
-class Work(NamedTuple):
+@dataclass(frozen=True)
+class Job:
     """A shot, and what to write of it."""
 
     shot: Shot
@@ -36,35 +39,44 @@ class Work(NamedTuple):
         """What tells of which layers it consists: the clip's folder, or the first file."""
         return self.clip or self.shot.files[0]
 
-    def stretches(self, *, both_ways: bool = False) -> Iterator[range]:
-        """Indices of consecutive frames, each after the first with a history: the wanted ones and their lead-in.
+    @cached_property
+    def exr_files(self) -> tuple[ExrFile, ...]:
+        """The files, each to be opened once."""
+        return tuple(ExrFile(file) for file in self.shot.files)
 
-        With ``both_ways`` there are as many frames after the last wanted one.
+    def count_channels(self) -> int:
+        """The number of channels of the first file."""
+        return len(self.exr_files[0].windows)
+
+    def segments(self, *, both_directions: bool = False) -> Iterator[range]:
+        """Indices of consecutive frames, each after the first with a history: the wanted ones and their warm-up.
+
+        With ``both_directions`` there are as many frames after the last wanted one.
         """
         last = len(self.shot.files) - 1
         breaks = {index + 1 for index, (one, next_) in enumerate(pairwise(self.shot.numbers)) if next_ != one + 1}
-        begun: int | None = None
+        start: int | None = None
         for index in range(last + 1):
-            if begun is not None and index in breaks:
-                yield range(begun, index)
-                begun = None
-            ahead = range(index, min(index + LEAD_IN, last) + 1)
+            if start is not None and index in breaks:
+                yield range(start, index)
+                start = None
+            ahead = range(index, min(index + WARM_UP, last) + 1)
             end = next((later for later in ahead if later > index and later in breaks), last + 1)
             needed = any(later in self.wanted for later in ahead if later < end)
-            if both_ways and begun is not None:
-                needed |= any(earlier in self.wanted for earlier in range(max(begun, index - LEAD_IN), index))
-            if needed and begun is None:
-                begun = index
-            elif not needed and begun is not None:
-                yield range(begun, index)
-                begun = None
-        if begun is not None:
-            yield range(begun, last + 1)
+            if both_directions and start is not None:
+                needed |= any(earlier in self.wanted for earlier in range(max(start, index - WARM_UP), index))
+            if needed and start is None:
+                start = index
+            elif not needed and start is not None:
+                yield range(start, index)
+                start = None
+        if start is not None:
+            yield range(start, last + 1)
 
 
-def work_on(
+def find_jobs(
     sources: Sequence[Path], out: Path, *, frames: Collection[int] | None = None, skip_existing: bool = False
-) -> list[Work]:
+) -> list[Job]:
     """The shots of folders, patterns and files; several sequences in a folder are several shots.
 
     Results have the names of their files. With inputs in several folders, they lie in folders of the same names below
@@ -91,8 +103,8 @@ def work_on(
     count = sum(len(shot.files) for shot, _ in found)
     if single and count > 1:
         raise ValueError(f"{out}: expected a folder for {count} frames, got the name of one EXR file.")
-    _refuse_file(out.parent if single else out)
-    works = []
+    _check_folder(out.parent if single else out)
+    jobs = []
     named = frames is None
     for shot, clip in found:
         below = [out / file.resolve().relative_to(together) for file in shot.files]
@@ -104,16 +116,16 @@ def work_on(
         ]
         wanted = frozenset(index for index in chosen if not (skip_existing and targets[index].is_file()))
         named |= bool(chosen) or not set(missing(shot.numbers)).isdisjoint(frames or ())
-        notes = _notes(shot, lone=len(found) > 1, there=len(chosen) - len(wanted))
-        works.append(Work(shot, clip, targets, wanted, notes))
-    _refuse_twice(works)
+        notes = _notes(shot, among_others=len(found) > 1, existing=len(chosen) - len(wanted))
+        jobs.append(Job(shot, clip, targets, wanted, notes))
+    _check_targets(jobs)
     inputs = {file.resolve() for shot, _ in found for file in shot.files}
-    if {target.resolve() for work in works for target in work.targets} & inputs or out.resolve() in inputs:
+    if {target.resolve() for job in jobs for target in job.targets} & inputs or out.resolve() in inputs:
         raise ValueError(f"{out}: expected another place than the input's, whose frames would be overwritten.")
     if frames is not None and not named:
-        there = "; ".join(f"{work.shot.label}" for work in works)
+        there = "; ".join(f"{job.shot.label}" for job in jobs)
         raise ValueError(f"--frames {ranges(sorted(frames))}: expected frames that are there, got none of {there}.")
-    return works
+    return jobs
 
 
 def _shots(source: Path) -> list[tuple[Shot, Path | None]]:
@@ -124,18 +136,18 @@ def _shots(source: Path) -> list[tuple[Shot, Path | None]]:
     return [(shot, None) for shot in find_shots(source)]
 
 
-def _refuse_file(folder: Path) -> None:
+def _check_folder(folder: Path) -> None:
     """Raise ValueError where a folder, or one that it is to lie in, is a file."""
     taken = next((path for path in (folder, *folder.parents) if path.is_file()), None)
     if taken is not None:
         raise ValueError(f"-o {folder}: expected a folder, but {taken} is a file; name another.")
 
 
-def _refuse_twice(works: Sequence[Work]) -> None:
+def _check_targets(jobs: Sequence[Job]) -> None:
     """Raise ValueError where two frames would be written into one file."""
     frames: dict[Path, Path] = {}
-    for work in works:
-        for file, target in zip(work.shot.files, work.targets, strict=True):
+    for job in jobs:
+        for file, target in zip(job.shot.files, job.targets, strict=True):
             other = frames.setdefault(target, file)
             if other is file:
                 continue
@@ -144,14 +156,14 @@ def _refuse_twice(works: Sequence[Work]) -> None:
             raise ValueError(f"{target}: expected the result of one frame, got {other} and {file}; rename one of them.")
 
 
-def _notes(shot: Shot, *, lone: bool, there: int) -> tuple[str, ...]:
+def _notes(shot: Shot, *, among_others: bool, existing: int) -> tuple[str, ...]:
     notes = []
     gaps = missing(shot.numbers)
     if gaps:
         notes.append(f"{shot.label}: {ranges(gaps)} missing; after a gap there is no history at first")
-    if lone and not shot.numbers:
+    if among_others and not shot.numbers:
         notes.append(f"{shot.label}: no frame number in its name, so it is denoised as an image of its own")
-    if there:
-        they = f"{there} frames are there already and stay as they are"
-        notes.append(f"{shot.label}: {they if there > 1 else '1 frame is there already and stays as it is'}")
+    if existing:
+        they = f"{existing} frames are there already and stay as they are"
+        notes.append(f"{shot.label}: {they if existing > 1 else '1 frame is there already and stays as it is'}")
     return tuple(notes)

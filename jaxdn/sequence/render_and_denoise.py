@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdn import color
 from jaxdn.core.frame import OF_SAMPLES, Frame
 from jaxdn.data.exr.exr import write_exr
 from jaxdn.denoiser.rollout import stream
@@ -14,9 +13,10 @@ from jaxdn.evaluation.report.images import save_png
 from jaxdn.planning.catalogue import OF_FIRST_HITS
 from jaxdn.render.adaptive import render_sampled
 from jaxdn.render.opening import open_scene
-from jaxdn.sequence.denoise_frames import light_of
+from jaxdn.sequence.frame_denoiser import light_of
 from jaxdn.sequence.render_jobs import plan_clip
-from jaxdn.sequence.run import Written, lettered
+from jaxdn.sequence.run import Written
+from jaxdn.sequence.write_frames import name_channels, write_preview
 from jaxdn.zoo.ready import Candidate
 
 MOST = 64
@@ -45,7 +45,7 @@ def denoise_scene(
     method: Candidate,
     settings: Settings,
     *,
-    say: Callable[[Path, int, int], None] = lambda path, done, total: None,
+    on_frame: Callable[[Path, int, int], None] = lambda path, done, total: None,
     log: Callable[[str], None] = lambda line: None,
 ) -> Written:
     """Render an animated scene as the method asks for samples, and denoise it; returns the files written.
@@ -95,11 +95,11 @@ def denoise_scene(
         path = out / f"frame_{index:04d}.exr"
         path.parent.mkdir(parents=True, exist_ok=True)
         picture = image + light_of(found.frame.emission)
-        write_exr(path, lettered("", picture) | lettered("denoised.", image) | {"samples.Y": counts[..., 0]})
+        write_exr(path, name_channels("", picture) | name_channels("denoised.", image) | {"samples.Y": counts[..., 0]})
         if settings.preview:
-            save_png(path.with_suffix(".png"), color.tonemap(picture))
+            write_preview(path, picture)
             save_png(path.with_suffix(".samples.png"), np.sqrt(counts[..., 0] / max(counts.max(), 1)))
         files.append(path)
         log(f"{path.name}: {counts.mean():.3g} samples per pixel, {counts.min():g} to {counts.max():g}")
-        say(path, len(files), len(wanted))
+        on_frame(path, len(files), len(wanted))
     return Written(files, len(step.programs), step.sanitized)

@@ -5,7 +5,7 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxdn.runtime.atomic_files import write_whole
+from jaxdn.runtime.atomic_files import write_atomically
 
 
 class Curve(NamedTuple):
@@ -23,7 +23,7 @@ class Log:
     def __init__(self, path: Path, *, keep_until: int):
         """Open the log; entries after step ``keep_until`` belong to lost updates and are removed."""
         kept = [entry for entry in read_log(path) if entry["step"] <= keep_until]
-        write_whole({path: "".join(json.dumps(entry) + "\n" for entry in kept)})
+        write_atomically({path: "".join(json.dumps(entry) + "\n" for entry in kept)})
         self._file = path.open("a")
 
     def write(self, **entry: Any) -> None:

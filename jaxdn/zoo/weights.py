@@ -15,7 +15,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.methods.registry import method_named
 from jaxdn.networks.widen import widen
-from jaxdn.runtime.atomic_files import write_whole
+from jaxdn.runtime.atomic_files import write_atomically
 
 SHIPPED = Path(__file__).parent / "shipped"
 """Folder of the weights that come with the package."""
@@ -68,7 +68,7 @@ def save_weights(
     path = Path(path).with_suffix(".safetensors")
     path.parent.mkdir(parents=True, exist_ok=True)
     description = json.dumps({"factory": factory, "options": options, **record}, indent=1, sort_keys=True) + "\n"
-    write_whole({path: save(flatten(params)), path.with_suffix(".json"): description})
+    write_atomically({path: save(flatten(params)), path.with_suffix(".json"): description})
     return path
 
 

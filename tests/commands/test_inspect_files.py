@@ -9,8 +9,8 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.commands import main
-from jaxdn.commands.sources import CONSEQUENCES
-from jaxdn.data.foreign.sources import sources_of
+from jaxdn.commands.channel_table import CONSEQUENCES
+from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.vectors import MOTION_CONVENTIONS
 from jaxdn.methods.registry import methods
 from tests.programs import HEIGHT, PROGRAMS, WIDTH, write_shot
@@ -89,7 +89,9 @@ def test_what_is_stated_is_not_asked_for(name: str, shots: dict[str, Path], run:
 def test_json_says_the_same_as_the_text(name: str, shots: dict[str, Path], run: Any) -> None:
     text, record = run(shots[name]), json.loads(run(shots[name], "--json"))
     assert set(record) == {"frames", "width", "height", "sources", "missing", "notes", "fitting_conventions"}
-    assert record["sources"] == [{**one._asdict(), "channels": list(one.channels)} for one in sources_of(shots[name])]
+    assert record["sources"] == [
+        {**one._asdict(), "channels": list(one.channels)} for one in read_channel_mapping(shots[name])
+    ]
     for source in record["sources"]:
         assert source["convention"] in text
     for buffer, consequence in record["missing"].items():

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import weakref
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from jaxdn.clips import ClipError
 from jaxdn.core.frame import BUFFERS, FAR, Clip, Frame
 from jaxdn.data.evidence import read_facts
 from jaxdn.data.exr.exr import to_half
+from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.vectors import convert_motion
 
 HALF = tuple(name for name, row in BUFFERS.items() if row.stored == "half")
@@ -455,12 +457,14 @@ def test_foreign_frames_are_read_one_at_a_time(tmp_path: Path, rng: np.random.Ge
     for index in range(5):
         write_plain(tmp_path / f"a{index}.exr", [*rgb(""), *rgb("Albedo"), *rgb("motion", "XY")], rng)
     read: list[Path] = []
+    decode = ExrFile.decode
 
-    def counted(path: Path) -> dict[str, np.ndarray]:
-        read.append(path)
-        return clips.read_exr(path)
+    def counted(file: ExrFile) -> Any:
+        if file.path not in read:
+            read.append(file.path)
+        return decode(file)
 
-    monkeypatch.setattr("jaxdn.data.foreign.import_exr.read_exr", counted)
+    monkeypatch.setattr(ExrFile, "decode", counted)
     files, frames = clips.plain_frames(tmp_path, motion_convention="uv", channels={"albedo": "Albedo"})
     assert [file.name for file in files] == [f"a{index}.exr" for index in range(5)]
     assert not read

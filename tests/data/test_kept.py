@@ -12,10 +12,13 @@ import pytest
 from jaxdn import clips
 from jaxdn.core.frame import Frame
 from jaxdn.data.exr.exr import rewrite_exr
+from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.exr.windows import Window
-from jaxdn.data.foreign.import_exr import canvas_of
+from jaxdn.data.foreign.import_exr import ForeignSequence
+from jaxdn.data.foreign.naming import UNNAMED
 from jaxdn.denoiser import Core, recurrent
-from jaxdn.sequence.run import Settings, denoise_files
+from jaxdn.sequence.run import denoise_files
+from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import Candidate
 from tests import programs
 from tests.programs import PROGRAMS, truth, write_shot
@@ -107,7 +110,7 @@ def test_only_the_beauty_if_asked_for(tmp_path: Path) -> None:
 def test_half_precision_does_not_overflow(tmp_path: Path) -> None:
     light = np.full((20, 20), 6e4, np.float16)
     clips.write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", light))
-    rewrite_exr(tmp_path / "a.exr", tmp_path / "b.exr", {"R": np.full((20, 20), 1e9, np.float32)})
+    rewrite_exr(ExrFile(tmp_path / "a.exr"), tmp_path / "b.exr", {"R": np.full((20, 20), 1e9, np.float32)})
     assert np.all(clips.read_exr(tmp_path / "b.exr")["R"] == np.float16(65504))
 
 
@@ -118,7 +121,7 @@ def test_attributes_of_types_that_nobody_knows_stay(tmp_path: Path) -> None:
     bytes_ = (tmp_path / "a.exr").read_bytes()
     assert b"odd\0v2i\0" in bytes_
     (tmp_path / "a.exr").write_bytes(bytes_.replace(b"odd\0v2i\0", b"odd\0xyz\0"))
-    assert rewrite_exr(tmp_path / "a.exr", tmp_path / "b.exr", {"R": np.zeros((4, 4))}) == []
+    assert rewrite_exr(ExrFile(tmp_path / "a.exr"), tmp_path / "b.exr", {"R": np.zeros((4, 4))}) == []
     at = (tmp_path / "b.exr").read_bytes().index(b"odd\0xyz\0")
     assert (tmp_path / "b.exr").read_bytes()[at + 8 : at + 20] == struct.pack("<Iii", 8, 24, 1)
 
@@ -131,7 +134,7 @@ def test_compression_stays_and_loss_is_said(tmp_path: Path, compression: str) ->
     )
     part = programs.part(channels, compression=getattr(OpenEXR, f"{compression}_COMPRESSION"))
     OpenEXR.File([part]).write(str(tmp_path / "a.exr"))
-    notes = rewrite_exr(tmp_path / "a.exr", tmp_path / "b.exr", {"R": np.zeros_like(scene.light[..., 0])})
+    notes = rewrite_exr(ExrFile(tmp_path / "a.exr"), tmp_path / "b.exr", {"R": np.zeros_like(scene.light[..., 0])})
     lossy = compression in ("B44", "DWAA")
     assert bool(notes) == lossy
     before, after = clips.read_exr(tmp_path / "a.exr"), clips.read_exr(tmp_path / "b.exr")
@@ -154,7 +157,8 @@ def test_a_mipmap_is_refused_in_words(tmp_path: Path) -> None:
 
 def test_windows_are_put_into_one_picture(tmp_path: Path) -> None:
     source = write_shot("Arnold", tmp_path)
-    assert canvas_of(sorted(source.iterdir())) == Window(1, 2, programs.WIDTH - 2, programs.HEIGHT - 1)
+    sequence = ForeignSequence([ExrFile(file) for file in sorted(source.iterdir())], UNNAMED)
+    assert sequence.window == Window(1, 2, programs.WIDTH - 2, programs.HEIGHT - 1)
     frames = list(clips.plain_frames(source, motion_convention="none")[1])
     for index, frame in enumerate(frames):
         assert frame.radiance.shape == (programs.HEIGHT - 2, programs.WIDTH - 2, 3)

@@ -10,9 +10,11 @@ from jaxdn import clips
 from jaxdn.clips import ClipError
 from jaxdn.commands import main
 from jaxdn.core.frame import Frame
-from jaxdn.data.foreign.import_exr import canvas_of
+from jaxdn.data.exr.file import ExrFile
+from jaxdn.data.foreign.channel_mapping import read_channel_mapping
+from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.foreign.measured_motion import fitting_conventions
-from jaxdn.data.foreign.sources import sources_of
+from jaxdn.data.foreign.naming import UNNAMED, ChannelNaming
 from jaxdn.ops.warp import warp
 from tests import programs
 from tests.needs import require_module
@@ -31,7 +33,7 @@ def shots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def read(name: str, folder: Path, **options: Any) -> tuple[list[Frame], tuple[slice, slice]]:
     """The frames of a program's shot, and which pixels of the truth they are."""
     files, frames = clips.plain_frames(folder, motion_convention=PROGRAMS[name].motion_convention, **options)
-    canvas = canvas_of(files)
+    canvas = ForeignSequence([ExrFile(file) for file in files], UNNAMED).window
     return list(frames), (slice(canvas.top, canvas.bottom + 1), slice(canvas.left, canvas.right + 1))
 
 
@@ -114,7 +116,7 @@ def test_the_table_names_the_layers(
     name: str, shots: dict[str, Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "250")  # no line is broken
-    found = sources_of(shots[name], motion_convention=PROGRAMS[name].motion_convention)
+    found = read_channel_mapping(shots[name], ChannelNaming(PROGRAMS[name].motion_convention))
     assert {source.buffer: source.layer for source in found} == PROGRAMS[name].buffers
     options = ["--motion-convention", PROGRAMS[name].motion_convention] if PROGRAMS[name].motion_convention else []
     main.main(["inspect", str(shots[name]), *options])
@@ -127,10 +129,13 @@ def test_the_table_names_the_layers(
 
 def test_what_the_numbers_are_taken_for(shots: dict[str, Path]) -> None:
     words = {
-        name: {source.buffer: source.convention for source in sources_of(shots[name], motion_convention="forward-up")}
+        name: {
+            source.buffer: source.convention
+            for source in read_channel_mapping(shots[name], ChannelNaming("forward-up"))
+        }
         for name in ("Mitsuba", "Arnold", "V-Ray")
     }
-    blender = {source.buffer: source.convention for source in sources_of(shots["Blender"])}
+    blender = {source.buffer: source.convention for source in read_channel_mapping(shots["Blender"])}
     assert words["Mitsuba"]["depth"] == "along the ray"
     assert words["V-Ray"]["depth"].startswith("along the optical axis")
     assert words["Arnold"]["ids"].startswith("hash of what covers most")
@@ -202,7 +207,7 @@ def test_a_lighting_pass_is_no_albedo(tmp_path: Path, scale: float, why: str) ->
     assert len(lines) == 1
     assert lines[0].startswith("not used: 'diffuse' is a lighting pass and no albedo: ")
     assert why in lines[0]
-    assert "albedo" not in [source.buffer for source in sources_of(path)]
+    assert "albedo" not in [source.buffer for source in read_channel_mapping(path)]
 
 
 def test_light_that_is_named_the_albedo_is_taken_with_a_warning(tmp_path: Path) -> None:
@@ -250,7 +255,7 @@ def test_the_names_of_mitsuba_are_those_of_mitsuba(tmp_path: Path) -> None:
     loaded = mi.load_dict(scene)
     mi.render(loaded)
     loaded.sensors()[0].film().bitmap().write(str(tmp_path / "box.exr"))
-    found = {source.buffer: source.layer for source in sources_of(tmp_path / "box.exr")}
+    found = {source.buffer: source.layer for source in read_channel_mapping(tmp_path / "box.exr")}
     wanted = {"radiance": "R, G, B", "albedo": "albedo", "depth": "dd.y", "normal": "nn", "ids": "shape_index"}
     assert found == wanted
     programs.mitsuba(tmp_path / "ours.exr", 0)

@@ -9,11 +9,13 @@ import pytest
 
 from jaxdn.clips import MOTION_CONVENTIONS, ClipError, read_clip, write_clip
 from jaxdn.commands import main
+from jaxdn.commands.channel_table import CONSEQUENCES, missing
 from jaxdn.commands.doctor import doctor
-from jaxdn.commands.sources import CONSEQUENCES, missing
-from jaxdn.data.exr.exr import read_exr, read_names
+from jaxdn.data.exr.exr import read_exr
+from jaxdn.data.exr.file import ExrFile
+from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.layers import LAYERS
-from jaxdn.data.foreign.sources import sources_of
+from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.methods.registry import methods
 from jaxdn.runtime.optional import install
 from tests.training.test_training import make_clip
@@ -45,31 +47,34 @@ def shot(tmp_path):
 
 
 def test_the_names_in_a_header_are_those_of_the_pixels(shot, tmp_path):
-    assert sorted(read_names(shot)) == sorted(read_exr(shot))
+    assert sorted(ExrFile(shot).windows) == sorted(read_exr(shot))
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     plane = np.ones((4, 4), np.float32)
     parts = [OpenEXR.Part({**header, "name": name}, {"R": plane.copy(), "Z": plane.copy()}) for name in ("a", "b.c")]
     OpenEXR.File(parts).write(str(tmp_path / "parts.exr"))
-    assert sorted(read_names(tmp_path / "parts.exr")) == sorted(read_exr(tmp_path / "parts.exr"))
+    assert sorted(ExrFile(tmp_path / "parts.exr").windows) == sorted(read_exr(tmp_path / "parts.exr"))
     (tmp_path / "no.exr").write_bytes(b"not an image")
     with pytest.raises(ClipError, match="not readable as OpenEXR"):
-        read_names(tmp_path / "no.exr")
+        ExrFile(tmp_path / "no.exr").windows  # noqa: B018
     with pytest.raises(ClipError, match="no such file"):
-        read_names(tmp_path / "nowhere.exr")
+        ExrFile(tmp_path / "nowhere.exr").windows  # noqa: B018
 
 
 def test_a_view_layer_is_chosen(shot, capsys):
     with pytest.raises(ClipError, match=r"'Hall\.Combined' and 'Room\.Combined' fit equally well.*--layer"):
-        sources_of(shot)
-    found = {source.buffer: source for source in sources_of(shot, layer="Hall")}
+        read_channel_mapping(shot)
+    found = {source.buffer: source for source in read_channel_mapping(shot, ChannelNaming(layer="Hall"))}
     assert found["radiance"].layer == "Hall.Combined"
     assert found["albedo"].channels == tuple(f"Hall.Denoising Albedo.{letter}" for letter in "RGB")
     assert found["motion"].convention.startswith("pixels, previous minus current position, y up (Blender")
     assert all(source.layer.startswith("Hall.") for source in found.values())
-    mixed = {source.buffer: source.layer for source in sources_of(shot, layer="Hall", channels={"depth": "Room.Depth"})}
+    mixed = {
+        source.buffer: source.layer
+        for source in read_channel_mapping(shot, ChannelNaming(layer="Hall", channels={"depth": "Room.Depth"}))
+    }
     assert (mixed["depth"], mixed["normal"]) == ("Room.Depth", "Hall.Denoising Normal")
     with pytest.raises(ClipError, match=r"layer: there is none called 'Cellar'; there are '\w+', '\w+'"):
-        sources_of(shot, layer="Cellar")
+        read_channel_mapping(shot, ChannelNaming(layer="Cellar"))
     assert read_clip(shot, layer="Hall").frames.albedo is not None
 
 
@@ -77,11 +82,11 @@ def test_only_what_can_be_named_is_listed_as_a_layer(tmp_path):
     """The letters of the image itself are no layers; a depth without a layer can be named: Z."""
     path = write(tmp_path / "a_1.exr", ":RGBAZ", "Paint:RGB", "N:XYZ")
     with pytest.raises(ClipError, match=r"no albedo in layer 'Dyes'; there are 'N', 'Paint', 'Z'\.$"):
-        sources_of(path, channels={"albedo": "Dyes"})
+        read_channel_mapping(path, ChannelNaming(channels={"albedo": "Dyes"}))
     with pytest.raises(ClipError, match=r"none called 'Cellar'; there are 'N', 'Paint'\.$|'Paint', 'N'\.$"):
-        sources_of(path, layer="Cellar")
+        read_channel_mapping(path, ChannelNaming(layer="Cellar"))
     with pytest.raises(ClipError, match=r"none called 'Cellar'; there are none\.$"):
-        sources_of(write(tmp_path / "b_1.exr", ":RGBA"), layer="Cellar")
+        read_channel_mapping(write(tmp_path / "b_1.exr", ":RGBA"), ChannelNaming(layer="Cellar"))
 
 
 @pytest.mark.parametrize("command", [["inspect", "nowhere"], ["denoise", "nowhere", "-o", "out"]])
@@ -126,7 +131,7 @@ def test_a_single_image_is_not_asked_about_motion(tmp_path, capsys):
 def test_what_is_missing_is_said_with_its_consequence(tmp_path, capsys):
     path = write(tmp_path / "a_1.exr", ":RGB", "diffuseFilter:RGB", "Paint:RGB", "mvec:XY")
     reads = methods()["svgf"].factory().reads
-    lost = missing(sources_of(path), reads)
+    lost = missing(read_channel_mapping(path), reads)
     assert set(lost) == {"normal", "depth", "ids"} | ({"specular_reflectance"} & reads)
     options = ("--motion-convention", "uv", "--channels", "albedo=Paint")
     text = run(capsys, "denoise", path, "-o", tmp_path / "out", "--method", "svgf", *options)
@@ -152,7 +157,7 @@ def test_inspect_prints_the_same_and_gives_it_as_json(tmp_path, capsys):
 
 def test_a_clip_of_ours_has_a_table_too(tmp_path, capsys):
     write_clip(make_clip(0), tmp_path / "clip")
-    found = {source.buffer: source for source in sources_of(tmp_path / "clip")}
+    found = {source.buffer: source for source in read_channel_mapping(tmp_path / "clip")}
     assert found["radiance"].channels == ("noisy_1spp.R", "noisy_1spp.G", "noisy_1spp.B")
     assert set(found) == {"radiance", "albedo", "normal", "depth", "motion", "dual_motion"}
     assert "motion motion X, Y pixels, previous minus current position, y down" in run(

@@ -18,7 +18,7 @@ from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.denoiser.tiles import GRID, find_history_halo, map_tiles, split_axis, stream_tiled
 from jaxdn.denoisers import asvgf, ntasd, ntd, steady, svgf, taa
 from jaxdn.filters.surface_test import depth_feature
-from jaxdn.sequence.safe_blend import REACH, combine
+from jaxdn.sequence.james_stein import REACH, combine
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

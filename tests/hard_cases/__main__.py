@@ -24,7 +24,7 @@ import tyro
 from jaxdn import color
 from jaxdn.commands.errors import plain_errors
 from jaxdn.evaluation.report.images import data_address, encode_png
-from jaxdn.runtime.atomic_files import write_whole
+from jaxdn.runtime.atomic_files import write_atomically
 from tests.hard_cases import laws
 from tests.hard_cases.cases import CASES
 from tests.hard_cases.inputs import good
@@ -55,7 +55,7 @@ def part(name: str, state: str, make: Callable[[], dict[str, Any]]) -> dict[str,
     made = {"state": state, **make()}
     made["seconds"] = time.monotonic() - began
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole({path: json.dumps(made)})
+    write_atomically({path: json.dumps(made)})
     return made
 
 

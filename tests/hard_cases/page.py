@@ -7,7 +7,7 @@ from pathlib import Path
 
 import jax
 
-from jaxdn.runtime.atomic_files import write_whole
+from jaxdn.runtime.atomic_files import write_atomically
 from tests.hard_cases.cases import CASES
 from tests.hard_cases.laws import Law
 from tests.hard_cases.table import DIRECTIONS, PRECISIONS, Row
@@ -63,7 +63,7 @@ a cell for all its results; click it for the case{" and its pictures" if picture
     page = folder / "table.html"
     document = f'<!doctype html><meta charset="utf-8"><title>Hard cases</title><style>{_STYLE}</style>{body}\n'
     record = {"rows": [row._asdict() for row in table], "laws": [law._asdict() for law in laws]}
-    write_whole({page: document, folder / "table.json": json.dumps(record, indent=0, default=str) + "\n"})
+    write_atomically({page: document, folder / "table.json": json.dumps(record, indent=0, default=str) + "\n"})
     return page
 
 

@@ -23,7 +23,7 @@ from jaxdn.networks.engines import ENGINES, Engine
 from jaxdn.ops.onednn import library
 from jaxdn.recipes.objectives import indirect_illumination
 from jaxdn.recipes.recipe import Recipe
-from jaxdn.sequence.run import candidate_on
+from jaxdn.sequence.run import select_engine
 from jaxdn.zoo.weights import save_weights
 from tests.methods.test_ntd import TINY
 from tests.needs import require
@@ -352,18 +352,18 @@ def test_a_custom_learned_method_can_denoise(toy, tmp_path, monkeypatch, rng):
     params = {"gain": jnp.asarray([[[0.5, 1.0, 2.0]]], jnp.float32)}
     path = save_weights(tmp_path / "run" / "weights", params, factory="toy", options={"gain": 0.25}, record={})
     for implementation in ("auto", "reference"):
-        found, engine = candidate_on(str(path), implementation)
+        found, engine = select_engine(str(path), implementation)
         assert engine == "reference"
         assert (found.label, found.method.name, dict(found.options)) == ("run", "toy", {"gain": 0.25})
         _, image = found.denoiser.step(found.params, found.denoiser.start(found.params, frame), frame)
         np.testing.assert_allclose(image, frame.radiance * params["gain"], rtol=1e-6)
     with pytest.raises(ValueError, match=r"toy: expected options out of gain, got 'implementation'"):
-        candidate_on(str(path), "onnxruntime")
+        select_engine(str(path), "onnxruntime")
 
 
 def test_a_learned_method_needs_weights(toy):
     with pytest.raises(ValueError, match="method 'toy': expected its weights"):
-        candidate_on("toy")
+        select_engine("toy")
 
 
 @pytest.mark.parametrize(("installed", "engine"), [(True, "onnxruntime"), (False, "reference")])
@@ -375,12 +375,12 @@ def test_weights_of_a_network_run_on_the_available_engine(installed, engine, mon
     params = denoiser.init(jax.random.key(0), Frame(jnp.ones((16, 16, 3))))
     options = {"size": TINY, "kernels": "plain"}
     path = save_weights(tmp_path / "tiny", params, factory="ntd", options=options, record={})
-    found, taken = candidate_on(str(path))
+    found, taken = select_engine(str(path))
     assert taken == engine
     assert found.options.get("implementation") == (engine if installed else None)
     options["compute_dtype"] = "bfloat16"
     half = save_weights(tmp_path / "half", params, factory="ntd", options=options, record={})
-    assert candidate_on(str(half))[1] == "reference"
+    assert select_engine(str(half))[1] == "reference"
 
 
 def test_layer_names_are_always_strings():

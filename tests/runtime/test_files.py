@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from jaxdn.runtime import atomic_files
-from jaxdn.runtime.atomic_files import whole, write_json, write_whole
+from jaxdn.runtime.atomic_files import atomic_write, write_atomically, write_json
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -27,7 +27,7 @@ OLD = {"a": "old", "b": "old"}
 
 
 def test_a_file_appears_when_it_is_complete(folder: Path) -> None:
-    with whole(folder / "a") as temporary:
+    with atomic_write(folder / "a") as temporary:
         temporary.write_text("new")
         assert (folder / "a").read_text() == "old"
         assert temporary.parent == folder  # a rename from another disk would be a copy
@@ -38,7 +38,7 @@ def test_a_file_appears_when_it_is_complete(folder: Path) -> None:
 @pytest.mark.parametrize("error", [ValueError, OSError, KeyboardInterrupt, SystemExit])
 def test_a_writer_that_stops_leaves_only_the_old_file(folder: Path, error: type[BaseException]) -> None:
     def write() -> None:
-        with whole(folder / "a") as temporary:
+        with atomic_write(folder / "a") as temporary:
             temporary.write_text("half of the n")
             raise error
 
@@ -48,7 +48,7 @@ def test_a_writer_that_stops_leaves_only_the_old_file(folder: Path, error: type[
 
 
 def test_a_writer_that_wrote_nothing_is_an_error(folder: Path) -> None:
-    with pytest.raises(FileNotFoundError), whole(folder / "a"):
+    with pytest.raises(FileNotFoundError), atomic_write(folder / "a"):
         pass
     assert contents(folder) == OLD
 
@@ -60,7 +60,7 @@ def test_a_late_disk_error_leaves_the_old_file(folder: Path, monkeypatch, name: 
 
     monkeypatch.setattr(atomic_files.os, name, refuse)
     with pytest.raises(OSError, match="No space left"):
-        write_whole({folder / "a": "new"})
+        write_atomically({folder / "a": "new"})
     assert contents(folder) == OLD
 
 
@@ -76,7 +76,7 @@ def test_a_disk_error_for_one_of_several_files_replaces_none(folder: Path, monke
 
     monkeypatch.setattr(atomic_files.os, "fsync", refuse_the_second)
     with pytest.raises(OSError, match="No space left"):
-        write_whole({folder / "a": "new", folder / "b": "new"})
+        write_atomically({folder / "a": "new", folder / "b": "new"})
     assert contents(folder) == OLD
 
 
@@ -90,7 +90,7 @@ def test_several_files_are_renamed_in_their_order_and_after_all_are_written(fold
         replace(temporary, path)
 
     monkeypatch.setattr(atomic_files.os, "replace", noted)
-    write_whole({folder / "b": "é", folder / "a": b"\x00"})
+    write_atomically({folder / "b": "é", folder / "a": b"\x00"})
     assert renamed == ["b", "a"]
     assert (folder / "b").read_bytes() == "é".encode()
     assert (folder / "a").read_bytes() == b"\x00"
@@ -99,19 +99,19 @@ def test_several_files_are_renamed_in_their_order_and_after_all_are_written(fold
 @pytest.mark.parametrize("bad", [3, None, "\ud800"])
 def test_contents_that_cannot_be_written_replace_nothing(folder: Path, bad: object) -> None:
     with pytest.raises((TypeError, ValueError)):
-        write_whole({folder / "a": "new", folder / "b": bad})  # type: ignore[dict-item]
+        write_atomically({folder / "a": "new", folder / "b": bad})  # type: ignore[dict-item]
     assert contents(folder) == OLD
 
 
 def test_a_folder_that_is_missing_is_named_before_anything_is_written(folder: Path) -> None:
     with pytest.raises(FileNotFoundError, match="nowhere does not exist; create it first"):
-        write_whole({folder / "a": "new", folder / "nowhere" / "b": "new"})
+        write_atomically({folder / "a": "new", folder / "nowhere" / "b": "new"})
     assert contents(folder) == OLD
 
 
 def test_threads_do_not_write_into_each_others_file(tmp_path: Path) -> None:
     texts = [str(digit) * 10_000 for digit in range(8)]
-    threads = [threading.Thread(target=write_whole, args=({tmp_path / "a": text},)) for text in texts]
+    threads = [threading.Thread(target=write_atomically, args=({tmp_path / "a": text},)) for text in texts]
     for thread in threads:
         thread.start()
     for thread in threads:

@@ -8,9 +8,9 @@ import pytest
 SCRIPT = """
 import resource, sys
 import numpy as np
-from jaxdn.runtime.malloc import keep_memory
+from jaxdn.runtime.malloc import tune_malloc
 
-kept = sys.argv[1] == "keep" and keep_memory()
+kept = sys.argv[1] == "keep" and tune_malloc()
 for _ in range(3):
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     array = np.ones(2**23)  # 64 MiB

@@ -16,8 +16,9 @@ from jaxdn.core.frame import FAR, Frame
 from jaxdn.data.read import open_frames
 from jaxdn.filters.time_reversal import SEEN_MOST, blend, seen, turned
 from jaxdn.ops.motion import on_screen
-from jaxdn.sequence.jobs import LEAD_IN
-from jaxdn.sequence.run import Settings, denoise_files
+from jaxdn.sequence.jobs import WARM_UP
+from jaxdn.sequence.run import denoise_files
+from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import candidate
 from tests.programs import PROGRAMS, truth, write_shot
 from tests.sequence.test_frames import part_of
@@ -116,10 +117,10 @@ def test_blenders_file_has_the_vectors_and_others_give_them(tmp_path: Path) -> N
 
 def test_frames_after_the_wanted_ones_are_read_too() -> None:
     def part(numbers: Any, wanted: Any) -> list[range]:
-        return part_of(numbers, wanted, both_ways=True)
+        return part_of(numbers, wanted, both_directions=True)
 
-    assert part(range(50), [25]) == [range(25 - LEAD_IN, 25 + LEAD_IN + 1)]
-    assert part(range(50), [3, 49]) == [range(3 + LEAD_IN + 1), range(49 - LEAD_IN, 50)]
+    assert part(range(50), [25]) == [range(25 - WARM_UP, 25 + WARM_UP + 1)]
+    assert part(range(50), [3, 49]) == [range(3 + WARM_UP + 1), range(49 - WARM_UP, 50)]
     assert part(range(50), range(50)) == [range(50)]
     gap = [*range(10), *range(12, 20)]
     assert part(gap, [9]) == [range(10)]
@@ -176,7 +177,7 @@ def test_an_error_and_an_interrupt_leave_nothing_behind(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        denoise_files([source], tmp_path / "out", candidate("svgf"), Settings(bidirectional=True), say=stop)
+        denoise_files([source], tmp_path / "out", candidate("svgf"), Settings(bidirectional=True), on_frame=stop)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.0000.exr"]
     (source / "a.0001.exr").write_bytes(b"broken")
     with pytest.raises(clips.ClipError, match=r"a\.0001"):

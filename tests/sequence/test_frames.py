@@ -13,8 +13,9 @@ from jaxdn import clips
 from jaxdn.commands import main
 from jaxdn.commands.progress import reporter
 from jaxdn.data.foreign.shots import Shot, find_shots, ranges
-from jaxdn.sequence.jobs import LEAD_IN, Work, work_on
-from jaxdn.sequence.run import Settings, denoise_files
+from jaxdn.sequence.jobs import WARM_UP, Job, find_jobs
+from jaxdn.sequence.run import denoise_files
+from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import candidate
 from tests.training.test_training import make_clip
 
@@ -97,16 +98,16 @@ def test_the_name_of_another_image_is_no_folder(tmp_path: Path) -> None:
 
 def part_of(numbers: Any, wanted: Any, **options: Any) -> list[range]:
     names = tuple(Path(f"{number}.exr") for number in numbers)
-    return list(Work(Shot(names, tuple(numbers)), None, names, frozenset(wanted), ()).stretches(**options))
+    return list(Job(Shot(names, tuple(numbers)), None, names, frozenset(wanted), ()).segments(**options))
 
 
-def test_stretches_have_a_lead_in_and_do_not_cross_gaps() -> None:
+def test_segments_have_a_warm_up_and_do_not_cross_gaps() -> None:
     everything = range(50)
     assert part_of(everything, everything) == [range(50)]
-    assert part_of(everything, [30]) == [range(30 - LEAD_IN, 31)]
+    assert part_of(everything, [30]) == [range(30 - WARM_UP, 31)]
     assert part_of(everything, [3]) == [range(4)]
-    assert part_of(everything, [5, 49]) == [range(6), range(49 - LEAD_IN, 50)]
-    assert part_of(everything, [20, 20 + LEAD_IN + 1]) == [range(20 - LEAD_IN, 20 + LEAD_IN + 2)]
+    assert part_of(everything, [5, 49]) == [range(6), range(49 - WARM_UP, 50)]
+    assert part_of(everything, [20, 20 + WARM_UP + 1]) == [range(20 - WARM_UP, 20 + WARM_UP + 2)]
     assert part_of(everything, []) == []
     gap = [*range(10), *range(12, 20)]
     assert part_of(gap, range(18)) == [range(10), range(10, 18)]
@@ -116,11 +117,11 @@ def test_stretches_have_a_lead_in_and_do_not_cross_gaps() -> None:
 
 @pytest.mark.slow
 def test_a_part_of_a_shot_is_as_in_the_whole(tmp_path: Path) -> None:
-    """After its lead-in, a frame differs from that of the whole run by a tenth of the noise that is left in it."""
+    """After its warm-up, a frame differs from that of the whole run by a tenth of the noise that is left in it."""
     rng = np.random.default_rng(0)
     source = tmp_path / "in"
     source.mkdir()
-    count = 2 * LEAD_IN + 8
+    count = 2 * WARM_UP + 8
     for number in range(count):
         light = rng.exponential(1.0, (32, 32)).astype(np.float32)
         clips.write_exr(source / f"a.{number:04d}.exr", dict.fromkeys("RGB", light))
@@ -165,9 +166,9 @@ def test_no_input_is_overwritten(tmp_path: Path) -> None:
     before = [path.read_bytes() for path in sorted(source.iterdir())]
     for sources, out in (([source], source), ([source / "a.0001.exr", source / "a.0002.exr"], source)):
         with pytest.raises(ValueError, match="expected another place than the input's"):
-            work_on(sources, out)
+            find_jobs(sources, out)
     with pytest.raises(ValueError, match="expected a folder for 2 frames"):
-        work_on([source], tmp_path / "x.exr")
+        find_jobs([source], tmp_path / "x.exr")
     assert [path.read_bytes() for path in sorted(source.iterdir())] == before
     assert not (tmp_path / "x.exr").exists()
 

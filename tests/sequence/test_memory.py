@@ -7,9 +7,11 @@ import pytest
 
 from experiments.stability.memory import peak_mib, write_sequence
 from jaxdn.clips import read_exr
-from jaxdn.data.exr.exr import read_windows
+from jaxdn.data.exr.file import ExrFile
+from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.sequence.memory_budget import STEP, needed
-from jaxdn.sequence.run import Settings, denoise_files
+from jaxdn.sequence.run import denoise_files
+from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import candidate
 
 pytestmark = pytest.mark.usefixtures("compiled_anew")  # loading a program takes less memory than compiling it
@@ -38,11 +40,11 @@ def test_frames_in_parts_are_the_same_files(tmp_path):
     """Half the frame fits into the memory that is allowed; the safe mixture and the previews are made in parts too."""
     height, width = 300, 520
     write_sequence(tmp_path / "in", 2, height, width)
-    channels = len(read_windows(tmp_path / "in/frame_0001.exr")[1])
+    channels = len(ExrFile(tmp_path / "in/frame_0001.exr").windows)
     enough = needed(height, width, channels)
     images, told = {}, []
     for name, limit in (("whole", enough), ("parts", enough - STEP * (height * width - 288 * 288))):
-        settings = Settings(motion_convention="previous-current", max_memory=limit)
+        settings = Settings(naming=ChannelNaming("previous-current"), max_memory=limit)
         files = denoise_files([tmp_path / "in"], tmp_path / name, candidate("svgf"), settings, log=told.append).files
         images[name] = [np.stack([read_exr(file)[letter] for letter in "RGB"], axis=-1) for file in files]
     assert [line for line in told if "in parts of at most 288 x 288 pixels" in line] == told[-2:-1]
@@ -52,7 +54,7 @@ def test_frames_in_parts_are_the_same_files(tmp_path):
 
 def test_too_little_memory_is_refused_before_anything_is_written(tmp_path):
     write_sequence(tmp_path / "in", 1, 200, 300)
-    settings = Settings(motion_convention="previous-current", max_memory=0.61 * 2**30)
+    settings = Settings(naming=ChannelNaming("previous-current"), max_memory=0.61 * 2**30)
     with pytest.raises(ValueError, match=r"--max-memory 0.61: whole frames of 300 x 200 need .* there is room for"):
         denoise_files([tmp_path / "in"], tmp_path / "out", candidate("svgf"), settings)
     assert not list((tmp_path / "out").glob("**/*.exr"))
@@ -72,6 +74,6 @@ def test_the_peak_is_that_of_the_child_alone(tmp_path):
 def test_a_process_keeps_to_the_memory_it_is_allowed(tmp_path):
     height, width, limit = 540, 960, 0.9
     write_sequence(tmp_path / "in", 2, height, width)
-    channels = len(read_windows(tmp_path / "in/frame_0001.exr")[1])
+    channels = len(ExrFile(tmp_path / "in/frame_0001.exr").windows)
     assert needed(height, width, channels) > 1.2 * limit * 2**30
     assert peak_mib(tmp_path / "in", tmp_path / "out", "svgf", limit) < 1024 * limit

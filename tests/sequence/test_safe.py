@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from jaxdn import clips, color
+from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.data.read import open_frames
 from jaxdn.metrics import psnr
 from jaxdn.render import ClipJob, render_clips
-from jaxdn.sequence.run import Settings, denoise_files
+from jaxdn.sequence.run import denoise_files
+from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import candidate
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -137,7 +139,7 @@ def test_no_rendered_frame_is_worse_than_it_was(
         clips.write_exr(tmp_path / "in" / file.name, light | {"all": rest, "none": {}, "turned": turned}[guides])
     convention = None if guides == "none" else "previous-current"
     files = denoise_files(
-        [tmp_path / "in"], tmp_path / "out", candidate(method), Settings(motion_convention=convention)
+        [tmp_path / "in"], tmp_path / "out", candidate(method), Settings(naming=ChannelNaming(convention))
     ).files
     for file in files:
         there = clips.read_exr(rendered / file.name)

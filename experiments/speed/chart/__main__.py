@@ -43,7 +43,7 @@ from jaxdn.core.frame import Frame, frame_at, written_out
 from jaxdn.evaluation.compare import describe_machine
 from jaxdn.evaluation.report import save_png
 from jaxdn.render import scene_from_record, use_variant
-from jaxdn.runtime.malloc import keep_memory
+from jaxdn.runtime.malloc import tune_malloc
 from jaxdn.zoo.weights import SHIPPED
 
 
@@ -224,7 +224,7 @@ def _digest(path: Path) -> str:
 
 def main(settings: Settings) -> None:
     """Render, score, time, draw."""
-    keep_memory()  # as `jaxdn denoise` does
+    tune_malloc()  # as `jaxdn denoise` does
     began = time.monotonic()
     console = Console()
     sizes = footage.QUICK if settings.quick else footage.FULL

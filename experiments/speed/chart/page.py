@@ -18,7 +18,7 @@ from experiments.speed.chart.summary import RENDERER, Equal, Point, headline, in
 from experiments.speed.chart.way import ALL
 from jaxdn.evaluation.report import images
 from jaxdn.evaluation.report.results import json_ready
-from jaxdn.runtime.atomic_files import write_whole
+from jaxdn.runtime.atomic_files import write_atomically
 
 Pictures = dict[str, dict[str, np.ndarray]]
 """Clip -> point, or "reference" -> [H, W, 3] in 0..1."""
@@ -42,7 +42,7 @@ def write_page(
     """
     path = Path(folder) / "chart.html"
     document = page(data, points, equals, sizes, read_pictures(Path(folder), data, points))
-    write_whole({path: document.encode("utf-8", "replace")})
+    write_atomically({path: document.encode("utf-8", "replace")})
     return path
 
 

@@ -18,7 +18,7 @@ from jaxdn.core.frame import OF_SAMPLES, Clip, frame_at, only, present
 from jaxdn.data.clip.frames import StoredFrame, layers_for, read_frame, stored_layers, write_frame
 from jaxdn.data.clip.record import FORMAT, checked, held_frames, is_planned
 from jaxdn.data.errors import ClipError, read_json
-from jaxdn.data.exr.exr import read_exr
+from jaxdn.data.exr.file import ExrFile
 from jaxdn.runtime.atomic_files import write_json
 
 RECORD = "clip.json"
@@ -223,7 +223,7 @@ def _unfinished(folder: Path) -> ClipError:
 
 def _looks_unfinished(path: str | Path) -> bool:
     first = frame_path(path, 0)
-    return (Path(path) / _UNFINISHED).is_file() or (first.is_file() and bool(stored_layers(read_exr(first))))
+    return (Path(path) / _UNFINISHED).is_file() or (first.is_file() and bool(stored_layers(ExrFile(first).windows)))
 
 
 def _names(stored: StoredFrame, *, planned: bool) -> set[str]:

@@ -14,14 +14,13 @@ import numpy as np
 import OpenEXR
 
 from jaxdn.data.errors import ClipError
-from jaxdn.data.exr.windows import Window, window_of
-from jaxdn.runtime.atomic_files import whole
+from jaxdn.data.exr.file import ExrFile
+from jaxdn.runtime.atomic_files import atomic_write
 
 HALF_MAX = 65504.0
 """The largest float16."""
 
 _NAME_LIMIT = 255  # longer channel names are cut off silently
-_SIDE_LIMIT = 1 << 16  # a larger size in a header counts as damaged, before memory is allocated for it
 _STORABLE = (np.float16, np.float32, np.uint32)
 _WRITERS_OWN = ("channels", "chunkCount")  # attributes that the writer makes
 _ABOUT_LAYERS = ("cryptomatte", "name", "view")
@@ -51,9 +50,9 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
 
 
 def _write(path: Path, parts: Sequence[tuple[dict[str, Any], dict[str, np.ndarray]]]) -> None:
-    """Write parts of a header and channels each, read them back, and rename; raises OSError as :func:`write_exr`."""
-    wanted = [len(channels) for _, channels in parts]
-    with whole(path) as temporary:
+    """Write parts of a header and channels each, decode them again, and rename; raises OSError as :func:`write_exr`."""
+    expected = [len(channels) for _, channels in parts]
+    with atomic_write(path) as temporary:
         try:
             # The dicts are changed by the call.
             OpenEXR.File([OpenEXR.Part(header, dict(channels)) for header, channels in parts]).write(str(temporary))
@@ -62,10 +61,10 @@ def _write(path: Path, parts: Sequence[tuple[dict[str, Any], dict[str, np.ndarra
             raise OSError(code, f"could not write the frame ({error})", str(path)) from error
         # The writer does not notice a disk that fills up within the last buffer: check what was written.
         try:
-            read_exr(temporary)
+            written = [len(part.channels) for part in ExrFile(temporary).decode()]
         except ClipError as error:
             raise OSError(errno.ENOSPC, "the file is incomplete after writing; is the disk full?", str(path)) from error
-        if [len(header["channels"]) for header in _headers(temporary)] != wanted:
+        if written != expected:
             raise OSError(errno.EIO, "the file lacks some of its channels after writing", str(path))
 
 
@@ -76,79 +75,11 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
     Subsampled channels are left out. Raises ClipError, naming the file and the reason, if the file is missing, not an
     OpenEXR file, truncated or damaged, or has deep data.
     """
-    found = {name: pixels for _, channels in _parts(Path(path)) for name, _, pixels in channels if pixels is not None}
-    if not found:
-        raise ClipError(f"{path}: the file has no channels.")
-    return found
-
-
-def _parts(path: Path) -> list[tuple[dict[str, Any], list[tuple[str, str, np.ndarray | None]]]]:
-    """The header of each part, and the full name, the own name and the pixels of its channels, None if subsampled."""
-    _headers(path)
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            parts = list(file.parts)
-            if not parts:
-                raise ClipError(f"{path}: the pixel data is truncated or damaged; write the frame again.")
-            found = []
-            for part in parts:
-                channels = []
-                for name, channel in part.channels.items():
-                    full, pixels = _full_name(part.header, name, len(parts)), channel.pixels
-                    if (channel.xSampling, channel.ySampling) != (1, 1):
-                        pixels = None
-                    elif not isinstance(pixels, np.ndarray) or pixels.ndim != 2 or pixels.dtype == object:
-                        raise ClipError(f"{path}: channel {name} is not a flat image; deep data cannot be read.")
-                    channels.append((full, name, pixels))
-                found.append((dict(part.header), channels))
-            return found
-    except ClipError:
-        raise
-    except (RuntimeError, ValueError, KeyError, TypeError, MemoryError, UnicodeDecodeError) as error:
-        raise ClipError(f"{path}: not readable as OpenEXR ({error}); write the frame again.") from error
-
-
-def read_header(path: str | Path) -> dict[str, Any]:
-    """The attributes of a file's first part, such as ``worldToCamera``. Raises ClipError if it is not readable."""
-    return _headers(path)[0]
-
-
-def read_names(path: str | Path) -> list[str]:
-    """The names of a file's channels as :func:`read_exr` gives them, from its header alone. Raises as that does."""
-    return list(read_windows(path)[1])
-
-
-def read_windows(path: str | Path) -> tuple[Window, dict[str, Window]]:
-    """The display window of a file, and the data window of each channel that :func:`read_exr` gives.
-
-    From the header alone. Raises as that does.
-    """
-    headers = _headers(path)
-    return window_of(headers[0], "displayWindow"), {
-        _full_name(header, channel.name, len(headers)): window_of(header, "dataWindow")
-        for header in headers
-        for channel in header["channels"]
-        if (channel.xSampling, channel.ySampling) == (1, 1)
-    }
-
-
-def _headers(path: str | Path) -> list[dict[str, Any]]:
-    """The header of each part."""
-    path = Path(path)
-    if not path.is_file():
-        raise ClipError(f"{path}: there is no such file.")
-    try:
-        with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
-            headers = [dict(part.header) for part in file.parts]
-    except (RuntimeError, ValueError, KeyError, TypeError, IndexError, UnicodeDecodeError) as error:
-        raise ClipError(f"{path}: not readable as OpenEXR ({error}); write the frame again.") from error
-    for header in headers:
-        _check_header(path, header)
-    return headers
+    return ExrFile(path).pixels
 
 
 def rewrite_exr(
-    source: str | Path, target: str | Path, replaced: Mapping[str, np.ndarray], *, only: Mapping[str, str] | None = None
+    source: ExrFile, target: str | Path, replaced: Mapping[str, np.ndarray], *, only: Mapping[str, str] | None = None
 ) -> list[str]:
     """Write a file again with other pixels in some channels, and everything else as it was.
 
@@ -164,7 +95,7 @@ def rewrite_exr(
     """
     notes: dict[str, None] = {}
     written = []
-    for header, channels in _parts(Path(source)):
+    for header, channels in source.decode():
         kept = {}
         for full, name, pixels in channels:
             if pixels is None:
@@ -202,21 +133,3 @@ def _storable(path: Path, name: str, pixels: np.ndarray) -> np.ndarray:
     if pixels.dtype not in _STORABLE:
         raise ValueError(f"{path}: channel {name}: expected float16, float32 or uint32, got {pixels.dtype}.")
     return np.ascontiguousarray(pixels)
-
-
-def _check_header(path: Path, header: Mapping[str, Any]) -> None:
-    window = header.get("dataWindow")
-    if not isinstance(window, tuple) or len(window) != 2:
-        raise ClipError(f"{path}: the header has no data window; the file is damaged.")
-    low, high = (np.asarray(corner, np.int64) for corner in window)
-    sides = high - low + 1
-    tiles = header.get("tiles")
-    if tiles is not None and tiles.mode != OpenEXR.ONE_LEVEL:
-        raise ClipError(f"{path}: tiles in several levels (a mipmap) cannot be read; save it with one level.")
-    if sides.min() < 1 or sides.max() > _SIDE_LIMIT:
-        raise ClipError(f"{path}: the header claims {sides[0]} x {sides[1]} pixels; the file is damaged.")
-
-
-def _full_name(header: Mapping[str, object], name: str, parts: int) -> str:
-    part = str(header.get("name", ""))
-    return name if parts == 1 or not part or name == part or name.startswith(part + ".") else f"{part}.{name}"

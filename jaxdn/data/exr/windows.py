@@ -1,7 +1,8 @@
 """Data and display windows: which pixels of the picture a file, or a part of it, has.
 
 A renderer may store less than the picture (a region, a cropped bounding box that differs from frame to frame) or more
-(overscan). All frames of a sequence are put into one *canvas*, so that motion vectors mean the same in each of them.
+(overscan). All frames of a sequence are placed into the union of their data windows, so that motion vectors mean the
+same in each of them.
 """
 
 from collections.abc import Iterable, Mapping
@@ -35,30 +36,30 @@ def window_of(header: Mapping[str, Any], name: str) -> Window:
     return Window(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
 
 
-def union(windows: Iterable[Window]) -> Window:
+def union_of(windows: Iterable[Window]) -> Window:
     """The smallest window that has all of them in it."""
     left, top, right, bottom = zip(*windows, strict=True)
     return Window(min(left), min(top), max(right), max(bottom))
 
 
-def place(pixels: np.ndarray, window: Window, canvas: Window, outside: Any = 0) -> np.ndarray:
-    """Pixels [H, W, ...] of a window as an image of the canvas, which holds it; ``outside`` of it is one value.
+def place(pixels: np.ndarray, window: Window, union: Window) -> np.ndarray:
+    """Pixels [H, W, ...] of a window as an image of a union that contains it; 0 elsewhere.
 
-    The pixels themselves where the window is the canvas.
+    The pixels themselves where the window is the union.
     """
-    if window == canvas:
+    if window == union:
         return pixels
-    image = np.full((*canvas.size, *pixels.shape[2:]), outside, pixels.dtype)
-    image[_inside(window, canvas)] = pixels
+    image = np.zeros((*union.size, *pixels.shape[2:]), pixels.dtype)
+    image[_inside(window, union)] = pixels
     return image
 
 
-def cut(image: np.ndarray, canvas: Window, window: Window) -> np.ndarray:
-    """The pixels of a window that lies in the canvas, from an image of the canvas."""
-    return image[_inside(window, canvas)]
+def crop(image: np.ndarray, union: Window, window: Window) -> np.ndarray:
+    """The pixels of a window that lies in the union, from an image of the union."""
+    return image[_inside(window, union)]
 
 
-def _inside(window: Window, canvas: Window) -> tuple[slice, slice]:
+def _inside(window: Window, union: Window) -> tuple[slice, slice]:
     height, width = window.size
-    top, left = window.top - canvas.top, window.left - canvas.left
+    top, left = window.top - union.top, window.left - union.left
     return slice(top, top + height), slice(left, left + width)

@@ -8,6 +8,8 @@ each program.
 import re
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from jaxdn.core.frame import BUFFERS, Buffer
 from jaxdn.data.errors import ClipError
 
@@ -180,6 +182,11 @@ def find(groups: Groups, layers: Sequence[str], buffer: Buffer, what: str = "", 
     return None
 
 
+def stack_channels(pixels: Mapping[str, np.ndarray], channels: Channels) -> np.ndarray:
+    """The channels [H, W] of a buffer as one image [H, W, C], in their precision."""
+    return np.stack([pixels[channel] for channel in channels], axis=-1)
+
+
 def layer_of(channels: Channels) -> str:
     """The layer that the channels of a buffer lie in; the channels themselves where they have none."""
     return channels[0].rpartition(".")[0] or ", ".join(channels)
@@ -200,12 +207,12 @@ def is_cryptomatte(channels: Channels) -> bool:
     return re.fullmatch(r".*crypto.*00", last_name(channels)) is not None
 
 
-def beauty(names: Sequence[str], found: Mapping[str, Channels]) -> Channels:
+def beauty_channels(names: Sequence[str], buffers: Mapping[str, Channels]) -> Channels:
     """The channels that a denoised image belongs in: those that the radiance was read from.
 
     If that was Blender's ``Noisy Image``, they are those of the ``Combined`` beside it, which Blender denoises into.
     """
-    read = found["radiance"]
+    read = buffers["radiance"]
     head, _, last = layer_of(read).rpartition(".")
     if last.lower() == "noisy image":
         combined = _fitting(grouped(names).get(f"{head}.Combined" if head else "Combined", {}), BUFFERS["radiance"])

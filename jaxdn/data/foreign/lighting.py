@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxdn.data.foreign.layers import LAYERS, Channels, grouped
+from jaxdn.data.foreign.layers import LAYERS, Channels, grouped, stack_channels
 
 SLACK = 0.1
 """By so much fractions may leave [0, 1]: pixel filters with negative lobes overshoot at edges."""
@@ -26,7 +26,7 @@ _NO_LIGHT = ("variance", "_var", "mse", "crypto", "noisy image", "denoised")
 """Words in the names of layers that may pass for a part of the beauty by their values."""
 
 
-def why_light(values: np.ndarray, beauty: np.ndarray) -> str | None:
+def explain_light(values: np.ndarray, beauty: np.ndarray) -> str | None:
     """Why a layer [H, W, 3] is light and not an albedo, in words; None where nothing says so.
 
     Three things tell light: values above 1, noise, and that it is nowhere brighter than the beauty, as only a part of
@@ -43,41 +43,45 @@ def why_light(values: np.ndarray, beauty: np.ndarray) -> str | None:
     return None
 
 
-def parts_of(there: Mapping[str, np.ndarray], beauty: Channels, found: Mapping[str, Channels]) -> dict[str, Channels]:
+def find_additive_layers(
+    pixels: Mapping[str, np.ndarray], beauty: Channels, buffers: Mapping[str, Channels]
+) -> dict[str, Channels]:
     """Layer -> channels of the additive parts of the beauty: coloured, never negative, nowhere brighter than it.
 
     Left out are layers that are read as something else, whose names are those of guides, or that hold variances, and
     ``Noisy Image``, which is to stay as it is.
 
     Args:
-      there: every channel of the file.
+      pixels: every channel of the file.
       beauty: the channels of the beauty, which is no part of itself.
-      found: buffer -> channels that are read.
+      buffers: buffer -> channels that are read.
     """
     known = {name for buffer, names in LAYERS.items() if buffer != "radiance" for name in names} - {"diffuse"}
-    read = {channel for channels in found.values() for channel in channels} | set(beauty)
-    whole = np.stack([there[channel] for channel in found["radiance"]], axis=-1)
-    parts = {}
-    for layer, group in grouped(list(there)).items():
+    read = {channel for channels in buffers.values() for channel in channels} | set(beauty)
+    radiance = stack_channels(pixels, buffers["radiance"])
+    additive = {}
+    for layer, group in grouped(list(pixels)).items():
         last = layer.rpartition(".")[2].lower()
         channels = tuple(group[letter] for letter in "rgb" if letter in group)
         if len(channels) < 3 or read & set(channels) or last in known or any(word in last for word in _NO_LIGHT):
             continue
-        values = np.stack([there[channel] for channel in channels], axis=-1)
-        if np.nanmin(values) >= 0 and _is_part(values, whole):
-            parts[layer] = channels
-    return parts
+        values = stack_channels(pixels, channels)
+        if np.nanmin(values) >= 0 and _is_part(values, radiance):
+            additive[layer] = channels
+    return additive
 
 
-def copies_of(there: Mapping[str, np.ndarray], beauty: Channels, parts: Mapping[str, Channels]) -> frozenset[str]:
-    """Those of the parts that are the beauty once more, within half precision: the compositor's, a viewer's."""
-    whole = np.stack([there[channel] for channel in beauty], axis=-1).astype(np.float64)
+def find_beauty_copies(
+    pixels: Mapping[str, np.ndarray], beauty: Channels, layers: Mapping[str, Channels]
+) -> frozenset[str]:
+    """Those of the layers that are the beauty once more, within half precision: the compositor's, a viewer's."""
+    radiance = stack_channels(pixels, beauty).astype(np.float64)
 
     def same(channels: Channels) -> bool:
-        values = np.stack([there[channel] for channel in channels], axis=-1)
-        return bool(np.mean(np.abs(values - whole) <= 2e-3 * np.abs(whole)) >= _PART)
+        values = stack_channels(pixels, channels)
+        return bool(np.mean(np.abs(values - radiance) <= 2e-3 * np.abs(radiance)) >= _PART)
 
-    return frozenset(layer for layer, channels in parts.items() if same(channels))
+    return frozenset(layer for layer, channels in layers.items() if same(channels))
 
 
 def _is_part(values: np.ndarray, beauty: np.ndarray) -> bool:

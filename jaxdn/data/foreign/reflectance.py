@@ -7,7 +7,7 @@ world space and the camera's place, which the file's header may have. Whatever l
 alone: nothing is guessed.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ import numpy as np
 from jaxdn.brdf import directional_albedo
 from jaxdn.core.frame import BUFFERS, Frame
 from jaxdn.data.errors import ClipError
-from jaxdn.data.foreign.layers import NOT_WANTED, Channels, find, grouped, layer_of, name_it
+from jaxdn.data.foreign.layers import NOT_WANTED, Channels, find, grouped, layer_of, name_it, stack_channels
 from jaxdn.data.foreign.lighting import SLACK
 
 _POINT = BUFFERS["normal"]
@@ -44,36 +44,36 @@ def check_fraction(name: str, layer: str, values: np.ndarray) -> np.ndarray:
 
 def with_reflectance(
     frame: Frame,
-    found: Mapping[str, Channels],
-    there: Mapping[str, np.ndarray],
-    header: Callable[[], Mapping[str, Any]],
+    buffers: Mapping[str, Channels],
+    pixels: Mapping[str, np.ndarray],
+    header: Mapping[str, Any],
 ) -> tuple[Frame, str | None]:
     """The frame with ``reflectance`` and ``specular_reflectance`` where its file tells them, and how in a sentence.
 
     Args:
       frame: with the buffers that were found by name.
-      found: buffer -> channels it was read from.
-      there: every channel of the file.
-      header: reads the file's header.
+      buffers: buffer -> channels it was read from.
+      pixels: every channel of the file.
+      header: of the file.
     """
     if frame.albedo is None:
         return frame._replace(specular_reflectance=None), None
-    albedo, diffuse = frame.albedo, layer_of(found["albedo"])
+    albedo, diffuse = frame.albedo, layer_of(buffers["albedo"])
     if frame.specular_reflectance is not None:
         specular = frame.specular_reflectance
-        how = f"{diffuse!r} + {layer_of(found['specular_reflectance'])!r}"
+        how = f"{diffuse!r} + {layer_of(buffers['specular_reflectance'])!r}"
     else:
-        color = find(grouped(list(there)), _F0, BUFFERS["specular_reflectance"])
+        color = find(grouped(list(pixels)), _F0, BUFFERS["specular_reflectance"])
         if color is None:
             return frame, None
         layer = layer_of(color)
         if frame.roughness is None:
             return frame, f"not used: {layer!r}, as what it reflects depends on the roughness, which is not there"
-        cosine, where = _cosine(frame, found, there, header)
+        cosine, where = _cosine(frame, buffers, pixels, header)
         if cosine is None:
             return frame, f"not used: {layer!r}, as what it reflects depends on the angle of view, and {where}"
-        specular = _lobe(check_fraction("F0", layer, _stack(there, color)), frame.roughness, cosine)
-        how = f"{diffuse!r} + GGX lobe of F0 {layer!r}, roughness {layer_of(found['roughness'])!r} and {where}"
+        specular = _lobe(check_fraction("F0", layer, stack_channels(pixels, color)), frame.roughness, cosine)
+        how = f"{diffuse!r} + GGX lobe of F0 {layer!r}, roughness {layer_of(buffers['roughness'])!r} and {where}"
     reflectance = np.clip(albedo + specular, 0.0, 1.0)
     return frame._replace(reflectance=reflectance, specular_reflectance=specular), f"derived: reflectance = {how}"
 
@@ -88,25 +88,25 @@ def _lobe(color: np.ndarray, roughness: np.ndarray, cosine: np.ndarray) -> np.nd
 
 def _cosine(
     frame: Frame,
-    found: Mapping[str, Channels],
-    there: Mapping[str, np.ndarray],
-    header: Callable[[], Mapping[str, Any]],
+    buffers: Mapping[str, Channels],
+    pixels: Mapping[str, np.ndarray],
+    header: Mapping[str, Any],
 ) -> tuple[np.ndarray | None, str]:
     """The cosine [H, W, 1] between normal and view, NaN where there is no normal; and from what, or why not."""
-    groups = grouped(list(there))
+    groups = grouped(list(pixels))
     normals, places = find(groups, CAMERA_NORMALS, _POINT), find(groups, _CAMERA_POSITIONS, _POINT)
     if normals and places:
         where = f"{layer_of(normals)!r} and {layer_of(places)!r} in camera space"
-        return _between(_stack(there, normals), -_stack(there, places)), where
+        return _between(stack_channels(pixels, normals), -stack_channels(pixels, places)), where
     places = find(groups, _WORLD_POSITIONS, _POINT)
-    world = frame.normal is not None and not _is_one_of(layer_of(found["normal"]), CAMERA_NORMALS)
+    world = frame.normal is not None and not _is_one_of(layer_of(buffers["normal"]), CAMERA_NORMALS)
     if not places or not world:
         return None, "there are no normals and positions of one space to find it"
-    eye = _camera_place(header().get("worldToCamera"))
+    eye = _camera_place(header.get("worldToCamera"))
     if eye is None:
         return None, "the header has no worldToCamera with the place of the camera"
-    where = f"{layer_of(found['normal'])!r} and {layer_of(places)!r} in world space"
-    return _between(frame.normal, eye.astype(np.float32) - _stack(there, places)), where
+    where = f"{layer_of(buffers['normal'])!r} and {layer_of(places)!r} in world space"
+    return _between(frame.normal, eye.astype(np.float32) - stack_channels(pixels, places)), where
 
 
 def _between(normal: np.ndarray, view: np.ndarray) -> np.ndarray:
@@ -133,7 +133,3 @@ def _camera_place(matrix: Any) -> np.ndarray | None:
 
 def _is_one_of(layer: str, names: Sequence[str]) -> bool:
     return any(layer.lower() == name or layer.lower().endswith("." + name) for name in names)
-
-
-def _stack(there: Mapping[str, np.ndarray], channels: Channels) -> np.ndarray:
-    return np.stack([there[channel] for channel in channels], axis=-1).astype(np.float32)

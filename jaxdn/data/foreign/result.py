@@ -5,19 +5,20 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxdn.data.exr.exr import read_windows, rewrite_exr
-from jaxdn.data.exr.windows import Window, cut
-from jaxdn.data.foreign.layers import Channels, beauty, detect_channels, grouped, layer_of
+from jaxdn.data.exr.exr import rewrite_exr
+from jaxdn.data.exr.file import ExrFile
+from jaxdn.data.exr.windows import Window, crop
+from jaxdn.data.foreign.layers import Channels, beauty_channels, grouped, layer_of
+from jaxdn.data.foreign.naming import ChannelNaming
 
 
 def write_result(
-    source: Path,
+    source: ExrFile,
     target: Path,
     images: Mapping[str, np.ndarray],
-    canvas: Window,
+    window: Window,
+    naming: ChannelNaming,
     *,
-    channels: Mapping[str, str] | None = None,
-    layer: str | None = None,
     only_beauty: bool = False,
 ) -> list[str]:
     """Write a file's denoised beauty, with all other layers, metadata, windows and parts of the file; or alone.
@@ -27,25 +28,26 @@ def write_result(
     Args:
       source: the renderer's file.
       target: the file to write.
-      images: layer -> denoised image [H, W, 3] of the canvas; "" is the beauty.
-      canvas: which pixels of the picture the images are (:func:`jaxdn.data.foreign.import_exr.canvas_of`).
-      channels: how the beauty was found, see :func:`jaxdn.data.foreign.layers.detect_channels`.
-      layer: the same.
+      images: layer -> denoised image [H, W, 3] of the window; "" is the beauty.
+      window: which pixels of the picture the images are (:attr:`jaxdn.data.foreign.import_exr.ForeignSequence.window`).
+      naming: how the beauty was found.
       only_beauty: write R, G, B, and A where there is one, and nothing else.
     """
-    _, windows = read_windows(source)
+    source.decode()  # first, as the windows are those of the decoded headers then
+    windows = source.windows
     names = list(windows)
-    place = beauty(names, detect_channels(names, channels=channels, layer=layer))
+    beauty = beauty_channels(names, naming.detect(names))
     groups = grouped(names)
     replaced = {}
-    for name, image in images.items():
-        for channel, pixels in zip(_color(groups, name) if name else place, np.moveaxis(image, -1, 0), strict=True):
-            replaced[channel] = cut(pixels, canvas, windows[channel])
+    for layer, image in images.items():
+        channels = _color(groups, layer) if layer else beauty
+        for channel, pixels in zip(channels, np.moveaxis(image, -1, 0), strict=True):
+            replaced[channel] = crop(pixels, window, windows[channel])
     if not only_beauty:
         return rewrite_exr(source, target, replaced)
-    beside = groups[layer_of(place) if "." in place[0] else ""]
+    beside = groups[layer_of(beauty) if "." in beauty[0] else ""]
     alpha = beside.get("a") or groups.get("", {}).get("a")
-    kept = dict(zip(place, "RGB", strict=True)) | ({} if alpha is None else {alpha: "A"})
+    kept = dict(zip(beauty, "RGB", strict=True)) | ({} if alpha is None else {alpha: "A"})
     return rewrite_exr(source, target, replaced, only=kept)
 
 

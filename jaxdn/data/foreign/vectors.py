@@ -63,36 +63,38 @@ def check_convention(stated: str | None) -> None:
 
 
 def motion_convention_of(
-    found: Mapping[str, Channels], there: Collection[str], stated: str | None, *, alone: bool = False
+    buffers: Mapping[str, Channels], names: Collection[str], stated: str | None, *, single: bool = False
 ) -> str | None:
     """The convention of the motion vectors among a file's channels; None where there are none, or none are wanted.
 
-    Raises UnknownMotion where nobody has stated it and the names do not tell; of a file ``alone``, it is None.
+    Raises UnknownMotion where nobody has stated it and the names do not tell; of a ``single`` image, it is None.
     """
-    if "motion" not in found or stated == "none":
+    if "motion" not in buffers or stated == "none":
         return None
     if stated is not None:
         return stated
-    if _is_cycles_vector(found["motion"], there):
+    if _is_cycles_vector(buffers["motion"], names):
         return CYCLES
-    if alone:
+    if single:
         return None
     raise UnknownMotion(
-        f"{', '.join(found['motion'])}: nothing in the file says what they mean; state --motion-convention NAME, "
+        f"{', '.join(buffers['motion'])}: nothing in the file says what they mean; state --motion-convention NAME, "
         f"one of these:\n{conventions()}"
     )
 
 
-def contradicts_cycles(found: Mapping[str, Channels], there: Collection[str], convention: str | None) -> bool:
+def contradicts_cycles(buffers: Mapping[str, Channels], names: Collection[str], convention: str | None) -> bool:
     """Whether another convention was stated for what has the name and the four components of Cycles' ``Vector``."""
-    return convention not in (None, CYCLES) and _is_cycles_vector(found["motion"], there)
+    return convention not in (None, CYCLES) and _is_cycles_vector(buffers["motion"], names)
 
 
-def forward_channels(found: Mapping[str, Channels], there: Collection[str], convention: str | None) -> Channels | None:
+def forward_channels(
+    buffers: Mapping[str, Channels], names: Collection[str], convention: str | None
+) -> Channels | None:
     """The last two components of Cycles' ``Vector``; None if the motion is anything else."""
-    if convention != CYCLES or not _is_cycles_vector(found["motion"], there):
+    if convention != CYCLES or not _is_cycles_vector(buffers["motion"], names):
         return None
-    layer = found["motion"][0].rpartition(".")[0]
+    layer = buffers["motion"][0].rpartition(".")[0]
     return f"{layer}.Z", f"{layer}.W"
 
 
@@ -121,6 +123,6 @@ def _dual(motion: jax.Array, forward: jax.Array) -> jax.Array:
     return jnp.where(occlusion_mask(motion, dual) > 0, dual, motion)
 
 
-def _is_cycles_vector(motion: Channels, there: Collection[str]) -> bool:
+def _is_cycles_vector(motion: Channels, names: Collection[str]) -> bool:
     layer = motion[0].rpartition(".")[0]
-    return last_name(motion) == "vector" and all(f"{layer}.{component}" in there for component in "XYZW")
+    return last_name(motion) == "vector" and all(f"{layer}.{component}" in names for component in "XYZW")

@@ -22,7 +22,7 @@ from jaxdn.data.clip.folder import find_clips
 from jaxdn.data.errors import ClipError, read_json
 from jaxdn.data.training.cache import CachedClip, kept, open_cached, read_array
 from jaxdn.data.training.compact import CODES, squeeze, unsqueeze
-from jaxdn.runtime.atomic_files import write_whole
+from jaxdn.runtime.atomic_files import write_atomically
 
 _MAGIC = b"jaxdnpk1"
 _HEADER = len(_MAGIC) + 32 + 8
@@ -113,7 +113,7 @@ def write_pack(
             index, total = longer, _HEADER + len(longer) + data
             say(len(entries), total)
     body = len(index).to_bytes(8, "little") + index + b"".join(blobs)
-    write_whole({Path(path): _MAGIC + hashlib.sha256(body).digest() + body})
+    write_atomically({Path(path): _MAGIC + hashlib.sha256(body).digest() + body})
     return Packed(len(entries), len({entry["clip"] for entry in entries}), total)
 
 

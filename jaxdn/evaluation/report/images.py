@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from jaxdn.runtime.atomic_files import write_whole
+from jaxdn.runtime.atomic_files import write_atomically
 
 NOT_FINITE = (1.0, 0.0, 1.0)
 """NaN and infinite pixels are painted magenta, so that an invalid image cannot be mistaken for a black one."""
@@ -22,9 +22,9 @@ def save_png(path: str | os.PathLike[str], image: Any) -> None:
     """Write a display-encoded image [H, W, 3] or [H, W] in 0..1 as an 8-bit PNG.
 
     Values outside 0..1 are clamped, pixels that are not finite are painted magenta. The file is never
-    incomplete (:func:`jaxdn.runtime.atomic_files.write_whole`). Raises ValueError for another shape.
+    incomplete (:func:`jaxdn.runtime.atomic_files.write_atomically`). Raises ValueError for another shape.
     """
-    write_whole({Path(path): encode_png(image)})
+    write_atomically({Path(path): encode_png(image)})
 
 
 def encode_png(image: Any) -> bytes:

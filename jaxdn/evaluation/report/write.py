@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jaxdn.evaluation.report.page import page
 from jaxdn.evaluation.report.results import Results, check_results, metrics
-from jaxdn.runtime.atomic_files import write_whole
+from jaxdn.runtime.atomic_files import write_atomically
 
 
 def write_report(results: Results, folder: str | os.PathLike[str]) -> Path:
@@ -23,7 +23,7 @@ def write_report(results: Results, folder: str | os.PathLike[str]) -> Path:
     document = page(results)
     target = Path(folder)
     target.mkdir(parents=True, exist_ok=True)
-    write_whole(
+    write_atomically(
         {
             target / "metrics.json": (numbers + "\n").encode("utf-8", "replace"),
             target / "report.html": document.encode("utf-8", "replace"),

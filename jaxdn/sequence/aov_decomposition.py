@@ -36,7 +36,7 @@ _DARK = 1e-6
 """Where the filtered beauty is below this, a part keeps the share that it has of all colours together."""
 
 
-class Shares(NamedTuple):
+class DecompositionState(NamedTuple):
     """What is carried from one frame to the next."""
 
     history: jax.Array
@@ -44,43 +44,45 @@ class Shares(NamedTuple):
     guides: Guides
 
 
-def start_shares(frame: Frame, count: int) -> Shares:
-    """No history, for ``count`` parts."""
+def init_decomposition(frame: Frame, count: int) -> DecompositionState:
+    """No history, for ``count`` layers."""
     nothing = jnp.zeros((*frame.radiance.shape[:2], 3 * count + 4), jnp.float32)
-    return Shares(nothing, jax.tree.map(jnp.zeros_like, guides_of(sanitize(frame)[0])))
+    return DecompositionState(nothing, jax.tree.map(jnp.zeros_like, guides_of(sanitize(frame)[0])))
 
 
 @jax.jit
-def share(state: Shares, frame: Frame, beauty: jax.Array, parts: jax.Array) -> tuple[Shares, jax.Array]:
-    """The parts [n, H, W, 3] of a denoised beauty [H, W, 3].
+def decompose(
+    state: DecompositionState, frame: Frame, beauty: jax.Array, layers: jax.Array
+) -> tuple[DecompositionState, jax.Array]:
+    """The additive layers [n, H, W, 3] of a denoised beauty [H, W, 3].
 
     Args:
-      state: after the frame before; :func:`start_shares` before the first.
-      frame: the noisy frame; its radiance is what the parts are parts of.
+      state: after the frame before; :func:`init_decomposition` before the first.
+      frame: the noisy frame; its radiance is what the layers are parts of.
       beauty: the denoised radiance.
-      parts: [n, H, W, 3] noisy.
+      layers: [n, H, W, 3] noisy.
     """
     frame, _ = sanitize(frame)
-    parts = sanitize_image(parts).astype(jnp.float32)
-    noisy = jnp.concatenate([*parts, frame.radiance], axis=-1)
+    layers = sanitize_image(layers).astype(jnp.float32)
+    noisy = jnp.concatenate([*layers, frame.radiance], axis=-1)
     blended = _blend(state, frame, noisy)
     filtered = _filter(frame, beauty, blended[..., :-1])
     hit = surface_mask(frame.depth, frame.ids)
     if hit is not None:  # what has no surface is not filtered
         filtered = jnp.where(hit[..., None], filtered, noisy)
-    whole = filtered[..., -3:]
-    dark = whole <= _DARK
-    level = jnp.sum(whole, axis=-1, keepdims=True)
+    total = filtered[..., -3:]
+    dark = total <= _DARK
+    grey_total = jnp.sum(total, axis=-1, keepdims=True)
 
-    def of(part: jax.Array) -> jax.Array:
-        grey = jnp.sum(part, axis=-1, keepdims=True) / jnp.where(level > 0, level, 1.0)
-        return beauty * jnp.where(dark, grey, part / jnp.where(dark, 1.0, whole))
+    def share(layer: jax.Array) -> jax.Array:
+        grey = jnp.sum(layer, axis=-1, keepdims=True) / jnp.where(grey_total > 0, grey_total, 1.0)
+        return beauty * jnp.where(dark, grey, layer / jnp.where(dark, 1.0, total))
 
-    images = jnp.stack([of(filtered[..., 3 * i : 3 * i + 3]) for i in range(parts.shape[0])])
-    return Shares(blended, guides_of(frame)), images
+    images = jnp.stack([share(filtered[..., 3 * i : 3 * i + 3]) for i in range(layers.shape[0])])
+    return DecompositionState(blended, guides_of(frame)), images
 
 
-def _blend(state: Shares, frame: Frame, noisy: jax.Array) -> jax.Array:
+def _blend(state: DecompositionState, frame: Frame, noisy: jax.Array) -> jax.Array:
     """The history with a frame's light blended in: a mean over the frames in which a point was seen."""
     past = reproject(
         state.history,

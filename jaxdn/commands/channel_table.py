@@ -1,14 +1,13 @@
 """The table that ``jaxdn denoise`` and ``jaxdn inspect`` begin with: what is read from where, and what is missing."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from jaxdn.data.foreign.channel_mapping import MappedBuffer
 from jaxdn.data.foreign.layers import LAYERS
-from jaxdn.data.foreign.sources import Source, sources_of
 from jaxdn.planning.plan import COMPOSED
 
 CONSEQUENCES: dict[str, str] = {
@@ -23,40 +22,34 @@ CONSEQUENCES: dict[str, str] = {
 """What it costs not to have a buffer that other renderers have a name for."""
 
 
-def missing(found: Iterable[Source], reads: frozenset[str] | None) -> dict[str, str]:
+def missing(mapping: Iterable[MappedBuffer], reads: frozenset[str] | None) -> dict[str, str]:
     """Buffer -> the consequence of its absence, for those that a denoiser reads (None: any) and files may have."""
-    there = {source.buffer for source in found}
+    there = {mapped.buffer for mapped in mapping}
     wanted = [name for name in LAYERS if name in CONSEQUENCES and name not in there]
     return {name: CONSEQUENCES[name] for name in wanted if reads is None or name in reads}
 
 
-def show_sources(
+def show_channel_mapping(
     path: str | Path,
+    mapping: Sequence[MappedBuffer],
     *,
     reads: frozenset[str] | None = None,
-    motion_convention: str | None = None,
-    channels: Mapping[str, str] | None = None,
-    layer: str | None = None,
-    alone: bool = False,
-    log: Callable[[str], None] = lambda line: None,
-) -> list[Source]:
-    """Print the table for a sequence and a denoiser that reads some buffers (None: any denoiser); returns its sources.
+    single: bool = False,
+) -> None:
+    """Print the table of a sequence for a denoiser that reads some buffers (None: any denoiser).
 
-    An image that is ``alone`` needs no motion. Raises as :func:`jaxdn.data.foreign.sources.sources_of` does.
+    A ``single`` image needs no motion.
     """
-    naming: Any = {"motion_convention": motion_convention, "channels": channels, "layer": layer}
-    found = sources_of(path, alone=alone, log=log, **naming)
     table = Table(title=f"{path}: what is read", title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for column in ("buffer", "from layer", "channels", "taken for"):
         table.add_column(column, overflow="fold")
-    for source in found:
-        used = reads is None or source.buffer in reads | {"radiance"}
-        note = "" if used else " (added back)" if source.buffer in COMPOSED else " (not used)"
-        letters = ", ".join(name.rpartition(".")[2] for name in source.channels)
-        table.add_row(source.buffer + note, source.layer, letters, source.convention)
-    for name, consequence in missing(found, reads).items():
-        if alone and name == "motion":
+    for mapped in mapping:
+        used = reads is None or mapped.buffer in reads | {"radiance"}
+        note = "" if used else " (added back)" if mapped.buffer in COMPOSED else " (not used)"
+        letters = ", ".join(name.rpartition(".")[2] for name in mapped.channels)
+        table.add_row(mapped.buffer + note, mapped.layer, letters, mapped.convention)
+    for name, consequence in missing(mapping, reads).items():
+        if single and name == "motion":
             continue
         table.add_row(name, "missing", "", consequence, style="yellow")
     Console().print(table)
-    return found

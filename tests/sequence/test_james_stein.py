@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.sequence.safe_blend import BLOCK, CLEAN, DOUBT, LITTLE, MOST, MUCH, NOISY, QUIET, RADIUS, combine, judge
+from jaxdn.sequence.james_stein import BLOCK, CLEAN, DOUBT, LITTLE, MOST, MUCH, NOISY, QUIET, RADIUS, combine, judge
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 

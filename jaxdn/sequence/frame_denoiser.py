@@ -1,4 +1,4 @@
-"""One pass of a denoiser through consecutive frames, whole or in parts as memory allows."""
+"""A denoiser on its way through consecutive frames, in tiles where memory asks for them."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -9,56 +9,65 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.core.frame import Frame
-from jaxdn.data.clip.folder import frame_path
 from jaxdn.data.clip.frames import StoredFrame, doubling_layers
-from jaxdn.data.exr.exr import read_windows
 from jaxdn.denoiser.rollout import Layers, Stream, stream
 from jaxdn.denoiser.sanitize import sanitize_image
 from jaxdn.denoiser.tiles import TiledStream, map_tiles, stream_tiled
+from jaxdn.sequence.james_stein import REACH, Confidence, JamesStein, combine, measure_confidence
 from jaxdn.sequence.memory_budget import GIB, memory_of_machine, needed, side_within
-from jaxdn.sequence.safe_blend import REACH, Combined, Judged, combine, judge
 from jaxdn.zoo.ready import Candidate
 
-_combine = jax.jit(combine, static_argnames="blind")
-_judge = jax.jit(judge)
+_combine = jax.jit(combine, static_argnames="texture_unknown")
+_measure_confidence = jax.jit(measure_confidence)
 
 
-class Safe(NamedTuple):
-    """What decided about an image."""
+class Fallback(NamedTuple):
+    """What decided how much of the noisy image is in a result."""
 
-    judged: Judged
+    confidence: Confidence
     kept: float
     """How much of the noisy frame was kept, pixel by pixel, in the mean."""
-    blind: bool
+    texture_unknown: bool
     """No guide tells of textures."""
 
 
-class Pass:
-    """A denoiser on its way through consecutive frames; gives the image [H, W, 3] of each.
+class FrameDenoiser:
+    """Gives the image [H, W, 3] of each of consecutive frames.
 
-    With ``limit`` bytes of memory, by default half of the machine's, frames that need more are denoised in parts.
+    With ``limit`` bytes of memory, by default half of the machine's, frames that need more are denoised in tiles.
     """
 
     def __init__(
-        self, source: Path, method: Candidate, *, limit: float | None = None, log: Callable[[str], None]
+        self,
+        method: Candidate,
+        source: Path,
+        *,
+        channels: Callable[[], int],
+        limit: float | None = None,
+        log: Callable[[str], None],
     ) -> None:
-        self._source, self._method, self._limit, self._log = source, method, limit, log
+        """``source`` is named in errors, ``channels`` counts those of its files, ``log`` is called with lines."""
+        self._method, self._source, self._count_channels = method, source, channels
+        self._limit, self._log = limit, log
         self._step: Stream | TiledStream | None = None
-        self._told = 0
+        self._lost_pixels = 0
 
     def __call__(self, stored: StoredFrame) -> np.ndarray:
         """The image of the next frame. Raises ValueError where a limit that was given cannot be kept."""
         if self._method.denoiser is None:
             return np.asarray(light_of(stored.frame.radiance))
-        if self._step is None:
-            self._step = self._chosen(*stored.frame.radiance.shape[:2])
-        if isinstance(self._step, Stream):
-            return np.asarray(self._step(stored.frame, self._layers(stored)))
-        image = self._step(stored.frame)
-        if self._step.beyond_halo > self._told:
-            self._told = self._step.beyond_halo
-            self._log(f"{self._told} pixels move too far for the parts and begin anew; give more --max-memory")
+        step = self._prepare(stored.frame)
+        if isinstance(step, Stream):
+            return np.asarray(step(stored.frame, self._layers(stored)))
+        image = step(stored.frame)
+        if step.beyond_halo > self._lost_pixels:
+            self._lost_pixels = step.beyond_halo
+            self._log(f"{self._lost_pixels} pixels move too far for the parts and begin anew; give more --max-memory")
         return image
+
+    def is_tiled(self, frame: Frame) -> bool:
+        """Whether frames like this one are denoised in tiles. Raises as the call does."""
+        return self.denoises and isinstance(self._prepare(frame), TiledStream)
 
     @property
     def denoises(self) -> bool:
@@ -75,29 +84,29 @@ class Pass:
         """Invalid values that were replaced."""
         return 0 if self._step is None else self._step.sanitized
 
-    def safe(self, frame: Frame, image: np.ndarray) -> tuple[np.ndarray, Safe]:
-        """The image of a frame with what is no noise as it was (:mod:`jaxdn.sequence.safe_blend`), and what decided."""
+    def blend_fallback(self, frame: Frame, image: np.ndarray) -> tuple[np.ndarray, Fallback]:
+        """The image of a frame with what is no noise as it was, and why (:mod:`jaxdn.sequence.james_stein`)."""
         noisy = np.asarray(frame.radiance)
-        blind = frame.albedo is None and frame.reflectance is None
-        found = self._combined(noisy, image, blind=blind)
-        judged: Judged = jax.device_get(_judge(found))
-        image = np.asarray(found.image)
-        if judged.distrust > 0:
-            image = image + np.float32(judged.distrust) * (np.asarray(light_of(noisy)) - image)
-        return image, Safe(judged, float(np.mean(found.share)), blind)
+        texture_unknown = frame.albedo is None and frame.reflectance is None
+        combined = self._combine(noisy, image, texture_unknown=texture_unknown)
+        confidence: Confidence = jax.device_get(_measure_confidence(combined))
+        image = np.asarray(combined.image)
+        if confidence.fallback > 0:
+            image = image + np.float32(confidence.fallback) * (np.asarray(light_of(noisy)) - image)
+        return image, Fallback(confidence, float(np.mean(combined.noisy_weight)), texture_unknown)
 
-    def _combined(self, noisy: np.ndarray, image: np.ndarray, *, blind: bool) -> Combined:
+    def _combine(self, noisy: np.ndarray, image: np.ndarray, *, texture_unknown: bool) -> JamesStein:
         if not isinstance(self._step, TiledStream):
-            return _combine(noisy, image, blind=blind)
-        level = jnp.asarray(np.mean(image, dtype=np.float64), jnp.float32)
-        found, _ = map_tiles(
-            lambda given: (_combine(*given, level, blind=blind), None),
+            return _combine(noisy, image, texture_unknown=texture_unknown)
+        mean_light = jnp.asarray(np.mean(image, dtype=np.float64), jnp.float32)
+        combined, _ = map_tiles(
+            lambda images: (_combine(*images, mean_light, texture_unknown=texture_unknown), None),
             (noisy, image),
             image.shape[:2],
             side=self._step.side,
             margin=REACH,
         )
-        return found
+        return combined
 
     def _layers(self, stored: StoredFrame) -> Layers:
         """The independent layers of a frame, for a method that requests samples."""
@@ -106,12 +115,16 @@ class Pass:
             return None
         return {count: stored.layers[count] for count in doubling_layers(stored.layers, self._source)}
 
-    def _chosen(self, height: int, width: int) -> Stream | TiledStream:
+    def _prepare(self, frame: Frame) -> Stream | TiledStream:
+        if self._step is None:
+            self._step = self._choose_step(*frame.radiance.shape[:2])
+        return self._step
+
+    def _choose_step(self, height: int, width: int) -> Stream | TiledStream:
         denoiser, params = self._method.denoiser, self._method.params
         assert denoiser is not None
         limit = memory_of_machine() / 2 if self._limit is None else self._limit
-        file = frame_path(self._source, 0) if self._source.is_dir() else self._source
-        size = height, width, len(read_windows(file)[1])
+        size = height, width, self._count_channels()
         side = side_within(limit, *size)
         if side is None:
             return stream(denoiser, params)

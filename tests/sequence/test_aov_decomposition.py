@@ -7,9 +7,11 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.core.frame import Frame
-from jaxdn.data.foreign.lighting import parts_of
-from jaxdn.sequence.aov_shares import share, start_shares
-from jaxdn.sequence.run import Settings, denoise_files
+from jaxdn.data.foreign.lighting import find_additive_layers
+from jaxdn.data.foreign.naming import ChannelNaming
+from jaxdn.sequence.aov_decomposition import decompose, init_decomposition
+from jaxdn.sequence.run import denoise_files
+from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import candidate
 from tests import programs
 from tests.data.test_kept import assert_same_but, box_blur
@@ -36,8 +38,8 @@ def test_every_set_of_parts_adds_up(guides: bool) -> None:
         key = scene.light * np.random.default_rng(index).uniform(0, 1, scene.light.shape)
         parts = np.stack([scene.diffuse, scene.light - scene.diffuse, key, scene.light - key]).astype(np.float32)
         beauty = np.asarray(clean.light, np.float32)
-        state = start_shares(frame, len(parts)) if state is None else state
-        state, images = share(state, frame, beauty, parts)
+        state = init_decomposition(frame, len(parts)) if state is None else state
+        state, images = decompose(state, frame, beauty, parts)
         images = np.asarray(images)
         assert images.min() >= 0
         for first, second in ((0, 1), (2, 3)):
@@ -51,7 +53,7 @@ def test_a_part_that_is_the_beauty_becomes_the_beauty_and_none_stays_none() -> N
     frame = frame_of(0)
     beauty = np.asarray(truth(0, 10_000).light, np.float32)
     parts = np.stack([frame.radiance, 0 * frame.radiance, frame.radiance, frame.radiance])
-    _, (whole, nothing, *_) = share(start_shares(frame, 4), frame, beauty, parts)
+    _, (whole, nothing, *_) = decompose(init_decomposition(frame, 4), frame, beauty, parts)
     np.testing.assert_allclose(whole, beauty, rtol=1e-5)
     assert not np.asarray(nothing).any()
 
@@ -62,7 +64,9 @@ def test_invalid_values_and_black_pixels_stay_finite() -> None:
     frame = frame_of(0, radiance=light)
     beauty = np.full_like(light, 0.1)
     beauty[9] = 0
-    _, images = share(start_shares(frame, 4), frame, beauty, np.stack([light, light / 2, light, np.zeros_like(light)]))
+    _, images = decompose(
+        init_decomposition(frame, 4), frame, beauty, np.stack([light, light / 2, light, np.zeros_like(light)])
+    )
     assert np.isfinite(np.asarray(images)).all()
     assert np.asarray(images).min() >= 0
     assert not np.asarray(images)[:, 9].any()
@@ -81,7 +85,7 @@ def test_parts_of_the_beauty_are_found_by_their_values(name: str, tmp_path: Path
     PROGRAMS[name].write(tmp_path / "a.exr", 0)
     there = clips.read_exr(tmp_path / "a.exr")
     found = clips.detect_channels(list(there))
-    parts = parts_of(there, PROGRAMS[name].beauty, found)
+    parts = find_additive_layers(there, PROGRAMS[name].beauty, found)
     assert set(parts) == set(ADDITIVE[name][0])
 
 
@@ -101,7 +105,7 @@ def test_the_beauty_once_more_is_denoised_but_is_no_part(tmp_path: Path) -> None
 def test_in_files_they_add_up_and_the_rest_stays(tmp_path: Path) -> None:
     program, told = PROGRAMS["Arnold"], list[str]()
     source, out = write_shot("Arnold", tmp_path / "in"), tmp_path / "out"
-    settings = Settings(motion_convention=program.motion_convention, aovs="additive")
+    settings = Settings(naming=ChannelNaming(program.motion_convention), aovs="additive")
     denoise_files([source], out, box_blur(), settings, log=told.append)
     assert "denoised with the beauty: diffuse, specular; together they have 1.00 of its light" in told
     changed = (*program.beauty, *(f"{layer}.{letter}" for layer in ("diffuse", "specular") for letter in "RGB"))

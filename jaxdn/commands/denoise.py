@@ -1,0 +1,124 @@
+"""``jaxdn denoise``: frames that are there, or a scene that is rendered for the denoiser."""
+
+from typing import Any
+
+from jaxdn.commands.arguments import Denoise
+from jaxdn.commands.channel_table import show_channel_mapping
+from jaxdn.commands.options import check_folder, name_channels
+from jaxdn.commands.progress import reporter
+from jaxdn.core.options import numbers
+from jaxdn.data.foreign.channel_mapping import read_channel_mapping
+from jaxdn.data.foreign.naming import ChannelNaming
+from jaxdn.runtime.malloc import tune_malloc
+from jaxdn.sequence.jobs import Job
+from jaxdn.sequence.run import denoise_files, select_engine
+from jaxdn.sequence.settings import Settings
+from jaxdn.zoo.ready import Candidate, candidate
+
+_OF_SCENES = ("width", "height", "animation", "seed")
+
+
+def run_denoise(options: Denoise) -> None:
+    """Denoise what the options name. Raises ValueError for options that frames, or scenes, do not have."""
+    if options.max_memory is None:  # else freed memory goes back to the system at once
+        tune_malloc()
+    naming = name_channels(options)
+    scene = _scene_of(options)
+    if scene is None:
+        _denoise_files(options, naming)
+    else:
+        _denoise_scene(options, scene)
+
+
+def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
+    """Frames of clips and of other renderers."""
+    method, engine = select_engine(options.method, options.implementation, **_budget(options))
+    settings = Settings(
+        spp=options.spp,
+        naming=naming,
+        frames=_frames(options),
+        skip_existing=options.skip_existing,
+        only_beauty=options.only_beauty,
+        aovs=options.aovs,
+        preview=options.preview,
+        bidirectional=options.bidirectional,
+        safe=options.safe,
+        max_memory=None if options.max_memory is None else options.max_memory * 2**30,
+    )
+    with reporter(options.method) as report:
+        written = denoise_files(
+            options.clips,
+            options.out,
+            method,
+            settings,
+            on_job=lambda job: _show_job(job, naming, method),
+            on_frame=report.on_frame,
+            log=report.log,
+        )
+    if not written.files:
+        print(f"nothing to do in {options.out}")
+        return
+    frames, compiled = _count(len(written.files), "frame"), _count(written.programs, "program")
+    print(f"{frames} denoised by {options.method} in {options.out} ({engine}, {compiled} compiled)")
+    if written.sanitized:
+        print(f"{_count(written.sanitized, 'value')} sanitized: not usable numbers (NaN, infinite, negative ...)")
+
+
+def _show_job(job: Job, naming: ChannelNaming, method: Candidate) -> None:
+    """Print what is read of a shot."""
+    single = len(job.shot.files) == 1
+    mapping = read_channel_mapping(job.clip or job.exr_files[0], naming, single=single)
+    reads = frozenset[str]() if method.denoiser is None else method.denoiser.reads
+    show_channel_mapping(job.source, mapping, reads=reads, single=single)
+
+
+def _denoise_scene(options: Denoise, scene: str) -> None:
+    """Frames that are rendered with samples where the denoiser wants them."""
+    from jaxdn.sequence.render_and_denoise import Settings, denoise_scene
+
+    asks = getattr(candidate(options.method).denoiser, "samples", None) is not None
+    budget = _budget(options)
+    method, engine = select_engine(options.method, options.implementation, **(budget if asks else {}))
+    size = {name: value for name in ("width", "height", "seed") if (value := getattr(options, name)) is not None}
+    settings = Settings(frames=_frames(options), preview=options.preview, **size, **budget)
+    out = check_folder(options.out)
+    with reporter(options.method) as report:
+        written = denoise_scene(
+            scene, options.animation, out, method, settings, on_frame=report.on_frame, log=report.log
+        )
+    frames = _count(len(written.files), "frame")
+    print(f"{frames} rendered, and denoised by {options.method}, in {options.out} ({engine})")
+
+
+def _scene_of(options: Denoise) -> str | None:
+    """The scene to render, if there is one. Raises ValueError for options that only one of scene and clips has."""
+    from jaxdn.render.families import FAMILIES
+
+    scenes = [path for path in options.clips if path.suffix == ".xml" or (str(path) in FAMILIES and not path.exists())]
+    if not scenes:
+        if given := [name for name in _OF_SCENES if getattr(options, name) is not None]:
+            raise ValueError(f"--{given[0]}: expected a scene to render, got frames that are there; leave it out.")
+        return None
+    if len(options.clips) > 1:
+        raise ValueError(f"{scenes[0]}: expected one scene and nothing else, got {len(options.clips)} sources.")
+    usual = Denoise(options.clips, options.out)
+    kept = {"clips", "out", "method", "implementation", "frames", "preview", "budget", *_OF_SCENES}
+    other = [name for name in vars(usual) if name not in kept and getattr(options, name) != getattr(usual, name)]
+    if other:
+        raise ValueError(f"--{other[0].replace('_', '-')}: expected frames that are there, got a scene; leave it out.")
+    return str(scenes[0])
+
+
+def _frames(options: Denoise) -> list[int] | None:
+    """The numbers of the frames to denoise; None: all."""
+    return numbers(options.frames, "--frames") if options.frames else None
+
+
+def _budget(options: Denoise) -> dict[str, Any]:
+    """The option of a method that says where samples go."""
+    return {} if options.budget is None else {"budget": options.budget}
+
+
+def _count(number: int, noun: str) -> str:
+    """``1 frame``, ``2 frames``."""
+    return f"{number} {noun}{'s' * (number != 1)}"

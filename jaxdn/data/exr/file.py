@@ -1,0 +1,178 @@
+"""One OpenEXR file to read: names and windows from its headers, pixels when they are asked for, both at most once."""
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import OpenEXR
+
+from jaxdn.data.errors import ClipError
+from jaxdn.data.exr.windows import Window, place, window_of
+
+_SIDE_LIMIT = 1 << 16  # a larger size in a header counts as damaged, before memory is allocated for it
+_UNREADABLE = (RuntimeError, ValueError, KeyError, IndexError, TypeError, MemoryError, UnicodeDecodeError)
+_T = TypeVar("_T")
+
+
+class ExrPart(NamedTuple):
+    """One part of a file."""
+
+    header: dict[str, Any]
+    channels: list["ExrChannel"]
+
+
+class ExrChannel(NamedTuple):
+    """One channel of a part."""
+
+    full_name: str
+    """Unique in the file: ``part.channel``, or the own name if the file has one part or it begins with the part's."""
+    name: str
+    """Within its part."""
+    pixels: np.ndarray | None
+    """[H, W] in the precision it is stored in; None if it is subsampled."""
+
+
+class ExrFile:
+    """A file that is opened once for its headers and once for its pixels, and only if somebody asks for them.
+
+    The headers are checked before the pixels are decoded, and are those of the decoded parts afterwards. Pixels stay in
+    memory until :meth:`drop`. Everything raises ClipError, naming the file and the reason, if the file is missing, not
+    an OpenEXR file, truncated or damaged, or has deep data or a mipmap. Subsampled channels are not offered.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._sound = False
+        self._parts: list[ExrPart] | None = None
+        self._layout: tuple[Window, dict[str, Window]] | None = None
+
+    @property
+    def display(self) -> Window:
+        """The display window: the picture."""
+        return self._read_layout()[0]
+
+    @property
+    def windows(self) -> dict[str, Window]:
+        """Full name of each channel -> its data window."""
+        return self._read_layout()[1]
+
+    def decode(self) -> list[ExrPart]:
+        """The parts with their pixels, in the order of the file."""
+        if self._parts is None:
+            if not self._sound:
+                self._read_headers()
+            self._parts = _open(self.path, lambda file: _decode(self.path, file))
+        return self._parts
+
+    @property
+    def pixels(self) -> dict[str, np.ndarray]:
+        """Full name of each channel -> its pixels. Raises ClipError if there are none."""
+        found = {name: pixels for part in self.decode() for name, _, pixels in part.channels if pixels is not None}
+        if not found:
+            raise ClipError(f"{self.path}: the file has no channels.")
+        return found
+
+    @property
+    def header(self) -> dict[str, Any]:
+        """The attributes of the first part, such as ``worldToCamera``."""
+        return self._read_headers()[0] if self._parts is None else self._parts[0].header
+
+    def placed(self, window: Window) -> Mapping[str, np.ndarray]:
+        """The channels as images of a window that holds theirs; 0 where the file has no pixel."""
+        return _Placed(self.pixels, self.windows, window)
+
+    def drop(self) -> None:
+        """Forget all that was read; it is read again if somebody asks for it."""
+        self._parts = self._layout = None
+
+    def drop_windows(self) -> None:
+        """Forget the windows alone: of a thousand files they take memory too."""
+        self._layout = None
+
+    def _read_layout(self) -> tuple[Window, dict[str, Window]]:
+        if self._layout is None:
+            headers = self._read_headers() if self._parts is None else [part.header for part in self._parts]
+            self._layout = (
+                window_of(headers[0], "displayWindow"),
+                {
+                    _full_name(header, channel.name, len(headers)): window_of(header, "dataWindow")
+                    for header in headers
+                    for channel in header["channels"]
+                    if (channel.xSampling, channel.ySampling) == (1, 1)
+                },
+            )
+        return self._layout
+
+    def _read_headers(self) -> list[dict[str, Any]]:
+        if not self.path.is_file():
+            raise ClipError(f"{self.path}: there is no such file.")
+        headers = _open(self.path, lambda file: [dict(part.header) for part in file.parts], header_only=True)
+        if not headers:
+            raise ClipError(f"{self.path}: the file has no parts; write the frame again.")
+        for header in headers:
+            _check_header(self.path, header)
+        self._sound = True
+        return headers
+
+
+class _Placed(Mapping[str, np.ndarray]):
+    """The channels of a file as images of one window, each placed when it is looked up."""
+
+    def __init__(self, pixels: Mapping[str, np.ndarray], windows: Mapping[str, Window], window: Window) -> None:
+        self._pixels, self._windows, self._window = pixels, windows, window
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return place(self._pixels[name], self._windows[name], self._window)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._pixels)
+
+    def __len__(self) -> int:
+        return len(self._pixels)
+
+
+def _open(path: Path, read: Callable[[Any], _T], **options: Any) -> _T:
+    """What ``read`` makes of the opened file, with the errors of the bindings in words."""
+    try:
+        with OpenEXR.File(str(path), separate_channels=True, **options) as file:
+            return read(file)
+    except ClipError:
+        raise
+    except _UNREADABLE as error:
+        raise ClipError(f"{path}: not readable as OpenEXR ({error}); write the frame again.") from error
+
+
+def _decode(path: Path, file: Any) -> list[ExrPart]:
+    if not file.parts:
+        raise ClipError(f"{path}: the pixel data is truncated or damaged; write the frame again.")
+    parts = []
+    for part in file.parts:
+        channels = []
+        for name, channel in part.channels.items():
+            pixels = channel.pixels
+            if (channel.xSampling, channel.ySampling) != (1, 1):
+                pixels = None
+            elif not isinstance(pixels, np.ndarray) or pixels.ndim != 2 or pixels.dtype == object:
+                raise ClipError(f"{path}: channel {name} is not a flat image; deep data cannot be read.")
+            channels.append(ExrChannel(_full_name(part.header, name, len(file.parts)), name, pixels))
+        parts.append(ExrPart(dict(part.header), channels))
+    return parts
+
+
+def _check_header(path: Path, header: Mapping[str, Any]) -> None:
+    window = header.get("dataWindow")
+    if not isinstance(window, tuple) or len(window) != 2:
+        raise ClipError(f"{path}: the header has no data window; the file is damaged.")
+    low, high = (np.asarray(corner, np.int64) for corner in window)
+    sides = high - low + 1
+    tiles = header.get("tiles")
+    if tiles is not None and tiles.mode != OpenEXR.ONE_LEVEL:
+        raise ClipError(f"{path}: tiles in several levels (a mipmap) cannot be read; save it with one level.")
+    if sides.min() < 1 or sides.max() > _SIDE_LIMIT:
+        raise ClipError(f"{path}: the header claims {sides[0]} x {sides[1]} pixels; the file is damaged.")
+
+
+def _full_name(header: Mapping[str, object], name: str, parts: int) -> str:
+    part = str(header.get("name", ""))
+    return name if parts == 1 or not part or name == part or name.startswith(part + ".") else f"{part}.{name}"

@@ -1,0 +1,172 @@
+"""Consecutive frames of a shot: read, denoised in one direction or both, and written."""
+
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import ExitStack
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxdn.data.clip.frames import StoredFrame
+from jaxdn.data.exr.file import ExrFile
+from jaxdn.data.foreign.import_exr import ForeignSequence
+from jaxdn.data.read import open_frames, store_frame
+from jaxdn.sequence.backward_pass import BackwardImages, backward_pass
+from jaxdn.sequence.frame_denoiser import Fallback, FrameDenoiser
+from jaxdn.sequence.jobs import Job
+from jaxdn.sequence.settings import Settings
+from jaxdn.sequence.write_frames import ClipWriter, ForeignWriter
+
+
+def denoise_segment(
+    job: Job, segment: range, denoisers: Sequence[FrameDenoiser], settings: Settings, log: Callable[[str], None]
+) -> Generator[Path, None, None]:
+    """Denoise consecutive frames of a shot; yields the files as they are written.
+
+    Args:
+      job: the shot.
+      segment: indices of its frames.
+      denoisers: the forward one, and with ``settings.bidirectional`` the backward one.
+      settings: what is read and written.
+      log: called with lines for the user.
+    """
+    wanted = [index for index in segment if index in job.wanted]
+    footage: _ClipFootage | _ForeignFootage
+    writer: ClipWriter | ForeignWriter
+    if job.clip is not None:
+        footage, writer = _ClipFootage(job.clip, segment, settings.spp), ClipWriter(settings)
+    else:
+        sequence = ForeignSequence(job.exr_files[segment.start : segment.stop], settings.naming)
+        footage, writer = _ForeignFootage(sequence, segment), ForeignWriter(sequence.window, settings, log)
+    with ExitStack() as stack:
+        backward: BackwardImages | None = None
+        if settings.bidirectional:
+            log(f"backwards first, through {segment.stop - wanted[0]} frames; nothing is written meanwhile")
+            reversed_frames = zip(reversed(segment), footage.read(log, backwards=True), strict=True)
+            needed = islice(reversed_frames, segment.stop - wanted[0])
+            folder = job.targets[wanted[0]].parent
+            backward = stack.enter_context(backward_pass(needed, denoisers[1], wanted, folder))
+        steps = _ForwardSteps(job, denoisers[0], backward, safe=settings.safe)
+        report = _FallbackReport(job, log)
+        frames = footage.read(log)
+        for index in range(segment.start, wanted[-1] + 1):
+            path = _denoise_frame(index, next(frames), footage.file(index), steps, writer, report)
+            if path is not None:
+                yield path
+        report.finish()
+
+
+class FrameOutput(NamedTuple):
+    """What became of one frame."""
+
+    image: np.ndarray
+    """[H, W, 3] the denoised radiance."""
+    fallback: Fallback | None
+    """What decided about the noisy image's part in it; None: nobody asked."""
+
+
+def _denoise_frame(
+    index: int,
+    stored: StoredFrame,
+    file: ExrFile | None,
+    steps: "_ForwardSteps",
+    writer: "ClipWriter | ForeignWriter",
+    report: "_FallbackReport",
+) -> Path | None:
+    """Denoise a frame, and write it if it is wanted. What this leaves in memory is gone when it returns."""
+    target = steps.job.targets[index] if index in steps.job.wanted else None
+    if file is not None and (steps.denoiser.is_tiled(stored.frame) or not writer.reads_again(target)):
+        file.drop()  # decoded once more when it is written: of large frames, memory is what there is least of
+    output = steps.denoise(index, stored)
+    if output.fallback is not None:
+        report.observe(index, output.fallback)
+    writer.write(target, file, stored.frame, output.image)
+    if file is not None:
+        file.drop()
+    return target
+
+
+class _ForwardSteps:
+    """The forward direction: the denoiser, the backward images that are blended in, and the fallback."""
+
+    def __init__(self, job: Job, denoiser: FrameDenoiser, backward: BackwardImages | None, *, safe: bool) -> None:
+        self.job, self.denoiser = job, denoiser
+        self._backward, self._safe = backward, safe
+
+    def denoise(self, index: int, stored: StoredFrame) -> FrameOutput:
+        image = self.denoiser(stored)
+        if self._backward is not None:
+            image = self._backward.blend(index, stored.frame, image)
+        if not (self._safe and self.denoiser.denoises):
+            return FrameOutput(image, None)
+        return FrameOutput(*self.denoiser.blend_fallback(stored.frame, image))
+
+
+class _FallbackReport:
+    """Lines about how much of the noisy frames is kept: of the first wanted one, and of those that are not trusted."""
+
+    def __init__(self, job: Job, log: Callable[[str], None]) -> None:
+        self._job, self._log = job, log
+        self._doubtful: list[Path] = []
+
+    def observe(self, index: int, fallback: Fallback) -> None:
+        """The next frame of the segment."""
+        file, confidence = self._job.shot.files[index], fallback.confidence
+        if index == min(self._job.wanted):
+            noise = f"noise is about {confidence.noise:.1%} of the light"
+            self._log(f"{file.name}: {noise}; {fallback.kept:.0%} of the frame is kept (--no-safe: nothing)")
+        if confidence.fallback > 0 and index in self._job.wanted:
+            if not self._doubtful:
+                self._log(_explain_fallback(file, fallback))
+            self._doubtful.append(file)
+
+    def finish(self) -> None:
+        """After the last frame of the segment."""
+        if len(self._doubtful) > 1:
+            self._log(f"likewise {len(self._doubtful) - 1} more, up to {self._doubtful[-1].name}")
+
+
+def _explain_fallback(file: Path, fallback: Fallback) -> str:
+    """Why a frame was kept, as a line."""
+    confidence = fallback.confidence
+    reason = (
+        "there is no albedo, so textures are lost; name one, --channels albedo=LAYER"
+        if fallback.texture_unknown
+        else "do albedo, normals and depth belong to this frame?"
+    )
+    return (
+        f"{file.name}: the denoised image differs by {confidence.lost:.0%} of the light, of which noise explains "
+        f"{confidence.noise:.0%}: {reason} {confidence.fallback:.0%} of the result is the frame as it came"
+    )
+
+
+class _ClipFootage:
+    """Frames of one of our clips."""
+
+    def __init__(self, clip: Path, segment: range, spp: int) -> None:
+        self._clip, self._segment, self._spp = clip, segment, spp
+
+    def read(self, log: Callable[[str], None], *, backwards: bool = False) -> Iterator[StoredFrame]:
+        """The frames, or the same from the last to the first with time turned around."""
+        return open_frames(self._clip, spp=self._spp, part=self._segment, backwards=backwards, log=log)[1]
+
+    def file(self, index: int) -> ExrFile | None:
+        """None: a result is a new file."""
+        return None
+
+
+class _ForeignFootage:
+    """Frames of another renderer, whose results are written into copies of their files."""
+
+    def __init__(self, sequence: ForeignSequence, segment: range) -> None:
+        self._sequence, self._start = sequence, segment.start
+
+    def read(self, log: Callable[[str], None], *, backwards: bool = False) -> Iterator[StoredFrame]:
+        """The frames, or the same from the last to the first with time turned around; forwards, files stay decoded."""
+        frames = self._sequence.frames(backwards=backwards, keep_pixels=not backwards, log=log)
+        return map(store_frame, frames)  # unlike a loop, this keeps no frame while the next one is read
+
+    def file(self, index: int) -> ExrFile | None:
+        """The file of a frame."""
+        return self._sequence.files[index - self._start]

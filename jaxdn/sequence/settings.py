@@ -1,0 +1,32 @@
+"""What ``jaxdn denoise`` does with files."""
+
+from collections.abc import Collection
+from typing import Literal, NamedTuple
+
+from jaxdn.data.foreign.naming import UNNAMED, ChannelNaming
+
+
+class Settings(NamedTuple):
+    """How frames are read, which of them are denoised, and what is written."""
+
+    spp: int = 1
+    """Samples per pixel to take from a clip's layers."""
+    naming: ChannelNaming = UNNAMED
+    """What is stated about the channels of other renderers' files."""
+    frames: Collection[int] | None = None
+    """Numbers of the frames to denoise; None: all."""
+    skip_existing: bool = False
+    """Leave out what is there already."""
+    only_beauty: bool = False
+    """Of files of other renderers, write the denoised beauty and its alpha alone."""
+    aovs: Literal["keep", "additive"] = "keep"
+    """What becomes of the other layers of light in files of other renderers: they stay, or are denoised too, so that
+    they still add up to the beauty (:mod:`jaxdn.sequence.aov_decomposition`)."""
+    preview: bool = False
+    """Write a PNG next to each frame."""
+    bidirectional: bool = False
+    """Denoise from the last frame to the first too, and blend both passes (:mod:`jaxdn.filters.time_reversal`)."""
+    safe: bool = True
+    """Keep of the noisy image what is no noise (:mod:`jaxdn.sequence.james_stein`)."""
+    max_memory: float | None = None
+    """Bytes; frames that need more are denoised in tiles. None: half of the machine's memory."""

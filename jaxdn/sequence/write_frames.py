@@ -1,0 +1,83 @@
+"""Denoised frames as files: new ones for our clips, copies of the source with another beauty for other renderers."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxdn import color
+from jaxdn.core.frame import Frame
+from jaxdn.data.exr.exr import write_exr
+from jaxdn.data.exr.file import ExrFile
+from jaxdn.data.exr.windows import Window
+from jaxdn.data.foreign.result import write_result
+from jaxdn.evaluation.report.images import save_png
+from jaxdn.sequence.additive_aovs import AdditiveAovs
+from jaxdn.sequence.frame_denoiser import light_of
+from jaxdn.sequence.settings import Settings
+
+
+class ClipWriter:
+    """Writes frames of our clips."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._preview = settings.preview
+
+    def reads_again(self, target: Path | None) -> bool:
+        """Whether the source's pixels are needed besides the frame."""
+        return False
+
+    def write(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> None:
+        """Write the denoised image [H, W, 3] of a frame; nothing without a target."""
+        if target is None:
+            return
+        beauty = compose_beauty(frame, image)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_exr(target, name_channels("", beauty) | name_channels("denoised.", image))
+        if self._preview:
+            write_preview(target, beauty)
+
+
+class ForeignWriter:
+    """Writes frames of another renderer, with their additive layers denoised where the settings say so."""
+
+    def __init__(self, window: Window, settings: Settings, log: Callable[[str], None]) -> None:
+        self._window, self._settings, self._log = window, settings, log
+        additive = settings.aovs == "additive"
+        self._aovs = AdditiveAovs(settings.naming, log) if additive else None
+
+    def reads_again(self, target: Path | None) -> bool:
+        """Whether the source's pixels are needed besides the frame."""
+        return target is not None or self._aovs is not None
+
+    def write(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> None:
+        """Denoise the additive layers of a frame, and write all; without a target they are for the history alone."""
+        assert source is not None
+        layers = {} if self._aovs is None else self._aovs.denoise(source.placed(self._window), frame, image)
+        if target is None:
+            return
+        beauty = compose_beauty(frame, image)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        images, settings = {"": beauty, **layers}, self._settings
+        for note in write_result(
+            source, target, images, self._window, settings.naming, only_beauty=settings.only_beauty
+        ):
+            self._log(note)
+        if settings.preview:
+            write_preview(target, beauty)
+
+
+def compose_beauty(frame: Frame, image: np.ndarray) -> Any:
+    """The denoised image [H, W, 3] with the frame's direct and emitted light added back."""
+    return image + light_of(frame.direct) + light_of(frame.emission)
+
+
+def name_channels(prefix: str, image: np.ndarray) -> dict[str, np.ndarray]:
+    """An image [H, W, 3] as the channels ``R``, ``G``, ``B`` of a file, with a prefix."""
+    return {f"{prefix}{letter}": np.ascontiguousarray(image[..., i], np.float32) for i, letter in enumerate("RGB")}
+
+
+def write_preview(target: Path, image: Any) -> None:
+    """Write a linear image [H, W, 3], tone-mapped, as a PNG next to the file ``target``."""
+    save_png(target.with_suffix(".png"), color.tonemap(image))
