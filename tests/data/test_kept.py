@@ -15,7 +15,7 @@ from jaxdn.data.exr.exr import rewrite_exr
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.exr.windows import Window
 from jaxdn.data.foreign.import_exr import ForeignSequence
-from jaxdn.data.foreign.naming import UNNAMED
+from jaxdn.data.foreign.naming import UNNAMED, ChannelNaming
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
@@ -78,7 +78,7 @@ def denoise(source: Path, out: Path, **settings: Any) -> None:
 def test_everything_but_the_beauty_stays(name: str, tmp_path: Path) -> None:
     program = PROGRAMS[name]
     source = write_shot(name, tmp_path / "in")
-    denoise(source, tmp_path / "out", motion_convention=program.motion_convention)
+    denoise(source, tmp_path / "out", naming=ChannelNaming(program.motion_convention))
     names = sorted(path.name for path in source.iterdir())
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == names
     errors = np.zeros(2)
@@ -95,8 +95,8 @@ def test_everything_but_the_beauty_stays(name: str, tmp_path: Path) -> None:
 def test_only_the_beauty_if_asked_for(tmp_path: Path) -> None:
     source = write_shot("Houdini", tmp_path / "in", frames=1) / "shot.0001.exr"
     whole, alone = tmp_path / "whole.exr", tmp_path / "alone.exr"
-    denoise(source, whole, motion_convention="none")
-    denoise(source, alone, motion_convention="none", only_beauty=True)
+    denoise(source, whole, naming=ChannelNaming("none"))
+    denoise(source, alone, naming=ChannelNaming("none"), only_beauty=True)
     ((header, channels),) = parts(alone)
     assert sorted(channels) == ["A", "B", "G", "R"]
     assert "husk:render_stats" in header

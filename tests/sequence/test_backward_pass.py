@@ -13,6 +13,7 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.core.frame import FAR, Frame
+from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.data.read import open_frames
 from jaxdn.filters.time_reversal import SEEN_MOST, blend, seen, turned
 from jaxdn.ops.motion import on_screen
@@ -165,8 +166,8 @@ def test_a_clip_of_ours_and_the_other_ways_to_denoise_go_together(tmp_path: Path
     assert len(denoised(tmp_path / "clip", tmp_path / "out", "ntd-small")) == 4
     shot = write_shot("Arnold", tmp_path / "shot")  # data windows differ from frame to frame
     convention = PROGRAMS["Arnold"].motion_convention
-    whole = denoised(shot, tmp_path / "whole", motion_convention=convention)
-    (one,) = denoised(shot, tmp_path / "one", motion_convention=convention, frames=[2], aovs="additive")
+    whole = denoised(shot, tmp_path / "whole", naming=ChannelNaming(convention))
+    (one,) = denoised(shot, tmp_path / "one", naming=ChannelNaming(convention), frames=[2], aovs="additive")
     np.testing.assert_allclose(one, whole[1], rtol=1e-3, atol=1e-4)
 
 
