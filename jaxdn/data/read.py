@@ -39,14 +39,19 @@ def open_frames(
             frames = read_frames(path, spp=spp, order=part[::-1] if backwards else part)
             return [frame_path(path, index) for index in part], _turned(frames) if backwards else frames
         refuse_unfinished(path)
-    if spp != 1:
-        where = path if isinstance(path, str | Path) else f"{path[0]} ({len(path)} file{'s' * (len(path) != 1)})"
-        raise ClipError(f"{where}: expected spp 1, got {spp}; only a clip with a {RECORD} has several sample counts.")
+    check_single_layer(path, spp)
     files, plain = plain_frames(
         path, motion_convention=motion_convention, channels=channels, layer=layer, backwards=backwards, log=log
     )
     # Unlike the variable of a loop, this does not keep a frame while the next one is read.
     return files, map(store_frame, plain)
+
+
+def check_single_layer(path: str | Path | Sequence[Path], spp: int) -> None:
+    """Raise ClipError for another renderer's files of which other than their only sample count is asked for."""
+    if spp != 1:
+        where = path if isinstance(path, str | Path) else f"{path[0]} ({len(path)} file{'s' * (len(path) != 1)})"
+        raise ClipError(f"{where}: expected spp 1, got {spp}; only a clip with a {RECORD} has several sample counts.")
 
 
 def store_frame(frame: Frame) -> StoredFrame:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxdn.data.clip.frames import StoredFrame
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.import_exr import ForeignSequence
-from jaxdn.data.read import open_frames, store_frame
+from jaxdn.data.read import check_single_layer, open_frames, store_frame
 from jaxdn.sequence.backward_pass import BackwardImages, backward_pass
 from jaxdn.sequence.frame_denoiser import Fallback, FrameDenoiser
 from jaxdn.sequence.jobs import Job
@@ -37,6 +37,7 @@ def denoise_segment(
     if job.clip is not None:
         footage, writer = _ClipFootage(job.clip, segment, settings.spp), ClipWriter(settings)
     else:
+        check_single_layer(job.shot.files[segment.start : segment.stop], settings.spp)
         sequence = ForeignSequence(job.exr_files[segment.start : segment.stop], settings.naming)
         footage, writer = _ForeignFootage(sequence, segment), ForeignWriter(sequence.window, settings, log)
     with ExitStack() as stack:

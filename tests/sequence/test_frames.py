@@ -258,7 +258,7 @@ def test_a_terminal_has_a_bar_with_the_time_left() -> None:
     console = Console(file=screen, force_terminal=True, width=100, color_system=None)
     with reporter("svgf", console) as report:
         for done in range(1, 4):
-            report.say(Path(f"out/a.{done:04d}.exr"), done, 3)
+            report.on_frame(Path(f"out/a.{done:04d}.exr"), done, 3)
         report.log("[not] used: 'x'")
     text = screen.getvalue()
     assert "3/3" in text

@@ -5,12 +5,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.sequence.james_stein import BLOCK, CLEAN, DOUBT, LITTLE, MOST, MUCH, NOISY, QUIET, RADIUS, combine, judge
+from jaxdn.sequence.james_stein import (
+    BLOCK,
+    CLEAN,
+    DOUBT,
+    LITTLE,
+    MOST,
+    MUCH,
+    NOISY,
+    QUIET,
+    RADIUS,
+    combine,
+    measure_confidence,
+)
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
 SIZE = (48, 64)
-mixed = jax.jit(combine, static_argnames="blind")
+mixed = jax.jit(combine, static_argnames="texture_unknown")
 
 
 def mse(image, truth):
@@ -74,7 +86,7 @@ def test_the_share_is_that_of_numpy(rng, deviation):
     noisy = (truth * rng.gamma(deviation**-2, deviation**2, truth.shape)).astype(np.float32)
     share, noise = reference(noisy, blurred)
     found = mixed(noisy, blurred)
-    np.testing.assert_allclose(found.share, share, atol=2e-4)
+    np.testing.assert_allclose(found.noisy_weight, share, atol=2e-4)
     np.testing.assert_allclose(found.noise, noise, rtol=1e-4)
     np.testing.assert_allclose(found.image, blurred + share * (noisy - blurred), atol=1e-3)
 
@@ -119,8 +131,8 @@ def test_the_least_of_blocks_has_no_bias(rng):
     """Of grey Gaussian noise: what is measured is its variance, near or far blocks alike."""
     noise = np.repeat(rng.standard_normal((640, 640, 1)), 3, axis=-1)
     flat = np.ones_like(noise, np.float32)
-    for blind in (False, True):
-        found = mixed(jnp.asarray(flat + 0.1 * noise, jnp.float32), flat, blind=blind)
+    for texture_unknown in (False, True):
+        found = mixed(jnp.asarray(flat + 0.1 * noise, jnp.float32), flat, texture_unknown=texture_unknown)
         measured = np.mean(np.square(np.asarray(found.noise) * 1.05))  # relative to the light and 5 % of its mean
         assert 0.85 < measured / 0.1**2 < 1.0  # at most that of the window, which is sometimes less
 
@@ -140,9 +152,9 @@ def test_a_frame_that_lost_more_than_noise_explains_is_not_trusted(rng, samples,
     pattern = np.kron(rng.uniform(0.3, 1.7, (12, 16, 1)), np.ones((8, 8, 3))).astype(np.float32)
     noisy = (truth * rng.gamma(samples, 1 / samples, truth[..., :1].shape)).astype(np.float32)
     for denoised, expected in ((truth * pattern, trusted), (truth, True)):
-        judged = judge(mixed(noisy, denoised))
-        assert (judged.distrust < 0.05) if expected else (judged.distrust > 0.95)
-    assert abs(float(judged.noise) - samples**-0.5) < 0.15 * samples**-0.5 + 0.01
+        confidence = measure_confidence(mixed(noisy, denoised))
+        assert (confidence.fallback < 0.05) if expected else (confidence.fallback > 0.95)
+    assert abs(float(confidence.noise) - samples**-0.5) < 0.15 * samples**-0.5 + 0.01
 
 
 def test_half_of_a_frame_may_be_clean(rng):
@@ -162,7 +174,7 @@ def test_fireflies_and_invalid_values_do_not_come_back():
     noisy[20, 30], noisy[3, 3, 0], noisy[40, 50], noisy[5, 60] = 200.0, np.nan, np.inf, -1.0
     found = mixed(noisy, denoised)
     np.testing.assert_allclose(found.image, denoised, atol=1e-6)
-    assert np.isfinite(found.share).all()
+    assert np.isfinite(found.noisy_weight).all()
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 7, 3), (3, 2, 3)])
