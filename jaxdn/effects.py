@@ -1,6 +1,6 @@
-"""Simulate only the effects that a scene has: find them, and plan what they need and what may be left out.
+"""Simulate only the effects that a scene has: detect them, and plan what they need and what may be left out.
 
-``inspect`` finds the effects of a scene or a finished clip, ``plan`` intersects them with what a denoiser reads, and
+``inspect`` detects the effects of a scene or a finished clip, ``plan`` intersects them with what a denoiser reads, and
 the renderer follows the plan. What is left out is ``None`` in a :class:`jaxdn.Frame` and not in the compiled step: the
 result is that of the neutral value, at a lower cost.
 """
@@ -11,18 +11,18 @@ from typing import Any
 
 from jaxdn.planning.catalogue import EFFECTS as EFFECTS
 from jaxdn.planning.catalogue import Effect as Effect
-from jaxdn.planning.facts import Facts as Facts
-from jaxdn.planning.facts import Light as Light
-from jaxdn.planning.facts import Moment as Moment
-from jaxdn.planning.facts import Surface as Surface
-from jaxdn.planning.found import Effects as Effects
-from jaxdn.planning.found import chosen as chosen
-from jaxdn.planning.found import everything as everything
-from jaxdn.planning.found import find as find
+from jaxdn.planning.detected_effects import Effects as Effects
+from jaxdn.planning.detected_effects import choose_all_effects as choose_all_effects
+from jaxdn.planning.detected_effects import choose_effects as choose_effects
+from jaxdn.planning.detected_effects import detect_effects as detect_effects
 from jaxdn.planning.plan import BOUND as BOUND
 from jaxdn.planning.plan import Plan as Plan
 from jaxdn.planning.plan import plan as plan
 from jaxdn.planning.plan import plan_from_record as plan_from_record
+from jaxdn.planning.scene_properties import Light as Light
+from jaxdn.planning.scene_properties import Moment as Moment
+from jaxdn.planning.scene_properties import SceneProperties as SceneProperties
+from jaxdn.planning.scene_properties import Surface as Surface
 
 
 def inspect(
@@ -40,7 +40,7 @@ def inspect(
     Args:
       scene: a Mitsuba scene file, the name of a family, a folder of a clip or of EXR files of any renderer, an
         :class:`jaxdn.render.AnimatedScene`, a loaded ``mi.Scene`` (``optimize=False``), a scene as Mitsuba's dict, or
-        :class:`Facts`.
+        :class:`SceneProperties`.
       animation: animation file (or its contents, as a dict) for a scene file or a loaded scene.
       width: of the image in pixels; with ``height`` it decides what is on screen.
       height: of the image in pixels.
@@ -53,18 +53,20 @@ def inspect(
     """
     if frames is not None and frames < 1:
         raise ValueError(f"frames: expected at least 1, got {frames}.")
-    if isinstance(scene, Facts):
-        return find(scene._replace(moments=scene.moments[:frames]))
+    if isinstance(scene, SceneProperties):
+        return detect_effects(scene._replace(moments=scene.moments[:frames]))
     if _is_footage(scene):
-        from jaxdn.data.evidence import read_facts
+        from jaxdn.data.evidence import read_clip_properties
         from jaxdn.data.foreign.naming import ChannelNaming
 
-        facts = read_facts(scene, animation, ChannelNaming(channels=channels, layer=layer))
-        return find(facts._replace(moments=facts.moments[:frames]))
-    from jaxdn.render.opening import open_scene
-    from jaxdn.render.scene_facts import facts_of
+        properties = read_clip_properties(scene, animation, ChannelNaming(channels=channels, layer=layer))
+        return detect_effects(properties._replace(moments=properties.moments[:frames]))
+    from jaxdn.render.open_scene import open_scene
+    from jaxdn.render.scene_properties import read_scene_properties
 
-    return find(facts_of(open_scene(scene, animation), width=width, height=height, frames=frames))
+    return detect_effects(
+        read_scene_properties(open_scene(scene, animation), width=width, height=height, frames=frames)
+    )
 
 
 def _is_footage(scene: Any) -> bool:

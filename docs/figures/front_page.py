@@ -26,6 +26,7 @@ from jaxdn.data.clip.folder import read_record
 from jaxdn.denoiser.rollout import denoise
 from jaxdn.evaluation.report.images import displayed_bytes
 from jaxdn.render import ClipJob, render_clips
+from jaxdn.render.settings import RenderSettings
 from jaxdn.zoo.ready import OURS
 from jaxdn.zoo.weights import load_weights
 
@@ -53,12 +54,14 @@ def clean_frame(folder: Path, frame: int, spp: int) -> Clip:
     job = ClipJob(
         {**record["scene"], "start": frame},
         str(Path("runs/front-page") / f"{folder.name}-{frame}"),
-        width=record["width"],
-        height=record["height"],
-        frames=1,
-        reference_spp=spp,
-        max_depth=record["max_depth"],
-        seed=record["seed"],
+        1,
+        RenderSettings(
+            width=record["width"],
+            height=record["height"],
+            reference_spp=spp,
+            max_depth=record["max_depth"],
+            seed=record["seed"],
+        ),
     )
     render_clips([job])
     return read_clip(job.folder)

@@ -25,6 +25,7 @@ from jaxdn.evaluation.report import Results, TrainingCurve, text_table, write_re
 from jaxdn.methods.registry import Method, method_named
 from jaxdn.recipes.recipe import Recipe
 from jaxdn.render import ClipJob, choose_variant, render_clips
+from jaxdn.render.settings import RenderSettings
 from jaxdn.training.log import read_curve
 from jaxdn.training.train import train
 from jaxdn.zoo.ready import NOISY, candidate, filters
@@ -142,11 +143,8 @@ def jobs(clips: ClipSet, folder: Path) -> list[ClipJob]:
         ClipJob(
             {"family": family, "seed": seed, **({"start": start} if start else {})},
             str(place),
-            width=clips.size,
-            height=clips.size,
-            frames=clips.frames,
-            reference_spp=clips.reference_spp,
-            seed=seed + start,
+            clips.frames,
+            RenderSettings(width=clips.size, height=clips.size, reference_spp=clips.reference_spp, seed=seed + start),
         )
         for (family, seed, start), place in zip(clips.clips, folders(clips, folder), strict=True)
     ]

@@ -10,10 +10,10 @@ clip as ``pictures/CLIP/METHOD.png``, and ``table.md``: errors without the noise
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -32,8 +32,8 @@ from jaxdn.core.frame import frame_at
 from jaxdn.evaluation.compare import compare
 from jaxdn.evaluation.report import write_report
 from jaxdn.planning.catalogue import NoisyLight
-from jaxdn.render import ClipJob, render_clips
-from jaxdn.sequence.render_jobs import clips_of
+from jaxdn.render import ClipJob, RenderSettings, render_clips
+from jaxdn.sequence.render_jobs import ClipSource, plan_jobs
 from jaxdn.zoo.ready import NOISY, candidate, filters
 from jaxdn.zoo.weights import shipped_names
 
@@ -73,43 +73,26 @@ class Settings:
 
 def clips(settings: Settings, light: NoisyLight) -> list[ClipJob]:
     """The clips with this noisy light."""
-    shared: dict[str, Any] = {
-        "seeds": [SEED],
-        "layers": [1],
-        "reference_spp": settings.reference_spp,
-        "light": light,
-        "max_depth": None,
-        "effects": "auto",
-        "denoiser": ",".join([*filters(), *shipped_names()]),
-    }
-    square: dict[str, Any] = {"width": settings.size, "height": settings.size}
     place = settings.data / light
-    found: list[ClipJob] = []
+    square = RenderSettings(settings.size, settings.size, reference_spp=settings.reference_spp, light=light)
+    wide = replace(square, width=320, height=180)
+    jobs: list[ClipJob] = []
     for family in settings.families:
-        found += clips_of(family, place, animation=None, frames=settings.frames, **square, **shared)
+        jobs += plan_jobs(ClipSource(family, [SEED], settings.frames, denoiser=_all_methods()), place, square)
     for scene, animation in rooms.scenes_in(settings.scenes) if settings.scenes else []:
-        found += clips_of(str(scene), place, animation=animation, frames=8, width=320, height=180, **shared)
-    return found
+        jobs += plan_jobs(ClipSource(str(scene), [SEED], 8, animation, denoiser=_all_methods()), place, wide)
+    return jobs
 
 
 def timed_clip(settings: Settings) -> ClipJob:
     """A clip of the size that is timed, with all light that surfaces reflect and its shadows: the most work."""
     height, width = settings.timed
-    return clips_of(
-        settings.families[-1],
-        settings.data / "timed",
-        animation=None,
-        seeds=[SEED],
-        width=width,
-        height=height,
-        frames=2,
-        reference_spp=0,
-        layers=[1],
-        light="reflected",
-        max_depth=None,
-        effects="all",
-        denoiser=",".join([*filters(), *shipped_names()]),
-    )[0]
+    source = ClipSource(settings.families[-1], [SEED], 2, effects="all", denoiser=_all_methods())
+    return plan_jobs(source, settings.data / "timed", RenderSettings(width, height, light="reflected"))[0]
+
+
+def _all_methods() -> str:
+    return ",".join([*filters(), *shipped_names()])
 
 
 def step(folder: Path, name: str) -> Call:

@@ -93,11 +93,11 @@ def monte_carlo(scene: Any, samples: int = SAMPLES) -> np.ndarray:
     import drjit as dr
     import mitsuba as mi
 
-    from jaxdn.render.tracing.wavefront import camera_rays
+    from jaxdn.render.tracing.radiance import make_camera_rays
 
     lane = dr.arange(mi.UInt32, SIZE * SIZE * samples)
     pixel = lane // samples
-    hit = scene.ray_intersect(camera_rays(scene.sensors()[0], pixel % SIZE, pixel // SIZE))
+    hit = scene.ray_intersect(make_camera_rays(scene.sensors()[0], pixel % SIZE, pixel // SIZE))
     pcg: Any = mi.PCG32
     numbers = pcg(size=SIZE * SIZE * samples, initstate=5)
     lobe = numbers.next_float32()
@@ -121,17 +121,18 @@ class Found(NamedTuple):
 
 def measure(material: dict[str, Any], *, furnace_samples: int = 1024) -> Found:
     """How far the renderer's F_b is from Monte Carlo's on a ball of a material, and the furnace from 1."""
-    from jaxdn.render.buffers.gbuffer import gbuffer
-    from jaxdn.render.tracing.wavefront import accumulate
+    from jaxdn.render.buffers.gbuffer import trace_gbuffer
+    from jaxdn.render.tracing.seeds import NOISY, SampleStream
+    from jaxdn.render.tracing.vectorised_path_tracer import accumulate
 
     scene = ball(material)
-    there = gbuffer(scene, reflectance=True)
+    there = trace_gbuffer(scene, reflectance=True)
     inside = there.ids[..., 0] >= 0
     assert there.reflectance is not None
     error = np.abs(there.reflectance - np.clip(monte_carlo(scene), 0, 1))[inside]
     clear = "dielectric" in material["type"]
     depth = 24 if clear else 2  # through the ball, and about in it, before light is outside again
-    light = accumulate(scene, seed=1, frame=0, stream=0, first=0, count=furnace_samples, max_depth=depth)
+    light = accumulate(scene, SampleStream(1, 0, NOISY), 0, furnace_samples, max_depth=depth)
     radiance = (light.direct + light.indirect) / furnace_samples
     furnace = float(np.mean(np.abs(radiance / np.maximum(there.reflectance, 1e-3) - 1)[inside]))
     # The inside of a mask's ball is black.

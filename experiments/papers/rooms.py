@@ -20,6 +20,7 @@ from jaxdn.evaluation.report import text_table, write_report
 from jaxdn.render import ClipJob, choose_variant, render_clips
 from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.render.settings import RenderSettings
 from jaxdn.zoo.ready import NOISY, Candidate, all_names, candidate, filters
 
 ANIMATIONS = Path(__file__).parent / "rooms"
@@ -66,11 +67,13 @@ def jobs(settings: Settings) -> list[ClipJob]:
         ClipJob(
             SceneFile(path, animation).record,
             str(Path("data/rooms") / animation.stem),
-            width=settings.width,
-            height=settings.height,
-            frames=settings.frames,
-            layers=settings.layers,
-            reference_spp=settings.reference_spp,
+            settings.frames,
+            RenderSettings(
+                width=settings.width,
+                height=settings.height,
+                layers=settings.layers,
+                reference_spp=settings.reference_spp,
+            ),
         )
         for path, animation in scenes_in(settings.scenes)
     ]

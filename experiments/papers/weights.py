@@ -2,17 +2,18 @@
 
     python -m experiments.papers.weights --rooms rooms/*/scene.xml    # `make weights`: hours; resumable
 
-Clips: tours of furnished Mitsuba scenes and the procedural families, 128 x 128 pixels, 10 frames, references of 32
-samples and six more single samples, 16 to 48 seconds of one core each. The rooms that the shipped weights saw are six
-of Benedikt Bitterli's rendering resources (bathroom, kitchen, living-room-2, spaceship, veach-ajar, veach-lamp);
-without ``--rooms`` the families are all there is. Finished clips and stages are reused, interrupted ones go on. Each
-network is trained at a constant rate first, so that it can always be continued, and with a falling rate at the end;
-LARGE begins as SMALL grown (:mod:`jaxdn.networks.widen`). A, B and C take the same number of updates.
+Clips: furnished Mitsuba scenes with randomised animations, and the procedural families; 128 x 128 pixels, 10 frames,
+references of 32 samples and six more single samples, 16 to 48 seconds of one core each. The rooms that the shipped
+weights saw are six of Benedikt Bitterli's rendering resources (bathroom, kitchen, living-room-2, spaceship,
+veach-ajar, veach-lamp); without ``--rooms`` the families are all there is. Finished clips and stages are reused,
+interrupted ones go on. Each network is trained at a constant rate first, so that it can always be continued, and with a
+falling rate at the end; LARGE begins as SMALL grown (:mod:`jaxdn.networks.widen`). A, B and C take the same number of
+updates.
 """
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,14 +24,16 @@ from jaxdn.data.clip.folder import is_clip, read_record
 from jaxdn.methods.registry import method_named
 from jaxdn.recipes.objectives import Objective, unbiased_illumination
 from jaxdn.render.scenes.scene_file import SceneFile
-from jaxdn.sequence.render_jobs import render
+from jaxdn.render.settings import RenderSettings
+from jaxdn.sequence.render_jobs import ClipSource, render
 from jaxdn.training.train import train
 from jaxdn.zoo.weights import SHIPPED, shipped_names
 
 FAMILIES = {"parlour": 90, "fruit": 14, "mobile": 14, "pinkroom": 14, "robot": 14}
 """Clips of each procedural family."""
-CLIP: dict[str, Any] = {"width": 128, "height": 128, "frames": 10, "reference_spp": 32, "layers": [1], "draws": 6}
-"""What each of them is."""
+CLIP = RenderSettings(width=128, height=128, reference_spp=32, draws=6)
+"""How each of them is rendered."""
+FRAMES = 10
 BLOCK = 4
 """Clips of each kind that are rendered before the next kind has its turn."""
 
@@ -78,7 +81,7 @@ class Settings:
     """Render the training clips, train the shipped weights and the paper's ablation."""
 
     rooms: list[Path] = field(default_factory=list)
-    """Mitsuba scenes (.xml) to make tours of."""
+    """Mitsuba scenes (.xml) to animate at random."""
     tours: int = 30
     """Clips of each of them."""
     stages: list[str] = field(default_factory=lambda: [stage.name for stage in STAGES])
@@ -105,31 +108,26 @@ def render_all(settings: Settings) -> None:
     ]
     # Block by block, so that what is there is a mixture of all kinds at any time.
     for part, seeds in [*blocks, ("validation", range(1000, 1001))]:
-        for (source, clips, tours), odd in itertools.product(sources, (False, True)):
-            wanted = {**CLIP, "see_through": bool(odd)}
-            out, name = settings.data / part, SceneFile.name_of(source) if tours else source
+        for (scene, clips, randomised), odd in itertools.product(sources, (False, True)):
+            wanted = replace(CLIP, see_through=odd)
+            out, name = settings.data / part, SceneFile.name_of(scene) if randomised else scene
             chosen = [seed for seed in seeds if seed % 2 == odd and (seed < clips or part == "validation")]
             # A clip that is there is not opened again to plan it: that takes 20 seconds each.
-            chosen = [seed for seed in chosen if not _there(out / f"{name}-{seed}", wanted)]
+            chosen = [seed for seed in chosen if not _is_rendered(out / f"{name}-{seed}", wanted)]
             if not chosen:
                 continue
-            render(
-                source,
-                out,
-                animation=None,
-                tours=tours,
-                seeds=chosen,
-                **wanted,
-                max_depth=None,
-                effects="auto",
-                denoiser=",".join({stage.method: None for stage in STAGES}),
-                workers=settings.workers,
-            )
+            denoisers = ",".join({stage.method: None for stage in STAGES})
+            source = ClipSource(scene, chosen, FRAMES, randomised=randomised, denoiser=denoisers)
+            render(source, out, wanted, workers=settings.workers)
 
 
-def _there(folder: Path, wanted: Mapping[str, Any]) -> bool:
-    """Whether a folder is a finished clip that was rendered as wanted."""
-    return is_clip(folder) and wanted.items() <= read_record(folder).items()
+def _is_rendered(folder: Path, wanted: RenderSettings) -> bool:
+    """Whether a folder is a finished clip that was rendered as wanted, whatever its seed and its plan."""
+    if not is_clip(folder):
+        return False
+    record = read_record(folder)
+    own = RenderSettings.from_record(record)
+    return record["frames"] == FRAMES and wanted == replace(own, seed=0, plan=None, variant=None, max_depth=None)
 
 
 def train_stage(stage: Stage, settings: Settings) -> Path:

@@ -36,6 +36,7 @@ from jaxdn.render import use_variant
 from jaxdn.render.clip import render_clip
 from jaxdn.render.path_depth import measure_depth
 from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.render.settings import RenderSettings
 
 SCENES = (
     "static grey box",
@@ -77,7 +78,9 @@ def medians(programs: dict[str, Callable[[], Any]], rounds: int) -> dict[str, fl
 def render(case: Case, settings: Settings, folder: Path) -> tuple[dict[str, Any], dict[str, Path]]:
     """Render one scene with everything and by plan; seconds, bytes and the clips."""
     scene = SceneFile(case.write(folder))
-    render_clip(scene, folder / "warm", width=settings.size, height=settings.size, frames=1, reference_spp=2)
+    render_clip(
+        scene, folder / "warm", RenderSettings(width=settings.size, height=settings.size, reference_spp=2), frames=1
+    )
 
     start = time.perf_counter()
     found = effects.inspect(scene, width=settings.size, height=settings.size)
@@ -96,11 +99,10 @@ def render(case: Case, settings: Settings, folder: Path) -> tuple[dict[str, Any]
             render_clip(
                 scene,
                 clips[name][-1],
-                width=settings.size,
-                height=settings.size,
+                RenderSettings(
+                    width=settings.size, height=settings.size, reference_spp=settings.reference_spp, plan=plans[name]
+                ),
                 frames=FRAMES,
-                reference_spp=settings.reference_spp,
-                plan=plans[name],
             )
 
         return run

@@ -71,7 +71,7 @@ class Counts(NamedTuple):
 def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
     """For each kind a function that writes the bytes to the expected path and reads them as a user would."""
     from jaxdn.clips import read_clip, read_frame
-    from jaxdn.data.evidence import read_facts
+    from jaxdn.data.evidence import read_clip_properties
     from jaxdn.data.training.cache import open_cached
     from jaxdn.render.scenes.animation import CameraKeys, RigidKeys, check_animation, light_scale, read_animation
     from jaxdn.zoo.weights import load_weights
@@ -97,7 +97,7 @@ def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
 
     def trained_on() -> None:
         read_clip(clip)
-        read_facts(clip)
+        read_clip_properties(clip)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a non-finite reference gives a warning and counts as 0
             open_cached(clip, cache=folder / "cache")

@@ -74,13 +74,14 @@ def _show_job(job: Job, naming: ChannelNaming, method: Candidate) -> None:
 
 def _denoise_scene(options: Denoise, scene: str) -> None:
     """Frames that are rendered with samples where the denoiser wants them."""
-    from jaxdn.sequence.render_and_denoise import Settings, denoise_scene
+    from jaxdn.render.settings import RenderSettings
+    from jaxdn.sequence.render_and_denoise import SceneSettings, denoise_scene
 
     asks = getattr(candidate(options.method).denoiser, "samples", None) is not None
     budget = _budget(options)
     method, engine = select_engine(options.method, options.implementation, **(budget if asks else {}))
     size = {name: value for name in ("width", "height", "seed") if (value := getattr(options, name)) is not None}
-    settings = Settings(frames=_frames(options), preview=options.preview, **size, **budget)
+    settings = SceneSettings(RenderSettings(**size), _frames(options), preview=options.preview, **budget)
     out = check_folder(options.out)
     with reporter(options.method) as report:
         written = denoise_scene(

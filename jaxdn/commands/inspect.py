@@ -22,11 +22,12 @@ from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.data.foreign.shots import ranges
 from jaxdn.denoiser import Denoiser
-from jaxdn.effects import EFFECTS, Plan, everything, inspect, plan
-from jaxdn.render.opening import open_scene
+from jaxdn.effects import EFFECTS, Plan, choose_all_effects, inspect, plan
+from jaxdn.render.open_scene import open_scene
+from jaxdn.render.settings import RenderSettings
 from jaxdn.sequence.render_jobs import Planned, denoiser_named, plan_clip
 
-EVERYTHING = plan(everything(1))
+EVERYTHING = plan(choose_all_effects(1))
 """The plan that corresponds to rendering everything."""
 
 
@@ -106,7 +107,7 @@ def _planned(
         return Planned(found, plan(found, reader))
     scene = open_scene(source, animation)
     count = scene.frames if frames is None else frames
-    planned = plan_clip(scene, denoiser=reader, width=width, height=height, frames=count)
+    planned = plan_clip(scene, RenderSettings(width=width, height=height), frames=count, denoiser=reader)
     assert planned is not None  # only "all" has no plan
     return planned
 
@@ -141,7 +142,7 @@ def left_out(made: Plan) -> list[str]:
 
 def noise_alone(made: Plan) -> int:
     """How many frames share everything except the noise with an earlier one."""
-    return sum(held != index for index, held in enumerate(made.held))
+    return sum(source != index for index, source in enumerate(made.shared_with))
 
 
 def channels(buffers: tuple[str, ...]) -> list[str]:
@@ -154,7 +155,7 @@ def bytes_a_pixel(made: Plan) -> float:
     light = BUFFERS["radiance"].bytes
     whole = [3 * light + sum(BUFFERS[name].bytes for name in names) for names in made.frames]
     noise = [light + sum(BUFFERS[name].bytes for name in OF_SAMPLES & set(names)) for names in made.frames]
-    stored = [noise[index] if held != index else whole[index] for index, held in enumerate(made.held)]
+    stored = [noise[index] if source != index else whole[index] for index, source in enumerate(made.shared_with)]
     return round(sum(stored) / len(stored), 2)
 
 
@@ -194,6 +195,6 @@ def _show(source: str, planned: Planned, reader: Denoiser | None, name: str | No
     console.print(f"left out      {', '.join(left_out(made)) or 'nothing'}")
     reader_name = "any denoiser" if name is None else name
     console.print(f"programs      {made.programs(None if reader is None else reader.reads)} compiled for {reader_name}")
-    console.print(f"rendered once {noise_alone(made)} of {len(made.held)} frames store only their noise")
+    console.print(f"rendered once {noise_alone(made)} of {len(made.shared_with)} frames store only their noise")
     sizes = f"{bytes_a_pixel(made):g} of {bytes_a_pixel(EVERYTHING):g} bytes per pixel and frame"
     console.print(f"on disk       {sizes}, uncompressed")

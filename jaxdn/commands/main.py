@@ -3,6 +3,7 @@
 
 import os
 import sys
+from dataclasses import fields
 from typing import Any
 
 import tyro
@@ -32,28 +33,18 @@ def _inspect(options: Inspect) -> None:
 
 def _render(options: Render) -> None:
     from jaxdn.core.options import numbers
-    from jaxdn.sequence.render_jobs import render
+    from jaxdn.render.settings import RenderSettings
+    from jaxdn.sequence.render_jobs import ClipSource, render
 
-    render(
-        options.scene,
-        check_folder(options.out),
-        animation=options.animation,
-        tours=options.tour,
-        seeds=numbers(options.seeds, "--seeds"),
-        width=options.width,
-        height=options.height,
-        frames=options.frames,
-        reference_spp=options.reference_spp,
-        layers=options.layers,
-        draws=options.draws,
-        light=options.light,
-        jitter=options.jitter,
-        see_through=options.see_through,
-        max_depth=options.max_depth,
-        effects=options.effects,
-        denoiser=options.denoiser,
-        workers=options.workers,
+    given = vars(options)
+    settings = RenderSettings(
+        **{field.name: given[field.name] for field in fields(RenderSettings) if field.name in given}
     )
+    seeds = numbers(options.seeds, "--seeds")
+    clips = ClipSource(
+        options.scene, seeds, options.frames, options.animation, options.tour, options.effects, options.denoiser
+    )
+    render(clips, check_folder(options.out), settings, workers=options.workers)
 
 
 def _pack(options: Pack) -> None:

@@ -1,4 +1,4 @@
-"""Facts about a finished clip from its buffers, for clips whose scene is not available.
+"""Properties of a finished clip from its buffers, for clips whose scene is not available.
 
 Buffers show less than a scene does. Where they cannot decide, the effect is uncertain and counts as present. The record
 of a clip that was rendered by a plan lists the effects that it was rendered for.
@@ -15,7 +15,7 @@ from jaxdn.data.clip.folder import is_clip, read_record
 from jaxdn.data.clip.record import is_planned
 from jaxdn.data.foreign.naming import UNNAMED, ChannelNaming
 from jaxdn.data.read import open_frames
-from jaxdn.planning.facts import NO_NAMES, Facts, Light, Moment, Surface
+from jaxdn.planning.scene_properties import NO_NAMES, Light, Moment, SceneProperties, Surface
 
 _ANY_CONVENTION = "previous-current"
 """Whether anything moves is the same in every convention of motion vectors."""
@@ -30,8 +30,8 @@ _HIDDEN = {
 """Effects that no buffer can rule out."""
 
 
-def read_facts(path: str | Path, animation: Any = None, naming: ChannelNaming = UNNAMED) -> Facts:
-    """Facts about a clip's folder, or EXR files of any renderer; frames are read one at a time.
+def read_clip_properties(path: str | Path, animation: Any = None, naming: ChannelNaming = UNNAMED) -> SceneProperties:
+    """Properties of a clip's folder, or EXR files of any renderer; frames are read one at a time.
 
     ``naming``: ``channels`` and ``layer`` of files of other renderers.
     Raises ClipError as :func:`jaxdn.clips.read_clip` does, and ValueError for an ``animation``, which a finished clip
@@ -47,7 +47,7 @@ def read_facts(path: str | Path, animation: Any = None, naming: ChannelNaming = 
     )
     for stored in frames:
         look.at(stored.frame)
-    return look.facts()
+    return look.properties()
 
 
 class _Look:
@@ -123,8 +123,8 @@ class _Look:
             albedo, ids = np.asarray(frame.albedo), np.asarray(frame.ids)[..., 0]
             self._textured = any(np.any(np.ptp(albedo[ids == shape], axis=0) > 0) for shape in np.unique(ids[ids >= 0]))
 
-    def facts(self) -> Facts:
-        """The facts that all frames together show."""
+    def properties(self) -> SceneProperties:
+        """The properties that all frames together show."""
         hidden = {name: why for name, why in _HIDDEN.items() if self._had(name)}
         if self._plan is None and not self._lit:
             hidden = {}
@@ -134,7 +134,7 @@ class _Look:
             hidden.pop("environment", None)
         surface = Surface("what is seen", frozenset(self._lobes), self._textured, specular=self._specular)
         lights = (Light("a light", environment=self._sky_shines),) if self._lit else ()
-        return Facts((surface,), lights, tuple(self._moments), uncertain=hidden | self._unsure)
+        return SceneProperties((surface,), lights, tuple(self._moments), uncertain=hidden | self._unsure)
 
 
 def _some(buffer: Any) -> bool:

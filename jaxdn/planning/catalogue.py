@@ -1,4 +1,4 @@
-"""The effects that a scene may have: how each is found, and what is needed to simulate it.
+"""The effects that a scene may have: how each is detected, and what is needed to simulate it.
 
 Effects are data, and the planner treats all of them equally: for a method that reads a new buffer, add the buffer to
 the effects that produce it, or add an effect. The absence of an effect equals the neutral value of its buffers
@@ -8,7 +8,7 @@ the effects that produce it, or add an effect. The absence of an effect equals t
 from collections.abc import Callable, Iterable
 from typing import Literal, NamedTuple
 
-from jaxdn.planning.facts import Facts, Moment
+from jaxdn.planning.scene_properties import Moment, SceneProperties
 
 NoisyLight = Literal["indirect", "reflected"]
 """The light that is rendered with noise: the indirect part, or all that surfaces reflect."""
@@ -16,7 +16,7 @@ INDIRECT: NoisyLight = "indirect"
 OF_SHADOWS = frozenset({"shadowed", "unshadowed", "shadow_motion"})
 """Buffers of direct light with noise."""
 THROUGH_CENTRES = frozenset({"luminance_gradient", "shadow_motion", "glossy_motion"})
-"""Buffers that are found by rays through the centres of pixels: none with sub-pixel jitter."""
+"""Buffers that are traced through the centres of pixels: none with sub-pixel jitter."""
 OF_FIRST_HITS = THROUGH_CENTRES | {
     "specular",
     "specular_reflectance",
@@ -35,8 +35,8 @@ class Effect(NamedTuple):
     name: str
     sentence: str
     """A description for the user."""
-    found: Callable[[Facts, Moment], str]
-    """(facts, moment) -> the reason why one frame has it; an empty string if it does not."""
+    detect: Callable[[SceneProperties, Moment], str]
+    """(scene properties, moment) -> the reason why one frame has it; an empty string if it does not."""
     buffers: frozenset[str] = frozenset()
     """The buffers of a Frame that it requires."""
     depth: int = DIRECT
@@ -54,87 +54,87 @@ def _list(names: Iterable[str]) -> str:
     return ", ".join(ordered[:3]) + (f" and {len(ordered) - 3} more" if len(ordered) > 3 else "")
 
 
-def _surfaces(facts: Facts, lobe: str, what: str) -> str:
-    names = [surface.name for surface in facts.surfaces if lobe in surface.lobes]
+def _surfaces(scene: SceneProperties, lobe: str, what: str) -> str:
+    names = [surface.name for surface in scene.surfaces if lobe in surface.lobes]
     return f"{_list(names)}: {what}" if names else ""
 
 
-def _camera_motion(facts: Facts, moment: Moment) -> str:
+def _camera_motion(scene: SceneProperties, moment: Moment) -> str:
     return "the camera moves" if moment.camera else ""
 
 
-def _object_motion(facts: Facts, moment: Moment) -> str:
+def _object_motion(scene: SceneProperties, moment: Moment) -> str:
     return f"{_list(moment.seen)} moves on screen" if moment.seen else ""
 
 
-def _disocclusion(facts: Facts, moment: Moment) -> str:
+def _disocclusion(scene: SceneProperties, moment: Moment) -> str:
     if not moment.reveals:
         return ""
     return f"behind {_list(moment.seen)} things come into view" if moment.seen else "the camera sees past edges"
 
 
-def _reflecting(facts: Facts) -> list[str]:
-    return [surface.name for surface in facts.surfaces if surface.lobes]
+def _reflecting(scene: SceneProperties) -> list[str]:
+    return [surface.name for surface in scene.surfaces if surface.lobes]
 
 
-def _indirect(facts: Facts, moment: Moment) -> str:
-    reflecting = _reflecting(facts)
-    if not (facts.lights and reflecting and facts.interreflects):
+def _indirect(scene: SceneProperties, moment: Moment) -> str:
+    reflecting = _reflecting(scene)
+    if not (scene.lights and reflecting and scene.interreflects):
         return ""
-    lights = _list(light.name for light in facts.lights)
+    lights = _list(light.name for light in scene.lights)
     return f"light of {lights} is reflected onto other surfaces by {_list(reflecting)}"
 
 
-def _glossy(facts: Facts, moment: Moment) -> str:
-    return _surfaces(facts, "glossy", "rougher than a mirror, smoother than roughness 1")
+def _glossy(scene: SceneProperties, moment: Moment) -> str:
+    return _surfaces(scene, "glossy", "rougher than a mirror, smoother than roughness 1")
 
 
-def _mirror(facts: Facts, moment: Moment) -> str:
-    return _surfaces(facts, "mirror", "reflects as a mirror")
+def _mirror(scene: SceneProperties, moment: Moment) -> str:
+    return _surfaces(scene, "mirror", "reflects as a mirror")
 
 
-def _transmission(facts: Facts, moment: Moment) -> str:
-    return _surfaces(facts, "transmission", "lets light through")
+def _transmission(scene: SceneProperties, moment: Moment) -> str:
+    return _surfaces(scene, "transmission", "lets light through")
 
 
-def _specular(facts: Facts, moment: Moment) -> str:
-    names = [surface.name for surface in facts.surfaces if surface.specular]
+def _specular(scene: SceneProperties, moment: Moment) -> str:
+    names = [surface.name for surface in scene.surfaces if surface.specular]
     return f"{_list(names)}: not perfectly diffuse" if names else ""
 
 
-def _moving_shadow(facts: Facts, moment: Moment) -> str:
-    if not (moment.moving and facts.lights and _reflecting(facts)):
+def _moving_shadow(scene: SceneProperties, moment: Moment) -> str:
+    if not (moment.moving and scene.lights and _reflecting(scene)):
         return ""
     unseen = moment.moving - moment.seen
     reason = f"{_list(moment.moving)} moves through light"
     return f"{reason} ({_list(unseen)} off screen: its shadow may fall into view)" if unseen else reason
 
 
-def _changing_light(facts: Facts, moment: Moment) -> str:
+def _changing_light(scene: SceneProperties, moment: Moment) -> str:
     return f"{_list(moment.changing)} moves or changes in brightness" if moment.changing else ""
 
 
-def _texture(facts: Facts, moment: Moment) -> str:
-    names = [surface.name for surface in facts.surfaces if surface.textured and "diffuse" in surface.lobes]
+def _texture(scene: SceneProperties, moment: Moment) -> str:
+    names = [surface.name for surface in scene.surfaces if surface.textured and "diffuse" in surface.lobes]
     return f"{_list(names)}: the reflectance varies over the surface" if names else ""
 
 
-def _environment(facts: Facts, moment: Moment) -> str:
-    names = [light.name for light in facts.lights if light.environment]
+def _environment(scene: SceneProperties, moment: Moment) -> str:
+    names = [light.name for light in scene.lights if light.environment]
     return f"{_list(names)} shines from all around" if names else ""
 
 
-def _media(facts: Facts, moment: Moment) -> str:
-    names = [surface.name for surface in facts.surfaces if surface.medium]
-    return f"{_list(names)} bounds a medium" if names else "the camera stands in a medium" if facts.medium else ""
+def _media(scene: SceneProperties, moment: Moment) -> str:
+    names = [surface.name for surface in scene.surfaces if surface.medium]
+    return f"{_list(names)} bounds a medium" if names else "the camera stands in a medium" if scene.medium else ""
 
 
-def _emission(facts: Facts, moment: Moment) -> str:
+def _emission(scene: SceneProperties, moment: Moment) -> str:
     return f"{_list(moment.shining)} is seen by the camera" if moment.shining else ""
 
 
-def _moving_reflection(facts: Facts, moment: Moment) -> str:
-    names = [surface.name for surface in facts.surfaces if {"glossy", "mirror"} & surface.lobes]
+def _moving_reflection(scene: SceneProperties, moment: Moment) -> str:
+    names = [surface.name for surface in scene.surfaces if {"glossy", "mirror"} & surface.lobes]
     if not names or not (moment.camera or moment.moving):
         return ""
     return f"{_list(moment.moving) or 'the camera'} moves, and {_list(names)} may reflect it"

@@ -14,7 +14,7 @@ from jaxdn.planning.catalogue import (
     THROUGH_CENTRES,
     NoisyLight,
 )
-from jaxdn.planning.found import Effects
+from jaxdn.planning.detected_effects import Effects
 
 GEOMETRY = frozenset({"albedo", "normal", "depth", "ids"})
 """Buffers that every scene has. A constant albedo is kept too: dividing by it makes scenes similar."""
@@ -22,6 +22,8 @@ COMPOSED = frozenset({"direct", "emission"})
 """Buffers that are added to the denoised image, whether or not the denoiser reads them."""
 SCORED = frozenset({"visible"})
 """Buffers that errors are reported by, where there is a reference: which pixels the previous frame did not see."""
+_ENTRIES = {"shared_with": "held"}
+"""Fields of a plan whose entry in a record has another name."""
 BOUND = 0.01
 """Largest share of an image's reflected light that limited path lengths may leave out."""
 
@@ -38,7 +40,7 @@ class Plan(NamedTuple):
     effects: tuple[str, ...]
     frames: tuple[tuple[str, ...], ...]
     """The buffers of each frame's file, without ``radiance``."""
-    held: tuple[int, ...]
+    shared_with: tuple[int, ...]
     """For each frame the one whose buffers and reference it shares; its own file then stores only the noise."""
 
     @property
@@ -52,27 +54,19 @@ class Plan(NamedTuple):
 
     def record(self) -> dict[str, Any]:
         """The plan as JSON, for ``clip.json`` and ``--json``; :func:`plan_from_record` is the inverse."""
-        return {
-            **self._asdict(),
-            "effects": list(self.effects),
-            "frames": [list(frame) for frame in self.frames],
-            "held": list(self.held),
-        }
-
-
-def entries(record: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """The entries of a plan's record that this version uses; those of earlier versions are dropped. None stays None."""
-    return None if record is None else {name: record[name] for name in Plan._fields if name in record}
+        own = {_ENTRIES.get(name, name): value for name, value in self._asdict().items()}
+        frames = [list(frame) for frame in self.frames]
+        return own | {"effects": list(self.effects), "frames": frames, "held": list(self.shared_with)}
 
 
 def plan_from_record(record: Mapping[str, Any]) -> Plan:
-    """The plan that :meth:`Plan.record` wrote, in this or an earlier version. Raises ValueError for missing entries."""
-    missing = [name for name in Plan._fields if name not in record]
-    if missing:
-        raise ValueError(f"plan: expected the entries {', '.join(Plan._fields)}; these are missing: {missing}.")
+    """The plan that :meth:`Plan.record` wrote. Raises ValueError for other entries than it writes."""
+    names = {_ENTRIES.get(name, name): name for name in Plan._fields}
+    if set(record) != set(names):
+        raise ValueError(f"plan: expected the entries {', '.join(names)}, got {', '.join(sorted(record))}.")
     frames = tuple(tuple(frame) for frame in record["frames"])
-    tuples = {"effects": tuple(record["effects"]), "frames": frames, "held": tuple(record["held"])}
-    return Plan(**{**(entries(record) or {}), **tuples})
+    tuples = {"effects": tuple(record["effects"]), "frames": frames, "shared_with": tuple(record["held"])}
+    return Plan(**{name: record[entry] for entry, name in names.items()} | tuples)
 
 
 def plan(
@@ -92,7 +86,7 @@ def plan(
     ``max_depth`` is the path length to render with, by default the scene's
     (:func:`jaxdn.render.path_depth.measure_depth` measures it). With ``light="reflected"`` direct light is a part of
     the noisy radiance, and its shadows have buffers, instead of a buffer of its own. With ``jitter`` no frame shows the
-    same as another, and what is found through the centres of pixels (``THROUGH_CENTRES``) is left out. With
+    same as another, and what is traced through the centres of pixels (``THROUGH_CENTRES``) is left out. With
     ``see_through`` the guides are those of what mirrors and glass show: what belongs to the first surface
     (``OF_FIRST_HITS``) is left out, and what moves in a mirror moves on screen.
     """
@@ -120,5 +114,5 @@ def plan(
         indirect=needed > DIRECT or (light == "reflected" and effects.lit),
         effects=effects.names,
         frames=tuple(buffers(present) for present in effects.frames),
-        held=tuple(range(len(effects.held))) if jitter else effects.held,
+        shared_with=tuple(range(len(effects.shared_with))) if jitter else effects.shared_with,
     )

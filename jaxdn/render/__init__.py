@@ -8,25 +8,27 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxdn.render.clip import render_clip as render_clip
-    from jaxdn.render.farm import ClipJob as ClipJob
-    from jaxdn.render.farm import render_clips as render_clips
     from jaxdn.render.frame import render_frame as render_frame
     from jaxdn.render.mitsuba.variant import choose_variant as choose_variant
     from jaxdn.render.mitsuba.variant import use_variant as use_variant
-    from jaxdn.render.opening import scene_from_record as scene_from_record
+    from jaxdn.render.open_scene import scene_from_record as scene_from_record
     from jaxdn.render.scenes.scene import AnimatedScene as AnimatedScene
     from jaxdn.render.scenes.scene import Camera as Camera
+    from jaxdn.render.settings import RenderSettings as RenderSettings
+    from jaxdn.render.worker_pool import ClipJob as ClipJob
+    from jaxdn.render.worker_pool import render_clips as render_clips
 
 _HOMES = {
     "AnimatedScene": "scenes.scene",
     "Camera": "scenes.scene",
-    "scene_from_record": "opening",
+    "scene_from_record": "open_scene",
     "choose_variant": "mitsuba.variant",
     "use_variant": "mitsuba.variant",
-    "ClipJob": "farm",
-    "render_clips": "farm",
+    "ClipJob": "worker_pool",
+    "render_clips": "worker_pool",
     "render_clip": "clip",
     "render_frame": "frame",
+    "RenderSettings": "settings",
 }
 
 __all__ = [*_HOMES]

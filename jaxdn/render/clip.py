@@ -2,114 +2,92 @@
 
 import importlib.metadata
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxdn.core.checks import check_at_least
-from jaxdn.data.clip.folder import begin_record, begun_record, finish_record, frame_path
+from jaxdn.data.clip.folder import begin_record, begun_record, finish_record, frame_path, is_clip
 from jaxdn.data.clip.frames import read_frame, write_frame
 from jaxdn.data.errors import ClipError
-from jaxdn.planning.catalogue import NoisyLight
-from jaxdn.planning.plan import Plan
 from jaxdn.render.buffers.geometry import View
-from jaxdn.render.frame import Rendered, check_options, path_length, render_frame, tracer
+from jaxdn.render.frame import Rendered, render_frame
 from jaxdn.render.mitsuba.errors import RenderError
-from jaxdn.render.mitsuba.variant import use_variant
+from jaxdn.render.resume import check_resumable
 from jaxdn.render.scenes.scene import AnimatedScene
-from jaxdn.render.settings import check_settings
+from jaxdn.render.settings import RenderSettings
+from jaxdn.render.tracing.tracer import choose_tracer
 
 
 def render_clip(
     scene: AnimatedScene,
     folder: str | Path,
+    settings: RenderSettings,
     *,
-    width: int,
-    height: int,
     frames: int | None = None,
-    layers: Sequence[int] = (1,),
-    reference_spp: int = 0,
-    max_depth: int | None = None,
-    seed: int = 0,
-    variant: str | None = None,
-    draws: int = 0,
-    light: NoisyLight = "indirect",
-    jitter: bool = False,
-    see_through: bool = False,
-    plan: Plan | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Path:
     """Render the frames 0 ... ``frames`` - 1 into ``folder``: one ``frame_0000.exr`` each, and then ``clip.json``.
 
     Existing complete frames are kept, so that an interrupted rendering is resumed; the folder must have been started
     with the same settings (ClipError otherwise). It only becomes a clip when all frames exist
-    (:func:`jaxdn.data.clip.folder.begin_record`). Returns the folder. Raises RenderError, naming the clip and the
-    frame, if a frame cannot be rendered or written.
+    (:func:`jaxdn.data.clip.folder.begin_record`); a clip that has them all is left as it is. Returns the folder. Raises
+    RenderError, naming the clip and the frame, if a frame cannot be rendered or written.
 
     Args:
       scene: to render.
       folder: of the clip.
-      width: in pixels.
-      height: in pixels.
+      settings: how; they are stored in the record.
       frames: number of frames; default: that of the scene.
-      layers: as in :func:`render_frame`, like the next nine.
-      reference_spp: samples per pixel of the reference; 0 for none.
-      max_depth: path length.
-      seed: of the random numbers.
-      variant: Mitsuba's.
-      draws: further images of one sample each.
-      light: what the radiance holds.
-      jitter: another point of the pixels in every frame.
-      see_through: guides of what mirrors and glass show.
-      plan: for these frames; it is stored in the record.
       progress: called with the index of every frame that is finished or already exists.
     """
     folder = Path(folder)
     frames = scene.frames if frames is None else frames
     check_at_least(1, frames=frames)
-    check_options(width, height, layers, reference_spp, draws, light, jitter, see_through, plan)
-    if plan is not None and len(plan.frames) != frames:
-        raise ValueError(f"plan: expected one for {frames} frames, got one for {len(plan.frames)}.")
-    chosen = use_variant(variant)
-    record: dict[str, Any] = {
-        "name": scene.name,
-        "frames": frames,
-        "width": width,
-        "height": height,
-        "layers": sorted(layers),
-        "reference_spp": reference_spp,
-        "draws": draws,
-        "light": light,
-        "jitter": jitter,
-        "see_through": see_through,
-        "variant": chosen,
-        "max_depth": path_length(scene, max_depth, plan),
-        "plan": None if plan is None else plan.record(),
-        "seed": seed,
-        "jittered": tracer(chosen).jittered,
-        "cameras": [_camera_record(scene, frame) for frame in range(frames)],
-        "scene": dict(scene.record),
-        "versions": _versions(),
-        "bad_samples": 0,
-    }
+    if settings.plan is not None and len(settings.plan.frames) != frames:
+        raise ValueError(f"plan: expected one for {frames} frames, got one for {len(settings.plan.frames)}.")
+    settings = settings.complete(scene)
+    record = _make_record(scene, frames, settings)
     before = begun_record(folder)
     if before is not None:
-        check_settings(folder, record, before)
+        check_resumable(folder, record, before)
         record["bad_samples"] = before.get("bad_samples", 0)
+    progress = progress or (lambda frame: None)
+    # To begin a record removes clip.json: a second renderer of a finished clip that is killed must not have done so.
+    if before is not None and _has_frames(folder, before, frames):
+        for frame in range(frames):
+            progress(frame)
+        return folder
     begin_record(record, folder)
-    options: dict[str, Any] = {"width": width, "height": height, "layers": layers, "reference_spp": reference_spp}
-    options |= {"max_depth": max_depth, "seed": seed, "variant": chosen, "draws": draws, "light": light}
-    options |= {"jitter": jitter, "see_through": see_through, "plan": plan}
+    _render_missing(scene, folder, settings, record, progress)
+    finish_record(record, folder)
+    return folder
+
+
+def _has_frames(folder: Path, begun: Mapping[str, Any], frames: int) -> bool:
+    """Whether a folder is a finished clip of so many frames, all of which are complete."""
+    complete = (_is_complete(frame_path(folder, frame)) for frame in range(frames))
+    return is_clip(folder) and begun["frames"] == frames and all(complete)
+
+
+def _render_missing(
+    scene: AnimatedScene,
+    folder: Path,
+    settings: RenderSettings,
+    record: dict[str, Any],
+    progress: Callable[[int], None],
+) -> None:
+    """Render the frames that a folder lacks; samples that were not finite are counted in its record."""
     previous: View | None = None
-    for frame in range(frames):
+    for frame in range(record["frames"]):
         path = frame_path(folder, frame)
-        if _is_whole(path):
+        if _is_complete(path):
             previous = None
         else:
             try:
-                rendered = render_frame(scene, frame, previous=previous, **options)
+                rendered = render_frame(scene, frame, settings, previous=previous)
                 _write(path, rendered)
             except Exception as error:
                 reason = f"{type(error).__name__}: {error}"
@@ -118,10 +96,7 @@ def render_clip(
             if rendered.bad_samples:
                 record["bad_samples"] += rendered.bad_samples
                 begin_record(record, folder)
-        if progress is not None:
-            progress(frame)
-    finish_record(record, folder)
-    return folder
+        progress(frame)
 
 
 def _write(path: Path, rendered: Rendered) -> None:
@@ -135,19 +110,33 @@ def _write(path: Path, rendered: Rendered) -> None:
     )
 
 
-def _camera_record(scene: AnimatedScene, frame: int) -> dict[str, Any]:
+def _make_record(scene: AnimatedScene, frames: int, settings: RenderSettings) -> dict[str, Any]:
+    """The record of a clip, with complete settings."""
+    return {
+        "name": scene.name,
+        "frames": frames,
+        **settings.record(),
+        "jittered": choose_tracer(settings.variant or "").jittered,
+        "cameras": [_record_camera(scene, frame) for frame in range(frames)],
+        "scene": dict(scene.record),
+        "versions": _list_versions(),
+        "bad_samples": 0,
+    }
+
+
+def _record_camera(scene: AnimatedScene, frame: int) -> dict[str, Any]:
     camera = scene.camera(frame)
     return {"to_world": np.asarray(camera.to_world, np.float64).tolist(), "x_fov": float(camera.x_fov)}
 
 
-def _versions() -> dict[str, str]:
+def _list_versions() -> dict[str, str]:
     return {
         "python": platform.python_version(),
         **{name: importlib.metadata.version(name) for name in ("mitsuba", "drjit")},
     }
 
 
-def _is_whole(path: Path) -> bool:
+def _is_complete(path: Path) -> bool:
     if not path.exists():
         return False
     try:

@@ -13,7 +13,8 @@ import numpy as np
 from jaxdn.planning.plan import BOUND
 from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.scene import AnimatedScene, brightness
-from jaxdn.render.tracing.seeds import DEPTH
+from jaxdn.render.tracing.seeds import DEPTH, SampleStream
+from jaxdn.render.tracing.tracer import choose_tracer
 
 _SIDE, _SAMPLES = 24, 16
 _FRAMES = 3
@@ -49,23 +50,22 @@ def measure_depth(scene: AnimatedScene, *, frames: int | None = None, bound: flo
     """
     if not 0 < bound < 1:
         raise ValueError(f"bound: expected a share of the light between 0 and 1, got {bound!r}.")
-    from jaxdn.render.frame import tracer
-
-    accumulate = tracer(use_variant()).accumulate
+    accumulate = choose_tracer(use_variant()).accumulate
+    stream = SampleStream(0, 0, DEPTH)
     found: list[PathDepth] = []
-    for frame in _measured_frames(scene, scene.frames if frames is None else frames):
+    for frame in _choose_frames(scene, scene.frames if frames is None else frames):
         built = scene.build(frame, _SIDE, _SIDE)
         light: dict[int, float] = {}
         for depth in sorted({min(depth, scene.max_depth) for depth in _DEPTHS}):
-            sums = accumulate(built, seed=0, frame=0, stream=DEPTH, first=0, count=_SAMPLES, max_depth=depth)
+            sums = accumulate(built, stream, 0, _SAMPLES, max_depth=depth)
             light[depth] = float(np.mean(sums.direct + sums.indirect)) / _SAMPLES
-            if depth >= 4 and _remaining(light) <= bound:
+            if depth >= 4 and _estimate_remaining(light) <= bound:
                 break
-        found.append(_shortest(light, bound)._replace(frame=frame))
+        found.append(_choose_shortest(light, bound)._replace(frame=frame))
     return max(found, key=lambda one: (one.max_depth, one.remaining))
 
 
-def _measured_frames(scene: AnimatedScene, frames: int) -> list[int]:
+def _choose_frames(scene: AnimatedScene, frames: int) -> list[int]:
     """The frames to measure; of those that show the same only the first."""
     chosen = {round(share * (frames - 1)) for share in np.linspace(0, 1, _FRAMES)}
     scales = [brightness(scene, frame) for frame in range(frames)]
@@ -81,15 +81,15 @@ def _measured_frames(scene: AnimatedScene, frames: int) -> list[int]:
     return list(different.values())
 
 
-def _gains(light: dict[int, float]) -> list[float]:
+def _compute_gains(light: dict[int, float]) -> list[float]:
     """The light added by each measured depth, per bounce."""
     depths = sorted(light)
     return [(light[b] - light[a]) / (b - a) for a, b in itertools.pairwise(depths)]
 
 
-def _remaining(light: dict[int, float]) -> float:
+def _estimate_remaining(light: dict[int, float]) -> float:
     """Share of the light that paths longer than the longest measured ones would add."""
-    depths, gains = sorted(light), _gains(light)
+    depths, gains = sorted(light), _compute_gains(light)
     total = light[depths[-1]]
     if total <= 0 or len(gains) < 2 or gains[-1] <= 0:
         return 0.0
@@ -106,10 +106,10 @@ def _remaining(light: dict[int, float]) -> float:
     return last * ratio / (1 - ratio) / total
 
 
-def _shortest(light: dict[int, float], bound: float) -> PathDepth:
+def _choose_shortest(light: dict[int, float], bound: float) -> PathDepth:
     """The shortest measured depth within the bound; the longest if none is."""
     depths = sorted(light)
-    tail = _remaining(light)
+    tail = _estimate_remaining(light)
     full = light[depths[-1]] * (1 + tail)
     found, left_out = depths[-1], tail / (1 + tail)
     for depth in depths[-2::-1]:

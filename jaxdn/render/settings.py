@@ -1,68 +1,103 @@
-"""Whether the frames that a folder already has were rendered with the settings that are wanted now."""
+"""The settings that a clip is rendered with, as one value: checked when it is made, and stored in ``clip.json``."""
 
 from collections.abc import Mapping
-from pathlib import Path
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from jaxdn.data.errors import ClipError
-from jaxdn.planning.plan import entries
-
-_FREE = ("frames", "cameras", "versions", "bad_samples")
-"""Entries of a record that may change when rendering is resumed."""
-
-UNSAID = {"draws": 0, "light": "indirect", "jitter": False, "see_through": False}
-"""What records of earlier versions do not say."""
+from jaxdn.core.checks import check_at_least, check_option
+from jaxdn.planning.catalogue import OF_FIRST_HITS, OF_SHADOWS, THROUGH_CENTRES, NoisyLight
+from jaxdn.planning.plan import Plan, plan_from_record
+from jaxdn.render.mitsuba.variant import use_variant
+from jaxdn.render.scenes.scene import AnimatedScene
 
 
-def check_settings(folder: Path, wanted: Mapping[str, Any], found: Mapping[str, Any]) -> None:
-    """Raise ClipError if the frames in a folder were rendered with other settings, naming those; both are records."""
-    # Frames may be added: what both records say about the same ones is compared.
-    common = min(int(found["frames"]), int(wanted["frames"]))
-    both = [{**UNSAID, **record, "plan": _planned(record.get("plan"), common)} for record in (found, wanted)]
-    names = [name for name in wanted if name not in _FREE]
-    differing = [line for name in names for line in _differences(name, both[0].get(name), both[1][name])]
-    cameras = zip(found.get("cameras", []), wanted["cameras"], strict=False)
-    if any(_plain(first) != _plain(second) for first, second in cameras):
-        differing.append("another camera path")
-    if differing:
-        if found["frames"] != wanted["frames"]:
-            differing.insert(0, f"{found['frames']} frames there, {wanted['frames']} wanted")
-        what = "; ".join(dict.fromkeys(differing))
-        raise ClipError(f"{folder}: was rendered with other settings ({what}); choose another folder or remove it.")
+@dataclass(frozen=True)
+class RenderSettings:
+    """How the frames of a clip are rendered. Raises ValueError as :meth:`check` does."""
 
+    width: int = 128
+    """In pixels."""
+    height: int = 128
+    """In pixels."""
+    layers: tuple[int, ...] = (1,)
+    """Samples per pixel of the independent noisy layers: powers of two, kept in ascending order."""
+    reference_spp: int = 0
+    """Samples per pixel of the reference; 0 for none."""
+    draws: int = 0
+    """Further images of one sample each, for training on noise that rarely repeats."""
+    light: NoisyLight = "indirect"
+    """What the radiance holds: ``"indirect"`` light, beside which there is ``direct``, or all that is ``"reflected"``,
+    without ``direct``."""
+    jitter: bool = False
+    """Rays go through another point of the pixels in every frame (:mod:`jaxdn.render.tracing.jitter`), and the
+    reference is the mean over each pixel, instead of everything through the centres."""
+    see_through: bool = False
+    """The guides of flat mirrors and of glass are those of what they show
+    (:mod:`jaxdn.render.buffers.primary_surface_replacement`); not with the scalar variant."""
+    variant: str | None = None
+    """Mitsuba's; None: the fastest that works here."""
+    max_depth: int | None = None
+    """Path length (1 emission, 2 direct light ...); None: that of the plan, else of the scene."""
+    plan: Plan | None = None
+    """What to leave out: buffers (None then), paths longer than its ``max_depth``, and, in a frame that shows the same
+    as an earlier one (``plan.shared_with``), everything except the noise. The rest is the same as without a plan, bit
+    for bit. Without one there are all buffers but those on request (:data:`jaxdn.core.frame.ON_REQUEST`)."""
+    seed: int = 0
+    """Of the random numbers."""
 
-def _planned(plan: Mapping[str, Any] | None, frames: int) -> dict[str, Any] | None:
-    """What a plan's record says about the first frames; the names of its effects follow from that."""
-    known = entries(plan)
-    if known is None:
-        return None
-    cut = {name: known[name][:frames] for name in ("frames", "held") if name in known}
-    return {name: value for name, value in known.items() if name != "effects"} | cut
+    def __post_init__(self) -> None:
+        self.check()
+        object.__setattr__(self, "layers", tuple(sorted(self.layers)))
 
+    def check(self) -> None:
+        """Raise ValueError for settings that are out of range or contradict each other."""
+        check_at_least(1, width=self.width, height=self.height)
+        powers = all(isinstance(spp, int) and spp >= 1 and spp & (spp - 1) == 0 for spp in self.layers)
+        if not self.layers or not powers or len(set(self.layers)) != len(self.layers):
+            raise ValueError(f"layers: expected different powers of two, such as (1, 2, 4), got {tuple(self.layers)}.")
+        if self.reference_spp < 0 or self.reference_spp == 1:
+            raise ValueError(f"reference_spp: expected 0 (no reference) or at least 2, got {self.reference_spp}.")
+        if self.draws < 0:
+            raise ValueError(f"draws: expected 0 or more images of one sample each, got {self.draws}.")
+        check_option(self.light, "light", ("indirect", "reflected"))
+        if self.draws and self.light == "reflected":
+            raise ValueError(
+                "draws: expected 0 with light 'reflected', as training draws indirect light; leave one out."
+            )
+        if self.max_depth is not None and self.max_depth < 1:
+            raise ValueError(f"max_depth: expected at least 1 (emission only), got {self.max_depth}.")
+        if self.plan is not None:
+            self._check_plan(self.plan)
 
-def _differences(name: str, there: Any, wanted: Any) -> list[str]:
-    """In words, one for each entry, where two values of a record differ; long ones are not written out."""
-    # Compared in the form read from JSON, where tuples have become lists.
-    there, wanted = _plain(there), _plain(wanted)
-    if there == wanted:
-        return []
-    if isinstance(there, dict) and isinstance(wanted, dict):
-        keys = dict.fromkeys((*wanted, *there))
-        return [line for key in keys for line in _differences(f"{name} {key}", there.get(key), wanted.get(key))]
-    if name == "plan frames":
-        pairs = ((index, set(old), set(new)) for index, (old, new) in enumerate(zip(there, wanted, strict=True)))
-        index, old, new = next((index, old, new) for index, old, new in pairs if old != new)
-        lists = (", ".join(sorted(buffers)) or "no more" for buffers in (old - new, new - old))
-        return ["buffers of frame {}: {} there, {} wanted".format(index, *lists)]
-    name = name.removeprefix("plan ")
-    if len(f"{there}{wanted}") > 120:
-        return [f"{name} differs"]
-    return [f"{name}: {there} there, {wanted} wanted"]
+    def _check_plan(self, plan: Plan) -> None:
+        """Raise ValueError for a plan that was made for other settings."""
+        buffers = set(plan.buffers)
+        if buffers & (OF_SHADOWS if self.light == "indirect" else {"direct"}):
+            raise ValueError(
+                f"plan: expected one that was made for light {self.light!r}; pass light={self.light!r} to effects.plan."
+            )
+        if self.jitter and (THROUGH_CENTRES & buffers or plan.shared_with != tuple(range(len(plan.frames)))):
+            raise ValueError("plan: expected one that was made for jitter; pass jitter=True to effects.plan.")
+        if self.see_through and OF_FIRST_HITS & buffers:
+            raise ValueError("plan: expected one that was made to see through; pass see_through=True to effects.plan.")
 
+    def record(self) -> dict[str, Any]:
+        """The settings as JSON, for ``clip.json``; :meth:`from_record` is the inverse."""
+        own = {field.name: getattr(self, field.name) for field in fields(self)}
+        return own | {"layers": list(self.layers), "plan": None if self.plan is None else self.plan.record()}
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> "RenderSettings":
+        """The settings in a clip's record, which has other entries besides. Raises ValueError for missing entries."""
+        names = [field.name for field in fields(cls)]
+        if missing := [name for name in names if name not in record]:
+            raise ValueError(f"clip record: expected {', '.join(names)}; these are missing: {', '.join(missing)}.")
+        own = {name: record[name] for name in names}
+        plan = None if own["plan"] is None else plan_from_record(own["plan"])
+        return cls(**own | {"layers": tuple(own["layers"]), "plan": plan})
+
+    def complete(self, scene: AnimatedScene) -> "RenderSettings":
+        """The same with the variant and the path length that they come to for a scene; switches to the variant."""
+        planned = None if self.plan is None else self.plan.max_depth
+        depth = self.max_depth or planned or scene.max_depth
+        return replace(self, variant=use_variant(self.variant), max_depth=depth)

@@ -1,8 +1,9 @@
 """``jaxdn denoise SCENE``: render and denoise frame by frame, with samples where the denoiser wants them."""
 
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +13,8 @@ from jaxdn.denoiser.rollout import stream
 from jaxdn.evaluation.report.images import save_png
 from jaxdn.planning.catalogue import OF_FIRST_HITS
 from jaxdn.render.adaptive import render_sampled
-from jaxdn.render.opening import open_scene
+from jaxdn.render.open_scene import open_scene
+from jaxdn.render.settings import RenderSettings
 from jaxdn.sequence.frame_denoiser import light_of
 from jaxdn.sequence.render_jobs import plan_clip
 from jaxdn.sequence.run import Written
@@ -23,17 +25,15 @@ MOST = 64
 """Samples that one pixel may have, in budgets; at least this many."""
 
 
-class Settings(NamedTuple):
+class SceneSettings(NamedTuple):
     """What is rendered and written."""
 
-    width: int = 128
-    height: int = 128
+    render: RenderSettings = RenderSettings()
+    """Size, seed and variant; the rest follows from the method."""
     frames: Collection[int] | None = None
     """Numbers of the frames to denoise; None: all of the scene."""
     budget: float = 4.0
     """Mean number of samples per pixel."""
-    seed: int = 0
-    """Of the samples."""
     preview: bool = False
     """Write a PNG next to each frame, and one of its samples."""
 
@@ -43,7 +43,7 @@ def denoise_scene(
     animation: Path | None,
     out: Path,
     method: Candidate,
-    settings: Settings,
+    settings: SceneSettings,
     *,
     on_frame: Callable[[Path, int, int], None] = lambda path, done, total: None,
     log: Callable[[str], None] = lambda line: None,
@@ -63,11 +63,10 @@ def denoise_scene(
     if method.denoiser is None:
         raise ValueError(f"--method {method.label}: expected a denoiser for a scene, got the noisy image itself.")
     reads = method.denoiser._replace(reads=method.denoiser.reads - OF_SAMPLES)
-    size: dict[str, Any] = {"width": settings.width, "height": settings.height}
-    through = not reads.reads & OF_FIRST_HITS
-    wished: dict[str, Any] = {"light": "reflected", "see_through": through}
-    planned = plan_clip(scene, denoiser=reads, frames=wanted[-1] + 1, **wished, **size)
+    rendering = replace(settings.render, light="reflected", see_through=not reads.reads & OF_FIRST_HITS)
+    planned = plan_clip(scene, rendering, frames=wanted[-1] + 1, denoiser=reads)
     assert planned is not None
+    rendering = replace(rendering, plan=planned.plan)
     if method.denoiser.samples is None and (settings.budget < 1 or settings.budget % 1):
         raise ValueError(
             f"--budget {settings.budget:g}: expected a whole number of at least 1, as {method.label} does not say "
@@ -80,21 +79,19 @@ def denoise_scene(
         asked = step.ask(frame, most)
         return np.full((*frame.radiance.shape[:2], 1), round(settings.budget)) if asked is None else np.asarray(asked)
 
-    if through and {"mirror", "transmission"} & set(planned.effects):
+    if rendering.see_through and {"mirror", "transmission"} & set(planned.effects):
         log("guides of flat mirrors and glass are those of what they show")
     files: list[Path] = []
     view = None
     for index in range(wanted[-1] + 1):
-        found = render_sampled(
-            scene, index, ask, plan=planned.plan, seed=settings.seed, previous=view, **wished, **size
-        )
-        view, counts = found.view, np.asarray(found.frame.sample_count)
-        image = np.asarray(step(found.frame))
+        sampled = render_sampled(scene, index, ask, rendering, previous=view)
+        view, counts = sampled.view, np.asarray(sampled.frame.sample_count)
+        image = np.asarray(step(sampled.frame))
         if index not in wanted:
             continue
         path = out / f"frame_{index:04d}.exr"
         path.parent.mkdir(parents=True, exist_ok=True)
-        picture = image + light_of(found.frame.emission)
+        picture = image + light_of(sampled.frame.emission)
         write_exr(path, name_channels("", picture) | name_channels("denoised.", image) | {"samples.Y": counts[..., 0]})
         if settings.preview:
             write_preview(path, picture)

@@ -8,7 +8,7 @@ import pytest
 
 from jaxdn.clips import ClipError, read_clip, write_clip
 from jaxdn.core.frame import Clip, Frame
-from jaxdn.data.evidence import read_facts
+from jaxdn.data.evidence import read_clip_properties
 from jaxdn.data.training.cache import open_cached
 from jaxdn.render.scenes.animation import check_animation, read_animation
 from jaxdn.zoo.weights import load_weights
@@ -37,7 +37,7 @@ def test_a_record_that_claims_endless_frames_is_refused_at_once(clip, read):
     assert time.monotonic() - began < 5
 
 
-@pytest.mark.parametrize("read", [read_clip, open_cached, read_facts])
+@pytest.mark.parametrize("read", [read_clip, open_cached, read_clip_properties])
 @pytest.mark.parametrize(
     "plan",
     [
@@ -63,7 +63,7 @@ def test_an_invalid_plan_is_refused(clip, read, plan):
 def test_a_record_with_fewer_cameras_than_frames_is_refused(clip):
     rewrite(clip, cameras=[{"x_fov": 60.0}])
     with pytest.raises(ClipError, match="cameras: expected"):
-        read_facts(clip)
+        read_clip_properties(clip)
 
 
 @pytest.mark.parametrize("number", [10**400, -(10**400)])

@@ -13,7 +13,7 @@ import pytest
 from jaxdn import clips
 from jaxdn.clips import ClipError
 from jaxdn.core.frame import BUFFERS, FAR, Clip, Frame
-from jaxdn.data.evidence import read_facts
+from jaxdn.data.evidence import read_clip_properties
 from jaxdn.data.exr.exr import to_half
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.vectors import convert_motion
@@ -288,7 +288,7 @@ def test_a_clip_counts_as_one_when_its_last_frame_is_written(tmp_path: Path, rng
     clips.write_frame(clips.frame_path(folder, 0), make_frame(rng, 5, 7))
     assert not clips.is_clip(folder)
     assert clips.begun_record(folder) == {"format": 1, **record}
-    for read in (clips.read_clip, clips.read_record, read_facts):
+    for read in (clips.read_clip, clips.read_record, read_clip_properties):
         with pytest.raises(ClipError, match="c: rendering this clip was interrupted; run the same command again"):
             read(folder)
     clips.finish_record(record, folder)
@@ -476,7 +476,7 @@ def test_foreign_frames_are_read_one_at_a_time(tmp_path: Path, rng: np.random.Ge
         # Only the latest frame is in memory; of the first one, its size and the names of its buffers.
         assert sum(reference() is not None for reference in alive) <= 1
     assert len(read) == 5
-    assert len(read_facts(tmp_path).moments) == 5  # whether anything moves does not depend on the convention
+    assert len(read_clip_properties(tmp_path).moments) == 5  # whether anything moves does not depend on the convention
 
 
 def test_foreign_sequences_that_are_not_one_clip_are_refused(tmp_path: Path, rng: np.random.Generator) -> None:

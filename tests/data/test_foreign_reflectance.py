@@ -11,7 +11,7 @@ import pytest
 from jaxdn import clips
 from jaxdn.brdf import directional_albedo
 from jaxdn.clips import ClipError
-from jaxdn.data.evidence import read_facts
+from jaxdn.data.evidence import read_clip_properties
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -77,7 +77,7 @@ def test_diffuse_and_specular_albedo_make_the_reflectance(tmp_path, scene, progr
     assert np.any(expected == 1)
     np.testing.assert_allclose(frame.reflectance, expected, atol=1e-6)
     assert lines[-1] == f"derived: reflectance = {diffuse!r} + {specular!r}"
-    assert read_facts(path).surfaces[0].specular
+    assert read_clip_properties(path).surfaces[0].specular
 
 
 def test_arnolds_total_is_not_added_to_its_part(tmp_path, scene):

@@ -19,7 +19,7 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
     monkeypatch.setattr(stages, "FAMILIES", ("fruit", "parlour"))
     monkeypatch.setattr(ntasd_holdout, "HELD_OUT", ("parlour",))
     # Rendering is a third of the time: of each clip, as many frames as give a network a history after its two.
-    monkeypatch.setattr(stages, "render", lambda *place, **how: render(*place, **{**how, "frames": 3}))
+    monkeypatch.setattr(stages, "render", lambda source, *how, **more: render(source._replace(frames=3), *how, **more))
     seen = ntasd_holdout.SEEN
     rows = (seen, f"{seen}, without parlour")
     tables = {

@@ -11,6 +11,7 @@ import jaxdn
 from jaxdn import color, effects
 from jaxdn.clips import read_clip
 from jaxdn.render.clip import render_clip
+from jaxdn.render.settings import RenderSettings
 from tests.render.render_scenes import grey, shift
 from tests.render.vector_scenes import FAST, Places, floor, look
 
@@ -46,10 +47,11 @@ def stage(ground, thing, lamp):
 
 
 def clip_of(scene, folder):
-    size: dict[str, Any] = {"width": 80, "height": 48, "frames": FRAMES}
+    size: dict[str, Any] = {"width": 80, "height": 48}
     denoiser = jaxdn.denoisers.trmv()
-    plan = effects.plan(effects.inspect(scene, **size), denoiser, light="reflected")
-    render_clip(scene, folder, **size, plan=plan, light="reflected", reference_spp=64, variant=FAST)
+    plan = effects.plan(effects.inspect(scene, frames=FRAMES, **size), denoiser, light="reflected")
+    settings = RenderSettings(**size, plan=plan, light="reflected", reference_spp=64, variant=FAST)
+    render_clip(scene, folder, settings, frames=FRAMES)
     return read_clip(folder)
 
 

@@ -15,7 +15,7 @@ from experiments.speed.small_rooms import CASES, FRAMES
 from jaxdn import effects
 from jaxdn.commands import inspect as command
 from jaxdn.core.frame import BUFFERS, ON_REQUEST, Frame
-from jaxdn.effects import EFFECTS, Effect, Effects, Facts, Light, Moment, Surface
+from jaxdn.effects import EFFECTS, Effect, Effects, Light, Moment, SceneProperties, Surface
 
 SIZE = {"width": 24, "height": 16}
 PLANNING = Path(effects.__file__).parent / "planning"
@@ -33,7 +33,7 @@ def test_effects_are_found_per_frame(tmp_path):
     found = effects.inspect(CASES["moving: ball, later"].write(tmp_path), **SIZE)
     moving = ["object-motion" in frame for frame in found.frames]
     assert moving == [False, False, True, True]
-    assert found.held == (0, 0, 2, 3)
+    assert found.shared_with == (0, 0, 2, 3)
 
 
 def test_the_first_frame_has_the_motion_of_the_second(tmp_path):
@@ -74,8 +74,8 @@ def test_a_constant_animation_has_constant_poses(tmp_path):
 
 
 def test_what_is_uncertain_counts_as_present():
-    facts = Facts((Surface("wall"),), (Light("lamp"),), (Moment(),), uncertain={"glossy": "not readable"})
-    found = effects.inspect(facts)
+    scene = SceneProperties((Surface("wall"),), (Light("lamp"),), (Moment(),), uncertain={"glossy": "not readable"})
+    found = effects.inspect(scene)
     assert "glossy" in found
     assert found.uncertain["glossy"] == "not readable"
     assert "roughness" in effects.plan(found).buffers
@@ -86,7 +86,7 @@ def test_a_new_effect_needs_no_change_of_the_planner(monkeypatch):
     glow = Effect(
         "fluorescence",
         "Light comes back in another colour.",
-        lambda facts, moment: "",
+        lambda scene, moment: "",
         frozenset({"luminance_gradient"}),
         depth=3,
         integrator="spectral",
@@ -103,7 +103,7 @@ def test_a_new_effect_needs_no_change_of_the_planner(monkeypatch):
 
 def test_the_planner_names_no_effect():
     names = {effect.name for effect in EFFECTS}
-    for file in ("plan.py", "found.py"):
+    for file in ("plan.py", "detected_effects.py"):
         tree = ast.parse((PLANNING / file).read_text())
         texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
         # "emission" is an effect, and a buffer that is added to every image.
@@ -112,7 +112,7 @@ def test_the_planner_names_no_effect():
 
 def test_planning_imports_no_upper_layer():
     code = (
-        "import sys; import jaxdn.planning.plan, jaxdn.planning.found; "
+        "import sys; import jaxdn.planning.plan, jaxdn.planning.detected_effects; "
         "print([name for name in sys.modules if name.startswith(('jaxdn.clips', 'jaxdn.render'))])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -124,7 +124,7 @@ def test_planning_imports_no_upper_layer():
 
 
 def test_a_plan_is_what_the_scene_has_and_the_denoiser_reads():
-    found = effects.chosen(["camera-motion", "disocclusion", "glossy", "indirect"], 3)
+    found = effects.choose_effects(["camera-motion", "disocclusion", "glossy", "indirect"], 3)
     svgf, ntd = jaxdn.denoisers.svgf(), jaxdn.denoisers.ntd(size="small")
     assert command.motion(effects.plan(found, svgf)) == "traditional"
     assert command.motion(effects.plan(found, ntd)) == "dual"
@@ -134,26 +134,20 @@ def test_a_plan_is_what_the_scene_has_and_the_denoiser_reads():
 
 
 def test_a_plan_round_trips_through_its_record():
-    made = effects.plan(effects.chosen(["glossy", "indirect"], 3), max_depth=5)
+    made = effects.plan(effects.choose_effects(["glossy", "indirect"], 3), max_depth=5)
     assert effects.plan_from_record(json.loads(json.dumps(made.record()))) == made
-    with pytest.raises(ValueError, match=r"expected the entries .* missing: .*held"):
+    with pytest.raises(ValueError, match=r"expected the entries .*held, got integrator"):
         effects.plan_from_record({"integrator": "path"})
-
-
-def test_a_plan_of_an_earlier_version_is_read():
-    made = effects.plan(effects.chosen(["glossy", "indirect"], 3), max_depth=5)
-    earlier = {"bound": 0.01, "remaining": 0.002, "motion": "none", "lobes_apart": False, "gradient_samples": False}
-    assert effects.plan_from_record(made.record() | earlier | {"demodulation": "none"}) == made
 
 
 def test_every_entry_of_a_plan_is_used():
     # What is only for readers follows from these, and is printed by `jaxdn inspect`.
-    assert set(effects.Plan._fields) == {"integrator", "max_depth", "indirect", "effects", "frames", "held"}
+    assert set(effects.Plan._fields) == {"integrator", "max_depth", "indirect", "effects", "frames", "shared_with"}
 
 
 def test_unknown_effects_raise_with_the_known_ones():
     with pytest.raises(ValueError, match=r"unknown 'fog'; expected auto, all or camera-motion, .*media"):
-        effects.chosen(["fog"], 1)
+        effects.choose_effects(["fog"], 1)
 
 
 @pytest.mark.parametrize("scene", ["nowhere", "nowhere.xml", 7])
@@ -170,7 +164,7 @@ def test_every_effect_has_a_description():
 
 
 def test_left_out_buffers_are_relative_to_rendering_without_a_plan():
-    nothing = effects.plan(effects.chosen([], 1))
+    nothing = effects.plan(effects.choose_effects([], 1))
     assert command.bytes_a_pixel(command.EVERYTHING) == 88
     assert set(command.left_out(nothing)) == {name for effect in EFFECTS for name in effect.buffers} - ON_REQUEST
     assert command.bytes_a_pixel(nothing) == 18 + sum(BUFFERS[name].bytes for name in nothing.buffers)
@@ -226,7 +220,7 @@ def test_a_user_error_ends_with_one_message(tmp_path):
 
 
 def test_effects_cannot_be_changed_by_accident():
-    found = effects.everything(1)
+    found = effects.choose_all_effects(1)
     with pytest.raises(dataclasses.FrozenInstanceError):
         found.names = ()
     assert len(found) == len(EFFECTS)

@@ -18,6 +18,7 @@ from jaxdn.data.clip.folder import frame_path, is_clip, read_record
 from jaxdn.methods.registry import methods
 from jaxdn.render.clip import render_clip
 from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.render.settings import RenderSettings
 from tests.needs import require_module
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -42,9 +43,11 @@ def rendered(case, folder):
     folder.mkdir(parents=True, exist_ok=True)
     scene = SceneFile(case.write(folder))
     found = effects.inspect(scene, width=WIDTH, height=HEIGHT)
-    options = {"width": WIDTH, "height": HEIGHT, "frames": FRAMES, "reference_spp": 2, "layers": LAYERS}
-    everything = render_clip(scene, folder / "all", **options)
-    return everything, render_clip(scene, folder / "auto", plan=effects.plan(found), **options)
+    options = {"width": WIDTH, "height": HEIGHT, "reference_spp": 2, "layers": LAYERS}
+    everything = render_clip(scene, folder / "all", RenderSettings(**options), frames=FRAMES)
+    return everything, render_clip(
+        scene, folder / "auto", RenderSettings(plan=effects.plan(found), **options), frames=FRAMES
+    )
 
 
 @pytest.fixture(scope="session")
@@ -141,7 +144,12 @@ def test_an_interrupted_plan_resumes_bit_for_bit(tmp_path):
         frame_path(auto, index).unlink()
     scene = SceneFile(tmp_path / "scene.xml")
     plan = effects.plan_from_record(read_record(auto)["plan"])
-    render_clip(scene, auto, width=WIDTH, height=HEIGHT, frames=FRAMES, reference_spp=2, layers=LAYERS, plan=plan)
+    render_clip(
+        scene,
+        auto,
+        RenderSettings(width=WIDTH, height=HEIGHT, reference_spp=2, layers=LAYERS, plan=plan),
+        frames=FRAMES,
+    )
     assert [frame_path(auto, index).read_bytes() for index in range(FRAMES)] == before
 
 

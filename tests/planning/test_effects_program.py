@@ -19,7 +19,7 @@ KINDS = {"visible": bool, "ids": jnp.int32}
 
 def frame_for(*names):
     """A frame with the buffers that a scene of these effects has, as shapes."""
-    plan = effects.plan(effects.chosen(["indirect", *names], 2))
+    plan = effects.plan(effects.choose_effects(["indirect", *names], 2))
 
     def shape(name):
         return jax.ShapeDtypeStruct((*SIZE, CHANNELS.get(name, 3)), KINDS.get(name, jnp.float32))
@@ -73,7 +73,7 @@ def test_disocclusion_is_one_warp_too(gathers_of_a_warp):
 
 @pytest.mark.parametrize("name", jaxdn.denoisers.NAMES)
 def test_every_effect_adds_operations_or_nothing(name):
-    everything = len(default_step(name, *effects.everything(1)).splitlines())
+    everything = len(default_step(name, *effects.choose_all_effects(1)).splitlines())
     nothing = len(default_step(name).splitlines())
     assert nothing < everything
 

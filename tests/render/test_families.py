@@ -8,8 +8,9 @@ import pytest
 
 from jaxdn.render.families import FAMILIES, family_scene, furniture, shapes, textures
 from jaxdn.render.families.staging import Stage, glass, look_at, matte, rod, scale, shift, shuttle, turn
-from jaxdn.render.opening import scene_from_record
+from jaxdn.render.open_scene import scene_from_record
 from jaxdn.render.scenes.scene import AnimatedScene, Camera, brightness
+from jaxdn.render.settings import RenderSettings
 from tests.needs import require_module
 
 NAMES = sorted(FAMILIES)
@@ -329,8 +330,11 @@ def test_a_later_part_is_rendered_with_its_motion(mitsuba: Any) -> None:
 
     whole, later = (scene_from_record({"family": "dash", "seed": 2, **start}) for start in ({}, {"start": 3}))
     size: Any = {"width": 12, "height": 8, "variant": "scalar_rgb"}
-    wanted, found = render_frame(whole, 4, **size).frame, render_frame(later, 1, **size).frame
+    wanted, found = (
+        render_frame(whole, 4, RenderSettings(**size)).frame,
+        render_frame(later, 1, RenderSettings(**size)).frame,
+    )
     for buffer in ("depth", "normal", "albedo", "motion", "visible"):
         np.testing.assert_array_equal(getattr(found, buffer), getattr(wanted, buffer), err_msg=buffer)
     assert np.abs(found.motion).max() > 0.5
-    assert not render_frame(later, 0, **size).frame.motion.any()
+    assert not render_frame(later, 0, RenderSettings(**size)).frame.motion.any()

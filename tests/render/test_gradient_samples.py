@@ -7,10 +7,13 @@ import pytest
 
 from jaxdn import effects
 from jaxdn.color import LUMINANCE
-from jaxdn.render.buffers.gradient_samples import luminance_gradient, pick, scattered
-from jaxdn.render.frame import render_frame, tracer
+from jaxdn.render.buffers.frame_pair import BuiltFrame, FramePair
+from jaxdn.render.buffers.gradient_samples import compute_luminance_gradient, pick_points, scatter_samples
+from jaxdn.render.frame import render_frame
 from jaxdn.render.mitsuba.variant import choose_variant, use_variant
-from jaxdn.render.tracing.seeds import NOISY, frame_key
+from jaxdn.render.settings import RenderSettings
+from jaxdn.render.tracing.seeds import NOISY, SampleStream
+from jaxdn.render.tracing.tracer import choose_tracer
 from tests.needs import require
 from tests.render.render_scenes import HEIGHT, PIXEL, SQUARE_Z, WIDTH, Stage, fast_variants, grey, shift
 
@@ -44,7 +47,7 @@ def variant(request: pytest.FixtureRequest) -> str:
 
 
 def gradient(scene: Stage, variant: str, frame: int = 1) -> np.ndarray:
-    found = render_frame(scene, frame, variant=variant, **SIZE).frame.luminance_gradient
+    found = render_frame(scene, frame, RenderSettings(variant=variant, **SIZE)).frame.luminance_gradient
     assert found is not None
     assert found.shape == (HEIGHT, WIDTH, 2)
     assert found.dtype == np.float32
@@ -82,15 +85,17 @@ def test_the_samples_are_those_of_the_previous_noisy_image() -> None:
     require("llvm")  # scalar variants cannot replay the samples of their images
     variant = choose_variant().variant
     for layers in ((1,), (2,)):
-        found = render_frame(Lamp(1, 0), 1, variant=variant, layers=layers, **SIZE).frame.luminance_gradient
+        found = render_frame(
+            Lamp(1, 0), 1, RenderSettings(variant=variant, layers=layers, **SIZE)
+        ).frame.luminance_gradient
         there = found[..., 1] > 0
         assert there.any()
         if layers == (1,):
-            image = render_frame(Lamp(1, 0), 0, variant=variant, **SIZE).frame.radiance @ LUMINANCE
+            image = render_frame(Lamp(1, 0), 0, RenderSettings(variant=variant, **SIZE)).frame.radiance @ LUMINANCE
             np.testing.assert_allclose(found[there, 1], image[there], rtol=1e-5)
         else:  # the first of the two samples
-            sample = tracer(variant).accumulate(
-                Lamp(1, 0).build(0, WIDTH, HEIGHT), seed=5, frame=0, stream=NOISY, first=1, count=1, max_depth=4
+            sample = choose_tracer(variant).accumulate(
+                Lamp(1, 0).build(0, WIDTH, HEIGHT), SampleStream(5, 0, NOISY), 1, 1, max_depth=4
             )
             np.testing.assert_allclose(found[there, 1], (sample.indirect @ LUMINANCE)[there], rtol=1e-5)
 
@@ -107,10 +112,10 @@ def test_what_is_hidden_now_is_left_out() -> None:
     use_variant()
     slid = Stage(square=lambda frame: shift(-3 * PIXEL * frame, 0, SQUARE_Z))
     options = {**SIZE, "variant": choose_variant().variant}
-    first, second = (render_frame(slid, frame, **options).view for frame in (0, 1))
+    first, second = (render_frame(slid, frame, RenderSettings(**options)).view for frame in (0, 1))
     assert first is not None
     assert second is not None
-    picked = pick(first, second, seed=5, frame=1)
+    picked = pick_points(first, second, SampleStream(5, 1, NOISY))
     # Those of the square itself have moved three pixels to the right, all others none.
     here = np.stack([picked.pixel % WIDTH, picked.pixel // WIDTH], -1) + 0.5
     moved = picked.target - here
@@ -121,15 +126,15 @@ def test_what_is_hidden_now_is_left_out() -> None:
 
     replayed = []
 
-    def replay(scene, target, pixel, **options):
-        found = tracer(choose_variant().variant).replay(scene, target, pixel, **options)
+    def replay(*arguments, **options):
+        found = choose_tracer(choose_variant().variant).replay(*arguments, **options)
         replayed.append(found)
         # Every sample changes, so that those that are kept can be told from the buffer.
         return found._replace(light=np.full_like(found.light, len(replayed)))
 
     scenes = [slid.build(frame, WIDTH, HEIGHT) for frame in (0, 1)]
-    numbers = {"seed": 5, "frame": 1, "sample": 0, "max_depth": 4}
-    buffer = luminance_gradient(replay, (scenes[0], first), (scenes[1], second), **numbers)
+    frames = FramePair(BuiltFrame(scenes[0], first), BuiltFrame(scenes[1], second), SampleStream(5, 1, NOISY), 0)
+    buffer = compute_luminance_gradient(replay, frames, max_depth=4)
     kept = np.argwhere(buffer[..., 1] > 0)
     # Where the wall was and the square is now, only samples of the square remain.
     now = second.gbuffer.ids[..., 0] == second.gbuffer.names.index("square")
@@ -143,17 +148,17 @@ def test_what_is_hidden_now_is_left_out() -> None:
 
 def test_strata_at_the_border_and_the_sky() -> None:
     use_variant()
-    view = render_frame(Stage(), 0, **SIZE).view
+    view = render_frame(Stage(), 0, RenderSettings(**SIZE)).view
     assert view is not None
-    picked = pick(view, view, seed=1, frame=3)
+    picked = pick_points(view, view, SampleStream(1, 3, NOISY))
     strata = {(int(y) // 3, int(x) // 3) for x, y in picked.target}
     assert len(strata) == len(picked.pixel) == np.prod(STRATA)
     ids = view.gbuffer.ids.copy()
     ids[:, :4] = -1
-    fewer = pick(view._replace(gbuffer=view.gbuffer._replace(ids=ids)), view, seed=1, frame=3)
+    fewer = pick_points(view._replace(gbuffer=view.gbuffer._replace(ids=ids)), view, SampleStream(1, 3, NOISY))
     assert len(fewer.pixel) == np.prod(STRATA) - STRATA[0]  # a stratum with one column left still has its sample
     assert np.all(fewer.pixel % WIDTH >= 4)
-    other = pick(view, view, seed=1, frame=4)
+    other = pick_points(view, view, SampleStream(1, 4, NOISY))
     assert 0.5 < np.mean(other.pixel != picked.pixel) < 1
 
 
@@ -168,38 +173,42 @@ def test_of_samples_in_one_stratum_the_nearest_is_kept_in_any_order(rng: np.rand
                 nearest = min(inside, key=lambda i: (depth[i], i))
                 x, y = np.floor(target[nearest]).astype(int)
                 expected[y, x] = samples[nearest]
-    np.testing.assert_array_equal(scattered(samples, target, depth, (7, 10)), expected)
+    np.testing.assert_array_equal(scatter_samples(samples, target, depth, (7, 10)), expected)
     unique = rng.permutation(np.arange(40.0))
     order = rng.permutation(40)
     np.testing.assert_array_equal(
-        scattered(samples, target, unique, (7, 10)), scattered(samples[order], target[order], unique[order], (7, 10))
+        scatter_samples(samples, target, unique, (7, 10)),
+        scatter_samples(samples[order], target[order], unique[order], (7, 10)),
     )
-    assert not scattered(samples * [0, 1], target, depth, (7, 10)).any()
+    assert not scatter_samples(samples * [0, 1], target, depth, (7, 10)).any()
 
 
 def test_it_is_planned_only_for_a_method_that_reads_it() -> None:
     import jaxdn
 
-    found = effects.chosen(["changing-light", "indirect"], 2)
+    found = effects.choose_effects(["changing-light", "indirect"], 2)
     assert "luminance_gradient" in effects.plan(found, jaxdn.denoisers.asvgf()).buffers
     assert "luminance_gradient" not in effects.plan(found, jaxdn.denoisers.svgf()).buffers
-    still = effects.chosen(["indirect"], 2)
+    still = effects.choose_effects(["indirect"], 2)
     assert "luminance_gradient" not in effects.plan(still, jaxdn.denoisers.asvgf()).buffers
     plan = effects.plan(found, jaxdn.denoisers.svgf())
-    assert render_frame(Lamp(1, 2), 1, plan=plan, **{**SIZE, "max_depth": None}).frame.luminance_gradient is None
+    assert (
+        render_frame(Lamp(1, 2), 1, RenderSettings(plan=plan, **{**SIZE, "max_depth": None})).frame.luminance_gradient
+        is None
+    )
 
 
 def test_a_sample_that_is_not_finite_says_nothing(variant: str) -> None:
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": 3e38}}
     ball = {"type": "sphere", "center": [0, 2, 2], "radius": 1.0, "emitter": emitter}
-    found = tracer(variant).replay(
+    found = choose_tracer(variant).replay(
         Stage(shapes={"lamp": ball}, extra={"more": {"type": "sphere", "center": [3, 0, 4], "bsdf": grey(0.9)}}).build(
             0, WIDTH, HEIGHT
         ),
+        SampleStream(0, 0, NOISY),
+        0,
         np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), -1).reshape(-1, 2),
         np.arange(WIDTH * HEIGHT),
-        key=frame_key(0, 0, NOISY),
-        sample=0,
         max_depth=4,
     )
     assert np.isfinite(found.light).all()

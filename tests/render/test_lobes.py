@@ -14,6 +14,7 @@ from jaxdn.planning.catalogue import OF_SHADOWS
 from jaxdn.render.clip import render_clip
 from jaxdn.render.frame import render_frame
 from jaxdn.render.mitsuba.variant import choose_variant
+from jaxdn.render.settings import RenderSettings
 from tests.render.render_scenes import HEIGHT, WALL_Z, WIDTH, Stage, grey, shift, turn
 
 FAST = choose_variant().variant
@@ -34,7 +35,7 @@ GLOSSY = {"type": "roughplastic", "alpha": 0.3, "diffuse_reflectance": {"type": 
 
 
 def everything(frames=1):
-    return effects.plan(effects.everything(frames), READER)
+    return effects.plan(effects.choose_all_effects(frames), READER)
 
 
 class Walled(Stage):
@@ -76,7 +77,7 @@ class Gap(Walled):
 
 
 def rendered(scene, **options):
-    found = render_frame(scene, 0, **{**SIZE, "plan": everything(), "variant": FAST, **options})
+    found = render_frame(scene, 0, RenderSettings(**{**SIZE, "plan": everything(), "variant": FAST, **options}))
     return found.frame
 
 
@@ -86,7 +87,7 @@ def test_requesting_the_parts_leaves_everything_else_bit_for_bit(bsdf):
     scene = Walled(bsdf)
     whole = rendered(scene)
     assert set(present(whole)) >= USUAL
-    usual = render_frame(scene, 0, **SIZE, variant=FAST).frame
+    usual = render_frame(scene, 0, RenderSettings(**SIZE, variant=FAST)).frame
     assert not set(present(usual)) & ON_REQUEST
     for name in ("radiance", *present(usual)):
         np.testing.assert_array_equal(getattr(usual, name), getattr(whole, name), err_msg=name)
@@ -170,13 +171,13 @@ def test_the_specular_reflectance_of_plastic_is_its_fresnel_reflectance():
 def test_infinity_turns_with_the_camera_and_does_not_move_with_it():
     plan = everything(2)._replace(frames=(tuple(name for name in GUIDES if name not in OF_SAMPLES),) * 2)
     options: dict[str, Any] = {**SIZE, "variant": "scalar_rgb", "plan": plan}
-    moved = render_frame(Stage(camera=lambda frame: shift(0.1 * frame, 0, 0)), 1, **options).frame
+    moved = render_frame(Stage(camera=lambda frame: shift(0.1 * frame, 0, 0)), 1, RenderSettings(**options)).frame
     assert np.max(np.abs(moved.far_motion)) < 1e-5
     assert np.min(np.abs(moved.motion[..., 0])) > 0.1
-    turned = render_frame(Stage(camera=lambda frame: turn(3.0 * frame)), 1, **options).frame
+    turned = render_frame(Stage(camera=lambda frame: turn(3.0 * frame)), 1, RenderSettings(**options)).frame
     np.testing.assert_allclose(turned.far_motion, turned.motion, atol=1e-4)
     assert np.min(np.abs(turned.far_motion[..., 0])) > 0.1
-    still = render_frame(Stage(square=lambda frame: shift(frame, 0, 3)), 1, **options).frame
+    still = render_frame(Stage(square=lambda frame: shift(frame, 0, 3)), 1, RenderSettings(**options)).frame
     assert not np.any(still.far_motion)
 
 
@@ -184,16 +185,18 @@ def test_the_scalar_variant_refuses_what_it_cannot_render():
     with pytest.raises(
         ValueError, match="scalar_rgb cannot render glossy_motion, hit_distance, specular, specular_hit_distance"
     ):
-        render_frame(Stage(), 0, **SIZE, variant="scalar_rgb", plan=everything())
+        render_frame(Stage(), 0, RenderSettings(**SIZE, variant="scalar_rgb", plan=everything()))
 
 
 @needs_fast
 def test_buffers_of_samples_are_each_frames_own_and_belong_to_one_layer(tmp_path):
     # Both frames show the same: the second one's file holds its noise alone.
-    plan = effects.plan(effects.chosen(["indirect", "specular"], 2), READER)
-    assert plan.held == (0, 0)
+    plan = effects.plan(effects.choose_effects(["indirect", "specular"], 2), READER)
+    assert plan.shared_with == (0, 0)
     scene = Walled(GLOSSY)
-    render_clip(scene, tmp_path, **SIZE, frames=2, layers=(1, 2), reference_spp=2, variant=FAST, plan=plan)
+    render_clip(
+        scene, tmp_path, RenderSettings(**SIZE, layers=(1, 2), reference_spp=2, variant=FAST, plan=plan), frames=2
+    )
     clip = read_clip(tmp_path)
     assert set(present(clip.frames)) >= {"specular", "hit_distance", "specular_hit_distance"}
     assert not np.array_equal(clip.frames.specular[0], clip.frames.specular[1])
@@ -211,7 +214,7 @@ def test_buffers_of_samples_are_each_frames_own_and_belong_to_one_layer(tmp_path
 
 
 def test_only_a_denoiser_that_reads_them_gets_them():
-    found = effects.everything(1)
+    found = effects.choose_all_effects(1)
     assert not ON_REQUEST & set(effects.plan(found).buffers)
     assert not ON_REQUEST & set(effects.plan(found, jaxdn.denoisers.svgf()).buffers)
     assert set(effects.plan(found, READER).buffers) >= USUAL

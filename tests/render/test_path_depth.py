@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxdn.render.opening import open_scene
+from jaxdn.render.open_scene import open_scene
 from jaxdn.render.path_depth import measure_depth
 
 

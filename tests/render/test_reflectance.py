@@ -10,7 +10,8 @@ from experiments.speed.small_rooms import CASES
 from jaxdn import effects
 from jaxdn.render.frame import render_frame
 from jaxdn.render.mitsuba.variant import choose_variant, use_variant
-from jaxdn.render.opening import open_scene
+from jaxdn.render.open_scene import open_scene
+from jaxdn.render.settings import RenderSettings
 
 FAST = choose_variant().variant
 NAMES = (
@@ -36,9 +37,9 @@ def scalar():
 
 
 def found(name):
-    from jaxdn.render.buffers.gbuffer import gbuffer
+    from jaxdn.render.buffers.gbuffer import trace_gbuffer
 
-    there = gbuffer(paper.ball(paper.materials()[name]), reflectance=True)
+    there = trace_gbuffer(paper.ball(paper.materials()[name]), reflectance=True)
     assert there.reflectance is not None
     return there
 
@@ -96,7 +97,7 @@ def test_it_is_a_fraction_and_1_where_nothing_is_hit(fast):
 
 def test_it_does_not_depend_on_the_seed(fast, tmp_path):
     scene = open_scene(CASES["a ball: textured roughness"].write(tmp_path))
-    frames = [render_frame(scene, 0, width=24, height=16, seed=seed).frame for seed in (0, 1)]
+    frames = [render_frame(scene, 0, RenderSettings(width=24, height=16, seed=seed)).frame for seed in (0, 1)]
     assert not np.array_equal(frames[0].radiance, frames[1].radiance)
     np.testing.assert_array_equal(frames[0].reflectance, frames[1].reflectance)
 
@@ -151,6 +152,6 @@ def test_a_scene_of_diffuse_surfaces_stores_the_albedo_alone(fast, tmp_path, cas
     scene = CASES[case].write(tmp_path)
     plan = effects.plan(effects.inspect(scene, width=24, height=16))
     assert ("reflectance" in plan.buffers) == there
-    frame = render_frame(open_scene(scene), 0, width=24, height=16, plan=plan).frame
+    frame = render_frame(open_scene(scene), 0, RenderSettings(width=24, height=16, plan=plan)).frame
     assert (frame.reflectance is not None) == there
     assert frame.albedo is not None

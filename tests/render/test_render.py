@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,16 @@ from jaxdn import effects
 from jaxdn.clips import ClipError, read_frame
 from jaxdn.core.frame import present
 from jaxdn.data.clip.folder import begun_record, is_clip, read_record
-from jaxdn.render import farm
+from jaxdn.render import worker_pool
 from jaxdn.render.clip import render_clip
-from jaxdn.render.frame import Rendered, render_frame, tracer
+from jaxdn.render.frame import Rendered, render_frame
 from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.render.mitsuba.variant import choose_variant, llvm_candidates, use_variant
-from jaxdn.render.opening import scene_from_record
+from jaxdn.render.open_scene import scene_from_record
 from jaxdn.render.scenes.scene import AnimatedScene
-from jaxdn.render.tracing.seeds import NOISY, REFERENCE, frame_key, pass_seed, tea
+from jaxdn.render.settings import RenderSettings
+from jaxdn.render.tracing.seeds import NOISY, REFERENCE, SampleStream, make_frame_key, make_pass_seed, tea
+from jaxdn.render.tracing.tracer import choose_tracer
 from tests.needs import LLVM_15, require
 from tests.render.render_scenes import HEIGHT, PIXEL, SQUARE_Z, WIDTH, Stage, fast_variants, shift
 
@@ -40,7 +43,8 @@ def variant(request: pytest.FixtureRequest) -> str:
 def converged() -> dict[str, Rendered]:
     """One frame by every variant, with as many samples as a test has time for."""
     return {
-        name: render_frame(Stage(), 0, reference_spp=SAMPLES, seed=1, variant=name, **SIZE) for name in fast_variants()
+        name: render_frame(Stage(), 0, RenderSettings(reference_spp=SAMPLES, seed=1, variant=name, **SIZE))
+        for name in fast_variants()
     }
 
 
@@ -93,7 +97,7 @@ def test_light_is_never_negative_and_always_finite(variant: str, converged: dict
 def test_light_that_is_not_finite_counts_as_black(variant: str) -> None:
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": 3e38}}
     lamp = {"type": "sphere", "center": [0, 2, 2], "radius": 1.0, "emitter": emitter}
-    found = render_frame(Stage(shapes={"lamp": lamp}), 0, reference_spp=4, variant=variant, **SIZE)
+    found = render_frame(Stage(shapes={"lamp": lamp}), 0, RenderSettings(reference_spp=4, variant=variant, **SIZE))
     for image in (found.frame.radiance, found.frame.direct, found.frame.emission, found.reference):
         assert image is not None
         assert np.isfinite(image).all()
@@ -102,8 +106,8 @@ def test_light_that_is_not_finite_counts_as_black(variant: str) -> None:
 
 
 def test_without_a_bounce_nothing_is_indirect(variant: str) -> None:
-    two = render_frame(Stage(), 0, max_depth=2, variant=variant, **SIZE)
-    one = render_frame(Stage(), 0, max_depth=1, variant=variant, **SIZE)
+    two = render_frame(Stage(), 0, RenderSettings(max_depth=2, variant=variant, **SIZE))
+    one = render_frame(Stage(), 0, RenderSettings(max_depth=1, variant=variant, **SIZE))
     assert np.all(two.frame.radiance == 0)
     assert np.any(two.frame.direct)
     assert np.all(one.frame.radiance == 0)
@@ -113,14 +117,14 @@ def test_without_a_bounce_nothing_is_indirect(variant: str) -> None:
 def test_emission_is_what_shines_into_the_camera(variant: str) -> None:
     emitter = {"type": "area", "radiance": {"type": "rgb", "value": [1.0, 2.0, 3.0]}}
     square = {"type": "sphere", "center": [0, 0, SQUARE_Z], "radius": 1.0, "emitter": emitter}
-    found = render_frame(Stage(shapes={"square": square}), 0, variant=variant, **SIZE).frame
+    found = render_frame(Stage(shapes={"square": square}), 0, RenderSettings(variant=variant, **SIZE)).frame
     assert found.emission is not None
     np.testing.assert_allclose(found.emission[HEIGHT // 2, WIDTH // 2], [1, 2, 3], rtol=1e-5)
     assert np.all(found.emission[0, 0] == 0)
 
 
 def test_the_reference_shares_no_sample_with_the_noise(variant: str) -> None:
-    found = render_frame(Stage(), 0, layers=(2,), reference_spp=4, variant=variant, **SIZE)
+    found = render_frame(Stage(), 0, RenderSettings(layers=(2,), reference_spp=4, variant=variant, **SIZE))
     assert found.reference_half is not None
     assert found.reference is not None
     # Two samples each: equal images would be the same samples.
@@ -131,13 +135,12 @@ def test_the_reference_shares_no_sample_with_the_noise(variant: str) -> None:
 
 @pytest.mark.parametrize("room", ["all at once", "one set at a time"])
 def test_sets_of_samples_are_those_that_are_traced_alone(variant: str, room: str) -> None:
-    trace, scene = tracer(variant), Stage().build(0, WIDTH, HEIGHT)
-    numbers: dict[str, Any] = {"seed": 3, "frame": 1, "stream": REFERENCE, "max_depth": Stage.max_depth, "count": 2}
-    few = {} if room == "all at once" or trace.jittered else {"max_lanes": 3 * WIDTH * HEIGHT}
-    found = trace.accumulate_sets(scene, 3, first=4, **numbers, **few)
+    tracer, scene, stream = choose_tracer(variant), Stage().build(0, WIDTH, HEIGHT), SampleStream(3, 1, REFERENCE)
+    few = {} if room == "all at once" or tracer.jittered else {"max_lanes": 3 * WIDTH * HEIGHT}
+    found = tracer.accumulate_sets(scene, stream, 4, 2, 3, max_depth=Stage.max_depth, **few)
     assert len(found) == 3
     for index, one in enumerate(found):
-        alone = trace.accumulate(scene, first=4 + 2 * index, **numbers)
+        alone = tracer.accumulate(scene, stream, 4 + 2 * index, 2, max_depth=Stage.max_depth)
         assert one.bad == alone.bad
         for mine, other in zip(one[:3], alone[:3], strict=True):
             np.testing.assert_array_equal(mine, other)
@@ -146,8 +149,10 @@ def test_sets_of_samples_are_those_that_are_traced_alone(variant: str, room: str
 
 def test_half_of_the_reference_measures_its_noise(variant: str) -> None:
     """The difference of reference and half has half the variance of the half itself: as large as the reference's."""
-    found = render_frame(Stage(), 0, reference_spp=64, seed=3, variant=variant, **SIZE)
-    truth = render_frame(Stage(), 0, reference_spp=256 if variant != "scalar_rgb" else 128, seed=4, **SIZE).reference
+    found = render_frame(Stage(), 0, RenderSettings(reference_spp=64, seed=3, variant=variant, **SIZE))
+    truth = render_frame(
+        Stage(), 0, RenderSettings(reference_spp=256 if variant != "scalar_rgb" else 128, seed=4, **SIZE)
+    ).reference
     assert found.reference is not None
     assert found.reference_half is not None
     assert truth is not None
@@ -166,23 +171,23 @@ def test_a_frame_depends_only_on_its_arguments(variant: str) -> None:
     """Rendered after its predecessor, alone, or with other layers: the same bit for bit."""
     scene = sliding()
     options: dict[str, Any] = {"reference_spp": 2, "variant": variant, **SIZE}
-    first = render_frame(scene, 0, **options)
-    after = render_frame(scene, 1, previous=first.view, **options)
-    alone = render_frame(sliding(), 1, **options)
+    first = render_frame(scene, 0, RenderSettings(**options))
+    after = render_frame(scene, 1, RenderSettings(**options), previous=first.view)
+    alone = render_frame(sliding(), 1, RenderSettings(**options))
     assert same(after, alone)
-    more = render_frame(scene, 1, layers=(1, 4), **options)
+    more = render_frame(scene, 1, RenderSettings(layers=(1, 4), **options))
     assert np.array_equal(more.layers[1], alone.layers[1])
-    assert not np.array_equal(render_frame(scene, 1, seed=1, **options).layers[1], alone.layers[1])
-    still = [render_frame(Stage(), frame, **options).layers[1] for frame in (0, 1)]
+    assert not np.array_equal(render_frame(scene, 1, RenderSettings(seed=1, **options)).layers[1], alone.layers[1])
+    still = [render_frame(Stage(), frame, RenderSettings(**options)).layers[1] for frame in (0, 1)]
     assert not np.array_equal(still[0], still[1])
 
 
 def test_motion_in_a_frame_is_that_of_the_geometry(variant: str) -> None:
-    first = render_frame(sliding(), 0, variant=variant, **SIZE).frame
+    first = render_frame(sliding(), 0, RenderSettings(variant=variant, **SIZE)).frame
     assert np.all(first.motion == 0)
     assert np.all(first.dual_motion == 0)
     assert np.all(first.visible)
-    frame = render_frame(sliding(), 1, variant=variant, **SIZE).frame
+    frame = render_frame(sliding(), 1, RenderSettings(variant=variant, **SIZE)).frame
     assert frame.motion is not None
     assert frame.dual_motion is not None
     assert frame.visible is not None
@@ -192,15 +197,15 @@ def test_motion_in_a_frame_is_that_of_the_geometry(variant: str) -> None:
 
 
 def test_a_clip_is_written_and_resumes_where_it_was_interrupted(variant: str, tmp_path: Path) -> None:
-    options: dict[str, Any] = {"frames": 3, "layers": (1, 2), "reference_spp": 2, "variant": variant, **SIZE}
-    whole = render_clip(sliding(), tmp_path / "whole", **options)
+    settings = RenderSettings(layers=(1, 2), reference_spp=2, variant=variant, **SIZE)
+    whole = render_clip(sliding(), tmp_path / "whole", settings, frames=3)
 
     def interrupt(frame: int) -> None:
         if frame == 1:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        render_clip(sliding(), tmp_path / "parts", progress=interrupt, **options)
+        render_clip(sliding(), tmp_path / "parts", settings, frames=3, progress=interrupt)
     parts = tmp_path / "parts"
     names = ["clip.unfinished.json", "frame_0000.exr", "frame_0001.exr"]
     assert sorted(path.name for path in parts.iterdir()) == names
@@ -210,7 +215,7 @@ def test_a_clip_is_written_and_resumes_where_it_was_interrupted(variant: str, tm
     (parts / "frame_0001.exr").write_bytes(damaged[: len(damaged) // 2])
     stamp = (parts / "frame_0000.exr").stat().st_mtime_ns
     seen: list[int] = []
-    render_clip(sliding(), parts, progress=seen.append, **options)
+    render_clip(sliding(), parts, settings, frames=3, progress=seen.append)
     assert seen == [0, 1, 2]
     assert is_clip(parts)
     assert not (parts / "clip.unfinished.json").exists()
@@ -234,16 +239,17 @@ import os, signal, sys
 sys.path.insert(0, sys.argv[2])
 from tests.render.render_scenes import HEIGHT, WIDTH, Stage
 from jaxdn.render.clip import render_clip
+from jaxdn.render.settings import RenderSettings
 def kill(frame):
     if frame == 1:
         os.kill(os.getpid(), signal.SIGKILL)
-size = {"width": WIDTH, "height": HEIGHT}
-render_clip(Stage(), sys.argv[1], frames=3, reference_spp=2, variant="scalar_rgb", progress=kill, **size)
+settings = RenderSettings(width=WIDTH, height=HEIGHT, reference_spp=2, variant="scalar_rgb")
+render_clip(Stage(), sys.argv[1], settings, frames=3, progress=kill)
 """
 
 
 def test_a_killed_rendering_leaves_no_clip_and_resumes(tmp_path: Path) -> None:
-    options: dict[str, Any] = {"frames": 3, "reference_spp": 2, "variant": "scalar_rgb", **SIZE}
+    settings = RenderSettings(reference_spp=2, variant="scalar_rgb", **SIZE)
     parts = tmp_path / "parts"
     done = subprocess.run([sys.executable, "-c", KILLED, str(parts), str(Path(__file__).parents[2])], check=False)
     assert done.returncode == -signal.SIGKILL
@@ -251,60 +257,67 @@ def test_a_killed_rendering_leaves_no_clip_and_resumes(tmp_path: Path) -> None:
     assert not is_clip(parts)
     with pytest.raises(ClipError):
         read_record(parts)
-    render_clip(Stage(), parts, **options)
+    render_clip(Stage(), parts, settings, frames=3)
     assert is_clip(parts)
-    whole = render_clip(Stage(), tmp_path / "whole", **options)
+    whole = render_clip(Stage(), tmp_path / "whole", settings, frames=3)
     assert read_record(parts) == read_record(whole)
     for index in range(3):
         name = f"frame_{index:04d}.exr"
         assert (parts / name).read_bytes() == (whole / name).read_bytes()
 
 
+def test_a_second_renderer_of_a_finished_clip_that_is_killed_leaves_the_clip(tmp_path: Path) -> None:
+    clip = tmp_path / "clip"
+    render_clip(Stage(), clip, RenderSettings(reference_spp=2, variant="scalar_rgb", **SIZE), frames=3)
+    before = {path.name: path.read_bytes() for path in clip.iterdir()}
+    done = subprocess.run([sys.executable, "-c", KILLED, str(clip), str(Path(__file__).parents[2])], check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert {path.name: path.read_bytes() for path in clip.iterdir()} == before
+    assert is_clip(clip)
+
+
 def test_a_finished_clip_that_gets_more_frames_is_unfinished_until_it_has_them(tmp_path: Path) -> None:
     options: dict[str, Any] = {"variant": "scalar_rgb", **SIZE}
-    render_clip(Stage(), tmp_path, frames=1, **options)
+    render_clip(Stage(), tmp_path, RenderSettings(**options), frames=1)
     assert is_clip(tmp_path)
 
     def interrupt(frame: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        render_clip(Stage(), tmp_path, frames=2, progress=interrupt, **options)
+        render_clip(Stage(), tmp_path, RenderSettings(**options), frames=2, progress=interrupt)
     assert not is_clip(tmp_path)
-    render_clip(Stage(), tmp_path, frames=2, **options)
+    render_clip(Stage(), tmp_path, RenderSettings(**options), frames=2)
     assert read_record(tmp_path)["frames"] == 2
 
 
 def test_without_a_plan_every_buffer_of_every_effect_is_rendered() -> None:
-    frame = render_frame(Stage(), 0, variant="scalar_rgb", **SIZE).frame
-    assert set(present(frame)) == set(effects.plan(effects.everything(1)).buffers)
+    frame = render_frame(Stage(), 0, RenderSettings(variant="scalar_rgb", **SIZE)).frame
+    assert set(present(frame)) == set(effects.plan(effects.choose_all_effects(1)).buffers)
 
 
-def test_a_clip_with_the_plan_of_an_earlier_version_resumes(tmp_path: Path) -> None:
+def test_a_clip_is_finished_with_all_its_frames_and_the_same_settings_alone(tmp_path: Path) -> None:
     scene = {"family": "fruit", "seed": 0}
-    plan = effects.plan(effects.chosen(["indirect"], 2))
-    options: dict[str, Any] = {"frames": 2, "variant": "scalar_rgb", **SIZE}
-    render_clip(scene_from_record(scene), tmp_path, plan=plan, **options)
-    record = json.loads((tmp_path / "clip.json").read_text())
-    record["plan"] |= {"motion": "none", "lobes_apart": False, "gradient_samples": False, "demodulation": "none"}
-    (tmp_path / "clip.json").write_text(json.dumps(record))
-    job = farm.ClipJob(scene, str(tmp_path), WIDTH, HEIGHT, 2, plan=plan.record())
-    assert farm._finished(job)
+    settings = RenderSettings(plan=effects.plan(effects.choose_effects(["indirect"], 2)), **SIZE)
+    render_clip(scene_from_record(scene), tmp_path, replace(settings, variant="scalar_rgb"), frames=2)
+    job = worker_pool.ClipJob(scene, str(tmp_path), 2, settings)
+    assert worker_pool._is_finished(job)
     (tmp_path / "frame_0001.exr").unlink()
-    assert not farm._finished(job)
-    render_clip(scene_from_record(scene), tmp_path, plan=plan, **options)
-    assert farm._finished(job)
-    assert farm._finished(job._replace(seed=1)) is False
+    assert not worker_pool._is_finished(job)
+    render_clip(scene_from_record(scene), tmp_path, replace(settings, variant="scalar_rgb"), frames=2)
+    assert worker_pool._is_finished(job)
+    for change in ({"seed": 1}, {"plan": None}, {"max_depth": 2}, {"variant": "llvm_ad_rgb"}, {"draws": 1}):
+        assert not worker_pool._is_finished(job._replace(settings=replace(settings, **change)))
 
 
 def test_other_settings_in_the_same_folder_raise(tmp_path: Path) -> None:
-    options: dict[str, Any] = {"frames": 1, "variant": "scalar_rgb", **SIZE}
-    render_clip(Stage(), tmp_path, **options)
+    settings = RenderSettings(variant="scalar_rgb", **SIZE)
+    render_clip(Stage(), tmp_path, settings, frames=1)
     with pytest.raises(ClipError, match="seed: 0 there, 5 wanted"):
-        render_clip(Stage(), tmp_path, seed=5, **options)
+        render_clip(Stage(), tmp_path, replace(settings, seed=5), frames=1)
     with pytest.raises(ClipError, match="another camera path"):
-        render_clip(Stage(camera=lambda frame: shift(0.1, 0, 0)), tmp_path, **options)
-    render_clip(Stage(), tmp_path, **{**options, "frames": 2})  # more frames with the same settings are allowed
+        render_clip(Stage(camera=lambda frame: shift(0.1, 0, 0)), tmp_path, settings, frames=1)
+    render_clip(Stage(), tmp_path, settings, frames=2)  # more frames with the same settings are allowed
     assert (tmp_path / "frame_0001.exr").exists()
 
 
@@ -315,7 +328,7 @@ def test_a_scene_that_fails_is_named_with_its_frame(tmp_path: Path) -> None:
         return shift(0, 0, SQUARE_Z)
 
     with pytest.raises(RenderError, match=r"'stage'.*frame 1: ArithmeticError: no pose here"):
-        render_clip(Stage(square=breaks), tmp_path, frames=2, variant="scalar_rgb", **SIZE)
+        render_clip(Stage(square=breaks), tmp_path, RenderSettings(variant="scalar_rgb", **SIZE), frames=2)
     assert (tmp_path / "frame_0000.exr").exists()
     assert not is_clip(tmp_path)
 
@@ -341,7 +354,7 @@ def test_unsupported_effects_raise(variant: str, effect: str) -> None:
         film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}
         extra = {"sensor": {**extra["sensor"], "film": film}}
     with pytest.raises(ValueError, match=effect):
-        render_frame(Stage(extra=extra), 0, variant=variant, **SIZE)
+        render_frame(Stage(extra=extra), 0, RenderSettings(variant=variant, **SIZE))
 
 
 @pytest.mark.parametrize(
@@ -358,7 +371,7 @@ def test_unsupported_effects_raise(variant: str, effect: str) -> None:
 )
 def test_options_out_of_range_raise(options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        render_frame(Stage(), 0, **{"variant": "scalar_rgb", **SIZE, **options})
+        render_frame(Stage(), 0, RenderSettings(**{"variant": "scalar_rgb", **SIZE, **options}))
 
 
 def test_a_record_without_a_known_family_raises() -> None:
@@ -376,7 +389,7 @@ def test_the_kernel_is_not_compiled_again_for_another_frame() -> None:
 
     def kernels(frame: int, seed: int) -> set[Any]:
         dr.kernel_history_clear()
-        render_frame(sliding(), frame, layers=(4,), reference_spp=8, seed=seed, variant=fast, **SIZE)
+        render_frame(sliding(), frame, RenderSettings(layers=(4,), reference_spp=8, seed=seed, variant=fast, **SIZE))
         return {entry["hash"] for entry in dr.kernel_history([dr.KernelType.JIT])}
 
     # Objects are numbered in the order of creation; the numbers are constant after two frames.
@@ -389,11 +402,11 @@ def test_the_kernel_is_not_compiled_again_for_another_frame() -> None:
 
 
 def test_seeds_are_all_different() -> None:
-    keys = {frame_key(seed, frame, stream) for seed in range(8) for frame in range(64) for stream in (0, 1)}
+    keys = {make_frame_key(seed, frame, stream) for seed in range(8) for frame in range(64) for stream in (0, 1)}
     assert len(keys) == 8 * 64 * 2
     assert len({tea(first, second) for first in range(64) for second in range(64)}) == 64 * 64
     # At 128 x 128 Mitsuba uses only its low 18 bits.
-    passes = {pass_seed(3, 7, stream, index) % 2**18 for stream in (NOISY, REFERENCE) for index in range(4096)}
+    passes = {make_pass_seed(3, 7, stream, index) % 2**18 for stream in (NOISY, REFERENCE) for index in range(4096)}
     assert len(passes) == 2 * 4096
 
 
@@ -431,12 +444,12 @@ def test_the_users_choice_wins_and_old_libraries_are_not_candidates(monkeypatch:
 
 
 def test_a_worker_that_dies_is_reported_with_its_clip(tmp_path: Path) -> None:
-    job = farm.ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "lost"), WIDTH, HEIGHT, 4)
-    worker = farm._start(job, threads=1)
+    job = worker_pool.ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "lost"), 4, RenderSettings(**SIZE))
+    worker = worker_pool._start_worker(job, threads=1)
     worker.process.kill()
     deadline, failure, ended = time.monotonic() + 60, "", False
     while not ended and time.monotonic() < deadline:
-        _, failure, ended = farm._listen(worker)
+        _, failure, ended = worker_pool._read_messages(worker)
     assert ended
     assert "lost" in failure
     assert "frame 0" in failure
@@ -450,16 +463,21 @@ def begin(folder: Path, scene: dict[str, Any], variant: str) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        render_clip(scene_from_record(scene), folder, frames=2, variant=variant, progress=interrupt, **SIZE)
+        render_clip(
+            scene_from_record(scene), folder, RenderSettings(variant=variant, **SIZE), frames=2, progress=interrupt
+        )
 
 
 def test_a_job_keeps_the_variant_that_its_clip_was_started_with(tmp_path: Path) -> None:
     scene = {"family": "fruit", "seed": 0}
     begin(tmp_path, scene, "scalar_rgb")
-    job = farm.ClipJob(scene, str(tmp_path), WIDTH, HEIGHT, 2)
-    assert farm._as_begun(job).variant == "scalar_rgb"
-    assert farm._as_begun(job._replace(variant="llvm_ad_rgb")).variant == "llvm_ad_rgb"
-    assert farm._as_begun(job._replace(folder=str(tmp_path / "new"))).variant is None
+    job = worker_pool.ClipJob(scene, str(tmp_path), 2, RenderSettings(**SIZE))
+    assert worker_pool._keep_variant(job).settings.variant == "scalar_rgb"
+    assert (
+        worker_pool._keep_variant(job._replace(settings=replace(job.settings, variant="llvm_ad_rgb"))).settings.variant
+        == "llvm_ad_rgb"
+    )
+    assert worker_pool._keep_variant(job._replace(folder=str(tmp_path / "new"))).settings.variant is None
 
 
 def test_a_clip_started_with_a_variant_that_does_not_run_here_is_named(tmp_path: Path) -> None:
@@ -467,16 +485,16 @@ def test_a_clip_started_with_a_variant_that_does_not_run_here_is_named(tmp_path:
     begin(tmp_path, scene, "scalar_rgb")
     file = tmp_path / "clip.unfinished.json"
     file.write_text(file.read_text().replace("scalar_rgb", "vulkan_rgb"))
-    job = farm.ClipJob(scene, str(tmp_path), WIDTH, HEIGHT, 2)
+    job = worker_pool.ClipJob(scene, str(tmp_path), 2, RenderSettings(**SIZE))
     with pytest.raises(ValueError, match=rf"{tmp_path.name}.*vulkan_rgb"):
-        farm.render_clips([job], progress=False)
+        worker_pool.render_clips([job], progress=False)
 
 
 @pytest.mark.slow
 def test_an_interrupted_clip_is_finished_with_the_variant_it_was_started_with(tmp_path: Path) -> None:
     scene = {"family": "fruit", "seed": 0}
     begin(tmp_path, scene, "scalar_rgb")
-    farm.render_clips([farm.ClipJob(scene, str(tmp_path), WIDTH, HEIGHT, 2)], progress=False)
+    worker_pool.render_clips([worker_pool.ClipJob(scene, str(tmp_path), 2, RenderSettings(**SIZE))], progress=False)
     assert is_clip(tmp_path)
     record = begun_record(tmp_path)
     assert record is not None
@@ -485,33 +503,38 @@ def test_an_interrupted_clip_is_finished_with_the_variant_it_was_started_with(tm
 
 @pytest.mark.slow
 def test_clips_are_rendered_in_parallel_and_failures_do_not_stop_the_others(tmp_path: Path) -> None:
-    good = farm.ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "good"), WIDTH, HEIGHT, 2)
-    bad = farm.ClipJob({"family": "nothing"}, str(tmp_path / "bad"), WIDTH, HEIGHT, 2)
+    good = worker_pool.ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "good"), 2, RenderSettings(**SIZE))
+    bad = worker_pool.ClipJob({"family": "nothing"}, str(tmp_path / "bad"), 2, RenderSettings(**SIZE))
     steps: list[tuple[int, int]] = []
     with pytest.raises(RenderError, match=r"1 of 2(.|\n)*bad(.|\n)*'nothing'"):
-        farm.render_clips([bad, good], workers=2, progress=lambda done, total: steps.append((done, total)))
+        worker_pool.render_clips([bad, good], workers=2, progress=lambda done, total: steps.append((done, total)))
     assert steps[-1] == (2, 4)
     assert len(list((tmp_path / "good").glob("frame_*.exr"))) == 2
     assert is_clip(tmp_path / "good")
     assert not is_clip(tmp_path / "bad")
     with pytest.raises(ValueError, match="a different folder for every clip"):
-        farm.render_clips([good, good], progress=False)
+        worker_pool.render_clips([good, good], progress=False)
 
 
 @pytest.mark.slow
 def test_a_finished_clip_needs_no_process(tmp_path, monkeypatch):
-    from jaxdn.render import ClipJob, farm
+    from jaxdn.render import ClipJob, worker_pool
 
-    job = ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "c"), 16, 12, 2, reference_spp=2, variant="scalar_rgb")
-    farm.render_clips([job], progress=False)
+    job = ClipJob(
+        {"family": "fruit", "seed": 0},
+        str(tmp_path / "c"),
+        2,
+        RenderSettings(width=16, height=12, reference_spp=2, variant="scalar_rgb"),
+    )
+    worker_pool.render_clips([job], progress=False)
     started = []
-    start = farm._start
-    monkeypatch.setattr(farm, "_start", lambda *a, **k: started.append(a) or start(*a, **k))
+    start = worker_pool._start_worker
+    monkeypatch.setattr(worker_pool, "_start_worker", lambda *a, **k: started.append(a) or start(*a, **k))
     seen = []
-    farm.render_clips([job], progress=lambda done, total: seen.append((done, total)))
+    worker_pool.render_clips([job], progress=lambda done, total: seen.append((done, total)))
     assert not started
     assert seen == [(2, 2)]
     (tmp_path / "c" / "frame_0001.exr").unlink()
-    farm.render_clips([job], progress=False)
+    worker_pool.render_clips([job], progress=False)
     assert len(started) == 1
     assert (tmp_path / "c" / "frame_0001.exr").is_file()

@@ -1,5 +1,7 @@
 """``jaxdn render``: scenes are opened and planned once, and the clips match the options."""
 
+from dataclasses import replace
+
 import pytest
 
 from experiments.speed.small_rooms import CASES
@@ -8,19 +10,14 @@ from jaxdn.commands import main
 from jaxdn.data.clip.folder import is_clip, read_record
 from jaxdn.render.clip import render_clip
 from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.render.settings import RenderSettings
 from jaxdn.sequence import render_jobs as command
 
-OPTIONS = {
-    "animation": None,
-    "width": 24,
-    "height": 16,
-    "frames": 2,
-    "reference_spp": 2,
-    "layers": [1],
-    "max_depth": None,
-    "effects": "auto",
-    "workers": 1,
-}
+SETTINGS = RenderSettings(width=24, height=16, reference_spp=2)
+
+
+def render(source, out, settings=SETTINGS, **options):
+    return command.render(command.ClipSource(str(source), **{"frames": 2, **options}), out, settings, workers=2)
 
 
 @pytest.fixture
@@ -46,13 +43,13 @@ def counted(monkeypatch):
 
 def test_a_scene_file_is_opened_and_planned_once_for_all_seeds(counted, tmp_path, capsys):
     path = CASES["moving: ball"].write(tmp_path)
-    command.render(str(path), tmp_path / "out", seeds=[3, 5, 8], **OPTIONS)
+    render(path, tmp_path / "out", seeds=[3, 5, 8])
     assert (counted["opened"], counted["planned"]) == (1, 1)
     jobs = counted["jobs"]
     name = tmp_path.name
-    assert [job.seed for job in jobs] == [3, 5, 8]
+    assert [job.settings.seed for job in jobs] == [3, 5, 8]
     assert [job.folder for job in jobs] == [str(tmp_path / "out" / f"{name}-{seed}") for seed in (3, 5, 8)]
-    assert all(job.plan == jobs[0].plan for job in jobs)
+    assert all(job.settings.plan == jobs[0].settings.plan for job in jobs)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("rendering with Mitsuba's ")
     found = "object-motion, disocclusion, indirect, moving-shadow; paths of depth 6"
@@ -60,44 +57,43 @@ def test_a_scene_file_is_opened_and_planned_once_for_all_seeds(counted, tmp_path
 
 
 def test_every_seed_of_a_family_is_a_different_scene(counted, tmp_path):
-    command.render("fruit", tmp_path, seeds=[0, 1], **OPTIONS)
+    render("fruit", tmp_path, seeds=[0, 1])
     assert (counted["opened"], counted["planned"]) == (2, 2)
     assert [job.scene for job in counted["jobs"]] == [{"family": "fruit", "seed": seed} for seed in (0, 1)]
 
 
 @pytest.mark.parametrize(("effects", "planned"), [("all", False), ("indirect, glossy", True)])
 def test_chosen_effects_are_not_inspected(counted, tmp_path, effects, planned):
-    command.render("fruit", tmp_path, seeds=[0], **{**OPTIONS, "effects": effects})
+    render("fruit", tmp_path, effects=effects)
     assert counted["planned"] == 0
-    assert (counted["jobs"][0].plan is not None) == planned
+    assert (counted["jobs"][0].settings.plan is not None) == planned
 
 
 @pytest.mark.parametrize("reference_spp", [0, 4])
 def test_what_errors_are_reported_by_is_rendered_with_the_reference_alone(counted, tmp_path, reference_spp):
     path = CASES["moving: ball"].write(tmp_path)
-    options = {**OPTIONS, "reference_spp": reference_spp, "denoiser": "taa"}
-    command.render(str(path), tmp_path / "out", seeds=[0], **options)
-    buffers = counted["jobs"][0].plan["frames"][1]
+    render(path, tmp_path / "out", replace(SETTINGS, reference_spp=reference_spp), denoiser="taa")
+    buffers = counted["jobs"][0].settings.plan.frames[1]
     assert "motion" in buffers
     assert ("visible" in buffers) == (reference_spp > 0)
 
 
 def test_an_invalid_scene_is_refused_at_once(tmp_path, capsys):
     with pytest.raises(ValueError, match=r"'castle': expected a family \(dash, .*\) or a Mitsuba scene"):
-        command.render("castle", tmp_path, seeds=[0], **OPTIONS)
+        render("castle", tmp_path)
     assert capsys.readouterr().out == ""
 
 
 def test_an_animation_of_a_family_is_refused_and_not_ignored(tmp_path):
     with pytest.raises(ValueError, match="expected none for the family 'fruit'"):
-        command.render("fruit", tmp_path / "out", seeds=[0], **{**OPTIONS, "animation": tmp_path / "walk.json"})
+        render("fruit", tmp_path / "out", animation=tmp_path / "walk.json")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
 def test_clips_are_rendered(tmp_path):
     path = CASES["static grey box"].write(tmp_path)
-    folders = command.render(str(path), tmp_path / "out", seeds=[0, 1], **{**OPTIONS, "workers": 2})
+    folders = render(path, tmp_path / "out", seeds=[0, 1])
     assert all(is_clip(folder) for folder in folders)
     assert [read_record(folder)["seed"] for folder in folders] == [0, 1]
 
@@ -127,10 +123,10 @@ def test_sample_counts_out_of_range_are_refused_before_planning(option, value, t
     assert (counted["opened"], counted["planned"]) == (0, 0)
 
 
-def planned_clip(scene, folder, frames, **options):
-    size = {"width": 16, "height": 12}
-    planned = command.plan_clip(scene, frames=frames, max_depth=options.pop("max_depth", 3), **size)
-    render_clip(scene, folder, frames=frames, plan=planned.plan, **{"seed": 1, **size, **options})
+def planned_clip(scene, folder, frames, seed=1, max_depth=3):
+    settings = RenderSettings(width=16, height=12, seed=seed, max_depth=max_depth)
+    planned = command.plan_clip(scene, settings, frames=frames)
+    render_clip(scene, folder, replace(settings, plan=planned.plan), frames=frames)
 
 
 def test_a_clip_gets_more_frames_and_other_settings_are_said_in_words(tmp_path):

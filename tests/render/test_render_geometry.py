@@ -8,8 +8,8 @@ import pytest
 
 from jaxdn.core.frame import FAR
 from jaxdn.ops.motion import dual_motion, occlusion_mask
-from jaxdn.render.buffers.gbuffer import GBuffer, gbuffer
-from jaxdn.render.buffers.geometry import Motion, View, motion_between, project, relative_poses
+from jaxdn.render.buffers.gbuffer import GBuffer, trace_gbuffer
+from jaxdn.render.buffers.geometry import Motion, View, compute_motion, compute_relative_poses, project
 from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.scene import Camera
 from tests.render.render_scenes import (
@@ -36,12 +36,12 @@ def variant(request: pytest.FixtureRequest) -> str:
 
 
 def view(stage: Stage, frame: int) -> View:
-    return View(gbuffer(stage.build(frame, WIDTH, HEIGHT)), stage.camera(frame), stage.pose(frame))
+    return View(trace_gbuffer(stage.build(frame, WIDTH, HEIGHT)), stage.camera(frame), stage.pose(frame))
 
 
 def moved(stage: Stage) -> tuple[View, View, Motion]:
     previous, current = view(stage, 0), view(stage, 1)
-    return current, previous, motion_between(current, previous)
+    return current, previous, compute_motion(current, previous)
 
 
 def dual(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
@@ -190,7 +190,7 @@ def slide(pixels: float, count: int = 8, depth: float = 4.0) -> np.ndarray:
 
 def flat_motion(now: list[int], before: list[int], step: float) -> Motion:
     camera = Camera(np.eye(4), 90.0)
-    return motion_between(
+    return compute_motion(
         View(flat(now), camera, {"a": slide(step)}),
         View(flat(before), camera, {"a": np.eye(4)}),
     )
@@ -224,15 +224,15 @@ def test_a_point_is_only_seen_before_on_its_own_surface(change: str) -> None:
         before = before._replace(normal=np.broadcast_to(np.array([0.6, 0, -0.8], np.float32), before.normal.shape))
     else:
         before = before._replace(position=before.position + [0, 0, 0.006 * 4.0])
-    same = motion_between(View(now, camera, {}), View(flat([0] * 8), camera, {}))
-    other = motion_between(View(now, camera, {}), View(before, camera, {}))
+    same = compute_motion(View(now, camera, {}), View(flat([0] * 8), camera, {}))
+    other = compute_motion(View(now, camera, {}), View(before, camera, {}))
     assert same.visible.all()
     assert not other.visible.any()
 
 
 def test_a_point_that_was_behind_the_camera_has_no_history() -> None:
     current = View(flat([0] * 8), Camera(np.eye(4), 90.0), {})
-    motion = motion_between(current, View(flat([0] * 8), Camera(shift(0, 0, 5.0), 90.0), {}))
+    motion = compute_motion(current, View(flat([0] * 8), Camera(shift(0, 0, 5.0), 90.0), {}))
     assert np.isnan(motion.motion).all()
     assert not motion.visible.any()
     assert np.all(motion.previous_depth == 0)
@@ -249,13 +249,13 @@ def test_off_screen_points_were_not_seen() -> None:
 )
 def test_a_pose_that_appears_or_disappears_raises(start: dict[str, np.ndarray], end: dict[str, np.ndarray]) -> None:
     with pytest.raises(ValueError, match="'a'"):
-        relative_poses(("a",), start, end)
+        compute_relative_poses(("a",), start, end)
 
 
 def test_shapes_that_appear_or_disappear_raise() -> None:
     camera = Camera(np.eye(4), 90.0)
     with pytest.raises(ValueError, match="none may appear or disappear"):
-        motion_between(View(flat([0]), camera, {}), View(flat([0])._replace(names=("a",)), camera, {}))
+        compute_motion(View(flat([0]), camera, {}), View(flat([0])._replace(names=("a",)), camera, {}))
 
 
 @pytest.mark.parametrize(
@@ -275,7 +275,7 @@ def test_albedo_and_roughness_are_those_of_the_lobes(
     variant: str, bsdf: dict[str, object], albedo: float | None, roughness: float
 ) -> None:
     square = {"type": "sphere", "center": [0, 0, SQUARE_Z], "radius": 1.0, "bsdf": bsdf}
-    found = gbuffer(Stage(shapes={"square": square}).build(0, WIDTH, HEIGHT))
+    found = trace_gbuffer(Stage(shapes={"square": square}).build(0, WIDTH, HEIGHT))
     shape = found.ids[..., 0] == found.names.index("square")
     assert shape.any()
     np.testing.assert_allclose(found.roughness[shape], roughness, atol=1e-5)
@@ -290,7 +290,7 @@ def test_albedo_and_roughness_are_those_of_the_lobes(
 
 def test_ids_are_places_in_the_sorted_names_whatever_else_is_loaded(variant: str) -> None:
     alive = [Stage().build(0, WIDTH, HEIGHT) for _ in range(2)]
-    first, second = gbuffer(alive[1]), gbuffer(Stage().build(0, WIDTH, HEIGHT))
+    first, second = trace_gbuffer(alive[1]), trace_gbuffer(Stage().build(0, WIDTH, HEIGHT))
     assert first.names == ("floor", "lamp", "square", "wall")
     np.testing.assert_array_equal(first.ids, second.ids)
     assert first.ids[HEIGHT // 2, WIDTH // 2, 0] == 2

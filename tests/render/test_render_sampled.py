@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.data.exr.exr import read_exr
 from jaxdn.render import render_frame
 from jaxdn.render.adaptive import render_sampled
+from jaxdn.render.settings import RenderSettings
 from jaxdn.zoo.weights import save_weights
 from tests.render.render_scenes import HEIGHT, WIDTH, Stage, fast_variants
 
@@ -56,8 +58,8 @@ def test_every_pixel_has_the_first_samples_of_its_frame(light, rng):
         seen.append(frame)
         return counts
 
-    found = render_sampled(Stage(), 1, ask, **options)
-    layers = render_frame(Stage(), 1, layers=(1, 2, 4), **options).layers
+    found = render_sampled(Stage(), 1, ask, RenderSettings(**options))
+    layers = render_frame(Stage(), 1, RenderSettings(layers=(1, 2, 4), **options)).layers
     np.testing.assert_array_equal(seen[0].radiance, layers[1])
     whole = {1: layers[1], 3: (layers[1] + 2 * layers[2]) / 3, 7: (layers[1] + 2 * layers[2] + 4 * layers[4]) / 7}
     for count, image in whole.items():
@@ -68,21 +70,31 @@ def test_every_pixel_has_the_first_samples_of_its_frame(light, rng):
     assert found.bad_samples == 0
 
 
+def test_settings_that_samples_for_each_pixel_do_not_have_are_refused():
+    settings = RenderSettings(**SIZE, plan=planned(), light="reflected")
+    wrong = ({"plan": None}, {"layers": (1, 2)}, {"reference_spp": 2}, {"jitter": True, "plan": None})
+    for change in wrong:
+        with pytest.raises(ValueError, match="samples for each pixel: expected a plan"):
+            render_sampled(Stage(), 0, lambda frame: np.ones((HEIGHT, WIDTH, 1)), replace(settings, **change))
+
+
 def test_pixels_without_samples_are_black():
     ask = lambda frame: np.indices((HEIGHT, WIDTH)).sum(0)[..., None] % 2  # noqa: E731
-    found = render_sampled(Stage(), 0, ask, **SIZE, plan=planned(), seed=1)
+    found = render_sampled(Stage(), 0, ask, RenderSettings(**SIZE, plan=planned(), seed=1, light="reflected"))
     dark = found.frame.sample_count[..., 0] == 0
     assert not np.any(found.frame.radiance[dark])
-    one = render_frame(Stage(), 0, **SIZE, plan=planned(), seed=1, light="reflected")
+    one = render_frame(Stage(), 0, RenderSettings(**SIZE, plan=planned(), seed=1, light="reflected"))
     np.testing.assert_allclose(found.frame.radiance[~dark], one.frame.radiance[~dark], rtol=1e-6)
 
 
 def test_more_samples_are_nearer_to_the_reference():
     options: dict[str, Any] = {**SIZE, "plan": planned(), "light": "reflected"}
-    reference = render_frame(Stage(), 0, reference_spp=512, **options).reference
+    reference = render_frame(Stage(), 0, RenderSettings(reference_spp=512, **options)).reference
     errors = []
     for count in (1, 4, 16):
-        found = render_sampled(Stage(), 0, lambda frame, count=count: np.full((HEIGHT, WIDTH, 1), count), **options)
+        found = render_sampled(
+            Stage(), 0, lambda frame, count=count: np.full((HEIGHT, WIDTH, 1), count), RenderSettings(**options)
+        )
         errors.append(np.mean(np.square(found.frame.radiance - reference)))
     np.testing.assert_allclose(errors[0] / errors[1], 4, rtol=0.5)
     np.testing.assert_allclose(errors[1] / errors[2], 4, rtol=0.5)

@@ -7,6 +7,7 @@ import pytest
 
 from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.render.settings import RenderSettings
 from tests.needs import require_module
 from tests.render.render_scenes import fast_variants
 
@@ -49,12 +50,12 @@ def fast():
 
 def ours(scene, frame=0, samples=256):
     """Mean of emitted, direct and indirect light, as clips are made of."""
-    from jaxdn.render.frame import tracer
+    from jaxdn.render.tracing.seeds import NOISY, SampleStream
+    from jaxdn.render.tracing.tracer import choose_tracer
 
-    accumulate = tracer(mi.variant()).accumulate
-    sums = accumulate(
-        scene.build(frame, WIDTH, HEIGHT), seed=1, frame=frame, stream=0, first=0, count=samples, max_depth=DEPTH
-    )
+    accumulate = choose_tracer(mi.variant()).accumulate
+    built = scene.build(frame, WIDTH, HEIGHT)
+    sums = accumulate(built, SampleStream(1, frame, NOISY), 0, samples, max_depth=DEPTH)
     return np.mean([sums.emitted, sums.direct, sums.indirect], axis=(1, 2)).sum(axis=0) / samples
 
 
@@ -209,7 +210,7 @@ def test_a_crop_and_hidden_lights_are_not_ignored_in_silence(folder):
         scene = SceneFile(path)
     from jaxdn.render.frame import render_frame
 
-    found = render_frame(scene, 0, width=WIDTH, height=HEIGHT, reference_spp=256, max_depth=DEPTH)
+    found = render_frame(scene, 0, RenderSettings(width=WIDTH, height=HEIGHT, reference_spp=256, max_depth=DEPTH))
     kept = (found.reference + found.frame.direct).mean(axis=(0, 1))
     np.testing.assert_allclose(kept, mitsubas(path), rtol=0.03)  # without the emission, as the warning says
 

@@ -13,12 +13,13 @@ from jaxdn.clips import ClipError
 from jaxdn.effects import plan
 from jaxdn.planning.catalogue import OF_FIRST_HITS
 from jaxdn.render.clip import render_clip
-from jaxdn.render.farm import render_clips
 from jaxdn.render.frame import render_frame
 from jaxdn.render.mitsuba.variant import choose_variant
 from jaxdn.render.scenes.scene_file import SceneFile
-from jaxdn.sequence.render_and_denoise import Settings, denoise_scene
-from jaxdn.sequence.render_jobs import clips_of
+from jaxdn.render.settings import RenderSettings
+from jaxdn.render.worker_pool import render_clips
+from jaxdn.sequence.render_and_denoise import SceneSettings, denoise_scene
+from jaxdn.sequence.render_jobs import ClipSource, plan_jobs
 from jaxdn.zoo.ready import candidate
 from tests.render.render_scenes import HEIGHT, SQUARE_Z, WIDTH, Stage, grey, shift, turn
 
@@ -85,10 +86,7 @@ def test_a_mirror_shows_what_would_stand_behind_it(what):
         render_frame(
             Mirrored(real=real, mirror=mirror, square=square, **options),
             2,
-            see_through=not real,
-            variant=FAST,
-            max_depth=2,
-            **SIZE,
+            RenderSettings(see_through=not real, variant=FAST, max_depth=2, **SIZE),
         )
         for real in (False, True)
     )
@@ -96,9 +94,9 @@ def test_a_mirror_shows_what_would_stand_behind_it(what):
     assert real.view is not None
     on_square = real.view.gbuffer.ids[..., 0] == real.view.gbuffer.names.index("square")
     assert on_square.sum() > 8
-    assert image.view.gbuffer.images is not None
+    assert image.view.gbuffer.replaced is not None
     shown = np.zeros(WIDTH * HEIGHT, bool)
-    seen = image.view.gbuffer.images
+    seen = image.view.gbuffer.replaced
     shown[seen.pixels] = seen.shapes == image.view.gbuffer.names.index("square")
     np.testing.assert_array_equal(shown.reshape(HEIGHT, WIDTH), on_square)
     for name in GUIDES:
@@ -128,12 +126,14 @@ def test_glass_shows_what_is_behind_it_less_what_it_reflects(kind):
     def move(frame: float) -> np.ndarray:
         return shift(0.3 * frame, 0, SQUARE_Z)
 
-    seen = render_frame(behind_glass(kind, square=move), 2, see_through=True, variant=FAST, max_depth=2, **SIZE)
-    without = render_frame(Stage(square=move), 2, variant=FAST, max_depth=2, **SIZE).frame
+    seen = render_frame(
+        behind_glass(kind, square=move), 2, RenderSettings(see_through=True, variant=FAST, max_depth=2, **SIZE)
+    )
+    without = render_frame(Stage(square=move), 2, RenderSettings(variant=FAST, max_depth=2, **SIZE)).frame
     assert seen.view is not None
-    assert seen.view.gbuffer.images is not None
+    assert seen.view.gbuffer.replaced is not None
     through = np.zeros((HEIGHT, WIDTH), bool)
-    through.reshape(-1)[seen.view.gbuffer.images.pixels] = True
+    through.reshape(-1)[seen.view.gbuffer.replaced.pixels] = True
     assert 0.2 < through.mean() < 0.8
     # Refraction shifts the view by a fraction of the slab's thickness: borders of the square may be another pixel's.
     same = through & (np.abs(np.asarray(seen.frame.depth) - np.asarray(without.depth))[..., 0] < 0.02)
@@ -147,7 +147,7 @@ def test_glass_shows_what_is_behind_it_less_what_it_reflects(kind):
     np.testing.assert_allclose(np.asarray(seen.frame.reflectance)[middle], share * 0.5, rtol=0.01)
     assert np.all(np.asarray(seen.frame.reflectance)[through] <= np.asarray(without.reflectance)[through] + 1e-6)
     names = seen.view.gbuffer.names
-    images = seen.view.gbuffer.images
+    images = seen.view.gbuffer.replaced
     pairs = {(names[first], names[shape]) for first, shape in zip(images.first, images.shapes, strict=True)}
     assert {("pane", "square"), ("pane", "wall")} <= pairs <= {("pane", name) for name in names}
     ids = np.asarray(seen.frame.ids)[..., 0]
@@ -168,7 +168,8 @@ def test_glass_shows_what_is_behind_it_less_what_it_reflects(kind):
 def test_what_shows_no_image_in_its_place_keeps_its_own_guides(shape):
     stage = Stage(shapes={"ball": {**shape, "center": [0, 0, 2.5]}})
     plain, through = (
-        render_frame(stage, 1, see_through=on, variant=FAST, max_depth=2, **SIZE).frame for on in (False, True)
+        render_frame(stage, 1, RenderSettings(see_through=on, variant=FAST, max_depth=2, **SIZE)).frame
+        for on in (False, True)
     )
     ball = np.asarray(plain.ids)[..., 0] == 0
     assert ball.sum() > 20
@@ -180,7 +181,9 @@ def test_what_shows_no_image_in_its_place_keeps_its_own_guides(shape):
 
 def test_a_scene_without_mirrors_and_glass_is_the_same():
     stage = Stage(square=lambda frame: shift(0.2 * frame, 0, SQUARE_Z))
-    plain, through = (render_frame(stage, 1, see_through=on, variant=FAST, **SIZE).frame for on in (False, True))
+    plain, through = (
+        render_frame(stage, 1, RenderSettings(see_through=on, variant=FAST, **SIZE)).frame for on in (False, True)
+    )
     for name, buffer in plain._asdict().items():
         if buffer is not None and name not in OF_FIRST_HITS:
             np.testing.assert_array_equal(buffer, getattr(through, name), err_msg=name)
@@ -189,7 +192,8 @@ def test_a_scene_without_mirrors_and_glass_is_the_same():
 def test_light_is_not_changed():
     stage = behind_glass("slab")
     plain, through = (
-        render_frame(stage, 1, see_through=on, variant=FAST, reference_spp=2, **SIZE) for on in (False, True)
+        render_frame(stage, 1, RenderSettings(see_through=on, variant=FAST, reference_spp=2, **SIZE))
+        for on in (False, True)
     )
     np.testing.assert_array_equal(plain.frame.radiance, through.frame.radiance)
     np.testing.assert_array_equal(plain.reference, through.reference)
@@ -199,30 +203,30 @@ def test_light_is_not_changed():
 def test_plans_leave_out_what_belongs_to_the_first_surface_and_follow_what_moves_in_mirrors():
     names = ["indirect", "mirror", "specular", "moving-reflection", "glossy"]
     reader = jaxdn.denoisers.trmv()
-    found = effects.chosen(names, 3)
+    found = effects.choose_effects(names, 3)
     plain, through = plan(found, reader), plan(found, reader, see_through=True)
     assert set(plain.buffers) - set(through.buffers) == {"glossy_motion", "specular", "specular_reflectance"}
     assert set(through.buffers) - set(plain.buffers) == {"motion", "dual_motion", "previous_depth"}
     with pytest.raises(ValueError, match="made to see through; pass see_through=True"):
-        render_frame(Stage(), 0, see_through=True, plan=plain, variant=FAST, **SIZE)
+        render_frame(Stage(), 0, RenderSettings(see_through=True, plan=plain, variant=FAST, **SIZE))
 
 
 def test_the_scalar_variant_is_refused():
     with pytest.raises(ValueError, match="scalar_rgb cannot follow rays past mirrors and glass; leave it out"):
-        render_frame(Stage(), 0, see_through=True, variant="scalar_rgb", **SIZE)
+        render_frame(Stage(), 0, RenderSettings(see_through=True, variant="scalar_rgb", **SIZE))
 
 
 def test_a_clip_keeps_to_its_setting_and_the_command_says_what_is_left_out(tmp_path, capsys):
-    wanted: dict[str, Any] = {"animation": None, "seeds": [0], "frames": 2, "reference_spp": 0, "layers": [1]}
-    wanted |= {"max_depth": 3, "effects": "all", **SIZE}
-    (job,) = clips_of("fruit", tmp_path, denoiser="trmv", see_through=True, **wanted)
+    settings, through = (RenderSettings(max_depth=3, see_through=on, **SIZE) for on in (False, True))
+    source = ClipSource("fruit", frames=2, effects="all", denoiser="svgf")
+    (job,) = plan_jobs(source._replace(denoiser="trmv"), tmp_path, through)
     assert "seen through, there is no" in capsys.readouterr().out
     (folder,) = render_clips([job], workers=1)
-    (other,) = clips_of("fruit", tmp_path, denoiser="svgf", **wanted)
-    (same,) = clips_of("fruit", tmp_path, denoiser="svgf", see_through=True, **wanted)
-    assert (job.see_through, other.see_through, same.see_through) == (True, False, True)
+    (other,) = plan_jobs(source, tmp_path, settings)
+    (same,) = plan_jobs(source, tmp_path, through)
+    assert [one.settings.see_through for one in (job, other, same)] == [True, False, True]
     with pytest.raises(ClipError, match="see_through: True there, False wanted"):
-        render_clip(Stage(), folder, frames=2, variant=FAST, **SIZE)
+        render_clip(Stage(), folder, RenderSettings(variant=FAST, **SIZE), frames=2)
 
 
 CHECKS = """<scene version="3.0.0">
@@ -247,7 +251,9 @@ def test_what_a_mirror_shows_stays_sharp(tmp_path):
     scene, svgf, error = SceneFile(tmp_path / "checks.xml"), jaxdn.denoisers.svgf(), {}
     for on in (False, True):
         found = render_frame(
-            scene, 0, width=48, height=48, reference_spp=256, light="reflected", see_through=on, variant=FAST
+            scene,
+            0,
+            RenderSettings(width=48, height=48, reference_spp=256, light="reflected", see_through=on, variant=FAST),
         )
         clip = Clip(jax.tree.map(lambda buffer: jnp.asarray(buffer)[None], found.frame))
         image = np.asarray(jaxdn.denoise(svgf, {}, clip)[0])
@@ -260,7 +266,7 @@ def test_a_scene_is_denoised_with_the_guides_of_what_is_seen(tmp_path):
     (tmp_path / "checks.xml").write_text(CHECKS)
     told: dict[str, list[str]] = {"svgf": [], "trmv": []}
     for name, lines in told.items():
-        settings = Settings(width=16, height=16, frames=[0], budget=1)
+        settings = SceneSettings(RenderSettings(width=16, height=16), frames=[0], budget=1)
         denoise_scene(str(tmp_path / "checks.xml"), None, tmp_path / name, candidate(name), settings, log=lines.append)
     line = "guides of flat mirrors and glass are those of what they show"
     assert line in told["svgf"]

@@ -10,8 +10,9 @@ from jaxdn import effects
 from jaxdn.core.frame import GUIDES, OF_SAMPLES, present
 from jaxdn.planning.catalogue import OF_SHADOWS
 from jaxdn.render.buffers.geometry import project
-from jaxdn.render.buffers.shadow_vectors import meets_plane
+from jaxdn.render.buffers.shadow_vectors import intersect_plane
 from jaxdn.render.frame import render_frame
+from jaxdn.render.settings import RenderSettings
 from tests.render.render_scenes import grey, shift
 from tests.render.vector_scenes import FAST, HEIGHT, WIDTH, Places, floor, look, rendered
 
@@ -150,7 +151,7 @@ def test_light_without_shadow_is_what_a_scene_without_blocker_shows():
     shadow = ground & (frame.shadowed.sum(-1) == 0)
     assert 30 < shadow.sum() < 0.2 * shadow.size
     # A point light is found by its samples alone: all of the direct light is one or the other.
-    whole = render_frame(lit, 0, width=WIDTH, height=HEIGHT, layers=(4,), variant=FAST).frame
+    whole = render_frame(lit, 0, RenderSettings(width=WIDTH, height=HEIGHT, layers=(4,), variant=FAST)).frame
     np.testing.assert_allclose(free.shadowed, whole.direct, rtol=1e-4, atol=1e-6)
 
 
@@ -164,7 +165,7 @@ def test_noisy_direct_light_has_the_mean_of_direct_light(bsdf):
     stage._shapes["lamp"]["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": 10.0}}
     stage._shapes["floor"] = floor(bsdf)
     frame = rendered(stage, 0, layers=(64,)).frame
-    apart = render_frame(stage, 0, width=WIDTH, height=HEIGHT, layers=(64,), variant=FAST).frame
+    apart = render_frame(stage, 0, RenderSettings(width=WIDTH, height=HEIGHT, layers=(64,), variant=FAST)).frame
     assert frame.direct is None
     np.testing.assert_allclose(frame.radiance, apart.radiance + apart.direct, rtol=1e-5, atol=1e-6)
     specular = frame.specular.mean() / frame.radiance.mean()
@@ -188,7 +189,7 @@ def test_a_frame_alone_is_the_same_bit_for_bit():
 def test_the_buffers_leave_everything_else_bit_for_bit():
     stage = scene(moving_lamp((0.1, 0, 0)))
     options: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "light": "reflected", "variant": FAST}
-    usual = render_frame(stage, 1, **options).frame
+    usual = render_frame(stage, 1, RenderSettings(**options)).frame
     whole = rendered(stage).frame
     assert not set(present(usual)) & OF_SHADOWS
     assert set(present(whole)) >= OF_SHADOWS
@@ -199,43 +200,45 @@ def test_the_buffers_leave_everything_else_bit_for_bit():
 def test_rays_that_do_not_meet_the_plane():
     up, origin = np.array([0.0, 1.0, 0.0]), np.zeros(3)
     near = np.array([0.0, 4.0, 0.0, 1.0])
-    np.testing.assert_allclose(meets_plane(near, np.array([1.0, 2.0, 0.0]), origin, up), [2.0, 0.0, 0.0])
-    assert np.isnan(meets_plane(near, np.array([1.0, 4.0, 0.0]), origin, up)).all()  # grazing
-    assert np.isnan(meets_plane(near, np.array([1.0, 5.0, 0.0]), origin, up)).all()  # away from it
-    assert np.isnan(meets_plane(near, np.array([0.0, -1.0, 0.0]), origin, up)).all()  # behind it
+    np.testing.assert_allclose(intersect_plane(near, np.array([1.0, 2.0, 0.0]), origin, up), [2.0, 0.0, 0.0])
+    assert np.isnan(intersect_plane(near, np.array([1.0, 4.0, 0.0]), origin, up)).all()  # grazing
+    assert np.isnan(intersect_plane(near, np.array([1.0, 5.0, 0.0]), origin, up)).all()  # away from it
+    assert np.isnan(intersect_plane(near, np.array([0.0, -1.0, 0.0]), origin, up)).all()  # behind it
     sun = np.array([0.6, 0.8, 0.0, 0.0])
-    np.testing.assert_allclose(meets_plane(sun, np.array([0.0, 0.8, 1.0]), origin, up), [-0.6, 0.0, 1.0])
+    np.testing.assert_allclose(intersect_plane(sun, np.array([0.0, 0.8, 1.0]), origin, up), [-0.6, 0.0, 1.0])
 
 
 def test_they_are_planned_where_something_moves_and_direct_light_is_noisy():
     reader = jaxdn.denoisers.trmv()
-    moving = effects.chosen(["moving-shadow", "indirect"], 2)
+    moving = effects.choose_effects(["moving-shadow", "indirect"], 2)
     assert set(effects.plan(moving, reader, light="reflected").buffers) >= OF_SHADOWS
     assert "direct" not in effects.plan(moving, reader, light="reflected").buffers
     assert not OF_SHADOWS & set(effects.plan(moving, reader).buffers)
     assert not OF_SHADOWS & set(effects.plan(moving, jaxdn.denoisers.svgf(), light="reflected").buffers)
-    still = effects.chosen(["indirect", "glossy"], 2)
+    still = effects.choose_effects(["indirect", "glossy"], 2)
     assert not (OF_SHADOWS | {"glossy_motion"}) & set(effects.plan(still, reader, light="reflected").buffers)
-    mirrored = effects.chosen(["indirect", "moving-reflection"], 2)
+    mirrored = effects.choose_effects(["indirect", "moving-reflection"], 2)
     assert "glossy_motion" in effects.plan(mirrored, reader).buffers
     # Direct light alone is to be denoised where it is noisy.
-    shadow = effects.chosen(["moving-shadow"], 2)
+    shadow = effects.choose_effects(["moving-shadow"], 2)
     assert [effects.plan(shadow, reader, light=light).indirect for light in ("indirect", "reflected")] == [False, True]
 
 
 def test_a_plan_for_other_light_is_refused():
-    plan = effects.plan(effects.chosen(["indirect"], 1))._replace(frames=(("direct",),))
+    plan = effects.plan(effects.choose_effects(["indirect"], 1))._replace(frames=(("direct",),))
     with pytest.raises(ValueError, match="light='reflected'"):
-        render_frame(scene(SUN), 0, width=4, height=4, light="reflected", plan=plan)
+        render_frame(scene(SUN), 0, RenderSettings(width=4, height=4, light="reflected", plan=plan))
     with pytest.raises(ValueError, match="draws: expected 0"):
-        render_frame(scene(SUN), 0, width=4, height=4, light="reflected", draws=1)
+        render_frame(scene(SUN), 0, RenderSettings(width=4, height=4, light="reflected", draws=1))
     with pytest.raises(ValueError, match="light: expected one of"):
-        render_frame(scene(SUN), 0, width=4, height=4, light="direct")
+        render_frame(scene(SUN), 0, RenderSettings(width=4, height=4, light="direct"))
 
 
 def test_the_scalar_variant_refuses_them():
-    plan = effects.plan(effects.everything(1), jaxdn.denoisers.trmv(), light="reflected")
+    plan = effects.plan(effects.choose_all_effects(1), jaxdn.denoisers.trmv(), light="reflected")
     assert set(plan.buffers) & OF_SAMPLES
     assert set(plan.buffers) <= set(GUIDES)
     with pytest.raises(ValueError, match=r"scalar_rgb cannot render .*shadow_motion"):
-        render_frame(scene(SUN), 0, width=4, height=4, variant="scalar_rgb", light="reflected", plan=plan)
+        render_frame(
+            scene(SUN), 0, RenderSettings(width=4, height=4, variant="scalar_rgb", light="reflected", plan=plan)
+        )

@@ -11,6 +11,7 @@ from jaxdn.core.frame import GUIDES
 from jaxdn.render.frame import Rendered, render_frame
 from jaxdn.render.mitsuba.variant import choose_variant
 from jaxdn.render.scenes.scene import Camera
+from jaxdn.render.settings import RenderSettings
 from tests.render.render_scenes import grey
 
 WIDTH, HEIGHT = 48, 32
@@ -82,6 +83,6 @@ def floor(bsdf: dict[str, Any] | None = None) -> dict[str, Any]:
 
 
 def rendered(scene: Any, frame: int = 1, *, light: Any = "reflected", **options: Any) -> Rendered:
-    plan = effects.plan(effects.everything(frame + 1), READER, light=light)
+    plan = effects.plan(effects.choose_all_effects(frame + 1), READER, light=light)
     settings: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "light": light, "plan": plan, "variant": FAST}
-    return render_frame(scene, frame, **(settings | options))
+    return render_frame(scene, frame, RenderSettings(**settings | options))

@@ -11,6 +11,7 @@ from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.data.read import open_frames
 from jaxdn.metrics import psnr
 from jaxdn.render import ClipJob, render_clips
+from jaxdn.render.settings import RenderSettings
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import candidate
@@ -98,7 +99,9 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A clip with wallpaper, pictures and thin edges at 64 samples, all light, as files of another renderer."""
     folder = tmp_path_factory.mktemp("rendered")
     scene = {"family": "pinkroom", "seed": 5}
-    job = ClipJob(scene, str(folder / "clip"), width=128, height=128, frames=2, layers=(64,), reference_spp=512)
+    job = ClipJob(
+        scene, str(folder / "clip"), 2, RenderSettings(width=128, height=128, layers=(64,), reference_spp=512)
+    )
     render_clips([job], workers=1, progress=False)
     for index, stored in enumerate(open_frames(folder / "clip", spp=64)[1]):
         frame = stored.frame

@@ -1,7 +1,7 @@
 """What the tables are made from: clips with layers, and networks that are trained on them alike."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,14 +9,15 @@ from experiments.papers import rooms
 from experiments.papers.preintegration import file_name
 from jaxdn.clips import find_clips
 from jaxdn.methods.registry import method_named
-from jaxdn.sequence.render_jobs import render
+from jaxdn.render.settings import RenderSettings
+from jaxdn.sequence.render_jobs import ClipSource, render
 from jaxdn.training.train import train
 from jaxdn.zoo.ready import Candidate, candidate
 
 FAMILIES = ("parlour", "fruit", "mobile", "pinkroom", "robot")
 HELD_OUT = ("parlour", "mobile", "pinkroom", "robot")
 """The families that :data:`STAGES` leave out of training, one each."""
-LAYERS = [1, 2, 4, 8, 16, 32]
+LAYERS = (1, 2, 4, 8, 16, 32)
 BUDGET = 4
 """Samples a pixel: the same everywhere, or in the mean for those who ask for samples."""
 TRAINED = "ntd,rae,arae,ntasd,dasr,svgf,steady"
@@ -57,7 +58,7 @@ class Settings:
     """Train the learned relatives alike and remake the papers' tables. The defaults are small."""
 
     rooms: list[Path] = field(default_factory=list)
-    """Mitsuba scenes (.xml) to make tours of, for training."""
+    """Mitsuba scenes (.xml) to animate at random, for training."""
     scenes: list[Path] = field(default_factory=list)
     """Folders of rooms to test on: one folder with a scene.xml each."""
     clips: int = 2
@@ -78,21 +79,18 @@ class Settings:
 
 def render_all(settings: Settings) -> list[Path]:
     """Render what is missing: clips to train on, of seeds from 0 on, and to test on, which are returned."""
-    size = {"width": settings.size, "height": settings.size}
-    shared: dict[str, Any] = {"layers": LAYERS, "draws": BUDGET, "max_depth": None, "effects": "auto"}
-    shared |= {"workers": settings.workers, "frames": 8}
-    seeds = list(range(settings.clips))
-    for source, tours in [*((str(room), True) for room in settings.rooms), *((name, False) for name in FAMILIES)]:
-        place = settings.data / "train"
-        own: dict[str, Any] = {"denoiser": TRAINED, "seeds": seeds, "reference_spp": 64, "tours": tours}
-        render(source, place, animation=None, **own, **size, **shared)
-    place = settings.data / "test"
-    shared |= {"denoiser": COMPARED, "seeds": [TEST_SEED], "reference_spp": 128}
+    own = RenderSettings(settings.size, settings.size, layers=LAYERS, draws=BUDGET, reference_spp=64)
+    seeds, place = list(range(settings.clips)), settings.data / "train"
+    for scene, randomised in [*((str(room), True) for room in settings.rooms), *((name, False) for name in FAMILIES)]:
+        source = ClipSource(scene, seeds, 8, randomised=randomised, denoiser=TRAINED)
+        render(source, place, own, workers=settings.workers)
+    place, own = settings.data / "test", replace(own, reference_spp=128)
     for family in FAMILIES:
-        render(family, place, animation=None, **size, **shared)
-    wide = {"width": 2 * settings.size, "height": settings.size}
-    for scene, animation in rooms.scenes_in(settings.scenes) if settings.scenes else []:
-        render(str(scene), place, animation=animation, **wide, **shared)
+        render(ClipSource(family, [TEST_SEED], 8, denoiser=COMPARED), place, own, workers=settings.workers)
+    wide = replace(own, width=2 * settings.size)
+    for room, animation in rooms.scenes_in(settings.scenes) if settings.scenes else []:
+        source = ClipSource(str(room), [TEST_SEED], 8, animation, denoiser=COMPARED)
+        render(source, place, wide, workers=settings.workers)
     return find_clips(place)
 
 

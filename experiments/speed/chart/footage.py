@@ -11,6 +11,7 @@ from jaxdn.clips import ClipError, read_clip, read_record
 from jaxdn.core.frame import Frame
 from jaxdn.data.clip.noise_floor import read_halves, read_noise_floor
 from jaxdn.render import ClipJob, render_clips
+from jaxdn.render.settings import RenderSettings
 
 
 class Sizes(NamedTuple):
@@ -70,12 +71,14 @@ def render(sizes: Sizes, folder: Path) -> list[Path]:
         ClipJob(
             {"family": family, "seed": seed},
             str(place),
-            width=sizes.pixels,
-            height=sizes.pixels,
-            frames=sizes.frames,
-            layers=sizes.layers,
-            reference_spp=sizes.reference_spp,
-            seed=seed,
+            sizes.frames,
+            RenderSettings(
+                width=sizes.pixels,
+                height=sizes.pixels,
+                layers=sizes.layers,
+                reference_spp=sizes.reference_spp,
+                seed=seed,
+            ),
         )
         for (family, seed), place in zip(sizes.scenes, places, strict=True)
     ]

@@ -10,6 +10,7 @@ from experiments.speed.timing import measure
 from jaxdn import effects
 from jaxdn.core.frame import OF_SAMPLES
 from jaxdn.render import AnimatedScene, render_frame
+from jaxdn.render.settings import RenderSettings
 
 SAMPLES = (1, 2, 4)
 FRAME = 2
@@ -52,13 +53,15 @@ def measure_cost(
     ``reads`` are what denoisers read (:func:`named`), of which the clip has the buffers ``there``. Buffers that need no
     paths are measured without any: a path tracer's time varies by more than they take.
     """
-    everything = effects.plan(effects.everything(FRAME + 1))
-    before = render_frame(scene, FRAME - 1, width=width, height=height).view
+    everything = effects.plan(effects.choose_all_effects(FRAME + 1))
+    before = render_frame(scene, FRAME - 1, RenderSettings(width=width, height=height)).view
 
     def frame(spp: int, buffers: Sequence[str], *, paths: bool = True) -> Callable[[], Any]:
         plan = everything._replace(frames=(tuple(buffers),) * (FRAME + 1))
         plan = plan if paths else plan._replace(integrator="none")
-        return lambda: render_frame(scene, FRAME, width=width, height=height, layers=(spp,), previous=before, plan=plan)
+        return lambda: render_frame(
+            scene, FRAME, RenderSettings(width=width, height=height, layers=(spp,), plan=plan), previous=before
+        )
 
     made = {one: [name for name in one.split(", ") if name in there and name in everything.buffers] for one in reads}
     calls = {f"light {spp}": frame(spp, ()) for spp in SAMPLES} | {"": frame(1, (), paths=False)}

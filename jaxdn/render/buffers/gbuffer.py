@@ -15,11 +15,16 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.core.frame import FAR
+from jaxdn.render.buffers.primary_surface_replacement import (
+    ReplacedPixels,
+    ReplacedRays,
+    map_to_images,
+    replace_primary_surfaces,
+)
 from jaxdn.render.buffers.reflectance import Reflectances
-from jaxdn.render.buffers.replacement import Followed, Images, follow, imaged
 from jaxdn.render.scenes.media import absorbs, media_of
-from jaxdn.render.tracing.light_samples import diffuse_reflectance
-from jaxdn.render.tracing.wavefront import camera_rays
+from jaxdn.render.tracing.light_samples import evaluate_diffuse_reflectance
+from jaxdn.render.tracing.radiance import make_camera_rays
 
 
 class GBuffer(NamedTuple):
@@ -46,12 +51,12 @@ class GBuffer(NamedTuple):
     if it was not requested."""
     specular_reflectance: np.ndarray | None = None
     """[H, W, 3] float32 the part of it that lobes other than diffuse ones reflect, 0 on a miss; None as above."""
-    images: Images | None = None
+    replaced: ReplacedPixels | None = None
     """The pixels whose buffers are those of an image in mirrors or of what is seen through glass, if they were
     requested and there are any. Their ids are of no shape: each pair of shapes, seen and met first, has its own."""
 
 
-def shape_names(scene: Any) -> list[str]:
+def list_shape_names(scene: Any) -> list[str]:
     """The name of every shape in the scene's order; unnamed shapes are named by their index."""
     names = [shape.id() or f"shape_{index:04d}" for index, shape in enumerate(scene.shapes())]
     if len(set(names)) != len(names):
@@ -74,106 +79,110 @@ def check_scene(scene: Any) -> None:
         raise ValueError("scene: motion blur is not supported yet; expected an instantaneous shutter.")
 
 
-def gbuffer(scene: Any, *, reflectance: bool = False, specular: bool = False, see_through: bool = False) -> GBuffer:
+def trace_gbuffer(
+    scene: Any, *, reflectance: bool = False, specular: bool = False, see_through: bool = False
+) -> GBuffer:
     """Trace one ray through the centre of every pixel of the scene's first sensor, with the current variant.
 
     With ``reflectance`` (:mod:`jaxdn.render.buffers.reflectance`) a material that cannot be averaged gives one warning
     with the name of its shape, and its albedo is used; with ``specular`` there is its specular part as well. With
     ``see_through`` the buffers of flat mirrors and of glass are those of what they show
-    (:mod:`jaxdn.render.buffers.replacement`), for which the variant has to be a vectorised one.
+    (:mod:`jaxdn.render.buffers.primary_surface_replacement`), for which the variant has to be a vectorised one.
     """
-    names = sorted(shape_names(scene))
-    trace = _one_by_one if str(mi.variant()).startswith("scalar") else _vectorised
+    names = sorted(list_shape_names(scene))
+    trace = _trace_one_by_one if str(mi.variant()).startswith("scalar") else _trace_all
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     reflectances = Reflectances(scene) if reflectance or specular else None
-    traced, followed = trace(scene, reflectances, specular, see_through)
-    if followed is not None:
-        traced = imaged(traced, followed)
+    traced, replaced = trace(scene, reflectances, specular, see_through)
+    if replaced is not None:
+        traced = map_to_images(traced, replaced)
     found = {name: buffer.reshape(height, width, -1) for name, buffer in traced.items()}
 
-    hit = found["ids"] >= 0
+    surface = found["ids"] >= 0
     direction, normal, position = found["direction"], found["normal"], found["position"]
     to_world = np.array(scene.sensors()[0].world_transform().matrix, np.float64).reshape(4, 4)
     forward = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2])
     # Distances along the ray begin at the near plane; the position is independent of it.
     depth = (position - to_world[:3, 3]) @ forward[:, None]
     away = np.sum(normal * direction, axis=-1, keepdims=True) > 0
-    albedo = np.where(hit, np.clip(np.nan_to_num(found["albedo"]), 0.0, 1.0), 1.0).astype(np.float32)
-    reflected = None if reflectances is None else _reflectance(found, albedo, names)
-    images = None if followed is None else _images(scene, followed, traced["ids"])
+    albedo = np.where(surface, np.clip(np.nan_to_num(found["albedo"]), 0.0, 1.0), 1.0).astype(np.float32)
+    reflected = None if reflectances is None else _bound_reflectance(found, albedo, names)
+    pixels = None if replaced is None else _find_replaced_pixels(scene, replaced, traced["ids"])
     ids = found["ids"].astype(np.int32)
-    if images is not None:
-        ids.reshape(-1)[images.pixels] = _of_pairs(images, len(names))
+    if pixels is not None:
+        ids.reshape(-1)[pixels.pixels] = _number_pairs(pixels, len(names))
     return GBuffer(
         albedo=albedo,
-        normal=np.where(hit, np.where(away, -normal, normal), 0.0).astype(np.float32),
-        depth=np.where(hit, depth, FAR).astype(np.float32),
-        roughness=np.where(hit, np.clip(np.nan_to_num(found["roughness"], nan=1.0), 0.0, 1.0), 1.0).astype(np.float32),
-        position=np.where(hit, position, 0.0),
+        normal=np.where(surface, np.where(away, -normal, normal), 0.0).astype(np.float32),
+        depth=np.where(surface, depth, FAR).astype(np.float32),
+        roughness=np.where(surface, np.clip(np.nan_to_num(found["roughness"], nan=1.0), 0.0, 1.0), 1.0).astype(
+            np.float32
+        ),
+        position=np.where(surface, position, 0.0),
         direction=direction,
         ids=ids,
         names=tuple(names),
         reflectance=reflected,
-        specular_reflectance=_specular(found, reflected) if specular and reflected is not None else None,
-        images=images,
+        specular_reflectance=_bound_specular(found, reflected) if specular and reflected is not None else None,
+        replaced=pixels,
     )
 
 
-def _images(scene: Any, followed: Followed, shapes: np.ndarray) -> Images | None:
+def _find_replaced_pixels(scene: Any, replaced: ReplacedRays, shapes: np.ndarray) -> ReplacedPixels | None:
     """The replaced pixels with ids of shapes, from those of all pixels' surfaces; None if there are none."""
-    pixels = np.flatnonzero(followed.replaced)
+    pixels = np.flatnonzero(replaced.replaced)
     if not len(pixels):
         return None
-    mirrors = ids_of(scene, followed.mirrors[pixels].ravel()).reshape(len(pixels), -1)
-    first = ids_of(scene, followed.first[pixels])
-    return Images(pixels, shapes.reshape(-1)[pixels].astype(int), first, mirrors, followed.planes[pixels])
+    mirrors = look_up_ids(scene, replaced.mirrors[pixels].ravel()).reshape(len(pixels), -1)
+    first = look_up_ids(scene, replaced.first[pixels])
+    return ReplacedPixels(pixels, shapes.reshape(-1)[pixels].astype(int), first, mirrors, replaced.planes[pixels])
 
 
-def _of_pairs(images: Images, count: int) -> np.ndarray:
+def _number_pairs(pixels: ReplacedPixels, count: int) -> np.ndarray:
     """Ids, the same in every frame, beyond those of the ``count`` shapes: one for each pair of shapes seen and met."""
-    return ((1 + images.first) * count + images.shapes).astype(np.int32)
+    return ((1 + pixels.first) * count + pixels.shapes).astype(np.int32)
 
 
-def _reflectance(found: dict[str, np.ndarray], albedo: np.ndarray, names: Sequence[str]) -> np.ndarray:
+def _bound_reflectance(found: dict[str, np.ndarray], albedo: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """The averaged reflectance in [0, 1], and the albedo where that is NaN."""
     broken = (found["ids"] >= 0) & ~np.all(np.isfinite(found["reflectance"]), axis=-1, keepdims=True)
     for number in np.unique(found["ids"][broken]):
-        _warn(names[int(number)])
+        _warn_of_albedo(names[int(number)])
     known = (found["ids"] >= 0) & ~broken
     return np.where(known, np.clip(found["reflectance"], 0.0, 1.0), albedo).astype(np.float32)
 
 
-def _specular(found: dict[str, np.ndarray], whole: np.ndarray) -> np.ndarray:
+def _bound_specular(found: dict[str, np.ndarray], whole: np.ndarray) -> np.ndarray:
     """The specular part of the averaged reflectance, at most ``whole``; 0 where it is not known."""
     known = (found["ids"] >= 0) & np.all(np.isfinite(found["specular_reflectance"]), axis=-1, keepdims=True)
     return np.minimum(np.where(known, np.maximum(found["specular_reflectance"], 0.0), 0.0), whole).astype(np.float32)
 
 
 @functools.cache
-def _warn(shape: str) -> None:
+def _warn_of_albedo(shape: str) -> None:
     """Warn once for each shape, not for each frame."""
     warnings.warn(f"{shape}: the reflectance of its material cannot be averaged; its albedo is used.", stacklevel=2)
 
 
-def _vectorised(
+def _trace_all(
     scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool
-) -> tuple[dict[str, np.ndarray], Followed | None]:
-    """All pixels at once; flat buffers of the hits of all rays, and how these were followed."""
+) -> tuple[dict[str, np.ndarray], ReplacedRays | None]:
+    """All pixels at once; flat buffers of the hits of all rays, and how these were replaced."""
     sensor = scene.sensors()[0]
     width, height = (int(size) for size in sensor.film().crop_size())
     pixel = dr.arange(mi.UInt32, width * height)
     across = dr.opaque(mi.UInt32, width)
-    ray = camera_rays(sensor, pixel % across, pixel // across)
+    ray = make_camera_rays(sensor, pixel % across, pixel // across)
     direction = ray.d
-    followed = follow(scene, ray, shape_of) if see_through else None
-    if followed is not None:
-        ray = followed.ray
+    replaced = replace_primary_surfaces(scene, ray, number_shapes) if see_through else None
+    if replaced is not None:
+        ray = replaced.ray
     hit = scene.ray_intersect(ray)
     valid = hit.is_valid()
     bsdf = hit.bsdf(ray)
 
     flags = bsdf.flags()
-    albedo = diffuse_reflectance(bsdf, hit, valid)
+    albedo = evaluate_diffuse_reflectance(bsdf, hit, valid)
     roughness = dr.select(mi.has_flag(flags, mi.BSDFFlags.Smooth), mi.Float(1.0), 0.0)
     there = valid & bsdf.has_attribute("alpha", valid)
     roughness = dr.select(there, dr.sqrt(dr.maximum(bsdf.eval_attribute_1("alpha", hit, there), 0.0)), roughness)
@@ -186,7 +195,7 @@ def _vectorised(
         "position": hit.p,
         "direction": direction,
         "roughness": roughness,
-        "shape": shape_of(hit),
+        "shape": number_shapes(hit),
     }
     if reflectances is not None:
         whole, part = reflectances.of_pixels(hit, bsdf, valid, albedo)
@@ -195,35 +204,35 @@ def _vectorised(
     dr.eval(buffers)
     arrays = {name: np.array(buffer).T for name, buffer in buffers.items()}
     arrays |= {name: arrays[name].astype(np.float64) for name in ("position", "direction")}
-    arrays["ids"] = ids_of(scene, arrays.pop("shape"))
-    return arrays, followed
+    arrays["ids"] = look_up_ids(scene, arrays.pop("shape"))
+    return arrays, replaced
 
 
-def shape_of(hit: Any) -> Any:
+def number_shapes(hit: Any) -> Any:
     """Mitsuba's number of the shape, or instance, of every hit; 0 where there is none."""
     instance = dr.reinterpret_array(mi.UInt32, hit.instance)
     shape = dr.select(instance != 0, instance, dr.reinterpret_array(mi.UInt32, hit.shape))
     return dr.select(hit.is_valid(), shape, 0)
 
 
-def ids_of(scene: Any, numbers: np.ndarray) -> np.ndarray:
-    """The ids of shapes by their numbers of :func:`shape_of`: the positions of their sorted names, -1 for none."""
+def look_up_ids(scene: Any, numbers: np.ndarray) -> np.ndarray:
+    """The ids of shapes by their numbers of :func:`number_shapes`: the positions of their sorted names, -1 for none."""
     # Registry numbers depend on the other existing objects; names do not. They count objects: a table holds them all.
     reinterpret: Any = dr.reinterpret_array
     own = [int(reinterpret(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in scene.shapes()]
     table = np.full(max([0, *own, int(numbers.max(initial=0))]) + 1, -1)
-    table[own] = _ranks(scene)
+    table[own] = _rank_shapes(scene)
     return table[numbers]
 
 
-def _ranks(scene: Any) -> list[int]:
+def _rank_shapes(scene: Any) -> list[int]:
     """The id of every shape, in the scene's order."""
-    names = shape_names(scene)
+    names = list_shape_names(scene)
     ranks = {name: rank for rank, name in enumerate(sorted(names))}
     return [ranks[name] for name in names]
 
 
-def _one_by_one(
+def _trace_one_by_one(
     scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool
 ) -> tuple[dict[str, np.ndarray], None]:
     """The same buffers, a pixel at a time, for the variant without vectorisation, which follows no rays."""
@@ -231,7 +240,7 @@ def _one_by_one(
         raise ValueError(f"see_through: {mi.variant()} cannot follow rays past mirrors and glass; leave it out.")
     sensor = scene.sensors()[0]
     width, height = (int(size) for size in sensor.film().crop_size())
-    by_shape = {_address(own): rank for own, rank in zip(scene.shapes(), _ranks(scene), strict=True)}
+    by_shape = {_get_id(own): rank for own, rank in zip(scene.shapes(), _rank_shapes(scene), strict=True)}
     sizes = {"albedo": 3, "normal": 3, "position": 3, "direction": 3, "roughness": 1}
     arrays: dict[str, np.ndarray] = {name: np.zeros((width * height, size)) for name, size in sizes.items()}
     if reflectances is not None:
@@ -245,10 +254,10 @@ def _one_by_one(
         if not hit.is_valid():
             continue
         owner = hit.instance if hit.instance is not None else hit.shape
-        arrays["ids"][pixel] = by_shape.get(_address(owner), -1)
+        arrays["ids"][pixel] = by_shape.get(_get_id(owner), -1)
         arrays["position"][pixel] = hit.p
         arrays["normal"][pixel] = hit.sh_frame.n
-        albedo, arrays["roughness"][pixel] = _surface(hit)
+        albedo, arrays["roughness"][pixel] = _read_surface(hit)
         arrays["albedo"][pixel] = albedo
         if reflectances is not None:
             found = reflectances.of_one(hit, hit.bsdf(), albedo)
@@ -256,12 +265,12 @@ def _one_by_one(
     return arrays, None
 
 
-def _address(shape: Any) -> str:
+def _get_id(shape: Any) -> str:
     """Python wrappers of a shape are temporary; its id is not."""
     return str(shape.id())
 
 
-def _surface(hit: Any) -> tuple[np.ndarray, float]:
+def _read_surface(hit: Any) -> tuple[np.ndarray, float]:
     """Albedo and roughness of one hit."""
     bsdf = hit.bsdf()
     if bsdf is None:

@@ -51,7 +51,7 @@ def project(points: np.ndarray, camera: Camera, size: tuple[int, int]) -> tuple[
     """
     height, width = size
     inverse = np.linalg.inv(np.asarray(camera.to_world, np.float64))
-    planes = _planes(points)
+    planes = _to_planes(points)
     local = inverse[:3, : len(planes)] @ planes.reshape(len(planes), -1)
     if len(planes) == 3:
         local += inverse[:3, 3:]
@@ -65,7 +65,7 @@ def project(points: np.ndarray, camera: Camera, size: tuple[int, int]) -> tuple[
     return np.moveaxis(pixels, 0, -1), z[..., None]
 
 
-def relative_poses(
+def compute_relative_poses(
     names: tuple[str, ...], start: Mapping[str, np.ndarray], end: Mapping[str, np.ndarray]
 ) -> np.ndarray:
     """[N + 1, 4, 4] motions that carry a point of each shape from pose ``start`` to pose ``end``.
@@ -81,8 +81,8 @@ def relative_poses(
     return motions
 
 
-def motion_between(current: View, previous: View, *, disocclusion: bool = True) -> Motion:
-    """Motion of the current frame's pixels into the previous frame, and of the previous frame's into the current.
+def compute_motion(current: View, previous: View, *, disocclusion: bool = True) -> Motion:
+    """Compute the motion of the current frame's pixels into the previous frame, and the other way round.
 
     Without ``disocclusion`` the latter, and what was visible, are not computed and None.
 
@@ -99,32 +99,32 @@ def motion_between(current: View, previous: View, *, disocclusion: bool = True) 
     if now.names != before.names or now.ids.shape != before.ids.shape:
         raise ValueError("motion: expected two frames of one size with the same shapes; none may appear or disappear.")
     size = now.ids.shape[:2]
-    back = _moves(now, relative_poses(now.names, current.pose, previous.pose))
+    back = _find_moves(now, compute_relative_poses(now.names, current.pose, previous.pose))
     fixed = same_camera(current.camera, previous.camera)
 
-    points = _homogeneous(now)
-    old_points = _carried(points, back)
+    points = _make_homogeneous(now)
+    old_points = _carry(points, back)
     target, z = project(old_points, previous.camera, size)
     motion = target - project(points, current.camera, size)[0]
     if fixed:
-        motion[_still(size, back)] = 0.0
+        motion[_find_still(size, back)] = 0.0
     sky = now.ids < 0
     previous_depth = np.where(sky, FAR, np.maximum(z, 0.0)).astype(np.float32)
     if not disocclusion:
         return Motion(motion, None, None, previous_depth)
 
-    there = _moves(before, relative_poses(now.names, previous.pose, current.pose))
-    old_surface = _homogeneous(before)
-    moved, _ = project(_carried(old_surface, there), current.camera, size)
+    there = _find_moves(before, compute_relative_poses(now.names, previous.pose, current.pose))
+    old_surface = _make_homogeneous(before)
+    moved, _ = project(_carry(old_surface, there), current.camera, size)
     forward = moved - project(old_surface, previous.camera, size)[0]
     if fixed:
-        forward[_still(size, there)] = 0.0
+        forward[_find_still(size, there)] = 0.0
 
-    normals = _carried(now.normal.astype(np.float64), back)
-    return Motion(motion, forward, _seen(now, before, motion, old_points, normals, z), previous_depth)
+    normals = _carry(now.normal.astype(np.float64), back)
+    return Motion(motion, forward, _find_visible(now, before, motion, old_points, normals, z), previous_depth)
 
 
-def _seen(
+def _find_visible(
     now: GBuffer, before: GBuffer, motion: np.ndarray, points: np.ndarray, normals: np.ndarray, z: np.ndarray
 ) -> np.ndarray:
     """[H, W, 1] bool, the points that the previous frame shows; ``points`` and what follows as in :func:`_matches`."""
@@ -136,12 +136,12 @@ def _seen(
     landing = pixels + motion.astype(np.float32) + np.float32(0.5)
     # The image's border belongs to the outermost pixel.
     tap = np.where(landing == [size[1], size[0]], landing - 1, np.floor(landing))
-    seen, nearest = _matches(before, tap, *shown)
+    seen, nearest = _compare_surfaces(before, tap, *shown)
     on_sky = ((nearest == -1) & ~sky)[..., 0]
     of_those = [each[on_sky] for each in shown]
     for corner in ((0, 0), (1, 0), (0, 1), (1, 1)):
         tap = np.floor(landing[on_sky] - np.float32(0.5)) + corner
-        seen[on_sky] |= _matches(before, tap, *of_those)[0]
+        seen[on_sky] |= _compare_surfaces(before, tap, *of_those)[0]
     return seen
 
 
@@ -154,13 +154,13 @@ class _Moves(NamedTuple):
     """[n, 4, 4]"""
 
 
-def _moves(gbuffer: GBuffer, motions: np.ndarray) -> _Moves:
+def _find_moves(gbuffer: GBuffer, motions: np.ndarray) -> _Moves:
     """The motion of what every pixel shows, from those of the shapes.
 
     An image in mirrors with the reflections M = M_1 ... M_k moves by ``M' T M^-1``, where T is the motion of the thing
     and M' are the reflections at the moved mirrors, ``B M_i B^-1`` with the mirror's motion B.
     """
-    images, shapes = gbuffer.images, gbuffer.ids.reshape(-1)
+    images, shapes = gbuffer.replaced, gbuffer.ids.reshape(-1)
     moves = ~unmoved(motions)
     if images is None:
         pixels = np.flatnonzero(moves[shapes])
@@ -178,7 +178,7 @@ def _moves(gbuffer: GBuffer, motions: np.ndarray) -> _Moves:
     return _Moves(np.concatenate([pixels, images.pixels[moved]]), np.concatenate([motions[shapes[pixels]], whole]))
 
 
-def _carried(points: np.ndarray, moves: _Moves) -> np.ndarray:
+def _carry(points: np.ndarray, moves: _Moves) -> np.ndarray:
     """Homogeneous points [H, W, 4], or directions [H, W, 3], of all pixels after their motion."""
     found = points.copy()
     row, column = np.unravel_index(moves.pixels, points.shape[:2])
@@ -187,22 +187,22 @@ def _carried(points: np.ndarray, moves: _Moves) -> np.ndarray:
     return found
 
 
-def _still(size: tuple[int, int], moves: _Moves) -> np.ndarray:
+def _find_still(size: tuple[int, int], moves: _Moves) -> np.ndarray:
     """[H, W] bool, the pixels that show nothing that moves."""
     found = np.ones(size, bool)
     found.reshape(-1)[moves.pixels] = False
     return found
 
 
-def ray_length(view: View) -> np.ndarray:
+def compute_ray_length(view: View) -> np.ndarray:
     """[H, W, 1] float32 length of the camera rays up to the surfaces, ``FAR`` on a miss."""
     camera = np.asarray(view.camera.to_world, np.float64)[:3, 3]
     length = np.linalg.norm(view.gbuffer.position - camera, axis=-1, keepdims=True)
     return np.where(view.gbuffer.ids >= 0, length, FAR).astype(np.float32)
 
 
-def far_motion(current: View, previous: View) -> np.ndarray:
-    """[H, W, 2] float64 px, motion as in :func:`motion_between` of what is infinitely far away in every pixel.
+def compute_far_motion(current: View, previous: View) -> np.ndarray:
+    """[H, W, 2] float64 px, motion as in :func:`compute_motion` of what is infinitely far away in every pixel.
 
     It turns with the camera and does not move with it; NaN where the direction was behind the previous camera.
     """
@@ -224,21 +224,21 @@ def unmoved(motions: np.ndarray) -> np.ndarray:
     return np.all(motions == np.eye(4), axis=(-2, -1))
 
 
-def _planes(points: np.ndarray) -> np.ndarray:
+def _to_planes(points: np.ndarray) -> np.ndarray:
     """Points [..., C] as planes [C, ...]: as they lie in memory if they are those of a G-buffer."""
     return np.moveaxis(points, -1, 0)
 
 
-def _homogeneous(gbuffer: GBuffer) -> np.ndarray:
+def _make_homogeneous(gbuffer: GBuffer) -> np.ndarray:
     """World positions with 1, directions of the sky with 0: [H, W, 4] float64."""
-    hit = gbuffer.ids[..., 0] >= 0
-    planes = np.empty((4, *hit.shape))
-    planes[:3] = np.where(hit, _planes(gbuffer.position), _planes(gbuffer.direction))
-    planes[3] = hit
+    surface = gbuffer.ids[..., 0] >= 0
+    planes = np.empty((4, *surface.shape))
+    planes[:3] = np.where(surface, _to_planes(gbuffer.position), _to_planes(gbuffer.direction))
+    planes[3] = surface
     return np.moveaxis(planes, 0, -1)
 
 
-def _matches(
+def _compare_surfaces(
     before: GBuffer, tap: np.ndarray, ids: np.ndarray, points: np.ndarray, normals: np.ndarray, z: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Whether the previous frame's pixel ``tap`` shows the same point [..., 1], and the id it shows (-2: none).

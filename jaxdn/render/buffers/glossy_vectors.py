@@ -18,11 +18,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from jaxdn.render.buffers.gbuffer import ids_of, shape_of
-from jaxdn.render.buffers.geometry import View, project, relative_poses, same_camera, unmoved
-from jaxdn.render.tracing.lobes import bounce_numbers
-from jaxdn.render.tracing.seeds import NOISY, frame_key
-from jaxdn.render.tracing.wavefront import camera_rays, generator
+from jaxdn.render.buffers.frame_pair import FramePair, carry, repeat_camera_rays, rotate, to_image, to_lanes
+from jaxdn.render.buffers.gbuffer import look_up_ids, number_shapes
+from jaxdn.render.buffers.geometry import View, compute_relative_poses, project, same_camera, unmoved
+from jaxdn.render.tracing.lobes import draw_bounce_numbers
 
 ROUGHEST = 0.6
 """Rougher surfaces show no reflection that could be followed."""
@@ -34,14 +33,14 @@ _SHORT = 1e-3
 _ALIKE = 0.1
 """Largest difference of roughness between a reflector's two places."""
 
-Between = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
-"""As :func:`between`, for the scene of the previous frame."""
+FindOccluders = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""As :func:`find_occluders`, for the scene of the previous frame."""
 
 
-class Reflected(NamedTuple):
+class SampledReflections(NamedTuple):
     """What one microfacet of every pixel's surface reflects; float64."""
 
-    there: np.ndarray
+    reflects: np.ndarray
     """[H, W] bool, the surface has such microfacets."""
     normal: np.ndarray
     """[H, W, 3] of the microfacet."""
@@ -51,37 +50,32 @@ class Reflected(NamedTuple):
     """[H, W] the id of what it hits."""
 
 
-def glossy_motion(
-    previous: tuple[Any, View], current: tuple[Any, View], motion: np.ndarray, *, seed: int, frame: int, sample: int
-) -> np.ndarray:
-    """The buffer of this name [H, W, 2], in pixels.
+def compute_glossy_motion(frames: FramePair, motion: np.ndarray) -> np.ndarray:
+    """Compute this buffer [H, W, 2], in pixels.
 
-    Args:
-      previous: the ``mi.Scene`` and the geometry of the previous frame.
-      current: those of the current frame.
-      motion: [H, W, 2] that of the surfaces, taken where no reflection can be followed.
-      seed: of the clip.
-      frame: index of the current frame.
-      sample: index of the sample of the noisy image whose microfacets are taken.
+    ``motion`` [H, W, 2], of the surfaces, is taken where no reflection can be followed.
     """
-    found = sampled_reflections(current[0], current[1], key=frame_key(seed, frame, NOISY), sample=sample)
-    return glossy_vectors(found, current[1], previous[1], motion, lambda start, end: between(previous[0], start, end))
+    previous, current = frames.previous, frames.current
+    reflected = sample_reflections(frames)
+    return compute_glossy_vectors(
+        reflected, current.view, previous.view, motion, lambda start, end: find_occluders(previous.scene, start, end)
+    )
 
 
-def glossy_vectors(
-    reflected: Reflected, current: View, previous: View, motion: np.ndarray, between: Between
+def compute_glossy_vectors(
+    reflected: SampledReflections, current: View, previous: View, motion: np.ndarray, find_occluders: FindOccluders
 ) -> np.ndarray:
     """[H, W, 2] float32: the vectors of reflections, ``motion`` where there is none or it cannot be followed.
 
     It cannot where the surface is rougher than ``ROUGHEST``, where the search leaves the reflector or the image, or
-    where it does not arrive. Where something else hid H' from the reflector, as ``between`` tells, the image of that
-    was seen instead: the vector is that image's own, as a *dual* vector, and NaN if that leads off the reflector.
+    where it does not arrive. Where something else hid H' from the reflector, as ``find_occluders`` tells, the image of
+    that was seen instead: the vector is that image's own, as a *dual* vector, and NaN if that leads off the reflector.
     """
     now, size = current.gbuffer, current.gbuffer.ids.shape[:2]
-    motions = relative_poses(now.names, current.pose, previous.pose)
+    motions = compute_relative_poses(now.names, current.pose, previous.pose)
     still = unmoved(motions)[now.ids[..., 0]] & unmoved(motions)[reflected.ids]
     still &= same_camera(current.camera, previous.camera)
-    asked = reflected.there & (now.ids[..., 0] >= 0) & (now.roughness[..., 0] <= ROUGHEST)
+    asked = reflected.reflects & (now.ids[..., 0] >= 0) & (now.roughness[..., 0] <= ROUGHEST)
     row, column = np.nonzero(asked)
     vectors = np.array(motion, np.float32)
     if not len(row) or (np.all(unmoved(motions)) and same_camera(current.camera, previous.camera)):
@@ -89,17 +83,17 @@ def glossy_vectors(
     surface = motions[now.ids[row, column, 0]]
     image = _Image(
         point=np.einsum("nij,nj->ni", motions[reflected.ids[row, column]], reflected.point[row, column]),
-        normal=_turned(surface, now.normal[row, column]),
-        tilt=_turned(surface, reflected.normal[row, column] - now.normal[row, column]),
+        normal=rotate(surface, now.normal[row, column]),
+        tilt=rotate(surface, reflected.normal[row, column] - now.normal[row, column]),
         ids=now.ids[row, column, 0],
         roughness=now.roughness[row, column, 0],
         previous=previous,
     )
     start = np.stack([column, row], axis=-1) + 0.5
     # On the pixel's own plane first: the answer for a flat mirror, and wherever the surface itself was hidden.
-    place = np.einsum("nij,nj->ni", surface[:, :3, :3], now.position[row, column]) + surface[:, :3, 3]
-    target, arrived = image.searched(start + motion[row, column])
-    other, found = image.searched(image.projected(place, image.normal))
+    place = carry(surface, now.position[row, column])
+    target, arrived = image.search(start + motion[row, column])
+    other, found = image.search(image.project(place, image.normal))
     target = np.where(arrived[:, None], target, other)
     here = project(now.position[row, column], current.camera, size)[0]
     # Where neither the reflector nor what it reflects has moved, rounding must not move the image.
@@ -110,11 +104,11 @@ def glossy_vectors(
     vectors[row, column] = target - here
 
     pixel = np.floor(target).astype(int)
-    hidden, other, ids = between(previous.gbuffer.position[pixel[:, 1], pixel[:, 0]], image.point[arrived])
+    hidden, other, ids = find_occluders(previous.gbuffer.position[pixel[:, 1], pixel[:, 0]], image.point[arrived])
     if not np.any(hidden):
         return vectors
-    there = relative_poses(now.names, previous.pose, current.pose)[ids[hidden]]
-    moved = np.einsum("nij,nj->ni", there[:, :3, :3], other[hidden]) + there[:, :3, 3]
+    there = compute_relative_poses(now.names, previous.pose, current.pose)[ids[hidden]]
+    moved = carry(there, other[hidden])
     row, column, here, target = (each[hidden] for each in (row, column, here, target))
     facet = reflected.normal[row, column]
     depth = np.sum((moved - now.position[row, column]) * facet, axis=-1, keepdims=True)
@@ -128,10 +122,10 @@ def glossy_vectors(
     return vectors
 
 
-def between(scene: Any, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whether something lies between points [n, 3] and points [n, 4] (or in a direction, with 0 at the end).
+def find_occluders(scene: Any, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find what lies between points [n, 3] and points [n, 4] (or in a direction, with 0 at the end).
 
-    Returns [n] bool, the first points [n, 3] of these things, and their ids [n].
+    Returns [n] bool, whether there is something, its first point [n, 3], and its id [n].
     """
     onward = end[:, :3] - end[:, 3:] * start
     length = np.linalg.norm(onward, axis=-1, keepdims=True)
@@ -140,16 +134,12 @@ def between(scene: Any, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray,
     skipped = _SHORT * np.minimum(length, 1.0)
     far = np.where(end[:, 3] > 0, (length * (1 - _SHORT) - skipped)[:, 0], np.inf)
     near = start + skipped * onward
-    ray = mi.Ray3f(mi.Point3f(_lanes(near)), mi.Vector3f(_lanes(onward)))
+    ray = mi.Ray3f(mi.Point3f(to_lanes(near)), mi.Vector3f(to_lanes(onward)))
     hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=False, active=mi.Bool(True))
-    distance, point, shape = hit.t, hit.p, shape_of(hit)
+    distance, point, shape = hit.t, hit.p, number_shapes(hit)
     dr.eval(distance, point, shape)
     there = np.array(distance, np.float64) < far
-    return there, np.array(point, np.float64).T, np.where(there, ids_of(scene, np.array(shape)), -1)
-
-
-def _lanes(values: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(values.T.astype(np.float32))
+    return there, np.array(point, np.float64).T, np.where(there, look_up_ids(scene, np.array(shape)), -1)
 
 
 class _Image(NamedTuple):
@@ -167,7 +157,7 @@ class _Image(NamedTuple):
     """[n] of the reflector."""
     previous: View
 
-    def projected(self, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    def project(self, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """[n, 2] the pixels of the virtual images in planes through ``place`` [n, 3], NaN for what is behind one."""
         facet = normal + self.tilt
         facet = facet / np.maximum(np.linalg.norm(facet, axis=-1, keepdims=True), 1e-12)
@@ -178,7 +168,7 @@ class _Image(NamedTuple):
         seen = (height > 0) & (np.sum((eye - place) * facet, axis=-1, keepdims=True) > 0)
         return np.where(seen, project(image, self.previous.camera, self._size)[0], np.nan)
 
-    def searched(self, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def search(self, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the previous frame showed the points, and [n] bool, whether that was found, from a first guess [n, 2].
 
         With F(q) the pixel of the image in the plane that pixel q shows, it solves q = F(q) by Newton's method, whose
@@ -186,9 +176,9 @@ class _Image(NamedTuple):
         """
         arrived = np.zeros(len(target), bool)
         for _ in range(_ROUNDS):
-            pixel, there = self._pixel(target)
-            found, _ = self._at(pixel)
-            across, below = (self._slope(pixel, step, found) for step in ((1, 0), (0, 1)))
+            pixel, there = self._find_pixel(target)
+            found, _ = self._evaluate(pixel)
+            across, below = (self._differentiate(pixel, step, found) for step in ((1, 0), (0, 1)))
             change = found - (pixel + 0.5)
             # (1 - dF/dq) step = F(q) - q, by Cramer's rule.
             a, b, c, d = 1 - across[:, 0], -below[:, 0], -across[:, 1], 1 - below[:, 1]
@@ -200,7 +190,7 @@ class _Image(NamedTuple):
             with np.errstate(invalid="ignore"):
                 arrived = there & np.all(np.abs(step) <= _CLOSE, axis=-1)
             target = pixel + 0.5 + step
-        _, there = self._pixel(target)
+        _, there = self._find_pixel(target)
         return target, arrived & there
 
     @property
@@ -208,7 +198,7 @@ class _Image(NamedTuple):
         height, width = self.previous.gbuffer.ids.shape[:2]
         return height, width
 
-    def _pixel(self, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _find_pixel(self, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The pixels [n, 2] (x, y) of targets, and whether they show the same reflector."""
         height, width = self._size
         pixel = np.floor(target)
@@ -220,40 +210,39 @@ class _Image(NamedTuple):
         same = then.ids[row, column, 0] == self.ids
         return pixel, inside & same & (np.abs(then.roughness[row, column, 0] - self.roughness) < _ALIKE)
 
-    def _at(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _evaluate(self, pixel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """F at pixels, and whether they show the same reflector."""
         height, width = self._size
         inside = np.all((pixel >= 0) & (pixel < [width, height]), axis=-1)
         column, row = np.where(inside[:, None], pixel, 0).T
         then = self.previous.gbuffer
         same = inside & (then.ids[row, column, 0] == self.ids)
-        return self.projected(then.position[row, column], then.normal[row, column].astype(np.float64)), same
+        return self.project(then.position[row, column], then.normal[row, column].astype(np.float64)), same
 
-    def _slope(self, pixel: np.ndarray, step: tuple[int, int], middle: np.ndarray) -> np.ndarray:
+    def _differentiate(self, pixel: np.ndarray, step: tuple[int, int], middle: np.ndarray) -> np.ndarray:
         """[n, 2] the change of F over one pixel: central, on one side where that alone is the reflector, else 0."""
-        (after, has_after), (before, has_before) = (self._at(pixel + sign * np.array(step)) for sign in (1, -1))
+        (after, has_after), (before, has_before) = (self._evaluate(pixel + sign * np.array(step)) for sign in (1, -1))
         forward = np.where(has_after[:, None], after - middle, 0.0)
         backward = np.where(has_before[:, None], middle - before, 0.0)
         slope = (forward + backward) / np.maximum(has_after.astype(int) + has_before, 1)[:, None]
         return np.where(np.isfinite(slope), slope, 0.0)
 
 
-def sampled_reflections(scene: Any, current: View, *, key: tuple[int, int], sample: int) -> Reflected:
-    """The reflections that one sample of each pixel's noisy radiance takes at its first hit.
+def sample_reflections(frames: FramePair) -> SampledReflections:
+    """Sample the reflections that one sample of each pixel's noisy radiance takes at its first hit.
 
     A sample that took a diffuse lobe has no microfacet: that of the surface's own normal stands in. What a surface lets
     through is not followed.
     """
-    height, width = current.gbuffer.ids.shape[:2]
-    pixel = dr.arange(mi.UInt32, width * height)
-    across = dr.opaque(mi.UInt32, width)
-    ray = camera_rays(scene.sensors()[0], pixel % across, pixel // across)
+    scene, current = frames.current
+    size = current.gbuffer.ids.shape[:2]
+    ray, numbers = repeat_camera_rays(scene, frames.noise, frames.sample)
     hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
     bsdf, valid = hit.bsdf(ray), hit.is_valid()
-    _, lobe, point = bounce_numbers(generator(pixel, dr.opaque(mi.UInt32, sample), key))
+    _, lobe, point = draw_bounce_numbers(numbers)
     sampled, weight = bsdf.sample(mi.BSDFContext(), hit, lobe, point, valid)
     goes = dr.max(weight) != 0
-    mirrors, taken = valid & _reflects(bsdf.flags()), goes & _reflects(sampled.sampled_type)
+    mirrors, taken = valid & _is_glossy(bsdf.flags()), goes & _is_glossy(sampled.sampled_type)
     through = goes & mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Transmission)
     plain = mi.Vector3f(-hit.wi.x, -hit.wi.y, hit.wi.z)
     onward = dr.select(taken, sampled.wo, plain)
@@ -262,22 +251,18 @@ def sampled_reflections(scene: Any, current: View, *, key: tuple[int, int], samp
     away = hit.spawn_ray(hit.to_world(onward))
     end = scene.ray_intersect(away, ray_flags=mi.RayFlags.Minimal, coherent=False, active=there)
     goal = dr.select(end.is_valid(), end.p, mi.Point3f(away.d))
-    shape = shape_of(end)
+    shape = number_shapes(end)
     dr.eval(there, facet, goal, shape)
-    ids = ids_of(scene, np.array(shape)).reshape(height, width)
-    points, facets = (np.array(each, np.float64).T.reshape(height, width, 3) for each in (goal, facet))
-    return Reflected(
-        np.array(there).astype(bool).reshape(height, width),
+    ids = look_up_ids(scene, np.array(shape)).reshape(size)
+    points, facets = (to_image(each, size, np.float64) for each in (goal, facet))
+    return SampledReflections(
+        to_image(there, size, bool),
         np.where(np.isfinite(facets), facets, 0.0),
         np.concatenate([points, (ids >= 0)[..., None]], axis=-1),
         ids,
     )
 
 
-def _reflects(flags: Any) -> Any:
+def _is_glossy(flags: Any) -> Any:
     """Whether flags of lobes are of one that reflects and is not diffuse."""
     return mi.has_flag(flags, mi.BSDFFlags.GlossyReflection) | mi.has_flag(flags, mi.BSDFFlags.DeltaReflection)
-
-
-def _turned(motions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    return np.einsum("nij,nj->ni", motions[:, :3, :3], directions)

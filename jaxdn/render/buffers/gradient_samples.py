@@ -7,22 +7,23 @@ of the two frames; the noisy image itself is left as it is.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxdn.color import LUMINANCE
-from jaxdn.render.buffers.geometry import SAME_PLANE, View, project, relative_poses, same_camera, unmoved
-from jaxdn.render.tracing.seeds import NOISY, frame_key, tea
-from jaxdn.render.tracing.wavefront import Replayed
+from jaxdn.render.buffers.frame_pair import FramePair, carry
+from jaxdn.render.buffers.geometry import SAME_PLANE, View, compute_relative_poses, project, same_camera, unmoved
+from jaxdn.render.tracing.radiance import ReplayedPaths
+from jaxdn.render.tracing.seeds import SampleStream, tea
 
 STRATUM = 3
 """Pixels along one side of a stratum."""
-Replay = Callable[..., Replayed]
-""":func:`jaxdn.render.tracing.wavefront.replay`, or that of :mod:`jaxdn.render.tracing.exact`."""
+Replay = Callable[..., ReplayedPaths]
+""":func:`jaxdn.render.tracing.vectorised_path_tracer.replay`, or that of the scalar path tracer."""
 
 
-class Picked(NamedTuple):
+class GradientPoints(NamedTuple):
     """Points of the previous frame, one for each stratum that saw a surface there, and where they are now."""
 
     pixel: np.ndarray
@@ -35,17 +36,8 @@ class Picked(NamedTuple):
     """[n] view-space z there."""
 
 
-def luminance_gradient(
-    replay: Replay,
-    previous: tuple[Any, View],
-    current: tuple[Any, View],
-    *,
-    seed: int,
-    frame: int,
-    sample: int,
-    max_depth: int,
-) -> np.ndarray:
-    """The buffer of this name [H, W, 2]: change of the samples' luminance, and the larger luminance of both frames.
+def compute_luminance_gradient(replay: Replay, frames: FramePair, *, max_depth: int) -> np.ndarray:
+    """Compute this buffer [H, W, 2]: change of the samples' luminance, and the larger luminance of both frames.
 
     It is scattered to the pixels that the points have reached, at most one in each stratum, and 0 elsewhere: where
     nothing landed, or something else is seen now. If no sample at all has changed the whole buffer is 0, which is its
@@ -53,53 +45,51 @@ def luminance_gradient(
 
     Args:
       replay: of the tracer.
-      previous: the ``mi.Scene`` and the geometry of the previous frame.
-      current: those of the current frame.
-      seed: of the clip.
-      frame: index of the current frame.
-      sample: index of the sample of the previous frame's noisy image that is replayed.
+      frames: the two frames, and the sample of the previous frame's noisy image that is replayed.
       max_depth: path length.
     """
-    height, width = current[1].gbuffer.ids.shape[:2]
-    picked = pick(previous[1], current[1], seed=seed, frame=frame)
-    if not len(picked.pixel):
+    previous, current = frames.previous, frames.current
+    height, width = current.view.gbuffer.ids.shape[:2]
+    points = pick_points(previous.view, current.view, frames.noise)
+    if not len(points.pixel):
         return np.zeros((height, width, 2), np.float32)
-    start = np.stack([picked.pixel % width, picked.pixel // width], -1) + 0.5
-    options: dict[str, Any] = {"key": frame_key(seed, frame - 1, NOISY), "sample": sample, "max_depth": max_depth}
-    old = replay(previous[0], start, picked.pixel, **options)
-    new = replay(current[0], picked.target, picked.pixel, **options)
+    start = np.stack([points.pixel % width, points.pixel // width], -1) + 0.5
+    numbers = frames.noise._replace(frame=frames.noise.frame - 1), frames.sample
+    old = replay(previous.scene, *numbers, start, points.pixel, max_depth=max_depth)
+    new = replay(current.scene, *numbers, points.target, points.pixel, max_depth=max_depth)
     # Through the same point the ray hits this point, unless something is in between now.
-    seen = np.linalg.norm(new.position - picked.position, axis=-1) <= SAME_PLANE * picked.depth
+    seen = np.linalg.norm(new.position - points.position, axis=-1) <= SAME_PLANE * points.depth
     first, second = old.light @ LUMINANCE, new.light @ LUMINANCE
     samples = np.stack([second - first, np.maximum(first, second)], -1)
-    return scattered(samples[seen], picked.target[seen], picked.depth[seen], (height, width))
+    return scatter_samples(samples[seen], points.target[seen], points.depth[seen], (height, width))
 
 
-def pick(previous: View, current: View, *, seed: int, frame: int) -> Picked:
-    """One pixel of each stratum of the previous frame, at random among those that see a surface; those now off screen
-    are left out."""
+def pick_points(previous: View, current: View, stream: SampleStream) -> GradientPoints:
+    """Pick one pixel of each stratum of the previous frame, at random among those that see a surface.
+
+    Those that are off screen in the current frame, which ``stream`` belongs to, are left out.
+    """
     then = previous.gbuffer
     size = then.ids.shape[:2]
-    pixel = _random_in_strata(then.ids[..., 0] >= 0, seed, frame)
+    pixel = _pick_in_strata(then.ids[..., 0] >= 0, stream)
     row, column = np.divmod(pixel, size[1])
-    motion = relative_poses(then.names, previous.pose, current.pose)[then.ids[row, column, 0]]
-    old = then.position[row, column]
-    position = np.einsum("nij,nj->ni", motion[:, :3, :3], old) + motion[:, :3, 3]
+    motion = compute_relative_poses(then.names, previous.pose, current.pose)[then.ids[row, column, 0]]
+    position = carry(motion, then.position[row, column])
     target, depth = project(position, current.camera, size)
     # Rounding must not move what stands still: a ray elsewhere would hit another triangle, texel or edge.
     still = unmoved(motion) & same_camera(previous.camera, current.camera)
     target = np.where(still[:, None], np.stack([column, row], -1) + 0.5, target)
     with np.errstate(invalid="ignore"):
         inside = np.all((target >= 0) & (target < [size[1], size[0]]), axis=-1)
-    return Picked(pixel[inside], target[inside], position[inside], depth[inside, 0])
+    return GradientPoints(pixel[inside], target[inside], position[inside], depth[inside, 0])
 
 
-def _random_in_strata(there: np.ndarray, seed: int, frame: int) -> np.ndarray:
-    """The indices of pixels, one for each stratum of ``there`` [H, W] that has a true one."""
-    height, width = there.shape
+def _pick_in_strata(surface: np.ndarray, stream: SampleStream) -> np.ndarray:
+    """The indices of pixels, one for each stratum of the mask ``surface`` [H, W] that has a true one."""
+    height, width = surface.shape
     index = np.arange(height * width, dtype=np.int64)
-    score = tea(index, np.full_like(index, tea(frame, seed)[0]))[0].reshape(height, width)
-    wide = np.pad(np.where(there, score, -1), ((0, -height % STRATUM), (0, -width % STRATUM)), constant_values=-1)
+    score = tea(index, np.full_like(index, tea(stream.frame, stream.seed)[0]))[0].reshape(height, width)
+    wide = np.pad(np.where(surface, score, -1), ((0, -height % STRATUM), (0, -width % STRATUM)), constant_values=-1)
     rows, columns = (size // STRATUM for size in wide.shape)
     strata = wide.reshape(rows, STRATUM, columns, STRATUM).transpose(0, 2, 1, 3).reshape(rows, columns, -1)
     place = np.argmax(strata, axis=-1)
@@ -108,8 +98,8 @@ def _random_in_strata(there: np.ndarray, seed: int, frame: int) -> np.ndarray:
     return (row * width + column)[strata.max(axis=-1) >= 0]
 
 
-def scattered(samples: np.ndarray, target: np.ndarray, depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """The buffer [H, W, 2] of samples [n, 2] at ``target`` [n, 2]; of several in one stratum the nearest one is kept.
+def scatter_samples(samples: np.ndarray, target: np.ndarray, depth: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Scatter samples [n, 2] to ``target`` [n, 2] of a buffer [H, W, 2]; in each stratum the nearest one is kept.
 
     All 0 if no sample has changed.
     """

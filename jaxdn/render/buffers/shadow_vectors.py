@@ -16,11 +16,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from jaxdn.render.buffers.gbuffer import ids_of, shape_names, shape_of
-from jaxdn.render.buffers.geometry import SAME_NORMAL, View, project, relative_poses
-from jaxdn.render.tracing.light_samples import light_sample
-from jaxdn.render.tracing.seeds import NOISY, frame_key
-from jaxdn.render.tracing.wavefront import camera_rays, generator
+from jaxdn.render.buffers.frame_pair import FramePair, carry, repeat_camera_rays, rotate, to_image, to_lanes
+from jaxdn.render.buffers.gbuffer import list_shape_names, look_up_ids, number_shapes
+from jaxdn.render.buffers.geometry import SAME_NORMAL, View, compute_relative_poses, project
+from jaxdn.render.tracing.light_samples import sample_light
 
 _GRAZING = 1e-4
 """Least cosine between a ray of light and a surface."""
@@ -28,7 +27,7 @@ _NEAR_PLANE = 0.01
 """Largest distance of what the target shows from the receiver's plane, as a fraction of its depth."""
 
 
-class Lights(NamedTuple):
+class SampledLights(NamedTuple):
     """One point of a light for every pixel, and what hides it; float64."""
 
     point: np.ndarray
@@ -47,7 +46,7 @@ class Lights(NamedTuple):
     """[H, W] its id."""
 
 
-class Blocked(NamedTuple):
+class PreviousBlockers(NamedTuple):
     """What hides the lights in the previous frame."""
 
     there: np.ndarray
@@ -58,25 +57,19 @@ class Blocked(NamedTuple):
     """[H, W]."""
 
 
-def shadow_motion(
-    previous: tuple[Any, View], current: tuple[Any, View], motion: np.ndarray, *, seed: int, frame: int, sample: int
-) -> np.ndarray:
-    """The buffer of this name [H, W, 2], in pixels.
+def compute_shadow_motion(frames: FramePair, motion: np.ndarray) -> np.ndarray:
+    """Compute this buffer [H, W, 2], in pixels.
 
-    Args:
-      previous: the ``mi.Scene`` and the geometry of the previous frame.
-      current: those of the current frame.
-      motion: [H, W, 2] that of the surfaces, taken where there is no shadow.
-      seed: of the clip.
-      frame: index of the current frame.
-      sample: index of the sample of the noisy image whose points of lights are taken.
+    ``motion`` [H, W, 2], of the surfaces, is taken where no shadow lies.
     """
-    found = sampled_lights(current[0], current[1], previous[1], key=frame_key(seed, frame, NOISY), sample=sample)
-    before = previous_blockers(previous[0], found, current[1], previous[1])
-    return shadow_vectors(found, before, current[1], previous[1], motion)
+    lights = sample_lights(frames)
+    before = find_previous_blockers(frames, lights)
+    return compute_shadow_vectors(lights, before, frames.current.view, frames.previous.view, motion)
 
 
-def shadow_vectors(lights: Lights, before: Blocked, current: View, previous: View, motion: np.ndarray) -> np.ndarray:
+def compute_shadow_vectors(
+    lights: SampledLights, before: PreviousBlockers, current: View, previous: View, motion: np.ndarray
+) -> np.ndarray:
     """[H, W, 2] float32: the vectors of shadows, ``motion`` where there is none or its history is not known.
 
     It is not known where the ray of light grazes the surface, where the shadow lay off screen, or where the previous
@@ -84,31 +77,31 @@ def shadow_vectors(lights: Lights, before: Blocked, current: View, previous: Vie
     """
     now = current.gbuffer
     size = now.ids.shape[:2]
-    back = _motions(current, previous)
-    there = _motions(previous, current)
+    back = _compute_motions(current, previous)
+    there = _compute_motions(previous, current)
     ids = now.ids[..., 0]
     receiver = back[ids]
-    old_place, old_normal = _carried(receiver, now.position), _turned(receiver, lights.normal)
+    old_place, old_normal = carry(receiver, now.position), _rotate_normals(receiver, lights.normal)
     old_light = np.einsum("hwij,hwj->hwi", lights.motion, lights.point)
 
     # Under a shadow: where did it lie?
-    carried = _carried(back[lights.blocker_ids], lights.blocker)
-    lay = meets_plane(old_light, carried, old_place, old_normal)
+    carried = carry(back[lights.blocker_ids], lights.blocker)
+    lay = intersect_plane(old_light, carried, old_place, old_normal)
     under = project(lay, previous.camera, size)[0] - project(now.position, current.camera, size)[0]
     # Left by a shadow: where has it gone?
-    carried = _carried(there[before.ids], before.blocker)
-    lies = meets_plane(lights.point, carried, now.position, lights.normal)
+    carried = carry(there[before.ids], before.blocker)
+    lies = intersect_plane(lights.point, carried, now.position, lights.normal)
     left = project(old_place, previous.camera, size)[0] - project(lies, current.camera, size)[0]
 
     blocker = np.where(lights.blocked[..., None, None], back[lights.blocker_ids], back[before.ids])
-    rigid = _equal(receiver, blocker) & _equal(receiver, lights.motion)
+    rigid = _are_equal(receiver, blocker) & _are_equal(receiver, lights.motion)
     shadow = lights.lit & (lights.blocked | before.there) & ~rigid & (ids >= 0)
     vectors = np.where(lights.blocked[..., None], under, left)
-    known = shadow & on_plane(vectors, previous, old_place, old_normal)
+    known = shadow & is_on_plane(vectors, previous, old_place, old_normal)
     return np.where(known[..., None], vectors, motion).astype(np.float32)
 
 
-def meets_plane(light: np.ndarray, blocker: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def intersect_plane(light: np.ndarray, blocker: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """[..., 3] where rays of light behind their blockers meet planes; NaN where they do not.
 
     Args:
@@ -126,7 +119,7 @@ def meets_plane(light: np.ndarray, blocker: np.ndarray, place: np.ndarray, norma
     return np.where(steep & (ahead >= 0), blocker + ahead * onward, np.nan)
 
 
-def on_plane(vectors: np.ndarray, previous: View, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
+def is_on_plane(vectors: np.ndarray, previous: View, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """[H, W] bool: the nearest pixel of the previous frame to ``p + vector(p)`` shows the plane of the surface."""
     height, width = vectors.shape[:2]
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1) + 0.5
@@ -140,63 +133,61 @@ def on_plane(vectors: np.ndarray, previous: View, place: np.ndarray, normal: np.
     return inside & (then.ids[row, column, 0] >= 0) & alike & (distance < _NEAR_PLANE * then.depth[row, column, 0])
 
 
-def sampled_lights(scene: Any, current: View, previous: View, *, key: tuple[int, int], sample: int) -> Lights:
-    """The points of lights that one sample of each pixel's noisy radiance takes at its first hit."""
-    height, width = current.gbuffer.ids.shape[:2]
-    pixel = dr.arange(mi.UInt32, width * height)
-    across = dr.opaque(mi.UInt32, width)
-    ray = camera_rays(scene.sensors()[0], pixel % across, pixel // across)
-    found = light_sample(scene, ray, generator(pixel, dr.opaque(mi.UInt32, sample), key))
+def sample_lights(frames: FramePair) -> SampledLights:
+    """Sample the points of lights that one sample of each pixel's noisy radiance takes at its first hit."""
+    scene, current = frames.current
+    size = current.gbuffer.ids.shape[:2]
+    found = sample_light(scene, *repeat_camera_rays(scene, frames.noise, frames.sample))
     far = mi.has_flag(found.towards.emitter.flags(), mi.EmitterFlags.Infinite)
     point = dr.select(far, mi.Point3f(found.towards.d), found.towards.p)
     number = dr.reinterpret_array(mi.UInt32, found.towards.emitter)
-    lit, blocked, shape = dr.max(found.whole) > 0, found.blocked, shape_of(found.blocker)
+    lit, blocked, shape = dr.max(found.whole) > 0, found.blocked, number_shapes(found.blocker)
     dr.eval(point, far, number, found.hit.n, lit, blocked, found.blocker.p, shape)
 
     def image(lanes: Any, dtype: Any) -> np.ndarray:
-        values = np.array(lanes).T.astype(dtype)
-        return values.reshape(height, width, *values.shape[1:])
+        return to_image(lanes, size, dtype)
 
-    motions, lookup = _light_motions(scene, current, previous)
+    motions, lookup = _compute_light_motions(scene, current, frames.previous.view)
     different, inverse = np.unique(image(number, np.int64), return_inverse=True)
-    rank = np.array([lookup.get(int(one), -1) for one in different])[inverse.reshape(height, width)]
+    rank = np.array([lookup.get(int(one), -1) for one in different])[inverse.reshape(size)]
     hidden, near = image(blocked, bool), ~image(far, bool)
-    return Lights(
+    return SampledLights(
         point=np.concatenate([image(point, np.float64), near[..., None]], axis=-1),
         motion=motions[rank],
         normal=image(found.hit.n, np.float64),
         lit=image(lit, bool),
         blocked=hidden,
         blocker=np.where(hidden[..., None], image(found.blocker.p, np.float64), 0.0),
-        blocker_ids=np.where(hidden, ids_of(scene, np.array(shape)).reshape(height, width), -1),
+        blocker_ids=np.where(hidden, look_up_ids(scene, np.array(shape)).reshape(size), -1),
     )
 
 
-def previous_blockers(scene: Any, lights: Lights, current: View, previous: View) -> Blocked:
-    """What hides the same points of the lights, in the previous frame, from the same points of surfaces."""
+def find_previous_blockers(frames: FramePair, lights: SampledLights) -> PreviousBlockers:
+    """Find what hides the same points of the lights, in the previous frame, from the same points of surfaces."""
+    (scene, previous), current = frames.previous, frames.current.view
     shape = lights.lit.shape
-    back = _motions(current, previous)[current.gbuffer.ids[..., 0]]
-    place = _carried(back, current.gbuffer.position)
+    back = _compute_motions(current, previous)[current.gbuffer.ids[..., 0]]
+    place = carry(back, current.gbuffer.position)
     light = np.einsum("hwij,hwj->hwi", lights.motion, lights.point)
     # A light that is infinitely far away is behind everything.
     reach = 4 * float(scene.bbox().bounding_sphere().radius) + 1.0
     goal = np.where(light[..., 3:] != 0, light[..., :3], place + reach * light[..., :3])
     start = dr.zeros(mi.SurfaceInteraction3f, shape[0] * shape[1])
-    start.p, start.n = mi.Point3f(_lanes(place)), mi.Normal3f(_lanes(_turned(back, lights.normal)))
+    start.p, start.n = mi.Point3f(to_lanes(place)), mi.Normal3f(to_lanes(_rotate_normals(back, lights.normal)))
     asked = mi.Bool((lights.lit & ~lights.blocked).ravel())
-    ray = start.spawn_ray_to(mi.Point3f(_lanes(goal)))
+    ray = start.spawn_ray_to(mi.Point3f(to_lanes(goal)))
     hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.Minimal, coherent=False, active=asked)
-    there, point, number = asked & hit.is_valid(), hit.p, shape_of(hit)
+    there, point, number = asked & hit.is_valid(), hit.p, number_shapes(hit)
     dr.eval(there, point, number)
     hidden = np.array(there).astype(bool).reshape(shape)
-    ids = ids_of(scene, np.array(number)).reshape(shape)
+    ids = look_up_ids(scene, np.array(number)).reshape(shape)
     blocker = np.array(point, np.float64).T.reshape(*shape, 3)
-    return Blocked(hidden, np.where(hidden[..., None], blocker, 0.0), np.where(hidden, ids, -1))
+    return PreviousBlockers(hidden, np.where(hidden[..., None], blocker, 0.0), np.where(hidden, ids, -1))
 
 
-def _light_motions(scene: Any, current: View, previous: View) -> tuple[np.ndarray, dict[int, int]]:
+def _compute_light_motions(scene: Any, current: View, previous: View) -> tuple[np.ndarray, dict[int, int]]:
     """The motions [N + 1, 4, 4] of lights from the current to the previous frame, and Mitsuba's number of each one."""
-    names = dict(zip((shape.id() for shape in scene.shapes()), shape_names(scene), strict=True))
+    names = dict(zip((shape.id() for shape in scene.shapes()), list_shape_names(scene), strict=True))
     owners: list[str] = []
     lookup: dict[int, int] = {}
     reinterpret: Any = dr.reinterpret_array
@@ -204,27 +195,18 @@ def _light_motions(scene: Any, current: View, previous: View) -> tuple[np.ndarra
         owner = emitter.get_shape()
         lookup[int(reinterpret(mi.UInt32, mi.EmitterPtr(emitter))[0])] = len(owners)
         owners.append(emitter.id() if owner is None else names[owner.id()])
-    return relative_poses(tuple(owners), current.pose, previous.pose), lookup
+    return compute_relative_poses(tuple(owners), current.pose, previous.pose), lookup
 
 
-def _motions(start: View, end: View) -> np.ndarray:
-    return relative_poses(start.gbuffer.names, start.pose, end.pose)
+def _compute_motions(start: View, end: View) -> np.ndarray:
+    return compute_relative_poses(start.gbuffer.names, start.pose, end.pose)
 
 
-def _carried(motions: np.ndarray, points: np.ndarray) -> np.ndarray:
-    return np.einsum("hwij,hwj->hwi", motions[..., :3, :3], points) + motions[..., :3, 3]
-
-
-def _turned(motions: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    turned = np.einsum("hwij,hwj->hwi", motions[..., :3, :3], directions)
+def _rotate_normals(motions: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    turned = rotate(motions, normals)
     length = np.linalg.norm(turned, axis=-1, keepdims=True)
     return turned / np.where(length > 0, length, 1.0)
 
 
-def _equal(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _are_equal(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.all(first == second, axis=(-2, -1))
-
-
-def _lanes(values: np.ndarray) -> np.ndarray:
-    """[H, W, 3] as Mitsuba takes it."""
-    return np.ascontiguousarray(values.reshape(-1, 3).T.astype(np.float32))

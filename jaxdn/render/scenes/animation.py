@@ -19,7 +19,7 @@ then a translation. An inserted shape is a sphere, cube, cylinder (along z) or r
 linearly, rotations about one axis linearly in the angle, other rotations spherically; before the first and after the
 last key nothing moves. ``lights`` names emitters, or shapes that emit, and scales their radiance: by one number, or by
 three for red, green and blue. ``materials`` names BSDFs, or shapes whose BSDF has no id, and changes their colours and
-roughness for the whole clip (:func:`jaxdn.render.scenes.repaint.repaint` has the formula).
+roughness for the whole clip (:func:`jaxdn.render.scenes.material_overrides.override_materials` has the formula).
 """
 
 import difflib

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdn.render.scenes.parsed import Parsed
+from jaxdn.render.scenes.scene_parser import SceneParser
 
 _POWERS = ("radiance", "intensity", "irradiance", "power")
 """The properties that define an emitter's brightness."""
@@ -14,7 +14,7 @@ _SCALES = ("scale", "sky_scale", "sun_scale")
 
 
 class Light(NamedTuple):
-    """One light of a parsed scene."""
+    """One light of a scene file."""
 
     owner: int
     """The child of the scene that it is, or is a part of."""
@@ -28,43 +28,43 @@ class Light(NamedTuple):
     """It is given in red, green and blue, each of which can be scaled by itself."""
 
 
-def lights_of(parsed: Parsed) -> dict[str, Light]:
+def lights_of(parser: SceneParser) -> dict[str, Light]:
     """The lights of a scene by their names: those of lamps, of shapes that emit, and the ids of these shapes' emitters.
 
     An emitter that stands beside the shapes, and that one of them refers to, is that shape's.
     """
     found: dict[str, Light] = {}
-    for owner in parsed.children:
-        kind = parsed.type_of(owner)
+    for owner in parser.children:
+        kind = parser.type_of(owner)
         if kind not in ("Shape", "Emitter"):
             continue
-        nodes = [owner] if kind == "Emitter" else parsed.references(owner)
-        for emitter in (node for node in nodes if parsed.type_of(node) == "Emitter"):
-            light = _light(parsed, owner, emitter)
+        nodes = [owner] if kind == "Emitter" else parser.references(owner)
+        for emitter in (node for node in nodes if parser.type_of(node) == "Emitter"):
+            light = _light(parser, owner, emitter)
             if kind == "Shape":
-                found[parsed.names[owner]] = light
-            name = parsed.id(emitter)
+                found[parser.names[owner]] = light
+            name = parser.id(emitter)
             if name and (kind == "Shape" or name not in found):
                 found[name] = light
     return found
 
 
-def _light(parsed: Parsed, owner: int, emitter: int) -> Light:
-    values = parsed.values(emitter)
+def _light(parser: SceneParser, owner: int, emitter: int) -> Light:
+    values = parser.values(emitter)
     powers = [values[name] for name in _POWERS if name in values]
     plain = [type(value).__name__ for value in powers if type(value).__name__ != "ResolvedReference"]
-    scaled = parsed.plugin(emitter) in ("envmap", "sky", "sun", "sunsky")
+    scaled = parser.plugin(emitter) in ("envmap", "sky", "sun", "sunsky")
     return Light(
         owner, emitter, bool(powers) or scaled, bool(plain), bool(plain) and all("Color" in name for name in plain)
     )
 
 
-def check_lights(parsed: Parsed, lights: Mapping[str, Light], keys: Mapping[str, Any]) -> None:
+def check_lights(parser: SceneParser, lights: Mapping[str, Light], keys: Mapping[str, Any]) -> None:
     """Raise ValueError for a name that is not a light of the scene, or a light that cannot be scaled so."""
     for name in keys:
         if name not in lights:
             known = ", ".join(lights) or "none"
-            raise ValueError(f"animation lights: the scene {parsed.path} has no light {name!r}; it has {known}.")
+            raise ValueError(f"animation lights: the scene {parser.path} has no light {name!r}; it has {known}.")
         if not lights[name].scalable:
             raise ValueError(f"animation lights: {name!r} has no colour or number to scale; give it one in the scene.")
         if any(np.ptp(np.broadcast_to(key["scale"], 3)) > 0 for key in keys[name]) and not lights[name].colored:

@@ -18,7 +18,7 @@ class Material(NamedTuple):
     """One BSDF with everything nested in it."""
 
     lobes: frozenset[str]
-    """As in :class:`jaxdn.planning.facts.Surface`."""
+    """As in :class:`jaxdn.planning.scene_properties.Surface`."""
     textured: bool = False
     unsure: Mapping[str, str] = {}
     """Effect -> why it could not be decided."""

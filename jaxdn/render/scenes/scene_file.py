@@ -1,8 +1,8 @@
 """Animated Mitsuba scene files: any scene XML, with an animation file of keys next to it.
 
-Mitsuba's own parser and loader are used (:mod:`jaxdn.render.scenes.parsed`): static parts are loaded once; for every
-frame the camera, the moving shapes with the motion in front of their transform, lights that change and inserted shapes
-are loaded in addition.
+Mitsuba's own parser and loader are used (:mod:`jaxdn.render.scenes.scene_parser`): static parts are loaded once; for
+every frame the camera, the moving shapes with the motion in front of their transform, lights that change and inserted
+shapes are loaded in addition.
 """
 
 import difflib
@@ -23,8 +23,8 @@ from jaxdn.render.scenes.animation import (
     read_animation,
 )
 from jaxdn.render.scenes.lights import check_lights, lights_of, scale_light
-from jaxdn.render.scenes.parsed import Parsed
 from jaxdn.render.scenes.scene import Camera
+from jaxdn.render.scenes.scene_parser import SceneParser
 
 _DEPTH = 8
 """Path length if the file has unlimited paths or does not specify it."""
@@ -34,11 +34,11 @@ class SceneFile:
     """A Mitsuba 3 scene file as an animated scene; see :mod:`jaxdn.render.scenes.animation` for the JSON file.
 
     Without ``animation_path`` the file ``<scene>.json`` next to the scene is used if there is one, and a scene without
-    an animation is static. Shapes and lights without an id are named (:class:`jaxdn.render.scenes.parsed.Parsed`). The
-    camera is the file's first sensor, which must be a perspective one; its horizontal field of view is that of the
-    file's own film at every image size. Raises ValueError for files that cannot be read and animations that do not
-    match the scene. Warns of what the file asks for and rendering leaves out: a crop of the film, lights that are
-    hidden.
+    an animation is static. Shapes and lights without an id are named by the
+    :class:`jaxdn.render.scenes.scene_parser.SceneParser`. The camera is the file's first sensor, which must be a
+    perspective one; its horizontal field of view is that of the file's own film at every image size. Raises ValueError
+    for files that cannot be read and animations that do not match the scene. Warns of what the file asks for and
+    rendering leaves out: a crop of the film, lights that are hidden.
     """
 
     def __init__(self, path: Path | str, animation_path: Path | str | None = None) -> None:
@@ -64,10 +64,10 @@ class SceneFile:
         return path.parent.name if path.stem == "scene" and path.parent.name else path.stem
 
     def _open(self, path: Path, animation: dict[str, Any]) -> None:
-        self._parsed = parsed = Parsed(path)
-        self._shapes = {parsed.names[child]: child for child in parsed.of_type("Shape")}
-        shapes = [name for name, child in self._shapes.items() if parsed.plugin(child) != "shapegroup"]
-        self._rest, self.near, self._far, self._medium = _rest_camera(parsed)
+        self._parser = parser = SceneParser(path)
+        self._shapes = {parser.names[child]: child for child in parser.of_type("Shape")}
+        shapes = [name for name, child in self._shapes.items() if parser.plugin(child) != "shapegroup"]
+        self._rest, self.near, self._far, self._medium = _rest_camera(parser)
         check_animation(animation, shapes, has_camera=self._rest is not None)
         if self._rest is None and "camera" not in animation:
             raise ValueError(
@@ -75,7 +75,7 @@ class SceneFile:
             )
         self.name = self.name_of(path)
         self.frames = int(animation.get("frames", 1))
-        self.max_depth = _path_length(parsed)
+        self.max_depth = _path_length(parser)
         near = os.path.relpath(path)
         self.record = {"file": path.resolve().as_posix() if near.startswith("..") else near, "animation": animation}
         self._camera = CameraKeys(animation["camera"]) if "camera" in animation else None
@@ -86,17 +86,17 @@ class SceneFile:
         self._inserted = {shape["id"]: shape for shape in animation.get("inserted", [])}
         for name, shape in self._inserted.items():
             self._motions[name] = RigidKeys(shape.get("keys", [{"frame": 0}]), np.zeros(3))
-        self._known_lights = lights_of(parsed)
+        self._known_lights = lights_of(parser)
         self._lights = animation.get("lights", {})
-        check_lights(parsed, self._known_lights, self._lights)
+        check_lights(parser, self._known_lights, self._lights)
         self._materials = animation.get("materials", {})
-        _check_materials(parsed, self._materials)
+        _check_materials(parser, self._materials)
         changing = {child for name, child in self._shapes.items() if name in self._motions}
         changing |= {self._known_lights[name].emitter for name in self._lights}
         # An emitter that a shape refers to is a part of that shape.
-        lamps = set(parsed.of_type("Emitter")).difference(*map(parsed.references, self._shapes.values()))
+        lamps = set(parser.of_type("Emitter")).difference(*map(parser.references, self._shapes.values()))
         parts = [*self._shapes.values(), *sorted(lamps)]
-        self._moving = [child for child in parts if changing & parsed.inside(child)]
+        self._moving = [child for child in parts if changing & parser.inside(child)]
         self._resting = [child for child in parts if child not in self._moving]
         self._still: tuple[str, list[Any]] | None = None
 
@@ -122,19 +122,19 @@ class SceneFile:
     def lights(self) -> dict[str, bool]:
         """The lights whose radiance keys can scale -> whether they can scale red, green and blue by themselves."""
         lights = {child: light for light in self._known_lights.values() for child in [light.owner]}
-        return {self._parsed.names[owner]: lights[owner].colored for owner in sorted(lights) if lights[owner].plain}
+        return {self._parser.names[owner]: lights[owner].colored for owner in sorted(lights) if lights[owner].plain}
 
     def build(self, frame: float, width: int, height: int) -> Any:
         """The ``mi.Scene`` of one frame; static parts are loaded once and shared by all frames."""
         import mitsuba as mi
 
+        from jaxdn.render.scenes.material_overrides import list_shapes, override_materials
         from jaxdn.render.scenes.plugins import shape_groups
-        from jaxdn.render.scenes.repaint import repaint, shapes_of
 
         variant = str(mi.variant())
         if self._still is None or self._still[0] != variant:
-            still = self._parsed.load(self._resting)
-            repaint(shapes_of(still), self._materials)
+            still = self._parser.load(self._resting)
+            override_materials(list_shapes(still), self._materials)
             # Groups are kept for inspection: instances do not show their contents.
             lamps = [emitter for emitter in still.emitters() if emitter.get_shape() is None]
             self._still = variant, [*still.shapes(), *shape_groups(still), *lamps]
@@ -152,19 +152,19 @@ class SceneFile:
         """The shapes and lamps of the file that move or change, in one frame."""
         import mitsuba as mi
 
-        from jaxdn.render.scenes.repaint import repaint
+        from jaxdn.render.scenes.material_overrides import override_materials
 
         poses, lights = self.pose(frame), self.brightness(frame)
         found: dict[int, Any] = {}
         for node in self._moving:
             changes: dict[str, Any] = {}
-            pose = poses.get(self._parsed.names[node])
+            pose = poses.get(self._parser.names[node])
             if pose is not None:
-                rest = self._parsed.values(node).get("to_world")
+                rest = self._parser.values(node).get("to_world")
                 own = np.eye(4) if rest is None else np.array(rest.matrix, np.float64).reshape(4, 4)
                 changes["to_world"] = mi.ScalarTransform4d(pose @ own)
-            found[node] = self._parsed.load_node(node, changes, still)
-        repaint([found[node] for node in self._moving if node in self._shapes.values()], self._materials)
+            found[node] = self._parser.load_node(node, changes, still)
+        override_materials([found[node] for node in self._moving if node in self._shapes.values()], self._materials)
         for name, factor in lights.items():
             owner = self._known_lights[name].owner
             emitter = found[owner].emitter() if owner in self._shapes.values() else found[owner]
@@ -186,66 +186,66 @@ class SceneFile:
             "to_world": mi.ScalarTransform4d(np.asarray(camera.to_world, np.float64)),
             "sampler": {"type": "independent"},
             "film": {**film, "pixel_format": "rgb", "component_format": "float32"},
-            **({} if self._medium is None else {"medium": self._parsed.load_node(self._medium)}),
+            **({} if self._medium is None else {"medium": self._parser.load_node(self._medium)}),
         }
 
 
-def _rest_camera(parsed: Parsed) -> tuple[Camera | None, float, float, int | None]:
+def _rest_camera(parser: SceneParser) -> tuple[Camera | None, float, float, int | None]:
     """The file's own camera with its near and far clip, read by Mitsuba, and the medium around it, as a node.
 
     No camera where the file has no sensor.
     """
     import mitsuba as mi
 
-    sensors = parsed.of_type("Sensor")
+    sensors = parser.of_type("Sensor")
     if not sensors:
         return None, 1e-2, 1e4, None
-    if parsed.plugin(sensors[0]) != "perspective":
+    if parser.plugin(sensors[0]) != "perspective":
         raise ValueError(
-            f"scene sensor: expected a perspective one, got {parsed.plugin(sensors[0])!r}; change its type."
+            f"scene sensor: expected a perspective one, got {parser.plugin(sensors[0])!r}; change its type."
         )
-    loaded = parsed.load_node(sensors[0])
+    loaded = parser.load_node(sensors[0])
     values, film = mi.traverse(loaded), loaded.film()
     offset = [float(np.ravel(np.array(values[f"principal_point_offset_{axis}"]))[0]) for axis in "xy"]
     if any(offset):
         raise ValueError(f"scene sensor: expected no principal point offset, got {offset}; remove it.")
     if list(film.crop_size()) != list(film.size()):
         warnings.warn(
-            f"scene {parsed.path}: its film shows a crop of {'x'.join(map(str, film.crop_size()))} pixels; the whole "
+            f"scene {parser.path}: its film shows a crop of {'x'.join(map(str, film.crop_size()))} pixels; the whole "
             "image is rendered.",
             stacklevel=5,
         )
-    media = [node for node in parsed.references(sensors[0]) if parsed.type_of(node) == "Medium"]
+    media = [node for node in parser.references(sensors[0]) if parser.type_of(node) == "Medium"]
     fov, near, far = (float(np.ravel(np.array(values[key]))[0]) for key in ("x_fov", "near_clip", "far_clip"))
     matrix = np.array(loaded.world_transform().matrix, np.float64).reshape(4, 4)
     return Camera(matrix, fov), near, far, media[0] if media else None
 
 
-def _path_length(parsed: Parsed) -> int:
+def _path_length(parser: SceneParser) -> int:
     """max_depth of the file's integrator, also if nested; warns where it hides lights."""
     depths: list[int] = []
-    for integrator in parsed.of_type("Integrator")[:1]:
-        values = [parsed.values(node) for node in sorted(parsed.inside(integrator))]
+    for integrator in parser.of_type("Integrator")[:1]:
+        values = [parser.values(node) for node in sorted(parser.inside(integrator))]
         depths = [int(one["max_depth"]) for one in values if int(one.get("max_depth", -1)) > 0]
         if any(one.get("hide_emitters") for one in values):
             warnings.warn(
-                f"scene {parsed.path}: its integrator hides lights from the camera; they are rendered, as the buffer "
+                f"scene {parser.path}: its integrator hides lights from the camera; they are rendered, as the buffer "
                 "'emission' alone: leave it out to hide them.",
                 stacklevel=5,
             )
     return depths[0] if depths else _DEPTH
 
 
-def _check_materials(parsed: Parsed, materials: Mapping[str, Any]) -> None:
+def _check_materials(parser: SceneParser, materials: Mapping[str, Any]) -> None:
     """Raise ValueError for a name that is neither a BSDF of the scene nor a shape whose BSDF has no id."""
-    names = [parsed.id(node) for node in range(len(parsed.nodes)) if parsed.type_of(node) == "BSDF" and parsed.id(node)]
-    for shape in parsed.of_type("Shape"):
-        inline = [node for node in parsed.references(shape) if parsed.type_of(node) == "BSDF"]
-        names += [parsed.names[shape] for node in inline if not parsed.id(node)]
+    names = [parser.id(node) for node in range(len(parser.nodes)) if parser.type_of(node) == "BSDF" and parser.id(node)]
+    for shape in parser.of_type("Shape"):
+        inline = [node for node in parser.references(shape) if parser.type_of(node) == "BSDF"]
+        names += [parser.names[shape] for node in inline if not parser.id(node)]
     for name in materials:
         if name not in names:
             near = ", ".join(difflib.get_close_matches(name, names, 5, 0.4) or names[:8]) or "none"
-            raise ValueError(f"animation materials: the scene {parsed.path} has no material {name!r}; near: {near}.")
+            raise ValueError(f"animation materials: the scene {parser.path} has no material {name!r}; near: {near}.")
 
 
 def _primitive(shape: Mapping[str, Any], pose: np.ndarray) -> dict[str, Any]:

@@ -14,7 +14,7 @@ POSITIONS = 32
 """Points of the pixel that a reference is the mean of."""
 
 
-def offset(index: int) -> tuple[float, float]:
+def get_offset(index: int) -> tuple[float, float]:
     """The point (x, y) of number ``index`` in pixels from the centre, in (-1/2, 1/2): the Halton sequence (2, 3).
 
     It begins with its number 1: number 0 is the pixel's corner.
@@ -22,12 +22,12 @@ def offset(index: int) -> tuple[float, float]:
     return _inverse(index + 1, 2) - 0.5, _inverse(index + 1, 3) - 0.5
 
 
-def of_frame(frame: int) -> tuple[float, float]:
+def get_frame_offset(frame: int) -> tuple[float, float]:
     """The offset of a frame."""
-    return offset(frame % PERIOD)
+    return get_offset(frame % PERIOD)
 
 
-def look_through(built: Any, point: tuple[float, float]) -> Any:
+def shift_principal_point(built: Any, point: tuple[float, float]) -> Any:
     """The ``mi.Scene``, its first sensor's rays now through ``point``, in pixels from the centres of the pixels."""
     sensor = built.sensors()[0]
     width, height = (int(size) for size in sensor.film().crop_size())

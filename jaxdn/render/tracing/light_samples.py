@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.scenes.media import media_of, medium_behind, transmittance
-from jaxdn.render.tracing.lobes import bounce_numbers
+from jaxdn.render.tracing.lobes import draw_bounce_numbers
 
 
 class LightSample(NamedTuple):
@@ -43,13 +43,13 @@ class Shadows(NamedTuple):
         return Shadows(*(mine + theirs for mine, theirs in zip(self, other, strict=True)))
 
 
-def no_shadows(shape: tuple[int, ...]) -> Shadows:
+def make_zero_shadows(shape: tuple[int, ...]) -> Shadows:
     """The sums over no samples."""
     return Shadows(*np.zeros((2, *shape, 3)))
 
 
-def diffuse_reflectance(bsdf: Any, hit: Any, active: Any) -> Any:
-    """Reflectance of the diffuse lobe of every hit; 0 for surfaces that have none."""
+def evaluate_diffuse_reflectance(bsdf: Any, hit: Any, active: Any) -> Any:
+    """Evaluate the reflectance of the diffuse lobe of every hit; 0 for surfaces that have none."""
     diffuse = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse)
     albedo = dr.select(diffuse, mi.Color3f(bsdf.eval_diffuse_reflectance(hit, diffuse)), 0.0)
     # "principled" reports its base colour even for pure metal or glass.
@@ -59,8 +59,8 @@ def diffuse_reflectance(bsdf: Any, hit: Any, active: Any) -> Any:
     return albedo
 
 
-def light_sample(scene: Any, ray: Any, numbers: Any) -> LightSample:
-    """The light sample that a path takes at its first hit; ``numbers`` is the generator that the path began with.
+def sample_light(scene: Any, ray: Any, numbers: Any) -> LightSample:
+    """Sample a light as a path does at its first hit; ``numbers`` is the generator that the path began with.
 
     The diffuse part is that of a Lambertian lobe, ``albedo cos / pi``, at most the whole; all of it where the material
     has no other lobe.
@@ -68,7 +68,7 @@ def light_sample(scene: Any, ray: Any, numbers: Any) -> LightSample:
     hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
     bsdf = hit.bsdf(ray)
     active = hit.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    pick, _, _ = bounce_numbers(numbers)
+    pick, _, _ = draw_bounce_numbers(numbers)
     towards, radiance = scene.sample_emitter_direction(hit, pick, False, active)
     active &= towards.pdf != 0.0
     onward = hit.to_local(towards.d)
@@ -79,7 +79,7 @@ def light_sample(scene: Any, ray: Any, numbers: Any) -> LightSample:
         medium = mi.MediumPtr(scene.sensors()[0].get_medium())
         whole *= transmittance(medium, hit.t, active)
         whole *= transmittance(medium_behind(hit, medium, towards.d), towards.dist, active)
-    lambert = diffuse_reflectance(bsdf, hit, active) * dr.abs(onward.z) / dr.pi
+    lambert = evaluate_diffuse_reflectance(bsdf, hit, active) * dr.abs(onward.z) / dr.pi
     share = dr.select(reflected > lambert, lambert / reflected, 1.0)
     glossy = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)
     diffuse = dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Diffuse), whole, 0.0)
@@ -90,7 +90,7 @@ def light_sample(scene: Any, ray: Any, numbers: Any) -> LightSample:
     return LightSample(hit, towards, whole, diffuse, blocker, lit & blocker.is_valid())
 
 
-def shadow_sums(sample: LightSample, finite: Any, count: int) -> Shadows:
+def sum_shadows(sample: LightSample, finite: Any, count: int) -> Shadows:
     """The sums over blocks of ``count`` lanes, flat; samples that are not ``finite`` do not count."""
     light = dr.select(finite & dr.all(sample.diffuse < dr.inf), sample.diffuse, 0.0)
     parts = [dr.select(sample.blocked, 0.0, light), light]

@@ -35,27 +35,40 @@ class Lobes(NamedTuple):
         return mean[..., :1], mean[..., 1:]
 
 
-def no_lobes(shape: tuple[int, ...]) -> Lobes:
+def make_zero_lobes(shape: tuple[int, ...]) -> Lobes:
     """The sums over no samples."""
     return Lobes(np.zeros((*shape, 3)), np.zeros((*shape, 2)), np.zeros((*shape, 2)))
 
 
-def bounce_numbers(numbers: Any) -> tuple[Any, Any, Any]:
-    """The random numbers of one bounce: to choose an emitter's point, a lobe, and a direction in it."""
+def make_generator(pixel: Any, sample: Any, key: tuple[int, int]) -> Any:
+    """Make a PCG32 generator for every lane, a bijection of (pixel, sample) mixed once more with the frame's key."""
+    # Literals would be compiled into the kernel, a new one for every frame; opaque values are data.
+    mix: Any = mi.sample_tea_32
+    first, second = mix(pixel, sample)
+    first, second = mix(first ^ dr.opaque(mi.UInt32, key[0]), second ^ dr.opaque(mi.UInt32, key[1]))
+    pcg: Any = mi.PCG32
+    wide: Any = mi.UInt64
+    numbers = pcg()
+    numbers.seed(wide(first), wide(second))
+    return numbers
+
+
+def draw_bounce_numbers(numbers: Any) -> tuple[Any, Any, Any]:
+    """Draw the random numbers of one bounce: to choose an emitter's point, a lobe, and a direction in it."""
     pick = mi.Point2f(numbers.next_float32(), numbers.next_float32())
     lobe = numbers.next_float32()
     return pick, lobe, mi.Point2f(numbers.next_float32(), numbers.next_float32())
 
 
-def first_segment(scene: Any, ray: Any, numbers: Any) -> tuple[Any, Any, Any]:
-    """(diffuse, specular, length) of every lane's path: two flags, and the length of its segment after the first hit.
+def trace_first_segment(scene: Any, ray: Any, numbers: Any) -> tuple[Any, Any, Any]:
+    """Trace (diffuse, specular, length) of every path: two flags, and the length of its segment after the first hit.
 
     Every lobe that is not diffuse is specular: glossy, mirrors, transmission, and what passes through a mask. Both
     flags are false where nothing is hit or the path ends there. ``numbers`` is the generator that the path began with.
     """
     hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
     there = hit.is_valid()
-    _, lobe, point = bounce_numbers(numbers)
+    _, lobe, point = draw_bounce_numbers(numbers)
     sampled, weight = hit.bsdf(ray).sample(mi.BSDFContext(), hit, lobe, point, there)
     goes = there & (dr.max(weight) != 0)
     is_diffuse = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Diffuse)
@@ -65,11 +78,11 @@ def first_segment(scene: Any, ray: Any, numbers: Any) -> tuple[Any, Any, Any]:
     return goes & is_diffuse, goes & ~is_diffuse, length
 
 
-def lobe_sums(first: tuple[Any, Any, Any], specular: Any, finite: Any, count: int) -> Lobes:
+def sum_lobes(first: tuple[Any, Any, Any], specular: Any, finite: Any, count: int) -> Lobes:
     """The sums over blocks of ``count`` lanes, flat; samples that are not ``finite`` do not count.
 
     Args:
-      first: what :func:`first_segment` gave.
+      first: what :func:`trace_first_segment` gave.
       specular: specular light of the same lanes.
       finite: the lanes that count.
       count: samples per pixel.

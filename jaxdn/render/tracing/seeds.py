@@ -5,7 +5,7 @@ with the noisy layers. The mixing function is TEA (Zafar, Olano and Curtis 2010)
 same level collide.
 """
 
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -29,13 +29,27 @@ def tea(first: _Number, second: _Number, rounds: int = 8) -> tuple[_Number, _Num
     return first, second
 
 
-def frame_key(seed: int, frame: int, stream: int) -> tuple[int, int]:
+class SampleStream(NamedTuple):
+    """The random numbers of one stream of one frame of a clip."""
+
+    seed: int
+    """Of the clip."""
+    frame: int
+    stream: int
+    """``NOISY``, ``REFERENCE``, ``DEPTH`` or ``DRAWS``."""
+
+    def key(self) -> tuple[int, int]:
+        """The 64-bit key of the stream (:func:`make_frame_key`)."""
+        return make_frame_key(*self)
+
+
+def make_frame_key(seed: int, frame: int, stream: int) -> tuple[int, int]:
     """The 64-bit key of one stream of one frame."""
     first, second = tea(frame, seed)
     return tea(first ^ stream, second)
 
 
-def pass_seed(seed: int, frame: int, stream: int, index: int) -> int:
+def make_pass_seed(seed: int, frame: int, stream: int, index: int) -> int:
     """The seed of one whole-image pass of Mitsuba's own integrators.
 
     Mitsuba multiplies it by the number of pixels modulo 2**32, so only its low bits count: consecutive passes need

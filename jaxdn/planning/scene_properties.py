@@ -1,6 +1,6 @@
-"""Plain facts about an animated scene, as far as they decide what has to be simulated.
+"""The properties of an animated scene that decide what has to be simulated.
 
-The data passed from the readers of facts (:mod:`jaxdn.render.scene_facts` for a scene,
+Plain data, passed from those who read them (:mod:`jaxdn.render.scene_properties` for a scene,
 :mod:`jaxdn.data.evidence` for a finished clip) to the catalogue of effects, which depends neither on Mitsuba nor
 on files.
 """
@@ -51,7 +51,7 @@ class Moment(NamedTuple):
     """Lights that may be on screen in this frame."""
 
 
-class Facts(NamedTuple):
+class SceneProperties(NamedTuple):
     """An animated scene."""
 
     surfaces: tuple[Surface, ...]

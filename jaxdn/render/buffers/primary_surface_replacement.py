@@ -1,12 +1,12 @@
-"""Surfaces that are seen in flat mirrors and through glass, in place of the mirror and of the glass.
+"""Primary surface replacement: the surfaces seen in flat mirrors and through glass, in place of mirror and glass.
 
 The guides of a mirror say nothing of what it shows: everything in it is blurred. But a camera ray can be followed: at
 a surface with no lobes but perfectly specular ones it goes on along the stronger of reflection and transmission, until
-it meets another surface ("primary surface replacement"). The surface there, mirrored back, is what the pixel shows.
+it meets another surface. The surface there, mirrored back, is what the pixel shows.
 
 For mirrors with the reflections M_1 ... M_k [4, 4] at their planes, in the order of the ray's hits, the image of a
 point x is ``M_1 ... M_k x``: position, normal and depth of the guides are those of the image, which lies on the camera
-ray and moves as the image does (:func:`jaxdn.render.buffers.geometry.motion_between`). Albedo and reflectance are
+ray and moves as the image does (:func:`jaxdn.render.buffers.geometry.compute_motion`). Albedo and reflectance are
 multiplied by what the way there leaves of light.
 
 Only images that lie where they are seen are taken: the last direction, mirrored back, has to be that of the camera ray.
@@ -35,11 +35,11 @@ _SAME = float(np.cos(np.radians(0.5)))
 _BENT = 0.02
 """How much the normal of a mirror may turn, in radians, over the length of the way."""
 _LEAST = 0.05
-"""Share of the light that is at least left on the way: of a black mirror, nothing is worth to be followed."""
+"""Share of the light that is at least left on the way: of a black mirror, nothing is worth to be replaced."""
 
 
-class Images(NamedTuple):
-    """How the pixels whose surface is seen in mirrors or through glass are seen; flat arrays of n such pixels."""
+class ReplacedPixels(NamedTuple):
+    """The pixels whose surface is seen in mirrors or through glass; flat arrays of n such pixels."""
 
     pixels: np.ndarray
     """[n] their positions in the flat image."""
@@ -53,7 +53,7 @@ class Images(NamedTuple):
     """[n, k, 4, 4] float64 the reflections at them, the identity for none."""
 
 
-class Followed(NamedTuple):
+class ReplacedRays(NamedTuple):
     """Where the camera rays of all pixels end; flat arrays of n pixels."""
 
     ray: Any
@@ -63,22 +63,22 @@ class Followed(NamedTuple):
     weight: np.ndarray
     """[n, 3] what is left of light."""
     first: np.ndarray
-    """[n] uint32 number of the shape that was met first (:func:`jaxdn.render.buffers.gbuffer.shape_of`)."""
+    """[n] uint32 number of the shape that was met first (:func:`jaxdn.render.buffers.gbuffer.number_shapes`)."""
     mirrors: np.ndarray
     """[n, MIRRORS] uint32 numbers of the mirrors' shapes, 0 for none."""
     planes: np.ndarray
     """[n, MIRRORS, 4, 4] float64 the reflections at them, the identity for none."""
 
 
-def follow(scene: Any, camera: Any, number: Any) -> Followed | None:
-    """The camera rays of all pixels, followed past specular surfaces; None in a scene without any.
+def replace_primary_surfaces(scene: Any, camera: Any, number: Any) -> ReplacedRays | None:
+    """Follow the camera rays of all pixels past specular surfaces; None in a scene without any.
 
     Args:
       scene: Mitsuba's.
       camera: rays, one lane for each pixel.
       number: function of a hit that numbers its shape.
     """
-    if not any(bool(_specular(int(bsdf.flags()))) for bsdf in materials(scene)):
+    if not any(bool(_is_specular(int(bsdf.flags()))) for bsdf in materials(scene)):
         return None
     lanes = dr.width(camera.d)
     ray, active = mi.Ray3f(camera), dr.full(mi.Bool, True, lanes)
@@ -89,9 +89,9 @@ def follow(scene: Any, camera: Any, number: Any) -> Followed | None:
     first, broken = np.zeros(lanes, np.uint32), np.zeros(lanes, bool)
     for event in range(EVENTS + 1):
         hit = scene.ray_intersect(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, coherent=event == 0, active=active)
-        goes, onward, share, mirrored = _passage(hit, hit.bsdf(ray), active)
+        goes, onward, share, mirrored = _pass_surface(hit, hit.bsdf(ray), active)
         length = length + dr.select(goes, hit.t, 0.0)
-        bent = length * dr.maximum(_curvature(hit.dn_du, hit.dp_du), _curvature(hit.dn_dv, hit.dp_dv))
+        bent = length * dr.maximum(_compute_curvature(hit.dn_du, hit.dp_du), _compute_curvature(hit.dn_dv, hit.dp_dv))
         shape, missed, turns = number(hit), active & ~hit.is_valid(), mirrored & (bent > _BENT)
         weight = dr.select(goes, weight * share, weight)
         ray = dr.select(goes, hit.spawn_ray(hit.to_world(onward)), ray)
@@ -103,7 +103,7 @@ def follow(scene: Any, camera: Any, number: Any) -> Followed | None:
         first = np.where(passed == 0, shapes, first)
         lane = np.flatnonzero(at_mirror)
         mirrors[lane, count[lane]] = shapes[lane]
-        planes[lane, count[lane]] = reflection(_points(hit.p)[lane], _points(hit.n)[lane])
+        planes[lane, count[lane]] = make_reflections(_to_numpy(hit.p)[lane], _to_numpy(hit.n)[lane])
         count += at_mirror
         passed += went
         if not went.any():
@@ -111,14 +111,14 @@ def follow(scene: Any, camera: Any, number: Any) -> Followed | None:
         active = goes
     else:
         broken |= went
-    direction = _points(ray.d)
+    direction = _to_numpy(ray.d)
     for index in reversed(range(MIRRORS)):
         direction = np.einsum("nij,nj->ni", planes[:, index, :3, :3], direction)
     left = np.array(weight).T.astype(np.float64)
-    there = np.sum(direction * _points(camera.d), axis=-1) > _SAME
+    there = np.sum(direction * _to_numpy(camera.d), axis=-1) > _SAME
     replaced = (passed > 0) & ~broken & there & (left.mean(axis=-1) > _LEAST)
     ends = dr.select(mi.Bool(replaced), ray, camera)
-    return Followed(
+    return ReplacedRays(
         mi.Ray3f(ends),
         replaced,
         np.where(replaced[:, None], np.clip(left, 0.0, 1.0), 1.0),
@@ -128,20 +128,20 @@ def follow(scene: Any, camera: Any, number: Any) -> Followed | None:
     )
 
 
-def imaged(traced: Mapping[str, np.ndarray], followed: Followed) -> dict[str, np.ndarray]:
+def map_to_images(traced: Mapping[str, np.ndarray], replaced: ReplacedRays) -> dict[str, np.ndarray]:
     """The flat buffers of the surfaces where rays ended, as those of their images: moved, turned and darkened."""
-    to_image = followed.planes[:, 0]
+    to_image = replaced.planes[:, 0]
     for index in range(1, MIRRORS):
-        to_image = to_image @ followed.planes[:, index]
+        to_image = to_image @ replaced.planes[:, index]
     found = dict(traced)
     found["position"] = np.einsum("nij,nj->ni", to_image[:, :3, :3], traced["position"]) + to_image[:, :3, 3]
     found["normal"] = np.einsum("nij,nj->ni", to_image[:, :3, :3], traced["normal"])
     for name in {"albedo", "reflectance", "specular_reflectance"} & traced.keys():
-        found[name] = followed.weight * traced[name]
+        found[name] = replaced.weight * traced[name]
     return found
 
 
-def reflection(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def make_reflections(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """[n, 4, 4] the reflections at the planes through points [n, 3] with unit normals [n, 3]."""
     found = np.tile(np.eye(4), (len(points), 1, 1))
     found[:, :3, :3] -= 2 * normals[:, :, None] * normals[:, None, :]
@@ -149,13 +149,13 @@ def reflection(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return found
 
 
-def _specular(flags: Any) -> Any:
+def _is_specular(flags: Any) -> Any:
     """Whether flags of a material are of specular lobes alone."""
     known: Any = mi.BSDFFlags
     return (flags & int(known.Smooth) == 0) & (flags & int(known.Delta) != 0)
 
 
-def _passage(hit: Any, bsdf: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+def _pass_surface(hit: Any, bsdf: Any, active: Any) -> tuple[Any, Any, Any, Any]:
     """Which rays go on, where to (in the frame of the hit), what is left of light, and which of them are mirrored."""
     known: Any = mi.BSDFFlags
     flags = bsdf.flags()
@@ -173,10 +173,10 @@ def _passage(hit: Any, bsdf: Any, active: Any) -> tuple[Any, Any, Any, Any]:
     return goes, dr.select(mirrored, back, through), share, goes & mirrored
 
 
-def _curvature(turn: Any, way: Any) -> Any:
+def _compute_curvature(turn: Any, way: Any) -> Any:
     """Radians by which a normal turns over a unit of length."""
     return dr.select(dr.norm(way) > 0, dr.norm(turn) / dr.norm(way), 0.0)
 
 
-def _points(vectors: Any) -> np.ndarray:
+def _to_numpy(vectors: Any) -> np.ndarray:
     return np.array(vectors, np.float64).T

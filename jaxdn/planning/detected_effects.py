@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from jaxdn.planning.catalogue import EFFECTS, NAMES
-from jaxdn.planning.facts import Facts
+from jaxdn.planning.scene_properties import SceneProperties
 
 IN_TIME = frozenset(effect.name for effect in EFFECTS if effect.in_time)
 
@@ -22,7 +22,7 @@ class Effects:
     frames: tuple[frozenset[str], ...]
     """The effects of every frame. The first frame takes those that concern two frames from the second: nothing has
     moved yet, but it would otherwise need a separately compiled step in nearly every clip."""
-    held: tuple[int, ...]
+    shared_with: tuple[int, ...]
     """For every frame the earliest one that shows the same, except for the noise: nothing moved or changed since."""
     lit: bool = True
     """The scene has any light."""
@@ -39,31 +39,31 @@ class Effects:
         return len(self.names)
 
 
-def find(facts: Facts) -> Effects:
-    """The effects that follow from facts. Raises ValueError for facts without a frame."""
-    if not facts.moments:
-        raise ValueError("facts: expected at least one frame, got none.")
+def detect_effects(scene: SceneProperties) -> Effects:
+    """Detect the effects of a scene from its properties. Raises ValueError for properties without a frame."""
+    if not scene.moments:
+        raise ValueError("scene properties: expected at least one frame, got none.")
     why: dict[str, str] = {}
     frames: list[frozenset[str]] = []
-    for moment in facts.moments:
-        present = set(facts.uncertain)
+    for moment in scene.moments:
+        present = set(scene.uncertain)
         for effect in EFFECTS:
-            reason = effect.found(facts, moment)
+            reason = effect.detect(scene, moment)
             if reason:
                 present.add(effect.name)
                 why.setdefault(effect.name, reason)
         frames.append(frozenset(present))
-    held: list[int] = []
+    shared_with: list[int] = []
     for index, present_now in enumerate(frames):
-        held.append(held[-1] if index and not present_now & IN_TIME else index)
+        shared_with.append(shared_with[-1] if index and not present_now & IN_TIME else index)
     if len(frames) > 1:
         frames[0] = (frames[0] - IN_TIME) | (frames[1] & IN_TIME)
-    why |= {name: why.get(name, "it could not be ruled out") for name in facts.uncertain}
+    why |= {name: why.get(name, "it could not be ruled out") for name in scene.uncertain}
     names = tuple(name for name in NAMES if name in why)
-    return Effects(names, why, facts.uncertain, tuple(frames), tuple(held), bool(facts.lights), facts.max_depth)
+    return Effects(names, why, scene.uncertain, tuple(frames), tuple(shared_with), bool(scene.lights), scene.max_depth)
 
 
-def chosen(names: Iterable[str], frames: int) -> Effects:
+def choose_effects(names: Iterable[str], frames: int) -> Effects:
     """Only the named effects, in every frame. Raises ValueError for an unknown name, listing the known ones."""
     wanted = set(names)
     unknown = sorted(wanted - set(NAMES))
@@ -79,6 +79,6 @@ def chosen(names: Iterable[str], frames: int) -> Effects:
     )
 
 
-def everything(frames: int) -> Effects:
+def choose_all_effects(frames: int) -> Effects:
     """Every effect in every frame: rendering without inspection."""
-    return chosen(NAMES, frames)
+    return choose_effects(NAMES, frames)

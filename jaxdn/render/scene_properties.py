@@ -1,4 +1,4 @@
-"""Facts about an animated scene: its surfaces and lights, and what moves between which frames.
+"""Read the properties of an animated scene: its surfaces and lights, and what moves between which frames.
 
 The scene is built once, for its first frame; later changes are read from its poses, its camera and its lights'
 brightness.
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxdn.core.checks import check_at_least
-from jaxdn.planning.facts import Facts, Light, Moment, Surface
+from jaxdn.planning.scene_properties import Light, Moment, SceneProperties, Surface
 from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.scene import AnimatedScene, brightness
 from jaxdn.render.scenes.visibility import corners, fills_view, may_be_seen, moved
@@ -20,8 +20,10 @@ _LOOK = 16
 """Height of the inspected image, in pixels."""
 
 
-def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | None = None) -> Facts:
-    """Facts about the first ``frames`` frames (default: all) of an animated scene, seen at ``width`` x ``height``.
+def read_scene_properties(
+    scene: AnimatedScene, *, width: int, height: int, frames: int | None = None
+) -> SceneProperties:
+    """Properties of the first ``frames`` frames (default: all) of an animated scene, seen at ``width`` x ``height``.
 
     Raises ValueError for a size or a number of frames below 1.
     """
@@ -29,20 +31,20 @@ def facts_of(scene: AnimatedScene, *, width: int, height: int, frames: int | Non
     check_at_least(1, width=width, height=height, frames=count)
     use_variant()
     # Mitsuba's names exist only after a variant is chosen.
-    from jaxdn.render.buffers.gbuffer import gbuffer, shape_names
+    from jaxdn.render.buffers.gbuffer import list_shape_names, trace_gbuffer
 
     # A small image of the same aspect ratio is enough to see whether rays leave the scene.
     built = scene.build(0, max(1, round(_LOOK * width / height)), _LOOK)
-    shapes = dict(zip(shape_names(built), built.shapes(), strict=True))
+    shapes = dict(zip(list_shape_names(built), built.shapes(), strict=True))
     surfaces, uncertain = _surfaces(built, shapes)
     lights = _lights(built, shapes)
     around = frozenset(light.name for light in lights if light.environment)
-    if around and not np.any(gbuffer(built).ids < 0):
+    if around and not np.any(trace_gbuffer(built).ids < 0):
         uncertain["emission"] = "the environment is not seen in a small image of frame 0, but may be later"
         around = frozenset()
 
     stage = _Stage(scene, shapes, (height, width), around)
-    return Facts(
+    return SceneProperties(
         surfaces=tuple(surfaces),
         lights=tuple(lights),
         moments=tuple(stage.moment(frame, lights) for frame in range(count)),

@@ -1,4 +1,4 @@
-"""Other colours and another roughness for the materials of a loaded scene, as an animation's "materials" say.
+"""Material overrides: other colours and another roughness for a loaded scene, as an animation's "materials" say.
 
 The loaded objects are edited and not the file, so that a texture changes like a constant colour.
 """
@@ -17,7 +17,7 @@ _COLORS = frozenset({"reflectance", "diffuse_reflectance", "specular_reflectance
 _GREY = np.full(3, 3**-0.5)
 
 
-def repaint(shapes: Iterable[Any], materials: Mapping[str, Mapping[str, Any]]) -> None:
+def override_materials(shapes: Iterable[Any], materials: Mapping[str, Mapping[str, Any]]) -> None:
     """Edit the materials of loaded shapes in place.
 
     A reflectance c becomes ``clip(tint * (g + s (R c - g)), 0, 1)``: R rotates by the ``hue`` about the axis of greys,
@@ -26,8 +26,8 @@ def repaint(shapes: Iterable[Any], materials: Mapping[str, Mapping[str, Any]]) -
     Raises ValueError for a roughness of a material that has none to set.
 
     Args:
-      shapes: such as :func:`shapes_of` a scene. A BSDF that several of them share changes once; shapes that were loaded
-        apart from each other have one each.
+      shapes: such as :func:`list_shapes` gives. A BSDF that several of them share changes once; shapes that were
+        loaded apart from each other have one each.
       materials: id of a BSDF, or of a shape whose BSDF has no id -> its changes, as in
         :mod:`jaxdn.render.scenes.animation`.
     """
@@ -38,15 +38,15 @@ def repaint(shapes: Iterable[Any], materials: Mapping[str, Mapping[str, Any]]) -
             _change(bsdf, name, materials[name])
 
 
-def shapes_of(scene: Any) -> list[Any]:
+def list_shapes(scene: Any) -> list[Any]:
     """The shapes of a scene, those of shape groups included."""
     grouped = [part for group in shape_groups(scene) for _, part in children(group) if hasattr(part, "bsdf")]
     return [*scene.shapes(), *grouped]
 
 
-def named_materials(scene: Any) -> list[tuple[str, Any]]:
+def list_materials(scene: Any) -> list[tuple[str, Any]]:
     """Name and BSDF of every shape of a scene: the BSDF's id, else the shape's."""
-    return _named(shapes_of(scene))
+    return _named(list_shapes(scene))
 
 
 def _named(shapes: Iterable[Any]) -> list[tuple[str, Any]]:
@@ -54,7 +54,7 @@ def _named(shapes: Iterable[Any]) -> list[tuple[str, Any]]:
     return [(bsdf.id() or name, bsdf) for name, bsdf in pairs if bsdf is not None]
 
 
-def changeable(bsdf: Any) -> tuple[bool, bool]:
+def can_override(bsdf: Any) -> tuple[bool, bool]:
     """Whether a BSDF has colours, and a roughness, that can be changed."""
     parameters = mi.traverse(bsdf)
     return any(_is_color(key, value) for key, value in parameters), bool(_rough_keys(parameters))

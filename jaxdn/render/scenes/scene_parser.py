@@ -16,8 +16,8 @@ from typing import Any
 from jaxdn.render.mitsuba.variant import use_variant
 
 
-class Parsed:
-    """The nodes of one scene file; see :mod:`jaxdn.render.scenes.parsed`.
+class SceneParser:
+    """The nodes of one scene file; see :mod:`jaxdn.render.scenes.scene_parser`.
 
     Every shape and light of the scene has a unique name, which is also its id when it is loaded: its id in the file,
     in which a dot becomes an underscore, else ``shape_<n>``, ``group_<n>`` or ``light_<n>``, counted from 0 in the

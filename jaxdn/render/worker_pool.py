@@ -1,4 +1,4 @@
-"""Render many clips in parallel, one process each.
+"""Render many clips in parallel by a pool of workers, one process a clip.
 
 Several processes with few threads are about a third faster than one process with many, and a process that dies affects
 only one clip. A frame's file gets its name when it is complete, so an interrupted rendering can always be resumed.
@@ -10,44 +10,31 @@ import signal
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxdn.data.clip.folder import begun_record, frame_path, is_clip, read_record
-from jaxdn.planning.catalogue import NoisyLight
-from jaxdn.planning.plan import entries, plan_from_record
 from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.render.mitsuba.variant import choose_variant
-from jaxdn.render.opening import scene_from_record
-from jaxdn.render.settings import UNSAID
+from jaxdn.render.open_scene import scene_from_record
+from jaxdn.render.settings import RenderSettings
 
 _THREADS = 2
 """Renderer threads of each process. With only one, Mitsuba's loader waits forever for some scenes' textures."""
 
 
 class ClipJob(NamedTuple):
-    """One clip to render; the options are those of :func:`jaxdn.render.render_clip`."""
+    """One clip to render."""
 
     scene: dict[str, Any]
     """The record of the scene, such as ``{"family": "robot", "seed": 3}``."""
     folder: str
-    width: int
-    height: int
     frames: int
-    layers: tuple[int, ...] = (1,)
-    reference_spp: int = 0
-    max_depth: int | None = None
-    seed: int = 0
-    draws: int = 0
-    light: NoisyLight = "indirect"
-    jitter: bool = False
-    see_through: bool = False
-    variant: str | None = None
-    """None: the one that the clip in the folder was started with, else the fastest that works here."""
-    plan: dict[str, Any] | None = None
-    """The record of a :class:`jaxdn.planning.plan.Plan`; None renders everything."""
+    settings: RenderSettings
+    """Without a variant, that is the one that the clip in the folder was started with, else the fastest that works."""
 
 
 class _Worker(NamedTuple):
@@ -70,31 +57,31 @@ def render_clips(
     processes and keeps every finished frame; another call resumes. A failed clip does not stop the others: at the end
     RenderError names each failed clip, its frame and the reason.
     """
-    waiting = [_as_begun(job) for job in jobs]
+    waiting = [_keep_variant(job) for job in jobs]
     folders = [job.folder for job in waiting]
     if len({os.path.abspath(folder) for folder in folders}) != len(folders):
         raise ValueError("render_clips: expected a different folder for every clip.")
     total = sum(job.frames for job in waiting)
-    waiting = [job for job in waiting if not _finished(job)]
+    waiting = [job for job in waiting if not _is_finished(job)]
     limit = max(1, min(workers or os.cpu_count() or 1, len(waiting)))
     for job in waiting:
         try:
-            choose_variant(job.variant)  # probed once, here: the processes inherit the result
+            choose_variant(job.settings.variant)  # probed once, here: the processes inherit the result
         except ValueError as error:
             raise ValueError(f"clip in {job.folder}: {error}") from error
 
     done = total - sum(job.frames for job in waiting)
     running: list[_Worker] = []
     failures: list[str] = []
-    with _display(progress, total) as show:
+    with _open_display(progress, total) as show:
         show(done, total)
         try:
             while waiting or running:
                 while waiting and len(running) < limit:
-                    running.append(_start(waiting.pop(0), threads=_THREADS if limit > 1 else 0))
+                    running.append(_start_worker(waiting.pop(0), threads=_THREADS if limit > 1 else 0))
                 wait([item for worker in running for item in (worker.messages, worker.process.sentinel)])
                 for worker in list(running):
-                    frames, failure, ended = _listen(worker)
+                    frames, failure, ended = _read_messages(worker)
                     done += frames
                     if ended:
                         worker.process.join()
@@ -113,43 +100,37 @@ def render_clips(
     return [Path(folder) for folder in folders]
 
 
-def _as_begun(job: ClipJob) -> ClipJob:
+def _keep_variant(job: ClipJob) -> ClipJob:
     """The job with a variant: a clip is completed, and checked for completeness, with the one it was started with."""
-    begun = begun_record(job.folder) if job.variant is None else None
-    return job if begun is None else job._replace(variant=begun.get("variant"))
+    begun = begun_record(job.folder) if job.settings.variant is None else None
+    return job if begun is None else job._replace(settings=replace(job.settings, variant=begun.get("variant")))
 
 
-def _finished(job: ClipJob) -> bool:
+def _is_finished(job: ClipJob) -> bool:
     """Whether the clip exists with all its frames and the wanted settings; this needs no separate process."""
     if not is_clip(job.folder):
         return False
     record = read_record(job.folder)
-    wanted: dict[str, Any] = {"width": job.width, "height": job.height, "frames": job.frames, "seed": job.seed}
-    wanted |= {"layers": sorted(job.layers), "reference_spp": job.reference_spp, "scene": job.scene}
-    chosen = {"max_depth": job.max_depth, "variant": job.variant}
-    # A clip from before plans existed has no such entry, and all buffers.
-    if entries(record.get("plan")) != entries(job.plan):
-        return False
-    if any(record.get(name, unsaid) != getattr(job, name) for name, unsaid in UNSAID.items()):
-        return False
-    wanted |= {key: value for key, value in chosen.items() if value is not None}
+    wanted = {"scene": job.scene, "frames": job.frames, **job.settings.record()}
+    # What a job leaves open was chosen when the clip was started.
+    open_names = {name for name in ("max_depth", "variant") if wanted[name] is None}
     # A frame's file gets its name only when it is complete.
-    return all(record.get(key) == value for key, value in wanted.items()) and all(
+    return all(record.get(name) == value for name, value in wanted.items() if name not in open_names) and all(
         frame_path(job.folder, frame).is_file() for frame in range(job.frames)
     )
 
 
-def _start(job: ClipJob, *, threads: int) -> _Worker:
+def _start_worker(job: ClipJob, *, threads: int) -> _Worker:
     # A forked child would inherit an inconsistent state of the renderer's and JAX's threads; a spawned one does not.
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(job, sender, threads), daemon=True)
+    process = context.Process(target=_render_in_worker, args=(job, sender, threads), daemon=True)
     process.start()
     sender.close()
     return _Worker(job, process, receiver, [])
 
 
-def _work(job: ClipJob, messages: Connection, threads: int) -> None:
+def _render_in_worker(job: ClipJob, messages: Connection, threads: int) -> None:
     """Runs in a separate process: render one clip and report each frame."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
@@ -158,7 +139,7 @@ def _work(job: ClipJob, messages: Connection, threads: int) -> None:
         from jaxdn.render.clip import render_clip
         from jaxdn.render.mitsuba.variant import use_variant
 
-        use_variant(job.variant)
+        use_variant(job.settings.variant)
         if threads:
             import drjit
 
@@ -167,9 +148,7 @@ def _work(job: ClipJob, messages: Connection, threads: int) -> None:
             scene = scene_from_record(job.scene)
         except Exception as error:
             raise ValueError(f"clip in {job.folder}: the scene {job.scene} does not load: {error}") from error
-        options = {name: getattr(job, name) for name in ClipJob._fields if name not in ("scene", "folder", "plan")}
-        plan = None if job.plan is None else plan_from_record(job.plan)
-        render_clip(scene, job.folder, **options, plan=plan, progress=messages.send)
+        render_clip(scene, job.folder, job.settings, frames=job.frames, progress=messages.send)
         messages.send("done")
     except BaseException as error:
         messages.send(f"{error}" if str(error) else repr(error))
@@ -177,7 +156,7 @@ def _work(job: ClipJob, messages: Connection, threads: int) -> None:
         messages.close()
 
 
-def _listen(worker: _Worker) -> tuple[int, str, bool]:
+def _read_messages(worker: _Worker) -> tuple[int, str, bool]:
     """A worker's messages: newly finished frames, the reason of a failure ("" for none), whether it has ended."""
     frames = 0
     while True:
@@ -188,7 +167,7 @@ def _listen(worker: _Worker) -> tuple[int, str, bool]:
         except (EOFError, OSError):
             # The pipe was closed without a message: the process was ended from outside.
             worker.process.join()
-            return frames, _death(worker), True
+            return frames, _describe_death(worker), True
         if isinstance(message, int):
             worker.finished.append(message)
             frames += 1
@@ -196,7 +175,7 @@ def _listen(worker: _Worker) -> tuple[int, str, bool]:
             return frames, "" if message == "done" else message, True
 
 
-def _death(worker: _Worker) -> str:
+def _describe_death(worker: _Worker) -> str:
     code = worker.process.exitcode
     cause = f"exit code {code}"
     if code is not None and code < 0:
@@ -206,7 +185,7 @@ def _death(worker: _Worker) -> str:
     return f"clip in {worker.job.folder}, frame {frame}: the renderer's process died: {cause}. Start again to resume."
 
 
-def _display(
+def _open_display(
     progress: bool | Callable[[int, int], None], total: int
 ) -> AbstractContextManager[Callable[[int, int], None]]:
     if progress is not True:

@@ -1,8 +1,8 @@
-"""Tours: any scene file, animated by a seed, as training data from furnished rooms.
+"""Randomised scenes (``jaxdn render --tour``): any scene file, animated by a seed, as training data from rooms.
 
-A tour is an ordinary animation (:mod:`jaxdn.render.scenes.animation`): a camera on a collision-free path, things of the
-room that move and things thrown in, changed materials, and changed lights. Its record holds the animation in full, so
-that the scene is built again without the search that found it.
+The result has an ordinary animation (:mod:`jaxdn.render.scenes.animation`): a collision-free camera path, objects of
+the room that move, inserted objects, overridden materials, and changed lights. Its record holds the animation in full,
+so that the scene is built again without the search that found it.
 """
 
 import functools
@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import mitsuba as mi
 import numpy as np
 
+from jaxdn.render.camera_paths.free_space import FreeSpace
+from jaxdn.render.camera_paths.inserted_objects import compute_focal_length, insert_objects, move_shapes
 from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.animation import CameraKeys, rotation_matrix
-from jaxdn.render.scenes.repaint import changeable, named_materials
+from jaxdn.render.scenes.material_overrides import can_override, list_materials
 from jaxdn.render.scenes.scene import Camera
 from jaxdn.render.scenes.scene_file import SceneFile
-from jaxdn.render.tours.free_space import FreeSpace
-from jaxdn.render.tours.tour_things import focal, moved_shapes, thrown_things
 
 _ATTEMPTS = 32
 _VIEWS = 48
@@ -31,36 +31,38 @@ _DARK = 0.03
 """A view that is darker than this share of the path's middle is rejected."""
 
 
-class _Plan(NamedTuple):
-    """A tour before its light is measured."""
+class _Draft(NamedTuple):
+    """An animation before its light is measured."""
 
     animation: dict[str, Any]
     level: float
     """Wanted mean radiance."""
 
 
-def tour(path: Path | str, seed: int, frames: int) -> SceneFile:
-    """The tour of a scene file for one seed, ``frames`` long; the same arguments always give the same tour.
+def randomise_scene(path: Path | str, seed: int, frames: int) -> SceneFile:
+    """Animate a scene file by one seed, for ``frames`` frames; the same arguments always give the same animation.
 
     Speeds are in pixels per frame at an image width of 128. The camera mostly moves by 0.2 to 3, sometimes by up to 30
-    (it pans) or hardly at all; things by 0.3 to 30. Fields of view are 35 to 80 degrees. The mean radiance of the
+    (it pans) or hardly at all; objects by 0.3 to 30. Fields of view are 35 to 80 degrees. The mean radiance of the
     image is drawn from 0.01 to 0.8. Raises ValueError for files that cannot be read or rendered, for a scene without
-    free space around its camera, and for one in which no tour is found.
+    free space around its camera, and for one in which no such view is found.
     """
     if frames < 1:
         raise ValueError(f"tour frames: expected at least 1, got {frames}.")
     if seed < 0:
         raise ValueError(f"tour seed: expected at least 0, got {seed}.")
     path = Path(path)
-    space = _space(os.path.abspath(path), path.stat().st_mtime if path.is_file() else 0.0, use_variant())
+    space = _find_free_space(os.path.abspath(path), path.stat().st_mtime if path.is_file() else 0.0, use_variant())
     for attempt in range(_ATTEMPTS):
-        plan = _plan(space, np.random.default_rng([seed, attempt]), frames, ease=attempt / _ATTEMPTS)
+        plan = _draft_animation(space, np.random.default_rng([seed, attempt]), frames, ease=attempt / _ATTEMPTS)
         if plan is None:
             continue
-        # What was changed and thrown in lights the room differently than its own lights were measured to.
-        level = _measured(SceneFile.from_record({"file": str(path), "animation": plan.animation}), frames // 2)
+        # Overridden materials and inserted objects light the room differently than its own lights were measured to.
+        level = _measure_scene_level(
+            SceneFile.from_record({"file": str(path), "animation": plan.animation}), frames // 2
+        )
         if level > 0:
-            animation = _brighter(plan.animation, plan.level / level)
+            animation = _scale_lights(plan.animation, plan.level / level)
             return SceneFile.from_record({"file": str(path), "animation": animation})
     raise ValueError(
         f"tour of {space.file.name}, seed {seed}: expected a lit view that shows the room, found none in {_ATTEMPTS} "
@@ -69,79 +71,79 @@ def tour(path: Path | str, seed: int, frames: int) -> SceneFile:
 
 
 @functools.lru_cache(maxsize=1)
-def _space(path: str, changed: float, variant: str) -> FreeSpace:
+def _find_free_space(path: str, changed: float, variant: str) -> FreeSpace:
     """The free space of a file as it is now, for all seeds."""
     return FreeSpace(SceneFile.from_record({"file": path}))
 
 
-def _plan(space: FreeSpace, rng: np.random.Generator, frames: int, *, ease: float) -> _Plan | None:
+def _draft_animation(space: FreeSpace, rng: np.random.Generator, frames: int, *, ease: float) -> _Draft | None:
     """An animation of the room; None if none of the views is good enough; ``ease`` in [0, 1) asks for less."""
-    view = _view(space, rng, ease)
+    view = _choose_view(space, rng, ease)
     if view is None:
         return None
-    keys = _camera_keys(space, view, rng, frames)
+    keys = _make_camera_keys(space, view, rng, frames)
     path = CameraKeys(keys)
     cameras = [Camera(path(frame), view.x_fov) for frame in range(frames)]
     level = float(10 ** (rng.uniform(-2, -1.2) if rng.random() < 0.25 else rng.uniform(-1.2, -0.1)))
     seen = [cameras[frame] for frame in sorted({0, frames // 2, frames - 1})]
     if not _shows_enough(space, seen, ease):
         return None
-    images = _light_images(space, cameras[frames // 2])
-    total = _level(sum(images.values(), np.zeros(1)))
-    if total <= 0 or min(_level(_image(space, camera)) for camera in seen) < _DARK * total:
+    images = _render_lights(space, cameras[frames // 2])
+    total = _measure_level(sum(images.values(), np.zeros(1)))
+    if total <= 0 or min(_measure_level(_render_luminance(space, camera)) for camera in seen) < _DARK * total:
         return None
-    lights = _light_keys(space, images, rng, frames, level)
-    moved = moved_shapes(space, cameras, rng, int(rng.integers(0, 5)), keep=set(lights))
+    lights = _make_light_keys(space, images, rng, frames, level)
+    moved = move_shapes(space, cameras, rng, int(rng.integers(0, 5)), keep=set(lights))
     animation: dict[str, Any] = {"frames": frames, "camera": keys}
-    thrown = thrown_things(space, cameras, rng, int(rng.integers(1, 7)), level)
-    if not thrown:
+    inserted = insert_objects(space, cameras, rng, int(rng.integers(1, 7)), level)
+    if not inserted:
         return None
     parts = {
         "shapes": moved,
-        "inserted": thrown,
+        "inserted": inserted,
         "lights": lights,
-        "materials": _materials(space, rng),
+        "materials": _draw_materials(space, rng),
     }
-    return _Plan(animation | {name: part for name, part in parts.items() if part}, level)
+    return _Draft(animation | {name: part for name, part in parts.items() if part}, level)
 
 
-def _view(space: FreeSpace, rng: np.random.Generator, ease: float) -> Camera | None:
-    """The best of some random views: many things, near and far ones, none too close; None if all are poor."""
+def _choose_view(space: FreeSpace, rng: np.random.Generator, ease: float) -> Camera | None:
+    """The best of some random views: many objects, near and far ones, none too close; None if all are poor."""
     cameras = []
     for spot in space.spots[rng.integers(len(space.spots), size=_VIEWS)]:
         pitch, turn = np.radians(rng.uniform(-35, 8)), rng.uniform(0, 360)
         ahead = np.roll(space.up, 1) * np.cos(pitch) + space.up * np.sin(pitch)
         forward = rotation_matrix(space.up, turn) @ ahead
-        cameras.append(Camera(_looking(space, spot, forward), float(rng.uniform(35, 80))))
-    views = space.judge(cameras)
+        cameras.append(Camera(_look_along(space, spot, forward), float(rng.uniform(35, 80))))
+    views = space.score_views(cameras)
     good = (views.empty < 0.35 + 0.25 * ease) & (views.close < 0.3 + 0.2 * ease) & (views.largest < 0.7 + 0.3 * ease)
     good &= (views.shapes >= 4 - 3 * ease) & (views.spread > 0.4 - 0.2 * ease) & (views.nearest > 1.5 * space.clear)
-    # Noise in the score, so that the richest corner of a room is not in every tour.
+    # Noise in the score, so that not every path begins at the richest corner of a room.
     score = np.log(views.shapes + 1.0) + views.spread - views.largest - views.empty + rng.normal(0, 0.4, _VIEWS)
     return cameras[int(np.argmax(np.where(good, score, -np.inf)))] if good.any() else None
 
 
 def _shows_enough(space: FreeSpace, cameras: Sequence[Camera], ease: float) -> bool:
-    """Whether the views along a path show things of the room, and not only a wall or the outside."""
-    views = space.judge(list(cameras))
+    """Whether the views along a path show objects of the room, and not only a wall or the outside."""
+    views = space.score_views(list(cameras))
     good = (views.empty < 0.7) & (views.close < 0.5) & (views.spread > 0.25 - 0.15 * ease)
     return bool((good & (views.shapes >= 4 - 3 * ease) & (views.nearest > 1.3 * space.near)).all())
 
 
-def _looking(space: FreeSpace, origin: np.ndarray, forward: np.ndarray) -> np.ndarray:
+def _look_along(space: FreeSpace, origin: np.ndarray, forward: np.ndarray) -> np.ndarray:
     """[4, 4] camera to world, upright."""
     key = {"frame": 0, "origin": origin, "target": origin + forward, "up": space.up}
     return CameraKeys([key])(0)
 
 
-def _camera_keys(space: FreeSpace, view: Camera, rng: np.random.Generator, frames: int) -> list[dict[str, Any]]:
+def _make_camera_keys(space: FreeSpace, view: Camera, rng: np.random.Generator, frames: int) -> list[dict[str, Any]]:
     """Camera keys of a path that begins at a view: nearly still, slow, fast, or panning."""
     style = rng.choice(["still", "slow", "fast", "pan"], p=[0.15, 0.5, 0.15, 0.2])
     low, high = {"still": (0.02, 0.2), "slow": (0.2, 3), "fast": (2, 8), "pan": (4, 30)}[str(style)]
-    speed = float(np.exp(rng.uniform(np.log(low), np.log(high)))) / focal(view)
-    middle = float(space.judge([view]).middle[0])
+    speed = float(np.exp(rng.uniform(np.log(low), np.log(high)))) / compute_focal_length(view)
+    middle = float(space.score_views([view]).middle[0])
     if style == "pan":
-        return _panning(space, view, rng, frames, float(np.degrees(speed)), middle)
+        return _make_panning_keys(space, view, rng, frames, float(np.degrees(speed)), middle)
     origin, forward = view.to_world[:3, 3], view.to_world[:3, 2]
     # Moving ahead changes the image less than moving sideways.
     step = view.to_world[:3, :3] @ (rng.normal(size=3) * (1, 0.4, 1.2))
@@ -150,7 +152,7 @@ def _camera_keys(space: FreeSpace, view: Camera, rng: np.random.Generator, frame
     for _ in range(8):
         bends = [rotation_matrix(space.up, angle) for angle in np.cumsum(rng.uniform(-45, 45, corners))]
         places = np.cumsum([origin, *(bend @ step / corners for bend in bends)], axis=0)
-        if space.is_free_way(places):
+        if space.is_collision_free(places):
             break
         step = 0.6 * step
     else:
@@ -159,10 +161,10 @@ def _camera_keys(space: FreeSpace, view: Camera, rng: np.random.Generator, frame
     follow = rng.uniform(0, 1)
     targets = origin + middle * forward + follow * (places - origin)
     times = np.linspace(0, max(frames - 1, 1), corners + 1)
-    return [_camera_key(space, view, *key) for key in zip(times, places, targets, strict=True)]
+    return [_make_camera_key(space, view, *key) for key in zip(times, places, targets, strict=True)]
 
 
-def _panning(
+def _make_panning_keys(
     space: FreeSpace, view: Camera, rng: np.random.Generator, frames: int, rate: float, middle: float
 ) -> list[dict[str, Any]]:
     """A key for every frame of a camera that turns by ``rate`` degrees a frame, to and fro between two angles."""
@@ -174,19 +176,21 @@ def _panning(
         phases = np.mod(start * widest + rate * np.arange(max(frames, 2)), 2 * widest)
         angles = sign * (widest - np.abs(phases - widest))
         turned = [rotation_matrix(space.up, angle - angles[0]) @ forward for angle in angles]
-        views = space.judge([Camera(_looking(space, origin, one), view.x_fov) for one in turned])
+        views = space.score_views([Camera(_look_along(space, origin, one), view.x_fov) for one in turned])
         shown = float((views.shapes * np.minimum(views.spread, 1)).min())
         if shown > most:
             best, most = turned, shown
-    return [_camera_key(space, view, at, origin, origin + middle * one) for at, one in enumerate(best)]
+    return [_make_camera_key(space, view, at, origin, origin + middle * one) for at, one in enumerate(best)]
 
 
-def _camera_key(space: FreeSpace, view: Camera, at: float, origin: np.ndarray, target: np.ndarray) -> dict[str, Any]:
+def _make_camera_key(
+    space: FreeSpace, view: Camera, at: float, origin: np.ndarray, target: np.ndarray
+) -> dict[str, Any]:
     key = {"frame": float(at), "origin": origin.tolist(), "target": target.tolist(), "up": space.up.tolist()}
     return {**key, "fov": view.x_fov}
 
 
-def _image(space: FreeSpace, camera: Camera) -> np.ndarray:
+def _render_luminance(space: FreeSpace, camera: Camera) -> np.ndarray:
     """[side, side] luminance of a view of the room."""
     sensor = {
         "type": "perspective",
@@ -197,12 +201,12 @@ def _image(space: FreeSpace, camera: Camera) -> np.ndarray:
         "film": {"type": "hdrfilm", "width": _SIDE, "height": _SIDE, "rfilter": {"type": "box"}},
     }
     integrator = mi.load_dict({"type": "path", "max_depth": min(space.file.max_depth, 8)})
-    return _luminance(
+    return _compute_luminance(
         mi.render(space.scene, sensor=mi.load_dict(sensor), integrator=integrator, spp=_SAMPLES, seed=mi.UInt32(0))
     )
 
 
-def _light_images(space: FreeSpace, camera: Camera) -> dict[str, np.ndarray]:
+def _render_lights(space: FreeSpace, camera: Camera) -> dict[str, np.ndarray]:
     """Name -> [side, side] luminance that each light alone gives the view."""
     emitters = [mi.traverse(emitter) for emitter in space.scene.emitters()]
     keys = [[key for key, _ in one if key.endswith((".value", ".data", "scale"))] for one in emitters]
@@ -219,18 +223,18 @@ def _light_images(space: FreeSpace, camera: Camera) -> dict[str, np.ndarray]:
     for shining, emitter in enumerate(space.scene.emitters()):
         shine({shining})
         name = emitter.get_shape().id() if emitter.get_shape() is not None else emitter.id()
-        images[name] = _image(space, camera)
+        images[name] = _render_luminance(space, camera)
     shine(set(range(len(emitters))))
     return images
 
 
-def _level(image: np.ndarray) -> float:
+def _measure_level(image: np.ndarray) -> float:
     """Mean of the darker 90 % of an image's pixels, so that a visible lamp does not count."""
     values = np.sort(image.ravel())
     return float(values[: max(1, int(0.9 * len(values)))].mean())
 
 
-def _light_keys(
+def _make_light_keys(
     space: FreeSpace, images: Mapping[str, np.ndarray], rng: np.random.Generator, frames: int, level: float
 ) -> dict[str, list[dict[str, Any]]]:
     """An animation's "lights": tints, lights that are off, and one that is switched or dims in the clip."""
@@ -238,18 +242,18 @@ def _light_keys(
     names = sorted(set(images) & set(colored))
     gains = {name: float(np.exp(rng.normal(0, 0.6))) for name in names}
     for name in names:
-        left = sum(gains[other] * _level(images[other]) for other in names if other != name)
-        if rng.random() < 0.2 and left > 0.1 * gains[name] * _level(images[name]):
+        left = sum(gains[other] * _measure_level(images[other]) for other in names if other != name)
+        if rng.random() < 0.2 and left > 0.1 * gains[name] * _measure_level(images[name]):
             gains[name] = 0.0
-    factor = level / max(_level(sum((gains[name] * images[name] for name in names), np.zeros(1))), 1e-9)
-    tint = {name: _tint(rng) if colored[name] else np.ones(3) for name in names}
+    factor = level / max(_measure_level(sum((gains[name] * images[name] for name in names), np.zeros(1))), 1e-9)
+    tint = {name: _draw_tint(rng) if colored[name] else np.ones(3) for name in names}
     keys = {name: [{"frame": 0.0, "scale": (factor * gains[name] * tint[name]).tolist()}] for name in names}
     lit = [name for name in names if gains[name] > 0]
     if lit and frames > 2 and rng.random() < 0.4:
         name = str(rng.choice(lit))
-        rest = sum(gains[other] * _level(images[other]) for other in lit if other != name)
+        rest = sum(gains[other] * _measure_level(images[other]) for other in lit if other != name)
         # Without other light it dims and is not switched off.
-        least = 0.0 if rest > 0.1 * gains[name] * _level(images[name]) else rng.uniform(0.1, 0.4)
+        least = 0.0 if rest > 0.1 * gains[name] * _measure_level(images[name]) else rng.uniform(0.1, 0.4)
         at = int(rng.integers(1, frames - 1)) if frames > 3 else 1
         over = 1 if rng.random() < 0.6 else int(rng.integers(1, frames - at + 1))
         ends = [keys[name][0]["scale"], (least * np.array(keys[name][0]["scale"])).tolist()]
@@ -261,7 +265,7 @@ def _light_keys(
     return keys
 
 
-def _tint(rng: np.random.Generator) -> np.ndarray:
+def _draw_tint(rng: np.random.Generator) -> np.ndarray:
     """[3] factors from warm to cold light, now and then a colour; their mean is 1."""
     warm = rng.normal(0, 0.25)
     tint = np.exp([warm, 0.0, -warm])
@@ -270,12 +274,12 @@ def _tint(rng: np.random.Generator) -> np.ndarray:
     return tint / tint.mean()
 
 
-def _materials(space: FreeSpace, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
+def _draw_materials(space: FreeSpace, rng: np.random.Generator) -> dict[str, dict[str, Any]]:
     """An animation's "materials": other hues, saturations, tints and roughnesses for a random share of them."""
     share = rng.choice([0.15, 0.5, 0.9])
     changes: dict[str, dict[str, Any]] = {}
-    for name, bsdf in sorted(dict(named_materials(space.scene)).items()):
-        colored, rough = changeable(bsdf)
+    for name, bsdf in sorted(dict(list_materials(space.scene)).items()):
+        colored, rough = can_override(bsdf)
         change: dict[str, Any] = {}
         if colored and rng.random() < share:
             change["hue"] = float(rng.uniform(-180, 180))
@@ -289,17 +293,19 @@ def _materials(space: FreeSpace, rng: np.random.Generator) -> dict[str, dict[str
     return changes
 
 
-def _measured(scene: SceneFile, frame: int) -> float:
+def _measure_scene_level(scene: SceneFile, frame: int) -> float:
     """The level of light of one frame."""
-    return _level(_luminance(mi.render(scene.build(frame, _SIDE, _SIDE), spp=_SAMPLES, seed=mi.UInt32(frame))))
+    return _measure_level(
+        _compute_luminance(mi.render(scene.build(frame, _SIDE, _SIDE), spp=_SAMPLES, seed=mi.UInt32(frame)))
+    )
 
 
-def _luminance(image: Any) -> np.ndarray:
+def _compute_luminance(image: Any) -> np.ndarray:
     """[H, W] mean of the colours of a rendered image."""
     return np.nan_to_num(np.array(image, np.float64))[..., :3].mean(axis=-1)
 
 
-def _brighter(animation: Mapping[str, Any], factor: float) -> dict[str, Any]:
+def _scale_lights(animation: Mapping[str, Any], factor: float) -> dict[str, Any]:
     """The animation with all of the room's lights scaled."""
 
     def scaled(keys: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

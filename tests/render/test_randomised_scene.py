@@ -1,4 +1,4 @@
-"""Tours of rooms: the camera stays clear, things are seen, speeds are bounded, and the record is the whole scene."""
+"""Randomised scenes: the camera stays clear, things are seen, speeds are bounded, and the record is the whole scene."""
 
 import itertools
 import json
@@ -8,7 +8,7 @@ import pytest
 
 from jaxdn.data.clip.folder import is_clip, read_record
 from jaxdn.render.mitsuba.variant import choose_variant
-from jaxdn.render.opening import scene_from_record
+from jaxdn.render.open_scene import scene_from_record
 from jaxdn.render.scenes.animation import check_animation
 from jaxdn.render.scenes.scene_file import SceneFile
 from tests.needs import require_module
@@ -75,26 +75,26 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def tours(folder):
-    from jaxdn.render.tours.rooms import tour
+def randomised(folder):
+    from jaxdn.render.camera_paths.randomised_scene import randomise_scene
 
-    return [tour(folder / "scene.xml", seed, FRAMES) for seed in SEEDS]
+    return [randomise_scene(folder / "scene.xml", seed, FRAMES) for seed in SEEDS]
 
 
-def test_a_seed_always_gives_the_same_tour_and_another_seed_another(tours, folder):
-    from jaxdn.render.tours.rooms import tour
+def test_a_seed_always_gives_the_same_animation_and_another_seed_another(randomised, folder):
+    from jaxdn.render.camera_paths.randomised_scene import randomise_scene
 
-    again = tour(folder / "scene.xml", 1, FRAMES)
-    assert again.record == tours[1].record
-    assert len({json.dumps(scene.record, sort_keys=True) for scene in tours}) == len(tours)
+    again = randomise_scene(folder / "scene.xml", 1, FRAMES)
+    assert again.record == randomised[1].record
+    assert len({json.dumps(scene.record, sort_keys=True) for scene in randomised}) == len(randomised)
     assert json.loads(json.dumps(again.record)) == again.record
 
 
-def test_cameras_keep_clear_of_everything(tours, folder):
+def test_cameras_keep_clear_of_everything(randomised, folder):
     empty = SceneFile(folder / "scene.xml").build(0, 4, 4)
     directions = np.random.default_rng(7).normal(size=(40, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    for scene in tours:
+    for scene in randomised:
         assert 35 <= scene.camera(0).x_fov <= 80
         for frame in np.linspace(0, FRAMES - 1, 5):
             place = scene.camera(frame).to_world[:3, 3]
@@ -104,8 +104,8 @@ def test_cameras_keep_clear_of_everything(tours, folder):
                 assert not np.any(empty.ray_test(near))
 
 
-def test_cameras_move_within_bounds(tours):
-    for scene in tours:
+def test_cameras_move_within_bounds(randomised):
+    for scene in randomised:
         cameras = [scene.camera(frame) for frame in range(FRAMES)]
         for first, second in itertools.pairwise(cameras):
             turn = np.degrees(np.arccos(np.clip(first.to_world[:3, 2] @ second.to_world[:3, 2], -1, 1)))
@@ -114,34 +114,35 @@ def test_cameras_move_within_bounds(tours):
             assert np.linalg.norm(second.to_world[:3, 3] - first.to_world[:3, 3]) < 1.5
 
 
-def test_things_thrown_in_are_seen_and_those_of_the_room_are_not_its_lights(tours):
-    from jaxdn.render.buffers.gbuffer import gbuffer
+def test_inserted_objects_are_seen_and_moved_ones_of_the_room_are_not_its_lights(randomised):
+    from jaxdn.render.buffers.gbuffer import trace_gbuffer
 
-    for scene in tours:
+    for scene in randomised:
         inserted = {shape["id"] for shape in scene.record["animation"]["inserted"]}
         seen = set()
         for frame in range(FRAMES):
-            found = gbuffer(scene.build(frame, 48, 48))
+            found = trace_gbuffer(scene.build(frame, 48, 48))
             seen |= {found.names[index] for index in np.unique(found.ids) if index >= 0}
         assert seen & inserted
         assert not {"lamp", "bulb"} & set(scene.record["animation"].get("shapes", {}))
 
 
-def test_the_record_rebuilds_the_scene_bit_for_bit(tours):
-    record = json.loads(json.dumps(tours[1].record))
+def test_the_record_rebuilds_the_scene_bit_for_bit(randomised):
+    record = json.loads(json.dumps(randomised[1].record))
     images = [
-        np.array(mi.render(scene.build(1, 12, 12), spp=2, seed=3)) for scene in (tours[1], scene_from_record(record))
+        np.array(mi.render(scene.build(1, 12, 12), spp=2, seed=3))
+        for scene in (randomised[1], scene_from_record(record))
     ]
     assert images[0].max() > 0
     np.testing.assert_array_equal(*images)
 
 
 def test_changed_materials_and_tinted_lights(folder):
-    from jaxdn.render.scenes.repaint import named_materials
+    from jaxdn.render.scenes.material_overrides import list_materials
 
     def colors(animation):
         scene = SceneFile.from_record({"file": str(folder / "scene.xml"), "animation": animation})
-        bsdfs = dict(named_materials(scene.build(0, 4, 4)))
+        bsdfs = dict(list_materials(scene.build(0, 4, 4)))
         values = {name: mi.traverse(bsdf) for name, bsdf in bsdfs.items()}
         texture, red = (np.array(values[name][key]) for name, key in KEYS.items())
         return texture, red.ravel(), float(np.ravel(np.array(values["ball"]["alpha.value"]))[0])
@@ -193,9 +194,9 @@ def test_a_wrong_scale_of_a_light_is_refused(scale):
 
 
 def test_motion_to_and_fro_has_its_speed_and_passes_its_place():
-    from jaxdn.render.tours.tour_things import _bounce
+    from jaxdn.render.camera_paths.inserted_objects import _bounce_between
 
-    times, places = np.array(_bounce(-1.0, 2.0, 0.7, 5.0, 20)).T
+    times, places = np.array(_bounce_between(-1.0, 2.0, 0.7, 5.0, 20)).T
     assert np.interp(5.0, times, places) == pytest.approx(0)
     assert places.min() >= -1
     assert places.max() <= 2
@@ -203,12 +204,12 @@ def test_motion_to_and_fro_has_its_speed_and_passes_its_place():
     np.testing.assert_allclose(inner, 0.7)
 
 
-def test_the_command_renders_tours_and_does_not_search_again(tours, folder, tmp_path, monkeypatch):
+def test_the_command_renders_randomised_scenes_and_does_not_search_again(randomised, folder, tmp_path, monkeypatch):
     from jaxdn.commands.main import main
-    from jaxdn.render.tours import rooms
+    from jaxdn.render.camera_paths import randomised_scene
 
-    # Searching has tests above; what counts here is that every seed has its own tour.
-    monkeypatch.setattr(rooms, "tour", lambda path, seed, frames: tours[seed])
+    # Searching has tests above; what counts here is that every seed has its own animation.
+    monkeypatch.setattr(randomised_scene, "randomise_scene", lambda path, seed, frames: randomised[seed])
 
     words = [
         "render",
@@ -227,7 +228,7 @@ def test_the_command_renders_tours_and_does_not_search_again(tours, folder, tmp_
     assert all(is_clip(clip) for clip in clips)
     records = [read_record(clip)["scene"] for clip in clips]
     assert records[0] != records[1]
-    monkeypatch.setattr(rooms, "tour", None)  # a second search would fail
+    monkeypatch.setattr(randomised_scene, "randomise_scene", None)  # a second search would fail
     main(words)
     assert [read_record(clip)["scene"] for clip in clips] == records
 
@@ -256,17 +257,17 @@ def test_the_command_refuses_what_it_cannot_do(folder, tmp_path, capsys, words, 
 
 
 def test_a_scene_without_free_space_or_with_fog_is_refused(folder, tmp_path):
-    from jaxdn.render.tours.rooms import tour
+    from jaxdn.render.camera_paths.randomised_scene import randomise_scene
 
     (tmp_path / "wood.png").write_bytes((folder / "wood.png").read_bytes())
     path = tmp_path / "scene.xml"
     path.write_text(room(camera=(0, 1000, 2000)))
     with pytest.raises(ValueError, match=r"expected free space around the scene's camera, found none"):
-        tour(path, 0, 2)
+        randomise_scene(path, 0, 2)
     path.write_text(room(fog='<medium type="homogeneous" name="interior"/>'))
     with pytest.raises(ValueError, match="participating media that scatter light"):
-        tour(path, 0, 3)
+        randomise_scene(path, 0, 3)
     with pytest.raises(ValueError, match="tour frames: expected at least 1"):
-        tour(path, 0, 0)
+        randomise_scene(path, 0, 0)
     with pytest.raises(ValueError, match="tour seed: expected at least 0"):
-        tour(path, -1, 2)
+        randomise_scene(path, -1, 2)

@@ -1,4 +1,4 @@
-"""Emitted, direct and indirect radiance from Mitsuba's own ``path`` integrator, for the scalar variant.
+"""A path tracer for the scalar variant: emitted, direct and indirect radiance from Mitsuba's own ``path`` integrator.
 
 With the same seed and one sample per pixel two ``path`` integrators of different depth follow the same paths, so that
 ``path(D) - path(2)`` is exactly the indirect light of ``path(D)``: never negative. With more than one sample the
@@ -12,14 +12,21 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.scenes.media import media_of
-from jaxdn.render.tracing.seeds import pass_seed, tea
-from jaxdn.render.tracing.wavefront import BRIGHTEST, Accumulated, Replayed, camera_rays, no_light
+from jaxdn.render.tracing.radiance import (
+    BRIGHTEST,
+    RadianceSums,
+    ReplayedPaths,
+    get_film_size,
+    make_camera_rays,
+    make_zero_radiance,
+)
+from jaxdn.render.tracing.seeds import SampleStream, make_pass_seed, tea
 
 _NO_ROULETTE = 1000
 
 
-def _integrators(scene: Any, max_depth: int) -> list[Any]:
-    """Integrators of all light, of light without the indirect part, and of emission only."""
+def _make_integrators(scene: Any, max_depth: int) -> list[Any]:
+    """Make integrators of all light, of light without the indirect part, and of emission only."""
     # The path tracer for media draws whether light is absorbed: the same mean, with noise.
     kind = "volpath" if media_of(scene) else "path"
     # Three renderings are three times faster than one "aov" integrator around all three.
@@ -29,26 +36,17 @@ def _integrators(scene: Any, max_depth: int) -> list[Any]:
     ]
 
 
-def accumulate(
-    scene: Any, *, seed: int, frame: int, stream: int, first: int, count: int, max_depth: int
-) -> Accumulated:
-    """The sums of the passes ``first`` to ``first + count`` of one stream; see :func:`wavefront.accumulate`.
+def accumulate(scene: Any, stream: SampleStream, first: int, count: int, *, max_depth: int) -> RadianceSums:
+    """Sum the passes ``first`` to ``first + count`` of one stream.
 
-    Args:
-      scene: the ``mi.Scene``.
-      seed: of the clip.
-      frame: index of the frame.
-      stream: of :mod:`jaxdn.render.tracing.seeds`.
-      first: index of the first pass.
-      count: number of passes.
-      max_depth: path length.
+    The arguments are those of :func:`jaxdn.render.tracing.vectorised_path_tracer.accumulate`.
     """
-    width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
-    integrators = _integrators(scene, max_depth)
-    total = no_light((height, width))
+    height, width = get_film_size(scene)
+    integrators = _make_integrators(scene, max_depth)
+    total = make_zero_radiance((height, width))
     render: Any = mi.render
     for index in range(first, first + count):
-        number = pass_seed(seed, frame, stream, index)
+        number = make_pass_seed(*stream, index)
         images = [
             np.array(render(scene, integrator=integrator, spp=1, seed=number), np.float64)[..., :3]
             for integrator in integrators
@@ -57,29 +55,34 @@ def accumulate(
         whole, two, one = (np.where(finite, image, 0.0) for image in images)
         # The film adds in float32: a last-digit difference of two equal sums must not become negative light.
         direct, indirect = np.maximum(two - one, 0.0), np.maximum(whole - two, 0.0)
-        total = total.plus(Accumulated(one, direct, indirect, int(np.sum(~finite))))
+        total = total.plus(RadianceSums(one, direct, indirect, int(np.sum(~finite))))
     return total
 
 
-def accumulate_sets(scene: Any, sets: int, *, first: int, count: int, **same: Any) -> list[Accumulated]:
-    """The sums of ``sets`` sets of ``count`` passes, one after the other; see :func:`wavefront.accumulate_sets`."""
-    return [accumulate(scene, first=first + index * count, count=count, **same) for index in range(sets)]
+def accumulate_sets(
+    scene: Any, stream: SampleStream, first: int, count: int, sets: int, *, max_depth: int
+) -> list[RadianceSums]:
+    """Sum ``sets`` sets of ``count`` passes, one after the other."""
+    return [
+        accumulate(scene, stream, at, count, max_depth=max_depth) for at in range(first, first + sets * count, count)
+    ]
 
 
 def replay(
-    scene: Any, target: np.ndarray, pixel: np.ndarray, *, key: tuple[int, int], sample: int, max_depth: int
-) -> Replayed:
-    """Paths through any points of the image with reproducible random numbers; see :func:`wavefront.replay`.
+    scene: Any, stream: SampleStream, sample: int, target: np.ndarray, pixel: np.ndarray, *, max_depth: int
+) -> ReplayedPaths:
+    """Trace paths through any points of the image with reproducible random numbers.
 
+    The arguments are those of :func:`jaxdn.render.tracing.vectorised_path_tracer.replay`.
     The numbers depend on the same arguments, but are not those of :func:`accumulate`, whose passes have one stream for
     each block of pixels.
     """
-    sensor = scene.sensors()[0]
-    deep, two, _ = _integrators(scene, max_depth)
+    sensor, key = scene.sensors()[0], stream.key()
+    deep, two, _ = _make_integrators(scene, max_depth)
     sampler: Any = mi.load_dict({"type": "independent"})
     light, position = np.zeros((len(pixel), 3)), np.full((len(pixel), 3), np.nan)
     for index, (x, y) in enumerate(target):
-        ray = camera_rays(sensor, float(x) - 0.5, float(y) - 0.5)
+        ray = make_camera_rays(sensor, float(x) - 0.5, float(y) - 0.5)
         number = tea(key[0] ^ int(pixel[index]), key[1] ^ sample)[0]
         parts = []
         for integrator in (deep, two):
@@ -90,4 +93,4 @@ def replay(
         hit = scene.ray_intersect(ray)
         if hit.is_valid():
             position[index] = hit.p
-    return Replayed(light, position)
+    return ReplayedPaths(light, position)

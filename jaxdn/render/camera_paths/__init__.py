@@ -1,0 +1,1 @@
+"""Randomised scenes: collision-free camera paths through rooms, with inserted objects."""

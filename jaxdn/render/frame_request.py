@@ -1,0 +1,92 @@
+"""What one frame of a clip needs: decided from the settings before anything is traced."""
+
+from typing import NamedTuple
+
+from jaxdn.core.frame import GUIDES, OF_SAMPLES, ON_REQUEST
+from jaxdn.planning.catalogue import OF_FIRST_HITS, OF_SHADOWS
+from jaxdn.render.mitsuba.variant import advice, tells_lobes
+from jaxdn.render.settings import RenderSettings
+from jaxdn.render.tracing.radiance import NOTHING_ELSE, TraceRequest
+
+DISOCCLUSION = frozenset({"dual_motion", "visible"})
+MOTION = frozenset({"motion", "previous_depth", "far_motion"}) | DISOCCLUSION
+LOBES = frozenset({"specular", "hit_distance", "specular_hit_distance"})
+VECTORS = frozenset({"shadow_motion", "glossy_motion"})
+"""Motion of what the samples of one noisy image have met."""
+GRADIENT = "luminance_gradient"
+
+
+class FrameRequest(NamedTuple):
+    """The buffers and the light of one frame."""
+
+    buffers: frozenset[str]
+    """Buffers that do not belong to one noisy image; none in a frame that shares those of an earlier one."""
+    sampled: frozenset[str]
+    """Buffers of the noisy layer with the fewest samples (:data:`jaxdn.core.frame.OF_SAMPLES`)."""
+    shared: bool
+    """It shows the same as an earlier frame, whose buffers and reference it shares: only its noise is its own."""
+    lit: bool
+    """The scene has light."""
+    noisy: bool
+    """The noisy layers may hold light."""
+    reflected: bool
+    """They hold all light that surfaces reflect."""
+
+    @property
+    def needs_view(self) -> bool:
+        """Whether there is a buffer of surfaces."""
+        return bool(self.buffers | self.sampled & VECTORS)
+
+    @property
+    def needs_previous_scene(self) -> bool:
+        """Whether rays are traced in the frame before, too."""
+        return not self.shared and (bool(self.sampled & VECTORS) or GRADIENT in self.buffers)
+
+    @property
+    def needs_previous_view(self) -> bool:
+        """Whether the surfaces of the frame before are needed."""
+        return self.needs_previous_scene or bool(self.buffers & MOTION)
+
+    @property
+    def samples(self) -> TraceRequest:
+        """What else is told of the samples of the noisy layer with the fewest."""
+        if not self.sampled:
+            return NOTHING_ELSE
+        return TraceRequest(bool(self.sampled & LOBES), bool(self.sampled & OF_SHADOWS), self.reflected)
+
+
+def request_frame(settings: RenderSettings, frame: int) -> FrameRequest:
+    """Decide what a frame needs.
+
+    Raises ValueError for settings that their variant, which is not None, cannot render.
+    """
+    plan = settings.plan
+    planned = frozenset(GUIDES) - ON_REQUEST if plan is None else frozenset(plan.frames[frame])
+    if settings.see_through:
+        planned -= OF_FIRST_HITS
+    if settings.light == "reflected":
+        planned -= {"direct"}
+    shared = plan is not None and plan.shared_with[frame] != frame
+    request = FrameRequest(
+        buffers=frozenset() if shared else planned - OF_SAMPLES,
+        sampled=planned & OF_SAMPLES,
+        shared=shared,
+        lit=plan is None or plan.integrator != "none",
+        noisy=plan is None or (plan.indirect and plan.integrator != "none"),
+        reflected=settings.light == "reflected",
+    )
+    _check_variant(settings, request)
+    return request
+
+
+def _check_variant(settings: RenderSettings, request: FrameRequest) -> None:
+    variant = settings.variant or ""
+    if tells_lobes(variant):
+        return
+    if settings.jitter:
+        raise ValueError(f"jitter: {variant} spreads its samples over the pixels itself; leave it out. {advice()}")
+    if settings.see_through:
+        raise ValueError(f"see_through: {variant} cannot follow rays past mirrors and glass; leave it out. {advice()}")
+    if request.sampled:
+        names = ", ".join(sorted(request.sampled))
+        raise ValueError(f"plan: {variant} cannot render {names}; plan without them. {advice()}")

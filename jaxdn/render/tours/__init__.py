@@ -1,1 +1,0 @@
-"""Randomised camera paths through rooms, with objects inserted and collisions avoided."""
