@@ -15,7 +15,12 @@ def without_reader(*command, stderr=subprocess.PIPE, **environment):
     os.close(reader)
     try:
         done = subprocess.run(
-            [sys.executable, *command], stdout=writer, stderr=stderr, text=True, env=os.environ | environment, timeout=300
+            [sys.executable, *command],
+            stdout=writer,
+            stderr=stderr,
+            text=True,
+            env=os.environ | environment,
+            timeout=300,
         )
     finally:
         os.close(writer)
