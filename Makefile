@@ -1,6 +1,8 @@
 # All targets work from a fresh clone with Python >= 3.11 and make; they create .venv first if they need it.
 PYTHON ?= python3
-BIN := .venv/bin
+# Another folder for another Python: make test VENV=.venv-3.13 PYTHON=python3.13
+VENV ?= .venv
+BIN := $(VENV)/bin
 SETTINGS ?=
 # Huge pages for large buffers (glibc; ignored elsewhere): a train step takes 0.87 of the time. The bench measures both.
 train weights: export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
@@ -12,15 +14,15 @@ export TF_CPP_MIN_LOG_LEVEL ?= 3
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
-setup: .venv/ready  ## .venv with the exact versions of constraints.txt (uses uv if it is installed, else pip)
+setup: $(VENV)/ready  ## .venv with the exact versions of constraints.txt (uses uv if it is installed, else pip)
 
-.venv/ready: pyproject.toml constraints.txt
-	@echo "Setting up .venv (Python packages of constraints.txt; a minute or two) ..."
+$(VENV)/ready: pyproject.toml constraints.txt
+	@echo "Setting up $(VENV) (Python packages of constraints.txt; a minute or two) ..."
 	@if command -v uv >/dev/null 2>&1; then \
-		uv venv --quiet --allow-existing --python $(PYTHON) .venv && \
+		uv venv --quiet --allow-existing --python $(PYTHON) $(VENV) && \
 		uv pip install --quiet --python $(BIN)/python -c constraints.txt --group dev -e '.[render,train,peers,onnx,onednn]'; \
 	else \
-		$(PYTHON) -m venv .venv && \
+		$(PYTHON) -m venv $(VENV) && \
 		$(BIN)/python -m pip install --quiet --upgrade -c constraints.txt pip && \
 		$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[render,train,peers,onnx,onednn]'; \
 	fi
@@ -43,7 +45,7 @@ hard-cases: setup  ## run every operation and denoiser on every hard case: runs/
 
 # Common alternatives to compare with. Only a CPU build of PyTorch is installed, from pip's configured index or else
 # through uv from PyTorch's own index: the default build brings gigabytes of CUDA packages.
-.venv/tools: .venv/ready
+$(VENV)/tools: $(VENV)/ready
 	@echo "Adding PyTorch's CPU build and Open Image Denoise to compare with ..."
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip >/dev/null
 	@$(BIN)/python -m pip install --quiet -c constraints.txt pyoidn || \
@@ -53,16 +55,16 @@ hard-cases: setup  ## run every operation and denoiser on every hard case: runs/
 		echo "no CPU build of PyTorch could be installed: its rows will be left out"
 	@touch $@
 
-bench: .venv/tools  ## time operations, steps and training, compared with PyTorch and Open Image Denoise: runs/bench.json
+bench: $(VENV)/tools  ## time operations, steps and training, compared with PyTorch and Open Image Denoise: runs/bench.json
 	$(BIN)/python -m experiments.speed.bench $(SETTINGS)
 
-chart: .venv/tools  ## error against time for every way to make an image: runs/chart/chart.html
+chart: $(VENV)/tools  ## error against time for every way to make an image: runs/chart/chart.html
 	$(BIN)/python -m experiments.speed.chart $(SETTINGS)
 
 papers: setup  ## the tables of the papers on learned denoisers, on small settings: runs/papers/report.md (tens of minutes)
 	$(BIN)/python -m experiments.papers.learned $(SETTINGS)
 
-compare: .venv/tools  ## the filters side by side, errors and times: runs/compare/table.md (SETTINGS="SCENES" adds rooms)
+compare: $(VENV)/tools  ## the filters side by side, errors and times: runs/compare/table.md (SETTINGS="SCENES" adds rooms)
 	$(BIN)/python -m experiments.papers.classical $(SETTINGS)
 
 results: setup  ## docs/results/index.md and the tables of the README, from docs/results/*.json
@@ -83,4 +85,4 @@ docs: setup  ## build the reference pages from the docstrings into site/
 	$(BIN)/python -m mkdocs build --strict
 
 clean:  ## delete the environment and everything rendered and trained
-	rm -rf .venv runs data site
+	rm -rf .venv .venv-* runs data site

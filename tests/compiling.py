@@ -3,16 +3,26 @@
 The emitters are how users' programs fuse operations. In one piece, one thread makes the code, and not
 32 pieces whose overhead is a fifth of the time; that results are the same was not compared.
 
-XLA ends a process whose ``XLA_FLAGS`` have a flag that it does not know: hence the version.
+XLA ends a process whose ``XLA_FLAGS`` have a flag that it does not know: hence the version. jax 0.12's has none for
+the emitters.
 """
 
 import jax
 
 _KNOWN = jax.__version_info__ < (0, 11)
 
-FLAGS = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1" if _KNOWN else ""
-"""For ``XLA_FLAGS``: without emitters, in one piece."""
+FLAGS = ("--xla_cpu_use_fusion_emitters=false " if _KNOWN else "") + "--xla_cpu_parallel_codegen_split_count=1"
+"""For ``XLA_FLAGS``: without emitters where they can be left out, in one piece."""
 AS_USERS: dict[str, bool] = {"xla_cpu_use_fusion_emitters": True} if _KNOWN else {}
 """Options of one program: with them, whatever the flags of the process."""
 SOON: dict[str, bool] = {"xla_cpu_use_fusion_emitters": False} if _KNOWN else {}
 """Options of one program: without."""
+
+
+def join_flags(*flags: str | None) -> str:
+    """A value of ``XLA_FLAGS`` with all of these, of which None and empty ones are left out.
+
+    XLA takes a value that does not begin with ``--``, be it a single space, for the name of a file of flags, and ends
+    the process if there is no such file.
+    """
+    return " ".join(words for some in flags if (words := (some or "").strip()))

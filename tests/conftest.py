@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.compiling import FLAGS
+from tests.compiling import FLAGS, join_flags
 from tests.needs import require
 
 hypothesis.settings.register_profile(
@@ -49,7 +49,7 @@ def _compile_quickly() -> None:
     processes compile as users do. XLA reads its flags once.
     """
     before = os.environ.get("XLA_FLAGS")
-    os.environ["XLA_FLAGS"] = f"{before or ''} {FLAGS}"
+    os.environ["XLA_FLAGS"] = join_flags(before, FLAGS)
     jax.jit(lambda x: x + 1)(1.0)
     if before is None:
         del os.environ["XLA_FLAGS"]

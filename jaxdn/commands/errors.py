@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 
 from rich.console import Console
 
+from jaxdn.commands.pipe import reader_has_gone
 from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.runtime.interrupt import EXIT_CODE, never_lost
 from jaxdn.runtime.optional import extra_of, install
@@ -28,6 +29,8 @@ def plain_errors() -> Iterator[None]:
     except (ValueError, RenderError) as error:
         _end(str(error))
     except OSError as error:
+        if isinstance(error, BrokenPipeError) and reader_has_gone():
+            raise  # nobody is there to read a message: `jaxdn ... | head`
         where = f"{error.filename}: " if error.filename else ""
         _end(f"{where}{error.strerror or error}")
     except ModuleNotFoundError as error:

@@ -13,6 +13,7 @@ import jaxdn
 from jaxdn.commands.arguments import COMMANDS, Compare, Denoise, Doctor, Export, Inspect, Pack, Render, Train
 from jaxdn.commands.errors import plain_errors
 from jaxdn.commands.options import check_folder, name_channels
+from jaxdn.commands.pipe import end_with_reader
 from jaxdn.runtime.interrupt import end_of_process
 
 
@@ -175,7 +176,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def program() -> None:
     """The command ``jaxdn``: :func:`main` in a process that ends with it."""
-    with end_of_process():
+    with end_with_reader(), end_of_process():
         main()
 
 

@@ -49,6 +49,12 @@ def _split(graph: Graph, equation: Any, x: str) -> list[str]:
     return graph.values("Split", [x, graph.shape(sizes)], len(sizes), axis=int(equation.params["axis"]))
 
 
+def _unstacked(graph: Graph, equation: Any, x: str) -> list[str]:
+    axis, count = int(equation.params["axis"]), len(equation.outvars)
+    parts = graph.values("Split", [x, graph.integers(*[1] * count)], count, axis=axis)
+    return [graph.value("Squeeze", part, graph.integers(axis)) for part in parts]
+
+
 def _slice(graph: Graph, equation: Any, x: str) -> str:
     given, shape = equation.params, equation.invars[0].aval.shape
     strides = given["strides"] or [1] * len(shape)
@@ -194,5 +200,6 @@ MOVEMENT: dict[str, Rule] = {
     "squeeze": _squeeze,
     "stack": _stacked,
     "transpose": _transpose,
+    "unstack": _unstacked,
 }
 """Primitive -> its rule."""

@@ -5,7 +5,7 @@ JAX has no exporter to ONNX. Programs here are traced to a jaxpr, whose primitiv
 symbolic: they are computed from the inputs' shapes when the graph runs.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -71,7 +71,7 @@ def _closed(program: Any) -> core.ClosedJaxpr:
 def _scan(graph: Graph, equation: core.JaxprEqn, *inputs: str) -> list[str]:
     """``lax.scan``; what stays the same in all rounds is read from the graph around."""
     parameters, program = equation.params, equation.params["jaxpr"]
-    constants, carried = parameters["num_consts"], parameters["num_carry"]
+    constants, carried = _constants_and_carried(parameters)
     body = Graph(graph)
     variables = program.jaxpr.invars[constants:]
     names = [body.name("round") for _ in variables]
@@ -88,6 +88,14 @@ def _scan(graph: Graph, equation: core.JaxprEqn, *inputs: str) -> list[str]:
         num_scan_inputs=lists,
         **directions,
     )
+
+
+def _constants_and_carried(parameters: Mapping[str, Any]) -> tuple[int, int]:
+    """How many inputs of ``lax.scan`` are the same in all rounds, and how many go from one round to the next."""
+    if "ft_in" in parameters:  # since jax 0.12: trees of both, and of what is read row by row
+        constants, carried, _ = parameters["ft_in"].unpack()
+        return len(constants), len(carried)
+    return parameters["num_consts"], parameters["num_carry"]
 
 
 def _cond(graph: Graph, equation: core.JaxprEqn, index: str, *inputs: str) -> list[str]:

@@ -53,13 +53,16 @@ def never_lost() -> Iterator[None]:
     an error of XLA that ends with its name.
     """
     before = sys.unraisablehook
+    again: threading.Timer | None = None
 
     def hook(dropped: "sys.UnraisableHookArgs") -> None:
-        if issubclass(dropped.exc_type, KeyboardInterrupt):
-            # From a thread, as here it would be dropped again.
-            threading.Timer(_AGAIN_S, _thread.interrupt_main).start()
-        else:
+        nonlocal again
+        if not issubclass(dropped.exc_type, KeyboardInterrupt):
             before(dropped)
+        elif again is None or not again.is_alive():
+            # From a thread, as here it would be dropped again.
+            again = threading.Timer(_AGAIN_S, _thread.interrupt_main)
+            again.start()
 
     sys.unraisablehook = hook
     try:

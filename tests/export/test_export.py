@@ -147,11 +147,12 @@ RULES = {
         x[None, ..., None], jnp.arange(18.0).reshape(3, 3, 1, 2), (2, 1), ((1, 1), (0, 2)),
         dimension_numbers=("NHWC", "HWIO", "NHWC"),
     ),
+    "unstacked": lambda x: sum(jnp.unstack(jnp.stack([x, x + 1, x * x], 1), axis=1)),
     "rows": lambda x: x[jnp.clip((x[:, 0] * 9).astype(jnp.int32), 0, x.shape[0] - 1)],
     "elements": lambda x: x.at[(x[:, 0] * 3).astype(jnp.int32), 1].get(mode="clip"),
     "slice": lambda x: lax.dynamic_slice(x, ((x[0, 0] * 40).astype(jnp.int32), 1), (2, 2)),
     "dropped": lambda x: jnp.zeros(4).at[jnp.arange(x.shape[0])].set(x[:, 0], mode="drop"),
-    "backwards": lambda x: lax.scan(lambda sum, row: (sum + row[0], sum * row), 1.0, x, reverse=True)[1],
+    "backwards": lambda x: lax.scan(lambda sum, row: (sum + row[0], sum * row - x[0]), 1.0, x, reverse=True)[1],
     "branches": lambda x: lax.cond(x[0, 0] > 0.5, lambda: x[1:] + 1, lambda: x[:-1]),
     "sizes": lambda x: jnp.ones((x.shape[0] // 3, -(-x.shape[1] // 4))) * (x.shape[0] % 5),
 }  # fmt: skip

@@ -60,6 +60,20 @@ def test_where_an_object_dies_twice(ctrl_c):
     assert during(lambda: (Dying(), Dying())) == 130
 
 
+def test_what_is_dropped_twice_arrives_once(ctrl_c):
+    """The second one would arrive where the command has ended, and print a traceback."""
+
+    class Dying:
+        def __del__(self):
+            ctrl_c()
+
+    assert during(lambda: (Dying() is None, time.sleep(0.02), Dying() is None)) == 130
+    try:
+        time.sleep(0.3)
+    except KeyboardInterrupt:
+        pytest.fail("it arrived twice")
+
+
 def test_in_a_callback_of_a_program(ctrl_c, capsys):
     def work(context, result, given):
         ctrl_c()
