@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name i
     from jaxdn.denoiser.rollout import stream as stream
     from jaxdn.denoiser.rollout import unroll as unroll
     from jaxdn.ops.affinity.filter import affinity_filter as affinity_filter
+    from jaxdn.ops.dispatch.operation import implementation as implementation
     from jaxdn.ops.kernel_prediction.apply import apply_kernels as apply_kernels
     from jaxdn.ops.kernel_prediction.apply import normalize_kernels as normalize_kernels
     from jaxdn.ops.kernel_prediction.softmax import softmax_filter as softmax_filter
@@ -52,6 +53,7 @@ _HOMES = {
     "apply_kernels": "ops.kernel_prediction.apply",
     "softmax_filter": "ops.kernel_prediction.softmax",
     "affinity_filter": "ops.affinity.filter",
+    "implementation": "ops.dispatch.operation",
     "compose_scales": "ops.scales",
     "denoise": "denoiser.rollout",
     "stream": "denoiser.rollout",

@@ -8,6 +8,7 @@ Pre-Integration Factorization"). For a microfacet lobe with Schlick's Fresnel te
 """
 
 import functools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +18,7 @@ import numpy as np
 
 from jaxdn.core.checks import check_image, check_option, check_same_size
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 
 Lobe = Literal["ggx", "ggx-correlated", "beckmann"]
 """GGX with Smith's separable shadowing (as in Mitsuba) or the height-correlated one, Beckmann (separable)."""
@@ -259,3 +260,10 @@ _FAINT, _UNEXPLAINED = 0.3, 0.01
 """From 0.1 to 0.3 the first, and from 0.02 to 0.1 the second, make no difference of more than 0.03 dB to svgf (means
 of four and of nine clips).
 """
+
+
+@texture_or_hue.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    reflectance, light = rng.random((height, width, 3)) ** 4, 9 * rng.random((height, width, 3))
+    for hue in (False, True):
+        yield Example((reflectance * (rng.random((height, width, 1)) > 0.2), light, np.array(hue)))

@@ -12,8 +12,11 @@ from rich.console import Console
 from rich.table import Table
 
 import jaxdn
+import jaxdn.networks.recurrent  # declares operations
+from jaxdn.methods.registry import methods
 from jaxdn.networks.engines import ENGINES
 from jaxdn.ops.dispatch import numba_call
+from jaxdn.ops.dispatch.operation import OPERATIONS, REFERENCE, VARIABLE, default_implementation
 from jaxdn.ops.onednn import library
 from jaxdn.render.mitsuba.variant import choose_variant, has_cuda
 from jaxdn.runtime.optional import EXTRAS, install
@@ -57,8 +60,7 @@ def _findings() -> Iterator[Finding]:
             yield Finding(f"engine for {engine.purpose}", "XLA alone", f"faster: {install(_EXTRA_OF[engine.name])}")
         else:
             yield Finding(f"engine for {engine.purpose}", "XLA, as on every GPU")
-    if jax.default_backend() == "cpu":
-        yield _loops()
+    yield from _operations()
     yield _packages("training", "train")
     yield _renderer()
 
@@ -73,13 +75,20 @@ def _device() -> Finding:
     return Finding("device", found)
 
 
-def _loops() -> Finding:
-    """Numba, which compiles the loops of filters."""
-    if not numba_call.unavailable():
-        return Finding("filters", f"loops compiled by numba {metadata.version('numba')}")
-    if find_spec("numba") is None:
-        return Finding("filters", "XLA alone", "twice as fast: pip install numba")
-    return Finding("filters", "XLA alone")
+def _operations() -> Iterator[Finding]:
+    """The implementation that each operation of the methods has here, and what would be faster."""
+    methods()  # imports the modules that declare them, but for the networks
+    chosen: dict[str, list[str]] = {}
+    for name, operation in sorted(OPERATIONS.items()):
+        fastest, differentiable = (one.name for one in operation.automatic())
+        label = fastest if fastest == differentiable else f"{fastest}, gradients by {differentiable}"
+        chosen.setdefault(label, []).append(name)
+    for label, names in chosen.items():
+        yield Finding(f"operations: {label}", ", ".join(names))
+    if default_implementation() == REFERENCE:
+        yield Finding(VARIABLE, REFERENCE, "filters are twice as fast without it")
+    elif jax.default_backend() == "cpu" and (reason := numba_call.unavailable()):
+        yield Finding("filters", "XLA alone", f"twice as fast; numba {reason}")
 
 
 def _packages(what: str, extra: str) -> Finding:

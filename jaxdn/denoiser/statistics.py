@@ -5,6 +5,7 @@ is a sum over pixels, or over blocks of 16x16 of them, so that the sums of parts
 of the frame.
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ import numpy as np
 from jaxdn import color
 from jaxdn.core.frame import FAR, Array, Frame
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 
 
 class FrameStatistics(NamedTuple):
@@ -83,3 +84,9 @@ def _sum_depths_by_numba(depth: jax.Array) -> jax.Array:
     from jaxdn.denoiser.numba_statistics import depths
 
     return numba_call.call(depths, [(depth.shape[0], 3)], [depth], np.float32(FAR), rows=depth.shape[0])[0].sum(axis=0)
+
+
+@sum_depths.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    depth = 10.0 ** rng.uniform(-3, 3, (height, width, 1))
+    yield Example((np.where(rng.random(depth.shape) > 0.1, depth, rng.choice([0.0, -1.0, FAR], depth.shape)),))

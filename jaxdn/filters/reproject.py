@@ -7,8 +7,8 @@ Fetches run by strips: at 720p, fetching the taps of all pixels at once takes tw
 """
 
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ from jaxdn.filters.surface_test import (
     unpack,
 )
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.dispatch.row_tiles import by_strips, where_needed
 from jaxdn.ops.motion import targets
 from jaxdn.ops.warp import cells, differentiable_mean, windows
@@ -291,3 +291,22 @@ def _mean(
     weights = [jnp.where(valid, weight / jnp.where(valid, total, 1.0), 0.0) for weight in weights]
     parts = [weight[..., None] * taps[..., index, :channels] for index, weight in enumerate(weights)]
     return functools.reduce(jnp.add, parts), valid, jnp.stack(weights, axis=-1)
+
+
+@_average_taps.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    def draw(*values: float) -> Any:
+        return rng.choice(values, (height, width))
+
+    history: Any = rng.random((height, width, 8)) * (rng.random((height, width, 1)) > 0.1)
+    history[height // 2, width // 2, 3] = np.nan
+    normals: Any = [rng.normal(size=(height, width, 3)).round() for _ in range(2)]
+    before = Guides(*(draw(1.0, 3.0)[..., None], normals[0], draw(-1, 0, 1).astype(np.int32)[..., None]))
+    expected = ExpectedSurface(draw(1.0, 3.0), draw(0.02, 0.5), normals[1], draw(-1, 0, 1).astype(np.int32))
+    rows, columns = np.mgrid[:height, :width]
+    x = np.clip(columns + draw(-2.5, -1.0, 0.0, 0.3), 0, width - 1)
+    y = np.clip(rows + draw(-2.5, -1.0, 0.0, 0.3), 0, height - 1)
+    inside: Any = rng.random((height, width)) > 0.1
+    for search_neighbours in (False, True):
+        rules = _Rules(moving=True, normal_threshold=0.9, search_neighbours=search_neighbours)
+        yield Example((_Request(history, before, (x, y), inside, expected),), {"rules": rules})

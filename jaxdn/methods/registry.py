@@ -16,6 +16,7 @@ from typing import Any
 from jaxdn.core import options as declared
 from jaxdn.denoiser import Denoiser
 from jaxdn.networks.engines import ENGINES, Purpose
+from jaxdn.ops.dispatch.operation import REFERENCE, default_implementation
 from jaxdn.recipes.recipe import Recipe
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
@@ -84,8 +85,11 @@ class Method:
         return any(each.name == option for each in dataclasses.fields(self.options))
 
     def engine(self, purpose: Purpose, options: Mapping[str, Any] = _NOTHING) -> str | None:
-        """The engine that runs it fastest here, for the option ``implementation``; None is XLA."""
-        if options.get("compute_dtype") not in (None, "float32"):
+        """The engine that runs it fastest here, for the option ``implementation``; None is XLA.
+
+        It is None too where :func:`jaxdn.implementation` or its environment variable asks for references.
+        """
+        if options.get("compute_dtype") not in (None, "float32") or default_implementation() == REFERENCE:
             return None
         fitting = (ENGINES[name] for name in self.engines if ENGINES[name].purpose == purpose)
         return next((each.name for each in fitting if each.available() and each.faster()), None)

@@ -4,16 +4,17 @@ Chakravarty R. Alla Chaitanya et al., "Interactive Reconstruction of Monte Carlo
 Denoising Autoencoder", 2017.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxdn.networks import Widths, description
 from jaxdn.networks.description import FEATURES, Description, Weights, evaluate, hidden
-from jaxdn.networks.unet import ONEDNN, XLA, initial, present_groups, storage, weights_for
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.networks.unet import ONEDNN, XLA, draw_weights, initial, present_groups, storage, weights_for
+from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.onednn import library
 
 
@@ -89,3 +90,12 @@ def recurrent_unet(
         return output, tuple(kept)
 
     return RecurrentNetwork(init, start, apply)
+
+
+@run_recurrent_unet.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    height, width = height + height % 2, width + width % 2
+    network = description.recurrent_unet(3, 2, widths=((4, 5), (4,)))
+    features, first = rng.normal(size=(1, height, width, 3)), rng.normal(size=(1, height, width, 4))
+    inputs = {FEATURES: features, hidden(0): first, hidden(1): rng.normal(size=(1, height // 2, width // 2, 5))}
+    yield Example((draw_weights(rng, network), inputs), {"network": network})

@@ -7,11 +7,12 @@ no other module depends on Flax.
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import nnx
 
 from jaxdn.core.checks import check_option
@@ -19,7 +20,7 @@ from jaxdn.denoiser import Params
 from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, description, onednn, onnx
 from jaxdn.networks.description import FEATURES, Description, Weights, evaluate
 from jaxdn.ops.convolution.api import convolve
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.onednn import library
 
 
@@ -248,3 +249,19 @@ def weights_for(
 def count(params: Params) -> int:
     """The number of weights in ``params``."""
     return sum(leaf.size for leaf in jax.tree.leaves(params))
+
+
+def draw_weights(rng: np.random.Generator, network: Description) -> Weights:
+    """Weights of a network with which signals keep their size."""
+    return {
+        name: {"kernel": rng.normal(size=shape) / math.sqrt(math.prod(shape[:3])), "bias": rng.normal(size=shape[3])}
+        for name, shape in network.kernels().items()
+    }
+
+
+@run_unet.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    height, width = height + -height % MULTIPLE, width + -width % MULTIPLE
+    network = description.unet(5, (3, 2), widths=((4,), (6,), (4,), (4,), (4,)), head_size=1)
+    groups = [rng.normal(size=(1, height, width, channels)) for channels in (3, 2)]
+    yield Example((draw_weights(rng, network), groups), {"network": network})

@@ -1,11 +1,14 @@
 """Images at several scales: halving, doubling, and composing filtered scales."""
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxdn.core.checks import check_image, check_option
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 
 
 def downsample(image: jax.Array, *, down: str = "mean") -> jax.Array:
@@ -140,3 +143,9 @@ def _check_even(height: int, width: int, name: str) -> None:
             f"{name}: expected an even height and width, got {height} x {width}; "
             "pad by edge to a multiple of 16 and crop the result."
         )
+
+
+@_fill_holes.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    size = height + -height % 4, width + -width % 4
+    yield Example((rng.random((*size, 3)), rng.random((*size, 1)) > 0.6))

@@ -5,13 +5,15 @@ image (0 <= x <= W - 1, likewise y).
 """
 
 import math
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxdn.core.checks import check_image, check_option, check_same_size
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.motion import targets
 
 
@@ -41,7 +43,6 @@ def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implemen
     else:
         x, y = jnp.clip(x, 0, width - 1), jnp.clip(y, 0, height - 1)
     x, y = x.astype(_position_dtype(image)), y.astype(_position_dtype(image))
-    x, y = lax.stop_gradient(x), lax.stop_gradient(y)
     warped = _sample_bilinearly(image, x, y, implementation=implementation).astype(image.dtype)
     return jnp.where(known[..., None], warped, 0.0)
 
@@ -62,7 +63,7 @@ def cells(x: jax.Array, y: jax.Array, height: int, width: int) -> tuple[jax.Arra
 def _sample_bilinearly(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     """Four fetches and their weighted sum."""
     height, width = image.shape[:2]
-    left, top, fx, fy = cells(x, y, height, width)
+    left, top, fx, fy = cells(lax.stop_gradient(x), lax.stop_gradient(y), height, width)
     right, below = jnp.minimum(left + 1, width - 1), jnp.minimum(top + 1, height - 1)
     upper = (1 - fx) * image[top, left] + fx * image[top, right]
     lower = (1 - fx) * image[below, left] + fx * image[below, right]
@@ -179,3 +180,9 @@ _pairs.defvjp(_forward, _backward)
 def _sample_by_pairs(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     """Two gathers of neighbouring pairs, and a VJP that scatters 2 x 2 blocks."""
     return _pairs(image, x, y)
+
+
+@_sample_bilinearly.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    x, y = (rng.uniform(0, side - 1, (height, width)) for side in (width, height))
+    yield Example((rng.normal(size=(height, width, 3)), x, y))

@@ -1,15 +1,16 @@
 """The running mean of light, how many frames it is worth, and what is remembered of a frame."""
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxdn import color
-from jaxdn.methods.steady.network_input import History
+from jaxdn.methods.steady.network_input import History, draw_history
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.layout.planar import planar
 from jaxdn.ops.scales import downsample
 
@@ -94,3 +95,23 @@ def _remember_by_numba(
 
     arrays = [*mean[:3], *shown, *history, feedback, blend]
     return numba_call.call(remembered, [history.values.shape], arrays, np.float32(most), rows=feedback.shape[0])[0]
+
+
+@accumulated.example
+def _accumulate_example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    height, width = height + height % 2, width + width % 2
+    light, hit = rng.random((height, width, 3)), rng.random((height, width)) > 0.1
+    history = draw_history(rng, height, width)
+    yield Example((light, history, hit, rng.uniform(0.1, 0.9, (height, width))), {"most": 20.0})
+
+
+@remembered.example
+def _remember_example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    height, width = height + height % 2, width + width % 2
+    planes = rng.uniform(-0.1, 2, (4, 3, height, width))
+    square, number, feedback, blend = rng.random((4, height, width))
+    history: Any = draw_history(rng, height, width)
+    mean: Any = planes[0], square, number, np.zeros((3, height // 2, width // 2))
+    for change in (None, planes[3]):
+        shown: Any = planes[1], planes[2], change
+        yield Example((Mean(*mean), Shown(*shown), history, feedback, blend), {"most": 1.5})

@@ -1,5 +1,8 @@
 """Single bright pixels, taken away: what is left of fireflies that had nobody to share their light with."""
 
+from collections.abc import Iterator
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +11,7 @@ from jaxdn.color import LUMINANCE, luminance_of_planes
 from jaxdn.filters.clamping import DARK, without_specks
 from jaxdn.methods.steady.accumulation import Mean
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 
 _SOME = 1.5
 """Effective number of frames from which on their deviation tells how sure a mean is."""
@@ -42,3 +45,12 @@ def _dim_by_numba(image: jax.Array, hit: jax.Array, mean: Mean) -> jax.Array:
     numbers = (np.float32(number) for number in (DARK, _SOME, _DEVIATIONS, _FAINTEST, _LEAST_VARIANCE))
     arrays = [image, hit, mean.light, mean.square, mean.number]
     return numba_call.call(dimmed, [image.shape], arrays, weights, *numbers, rows=hit.shape[0])[0]
+
+
+@dimmed.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    light: Any = rng.random((3, height, width)) ** 8
+    square = np.einsum("c,cyx->yx", LUMINANCE, light) ** 2 * rng.uniform(0.9, 1.5, (height, width))
+    number: Any = rng.choice([1.0, 2.0, 30.0], (height, width))
+    hit = rng.random((height, width)) > 0.2
+    yield Example((light * rng.uniform(0.5, 2, light.shape), hit, Mean(light, square, number, light)))

@@ -16,6 +16,7 @@ The filter is variance-guided filtering without its variance (Schied et al. 2017
 (Isik et al. 2021) and a recurrent network's view of noisy frame, mean and last output (Zeng et al. 2021).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
@@ -38,7 +39,7 @@ from jaxdn.methods.steady.levels import BLOCKS, LEVELS, Decisions, Surfaces, fil
 from jaxdn.methods.steady.network_input import CHANNELS, DARK, History, seen
 from jaxdn.networks import Widths, crop, description, pad
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.layout.planar import join_planes, planar
 from jaxdn.ops.scales import downsample, fill_holes, upsample
 from jaxdn.recipes.objectives import pyramid_illumination
@@ -228,3 +229,11 @@ def _apart_by_numba(head: jax.Array, *, size: tuple[int, int]) -> _Apart:
     shapes.append((head.shape[-1] - last, height, width))
     own, planes, half, rest = numba_call.call(decided, shapes, [head], rows=height)
     return own, planes, half, rest
+
+
+@_apart.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    channels = int(_PLACES[-1]) + 1 + LEVELS + 1
+    yield Example(
+        (3 * rng.normal(size=(height + -height % 16, width + -width % 16, channels)),), {"size": (height, width)}
+    )

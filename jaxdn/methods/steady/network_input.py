@@ -1,6 +1,7 @@
 """What a network at half resolution sees of a frame: surfaces, all four pixels of a block; light, mostly their mean."""
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 from jaxdn import color
 from jaxdn.networks import pad
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.scales import downsample, space_to_depth
 
 CHANNELS = 20
@@ -83,3 +84,19 @@ def _see_by_numba(
     arrays: list[numba_call.Given] = [geometry, noisy, *history, hit, jnp.reshape(gain, (1,))]
     weights = np.asarray(color.LUMINANCE, np.float32)
     return numba_call.call(seen, [(height, width, channels)], arrays, weights, *numbers, rows=height)[0]
+
+
+def draw_history(rng: np.random.Generator, height: int, width: int) -> History:
+    """A history of which a fifth is not known, in NumPy's float64."""
+    valid: Any = rng.random((height, width)) > 0.2
+    values: Any = rng.random((height, width, 8)) + np.array([0.0, 0, 0, 2, 1, 0, 0, 0])
+    return History(values * valid[..., None], valid)
+
+
+@seen.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    height, width = height + height % 2, width + width % 2
+    geometry = rng.normal(size=(height, width, 3)), rng.random((height, width, 1))
+    light, hit = 10.0 ** rng.uniform(-4, 4, (height, width, 3)), rng.random((height, width)) > 0.1
+    history = draw_history(rng, height, width)
+    yield Example((geometry, light, history, hit, np.array(0.5)), {"multiple": 16})

@@ -21,6 +21,9 @@ guides in the neighbourhood of each pixel. Here one filter serves both light and
 Planes are [C, H, W].
 """
 
+from collections.abc import Iterator
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +31,7 @@ from jax import lax
 
 from jaxdn.ops.affinity.filter import SPLINE
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.layout.planar import join_planes
 
 SCALES = {"normal": 0.0, "position": 0.0, "gloss": 0.0, "depth": 0.0}
@@ -194,3 +197,27 @@ def _explain_by_numba(
 def reach() -> int:
     """How far :func:`given_back` sees, in pixels: the windows, and the cells that are interpolated."""
     return CELL * (2 * sum(_WINDOWS) + 2)
+
+
+def _draw_planes(rng: np.random.Generator, height: int, width: int) -> tuple[Any, ...]:
+    """Light and guides before and after a filter, where there are surfaces, the floor, the guides' factors."""
+    before, after = rng.random((2, 3 + GUIDES, height, width))
+    return before, after, rng.random((height, width)) > 0.1, np.array(0.05), rng.uniform(0.5, 2, GUIDES)
+
+
+@_moments.example
+def _moments_example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    yield Example(_draw_planes(rng, height, width))
+
+
+@_explained.example
+def _explain_example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    cells = -(-height // CELL), -(-width // CELL)
+    yield Example((rng.normal(size=(GUIDES, 3, *cells)), *_draw_planes(rng, height, width)))
+
+
+@solved.example
+def _solve_example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    both = rng.normal(size=(GUIDES + 3, 32, height, width))
+    system = np.einsum("inyx,jnyx->ijyx", both[:GUIDES], both) / 32
+    yield Example((system, rng.uniform(0.1, 1, (height, width)), rng.normal(size=(GUIDES, 3, height, width))))

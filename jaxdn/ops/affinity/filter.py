@@ -21,8 +21,8 @@ would compute every weight once for each channel that uses it.
 """
 
 import functools
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ from jax import lax
 from jaxdn.core.platform import platform
 from jaxdn.ops.affinity import pallas_kernels
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 
 RADIUS = 2
 SPLINE = (0.375, 0.25, 0.0625)
@@ -369,3 +369,20 @@ def _gather_gradients(
 _by_xla = _differentiable(_sum_taps, _gather_gradients)
 _by_pallas = _differentiable(_sum_by_pallas, _gather_by_pallas)
 _by_numba.defvjp(_numba_forward, _numba_backward)
+
+
+def draw_guide(rng: np.random.Generator, height: int, width: int, *, scales: np.ndarray | None = None) -> Guide:
+    """A guide of four features with edges and with pixels that no other may take anything from, in NumPy's float64."""
+    features = rng.uniform(-1, 1, (4, height, width)).round()
+    features[:, height // 2, width // 2] = 50.0  # a pixel that is like no other
+    confidence = rng.random((height, width)) * (rng.random((height, width)) > 0.2)
+    guide: Any = features, 0.3 * rng.normal(size=(3, height, width)), confidence, scales
+    return Guide(*guide)
+
+
+@_filter_by_affinity.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    image = rng.random((3, height, width))
+    yield Example((image, draw_guide(rng, height, width)), {"step": 1})
+    scales = np.array([0.5, 1.0, 0.7, 0.1, 1.5])
+    yield Example((image, draw_guide(rng, height, width, scales=scales)), {"step": 2})

@@ -7,6 +7,7 @@ The four fine pixels of a block are four planes of the coarse image's size: all 
 in strips that fit into the cache, over a scan of the nine taps (as in :mod:`jaxdn.ops.affinity.filter`).
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import jax
@@ -15,9 +16,9 @@ import numpy as np
 from jax import lax
 
 from jaxdn.core.platform import platform
-from jaxdn.ops.affinity.filter import Guide, affinity
+from jaxdn.ops.affinity.filter import Guide, affinity, draw_guide
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 
 _SPREAD = 3.0
 """Twice the variance of the spatial weights, in pixels of the fine image."""
@@ -167,3 +168,9 @@ def _spatial() -> tuple[np.ndarray, np.ndarray]:
     # The centre of a coarse pixel lies between its four.
     spatial = np.exp(-np.sum(np.square(offset + 0.5), axis=-1) / _SPREAD)
     return offset, spatial / spatial.sum(axis=0)
+
+
+@joint_bilateral_upsample.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    here = draw_guide(rng, 2 * height, 2 * width, scales=np.array([0.5, 1.0, 0.7, 0.1, 1.5]))
+    yield Example((rng.random((3, height, width)), draw_guide(rng, height, width), here))

@@ -10,17 +10,18 @@ slower in a test with two layers, jax 0.10). The ``"blocked"`` implementation ha
 matrix products, and in double precision the convolution too. The ``"onednn"`` implementation runs all in oneDNN.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from jaxdn.ops.convolution import onednn
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.onednn import library
 
 Product = Callable[[jax.Array, jax.Array], jax.Array]
@@ -183,3 +184,9 @@ def _convolve_blocked(x: jax.Array, kernel: jax.Array) -> jax.Array:
 def _convolve_by_onednn(x: jax.Array, kernel: jax.Array) -> jax.Array:
     """Value and gradients in oneDNN, which runs other types no faster than XLA."""
     return _by_onednn(x, kernel)
+
+
+@convolve.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    for inputs, outputs in ((2, 3), (3, 2)):
+        yield Example((rng.normal(size=(2, height, width, inputs)), rng.normal(size=(3, 3, inputs, outputs))))

@@ -7,12 +7,14 @@ multiply-adds for the image, K*K concatenated short sums for the kernels.
 """
 
 import math
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxdn.core.checks import check_image, check_same_size
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 
 
 def normalize_kernels(logits: jax.Array) -> jax.Array:
@@ -120,3 +122,9 @@ _recompute.defvjp(_forward, _backward)
 def _sum_taps_recomputed(image: jax.Array, kernels: jax.Array) -> jax.Array:
     """The same multiply-adds; the gradients are recomputed from the arguments."""
     return _recompute(image, kernels)
+
+
+@_sum_taps.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    for taps in (1, 25):
+        yield Example((rng.normal(size=(height, width, 3)), rng.normal(size=(height, width, taps))))

@@ -11,13 +11,15 @@ Kernels may be guided: features of the pixels, such as albedo and normals, add a
 
 import functools
 import math
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from jaxdn.core.checks import check_image, check_same_size
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.kernel_prediction import apply, guide_distances
 from jaxdn.ops.kernel_prediction.apply import check_taps
 
@@ -242,3 +244,14 @@ _by_strips.defvjp(_forward, _backward)
 def _filter_by_row_tiles(images: jax.Array, logits: jax.Array, features: jax.Array | None, *, taps: int) -> jax.Array:
     """Some rows at a time; the gradients recompute the weights."""
     return _by_strips(images, logits, features, taps)
+
+
+@_filter_by_softmax.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    for taps, count, spare, channels in ((9, 2, 1, 0), (25, 1, 0, 7)):
+        images, logits = (
+            rng.normal(size=(count, height, width, 3)),
+            rng.normal(size=(height, width, count * taps + spare)),
+        )
+        features = rng.normal(size=(height, width, channels)) if channels else None
+        yield Example((images, 3 * logits, features), {"taps": taps})

@@ -5,13 +5,14 @@ channels: a compiled loop keeps both apart.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxdn.ops.dispatch import numba_call
-from jaxdn.ops.dispatch.operation import operation
+from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.scales import downsample
 
 LAYOUTS = ("planes", "pixels", "blocks", "corners", "means")
@@ -65,3 +66,15 @@ _TO_PLANES = {
     "corners": lambda array: planar(_mean_of_corners(array)),
     "means": lambda array: planar(downsample(array)),
 }
+
+
+@_join_planes.example
+def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    shapes = {
+        "planes": (2, 2 * height, 2 * width),
+        "pixels": (2 * height, 2 * width, 3),
+        "blocks": (height, width, 8),
+        "corners": (2 * height, 2 * width, 4),
+        "means": (4 * height, 4 * width, 2),
+    }
+    yield Example(tuple(map(rng.random, shapes.values())), {"layouts": tuple(shapes)})
