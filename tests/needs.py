@@ -58,9 +58,9 @@ def _onednn() -> bool:
 
 def _bfloat16() -> bool:
     from jaxdn.networks import onednn
-    from jaxdn.networks.engines import ENGINES
+    from jaxdn.networks.backends import BACKENDS
 
-    return ENGINES[onednn.BFLOAT16.engine].available()
+    return BACKENDS[onednn.BFLOAT16.backend].available()
 
 
 def _peak_memory() -> bool:

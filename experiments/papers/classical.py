@@ -104,9 +104,9 @@ def step(folder: Path, name: str) -> Call:
     if name == PEER:
         return steps.open_image_denoise(frame, "high")
     method = candidate(name)
-    engine = method.engine()
-    if engine is not None:
-        method = candidate(name, implementation=engine)
+    backend = method.backend()
+    if backend is not None:
+        method = candidate(name, implementation=backend)
     assert method.denoiser is not None
     call = steps.recurrent(method.denoiser, method.params, frame)
     for _ in range(_WARM):

@@ -7,7 +7,7 @@ references of 32 samples and six more single samples, 16 to 48 seconds of one co
 weights saw are six of Benedikt Bitterli's rendering resources (bathroom, kitchen, living-room-2, spaceship,
 veach-ajar, veach-lamp); without ``--rooms`` the families are all there is. Finished clips and stages are reused,
 interrupted ones go on. Each network is trained at a constant rate first, so that it can always be continued, and with a
-falling rate at the end; LARGE begins as SMALL grown (:mod:`jaxdn.networks.widen`). A, B and C take the same number of
+falling rate at the end; LARGE begins as SMALL grown (:mod:`jaxdn.networks.grow`). A, B and C take the same number of
 updates.
 """
 

@@ -213,7 +213,7 @@ def compiled(
     listed = list(works())
     programs: list[compilation.Program] = [("torch", work.name) for work in listed if "torch-compiled" in work.peers]
     for work in listed:
-        # Programs that call an engine are compiled where they run, as jax's cache does not share them.
+        # Programs that call a backend are compiled where they run, as jax's cache does not share them.
         own = [name for name in work.ours if name.startswith("xla") and name not in work.huge_pages]
         programs += [("xla", work.name + name.removeprefix("xla")) for name in own]
     say(f"compiling {', '.join(sorted({name for _, name in programs}))} ...")

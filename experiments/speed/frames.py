@@ -1,4 +1,4 @@
-"""What a frame costs: shipped methods in each of their engines, and Open Image Denoise, at one or several sizes.
+"""What a frame costs: shipped methods in each of their backends, and Open Image Denoise, at one or several sizes.
 
 Memory is kept between frames as in `jaxdn denoise` (:mod:`jaxdn.runtime.malloc`).
 
@@ -26,7 +26,7 @@ from experiments.speed.timing import Call
 from experiments.speed.workers import Team
 from experiments.speed.works.steps import frame_of, oidn_high, recurrent
 from jaxdn.commands.errors import plain_errors
-from jaxdn.networks.engines import ENGINES
+from jaxdn.networks.backends import BACKENDS
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import REFERENCE, VARIABLE
 from jaxdn.runtime.atomic_files import write_json
@@ -48,21 +48,21 @@ class Settings:
     out: Path = Path("runs/frames.json")
 
 
-def ours(name: str, engine: str | None, height: int, width: int, *, compiled: bool = True) -> Call:
-    """The compiled step of a method, with its own state, on an engine; None is XLA.
+def ours(name: str, backend: str | None, height: int, width: int, *, compiled: bool = True) -> Call:
+    """The compiled step of a method, with its own state, on a backend; None is XLA.
 
     To be called once in a process. Without ``compiled`` every operation is its reference.
     """
     tune_malloc()
     if not compiled:
         os.environ[VARIABLE] = REFERENCE
-    found, frame = candidate(name, **({} if engine is None else {"implementation": engine})), frame_of(height, width)
+    found, frame = candidate(name, **({} if backend is None else {"implementation": backend})), frame_of(height, width)
     assert found.denoiser is not None
     return recurrent(found.denoiser, found.params, frame)
 
 
 def builds(names: list[str], height: int, width: int) -> dict[str, Callable[[], Call]]:
-    """Label -> its call, for every engine for inference that a method has and that runs here. Raises ValueError."""
+    """Label -> its call, for every backend for inference that a method has and that runs here. Raises ValueError."""
     found: dict[str, Callable[[], Call]] = {}
     # First, as ratios are to it: what is started last may find too little memory.
     if "pyoidn" not in peers.missing():
@@ -71,9 +71,9 @@ def builds(names: list[str], height: int, width: int) -> dict[str, Callable[[], 
         one = candidate(name)
         if one.denoiser is None or one.method is None:
             raise ValueError(f"--methods {name}: expected a denoiser, got the noisy image.")
-        engines = [each for each in one.method.engines if ENGINES[each].purpose == "inference"]
-        for engine in [None, *(each for each in engines if ENGINES[each].available())]:
-            found[f"{name}, {engine or 'xla'}"] = partial(ours, name, engine, height, width)
+        backends = [each for each in one.method.backends if BACKENDS[each].purpose == "inference"]
+        for backend in [None, *(each for each in backends if BACKENDS[each].available())]:
+            found[f"{name}, {backend or 'xla'}"] = partial(ours, name, backend, height, width)
         if not numba_call.unavailable():
             found[f"{name}, reference"] = partial(ours, name, None, height, width, compiled=False)
     return found
@@ -98,7 +98,7 @@ def parsed(size: str) -> tuple[int, int]:
 def table(title: str, found: Mapping[str, float], pixels: int) -> Table:
     """The figures of one size."""
     shown = Table(title=title)
-    for column in ("method, engine", "ms", f"of {OIDN}", "ns per pixel"):
+    for column in ("method, backend", "ms", f"of {OIDN}", "ns per pixel"):
         shown.add_column(column, justify="left" if column.startswith("method") else "right")
     for label, ms in found.items():
         ratio = f"{ms / found[OIDN]:.2f}" if OIDN in found else ""

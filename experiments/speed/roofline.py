@@ -18,7 +18,7 @@ import numpy as np
 
 from experiments.speed.timing import Call
 from jaxdn.methods.reconstruction import TAPS
-from jaxdn.networks import Widths, description
+from jaxdn.networks import Widths, graph
 
 FLOAT = 4
 """Bytes of a number."""
@@ -167,7 +167,7 @@ def network(
       features: input channels.
       heads: output channels at full, half and quarter resolution.
     """
-    described = description.unet(features, heads, widths=widths, head_size=3)
+    described = graph.unet(features, heads, widths=widths, head_size=3)
     kernels = described.kernels()
     sizes = [(height >> described.layers[name].depth, width >> described.layers[name].depth) for name in kernels]
     return [convolution(count, *size, *kernel[2:]) for size, kernel in zip(sizes, kernels.values(), strict=True)]

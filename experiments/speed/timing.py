@@ -79,7 +79,7 @@ def peak_mib(call: Call) -> float | None:
     (only Linux does).
 
     It includes the results but not what the caller holds already (arguments, weights). Call once before, to exclude
-    compilation. Memory that an engine keeps between calls is not counted: pass a call that also builds the engine.
+    compilation. Memory that a backend keeps between calls is not counted: pass a call that also builds the backend.
     """
     if sys.platform != "linux":
         return None

@@ -67,7 +67,7 @@ def train(clips: Path, folder: Path, sizes: Sizes) -> None:
     jax.config.update("jax_compilation_cache_dir", str(clips.parent / "programs"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     method = method_named("ntd")
-    denoiser = method.factory(size=WIDTHS, implementation=method.engine("training"))
+    denoiser = method.factory(size=WIDTHS, implementation=method.backend("training"))
     recipe = method.recipe_named(None)._replace(steps=sizes.steps, batch=2, crop=16, frames=4)
     batches = training_batches(
         clips, buffers=denoiser.reads, batch=recipe.batch, crop=recipe.crop, frames=recipe.frames, seed=recipe.seed

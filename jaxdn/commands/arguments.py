@@ -182,7 +182,7 @@ class Train:
     time_limit: float | None = None
     """Minutes after which training stops and writes its weights; the same command goes on from there."""
     implementation: str = "auto"
-    """Engine for convolutions: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest available."""
+    """Backend for convolutions: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest available."""
 
 
 @dataclass
@@ -237,7 +237,7 @@ class Denoise:
     layer: str | None = None
     """For files of other renderers: the view layer or part to look for buffers in."""
     implementation: str = "auto"
-    """Engine for the network: reference (XLA), onednn-bfloat16 (CPUs with AVX-512 BF16 or AMX; the extra onednn),
+    """Backend for the network: reference (XLA), onednn-bfloat16 (CPUs with AVX-512 BF16 or AMX; the extra onednn),
     onednn-float32 (CPUs; the extra onednn), onnxruntime (CPUs; the extra onnx); auto: the fastest available."""
     budget: float | None = None
     """Samples per pixel for a method that says where they go (ntasd, dasr), and for a scene: their mean; default: the

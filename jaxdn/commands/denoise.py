@@ -11,7 +11,7 @@ from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.runtime.malloc import tune_malloc
 from jaxdn.sequence.jobs import Job
-from jaxdn.sequence.run import denoise_files, select_engine
+from jaxdn.sequence.run import denoise_files, select_backend
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import Candidate, candidate
 
@@ -32,7 +32,7 @@ def run_denoise(options: Denoise) -> None:
 
 def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
     """Frames of clips and of other renderers."""
-    method, engine = select_engine(options.method, options.implementation, **_budget(options))
+    method, backend = select_backend(options.method, options.implementation, **_budget(options))
     settings = Settings(
         spp=options.spp,
         naming=naming,
@@ -59,7 +59,7 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
         print(f"nothing to do in {options.out}")
         return
     frames, compiled = _count(len(written.files), "frame"), _count(written.programs, "program")
-    print(f"{frames} denoised by {options.method} in {options.out} ({engine}, {compiled} compiled)")
+    print(f"{frames} denoised by {options.method} in {options.out} ({backend}, {compiled} compiled)")
     if written.sanitized:
         print(f"{_count(written.sanitized, 'value')} sanitized: not usable numbers (NaN, infinite, negative ...)")
 
@@ -79,7 +79,7 @@ def _denoise_scene(options: Denoise, scene: str) -> None:
 
     asks = getattr(candidate(options.method).denoiser, "samples", None) is not None
     budget = _budget(options)
-    method, engine = select_engine(options.method, options.implementation, **(budget if asks else {}))
+    method, backend = select_backend(options.method, options.implementation, **(budget if asks else {}))
     size = {name: value for name in ("width", "height", "seed") if (value := getattr(options, name)) is not None}
     settings = SceneSettings(RenderSettings(**size), _frames(options), preview=options.preview, **budget)
     out = check_folder(options.out)
@@ -88,7 +88,7 @@ def _denoise_scene(options: Denoise, scene: str) -> None:
             scene, options.animation, out, method, settings, on_frame=report.on_frame, log=report.log
         )
     frames = _count(len(written.files), "frame")
-    print(f"{frames} rendered, and denoised by {options.method}, in {options.out} ({engine})")
+    print(f"{frames} rendered, and denoised by {options.method}, in {options.out} ({backend})")
 
 
 def _scene_of(options: Denoise) -> str | None:

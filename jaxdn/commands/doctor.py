@@ -14,7 +14,7 @@ from rich.table import Table
 import jaxdn
 import jaxdn.networks.recurrent  # declares operations
 from jaxdn.methods.registry import methods
-from jaxdn.networks.engines import ENGINES
+from jaxdn.networks.backends import BACKENDS
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import OPERATIONS, REFERENCE, VARIABLE, default_implementation
 from jaxdn.ops.onednn import library
@@ -22,7 +22,7 @@ from jaxdn.render.mitsuba.variant import choose_variant, has_cuda
 from jaxdn.runtime.optional import EXTRAS, install
 
 _EXTRA_OF = {"onednn-bfloat16": "onednn", "onednn-float32": "onednn", "onnxruntime": "onnx", "onednn": "onednn"}
-"""Engine -> the extra that brings it."""
+"""Backend -> the extra that brings it."""
 
 
 class Finding(NamedTuple):
@@ -49,17 +49,17 @@ def doctor() -> list[Finding]:
 def _findings() -> Iterator[Finding]:
     yield Finding("jaxdn", f"{jaxdn.__version__}, Python {platform.python_version()}, {os.cpu_count()} cores")
     yield _device()
-    for engine in ENGINES.values():
-        if engine.available() and engine.faster():
-            yield Finding(f"engine for {engine.purpose}", engine.name)
-        elif engine.available():
-            yield Finding(f"engine for {engine.purpose}", f"XLA: {engine.name} is slower on this CPU")
-        elif engine.name == "onednn-bfloat16" and library.available():
-            yield Finding(f"engine for {engine.purpose}", "no onednn-bfloat16: this CPU does not compute with it")
+    for backend in BACKENDS.values():
+        if backend.available() and backend.faster():
+            yield Finding(f"backend for {backend.purpose}", backend.name)
+        elif backend.available():
+            yield Finding(f"backend for {backend.purpose}", f"XLA: {backend.name} is slower on this CPU")
+        elif backend.name == "onednn-bfloat16" and library.available():
+            yield Finding(f"backend for {backend.purpose}", "no onednn-bfloat16: this CPU does not compute with it")
         elif jax.default_backend() == "cpu":
-            yield Finding(f"engine for {engine.purpose}", "XLA alone", f"faster: {install(_EXTRA_OF[engine.name])}")
+            yield Finding(f"backend for {backend.purpose}", "XLA alone", f"faster: {install(_EXTRA_OF[backend.name])}")
         else:
-            yield Finding(f"engine for {engine.purpose}", "XLA, as on every GPU")
+            yield Finding(f"backend for {backend.purpose}", "XLA, as on every GPU")
     yield from _operations()
     yield _packages("training", "train")
     yield _renderer()

@@ -15,7 +15,7 @@ OPSET = 18
 IR_VERSION = 8
 
 
-class Graph(onnx.Graph):
+class Graph(onnx.OnnxGraph):
     """The nodes of one graph; the same operation on the same values is written once."""
 
     def __init__(self, outer: "Graph | None" = None) -> None:
@@ -37,7 +37,7 @@ class Graph(onnx.Graph):
         array = np.asarray(array)
         root, key = self.root, (array.dtype.str, array.shape, array.tobytes())
         if key not in root._known:
-            root._known[key] = onnx.Graph.constant(root, array)
+            root._known[key] = onnx.OnnxGraph.constant(root, array)
         return root._known[key]
 
     def integers(self, *values: int) -> str:

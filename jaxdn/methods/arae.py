@@ -37,7 +37,7 @@ class AraeState(NamedTuple):
     presets=rae.PRESETS,
     recipes=rae.RECIPES,
     variants={"arae-large": {"size": "large"}, "arae-small": {"size": "small"}},
-    engines=("onednn",),
+    backends=("onednn",),
 )
 def arae(options: rae.Options) -> Denoiser:
     """The recurrent autoencoder on accumulated light; ``params`` are those of ``rae``.

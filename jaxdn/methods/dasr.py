@@ -40,7 +40,7 @@ class Options(Sampling):
     demodulate: Demodulation | bool = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     implementation: Literal["reference", "onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"] | None = None
-    """Engine of the U-Nets: XLA, or on CPUs oneDNN in bfloat16 or float32 or ONNX Runtime (inference), or oneDNN
+    """Backend of the U-Nets: XLA, or on CPUs oneDNN in bfloat16 or float32 or ONNX Runtime (inference), or oneDNN
     (training). None is XLA."""
 
     def __post_init__(self) -> None:
@@ -57,7 +57,7 @@ class Options(Sampling):
         "paper": Recipe(compressed_illumination(), frames=1, decay=False, variation=STILL, average=0.0),
     },
     variants={"dasr-large": {"size": "large"}, "dasr-small": {"size": "small"}},
-    engines=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
+    backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
 )
 def dasr(options: Options) -> Denoiser:
     """Adaptive sampling of single frames; it requests samples, from stored layers of 1, 2, 4, ... or from the renderer.

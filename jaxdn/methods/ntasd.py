@@ -54,7 +54,7 @@ PAPER = Options(least=0, rounding="nearest", **ntd.AS_PUBLISHED)
         "paper": Recipe(last_frames(), frames=5, decay=False, variation=STILL, average=0.0),
     },
     variants={"ntasd-large": {"size": "large"}, "ntasd-small": {"size": "small"}},
-    engines=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
+    backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
 )
 def ntasd(options: Options) -> Denoiser:
     """Adaptive sampling and denoising; it requests samples, from stored layers of 1, 2, 4, ... or from the renderer.

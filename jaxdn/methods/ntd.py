@@ -28,7 +28,7 @@ from jaxdn.filters.surface_test import depth_feature, surface_mask
 from jaxdn.methods.demodulation import Demodulation, demodulated
 from jaxdn.methods.reconstruction import SCALES, Prediction, begin_blending, blend, heads_of
 from jaxdn.methods.registry import method
-from jaxdn.networks import LARGE, SMALL, Widths, crop, description, pad
+from jaxdn.networks import LARGE, SMALL, Widths, crop, graph, pad
 from jaxdn.ops.motion import on_screen
 from jaxdn.ops.scales import downsample, fill_holes
 from jaxdn.ops.warp import warp
@@ -91,7 +91,7 @@ class Options:
     compute_dtype: Literal["float32", "bfloat16"] | None = None
     """Precision of the U-Net only; None is the images' dtype."""
     implementation: Literal["reference", "onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"] | None = None
-    """Engine of the U-Net: XLA, or on CPUs oneDNN in bfloat16 or float32 (the extra ``onednn``) or ONNX Runtime (the
+    """Backend of the U-Net: XLA, or on CPUs oneDNN in bfloat16 or float32 (the extra ``onednn``) or ONNX Runtime (the
     extra ``onnx``) for inference, or oneDNN's convolutions for training. None is XLA."""
 
 
@@ -192,7 +192,7 @@ def warped_history(
         ),
     },
     variants={"ntd-large": {"size": "large"}, "ntd-small": {"size": "small"}},
-    engines=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
+    backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
     earlier={
         "demodulate": "albedo",
         "kernels": "plain",
@@ -246,8 +246,8 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
 
     sizes = {"large": LARGE, "small": SMALL}
     widths = sizes[options.size] if isinstance(options.size, str) else options.size
-    scheme, engine = options.initialization, options.implementation
-    network = unet(groups, heads, widths=widths, initialization=scheme, implementation=engine)
+    scheme, backend = options.initialization, options.implementation
+    network = unet(groups, heads, widths=widths, initialization=scheme, implementation=backend)
     reads = frozenset({"albedo", "normal", "depth", "motion"})
     reads |= {"dual_motion"} if options.motion == "dual" else set()
     reads |= {"reflectance", "roughness"} if materials else set()
@@ -318,7 +318,7 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
         shown = image if hit is None else jnp.where(hit[..., None], image, frame.radiance)
         return image, shown, invalid
 
-    seen = description.reach(description.unet(1, heads, widths=widths, head_size=3))
+    seen = graph.receptive_field_radius(graph.unet(1, heads, widths=widths, head_size=3))
     return Core(start, step, reads, init, measure=measure, reach=seen + _FILTERS_REACH)
 
 

@@ -40,7 +40,7 @@ class Options:
     """Details that the papers leave open; the first choice is the default."""
 
     size: Literal["large", "small"] | Widths = "large"
-    """The network's widths, by name or as tuples (see :func:`jaxdn.networks.description.recurrent_unet`)."""
+    """The network's widths, by name or as tuples (see :func:`jaxdn.networks.graph.recurrent_unet`)."""
     guides: Literal["geometry", "materials"] = "geometry"
     """What the network sees besides light: normal, depth and roughness, as in the paper; or the albedo too, as in
     Hasselgren et al. 2020."""
@@ -52,7 +52,7 @@ class Options:
     demodulate: Demodulation | bool = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     implementation: Literal["reference", "onednn"] | None = None
-    """Engine of the network: XLA, or on CPUs oneDNN (training; the extra ``onednn``). None is XLA."""
+    """Backend of the network: XLA, or on CPUs oneDNN (training; the extra ``onednn``). None is XLA."""
 
 
 PRESETS = {
@@ -72,7 +72,7 @@ RECIPES = {
     presets=PRESETS,
     recipes=RECIPES,
     variants={"rae-large": {"size": "large"}, "rae-small": {"size": "small"}},
-    engines=("onednn",),
+    backends=("onednn",),
 )
 def rae(options: Options) -> Denoiser:
     """The recurrent autoencoder.

@@ -15,7 +15,7 @@ from typing import Any
 
 from jaxdn.core import options as declared
 from jaxdn.denoiser import Denoiser
-from jaxdn.networks.engines import ENGINES, Purpose
+from jaxdn.networks.backends import BACKENDS, Purpose
 from jaxdn.ops.dispatch.operation import REFERENCE, default_implementation
 from jaxdn.recipes.recipe import Recipe
 
@@ -40,8 +40,8 @@ class Method:
     """Name -> how it is trained, the usual one first; empty if it has nothing to learn."""
     variants: Mapping[str, Mapping[str, Any]]
     """Names of weights that are or may be shipped -> options, from the most accurate to the fastest."""
-    engines: tuple[str, ...]
-    """Values of its option ``implementation`` besides XLA: names in :data:`jaxdn.networks.engines.ENGINES`."""
+    backends: tuple[str, ...]
+    """Values of its option ``implementation`` besides XLA: names in :data:`jaxdn.networks.backends.BACKENDS`."""
     earlier: Mapping[str, Any]
     """Options that weights without a record of them were trained with, where the default is another today."""
     filter: bool
@@ -84,14 +84,14 @@ class Method:
         """Whether it has an option of that name."""
         return any(each.name == option for each in dataclasses.fields(self.options))
 
-    def engine(self, purpose: Purpose, options: Mapping[str, Any] = _NOTHING) -> str | None:
-        """The engine that runs it fastest here, for the option ``implementation``; None is XLA.
+    def backend(self, purpose: Purpose, options: Mapping[str, Any] = _NOTHING) -> str | None:
+        """The backend that runs it fastest here, for the option ``implementation``; None is XLA.
 
         It is None too where :func:`jaxdn.implementation` or its environment variable asks for references.
         """
         if options.get("compute_dtype") not in (None, "float32") or default_implementation() == REFERENCE:
             return None
-        fitting = (ENGINES[name] for name in self.engines if ENGINES[name].purpose == purpose)
+        fitting = (BACKENDS[name] for name in self.backends if BACKENDS[name].purpose == purpose)
         return next((each.name for each in fitting if each.available() and each.faster()), None)
 
 
@@ -105,7 +105,7 @@ def method(
     presets: Mapping[str, Any] = _NOTHING,
     recipes: Mapping[str, Recipe] = _NOTHING,
     variants: Mapping[str, Mapping[str, Any]] = _NOTHING,
-    engines: tuple[str, ...] = (),
+    backends: tuple[str, ...] = (),
     earlier: Mapping[str, Any] = _NOTHING,
     filter: bool | None = None,
 ) -> Callable[[Callable[[Any], Denoiser]], Callable[..., Denoiser]]:
@@ -136,7 +136,7 @@ def method(
         if presets:
             signature.append(inspect.Parameter("preset", keyword, default=None, annotation=str | None))
         factory.__signature__ = inspect.Signature(signature, return_annotation=Denoiser)  # type: ignore[attr-defined]
-        row = Method(name, title, factory, options, presets, recipes, variants, engines, earlier, ready)
+        row = Method(name, title, factory, options, presets, recipes, variants, backends, earlier, ready)
         _METHODS[name] = row
         return factory
 

@@ -22,8 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-from jaxdn.networks.description import FEATURES, Description, Weights, evaluate, output_shapes
-from jaxdn.networks.inference import same
+from jaxdn.networks.graph import FEATURES, GraphSpec, Weights, evaluate, output_shapes, same_weights
 from jaxdn.ops.onednn import layers
 from jaxdn.ops.onednn import library as dnnl
 
@@ -31,8 +30,8 @@ from jaxdn.ops.onednn import library as dnnl
 class Precision(NamedTuple):
     """Of activations and of the kernels."""
 
-    engine: str
-    """The name of the engine that computes in it."""
+    backend: str
+    """The name of the backend that computes in it."""
     dtype: Any
     """As jax knows it."""
     kind: int
@@ -52,7 +51,7 @@ def unavailable_in_bfloat16() -> str:
     """Why oneDNN cannot compute in bfloat16 here, and what to do; empty if it can."""
     if reason := dnnl.unavailable():
         return reason
-    return "" if dnnl.computes_bfloat16() else f'needs a CPU with AVX-512 BF16 or AMX; take "{FLOAT32.engine}"'
+    return "" if dnnl.computes_bfloat16() else f'needs a CPU with AVX-512 BF16 or AMX; take "{FLOAT32.backend}"'
 
 
 class Value(NamedTuple):
@@ -74,8 +73,8 @@ class Step:
         """Of the rectifier that is a part of it."""
 
 
-class Draft:
-    """The steps of a program (:class:`jaxdn.networks.description.Operations`)."""
+class ProgramBuilder:
+    """The steps of a program (:class:`jaxdn.networks.graph.LayerBackend`)."""
 
     def __init__(self) -> None:
         self.steps: list[Step] = []
@@ -92,9 +91,9 @@ class Draft:
         for x, kernel in zip(inputs, kernels, strict=True):
             weights: dict[str, Any] = {"kernel": kernel, "bias": bias if x is inputs[-1] else None}
             before = self.steps[x.number] if x.number >= 0 else None
-            if before is not None and before.kind == "enlarge" and kernel.shape[0] == 3:
+            if before is not None and before.kind == "upsample" and kernel.shape[0] == 3:
                 read = [before.inputs[0], *total]
-                total = [self._add("enlarging convolution", read, kernel.shape[3], 2.0, **weights)]
+                total = [self._add("upsampling convolution", read, kernel.shape[3], 2.0, **weights)]
             else:
                 total = [self._add("convolution", [x, *total], kernel.shape[3], **weights)]
         return total[0]
@@ -108,23 +107,23 @@ class Draft:
         """A step of its own."""
         return self._add("pool", [x], x.channels, 0.5)
 
-    def enlarge(self, x: Value) -> Value:
+    def upsample(self, x: Value) -> Value:
         """A step of its own, which a 3x3 convolution does without."""
-        return self._add("enlarge", [x], x.channels, 2.0)
+        return self._add("upsample", [x], x.channels, 2.0)
 
     def needed(self, outputs: set[int]) -> list[Step]:
         """The steps whose results are outputs, by number, or read."""
-        read = outputs | {value.number for step in self.steps if step.kind != "enlarge" for value in step.inputs}
+        read = outputs | {value.number for step in self.steps if step.kind != "upsample" for value in step.inputs}
         return [step for step in self.steps if step.result.number in read]
 
 
 class Program:
     """The network with its weights, for one shape [N, H, W, c] of its features."""
 
-    def __init__(self, network: Description, weights: Weights, shape: Sequence[int], precision: Precision) -> None:
-        draft, self._count, self._precision = Draft(), shape[0], precision
+    def __init__(self, network: GraphSpec, weights: Weights, shape: Sequence[int], precision: Precision) -> None:
+        builder, self._count, self._precision = ProgramBuilder(), shape[0], precision
         given = Value(-1, shape[3], shape[1], shape[2])
-        heads = evaluate(network, weights, {FEATURES: given}, draft)
+        heads = evaluate(network, weights, {FEATURES: given}, builder)
         self._memory: dict[int, c_void_p] = {-1: dnnl.memory(self._description(given))}
         self._free: list[np.ndarray] = []
         self.bytes = 0
@@ -132,7 +131,7 @@ class Program:
         self._arrays: dict[int, np.ndarray] = {}
         self._kept: list[np.ndarray] = []
         outputs = {head.number for head in heads}
-        steps = draft.needed(outputs)
+        steps = builder.needed(outputs)
         last_use = {value.number: step.result.number for step in steps for value in step.inputs}
         self._primitives: list[dnnl.Primitive] = []
         for step in steps:
@@ -169,10 +168,10 @@ class Program:
         reads = self._description(step.inputs[0])
         if step.kernel is not None:
             after: Any = {"kind": self._precision.kind, "slope": step.slope, "adds": len(step.inputs) > 1}
-            enlarges = step.kind == "enlarging convolution"
-            placed = layers.convolution(reads, result, step.kernel, step.bias, enlarges=enlarges, **after)
+            upsamples = step.kind == "upsampling convolution"
+            placed = layers.convolution(reads, result, step.kernel, step.bias, upsamples=upsamples, **after)
         else:
-            placed = (layers.pooling if step.kind == "pool" else layers.enlarging)(reads, result)
+            placed = (layers.pooling if step.kind == "pool" else layers.upsampling)(reads, result)
         self._primitives.append(placed(source, target))
 
     def _room(self, size: int) -> np.ndarray:
@@ -209,16 +208,16 @@ class Session:
         """Fill ``outputs``; the arguments are views of XLA's own buffers."""
         with self._lock:
             given = [np.asarray(weight) for weight in weights]
-            if not same(given, self._weights):
+            if not same_weights(given, self._weights):
                 self._weights = [weight.copy() for weight in given]
                 self._program = self._describe(self._weights)
             heads = [dnnl.address(np.asarray(output)) for output in outputs]
-            with dnnl.ALONE:
+            with dnnl.LOCK:
                 self._program(dnnl.address(np.asarray(features)), heads)
 
 
 def run(
-    network: Description, weights: Weights, groups: list[jax.Array], *, precision: Precision
+    network: GraphSpec, weights: Weights, groups: list[jax.Array], *, precision: Precision
 ) -> tuple[jax.Array, ...]:
     """The outputs of the network, in float32, for the feature groups [N, H, W, c] that are present."""
     leaves, tree = jax.tree.flatten(weights)

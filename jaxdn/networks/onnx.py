@@ -1,4 +1,4 @@
-"""A network run by ONNX Runtime, an inference engine for CPUs, from inside a jitted program.
+"""A network run by ONNX Runtime, an inference backend for CPUs, from inside a jitted program.
 
 XLA:CPU's convolutions reach about two thirds of the machine's peak. ONNX Runtime keeps activations in blocks of 16
 channels from one convolution to the next; a 720p step takes 0.77 to 1.03 of XLA's time (``docs/results/index.md``). It
@@ -16,13 +16,12 @@ import jax
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-from jaxdn.networks.description import FEATURES, Description, Weights, evaluate, output_shapes
-from jaxdn.networks.inference import same
+from jaxdn.networks.graph import FEATURES, GraphSpec, Weights, evaluate, output_shapes, same_weights
 from jaxdn.runtime.optional import install
 
 OPSET = 17
 BLOCK = 16
-"""Channels that the engine computes at a time; other input counts take a slow path (3 times the time)."""
+"""Channels that the backend computes at a time; other input counts take a slow path (3 times the time)."""
 
 
 def available() -> bool:
@@ -33,14 +32,14 @@ def available() -> bool:
 
 
 def unavailable() -> str:
-    """Why the engine cannot run here, and what to do; empty if it can."""
+    """Why the backend cannot run here, and what to do; empty if it can."""
     if (backend := jax.default_backend()) != "cpu":
         return f"runs on the CPU, and jax computes on {backend!r}; leave it None, or set JAX_PLATFORMS=cpu"
     return "" if available() else f"needs the packages onnxruntime and onnx: {install('onnx')}"
 
 
-class Graph:
-    """The nodes of an ONNX graph (:class:`jaxdn.networks.description.Operations`); values are names, [N, C, H, W]."""
+class OnnxGraph:
+    """The nodes of an ONNX graph (:class:`jaxdn.networks.graph.LayerBackend`); values are names, [N, C, H, W]."""
 
     def __init__(self) -> None:
         self.nodes: list[Any] = []
@@ -60,7 +59,7 @@ class Graph:
         return output
 
     def convolution(self, inputs: Sequence[str], kernels: Sequence[np.ndarray], bias: np.ndarray) -> str:
-        # The engine adds a sum of two convolutions in place, which is cheaper than to join their inputs.
+        # The backend adds a sum of two convolutions in place, which is cheaper than to join their inputs.
         parts: list[str] = []
         for x, kernel in zip(inputs, kernels, strict=True):
             spare = -kernel.shape[2] % BLOCK if x == FEATURES else 0
@@ -77,13 +76,13 @@ class Graph:
     def pool(self, x: str) -> str:
         return self.node("MaxPool", x, kernel_shape=[2, 2], strides=[2, 2])
 
-    def enlarge(self, x: str) -> str:
+    def upsample(self, x: str) -> str:
         twice = self.constant(np.asarray([1, 1, 2, 2], np.float32))
         how = {"mode": "nearest", "nearest_mode": "floor", "coordinate_transformation_mode": "asymmetric"}
         return self.node("Resize", x, "", twice, **how)
 
 
-def model(network: Description, weights: Weights, shape: Sequence[int]) -> bytes:
+def model(network: GraphSpec, weights: Weights, shape: Sequence[int]) -> bytes:
     """The network with these weights as a serialised ONNX graph.
 
     Its input is :data:`FEATURES` of ``shape`` [N, c, H, W], c a multiple of :data:`BLOCK`; its outputs are named as
@@ -91,7 +90,7 @@ def model(network: Description, weights: Weights, shape: Sequence[int]) -> bytes
     """
     from onnx import TensorProto, helper
 
-    graph = Graph()
+    graph = OnnxGraph()
     for name, planes in zip(network.outputs, evaluate(network, weights, {FEATURES: FEATURES}, graph), strict=True):
         graph.node("Transpose", planes, output=name, perm=[0, 2, 3, 1])
     features = helper.make_tensor_value_info(FEATURES, TensorProto.FLOAT, list(shape))
@@ -103,7 +102,7 @@ def model(network: Description, weights: Weights, shape: Sequence[int]) -> bytes
 class Session:
     """The session of one shape, created for the weights of its last call.
 
-    The engine rearranges weights for its blocks, so they belong to the session. Every call compares its weights with
+    The backend rearranges weights for its blocks, so they belong to the session. Every call compares its weights with
     those of the session (by bytes, about a millisecond), which keeps the function pure.
     """
 
@@ -134,7 +133,7 @@ class Session:
             self._session.run_with_iobinding(binding)
 
     def _prepare(self, weights: list[np.ndarray]) -> None:
-        if same(weights, self._weights):
+        if same_weights(weights, self._weights):
             return
         import onnxruntime
 
@@ -149,7 +148,7 @@ class Session:
         )
 
 
-def run(network: Description, weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:
+def run(network: GraphSpec, weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:
     """The outputs of the network for the feature groups [N, H, W, c] that are present, float32."""
     channels = network.layers[FEATURES].channels
     shape = (groups[0].shape[0], channels + -channels % BLOCK, *groups[0].shape[1:3])

@@ -11,9 +11,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn.networks import Widths, description
-from jaxdn.networks.description import FEATURES, Description, Weights, evaluate, hidden
-from jaxdn.networks.unet import ONEDNN, XLA, draw_weights, initial, present_groups, storage, weights_for
+from jaxdn.networks import Widths, graph
+from jaxdn.networks.graph import FEATURES, GraphSpec, Weights, evaluate, hidden
+from jaxdn.networks.unet import (
+    ONEDNN,
+    XLA,
+    draw_initial_weights,
+    draw_weights,
+    flax_structure,
+    select_groups,
+    select_weights,
+)
 from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.onednn import library
 
@@ -30,16 +38,14 @@ class RecurrentNetwork(NamedTuple):
 
 
 @operation(name="recurrent_unet")
-def run_recurrent_unet(
-    weights: Weights, inputs: dict[str, jax.Array], *, network: Description
-) -> tuple[jax.Array, ...]:
+def run_recurrent_unet(weights: Weights, inputs: dict[str, jax.Array], *, network: GraphSpec) -> tuple[jax.Array, ...]:
     """The outputs of the network for its inputs by name [N, H, W, c]; XLA alone."""
     return evaluate(network, weights, inputs, XLA)
 
 
 @run_recurrent_unet.implementation("onednn", dtypes=(jnp.float32,), unavailable=library.unavailable)
 def _run_with_onednn_convolutions(
-    weights: Weights, inputs: dict[str, jax.Array], *, network: Description
+    weights: Weights, inputs: dict[str, jax.Array], *, network: GraphSpec
 ) -> tuple[jax.Array, ...]:
     """XLA with oneDNN's convolutions and their gradients: for training on CPUs."""
     return evaluate(network, weights, inputs, ONEDNN)
@@ -48,7 +54,7 @@ def _run_with_onednn_convolutions(
 def recurrent_unet(
     groups: Sequence[int], outputs: int, *, widths: Widths, implementation: str | None = None
 ) -> RecurrentNetwork:
-    """The network as pure functions; see :func:`jaxdn.networks.description.recurrent_unet` for its layers and widths.
+    """The network as pure functions; see :func:`jaxdn.networks.graph.recurrent_unet` for its layers and widths.
 
     ``groups`` are the channel counts of the feature groups; an absent one, None, equals zeros, as in
     :func:`jaxdn.networks.unet.unet`. H and W are multiples of ``2^(stages - 1)``. The output is raw.
@@ -64,13 +70,13 @@ def recurrent_unet(
             f"widths: expected the channels of n encoder stages, then those of n - 1 decoder levels, got {widths!r}."
         )
 
-    def described(channels: int) -> Description:
-        return description.recurrent_unet(channels, outputs, widths=widths)
+    def described(channels: int) -> GraphSpec:
+        return graph.recurrent_unet(channels, outputs, widths=widths)
 
-    graph = storage(described(sum(groups)))
+    structure = flax_structure(described(sum(groups)))
 
     def init(key: jax.Array) -> dict[str, Any]:
-        return initial(key, described(sum(groups)), scheme="he")
+        return draw_initial_weights(key, described(sum(groups)), scheme="he")
 
     def start(count: int, height: int, width: int, dtype: Any) -> tuple[jax.Array, ...]:
         return tuple(
@@ -81,11 +87,11 @@ def recurrent_unet(
     def apply(
         params: dict[str, Any], features: Sequence[jax.Array | None], states: Sequence[jax.Array]
     ) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        present = present_groups(features, groups, 2 ** (len(stages) - 1))
+        present = select_groups(features, groups, 2 ** (len(stages) - 1))
         network = described(sum(group.shape[-1] for group in present))
         inputs = {FEATURES: jnp.concatenate(present, axis=-1)}
         inputs |= {hidden(stage): state for stage, state in enumerate(states)}
-        weights = weights_for(network, graph, params, features, groups)
+        weights = select_weights(network, structure, params, features, groups)
         output, *kept = run_recurrent_unet(weights, inputs, network=network, implementation=implementation)
         return output, tuple(kept)
 
@@ -95,7 +101,7 @@ def recurrent_unet(
 @run_recurrent_unet.example
 def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
     height, width = height + height % 2, width + width % 2
-    network = description.recurrent_unet(3, 2, widths=((4, 5), (4,)))
+    network = graph.recurrent_unet(3, 2, widths=((4, 5), (4,)))
     features, first = rng.normal(size=(1, height, width, 3)), rng.normal(size=(1, height, width, 4))
     inputs = {FEATURES: features, hidden(0): first, hidden(1): rng.normal(size=(1, height // 2, width // 2, 5))}
     yield Example((draw_weights(rng, network), inputs), {"network": network})

@@ -1,4 +1,4 @@
-"""The U-Net that predicts kernels, and its engines.
+"""The U-Net that predicts kernels, and its backends.
 
 Flax NNX is used only inside this module. Its results are plain nested dicts of arrays and two pure functions, so that
 no other module depends on Flax.
@@ -17,8 +17,8 @@ from flax import nnx
 
 from jaxdn.core.checks import check_option
 from jaxdn.denoiser import Params
-from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, description, onednn, onnx
-from jaxdn.networks.description import FEATURES, Description, Weights, evaluate
+from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, graph, onednn, onnx
+from jaxdn.networks.graph import FEATURES, GraphSpec, Weights, evaluate
 from jaxdn.ops.convolution.api import convolve
 from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.onednn import library
@@ -33,8 +33,8 @@ class Network(NamedTuple):
     """(params, feature groups [N, H, W, c] or None) -> heads at full, half and quarter resolution."""
 
 
-class Layers(NamedTuple):
-    """The layers in XLA (:class:`jaxdn.networks.description.Operations`), on arrays [N, H, W, C]."""
+class XlaLayers(NamedTuple):
+    """The layers in XLA (:class:`jaxdn.networks.graph.LayerBackend`), on arrays [N, H, W, C]."""
 
     convolve: Callable[[jax.Array, jax.Array], jax.Array]
     """Of an image with a 3x3 kernel."""
@@ -61,14 +61,14 @@ class Layers(NamedTuple):
         corners = [x[:, i::2, j::2] for i in (0, 1) for j in (0, 1)]
         return jnp.maximum(jnp.maximum(corners[0], corners[1]), jnp.maximum(corners[2], corners[3]))
 
-    def enlarge(self, x: jax.Array) -> jax.Array:
+    def upsample(self, x: jax.Array) -> jax.Array:
         n, height, width, channels = x.shape
         blocks = jnp.broadcast_to(x[:, :, None, :, None, :], (n, height, 2, width, 2, channels))
         return jnp.reshape(blocks, (n, 2 * height, 2 * width, channels))
 
 
-XLA = Layers(convolve, 16)  # 51 outputs take XLA:CPU 1.4 times as long as 64
-ONEDNN = Layers(functools.partial(convolve, implementation="onednn"), 1)
+XLA = XlaLayers(convolve, 16)  # 51 outputs take XLA:CPU 1.4 times as long as 64
+ONEDNN = XlaLayers(functools.partial(convolve, implementation="onednn"), 1)
 
 
 class Convolution(nnx.Module):
@@ -82,7 +82,7 @@ class Convolution(nnx.Module):
 class Convolutions(nnx.Module):
     """The weights of a described network: a convolution ``a/b`` is the attribute ``b`` of the attribute ``a``."""
 
-    def __init__(self, network: Description) -> None:
+    def __init__(self, network: GraphSpec) -> None:
         for name, shape in network.kernels().items():
             level, _, layer = name.rpartition("/")
             if level and not hasattr(self, level):
@@ -90,12 +90,12 @@ class Convolutions(nnx.Module):
             setattr(getattr(self, level) if level else self, layer, Convolution(shape))
 
     def weights(self, names: Iterable[str]) -> dict[str, Any]:
-        """:data:`jaxdn.networks.description.Weights`, by the names of the convolutions."""
+        """:data:`jaxdn.networks.graph.Weights`, by the names of the convolutions."""
         found: dict[str, Any] = {name: functools.reduce(getattr, name.split("/"), self) for name in names}
         return {name: {"kernel": one.kernel[...], "bias": one.bias[...]} for name, one in found.items()}
 
 
-def initial(key: jax.Array, network: Description, *, scheme: str) -> dict[str, Any]:
+def draw_initial_weights(key: jax.Array, network: GraphSpec, *, scheme: str) -> dict[str, Any]:
     """Kernels uniform within +-limit, biases zero.
 
     ``scheme``: with "he" the limit is ``sqrt(6 / fan_in)``, so that signals keep their size through the rectifiers (He
@@ -126,13 +126,13 @@ Heads = tuple[jax.Array, ...]
 
 
 @operation(name="unet")
-def run_unet(weights: Weights, groups: list[jax.Array], *, network: Description) -> Heads:
+def run_unet(weights: Weights, groups: list[jax.Array], *, network: GraphSpec) -> Heads:
     """The heads of the network for the feature groups [N, H, W, c] that are present; XLA alone."""
     return evaluate(network, weights, {FEATURES: jnp.concatenate(groups, axis=-1)}, XLA)
 
 
 @run_unet.implementation("onednn", dtypes=(jnp.float32,), unavailable=library.unavailable)
-def _run_with_onednn_convolutions(weights: Weights, groups: list[jax.Array], *, network: Description) -> Heads:
+def _run_with_onednn_convolutions(weights: Weights, groups: list[jax.Array], *, network: GraphSpec) -> Heads:
     """XLA with oneDNN's convolutions and their gradients: for training on CPUs."""
     return evaluate(network, weights, {FEATURES: jnp.concatenate(groups, axis=-1)}, ONEDNN)
 
@@ -141,7 +141,7 @@ _INFERENCE: Any = {"dtypes": (jnp.float32,), "differentiable": False}
 
 
 @run_unet.implementation("onednn-float32", **_INFERENCE, unavailable=library.unavailable)
-def _run_in_float32(weights: Weights, groups: list[jax.Array], *, network: Description) -> Heads:
+def _run_in_float32(weights: Weights, groups: list[jax.Array], *, network: GraphSpec) -> Heads:
     """The whole network in oneDNN."""
     return onednn.run(network, weights, groups, precision=onednn.FLOAT32)
 
@@ -149,13 +149,13 @@ def _run_in_float32(weights: Weights, groups: list[jax.Array], *, network: Descr
 @run_unet.implementation(
     "onednn-bfloat16", **_INFERENCE, unavailable=onednn.unavailable_in_bfloat16, precision=jnp.bfloat16
 )
-def _run_in_bfloat16(weights: Weights, groups: list[jax.Array], *, network: Description) -> Heads:
+def _run_in_bfloat16(weights: Weights, groups: list[jax.Array], *, network: GraphSpec) -> Heads:
     """The same in bfloat16."""
     return onednn.run(network, weights, groups, precision=onednn.BFLOAT16)
 
 
 @run_unet.implementation("onnxruntime", **_INFERENCE, unavailable=onnx.unavailable)
-def _run_by_onnxruntime(weights: Weights, groups: list[jax.Array], *, network: Description) -> Heads:
+def _run_by_onnxruntime(weights: Weights, groups: list[jax.Array], *, network: GraphSpec) -> Heads:
     """The whole network in ONNX Runtime."""
     return onnx.run(network, weights, groups)
 
@@ -176,11 +176,11 @@ def unet(
     of ``params`` never depend on it. H and W are multiples of 16. ``heads`` are the channel counts at full, half and
     quarter resolution; their outputs are raw (logits), by convolutions of ``head_size``. ``widths`` gives the channels
     of each convolution of each of the five levels; the decoder mirrors the first four. ``initialization``: see
-    :func:`initial`. Computes in the features' dtype. ``implementation``: None or "reference" (XLA), "onednn-bfloat16",
-    "onednn-float32" or "onnxruntime" (inference, see :mod:`jaxdn.networks.onednn` and :mod:`jaxdn.networks.onnx`) or
-    "onednn" (convolutions and their gradients, see :mod:`jaxdn.ops.convolution.onednn`). Raises ValueError when
-    ``widths`` is not five non-empty levels of positive integers, the features do not fit, or the implementation cannot
-    run here.
+    :func:`draw_initial_weights`. Computes in the features' dtype. ``implementation``: None or "reference" (XLA),
+    "onednn-bfloat16", "onednn-float32" or "onnxruntime" (inference, see :mod:`jaxdn.networks.onednn` and
+    :mod:`jaxdn.networks.onnx`) or "onednn" (convolutions and their gradients, see
+    :mod:`jaxdn.ops.convolution.onednn`). Raises ValueError when ``widths`` is not five non-empty levels of positive
+    integers, the features do not fit, or the implementation cannot run here.
     """
     if implementation is not None:
         run_unet.named(implementation)
@@ -191,29 +191,29 @@ def unet(
             "see jaxdn.networks.unet.LARGE."
         )
 
-    def described(channels: int) -> Description:
-        return description.unet(channels, heads, widths=widths, head_size=head_size)
+    def described(channels: int) -> GraphSpec:
+        return graph.unet(channels, heads, widths=widths, head_size=head_size)
 
-    graph = storage(described(sum(groups)))
+    structure = flax_structure(described(sum(groups)))
 
     def init(key: jax.Array) -> dict[str, Any]:
-        return initial(key, described(sum(groups)), scheme=initialization)
+        return draw_initial_weights(key, described(sum(groups)), scheme=initialization)
 
     def apply(params: dict[str, Any], features: Sequence[jax.Array | None]) -> tuple[jax.Array, ...]:
-        present = present_groups(features, groups, MULTIPLE)
+        present = select_groups(features, groups, MULTIPLE)
         network = described(sum(group.shape[-1] for group in present))
-        weights = weights_for(network, graph, params, features, groups)
+        weights = select_weights(network, structure, params, features, groups)
         return run_unet(weights, present, network=network, implementation=implementation)
 
     return Network(init, apply)
 
 
-def storage(network: Description) -> Any:
+def flax_structure(network: GraphSpec) -> Any:
     """How Flax stores the weights of a network."""
     return nnx.split(nnx.eval_shape(lambda: Convolutions(network)), nnx.Param, graph=False)[0]
 
 
-def present_groups(features: Sequence[jax.Array | None], groups: Sequence[int], multiple: int) -> list[jax.Array]:
+def select_groups(features: Sequence[jax.Array | None], groups: Sequence[int], multiple: int) -> list[jax.Array]:
     """The feature groups that are there. Raises ValueError unless they fit ``groups`` and the sizes ``multiple``."""
     present = [group for group in features if group is not None]
     fits = len(features) == len(groups) and all(
@@ -229,15 +229,15 @@ def present_groups(features: Sequence[jax.Array | None], groups: Sequence[int], 
     return present
 
 
-def weights_for(
-    network: Description,
-    graph: Any,
+def select_weights(
+    network: GraphSpec,
+    structure: Any,
     params: dict[str, Any],
     features: Sequence[jax.Array | None],
     groups: Sequence[int],
 ) -> dict[str, Any]:
     """The weights of a network that sees only the groups which are there, out of those for all groups."""
-    weights = nnx.merge(graph, params).weights(network.kernels())
+    weights = nnx.merge(structure, params).weights(network.kernels())
     if any(group is None for group in features):
         first = next(iter(weights))
         parts = jnp.split(weights[first]["kernel"], list(itertools.accumulate(groups))[:-1], axis=2)
@@ -246,12 +246,12 @@ def weights_for(
     return weights
 
 
-def count(params: Params) -> int:
+def count_weights(params: Params) -> int:
     """The number of weights in ``params``."""
     return sum(leaf.size for leaf in jax.tree.leaves(params))
 
 
-def draw_weights(rng: np.random.Generator, network: Description) -> Weights:
+def draw_weights(rng: np.random.Generator, network: GraphSpec) -> Weights:
     """Weights of a network with which signals keep their size."""
     return {
         name: {"kernel": rng.normal(size=shape) / math.sqrt(math.prod(shape[:3])), "bias": rng.normal(size=shape[3])}
@@ -262,6 +262,6 @@ def draw_weights(rng: np.random.Generator, network: Description) -> Weights:
 @run_unet.example
 def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
     height, width = height + -height % MULTIPLE, width + -width % MULTIPLE
-    network = description.unet(5, (3, 2), widths=((4,), (6,), (4,), (4,), (4,)), head_size=1)
+    network = graph.unet(5, (3, 2), widths=((4,), (6,), (4,), (4,), (4,)), head_size=1)
     groups = [rng.normal(size=(1, height, width, channels)) for channels in (3, 2)]
     yield Example((draw_weights(rng, network), groups), {"network": network})

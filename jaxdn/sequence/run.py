@@ -22,18 +22,20 @@ class Written(NamedTuple):
     """Invalid values (NaN, infinite, negative ...) of frames and histories that were replaced."""
 
 
-def select_engine(name: str, implementation: str = "auto", **options: Any) -> tuple[Candidate, str]:
-    """The candidate of that name on an engine, and the engine's name; "reference" is XLA.
+def select_backend(name: str, implementation: str = "auto", **options: Any) -> tuple[Candidate, str]:
+    """The candidate of that name on a backend, and the backend's name; "reference" is XLA.
 
-    ``options`` are given to it (:func:`jaxdn.zoo.ready.candidate`). ``"auto"`` is the fastest engine for inference
-    that the method has and that can run here. Raises ValueError for a name that is not a method, and for an engine that
+    ``options`` are given to it (:func:`jaxdn.zoo.ready.candidate`). ``"auto"`` is the fastest backend for inference
+    that the method has and that can run here. Raises ValueError for a name that is not a method, and for a backend that
     cannot run it.
     """
     found = candidate(name, **options)
     known = found.method is not None and found.method.knows("implementation")
     if implementation == "auto":
-        engine = found.engine("inference")
-        return (found, "reference") if engine is None else (candidate(name, implementation=engine, **options), engine)
+        backend = found.backend("inference")
+        if backend is None:
+            return found, "reference"
+        return candidate(name, implementation=backend, **options), backend
     if implementation == "reference" and not known:
         return found, implementation
     return candidate(name, implementation=implementation, **options), implementation

@@ -32,7 +32,7 @@ def train(
     """Train a method to the end, unless it is trained already, and return the path of its weights.
 
     The weights are the running mean that the recipe asks for. A second call resumes from the newest checkpoint in
-    ``out``. Raises ValueError for options that the method does not have, unsuitable clips, and an engine that cannot
+    ``out``. Raises ValueError for options that the method does not have, unsuitable clips, and a backend that cannot
     run here.
 
     Args:
@@ -44,7 +44,7 @@ def train(
       start: shipped weights or a .safetensors file to continue from (:func:`jaxdn.zoo.weights.starting_params`); None:
         new ones.
       validation: folders of held-out clips, or packed sets, used whole.
-      implementation: the engine for training; "auto" is the method's fastest that is available here.
+      implementation: the backend for training; "auto" is the method's fastest that is available here.
       time_limit: seconds after which training stops; the weights of that moment are written all the same.
       label: the run's name in messages; default: that of its folder.
       record: further entries of the weights' JSON.
@@ -52,10 +52,10 @@ def train(
     if time_limit is not None and not time_limit > 0:
         raise ValueError(f"time limit: expected more than 0, got {time_limit:g} s; leave it out for no limit.")
     label = out.name if label is None else label
-    engine = method.engine("training", options) if implementation == "auto" else implementation
-    if engine not in (None, "reference"):
-        denoiser = method.factory(**{**options, "implementation": engine})
-        print(f"{label}: convolutions run on {engine}", flush=True)
+    backend = method.backend("training", options) if implementation == "auto" else implementation
+    if backend not in (None, "reference"):
+        denoiser = method.factory(**{**options, "implementation": backend})
+        print(f"{label}: convolutions run on {backend}", flush=True)
     else:
         denoiser = method.factory(**options)
         print(f"{label}: everything runs on XLA", flush=True)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.methods.registry import Method, method_named, methods
-from jaxdn.networks.engines import Purpose
+from jaxdn.networks.backends import Purpose
 from jaxdn.zoo.weights import describe, load_weights, shipped_names
 
 NOISY = "noisy"
@@ -36,9 +36,9 @@ class Candidate(NamedTuple):
     options: Mapping[str, Any] = {}
     """The options given to its factory."""
 
-    def engine(self, purpose: Purpose = "inference") -> str | None:
-        """The engine that runs it fastest here (:meth:`jaxdn.methods.registry.Method.engine`); None is XLA."""
-        return None if self.method is None else self.method.engine(purpose, self.options)
+    def backend(self, purpose: Purpose = "inference") -> str | None:
+        """The backend that runs it fastest here (:meth:`jaxdn.methods.registry.Method.backend`); None is XLA."""
+        return None if self.method is None else self.method.backend(purpose, self.options)
 
 
 def candidate(name: str, **options: Any) -> Candidate:

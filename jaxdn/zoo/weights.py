@@ -14,7 +14,7 @@ from safetensors.numpy import load_file, save
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.methods.registry import method_named
-from jaxdn.networks.widen import widen
+from jaxdn.networks.grow import grow
 from jaxdn.runtime.atomic_files import write_atomically
 
 SHIPPED = Path(__file__).parent / "shipped"
@@ -104,7 +104,7 @@ def starting_params(name_or_path: str | Path, denoiser: Denoiser) -> Params:
     """Parameters to continue training ``denoiser`` from: those of shipped weights or of a file.
 
     The denoiser may see more than the one that the weights were trained for, and its network may be larger
-    (:func:`jaxdn.networks.widen.widen`): its first images are those of the stored weights. Arrays beside the network's
+    (:func:`jaxdn.networks.grow.grow`): its first images are those of the stored weights. Arrays beside the network's
     layers that the stored weights lack, such as the precisions of guided kernels, have the values that training starts
     from, and the first images differ. Raises ValueError as :func:`load_weights` does, and for weights of another
     network.
@@ -118,7 +118,7 @@ def starting_params(name_or_path: str | Path, denoiser: Denoiser) -> Params:
         return {name: array for name, array in weights.items() if (name in layers) == kept}
 
     try:
-        grown = widen(network(trained, True), network(initial, True))
+        grown = grow(network(trained, True), network(initial, True))
         beside = network(initial, False) | network(trained, False)
         if found := [name for name in beside if name not in initial or beside[name].shape != initial[name].shape]:
             raise ValueError(f"{found[0]} is {beside[found[0]].shape} there")

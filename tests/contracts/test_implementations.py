@@ -154,7 +154,7 @@ def _pull_back(function, name):
 
 
 def runnable(op):
-    """The implementations that can run here: engines are extras."""
+    """The implementations that can run here: backends are extras."""
     return tuple(name for name, one in OPERATIONS[op].implementations.items() if not one.refuses(()))
 
 
@@ -259,7 +259,7 @@ def test_a_named_implementation_runs_or_raises(op):
     known = OPERATIONS[op]
     assert len(known.implementations) > 1
     assert "reference" in runnable(op)
-    # Engines are extras, and one of them needs instructions that not every CPU has.
+    # Backends are extras, and one of them needs instructions that not every CPU has.
     assert set(known.implementations) - set(runnable(op)) <= {"onednn", "onnxruntime", "onednn-bfloat16"}
     assert known.automatic()[0].name in runnable(op)
     with pytest.raises(ValueError, match=r"'reference'.*'no such'"):

@@ -172,7 +172,7 @@ def test_every_buffer_that_other_renderers_have_has_a_consequence():
 def test_the_version_and_what_is_installed(capsys, monkeypatch):
     assert run(capsys, "--version") == f"jaxdn {main.jaxdn.__version__}"
     text = run(capsys, "doctor")
-    for word in ("jax ", " on ", "engine for inference", "engine for training", "optax", "mitsuba", "Python"):
+    for word in ("jax ", " on ", "backend for inference", "backend for training", "optax", "mitsuba", "Python"):
         assert word in text
     monkeypatch.setattr("jaxdn.commands.doctor.find_spec", lambda name: None)
     advice = {finding.what: finding.advice for finding in doctor()}

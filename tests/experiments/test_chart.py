@@ -37,7 +37,7 @@ from jaxdn.denoiser import Core, recurrent
 from jaxdn.denoiser.rollout import denoise
 from jaxdn.methods import registry
 from jaxdn.methods.registry import method, method_named, methods
-from jaxdn.networks.engines import ENGINES
+from jaxdn.networks.backends import BACKENDS
 from jaxdn.zoo.ready import Candidate, untrained
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -233,7 +233,7 @@ def test_every_registered_method_is_there_with_its_variants(denoisers):
         assert "motion" in found[name].reads
         assert "luminance_gradient" not in found[name].reads, "it would be charged for what it does not read"
     assert "ntd-large, bfloat16" in found
-    assert ("ntd-large, onnxruntime" in found) == ENGINES["onnxruntime"].available()
+    assert ("ntd-large, onnxruntime" in found) == BACKENDS["onnxruntime"].available()
     assert found["ntd tiny"].images is None
     assert {each.method.name for each in denoisers} == set(methods()) - {"ntasd", "dasr"}
     told = " ".join(left_out())

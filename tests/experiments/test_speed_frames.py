@@ -5,16 +5,16 @@ import json
 import pytest
 
 from experiments.speed.frames import OIDN, Settings, builds, main, parsed
-from jaxdn.networks.engines import ENGINES
+from jaxdn.networks.backends import BACKENDS
 from jaxdn.ops.dispatch import numba_call
 
 
 def test_every_engine_for_inference_that_runs_here_is_timed():
-    engines = [name for name in ("onednn-bfloat16", "onednn-float32", "onnxruntime") if ENGINES[name].available()]
+    backends = [name for name in ("onednn-bfloat16", "onednn-float32", "onnxruntime") if BACKENDS[name].available()]
     found = set(builds(["svgf", "steady-fast"], 32, 48)) - {OIDN}
     methods = ("svgf", "steady-fast")
     without = [f"{name}, reference" for name in methods if not numba_call.unavailable()]
-    assert found == {*(f"{name}, xla" for name in methods), *without, *(f"steady-fast, {name}" for name in engines)}
+    assert found == {*(f"{name}, xla" for name in methods), *without, *(f"steady-fast, {name}" for name in backends)}
 
 
 @pytest.mark.slow

@@ -19,11 +19,11 @@ from jaxdn.denoiser import Core, Denoiser, recurrent
 from jaxdn.methods import registry
 from jaxdn.methods.ntd import PARITY, Options
 from jaxdn.methods.registry import method, method_named, methods
-from jaxdn.networks.engines import ENGINES, Engine
+from jaxdn.networks.backends import BACKENDS, Backend
 from jaxdn.ops.onednn import library
 from jaxdn.recipes.objectives import indirect_illumination
 from jaxdn.recipes.recipe import Recipe
-from jaxdn.sequence.run import select_engine
+from jaxdn.sequence.run import select_backend
 from jaxdn.zoo.weights import save_weights
 from tests.methods.test_ntd import TINY
 from tests.needs import require
@@ -258,11 +258,11 @@ def test_an_unknown_name_says_which_there_are():
     assert ntd.recipe_named(None) is ntd.recipes["usual"]
 
 
-def engines(monkeypatch, **available):
-    """Only these engines are available."""
-    for name in ENGINES:
+def backends(monkeypatch, **available):
+    """Only these backends are available."""
+    for name in BACKENDS:
         there = available.get(name, False)
-        monkeypatch.setitem(ENGINES, name, Engine(name, ENGINES[name].purpose, lambda there=there: there))
+        monkeypatch.setitem(BACKENDS, name, Backend(name, BACKENDS[name].purpose, lambda there=there: there))
 
 
 @pytest.mark.parametrize(
@@ -277,21 +277,23 @@ def engines(monkeypatch, **available):
 )
 def test_the_engine_is_the_fastest_for_the_purpose_and_none_for_half_precision(purpose, options, expected, monkeypatch):
     ntd, svgf = method_named("ntd"), method_named("svgf")
-    engines(monkeypatch, onnxruntime=True, onednn=True)
-    assert ntd.engine(purpose, options) == expected
-    assert svgf.engine(purpose, options) is None
-    engines(monkeypatch, **{"onednn-bfloat16": True, "onnxruntime": True, "onednn": True})
-    assert ntd.engine(purpose, options) == ("onednn-bfloat16" if expected == "onnxruntime" else expected)
-    engines(monkeypatch, **{"onednn-float32": True, "onnxruntime": True, "onednn": True})
-    assert ntd.engine(purpose, options) == ("onednn-float32" if expected == "onnxruntime" else expected)
-    engines(monkeypatch)
-    assert ntd.engine(purpose, options) is None
+    backends(monkeypatch, onnxruntime=True, onednn=True)
+    assert ntd.backend(purpose, options) == expected
+    assert svgf.backend(purpose, options) is None
+    backends(monkeypatch, **{"onednn-bfloat16": True, "onnxruntime": True, "onednn": True})
+    assert ntd.backend(purpose, options) == ("onednn-bfloat16" if expected == "onnxruntime" else expected)
+    backends(monkeypatch, **{"onednn-float32": True, "onnxruntime": True, "onednn": True})
+    assert ntd.backend(purpose, options) == ("onednn-float32" if expected == "onnxruntime" else expected)
+    backends(monkeypatch)
+    assert ntd.backend(purpose, options) is None
 
 
-def test_an_engine_that_is_slower_here_is_used_on_request_alone(monkeypatch):
+def test_a_backend_that_is_slower_here_is_used_on_request_alone(monkeypatch):
     for faster in (True, False):
-        monkeypatch.setitem(ENGINES, "onednn", Engine("onednn", "training", lambda: True, lambda faster=faster: faster))
-        assert method_named("ntd").engine("training") == ("onednn" if faster else None)
+        monkeypatch.setitem(
+            BACKENDS, "onednn", Backend("onednn", "training", lambda: True, lambda faster=faster: faster)
+        )
+        assert method_named("ntd").backend("training") == ("onednn" if faster else None)
 
 
 @pytest.mark.parametrize(("isa", "faster"), [(0x7, False), (0x1F, False), (0x27, True), (0xFEF, True)])
@@ -300,8 +302,8 @@ def test_onednn_trains_faster_with_avx512(isa, faster, monkeypatch):
     monkeypatch.setattr(library, "available", lambda: True)
     fake = types.SimpleNamespace(dnnl_get_effective_cpu_isa=lambda: isa)
     monkeypatch.setattr(library, "library", lambda: fake)
-    assert library.trains_faster() == faster
-    assert ENGINES["onednn"].faster() == faster
+    assert library.training_is_faster() == faster
+    assert BACKENDS["onednn"].faster() == faster
 
 
 # A method from outside the package.
@@ -316,7 +318,7 @@ class Gains:
 
 @pytest.fixture
 def toy(monkeypatch):
-    """A learned method that has neither a network nor engines, in the table for one test."""
+    """A learned method that has neither a network nor backends, in the table for one test."""
     monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
 
     @method(Gains, title="A toy", recipes={"usual": Recipe(indirect_illumination())})
@@ -341,46 +343,46 @@ def test_a_registered_method_is_found_everywhere(toy):
     assert jaxdn.denoisers.toy is toy
     assert "toy" in jaxdn.denoisers.NAMES
     assert toy.__doc__.startswith("Radiance times a learned number.")
-    assert row.engine("inference") is None
+    assert row.backend("inference") is None
     assert row.variant_named(None) == {}
 
 
 def test_a_custom_learned_method_can_denoise(toy, tmp_path, monkeypatch, rng):
     """Where ONNX Runtime is installed, `jaxdn denoise` must not pass it to a method without this option."""
-    engines(monkeypatch, onnxruntime=True, onednn=True)
+    backends(monkeypatch, onnxruntime=True, onednn=True)
     frame = Frame(jnp.asarray(rng.exponential(size=(4, 5, 3)), jnp.float32))
     params = {"gain": jnp.asarray([[[0.5, 1.0, 2.0]]], jnp.float32)}
     path = save_weights(tmp_path / "run" / "weights", params, factory="toy", options={"gain": 0.25}, record={})
     for implementation in ("auto", "reference"):
-        found, engine = select_engine(str(path), implementation)
-        assert engine == "reference"
+        found, backend = select_backend(str(path), implementation)
+        assert backend == "reference"
         assert (found.label, found.method.name, dict(found.options)) == ("run", "toy", {"gain": 0.25})
         _, image = found.denoiser.step(found.params, found.denoiser.start(found.params, frame), frame)
         np.testing.assert_allclose(image, frame.radiance * params["gain"], rtol=1e-6)
     with pytest.raises(ValueError, match=r"toy: expected options out of gain, got 'implementation'"):
-        select_engine(str(path), "onnxruntime")
+        select_backend(str(path), "onnxruntime")
 
 
 def test_a_learned_method_needs_weights(toy):
     with pytest.raises(ValueError, match="method 'toy': expected its weights"):
-        select_engine("toy")
+        select_backend("toy")
 
 
-@pytest.mark.parametrize(("installed", "engine"), [(True, "onnxruntime"), (False, "reference")])
-def test_weights_of_a_network_run_on_the_available_engine(installed, engine, monkeypatch, tmp_path):
+@pytest.mark.parametrize(("installed", "backend"), [(True, "onnxruntime"), (False, "reference")])
+def test_weights_of_a_network_run_on_the_available_backend(installed, backend, monkeypatch, tmp_path):
     if installed:
         require("onnxruntime")
-    engines(monkeypatch, onnxruntime=installed, onednn=True)
+    backends(monkeypatch, onnxruntime=installed, onednn=True)
     denoiser = jaxdn.denoisers.ntd(size=TINY, kernels="plain")
     params = denoiser.init(jax.random.key(0), Frame(jnp.ones((16, 16, 3))))
     options = {"size": TINY, "kernels": "plain"}
     path = save_weights(tmp_path / "tiny", params, factory="ntd", options=options, record={})
-    found, taken = select_engine(str(path))
-    assert taken == engine
-    assert found.options.get("implementation") == (engine if installed else None)
+    found, taken = select_backend(str(path))
+    assert taken == backend
+    assert found.options.get("implementation") == (backend if installed else None)
     options["compute_dtype"] = "bfloat16"
     half = save_weights(tmp_path / "half", params, factory="ntd", options=options, record={})
-    assert select_engine(str(half))[1] == "reference"
+    assert select_backend(str(half))[1] == "reference"
 
 
 def test_layer_names_are_always_strings():

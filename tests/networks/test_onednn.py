@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jaxdn.methods.registry import method_named
-from jaxdn.networks import LARGE, description, onednn
-from jaxdn.networks.engines import ENGINES
+from jaxdn.networks import LARGE, graph, onednn
+from jaxdn.networks.backends import BACKENDS
 from jaxdn.networks.unet import unet
 from jaxdn.ops.onednn import layers
 from jaxdn.ops.onednn import library as dnnl
@@ -16,7 +16,7 @@ from tests.needs import require
 WIDTHS = ((16,), (24,), (32,), (32,), (32,))
 
 
-@pytest.fixture(params=[onednn.FLOAT32, onednn.BFLOAT16], ids=lambda each: each.engine, scope="module")
+@pytest.fixture(params=[onednn.FLOAT32, onednn.BFLOAT16], ids=lambda each: each.backend, scope="module")
 def precision(request):
     require("onednn")
     if request.param is onednn.BFLOAT16:
@@ -69,7 +69,7 @@ def test_a_convolution_of_an_enlarged_image_is_exact_for_small_whole_numbers(pre
     bias, before = rng.integers(-5, 6, 24) * 1.0, rng.integers(-9, 9, (2, 10, 12, 24)) * 1.0
     wanted = convolved(x.repeat(2, axis=1).repeat(2, axis=2), kernel) + bias + before * adds
     wanted = np.where(wanted >= 0, wanted, 0.25 * wanted)
-    options = {"kind": precision.kind, "slope": 0.25, "adds": adds, "enlarges": True}
+    options = {"kind": precision.kind, "slope": 0.25, "adds": adds, "upsamples": True}
     found = run(
         lambda *ends: layers.convolution(*ends, kernel, bias, **options),
         precision,
@@ -83,8 +83,8 @@ def test_a_convolution_of_an_enlarged_image_is_exact_for_small_whole_numbers(pre
 def test_pooling_and_enlarging(precision, rng):
     x = rng.integers(-99, 99, (2, 8, 6, 16)) * 1.0
     pooled = run(layers.pooling, precision, x, (2, 4, 3, 16))
-    enlarged = run(layers.enlarging, precision, x, (2, 16, 12, 16))
-    as_numbers = [np.asarray(each, np.float64) for each in (pooled, enlarged)]
+    upsampled = run(layers.upsampling, precision, x, (2, 16, 12, 16))
+    as_numbers = [np.asarray(each, np.float64) for each in (pooled, upsampled)]
     np.testing.assert_array_equal(as_numbers[0], x.reshape(2, 4, 2, 3, 2, 16).max(axis=(2, 4)))
     np.testing.assert_array_equal(as_numbers[1], x.repeat(2, axis=1).repeat(2, axis=2))
 
@@ -92,7 +92,7 @@ def test_pooling_and_enlarging(precision, rng):
 @pytest.fixture(scope="module")
 def pair(precision):
     """The same network in XLA and in oneDNN, parameters, and features of two images."""
-    plain, fast = (unet((12, 8), (30, 9), widths=WIDTHS, implementation=name) for name in (None, precision.engine))
+    plain, fast = (unet((12, 8), (30, 9), widths=WIDTHS, implementation=name) for name in (None, precision.backend))
     keys = jax.random.split(jax.random.key(3), 3)
     groups = [jax.random.normal(key, (2, 32, 48, count)) for key, count in zip(keys, (12, 8), strict=False)]
     return jax.jit(plain.apply), jax.jit(fast.apply), plain.init(keys[2]), groups
@@ -138,7 +138,7 @@ def test_under_vmap_and_with_the_gradient_of_xla(pair, precision):
 
 def test_large_results_of_64_channels(precision):
     """They are written past the caches, to addresses that have to be multiples of 64."""
-    network = description.unet(16, (8,), widths=((64,),) * 5, head_size=1)
+    network = graph.unet(16, (8,), widths=((64,),) * 5, head_size=1)
     weights = {
         name: {"kernel": np.zeros(shape, np.float32), "bias": np.ones(shape[3], np.float32)}
         for name, shape in network.kernels().items()
@@ -150,14 +150,14 @@ def test_large_results_of_64_channels(precision):
 
 
 def test_memory_is_used_again(precision):
-    network = description.unet(20, (9,), widths=LARGE, head_size=3)
+    network = graph.unet(20, (9,), widths=LARGE, head_size=3)
     weights = {
         name: {"kernel": np.zeros(shape, np.float32), "bias": np.zeros(shape[3], np.float32)}
         for name, shape in network.kernels().items()
     }
     program = onednn.Program(network, weights, (1, 64, 64, 20), precision)
     # All layers but the input and the head, each a convolution with its rectifier, or a step of its own.
-    layers = [layer for layer in network.layers.values() if layer.kind in ("rectifier", "pool", "enlarge")]
+    layers = [layer for layer in network.layers.values() if layer.kind in ("rectifier", "pool", "upsample")]
     size = jnp.dtype(precision.dtype).itemsize
     sizes = [size * layer.channels * (64 >> layer.depth) ** 2 for layer in layers]
     assert program.bytes < 0.6 * sum(sizes)
@@ -165,7 +165,7 @@ def test_memory_is_used_again(precision):
 
 def test_other_types_are_refused(pair, precision):
     _, fast, params, groups = pair
-    with pytest.raises(ValueError, match=f'"{precision.engine}" takes float32, got bfloat16'):
+    with pytest.raises(ValueError, match=f'"{precision.backend}" takes float32, got bfloat16'):
         fast(params, [group.astype(jnp.bfloat16) for group in groups])
 
 
@@ -177,9 +177,9 @@ def test_a_cpu_without_it_is_told(monkeypatch):
         method_named("steady").factory(implementation="onednn-bfloat16")
 
 
-@pytest.mark.parametrize("engine", ["onednn-bfloat16", "onednn-float32"])
-def test_without_the_library_it_is_told_what_to_install(engine, monkeypatch):
+@pytest.mark.parametrize("backend", ["onednn-bfloat16", "onednn-float32"])
+def test_without_the_library_it_is_told_what_to_install(backend, monkeypatch):
     monkeypatch.setattr(dnnl, "PACKAGE", "no-such-package")
-    assert not ENGINES[engine].available()
-    with pytest.raises(ValueError, match=rf'"{engine}" needs the package .*pip install onednn-cpu-gomp'):
-        method_named("steady").factory(implementation=engine)
+    assert not BACKENDS[backend].available()
+    with pytest.raises(ValueError, match=rf'"{backend}" needs the package .*pip install onednn-cpu-gomp'):
+        method_named("steady").factory(implementation=backend)

@@ -1,14 +1,16 @@
 """The U-Net against a NumPy one, and its guarantees: plain dicts, fixed shapes, absent groups at a lower cost."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
 
-from jaxdn.networks import LARGE, LEVELS, SMALL, description, onnx
-from jaxdn.networks.description import FEATURES, NEGATIVE_SLOPE, Description, Layer
-from jaxdn.networks.unet import XLA, Network, by_xla, count, unet
+from jaxdn.networks import LARGE, LEVELS, SMALL, graph
+from jaxdn.networks.graph import FEATURES, NEGATIVE_SLOPE, GraphSpec, Layer
+from jaxdn.networks.unet import Network, count_weights, run_unet, unet
 from jaxdn.zoo.weights import flatten, load_weights
 from tests.needs import require
 
@@ -59,7 +61,7 @@ def numpy_unet(params: dict, x: np.ndarray, heads: int) -> list[np.ndarray]:
 @pytest.mark.parametrize(("widths", "weights"), [(LARGE, 895_495), (SMALL, 434_423)])
 def test_weight_counts(widths: tuple, weights: int, key: jax.Array) -> None:
     network = unet(GROUPS, HEADS, widths=widths)
-    assert count(jax.eval_shape(network.init, key)) == weights
+    assert count_weights(jax.eval_shape(network.init, key)) == weights
 
 
 def test_small_computes_a_third_of_large(key: jax.Array) -> None:
@@ -174,20 +176,20 @@ def test_shipped_weights_are_those_of_the_description() -> None:
     ):
         _, params = load_weights(name)
         found = {path: leaf.shape for path, leaf in flatten(params).items() if not path.startswith("guide")}
-        kernels = description.unet(sum(groups), heads, widths=widths, head_size=size).kernels()
+        kernels = graph.unet(sum(groups), heads, widths=widths, head_size=size).kernels()
         wanted = {f"{layer}/kernel": shape for layer, shape in kernels.items()}
         wanted |= {f"{layer}/bias": shape[3:] for layer, shape in kernels.items()}
         assert found == wanted
 
 
-OTHER = Description(
+OTHER = GraphSpec(
     {
         FEATURES: Layer("input", (), 18, 0),
         "thin": Layer("convolution", (FEATURES,), 3, 0, 1),
         "half": Layer("pool", ("thin",), 3, 1),
         "wide": Layer("convolution", ("half",), 5, 1, 3),
         "bent": Layer("rectifier", ("wide",), 5, 1),
-        "large": Layer("enlarge", ("bent",), 5, 0),
+        "large": Layer("upsample", ("bent",), 5, 0),
         "end": Layer("convolution", ("thin", "large", FEATURES), 4, 0, 3),
     },
     ("bent", "end"),
@@ -195,9 +197,9 @@ OTHER = Description(
 """No U-Net: outputs at two levels, one of them rectified, three inputs joined."""
 
 
-@pytest.mark.parametrize("engine", ["xla", "onnxruntime"])
-def test_every_engine_runs_whatever_network_is_described(engine: str, rng: np.random.Generator) -> None:
-    if engine == "onnxruntime":
+@pytest.mark.parametrize("backend", ["reference", "onnxruntime"])
+def test_every_engine_runs_whatever_network_is_described(backend: str, rng: np.random.Generator) -> None:
+    if backend == "onnxruntime":
         require("onnxruntime")
     weights = {
         name: {"kernel": 0.2 * rng.normal(size=shape), "bias": rng.normal(size=shape[3:])}
@@ -209,7 +211,7 @@ def test_every_engine_runs_whatever_network_is_described(engine: str, rng: np.ra
     bent = np.where(wide < 0, NEGATIVE_SLOPE * wide, wide)
     end = numpy_convolution(np.concatenate([thin, bent.repeat(2, 1).repeat(2, 2), x], axis=-1), weights["end"])
 
-    run = by_xla(XLA, OTHER) if engine == "xla" else onnx.engine(OTHER, by_xla(XLA, OTHER))
+    run = functools.partial(run_unet, network=OTHER, implementation=backend)
     single = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), weights)
     found = jax.jit(run)(single, [jnp.asarray(x[..., :7], jnp.float32), jnp.asarray(x[..., 7:], jnp.float32)])
     for got, wanted in zip(found, (bent, end), strict=True):
@@ -218,12 +220,12 @@ def test_every_engine_runs_whatever_network_is_described(engine: str, rng: np.ra
 
 @pytest.mark.parametrize("absent", [(), (1, 3)])
 @pytest.mark.parametrize("name", ["onnxruntime", "onednn"])
-def test_an_engine_runs_the_same_network(
+def test_a_backend_runs_the_same_network(
     name: str, absent: tuple[int, ...], rng: np.random.Generator, key: jax.Array
 ) -> None:
-    """Values of the engine and its gradient, with all features and without some."""
+    """Values of the backend and its gradient, with all features and without some."""
     require(name)
-    plain, engine = (unet(GROUPS, HEADS, widths=TINY, implementation=each) for each in (None, name))
+    plain, backend = (unet(GROUPS, HEADS, widths=TINY, implementation=each) for each in (None, name))
     params = jax.tree.map(lambda leaf: leaf + 0.01, plain.init(key))
     inputs = [None if index in absent else group for index, group in enumerate(features(rng, GROUPS))]
 
@@ -234,24 +236,24 @@ def test_an_engine_runs_the_same_network(
 
         return jax.jit(jax.grad(loss, has_aux=True))(params)
 
-    wanted, got = both(plain), both(engine)
+    wanted, got = both(plain), both(backend)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), got, wanted)
 
 
 def test_onnxruntime_follows_the_weights_under_scan_and_vmap(rng: np.random.Generator, key: jax.Array) -> None:
-    """The engine keeps weights in its own layout; new weights in the next call give the new image."""
+    """The backend keeps weights in its own layout; new weights in the next call give the new image."""
     require("onnxruntime")
-    plain, engine = (unet((3, 2), (5, 3, 2), widths=TINY, implementation=name) for name in (None, "onnxruntime"))
+    plain, backend = (unet((3, 2), (5, 3, 2), widths=TINY, implementation=name) for name in (None, "onnxruntime"))
     inputs = [jnp.stack([group, 2 * group]) for group in features(rng, (3, 2))]
-    run = jax.jit(engine.apply)
+    run = jax.jit(backend.apply)
     for scale in (1.0, 1.5, 1.0):
         params = jax.tree.map(lambda leaf, scale=scale: scale * leaf, plain.init(key))
         wanted = jax.vmap(lambda *groups, params=params: plain.apply(params, list(groups)))(*inputs)
         for index in range(2):
             got = run(params, [group[index] for group in inputs])
             jax.tree.map(lambda a, b, i=index: np.testing.assert_allclose(a, b[i], rtol=1e-4, atol=1e-5), got, wanted)
-        mapped = jax.vmap(lambda *groups, params=params: engine.apply(params, list(groups)))(*inputs)
-        _, scanned = jax.lax.scan(lambda _, groups, params=params: (None, engine.apply(params, groups)), None, inputs)
+        mapped = jax.vmap(lambda *groups, params=params: backend.apply(params, list(groups)))(*inputs)
+        _, scanned = jax.lax.scan(lambda _, groups, params=params: (None, backend.apply(params, groups)), None, inputs)
         for got in (mapped, scanned):
             jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), got, wanted)
 
@@ -264,7 +266,7 @@ def test_onnxruntime_takes_only_float32(rng: np.random.Generator, key: jax.Array
         network.apply(network.init(key), inputs)
 
 
-def test_an_engine_that_is_not_installed_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_backend_that_is_not_installed_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install onnxruntime onnx"):
         unet((3, 2), (5, 3, 2), widths=TINY, implementation="onnxruntime")

@@ -108,7 +108,7 @@ def test_the_default_of_a_block_is_a_part_of_the_key_of_compiled_programs(scaled
 def test_the_default_of_a_process(scaled, monkeypatch):
     monkeypatch.setenv("JAXDN_IMPLEMENTATION", "reference")
     np.testing.assert_array_equal(scaled(ONE, by=2), 2)
-    assert method_named("ntd").engine("training") is None
+    assert method_named("ntd").backend("training") is None
     with jaxdn.implementation("auto"):
         np.testing.assert_array_equal(scaled(ONE, by=2), 4)
     monkeypatch.setenv("JAXDN_IMPLEMENTATION", "numba")

@@ -73,7 +73,7 @@ run = partial(run_on, None)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", dict.fromkeys(("reference", METHOD.engine("training") or "reference")))
+@pytest.mark.parametrize("engine", dict.fromkeys(("reference", METHOD.backend("training") or "reference")))
 def test_interrupted_training_ends_in_bit_identical_weights(engine, clips, tmp_path):
     run = partial(run_on, engine)
     whole = run(clips, tmp_path / "whole", checkpoint_every=100)

@@ -21,7 +21,7 @@ from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods.ntd import guided_features
 from jaxdn.methods.reconstruction import TAPS
 from jaxdn.networks import MULTIPLE, Widths
-from jaxdn.networks.engines import ENGINES
+from jaxdn.networks.backends import BACKENDS
 from jaxdn.networks.unet import unet
 from jaxdn.ops.kernel_prediction.softmax import softmax_filter
 from jaxdn.ops.motion import on_screen
@@ -40,21 +40,21 @@ class Subject(NamedTuple):
     """A step whose parts can be timed."""
 
     name: str
-    """Weights and engine."""
+    """Weights and backend."""
     widths: Widths
     denoiser: Denoiser
     params: Params
-    engine: str
+    backend: str
 
 
 def subjects(denoisers: Sequence[Candidate], *, quick: bool = False) -> Iterator[Subject]:
-    """Denoisers whose step has the parts below, in plain XLA and in each available engine (``quick``: only XLA).
+    """Denoisers whose step has the parts below, in plain XLA and in each available backend (``quick``: only XLA).
 
     These are weights of ``ntd`` with its default options and any size of network: others change the parts.
     """
     method = steps.METHOD
-    fitting = [ENGINES[name] for name in method.engines if ENGINES[name].purpose == "inference"]
-    engines = ["reference", *(each.name for each in fitting if each.available() and not quick)]
+    fitting = [BACKENDS[name] for name in method.backends if BACKENDS[name].purpose == "inference"]
+    backends = ["reference", *(each.name for each in fitting if each.available() and not quick)]
     for each in denoisers:
         if each.method != method:
             continue
@@ -64,9 +64,9 @@ def subjects(denoisers: Sequence[Candidate], *, quick: bool = False) -> Iterator
         if dataclasses.replace(options, **kept) != ordinary:
             continue
         widths = steps.WIDTHS.get(options.size, options.size)
-        for engine in engines:
-            denoiser = method.factory(**{**each.options, "implementation": engine})
-            yield Subject(f"{each.label}, {engine}", widths, denoiser, each.params, engine)
+        for backend in backends:
+            denoiser = method.factory(**{**each.options, "implementation": backend})
+            yield Subject(f"{each.label}, {backend}", widths, denoiser, each.params, backend)
 
 
 def reproject(history: jax.Array, frame: Frame, noisy: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -104,7 +104,7 @@ def breakdown(subject: Subject, frame: Frame, *, rounds: int) -> dict[str, Timin
     if height % MULTIPLE or width % MULTIPLE:
         raise ValueError(f"frame: expected sides that are multiples of {MULTIPLE}, got {height} x {width}.")
     params = subject.params
-    network = unet(GROUPS, HEADS, widths=subject.widths, implementation=subject.engine)
+    network = unet(GROUPS, HEADS, widths=subject.widths, implementation=subject.backend)
 
     def predict(params: Params, frame: Frame, noisy: jax.Array, recalled: jax.Array, lost: jax.Array) -> Any:
         frame, _ = sanitize(frame)

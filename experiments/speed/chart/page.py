@@ -244,7 +244,7 @@ def _table(
         rows.append(row)
     return (
         '<section id="points"><h2>Every point</h2><p class="note">First calls compile. Peak memory is the growth '
-        "of the process during one call; what an engine keeps between calls (ONNX Runtime, Open Image Denoise) is not "
+        "of the process during one call; what a backend keeps between calls (ONNX Runtime, Open Image Denoise) is not "
         f"in it.</p>{_rows(head, rows)}</section>"
     )
 

@@ -13,7 +13,7 @@ from experiments.speed.timing import Call
 from experiments.speed.works import steps
 from jaxdn.core.frame import Frame, written_out
 from jaxdn.methods.registry import Method, methods
-from jaxdn.networks.engines import ENGINES
+from jaxdn.networks.backends import BACKENDS
 from jaxdn.zoo import ready
 from jaxdn.zoo.ready import Candidate
 
@@ -66,8 +66,8 @@ def _place(candidate: Candidate) -> int:
 def _alternatives(method: Method) -> dict[str, dict[str, Any]]:
     """Variant -> options that change the step but not the weights."""
     found: dict[str, dict[str, Any]] = {}
-    for name in method.engines:
-        if ENGINES[name].purpose == "inference" and ENGINES[name].available():
+    for name in method.backends:
+        if BACKENDS[name].purpose == "inference" and BACKENDS[name].available():
             found[name] = {"implementation": name}
     if method.knows("compute_dtype"):
         found["bfloat16"] = {"compute_dtype": "bfloat16"}
@@ -117,9 +117,9 @@ def ways(denoisers: Sequence[Candidate], *, quick: bool = False) -> list[Way]:
 def left_out() -> list[str]:
     """Why some rows are missing here, in sentences."""
     sentences = [why for name, why in peers.missing().items() if name == "pyoidn"]
-    wanted = {name for method in methods().values() for name in method.engines}
-    for name, engine in ENGINES.items():
-        if name in wanted and engine.purpose == "inference" and not engine.available():
+    wanted = {name for method in methods().values() for name in method.backends}
+    for name, backend in BACKENDS.items():
+        if name in wanted and backend.purpose == "inference" and not backend.available():
             sentences.append(f"{name} is not installed or does not run on jax's device: its rows are left out.")
     for each in ready.everything():
         if _requests_samples(each):

@@ -22,7 +22,7 @@ from jaxdn.brdf import FLOOR
 from jaxdn.core.frame import FAR, RADIANCE_MAX, Frame
 from jaxdn.methods.reconstruction import TAPS
 from jaxdn.networks import LEVELS, Widths
-from jaxdn.networks.description import NEGATIVE_SLOPE
+from jaxdn.networks.graph import NEGATIVE_SLOPE
 
 FEATURES = 14
 """Compressed radiance 3, albedo 3, normal 3, depth 1, compressed history 3, missing history 1."""

@@ -21,6 +21,6 @@ class Work(NamedTuple):
     roofline: Sequence[Cost]
     rounds: int = 5
     alone: Mapping[str, Callable[[], Any]] = MappingProxyType({})
-    """Calls for measuring the peak memory, where they differ: for engines that keep memory between calls."""
+    """Calls for measuring the peak memory, where they differ: for backends that keep memory between calls."""
     huge_pages: frozenset[str] = frozenset()
     """Implementations whose large buffers are in huge pages."""

@@ -1,7 +1,7 @@
 """The performance-critical operations, forward and gradient: our implementations, PyTorch's, and the roofline.
 
 The default implementation (``implementation=None``) is called ``xla``; the others, except the reference, keep their
-names. An engine that is not installed is left out.
+names. A backend that is not installed is left out.
 """
 
 from collections.abc import Callable, Iterator
@@ -31,10 +31,10 @@ Arrays = Callable[[], list[np.ndarray]]
 
 def forms(operation: str) -> dict[str, str | None]:
     """Name in the results -> implementation; the default is ``xla``."""
-    engines = ["onednn"] if operation == "convolve" and library.available() else []
+    backends = ["onednn"] if operation == "convolve" and library.available() else []
     known, default = OPERATIONS[operation].implementations, OPERATIONS[operation].automatic()[0].name
     others = [name for name in known if name not in (REFERENCE, "onednn", default)]
-    return {"xla": None, **{f"xla-{name}": name for name in others}, **{name: name for name in engines}}
+    return {"xla": None, **{f"xla-{name}": name for name in others}, **{name: name for name in backends}}
 
 
 def jitted(function: Function, arrays: Arrays) -> Call:

@@ -1,4 +1,4 @@
-"""One recurrent ``ntd`` step at 1280x720: ours in each engine, the same network in PyTorch, Open Image Denoise."""
+"""One recurrent ``ntd`` step at 1280x720: ours in each backend, the same network in PyTorch, Open Image Denoise."""
 
 from collections.abc import Callable, Iterator
 from functools import cache, partial
@@ -15,7 +15,7 @@ from jaxdn.core.frame import Frame, frame_at
 from jaxdn.denoiser import Denoiser
 from jaxdn.methods.registry import method_named
 from jaxdn.networks import LARGE, SMALL
-from jaxdn.networks.engines import ENGINES, Purpose
+from jaxdn.networks.backends import BACKENDS, Purpose
 
 HEIGHT, WIDTH = 720, 1280
 WIDTHS = {"large": LARGE, "small": SMALL}
@@ -26,9 +26,9 @@ PLAIN = {"kernels": "plain", "background": "filter", "exposure": "given", "initi
 
 
 def implementations(purpose: Purpose) -> dict[str, dict[str, Any]]:
-    """Name in the results -> options of the method: XLA, and its engines for this purpose."""
-    engines = [name for name in METHOD.engines if ENGINES[name].purpose == purpose]
-    return {"xla": {}, **{name: {"implementation": name} for name in engines}}
+    """Name in the results -> options of the method: XLA, and its backends for this purpose."""
+    backends = [name for name in METHOD.backends if BACKENDS[name].purpose == purpose]
+    return {"xla": {}, **{name: {"implementation": name} for name in backends}}
 
 
 def program(denoiser: Denoiser) -> Callable[..., Any]:

@@ -13,7 +13,7 @@ from experiments.speed.timing import Call
 from experiments.speed.works import Work, scene
 from experiments.speed.works.steps import METHOD, PLAIN, WIDTHS, implementations
 from jaxdn.core.frame import Clip
-from jaxdn.networks.engines import ENGINES
+from jaxdn.networks.backends import BACKENDS
 from jaxdn.recipes.recipe import Recipe
 from jaxdn.training.step import initial_state, make_train_step
 
@@ -56,7 +56,7 @@ def pytorch(size: str, crop: int, recipe: Recipe = RECIPE, *, compiled: bool) ->
 
 
 def works() -> Iterator[Work]:
-    """``train-large-64`` and so on: plain, with each engine for training available here, rematerialised, and with huge
+    """``train-large-64`` and so on: plain, with each backend for training available here, rematerialised, and with huge
     pages, which ``make train`` asks for."""
     lacking = peers.missing()
     forms = implementations("training").items()
@@ -64,7 +64,7 @@ def works() -> Iterator[Work]:
         mine: dict[str, Callable[[], Call]] = {
             name: partial(ours, size, crop, **options)
             for name, options in forms
-            if name not in ENGINES or ENGINES[name].available()
+            if name not in BACKENDS or BACKENDS[name].available()
         }
         pages: dict[str, Callable[[], Call]] = {}
         others: dict[str, Callable[[], Call]] = {}

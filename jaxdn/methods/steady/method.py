@@ -37,7 +37,7 @@ from jaxdn.methods.steady.accumulation import accumulated, remembered
 from jaxdn.methods.steady.fireflies import dimmed
 from jaxdn.methods.steady.levels import BLOCKS, LEVELS, Decisions, Surfaces, filtered, reach, slanted, surfaces_of
 from jaxdn.methods.steady.network_input import CHANNELS, DARK, History, seen
-from jaxdn.networks import Widths, crop, description, pad
+from jaxdn.networks import Widths, crop, graph, pad
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.layout.planar import join_planes, planar
@@ -91,7 +91,7 @@ class Options:
     demodulate: Demodulation | bool = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     implementation: Literal["reference", "onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"] | None = None
-    """Engine of the U-Net: XLA, or on CPUs oneDNN in bfloat16 or float32 or ONNX Runtime (inference) or oneDNN
+    """Backend of the U-Net: XLA, or on CPUs oneDNN in bfloat16 or float32 or ONNX Runtime (inference) or oneDNN
     (training). None is XLA."""
 
 
@@ -110,7 +110,7 @@ class SteadyState(NamedTuple):
     title="A steady recurrent filter guided by a network at half resolution",
     recipes={"usual": Recipe(pyramid_illumination()), "finish": FINISH},
     variants={f"steady-{quality}": {"quality": quality} for quality in QUALITIES},
-    engines=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
+    backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
 )
 def steady(options: Options) -> Denoiser:
     """The denoiser.
@@ -172,7 +172,7 @@ def steady(options: Options) -> Denoiser:
         surfaces = surfaces_of(frame)
         return measure_frame(_noisy(frame, _known(frame, surfaces)), surfaces.depth, frame)
 
-    network_sees = 2 * description.reach(description.unet(1, heads, widths=quality.widths, head_size=1))
+    network_sees = 2 * graph.receptive_field_radius(graph.unet(1, heads, widths=quality.widths, head_size=1))
     far = reach(quality.full_levels, back=quality.back, at_once=quality.at_once)
     core = Core(start, step, reads, init, measure=measure, reach=network_sees + far, counted=True)
     return demodulated(recurrent(core), by=options.demodulate)

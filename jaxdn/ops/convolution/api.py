@@ -2,7 +2,7 @@
 
 A convolution is linear in the image and in the kernel, and its gradients are of the same kind: that by the image is
 the convolution of the cotangent with the turned kernel; that by the kernel is a sum over pixels, linear in the image
-and in the cotangent, whose own gradients are convolutions again. An engine is therefore two functions, and all
+and in the cotangent, whose own gradients are convolutions again. A backend is therefore two functions, and all
 derivatives follow (:func:`_differentiable`).
 
 XLA:CPU runs plain NHWC/HWIO convolutions fast, but not those of automatic differentiation inside ``lax.scan`` (28 times
@@ -49,7 +49,7 @@ def _differentiable(name: str, forward: Product, kernel_gradient: Product) -> Pr
     that share a kernel become one longer array of images, so the kernel's gradient is one product of all of them.
 
     Args:
-      name: of the engine.
+      name: of the backend.
       forward: (x [N, H, W, Ci], kernel [3, 3, Ci, Co]) -> [N, H, W, Co].
       kernel_gradient: (x, cotangent [N, H, W, Co]) -> ``sum_p x(p + offset) cotangent(p)``, [3, 3, Ci, Co].
     """

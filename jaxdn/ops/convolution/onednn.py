@@ -36,10 +36,10 @@ class _Convolution:
     def __init__(self, direction: str, count: int, height: int, width: int, inputs: int, outputs: int) -> None:
         x, y = (dnnl.images(count, height, width, channels) for channels in (inputs, outputs))
         ours, dims = dnnl.kernels(3, inputs, outputs)
-        free = dnnl.made("dnnl_memory_desc_create_with_tag", 4, dims, dnnl.FLOAT32, dnnl.ANY_LAYOUT)
+        free = dnnl.create("dnnl_memory_desc_create_with_tag", 4, dims, dnnl.FLOAT32, dnnl.ANY_LAYOUT)
         window = (_ONE, _ZERO, _ONE, _ONE)  # stride, dilation, zeros before and after
         cpu, ours_alone = dnnl.engine()[0], dnnl.attributes()
-        forward = dnnl.made(
+        forward = dnnl.create(
             "dnnl_convolution_forward_primitive_desc_create",
             *(cpu, dnnl.TRAINING, dnnl.DIRECT, x, free, None, y, *window, ours_alone),
         )
@@ -47,13 +47,13 @@ class _Convolution:
         roles = dnnl.SOURCE, dnnl.WEIGHTS, dnnl.DESTINATION
         backward = direction == "kernel gradient"
         if backward:
-            description = dnnl.made(
+            description = dnnl.create(
                 "dnnl_convolution_backward_weights_primitive_desc_create",
                 *(cpu, dnnl.DIRECT, x, free, None, y, *window, forward, ours_alone),
             )
             query = dnnl.ASK_WEIGHTS_GRADIENT
             roles = dnnl.SOURCE, dnnl.WEIGHTS_GRADIENT, dnnl.DESTINATION_GRADIENT
-        theirs = dnnl.asked(description, query)
+        theirs = dnnl.query(description, query)
         # Memory without an address: it is set at every call.
         self._given = [dnnl.memory(each) for each in (x, ours, y)]
         inside = dnnl.memory(theirs, dnnl.OWN_MEMORY)
@@ -87,7 +87,7 @@ def _kernel_gradient(context: Any, out: Any, x: Any, cotangent: Any) -> None:
 def _run(direction: str, x: Any, kernel: Any, y: Any) -> None:
     buffers = [np.asarray(each) for each in (x, kernel, y)]
     run = _made_once(direction, *buffers[0].shape, buffers[2].shape[-1])
-    with dnnl.ALONE:
+    with dnnl.LOCK:
         run(*map(dnnl.address, buffers))
 
 

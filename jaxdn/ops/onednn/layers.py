@@ -1,4 +1,4 @@
-"""oneDNN's layers for inference: convolutions with all that follows them, pooling, enlarging.
+"""oneDNN's layers for inference: convolutions with all that follows them, pooling, upsampling.
 
 Activations are [N, H, W, C] in float32 or bfloat16, sums are float32. Each function describes a layer and converts its
 weights once; the result is placed on memory and called. The library: :mod:`jaxdn.ops.onednn.library`.
@@ -28,7 +28,7 @@ def convolution(
     kind: int,
     slope: float | None = None,
     adds: bool = False,
-    enlarges: bool = False,
+    upsamples: bool = False,
 ) -> Placed:
     """A convolution, stride 1, zeros outside.
 
@@ -40,24 +40,24 @@ def convolution(
       kind: the type in which the kernel is kept and multiplied, that of the images that are read.
       slope: that of a leaky rectifier of the result; None: none.
       adds: it adds to what is there.
-      enlarges: it is one by a 3x3 kernel of the images after :func:`enlarging`, with 4/9 of the operations.
+      upsamples: it is one by a 3x3 kernel of the images after :func:`upsampling`, with 4/9 of the operations.
     """
-    if enlarges:
-        kernel, name, algorithm = _of_enlarged(kernel), "dnnl_deconvolution_forward", _TRANSPOSED
+    if upsamples:
+        kernel, name, algorithm = _of_upsampled(kernel), "dnnl_deconvolution_forward", _TRANSPOSED
     else:
         name, algorithm = "dnnl_convolution_forward", dnnl.DIRECT
     size, _, inputs, outputs = kernel.shape
-    stride, edge = (2, 1) if enlarges else (1, size // 2)
+    stride, edge = (2, 1) if upsamples else (1, size // 2)
     ours, dims = dnnl.kernels(size, inputs, outputs)
-    free = dnnl.made("dnnl_memory_desc_create_with_tag", 4, dims, kind, dnnl.ANY_LAYOUT)
-    row = dnnl.made("dnnl_memory_desc_create_with_tag", 1, dnnl.Dims(outputs), dnnl.FLOAT32, dnnl.ROW)
+    free = dnnl.create("dnnl_memory_desc_create_with_tag", 4, dims, kind, dnnl.ANY_LAYOUT)
+    row = dnnl.create("dnnl_memory_desc_create_with_tag", 1, dnnl.Dims(outputs), dnnl.FLOAT32, dnnl.ROW)
     edges = dnnl.Dims(edge, edge)
-    description = dnnl.made(
+    description = dnnl.create(
         f"{name}_primitive_desc_create",
         *(dnnl.engine()[0], dnnl.INFERENCE, algorithm, reads, free, None if bias is None else row, writes),
         *(dnnl.Dims(stride, stride), dnnl.Dims(0, 0), edges, edges, _followed_by(slope, adds)),
     )
-    theirs = dnnl.asked(description, dnnl.ASK_WEIGHTS)
+    theirs = dnnl.query(description, dnnl.ASK_WEIGHTS)
     given = np.ascontiguousarray(kernel, np.float32)
     source, inside = dnnl.memory(ours, dnnl.address(given)), dnnl.memory(theirs, dnnl.OWN_MEMORY)
     dnnl.Primitive(dnnl.reorder(ours, theirs), (dnnl.SOURCE, source), (dnnl.DESTINATION, inside))()
@@ -71,10 +71,10 @@ def convolution(
     return _placed(description, weights)
 
 
-def _of_enlarged(kernel: np.ndarray) -> np.ndarray:
-    """[4, 4, inputs, outputs] of a transposed convolution of stride 2, which is one by a 3x3 kernel of enlarged images.
+def _of_upsampled(kernel: np.ndarray) -> np.ndarray:
+    """[4, 4, inputs, outputs] of the transposed convolution of stride 2 that equals upsampling and a 3x3 convolution.
 
-    Three enlarged pixels in a row are two of before: the weights of those that are equal are added. The result is the
+    Three upsampled pixels in a row are two of before: the weights of those that are equal are added. The result is the
     3x3 kernel, turned, summed over windows of 2x2.
     """
     for axis in (0, 1):
@@ -87,7 +87,7 @@ def pooling(reads: c_void_p, writes: c_void_p) -> Placed:
     """The maximum of each 2x2 block."""
     two, none = dnnl.Dims(2, 2), dnnl.Dims(0, 0)
     return _placed(
-        dnnl.made(
+        dnnl.create(
             "dnnl_pooling_forward_primitive_desc_create",
             *(dnnl.engine()[0], dnnl.INFERENCE, _MAXIMUM, reads, writes, two, two, none, none, none),
             dnnl.attributes(),
@@ -95,10 +95,10 @@ def pooling(reads: c_void_p, writes: c_void_p) -> Placed:
     )
 
 
-def enlarging(reads: c_void_p, writes: c_void_p) -> Placed:
+def upsampling(reads: c_void_p, writes: c_void_p) -> Placed:
     """Every pixel repeated 2x2 times."""
     return _placed(
-        dnnl.made(
+        dnnl.create(
             "dnnl_resampling_forward_primitive_desc_create",
             *(dnnl.engine()[0], dnnl.INFERENCE, _NEAREST, None, reads, writes, dnnl.attributes()),
         )
@@ -107,7 +107,7 @@ def enlarging(reads: c_void_p, writes: c_void_p) -> Placed:
 
 def _followed_by(slope: float | None, adds: bool) -> c_void_p:
     """Attributes of a layer: first the sum with what is there, then the rectifier."""
-    after = dnnl.made("dnnl_post_ops_create")
+    after = dnnl.create("dnnl_post_ops_create")
     if adds:
         dnnl.call("dnnl_post_ops_append_sum", after, c_float(1.0), 0, _SAME_TYPE)
     if slope is not None:

@@ -36,7 +36,7 @@ OWN_MEMORY, NO_MEMORY = c_void_p(-1), c_void_p(None)
 
 Dims = c_int64 * 12
 
-ALONE = threading.Lock()
+LOCK = threading.Lock()
 """One layer at a time: each uses all cores, and layers of one shape share their buffers."""
 
 
@@ -85,7 +85,7 @@ def computes_bfloat16() -> bool:
     return bool(library().dnnl_get_effective_cpu_isa() & _HAS_BFLOAT16)
 
 
-def trains_faster() -> bool:
+def training_is_faster() -> bool:
     """Whether training with oneDNN's convolutions takes less time than in XLA, which it does on CPUs with AVX-512.
 
     A step takes 0.7 to 1.0 of XLA's time there, and 1.02 to 1.5 times as long with AVX2 alone. False where the library
@@ -108,7 +108,7 @@ def call(function: str, *arguments: Any) -> None:
         raise RuntimeError(f"oneDNN: {function} failed with status {status}.")
 
 
-def made(function: str, *arguments: Any) -> c_void_p:
+def create(function: str, *arguments: Any) -> c_void_p:
     """What a ``dnnl_..._create`` function puts into its first argument."""
     place = c_void_p()
     call(function, byref(place), *arguments)
@@ -118,8 +118,8 @@ def made(function: str, *arguments: Any) -> c_void_p:
 @functools.cache
 def engine() -> tuple[c_void_p, c_void_p]:
     """The CPU, and a stream of work for it. Neither is ever freed: they live as long as the process."""
-    cpu = made("dnnl_engine_create", _CPU, c_size_t(0))
-    return cpu, made("dnnl_stream_create", cpu, _IN_ORDER)
+    cpu = create("dnnl_engine_create", _CPU, c_size_t(0))
+    return cpu, create("dnnl_stream_create", cpu, _IN_ORDER)
 
 
 def new_attributes() -> c_void_p:
@@ -128,7 +128,7 @@ def new_attributes() -> c_void_p:
     The library's own belongs to the thread that creates a primitive, and XLA calls back from any of its threads: there
     it would be missing, and the primitive would write to address 0.
     """
-    found = made("dnnl_primitive_attr_create")
+    found = create("dnnl_primitive_attr_create")
     call("dnnl_primitive_attr_set_scratchpad_mode", found, _USER_SCRATCHPAD)
     return found
 
@@ -141,24 +141,24 @@ def images(count: int, height: int, width: int, channels: int, dtype: int = FLOA
     """Describes [N, H, W, C] in memory; oneDNN's dimensions are N, C, H, W for any order in memory."""
     strides = Dims(height * width * channels, 1, width * channels, channels)
     dims = Dims(count, channels, height, width)
-    return made("dnnl_memory_desc_create_with_strides", 4, dims, dtype, strides)
+    return create("dnnl_memory_desc_create_with_strides", 4, dims, dtype, strides)
 
 
 def kernels(size: int, inputs: int, outputs: int) -> tuple[c_void_p, Any]:
     """Describes [size, size, inputs, outputs] in memory, float32; and oneDNN's dimensions of it."""
     dims = Dims(outputs, inputs, size, size)
     strides = Dims(1, outputs, size * inputs * outputs, inputs * outputs)
-    return made("dnnl_memory_desc_create_with_strides", 4, dims, FLOAT32, strides), dims
+    return create("dnnl_memory_desc_create_with_strides", 4, dims, FLOAT32, strides), dims
 
 
-def asked(description: c_void_p, what: int) -> c_void_p:
+def query(description: c_void_p, what: int) -> c_void_p:
     """The memory that a primitive wants, by one of the numbers ``ASK_...``."""
     return c_void_p(library().dnnl_primitive_desc_query_md(description, what, 0))
 
 
 def memory(description: c_void_p, place: c_void_p | int = NO_MEMORY) -> c_void_p:
     """Memory at an address, of the library's own, or without an address."""
-    return made("dnnl_memory_create", description, engine()[0], c_void_p(place) if isinstance(place, int) else place)
+    return create("dnnl_memory_create", description, engine()[0], c_void_p(place) if isinstance(place, int) else place)
 
 
 def set_address(given: c_void_p, place: int) -> None:
@@ -170,8 +170,8 @@ class Primitive:
     """Work for the library: a described primitive and its arguments, by their roles."""
 
     def __init__(self, description: c_void_p, *given: tuple[int, c_void_p], scratch: c_void_p = OWN_MEMORY) -> None:
-        self._primitive, self._stream = made("dnnl_primitive_create", description), engine()[1]
-        needed = asked(description, ASK_SCRATCHPAD)
+        self._primitive, self._stream = create("dnnl_primitive_create", description), engine()[1]
+        needed = query(description, ASK_SCRATCHPAD)
         self.scratch_bytes = int(library().dnnl_memory_desc_get_size(needed))
         """Of its working memory, which ``scratch`` places."""
         self.scratch = memory(needed, scratch)
@@ -186,7 +186,7 @@ class Primitive:
 def reorder(source: c_void_p, target: c_void_p) -> c_void_p:
     """Describes the primitive that copies between two layouts or types."""
     cpu = engine()[0]
-    return made("dnnl_reorder_primitive_desc_create", source, cpu, target, cpu, attributes())
+    return create("dnnl_reorder_primitive_desc_create", source, cpu, target, cpu, attributes())
 
 
 def aligned(size: int) -> np.ndarray:

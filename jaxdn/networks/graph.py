@@ -4,13 +4,15 @@ from collections.abc import Mapping, Sequence
 from itertools import accumulate
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
+import numpy as np
+
 from jaxdn.networks import LEVELS, Widths
 
 NEGATIVE_SLOPE = 0.01
 RECURRENT_SLOPE = 0.1
 """Of the recurrent autoencoder."""
 FEATURES = "features"
-"""What a network sees, which only convolutions read: an engine may add channels to it."""
+"""What a network sees, which only convolutions read: a backend may add channels to it."""
 
 Value = TypeVar("Value")
 Weights = Mapping[str, Mapping[str, Any]]
@@ -20,7 +22,7 @@ Weights = Mapping[str, Mapping[str, Any]]
 class Layer(NamedTuple):
     """A layer; its result is [N, H >> depth, W >> depth, channels]."""
 
-    kind: Literal["input", "convolution", "rectifier", "pool", "enlarge"]
+    kind: Literal["input", "convolution", "rectifier", "pool", "upsample"]
     inputs: tuple[str, ...]
     """The layers that it reads; a convolution reads several as if they were joined, channel after channel."""
     channels: int
@@ -31,7 +33,7 @@ class Layer(NamedTuple):
     """A rectifier's, of negative values."""
 
 
-class Description(NamedTuple):
+class GraphSpec(NamedTuple):
     """Layers by name, each after those that it reads, and the names of the outputs."""
 
     layers: dict[str, Layer]
@@ -46,24 +48,31 @@ class Description(NamedTuple):
         }
 
 
-def output_shapes(network: Description, shape: Sequence[int]) -> list[tuple[int, ...]]:
+def output_shapes(network: GraphSpec, shape: Sequence[int]) -> list[tuple[int, ...]]:
     """Of the outputs [N, H >> depth, W >> depth, channels], for features of ``shape`` [N, H, W, c]."""
     ends = [network.layers[name] for name in network.outputs]
     return [(shape[0], shape[1] >> end.depth, shape[2] >> end.depth, end.channels) for end in ends]
 
 
-def reach(network: Description) -> int:
+def receptive_field_radius(network: GraphSpec) -> int:
     """How many pixels away the outputs see, on each side, at the resolution of the input."""
     found: dict[str, int] = {}
     for name, layer in network.layers.items():
-        # An enlarged pixel is one of a block, which sees around the whole block; a pooled one is its block.
-        own = {"convolution": layer.size // 2, "enlarge": 1}.get(layer.kind, 0) << layer.depth
+        # An upsampled pixel is one of a block, which sees around the whole block; a pooled one is its block.
+        own = {"convolution": layer.size // 2, "upsample": 1}.get(layer.kind, 0) << layer.depth
         found[name] = own + max((found[each] for each in layer.inputs), default=0)
     return max(found[name] for name in network.outputs)
 
 
-class Operations(Protocol[Value]):
-    """An engine: what it does for each kind of layer. Its values are arrays, or the names of what will be arrays."""
+def same_weights(new: Sequence[np.ndarray], old: Sequence[np.ndarray]) -> bool:
+    """Whether two lists of arrays are equal, bit for bit: backends keep what they made for the weights of a call."""
+    return len(new) == len(old) and all(
+        np.array_equal(one.view(np.int32), other.view(np.int32)) for one, other in zip(new, old, strict=True)
+    )
+
+
+class LayerBackend(Protocol[Value]):
+    """A backend: what it does for each kind of layer. Its values are arrays, or the names of what will be arrays."""
 
     def convolution(self, inputs: Sequence[Value], kernels: Sequence[Any], bias: Any) -> Value:
         """The sum of the inputs' convolutions, each with its part of the kernel: stride 1, zeros outside."""
@@ -74,12 +83,12 @@ class Operations(Protocol[Value]):
     def pool(self, x: Value) -> Value:
         """The maximum of each 2x2 block."""
 
-    def enlarge(self, x: Value) -> Value:
+    def upsample(self, x: Value) -> Value:
         """Every pixel repeated 2x2 times."""
 
 
 def evaluate(
-    network: Description, weights: Weights, inputs: Mapping[str, Value], operations: Operations[Value]
+    network: GraphSpec, weights: Weights, inputs: Mapping[str, Value], backend: LayerBackend[Value]
 ) -> tuple[Value, ...]:
     """The outputs for the values of all inputs, layer by layer."""
     values = dict(inputs)
@@ -89,15 +98,15 @@ def evaluate(
             kernel, bias = weights[name]["kernel"], weights[name]["bias"]
             ends = list(accumulate(network.layers[each].channels for each in layer.inputs))
             kernels = [kernel[:, :, first:last] for first, last in zip([0, *ends], ends, strict=False)]
-            values[name] = operations.convolution(read, kernels, bias)
+            values[name] = backend.convolution(read, kernels, bias)
         elif layer.kind == "rectifier":
-            values[name] = operations.rectifier(read[0], layer.slope)
+            values[name] = backend.rectifier(read[0], layer.slope)
         elif layer.kind != "input":
-            values[name] = getattr(operations, layer.kind)(*read)
+            values[name] = getattr(backend, layer.kind)(*read)
     return tuple(values[name] for name in network.outputs)
 
 
-class _Draft:
+class _GraphBuilder:
     """A description in the making."""
 
     def __init__(self, inputs: int) -> None:
@@ -106,7 +115,7 @@ class _Draft:
     def add(self, name: str, kind: Any, *read: str, channels: int = 0, size: int = 0, **more: Any) -> str:
         """A layer that reads others; its name."""
         below = self.layers[read[0]]
-        depth = below.depth + {"pool": 1, "enlarge": -1}.get(kind, 0)
+        depth = below.depth + {"pool": 1, "upsample": -1}.get(kind, 0)
         self.layers[name] = Layer(kind, read, channels or below.channels, depth, size, **more)
         return name
 
@@ -118,25 +127,27 @@ class _Draft:
         return read[0]
 
 
-def unet(inputs: int, heads: Sequence[int], *, widths: Widths, head_size: Literal[1, 3]) -> Description:
+def unet(inputs: int, heads: Sequence[int], *, widths: Widths, head_size: Literal[1, 3]) -> GraphSpec:
     """The U-Net: five resolution levels, heads on the last decoder levels, from full resolution down.
 
     Architecture (Zeng et al. 2021, sec. 4.3 and fig. 6, after Hasselgren et al. 2020): 3x3 convolutions, LeakyReLU, 2x2
     max-pooling down, nearest upsampling and skip concatenation up. The papers give no widths.
     """
-    draft = _Draft(inputs)
-    skips = [draft.level("encoder_0", widths[0], FEATURES)]
+    builder = _GraphBuilder(inputs)
+    skips = [builder.level("encoder_0", widths[0], FEATURES)]
     for depth in range(1, LEVELS):
-        skips.append(draft.level(f"encoder_{depth}", widths[depth], draft.add(f"pool_{depth}", "pool", skips[-1])))
+        skips.append(builder.level(f"encoder_{depth}", widths[depth], builder.add(f"pool_{depth}", "pool", skips[-1])))
     x = skips.pop()
     for depth in reversed(range(LEVELS - 1)):
-        x = draft.level(f"decoder_{depth}", widths[depth], draft.add(f"enlarge_{depth}", "enlarge", x), skips[depth])
+        x = builder.level(
+            f"decoder_{depth}", widths[depth], builder.add(f"upsample_{depth}", "upsample", x), skips[depth]
+        )
         if depth < len(heads):
-            draft.add(f"head_{depth}", "convolution", x, channels=heads[depth], size=head_size)
-    return Description(draft.layers, tuple(f"head_{depth}" for depth in range(len(heads))))
+            builder.add(f"head_{depth}", "convolution", x, channels=heads[depth], size=head_size)
+    return GraphSpec(builder.layers, tuple(f"head_{depth}" for depth in range(len(heads))))
 
 
-def recurrent_unet(inputs: int, outputs: int, *, widths: Widths) -> Description:
+def recurrent_unet(inputs: int, outputs: int, *, widths: Widths) -> GraphSpec:
     """The recurrent autoencoder: a U-Net whose encoder remembers (Chaitanya et al. 2017, sec. 3.2 and fig. 4).
 
     ``widths``: first the channels of each encoder stage, from full resolution down; then the channels of each decoder
@@ -145,21 +156,21 @@ def recurrent_unet(inputs: int, outputs: int, *, widths: Widths) -> Description:
     output and its hidden state in the next frame. The inputs ``hidden_K`` are the states of the stages; outputs are the
     head "output", then the stages' new states.
     """
-    draft = _Draft(inputs)
+    builder = _GraphBuilder(inputs)
     stages, decoder = widths[0], widths[1:]
     states: list[str] = []
     for depth, channels in enumerate(stages):
-        below = draft.add(f"pool_{depth}", "pool", states[-1]) if depth else FEATURES
-        draft.layers[hidden(depth)] = Layer("input", (), channels, depth)
+        below = builder.add(f"pool_{depth}", "pool", states[-1]) if depth else FEATURES
+        builder.layers[hidden(depth)] = Layer("input", (), channels, depth)
         name, slope = f"encoder_{depth}", RECURRENT_SLOPE
-        block = draft.level(name, (channels, channels), below, slope=slope)
-        states.append(draft.level(name, (channels, channels), block, hidden(depth), first=2, slope=slope))
+        block = builder.level(name, (channels, channels), below, slope=slope)
+        states.append(builder.level(name, (channels, channels), block, hidden(depth), first=2, slope=slope))
     x = states[-1]
     for level, depth in zip(decoder, reversed(range(len(decoder))), strict=True):
-        larger = draft.add(f"enlarge_{depth}", "enlarge", x)
-        x = draft.level(f"decoder_{depth}", level, larger, states[depth], slope=RECURRENT_SLOPE)
-    head = draft.add("output", "convolution", x, channels=outputs, size=3)
-    return Description(draft.layers, (head, *states))
+        larger = builder.add(f"upsample_{depth}", "upsample", x)
+        x = builder.level(f"decoder_{depth}", level, larger, states[depth], slope=RECURRENT_SLOPE)
+    head = builder.add("output", "convolution", x, channels=outputs, size=3)
+    return GraphSpec(builder.layers, (head, *states))
 
 
 def hidden(stage: int) -> str:

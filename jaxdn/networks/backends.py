@@ -1,4 +1,4 @@
-"""The engines that can run a network instead of plain XLA, and their purposes."""
+"""The backends that can run a network instead of plain XLA, and their purposes."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -9,7 +9,7 @@ from jaxdn.ops.onednn import library
 Purpose = Literal["inference", "training"]
 
 
-class Engine(NamedTuple):
+class Backend(NamedTuple):
     """A value of a network's option ``implementation``; their features and results are float32."""
 
     name: str
@@ -21,9 +21,9 @@ class Engine(NamedTuple):
     """Whether it is faster than XLA here, if it can run: else it is used only on request."""
 
 
-ENGINES: dict[str, Engine] = {
-    "onednn-bfloat16": Engine("onednn-bfloat16", "inference", onednn.computes_bfloat16),
-    "onednn-float32": Engine("onednn-float32", "inference", library.available),
-    "onnxruntime": Engine("onnxruntime", "inference", onnx.available),
-    "onednn": Engine("onednn", "training", library.available, library.trains_faster),
+BACKENDS: dict[str, Backend] = {
+    "onednn-bfloat16": Backend("onednn-bfloat16", "inference", onednn.computes_bfloat16),
+    "onednn-float32": Backend("onednn-float32", "inference", library.available),
+    "onnxruntime": Backend("onnxruntime", "inference", onnx.available),
+    "onednn": Backend("onednn", "training", library.available, library.training_is_faster),
 }

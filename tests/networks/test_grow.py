@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxdn.networks.grow import grow
 from jaxdn.networks.unet import unet
-from jaxdn.networks.widen import widen
 from jaxdn.zoo.weights import flatten, unflatten
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -29,7 +29,7 @@ def features(rng):
 
 def larger(trained, widths, groups=GROUPS):
     network = unet(groups, HEADS, widths=widths)
-    return network, unflatten(widen(trained, flatten(network.init(jax.random.key(1)))))
+    return network, unflatten(grow(trained, flatten(network.init(jax.random.key(1)))))
 
 
 def test_wider_levels_and_more_inputs_change_no_output(trained, features):
@@ -67,4 +67,4 @@ def test_one_convolution_more_changes_outputs_by_its_rectifier_alone(trained, fe
 def test_a_smaller_or_another_network_is_refused(trained, widths, heads, message):
     initial = flatten(unet(GROUPS, heads, widths=widths).init(jax.random.key(1)))
     with pytest.raises(ValueError, match=message):
-        widen(trained, initial)
+        grow(trained, initial)

@@ -12,7 +12,7 @@ from jaxdn.networks import LEVELS
 Flat = dict[str, np.ndarray]
 
 
-def widen(trained: Flat, larger: Flat) -> Flat:
+def grow(trained: Flat, larger: Flat) -> Flat:
     """The weights ``larger`` with those of a smaller network in their first channels.
 
     Args:
