@@ -61,7 +61,7 @@ def train(clips: Path, folder: Path, sizes: Sizes) -> None:
 
     from jaxdn.clips import training_batches
     from jaxdn.methods.registry import method_named
-    from jaxdn.training.loop import fit
+    from jaxdn.training.loop import Every, fit
     from jaxdn.zoo.weights import save_weights
 
     jax.config.update("jax_compilation_cache_dir", str(clips.parent / "programs"))
@@ -73,7 +73,7 @@ def train(clips: Path, folder: Path, sizes: Sizes) -> None:
         clips, buffers=denoiser.reads, batch=recipe.batch, crop=recipe.crop, frames=recipe.frames, seed=recipe.seed
     )
     every = sizes.checkpoint_every
-    state = fit(denoiser, recipe, batches, folder, label="killed", log_every=1, checkpoint_every=every)
+    state = fit(denoiser, recipe, batches, folder, label="killed", every=Every(1, checkpoint=every))
     save_weights(folder / "weights.safetensors", state.params, factory=method.name, options={"size": WIDTHS}, record={})
 
 

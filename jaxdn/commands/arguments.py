@@ -152,7 +152,8 @@ class Train:
     """Folder of held-out clips, or a file of `jaxdn pack`, for validation, used whole; its PSNR is free of the noise of
     references that keep one half (those of `jaxdn render` do)."""
     method: str = "ntd"
-    """Method to train; an unknown name lists the available ones."""
+    """Method to train, by default ntd (`jaxdn denoise` takes steady-balanced by default, of the method steady); an
+    unknown name lists the available ones."""
     variant: str | None = None
     """One of the method's variants (ntd-large, ntd-small); default: the fastest."""
     set: list[str] = field(default_factory=list)
@@ -208,7 +209,8 @@ class Denoise:
     """Folder for the denoised frames; for a single frame, also the name of an EXR file."""
     method: str = "steady-balanced"
     """Shipped weights (ntd-large, ntd-small, relax-fitted, steady-balanced, steady-fast, steady-high, svgf-fitted), a
-    filter (svgf, asvgf, taa), or the path of a .safetensors file; an unknown name lists all."""
+    filter (svgf, asvgf, taa), or the path of a .safetensors file; an unknown name lists all. By default
+    steady-balanced, while `jaxdn train` trains ntd."""
     bidirectional: bool = False
     """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
     frames are about as good as the last."""

@@ -81,14 +81,14 @@ def clip_loss(
     return loss, metrics.psnr(color.tonemap(last), color.tonemap(clip.reference[-1]))
 
 
-def initial_state(denoiser: Denoiser, recipe: Recipe, batch: Clip) -> TrainState:
+def init_state(denoiser: Denoiser, recipe: Recipe, batch: Clip) -> TrainState:
     """Parameters drawn with the recipe's seed and a new optimiser state; ``batch`` gives the shapes."""
     frame = jax.tree.map(lambda buffer: buffer[0, 0], batch.frames)
     params = denoiser.init(jax.random.key(recipe.seed), frame)
-    return begun(params, recipe)
+    return init_state_from(params, recipe)
 
 
-def begun(params: Params, recipe: Recipe) -> TrainState:
+def init_state_from(params: Params, recipe: Recipe) -> TrainState:
     """The state before the first update of given parameters."""
     zero = jnp.zeros((), jnp.int32)
     return TrainState(params, jax.tree.map(jnp.copy, params), optimizer(recipe).init(params), zero, jnp.copy(zero))

@@ -1,16 +1,15 @@
 """``jaxdn train``: a learned method, trained on rendered clips."""
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxdn.core.frame import Clip
 from jaxdn.data.training.dataset import training_batches
 from jaxdn.denoiser import Denoiser
 from jaxdn.methods.registry import Method
 from jaxdn.recipes.recipe import Recipe
-from jaxdn.training.loop import Start, begun_with, fit
+from jaxdn.training.loop import InitialWeights, ResumableBatches, fit, read_resumed_from
 from jaxdn.training.validation import load_validation
 from jaxdn.zoo.weights import save_weights, starting_params
 
@@ -61,17 +60,16 @@ def train(
         print(f"{label}: everything runs on XLA", flush=True)
     batches = recipe_batches(denoiser, recipe, clips)
     held_out = load_validation(denoiser, validation, spp=min(recipe.spp))
-    first = None if start is None else Start(str(start), starting_params(start, denoiser))
+    first = None if start is None else InitialWeights(str(start), starting_params(start, denoiser))
     state = fit(denoiser, recipe, batches, out, label=label, start=first, validation=held_out, time_limit=time_limit)
-    begun: dict[str, Any] = {} if first is None else {"start": first.name}
-    shorter = begun_with(out)
-    if shorter:
-        begun["begun_with"] = shorter
+    origin: dict[str, Any] = {} if first is None else {"start": first.name}
+    if earlier := read_resumed_from(out):
+        origin["begun_with"] = earlier
     about = {
         "recipe": recipe.record(),
         "updates": int(state.step),
         "skipped": int(state.skipped),
-        **begun,
+        **origin,
         **(record or {}),
     }
     return save_weights(
@@ -79,7 +77,7 @@ def train(
     )
 
 
-def recipe_batches(denoiser: Denoiser, recipe: Recipe, clips: Sequence[Path]) -> Iterator[Clip]:
+def recipe_batches(denoiser: Denoiser, recipe: Recipe, clips: Sequence[Path]) -> ResumableBatches:
     """The batches that a recipe asks for, with the buffers that the denoiser and the objective read, without end.
 
     ``clips`` are folders of clips, or packed sets.

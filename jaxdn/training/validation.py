@@ -10,11 +10,9 @@ import numpy as np
 
 from jaxdn import color, metrics
 from jaxdn.core.frame import Clip
-from jaxdn.data.clip.folder import find_clips
-from jaxdn.data.clip.noise_floor import other_half, read_halves
-from jaxdn.data.read import read_clip
-from jaxdn.data.training.cache import read_array, read_window
-from jaxdn.data.training.pack import open_pack
+from jaxdn.data.clip.noise_floor import other_half
+from jaxdn.data.training.cache import CachedClip, read_array, read_window
+from jaxdn.data.training.pack import open_clips
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.denoiser.rollout import denoise
 
@@ -22,7 +20,7 @@ LEAST_ERROR = 1e-6
 """Estimates of the mean squared error below it count as it (60 dB): where it is small they may be negative."""
 
 
-class HeldOut(NamedTuple):
+class ValidationClip(NamedTuple):
     """A clip to validate on."""
 
     clip: Clip
@@ -30,30 +28,21 @@ class HeldOut(NamedTuple):
     """Two independent references [T, H, W, 3] of half the samples each, linear; None where the clip keeps none."""
 
 
-def load_validation(denoiser: Denoiser, places: Sequence[Path], *, spp: int = 1) -> list[HeldOut]:
-    """Held-out clips of folders, and windows of packed sets, each read whole."""
-    layers, everything = denoiser.samples is not None, (slice(None),) * 3
-    found: list[HeldOut] = []
-    for place in places:
-        if not place.is_file():
-            for folder in find_clips(place):
-                found.append(_held_out(read_clip(folder, spp=spp, layers=layers), read_halves(folder)))
-            continue
-        for window in open_pack(place):
-            clip = read_window(window, everything, spp=spp, buffers=denoiser.reads, layers=layers)
-            halves = None
-            if "reference_half" in window.arrays:
-                first = read_array(window, "reference_half", everything)
-                halves = first, other_half(np.asarray(clip.reference), first)
-            found.append(_held_out(clip, halves))
-    return found
+def load_validation(denoiser: Denoiser, places: Sequence[Path], *, spp: int = 1) -> list[ValidationClip]:
+    """Clips of folders, and windows of packed sets, each read whole; opened as those to train on."""
+    return [_load(clip, denoiser, spp) for place in places for clip in open_clips(place)]
 
 
-def _held_out(clip: Clip, halves: tuple[np.ndarray, np.ndarray] | None) -> HeldOut:
-    return HeldOut(clip, None if halves is None else (jnp.asarray(halves[0]), jnp.asarray(halves[1])))
+def _load(cached: CachedClip, denoiser: Denoiser, spp: int) -> ValidationClip:
+    everything = (slice(None),) * 3
+    clip = read_window(cached, everything, spp=spp, buffers=denoiser.reads, layers=denoiser.samples is not None)
+    if "reference_half" not in cached.arrays:
+        return ValidationClip(clip, None)
+    first = read_array(cached, "reference_half", everything)
+    return ValidationClip(clip, (jnp.asarray(first), jnp.asarray(other_half(np.asarray(clip.reference), first))))
 
 
-def make_validation(denoiser: Denoiser, held_out: Sequence[HeldOut]) -> Callable[[Params], float]:
+def make_validation(denoiser: Denoiser, clips: Sequence[ValidationClip]) -> Callable[[Params], float]:
     """A function of the parameters: the mean over the clips of the PSNR of all their frames, tone-mapped, in dB.
 
     Free of the references' noise where clips keep halves of them (:func:`jaxdn.metrics.unbiased_mse`): references for
@@ -62,14 +51,14 @@ def make_validation(denoiser: Denoiser, held_out: Sequence[HeldOut]) -> Callable
     """
 
     @jax.jit
-    def error(params: Params, held: HeldOut) -> jax.Array:
-        image = color.tonemap(denoise(denoiser, params, held.clip))
-        if held.halves is None:
-            return metrics.mse(image, color.tonemap(held.clip.reference))
-        return metrics.unbiased_mse(image, *color.tonemap_halves(*held.halves))
+    def error(params: Params, one: ValidationClip) -> jax.Array:
+        image = color.tonemap(denoise(denoiser, params, one.clip))
+        if one.halves is None:
+            return metrics.mse(image, color.tonemap(one.clip.reference))
+        return metrics.unbiased_mse(image, *color.tonemap_halves(*one.halves))
 
     def score(params: Params) -> float:
-        errors = [max(float(error(params, held)), LEAST_ERROR) for held in held_out]
+        errors = [max(float(error(params, clip)), LEAST_ERROR) for clip in clips]
         return float(np.mean(-10.0 * np.log10(errors))) if errors else float("nan")
 
     return score

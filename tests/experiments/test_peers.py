@@ -12,7 +12,7 @@ from jaxdn.denoiser.rollout import denoise, stream
 from jaxdn.denoisers import ntd
 from jaxdn.methods.registry import method_named
 from jaxdn.ops.warp import warp
-from jaxdn.training.step import clip_loss, initial_state
+from jaxdn.training.step import clip_loss, init_state
 from tests.needs import require
 
 TINY = ((4,), (4,), (5,), (5,), (6,))
@@ -67,7 +67,7 @@ def test_pytorch_has_the_same_loss_and_gradients(key, x64):
     clips = [scene.clip(3, 16, 16, seed=seed) for seed in range(2)]
     batch: Clip = double(jax.tree.map(lambda *leaves: np.stack(leaves), *clips))
     denoiser = ntd(size=TINY, **PLAIN)
-    params = lively(initial_state(denoiser, RECIPE, batch).params, key)
+    params = lively(init_state(denoiser, RECIPE, batch).params, key)
 
     def batch_loss(params):
         loss, psnr = jax.vmap(lambda clip: clip_loss(denoiser, params, clip, RECIPE.objective))(batch)

@@ -19,7 +19,7 @@ from jaxdn.recipes.objectives import Objective
 from jaxdn.recipes.recipe import Recipe
 from jaxdn.training import loop as loop
 from jaxdn.training.log import Log, read_curve, read_log
-from jaxdn.training.loop import Start, begun_with, fit
+from jaxdn.training.loop import Every, InitialWeights, fit, read_resumed_from
 from jaxdn.training.train import train
 from jaxdn.training.validation import load_validation
 from jaxdn.zoo.ready import candidate
@@ -66,7 +66,8 @@ class Stopping:
 
 def run_on(engine, clips, folder, **options):
     denoiser, source = ntd(size=TINY, **PLAIN, implementation=engine), options.pop("source", batches(clips))
-    return fit(denoiser, RECIPE, source, folder, label="t", log_every=1, **options)
+    checkpoints = options.pop("checkpoint_every", 100)
+    return fit(denoiser, RECIPE, source, folder, label="t", every=Every(1, checkpoint=checkpoints), **options)
 
 
 run = partial(run_on, None)
@@ -126,10 +127,10 @@ def test_training_begins_with_given_weights_and_refuses_others_for_the_same_run(
     # The warm-up's first update has a learning rate of zero.
     short = RECIPE._replace(steps=1)
     again = partial(fit, ntd(size=TINY, **PLAIN), short, folder=tmp_path / "two", label="t")
-    state = again(batches(clips), start=Start("one", one.params))
+    state = again(batches(clips), start=InitialWeights("one", one.params))
     jax.tree.map(np.testing.assert_array_equal, state.params, one.params)
     with pytest.raises(ValueError, match="start 'one' -> 'another'"):
-        again(batches(clips), start=Start("another", one.params))
+        again(batches(clips), start=InitialWeights("another", one.params))
 
 
 @pytest.mark.slow
@@ -159,7 +160,16 @@ SHORT = Recipe(SQUARES, steps=4, batch=2, crop=16, frames=4)
 
 
 def run_gain(clips, folder, recipe=SHORT, source=None, **options):
-    return fit(gain(), recipe, source or batches(clips), folder, label="gain", log_every=2, **options)
+    checkpoints = options.pop("checkpoint_every", 100)
+    return fit(
+        gain(),
+        recipe,
+        source or batches(clips),
+        folder,
+        label="gain",
+        every=Every(2, checkpoint=checkpoints),
+        **options,
+    )
 
 
 def test_ctrl_c_on_a_logging_step_keeps_its_log_entry(clips, tmp_path, monkeypatch):
@@ -211,19 +221,19 @@ def test_a_second_ctrl_c_stops_at_once_and_the_run_still_ends_the_same(clips, tm
 
 def test_a_finished_run_goes_on_with_more_steps_and_says_so(clips, tmp_path, capsys):
     first = run_gain(clips, tmp_path)
-    assert begun_with(tmp_path) == []
+    assert read_resumed_from(tmp_path) == []
     longer = run_gain(clips, tmp_path, SHORT._replace(steps=8))
     assert "begun with 4 steps, goes on to 8" in capsys.readouterr().out
     assert int(longer.step) == 8
     assert read_curve(tmp_path).step == [2, 4, 6, 8]
-    assert begun_with(tmp_path) == [4]
+    assert read_resumed_from(tmp_path) == [4]
     assert float(longer.params["gain"]) != float(first.params["gain"])
     run_gain(clips, tmp_path, SHORT._replace(steps=8))
-    assert begun_with(tmp_path) == [4]
+    assert read_resumed_from(tmp_path) == [4]
     for other in (SHORT, SHORT._replace(steps=9, learning_rate=0.5)):
         with pytest.raises(ValueError, match="steps 8 -> "):
             run_gain(clips, tmp_path, other)
-    assert begun_with(tmp_path) == [4]
+    assert read_resumed_from(tmp_path) == [4]
 
 
 def test_the_validation_reaches_the_terminal(clips, tmp_path, capsys):

@@ -15,7 +15,7 @@ from jaxdn.methods.registry import method_named
 from jaxdn.ops.motion import occlusion_mask
 from jaxdn.recipes.augmentation import STILL
 from jaxdn.recipes.objectives import unbiased_illumination
-from jaxdn.training.step import clip_loss, initial_state, make_train_step
+from jaxdn.training.step import clip_loss, init_state, make_train_step
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -60,7 +60,7 @@ def step(denoiser):
 
 @pytest.fixture
 def state(denoiser):
-    return initial_state(denoiser, RECIPE, batch_of(make_clip(0), make_clip(1)))
+    return init_state(denoiser, RECIPE, batch_of(make_clip(0), make_clip(1)))
 
 
 @pytest.mark.slow
@@ -205,7 +205,7 @@ def test_the_running_mean_follows_the_weights():
     recipe = RECIPE._replace(average=0.5, decay=False)
     step = make_train_step(denoiser, recipe)
     batch = batch_of(make_clip(0), make_clip(1))
-    state = initial_state(denoiser, recipe, batch)
+    state = init_state(denoiser, recipe, batch)
     wanted = jax.tree.map(np.array, state.params)
     for count in range(8):
         state, _ = step(state, batch)

@@ -14,8 +14,8 @@ from jaxdn.denoiser import Denoiser
 from jaxdn.denoiser.sanitize import sanitize_image
 from jaxdn.training.checkpoint import Checkpoints
 from jaxdn.training.log import Log, read_curve
-from jaxdn.training.loop import fit
-from jaxdn.training.step import clip_loss, initial_state
+from jaxdn.training.loop import Every, fit
+from jaxdn.training.step import clip_loss, init_state
 from tests.compiling import FLAGS
 from tests.training import test_loop
 from tests.training.test_checkpoint import torn
@@ -54,7 +54,7 @@ def brighter():
 
 def run(clips, folder, recipe=test_loop.RECIPE, source=None, every=2):
     batches = test_loop.batches(clips) if source is None else source
-    return fit(brighter(), recipe, batches, folder, label="t", log_every=1, checkpoint_every=every)
+    return fit(brighter(), recipe, batches, folder, label="t", every=Every(1, checkpoint=every))
 
 
 @pytest.mark.filterwarnings("ignore:overflow encountered in cast")  # 1e39 is infinite in single precision
@@ -67,7 +67,7 @@ def test_a_diverging_learning_rate_ends_with_advice_and_finite_weights(clips, tm
     with pytest.raises(ValueError, match="learning rate"):  # a restart does not continue either
         run(clips, tmp_path, recipe, every=1)
     kept_state, _ = Checkpoints(tmp_path / "checkpoints").restore(
-        initial_state(brighter(), recipe, next(test_loop.batches(clips)))
+        init_state(brighter(), recipe, next(test_loop.batches(clips)))
     )
     assert np.isfinite(kept_state.params["gain"])
 

@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 
 from jaxdn import color, metrics
+from jaxdn.clips import write_clip
 from jaxdn.core.frame import Clip, Frame
 from jaxdn.denoiser import Core, recurrent
-from jaxdn.training.validation import HeldOut, make_validation
+from jaxdn.training.validation import ValidationClip, load_validation, make_validation
+from tests.training.test_training import make_clip
 
 
 def identity():
@@ -25,7 +27,7 @@ def held_out(rng, *, error, noise):
     shape = (truth / noise) ** 2
     halves = [rng.gamma(shape, truth / shape) for _ in range(2)]
     clip = Clip(Frame(jnp.asarray(image, jnp.float32)), jnp.asarray(np.mean(halves, axis=0), jnp.float32))
-    return truth, HeldOut(clip, (jnp.asarray(halves[0], jnp.float32), jnp.asarray(halves[1], jnp.float32)))
+    return truth, ValidationClip(clip, (jnp.asarray(halves[0], jnp.float32), jnp.asarray(halves[1], jnp.float32)))
 
 
 @pytest.mark.parametrize("noise", [0.02, 0.06])
@@ -52,3 +54,17 @@ def test_an_estimate_below_zero_counts_as_60_db(rng):
     first, _ = held.halves
     opposite = held._replace(halves=(first, 2 * held.clip.frames.radiance - first))
     assert make_validation(identity(), [opposite])({"gain": jnp.float32(1.0)}) == 60.0
+
+
+def test_clips_are_opened_as_those_to_train_on(tmp_path):
+    """Values of a reference that are no light count as 0, with a warning; one of them made the whole score NaN."""
+    clip = make_clip(0, frames=2, size=16)
+    reference = np.array(clip.reference)
+    reference[0, 3, 4] = np.nan
+    write_clip(clip._replace(reference=reference), tmp_path / "clip")
+    with pytest.warns(UserWarning, match="3 values of the reference are not finite or negative; they count as 0"):
+        (loaded,) = load_validation(identity(), [tmp_path])
+    expected = np.where(np.isfinite(reference), reference, 0).astype(np.float16)
+    np.testing.assert_array_equal(loaded.clip.reference, expected.astype(np.float32))
+    assert loaded.halves is None
+    assert np.isfinite(make_validation(identity(), [loaded])({"gain": jnp.float32(1.0)}))

@@ -59,7 +59,7 @@ def _xla(program: str) -> float:
     import jax
 
     from experiments.speed.works import steps, train_steps
-    from jaxdn.training.step import initial_state, make_train_step
+    from jaxdn.training.step import init_state, make_train_step
 
     kind, size, detail, *remat = program.split("-")
     denoiser = steps.METHOD.factory(size=size, **steps.PLAIN)
@@ -72,7 +72,7 @@ def _xla(program: str) -> float:
         step, arguments = steps.program(denoiser), (params, denoiser.start(params, frame), frame)
     else:
         batch = train_steps.batch_of(int(detail))
-        state = initial_state(denoiser, recipe, batch)
+        state = init_state(denoiser, recipe, batch)
         step, arguments = make_train_step(denoiser, recipe), (state, batch)
     began = time.perf_counter()
     step.lower(*arguments).compile()

@@ -17,7 +17,7 @@ from experiments.speed.timing import Timing
 from experiments.speed.works import scene, steps
 from jaxdn.clips import training_batches, write_clip
 from jaxdn.recipes.recipe import Recipe
-from jaxdn.training.step import initial_state, make_train_step
+from jaxdn.training.step import init_state, make_train_step
 
 WINDOWS, STEPS = 3, 4
 """Each figure is measured this many times, over this many updates."""
@@ -39,7 +39,7 @@ def measure_input(recipe: Recipe) -> dict[str, Timing]:
             seed=recipe.seed,
         )
         held = next(batches)
-        state, step = initial_state(denoiser, recipe, held), make_train_step(denoiser, recipe)
+        state, step = init_state(denoiser, recipe, held), make_train_step(denoiser, recipe)
 
         def window(next_batch: Callable[[], Any]) -> tuple[float, float]:
             """Milliseconds per step of waiting, and in total."""

@@ -15,7 +15,7 @@ from experiments.speed.works.steps import METHOD, PLAIN, WIDTHS, implementations
 from jaxdn.core.frame import Clip
 from jaxdn.networks.backends import BACKENDS
 from jaxdn.recipes.recipe import Recipe
-from jaxdn.training.step import initial_state, make_train_step
+from jaxdn.training.step import init_state, make_train_step
 
 RECIPE = METHOD.recipe_named(None)._replace(decay=False)
 CASES = (("large", 64), ("large", 128))
@@ -32,7 +32,7 @@ def ours(size: str, crop: int, *, rematerialize: bool = False, **options: Any) -
     """A call that makes one update; state and batch are on the device, the old state's memory is donated."""
     recipe, batch = RECIPE._replace(rematerialize=rematerialize), batch_of(crop)
     denoiser = METHOD.factory(size=size, **PLAIN, **options)
-    state = [initial_state(denoiser, recipe, batch)]
+    state = [init_state(denoiser, recipe, batch)]
     step, there = make_train_step(denoiser, recipe), jax.tree.map(jnp.asarray, batch)
 
     def call() -> float:
@@ -49,7 +49,7 @@ def pytorch(size: str, crop: int, recipe: Recipe = RECIPE, *, compiled: bool) ->
 
     peer.prepare_process()
     batch = batch_of(crop, recipe)
-    params = initial_state(METHOD.factory(size=size, **PLAIN), recipe, batch).params
+    params = init_state(METHOD.factory(size=size, **PLAIN), recipe, batch).params
     trainer = Trainer(WIDTHS[size], params, recipe, compiled=compiled)
     tensors = batch_tensors(batch)
     return lambda: trainer(*tensors)

@@ -1,0 +1,67 @@
+"""How far training is, in a terminal or in the log of a batch system."""
+
+import sys
+import time
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from jaxdn.recipes.recipe import Recipe
+
+
+class ProgressBar:
+    """A bar with loss, validation PSNR, frames/s and time left; plain lines without a terminal."""
+
+    def __init__(self, label: str, recipe: Recipe, start: int):
+        self._label, self._recipe, self._first = label, recipe, start
+        self._validation = float("nan")
+        self._console = Console(stderr=False)
+        self._began: float | None = None
+        self._printed = 0.0
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.completed}/{task.total} steps  {task.fields[state]}"),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not sys.stdout.isatty(),
+        )
+        self._task = self._bar.add_task(label, total=recipe.steps, completed=start, state="compiling ...")
+
+    def __enter__(self) -> "ProgressBar":
+        self._bar.start()
+        if self._first >= self._recipe.steps:
+            self.print(f"{self._label}: all {self._recipe.steps} steps are there already")
+        elif self._bar.disable:
+            self.print(f"{self._label}: step {self._first} of {self._recipe.steps}, compiling ...")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def print(self, line: str) -> None:
+        """Print one line above the bar."""
+        self._console.print(line, highlight=False, markup=False)
+
+    def validated(self, psnr: float) -> None:
+        """Keep the newest validation PSNR."""
+        self._validation = psnr
+
+    def advance(self, step: int, *, loss: float, skipped: int) -> None:
+        """Show the progress after ``step`` updates."""
+        now = time.monotonic()
+        if self._began is None:  # the first report comes after the compilation: measure speed from there
+            self._began, self._first = now, step
+        rate = (step - self._first) / max(now - self._began, 1e-9)
+        state = f"loss {loss:.4f}"
+        if self._validation == self._validation:
+            state += f"  validation {self._validation:.2f} dB"
+        if rate > 0:
+            state += f"  {rate * self._recipe.batch * self._recipe.frames:.0f} frames/s"
+        if skipped:
+            state += f"  {skipped} skipped (gradient not finite)"
+        self._bar.update(self._task, completed=step, state=state)
+        if self._bar.disable and (now - self._printed > 15 or step == self._recipe.steps):
+            left = f"  {(self._recipe.steps - step) / rate:.0f} s left" if rate > 0 else ""
+            self.print(f"{self._label}: step {step}/{self._recipe.steps}  {state}{left}")
+            self._printed = now
