@@ -23,13 +23,13 @@ from jaxdn.clips import find_clips
 from jaxdn.commands.errors import plain_errors
 from jaxdn.core.frame import Frame
 from jaxdn.data.clip.folder import read_frames
-from jaxdn.evaluation.compare import Footage, compare, read_footage
+from jaxdn.evaluation.compare import EvaluationClip, compare, read_evaluation_clip
 from jaxdn.evaluation.report import Results, write_report
 from jaxdn.evaluation.report.results import mean_scores
 from jaxdn.zoo.ready import NOISY, Candidate, candidate, filters
 from jaxdn.zoo.weights import shipped_names
 
-Read = Callable[..., Footage]
+Read = Callable[..., EvaluationClip]
 _NOTHING: Mapping[str, Mapping[str, str]] = MappingProxyType({})
 
 
@@ -44,16 +44,16 @@ def single_samples(folder: Path, spp: int) -> Iterator[tuple[Frame, np.ndarray]]
         yield stored.frame, stored.draws[:spp].mean(0, dtype=np.float32)
 
 
-def indirect(folder: Path, *, spp: int, layers: bool = False) -> Footage:
+def indirect(folder: Path, *, spp: int, layers: bool = False) -> EvaluationClip:
     """Indirect light as rendered, its noise that of ``spp`` single samples."""
-    footage = read_footage(folder, layers=layers)
+    footage = read_evaluation_clip(folder, layers=layers)
     light = np.stack([mean[..., :3] for _, mean in single_samples(folder, spp)])
     return footage._replace(clip=footage.clip._replace(frames=footage.clip.frames._replace(radiance=light)))
 
 
-def beauty(folder: Path, *, spp: int, layers: bool = False) -> Footage:
+def beauty(folder: Path, *, spp: int, layers: bool = False) -> EvaluationClip:
     """All light in place of indirect light: direct light as noisy, and emitted light, as in other renderers' frames."""
-    footage, light, rest = read_footage(folder, layers=layers), [], []
+    footage, light, rest = read_evaluation_clip(folder, layers=layers), [], []
     for frame, mean in single_samples(folder, spp):
         emission = 0.0 if frame.emission is None else frame.emission
         direct = 0.0 if frame.direct is None else frame.direct
@@ -70,7 +70,7 @@ def beauty(folder: Path, *, spp: int, layers: bool = False) -> Footage:
 def without(read: Read, *names: str) -> Read:
     """The same without some buffers."""
 
-    def reader(folder: Path, *, spp: int, layers: bool = False) -> Footage:
+    def reader(folder: Path, *, spp: int, layers: bool = False) -> EvaluationClip:
         footage = read(folder, spp=spp, layers=layers)
         frames = footage.clip.frames._replace(**dict.fromkeys(names))
         return footage._replace(clip=footage.clip._replace(frames=frames))

@@ -19,7 +19,7 @@ from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import OPERATIONS, REFERENCE, VARIABLE, default_implementation
 from jaxdn.ops.onednn import library
 from jaxdn.render.mitsuba.variant import choose_variant, has_cuda
-from jaxdn.runtime.optional import EXTRAS, install
+from jaxdn.runtime.optional import OPTIONAL_DEPENDENCIES, install
 
 _EXTRA_OF = {"onednn-bfloat16": "onednn", "onednn-float32": "onednn", "onnxruntime": "onnx", "onednn": "onednn"}
 """Backend -> the extra that brings it."""
@@ -92,10 +92,12 @@ def _operations() -> Iterator[Finding]:
 
 
 def _packages(what: str, extra: str) -> Finding:
-    missing = [module for module in EXTRAS[extra].modules if find_spec(module) is None]
+    missing = [module for module in OPTIONAL_DEPENDENCIES[extra].modules if find_spec(module) is None]
     if missing:
         return Finding(what, f"without {', '.join(missing)}", f"to use it: {install(extra)}")
-    return Finding(what, ", ".join(f"{name} {metadata.version(name)}" for name in EXTRAS[extra].packages))
+    return Finding(
+        what, ", ".join(f"{name} {metadata.version(name)}" for name in OPTIONAL_DEPENDENCIES[extra].packages)
+    )
 
 
 def _renderer() -> Finding:

@@ -10,8 +10,8 @@ from rich.console import Console
 
 from jaxdn.commands.pipe import reader_has_gone
 from jaxdn.render.mitsuba.errors import RenderError
-from jaxdn.runtime.interrupt import EXIT_CODE, never_lost
-from jaxdn.runtime.optional import extra_of, install
+from jaxdn.runtime.interrupt import EXIT_CODE, keep_interrupts
+from jaxdn.runtime.optional import find_group, install
 
 
 @contextmanager
@@ -24,7 +24,7 @@ def plain_errors() -> Iterator[None]:
     before = warnings.formatwarning
     warnings.formatwarning = _line
     try:
-        with never_lost():
+        with keep_interrupts():
             yield
     except (ValueError, RenderError) as error:
         _end(str(error))
@@ -35,7 +35,7 @@ def plain_errors() -> Iterator[None]:
         _end(f"{where}{error.strerror or error}")
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        extra = extra_of(package)
+        extra = find_group(package)
         if extra is None:
             raise
         _end(f"this needs the package {package!r}, which is not installed: {install(extra)}")

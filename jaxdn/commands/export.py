@@ -26,7 +26,7 @@ def export(
     buffers: Collection[str] | None = None,
     size: tuple[int, int] | None = None,
     format: Format = "both",
-    say: Callable[[str], object] = lambda what: None,
+    progress: Callable[[str], object] = lambda what: None,
 ) -> Exported:
     """Write the step of a method as ``NAME.stablehlo`` and ``NAME.onnx`` into the folder ``out``; both or none.
 
@@ -36,7 +36,7 @@ def export(
       buffers: those that frames will have besides ``radiance``; None: all that the method reads.
       size: height and width; None: any.
       format: what is written.
-      say: called with what is being done.
+      progress: called with what is being done.
 
     Raises ValueError for an unknown name or buffer, a size below 16, and where a step cannot be exported so.
     """
@@ -45,17 +45,17 @@ def export(
     method = candidate(name)
     if method.denoiser is None:
         raise ValueError(f"method {name!r}: expected one that denoises, such as svgf or steady-balanced.")
-    say("tracing the step")
+    progress("tracing the step")
     try:
         step = exported_step(method.denoiser, method.params, buffers=buffers, size=size)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
     contents: dict[Path, bytes | str] = {}
     if format != "stablehlo":
-        say("translating it to ONNX")
+        progress("translating it to ONNX")
         contents[out / f"{method.label}.onnx"] = onnx_model(step, method.label)
     if format != "onnx":
-        say("lowering it to StableHLO")
+        progress("lowering it to StableHLO")
         contents[out / f"{method.label}.stablehlo"] = stablehlo(step)
     out.mkdir(parents=True, exist_ok=True)
     write_atomically(contents)

@@ -10,7 +10,7 @@ from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import UNSTATED, read_channel_mapping
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.foreign.naming import ChannelNaming
-from jaxdn.data.foreign.shots import sequence_files
+from jaxdn.data.foreign.shots import find_sequence
 from jaxdn.data.foreign.vectors import CHOICES
 
 
@@ -29,7 +29,7 @@ def inspect_files(source: str, *, reads: frozenset[str] | None, as_json: bool, n
       naming: what is stated about the channels.
     """
     refuse_unfinished(source)
-    files = sequence_files(source)
+    files = find_sequence(source)
     sequence = ForeignSequence([ExrFile(file) for file in files], naming)
     notes: list[str] = []
     mapping = read_channel_mapping(sequence.files[0], naming, log=notes.append if as_json else print)

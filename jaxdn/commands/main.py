@@ -14,7 +14,7 @@ from jaxdn.commands.arguments import COMMANDS, Compare, Denoise, Doctor, Export,
 from jaxdn.commands.errors import plain_errors
 from jaxdn.commands.options import check_folder, name_channels
 from jaxdn.commands.pipe import end_with_reader
-from jaxdn.runtime.interrupt import end_of_process
+from jaxdn.runtime.interrupt import exit_on_interrupt
 
 
 def _inspect(options: Inspect) -> None:
@@ -67,7 +67,7 @@ def _pack(options: Pack) -> None:
             options.out,
             packing,
             mib=options.mib,
-            say=lambda windows, size: status.update(f"{windows} windows, {size / 2**20:.1f} MiB"),
+            progress=lambda windows, size: status.update(f"{windows} windows, {size / 2**20:.1f} MiB"),
         )
     print(f"{options.out}: {packed.windows} windows of {packed.clips} clips, {packed.size / 2**20:.1f} MiB")
 
@@ -131,7 +131,7 @@ def _export(options: Export) -> None:
             buffers=options.buffers,
             size=(sides[0], sides[1]) if sides else None,
             format=options.format,
-            say=lambda what: status.update(f"{what} ..."),
+            progress=lambda what: status.update(f"{what} ..."),
         )
     step = exported.step
     multiple = "" if step.multiple in (None, 1) else f"; height and width are multiples of {step.multiple}"
@@ -176,7 +176,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def program() -> None:
     """The command ``jaxdn``: :func:`main` in a process that ends with it."""
-    with end_with_reader(), end_of_process():
+    with end_with_reader(), exit_on_interrupt():
         main()
 
 

@@ -13,7 +13,7 @@ def pack(
     packing: Packing,
     *,
     mib: float,
-    say: Callable[[int, int], None] = lambda windows, size: None,
+    progress: Callable[[int, int], None] = lambda windows, size: None,
 ) -> Packed:
     """Pack random windows of clips into the file ``out`` of at most ``mib`` MiB, in a folder that is made if missing.
 
@@ -26,4 +26,4 @@ def pack(
     if not clips:
         raise ClipError("clips: expected at least one folder, got none.")
     out.parent.mkdir(parents=True, exist_ok=True)
-    return write_pack(out, clips, size=int(mib * 2**20), packing=packing, say=say)
+    return write_pack(out, clips, size=int(mib * 2**20), packing=packing, progress=progress)

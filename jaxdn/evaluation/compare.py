@@ -24,7 +24,7 @@ from jaxdn.zoo.ready import OURS, Candidate
 Halves = tuple[Any, Any]
 
 
-class Footage(NamedTuple):
+class EvaluationClip(NamedTuple):
     """A clip to score images by."""
 
     clip: Clip
@@ -37,7 +37,7 @@ class Footage(NamedTuple):
     """[T, H, W, 3] what relative MSE without the reference's noise is relative to; None: to the reference."""
 
 
-def read_footage(folder: Path, *, spp: int = 1, layers: bool = False) -> Footage:
+def read_evaluation_clip(folder: Path, *, spp: int = 1, layers: bool = False) -> EvaluationClip:
     """A clip of a folder with ``spp`` samples a pixel. Raises ValueError for one without a reference.
 
     ``layers`` reads the independent noisy layers too, for denoisers that request samples.
@@ -45,14 +45,14 @@ def read_footage(folder: Path, *, spp: int = 1, layers: bool = False) -> Footage
     clip = read_clip(folder, spp=spp, layers=layers)
     if clip.reference is None:
         raise ValueError(f"{folder}: expected a clip with a reference to compare with, got none; render one.")
-    return Footage(clip, read_halves(folder), read_noise_floor(folder))
+    return EvaluationClip(clip, read_halves(folder), read_noise_floor(folder))
 
 
 @jax.jit
 def _clip_scores(
     denoised: jax.Array,
     reference: jax.Array,
-    hidden: jax.Array,
+    disoccluded: jax.Array,
     halves: Halves | None,
     relative_to: jax.Array | None = None,
 ) -> dict[str, jax.Array]:
@@ -61,7 +61,7 @@ def _clip_scores(
     Args:
       denoised: [T, H, W, 3].
       reference: [T, H, W, 3].
-      hidden: [T, H, W, 1], above 0 where a point was hidden one frame earlier.
+      disoccluded: [T, H, W, 1], above 0 where a point was hidden one frame earlier.
       halves: two independent references of half the samples each, where the clip has them.
       relative_to: [T, H, W, 3] that of :func:`jaxdn.metrics.unbiased_relative_mse`.
     """
@@ -74,17 +74,17 @@ def _clip_scores(
         "temporal_psnr": metrics.temporal_psnr(image, wanted),
         "relative_mse": metrics.relative_mse(denoised, reference),
         "flip": metrics.flip(image, wanted),
-        "disoccluded_l1": metrics.l1(image, wanted, mask=hidden),
-        "disoccluded_mse": metrics.mse(image, wanted, mask=hidden),
+        "disoccluded_l1": metrics.l1(image, wanted, mask=disoccluded),
+        "disoccluded_mse": metrics.mse(image, wanted, mask=disoccluded),
         "frame_psnr": jax.vmap(metrics.psnr)(image, wanted),
         "frame_l1": jax.vmap(metrics.l1)(image, wanted),
-        "frame_disoccluded_l1": jax.vmap(lambda a, b, m: metrics.l1(a, b, mask=m))(image, wanted, hidden),
+        "frame_disoccluded_l1": jax.vmap(lambda a, b, m: metrics.l1(a, b, mask=m))(image, wanted, disoccluded),
     }
-    return found if halves is None else found | unbiased_scores(denoised, hidden, halves, relative_to)
+    return found if halves is None else found | unbiased_scores(denoised, disoccluded, halves, relative_to)
 
 
 def unbiased_scores(
-    denoised: jax.Array, hidden: jax.Array, halves: Halves, relative_to: jax.Array | None = None
+    denoised: jax.Array, disoccluded: jax.Array, halves: Halves, relative_to: jax.Array | None = None
 ) -> dict[str, jax.Array]:
     """The scores of a linear clip without the noise of the reference; the arguments are those of ``_clip_scores``."""
     image, shown = color.tonemap(denoised), color.tonemap_halves(*halves)
@@ -92,7 +92,7 @@ def unbiased_scores(
         "unbiased_psnr": metrics.unbiased_psnr(image, *shown),
         "unbiased_temporal_psnr": metrics.unbiased_temporal_psnr(image, *shown),
         "unbiased_mse": metrics.unbiased_mse(image, *shown),
-        "unbiased_disoccluded_mse": metrics.unbiased_mse(image, *shown, mask=hidden),
+        "unbiased_disoccluded_mse": metrics.unbiased_mse(image, *shown, mask=disoccluded),
         "unbiased_relative_mse": metrics.unbiased_relative_mse(denoised, *halves, relative_to=relative_to),
     }
 
@@ -106,8 +106,8 @@ def compare(
     training: dict[str, TrainingCurve] | None = None,
     about: Mapping[str, str] | None = None,
     spp: int = 1,
-    read: Callable[..., Footage] = read_footage,
-    say: Callable[[str], None] = print,
+    read: Callable[..., EvaluationClip] = read_evaluation_clip,
+    log: Callable[[str], None] = print,
 ) -> Results:
     """Denoise every clip by every method and score it against the clip's reference.
 
@@ -126,7 +126,7 @@ def compare(
       about: label of a method -> what it is, in a few words, where that is not the title of the method.
       spp: samples per pixel to take from the clips' layers.
       read: (folder, spp, layers) -> what to score by.
-      say: prints one line per clip.
+      log: called with one line per clip.
     """
     compiled: dict[str, Callable[[Params, Clip], jax.Array]] = {}
     for method in methods:
@@ -135,13 +135,13 @@ def compare(
     needs_layers = any(method.denoiser is not None and method.denoiser.samples is not None for method in methods)
     clips = []
     for count, folder in enumerate(folders):
-        footage = read(folder, spp=spp, layers=needs_layers)
+        evaluated = read(folder, spp=spp, layers=needs_layers)
         began = time.monotonic()
-        result = _compare_on(footage, folder.name, methods, compiled, spp)
+        result = _compare_on(evaluated, folder.name, methods, compiled, spp)
         field = headline_psnr([result.scores])
         psnr = "  ".join(f"{label} {getattr(scores, field):.2f}" for label, scores in result.scores.items())
         free = "" if field == "psnr" else " without the reference's noise"
-        say(
+        log(
             f"[{count + 1}/{len(folders)}] {result.name}: PSNR{free} {psnr} dB (reference good to "
             f"{result.noise_floor_psnr:.1f} dB)  {time.monotonic() - began:.0f} s"
         )
@@ -149,8 +149,8 @@ def compare(
     labels = [method.label for method in methods]
     known = {method.label: method.method.title for method in methods if method.method is not None}
     opens_on = OURS if OURS in labels else _last_network(methods)
-    told = {**known, **(about or {})}
-    return Results(title, settings, describe_machine(), labels, clips, training or {}, told, opens_on)
+    descriptions = {**known, **(about or {})}
+    return Results(title, settings, describe_machine(), labels, clips, training or {}, descriptions, opens_on)
 
 
 def _last_network(methods: Sequence[Candidate]) -> str | None:
@@ -164,7 +164,7 @@ def _compile(denoiser: Denoiser) -> Callable[[Params, Clip], jax.Array]:
 
 
 def _compare_on(
-    footage: Footage,
+    evaluated: EvaluationClip,
     name: str,
     methods: Sequence[Candidate],
     compiled: dict[str, Callable[[Params, Clip], jax.Array]],
@@ -173,21 +173,21 @@ def _compare_on(
     """The scores and images of one clip.
 
     Args:
-      footage: the clip and its references.
+      evaluated: the clip and its references.
       name: of the clip.
       methods: what to compare.
       compiled: label of a method -> its compiled function.
       spp: samples per pixel of the clip's radiance.
     """
-    clip, halves = footage.clip, footage.halves
+    clip, halves = evaluated.clip, evaluated.halves
     frames = clip.frames
     inputs = jax.tree.map(jax.numpy.asarray, clip._replace(reference=None))
     reference = jax.numpy.asarray(clip.reference)
     shape = (*np.shape(frames.radiance)[:3], 1)
-    hidden = ~np.asarray(frames.visible, bool) if frames.visible is not None else np.zeros(shape, bool)
+    disoccluded = ~np.asarray(frames.visible, bool) if frames.visible is not None else np.zeros(shape, bool)
     # At a clip's first frame no method has a history, so no pixel counts as disoccluded.
-    hidden = np.concatenate([np.zeros_like(hidden[:1]), hidden[1:]])
-    shown = int(np.argmax(hidden.sum((1, 2, 3)))) if hidden.any() else shape[0] - 1
+    disoccluded = np.concatenate([np.zeros_like(disoccluded[:1]), disoccluded[1:]])
+    shown = int(np.argmax(disoccluded.sum((1, 2, 3)))) if disoccluded.any() else shape[0] - 1
     scores, per_frame = {}, {}
     images = {"reference": np.asarray(color.tonemap(reference[shown]))}
     wanted = np.asarray(color.tonemap(reference[:FRAMES]))
@@ -197,27 +197,27 @@ def _compare_on(
             denoised, milliseconds = inputs.frames.radiance, 0.0
         else:
             denoised, milliseconds = _timed(compiled[method.label], method.params, inputs, shape[0])
-        scored = _clip_scores(denoised, reference, hidden * 1.0, halves, footage.relative_to)
+        scored = _clip_scores(denoised, reference, disoccluded * 1.0, halves, evaluated.relative_to)
         found = {name: np.asarray(value) for name, value in scored.items()}
-        scores[method.label] = _as_scores(found, hidden, milliseconds, spp)
+        scores[method.label] = _as_scores(found, disoccluded, milliseconds, spp)
         per_frame[method.label] = {
             "psnr": found["frame_psnr"].tolist(),
             "l1": found["frame_l1"].tolist(),
-            "disoccluded_l1": np.where(hidden.any((1, 2, 3)), found["frame_disoccluded_l1"], np.nan).tolist(),
+            "disoccluded_l1": np.where(disoccluded.any((1, 2, 3)), found["frame_disoccluded_l1"], np.nan).tolist(),
         }
         images[method.label] = np.asarray(color.tonemap(denoised[shown]))
         films[method.label] = film(np.asarray(color.tonemap(denoised[:FRAMES])), wanted)
-    return ClipResult(name, footage.noise_floor, scores, per_frame, shown, images, hidden[shown, ..., 0], films)
+    return ClipResult(name, evaluated.noise_floor, scores, per_frame, shown, images, disoccluded[shown, ..., 0], films)
 
 
-def _as_scores(found: dict[str, np.ndarray], hidden: np.ndarray, milliseconds: float, spp: int) -> Scores:
-    any_hidden = bool(hidden.any())
+def _as_scores(found: dict[str, np.ndarray], disoccluded: np.ndarray, milliseconds: float, spp: int) -> Scores:
+    any_disoccluded = bool(disoccluded.any())
     with np.errstate(divide="ignore"):
-        hidden_psnr = float(-10.0 * np.log10(found["disoccluded_mse"]))
-    nothing = () if any_hidden else ("disoccluded_l1", "unbiased_disoccluded_mse")
+        disoccluded_psnr = float(-10.0 * np.log10(found["disoccluded_mse"]))
+    nothing = () if any_disoccluded else ("disoccluded_l1", "unbiased_disoccluded_mse")
     return Scores(
         **{name: float("nan") if name in nothing else float(found[name]) for name in Scores._fields if name in found},
-        disoccluded_psnr=hidden_psnr if any_hidden else float("nan"),
+        disoccluded_psnr=disoccluded_psnr if any_disoccluded else float("nan"),
         ms_per_frame=milliseconds,
         spp=float(spp),
     )

@@ -21,10 +21,10 @@ class Interrupt:
     Python receives signals in the main thread alone: in any other one this changes nothing.
     """
 
-    def __init__(self, say: Callable[[], None]):
-        """``say`` is called at the first Ctrl-C, so that it does not seem to be ignored."""
+    def __init__(self, on_first: Callable[[], None]):
+        """``on_first`` is called at the first Ctrl-C, so that it does not seem to be ignored."""
         self.asked = False
-        self._say = say
+        self._on_first = on_first
         self._before: Any = None
 
     def __enter__(self) -> "Interrupt":
@@ -40,11 +40,11 @@ class Interrupt:
         if self.asked:
             raise KeyboardInterrupt
         self.asked = True
-        self._say()
+        self._on_first()
 
 
 @contextmanager
-def never_lost() -> Iterator[None]:
+def keep_interrupts() -> Iterator[None]:
     """While it is entered, a KeyboardInterrupt that would be dropped, or become another error, arrives all the same.
 
     No exception leaves functions that Python calls between two lines of a program: callbacks of the garbage collector
@@ -76,7 +76,7 @@ def never_lost() -> Iterator[None]:
 
 
 @contextmanager
-def end_of_process() -> Iterator[None]:
+def exit_on_interrupt() -> Iterator[None]:
     """At Ctrl-C the process ends where this is left, all blocks inside being cleaned up, and waits for nothing else.
 
     Threads of XLA may still compile or run a program, which nobody can stop: as Python tears down what they use, one

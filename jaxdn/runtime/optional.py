@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 
-class Extra(NamedTuple):
+class DependencyGroup(NamedTuple):
     """One extra of pyproject.toml."""
 
     packages: tuple[str, ...]
@@ -12,20 +12,22 @@ class Extra(NamedTuple):
     """The top-level modules that these packages bring."""
 
 
-EXTRAS: dict[str, Extra] = {
-    "render": Extra(("mitsuba",), ("mitsuba", "drjit")),
-    "train": Extra(("optax", "orbax-checkpoint", "grain", "matplotlib"), ("optax", "orbax", "grain", "matplotlib")),
-    "onnx": Extra(("onnxruntime", "onnx"), ("onnxruntime", "onnx")),
-    "onednn": Extra(("onednn-cpu-gomp",), ()),
-    "bench": Extra(("torch", "pyoidn"), ("torch", "pyoidn")),
+OPTIONAL_DEPENDENCIES: dict[str, DependencyGroup] = {
+    "render": DependencyGroup(("mitsuba",), ("mitsuba", "drjit")),
+    "train": DependencyGroup(
+        ("optax", "orbax-checkpoint", "grain", "matplotlib"), ("optax", "orbax", "grain", "matplotlib")
+    ),
+    "onnx": DependencyGroup(("onnxruntime", "onnx"), ("onnxruntime", "onnx")),
+    "onednn": DependencyGroup(("onednn-cpu-gomp",), ()),
+    "bench": DependencyGroup(("torch", "pyoidn"), ("torch", "pyoidn")),
 }
 
 
 def install(extra: str) -> str:
     """The command that installs the packages of an extra."""
-    return f"pip install {' '.join(EXTRAS[extra].packages)}"
+    return f"pip install {' '.join(OPTIONAL_DEPENDENCIES[extra].packages)}"
 
 
-def extra_of(module: str) -> str | None:
+def find_group(module: str) -> str | None:
     """The extra that brings a top-level module; None if none does."""
-    return next((name for name, extra in EXTRAS.items() if module in extra.modules), None)
+    return next((name for name, extra in OPTIONAL_DEPENDENCIES.items() if module in extra.modules), None)

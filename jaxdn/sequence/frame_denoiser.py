@@ -14,7 +14,7 @@ from jaxdn.denoiser.rollout import Layers, Stream, stream
 from jaxdn.denoiser.sanitize import sanitize_image
 from jaxdn.denoiser.tiles import TiledStream, map_tiles, stream_tiled
 from jaxdn.sequence.james_stein import REACH, Confidence, JamesStein, combine, measure_confidence
-from jaxdn.sequence.memory_budget import GIB, memory_of_machine, needed, side_within
+from jaxdn.sequence.memory_budget import GIB, choose_tile_side, estimate_bytes, measure_machine_memory
 from jaxdn.zoo.ready import Candidate
 
 _combine = jax.jit(combine, static_argnames="texture_unknown")
@@ -62,7 +62,7 @@ class FrameDenoiser:
         image = step(stored.frame)
         if step.beyond_halo > self._lost_pixels:
             self._lost_pixels = step.beyond_halo
-            self._log(f"{self._lost_pixels} pixels move too far for the parts and begin anew; give more --max-memory")
+            self._log(f"{self._lost_pixels} pixels move too far for the tiles and begin anew; give more --max-memory")
         return image
 
     def is_tiled(self, frame: Frame) -> bool:
@@ -123,20 +123,20 @@ class FrameDenoiser:
     def _choose_step(self, height: int, width: int) -> Stream | TiledStream:
         denoiser, params = self._method.denoiser, self._method.params
         assert denoiser is not None
-        limit = memory_of_machine() / 2 if self._limit is None else self._limit
+        limit = measure_machine_memory() / 2 if self._limit is None else self._limit
         size = height, width, self._count_channels()
-        side = side_within(limit, *size)
+        side = choose_tile_side(limit, *size)
         if side is None:
             return stream(denoiser, params)
-        whole = f"whole frames of {width} x {height} need about {needed(*size) / GIB:.1f} GiB"
+        whole = f"whole frames of {width} x {height} need about {estimate_bytes(*size) / GIB:.1f} GiB"
         try:
             step = stream_tiled(denoiser, params, side, (height, width))
         except ValueError as error:
             if self._limit is not None:
                 raise ValueError(f"--max-memory {limit / GIB:g}: {whole}; {error}") from None
-            self._log(f"{whole}, more than half of this machine's memory, and cannot be parted: {error}")
+            self._log(f"{whole}, more than half of this machine's memory, and cannot be tiled: {error}")
             return stream(denoiser, params)
-        self._log(f"in parts of at most {side} x {side} pixels: {whole} (--max-memory)")
+        self._log(f"in tiles of at most {side} x {side} pixels: {whole} (--max-memory)")
         return step
 
 

@@ -1,4 +1,4 @@
-"""How a frame fits into memory: whole, or in parts whose image is the same."""
+"""How a frame fits into memory: whole, or in tiles whose image is the same."""
 
 import math
 import os
@@ -17,7 +17,7 @@ STEP = 1100
 methods on two cores, by ``python -m experiments.stability.memory``."""
 
 
-def memory_of_machine() -> float:
+def measure_machine_memory() -> float:
     """Bytes of memory of this machine; infinite where the system does not tell."""
     try:
         return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
@@ -25,17 +25,17 @@ def memory_of_machine() -> float:
         return math.inf
 
 
-def needed(height: int, width: int, channels: int) -> float:
+def estimate_bytes(height: int, width: int, channels: int) -> float:
     """Bytes that denoising whole frames needs, of files with so many channels."""
     return _beside_step(height, width, channels) + STEP * height * width
 
 
-def side_within(limit: float, height: int, width: int, channels: int) -> int | None:
+def choose_tile_side(limit: float, height: int, width: int, channels: int) -> int | None:
     """The side of square windows with which frames are denoised within ``limit`` bytes; None: whole frames fit.
 
     It is 0 where even what windows leave out does not fit.
     """
-    if needed(height, width, channels) <= limit:
+    if estimate_bytes(height, width, channels) <= limit:
         return None
     left = limit - _beside_step(height, width, channels)
     return int(math.sqrt(max(left, 0) / STEP)) // GRID * GRID

@@ -32,27 +32,27 @@ def denoise_segment(
       log: called with lines for the user.
     """
     wanted = [index for index in segment if index in job.wanted]
-    footage: _ClipFootage | _ForeignFootage
+    source: _ClipFrames | _ForeignFrames
     writer: ClipWriter | ForeignWriter
     if job.clip is not None:
-        footage, writer = _ClipFootage(job.clip, segment, settings.spp), ClipWriter(settings)
+        source, writer = _ClipFrames(job.clip, segment, settings.spp), ClipWriter(settings)
     else:
         check_single_layer(job.shot.files[segment.start : segment.stop], settings.spp)
         sequence = ForeignSequence(job.exr_files[segment.start : segment.stop], settings.naming)
-        footage, writer = _ForeignFootage(sequence, segment), ForeignWriter(sequence.window, settings, log)
+        source, writer = _ForeignFrames(sequence, segment), ForeignWriter(sequence.window, settings, log)
     with ExitStack() as stack:
         backward: BackwardImages | None = None
         if settings.bidirectional:
             log(f"backwards first, through {segment.stop - wanted[0]} frames; nothing is written meanwhile")
-            reversed_frames = zip(reversed(segment), footage.read(log, backwards=True), strict=True)
+            reversed_frames = zip(reversed(segment), source.read(log, backwards=True), strict=True)
             needed = islice(reversed_frames, segment.stop - wanted[0])
             folder = job.targets[wanted[0]].parent
             backward = stack.enter_context(backward_pass(needed, denoisers[1], wanted, folder))
         steps = _ForwardSteps(job, denoisers[0], backward, safe=settings.safe)
         report = _FallbackReport(job, log)
-        frames = footage.read(log)
+        frames = source.read(log)
         for index in range(segment.start, wanted[-1] + 1):
-            path = _denoise_frame(index, next(frames), footage.file(index), steps, writer, report)
+            path = _denoise_frame(index, next(frames), source.file(index), steps, writer, report)
             if path is not None:
                 yield path
         report.finish()
@@ -142,7 +142,7 @@ def _explain_fallback(file: Path, fallback: Fallback) -> str:
     )
 
 
-class _ClipFootage:
+class _ClipFrames:
     """Frames of one of our clips."""
 
     def __init__(self, clip: Path, segment: range, spp: int) -> None:
@@ -157,7 +157,7 @@ class _ClipFootage:
         return None
 
 
-class _ForeignFootage:
+class _ForeignFrames:
     """Frames of another renderer, whose results are written into copies of their files."""
 
     def __init__(self, sequence: ForeignSequence, segment: range) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxdn import color, metrics
 from jaxdn.core.frame import Clip
-from jaxdn.data.clip.noise_floor import other_half
+from jaxdn.data.clip.noise_floor import second_half
 from jaxdn.data.training.cache import CachedClip, read_array, read_window
 from jaxdn.data.training.pack import open_clips
 from jaxdn.denoiser import Denoiser, Params
@@ -39,7 +39,7 @@ def _load(cached: CachedClip, denoiser: Denoiser, spp: int) -> ValidationClip:
     if "reference_half" not in cached.arrays:
         return ValidationClip(clip, None)
     first = read_array(cached, "reference_half", everything)
-    return ValidationClip(clip, (jnp.asarray(first), jnp.asarray(other_half(np.asarray(clip.reference), first))))
+    return ValidationClip(clip, (jnp.asarray(first), jnp.asarray(second_half(np.asarray(clip.reference), first))))
 
 
 def make_validation(denoiser: Denoiser, clips: Sequence[ValidationClip]) -> Callable[[Params], float]:

@@ -17,7 +17,7 @@ from jaxdn.clips import ClipError, training_batches
 from jaxdn.core.frame import BUFFERS, FAR, Frame
 from jaxdn.data.training import compact
 from jaxdn.data.training.cache import read_array, read_window
-from jaxdn.data.training.draws import draw_light
+from jaxdn.data.training.light_samples import sample_light
 from jaxdn.data.training.pack import Packing, open_clips, open_pack, write_pack
 from jaxdn.denoisers import svgf
 from jaxdn.recipes.augmentation import STILL
@@ -151,7 +151,7 @@ def test_compression_loses_nothing(dtype: type, slopes: tuple[int, ...], rng: np
     for codes in (rng.integers(0, np.iinfo(dtype).max, (3, 5, 4, 2)), np.zeros((3, 5, 4, 2)), np.ones((1, 1, 1, 1))):
         codes = codes.astype(dtype)
         way, data = compact.squeeze(codes, slopes)
-        np.testing.assert_array_equal(compact.unsqueeze(way, data, dtype, codes.shape, slopes), codes)
+        np.testing.assert_array_equal(compact.decompress(way, data, dtype, codes.shape, slopes), codes)
 
 
 def test_every_array_comes_back_within_its_bound(folder: Path, packed: Path) -> None:
@@ -204,7 +204,7 @@ def test_indirect_light_alone_and_no_single_samples(folder: Path, tmp_path: Path
     window = open_pack(tmp_path / "a.pack")[0]
     assert {"direct", "emission", "reference_half"}.isdisjoint(window.arrays)
     assert window.half_spp == 0
-    light = draw_light(window, EVERYTHING, 2, np.random.default_rng(0), beauty=True)
+    light = sample_light(window, EVERYTHING, 2, np.random.default_rng(0), beauty=True)
     np.testing.assert_array_equal(light.reference, read_array(window, "reference", EVERYTHING))
     whole = Packing(crop=SIDE, draws=0, buffers=("albedo",))
     write_pack(tmp_path / "b.pack", sources, size=2**22, packing=whole)

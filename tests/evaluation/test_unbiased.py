@@ -51,7 +51,7 @@ def test_a_clip_without_a_half_has_none(tmp_path):
 def test_the_references_noise_is_not_in_the_score(tmp_path, halves):
     write(tmp_path / "clip", halves=halves)
     noisy = Candidate("noisy", None, {}, None, {})
-    results = compare([noisy], [tmp_path / "clip"], title="", settings={}, say=lambda text: None)
+    results = compare([noisy], [tmp_path / "clip"], title="", settings={}, log=lambda text: None)
     scores = results.clips[0].scores["noisy"]
     if not halves:
         assert np.isnan(scores.unbiased_psnr)
@@ -68,7 +68,7 @@ def test_the_report_says_which_score_to_read(tmp_path, halves):
     write(tmp_path / "clip", halves=halves)
     said = []
     noisy = Candidate("noisy", None, {}, None, {})
-    results = compare([noisy], [tmp_path / "clip"], title="", settings={}, say=said.append)
+    results = compare([noisy], [tmp_path / "clip"], title="", settings={}, log=said.append)
     assert headline(results).field == ("unbiased_psnr" if halves else "psnr")
     assert ("without the reference's noise" in said[0]) == halves
     assert ("Compare by the unbiased columns" in " ".join(sentences(results))) == halves

@@ -14,7 +14,7 @@ import tyro
 from experiments.speed.chart import __main__ as chart
 from experiments.speed.chart.breakdown import WHOLE, breakdown, subjects
 from experiments.speed.chart.energy import find_meter
-from experiments.speed.chart.footage import Footage
+from experiments.speed.chart.footage import EvaluationClip
 from experiments.speed.chart.page import page
 from experiments.speed.chart.render_cost import Cost, fit
 from experiments.speed.chart.scores import MEASURES, score
@@ -163,7 +163,9 @@ def test_the_chart_is_read_without_the_noise_of_the_references_where_every_clip_
 def test_a_clip_without_halves_has_no_unbiased_errors(rng):
     clip = rng.exponential(0.3, (6, 8, 9, 3)).astype(np.float32)
     noise = [(clip * rng.gamma(50, 1 / 50, clip.shape)).astype(np.float32) for _ in range(2)]
-    footage = Footage("", None, {}, None, {}, (noise[0] + noise[1]) / 2, None, np.zeros((6, 8, 9, 1), bool), 3, 30.0)
+    footage = EvaluationClip(
+        "", None, {}, None, {}, (noise[0] + noise[1]) / 2, None, np.zeros((6, 8, 9, 1), bool), 3, 30.0
+    )
     plain, known = score(clip, footage), score(clip, footage._replace(halves=tuple(noise)))
     unbiased = [measure.field for measure in MEASURES if measure.field.startswith("unbiased")]
     assert len(unbiased) == 4

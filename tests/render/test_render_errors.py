@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from jaxdn.commands.errors import plain_errors
-from jaxdn.runtime.optional import EXTRAS, install
+from jaxdn.runtime.optional import OPTIONAL_DEPENDENCIES, install
 
 WITHOUT_RENDERER = """
 import importlib.abc, sys
@@ -58,7 +58,10 @@ def test_without_the_renderer_llvm_is_not_blamed(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("extra", "module"), [(name, module) for name in EXTRAS for module in EXTRAS[name].modules])
+@pytest.mark.parametrize(
+    ("extra", "module"),
+    [(name, module) for name in OPTIONAL_DEPENDENCIES for module in OPTIONAL_DEPENDENCIES[name].modules],
+)
 def test_a_missing_package_is_named_with_the_command_that_installs_it(extra, module, capsys):
     with pytest.raises(SystemExit) as ended, plain_errors():
         raise ModuleNotFoundError(f"No module named {module!r}", name=f"{module}.inner")
@@ -68,11 +71,11 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it(extra, mod
     assert "jaxdn[" not in message  # no package index has jaxdn
 
 
-@pytest.mark.parametrize("extra", EXTRAS)
+@pytest.mark.parametrize("extra", OPTIONAL_DEPENDENCIES)
 def test_the_extras_are_those_of_the_project(extra):
     declared = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     needed = declared["optional-dependencies"][extra]
-    assert EXTRAS[extra].packages == tuple(re.match(r"[\w-]+", requirement)[0] for requirement in needed)
+    assert OPTIONAL_DEPENDENCIES[extra].packages == tuple(re.match(r"[\w-]+", requirement)[0] for requirement in needed)
 
 
 @pytest.mark.parametrize("name", ["jaxdn.nowhere", "PIL", None])

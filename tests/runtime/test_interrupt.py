@@ -102,7 +102,7 @@ _COMPILING = """
 import sys, threading, time
 import jax, jax.numpy as jnp
 from jaxdn.commands.errors import plain_errors
-from jaxdn.runtime.interrupt import end_of_process
+from jaxdn.runtime.interrupt import exit_on_interrupt
 
 def long(x):
     for i in range(400):
@@ -110,7 +110,7 @@ def long(x):
     return x
 
 given = jnp.ones((8, 8))
-with end_of_process(), plain_errors():
+with exit_on_interrupt(), plain_errors():
     lowered = jax.jit(long).lower(given)
     threading.Thread(target=lowered.compile, daemon=True).start()
     time.sleep(0.5)

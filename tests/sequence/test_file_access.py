@@ -16,7 +16,7 @@ from jaxdn.data.clip.folder import refuse_unfinished
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.data.read import read_clip
-from jaxdn.sequence.memory_budget import STEP, needed
+from jaxdn.sequence.memory_budget import STEP, estimate_bytes
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import candidate
@@ -87,7 +87,7 @@ def test_pixels_are_dropped_while_a_frame_is_denoised_in_tiles(tmp_path: Path, m
     source = tmp_path / "in"
     write_sequence(source, 2, height, width)
     channels = len(ExrFile(source / "frame_0001.exr").windows)
-    limit = needed(height, width, channels) - STEP * (height * width - 288 * 288)
+    limit = estimate_bytes(height, width, channels) - STEP * (height * width - 288 * 288)
     settings = Settings(naming=ChannelNaming("previous-current"), max_memory=limit, safe=False)
     with counted(monkeypatch, source) as counts:
         denoise_files([source], tmp_path / "out", candidate("taa"), settings)

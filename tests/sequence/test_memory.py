@@ -9,7 +9,7 @@ from experiments.stability.memory import peak_mib, write_sequence
 from jaxdn.clips import read_exr
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.naming import ChannelNaming
-from jaxdn.sequence.memory_budget import STEP, needed
+from jaxdn.sequence.memory_budget import STEP, estimate_bytes
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import candidate
@@ -37,17 +37,17 @@ def test_memory_does_not_grow_with_the_frames_of_a_foreign_sequence(tmp_path):
 
 @pytest.mark.slow
 def test_frames_in_parts_are_the_same_files(tmp_path):
-    """Half the frame fits into the memory that is allowed; the safe mixture and the previews are made in parts too."""
+    """Half the frame fits into the memory that is allowed; the safe mixture and the previews are made in tiles too."""
     height, width = 300, 520
     write_sequence(tmp_path / "in", 2, height, width)
     channels = len(ExrFile(tmp_path / "in/frame_0001.exr").windows)
-    enough = needed(height, width, channels)
+    enough = estimate_bytes(height, width, channels)
     images, told = {}, []
     for name, limit in (("whole", enough), ("parts", enough - STEP * (height * width - 288 * 288))):
         settings = Settings(naming=ChannelNaming("previous-current"), max_memory=limit)
         files = denoise_files([tmp_path / "in"], tmp_path / name, candidate("svgf"), settings, log=told.append).files
         images[name] = [np.stack([read_exr(file)[letter] for letter in "RGB"], axis=-1) for file in files]
-    assert [line for line in told if "in parts of at most 288 x 288 pixels" in line] == told[-2:-1]
+    assert [line for line in told if "in tiles of at most 288 x 288 pixels" in line] == told[-2:-1]
     np.testing.assert_allclose(images["parts"], images["whole"], rtol=1e-4, atol=1e-5)
     assert np.abs(images["whole"][1] - images["whole"][0]).mean() > 1e-4, "the history of the first frame is used"
 
@@ -75,5 +75,5 @@ def test_a_process_keeps_to_the_memory_it_is_allowed(tmp_path):
     height, width, limit = 540, 960, 0.9
     write_sequence(tmp_path / "in", 2, height, width)
     channels = len(ExrFile(tmp_path / "in/frame_0001.exr").windows)
-    assert needed(height, width, channels) > 1.2 * limit * 2**30
+    assert estimate_bytes(height, width, channels) > 1.2 * limit * 2**30
     assert peak_mib(tmp_path / "in", tmp_path / "out", "svgf", limit) < 1024 * limit

@@ -12,7 +12,7 @@ import numpy as np
 from experiments.papers import results
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser.rollout import unroll
-from jaxdn.evaluation.compare import Footage, read_footage
+from jaxdn.evaluation.compare import EvaluationClip, read_evaluation_clip
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import mean_scores
 from jaxdn.zoo.ready import candidate
@@ -38,13 +38,13 @@ class Table(NamedTuple):
     claims: Callable[[Results], list[Claim]]
 
 
-def read(folder: Path, *, spp: int, layers: bool = False) -> Footage:
+def read(folder: Path, *, spp: int, layers: bool = False) -> EvaluationClip:
     """A test clip whose relative MSE is relative to the image that :func:`near` makes of all stored samples.
 
     The references have 128 samples, whose noise is 15 to 27 % of the light and has heavy tails: relative to them, the
     errors of all methods would be that noise's.
     """
-    footage = read_footage(folder, spp=spp, layers=True)
+    footage = read_evaluation_clip(folder, spp=spp, layers=True)
     stored = footage.clip.layers
     if not stored:
         raise ValueError(f"{folder}: expected layers of samples; render the clip with --layers.")

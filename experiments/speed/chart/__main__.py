@@ -28,7 +28,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedCo
 from experiments.speed.chart import footage, summary
 from experiments.speed.chart.breakdown import breakdown, subjects
 from experiments.speed.chart.energy import NOT_MEASURABLE, Meter, find_meter
-from experiments.speed.chart.footage import Footage, Sizes
+from experiments.speed.chart.footage import EvaluationClip, Sizes
 from experiments.speed.chart.page import write_page
 from experiments.speed.chart.render_cost import measure_cost
 from experiments.speed.chart.scores import MEASURES, picture, score
@@ -62,7 +62,7 @@ class Settings:
 class Run:
     """One run: the measurements, their storage and the messages."""
 
-    def __init__(self, sizes: Sizes, clips: Sequence[Footage], folder: Path, console: Console) -> None:
+    def __init__(self, sizes: Sizes, clips: Sequence[EvaluationClip], folder: Path, console: Console) -> None:
         self.sizes, self.clips, self.folder, self.console = sizes, clips, folder, console
         self.denoisers = chosen(quick=sizes.quick)
         self.ways = ways(self.denoisers, quick=sizes.quick)
@@ -134,7 +134,7 @@ class Run:
         self.store.put("errors", key, found)
         return float(np.mean([scores["psnr"] for scores in found.values()]))
 
-    def _picture(self, key: str, clip: Footage) -> Path:
+    def _picture(self, key: str, clip: EvaluationClip) -> Path:
         folder = self.folder / "images" / clip.name
         folder.mkdir(parents=True, exist_ok=True)
         return folder / f"{key.replace(' ', '_')}.png"

@@ -43,7 +43,7 @@ SCORED = 4
 """Frames at a clip's end that are scored: recurrent methods have a history by then."""
 
 
-class Footage(NamedTuple):
+class EvaluationClip(NamedTuple):
     """One clip, read."""
 
     name: str
@@ -85,7 +85,7 @@ def render(sizes: Sizes, folder: Path) -> list[Path]:
     return render_clips(jobs)
 
 
-def read(folder: Path) -> Footage:
+def read(folder: Path) -> EvaluationClip:
     """Read a clip. Raises ClipError if it has no reference or too few frames to be scored."""
     record = read_record(folder)
     layers = sorted(record["layers"])
@@ -103,10 +103,10 @@ def read(folder: Path) -> Footage:
     frames = clip.frames._replace(**{name: None for name in Frame._fields[1:] if name not in planned})
     floor, halves = read_noise_floor(folder), read_halves(folder)
     reference = np.asarray(clip.reference)
-    return Footage(folder.name, folder, record, frames, noisy, reference, halves, hidden, shown, floor)
+    return EvaluationClip(folder.name, folder, record, frames, noisy, reference, halves, hidden, shown, floor)
 
 
-def common_layers(clips: Sequence[Footage]) -> list[int]:
+def common_layers(clips: Sequence[EvaluationClip]) -> list[int]:
     """The numbers of samples that every clip has. Raises ClipError if there are none, or the sizes differ."""
     shared = set.intersection(*(set(clip.noisy) for clip in clips))
     shapes = {clip.reference.shape[1:3] for clip in clips}

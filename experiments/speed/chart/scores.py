@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.speed.chart.footage import SCORED, Footage
+from experiments.speed.chart.footage import SCORED, EvaluationClip
 from jaxdn import color, metrics
 from jaxdn.evaluation.compare import unbiased_scores
 
@@ -53,7 +53,7 @@ def _scores(
     return found if halves is None else found | unbiased_scores(images, hidden, halves)
 
 
-def score(images: np.ndarray, clip: Footage) -> dict[str, float]:
+def score(images: np.ndarray, clip: EvaluationClip) -> dict[str, float]:
     """Every measure over the last frames of images [T, H, W, 3], linear; all except relative MSE on sRGB, clipped at 1.
 
     NaN in disoccluded pixels where the clip has none, and without the noise of the reference where it keeps no half.

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxdn.core.frame import OF_SAMPLES, Clip, frame_at, only, present
 from jaxdn.data.clip.frames import StoredFrame, layers_for, read_frame, stored_layers, write_frame
-from jaxdn.data.clip.record import FORMAT, checked, held_frames, is_planned
+from jaxdn.data.clip.record import FORMAT, check_record, is_planned, shared_with
 from jaxdn.data.errors import ClipError, read_json
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.runtime.atomic_files import write_json
@@ -44,7 +44,7 @@ def begin_record(record: Mapping[str, Any], folder: str | Path) -> None:
     written.
     """
     folder = Path(folder)
-    record = checked({"format": FORMAT, **record}, folder / _UNFINISHED)
+    record = check_record({"format": FORMAT, **record}, folder / _UNFINISHED)
     folder.mkdir(parents=True, exist_ok=True)
     # In this order there is always a record, however this is interrupted; until the second step, the finished clip's.
     write_json(folder / _UNFINISHED, record)
@@ -57,7 +57,7 @@ def finish_record(record: Mapping[str, Any], folder: str | Path) -> None:
     Raises as :func:`begin_record` does.
     """
     folder = Path(folder)
-    write_json(folder / RECORD, checked({"format": FORMAT, **record}, folder / RECORD))
+    write_json(folder / RECORD, check_record({"format": FORMAT, **record}, folder / RECORD))
     (folder / _UNFINISHED).unlink(missing_ok=True)
 
 
@@ -68,7 +68,7 @@ def begun_record(folder: str | Path) -> dict[str, Any] | None:
     """
     for file in (Path(folder) / RECORD, Path(folder) / _UNFINISHED):  # where both exist, the clip is finished
         if file.is_file():
-            return checked(read_json(file), file)
+            return check_record(read_json(file), file)
     return None
 
 
@@ -82,7 +82,7 @@ def read_record(path: str | Path) -> dict[str, Any]:
         raise ClipError(f"{folder}: there is no such folder.")
     if not is_clip(folder):
         raise _unfinished(folder)
-    return checked(read_json(folder / RECORD), folder / RECORD)
+    return check_record(read_json(folder / RECORD), folder / RECORD)
 
 
 def find_clips(path: str | Path) -> list[Path]:
@@ -153,7 +153,7 @@ def read_frames(path: str | Path, *, spp: int = 1, order: Iterable[int] | None =
     own_samples = layers_for(spp, record["layers"], folder) == [min(record["layers"])]
     count, size = record["frames"], (record["height"], record["width"])
     _all_there(folder, count)
-    held = held_frames(record)
+    held = shared_with(record)
 
     def frames() -> Iterator[StoredFrame]:
         first: set[str] | None = None

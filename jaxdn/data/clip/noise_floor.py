@@ -15,12 +15,12 @@ def noise_floor(reference: np.ndarray, reference_half: np.ndarray) -> float:
     With the halves ``a`` and ``b = 2 * reference - a``, which are independent, the reference ``(a + b) / 2`` has a
     quarter of the variance of ``a - b``; so its error is about ``mean((tonemap(a) - tonemap(b))^2) / 4``.
     """
-    halves = reference_half, other_half(reference, reference_half)
+    halves = reference_half, second_half(reference, reference_half)
     first, second = (np.asarray(color.tonemap(jnp.asarray(half))) for half in halves)
     return float(np.mean((first.astype(np.float64) - second) ** 2) / 4.0)
 
 
-def other_half(reference: np.ndarray, first: np.ndarray) -> np.ndarray:
+def second_half(reference: np.ndarray, first: np.ndarray) -> np.ndarray:
     """The mean of the other half of a reference's samples: ``2 reference - first``.
 
     It is 0 where rounding to half precision has made that negative.
@@ -38,7 +38,7 @@ def read_halves(folder: str | Path) -> tuple[np.ndarray, np.ndarray] | None:
         if stored.reference is None or stored.reference_half is None:
             return None
         first.append(stored.reference_half)
-        second.append(other_half(stored.reference, stored.reference_half))
+        second.append(second_half(stored.reference, stored.reference_half))
     return (np.stack(first), np.stack(second)) if first else None
 
 

@@ -11,7 +11,7 @@ FORMAT = 1
 """The version of the layout that this code writes and reads."""
 
 
-def checked(record: Any, file: Path) -> dict[str, Any]:
+def check_record(record: Any, file: Path) -> dict[str, Any]:
     """The record itself, if it is valid; raises ClipError, naming ``file`` and the entry, if it is not."""
     if not isinstance(record, dict):
         raise ClipError(f"{file}: expected a JSON object, got {type(record).__name__}.")
@@ -38,7 +38,7 @@ def is_planned(record: Mapping[str, Any]) -> bool:
     return record.get("plan") is not None
 
 
-def held_frames(record: Mapping[str, Any]) -> list[int]:
+def shared_with(record: Mapping[str, Any]) -> list[int]:
     """For each frame of a clip the one whose buffers it shares."""
     return list(record["plan"]["held"]) if is_planned(record) else list(range(record["frames"]))
 

@@ -14,8 +14,8 @@ from jaxdn.data.foreign.classify import classify_channels
 from jaxdn.data.foreign.layers import Channels, is_cryptomatte, last_name, layer_of
 from jaxdn.data.foreign.naming import UNNAMED, ChannelNaming
 from jaxdn.data.foreign.reflectance import CAMERA_NORMALS
-from jaxdn.data.foreign.shots import sequence_files
-from jaxdn.data.foreign.vectors import MOTION_CONVENTIONS, UnknownMotion, motion_convention_of
+from jaxdn.data.foreign.shots import find_sequence
+from jaxdn.data.foreign.vectors import MOTION_CONVENTIONS, UnknownMotion, find_motion_convention
 
 OWN = "previous-current"
 """The convention of the motion vectors in jaxdn's own clips."""
@@ -51,7 +51,7 @@ def read_channel_mapping(
         return _map_foreign(source, naming, single=single, log=log)
     if is_clip(source):
         return _map_own(list(ExrFile(frame_path(source, 0)).windows))
-    return _map_foreign(ExrFile(sequence_files(source)[0]), naming, single=single, log=log)
+    return _map_foreign(ExrFile(find_sequence(source)[0]), naming, single=single, log=log)
 
 
 def _map_foreign(
@@ -62,7 +62,7 @@ def _map_foreign(
     unknown = False
     try:
         try:
-            motion_convention_of(naming.detect(list(pixels)), pixels, naming.motion_convention, single=single)
+            find_motion_convention(naming.detect(list(pixels)), pixels, naming.motion_convention, single=single)
         except UnknownMotion:
             unknown = True
         assumed = replace(naming, motion_convention=OWN) if unknown else naming

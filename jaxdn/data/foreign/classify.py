@@ -17,7 +17,7 @@ from jaxdn.data.foreign.layers import (
 )
 from jaxdn.data.foreign.lighting import explain_light
 from jaxdn.data.foreign.naming import ChannelNaming
-from jaxdn.data.foreign.vectors import contradicts_cycles, forward_channels, motion_convention_of
+from jaxdn.data.foreign.vectors import contradicts_cycles, find_motion_convention, forward_channels
 
 
 class ChannelMapping(NamedTuple):
@@ -56,7 +56,7 @@ def classify_channels(
     """
     stated = naming.channels or {}
     buffers = naming.detect(list(pixels))
-    convention = motion_convention_of(buffers, pixels, naming.motion_convention, single=single)
+    convention = find_motion_convention(buffers, pixels, naming.motion_convention, single=single)
     vectors = buffers.pop("motion") if convention is None and "motion" in buffers else None
     notes: dict[str, str] = {}
     if rejected is None:

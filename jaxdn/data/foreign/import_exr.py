@@ -20,9 +20,9 @@ from jaxdn.data.foreign.classify import ChannelMapping, classify_channels
 from jaxdn.data.foreign.layers import Channels, is_cryptomatte, layer_of, stack_channels
 from jaxdn.data.foreign.measured_motion import fitting_conventions
 from jaxdn.data.foreign.naming import ChannelNaming
-from jaxdn.data.foreign.reflectance import check_fraction, with_reflectance
-from jaxdn.data.foreign.shots import sequence_files
-from jaxdn.data.foreign.vectors import UnknownMotion, convert_motion, dual_of, forward_of_cycles
+from jaxdn.data.foreign.reflectance import check_fraction, derive_reflectance
+from jaxdn.data.foreign.shots import find_sequence
+from jaxdn.data.foreign.vectors import UnknownMotion, convert_cycles_forward, convert_motion, derive_dual_motion
 from jaxdn.filters.time_reversal import turned
 
 
@@ -53,7 +53,7 @@ def plain_frames(
     cannot be read or differs from the first.
     """
     naming = ChannelNaming(motion_convention, channels, layer)
-    files = sequence_files(path) if isinstance(path, str | Path) else list(path)
+    files = find_sequence(path) if isinstance(path, str | Path) else list(path)
     return files, ForeignSequence([ExrFile(file) for file in files], naming).frames(backwards=backwards, log=log)
 
 
@@ -155,8 +155,8 @@ class ForeignSequence:
             raise ClipError(f"{file.path}: {error}") from error
         if mapping.forward is None:
             return frame, mapping, derived, None
-        frame = frame._replace(dual_motion=dual_of(frame.motion, forward))
-        return frame, mapping, derived, forward_of_cycles(stack_channels(pixels, mapping.forward))
+        frame = frame._replace(dual_motion=derive_dual_motion(frame.motion, forward))
+        return frame, mapping, derived, convert_cycles_forward(stack_channels(pixels, mapping.forward))
 
     def _advise_convention(self) -> str:
         """What the first two frames tell about the convention of their motion vectors, as a line; "" for nothing."""
@@ -184,7 +184,7 @@ def _make_frame(file: ExrFile, pixels: Mapping[str, np.ndarray], mapping: Channe
     }
     for name in {"roughness", "specular_reflectance"} & set(buffers):
         buffers[name] = check_fraction(name, layer_of(mapping.buffers[name]), buffers[name])
-    frame, derived = with_reflectance(Frame(**buffers), mapping.buffers, pixels, file.header)
+    frame, derived = derive_reflectance(Frame(**buffers), mapping.buffers, pixels, file.header)
     return frame, [] if derived is None else [derived]
 
 

@@ -115,7 +115,7 @@ def detect_channels(
     ``"ViewLayer"``: what is not named outright is looked for in it alone. Raises ClipError if two layers fit a buffer
     equally well, if a named layer is not there, or if there is no radiance.
     """
-    groups = grouped(names)
+    groups = group_layers(names)
     inside = groups if layer is None else _inside(groups, layer)
     stated = channels or {}
     unknown = set(stated) - set(LAYERS)
@@ -128,12 +128,14 @@ def detect_channels(
         fitting = (
             _named(groups, buffer, stated[buffer])
             if buffer in stated
-            else find(inside, layers, BUFFERS[buffer], f"{buffer}: ", f"; {name_it(buffer)}, or a view layer: --layer")
+            else find_layer(
+                inside, layers, BUFFERS[buffer], f"{buffer}: ", f"; {advise_naming(buffer)}, or a view layer: --layer"
+            )
         )
         if fitting:
             found[buffer] = fitting
     if "radiance" not in found:
-        raise ClipError(f"no radiance among the channels {', '.join(sorted(names))}; {name_it('radiance')}.")
+        raise ClipError(f"no radiance among the channels {', '.join(sorted(names))}; {advise_naming('radiance')}.")
     return _with_partner(inside, found, stated)
 
 
@@ -146,7 +148,7 @@ def _inside(groups: Groups, layer: str) -> Groups:
     return found
 
 
-def grouped(names: Sequence[str]) -> Groups:
+def group_layers(names: Sequence[str]) -> Groups:
     """The channels of a file by their layers."""
     groups: dict[str, dict[str, str]] = {}
     for name in names:
@@ -157,7 +159,9 @@ def grouped(names: Sequence[str]) -> Groups:
     return groups
 
 
-def find(groups: Groups, layers: Sequence[str], buffer: Buffer, what: str = "", hint: str = "") -> Channels | None:
+def find_layer(
+    groups: Groups, layers: Sequence[str], buffer: Buffer, what: str = "", hint: str = ""
+) -> Channels | None:
     """The channels of the first of ``layers`` (lower case) that is there and has the components of ``buffer``.
 
     Raises ClipError, with ``what`` in front and ``hint`` at its end, if two layers fit equally well.
@@ -192,7 +196,7 @@ def layer_of(channels: Channels) -> str:
     return channels[0].rpartition(".")[0] or ", ".join(channels)
 
 
-def name_it(buffer: str) -> str:
+def advise_naming(buffer: str) -> str:
     """How to name the layer of a buffer."""
     return f"name its layer: channels={{{buffer!r}: LAYER}} (jaxdn denoise --channels {buffer}=LAYER)"
 
@@ -215,7 +219,9 @@ def beauty_channels(names: Sequence[str], buffers: Mapping[str, Channels]) -> Ch
     read = buffers["radiance"]
     head, _, last = layer_of(read).rpartition(".")
     if last.lower() == "noisy image":
-        combined = _fitting(grouped(names).get(f"{head}.Combined" if head else "Combined", {}), BUFFERS["radiance"])
+        combined = _fitting(
+            group_layers(names).get(f"{head}.Combined" if head else "Combined", {}), BUFFERS["radiance"]
+        )
         return combined or read
     return read
 
@@ -224,7 +230,7 @@ def unpaired_specular(names: Sequence[str], found: Mapping[str, Channels]) -> st
     """The layer of a specular albedo that was left out, as no diffuse albedo belongs to it; None if there is none."""
     if "specular_reflectance" in found:
         return None
-    there = find(grouped(names), LAYERS["specular_reflectance"], BUFFERS["specular_reflectance"])
+    there = find_layer(group_layers(names), LAYERS["specular_reflectance"], BUFFERS["specular_reflectance"])
     return None if there is None else layer_of(there)
 
 
@@ -235,7 +241,7 @@ def _with_partner(groups: Groups, found: dict[str, Channels], stated: Mapping[st
     specular = layer_of(found["specular_reflectance"]).lower()
     name = next(name for name in _DIFFUSE_PARTNERS if specular == name or specular.endswith("." + name))
     wanted = specular.removesuffix(name) + _DIFFUSE_PARTNERS[name]
-    partner = find(groups, (wanted,), BUFFERS["albedo"])
+    partner = find_layer(groups, (wanted,), BUFFERS["albedo"])
     if partner is not None and ("albedo" not in stated or found.get("albedo") == partner):
         return {**found, "albedo": partner}
     return {buffer: channels for buffer, channels in found.items() if buffer != "specular_reflectance"}

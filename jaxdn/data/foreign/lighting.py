@@ -10,7 +10,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jaxdn.data.foreign.layers import LAYERS, Channels, grouped, stack_channels
+from jaxdn.data.foreign.layers import LAYERS, Channels, group_layers, stack_channels
 
 SLACK = 0.1
 """By so much fractions may leave [0, 1]: pixel filters with negative lobes overshoot at edges."""
@@ -60,7 +60,7 @@ def find_additive_layers(
     read = {channel for channels in buffers.values() for channel in channels} | set(beauty)
     radiance = stack_channels(pixels, buffers["radiance"])
     additive = {}
-    for layer, group in grouped(list(pixels)).items():
+    for layer, group in group_layers(list(pixels)).items():
         last = layer.rpartition(".")[2].lower()
         channels = tuple(group[letter] for letter in "rgb" if letter in group)
         if len(channels) < 3 or read & set(channels) or last in known or any(word in last for word in _NO_LIGHT):

@@ -16,7 +16,15 @@ import numpy as np
 from jaxdn.brdf import directional_albedo
 from jaxdn.core.frame import BUFFERS, Frame
 from jaxdn.data.errors import ClipError
-from jaxdn.data.foreign.layers import NOT_WANTED, Channels, find, grouped, layer_of, name_it, stack_channels
+from jaxdn.data.foreign.layers import (
+    NOT_WANTED,
+    Channels,
+    advise_naming,
+    find_layer,
+    group_layers,
+    layer_of,
+    stack_channels,
+)
 from jaxdn.data.foreign.lighting import SLACK
 
 _POINT = BUFFERS["normal"]
@@ -35,14 +43,14 @@ def check_fraction(name: str, layer: str, values: np.ndarray) -> np.ndarray:
     if known.size and not (known.min() >= -SLACK and known.max() <= 1 + SLACK):
         advice = "rename it if it is something else"
         if name in BUFFERS:
-            advice = f"{name_it(name)}, or leave it out: --channels {name}={NOT_WANTED}"
+            advice = f"{advise_naming(name)}, or leave it out: --channels {name}={NOT_WANTED}"
         raise ClipError(
             f"{name}: expected values in [0, 1] in layer {layer!r}, got {known.min():g} to {known.max():g}; {advice}."
         )
     return np.clip(values, 0.0, 1.0)
 
 
-def with_reflectance(
+def derive_reflectance(
     frame: Frame,
     buffers: Mapping[str, Channels],
     pixels: Mapping[str, np.ndarray],
@@ -63,7 +71,7 @@ def with_reflectance(
         specular = frame.specular_reflectance
         how = f"{diffuse!r} + {layer_of(buffers['specular_reflectance'])!r}"
     else:
-        color = find(grouped(list(pixels)), _F0, BUFFERS["specular_reflectance"])
+        color = find_layer(group_layers(list(pixels)), _F0, BUFFERS["specular_reflectance"])
         if color is None:
             return frame, None
         layer = layer_of(color)
@@ -93,12 +101,12 @@ def _cosine(
     header: Mapping[str, Any],
 ) -> tuple[np.ndarray | None, str]:
     """The cosine [H, W, 1] between normal and view, NaN where there is no normal; and from what, or why not."""
-    groups = grouped(list(pixels))
-    normals, places = find(groups, CAMERA_NORMALS, _POINT), find(groups, _CAMERA_POSITIONS, _POINT)
+    groups = group_layers(list(pixels))
+    normals, places = find_layer(groups, CAMERA_NORMALS, _POINT), find_layer(groups, _CAMERA_POSITIONS, _POINT)
     if normals and places:
         where = f"{layer_of(normals)!r} and {layer_of(places)!r} in camera space"
         return _between(stack_channels(pixels, normals), -stack_channels(pixels, places)), where
-    places = find(groups, _WORLD_POSITIONS, _POINT)
+    places = find_layer(groups, _WORLD_POSITIONS, _POINT)
     world = frame.normal is not None and not _is_one_of(layer_of(buffers["normal"]), CAMERA_NORMALS)
     if not places or not world:
         return None, "there are no normals and positions of one space to find it"

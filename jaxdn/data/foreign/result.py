@@ -8,7 +8,7 @@ import numpy as np
 from jaxdn.data.exr.exr import rewrite_exr
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.exr.windows import Window, crop
-from jaxdn.data.foreign.layers import Channels, beauty_channels, grouped, layer_of
+from jaxdn.data.foreign.layers import Channels, beauty_channels, group_layers, layer_of
 from jaxdn.data.foreign.naming import ChannelNaming
 
 
@@ -37,7 +37,7 @@ def write_result(
     windows = source.windows
     names = list(windows)
     beauty = beauty_channels(names, naming.detect(names))
-    groups = grouped(names)
+    groups = group_layers(names)
     replaced = {}
     for layer, image in images.items():
         channels = _color(groups, layer) if layer else beauty

@@ -51,7 +51,7 @@ def find_shots(path: str | Path) -> list[Shot]:
     return [*shots, *single]
 
 
-def sequence_files(path: str | Path) -> list[Path]:
+def find_sequence(path: str | Path) -> list[Path]:
     """The EXR files of one sequence in the order of their frame numbers.
 
     ``path`` is a folder, a glob pattern or one file. Raises ClipError if there are none, if they belong to several

@@ -62,7 +62,7 @@ def check_convention(stated: str | None) -> None:
         raise ClipError(f"--motion-convention: expected one of the names below, got {stated!r}.\n{conventions()}")
 
 
-def motion_convention_of(
+def find_motion_convention(
     buffers: Mapping[str, Channels], names: Collection[str], stated: str | None, *, single: bool = False
 ) -> str | None:
     """The convention of the motion vectors among a file's channels; None where there are none, or none are wanted.
@@ -98,7 +98,7 @@ def forward_channels(
     return f"{layer}.Z", f"{layer}.W"
 
 
-def forward_of_cycles(vectors: np.ndarray) -> np.ndarray:
+def convert_cycles_forward(vectors: np.ndarray) -> np.ndarray:
     """Displacement [H, W, 2] to the next frame, in our axes, from the last two components of Cycles' ``Vector``.
 
     They are the current position minus the next one, y up: the difference the other way round than in the first two.
@@ -106,7 +106,7 @@ def forward_of_cycles(vectors: np.ndarray) -> np.ndarray:
     return -convert_motion(vectors.astype(np.float32), CYCLES)
 
 
-def dual_of(motion: np.ndarray, forward: np.ndarray | None) -> np.ndarray:
+def derive_dual_motion(motion: np.ndarray, forward: np.ndarray | None) -> np.ndarray:
     """Dual motion vectors [H, W, 2] of a frame, from its motion and the forward displacement in the frame before.
 
     Where both describe the same movement to within half a pixel, the point was seen in the previous frame, or it does

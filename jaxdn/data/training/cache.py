@@ -80,7 +80,7 @@ def open_cached(path: str | Path, *, cache: str | Path | None = None) -> CachedC
     path = Path(path)
     record = read_record(path)
     frames = (frame_path(path, index) for index in range(record["frames"]))  # the record may claim any number
-    home = kept(path, cache, itertools.chain([path / "clip.json"], frames), lambda folder: _fill(path, folder))
+    home = ensure_cache(path, cache, itertools.chain([path / "clip.json"], frames), lambda folder: _fill(path, folder))
     facts = read_json(home / "facts.json")
     if facts["bad_reference_values"]:
         warnings.warn(
@@ -143,7 +143,7 @@ def read_array(clip: CachedClip, name: str, window: tuple[Any, ...]) -> np.ndarr
     return np.array(whole[window], BUFFERS.get(name, _LIGHT).dtype)
 
 
-def kept(
+def ensure_cache(
     path: Path, cache: str | Path | None, files: Iterable[Path], fill: Callable[[Path], Mapping[str, Any]]
 ) -> Path:
     """The folder ``<cache>/<name of path>.<stamp of files>`` (default: ``.cache`` next to ``path``).
@@ -155,7 +155,7 @@ def kept(
     home = root / f"{path.name}.{_stamp(files)}"
     if not home.is_dir():
         _build(path.name, home, fill)
-        _forget(root, path.name, home)
+        _remove_stale(root, path.name, home)
     return home
 
 
@@ -229,7 +229,7 @@ def _noisy(samples: int) -> str:
     return f"noisy_{samples}spp"
 
 
-def _forget(root: Path, name: str, home: Path) -> None:
+def _remove_stale(root: Path, name: str, home: Path) -> None:
     """Remove this clip's caches of earlier stamps; maps that other processes hold open stay valid for them."""
     for old in root.glob(f"{glob.escape(name)}.*"):
         if old != home and old.suffix[1:].isalnum() and len(old.suffix) == 17:

@@ -156,7 +156,7 @@ CODES: dict[str, Code] = {
 """Of each kind of buffer, and of single samples of light."""
 
 
-def squeeze(codes: np.ndarray, slopes: tuple[int, ...] = ()) -> tuple[str, bytes]:
+def compress(codes: np.ndarray, slopes: tuple[int, ...] = ()) -> tuple[str, bytes]:
     """Codes without loss in few bytes, and the name of the way that made them fewest.
 
     LZMA of the integers as they are, LZMA of all first bytes, then all second ones ... (``planes``), or bzip2: noise,
@@ -172,8 +172,8 @@ def squeeze(codes: np.ndarray, slopes: tuple[int, ...] = ()) -> tuple[str, bytes
     return min(found.items(), key=lambda item: len(item[1]))
 
 
-def unsqueeze(way: str, data: bytes, dtype: Any, shape: tuple[int, ...], slopes: tuple[int, ...] = ()) -> np.ndarray:
-    """The codes that :func:`squeeze` was given. Raises ValueError or LZMAError if ``data`` is not its result."""
+def decompress(way: str, data: bytes, dtype: Any, shape: tuple[int, ...], slopes: tuple[int, ...] = ()) -> np.ndarray:
+    """The codes that :func:`compress` was given. Raises ValueError or LZMAError if ``data`` is not its result."""
     size = np.dtype(dtype).itemsize
     if way == "bzip2":
         whole = bz2.decompress(data)

@@ -17,7 +17,7 @@ from jaxdn.core.frame import OF_SAMPLES, Clip, written_out
 from jaxdn.data.clip.frames import doubling_layers
 from jaxdn.data.errors import ClipError
 from jaxdn.data.training.cache import CachedClip, read_window
-from jaxdn.data.training.draws import check_samples, draw_light
+from jaxdn.data.training.light_samples import check_samples, sample_light
 from jaxdn.data.training.pack import open_clips
 from jaxdn.data.training.symmetries import transform_clip
 from jaxdn.recipes.augmentation import STILL, Variation, varied
@@ -45,8 +45,8 @@ def training_batches(
       crop: side of the square crop, or (height, width), in pixels.
       frames: consecutive frames of each element.
       seed: decides the order, windows, crops and symmetries; from 0 to 2^32 - 1.
-      spp: samples per pixel of the noisy radiance (:func:`jaxdn.data.training.draws.draw_light`); of several numbers,
-        each element takes one at random.
+      spp: samples per pixel of the noisy radiance (:func:`jaxdn.data.training.light_samples.sample_light`); of several
+        numbers, each element takes one at random.
       buffers: Frame buffers to read, usually ``denoiser.reads`` (default: all that the clips have).
       layers: add the independent noisy layers of 1, 2, 4, ... samples that every clip has (``Clip.layers``), for a
         denoiser that requests samples; then no element has all light (``variation.beauty``), as layers have not.
@@ -93,7 +93,7 @@ def training_batches(
         if of_samples & source.buffers and samples == min(source.layers, default=0) and not beauty:
             clip = read_window(source, window, spp=samples, buffers=names, layers=layers)
         else:
-            light = draw_light(source, window, samples, rng, beauty=beauty)
+            light = sample_light(source, window, samples, rng, beauty=beauty)
             clip = read_window(source, window, light=light, buffers=names, layers=layers)
         clip = clip._replace(frames=written_out(clip.frames, of_samples))
         if clip.layers is not None:

@@ -20,8 +20,8 @@ from jaxdn.core.checks import check_at_least
 from jaxdn.core.frame import BUFFERS, GUIDES
 from jaxdn.data.clip.folder import find_clips
 from jaxdn.data.errors import ClipError, read_json
-from jaxdn.data.training.cache import CachedClip, kept, open_cached, read_array
-from jaxdn.data.training.compact import CODES, squeeze, unsqueeze
+from jaxdn.data.training.cache import CachedClip, ensure_cache, open_cached, read_array
+from jaxdn.data.training.compact import CODES, compress, decompress
 from jaxdn.runtime.atomic_files import write_atomically
 
 _MAGIC = b"jaxdnpk1"
@@ -79,15 +79,15 @@ def write_pack(
     *,
     size: int,
     packing: Packing,
-    say: Callable[[int, int], None] = lambda windows, size: None,
+    progress: Callable[[int, int], None] = lambda windows, size: None,
 ) -> Packed:
     """Pack random windows of clips into a file of at most ``size`` bytes, of every clip one before of any a second.
 
     Equal arguments give equal files. It ends before the first window that does not fit, or when chance finds no new
-    window any more (in clips as large as a window there is one). ``say`` is called with the windows and bytes so far.
-    The file is complete or absent. Raises ClipError for clips that lack what is asked for or are smaller than a window,
-    and for a size that not even one window fits in; ValueError for other values out of range; OSError if it cannot be
-    written.
+    window any more (in clips as large as a window there is one). ``progress`` is called with the windows and bytes so
+    far. The file is complete or absent. Raises ClipError for clips that lack what is asked for or are smaller than a
+    window, and for a size that not even one window fits in; ValueError for other values out of range; OSError if it
+    cannot be written.
     """
     for clip in clips:
         _check(clip, packing)
@@ -111,7 +111,7 @@ def write_pack(
             entries.append(entry)
             blobs += [data for _, _, data in stored]
             index, total = longer, _HEADER + len(longer) + data
-            say(len(entries), total)
+            progress(len(entries), total)
     body = len(index).to_bytes(8, "little") + index + b"".join(blobs)
     write_atomically({Path(path): _MAGIC + hashlib.sha256(body).digest() + body})
     return Packed(len(entries), len({entry["clip"] for entry in entries}), total)
@@ -126,7 +126,7 @@ def open_pack(path: str | Path, *, cache: str | Path | None = None) -> list[Cach
     path = Path(path)
     if not path.is_file():
         raise ClipError(f"{path}: there is no such file.")
-    home = kept(path, cache, [path], lambda folder: _unpack(path, folder))
+    home = ensure_cache(path, cache, [path], lambda folder: _unpack(path, folder))
     clips = []
     for number, entry in enumerate(read_json(home / "facts.json")["windows"]):
         where = path / f"{number:04d}-{entry['clip']}"
@@ -191,8 +191,8 @@ def _stored(
         for name in list(_PARTS)[: 1 + packing.direct]:
             codes[name] = CODES["sample"].encode(draws[..., _PARTS[name]])
     changes = {name: _changes(name, codes) for name in codes}
-    squeezed = pool.map(lambda name: squeeze(changes[name], _slopes(name, codes)), codes)
-    return [(name, way, data) for name, (way, data) in zip(codes, squeezed, strict=True)]
+    compressed = pool.map(lambda name: compress(changes[name], _slopes(name, codes)), codes)
+    return [(name, way, data) for name, (way, data) in zip(codes, compressed, strict=True)]
 
 
 def _kind(name: str) -> str:
@@ -264,7 +264,7 @@ def _unpack_window(folder: Path, entry: Mapping[str, Any], blobs: Sequence[bytes
         channels = BUFFERS[name].channels if code.channels is None else code.channels
         count = [entry["draws"]] if name in _PARTS else []
         shape = (frames, *count, *pixels, *([channels] if channels else []))
-        codes[name] = unsqueeze(way, blob, code.dtype, shape, _slopes(name, dict.fromkeys(there)))
+        codes[name] = decompress(way, blob, code.dtype, shape, _slopes(name, dict.fromkeys(there)))
         base = _base(name, codes)
         if base is not None:
             codes[name] = codes[name] + codes[base]

@@ -9,7 +9,7 @@ from jaxdn import clips
 from jaxdn.clips import ClipError, training_batches
 from jaxdn.core.frame import Frame
 from jaxdn.data.training.cache import open_cached
-from jaxdn.data.training.draws import check_samples, draw_light
+from jaxdn.data.training.light_samples import check_samples, sample_light
 from jaxdn.recipes.augmentation import STILL
 
 COUNT, FRAMES, SIDE = 4, 3, 6
@@ -42,29 +42,29 @@ def test_draws_come_back_from_the_file(folder: Path) -> None:
 
 def test_some_samples_are_a_mean_of_different_draws(folder: Path) -> None:
     clip, rng = open_cached(folder / "one"), np.random.default_rng(0)
-    single = {float(draw_light(clip, EVERYTHING, 1, rng).noisy[0, 0, 0, 0]) for _ in range(40)}
+    single = {float(sample_light(clip, EVERYTHING, 1, rng).noisy[0, 0, 0, 0]) for _ in range(40)}
     assert single == {1.0, 2.0, 4.0, 8.0}
-    pairs = {float(2 * draw_light(clip, EVERYTHING, 2, rng).noisy[0, 0, 0, 0]) for _ in range(60)}
+    pairs = {float(2 * sample_light(clip, EVERYTHING, 2, rng).noisy[0, 0, 0, 0]) for _ in range(60)}
     assert pairs == {3.0, 5.0, 6.0, 9.0, 10.0, 12.0}  # never the same draw twice
     window = (slice(1, 3), slice(2, 5), slice(0, 4))
-    light = draw_light(clip, window, 4, rng)
+    light = sample_light(clip, window, 4, rng)
     assert light.noisy.shape == light.reference.shape == (2, 3, 4, 3)
     np.testing.assert_array_equal(light.noisy, 15 / 4)
     np.testing.assert_array_equal(light.reference, 7)
 
 
 def test_all_light_has_noisy_direct_light_and_emission(folder: Path) -> None:
-    light = draw_light(open_cached(folder / "one"), EVERYTHING, 4, np.random.default_rng(0), beauty=True)
+    light = sample_light(open_cached(folder / "one"), EVERYTHING, 4, np.random.default_rng(0), beauty=True)
     np.testing.assert_array_equal(light.noisy, 15 / 4 + 100 + 2)
     np.testing.assert_array_equal(light.reference, 7 + 3 + 2)
 
 
 def test_half_of_the_reference_is_a_clean_input_with_the_other_half_as_its_target(folder: Path) -> None:
     clip, rng = open_cached(folder / "one"), np.random.default_rng(0)
-    light = draw_light(clip, EVERYTHING, 12, rng)
+    light = sample_light(clip, EVERYTHING, 12, rng)
     np.testing.assert_array_equal(light.noisy, 5)
     np.testing.assert_allclose(light.reference, 9)  # the mean of both is 7
-    np.testing.assert_array_equal(draw_light(clip, EVERYTHING, 16, rng).noisy, 60)
+    np.testing.assert_array_equal(sample_light(clip, EVERYTHING, 16, rng).noisy, 60)
     for spp in (1, 4, 12, 16):
         check_samples(clip, spp)
     with pytest.raises(ClipError, match=r"single samples give 1 to 4, or 12 \(half of the reference\)"):

@@ -38,7 +38,9 @@ def check_samples(clip: CachedClip, spp: int) -> None:
         ) from error
 
 
-def draw_light(clip: CachedClip, window: Window, spp: int, rng: np.random.Generator, *, beauty: bool = False) -> Light:
+def sample_light(
+    clip: CachedClip, window: Window, spp: int, rng: np.random.Generator, *, beauty: bool = False
+) -> Light:
     """Light of ``spp`` samples a pixel in a window (frames, rows, columns) of a clip.
 
     Args:
