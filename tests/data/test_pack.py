@@ -150,7 +150,7 @@ def test_vectors_and_fractions_are_within_their_bounds(values: np.ndarray) -> No
 def test_compression_loses_nothing(dtype: type, slopes: tuple[int, ...], rng: np.random.Generator) -> None:
     for codes in (rng.integers(0, np.iinfo(dtype).max, (3, 5, 4, 2)), np.zeros((3, 5, 4, 2)), np.ones((1, 1, 1, 1))):
         codes = codes.astype(dtype)
-        way, data = compact.squeeze(codes, slopes)
+        way, data = compact.compress(codes, slopes)
         np.testing.assert_array_equal(compact.decompress(way, data, dtype, codes.shape, slopes), codes)
 
 
