@@ -41,7 +41,7 @@ test-slow: setup  ## the slow tests: real training runs, the notebook, real proc
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q -m slow $(SETTINGS)
 
 hard-cases: setup  ## run every operation and denoiser on every hard case: runs/hard-cases/table.html
-	$(BIN)/python -m tests.hard_cases
+	$(BIN)/python -m tests.hard_cases $(SETTINGS)
 
 # Common alternatives to compare with. Only a CPU build of PyTorch is installed, from pip's configured index or else
 # through uv from PyTorch's own index: the default build brings gigabytes of CUDA packages.

@@ -17,7 +17,7 @@ from jaxdn.commands import main
 from jaxdn.methods import registry
 from jaxdn.zoo.weights import describe
 from tests.hard_cases.cases import CASES
-from tests.hard_cases.subjects import denoiser_subjects
+from tests.hard_cases.functions import list_denoisers
 from tests.hard_cases.table import rows
 from tests.training.test_training import make_clip
 
@@ -115,9 +115,9 @@ def test_a_new_method_is_trained_denoises_and_is_compared(toy, clips, tmp_path, 
 
 
 def test_a_new_method_appears_in_the_hard_cases_and_the_chart(toy):
-    subject = next(subject for subject in denoiser_subjects() if subject.name == "toy")
+    function = next(function for function in list_denoisers() if function.name == "toy")
     cases = [CASES["radiance not a number"], CASES["every pixel off screen"]]
-    table_rows = list(rows(cases, [subject]))
+    table_rows = list(rows(cases, [function]))
     assert len(table_rows) == 8
     assert {row.verdict for row in table_rows} == {"green"}
 

@@ -2,7 +2,7 @@
 
     python -m experiments.stability.long_runs      # curves.json and curves.png in runs/long-runs/
 
-Three runs of 2,000 frames for each subject: a static camera; a clip played back and forth; and the same with one
+Three runs of 2,000 frames for each method: a static camera; a clip played back and forth; and the same with one
 *poisoned* frame in the middle, in which every value is NaN or 1e30. Per frame: the largest magnitude in the state, the
 error of the output against the noise-free image, and, for a poisoned run, its distance from the clean one.
 """
@@ -39,7 +39,7 @@ LAYERS = (1, 2, 4, 8)
 class Settings:
     """Denoise thousands of frames and record curves."""
 
-    subjects: tuple[str, ...] = field(default_factory=lambda: tuple(name for name in all_names() if name != NOISY))
+    methods: tuple[str, ...] = field(default_factory=lambda: tuple(name for name in all_names() if name != NOISY))
     """Filters, and names or paths of weights; default: all that are shipped."""
     frames: int = 2000
     out: Path = Path("runs/long-runs")
@@ -121,11 +121,11 @@ def distance(clean: Curves, poisoned: Curves) -> np.ndarray:
 
 
 def examine(name: str, frames: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """All runs of one subject: their results and curves."""
-    subject = candidate(name)
-    if subject.denoiser is None:
-        raise ValueError(f"subject {name!r}: expected a denoiser, got the noisy image itself.")
-    run = compiled(subject.denoiser, subject.params, frames)
+    """All runs of one method: their results and curves."""
+    method = candidate(name)
+    if method.denoiser is None:
+        raise ValueError(f"method {name!r}: expected a denoiser, got the noisy image itself.")
+    run = compiled(method.denoiser, method.params, frames)
     at = frames // 2
 
     def curves(speed: float, poison: float = 0.0, poisoned: int = -1) -> Curves:
@@ -147,7 +147,7 @@ def examine(name: str, frames: int) -> tuple[dict[str, Any], dict[str, np.ndarra
 
 
 def draw(curves: dict[str, dict[str, np.ndarray]], path: Path) -> None:
-    """State and error over all frames, and the frames around the poisoned one, a row for each subject."""
+    """State and error over all frames, and the frames around the poisoned one, a row for each method."""
     import matplotlib
 
     matplotlib.use("agg")
@@ -171,11 +171,11 @@ def draw(curves: dict[str, dict[str, np.ndarray]], path: Path) -> None:
 
 
 def main(settings: Settings) -> None:
-    """Run all subjects, write curves.json and curves.png, print the results."""
+    """Run all methods, write curves.json and curves.png, print the results."""
     settings.out.mkdir(parents=True, exist_ok=True)
     outcomes: dict[str, Any] = {}
     curves: dict[str, dict[str, np.ndarray]] = {}
-    for name in settings.subjects:
+    for name in settings.methods:
         began = time.monotonic()
         outcomes[name], curves[name] = examine(name, settings.frames)
         print(f"{name} ({time.monotonic() - began:.0f} s)", flush=True)
@@ -185,7 +185,7 @@ def main(settings: Settings) -> None:
         name: {label: [float(f"{value:.5g}") for value in line] for label, line in lines.items()}
         for name, lines in curves.items()
     }
-    report = {"frames": settings.frames, "size": SIZE, "subjects": outcomes, "curves": per_frame}
+    report = {"frames": settings.frames, "size": SIZE, "methods": outcomes, "curves": per_frame}
     write_atomically({settings.out / "curves.json": json.dumps(report) + "\n"})
     draw(curves, settings.out / "curves.png")
     print(f"{settings.out / 'curves.json'}, {settings.out / 'curves.png'}")

@@ -83,7 +83,7 @@ class Options:
     """The network sees radiance times :func:`jaxdn.color.exposure` of each frame, so that twice the light gives twice
     the image; or radiance as it is given."""
     initialization: Literal["he", "xavier"] = "he"
-    """Of the U-Net's weights, see :func:`jaxdn.networks.unet.initial`."""
+    """Of the U-Net's weights, see :func:`jaxdn.networks.unet.draw_initial_weights`."""
     demodulate: Demodulation | bool = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     truncate: bool = False

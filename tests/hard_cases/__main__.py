@@ -1,134 +1,146 @@
 """Run all hard cases and write the page: ``make hard-cases``.
 
-    python -m tests.hard_cases                # runs/hard-cases/table.html and table.json
+    python -m tests.hard_cases                # runs/hard-cases/table.html, table.json and summary.json
     python -m tests.hard_cases svgf relax     # these alone, without the page
 
-Results are stored in ``runs/hard-cases/parts``, one file for each function; an interrupted run is resumed from them, as
-long as neither the package nor the cases have changed. Compiled programs are cached there too, so that a run after a
-fix compiles only what the fix has changed.
+An interrupted run goes on where it was, as long as neither the package nor the cases have changed.
 """
 
-import hashlib
-import json
+import math
+import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
-import numpy as np
 import tyro
 
-from jaxdn import color
 from jaxdn.commands.errors import plain_errors
-from jaxdn.evaluation.report.images import data_address, encode_png
-from jaxdn.runtime.atomic_files import write_atomically
-from tests.hard_cases import laws
-from tests.hard_cases.cases import CASES
-from tests.hard_cases.inputs import good
+from jaxdn.evaluation.compare import describe_machine
+from jaxdn.runtime.atomic_files import write_json
+from tests.hard_cases import run
+from tests.hard_cases.invariances import Deviation
 from tests.hard_cases.page import write_page
-from tests.hard_cases.subjects import Subject, denoiser_subjects, operation_subjects
-from tests.hard_cases.table import Row, rows
-
-FOLDER = Path("runs/hard-cases")
-
-
-def fingerprint() -> str:
-    """Changes with the package, the cases, jax and the device: results of another state are not reused."""
-    here = Path(__file__).parent
-    package = (here.parent.parent / "jaxdn").rglob("*.py")
-    sources = sorted([*(path for path in here.glob("*.py") if path.name != "page.py"), *package])
-    state = [jax.__version__, jax.default_backend(), *(path.read_text() for path in sources)]
-    return hashlib.sha256("\0".join(state).encode()).hexdigest()
-
-
-def part(name: str, state: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """The result of ``make()``, read from its file if that has the same state, else computed and written."""
-    path = FOLDER / "parts" / f"{name.replace(' ', '-').replace(',', '')}.json"
-    if path.is_file():
-        known = json.loads(path.read_text())
-        if known["state"] == state:
-            return known
-    began = time.monotonic()
-    made = {"state": state, **make()}
-    made["seconds"] = time.monotonic() - began
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically({path: json.dumps(made)})
-    return made
-
-
-def picture(image: np.ndarray, exposure: float) -> str:
-    """The data address of linear radiance [H, W, 3], exposed and encoded for a display; magenta is NaN."""
-    return data_address(encode_png(np.asarray(color.tonemap(np.asarray(image, np.float32) * exposure))))
-
-
-def exposure_of(case: str) -> float:
-    """The exposure that maps the median of a case's reference to middle grey, so that dark and bright cases show."""
-    middle = float(np.median(CASES[case].make(good()).clip.reference))
-    return 0.3 / middle if middle > 0 else 1.0
-
-
-def of_subject(subject: Subject) -> dict[str, Any]:
-    """All rows of one subject, and its pictures."""
-    images: dict[tuple[str, str], np.ndarray] = {}
-    table = list(rows(CASES.values(), [subject], pictures=images))
-    pictures = {case: picture(image, exposure_of(case)) for (case, _), image in images.items()}
-    return {"rows": table, "pictures": pictures}
-
-
-def given_pictures() -> dict[tuple[str, str], str]:
-    """The inputs: the last noisy frame of each case, and its reference."""
-    shown = {}
-    for name, case in CASES.items():
-        clip = case.make(good()).clip
-        shown[name, "noisy"] = picture(clip.frames.radiance[-1], exposure_of(name))
-        shown[name, "reference"] = picture(clip.reference[-1], exposure_of(name))
-    return shown
+from tests.hard_cases.table import Row
 
 
 @dataclass
 class Settings:
-    """Run the hard cases and list what is red; the exit code says whether anything is."""
+    """Run the hard cases and list what is red; the exit code is 1 if anything is."""
 
-    subjects: Annotated[list[str], tyro.conf.Positional] = field(default_factory=list)
+    functions: Annotated[list[str], tyro.conf.Positional] = field(default_factory=list)
     """How the names of denoisers and operations begin; default: all, and the page is written."""
+    workers: int = 2
+    """Processes that run functions side by side; each needs about 2 GB."""
 
 
 def main(settings: Settings) -> int:
-    """Run the cases, write the page, list what is red. Raises ValueError for a name that no subject has."""
-    jax.config.update("jax_compilation_cache_dir", str(FOLDER.resolve() / "compiled"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
-    state = fingerprint()
-    everything = [*denoiser_subjects(), *operation_subjects()]
-    subjects = [one for one in everything if not settings.subjects or one.name.startswith(tuple(settings.subjects))]
-    if not subjects:
-        names = ", ".join(one.name for one in everything)
-        raise ValueError(f"subjects: expected some out of {names}, got {', '.join(settings.subjects)}.")
-    table: list[Row] = []
-    pictures = given_pictures()
-    seconds = 0.0
-    for number, subject in enumerate(subjects, 1):
-        made = part(subject.name, state, lambda subject=subject: of_subject(subject))
-        found = [Row(*row) for row in made["rows"]]
-        table += found
-        pictures |= {(case, subject.name): address for case, address in made["pictures"].items()}
-        seconds += made["seconds"]
-        red = sum(row.verdict == "red" for row in found)
-        verdict = f"{red} of {len(found)} red" if red else f"{len(found)} cells without red"
-        print(f"[{number}/{len(subjects)}] {subject.name}: {verdict}, {made['seconds']:.0f} s", flush=True)
+    """Run the cases, write the page, list what is red. Raises ValueError for a name that no function has."""
+    if settings.workers < 1:
+        raise ValueError(f"workers: expected at least 1, got {settings.workers}.")
+    names = choose(settings.functions)
+    state = run.fingerprint()
+    jobs = names if settings.functions else [*names, run.INVARIANCES]
+    announce(jobs, state, settings.workers)
+    began = time.monotonic()
+    results = follow(jobs, names, state, settings.workers)
+    seconds = time.monotonic() - began
+    table = [Row(*row) for name in names for row in results[name]["rows"]]
     red = [row for row in table if row.verdict == "red"]
     for row in red:
-        print(f"red: {row.subject}, {row.case}, {row.precision}, {row.direction}: {row.reason}")
-    if settings.subjects:
-        print(f"{len(table)} cells, {len(red)} red, {seconds / 60:.0f} min")
-        return 1 if red else 0
-    made = part("laws", state, lambda: {"laws": list(laws.measured())})
-    seconds += made["seconds"]
-    page = write_page(table, FOLDER, laws=[laws.Law(*law) for law in made["laws"]], pictures=pictures)
-    print(f"{len(table)} cells, {len(red)} red, {seconds / 60:.0f} min: {page}")
+        print(f"red: {row.function}, {row.case}, {row.precision}, {row.direction}: {row.reason}")
+    end = f"{len(table):,} cells, {len(red)} red, {seconds / 60:.0f} min"
+    if not settings.functions:
+        deviations = [Deviation(*one) for one in results[run.INVARIANCES]["deviations"]]
+        pictures = run.input_pictures()
+        for name in names:
+            pictures |= {(case, name): address for case, address in results[name]["pictures"].items()}
+        page = write_page(table, run.FOLDER, deviations=deviations, pictures=pictures)
+        worked = sum(one["seconds"] for one in results.values())
+        write_json(run.FOLDER / "summary.json", summarize(table, seconds=seconds, process_seconds=worked))
+        end = f"{end}: {page}"
+    print(end)
     return 1 if red else 0
+
+
+def choose(wanted: Sequence[str]) -> list[str]:
+    """The names of the functions whose names begin so; all if none is wanted. Raises ValueError for one without any."""
+    known = list(run.functions())
+    for start in wanted:
+        if not any(name.startswith(start) for name in known):
+            raise ValueError(f"functions: expected some out of {', '.join(known)}, got {start}.")
+    return [name for name in known if not wanted or name.startswith(tuple(wanted))]
+
+
+def announce(jobs: Sequence[str], state: str, workers: int) -> None:
+    """Print what there is to do, what is kept, and what is computed anew."""
+    found = [result["state"] == state for name in jobs if (result := run.stored(name)) is not None]
+    kept, outdated = sum(found), len(found) - sum(found)
+    if kept:
+        print(f"{kept} of {len(jobs)} results are kept: they are of this state of the code.")
+    if outdated:
+        print(f"{outdated} of {len(jobs)} results are of another state of the code: they are computed anew.")
+    minutes = run.expected_seconds(jobs, state) / workers / 60
+    print(f"{len(jobs) - kept} to run in {workers} processes: about {minutes:.0f} min if as many cores are idle.")
+
+
+def follow(jobs: Sequence[str], names: Sequence[str], state: str, workers: int) -> dict[str, dict[str, Any]]:
+    """The results of all jobs by name; prints each as it is finished, with all cells so far and the time left."""
+    results: dict[str, dict[str, Any]] = {}
+    cells = reds = 0
+    for name, result, left in run.run_all(jobs, state, workers=workers):
+        results[name] = result
+        found = [Row(*row) for row in result.get("rows", ())]
+        red = sum(row.verdict == "red" for row in found)
+        cells, reds = cells + len(found), reds + red
+        if math.isnan(left):  # known before
+            continue
+        verdict = f"{red} of {len(found)} red" if red else f"{len(found)} cells without red" if found else "measured"
+        print(
+            f"[{len(results)}/{len(jobs)}] {name}: {verdict}, {result['seconds']:.0f} s; "
+            f"{cells:,} of {len(names) * run.CELLS:,} cells, {reds} red, {left / 60:.0f} min left",
+            flush=True,
+        )
+    return results
+
+
+def summarize(table: Sequence[Row], *, seconds: float, process_seconds: float) -> dict[str, Any]:
+    """What a page of results needs: where and when the table was run, and how many cells had which verdict."""
+    verdicts = Counter(row.verdict for row in table)
+    return {
+        "revision": revision(),
+        "machine": describe_machine(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "functions": len({row.function for row in table}),
+        "cases": len({row.case for row in table}),
+        "cells": len(table),
+        **{verdict: verdicts[verdict] for verdict in ("green", "input", "red")},
+        "red_cells": [
+            [row.function, row.case, row.precision, row.direction, row.reason] for row in table if row.verdict == "red"
+        ],
+        "seconds": round(seconds, 1),
+        "process_seconds": round(process_seconds, 1),
+    }
+
+
+def revision() -> str | None:
+    """The commit of the code, with ``-dirty`` if files differ from it; None without git."""
+    here = Path(__file__).parent
+    try:
+        done = subprocess.run(
+            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
+            cwd=here,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()
 
 
 if __name__ == "__main__":

@@ -9,11 +9,11 @@ import jax
 
 from jaxdn.runtime.atomic_files import write_atomically
 from tests.hard_cases.cases import CASES
-from tests.hard_cases.laws import Law
+from tests.hard_cases.invariances import Deviation
 from tests.hard_cases.table import DIRECTIONS, PRECISIONS, Row
 
 Pictures = Mapping[tuple[str, str], str]
-"""(case, subject) -> the address of a PNG."""
+"""(case, function) -> the address of a PNG."""
 
 _WORST = ("green", "input", "red")
 _STYLE = """
@@ -35,18 +35,18 @@ figure:target,section:target h3{background:#fff3b0}
 
 
 def write_page(
-    table: Sequence[Row], folder: Path, *, laws: Sequence[Law] = (), pictures: Pictures | None = None
+    table: Sequence[Row], folder: Path, *, deviations: Sequence[Deviation] = (), pictures: Pictures | None = None
 ) -> Path:
-    """``table.json`` and ``table.html`` in ``folder``: cases down, subjects across, each cell linked to its case."""
+    """``table.json`` and ``table.html`` in ``folder``: cases down, functions across, each cell linked to its case."""
     folder.mkdir(parents=True, exist_ok=True)
     counts = {verdict: sum(row.verdict == verdict for row in table) for verdict in _WORST}
     cells: dict[tuple[str, str], list[Row]] = {}
     for row in table:
-        cells.setdefault((row.case, row.subject), []).append(row)
+        cells.setdefault((row.case, row.function), []).append(row)
     cases = list(dict.fromkeys(row.case for row in table))
-    kinds = {kind: list(dict.fromkeys(row.subject for row in table if row.kind == kind)) for kind in _kinds(table)}
+    kinds = {kind: list(dict.fromkeys(row.function for row in table if row.kind == kind)) for kind in _kinds(table)}
     pictures = pictures or {}
-    tables = "".join(_table(kind, cases, subjects, cells, pictures) for kind, subjects in kinds.items())
+    tables = "".join(_table(kind, cases, functions, cells, pictures) for kind, functions in kinds.items())
     red = [row for row in table if row.verdict == "red"]
     body = f"""<h1>Hard cases</h1>
 <p>{len(cases)} cases, {sum(map(len, kinds.values()))} functions, {len(table)} cells: <span class="green key">
@@ -58,11 +58,11 @@ images), as a pure function may and a denoiser may not. Compiled by jax {jax.__v
 difference from it, relative to the largest value (small ones: bfloat16 inputs); – is
 where infinity in the input leaves nothing to compare. Point at
 a cell for all its results; click it for the case{" and its pictures" if pictures else ""}.</p>
-{_list("Red", red) if red else ""}{tables}{_laws(laws) if laws else ""}
+{_list("Red", red) if red else ""}{tables}{_deviations(deviations) if deviations else ""}
 <h2>Cases</h2>{"".join(_section(case, cells, pictures) for case in cases)}"""
     page = folder / "table.html"
     document = f'<!doctype html><meta charset="utf-8"><title>Hard cases</title><style>{_STYLE}</style>{body}\n'
-    record = {"rows": [row._asdict() for row in table], "laws": [law._asdict() for law in laws]}
+    record = {"rows": [row._asdict() for row in table], "deviations": [one._asdict() for one in deviations]}
     write_atomically({page: document, folder / "table.json": json.dumps(record, indent=0, default=str) + "\n"})
     return page
 
@@ -71,8 +71,8 @@ def _kinds(table: Sequence[Row]) -> list[str]:
     return list(dict.fromkeys(row.kind for row in table))
 
 
-def _anchor(case: str, subject: str | None = None) -> str:
-    return html.escape("--".join(part.replace(" ", "-").replace(",", "") for part in (case, subject) if part))
+def _anchor(case: str, function: str | None = None) -> str:
+    return html.escape("--".join(part.replace(" ", "-").replace(",", "") for part in (case, function) if part))
 
 
 def _sentence(case: str) -> str:
@@ -92,7 +92,7 @@ def _described(row: Row) -> str:
 def _table(
     kind: str,
     cases: Sequence[str],
-    subjects: Sequence[str],
+    functions: Sequence[str],
     cells: Mapping[tuple[str, str], Sequence[Row]],
     pictures: Pictures,
 ) -> str:
@@ -100,18 +100,20 @@ def _table(
     wide = kind == "denoiser"
     ways = [(precision, direction) for precision in PRECISIONS for direction in DIRECTIONS] if wide else [None]
     head = []
-    for subject in subjects:
+    for function in functions:
         for way in ways:
-            label = subject if way is None else f"{subject}: {way[0]}, {way[1]}"
+            label = function if way is None else f"{function}: {way[0]}, {way[1]}"
             head.append(f"<th><div class='up'>{html.escape(label)}</div></th>")
     body = []
     for case in cases:
         where = html.escape(_sentence(case), quote=True)
         line = [f'<th title="{where}"><a href="#{_anchor(case)}">{html.escape(case)}</a></th>']
-        for subject in subjects:
-            place = _anchor(case, subject) if (case, subject) in pictures else _anchor(case)
+        for function in functions:
+            place = _anchor(case, function) if (case, function) in pictures else _anchor(case)
             for way in ways:
-                found = [row for row in cells.get((case, subject), ()) if way in (None, (row.precision, row.direction))]
+                found = [
+                    row for row in cells.get((case, function), ()) if way in (None, (row.precision, row.direction))
+                ]
                 line.append(_cell(found, place))
         body.append(f"<tr>{''.join(line)}</tr>\n")
     rows = "".join(body)
@@ -133,7 +135,7 @@ def _cell(found: Sequence[Row], place: str) -> str:
 
 def _list(title: str, found: Iterable[Row]) -> str:
     lines = (
-        f'<li><a href="#{_anchor(row.case)}">{html.escape(f"{row.subject}, {row.case}")}</a>: '
+        f'<li><a href="#{_anchor(row.case)}">{html.escape(f"{row.function}, {row.case}")}</a>: '
         f"{html.escape(_described(row))}"
         for row in found
     )
@@ -142,9 +144,9 @@ def _list(title: str, found: Iterable[Row]) -> str:
 
 def _section(case: str, cells: Mapping[tuple[str, str], Sequence[Row]], pictures: Pictures) -> str:
     shown = [
-        f'<figure id="{_anchor(case, subject)}"><img src="{address}" alt="{html.escape(f"{case}: {subject}")}">'
-        f"<figcaption>{html.escape(subject)}</figcaption></figure>"
-        for (one, subject), address in pictures.items()
+        f'<figure id="{_anchor(case, function)}"><img src="{address}" alt="{html.escape(f"{case}: {function}")}">'
+        f"<figcaption>{html.escape(function)}</figcaption></figure>"
+        for (one, function), address in pictures.items()
         if one == case
     ]
     faults = [row for (one, _), rows in cells.items() if one == case for row in rows if row.verdict == "red"]
@@ -154,11 +156,11 @@ def _section(case: str, cells: Mapping[tuple[str, str], Sequence[Row]], pictures
     )
 
 
-def _laws(laws: Sequence[Law]) -> str:
+def _deviations(deviations: Sequence[Deviation]) -> str:
     body = "".join(
-        f"<tr><th>{html.escape(law.law)}</th><th>{html.escape(law.method)}</th><td>{law.difference:.1e}</td>"
-        f"<td>{law.error:.1e}</td><td>{law.difference / law.error:.2f}</td></tr>\n"
-        for law in laws
+        f"<tr><th>{html.escape(one.change)}</th><th>{html.escape(one.method)}</th><td>{one.difference:.1e}</td>"
+        f"<td>{one.error:.1e}</td><td>{one.difference / one.error:.2f}</td></tr>\n"
+        for one in deviations
     )
     return f"""<h2>Invariances of the learned networks</h2><p>A filter commutes with each of these changes of its
 input; a network has only learned to. Its deviation: root mean square of the difference between the denoised change

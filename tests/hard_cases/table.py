@@ -1,6 +1,6 @@
-"""All combinations of cases, subjects, precisions and directions with their results: one row per cell."""
+"""All combinations of cases, functions, precisions and directions with their results: one row per cell."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -9,8 +9,10 @@ import numpy as np
 
 from tests.compiling import AS_USERS, SOON
 from tests.hard_cases.cases import Case
+from tests.hard_cases.functions import Function, gradient_of, narrow_gradient
 from tests.hard_cases.inputs import Inputs, good
-from tests.hard_cases.subjects import Subject, gradient_of
+from tests.hard_cases.programs import Program, Widening
+from tests.hard_cases.widening import widen
 
 PRECISIONS = ("float32", "bfloat16 inputs")
 DIRECTIONS = ("forward", "gradient")
@@ -29,7 +31,7 @@ class Row(NamedTuple):
     """One cell of the table."""
 
     case: str
-    subject: str
+    function: str
     kind: str
     """``denoiser`` or ``operation``."""
     precision: str
@@ -47,70 +49,47 @@ class Row(NamedTuple):
 
 def rows(
     cases: Iterable[Case],
-    subjects: Sequence[Subject],
+    functions: Sequence[Function],
     *,
     precisions: Sequence[str] = PRECISIONS,
     directions: Sequence[str] = DIRECTIONS,
     pictures: dict[tuple[str, str], np.ndarray] | None = None,
 ) -> Iterator[Row]:
-    """Every cell; one compiled program for each subject, precision, direction and size.
+    """Every cell; one compiled program for each function, direction, size and, where it does not widen, precision.
 
-    ``pictures`` is filled with the last image [H, W, 3] that each case and pictured subject gives in single precision.
+    A function that widens its bfloat16 inputs before it computes (:mod:`tests.hard_cases.widening`) is one program for
+    both precisions: it gets the same numbers as float32, and its gradients are rounded to bfloat16 afterwards.
+
+    ``pictures`` is filled with the last image [H, W, 3] that each case and pictured function gives in single precision.
     """
     made = {case.name: case.make(good()) for case in cases}
-    for subject in subjects:
-        params = subject.begin()
+    for function in functions:
+        params = function.begin()
         wide = _widened(params)
+        widening = Widening(function.run)
         for direction in directions:
             forward = direction == "forward"
-            exact = subject.truth or subject.run
-            run = _Program(subject.run if forward else gradient_of(subject.run), compiler_options=AS_USERS)
+            exact = function.truth or function.run
+            run = Program(function.run if forward else gradient_of(function.run), compiler_options=AS_USERS)
             # The comparison runs once for each case: compiled without optimisation, in a fifth of the time.
             plain = {"xla_backend_optimization_level": 0, **SOON}
-            double = _Program(exact if forward else gradient_of(exact), compiler_options=plain)
+            double = Program(exact if forward else gradient_of(exact), compiler_options=plain)
             for precision in precisions:
                 for name, inputs in made.items():
-                    given = _cast(inputs, precision)
-                    found = run(params, given)
+                    given = cast(inputs, precision)
+                    if widening(params, given):
+                        found = run(params, widen(given))
+                        found = found if forward else narrow_gradient(found, given)
+                    else:
+                        found = run(params, given)
                     with jax.enable_x64(True):
                         truth = double(wide, _widened(given))
-                    yield _judge(name, subject, precision, direction, found, truth, given)
-                    if pictures is not None and subject.pictured and forward and precision == "float32":
-                        pictures[name, subject.name] = np.asarray(found).reshape(-1, *found.shape[-3:])[-1]
+                    yield _judge(name, function, precision, direction, found, truth, given)
+                    if pictures is not None and function.pictured and forward and precision == "float32":
+                        pictures[name, function.name] = np.asarray(found).reshape(-1, *found.shape[-3:])[-1]
 
 
-class _Program:
-    """A function of parameters and inputs, compiled, that runs once for all inputs with the same in what it reads.
-
-    Most cases break one buffer, and most functions do not read it: their programs have no such argument.
-    """
-
-    def __init__(self, function: Callable[[Any, Inputs], Any], **options: Any) -> None:
-        self._jitted = jax.jit(function, **options)
-        self._compiled: dict[Any, tuple[Callable[..., Any], list[int]]] = {}
-        self._results: dict[Any, Any] = {}
-
-    def __call__(self, params: Any, inputs: Inputs) -> Any:
-        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(inputs)]
-        types = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-        if types not in self._compiled:
-            traced = self._jitted.trace(params, inputs)
-            self._compiled[types] = traced.lower().compile(), _read(traced.jaxpr.jaxpr, len(leaves))
-        compiled, read = self._compiled[types]
-        given = (types, *(leaves[index].tobytes() for index in read))
-        if given not in self._results:
-            self._results[given] = jax.tree.map(np.asarray, compiled(params, inputs))
-        return self._results[given]
-
-
-def _read(program: Any, count: int) -> list[int]:
-    """Which of the program's last ``count`` arguments any operation has as an operand, or are results themselves."""
-    operands = [*program.outvars, *(operand for equation in program.eqns for operand in equation.invars)]
-    read = {id(operand) for operand in operands}
-    return [index for index, argument in enumerate(program.invars[-count:]) if id(argument) in read]
-
-
-def _cast(inputs: Inputs, precision: str) -> Inputs:
+def cast(inputs: Inputs, precision: str) -> Inputs:
     """Half-precision inputs, as a file or a GPU gives them."""
     if precision == "float32":
         return inputs
@@ -141,7 +120,9 @@ def _leaves(tree: Any) -> np.ndarray:
     return np.concatenate(kept) if kept else np.zeros(0)
 
 
-def _judge(case: str, subject: Subject, precision: str, direction: str, result: Any, exact: Any, inputs: Inputs) -> Row:
+def _judge(
+    case: str, function: Function, precision: str, direction: str, result: Any, exact: Any, inputs: Inputs
+) -> Row:
     found, truth = _leaves(result), _leaves(exact)
     finite = np.isfinite(found)
     representable = np.isfinite(truth) & (np.abs(truth) <= _MOST)
@@ -150,33 +131,33 @@ def _judge(case: str, subject: Subject, precision: str, direction: str, result: 
     lowest = float(np.min(found[finite], initial=0.0))
     error = None
     # A pure function of infinity saturates at the largest number of its own precision: nothing to compare there.
-    if subject.sanitizes or not _infinite(inputs):
+    if function.sanitizes or not _infinite(inputs):
         # Below the smallest normal number XLA:CPU rounds to 0, as most hardware does.
         scale = max(float(np.max(np.abs(truth[both]), initial=0.0)), 1e3 * _LEAST)
         size = min(1.0, float(np.max(np.abs(_leaves(inputs.clip.frames.radiance)), initial=0.0)))
         if scale < 1e-9 * size:  # 0 because its terms cancel: equal up to the rounding of the terms
             scale = 1e-4 * size
         error = float(np.max(np.abs(found[both] - truth[both]), initial=0.0)) / scale
-    reduced = subject.truth is not None or jax.tree.leaves(result)[0].dtype == jnp.bfloat16
+    reduced = function.truth is not None or jax.tree.leaves(result)[0].dtype == jnp.bfloat16
     bound = ERROR_BOUND["half" if reduced else "single"]
 
     # Not finite in double precision either: it comes from the input or is the true value (an infinite PSNR).
-    excused = np.zeros_like(finite) if subject.sanitizes else ~representable
+    excused = np.zeros_like(finite) if function.sanitizes else ~representable
     verdict, reason = "green", ""
     if not np.all(finite | excused):
         verdict, reason = "red", f"{int(np.sum(~finite & ~excused))} values are not finite"
-    elif direction == "gradient" and largest > STEEPEST and subject.sanitizes:
+    elif direction == "gradient" and largest > STEEPEST and function.sanitizes:
         verdict, reason = "red", f"a gradient of {largest:.1e}"
-    elif direction == "forward" and lowest < subject.bounds[0] - 1e-6:
-        verdict, reason = "red", f"{lowest:.3g} is below {subject.bounds[0]:g}"
-    elif direction == "forward" and largest > subject.bounds[1]:
-        verdict, reason = "red", f"{largest:.3g} is above {subject.bounds[1]:g}"
+    elif direction == "forward" and lowest < function.bounds[0] - 1e-6:
+        verdict, reason = "red", f"{lowest:.3g} is below {function.bounds[0]:g}"
+    elif direction == "forward" and largest > function.bounds[1]:
+        verdict, reason = "red", f"{largest:.3g} is above {function.bounds[1]:g}"
     elif direction == "forward" and error is not None and error > bound:
         verdict, reason = "red", f"relative error {error:.1e}"
     elif not np.all(finite):
         verdict, reason = "input", "not finite in double precision either"
     return Row(
-        case, subject.name, subject.kind, precision, direction, bool(np.all(finite)), largest, error, verdict, reason
+        case, function.name, function.kind, precision, direction, bool(np.all(finite)), largest, error, verdict, reason
     )
 
 

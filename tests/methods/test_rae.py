@@ -18,7 +18,7 @@ from jaxdn.methods.arae import arae
 from jaxdn.methods.rae import LARGE, SMALL, rae
 from jaxdn.methods.registry import methods
 from jaxdn.networks.recurrent import recurrent_unet
-from jaxdn.networks.unet import count
+from jaxdn.networks.unet import count_weights
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -123,7 +123,7 @@ def test_three_frames_are_those_of_the_numpy_network(rng, key):
 
 def test_it_has_the_weights_of_the_published_layout(key):
     networks = [recurrent_unet((3, 2, 1, 1), 3, widths=widths) for widths in (LARGE, SMALL)]
-    weights = [count(jax.eval_shape(network.init, key)) for network in networks]
+    weights = [count_weights(jax.eval_shape(network.init, key)) for network in networks]
     assert weights[0] == pytest.approx(1.95e6, rel=0.005)
     assert weights[1] < 0.25 * weights[0]
 

@@ -1,4 +1,4 @@
-"""The subjects of the hard cases: every registered denoiser and every public operation, as functions of the inputs."""
+"""The functions under test: every registered denoiser and every public operation, as functions of the inputs."""
 
 from collections.abc import Callable
 from functools import partial
@@ -32,8 +32,8 @@ _PICTURED = {*(f"warp, {border}" for border in _BORDERS), "apply_kernels", "comp
 }
 
 
-class Subject(NamedTuple):
-    """A function of inputs, and the conditions on its result."""
+class Function(NamedTuple):
+    """A function under test, and the conditions on its result."""
 
     name: str
     run: Callable[[Any, Inputs], Any]
@@ -50,17 +50,17 @@ class Subject(NamedTuple):
     kind: str = "operation"
 
 
-def denoiser_subjects() -> list[Subject]:
+def list_denoisers() -> list[Function]:
     """Every registered method, in its smallest variant, each precision, both ways to divide light and to filter it.
 
     A network has the weights that training starts from; what may follow another method also follows svgf.
     """
-    subjects = []
+    functions = []
     for name, method in methods().items():
         options = method.variant_named(None)
         denoiser = method.factory(**options)
         begin = _beginning(denoiser)
-        usual = Subject(
+        usual = Function(
             name,
             _on_clips(denoiser),
             begin,
@@ -69,24 +69,24 @@ def denoiser_subjects() -> list[Subject]:
             pictured=True,
             kind="denoiser",
         )
-        subjects.append(usual)
+        functions.append(usual)
         if method.knows("compute_dtype"):
             half = method.factory(**{**options, "compute_dtype": "bfloat16"})
-            subjects.append(usual._replace(name=f"{name} bfloat16", run=_on_clips(half), truth=usual.run))
+            functions.append(usual._replace(name=f"{name} bfloat16", run=_on_clips(half), truth=usual.run))
         if method.knows("demodulate"):
             plain = method.factory(**{**options, "demodulate": "albedo"})
-            subjects.append(usual._replace(name=f"{name} by albedo", run=_on_clips(plain)))
+            functions.append(usual._replace(name=f"{name} by albedo", run=_on_clips(plain)))
         if method.knows("after"):
             after = method.factory(**{**options, "after": methods()["svgf"].factory()})
-            subjects.append(usual._replace(name=f"{name} after svgf", run=_on_clips(after)))
+            functions.append(usual._replace(name=f"{name} after svgf", run=_on_clips(after)))
         if method.knows("kernels"):
             alone = method.factory(**{**options, "kernels": "plain", "background": "filter"})
-            subjects.append(usual._replace(name=f"{name} unguided", run=_on_clips(alone), begin=_beginning(alone)))
-    return subjects
+            functions.append(usual._replace(name=f"{name} unguided", run=_on_clips(alone), begin=_beginning(alone)))
+    return functions
 
 
 def _beginning(denoiser: jaxdn.Denoiser) -> Callable[[], Any]:
-    """Makes its weights when they are asked for, in one program: pytest lists the subjects and runs few of them."""
+    """Makes its weights when they are asked for, in one program: pytest lists the functions and runs few of them."""
 
     def begin() -> Any:
         return jax.jit(denoiser.init)(jax.random.key(0), Frame(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
@@ -284,17 +284,17 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
     }
 
 
-def operation_subjects() -> list[Subject]:
+def list_operations() -> list[Function]:
     """Every public operation, and the sanitizing of a frame, the first step of every denoiser."""
     pure = [
-        Subject(name, lambda params, inputs, run=run: run(inputs), pictured=name in _PICTURED)
+        Function(name, lambda params, inputs, run=run: run(inputs), pictured=name in _PICTURED)
         for name, run in _operations().items()
     ]
 
     def sanitized(params: Any, inputs: Inputs) -> jax.Array:
         return sanitize(inputs.clip.frames)[0].radiance
 
-    mended = Subject("sanitize", sanitized, sanitizes=True, bounds=(0.0, RADIANCE_MAX), pictured=True)
+    mended = Function("sanitize", sanitized, sanitizes=True, bounds=(0.0, RADIANCE_MAX), pictured=True)
     return [*pure, mended]
 
 
@@ -315,3 +315,9 @@ def gradient_of(run: Callable[[Any, Inputs], Any]) -> Callable[[Any, Inputs], An
         return jax.grad(mean, (0, 1, 2), allow_int=True)(params, inputs.clip.frames.radiance, inputs.logits, inputs)
 
     return gradient
+
+
+def narrow_gradient(gradient: Any, inputs: Inputs) -> Any:
+    """A gradient of :func:`gradient_of` by widened inputs, as one by ``inputs``: each in the precision of its own."""
+    params, radiance, logits = gradient
+    return params, radiance.astype(inputs.clip.frames.radiance.dtype), logits.astype(inputs.logits.dtype)

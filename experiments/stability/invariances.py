@@ -1,6 +1,6 @@
-"""How far does each denoiser deviate from laws that light transport obeys: mirrors, exposure, channels, axes?
+"""How far does each denoiser deviate from invariances of light transport: mirrors, exposure, channels, axes?
 
-    python -m experiments.stability.laws CLIP ... [--subjects svgf ntd-small mine.safetensors]
+    python -m experiments.stability.invariances CLIP ... [--methods svgf ntd-small mine.safetensors]
 
 The difference between the output for a changed clip, changed back, and the output for the clip itself: its root mean
 square relative to the image's, both tone-mapped, over all frames. The last row is the same of the difference from the
@@ -31,33 +31,33 @@ Image = np.ndarray
 
 @dataclass
 class Settings:
-    """Measure how far denoisers deviate from laws of light transport."""
+    """Measure how far denoisers deviate from invariances of light transport."""
 
     clips: Annotated[list[Path], tyro.conf.Positional]
     """Clips, or folders of clips."""
-    subjects: list[str] = field(default_factory=lambda: [name for name in all_names() if name != NOISY])
+    methods: list[str] = field(default_factory=lambda: [name for name in all_names() if name != NOISY])
     """Filters, and names or files of weights; default: all that are shipped."""
 
 
-class Law(NamedTuple):
+class Invariance(NamedTuple):
     """A change of a clip, and how to change its image back."""
 
     change: Callable[[Clip], Clip]
     back: Callable[[Image], Image]
 
 
-def light_times(factor: float) -> Law:
+def light_times(factor: float) -> Invariance:
     """All light times a factor."""
-    return Law(
+    return Invariance(
         lambda clip: _each(clip, ("light", "signed"), lambda image: image * np.float32(factor)),
         lambda image: image / factor,
     )
 
 
-def mirror(turns: int) -> Law:
+def mirror(turns: int) -> Invariance:
     """The image mirrored left to right (0) or top to bottom (2)."""
     # A mirror is its own inverse.
-    return Law(
+    return Invariance(
         lambda clip: transform_clip(clip, flip=True, turns=turns),
         lambda image: transform_image(image, flip=True, turns=turns),
     )
@@ -80,11 +80,11 @@ def _channels(clip: Clip) -> Clip:
 
 _AXES = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]], np.float32)
 
-LAWS = {
+INVARIANCES = {
     "mirrored left to right": mirror(0),
     "mirrored top to bottom": mirror(2),
-    "red, green and blue exchanged": Law(_channels, lambda image: image[..., [1, 2, 0]]),
-    "the world's axes exchanged": Law(
+    "red, green and blue exchanged": Invariance(_channels, lambda image: image[..., [1, 2, 0]]),
+    "the world's axes exchanged": Invariance(
         lambda clip: _each(clip, ("direction",), lambda image: image @ _AXES), lambda image: image
     ),
     "a sixteenth of the light": light_times(1 / 16),
@@ -94,8 +94,8 @@ LAWS = {
 }
 
 
-def deviations(denoiser: Denoiser, params: Params, clip: Clip) -> dict[str, float]:
-    """Law -> relative deviation; ``"error"`` -> the same of the difference from the reference."""
+def measure_deviations(denoiser: Denoiser, params: Params, clip: Clip) -> dict[str, float]:
+    """Invariance -> relative deviation; ``"error"`` -> the same of the difference from the reference."""
     run = jax.jit(lambda clip: denoise(denoiser, params, clip))
     bare = clip._replace(reference=None)
 
@@ -108,7 +108,7 @@ def deviations(denoiser: Denoiser, params: Params, clip: Clip) -> dict[str, floa
     def difference(other: Image) -> float:
         return float(np.sqrt(np.mean((seen(other) - image) ** 2)) / size)
 
-    found = {name: difference(law.back(np.asarray(run(law.change(bare))))) for name, law in LAWS.items()}
+    found = {name: difference(one.back(np.asarray(run(one.change(bare))))) for name, one in INVARIANCES.items()}
     return found | {"error": difference(np.asarray(clip.reference))}
 
 
@@ -116,11 +116,11 @@ def main(settings: Settings) -> None:
     """Measure and print a table in the form of Markdown: means over the clips."""
     folders = [folder for place in settings.clips for folder in find_clips(place)]
     columns = {}
-    for subject in settings.subjects:
-        one = candidate(subject)
+    for method in settings.methods:
+        one = candidate(method)
         if one.denoiser is None:
-            raise ValueError(f"--subjects: expected denoisers, got {subject}, which is the noisy image.")
-        rows = [deviations(one.denoiser, one.params, read_clip(folder)) for folder in folders]
+            raise ValueError(f"--methods: expected denoisers, got {method}, which is the noisy image.")
+        rows = [measure_deviations(one.denoiser, one.params, read_clip(folder)) for folder in folders]
         columns[one.label] = {name: np.mean([row[name] for row in rows]) for name in rows[0]}
     print("| change | " + " | ".join(columns) + " |\n" + "|---" * (1 + len(columns)) + "|")
     for name in next(iter(columns.values())):

@@ -1,11 +1,11 @@
-"""The script that measures deviations from laws: a filter that obeys them has none, one that does not has."""
+"""The script that measures deviations from invariances: a filter that has them has none, one that does not has."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.stability.laws import LAWS, deviations
+from experiments.stability.invariances import INVARIANCES, measure_deviations
 from jaxdn.core.frame import Clip, Frame
 from jaxdn.denoiser import Core, recurrent
 
@@ -22,14 +22,14 @@ def filter_of(change, *reads):
 
 
 def test_every_change_is_changed_back(clip):
-    found = deviations(filter_of(lambda frame: frame.radiance), {}, clip)
-    assert set(found) == {*LAWS, "error"}
+    found = measure_deviations(filter_of(lambda frame: frame.radiance), {}, clip)
+    assert set(found) == {*INVARIANCES, "error"}
     assert max(found.values()) < 1e-6
 
 
-@pytest.mark.parametrize("name", [name for name in LAWS if name.startswith("mirrored")])
+@pytest.mark.parametrize("name", [name for name in INVARIANCES if name.startswith("mirrored")])
 def test_mirroring_twice_is_the_identity(clip, name):
-    change = LAWS[name].change
+    change = INVARIANCES[name].change
     jax.tree.map(np.testing.assert_array_equal, change(change(clip)), clip)
 
 
@@ -47,5 +47,5 @@ def test_mirroring_twice_is_the_identity(clip, name):
 )
 def test_a_filter_that_breaks_a_law_is_found(clip, broken, change, reads):
     with jax.numpy_rank_promotion("allow"):
-        found = deviations(filter_of(change, *reads), {}, clip)
+        found = measure_deviations(filter_of(change, *reads), {}, clip)
     assert found[broken] > 0.05
