@@ -73,7 +73,13 @@ def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
     from jaxdn.clips import read_clip, read_frame
     from jaxdn.data.evidence import read_clip_properties
     from jaxdn.data.training.cache import open_cached
-    from jaxdn.render.scenes.animation import CameraKeys, RigidKeys, check_animation, light_scale, read_animation
+    from jaxdn.render.scenes.animation import (
+        CameraKeys,
+        RigidKeys,
+        check_animation,
+        interpolate_light_scale,
+        read_animation,
+    )
     from jaxdn.zoo.weights import load_weights
 
     clip, foreign, weights = folder / "clip", folder / "foreign", folder / "weights.safetensors"
@@ -93,7 +99,7 @@ def readers(folder: Path) -> dict[str, Callable[[bytes], Any]]:
         for motion in keys.get("shapes", {}).values():
             RigidKeys(motion["keys"], motion.get("pivot", (0, 0, 0)))(1.5)
         for scales in keys.get("lights", {}).values():
-            light_scale(scales, 1.5)
+            interpolate_light_scale(scales, 1.5)
 
     def trained_on() -> None:
         read_clip(clip)

@@ -25,7 +25,7 @@ from jaxdn.denoiser import Denoiser
 from jaxdn.effects import EFFECTS, Plan, choose_all_effects, inspect, plan
 from jaxdn.render.open_scene import open_scene
 from jaxdn.render.settings import RenderSettings
-from jaxdn.sequence.render_jobs import Planned, denoiser_named, plan_clip
+from jaxdn.sequence.render_jobs import PlannedClip, find_denoiser, plan_clip
 
 EVERYTHING = plan(choose_all_effects(1))
 """The plan that corresponds to rendering everything."""
@@ -56,7 +56,7 @@ def inspect_to_terminal(
       as_json: print only one JSON object.
       naming: what is stated about the channels of other renderers' files.
     """
-    reader = None if denoiser is None else denoiser_named(denoiser)
+    reader = None if denoiser is None else find_denoiser(denoiser)
     clip = is_clip(source)
     if not clip and (Path(source).is_dir() or source.endswith(".exr")):
         if animation is not None or frames is not None:
@@ -100,11 +100,11 @@ def _planned(
     width: int,
     height: int,
     frames: int | None,
-) -> Planned:
+) -> PlannedClip:
     """The effects of a scene or a finished clip, and what would be rendered for them."""
     if is_clip(source):
         found = inspect(source, animation, frames=frames)
-        return Planned(found, plan(found, reader))
+        return PlannedClip(found, plan(found, reader))
     scene = open_scene(source, animation)
     count = scene.frames if frames is None else frames
     planned = plan_clip(scene, RenderSettings(width=width, height=height), frames=count, denoiser=reader)
@@ -112,7 +112,7 @@ def _planned(
     return planned
 
 
-def plan_record(planned: Planned, reader: Denoiser | None) -> dict[str, Any]:
+def plan_record(planned: PlannedClip, reader: Denoiser | None) -> dict[str, Any]:
     """A plan as JSON, with how its path length was measured, and with derived figures."""
     made, depth = planned.plan, planned.depth
     return {
@@ -173,7 +173,7 @@ def _nothing_else_on_stdout() -> Iterator[None]:
         os.close(kept)
 
 
-def _show(source: str, planned: Planned, reader: Denoiser | None, name: str | None) -> None:
+def _show(source: str, planned: PlannedClip, reader: Denoiser | None, name: str | None) -> None:
     found, made, depth = planned
     console = Console()
     table = Table(title=f"{source}: {len(found)} of {len(EFFECTS)} effects, {len(found.frames)} frames")

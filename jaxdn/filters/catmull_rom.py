@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdn.ops.motion import targets
+from jaxdn.ops.motion import find_targets
 
 
 def warp_cubic(image: jax.Array, motion: jax.Array) -> jax.Array:
@@ -18,7 +18,7 @@ def warp_cubic(image: jax.Array, motion: jax.Array) -> jax.Array:
     height, width, channels = image.shape
     motion = lax.stop_gradient(motion)
     known = jnp.all(jnp.isfinite(motion), axis=-1)
-    x, y = targets(jnp.where(known[..., None], motion, 0.0))
+    x, y = find_targets(jnp.where(known[..., None], motion, 0.0))
     inside = known & (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
     x, y = jnp.where(inside, x, 0.0), jnp.where(inside, y, 0.0)
     left, top = jnp.floor(x), jnp.floor(y)

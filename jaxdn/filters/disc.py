@@ -13,13 +13,13 @@ import numpy as np
 from jax import lax
 
 from jaxdn.filters.edge_stopping import Offset, Weight
-from jaxdn.ops.dispatch.row_tiles import by_strips
+from jaxdn.ops.dispatch.row_tiles import map_row_tiles
 
 _PLACES = [(r, turn + 0.5 * np.pi * k) for r, turn in ((1.0, 0.0), (0.5, 0.25 * np.pi)) for k in range(4)]
 TAPS = np.array([(r * np.cos(angle), r * np.sin(angle), np.exp(-0.66 * r * r)) for r, angle in _PLACES])
 """Rows of (x, y, h): four taps on the rim of the unit disc, four between them at half its radius, and a Gaussian."""
-_STRIP = 5_000
-"""Approximate number of pixels in a strip."""
+_TILE_PIXELS = 5_000
+"""Approximate number of pixels in a tile."""
 
 
 def rotations(shape: tuple[int, ...], number: jax.Array | int, dtype: jnp.dtype) -> jax.Array:
@@ -60,7 +60,7 @@ def disc_average(
     steps = jnp.stack([radius * jnp.cos(angle), radius * jnp.sin(angle)], axis=-1)
     place = jnp.stack(jnp.meshgrid(jnp.arange(height), jnp.arange(width), indexing="ij"), axis=-1).astype(jnp.int32)
 
-    def strip(part: tuple[jax.Array, ...]) -> jax.Array:
+    def tile(part: tuple[jax.Array, ...]) -> jax.Array:
         place, steps, centre, *here = part
 
         def add(sums: jax.Array, tap: jax.Array) -> tuple[jax.Array, None]:
@@ -82,7 +82,7 @@ def disc_average(
         return jnp.where(some, sums[..., :-1] / jnp.where(some, sums[..., -1:], 1.0), 0.0)
 
     centre = packed[:, : channels + 1].reshape(height, width, -1)
-    return by_strips(strip, (place, steps, centre, *here), pixels=_STRIP).transpose(2, 0, 1)
+    return map_row_tiles(tile, (place, steps, centre, *here), pixels=_TILE_PIXELS).transpose(2, 0, 1)
 
 
 def _weight(

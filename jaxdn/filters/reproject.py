@@ -3,7 +3,7 @@
 A plain bilinear warp mixes all four taps. Here each is accepted or rejected, and the accepted ones are renormalised;
 where none is, the 3x3 pixels around the target are tried on request (Schied et al. 2017). What is fetched and with
 which weights does not depend on the history's values, so that training needs only the adjoint of a weighted sum.
-Fetches run by strips: at 720p, fetching the taps of all pixels at once takes twice as long.
+Fetches run by tiles: at 720p, fetching the taps of all pixels at once takes twice as long.
 """
 
 import functools
@@ -28,14 +28,14 @@ from jaxdn.filters.surface_test import (
 )
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
-from jaxdn.ops.dispatch.row_tiles import by_strips, where_needed
-from jaxdn.ops.motion import targets
-from jaxdn.ops.warp import cells, differentiable_mean, windows
+from jaxdn.ops.dispatch.row_tiles import evaluate_sparsely, map_row_tiles
+from jaxdn.ops.motion import find_targets
+from jaxdn.ops.warp import attach_mean_gradient, gather_windows, locate_cells
 
 WEIGHT_MIN = 0.01
 """Minimum sum of accepted bilinear weights that counts as history."""
-_STRIP = 5_000
-"""Approximate number of pixels in a strip."""
+_TILE_PIXELS = 5_000
+"""Approximate number of pixels in a tile."""
 
 
 _Position = tuple[jax.Array, jax.Array]
@@ -191,7 +191,7 @@ def _find_targets(
     height, width, _ = history.shape
     vector = jnp.zeros((height, width, 2), history.dtype) if motion is None else lax.stop_gradient(motion)
     known = jnp.all(jnp.isfinite(vector), axis=-1)
-    x, y = targets(jnp.where(known[..., None], vector, 0.0))
+    x, y = find_targets(jnp.where(known[..., None], vector, 0.0))
     inside = known & (x > -1) & (x < width) & (y > -1) & (y < height) & ~first
     return jnp.clip(x, 0, width - 1), jnp.clip(y, 0, height - 1), inside
 
@@ -209,11 +209,11 @@ def _average_cells(
     accepted: _Accepted,
 ) -> tuple[jax.Array, jax.Array]:
     """The mean [H, W, C] of the accepted taps of each target's cell, and bool [H, W], whether there is one."""
-    cell = cells(*at, *history.shape[:2])
+    cell = locate_cells(*at, *history.shape[:2])
 
-    def strip(part: tuple[tuple[jax.Array, ...], jax.Array, ExpectedSurface]) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def tile(part: tuple[tuple[jax.Array, ...], jax.Array, ExpectedSurface]) -> tuple[jax.Array, jax.Array, jax.Array]:
         (left, top, fx, fy), inside, expected = part
-        taps = windows(packed, top, left, 2)
+        taps = gather_windows(packed, top, left, 2)
         shares = ((wy * wx)[..., 0] for wy in (1 - fy, fy) for wx in (1 - fx, fx))
         weights = [
             jnp.where(inside & accepted(taps[..., index, :], expected), share, 0.0)
@@ -222,8 +222,8 @@ def _average_cells(
         return _mean(taps, weights, history.shape[-1], least=WEIGHT_MIN)
 
     # The weights are for the gradient; where none is taken, they are not computed.
-    mean, valid, weights = by_strips(strip, (cell, inside, expected), pixels=_STRIP)
-    return differentiable_mean(mean, history, cell[1], cell[0], weights), valid
+    mean, valid, weights = map_row_tiles(tile, (cell, inside, expected), pixels=_TILE_PIXELS)
+    return attach_mean_gradient(mean, history, cell[1], cell[0], weights), valid
 
 
 def _search_target(
@@ -242,7 +242,7 @@ def _search_target(
 
     def search(part: tuple[tuple[jax.Array, ...], ExpectedSurface]) -> tuple[jax.Array, jax.Array, jax.Array]:
         (row, column, top, left), expected = part
-        taps = windows(packed, top, left, 3)
+        taps = gather_windows(packed, top, left, 3)
         weights = []
         for index, (dy, dx) in enumerate(np.ndindex(3, 3)):
             y, x = top + dy, left + dx
@@ -250,8 +250,8 @@ def _search_target(
             weights.append((near & accepted(taps[..., index, :], expected)).astype(history.dtype))
         return _mean(taps, weights, channels, least=1.0)
 
-    mean, found, weights = where_needed(search, lost, ((row, column, top, left), expected))
-    return differentiable_mean(mean, history, top, left, weights), found
+    mean, found, weights = evaluate_sparsely(search, lost, ((row, column, top, left), expected))
+    return attach_mean_gradient(mean, history, top, left, weights), found
 
 
 def _search_pixel(

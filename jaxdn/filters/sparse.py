@@ -15,7 +15,7 @@ from jax import lax
 from jaxdn.core.platform import ANY, platform
 from jaxdn.filters.edge_stopping import Offset, Weight
 from jaxdn.filters.stencil_tiles import NO_WEIGHT
-from jaxdn.ops.dispatch.row_tiles import where_needed
+from jaxdn.ops.dispatch.row_tiles import evaluate_sparsely
 
 _WORTH = 100_000
 """Pixels of an image from which on the two ways are compiled."""
@@ -85,4 +85,4 @@ def average_of_few(
         return [*(mean[:, index] for index in range(count)), total]
 
     places = jnp.arange(height * width, dtype=jnp.int32).reshape(height, width)
-    return jnp.stack(where_needed(work, needed, (places, steps)))
+    return jnp.stack(evaluate_sparsely(work, needed, (places, steps)))

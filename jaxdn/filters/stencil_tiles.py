@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.core.platform import platform
 from jaxdn.filters.edge_stopping import Offset, Planes, Weight
+from jaxdn.ops.dispatch.row_tiles import rows_per_tile
 
 _STRIP_PIXELS = 16384
 NO_WEIGHT = 1e-10
@@ -86,7 +86,7 @@ def canvas_for(height: int, width: int, taps: np.ndarray, *, step_max: int) -> C
 
     Strips are for the CPU's cache only; other devices take one strip.
     """
-    rows = height if platform() != "cpu" else min(height, max(8, _STRIP_PIXELS // width))
+    rows = rows_per_tile(height, width, pixels=_STRIP_PIXELS, least=8)
     reach = np.abs(taps[:, :2]).max(axis=0).astype(int) * step_max
     return Canvas(height, width, rows, (int(reach[0]), int(reach[1])))
 

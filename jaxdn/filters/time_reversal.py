@@ -14,7 +14,7 @@ from jaxdn.core.frame import Array, Frame, only
 from jaxdn.denoiser.sanitize import sanitize
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, expect_surface, guides_of, same_surface
-from jaxdn.ops.motion import targets
+from jaxdn.ops.motion import find_targets
 
 SEEN_MOST = 8.0
 """More frames than this hardly make a history better: each new one counts a fifth or so (docs/how-to/two-passes.md)."""
@@ -57,7 +57,7 @@ def _derived(frame: Frame, after: Frame) -> tuple[jax.Array, jax.Array | None]:
     height, width = frame.radiance.shape[:2]
     count = height * width
     motion = jnp.zeros((height, width, 2)) if after.motion is None else after.motion
-    x, y = targets(motion)
+    x, y = find_targets(motion)
     known = jnp.isfinite(x) & jnp.isfinite(y)
     x, y = jnp.where(known, x, 0.0), jnp.where(known, y, 0.0)
     guides = guides_of(frame)

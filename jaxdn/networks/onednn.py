@@ -124,7 +124,7 @@ class Program:
         builder, self._count, self._precision = ProgramBuilder(), shape[0], precision
         given = Value(-1, shape[3], shape[1], shape[2])
         heads = evaluate(network, weights, {FEATURES: given}, builder)
-        self._memory: dict[int, c_void_p] = {-1: dnnl.memory(self._description(given))}
+        self._memory: dict[int, c_void_p] = {-1: dnnl.create_memory(self._description(given))}
         self._free: list[np.ndarray] = []
         self.bytes = 0
         """Of all activations: what nobody reads any more is written over."""
@@ -139,14 +139,14 @@ class Program:
             for value in step.inputs:
                 if last_use[value.number] == step.result.number and value.number in self._arrays:
                     self._free.append(self._arrays.pop(value.number))
-        self._scratch = dnnl.aligned(max(primitive.scratch_bytes for primitive in self._primitives))
+        self._scratch = dnnl.allocate_aligned(max(primitive.scratch_bytes for primitive in self._primitives))
         for primitive in self._primitives:
-            dnnl.set_address(primitive.scratch, dnnl.address(self._scratch))
+            dnnl.set_address(primitive.scratch, dnnl.address_of(self._scratch))
         self._ends = [self._memory[-1], *(self._memory[head.number] for head in heads)]
 
     def _description(self, value: Value, kind: int | None = None) -> c_void_p:
         kind = self._precision.kind if kind is None else kind
-        return dnnl.images(self._count, value.height, value.width, value.channels, kind)
+        return dnnl.describe_images(self._count, value.height, value.width, value.channels, kind)
 
     def _add(self, step: Step, *, output: bool) -> None:
         """The primitive of a step, on its memory: of what nobody reads any more, else new."""
@@ -158,20 +158,20 @@ class Program:
             if before in self._arrays:
                 self._arrays[step.result.number] = self._arrays.pop(before)
         elif output:
-            self._memory[step.result.number] = dnnl.memory(result)
+            self._memory[step.result.number] = dnnl.create_memory(result)
         else:
             size = jnp.dtype(self._precision.dtype).itemsize * self._count * math.prod(step.result[1:])
             array = self._room(size)
             self._arrays[step.result.number] = array
-            self._memory[step.result.number] = dnnl.memory(result, dnnl.address(array))
+            self._memory[step.result.number] = dnnl.create_memory(result, dnnl.address_of(array))
         source, target = self._memory[step.inputs[0].number], self._memory[step.result.number]
         reads = self._description(step.inputs[0])
         if step.kernel is not None:
             after: Any = {"kind": self._precision.kind, "slope": step.slope, "adds": len(step.inputs) > 1}
             upsamples = step.kind == "upsampling convolution"
-            placed = layers.convolution(reads, result, step.kernel, step.bias, upsamples=upsamples, **after)
+            placed = layers.make_convolution(reads, result, step.kernel, step.bias, upsamples=upsamples, **after)
         else:
-            placed = (layers.pooling if step.kind == "pool" else layers.upsampling)(reads, result)
+            placed = (layers.make_pooling if step.kind == "pool" else layers.make_upsampling)(reads, result)
         self._primitives.append(placed(source, target))
 
     def _room(self, size: int) -> np.ndarray:
@@ -180,7 +180,7 @@ class Program:
         if fitting:
             return self._free.pop(min(fitting, key=lambda index: self._free[index].size))
         self.bytes += size
-        array = dnnl.aligned(size)
+        array = dnnl.allocate_aligned(size)
         self._kept.append(array)
         return array
 
@@ -211,9 +211,9 @@ class Session:
             if not same_weights(given, self._weights):
                 self._weights = [weight.copy() for weight in given]
                 self._program = self._describe(self._weights)
-            heads = [dnnl.address(np.asarray(output)) for output in outputs]
+            heads = [dnnl.address_of(np.asarray(output)) for output in outputs]
             with dnnl.LOCK:
-                self._program(dnnl.address(np.asarray(features)), heads)
+                self._program(dnnl.address_of(np.asarray(features)), heads)
 
 
 def run(

@@ -79,7 +79,7 @@ def occlusion_mask(motion: jax.Array, dual_motion: jax.Array, *, threshold: floa
     return (squared > threshold * threshold).astype(difference.dtype)
 
 
-def targets(motion: jax.Array) -> tuple[jax.Array, jax.Array]:
+def find_targets(motion: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The array position (x, y) that each pixel's vector points to."""
     height, width = motion.shape[:2]
     x = jnp.arange(width, dtype=motion.dtype)[None, :] + motion[..., 0]
@@ -94,6 +94,6 @@ def on_screen(motion: jax.Array) -> jax.Array:
     """
     check_image(motion, "motion", channels=2)
     height, width = motion.shape[:2]
-    x, y = targets(motion)
+    x, y = find_targets(motion)
     inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
     return inside[..., None]

@@ -6,7 +6,7 @@ from jaxdn.ops.dispatch.numba_rows import Array, loop
 
 
 @loop
-def filled(top: int, bottom: int, image: Array, known: Array, out: Array) -> None:
+def fill_rows(top: int, bottom: int, image: Array, known: Array, out: Array) -> None:
     """Four rows of ``out`` [H, W, C] each: ``image`` where it is known, else the mean of a block's known pixels."""
     width, zero, one = known.shape[1], np.float32(0.0), np.float32(1.0)
     for block in range(top, bottom):

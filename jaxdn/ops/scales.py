@@ -68,9 +68,9 @@ def _fill_holes(image: jax.Array, known: jax.Array) -> jax.Array:
 
 @numba_call.implements(_fill_holes)
 def _fill_holes_by_numba(image: jax.Array, known: jax.Array) -> jax.Array:
-    from jaxdn.ops.numba_fill import filled
+    from jaxdn.ops.numba_fill import fill_rows
 
-    return numba_call.call(filled, [image.shape], [image, known[..., 0]], rows=image.shape[0] // 4)[0]
+    return numba_call.call(fill_rows, [image.shape], [image, known[..., 0]], rows=image.shape[0] // 4)[0]
 
 
 def upsample(image: jax.Array, *, up: str = "bilinear") -> jax.Array:

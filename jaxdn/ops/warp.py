@@ -14,7 +14,7 @@ from jax import lax
 
 from jaxdn.core.checks import check_image, check_option, check_same_size
 from jaxdn.ops.dispatch.operation import Example, operation
-from jaxdn.ops.motion import targets
+from jaxdn.ops.motion import find_targets
 
 
 def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implementation: str | None = None) -> jax.Array:
@@ -36,7 +36,7 @@ def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implemen
     height, width = image.shape[:2]
     # Plane by plane: XLA:CPU takes half the time that it takes for vectors of two.
     known = jnp.isfinite(motion[..., 0]) & jnp.isfinite(motion[..., 1])
-    x, y = (jnp.where(known, position, 0.0) for position in targets(motion))
+    x, y = (jnp.where(known, position, 0.0) for position in find_targets(motion))
     if border == "zeros":
         image = jnp.pad(image, ((1, 1), (1, 1), (0, 0)))
         x, y = jnp.clip(x + 1, 0, width + 1), jnp.clip(y + 1, 0, height + 1)
@@ -52,7 +52,7 @@ def _position_dtype(image: jax.Array) -> jnp.dtype:
     return jnp.promote_types(image.dtype, jnp.float32)
 
 
-def cells(x: jax.Array, y: jax.Array, height: int, width: int) -> tuple[jax.Array, ...]:
+def locate_cells(x: jax.Array, y: jax.Array, height: int, width: int) -> tuple[jax.Array, ...]:
     """The upper left pixel of each position's cell and the position inside it; the last pixel belongs to a cell too."""
     left = jnp.clip(jnp.floor(x), 0, max(width - 2, 0))
     top = jnp.clip(jnp.floor(y), 0, max(height - 2, 0))
@@ -63,25 +63,25 @@ def cells(x: jax.Array, y: jax.Array, height: int, width: int) -> tuple[jax.Arra
 def _sample_bilinearly(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
     """Four fetches and their weighted sum."""
     height, width = image.shape[:2]
-    left, top, fx, fy = cells(lax.stop_gradient(x), lax.stop_gradient(y), height, width)
+    left, top, fx, fy = locate_cells(lax.stop_gradient(x), lax.stop_gradient(y), height, width)
     right, below = jnp.minimum(left + 1, width - 1), jnp.minimum(top + 1, height - 1)
     upper = (1 - fx) * image[top, left] + fx * image[top, right]
     lower = (1 - fx) * image[below, left] + fx * image[below, right]
     return (1 - fy) * upper + fy * lower
 
 
-def _at_least(image: jax.Array, size: int) -> jax.Array:
+def _extend_to(image: jax.Array, size: int) -> jax.Array:
     """An image smaller than a window of ``size`` pixels is continued by its last row and column."""
     missing = (max(size - length, 0) for length in image.shape[:2])
     return jnp.pad(image, (*((0, more) for more in missing), (0, 0)), mode="edge")
 
 
-def windows(image: jax.Array, top: jax.Array, left: jax.Array, size: int) -> jax.Array:
+def gather_windows(image: jax.Array, top: jax.Array, left: jax.Array, size: int) -> jax.Array:
     """The pixels of square windows whose upper left pixels are ``top``, ``left`` [...]: [..., size * size, C], by rows.
 
     All windows lie in the image; the last row and column of one that is smaller than a window are repeated.
     """
-    image = _at_least(image, size)
+    image = _extend_to(image, size)
     _, width, channels = image.shape
     flat = image.reshape(-1)
     start = (top * width + left) * channels
@@ -96,15 +96,15 @@ def windows(image: jax.Array, top: jax.Array, left: jax.Array, size: int) -> jax
 
 
 def _fetch(image: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-    left, top, fx, fy = cells(x, y, *image.shape[:2])
-    found = windows(image, top, left, 2)
+    left, top, fx, fy = locate_cells(x, y, *image.shape[:2])
+    found = gather_windows(image, top, left, 2)
     upper = (1 - fx) * found[..., 0, :] + fx * found[..., 1, :]
     lower = (1 - fx) * found[..., 2, :] + fx * found[..., 3, :]
     return (1 - fy) * upper + fy * lower
 
 
-def _scattered(shape: tuple[int, ...], top: jax.Array, left: jax.Array, blocks: jax.Array) -> jax.Array:
-    """The adjoint of :func:`windows`: blocks [..., size * size, C] are added to the pixels of their windows."""
+def _scatter_windows(shape: tuple[int, ...], top: jax.Array, left: jax.Array, blocks: jax.Array) -> jax.Array:
+    """The adjoint of :func:`gather_windows`: blocks [..., size * size, C] are added to the pixels of their windows."""
     size = math.isqrt(blocks.shape[-2])
     height, width, channels = max(shape[0], size), max(shape[1], size), shape[2]
     where = jnp.stack([top, left * channels], axis=-1).reshape(-1, 2)
@@ -121,20 +121,20 @@ def _scattered(shape: tuple[int, ...], top: jax.Array, left: jax.Array, blocks: 
     return jnp.concatenate([total[:, :last_column], total[:, last_column:].sum(1, keepdims=True)], axis=1)
 
 
-def _spread(shape: tuple[int, ...], x: jax.Array, y: jax.Array, cotangent: jax.Array) -> jax.Array:
+def _scatter_samples(shape: tuple[int, ...], x: jax.Array, y: jax.Array, cotangent: jax.Array) -> jax.Array:
     """The adjoint of the fetch: every value is scattered to its four pixels."""
-    left, top, fx, fy = cells(x, y, *shape[:2])
+    left, top, fx, fy = locate_cells(x, y, *shape[:2])
     blocks = [wy * wx * cotangent for wy in (1 - fy, fy) for wx in (1 - fx, fx)]
-    return _scattered(shape, top, left, jnp.stack(blocks, axis=-2))
+    return _scatter_windows(shape, top, left, jnp.stack(blocks, axis=-2))
 
 
 @jax.custom_vjp
-def differentiable_mean(
+def attach_mean_gradient(
     mean: jax.Array, image: jax.Array, top: jax.Array, left: jax.Array, weights: jax.Array
 ) -> jax.Array:
     """``mean`` with a gradient by ``image``: the sum of the pixels of each window times ``weights`` [..., size * size].
 
-    The order is that of :func:`windows`. For fetches that are done another way than their gradient.
+    The order is that of :func:`gather_windows`. For fetches that are done another way than their gradient.
     """
     return mean
 
@@ -152,10 +152,10 @@ def _mean_forward(
 def _mean_backward(residuals: _Residuals, cotangent: jax.Array) -> tuple[None, jax.Array, None, None, None]:
     shape, top, left, weights = residuals
     blocks = weights[..., None] * cotangent[..., None, :]
-    return None, _scattered(shape.shape[:3], top, left, blocks).astype(shape.dtype), None, None, None
+    return None, _scatter_windows(shape.shape[:3], top, left, blocks).astype(shape.dtype), None, None, None
 
 
-differentiable_mean.defvjp(_mean_forward, _mean_backward)
+attach_mean_gradient.defvjp(_mean_forward, _mean_backward)
 
 
 @jax.custom_vjp
@@ -170,7 +170,7 @@ def _forward(image: jax.Array, x: jax.Array, y: jax.Array) -> tuple[jax.Array, t
 
 def _backward(residuals: tuple[jax.Array, ...], cotangent: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     shape, x, y = residuals
-    return _spread(shape.shape[:3], x, y, cotangent).astype(shape.dtype), jnp.zeros_like(x), jnp.zeros_like(y)
+    return _scatter_samples(shape.shape[:3], x, y, cotangent).astype(shape.dtype), jnp.zeros_like(x), jnp.zeros_like(y)
 
 
 _pairs.defvjp(_forward, _backward)

@@ -9,7 +9,7 @@ from jaxdn.planning.catalogue import (
     DIRECT,
     EFFECTS,
     INDIRECT,
-    OF_FIRST_HITS,
+    OF_PRIMARY_SURFACES,
     OF_SHADOWS,
     THROUGH_CENTRES,
     NoisyLight,
@@ -88,13 +88,13 @@ def plan(
     the noisy radiance, and its shadows have buffers, instead of a buffer of its own. With ``jitter`` no frame shows the
     same as another, and what is traced through the centres of pixels (``THROUGH_CENTRES``) is left out. With
     ``see_through`` the guides are those of what mirrors and glass show: what belongs to the first surface
-    (``OF_FIRST_HITS``) is left out, and what moves in a mirror moves on screen.
+    (``OF_PRIMARY_SURFACES``) is left out, and what moves in a mirror moves on screen.
     """
     by_name = {effect.name: effect for effect in EFFECTS}
     wanted = frozenset(GUIDES) - ON_REQUEST if denoiser is None else denoiser.reads | COMPOSED
     wanted -= {"direct"} if light == "reflected" else OF_SHADOWS
     wanted -= THROUGH_CENTRES if jitter else frozenset()
-    wanted -= OF_FIRST_HITS if see_through else frozenset()
+    wanted -= OF_PRIMARY_SURFACES if see_through else frozenset()
     there = [by_name[name] for name in effects.names]
 
     def buffers(present: frozenset[str]) -> tuple[str, ...]:

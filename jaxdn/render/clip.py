@@ -13,7 +13,7 @@ from jaxdn.data.clip.folder import begin_record, begun_record, finish_record, fr
 from jaxdn.data.clip.frames import read_frame, write_frame
 from jaxdn.data.errors import ClipError
 from jaxdn.render.buffers.geometry import View
-from jaxdn.render.frame import Rendered, render_frame
+from jaxdn.render.frame import RenderedFrame, render_frame
 from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.render.resume import check_resumable
 from jaxdn.render.scenes.scene import AnimatedScene
@@ -99,7 +99,7 @@ def _render_missing(
         progress(frame)
 
 
-def _write(path: Path, rendered: Rendered) -> None:
+def _write(path: Path, rendered: RenderedFrame) -> None:
     write_frame(
         path,
         rendered.frame,

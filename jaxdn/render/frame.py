@@ -24,7 +24,7 @@ from jaxdn.render.tracing.tracer import Tracer, choose_tracer
 _SURFACE = ("albedo", "normal", "depth", "roughness", "reflectance", "specular_reflectance", "ids")
 
 
-class Rendered(NamedTuple):
+class RenderedFrame(NamedTuple):
     """Everything that a clip stores of one frame, as NumPy arrays."""
 
     frame: Frame
@@ -45,7 +45,7 @@ class Rendered(NamedTuple):
 
 def render_frame(
     scene: AnimatedScene, frame: int, settings: RenderSettings, *, previous: View | None = None
-) -> Rendered:
+) -> RenderedFrame:
     """Render one frame of an animated scene: noisy layers, a reference, G-buffers and motion vectors.
 
     ``direct`` and ``emission`` are means over the reference's samples, or over the noisy ones if ``reference_spp`` is
@@ -155,7 +155,7 @@ def _assemble(
     view: View | None,
     settings: RenderSettings,
     request: FrameRequest,
-) -> Rendered:
+) -> RenderedFrame:
     """Everything that is stored, of the buffers that the request asks for."""
 
     def noise(sums: RadianceSums) -> np.ndarray:
@@ -170,7 +170,7 @@ def _assemble(
         draws = np.stack([_to_single(np.concatenate([one.indirect, one.direct], -1)) for one in samples.singles])
     wanted = {name: buffer for name, buffer in buffers.items() if name in request.buffers | request.sampled}
     frame = Frame(radiance=layers[settings.layers[0]], **wanted)
-    return Rendered(frame, layers, reference, half, draws, view, samples.bad())
+    return RenderedFrame(frame, layers, reference, half, draws, view, samples.bad())
 
 
 def _to_single(image: np.ndarray) -> np.ndarray:

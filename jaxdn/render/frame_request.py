@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 from jaxdn.core.frame import GUIDES, OF_SAMPLES, ON_REQUEST
-from jaxdn.planning.catalogue import OF_FIRST_HITS, OF_SHADOWS
-from jaxdn.render.mitsuba.variant import advice, tells_lobes
+from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES, OF_SHADOWS
+from jaxdn.render.mitsuba.variant import advice, separates_lobes
 from jaxdn.render.settings import RenderSettings
 from jaxdn.render.tracing.radiance import NOTHING_ELSE, TraceRequest
 
@@ -63,7 +63,7 @@ def request_frame(settings: RenderSettings, frame: int) -> FrameRequest:
     plan = settings.plan
     planned = frozenset(GUIDES) - ON_REQUEST if plan is None else frozenset(plan.frames[frame])
     if settings.see_through:
-        planned -= OF_FIRST_HITS
+        planned -= OF_PRIMARY_SURFACES
     if settings.light == "reflected":
         planned -= {"direct"}
     shared = plan is not None and plan.shared_with[frame] != frame
@@ -81,7 +81,7 @@ def request_frame(settings: RenderSettings, frame: int) -> FrameRequest:
 
 def _check_variant(settings: RenderSettings, request: FrameRequest) -> None:
     variant = settings.variant or ""
-    if tells_lobes(variant):
+    if separates_lobes(variant):
         return
     if settings.jitter:
         raise ValueError(f"jitter: {variant} spreads its samples over the pixels itself; leave it out. {advice()}")

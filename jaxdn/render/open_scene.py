@@ -36,7 +36,7 @@ def scene_from_record(record: Mapping[str, Any]) -> AnimatedScene:
     return FAMILIES[name](**options)
 
 
-def family_scene(name: str, seed: int, animation: Any = None) -> AnimatedScene:
+def open_family(name: str, seed: int, animation: Any = None) -> AnimatedScene:
     """A scene of a family. Raises ValueError for an animation, which belongs to scene files: families move already."""
     if animation is not None:
         raise ValueError(
@@ -52,7 +52,7 @@ def open_scene(scene: Any, animation: Any = None) -> AnimatedScene:
     returned unchanged. Raises ValueError for anything else, and for files that cannot be read.
     """
     if isinstance(scene, str | Path):
-        return _named(scene, animation)
+        return _open_named(scene, animation)
     if isinstance(scene, Mapping):
         use_variant()
         import mitsuba as mi
@@ -65,10 +65,10 @@ def open_scene(scene: Any, animation: Any = None) -> AnimatedScene:
     return scene
 
 
-def _named(scene: str | Path, animation: Any) -> AnimatedScene:
+def _open_named(scene: str | Path, animation: Any) -> AnimatedScene:
     """The scene of a family's name or a file's path."""
     if str(scene) in FAMILIES:
-        return family_scene(str(scene), 0, animation)
+        return open_family(str(scene), 0, animation)
     if Path(scene).suffix != ".xml":
         raise ValueError(
             f"scene {str(scene)!r}: expected a Mitsuba scene (.xml), a folder of frames, or a family "

@@ -36,38 +36,38 @@ def read_scene_properties(
     # A small image of the same aspect ratio is enough to see whether rays leave the scene.
     built = scene.build(0, max(1, round(_LOOK * width / height)), _LOOK)
     shapes = dict(zip(list_shape_names(built), built.shapes(), strict=True))
-    surfaces, uncertain = _surfaces(built, shapes)
-    lights = _lights(built, shapes)
+    surfaces, uncertain = _list_surfaces(built, shapes)
+    lights = _list_lights(built, shapes)
     around = frozenset(light.name for light in lights if light.environment)
     if around and not np.any(trace_gbuffer(built).ids < 0):
         uncertain["emission"] = "the environment is not seen in a small image of frame 0, but may be later"
         around = frozenset()
 
-    stage = _Stage(scene, shapes, (height, width), around)
+    stage = _ShapePlaces(scene, shapes, (height, width), around)
     return SceneProperties(
         surfaces=tuple(surfaces),
         lights=tuple(lights),
-        moments=tuple(stage.moment(frame, lights) for frame in range(count)),
-        medium=_in_fog(built.sensors()[0]),
+        moments=tuple(stage.describe_moment(frame, lights) for frame in range(count)),
+        medium=_is_in_fog(built.sensors()[0]),
         interreflects=_interreflects(stage, shapes, surfaces, lights),
         max_depth=scene.max_depth,
         uncertain=uncertain,
     )
 
 
-def _surfaces(built: Any, shapes: Mapping[str, Any]) -> tuple[list[Surface], dict[str, str]]:
+def _list_surfaces(built: Any, shapes: Mapping[str, Any]) -> tuple[list[Surface], dict[str, str]]:
     """The surfaces of a scene, and effect -> why their materials leave it undecided."""
-    from jaxdn.render.scenes.materials import NOTHING, is_lambertian, material_of
-    from jaxdn.render.scenes.media import absorbs, media_of
-    from jaxdn.render.scenes.plugins import children, shape_groups
+    from jaxdn.render.scenes.materials import NOTHING, describe_material, is_lambertian
+    from jaxdn.render.scenes.media import absorbs, list_media
+    from jaxdn.render.scenes.plugins import list_children, list_shape_groups
 
-    grouped = [part for group in shape_groups(built) for _, part in children(group) if hasattr(part, "bsdf")]
-    scattering = {name for name, medium in media_of(built).items() if not absorbs(medium)}
+    grouped = [part for group in list_shape_groups(built) for _, part in list_children(group) if hasattr(part, "bsdf")]
+    scattering = {name for name, medium in list_media(built).items() if not absorbs(medium)}
     surfaces: list[Surface] = []
     uncertain: dict[str, str] = {}
     for name, shape in shapes.items():
         members = grouped if shape.class_name() == "Instance" else [shape]
-        materials = [NOTHING if part.bsdf() is None else material_of(part.bsdf()) for part in members]
+        materials = [NOTHING if part.bsdf() is None else describe_material(part.bsdf()) for part in members]
         for material in materials:
             uncertain |= {effect: f"{name}: {reason}" for effect, reason in material.unsure.items()}
         if shape.class_name() == "Instance" and not members:
@@ -80,14 +80,14 @@ def _surfaces(built: Any, shapes: Mapping[str, Any]) -> tuple[list[Surface], dic
     return surfaces, uncertain
 
 
-def _in_fog(sensor: Any) -> bool:
+def _is_in_fog(sensor: Any) -> bool:
     """Whether the camera stands in a medium that scatters light."""
     from jaxdn.render.scenes.media import absorbs
 
     return sensor.get_medium() is not None and not absorbs(sensor.get_medium())
 
 
-def _lights(built: Any, shapes: Mapping[str, Any]) -> list[Light]:
+def _list_lights(built: Any, shapes: Mapping[str, Any]) -> list[Light]:
     """The lights of a scene; one that is a shape has the shape's name."""
     lights: list[Light] = []
     by_id = {shape.id(): name for name, shape in shapes.items()}
@@ -98,7 +98,7 @@ def _lights(built: Any, shapes: Mapping[str, Any]) -> list[Light]:
     return lights
 
 
-class _Stage:
+class _ShapePlaces:
     """Places of the shapes in each frame, relative to the view."""
 
     def __init__(
@@ -113,18 +113,18 @@ class _Stage:
             box = shape.bbox()
             self.boxes[name] = corners(np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel())
             if shape.class_name() == "Rectangle":
-                self.squares[name] = _to_world(shape)
+                self.squares[name] = _read_to_world(shape)
 
-    def place(self, name: str, pose: Mapping[str, np.ndarray]) -> np.ndarray:
+    def compute_place(self, name: str, pose: Mapping[str, np.ndarray]) -> np.ndarray:
         """The motion of a shape since frame 0, for which it was built."""
         return np.asarray(pose[name]) @ np.linalg.inv(self.rest[name]) if name in pose else np.eye(4)
 
     def on_screen(self, name: str, frame: float) -> bool:
         """Whether a shape's box may be in view."""
-        points = moved(self.boxes[name], self.place(name, self.pose(frame)))
+        points = moved(self.boxes[name], self.compute_place(name, self.pose(frame)))
         return may_be_seen(points, self.camera(frame), self.size)
 
-    def moment(self, frame: int, lights: Sequence[Light]) -> Moment:
+    def describe_moment(self, frame: int, lights: Sequence[Light]) -> Moment:
         """The changes between a frame and the one before it."""
         emitting = (light.name for light in lights if light.name in self.boxes)
         shining = self.around.union(name for name in emitting if self.on_screen(name, frame))
@@ -140,22 +140,22 @@ class _Stage:
         changing = {light.name for light in lights} & moving
         bright, dim = brightness(self.scene, frame), brightness(self.scene, frame - 1)
         changing |= {name for name in bright if bright[name] != dim[name]}
-        reveals = (camera or bool(seen)) and not self._one_flat_view(frame)
+        reveals = (camera or bool(seen)) and not self._shows_one_flat_surface(frame)
         return Moment(camera, moving, seen, reveals, frozenset(changing), shining)
 
-    def _one_flat_view(self, frame: int) -> bool:
+    def _shows_one_flat_surface(self, frame: int) -> bool:
         """One flat surface fills the image now and before: nothing can be disoccluded."""
         there = {name for name in self.boxes for at in (frame - 1, frame) if self.on_screen(name, at)}
         if len(there) != 1 or not there <= set(self.squares):
             return False
         name = there.pop()
         return all(
-            fills_view(self.place(name, self.pose(at)) @ self.squares[name], self.camera(at), self.size)
+            fills_view(self.compute_place(name, self.pose(at)) @ self.squares[name], self.camera(at), self.size)
             for at in (frame - 1, frame)
         )
 
 
-def _to_world(shape: Any) -> np.ndarray:
+def _read_to_world(shape: Any) -> np.ndarray:
     import mitsuba as mi
 
     matrix = mi.traverse(shape)["to_world"].matrix
@@ -163,7 +163,7 @@ def _to_world(shape: Any) -> np.ndarray:
 
 
 def _interreflects(
-    stage: _Stage, shapes: Mapping[str, Any], surfaces: Sequence[Surface], lights: Sequence[Light]
+    stage: _ShapePlaces, shapes: Mapping[str, Any], surfaces: Sequence[Surface], lights: Sequence[Light]
 ) -> bool:
     """False if the only reflector is flat, or convex and lit and seen from outside."""
     reflecting = [surface for surface in surfaces if surface.lobes]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from jaxdn.core.checks import check_at_least, check_option
-from jaxdn.planning.catalogue import OF_FIRST_HITS, OF_SHADOWS, THROUGH_CENTRES, NoisyLight
+from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES, OF_SHADOWS, THROUGH_CENTRES, NoisyLight
 from jaxdn.planning.plan import Plan, plan_from_record
 from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.scene import AnimatedScene
@@ -78,7 +78,7 @@ class RenderSettings:
             )
         if self.jitter and (THROUGH_CENTRES & buffers or plan.shared_with != tuple(range(len(plan.frames)))):
             raise ValueError("plan: expected one that was made for jitter; pass jitter=True to effects.plan.")
-        if self.see_through and OF_FIRST_HITS & buffers:
+        if self.see_through and OF_PRIMARY_SURFACES & buffers:
             raise ValueError("plan: expected one that was made to see through; pass see_through=True to effects.plan.")
 
     def record(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from jaxdn.core.frame import OF_SAMPLES, Frame
 from jaxdn.data.exr.exr import write_exr
 from jaxdn.denoiser.rollout import stream
 from jaxdn.evaluation.report.images import save_png
-from jaxdn.planning.catalogue import OF_FIRST_HITS
+from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES
 from jaxdn.render.adaptive import render_sampled
 from jaxdn.render.open_scene import open_scene
 from jaxdn.render.settings import RenderSettings
@@ -63,7 +63,7 @@ def denoise_scene(
     if method.denoiser is None:
         raise ValueError(f"--method {method.label}: expected a denoiser for a scene, got the noisy image itself.")
     reads = method.denoiser._replace(reads=method.denoiser.reads - OF_SAMPLES)
-    rendering = replace(settings.render, light="reflected", see_through=not reads.reads & OF_FIRST_HITS)
+    rendering = replace(settings.render, light="reflected", see_through=not reads.reads & OF_PRIMARY_SURFACES)
     planned = plan_clip(scene, rendering, frames=wanted[-1] + 1, denoiser=reads)
     assert planned is not None
     rendering = replace(rendering, plan=planned.plan)

@@ -11,11 +11,11 @@ from jaxdn.data.clip.folder import begun_record
 from jaxdn.denoiser import Denoiser
 from jaxdn.effects import Effects, Plan, choose_all_effects, choose_effects, inspect, plan
 from jaxdn.methods.registry import methods
-from jaxdn.planning.catalogue import OF_FIRST_HITS, THROUGH_CENTRES
+from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES, THROUGH_CENTRES
 from jaxdn.planning.plan import SCORED
 from jaxdn.render.families import FAMILIES
-from jaxdn.render.mitsuba.variant import choose_variant, tells_lobes, use_variant
-from jaxdn.render.open_scene import family_scene
+from jaxdn.render.mitsuba.variant import choose_variant, separates_lobes, use_variant
+from jaxdn.render.open_scene import open_family
 from jaxdn.render.path_depth import PathDepth, measure_depth
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.scenes.scene_file import SceneFile
@@ -24,7 +24,7 @@ from jaxdn.render.worker_pool import ClipJob, render_clips
 from jaxdn.zoo.ready import candidate
 
 
-class Planned(NamedTuple):
+class PlannedClip(NamedTuple):
     """The effects detected in a scene, and the plan derived from them."""
 
     effects: Effects
@@ -33,7 +33,7 @@ class Planned(NamedTuple):
     """How the plan's path length was measured; None if it was not."""
 
 
-def denoiser_named(names: str) -> Denoiser | None:
+def find_denoiser(names: str) -> Denoiser | None:
     """A denoiser to plan for: a method, shipped weights or a file; None for the noisy image, which is not denoised.
 
     Of several names, separated by commas, it is the first, with all buffers that one of them reads. The weights do not
@@ -52,7 +52,7 @@ def plan_clip(
     frames: int,
     effects: str = "auto",
     denoiser: Denoiser | None = None,
-) -> Planned | None:
+) -> PlannedClip | None:
     """The effects to render an animated scene for, and the plan; None means no plan: ``"all"`` without a denoiser.
 
     Raises ValueError for a name that is not an effect.
@@ -65,24 +65,24 @@ def plan_clip(
       denoiser: plan for the buffers that it reads; None: for any denoiser, without the buffers that only few read.
     """
 
-    def made(detected: Effects, max_depth: int | None = settings.max_depth) -> Planned:
+    def make(detected: Effects, max_depth: int | None = settings.max_depth) -> PlannedClip:
         light, jitter, see_through = settings.light, settings.jitter, settings.see_through
-        return Planned(
+        return PlannedClip(
             detected,
             plan(detected, denoiser, max_depth=max_depth, light=light, jitter=jitter, see_through=see_through),
         )
 
     if effects == "all":
-        return None if denoiser is None else made(choose_all_effects(frames))
+        return None if denoiser is None else make(choose_all_effects(frames))
     if effects != "auto":
-        return made(choose_effects([name.strip() for name in effects.split(",") if name.strip()], frames))
+        return make(choose_effects([name.strip() for name in effects.split(",") if name.strip()], frames))
     detected = inspect(scene, width=settings.width, height=settings.height, frames=frames)
-    planned = made(detected)
+    planned = make(detected)
     # Measuring needs a path tracer, and indirect light that longer paths may add.
     if settings.max_depth is not None or not planned.plan.indirect or planned.plan.integrator != "path":
         return planned
     depth = measure_depth(scene, frames=frames)
-    return made(detected, depth.max_depth)._replace(depth=depth)
+    return make(detected, depth.max_depth)._replace(depth=depth)
 
 
 class ClipSource(NamedTuple):
@@ -142,15 +142,15 @@ def plan_jobs(source: ClipSource, out: Path, settings: RenderSettings) -> list[C
 
 def _find_reader(names: str, variant: str, settings: RenderSettings) -> Denoiser | None:
     """A denoiser with what it reads, as far as it can be rendered; prints what is left out."""
-    reader = denoiser_named(names)
+    reader = find_denoiser(names)
     if reader is None:
         return None
-    if not tells_lobes(variant) and (lost := reader.reads & OF_SAMPLES):
+    if not separates_lobes(variant) and (lost := reader.reads & OF_SAMPLES):
         print(f"{variant} cannot tell diffuse from specular light: {', '.join(sorted(lost))} left out")
         reader = reader._replace(reads=reader.reads - OF_SAMPLES)
     if settings.jitter and (lost := reader.reads & THROUGH_CENTRES):
         print(f"with jitter there is no {', '.join(sorted(lost))}: left out", flush=True)
-    if settings.see_through and (lost := reader.reads & OF_FIRST_HITS):
+    if settings.see_through and (lost := reader.reads & OF_PRIMARY_SURFACES):
         print(f"seen through, there is no {', '.join(sorted(lost))}: left out", flush=True)
     return reader._replace(reads=reader.reads | SCORED) if settings.reference_spp else reader
 
@@ -159,7 +159,7 @@ def _open_scenes(source: ClipSource) -> Iterable[tuple[str, AnimatedScene, list[
     """Every scene once: its name, the scene, and the seeds of the noise to render it with."""
     name, animation = source.scene, source.animation
     if name in FAMILIES:  # built one at a time: there may be hundreds
-        return ((name, family_scene(name, seed, animation), [seed]) for seed in source.seeds)
+        return ((name, open_family(name, seed, animation), [seed]) for seed in source.seeds)
     if name.endswith(".xml"):
         scene = SceneFile(Path(name), animation)
         return [(scene.name, scene, list(source.seeds))]

@@ -43,8 +43,8 @@ SMALLEST = [CASES["size 1x1"], CASES["size 3x3 and two frames"]]
 LONG_TO_COMPILE = ("metrics.flip", "metrics.ssim", "losses.gradient, hfen")
 OPERATIONS = [one for one in list_operations() if not one.name.startswith(LONG_TO_COMPILE)]
 INNER = {
-    *("targets", "check_taps", "offsets", "angles", "alpha_of", "cosine_and_sine"),
-    *("albedo_table", "ggx_albedo_table", "affinity", "cells", "windows", "differentiable_mean"),
+    *("find_targets", "check_taps", "tap_offsets", "angles", "alpha_of", "cosine_and_sine"),
+    *("albedo_table", "ggx_albedo_table", "affinity", "locate_cells", "gather_windows", "attach_mean_gradient"),
 }  # fmt: skip
 """Helpers of operations, which are tested through them, and tables that take no image."""
 PLAIN = [one for one in OPERATIONS if not one.name.endswith(", masked")]

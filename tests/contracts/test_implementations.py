@@ -269,9 +269,9 @@ def test_a_named_implementation_runs_or_raises(op):
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("guided", [False, True])
 @pytest.mark.parametrize("height", [5, 7, 8])
-def test_strips_of_any_number_of_rows_are_the_whole_image(height, guided, rng, monkeypatch):
-    """Two rows a strip: heights that they divide and others, whose last strip computes a row again."""
-    monkeypatch.setattr("jaxdn.ops.kernel_prediction.softmax._STRIP", 2 * 6 * 51)
+def test_tiles_of_any_number_of_rows_are_the_whole_image(height, guided, rng, monkeypatch):
+    """Two rows a tile: heights that they divide and others, whose last tile computes a row again."""
+    monkeypatch.setattr("jaxdn.ops.kernel_prediction.softmax._TILE_LOGITS", 2 * 6 * 51)
     images, logits = rng.standard_normal((2, height, 6, 3)), rng.standard_normal((height, 6, 51))
     features = rng.standard_normal((height, 6, 7)) if guided else None
     cotangent = rng.standard_normal(images.shape)

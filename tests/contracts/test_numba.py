@@ -295,30 +295,30 @@ def test_what_has_no_loop_for_its_gradient_is_left_to_jax(rng, both):
 
 def test_an_error_in_a_loop_is_raised(rng):
     def fails(top, bottom, image, out):
-        raise RuntimeError("the strip is torn")
+        raise RuntimeError("the tile is torn")
 
-    with pytest.raises(jax.errors.JaxRuntimeError, match="the strip is torn"):
+    with pytest.raises(jax.errors.JaxRuntimeError, match="the tile is torn"):
         jax.block_until_ready(numba_call.call(fails, [(4, 4)], [jnp.ones((4, 4))], rows=4))
 
 
-def test_no_strip_is_written_any_more_after_an_error():
+def test_no_tile_is_written_any_more_after_an_error():
     written = []
 
     def fails_first(top, bottom, image, out):
         if top == 0:
-            raise RuntimeError("the strip is torn")
+            raise RuntimeError("the tile is torn")
         time.sleep(0.1)
         out[top:bottom] = 1
         written.append(top)
 
-    with pytest.raises(jax.errors.JaxRuntimeError, match="the strip is torn"):
+    with pytest.raises(jax.errors.JaxRuntimeError, match="the tile is torn"):
         jax.block_until_ready(numba_call.call(fails_first, [(16, 4)], [jnp.ones((16, 4))], rows=16))
     there = list(written)
     time.sleep(0.5)
     assert written == there != []
 
 
-def test_every_row_belongs_to_one_strip():
+def test_every_row_belongs_to_one_tile():
     def counts(top, bottom, image, out):
         out[top:bottom] = image[top:bottom] + 1
 
@@ -338,10 +338,10 @@ def test_what_was_compiled_before_functions_of_rows_changed_is_not_used(tmp_path
     script = "from jaxdn.ops.affinity import numba_kernels"
     folder = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     subprocess.run(
-        [sys.executable, "-c", script + "; print(numba_kernels.filtered.stats.cache_path)"], env=folder, check=True
+        [sys.executable, "-c", script + "; print(numba_kernels.filter_rows.stats.cache_path)"], env=folder, check=True
     )
     (own,) = tmp_path.iterdir()
-    old, new = own / "numba_kernels.filtered-1.py311.nbi", own / "numba_kernels.enlarged-1.py311.nbi"
+    old, new = own / "numba_kernels.filter_rows-1.py311.nbi", own / "numba_kernels.upsample_rows-1.py311.nbi"
     for file in (old, new):
         file.touch()
     os.utime(old, (0, 0))

@@ -69,11 +69,11 @@ def test_a_disc_matches_a_loop(rng, x64):
     np.testing.assert_allclose(found, reference_disc(values, hit, depth, normal, radius, angle), rtol=1e-9)
 
 
-def test_strips_do_not_show(rng, monkeypatch):
+def test_tiles_do_not_show(rng, monkeypatch):
     values = jnp.asarray(rng.random((3, HEIGHT, WIDTH)), jnp.float32)
     place = jnp.full((HEIGHT, WIDTH), 3.0), jnp.asarray(rng.uniform(0, 6, (HEIGHT, WIDTH)), jnp.float32)
     whole = disc_average(values, None, [], *place)
-    monkeypatch.setattr("jaxdn.filters.disc._STRIP", 2 * WIDTH)
+    monkeypatch.setattr("jaxdn.filters.disc._TILE_PIXELS", 2 * WIDTH)
     np.testing.assert_allclose(disc_average(values, None, [], *place), whole, rtol=1e-6)
 
 

@@ -12,7 +12,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.filters import reproject as module
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, guides_of
-from jaxdn.ops.dispatch.row_tiles import by_strips
+from jaxdn.ops.dispatch.row_tiles import map_row_tiles
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -60,20 +60,22 @@ def by_loops(history, frame, *, search_neighbours=False):
 
 def recalled(history, frame, *, first=False, search_neighbours=False):
     frame = jax.tree.map(jnp.asarray, frame)
-    return program(search_neighbours, module._STRIP)(jnp.asarray(history), guides_of(frame), frame, jnp.asarray(first))
+    return program(search_neighbours, module._TILE_PIXELS)(
+        jnp.asarray(history), guides_of(frame), frame, jnp.asarray(first)
+    )
 
 
 @functools.cache
-def program(search_neighbours, strip):
-    """``recall``, compiled once for each set of buffers while a strip has so many pixels."""
+def program(search_neighbours, tile):
+    """``recall``, compiled once for each set of buffers while a tile has so many pixels."""
     return jax.jit(lambda *given: reproject(*given, search_neighbours=search_neighbours))
 
 
 @pytest.mark.parametrize("search_neighbours", [False, True])
-@pytest.mark.parametrize("strip", [5_000, 20])
+@pytest.mark.parametrize("tile", [5_000, 20])
 @pytest.mark.parametrize("guide", ["ids", "normal", "depth"])
-def test_it_is_the_mean_of_the_taps_of_the_same_surface(guide, strip, search_neighbours, rng, x64, monkeypatch):
-    monkeypatch.setattr(module, "_STRIP", strip)
+def test_it_is_the_mean_of_the_taps_of_the_same_surface(guide, tile, search_neighbours, rng, x64, monkeypatch):
+    monkeypatch.setattr(module, "_TILE_PIXELS", tile)
     history, frame = drawn(rng)
     one = Frame(radiance=frame.radiance, motion=frame.motion, **{guide: getattr(frame, guide)})
     found = recalled(history, one, search_neighbours=search_neighbours)
@@ -175,8 +177,10 @@ def test_motion_that_is_no_number_means_no_history(rng):
 
 
 @pytest.mark.parametrize("pixels", [1, 12, 63, 1000])
-def test_strips_join_to_the_whole(pixels, rng):
+def test_tiles_join_to_the_whole(pixels, rng):
     arrays = {"a": rng.random((HEIGHT, WIDTH)), "b": rng.random((HEIGHT, WIDTH, 2))}
-    found = by_strips(lambda each: (each["a"] + 1, each["b"].sum(-1)), jax.tree.map(jnp.asarray, arrays), pixels=pixels)
+    found = map_row_tiles(
+        lambda each: (each["a"] + 1, each["b"].sum(-1)), jax.tree.map(jnp.asarray, arrays), pixels=pixels
+    )
     np.testing.assert_allclose(found[0], arrays["a"] + 1, rtol=1e-6)
     np.testing.assert_allclose(found[1], arrays["b"].sum(-1), rtol=1e-6)

@@ -10,7 +10,7 @@ from jaxdn.filters.atrous import edge_average, stencil
 from jaxdn.filters.edge_stopping import depth_weight, luminance_weight, normal_weight
 from jaxdn.filters.history_fix import fix_history
 from jaxdn.filters.variance import estimate_variance
-from jaxdn.ops.dispatch.row_tiles import where_needed
+from jaxdn.ops.dispatch.row_tiles import evaluate_sparsely
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -83,6 +83,6 @@ def test_large_images_get_what_small_ones_get(rng, x64, monkeypatch):
 def test_work_is_done_where_it_is_needed(share, rng):
     array = jnp.asarray(rng.random((HEIGHT, WIDTH, 2)), jnp.float32)
     needed = jnp.asarray(rng.random((HEIGHT, WIDTH)) < share)
-    found = where_needed(lambda part: (part + 1, part[:, 0] > 0.5), needed, array)
+    found = evaluate_sparsely(lambda part: (part + 1, part[:, 0] > 0.5), needed, array)
     np.testing.assert_array_equal(found[0], np.where(np.asarray(needed)[..., None], array + 1, 0))
     np.testing.assert_array_equal(found[1], np.asarray(needed) & (np.asarray(array)[..., 0] > 0.5))

@@ -29,11 +29,11 @@ def run(layer, precision, x, shape, dtype=None, before=None):
     source = np.array(jnp.asarray(x, precision.dtype))
     out = np.zeros(shape, source.dtype if dtype is None else dtype) if before is None else before
     kind = dnnl.FLOAT32 if out.dtype == np.float32 else dnnl.BFLOAT16
-    reads, writes = dnnl.images(*x.shape, precision.kind), dnnl.images(*shape, kind)
-    ends = (dnnl.memory(reads, dnnl.address(source)), dnnl.memory(writes, dnnl.address(out)))
+    reads, writes = dnnl.describe_images(*x.shape, precision.kind), dnnl.describe_images(*shape, kind)
+    ends = (dnnl.create_memory(reads, dnnl.address_of(source)), dnnl.create_memory(writes, dnnl.address_of(out)))
     primitive = layer(reads, writes)(*ends)
     scratch = np.empty(primitive.scratch_bytes, np.uint8)
-    dnnl.set_address(primitive.scratch, dnnl.address(scratch))
+    dnnl.set_address(primitive.scratch, dnnl.address_of(scratch))
     primitive()
     return out
 
@@ -54,7 +54,7 @@ def test_a_convolution_is_exact_for_small_whole_numbers(precision, rng, size, sl
     wanted = convolved(x, kernel) + bias + before * adds
     wanted = wanted if slope is None else np.where(wanted >= 0, wanted, slope * wanted)
     found = run(
-        lambda *ends: layers.convolution(*ends, kernel, bias, kind=precision.kind, slope=slope, adds=adds),
+        lambda *ends: layers.make_convolution(*ends, kernel, bias, kind=precision.kind, slope=slope, adds=adds),
         precision,
         x,
         wanted.shape,
@@ -71,7 +71,7 @@ def test_a_convolution_of_an_enlarged_image_is_exact_for_small_whole_numbers(pre
     wanted = np.where(wanted >= 0, wanted, 0.25 * wanted)
     options = {"kind": precision.kind, "slope": 0.25, "adds": adds, "upsamples": True}
     found = run(
-        lambda *ends: layers.convolution(*ends, kernel, bias, **options),
+        lambda *ends: layers.make_convolution(*ends, kernel, bias, **options),
         precision,
         x,
         wanted.shape,
@@ -82,8 +82,8 @@ def test_a_convolution_of_an_enlarged_image_is_exact_for_small_whole_numbers(pre
 
 def test_pooling_and_enlarging(precision, rng):
     x = rng.integers(-99, 99, (2, 8, 6, 16)) * 1.0
-    pooled = run(layers.pooling, precision, x, (2, 4, 3, 16))
-    upsampled = run(layers.upsampling, precision, x, (2, 16, 12, 16))
+    pooled = run(layers.make_pooling, precision, x, (2, 4, 3, 16))
+    upsampled = run(layers.make_upsampling, precision, x, (2, 16, 12, 16))
     as_numbers = [np.asarray(each, np.float64) for each in (pooled, upsampled)]
     np.testing.assert_array_equal(as_numbers[0], x.reshape(2, 4, 2, 3, 2, 16).max(axis=(2, 4)))
     np.testing.assert_array_equal(as_numbers[1], x.repeat(2, axis=1).repeat(2, axis=2))
@@ -145,7 +145,7 @@ def test_large_results_of_64_channels(precision):
     }
     features, head = np.array(jnp.zeros((1, 384, 640, 16), precision.dtype)), np.zeros((1, 384, 640, 8), np.float32)
     program = onednn.Program(network, weights, features.shape, precision)
-    program(dnnl.address(features), [dnnl.address(head)])
+    program(dnnl.address_of(features), [dnnl.address_of(head)])
     np.testing.assert_array_equal(head, 1.0)
 
 

@@ -39,9 +39,9 @@ def by_formula(image, features, slanted, confidence, step):
 
 
 @pytest.mark.parametrize("step", [1, 2, 4])
-@pytest.mark.parametrize("strip", [16384, 22])
-def test_it_is_the_formula(step, strip, rng, x64, monkeypatch):
-    monkeypatch.setattr(module, "_STRIP", strip)
+@pytest.mark.parametrize("tile", [16384, 22])
+def test_it_is_the_formula(step, tile, rng, x64, monkeypatch):
+    monkeypatch.setattr(module, "_TILE_PIXELS", tile)
     image, *guide = drawn(rng, 19)
     found = affinity_filter(jnp.asarray(image), Guide(*map(jnp.asarray, guide)), step=step)
     np.testing.assert_allclose(found, by_formula(image, *guide, step), rtol=1e-10)

@@ -173,7 +173,7 @@ for size, inputs, outputs in (((1, 1), 4, 4), ((16, 16), 14, 4), ((64, 64), 14, 
     }.items():
         made, found = [], out if direction != "kernel gradient" else second
         make = lambda: made.append(onednn._Convolution(direction, 1, *size, inputs, outputs))
-        run = lambda: made[0](*(library.address(array) for array in (first, second, out)))
+        run = lambda: made[0](*(library.address_of(array) for array in (first, second, out)))
         for task in (make, run):
             thread = threading.Thread(target=task)
             thread.start()

@@ -41,27 +41,26 @@ def by_formula(coarse, there, here):
     return out, sums
 
 
-@pytest.mark.parametrize(("platform", "strip"), [("cpu", 4096), ("cpu", 12), ("gpu", 4096)])
-def test_it_is_the_formula(platform, strip, rng, x64, monkeypatch):
-    monkeypatch.setattr(module, "platform", lambda: platform)
-    monkeypatch.setattr(module, "_STRIP", strip)
-    coarse, there, here = drawn(rng)
-    found, weight = joint_bilateral_upsample(jnp.asarray(coarse), *jax.tree.map(jnp.asarray, (there, here)))
-    wanted, sums = by_formula(coarse, there, here)
+@pytest.mark.parametrize(("name", "tile"), [("reference", 4096), ("reference", 12), ("unrolled", 4096)])
+def test_it_is_the_formula(name, tile, rng, x64, monkeypatch):
+    monkeypatch.setattr(module, "_TILE_PIXELS", tile)
+    coarse, *guides = jax.tree.map(jnp.asarray, drawn(rng))
+    found, weight = joint_bilateral_upsample(coarse, *guides, implementation=name)
+    wanted, sums = by_formula(*jax.tree.map(np.asarray, (coarse, *guides)))
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
     np.testing.assert_allclose(weight, sums, rtol=1e-10)
 
 
-@pytest.mark.parametrize("platform", ["cpu", "gpu"])
-def test_gradients(platform, rng, x64, monkeypatch):
-    monkeypatch.setattr(module, "platform", lambda: platform)
+@pytest.mark.parametrize("name", ["reference", "unrolled"])
+def test_gradients(name, rng, x64):
     coarse, there, here = drawn(rng, 3, 4)
 
-    def enlarged(coarse, *parts):
-        return joint_bilateral_upsample(coarse, Guide(*parts[:3]), Guide(*parts[3:], jnp.ones(here.confidence.shape)))
+    def upsampled(coarse, *parts):
+        fine = Guide(*parts[3:], jnp.ones(here.confidence.shape))
+        return joint_bilateral_upsample(coarse, Guide(*parts[:3]), fine, implementation=name)
 
     arguments = tuple(map(jnp.asarray, (coarse, *there[:3], *here[:2])))
-    check_grads(jax.jit(enlarged), arguments, order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
+    check_grads(jax.jit(upsampled), arguments, order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
 
 
 def test_a_fine_pixel_that_nothing_resembles_has_no_weight(rng):

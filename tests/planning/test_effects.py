@@ -173,20 +173,20 @@ def test_left_out_buffers_are_relative_to_rendering_without_a_plan():
 
 @pytest.mark.parametrize("name", ["svgf", "ntd", "ntd-small"])
 def test_a_plan_is_made_for_a_method_with_or_without_weights(name):
-    assert command.denoiser_named(name).reads
+    assert command.find_denoiser(name).reads
 
 
 def test_several_denoisers_read_what_each_of_them_reads():
-    apart = [command.denoiser_named(name).reads for name in ("taa", "relax", "asvgf")]
-    assert command.denoiser_named("taa,relax,asvgf").reads == frozenset().union(*apart) != apart[1]
-    assert command.denoiser_named("noisy,taa").reads == apart[0]
+    apart = [command.find_denoiser(name).reads for name in ("taa", "relax", "asvgf")]
+    assert command.find_denoiser("taa,relax,asvgf").reads == frozenset().union(*apart) != apart[1]
+    assert command.find_denoiser("noisy,taa").reads == apart[0]
     with pytest.raises(ValueError, match="magic"):
-        command.denoiser_named("svgf,magic")
+        command.find_denoiser("svgf,magic")
 
 
 def test_an_unknown_method_is_refused():
     with pytest.raises(ValueError, match="magic"):
-        command.denoiser_named("magic")
+        command.find_denoiser("magic")
 
 
 def test_only_json_is_printed(tmp_path):

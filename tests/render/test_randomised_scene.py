@@ -138,11 +138,11 @@ def test_the_record_rebuilds_the_scene_bit_for_bit(randomised):
 
 
 def test_changed_materials_and_tinted_lights(folder):
-    from jaxdn.render.scenes.material_overrides import list_materials
+    from jaxdn.render.scenes.material_overrides import name_materials
 
     def colors(animation):
         scene = SceneFile.from_record({"file": str(folder / "scene.xml"), "animation": animation})
-        bsdfs = dict(list_materials(scene.build(0, 4, 4)))
+        bsdfs = dict(name_materials(scene.build(0, 4, 4)))
         values = {name: mi.traverse(bsdf) for name, bsdf in bsdfs.items()}
         texture, red = (np.array(values[name][key]) for name, key in KEYS.items())
         return texture, red.ravel(), float(np.ravel(np.array(values["ball"]["alpha.value"]))[0])

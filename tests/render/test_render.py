@@ -19,9 +19,9 @@ from jaxdn.core.frame import present
 from jaxdn.data.clip.folder import begun_record, is_clip, read_record
 from jaxdn.render import worker_pool
 from jaxdn.render.clip import render_clip
-from jaxdn.render.frame import Rendered, render_frame
+from jaxdn.render.frame import RenderedFrame, render_frame
 from jaxdn.render.mitsuba.errors import RenderError
-from jaxdn.render.mitsuba.variant import choose_variant, llvm_candidates, use_variant
+from jaxdn.render.mitsuba.variant import choose_variant, list_llvm_candidates, use_variant
 from jaxdn.render.open_scene import scene_from_record
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.settings import RenderSettings
@@ -40,7 +40,7 @@ def variant(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def converged() -> dict[str, Rendered]:
+def converged() -> dict[str, RenderedFrame]:
     """One frame by every variant, with as many samples as a test has time for."""
     return {
         name: render_frame(Stage(), 0, RenderSettings(reference_spp=SAMPLES, seed=1, variant=name, **SIZE))
@@ -56,7 +56,7 @@ def test_the_stage_is_an_animated_scene() -> None:
     assert isinstance(Stage(), AnimatedScene)
 
 
-def test_the_parts_add_up_to_mitsubas_path_integrator(variant: str, converged: dict[str, Rendered]) -> None:
+def test_the_parts_add_up_to_mitsubas_path_integrator(variant: str, converged: dict[str, RenderedFrame]) -> None:
     import mitsuba as mi
 
     scene, found = Stage().build(0, WIDTH, HEIGHT), converged[variant]
@@ -75,7 +75,7 @@ def test_the_parts_add_up_to_mitsubas_path_integrator(variant: str, converged: d
         np.testing.assert_allclose(mine.mean(), its.mean(), rtol=0.03)
 
 
-def test_the_variants_agree(converged: dict[str, Rendered]) -> None:
+def test_the_variants_agree(converged: dict[str, RenderedFrame]) -> None:
     require("llvm")
     first, second = converged.values()
     for one, other in ((first.reference, second.reference), (first.frame.direct, second.frame.direct)):
@@ -84,7 +84,7 @@ def test_the_variants_agree(converged: dict[str, Rendered]) -> None:
         np.testing.assert_allclose(np.mean(one), np.mean(other), rtol=0.03)
 
 
-def test_light_is_never_negative_and_always_finite(variant: str, converged: dict[str, Rendered]) -> None:
+def test_light_is_never_negative_and_always_finite(variant: str, converged: dict[str, RenderedFrame]) -> None:
     found = converged[variant]
     assert found.bad_samples == 0
     for image in (*found.layers.values(), found.reference, found.reference_half, found.frame.direct):
@@ -161,7 +161,7 @@ def test_half_of_the_reference_measures_its_noise(variant: str) -> None:
     assert 0.3 < estimated / real < 1.5
 
 
-def same(first: Rendered, second: Rendered) -> bool:
+def same(first: RenderedFrame, second: RenderedFrame) -> bool:
     pairs: list[Any] = [*zip(first.frame, second.frame, strict=True), (first.reference, second.reference)]
     pairs += [(first.layers[samples], second.layers[samples]) for samples in first.layers]
     return all(np.array_equal(one, other) for one, other in pairs if one is not None)
@@ -438,9 +438,9 @@ def test_an_llvm_that_aborts_the_process_is_survived() -> None:
 def test_the_users_choice_wins_and_old_libraries_are_not_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     assert chosen(JAXDN_VARIANT="scalar_rgb").startswith("scalar_rgb|")
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
-    assert not any(f"LLVM-{old}" in path for path in llvm_candidates() for old in (14, 15, 16))
+    assert not any(f"LLVM-{old}" in path for path in list_llvm_candidates() for old in (14, 15, 16))
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/somewhere")
-    assert llvm_candidates() == ["/somewhere"]
+    assert list_llvm_candidates() == ["/somewhere"]
 
 
 def test_a_worker_that_dies_is_reported_with_its_clip(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ def counted(monkeypatch):
         monkeypatch.setattr(command, name, counting)
 
     count("SceneFile", "opened")
-    count("family_scene", "opened")
+    count("open_family", "opened")
     count("inspect", "planned")
     monkeypatch.setattr(command, "render_clips", lambda jobs, workers: seen["jobs"].extend(jobs) or [])
     return seen

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from jaxdn.render.scenes.animation import RigidKeys, rotation_matrix, slerp
+from jaxdn.render.scenes.animation import RigidKeys, make_rotation, slerp
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.scenes.scene_file import SceneFile
 from tests.needs import require_module
@@ -115,7 +115,7 @@ def test_shapes_move_as_keyed(folder):
         assert shape_at(scene, frame, round(column), round(row)) == "Box"
         center = scene.pose(frame)["Box"] @ [-1, 1, 1, 1]
         np.testing.assert_allclose(center[:3], [x, 1, 1], atol=1e-12)
-    np.testing.assert_allclose(scene.pose(2)["Box"][:3, :3], rotation_matrix(np.array([0, 0, 1]), 45), atol=1e-12)
+    np.testing.assert_allclose(scene.pose(2)["Box"][:3, :3], make_rotation(np.array([0, 0, 1]), 45), atol=1e-12)
     column, row = pixel_of(scene, 0, (-1, 1, 1.5))
     assert shape_at(scene, 4, round(column), round(row)) == "Wall"
     # Outside the keys nothing moves.
@@ -177,15 +177,15 @@ def test_an_animation_next_to_the_scene_is_found(folder):
 
 def test_turns_longer_than_half_a_circle():
     keys = RigidKeys([{"frame": 0}, {"frame": 8, "axis": [0, 0, 2], "angle": 720}], np.zeros(3))
-    np.testing.assert_allclose(keys(1)[:3, :3], rotation_matrix(np.array([0, 0, 1]), 90), atol=1e-12)
-    np.testing.assert_allclose(keys(6)[:3, :3], rotation_matrix(np.array([0, 0, 1]), 180), atol=1e-12)
+    np.testing.assert_allclose(keys(1)[:3, :3], make_rotation(np.array([0, 0, 1]), 90), atol=1e-12)
+    np.testing.assert_allclose(keys(6)[:3, :3], make_rotation(np.array([0, 0, 1]), 180), atol=1e-12)
 
 
 @pytest.mark.parametrize("angle", [1e-7, 30.0, 179.999, 180.0])
 def test_slerp_turns_evenly_about_one_axis(angle):
     axis = np.array([2.0, -1.0, 2.0]) / 3
-    first = rotation_matrix(np.array([1.0, 0.0, 0.0]), 70)
-    second = first @ rotation_matrix(axis, angle)
+    first = make_rotation(np.array([1.0, 0.0, 0.0]), 70)
+    second = first @ make_rotation(axis, angle)
     np.testing.assert_allclose(slerp(first, second, 1.0), second, atol=1e-7)
     half = slerp(first, second, 0.5)
     np.testing.assert_allclose(half @ (first.T @ half), second, atol=1e-7)

@@ -11,7 +11,7 @@ import jaxdn
 from jaxdn import Clip, effects
 from jaxdn.clips import ClipError
 from jaxdn.effects import plan
-from jaxdn.planning.catalogue import OF_FIRST_HITS
+from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES
 from jaxdn.render.clip import render_clip
 from jaxdn.render.frame import render_frame
 from jaxdn.render.mitsuba.variant import choose_variant
@@ -185,7 +185,7 @@ def test_a_scene_without_mirrors_and_glass_is_the_same():
         render_frame(stage, 1, RenderSettings(see_through=on, variant=FAST, **SIZE)).frame for on in (False, True)
     )
     for name, buffer in plain._asdict().items():
-        if buffer is not None and name not in OF_FIRST_HITS:
+        if buffer is not None and name not in OF_PRIMARY_SURFACES:
             np.testing.assert_array_equal(buffer, getattr(through, name), err_msg=name)
 
 

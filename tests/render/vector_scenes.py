@@ -8,7 +8,7 @@ import numpy as np
 import jaxdn
 from jaxdn import effects
 from jaxdn.core.frame import GUIDES
-from jaxdn.render.frame import Rendered, render_frame
+from jaxdn.render.frame import RenderedFrame, render_frame
 from jaxdn.render.mitsuba.variant import choose_variant
 from jaxdn.render.scenes.scene import Camera
 from jaxdn.render.settings import RenderSettings
@@ -82,7 +82,9 @@ def floor(bsdf: dict[str, Any] | None = None) -> dict[str, Any]:
     return {"type": "rectangle", "place": FLOOR, "bsdf": bsdf or grey(0.6)}
 
 
-def rendered(scene: Any, frame: int = 1, *, light: Any = "reflected", **options: Any) -> Rendered:
+def rendered(
+    scene: Any, frame: int = 1, *, light: Any = "reflected", previous: Any = None, **options: Any
+) -> RenderedFrame:
     plan = effects.plan(effects.choose_all_effects(frame + 1), READER, light=light)
     settings: dict[str, Any] = {"width": WIDTH, "height": HEIGHT, "light": light, "plan": plan, "variant": FAST}
-    return render_frame(scene, frame, RenderSettings(**settings | options))
+    return render_frame(scene, frame, RenderSettings(**settings | options), previous=previous)

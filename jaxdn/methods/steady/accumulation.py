@@ -11,7 +11,7 @@ from jaxdn import color
 from jaxdn.methods.steady.network_input import History, draw_history
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
-from jaxdn.ops.layout.planar import planar
+from jaxdn.ops.layout.planar import to_planes
 from jaxdn.ops.scales import downsample
 
 
@@ -36,17 +36,17 @@ def accumulated(noisy: jax.Array, history: History, hit: jax.Array, follow: jax.
     and its logit is added to that of the weight. With weights 1 - a and a, the variance is ``(1 - a)^2 / N + a^2`` of a
     frame's: the effective number is its inverse, but at most ``most``. ``hit`` [H, W] bool: there is a surface.
     """
-    values, valid = planar(history.values), history.valid
+    values, valid = to_planes(history.values), history.valid
     # The odds of 1 / (N + 1) are 1 to N.
     count = jnp.maximum(values[4], 1e-6)
     share = jnp.where(valid, follow / (follow + count * (1.0 - follow)), 1.0)
-    now = jnp.concatenate([planar(noisy), color.luminance(noisy)[None, ..., 0] ** 2])
+    now = jnp.concatenate([to_planes(noisy), color.luminance(noisy)[None, ..., 0] ** 2])
     then = jnp.where(valid[None], values[:4], now)
     mixed = then + share[None] * (now - then)
     variance = jnp.square(1.0 - share) / count + share**2
     number = jnp.where(valid, jnp.minimum(1.0 / variance, most), 1.0)
     missed = jnp.where(hit[None], now[:3] - mixed[:3], 0.0)
-    return Mean(mixed[:3], mixed[3], number, planar(downsample(missed.transpose(1, 2, 0))))
+    return Mean(mixed[:3], mixed[3], number, to_planes(downsample(missed.transpose(1, 2, 0))))
 
 
 @numba_call.implements(accumulated)
@@ -80,7 +80,7 @@ def remembered(
     ``blend`` [H, W] of the image, all of it where there was no history.
     """
     change = jnp.zeros_like(shown.image) if shown.change is None else shown.change
-    before = planar(history.values)[5:] + change
+    before = to_planes(history.values)[5:] + change
     newest = jnp.where(history.valid, blend, 1.0)[None]
     output = jnp.clip(before + newest * (shown.image - before), 0.0, most)
     kept = jnp.maximum(mean.light + feedback[None] * (shown.fine - mean.light) + change, 0.0)

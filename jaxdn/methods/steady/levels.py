@@ -24,7 +24,7 @@ from jaxdn.methods.steady.accumulation import Shown
 from jaxdn.networks import pad
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
-from jaxdn.ops.layout.planar import Part, join_planes
+from jaxdn.ops.layout.planar import Channels, join_planes
 from jaxdn.ops.scales import upsample
 
 LEVELS = 4
@@ -50,7 +50,7 @@ class Surfaces(NamedTuple):
     hit: jax.Array
     """[H, W] bool, there is a surface."""
 
-    def guides(self, layout: str = "pixels") -> list[Part]:
+    def guides(self, layout: str = "pixels") -> list[Channels]:
         """Albedo, gloss and normal, parts of planes (:mod:`jaxdn.ops.layout.planar`)."""
         return [(layout, self.albedo), (layout, self.gloss), (layout, self.normal)]
 
@@ -185,7 +185,7 @@ def _any_of_four(hit: jax.Array) -> jax.Array:
     return hit[::2, ::2] | hit[::2, 1::2] | hit[1::2, ::2] | hit[1::2, 1::2]
 
 
-def _guide(features: Sequence[Part], slanted: jax.Array, trust: jax.Array, hit: jax.Array) -> Guide:
+def _guide(features: Sequence[Channels], slanted: jax.Array, trust: jax.Array, hit: jax.Array) -> Guide:
     """Surfaces and what else is learned, not yet scaled; what is no surface gives nothing."""
     return Guide(join_planes(features), slanted, (trust + _LEAST_TRUST) * hit)
 

@@ -40,7 +40,7 @@ from jaxdn.methods.steady.network_input import CHANNELS, DARK, History, seen
 from jaxdn.networks import Widths, crop, graph, pad
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
-from jaxdn.ops.layout.planar import join_planes, planar
+from jaxdn.ops.layout.planar import join_planes, to_planes
 from jaxdn.ops.scales import downsample, fill_holes, upsample
 from jaxdn.recipes.objectives import pyramid_illumination
 from jaxdn.recipes.recipe import FINISH, Recipe
@@ -217,7 +217,7 @@ def _apart(head: jax.Array, *, size: tuple[int, int]) -> _Apart:
     # Splits, not slices: the gradient of a slice is an array of the whole size, and all of them are added.
     own, logits, half, rest = jnp.split(crop(head, size), _PLACES, axis=-1)
     # Before they are unfolded, while they lie side by side in memory.
-    return own, join_planes([("blocks", jax.nn.sigmoid(logits))]), half, planar(jax.nn.sigmoid(rest))
+    return own, join_planes([("blocks", jax.nn.sigmoid(logits))]), half, to_planes(jax.nn.sigmoid(rest))
 
 
 @numba_call.implements(_apart)

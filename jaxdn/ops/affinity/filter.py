@@ -14,7 +14,7 @@ Affinity of Neural Features".
 
 Arrays are planar, ``[C, H, W]``: the stencil then runs along contiguous rows and vectorises. On CPUs both passes are
 compiled loops (:mod:`jaxdn.ops.affinity.numba_kernels`) where these are available, on GPUs one kernel each
-(:mod:`jaxdn.ops.affinity.pallas_kernels`). Elsewhere the forward pass works on strips
+(:mod:`jaxdn.ops.affinity.pallas_kernels`). Elsewhere the forward pass works on tiles
 of rows that fit into the cache; the gradient keeps only the arguments and recomputes the weights. Both scan over pairs
 of opposite taps and compute the weights of one pair while they use those of the pair before: in one expression, XLA:CPU
 would compute every weight once for each channel that uses it.
@@ -29,16 +29,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.core.platform import platform
 from jaxdn.ops.affinity import pallas_kernels
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
+from jaxdn.ops.dispatch.row_tiles import rows_per_tile
 
 RADIUS = 2
 SPLINE = (0.375, 0.25, 0.0625)
 """The B3 spline, from its centre outwards."""
-_STRIP = 32768
-"""Approximate number of pixels in a strip."""
+_TILE_PIXELS = 32768
+"""Approximate number of pixels in a tile."""
 _NO_WEIGHT = 1e-12
 
 Planes = list[jax.Array]
@@ -109,17 +109,17 @@ def _by_numba(image: jax.Array, guide: Guide, step: int) -> jax.Array:
 
 
 def _numba_forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, "_Residuals"]:
-    from jaxdn.ops.affinity.numba_kernels import filtered
+    from jaxdn.ops.affinity.numba_kernels import filter_rows
 
     arrays = [image, *guide[:3], guide.factors()]
     numbers = step, np.asarray(SPLINE, np.float32), np.float32(_NO_WEIGHT)
     shapes = [image.shape, image.shape[1:]]
-    found, weight = numba_call.call(filtered, shapes, arrays, *numbers, rows=image.shape[1], least=8 * step)
+    found, weight = numba_call.call(filter_rows, shapes, arrays, *numbers, rows=image.shape[1], least=8 * step)
     return found, (image, guide, found, weight[None])
 
 
 def _numba_backward(step: int, residuals: "_Residuals", cotangent: jax.Array) -> tuple[jax.Array, Guide]:
-    from jaxdn.ops.affinity.numba_kernels import filtered_gradient
+    from jaxdn.ops.affinity.numba_kernels import filter_gradient_rows
 
     image, given, filtered, weight = residuals
     some, gains, level = _gains(filtered, weight, cotangent)
@@ -127,7 +127,7 @@ def _numba_backward(step: int, residuals: "_Residuals", cotangent: jax.Array) ->
     arrays = [image, *guide[:3], gains, level]
     shapes = [each.shape for each in arrays[:4]]
     spline = np.asarray(SPLINE, np.float32)
-    by_image, *by_guide = numba_call.call(filtered_gradient, shapes, arrays, step, spline, rows=image.shape[1])
+    by_image, *by_guide = numba_call.call(filter_gradient_rows, shapes, arrays, step, spline, rows=image.shape[1])
     return by_image + jnp.where(some, 0.0, cotangent), *by_given(Guide(*by_guide))
 
 
@@ -156,11 +156,11 @@ def _pairs(step: int, dtype: jnp.dtype) -> _Pair:
     return _Pair(jnp.asarray(step * np.array(after), jnp.int32), jnp.asarray(spline, dtype))
 
 
-def _from(pairs: _Pair, first: int) -> _Pair:
+def _drop_first(pairs: _Pair, first: int) -> _Pair:
     return jax.tree.map(lambda each: each[first:], pairs)
 
 
-def _one(pairs: _Pair, index: int) -> _Pair:
+def _take(pairs: _Pair, index: int) -> _Pair:
     return jax.tree.map(lambda each: each[index], pairs)
 
 
@@ -225,14 +225,14 @@ def _differentiable(sum_taps: _Sums, gather_gradients: _Gradients) -> Callable[[
 
 def _sum_by_pallas(image: jax.Array, guide: Guide, step: int) -> jax.Array:
     mass = jnp.concatenate([image * guide.confidence[None], guide.confidence[None]])
-    return pallas_kernels.totals(_planes(guide), mass, step=step)
+    return pallas_kernels.sum_taps(_planes(guide), mass, step=step)
 
 
 def _gather_by_pallas(
     image: jax.Array, guide: Guide, gains: jax.Array, level: jax.Array, step: int
 ) -> tuple[jax.Array, Guide]:
     given = _planes(guide), guide.confidence, image, gains, level
-    by_image, by_confidence, by_planes = pallas_kernels.gradients(*given, step=step)
+    by_image, by_confidence, by_planes = pallas_kernels.gather_gradients(*given, step=step)
     return by_image, Guide(by_planes[:-3], by_planes[-3:], by_confidence)
 
 
@@ -243,7 +243,7 @@ def _planes(guide: Guide) -> jax.Array:
 def _sum_taps(image: jax.Array, guide: Guide, step: int) -> jax.Array:
     channels, height, width = image.shape
     dtype, margin = image.dtype, step * RADIUS
-    rows = height if platform() != "cpu" else min(height, max(8 * step, _STRIP // width))
+    rows = rows_per_tile(height, width, pixels=_TILE_PIXELS, least=8 * step)
     count = -(-height // rows)
     below = count * rows - height
 
@@ -255,9 +255,9 @@ def _sum_taps(image: jax.Array, guide: Guide, step: int) -> jax.Array:
     pairs = _pairs(step, dtype)
     wide = (rows + margin, width + 2 * margin)
 
-    def strip(top: jax.Array | int) -> jax.Array:
+    def tile(top: jax.Array | int) -> jax.Array:
         def weigh(pair: _Pair) -> jax.Array:
-            """The weight of p and p + o, for all p of the strip and the pixels before and beside it.
+            """The weight of p and p + o, for all p of the tile and the pixels before and beside it.
 
             It is that of p + o and p too: shifted by o, it serves the opposite tap.
             """
@@ -277,16 +277,16 @@ def _sum_taps(image: jax.Array, guide: Guide, step: int) -> jax.Array:
         def body(carry: tuple[Planes, _Pair, jax.Array], pair: _Pair) -> tuple[tuple[Planes, _Pair, jax.Array], None]:
             return (add(*carry), pair, weigh(pair)), None
 
-        first = _one(pairs, 0)
+        first = _take(pairs, 0)
         centre = _window(mass, top + margin, margin, (rows, width))
         begin = ([SPLINE[0] ** 2 * plane for plane in centre], first, weigh(first))
-        carry, _ = lax.scan(body, begin, _from(pairs, 1))
+        carry, _ = lax.scan(body, begin, _drop_first(pairs, 1))
         return jnp.stack(add(*carry))
 
     if count == 1:
-        totals = strip(0)
+        totals = tile(0)
     else:
-        totals = lax.map(strip, rows * jnp.arange(count, dtype=jnp.int32))
+        totals = lax.map(tile, rows * jnp.arange(count, dtype=jnp.int32))
         totals = totals.transpose(1, 0, 2, 3).reshape(channels + 1, count * rows, width)[:, :height]
     return totals
 
@@ -355,12 +355,12 @@ def _gather_gradients(
 
     centre = SPLINE[0] ** 2
     begin = [centre * one * c for one in g] + [centre * (_dot(g, x) - level)] + [jnp.zeros_like(level)] * len(here)
-    first, second = _one(pairs, 0), _one(pairs, 1)
+    first, second = _take(pairs, 0), _take(pairs, 1)
     ready = weigh(first)
     carry: Carry = (begin, (first, ready, slopes(first, ready)), (second, weigh(second)))
     # Two pairs without weight come last: whatever follows the scan is computed once for every one of the sums.
     nothing = jax.tree.map(lambda each: jnp.zeros_like(each[:2]), pairs)
-    rest = jax.tree.map(lambda one, other: jnp.concatenate([one, other]), _from(pairs, 2), nothing)
+    rest = jax.tree.map(lambda one, other: jnp.concatenate([one, other]), _drop_first(pairs, 2), nothing)
     (sums, _, _), _ = lax.scan(body, carry, rest)
     by_guides = sums[len(x) + 1 :]
     return jnp.stack(sums[: len(x)]), Guide(jnp.stack(by_guides[:-3]), jnp.stack(by_guides[-3:]), sums[len(x)])

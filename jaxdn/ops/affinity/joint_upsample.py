@@ -4,7 +4,7 @@ Kopf et al. 2007, "Joint Bilateral Upsampling". Bilinear enlarging carries light
 what the coarse image changed leaves noise of two to four pixels in the fine one.
 
 The four fine pixels of a block are four planes of the coarse image's size: all work runs along contiguous rows, on CPUs
-in strips that fit into the cache, over a scan of the nine taps (as in :mod:`jaxdn.ops.affinity.filter`).
+in tiles that fit into the cache, over a scan of the nine taps (as in :mod:`jaxdn.ops.affinity.filter`).
 """
 
 from collections.abc import Iterator
@@ -15,15 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.core.platform import platform
 from jaxdn.ops.affinity.filter import Guide, affinity, draw_guide
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
+from jaxdn.ops.dispatch.row_tiles import rows_per_tile
 
 _SPREAD = 3.0
 """Twice the variance of the spatial weights, in pixels of the fine image."""
-_STRIP = 4096
-"""Approximate number of coarse pixels in a strip."""
+_TILE_PIXELS = 4096
+"""Approximate number of coarse pixels in a tile."""
 _NO_WEIGHT = 1e-6
 
 Planes = list[jax.Array]
@@ -57,13 +57,13 @@ def _normalize(totals: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 @numba_call.implements(joint_bilateral_upsample)
 def _upsample_by_numba(coarse: jax.Array, there: Guide, here: Guide) -> tuple[jax.Array, jax.Array]:
-    from jaxdn.ops.affinity.numba_kernels import enlarged
+    from jaxdn.ops.affinity.numba_kernels import upsample_rows
 
     channels, height, width = coarse.shape
     fine = 2 * height, 2 * width
     arrays = [coarse, *there[:3], here.features, here.slanted, here.factors()]
     numbers = _spatial()[1].reshape(3, 3, 2, 2).astype(np.float32), np.float32(_NO_WEIGHT)
-    image, weight = numba_call.call(enlarged, [(channels, *fine), fine], arrays, *numbers, rows=fine[0])
+    image, weight = numba_call.call(upsample_rows, [(channels, *fine), fine], arrays, *numbers, rows=fine[0])
     return image, weight
 
 
@@ -91,7 +91,7 @@ def _sum_unrolled_taps(coarse: jax.Array, there: Guide, here: Guide) -> jax.Arra
 def _sum_taps(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
     """[C + 1, 2h, 2w] the weighted sum of every fine pixel's taps and of their weights."""
     channels, height, width = coarse.shape
-    rows = height if platform() != "cpu" else min(height, max(1, _STRIP // width))
+    rows = rows_per_tile(height, width, pixels=_TILE_PIXELS)
     count = -(-height // rows)
     below = count * rows - height
 
@@ -107,7 +107,7 @@ def _sum_taps(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
     blocks = jnp.pad(fine, ((0, 0), (0, 0), (0, 0), (0, below), (0, 0))).reshape(4, -1, height + below, width)
     taps = _taps(coarse.dtype)
 
-    def strip(top: jax.Array | int) -> jax.Array:
+    def tile(top: jax.Array | int) -> jax.Array:
         def at(planes: Planes, shift: jax.Array | np.ndarray) -> Planes:
             return [lax.dynamic_slice(plane, (top + 1 + shift[0], 1 + shift[1]), (rows, width)) for plane in planes]
 
@@ -136,7 +136,7 @@ def _sum_taps(coarse: jax.Array, there: Guide, here: Guide) -> jax.Array:
         carry, _ = lax.scan(body, (empty, first.shift, weigh(first)), rest)
         return jnp.stack([jnp.stack(planes) for planes in add(*carry)])
 
-    found = strip(0)[None] if count == 1 else lax.map(strip, rows * jnp.arange(count, dtype=jnp.int32))
+    found = tile(0)[None] if count == 1 else lax.map(tile, rows * jnp.arange(count, dtype=jnp.int32))
     found = found.reshape(count, 2, 2, channels + 1, rows, width).transpose(3, 0, 4, 1, 5, 2)
     return found.reshape(channels + 1, 2 * count * rows, 2 * width)[:, : 2 * height]
 

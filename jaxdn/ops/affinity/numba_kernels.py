@@ -59,7 +59,7 @@ def _add_three(total: Array, one: Array, other: Array, third: Array, fourth: Arr
 
 
 @loop
-def filtered(
+def filter_rows(
     top: int,
     bottom: int,
     image: Array,
@@ -173,7 +173,7 @@ def _add_scaled(total: Array, other: Array, factor: float) -> None:
 
 
 @loop
-def filtered_gradient(
+def filter_gradient_rows(
     top: int,
     bottom: int,
     image: Array,
@@ -276,7 +276,7 @@ def _side_by_side(row: Array, total: Array, shares: Array) -> None:
 
 
 @loop
-def enlarged(
+def upsample_rows(
     top: int,
     bottom: int,
     coarse: Array,

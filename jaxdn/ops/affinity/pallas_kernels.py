@@ -19,8 +19,8 @@ from jaxdn.core.platform import platform
 
 _BLOCK = 64
 """Pixels of a row that one block of threads has."""
-_REACH = 2
-_SPAN = 2 * _REACH + 1
+_RADIUS = 2
+_SPAN = 2 * _RADIUS + 1
 
 Planes = list[jax.Array]
 
@@ -40,7 +40,7 @@ def unavailable() -> str:
     return "" if _installed() else "needs jax.experimental.pallas.triton, which this version of jax lacks"
 
 
-def totals(guides: jax.Array, mass: jax.Array, *, step: int) -> jax.Array:
+def sum_taps(guides: jax.Array, mass: jax.Array, *, step: int) -> jax.Array:
     """[C, H, W] the sum over all taps of h exp(-d) times ``mass`` [C, H, W].
 
     ``guides`` [F + 3, H, W]: features, and the slanted guide with its slopes. Taps beyond the border do not count.
@@ -62,7 +62,7 @@ def totals(guides: jax.Array, mass: jax.Array, *, step: int) -> jax.Array:
     return _call(kernel, [guides, mass], mass.shape[0], step=step)
 
 
-def gradients(
+def gather_gradients(
     guides: jax.Array,
     confidence: jax.Array,
     image: jax.Array,
@@ -116,7 +116,7 @@ def _call(kernel: Callable[..., None], arrays: Sequence[jax.Array], channels: in
     from jax.experimental.pallas import triton
 
     _, height, width = arrays[0].shape
-    margin, beyond = _REACH * step, -width % _BLOCK
+    margin, beyond = _RADIUS * step, -width % _BLOCK
     wide = [jnp.pad(each, ((0, 0), (margin, margin), (margin, margin + beyond))) for each in arrays]
     shape = jax.ShapeDtypeStruct((channels, height, width + beyond), jnp.float32)
     with warnings.catch_warnings():
@@ -136,7 +136,7 @@ def _place(step: int) -> tuple[jax.Array, jax.Array]:
     """Row and first column of a block's pixels, in arrays with a margin."""
     from jax.experimental import pallas
 
-    return pallas.program_id(0) + _REACH * step, pallas.program_id(1) * _BLOCK + _REACH * step
+    return pallas.program_id(0) + _RADIUS * step, pallas.program_id(1) * _BLOCK + _RADIUS * step
 
 
 def _load(planes: Any, row: jax.Array, column: jax.Array) -> Planes:
@@ -155,7 +155,7 @@ def _store(out: Any, planes: Planes) -> None:
 
 def _offset(index: jax.Array, step: int) -> tuple[jax.Array, jax.Array]:
     """(y, x) in pixels."""
-    return step * (lax.div(index, _SPAN) - _REACH), step * (lax.rem(index, _SPAN) - _REACH)
+    return step * (lax.div(index, _SPAN) - _RADIUS), step * (lax.rem(index, _SPAN) - _RADIUS)
 
 
 def _spline(index: jax.Array) -> jax.Array:

@@ -57,16 +57,16 @@ def _differentiable(name: str, forward: Product, kernel_gradient: Product) -> Pr
         f"{name}_convolution", forward, lambda x, kernel: (*x.shape[:3], kernel.shape[3]), _batch_of_images
     )
     gradient = _primitive(
-        f"{name}_kernel_gradient", kernel_gradient, lambda x, y: (3, 3, x.shape[3], y.shape[3]), _one_by_one
+        f"{name}_kernel_gradient", kernel_gradient, lambda x, y: (3, 3, x.shape[3], y.shape[3]), _map_one_by_one
     )
     ad.defbilinear(
         product,
-        lambda cotangent, x, kernel: product.bind(cotangent, _turned(kernel)),
+        lambda cotangent, x, kernel: product.bind(cotangent, _turn_kernel(kernel)),
         lambda cotangent, x, kernel: gradient.bind(x, cotangent),
     )
     ad.defbilinear(
         gradient,
-        lambda cotangent, x, y: product.bind(y, _turned(cotangent)),
+        lambda cotangent, x, y: product.bind(y, _turn_kernel(cotangent)),
         lambda cotangent, x, y: product.bind(x, cotangent),
     )
     return product.bind
@@ -82,20 +82,20 @@ def _primitive(name: str, compute: Product, shape: Callable[[Any, Any], tuple[in
     return made
 
 
-def _turned(kernel: jax.Array) -> jax.Array:
+def _turn_kernel(kernel: jax.Array) -> jax.Array:
     return jnp.flip(kernel, (0, 1)).swapaxes(2, 3)
 
 
 def _batch_of_images(product: Primitive, arguments: Any, axes: Any) -> tuple[jax.Array, int]:
     (x, kernel), (axis, kernels) = arguments, axes
     if kernels is not None:
-        return _one_by_one(product, arguments, axes)
+        return _map_one_by_one(product, arguments, axes)
     x = jnp.moveaxis(x, axis, 0)
     out = product.bind(x.reshape(-1, *x.shape[2:]), kernel)
     return out.reshape(*x.shape[:2], *out.shape[1:]), 0
 
 
-def _one_by_one(product: Primitive, arguments: Any, axes: Any) -> tuple[jax.Array, int]:
+def _map_one_by_one(product: Primitive, arguments: Any, axes: Any) -> tuple[jax.Array, int]:
     """One plain product per example: XLA:CPU has no fast path for batched ones.
 
     The loop is not unrolled: it takes about the same time and a third of the compilation time.
@@ -109,15 +109,15 @@ def _one_by_one(product: Primitive, arguments: Any, axes: Any) -> tuple[jax.Arra
     return lax.map(one, batched), 0
 
 
-def _patches(image: jax.Array, first: jax.Array | int, rows: int) -> jax.Array:
+def _gather_patches(image: jax.Array, first: jax.Array | int, rows: int) -> jax.Array:
     """The 3x3 neighbourhoods of ``rows`` rows of a padded image: [N * rows * W, 9 * C], row-major taps."""
     width = image.shape[2] - 2
-    strip = lax.dynamic_slice_in_dim(image, first, rows + 2, 1)
-    taps = [strip[:, i : i + rows, j : j + width] for i in range(3) for j in range(3)]
+    block = lax.dynamic_slice_in_dim(image, first, rows + 2, 1)
+    taps = [block[:, i : i + rows, j : j + width] for i in range(3) for j in range(3)]
     return jnp.concatenate(taps, axis=-1).reshape(-1, 9 * image.shape[3])
 
 
-def _rows(image: jax.Array) -> int:
+def _rows_per_block(image: jax.Array) -> int:
     """How many rows of patches make a block."""
     count, rows, width, channels = image.shape
     while rows % 2 == 0 and count * rows * width * 9 * channels * image.dtype.itemsize > _BLOCK_BYTES:
@@ -133,10 +133,10 @@ def _forward(x: jax.Array, kernel: jax.Array) -> jax.Array:
     if x.dtype != jnp.float64:
         return convolve(x, kernel, implementation="reference")
     count, height, width, _ = x.shape
-    padded, flat, rows = jnp.pad(x, _BORDER), kernel.reshape(-1, kernel.shape[3]), _rows(x)
+    padded, flat, rows = jnp.pad(x, _BORDER), kernel.reshape(-1, kernel.shape[3]), _rows_per_block(x)
 
     def block(first: jax.Array | int) -> jax.Array:
-        return (_patches(padded, first, rows) @ flat).reshape(count, rows, width, -1)
+        return (_gather_patches(padded, first, rows) @ flat).reshape(count, rows, width, -1)
 
     if rows == height:
         return block(0)
@@ -151,19 +151,19 @@ def _kernel_gradient(x: jax.Array, cotangent: jax.Array) -> jax.Array:
     thin, wide = (cotangent, x) if around_output else (x, cotangent)
     padded = jnp.pad(thin, _BORDER)
     exact = jnp.promote_types(x.dtype, jnp.float32)  # a sum over all pixels needs more digits than bfloat16 has
-    rows = _rows(thin)
+    rows = _rows_per_block(thin)
 
-    def strip(first: jax.Array | int) -> jax.Array:
+    def block(first: jax.Array | int) -> jax.Array:
         flat = lax.dynamic_slice_in_dim(wide, first, rows, 1).reshape(-1, wide.shape[3])
         return lax.dot_general(
-            flat, _patches(padded, first, rows), (((0,), (0,)), ((), ())), preferred_element_type=exact
+            flat, _gather_patches(padded, first, rows), (((0,), (0,)), ((), ())), preferred_element_type=exact
         )
 
     if rows == height:
-        total = strip(0)
+        total = block(0)
     else:
         empty = jnp.zeros((wide.shape[3], 9 * thin.shape[3]), exact)
-        total, _ = lax.scan(lambda sum, index: (sum + strip(index * rows), None), empty, jnp.arange(height // rows))
+        total, _ = lax.scan(lambda sum, index: (sum + block(index * rows), None), empty, jnp.arange(height // rows))
     total = total.astype(x.dtype).reshape(wide.shape[3], 3, 3, thin.shape[3])
     if around_output:  # offsets of the cotangent's patches have the opposite sign
         return jnp.flip(total, (1, 2)).transpose(1, 2, 0, 3)

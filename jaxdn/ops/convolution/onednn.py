@@ -34,8 +34,8 @@ class _Convolution:
     """
 
     def __init__(self, direction: str, count: int, height: int, width: int, inputs: int, outputs: int) -> None:
-        x, y = (dnnl.images(count, height, width, channels) for channels in (inputs, outputs))
-        ours, dims = dnnl.kernels(3, inputs, outputs)
+        x, y = (dnnl.describe_images(count, height, width, channels) for channels in (inputs, outputs))
+        ours, dims = dnnl.describe_kernels(3, inputs, outputs)
         free = dnnl.create("dnnl_memory_desc_create_with_tag", 4, dims, dnnl.FLOAT32, dnnl.ANY_LAYOUT)
         window = (_ONE, _ZERO, _ONE, _ONE)  # stride, dilation, zeros before and after
         cpu, ours_alone = dnnl.engine()[0], dnnl.attributes()
@@ -55,8 +55,8 @@ class _Convolution:
             roles = dnnl.SOURCE, dnnl.WEIGHTS_GRADIENT, dnnl.DESTINATION_GRADIENT
         theirs = dnnl.query(description, query)
         # Memory without an address: it is set at every call.
-        self._given = [dnnl.memory(each) for each in (x, ours, y)]
-        inside = dnnl.memory(theirs, dnnl.OWN_MEMORY)
+        self._given = [dnnl.create_memory(each) for each in (x, ours, y)]
+        inside = dnnl.create_memory(theirs, dnnl.OWN_MEMORY)
         first, kernel, last = self._given
         convolve = dnnl.Primitive(description, (roles[0], first), (roles[1], inside), (roles[2], last))
         pair = (theirs, ours) if backward else (ours, theirs)
@@ -88,7 +88,7 @@ def _run(direction: str, x: Any, kernel: Any, y: Any) -> None:
     buffers = [np.asarray(each) for each in (x, kernel, y)]
     run = _made_once(direction, *buffers[0].shape, buffers[2].shape[-1])
     with dnnl.LOCK:
-        run(*map(dnnl.address, buffers))
+        run(*map(dnnl.address_of, buffers))
 
 
 def _program(callback: Callable[..., None], shape: Sequence[int], *arguments: jax.Array) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Compiled loops called from inside a jitted program, strip by strip of rows, on all cores."""
+"""Compiled loops called from inside a jitted program, tile by tile of rows, on all cores."""
 
 import functools
 import os
@@ -49,29 +49,29 @@ def call(
     """Float32 arrays of ``shapes``, filled by ``loop``; one after the other under ``jax.vmap``.
 
     Args:
-      loop: compiled without Python's lock; gets the first and the last row of a strip, the arrays, the results, and
+      loop: compiled without Python's lock; gets the first and the last row of a tile, the arrays, the results, and
         ``numbers``, and fills those rows of the results.
       shapes: of the results.
       arrays: what is read; None for what is absent, a tuple for what the loop gets as a tuple.
       numbers: constants of the program.
-      rows: height of the image, of which strips are made.
-      least: rows of a strip, where a loop does more for its first ones.
+      rows: height of the image, of which tiles are made.
+      least: rows of a tile, where a loop does more for its first ones.
     """
 
     def work(context: Any, results: Any, *given: Any) -> None:
         read = jax.tree.map(np.asarray, given)
         written = [np.asarray(each) for each in results]
         pool, threads = _pool()
-        # Several strips for each thread, as some take longer.
+        # Several tiles for each thread, as some take longer.
         height = max(least, -(-rows // (4 * threads)))
-        strips: list[Future[None]] = []
+        tiles: list[Future[None]] = []
         try:
             for top in range(0, rows, height):
-                strips.append(pool.submit(loop, top, min(rows, top + height), *read, *written, *numbers))
-            for strip in strips:
-                strip.result()
+                tiles.append(pool.submit(loop, top, min(rows, top + height), *read, *written, *numbers))
+            for tile in tiles:
+                tile.result()
         finally:  # after Ctrl-C, too, nothing may write into results that XLA frees
-            wait(strips)
+            wait(tiles)
 
     kinds = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
     return list(buffer_callback(work, kinds, vmap_method="sequential")(*arrays))
@@ -89,4 +89,4 @@ def _installed() -> bool:
 def _pool() -> tuple[ThreadPoolExecutor, int]:
     """Threads, one for each core that this process may use, and their number."""
     threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return ThreadPoolExecutor(threads, "jaxdn-strips"), threads
+    return ThreadPoolExecutor(threads, "jaxdn-tiles"), threads

@@ -63,7 +63,7 @@ def _extend(image: jax.Array, radius: int) -> jax.Array:
     return jnp.pad(image, ((radius, radius), (radius, radius), (0, 0)), mode="edge")
 
 
-def offsets(radius: int) -> list[tuple[int, int]]:
+def tap_offsets(radius: int) -> list[tuple[int, int]]:
     """(row, column) of every tap in the extended image, row-major."""
     size = 2 * radius + 1
     return [(row, column) for row in range(size) for column in range(size)]
@@ -76,7 +76,7 @@ def _sum_taps(image: jax.Array, kernels: jax.Array) -> jax.Array:
     radius = _radius(kernels)
     extended = _extend(image, radius)
     out = jnp.zeros_like(image)
-    for tap, (i, j) in enumerate(offsets(radius)):
+    for tap, (i, j) in enumerate(tap_offsets(radius)):
         out = out + kernels[:, :, tap : tap + 1] * extended[i : i + height, j : j + width]
     return out
 
@@ -101,14 +101,14 @@ def _backward(residuals: tuple[jax.Array, jax.Array], cotangent: jax.Array) -> t
         terms = [cotangent[..., c : c + 1] * shifted[..., c : c + 1] for c in range(channels)]
         return sum(terms[1:], terms[0])
 
-    kernels_gradient = jnp.concatenate([inner_product(i, j) for i, j in offsets(radius)], axis=-1)
+    kernels_gradient = jnp.concatenate([inner_product(i, j) for i, j in tap_offsets(radius)], axis=-1)
 
     # Gradient of the extended image, gathered: its pixel e receives tap t of pixel e - offset_t wherever that exists.
     around = ((2 * radius, 2 * radius), (2 * radius, 2 * radius), (0, 0))
     wide_kernels, wide_cotangent = jnp.pad(kernels, around), jnp.pad(cotangent, around)
     rows, columns = extended.shape[:2]
     total = jnp.zeros_like(extended)
-    for tap, (i, j) in enumerate(offsets(radius)):
+    for tap, (i, j) in enumerate(tap_offsets(radius)):
         y, x = 2 * radius - i, 2 * radius - j
         weight = wide_kernels[y : y + rows, x : x + columns, tap : tap + 1]
         total = total + weight * wide_cotangent[y : y + rows, x : x + columns]

@@ -40,7 +40,7 @@ def _planar(features: jax.Array, radius: int) -> jax.Array:
     return jnp.stack([jnp.pad(features[..., f], radius, mode="edge") for f in range(features.shape[-1])])
 
 
-def _of_plane(extended: jax.Array, offset: Offset, radius: int) -> tuple[jax.Array, jax.Array]:
+def _slice_ends(extended: jax.Array, offset: Offset, radius: int) -> tuple[jax.Array, jax.Array]:
     """The features of both ends of every distance in a plane, [F, H + dy, W + |dx|] each."""
     height = extended.shape[1] - 2 * radius + offset.down
     width = extended.shape[2] - 2 * radius + offset.left + offset.right
@@ -51,20 +51,20 @@ def _of_plane(extended: jax.Array, offset: Offset, radius: int) -> tuple[jax.Arr
     )
 
 
-def distances(features: jax.Array, taps: int) -> tuple[jax.Array, ...]:
+def compute_distances(features: jax.Array, taps: int) -> tuple[jax.Array, ...]:
     """The plane of squared distances for each of :func:`half_offsets`, from features [H, W, F]."""
     radius = math.isqrt(taps) // 2
     extended = _planar(features, radius)
     planes = []
     for offset in half_offsets(taps):
-        here, there = _of_plane(extended, offset, radius)
+        here, there = _slice_ends(extended, offset, radius)
         # A sum of differences squared: with 2 <f, g> - |g|^2 features of size 20 would lose three digits.
         terms = [jnp.square(there[f] - here[f]) for f in range(extended.shape[0])]
         planes.append(sum(terms[1:], terms[0]))
     return tuple(planes)
 
 
-def by_taps(planes: Sequence[jax.Array], height: int, width: int, taps: int) -> jax.Array:
+def planes_to_taps(planes: Sequence[jax.Array], height: int, width: int, taps: int) -> jax.Array:
     """The squared distance of every pixel to each of its taps, [height, width, taps]."""
     before, after = [], []
     for plane, offset in zip(planes, half_offsets(taps), strict=True):
@@ -73,9 +73,9 @@ def by_taps(planes: Sequence[jax.Array], height: int, width: int, taps: int) -> 
     return jnp.stack([*reversed(before), jnp.zeros_like(after[0]), *after], axis=-1)
 
 
-def to_planes(slopes: jax.Array, taps: int) -> tuple[jax.Array, ...]:
+def taps_to_planes(slopes: jax.Array, taps: int) -> tuple[jax.Array, ...]:
     """The gradient by the planes, from that by the distances of the taps [height, width, taps]: the transpose of
-    :func:`by_taps`."""
+    :func:`planes_to_taps`."""
     planes = []
     for index, (down, left, right) in enumerate(half_offsets(taps)):
         after = jnp.pad(slopes[..., taps // 2 + 1 + index], ((down, 0), (left, right)))

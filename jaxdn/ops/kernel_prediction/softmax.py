@@ -1,4 +1,4 @@
-"""Filtering with kernels given as logits: the softmax over the taps and the filter combined, strip by strip.
+"""Filtering with kernels given as logits: the softmax over the taps and the filter combined, tile by tile.
 
 The 25 logits per pixel of a 720p frame are 92 MB. For softmax, filter and each use of the result, XLA:CPU writes and
 reads them again, and it recomputes the filter for each of its users, because it fuses it into them. ``"row_tiles"``
@@ -23,12 +23,12 @@ from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.kernel_prediction import apply, guide_distances
 from jaxdn.ops.kernel_prediction.apply import check_taps
 
-_STRIP = 1_000_000
-"""Approximate number of logits in a strip: 15 rows of two kernels at 720p."""
+_TILE_LOGITS = 1_000_000
+"""Approximate number of logits in a tile: 15 rows of two kernels at 720p."""
 
 
 Planes = tuple[jax.Array, ...]
-"""Squared distances between features (:func:`~.guide_distances.distances`); empty without features."""
+"""Squared distances between features (:func:`~.guide_distances.compute_distances`); empty without features."""
 
 
 def softmax_filter(
@@ -83,7 +83,7 @@ def _prior(features: jax.Array, radius: int) -> jax.Array:
     """Squared distances to the taps [H, W, taps], tap by tap."""
     height, width = features.shape[:2]
     extended = _extend(features[None], radius)[0]
-    shifted = [extended[i : i + height, j : j + width] for i, j in apply.offsets(radius)]
+    shifted = [extended[i : i + height, j : j + width] for i, j in apply.tap_offsets(radius)]
     return jnp.stack([jnp.sum(jnp.square(features - one), axis=-1) for one in shifted], axis=-1)
 
 
@@ -95,13 +95,13 @@ def _filter_by_softmax(images: jax.Array, logits: jax.Array, features: jax.Array
     return jnp.stack([apply.apply_kernels(image, one) for image, one in zip(images, kernels_of, strict=True)])
 
 
-def _rows(logits: jax.Array) -> int:
-    """Rows in a strip."""
+def _rows_per_tile(logits: jax.Array) -> int:
+    """Rows in a tile."""
     height, width, depth = logits.shape
-    return min(height, max(1, _STRIP // (width * depth)))
+    return min(height, max(1, _TILE_LOGITS // (width * depth)))
 
 
-def _strips(height: int, rows: int) -> int:
+def _count_tiles(height: int, rows: int) -> int:
     return -(-height // rows)
 
 
@@ -113,7 +113,7 @@ def _radius(taps: int) -> int:
     return math.isqrt(taps) // 2
 
 
-def _strip_of(planes: Planes, first: jax.Array, rows: int) -> Planes:
+def _slice_rows(planes: Planes, first: jax.Array, rows: int) -> Planes:
     """The rows of each plane that hold the distances of some rows of the image."""
     more = [plane.shape[0] - planes[0].shape[0] for plane in planes]  # the first offset stays in its row
     return tuple(
@@ -121,45 +121,45 @@ def _strip_of(planes: Planes, first: jax.Array, rows: int) -> Planes:
     )
 
 
-def _strip_weights(logits: jax.Array, count: int, taps: int, planes: Planes) -> list[jax.Array]:
-    """Each image's kernels [h, w, taps] in a strip."""
-    prior = guide_distances.by_taps(planes, logits.shape[0], logits.shape[1], taps) if planes else None
+def _tile_weights(logits: jax.Array, count: int, taps: int, planes: Planes) -> list[jax.Array]:
+    """Each image's kernels [h, w, taps] in a tile."""
+    prior = guide_distances.planes_to_taps(planes, logits.shape[0], logits.shape[1], taps) if planes else None
     return _weights(logits, count, taps, prior)
 
 
-def _filtered(extended: jax.Array, logits: jax.Array, planes: Planes, taps: int) -> jax.Array:
-    """Filter a strip: extended images [n, h + 2r, w + 2r, C], logits [h, w, m] -> [n, h, w, C]."""
+def _filter_tile(extended: jax.Array, logits: jax.Array, planes: Planes, taps: int) -> jax.Array:
+    """Filter a tile: extended images [n, h + 2r, w + 2r, C], logits [h, w, m] -> [n, h, w, C]."""
     height, width = logits.shape[:2]
     radius = _radius(taps)
     images = []
-    for image, weights in zip(extended, _strip_weights(logits, extended.shape[0], taps, planes), strict=True):
+    for image, weights in zip(extended, _tile_weights(logits, extended.shape[0], taps, planes), strict=True):
         total = jnp.zeros((height, width, image.shape[-1]), image.dtype)
-        for tap, (i, j) in enumerate(apply.offsets(radius)):
+        for tap, (i, j) in enumerate(apply.tap_offsets(radius)):
             total = total + weights[:, :, tap : tap + 1] * image[i : i + height, j : j + width]
         images.append(total)
     return jnp.stack(images)
 
 
 def _distances(features: jax.Array | None, taps: int) -> Planes:
-    return () if features is None else guide_distances.distances(features, taps)
+    return () if features is None else guide_distances.compute_distances(features, taps)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
-def _by_strips(images: jax.Array, logits: jax.Array, features: jax.Array | None, taps: int) -> jax.Array:
-    radius, rows, height = _radius(taps), _rows(logits), logits.shape[0]
+def _by_row_tiles(images: jax.Array, logits: jax.Array, features: jax.Array | None, taps: int) -> jax.Array:
+    radius, rows, height = _radius(taps), _rows_per_tile(logits), logits.shape[0]
     extended, planes = _extend(images, radius), _distances(features, taps)
 
-    def strip(index: jax.Array | int, out: jax.Array) -> jax.Array:
-        first = jnp.minimum(index * rows, height - rows)  # the last strip may recompute some rows
-        part = _filtered(
+    def tile(index: jax.Array | int, out: jax.Array) -> jax.Array:
+        first = jnp.minimum(index * rows, height - rows)  # the last tile may recompute some rows
+        part = _filter_tile(
             lax.dynamic_slice_in_dim(extended, first, rows + 2 * radius, 1),
             lax.dynamic_slice_in_dim(logits, first, rows, 0),
-            _strip_of(planes, first, rows),
+            _slice_rows(planes, first, rows),
             taps,
         )
         return lax.dynamic_update_slice_in_dim(out, part, first, 1)
 
-    return lax.fori_loop(0, _strips(height, rows), strip, jnp.zeros_like(images))
+    return lax.fori_loop(0, _count_tiles(height, rows), tile, jnp.zeros_like(images))
 
 
 _Arguments = tuple[jax.Array, jax.Array, jax.Array | None]
@@ -168,13 +168,13 @@ _Arguments = tuple[jax.Array, jax.Array, jax.Array | None]
 def _forward(
     images: jax.Array, logits: jax.Array, features: jax.Array | None, taps: int
 ) -> tuple[jax.Array, _Arguments]:
-    return _by_strips(images, logits, features, taps), (images, logits, features)
+    return _by_row_tiles(images, logits, features, taps), (images, logits, features)
 
 
 def _gradients(
     extended: jax.Array, logits: jax.Array, planes: Planes, cotangents: jax.Array, taps: int
 ) -> tuple[jax.Array, jax.Array, Planes]:
-    """A strip's gradients by the extended images [n, h + 2r, w + 2r, C], by the logits [h, w, m] and by the planes.
+    """A tile's gradients by the extended images [n, h + 2r, w + 2r, C], by the logits [h, w, m] and by the planes.
 
     With w the softmax and d_t = <cotangent, image(p + offset_t)>, the gradient by the logits is
     ``w_t (d_t - sum_s w_s d_s)``; the distances are taken off the logits of every image.
@@ -183,10 +183,10 @@ def _gradients(
     radius = _radius(taps)
     around = ((2 * radius, 2 * radius), (2 * radius, 2 * radius), (0, 0))
     by_image, by_logits = [], []
-    weights_of = _strip_weights(logits, extended.shape[0], taps, planes)
+    weights_of = _tile_weights(logits, extended.shape[0], taps, planes)
     for image, weights, cotangent in zip(extended, weights_of, cotangents, strict=True):
         inner = []
-        for i, j in apply.offsets(radius):
+        for i, j in apply.tap_offsets(radius):
             shifted = image[i : i + height, j : j + width]
             terms = [cotangent[..., c : c + 1] * shifted[..., c : c + 1] for c in range(image.shape[-1])]
             inner.append(sum(terms[1:], terms[0]))
@@ -195,36 +195,36 @@ def _gradients(
         # Gathered: pixel e of the extended image receives tap t of pixel e - offset_t wherever that exists.
         wide_weights, wide_cotangent = jnp.pad(weights, around), jnp.pad(cotangent, around)
         total = jnp.zeros_like(image)
-        for tap, (i, j) in enumerate(apply.offsets(radius)):
+        for tap, (i, j) in enumerate(apply.tap_offsets(radius)):
             y, x = 2 * radius - i, 2 * radius - j
             weight = wide_weights[y : y + height + 2 * radius, x : x + width + 2 * radius, tap : tap + 1]
             total = total + weight * wide_cotangent[y : y + height + 2 * radius, x : x + width + 2 * radius]
         by_image.append(total)
-    by_planes = guide_distances.to_planes(-sum(by_logits[1:], by_logits[0]), taps) if planes else ()
+    by_planes = guide_distances.taps_to_planes(-sum(by_logits[1:], by_logits[0]), taps) if planes else ()
     by_logits.append(jnp.zeros_like(logits[..., taps * len(by_image) :]))
     return jnp.stack(by_image), jnp.concatenate(by_logits, axis=-1), by_planes
 
 
 def _backward(taps: int, residuals: _Arguments, cotangent: jax.Array) -> _Arguments:
     images, logits, features = residuals
-    radius, rows, height = _radius(taps), _rows(logits), logits.shape[0]
+    radius, rows, height = _radius(taps), _rows_per_tile(logits), logits.shape[0]
     extended, undo = jax.vjp(lambda images: _extend(images, radius), images)
     planes = _distances(features, taps)
 
-    def strip(index: jax.Array | int, sums: tuple[jax.Array, jax.Array, Planes]) -> tuple[jax.Array, jax.Array, Planes]:
+    def tile(index: jax.Array | int, sums: tuple[jax.Array, jax.Array, Planes]) -> tuple[jax.Array, jax.Array, Planes]:
         by_images, by_logits, by_planes = sums
         first = jnp.minimum(index * rows, height - rows)
-        fresh = first + jnp.arange(rows) >= index * rows  # rows that the previous strip has computed count only once
+        fresh = first + jnp.arange(rows) >= index * rows  # rows that the previous tile has computed count only once
         part_images, part_logits, part_planes = _gradients(
             lax.dynamic_slice_in_dim(extended, first, rows + 2 * radius, 1),
             lax.dynamic_slice_in_dim(logits, first, rows, 0),
-            _strip_of(planes, first, rows),
+            _slice_rows(planes, first, rows),
             jnp.where(fresh[:, None, None], lax.dynamic_slice_in_dim(cotangent, first, rows, 1), 0),
             taps,
         )
         before = lax.dynamic_slice_in_dim(by_images, first, rows + 2 * radius, 1)
         known = lax.dynamic_slice_in_dim(by_logits, first, rows, 0)
-        so_far = zip(by_planes, _strip_of(by_planes, first, rows), part_planes, strict=True)
+        so_far = zip(by_planes, _slice_rows(by_planes, first, rows), part_planes, strict=True)
         return (
             lax.dynamic_update_slice_in_dim(by_images, before + part_images, first, 1),
             lax.dynamic_update_slice_in_dim(by_logits, known + part_logits, first, 0),
@@ -232,18 +232,18 @@ def _backward(taps: int, residuals: _Arguments, cotangent: jax.Array) -> _Argume
         )
 
     sums = (jnp.zeros_like(extended), jnp.zeros_like(logits), tuple(map(jnp.zeros_like, planes)))
-    by_images, by_logits, by_planes = lax.fori_loop(0, _strips(height, rows), strip, sums)
+    by_images, by_logits, by_planes = lax.fori_loop(0, _count_tiles(height, rows), tile, sums)
     by_features = None if features is None else guide_distances.features_gradient(features, by_planes, taps)
     return undo(by_images)[0], by_logits, by_features
 
 
-_by_strips.defvjp(_forward, _backward)
+_by_row_tiles.defvjp(_forward, _backward)
 
 
 @_filter_by_softmax.implementation("row_tiles", platforms=("cpu",))
 def _filter_by_row_tiles(images: jax.Array, logits: jax.Array, features: jax.Array | None, *, taps: int) -> jax.Array:
     """Some rows at a time; the gradients recompute the weights."""
-    return _by_strips(images, logits, features, taps)
+    return _by_row_tiles(images, logits, features, taps)
 
 
 @_filter_by_softmax.example

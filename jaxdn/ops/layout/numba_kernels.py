@@ -9,7 +9,7 @@ PLANES, PIXELS, BLOCKS, CORNERS, MEANS = range(5)
 
 
 @loop
-def planes(top: int, bottom: int, arrays: tuple[Array, ...], out: Array, layouts: tuple[int, ...]) -> None:
+def join_rows(top: int, bottom: int, arrays: tuple[Array, ...], out: Array, layouts: tuple[int, ...]) -> None:
     """Rows of ``out`` [C, H, W]: the channels of all arrays."""
     width = out.shape[2]
     for y in range(top, bottom):

@@ -19,7 +19,7 @@ Placed = Callable[[c_void_p, c_void_p], dnnl.Primitive]
 """(memory to read, memory to write) -> the primitive."""
 
 
-def convolution(
+def make_convolution(
     reads: c_void_p,
     writes: c_void_p,
     kernel: np.ndarray,
@@ -48,7 +48,7 @@ def convolution(
         name, algorithm = "dnnl_convolution_forward", dnnl.DIRECT
     size, _, inputs, outputs = kernel.shape
     stride, edge = (2, 1) if upsamples else (1, size // 2)
-    ours, dims = dnnl.kernels(size, inputs, outputs)
+    ours, dims = dnnl.describe_kernels(size, inputs, outputs)
     free = dnnl.create("dnnl_memory_desc_create_with_tag", 4, dims, kind, dnnl.ANY_LAYOUT)
     row = dnnl.create("dnnl_memory_desc_create_with_tag", 1, dnnl.Dims(outputs), dnnl.FLOAT32, dnnl.ROW)
     edges = dnnl.Dims(edge, edge)
@@ -59,13 +59,13 @@ def convolution(
     )
     theirs = dnnl.query(description, dnnl.ASK_WEIGHTS)
     given = np.ascontiguousarray(kernel, np.float32)
-    source, inside = dnnl.memory(ours, dnnl.address(given)), dnnl.memory(theirs, dnnl.OWN_MEMORY)
+    source, inside = dnnl.create_memory(ours, dnnl.address_of(given)), dnnl.create_memory(theirs, dnnl.OWN_MEMORY)
     dnnl.Primitive(dnnl.reorder(ours, theirs), (dnnl.SOURCE, source), (dnnl.DESTINATION, inside))()
     weights = [(dnnl.WEIGHTS, inside)]
     if bias is not None:
-        own = dnnl.memory(row, dnnl.OWN_MEMORY)
+        own = dnnl.create_memory(row, dnnl.OWN_MEMORY)
         offsets = np.ascontiguousarray(bias, np.float32)
-        outside = dnnl.memory(row, dnnl.address(offsets))
+        outside = dnnl.create_memory(row, dnnl.address_of(offsets))
         dnnl.Primitive(dnnl.reorder(row, row), (dnnl.SOURCE, outside), (dnnl.DESTINATION, own))()
         weights.append((dnnl.BIAS, own))
     return _placed(description, weights)
@@ -83,7 +83,7 @@ def _of_upsampled(kernel: np.ndarray) -> np.ndarray:
     return kernel
 
 
-def pooling(reads: c_void_p, writes: c_void_p) -> Placed:
+def make_pooling(reads: c_void_p, writes: c_void_p) -> Placed:
     """The maximum of each 2x2 block."""
     two, none = dnnl.Dims(2, 2), dnnl.Dims(0, 0)
     return _placed(
@@ -95,7 +95,7 @@ def pooling(reads: c_void_p, writes: c_void_p) -> Placed:
     )
 
 
-def upsampling(reads: c_void_p, writes: c_void_p) -> Placed:
+def make_upsampling(reads: c_void_p, writes: c_void_p) -> Placed:
     """Every pixel repeated 2x2 times."""
     return _placed(
         dnnl.create(

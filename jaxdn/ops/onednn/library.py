@@ -137,14 +137,14 @@ attributes = functools.cache(new_attributes)
 """The same, of which nothing is changed."""
 
 
-def images(count: int, height: int, width: int, channels: int, dtype: int = FLOAT32) -> c_void_p:
+def describe_images(count: int, height: int, width: int, channels: int, dtype: int = FLOAT32) -> c_void_p:
     """Describes [N, H, W, C] in memory; oneDNN's dimensions are N, C, H, W for any order in memory."""
     strides = Dims(height * width * channels, 1, width * channels, channels)
     dims = Dims(count, channels, height, width)
     return create("dnnl_memory_desc_create_with_strides", 4, dims, dtype, strides)
 
 
-def kernels(size: int, inputs: int, outputs: int) -> tuple[c_void_p, Any]:
+def describe_kernels(size: int, inputs: int, outputs: int) -> tuple[c_void_p, Any]:
     """Describes [size, size, inputs, outputs] in memory, float32; and oneDNN's dimensions of it."""
     dims = Dims(outputs, inputs, size, size)
     strides = Dims(1, outputs, size * inputs * outputs, inputs * outputs)
@@ -156,7 +156,7 @@ def query(description: c_void_p, what: int) -> c_void_p:
     return c_void_p(library().dnnl_primitive_desc_query_md(description, what, 0))
 
 
-def memory(description: c_void_p, place: c_void_p | int = NO_MEMORY) -> c_void_p:
+def create_memory(description: c_void_p, place: c_void_p | int = NO_MEMORY) -> c_void_p:
     """Memory at an address, of the library's own, or without an address."""
     return create("dnnl_memory_create", description, engine()[0], c_void_p(place) if isinstance(place, int) else place)
 
@@ -174,7 +174,7 @@ class Primitive:
         needed = query(description, ASK_SCRATCHPAD)
         self.scratch_bytes = int(library().dnnl_memory_desc_get_size(needed))
         """Of its working memory, which ``scratch`` places."""
-        self.scratch = memory(needed, scratch)
+        self.scratch = create_memory(needed, scratch)
         self._count = len(given) + 1
         self._arguments = (Argument * self._count)(*(Argument(*each) for each in (*given, (SCRATCHPAD, self.scratch))))
 
@@ -189,16 +189,16 @@ def reorder(source: c_void_p, target: c_void_p) -> c_void_p:
     return create("dnnl_reorder_primitive_desc_create", source, cpu, target, cpu, attributes())
 
 
-def aligned(size: int) -> np.ndarray:
+def allocate_aligned(size: int) -> np.ndarray:
     """New memory of ``size`` bytes that begins at a multiple of 64.
 
     The library writes large results past the caches, with instructions that end the process at any other address.
     """
     array = np.empty(size + _LINE, np.uint8)
-    first = -address(array) % _LINE
+    first = -address_of(array) % _LINE
     return array[first : first + size]
 
 
-def address(array: np.ndarray) -> int:
+def address_of(array: np.ndarray) -> int:
     """Of an array's first number."""
     return int(array.__array_interface__["data"][0])

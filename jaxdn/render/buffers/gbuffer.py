@@ -22,7 +22,7 @@ from jaxdn.render.buffers.primary_surface_replacement import (
     replace_primary_surfaces,
 )
 from jaxdn.render.buffers.reflectance import Reflectances
-from jaxdn.render.scenes.media import absorbs, media_of
+from jaxdn.render.scenes.media import absorbs, list_media
 from jaxdn.render.tracing.light_samples import evaluate_diffuse_reflectance
 from jaxdn.render.tracing.radiance import make_camera_rays
 
@@ -67,7 +67,7 @@ def list_shape_names(scene: Any) -> list[str]:
 def check_scene(scene: Any) -> None:
     """Raise ValueError for effects that the tracers would otherwise silently ignore."""
     sensor = scene.sensors()[0]
-    scattering = [name for name, medium in media_of(scene).items() if not absorbs(medium)]
+    scattering = [name for name, medium in list_media(scene).items() if not absorbs(medium)]
     if scattering:
         raise ValueError(
             f"scene: participating media that scatter light (fog, smoke) are not supported yet, but {scattering[0]!r} "
@@ -198,7 +198,7 @@ def _trace_all(
         "shape": number_shapes(hit),
     }
     if reflectances is not None:
-        whole, part = reflectances.of_pixels(hit, bsdf, valid, albedo)
+        whole, part = reflectances.average_pixels(hit, bsdf, valid, albedo)
         # Not evaluated unless it is named here.
         buffers |= {"reflectance": whole} | ({"specular_reflectance": part} if specular else {})
     dr.eval(buffers)
@@ -260,7 +260,7 @@ def _trace_one_by_one(
         albedo, arrays["roughness"][pixel] = _read_surface(hit)
         arrays["albedo"][pixel] = albedo
         if reflectances is not None:
-            found = reflectances.of_one(hit, hit.bsdf(), albedo)
+            found = reflectances.average_one(hit, hit.bsdf(), albedo)
             arrays["reflectance"][pixel], arrays["specular_reflectance"][pixel] = found
     return arrays, None
 

@@ -100,7 +100,7 @@ def compute_motion(current: View, previous: View, *, disocclusion: bool = True) 
         raise ValueError("motion: expected two frames of one size with the same shapes; none may appear or disappear.")
     size = now.ids.shape[:2]
     back = _find_moves(now, compute_relative_poses(now.names, current.pose, previous.pose))
-    fixed = same_camera(current.camera, previous.camera)
+    fixed = is_same_camera(current.camera, previous.camera)
 
     points = _make_homogeneous(now)
     old_points = _carry(points, back)
@@ -161,7 +161,7 @@ def _find_moves(gbuffer: GBuffer, motions: np.ndarray) -> _Moves:
     and M' are the reflections at the moved mirrors, ``B M_i B^-1`` with the mirror's motion B.
     """
     images, shapes = gbuffer.replaced, gbuffer.ids.reshape(-1)
-    moves = ~unmoved(motions)
+    moves = ~is_unmoved(motions)
     if images is None:
         pixels = np.flatnonzero(moves[shapes])
         return _Moves(pixels, motions[shapes[pixels]])
@@ -208,18 +208,18 @@ def compute_far_motion(current: View, previous: View) -> np.ndarray:
     """
     direction = current.gbuffer.direction
     size = direction.shape[:2]
-    if same_camera(current.camera, previous.camera):
+    if is_same_camera(current.camera, previous.camera):
         return np.zeros((*size, 2))
     points = np.concatenate([direction, np.zeros((*size, 1))], axis=-1)
     return project(points, previous.camera, size)[0] - project(points, current.camera, size)[0]
 
 
-def same_camera(first: Camera, second: Camera) -> bool:
+def is_same_camera(first: Camera, second: Camera) -> bool:
     """Whether two cameras see exactly the same."""
     return first.x_fov == second.x_fov and np.array_equal(first.to_world, second.to_world)
 
 
-def unmoved(motions: np.ndarray) -> np.ndarray:
+def is_unmoved(motions: np.ndarray) -> np.ndarray:
     """Whether each of the motions [..., 4, 4] is none: [...] bool."""
     return np.all(motions == np.eye(4), axis=(-2, -1))
 

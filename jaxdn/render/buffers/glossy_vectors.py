@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxdn.render.buffers.frame_pair import FramePair, carry, repeat_camera_rays, rotate, to_image, to_lanes
 from jaxdn.render.buffers.gbuffer import look_up_ids, number_shapes
-from jaxdn.render.buffers.geometry import View, compute_relative_poses, project, same_camera, unmoved
+from jaxdn.render.buffers.geometry import View, compute_relative_poses, is_same_camera, is_unmoved, project
 from jaxdn.render.tracing.lobes import draw_bounce_numbers
 
 ROUGHEST = 0.6
@@ -73,12 +73,12 @@ def compute_glossy_vectors(
     """
     now, size = current.gbuffer, current.gbuffer.ids.shape[:2]
     motions = compute_relative_poses(now.names, current.pose, previous.pose)
-    still = unmoved(motions)[now.ids[..., 0]] & unmoved(motions)[reflected.ids]
-    still &= same_camera(current.camera, previous.camera)
+    still = is_unmoved(motions)[now.ids[..., 0]] & is_unmoved(motions)[reflected.ids]
+    still &= is_same_camera(current.camera, previous.camera)
     asked = reflected.reflects & (now.ids[..., 0] >= 0) & (now.roughness[..., 0] <= ROUGHEST)
     row, column = np.nonzero(asked)
     vectors = np.array(motion, np.float32)
-    if not len(row) or (np.all(unmoved(motions)) and same_camera(current.camera, previous.camera)):
+    if not len(row) or (np.all(is_unmoved(motions)) and is_same_camera(current.camera, previous.camera)):
         return vectors
     surface = motions[now.ids[row, column, 0]]
     image = _Image(

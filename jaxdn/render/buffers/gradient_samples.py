@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxdn.color import LUMINANCE
 from jaxdn.render.buffers.frame_pair import FramePair, carry
-from jaxdn.render.buffers.geometry import SAME_PLANE, View, compute_relative_poses, project, same_camera, unmoved
+from jaxdn.render.buffers.geometry import SAME_PLANE, View, compute_relative_poses, is_same_camera, is_unmoved, project
 from jaxdn.render.tracing.radiance import ReplayedPaths
 from jaxdn.render.tracing.seeds import SampleStream, tea
 
@@ -77,7 +77,7 @@ def pick_points(previous: View, current: View, stream: SampleStream) -> Gradient
     position = carry(motion, then.position[row, column])
     target, depth = project(position, current.camera, size)
     # Rounding must not move what stands still: a ray elsewhere would hit another triangle, texel or edge.
-    still = unmoved(motion) & same_camera(previous.camera, current.camera)
+    still = is_unmoved(motion) & is_same_camera(previous.camera, current.camera)
     target = np.where(still[:, None], np.stack([column, row], -1) + 0.5, target)
     with np.errstate(invalid="ignore"):
         inside = np.all((target >= 0) & (target < [size[1], size[0]]), axis=-1)

@@ -24,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from jaxdn.render.scenes.plugins import materials
+from jaxdn.render.scenes.plugins import list_materials
 
 EVENTS = 8
 """Specular surfaces that a ray is followed through; a pane of glass has two."""
@@ -78,7 +78,7 @@ def replace_primary_surfaces(scene: Any, camera: Any, number: Any) -> ReplacedRa
       camera: rays, one lane for each pixel.
       number: function of a hit that numbers its shape.
     """
-    if not any(bool(_is_specular(int(bsdf.flags()))) for bsdf in materials(scene)):
+    if not any(bool(_is_specular(int(bsdf.flags()))) for bsdf in list_materials(scene)):
         return None
     lanes = dr.width(camera.d)
     ray, active = mi.Ray3f(camera), dr.full(mi.Bool, True, lanes)

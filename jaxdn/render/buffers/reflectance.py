@@ -27,7 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.scenes.materials import is_lambertian
-from jaxdn.render.scenes.plugins import children, materials
+from jaxdn.render.scenes.plugins import list_children, list_materials
 
 COSINES = 64
 """Entries of a material's table on each side of the surface, from grazing to head-on."""
@@ -57,47 +57,47 @@ class Reflectances:
         self._averaged: list[Any] = []
         self._numbers: dict[int, int] = {}
         # The wrappers are kept, so that Mitsuba returns the same ones again and their ids identify the materials.
-        self._materials = list(materials(scene))
+        self._materials = list(list_materials(scene))
         for material in self._materials:
-            number = _way(material)
+            number = _choose_way(material)
             if number == _TABLED:
                 number = len(tables)
-                tables.append(_table(material))
+                tables.append(_make_table(material))
             elif number == _AVERAGED:
                 number = _AVERAGED - len(self._averaged)
                 self._averaged.append(material)
             self._numbers[id(material)] = number
         self._tables = np.stack(tables) if tables else np.ones((1, 2 * COSINES, 6), np.float32)
 
-    def of_pixels(self, hit: Any, bsdf: Any, active: Any, albedo: Any) -> tuple[Any, Any]:
+    def average_pixels(self, hit: Any, bsdf: Any, active: Any, albedo: Any) -> tuple[Any, Any]:
         """F_b of all hits at once and its specular part, for the vectorised variants.
 
         F_b is NaN where a material cannot be averaged.
         """
-        numbers = {int(_identity(mi.BSDFPtr(one))[0]): self._numbers[id(one)] for one in self._materials}
+        numbers = {int(_number_bsdf(mi.BSDFPtr(one))[0]): self._numbers[id(one)] for one in self._materials}
         by_identity = np.full(max(numbers, default=0) + 1, _NEITHER, np.int32)
         by_identity[list(numbers)] = list(numbers.values())
-        there = active & (_identity(bsdf) < dr.opaque(mi.UInt32, len(by_identity)))
-        number = dr.select(there, dr.gather(mi.Int32, mi.Int32(by_identity), _identity(bsdf), there), _NEITHER)
-        low, share = _places(hit.wi.z, dr)
+        there = active & (_number_bsdf(bsdf) < dr.opaque(mi.UInt32, len(by_identity)))
+        number = dr.select(there, dr.gather(mi.Int32, mi.Int32(by_identity), _number_bsdf(bsdf), there), _NEITHER)
+        low, share = _locate_cosine(hit.wi.z, dr)
         tabled = there & (number >= 0)
         start = mi.UInt32(number) * (2 * COSINES) + mi.UInt32(low)
-        found, specular = (self._looked_up(part, start, share, tabled) for part in (slice(3), slice(3, 6)))
+        found, specular = (self._look_up(part, start, share, tabled) for part in (slice(3), slice(3, 6)))
         found = dr.select(number == _ALBEDO, albedo, dr.select(tabled, found, dr.nan))
         # Called one by one: a call through the pointer would be compiled for every material of the scene.
         for place, material in enumerate(self._averaged):
             mine = there & (number == _AVERAGED - place)
-            whole, part = _averages(hit, material, _points(PIXEL_SAMPLES), mine)
+            whole, part = _averages(hit, material, _make_points(PIXEL_SAMPLES), mine)
             found, specular = dr.select(mine, whole, found), dr.select(mine, part, specular)
         return found, specular
 
-    def _looked_up(self, part: slice, start: Any, share: Any, tabled: Any) -> Any:
+    def _look_up(self, part: slice, start: Any, share: Any, tabled: Any) -> Any:
         """Three of the tables' columns between two entries; 0 where there is no table."""
         stored = mi.Float(np.ascontiguousarray(self._tables[..., part]).ravel())
         ends = [dr.gather(mi.Color3f, stored, start + step, tabled) for step in (0, 1)]
         return dr.select(tabled, dr.lerp(ends[0], ends[1], share), 0.0)
 
-    def of_one(self, hit: Any, bsdf: Any, albedo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def average_one(self, hit: Any, bsdf: Any, albedo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """F_b [3] of one hit and its specular part [3], for the variant without vectorisation."""
         number = self._numbers.get(id(bsdf), _NEITHER)
         if number == _ALBEDO:
@@ -105,27 +105,27 @@ class Reflectances:
         if number == _NEITHER:
             return np.full(3, np.nan), np.zeros(3)
         if number <= _AVERAGED:
-            found = _average(hit, bsdf, _points_array(PIXEL_SAMPLES))
+            found = _average(hit, bsdf, _compute_points(PIXEL_SAMPLES))
         else:
-            low, share = _places(hit.wi[2], np)
+            low, share = _locate_cosine(hit.wi[2], np)
             ends = self._tables[number, int(low) : int(low) + 2]
             found = np.asarray((1 - share) * ends[0] + share * ends[1], np.float64)
         return found[:3], found[3:]
 
 
-def _identity(bsdf: Any) -> Any:
+def _number_bsdf(bsdf: Any) -> Any:
     """The number that a vectorised variant assigns to a BSDF; 0 is none."""
     reinterpret: Any = dr.reinterpret_array
     return reinterpret(mi.UInt32, bsdf)
 
 
-def _way(bsdf: Any) -> int:
+def _choose_way(bsdf: Any) -> int:
     """How the F_b of a material is found."""
     if is_lambertian(bsdf):
         return _ALBEDO
-    parts = list(_tree(bsdf))
+    parts = list(_walk_tree(bsdf))
     # An unknown class may not support sampling: it is tested, as an error in the tracer would end the whole frame.
-    if any(part.class_name() not in _KNOWN for part in parts if isinstance(part, mi.BSDF)) and not _samples(bsdf):
+    if any(part.class_name() not in _KNOWN for part in parts if isinstance(part, mi.BSDF)) and not _can_sample(bsdf):
         return _NEITHER
     uniform = all(
         part.class_name() in _UNIFORM if isinstance(part, mi.BSDF) else not part.is_spatially_varying()
@@ -135,22 +135,22 @@ def _way(bsdf: Any) -> int:
     return _TABLED if uniform and not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Anisotropic) else _AVERAGED
 
 
-def _tree(plugin: Any) -> Iterator[Any]:
+def _walk_tree(plugin: Any) -> Iterator[Any]:
     yield plugin
-    for _, child in children(plugin):
-        yield from _tree(child)
+    for _, child in list_children(plugin):
+        yield from _walk_tree(child)
 
 
-def _samples(bsdf: Any) -> bool:
+def _can_sample(bsdf: Any) -> bool:
     """Whether a BSDF can be sampled at all."""
     try:
-        weight = bsdf.sample(mi.BSDFContext(), _seen_from(0.6, 0.8), 0.5, mi.Point2f(0.4, 0.6), True)[1]
+        weight = bsdf.sample(mi.BSDFContext(), _make_hit(0.6, 0.8), 0.5, mi.Point2f(0.4, 0.6), True)[1]
         return bool(np.all(np.isfinite(np.array(weight, np.float64))))
     except Exception:
         return False
 
 
-def _seen_from(x: Any, z: Any) -> Any:
+def _make_hit(x: Any, z: Any) -> Any:
     """A flat surface, seen from the direction (x, 0, z) of its own frame."""
     hit = dr.zeros(mi.SurfaceInteraction3f, dr.width(z))
     hit.n = mi.Normal3f(0, 0, 1)
@@ -160,7 +160,7 @@ def _seen_from(x: Any, z: Any) -> Any:
     return hit
 
 
-def _places(cosine: Any, numbers: Any) -> tuple[Any, Any]:
+def _locate_cosine(cosine: Any, numbers: Any) -> tuple[Any, Any]:
     """The entry of a table below a cosine, and how far it is from there to the next.
 
     Entries lie at ``(i + 0.5) / COSINES`` on each side, the outside after the inside: a surface may have two.
@@ -173,7 +173,7 @@ def _places(cosine: Any, numbers: Any) -> tuple[Any, Any]:
 
 
 @functools.cache
-def _points_array(count: int) -> np.ndarray:
+def _compute_points(count: int) -> np.ndarray:
     """[count, 3] low-discrepancy points in (0, 1)^3 (Hammersley): lobe, and direction in it; count: a power of 2."""
     index = np.arange(count)
 
@@ -187,8 +187,8 @@ def _points_array(count: int) -> np.ndarray:
     return np.stack([(index + 0.5) / count, inverse(2) + 0.5 / count, (inverse(3) + even / 2) % 1.0], axis=-1)
 
 
-def _points(count: int) -> Any:
-    return mi.Float(_points_array(count).astype(np.float32).ravel())
+def _make_points(count: int) -> Any:
+    return mi.Float(_compute_points(count).astype(np.float32).ravel())
 
 
 @dr.syntax
@@ -228,35 +228,35 @@ def _average(hit: Any, bsdf: Any, points: np.ndarray) -> np.ndarray:
 _made: dict[str, np.ndarray] = {}
 
 
-def _table(bsdf: Any) -> np.ndarray:
+def _make_table(bsdf: Any) -> np.ndarray:
     """[2 * COSINES, 6] F_b of a material that is constant over the surface, from inside and from outside, and its
     specular part."""
-    content = _content(bsdf)
+    content = _describe_content(bsdf)
     if content not in _made:
         if len(_made) >= _KEPT:
             _made.clear()
-        make = _table_one_by_one if str(mi.variant()).startswith("scalar") else _table_at_once
+        make = _make_table_one_by_one if str(mi.variant()).startswith("scalar") else _make_table_at_once
         centres = (np.arange(COSINES) + 0.5) / COSINES
         _made[content] = make(bsdf, np.concatenate([-centres, centres])).astype(np.float32)
     return _made[content]
 
 
-def _content(bsdf: Any) -> str:
+def _describe_content(bsdf: Any) -> str:
     """All parameters of a material as text: equal for the same material in the next frame's scene."""
     parameters = mi.traverse(bsdf)
     exact = (np.asarray(parameters[name], np.float64).tobytes().hex() for name in parameters.keys())  # noqa: SIM118
     return "|".join([str(mi.variant()), str(bsdf), *exact])
 
 
-def _table_at_once(bsdf: Any, cosines: np.ndarray) -> np.ndarray:
+def _make_table_at_once(bsdf: Any, cosines: np.ndarray) -> np.ndarray:
     lane = dr.arange(mi.UInt32, len(cosines) * TABLE_SAMPLES)
     count = dr.opaque(mi.UInt32, TABLE_SAMPLES)
     place = lane // count
     sample = (lane - place * count) * 3
     cosine = dr.gather(mi.Float, mi.Float(cosines.astype(np.float32)), place)
-    points = _points(TABLE_SAMPLES)
+    points = _make_points(TABLE_SAMPLES)
     lobe, x, y = (dr.gather(mi.Float, points, sample + axis) for axis in range(3))
-    hit = _seen_from(dr.safe_sqrt(1 - dr.square(cosine)), cosine)
+    hit = _make_hit(dr.safe_sqrt(1 - dr.square(cosine)), cosine)
     sampled, weight = bsdf.sample(mi.BSDFContext(), hit, lobe, mi.Point2f(x, y), True)
     # A weight that is the same for all lanes (thin glass) has only one value.
     weight = mi.Color3f(weight * dr.square(sampled.eta)) + mi.Color3f(dr.zeros(mi.Float, dr.width(lane)))
@@ -266,6 +266,6 @@ def _table_at_once(bsdf: Any, cosines: np.ndarray) -> np.ndarray:
     return np.concatenate([each.mean(axis=1) for each in lights], axis=-1)
 
 
-def _table_one_by_one(bsdf: Any, cosines: np.ndarray) -> np.ndarray:
-    points = _points_array(TABLE_SAMPLES // 8)  # a microsecond each
-    return np.stack([_average(_seen_from((1 - c * c) ** 0.5, c), bsdf, points) for c in cosines.tolist()])
+def _make_table_one_by_one(bsdf: Any, cosines: np.ndarray) -> np.ndarray:
+    points = _compute_points(TABLE_SAMPLES // 8)  # a microsecond each
+    return np.stack([_average(_make_hit((1 - c * c) ** 0.5, c), bsdf, points) for c in cosines.tolist()])

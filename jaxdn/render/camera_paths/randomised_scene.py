@@ -17,8 +17,8 @@ import numpy as np
 from jaxdn.render.camera_paths.free_space import FreeSpace
 from jaxdn.render.camera_paths.inserted_objects import compute_focal_length, insert_objects, move_shapes
 from jaxdn.render.mitsuba.variant import use_variant
-from jaxdn.render.scenes.animation import CameraKeys, rotation_matrix
-from jaxdn.render.scenes.material_overrides import can_override, list_materials
+from jaxdn.render.scenes.animation import CameraKeys, make_rotation
+from jaxdn.render.scenes.material_overrides import can_override, name_materials
 from jaxdn.render.scenes.scene import Camera
 from jaxdn.render.scenes.scene_file import SceneFile
 
@@ -113,7 +113,7 @@ def _choose_view(space: FreeSpace, rng: np.random.Generator, ease: float) -> Cam
     for spot in space.spots[rng.integers(len(space.spots), size=_VIEWS)]:
         pitch, turn = np.radians(rng.uniform(-35, 8)), rng.uniform(0, 360)
         ahead = np.roll(space.up, 1) * np.cos(pitch) + space.up * np.sin(pitch)
-        forward = rotation_matrix(space.up, turn) @ ahead
+        forward = make_rotation(space.up, turn) @ ahead
         cameras.append(Camera(_look_along(space, spot, forward), float(rng.uniform(35, 80))))
     views = space.score_views(cameras)
     good = (views.empty < 0.35 + 0.25 * ease) & (views.close < 0.3 + 0.2 * ease) & (views.largest < 0.7 + 0.3 * ease)
@@ -150,7 +150,7 @@ def _make_camera_keys(space: FreeSpace, view: Camera, rng: np.random.Generator, 
     step = step / np.linalg.norm(step) * min(speed * middle * max(frames - 1, 1), 1.5 * space.reach)
     corners = int(rng.integers(1, 4))
     for _ in range(8):
-        bends = [rotation_matrix(space.up, angle) for angle in np.cumsum(rng.uniform(-45, 45, corners))]
+        bends = [make_rotation(space.up, angle) for angle in np.cumsum(rng.uniform(-45, 45, corners))]
         places = np.cumsum([origin, *(bend @ step / corners for bend in bends)], axis=0)
         if space.is_collision_free(places):
             break
@@ -175,7 +175,7 @@ def _make_panning_keys(
         widest, start, sign = rng.uniform(30, 140), rng.random(), rng.choice([-1, 1])
         phases = np.mod(start * widest + rate * np.arange(max(frames, 2)), 2 * widest)
         angles = sign * (widest - np.abs(phases - widest))
-        turned = [rotation_matrix(space.up, angle - angles[0]) @ forward for angle in angles]
+        turned = [make_rotation(space.up, angle - angles[0]) @ forward for angle in angles]
         views = space.score_views([Camera(_look_along(space, origin, one), view.x_fov) for one in turned])
         shown = float((views.shapes * np.minimum(views.spread, 1)).min())
         if shown > most:
@@ -278,7 +278,7 @@ def _draw_materials(space: FreeSpace, rng: np.random.Generator) -> dict[str, dic
     """An animation's "materials": other hues, saturations, tints and roughnesses for a random share of them."""
     share = rng.choice([0.15, 0.5, 0.9])
     changes: dict[str, dict[str, Any]] = {}
-    for name, bsdf in sorted(dict(list_materials(space.scene)).items()):
+    for name, bsdf in sorted(dict(name_materials(space.scene)).items()):
         colored, rough = can_override(bsdf)
         change: dict[str, Any] = {}
         if colored and rng.random() < share:

@@ -5,7 +5,6 @@ of a seed must not change once clips have been rendered from it: add a new famil
 """
 
 from collections.abc import Callable
-from typing import Any
 
 from jaxdn.render.families.dash import dash
 from jaxdn.render.families.edge import edge
@@ -27,10 +26,3 @@ FAMILIES: dict[str, Callable[..., Stage]] = {
     "glitter": glitter,
     "parlour": parlour,
 }
-
-
-def family_scene(name: str, seed: int, **options: Any) -> Stage:
-    """The scene of a family for one seed. Options: ``lamp`` "mix" (the seed chooses), "up", "down" or "window"."""
-    if name not in FAMILIES:
-        raise ValueError(f"family: expected one of {', '.join(sorted(FAMILIES))}, got {name!r}.")
-    return FAMILIES[name](seed, **options)

@@ -55,7 +55,7 @@ class Choice(NamedTuple):
 _choice: dict[str | None, Choice] = {}
 
 
-def llvm_candidates() -> list[str]:
+def list_llvm_candidates() -> list[str]:
     """LLVM libraries to try, newest first; only ``DRJIT_LIBLLVM_PATH`` if the user set it."""
     if os.environ.get(_LIBRARY):
         return [os.environ[_LIBRARY]]
@@ -94,7 +94,7 @@ def _find(requested: str | None) -> Choice:
         if requested:
             raise ValueError(f"variant: {requested!r} does not run here (it needs an NVIDIA driver with OptiX).")
     if requested in (None, "llvm_ad_rgb"):
-        for library in llvm_candidates():
+        for library in list_llvm_candidates():
             if _works("llvm_ad_rgb", library):
                 return Choice("llvm_ad_rgb", library, f"{library} works")
         if requested:
@@ -102,7 +102,7 @@ def _find(requested: str | None) -> Choice:
     return Choice("scalar_rgb", "", f"no LLVM library works here. {advice()}" if not requested else "it was requested")
 
 
-def tells_lobes(variant: str) -> bool:
+def separates_lobes(variant: str) -> bool:
     """Whether a variant can tell diffuse from specular samples: the scalar one uses Mitsuba's own integrators."""
     return not variant.startswith("scalar")
 

@@ -59,9 +59,9 @@ class RigidKeys:
         first, second, share = _between(self.frames, frame)
         if np.allclose(self.axes[first], self.axes[second]):
             angle = _mix(self.angles[first], self.angles[second], share)
-            rotation = rotation_matrix(self.axes[first], angle)
+            rotation = make_rotation(self.axes[first], angle)
         else:
-            ends = [rotation_matrix(self.axes[end], self.angles[end]) for end in (first, second)]
+            ends = [make_rotation(self.axes[end], self.angles[end]) for end in (first, second)]
             rotation = slerp(ends[0], ends[1], share)
         matrix = np.eye(4)
         matrix[:3, :3] = rotation
@@ -100,7 +100,7 @@ class CameraKeys:
         return float(np.interp(frame, self.frames, [key["fov"] for key in self.keys]))
 
 
-def light_scale(keys: Sequence[Mapping[str, Any]], frame: float) -> float | tuple[float, ...]:
+def interpolate_light_scale(keys: Sequence[Mapping[str, Any]], frame: float) -> float | tuple[float, ...]:
     """The factor on a light's radiance at one time: a number, or three if they differ."""
     scales = [np.broadcast_to(np.array(key["scale"], float), 3) for key in keys]
     first, second, share = _between(np.array([key["frame"] for key in keys], float), frame)
@@ -124,7 +124,7 @@ def look_at(origin: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarra
     return matrix
 
 
-def rotation_matrix(axis: np.ndarray, degrees: float) -> np.ndarray:
+def make_rotation(axis: np.ndarray, degrees: float) -> np.ndarray:
     """[3, 3] right-handed rotation about a unit axis (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -147,7 +147,7 @@ def slerp(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
     twist = np.array([between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1]])
     if twist @ axis < 0:
         axis = -axis
-    return first @ rotation_matrix(axis, float(np.degrees(angle)) * share)
+    return first @ make_rotation(axis, float(np.degrees(angle)) * share)
 
 
 def read_animation(path: Path) -> dict[str, Any]:
@@ -268,7 +268,7 @@ def _check_inserted(shape: Mapping[str, Any], place: str) -> None:
     kind = shape.get("type")
     if kind not in PRIMITIVES:
         raise ValueError(f"{place} type: expected one of {', '.join(PRIMITIVES)}, got {kind!r}.")
-    size = extents(shape, place)
+    size = read_extents(shape, place)
     if not (size > 0).all() or (kind == "sphere" and np.ptp(size) > 0):
         raise ValueError(f"{place} size: expected extents > 0 (for a sphere all the same), got {shape.get('size')!r}.")
     for name, top in (("color", 1.0), ("emission", np.inf)):
@@ -287,7 +287,7 @@ def _check_inserted(shape: Mapping[str, Any], place: str) -> None:
     _check_rigid(shape.get("keys", [{"frame": 0}]), place)
 
 
-def extents(shape: Mapping[str, Any], place: str = "size") -> np.ndarray:
+def read_extents(shape: Mapping[str, Any], place: str = "size") -> np.ndarray:
     """[3] extents of an inserted shape; a rectangle's third is 1."""
     size = shape.get("size", 1.0)
     if isinstance(size, int | float) and not isinstance(size, bool):

@@ -28,7 +28,7 @@ class Light(NamedTuple):
     """It is given in red, green and blue, each of which can be scaled by itself."""
 
 
-def lights_of(parser: SceneParser) -> dict[str, Light]:
+def list_lights(parser: SceneParser) -> dict[str, Light]:
     """The lights of a scene by their names: those of lamps, of shapes that emit, and the ids of these shapes' emitters.
 
     An emitter that stands beside the shapes, and that one of them refers to, is that shape's.
@@ -40,7 +40,7 @@ def lights_of(parser: SceneParser) -> dict[str, Light]:
             continue
         nodes = [owner] if kind == "Emitter" else parser.references(owner)
         for emitter in (node for node in nodes if parser.type_of(node) == "Emitter"):
-            light = _light(parser, owner, emitter)
+            light = _read_light(parser, owner, emitter)
             if kind == "Shape":
                 found[parser.names[owner]] = light
             name = parser.id(emitter)
@@ -49,7 +49,7 @@ def lights_of(parser: SceneParser) -> dict[str, Light]:
     return found
 
 
-def _light(parser: SceneParser, owner: int, emitter: int) -> Light:
+def _read_light(parser: SceneParser, owner: int, emitter: int) -> Light:
     values = parser.values(emitter)
     powers = [values[name] for name in _POWERS if name in values]
     plain = [type(value).__name__ for value in powers if type(value).__name__ != "ResolvedReference"]

@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.color import srgb_decode
-from jaxdn.render.scenes.animation import rotation_matrix
-from jaxdn.render.scenes.plugins import children, shape_groups
+from jaxdn.render.scenes.animation import make_rotation
+from jaxdn.render.scenes.plugins import list_children, list_shape_groups
 
 _COLORS = frozenset({"reflectance", "diffuse_reflectance", "specular_reflectance", "base_color"})
 _GREY = np.full(3, 3**-0.5)
@@ -32,7 +32,7 @@ def override_materials(shapes: Iterable[Any], materials: Mapping[str, Mapping[st
         :mod:`jaxdn.render.scenes.animation`.
     """
     done: list[Any] = []
-    for name, bsdf in _named(shapes):
+    for name, bsdf in _pair_with_names(shapes):
         if name in materials and not any(bsdf is other for other in done):
             done.append(bsdf)
             _change(bsdf, name, materials[name])
@@ -40,16 +40,16 @@ def override_materials(shapes: Iterable[Any], materials: Mapping[str, Mapping[st
 
 def list_shapes(scene: Any) -> list[Any]:
     """The shapes of a scene, those of shape groups included."""
-    grouped = [part for group in shape_groups(scene) for _, part in children(group) if hasattr(part, "bsdf")]
+    grouped = [part for group in list_shape_groups(scene) for _, part in list_children(group) if hasattr(part, "bsdf")]
     return [*scene.shapes(), *grouped]
 
 
-def list_materials(scene: Any) -> list[tuple[str, Any]]:
+def name_materials(scene: Any) -> list[tuple[str, Any]]:
     """Name and BSDF of every shape of a scene: the BSDF's id, else the shape's."""
-    return _named(list_shapes(scene))
+    return _pair_with_names(list_shapes(scene))
 
 
-def _named(shapes: Iterable[Any]) -> list[tuple[str, Any]]:
+def _pair_with_names(shapes: Iterable[Any]) -> list[tuple[str, Any]]:
     pairs = [(shape.id(), shape.bsdf()) for shape in shapes]
     return [(bsdf.id() or name, bsdf) for name, bsdf in pairs if bsdf is not None]
 
@@ -57,7 +57,7 @@ def _named(shapes: Iterable[Any]) -> list[tuple[str, Any]]:
 def can_override(bsdf: Any) -> tuple[bool, bool]:
     """Whether a BSDF has colours, and a roughness, that can be changed."""
     parameters = mi.traverse(bsdf)
-    return any(_is_color(key, value) for key, value in parameters), bool(_rough_keys(parameters))
+    return any(_is_color(key, value) for key, value in parameters), bool(_find_rough_keys(parameters))
 
 
 def _change(bsdf: Any, name: str, changes: Mapping[str, Any]) -> None:
@@ -68,10 +68,10 @@ def _change(bsdf: Any, name: str, changes: Mapping[str, Any]) -> None:
             colors = np.array(value)
             texture = key.endswith(".data")
             # A constant colour has its channels first, or is one vector; a texture has them last.
-            changed = _recolored(colors if texture else colors.reshape(3, -1).T, changes)
+            changed = _recolor(colors if texture else colors.reshape(3, -1).T, changes)
             parameters[key] = type(value)(changed if texture else changed.reshape(3).tolist())
     if "roughness" in changes:
-        rough = _rough_keys(parameters)
+        rough = _find_rough_keys(parameters)
         if not rough:
             raise ValueError(
                 f"animation materials {name!r} roughness: expected a material with a constant roughness, got "
@@ -84,20 +84,20 @@ def _change(bsdf: Any, name: str, changes: Mapping[str, Any]) -> None:
     parameters.update()
 
 
-def _recolored(colors: np.ndarray, changes: Mapping[str, Any]) -> np.ndarray:
+def _recolor(colors: np.ndarray, changes: Mapping[str, Any]) -> np.ndarray:
     """[..., 3] linear reflectances, or 8-bit sRGB codes, after a change; the same type."""
     codes = colors.dtype == np.uint8
-    linear = _levels(0.0)[colors] if codes else colors
-    turned = linear @ rotation_matrix(_GREY, float(changes.get("hue", 0.0))).T
+    linear = _decode_levels(0.0)[colors] if codes else colors
+    turned = linear @ make_rotation(_GREY, float(changes.get("hue", 0.0))).T
     grey = turned.mean(axis=-1, keepdims=True)
     mixed = grey + float(changes.get("saturation", 1.0)) * (turned - grey)
     changed = np.clip(np.array(changes.get("tint", (1.0, 1.0, 1.0))) * mixed, 0.0, 1.0)
     if codes:  # the nearest code: the number of half-way levels below
-        return np.searchsorted(_levels(0.5)[:-1], changed).astype(np.uint8)
+        return np.searchsorted(_decode_levels(0.5)[:-1], changed).astype(np.uint8)
     return changed.astype(colors.dtype)
 
 
-def _levels(offset: float) -> np.ndarray:
+def _decode_levels(offset: float) -> np.ndarray:
     """[256] linear light of the 8-bit sRGB codes 0 ... 255 plus an offset."""
     return np.asarray(srgb_decode(np.minimum(np.arange(256) + offset, 255) / np.float64(255)), np.float64)
 
@@ -111,7 +111,7 @@ def _is_color(key: str, value: Any) -> bool:
     return (shape[-1:] == (3,) and len(shape) == 3) if last == "data" else shape[:1] == (3,)
 
 
-def _rough_keys(parameters: Any) -> list[str]:
+def _find_rough_keys(parameters: Any) -> list[str]:
     """The keys of constant alphas and roughnesses."""
     return [
         key

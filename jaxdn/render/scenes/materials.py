@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import mitsuba as mi
 import numpy as np
 
-from jaxdn.render.scenes.plugins import children
+from jaxdn.render.scenes.plugins import list_children
 
 
 class Material(NamedTuple):
@@ -57,7 +57,7 @@ def range_of(texture: Any) -> Range:
     if data is not None:
         varies = data.ndim > 2 and bool(np.any(np.ptp(data.reshape(-1, data.shape[-1]), axis=0) > 0))
         return Range(float(data.min()), float(data.max()), varies)
-    parts = [range_of(child) for _, child in children(texture)]
+    parts = [range_of(child) for _, child in list_children(texture)]
     if parts:
         low, high = min(part.low for part in parts), max(part.high for part in parts)
         return Range(low, high, len({*parts}) > 1 or any(p.varies for p in parts), all(p.known for p in parts))
@@ -68,7 +68,7 @@ def range_of(texture: Any) -> Range:
 
 
 def _parameter(bsdf: Any, name: str, default: float) -> Range:
-    for label, child in children(bsdf):
+    for label, child in list_children(bsdf):
         if label == name:
             return range_of(child)
     parameters = mi.traverse(bsdf)
@@ -83,12 +83,12 @@ def _join(parts: list[Material]) -> Material:
 
 
 def _nested(bsdf: Any) -> list[Material]:
-    return [material_of(child) for _, child in children(bsdf) if isinstance(child, mi.BSDF)]
+    return [describe_material(child) for _, child in list_children(bsdf) if isinstance(child, mi.BSDF)]
 
 
 def _diffuse(bsdf: Any, *names: str) -> Material:
     for name in names:
-        if any(label == name for label, _ in children(bsdf)):
+        if any(label == name for label, _ in list_children(bsdf)):
             color = _parameter(bsdf, name, 0.5)
             return Material(frozenset({"diffuse"}), color.varies) if color.high > 0 else NOTHING
     return Material(frozenset({"diffuse"}))
@@ -112,7 +112,7 @@ def _rough(bsdf: Any, *, squared: bool) -> Material:
 
 
 def _has(bsdf: Any, name: str) -> bool:
-    return name in mi.traverse(bsdf) or any(label == name for label, _ in children(bsdf))
+    return name in mi.traverse(bsdf) or any(label == name for label, _ in list_children(bsdf))
 
 
 def _specular(bsdf: Any, lobe: str, name: str = "specular_reflectance") -> Material:
@@ -194,7 +194,7 @@ _CLASSES: dict[str, Callable[[Any], Material]] = {
 }
 
 
-def material_of(bsdf: Any) -> Material:
+def describe_material(bsdf: Any) -> Material:
     """The material of a BSDF; an unknown class is classified by its flags and marked as uncertain."""
     kind = bsdf.class_name()
     if kind in _CLASSES:

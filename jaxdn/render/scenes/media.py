@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 
-def media_of(scene: Any) -> dict[str, Any]:
+def list_media(scene: Any) -> dict[str, Any]:
     """The media of a loaded scene: name of a shape -> the one inside it or around it, and ``"camera"``."""
     found: dict[str, Any] = {}
     for shape in scene.shapes():
@@ -28,7 +28,7 @@ def absorbs(medium: Any) -> bool:
     return bool(medium.is_homogeneous()) and bool(albedo) and not any(np.any(np.array(value)) for value in albedo)
 
 
-def transmittance(medium: Any, distance: Any, active: Any) -> Any:
+def compute_transmittance(medium: Any, distance: Any, active: Any) -> Any:
     """The share of light that is left after a distance in a medium, for arrays of media; no medium leaves all."""
     point = dr.zeros(mi.MediumInteraction3f, dr.width(distance))
     extinction = medium.get_scattering_coefficients(point, active)[2]
@@ -36,6 +36,6 @@ def transmittance(medium: Any, distance: Any, active: Any) -> Any:
     return dr.exp(-mi.Spectrum(extinction) * dr.minimum(distance, dr.largest(mi.Float)))
 
 
-def medium_behind(hit: Any, medium: Any, direction: Any) -> Any:
+def find_medium_behind(hit: Any, medium: Any, direction: Any) -> Any:
     """The medium of rays that leave a surface, for arrays of hits; ``medium`` is the one in front of it."""
     return dr.select(hit.is_medium_transition(), hit.target_medium(direction), medium)

@@ -7,7 +7,7 @@ from typing import Any
 import mitsuba as mi
 
 
-def children(plugin: Any) -> list[tuple[str, Any]]:
+def list_children(plugin: Any) -> list[tuple[str, Any]]:
     """The objects directly inside a plugin, by name."""
     walk = _walk(str(mi.variant()))()
     plugin.traverse(walk)
@@ -37,13 +37,13 @@ def _walk(variant: str) -> Any:
     return Walk
 
 
-def shape_groups(scene: Any) -> list[Any]:
+def list_shape_groups(scene: Any) -> list[Any]:
     """The shape groups that a scene instantiates; a group is not a shape of the scene itself."""
-    return [child for _, child in children(scene) if child.class_name() == "ShapeGroupPlugin"]
+    return [child for _, child in list_children(scene) if child.class_name() == "ShapeGroupPlugin"]
 
 
-def materials(scene: Any) -> Iterator[Any]:
+def list_materials(scene: Any) -> Iterator[Any]:
     """Every BSDF that a hit may have, once."""
-    grouped = [part for group in shape_groups(scene) for _, part in children(group) if hasattr(part, "bsdf")]
+    grouped = [part for group in list_shape_groups(scene) for _, part in list_children(group) if hasattr(part, "bsdf")]
     seen = {id(bsdf): bsdf for bsdf in (shape.bsdf() for shape in (*scene.shapes(), *grouped)) if bsdf is not None}
     yield from seen.values()

@@ -18,11 +18,11 @@ from jaxdn.render.scenes.animation import (
     CameraKeys,
     RigidKeys,
     check_animation,
-    extents,
-    light_scale,
+    interpolate_light_scale,
     read_animation,
+    read_extents,
 )
-from jaxdn.render.scenes.lights import check_lights, lights_of, scale_light
+from jaxdn.render.scenes.lights import check_lights, list_lights, scale_light
 from jaxdn.render.scenes.scene import Camera
 from jaxdn.render.scenes.scene_parser import SceneParser
 
@@ -67,7 +67,7 @@ class SceneFile:
         self._parser = parser = SceneParser(path)
         self._shapes = {parser.names[child]: child for child in parser.of_type("Shape")}
         shapes = [name for name, child in self._shapes.items() if parser.plugin(child) != "shapegroup"]
-        self._rest, self.near, self._far, self._medium = _rest_camera(parser)
+        self._rest, self.near, self._far, self._medium = _read_camera(parser)
         check_animation(animation, shapes, has_camera=self._rest is not None)
         if self._rest is None and "camera" not in animation:
             raise ValueError(
@@ -75,7 +75,7 @@ class SceneFile:
             )
         self.name = self.name_of(path)
         self.frames = int(animation.get("frames", 1))
-        self.max_depth = _path_length(parser)
+        self.max_depth = _read_path_length(parser)
         near = os.path.relpath(path)
         self.record = {"file": path.resolve().as_posix() if near.startswith("..") else near, "animation": animation}
         self._camera = CameraKeys(animation["camera"]) if "camera" in animation else None
@@ -86,7 +86,7 @@ class SceneFile:
         self._inserted = {shape["id"]: shape for shape in animation.get("inserted", [])}
         for name, shape in self._inserted.items():
             self._motions[name] = RigidKeys(shape.get("keys", [{"frame": 0}]), np.zeros(3))
-        self._known_lights = lights_of(parser)
+        self._known_lights = list_lights(parser)
         self._lights = animation.get("lights", {})
         check_lights(parser, self._known_lights, self._lights)
         self._materials = animation.get("materials", {})
@@ -117,7 +117,7 @@ class SceneFile:
 
     def brightness(self, frame: float) -> dict[str, float | tuple[float, ...]]:
         """Light -> factor on its radiance, one or three for red, green and blue, for lights with keys."""
-        return {name: light_scale(keys, frame) for name, keys in self._lights.items()}
+        return {name: interpolate_light_scale(keys, frame) for name, keys in self._lights.items()}
 
     def lights(self) -> dict[str, bool]:
         """The lights whose radiance keys can scale -> whether they can scale red, green and blue by themselves."""
@@ -129,7 +129,7 @@ class SceneFile:
         import mitsuba as mi
 
         from jaxdn.render.scenes.material_overrides import list_shapes, override_materials
-        from jaxdn.render.scenes.plugins import shape_groups
+        from jaxdn.render.scenes.plugins import list_shape_groups
 
         variant = str(mi.variant())
         if self._still is None or self._still[0] != variant:
@@ -137,18 +137,18 @@ class SceneFile:
             override_materials(list_shapes(still), self._materials)
             # Groups are kept for inspection: instances do not show their contents.
             lamps = [emitter for emitter in still.emitters() if emitter.get_shape() is None]
-            self._still = variant, [*still.shapes(), *shape_groups(still), *lamps]
+            self._still = variant, [*still.shapes(), *list_shape_groups(still), *lamps]
         parts = {part.id(): part for part in self._still[1]}
-        parts |= {part.id(): part for part in self._changed(frame, parts)}
-        parts |= {name: _primitive(shape, self.pose(frame)[name]) for name, shape in self._inserted.items()}
+        parts |= {part.id(): part for part in self._load_changed(frame, parts)}
+        parts |= {name: _make_primitive(shape, self.pose(frame)[name]) for name, shape in self._inserted.items()}
         parts |= {
-            "animation_sensor": self._sensor(frame, width, height),
+            "animation_sensor": self._make_sensor(frame, width, height),
             "animation_integrator": {"type": "path", "max_depth": self.max_depth},
         }
         # A key of this dictionary becomes the object's id.
         return mi.load_dict({"type": "scene", **parts}, optimize=False)
 
-    def _changed(self, frame: float, still: Mapping[str, Any]) -> list[Any]:
+    def _load_changed(self, frame: float, still: Mapping[str, Any]) -> list[Any]:
         """The shapes and lamps of the file that move or change, in one frame."""
         import mitsuba as mi
 
@@ -171,7 +171,7 @@ class SceneFile:
             scale_light(emitter, np.broadcast_to(factor, 3), name)
         return list(found.values())
 
-    def _sensor(self, frame: float, width: int, height: int) -> dict[str, Any]:
+    def _make_sensor(self, frame: float, width: int, height: int) -> dict[str, Any]:
         """The camera and film of one frame, as Mitsuba's dict."""
         import mitsuba as mi
 
@@ -190,7 +190,7 @@ class SceneFile:
         }
 
 
-def _rest_camera(parser: SceneParser) -> tuple[Camera | None, float, float, int | None]:
+def _read_camera(parser: SceneParser) -> tuple[Camera | None, float, float, int | None]:
     """The file's own camera with its near and far clip, read by Mitsuba, and the medium around it, as a node.
 
     No camera where the file has no sensor.
@@ -221,7 +221,7 @@ def _rest_camera(parser: SceneParser) -> tuple[Camera | None, float, float, int 
     return Camera(matrix, fov), near, far, media[0] if media else None
 
 
-def _path_length(parser: SceneParser) -> int:
+def _read_path_length(parser: SceneParser) -> int:
     """max_depth of the file's integrator, also if nested; warns where it hides lights."""
     depths: list[int] = []
     for integrator in parser.of_type("Integrator")[:1]:
@@ -248,11 +248,11 @@ def _check_materials(parser: SceneParser, materials: Mapping[str, Any]) -> None:
             raise ValueError(f"animation materials: the scene {parser.path} has no material {name!r}; near: {near}.")
 
 
-def _primitive(shape: Mapping[str, Any], pose: np.ndarray) -> dict[str, Any]:
+def _make_primitive(shape: Mapping[str, Any], pose: np.ndarray) -> dict[str, Any]:
     """An inserted shape as Mitsuba's dict: its own primitive, centred, scaled to its box, posed."""
     import mitsuba as mi
 
-    kind, size = shape["type"], extents(shape)
+    kind, size = shape["type"], read_extents(shape)
     place = np.eye(4)
     if kind == "cylinder":  # Mitsuba's has radius 1 and runs from z = 0 to 1
         place[2, 3] = -0.5
@@ -274,15 +274,15 @@ def _primitive(shape: Mapping[str, Any], pose: np.ndarray) -> dict[str, Any]:
         else:
             inner = {"type": "diffuse", "reflectance": color}
         bsdf = {"type": "twosided", "nested": inner}
-    own["bsdf"] = _plugin(bsdf)
+    own["bsdf"] = _make_plugin(bsdf)
     if "emission" in shape:
         own["emitter"] = {"type": "area", "radiance": {"type": "rgb", "value": shape["emission"]}}
     return own
 
 
-def _plugin(value: Any) -> Any:
+def _make_plugin(value: Any) -> Any:
     """A parameter of an inserted shape's material as Mitsuba's dict: three numbers are a colour."""
     if isinstance(value, Mapping):
         plain = value.get("type") in ("rgb", "spectrum")
-        return {key: part if plain else _plugin(part) for key, part in value.items()}
+        return {key: part if plain else _make_plugin(part) for key, part in value.items()}
     return {"type": "rgb", "value": value} if isinstance(value, list | tuple) else value

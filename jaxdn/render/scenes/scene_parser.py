@@ -35,9 +35,9 @@ class SceneParser:
         self.nodes = list(self._state.nodes)
         self.inside = cache(self._inside)
         # Child of the scene -> the property of the scene that refers to it.
-        self._slots = {target: name for name, target in _references(self._state.nodes[0]).items()}
+        self._slots = {target: name for name, target in _find_references(self._state.nodes[0]).items()}
         self.children = list(self._slots)
-        self.names = self._named()
+        self.names = self._assign_names()
 
     def of_type(self, kind: str) -> list[int]:
         """The children of the scene of one of Mitsuba's object types: ``"Shape"``, ``"Emitter"``, ``"Sensor"`` ..."""
@@ -61,7 +61,7 @@ class SceneParser:
 
     def references(self, node: int) -> list[int]:
         """The nodes that a node refers to."""
-        return list(_references(self.nodes[node]).values())
+        return list(_find_references(self.nodes[node]).values())
 
     def _inside(self, node: int) -> frozenset[int]:
         """A node and all that it refers to, directly or not."""
@@ -75,7 +75,7 @@ class SceneParser:
         for child in children:
             kept[self._slots[child]] = self.nodes[0].props[self._slots[child]]
         state.nodes[0].props = kept
-        return _instantiated(state)
+        return _instantiate(state)
 
     def load_node(
         self, node: int, changes: Mapping[str, Any] | None = None, shared: Mapping[str, Any] | None = None
@@ -91,16 +91,18 @@ class SceneParser:
 
         state = mi.parser.ParserState(self._state)
         alone = mi.parser.SceneNode(state.nodes[node])
-        given = {name: (shared or {}).get(self.names.get(target, "")) for name, target in _references(alone).items()}
+        given = {
+            name: (shared or {}).get(self.names.get(target, "")) for name, target in _find_references(alone).items()
+        }
         for name, value in {
             **{name: value for name, value in given.items() if value is not None},
             **(changes or {}),
         }.items():
             alone.props[name] = value
         state.nodes[0] = alone
-        return _instantiated(state)
+        return _instantiate(state)
 
-    def _named(self) -> dict[int, str]:
+    def _assign_names(self) -> dict[int, str]:
         """Give every shape and light of the scene its name; returns child -> name."""
         taken = {self.id(node) for node in range(len(self.nodes))}
         names: dict[int, str] = {}
@@ -117,7 +119,7 @@ class SceneParser:
         return names
 
 
-def _references(node: Any) -> dict[str, int]:
+def _find_references(node: Any) -> dict[str, int]:
     """The properties of a node that refer to other nodes, with these nodes."""
     import mitsuba as mi
 
@@ -131,9 +133,9 @@ def _parse(path: Path) -> Any:
 
     if not path.is_file():
         raise ValueError(f"scene {path}: expected a Mitsuba scene (XML), could not read it: there is no such file.")
-    config = _config()
+    config = _make_config()
     try:
-        with _searched(path.parent) as resolver:
+        with _search_in(path.parent) as resolver:
             state = mi.parser.parse_file(config, str(path))
             mi.parser.transform_all(config, state)
     except (RuntimeError, ValueError) as error:
@@ -155,7 +157,7 @@ def _parse(path: Path) -> Any:
 
 
 @contextmanager
-def _searched(folder: Path) -> Iterator[Any]:
+def _search_in(folder: Path) -> Iterator[Any]:
     """Let Mitsuba look for files in a folder too, as its own loader does with that of the scene."""
     mi: Any = importlib.import_module("mitsuba")
     before = mi.file_resolver()
@@ -168,7 +170,7 @@ def _searched(folder: Path) -> Iterator[Any]:
         mi.set_file_resolver(before)
 
 
-def _config() -> Any:
+def _make_config() -> Any:
     """Nothing is merged: every shape keeps its id, and every material its own parameters."""
     import mitsuba as mi
 
@@ -177,8 +179,8 @@ def _config() -> Any:
     return config
 
 
-def _instantiated(state: Any) -> Any:
+def _instantiate(state: Any) -> Any:
     import mitsuba as mi
 
-    made = mi.parser.instantiate(_config(), state)
+    made = mi.parser.instantiate(_make_config(), state)
     return made[0] if isinstance(made, list) else made

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from jaxdn.render.scenes.media import media_of, medium_behind, transmittance
+from jaxdn.render.scenes.media import compute_transmittance, find_medium_behind, list_media
 from jaxdn.render.tracing.lobes import draw_bounce_numbers
 
 
@@ -75,10 +75,10 @@ def sample_light(scene: Any, ray: Any, numbers: Any) -> LightSample:
     reflected, bsdf_pdf = bsdf.eval_pdf(mi.BSDFContext(), hit, onward, active)
     weight = dr.select(towards.delta, 1.0, towards.pdf / (towards.pdf + bsdf_pdf))
     whole = dr.select(active, reflected * radiance * weight, 0.0)
-    if media_of(scene):
+    if list_media(scene):
         medium = mi.MediumPtr(scene.sensors()[0].get_medium())
-        whole *= transmittance(medium, hit.t, active)
-        whole *= transmittance(medium_behind(hit, medium, towards.d), towards.dist, active)
+        whole *= compute_transmittance(medium, hit.t, active)
+        whole *= compute_transmittance(find_medium_behind(hit, medium, towards.d), towards.dist, active)
     lambert = evaluate_diffuse_reflectance(bsdf, hit, active) * dr.abs(onward.z) / dr.pi
     share = dr.select(reflected > lambert, lambert / reflected, 1.0)
     glossy = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy)

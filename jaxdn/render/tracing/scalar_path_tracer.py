@@ -11,7 +11,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from jaxdn.render.scenes.media import media_of
+from jaxdn.render.scenes.media import list_media
 from jaxdn.render.tracing.radiance import (
     BRIGHTEST,
     RadianceSums,
@@ -28,7 +28,7 @@ _NO_ROULETTE = 1000
 def _make_integrators(scene: Any, max_depth: int) -> list[Any]:
     """Make integrators of all light, of light without the indirect part, and of emission only."""
     # The path tracer for media draws whether light is absorbed: the same mean, with noise.
-    kind = "volpath" if media_of(scene) else "path"
+    kind = "volpath" if list_media(scene) else "path"
     # Three renderings are three times faster than one "aov" integrator around all three.
     return [
         mi.load_dict({"type": kind, "max_depth": depth, "rr_depth": _NO_ROULETTE})

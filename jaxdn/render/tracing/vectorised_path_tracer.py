@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from jaxdn.render.scenes.media import media_of, medium_behind, transmittance
+from jaxdn.render.scenes.media import compute_transmittance, find_medium_behind, list_media
 from jaxdn.render.tracing.light_samples import Shadows, sample_light, sum_shadows
 from jaxdn.render.tracing.lobes import Lobes, draw_bounce_numbers, make_generator, sum_lobes, trace_first_segment
 from jaxdn.render.tracing.radiance import (
@@ -39,7 +39,7 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
     ``max_depth`` counts as Mitsuba does: 1 is emission, 2 adds direct light, 3 one indirect bounce. No Russian
     roulette: it does not help at these depths.
     """
-    absorbing = bool(media_of(scene))  # without media nothing of them is compiled
+    absorbing = bool(list_media(scene))  # without media nothing of them is compiled
     medium = mi.MediumPtr(scene.sensors()[0].get_medium())
     context = mi.BSDFContext()
     emitted, direct, indirect = mi.Spectrum(0.0), mi.Spectrum(0.0), mi.Spectrum(0.0)
@@ -53,7 +53,7 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
     while active:
         hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=depth == 0, active=active)
         if absorbing:
-            throughput *= transmittance(medium, hit.t, active)
+            throughput *= compute_transmittance(medium, hit.t, active)
 
         # The BSDF sample found an emitter: weigh it against having sampled that emitter directly.
         found: Any = mi.DirectionSample3f(scene, hit, last)
@@ -79,14 +79,14 @@ def trace(scene: Any, ray: Any, numbers: Any, max_depth: Any) -> tuple[Any, Any,
         weight = dr.select(towards.delta, 1.0, towards.pdf / (towards.pdf + bsdf_pdf))
         light = dr.select(smooth, throughput * reflected * radiance * weight, 0.0)
         if absorbing:  # surfaces between two media block this ray: it stays in one
-            light *= transmittance(medium_behind(hit, medium, towards.d), towards.dist, smooth)
+            light *= compute_transmittance(find_medium_behind(hit, medium, towards.d), towards.dist, smooth)
         direct += dr.select(depth == 0, light, 0.0)
         indirect += dr.select(depth >= 1, light, 0.0)
 
         throughput *= bsdf_weight
         ray = hit.spawn_ray(hit.to_world(sampled.wo))
         if absorbing:
-            medium = medium_behind(hit, medium, ray.d)
+            medium = find_medium_behind(hit, medium, ray.d)
         last = hit
         last_pdf = sampled.pdf
         last_delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
