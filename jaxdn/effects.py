@@ -57,7 +57,7 @@ def inspect(
         return detect_effects(scene._replace(moments=scene.moments[:frames]))
     if _is_footage(scene):
         from jaxdn.data.evidence import read_clip_properties
-        from jaxdn.data.foreign.naming import ChannelNaming
+        from jaxdn.data.foreign.classify import ChannelNaming
 
         properties = read_clip_properties(scene, animation, ChannelNaming(channels=channels, layer=layer))
         return detect_effects(properties._replace(moments=properties.moments[:frames]))

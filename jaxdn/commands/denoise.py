@@ -8,7 +8,7 @@ from jaxdn.commands.options import check_folder, name_channels
 from jaxdn.commands.progress import reporter
 from jaxdn.core.options import numbers
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
-from jaxdn.data.foreign.naming import ChannelNaming
+from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.runtime.malloc import tune_malloc
 from jaxdn.sequence.jobs import Job
 from jaxdn.sequence.run import denoise_files, select_backend

@@ -19,7 +19,7 @@ from jaxdn.commands.inspect_files import inspect_files
 from jaxdn.core.frame import BUFFERS, OF_SAMPLES
 from jaxdn.data.clip.folder import is_clip
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
-from jaxdn.data.foreign.naming import ChannelNaming
+from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.shots import ranges
 from jaxdn.denoiser import Denoiser
 from jaxdn.effects import EFFECTS, Plan, choose_all_effects, inspect, plan

@@ -8,8 +8,8 @@ from jaxdn.commands.channel_table import missing, show_channel_mapping
 from jaxdn.data.clip.folder import refuse_unfinished
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import UNSTATED, read_channel_mapping
+from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
-from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.data.foreign.shots import find_sequence
 from jaxdn.data.foreign.vectors import CHOICES
 

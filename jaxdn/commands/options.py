@@ -4,7 +4,7 @@ from pathlib import Path
 
 from jaxdn.commands.arguments import Denoise, Inspect
 from jaxdn.core.options import parse
-from jaxdn.data.foreign.naming import ChannelNaming
+from jaxdn.data.foreign.classify import ChannelNaming
 
 
 def check_folder(out: Path) -> Path:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxdn.core.frame import BUFFERS, FAR, Frame
 from jaxdn.data.clip.folder import is_clip, read_record
 from jaxdn.data.clip.record import is_planned
-from jaxdn.data.foreign.naming import UNNAMED, ChannelNaming
+from jaxdn.data.foreign.classify import UNNAMED, ChannelNaming
 from jaxdn.data.read import open_frames
 from jaxdn.planning.scene_properties import NO_NAMES, Light, Moment, SceneProperties, Surface
 

@@ -44,7 +44,7 @@ def open_frames(
         path, motion_convention=motion_convention, channels=channels, layer=layer, backwards=backwards, log=log
     )
     # Unlike the variable of a loop, this does not keep a frame while the next one is read.
-    return files, map(store_frame, plain)
+    return files, map(StoredFrame, plain)
 
 
 def check_single_layer(path: str | Path | Sequence[Path], spp: int) -> None:
@@ -52,11 +52,6 @@ def check_single_layer(path: str | Path | Sequence[Path], spp: int) -> None:
     if spp != 1:
         where = path if isinstance(path, str | Path) else f"{path[0]} ({len(path)} file{'s' * (len(path) != 1)})"
         raise ClipError(f"{where}: expected spp 1, got {spp}; only a clip with a {RECORD} has several sample counts.")
-
-
-def store_frame(frame: Frame) -> StoredFrame:
-    """A frame of another renderer: without layers and reference."""
-    return StoredFrame(frame, {}, None, None)
 
 
 def _turned(frames: Iterator[StoredFrame]) -> Iterator[StoredFrame]:

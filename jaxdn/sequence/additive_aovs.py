@@ -5,9 +5,9 @@ from collections.abc import Callable, Collection, Mapping
 import numpy as np
 
 from jaxdn.core.frame import Frame
+from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.layers import Channels, beauty_channels, stack_channels
 from jaxdn.data.foreign.lighting import find_additive_layers, find_beauty_copies
-from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.sequence.aov_decomposition import DecompositionState, decompose, init_decomposition
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxdn.data.clip.frames import StoredFrame
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.import_exr import ForeignSequence
-from jaxdn.data.read import check_single_layer, open_frames, store_frame
+from jaxdn.data.read import check_single_layer, open_frames
 from jaxdn.sequence.backward_pass import BackwardImages, backward_pass
 from jaxdn.sequence.frame_denoiser import Fallback, FrameDenoiser
 from jaxdn.sequence.jobs import Job
@@ -77,7 +77,8 @@ def _denoise_frame(
 ) -> Path | None:
     """Denoise a frame, and write it if it is wanted. What this leaves in memory is gone when it returns."""
     target = steps.job.targets[index] if index in steps.job.wanted else None
-    if file is not None and (steps.denoiser.is_tiled(stored.frame) or not writer.reads_again(target)):
+    needs_pixels = target is not None or writer.has_history
+    if file is not None and (not needs_pixels or steps.denoiser.is_tiled(stored.frame)):
         file.drop()  # decoded once more when it is written: of large frames, memory is what there is least of
     output = steps.denoise(index, stored)
     if output.fallback is not None:
@@ -166,7 +167,7 @@ class _ForeignFrames:
     def read(self, log: Callable[[str], None], *, backwards: bool = False) -> Iterator[StoredFrame]:
         """The frames, or the same from the last to the first with time turned around; forwards, files stay decoded."""
         frames = self._sequence.frames(backwards=backwards, keep_pixels=not backwards, log=log)
-        return map(store_frame, frames)  # unlike a loop, this keeps no frame while the next one is read
+        return map(StoredFrame, frames)  # unlike a loop, this keeps no frame while the next one is read
 
     def file(self, index: int) -> ExrFile | None:
         """The file of a frame."""

@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from typing import Literal, NamedTuple
 
-from jaxdn.data.foreign.naming import UNNAMED, ChannelNaming
+from jaxdn.data.foreign.classify import UNNAMED, ChannelNaming
 
 
 class Settings(NamedTuple):

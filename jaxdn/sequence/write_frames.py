@@ -21,12 +21,11 @@ from jaxdn.sequence.settings import Settings
 class ClipWriter:
     """Writes frames of our clips."""
 
+    has_history = False
+    """Whether frames that are not wanted change those after them."""
+
     def __init__(self, settings: Settings) -> None:
         self._preview = settings.preview
-
-    def reads_again(self, target: Path | None) -> bool:
-        """Whether the source's pixels are needed besides the frame."""
-        return False
 
     def write(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> None:
         """Write the denoised image [H, W, 3] of a frame; nothing without a target."""
@@ -44,12 +43,8 @@ class ForeignWriter:
 
     def __init__(self, window: Window, settings: Settings, log: Callable[[str], None]) -> None:
         self._window, self._settings, self._log = window, settings, log
-        additive = settings.aovs == "additive"
-        self._aovs = AdditiveAovs(settings.naming, log) if additive else None
-
-    def reads_again(self, target: Path | None) -> bool:
-        """Whether the source's pixels are needed besides the frame."""
-        return target is not None or self._aovs is not None
+        self.has_history = settings.aovs == "additive"
+        self._aovs = AdditiveAovs(settings.naming, log) if self.has_history else None
 
     def write(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> None:
         """Denoise the additive layers of a frame, and write all; without a target they are for the history alone."""

@@ -14,8 +14,8 @@ from jaxdn.core.frame import Frame
 from jaxdn.data.exr.exr import rewrite_exr
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.exr.windows import Window
+from jaxdn.data.foreign.classify import UNNAMED, ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
-from jaxdn.data.foreign.naming import UNNAMED, ChannelNaming
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings

@@ -12,9 +12,9 @@ from jaxdn.commands import main
 from jaxdn.core.frame import Frame
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
+from jaxdn.data.foreign.classify import UNNAMED, ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.foreign.measured_motion import fitting_conventions
-from jaxdn.data.foreign.naming import UNNAMED, ChannelNaming
 from jaxdn.ops.warp import warp
 from tests import programs
 from tests.needs import require_module

@@ -14,8 +14,8 @@ from jaxdn.commands.doctor import doctor
 from jaxdn.data.exr.exr import read_exr
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
+from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.layers import LAYERS
-from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.methods.registry import methods
 from jaxdn.runtime.optional import install
 from tests.training.test_training import make_clip

@@ -7,8 +7,8 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.core.frame import Frame
+from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.lighting import find_additive_layers
-from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.sequence.aov_decomposition import decompose, init_decomposition
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings

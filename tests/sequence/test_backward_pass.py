@@ -13,7 +13,7 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.core.frame import FAR, Frame
-from jaxdn.data.foreign.naming import ChannelNaming
+from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.read import open_frames
 from jaxdn.filters.time_reversal import SEEN_MOST, blend, seen, turned
 from jaxdn.ops.motion import on_screen

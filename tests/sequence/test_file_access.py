@@ -14,7 +14,7 @@ from jaxdn.commands.arguments import Denoise
 from jaxdn.commands.denoise import run_denoise
 from jaxdn.data.clip.folder import refuse_unfinished
 from jaxdn.data.exr.file import ExrFile
-from jaxdn.data.foreign.naming import ChannelNaming
+from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.read import read_clip
 from jaxdn.sequence.memory_budget import STEP, estimate_bytes
 from jaxdn.sequence.run import denoise_files

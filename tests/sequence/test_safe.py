@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxdn import clips, color
-from jaxdn.data.foreign.naming import ChannelNaming
+from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.read import open_frames
 from jaxdn.metrics import psnr
 from jaxdn.render import ClipJob, render_clips

@@ -9,6 +9,7 @@ stored follows from its row in :data:`jaxdn.core.frame.BUFFERS`.
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,11 +27,11 @@ class StoredFrame(NamedTuple):
 
     frame: Frame
     """Its radiance has the requested number of samples."""
-    layers: dict[int, np.ndarray]
+    layers: Mapping[int, np.ndarray] = MappingProxyType({})
     """Every independent noisy image [H, W, 3] by its number of samples."""
-    reference: np.ndarray | None
+    reference: np.ndarray | None = None
     """[H, W, 3] the converged radiance."""
-    reference_half: np.ndarray | None
+    reference_half: np.ndarray | None = None
     """[H, W, 3] the mean of the first half of the reference's samples, to measure the reference's noise."""
     draws: np.ndarray | None = None
     """[n, H, W, 6] n independent samples of indirect (first three channels) and direct light, for training."""

@@ -10,9 +10,8 @@ from jaxdn.data.clip.folder import frame_path, is_clip
 from jaxdn.data.clip.frames import stored_layers
 from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.file import ExrFile
-from jaxdn.data.foreign.classify import classify_channels
+from jaxdn.data.foreign.classify import UNNAMED, ChannelNaming, classify_channels
 from jaxdn.data.foreign.layers import Channels, is_cryptomatte, last_name, layer_of
-from jaxdn.data.foreign.naming import UNNAMED, ChannelNaming
 from jaxdn.data.foreign.reflectance import CAMERA_NORMALS
 from jaxdn.data.foreign.shots import find_sequence
 from jaxdn.data.foreign.vectors import MOTION_CONVENTIONS, UnknownMotion, find_motion_convention

@@ -1,6 +1,7 @@
-"""Which channels of another renderer's file make up which buffer: by names and, where those mislead, by values."""
+"""Which channels of another renderer's file make up which buffer: by what is stated, by names, and by values."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from jaxdn.data.errors import ClipError
 from jaxdn.data.foreign.layers import (
     UNSURE_ALBEDO,
     Channels,
+    detect_channels,
     is_cryptomatte,
     last_name,
     layer_of,
@@ -16,8 +18,43 @@ from jaxdn.data.foreign.layers import (
     unpaired_specular,
 )
 from jaxdn.data.foreign.lighting import explain_light
-from jaxdn.data.foreign.naming import ChannelNaming
-from jaxdn.data.foreign.vectors import contradicts_cycles, find_motion_convention, forward_channels
+from jaxdn.data.foreign.vectors import check_convention, contradicts_cycles, find_motion_convention, forward_channels
+
+
+@dataclass(frozen=True)
+class ChannelNaming:
+    """How the buffers of other renderers' files are found; empty: by the names of their channels alone.
+
+    Raises ClipError, listing the known ones, for a motion convention that does not exist.
+    """
+
+    motion_convention: str | None = None
+    """Of the motion vectors: a key of :data:`jaxdn.data.foreign.vectors.CHOICES`; None: nobody has stated it."""
+    channels: Mapping[str, str] | None = None
+    """Buffer -> the layer it is read from, or ``"none"``."""
+    layer: str | None = None
+    """The view layer or part that the other buffers are looked for in."""
+
+    def __post_init__(self) -> None:
+        check_convention(self.motion_convention)
+
+    @property
+    def options(self) -> list[str]:
+        """The command line's options that say what this says."""
+        stated = {
+            "--channels": self.channels,
+            "--layer": self.layer,
+            "--motion-convention": self.motion_convention,
+        }
+        return [option for option, value in stated.items() if value]
+
+    def detect(self, names: Sequence[str]) -> dict[str, Channels]:
+        """Buffer -> its channels (:func:`jaxdn.data.foreign.layers.detect_channels`)."""
+        return detect_channels(names, channels=self.channels, layer=self.layer)
+
+
+UNNAMED = ChannelNaming()
+"""Nothing is stated."""
 
 
 class ChannelMapping(NamedTuple):

@@ -16,10 +16,9 @@ from jaxdn.core.frame import BUFFERS, FAR, Buffer, Frame, present
 from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.exr.windows import Window, union_of
-from jaxdn.data.foreign.classify import ChannelMapping, classify_channels
+from jaxdn.data.foreign.classify import ChannelMapping, ChannelNaming, classify_channels
 from jaxdn.data.foreign.layers import Channels, is_cryptomatte, layer_of, stack_channels
 from jaxdn.data.foreign.measured_motion import fitting_conventions
-from jaxdn.data.foreign.naming import ChannelNaming
 from jaxdn.data.foreign.reflectance import check_fraction, derive_reflectance
 from jaxdn.data.foreign.shots import find_sequence
 from jaxdn.data.foreign.vectors import UnknownMotion, convert_cycles_forward, convert_motion, derive_dual_motion

@@ -8,8 +8,8 @@ import numpy as np
 from jaxdn.data.exr.exr import rewrite_exr
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.exr.windows import Window, crop
+from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.layers import Channels, beauty_channels, group_layers, layer_of
-from jaxdn.data.foreign.naming import ChannelNaming
 
 
 def write_result(
