@@ -78,7 +78,8 @@ def _denoise_frame(
     """Denoise a frame, and write it if it is wanted. What this leaves in memory is gone when it returns."""
     target = steps.job.targets[index] if index in steps.job.wanted else None
     needs_pixels = target is not None or writer.has_history
-    if file is not None and (not needs_pixels or steps.denoiser.is_tiled(stored.frame)):
+    # First whether frames are tiled: it is asked with the number of channels, which a file knows as long as it is open.
+    if file is not None and (steps.denoiser.is_tiled(stored.frame) or not needs_pixels):
         file.drop()  # decoded once more when it is written: of large frames, memory is what there is least of
     output = steps.denoise(index, stored)
     if output.fallback is not None:
