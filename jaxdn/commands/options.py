@@ -1,10 +1,12 @@
 """What several commands make of their options."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jaxdn.commands.arguments import Denoise, Inspect
-from jaxdn.core.options import parse
-from jaxdn.data.foreign.classify import ChannelNaming
+
+if TYPE_CHECKING:  # --help does not wait for jax
+    from jaxdn.data.foreign.classify import ChannelNaming
 
 
 def check_folder(out: Path) -> Path:
@@ -15,8 +17,11 @@ def check_folder(out: Path) -> Path:
     return out
 
 
-def name_channels(options: Inspect | Denoise) -> ChannelNaming:
+def name_channels(options: Inspect | Denoise) -> "ChannelNaming":
     """What is stated about the channels of other renderers' files."""
+    from jaxdn.core.options import parse
+    from jaxdn.data.foreign.classify import ChannelNaming
+
     return ChannelNaming(
         options.motion_convention,
         parse(options.channels, option="--channels", words=True),
