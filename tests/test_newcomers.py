@@ -56,7 +56,7 @@ def toy(options):
     def start(params, frame):
         return jnp.zeros_like(frame.radiance)
 
-    def step(params, state, frame, first):
+    def step(params, state, frame, first, statistics):
         image = params["gain"] * jnp.where(first, frame.radiance, 0.5 * (frame.radiance + state))
         return image, image, 0
 

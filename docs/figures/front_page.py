@@ -27,7 +27,7 @@ from jaxdn.denoiser.rollout import denoise
 from jaxdn.evaluation.report.images import displayed_bytes
 from jaxdn.render import ClipJob, render_clips
 from jaxdn.render.settings import RenderSettings
-from jaxdn.zoo.ready import OURS
+from jaxdn.zoo.ready import DEFAULT_MODEL
 from jaxdn.zoo.weights import load_weights
 
 _GAP = 4
@@ -96,11 +96,11 @@ def main(settings: Settings) -> None:
     clip = read_clip(settings.clip)
     last = len(clip.frames.radiance) - 1
     clean = clean_frame(settings.clip, last, settings.reference_spp)
-    denoiser, params = load_weights(OURS)
+    denoiser, params = load_weights(DEFAULT_MODEL)
     denoised = jax.jit(partial(denoise, denoiser))(params, clip._replace(reference=None))
     pictures = {
         "before: 1 sample per pixel": lit(clip.frames.radiance[last], clean, 0),
-        f"after: {OURS}": lit(denoised[last], clean, 0),
+        f"after: {DEFAULT_MODEL}": lit(denoised[last], clean, 0),
         f"reference: {settings.reference_spp} samples": lit(clean.reference[0], clean, 0),
     }
     settings.out.parent.mkdir(parents=True, exist_ok=True)

@@ -28,7 +28,7 @@ from jaxdn.render import ClipJob, choose_variant, render_clips
 from jaxdn.render.settings import RenderSettings
 from jaxdn.training.log import read_curve
 from jaxdn.training.train import train
-from jaxdn.zoo.ready import NOISY, candidate, filters
+from jaxdn.zoo.ready import NOISY, filter_names, find_model
 from jaxdn.zoo.weights import describe, shipped_names
 
 FAMILIES = ("fruit", "robot", "pinkroom", "mobile")
@@ -188,16 +188,16 @@ def _after(start: str | None) -> str:
 
 def evaluate(preset: Preset, settings: Settings, data: Path, folder: Path, machine: dict[str, Any]) -> Results:
     """Score the noisy image, every filter, every run that has weights, and shipped weights on the test clips."""
-    contestants = [candidate(name) for name in (NOISY, *filters())]
+    contestants = [find_model(name) for name in (NOISY, *filter_names())]
     curves, about = {}, {}
     for run in sorted(preset.runs, key=lambda run: run.label):
         path = folder / run.folder / "weights.safetensors"
         if path.is_file():
-            contestants.append(candidate(str(path))._replace(label=run.label))
+            contestants.append(find_model(str(path))._replace(label=run.label))
             about[run.label] = f"{run.about}: {run.steps} steps here{_after(preset.start)}"
             curves[run.label] = TrainingCurve(*read_curve(path.parent))
     for name in shipped_names():
-        contestants.append(candidate(name))
+        contestants.append(find_model(name))
         about[name] = f"{method_named(describe(name)['factory']).title}: shipped with jaxdn"
     tests = [place for clips in preset.tests for place in folders(clips, data / "test")]
     recipe = preset.recipe(method_named(METHOD), preset.runs[0]).record()

@@ -34,7 +34,7 @@ from jaxdn.evaluation.report import write_report
 from jaxdn.planning.catalogue import NoisyLight
 from jaxdn.render import ClipJob, RenderSettings, render_clips
 from jaxdn.sequence.render_jobs import ClipSource, plan_jobs
-from jaxdn.zoo.ready import NOISY, candidate, filters
+from jaxdn.zoo.ready import NOISY, filter_names, find_model
 from jaxdn.zoo.weights import shipped_names
 
 FAMILIES = ("fruit", "robot", "mobile", "pinkroom", "parlour")
@@ -92,7 +92,7 @@ def timed_clip(settings: Settings) -> ClipJob:
 
 
 def _all_methods() -> str:
-    return ",".join([*filters(), *shipped_names()])
+    return ",".join([*filter_names(), *shipped_names()])
 
 
 def step(folder: Path, name: str) -> Call:
@@ -103,10 +103,10 @@ def step(folder: Path, name: str) -> Call:
     frame = jax.tree.map(jnp.asarray, frame_at(read_clip(folder).frames, 1))
     if name == PEER:
         return steps.open_image_denoise(frame, "high")
-    method = candidate(name)
+    method = find_model(name)
     backend = method.backend()
     if backend is not None:
-        method = candidate(name, implementation=backend)
+        method = find_model(name, implementation=backend)
     assert method.denoiser is not None
     call = steps.recurrent(method.denoiser, method.params, frame)
     for _ in range(_WARM):
@@ -126,11 +126,11 @@ def milliseconds(
 
 def main(settings: Settings) -> None:
     """Render, compare, time, report."""
-    methods = list(results.contestants([NOISY, *filters(), *shipped_names()]))
+    methods = list(results.contestants([NOISY, *filter_names(), *shipped_names()]))
     jobs = {light: clips(settings, light) for light in LIGHTS}
     timed = timed_clip(settings)
     render_clips([*(job for own in jobs.values() for job in own), timed], workers=settings.workers)
-    names = [*filters(), *shipped_names(), *([] if "pyoidn" in peers.missing() else [PEER])]
+    names = [*filter_names(), *shipped_names(), *([] if "pyoidn" in peers.missing() else [PEER])]
     times = milliseconds(Path(timed.folder), names, rounds=settings.rounds)
     own_ms = times.get(AGAINST, float("nan"))
     shown = {name: f"{ms:.0f} ({ms / own_ms:.2f})" for name, ms in times.items()}

@@ -24,7 +24,7 @@ from jaxdn.evaluation.report import Results, text_table, write_report
 from jaxdn.evaluation.report.images import save_png
 from jaxdn.methods.demodulation import Demodulation
 from jaxdn.methods.registry import method_named
-from jaxdn.zoo.ready import NOISY, Candidate, candidate, filters
+from jaxdn.zoo.ready import NOISY, Model, filter_names, find_model
 from jaxdn.zoo.weights import shipped_names
 
 
@@ -40,19 +40,19 @@ class Settings:
     """Folder for the report and the pictures."""
 
 
-def contestants(weights: list[str]) -> Iterator[Candidate]:
+def contestants(weights: list[str]) -> Iterator[Model]:
     """The noisy image, every filter in every way, weights as they were trained, and Open Image Denoise."""
-    yield candidate(NOISY)
-    for name in filters():
-        if method_named(name).knows("demodulate"):
+    yield find_model(NOISY)
+    for name in filter_names():
+        if method_named(name).has_option("demodulate"):
             for by in get_args(Demodulation):
-                yield candidate(name, demodulate=by)._replace(label=f"{name}, {by}")
+                yield find_model(name, demodulate=by)._replace(label=f"{name}, {by}")
     for name in (*shipped_names(), *weights):
-        yield candidate(name)
+        yield find_model(name)
     if "pyoidn" not in peers.missing():
         from experiments.speed.peers.oidn import frame_by_frame
 
-        yield Candidate("Open Image Denoise", frame_by_frame(), {})
+        yield Model("Open Image Denoise", frame_by_frame(), {})
 
 
 def file_name(label: str) -> str:

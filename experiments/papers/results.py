@@ -26,7 +26,7 @@ from jaxdn.data.clip.folder import read_frames
 from jaxdn.evaluation.compare import EvaluationClip, compare, read_evaluation_clip
 from jaxdn.evaluation.report import Results, write_report
 from jaxdn.evaluation.report.results import mean_scores
-from jaxdn.zoo.ready import NOISY, Candidate, candidate, filters
+from jaxdn.zoo.ready import NOISY, Model, filter_names, find_model
 from jaxdn.zoo.weights import shipped_names
 
 Read = Callable[..., EvaluationClip]
@@ -97,7 +97,7 @@ class Settings:
     """Samples per pixel."""
     views: list[str] = field(default_factory=lambda: list(VIEWS))
     """Some of: indirect, beauty, beauty-without-depth, beauty-without-motion."""
-    methods: list[str] = field(default_factory=lambda: [NOISY, *filters(), *shipped_names()])
+    methods: list[str] = field(default_factory=lambda: [NOISY, *filter_names(), *shipped_names()])
     """Filters and shipped weights to compare; Open Image Denoise comes in addition."""
     weights: list[str] = field(default_factory=list)
     """Files of weights to compare in addition to those that are shipped."""
@@ -105,14 +105,14 @@ class Settings:
     """Folder for the reports and the pictures."""
 
 
-def contestants(names: list[str]) -> Iterator[Candidate]:
+def contestants(names: list[str]) -> Iterator[Model]:
     """Those with these names, and Open Image Denoise."""
     for name in names:
-        yield candidate(name)
+        yield find_model(name)
     if "pyoidn" not in peers.missing():
         from experiments.speed.peers.oidn import frame_by_frame
 
-        yield Candidate("Open Image Denoise", frame_by_frame(), {})
+        yield Model("Open Image Denoise", frame_by_frame(), {})
 
 
 def table(results: Results, more: Mapping[str, Mapping[str, str]] = _NOTHING) -> str:

@@ -21,7 +21,7 @@ from jaxdn.render import ClipJob, choose_variant, render_clips
 from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.render.scenes.scene_file import SceneFile
 from jaxdn.render.settings import RenderSettings
-from jaxdn.zoo.ready import NOISY, Candidate, all_names, candidate, filters
+from jaxdn.zoo.ready import NOISY, Model, all_names, filter_names, find_model
 
 ANIMATIONS = Path(__file__).parent / "rooms"
 
@@ -79,12 +79,12 @@ def jobs(settings: Settings) -> list[ClipJob]:
     ]
 
 
-def contestants(runs: Path | None) -> list[Candidate]:
+def contestants(runs: Path | None) -> list[Model]:
     """The noisy image, every filter, and the weights in a folder of runs, or else those that are shipped."""
     if runs is None:
-        return [candidate(name) for name in all_names()]
+        return [find_model(name) for name in all_names()]
     weights = [str(path) for path in sorted(runs.glob("*/weights.safetensors"))]
-    return [candidate(name) for name in (NOISY, *filters(), *weights)]
+    return [find_model(name) for name in (NOISY, *filter_names(), *weights)]
 
 
 def main(settings: Settings) -> None:

@@ -31,7 +31,7 @@ from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import REFERENCE, VARIABLE
 from jaxdn.runtime.atomic_files import write_json
 from jaxdn.runtime.malloc import tune_malloc
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 
 OIDN = "Open Image Denoise high"
 
@@ -56,7 +56,7 @@ def ours(name: str, backend: str | None, height: int, width: int, *, compiled: b
     tune_malloc()
     if not compiled:
         os.environ[VARIABLE] = REFERENCE
-    found, frame = candidate(name, **({} if backend is None else {"implementation": backend})), frame_of(height, width)
+    found, frame = find_model(name, **({} if backend is None else {"implementation": backend})), frame_of(height, width)
     assert found.denoiser is not None
     return recurrent(found.denoiser, found.params, frame)
 
@@ -68,7 +68,7 @@ def builds(names: list[str], height: int, width: int) -> dict[str, Callable[[], 
     if "pyoidn" not in peers.missing():
         found[OIDN] = partial(oidn_high, height, width)
     for name in names:
-        one = candidate(name)
+        one = find_model(name)
         if one.denoiser is None or one.method is None:
             raise ValueError(f"--methods {name}: expected a denoiser, got the noisy image.")
         backends = [each for each in one.method.backends if BACKENDS[each].purpose == "inference"]

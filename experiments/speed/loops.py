@@ -25,11 +25,11 @@ from jaxdn.core.frame import Frame
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import guides_of
 from jaxdn.methods.steady import regression
-from jaxdn.methods.steady.accumulation import Mean, accumulated
-from jaxdn.methods.steady.fireflies import dimmed
+from jaxdn.methods.steady.accumulation import History, RunningMean, update_mean
+from jaxdn.methods.steady.fireflies import suppress_fireflies
 from jaxdn.methods.steady.levels import LEVELS
-from jaxdn.methods.steady.method import BEGIN, FEATURES, HALF_FEATURES, decisions
-from jaxdn.methods.steady.network_input import History, seen
+from jaxdn.methods.steady.method import FEATURES, HALF_FEATURES, INITIAL, split_heads
+from jaxdn.methods.steady.network_input import assemble_network_input
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
 from jaxdn.ops.dispatch import numba_call
@@ -80,15 +80,21 @@ def works(height: int, width: int) -> dict[str, Work]:
             reproject,
             (history.values, guides_of(frame), frame, jnp.asarray(False)),
         ),
-        "what the network sees": (partial(seen, multiple=16), ((albedo, normal, depth, roughness), *seen_light, gain)),
-        "the running mean": (partial(accumulated, most=32.0), (*seen_light, noise(height, width))),
+        "what the network sees": (
+            partial(assemble_network_input, multiple=16),
+            ((albedo, normal, depth, roughness), *seen_light, gain),
+        ),
+        "the running mean": (partial(update_mean, most=32.0), (*seen_light, noise(height, width))),
         "what is decided": (
-            partial(decisions, size=half),
-            (noise(*half, 4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + LEVELS + 2),),
+            partial(split_heads, size=half),
+            (noise(*half, 4 * (FEATURES + len(INITIAL)) + HALF_FEATURES + LEVELS + 2),),
         ),
         "the texture that a division leaves": (brdf.texture_or_hue, (albedo, light, jnp.asarray(True))),
-        "single bright pixels": (dimmed, (image[:3], hit, Mean(image[3:6], image[6], image[7], image[:3]))),
-        "what light follows": (regression.given_back, (scales, image, image + 0.1, hit, gain)),
+        "single bright pixels": (
+            suppress_fireflies,
+            (image[:3], hit, RunningMean(image[3:6], image[6], image[7], image[:3])),
+        ),
+        "what light follows": (regression.regress_residual, (scales, image, image + 0.1, hit, gain)),
         "11 channels as planes": (
             lambda *arrays: join_planes(list(zip(layouts, arrays, strict=True))),
             (albedo, normal, learned),

@@ -24,7 +24,7 @@ from jaxdn.core.frame import BUFFERS, Clip
 from jaxdn.data.training.symmetries import transform_clip, transform_image
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.denoiser.rollout import denoise
-from jaxdn.zoo.ready import NOISY, all_names, candidate
+from jaxdn.zoo.ready import NOISY, all_names, find_model
 
 Image = np.ndarray
 
@@ -117,7 +117,7 @@ def main(settings: Settings) -> None:
     folders = [folder for place in settings.clips for folder in find_clips(place)]
     columns = {}
     for method in settings.methods:
-        one = candidate(method)
+        one = find_model(method)
         if one.denoiser is None:
             raise ValueError(f"--methods: expected denoisers, got {method}, which is the noisy image.")
         rows = [measure_deviations(one.denoiser, one.params, read_clip(folder)) for folder in folders]

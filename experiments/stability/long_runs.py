@@ -26,7 +26,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Denoiser
 from jaxdn.denoiser.rollout import render_requested
 from jaxdn.runtime.atomic_files import write_atomically
-from jaxdn.zoo.ready import NOISY, all_names, candidate
+from jaxdn.zoo.ready import NOISY, all_names, find_model
 
 SIZE, TURN = 48, 16
 """Width and height in pixels, and frames after which the clip is reversed."""
@@ -122,7 +122,7 @@ def distance(clean: Curves, poisoned: Curves) -> np.ndarray:
 
 def examine(name: str, frames: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """All runs of one method: their results and curves."""
-    method = candidate(name)
+    method = find_model(name)
     if method.denoiser is None:
         raise ValueError(f"method {name!r}: expected a denoiser, got the noisy image itself.")
     run = compiled(method.denoiser, method.params, frames)

@@ -209,8 +209,8 @@ class Denoise:
     """Folder for the denoised frames; for a single frame, also the name of an EXR file."""
     method: str = "steady-balanced"
     """Shipped weights (ntd-large, ntd-small, relax-fitted, steady-balanced, steady-fast, steady-high, svgf-fitted), a
-    filter (svgf, asvgf, taa), or the path of a .safetensors file; an unknown name lists all. By default
-    steady-balanced, while `jaxdn train` trains ntd."""
+    filter (svgf, asvgf, taa), the path of a .safetensors file, or a filter of another package (package.module:name); an
+    unknown name lists all. By default steady-balanced, while `jaxdn train` trains ntd."""
     bidirectional: bool = False
     """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
     frames are about as good as the last."""
@@ -268,7 +268,8 @@ class Compare:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the report."""
     methods: list[str] = field(default_factory=list)
-    """noisy, filters, shipped weights or .safetensors files; default: all that come with the package."""
+    """noisy, filters (also of other packages, as package.module:name), shipped weights or .safetensors files; default:
+    all that come with the package."""
     spp: int = 1
     """Samples per pixel to take from the clips' layers."""
 
@@ -285,7 +286,8 @@ class Export:
     """
 
     method: tyro.conf.Positional[str]
-    """A filter (svgf, taa), shipped weights (steady-balanced, ntd-large), or the path of a .safetensors file."""
+    """A filter (svgf, taa), shipped weights (steady-balanced, ntd-large), the path of a .safetensors file, or a filter
+    of another package (package.module:name)."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for METHOD.stablehlo and METHOD.onnx."""
     width: int | None = None

@@ -13,7 +13,7 @@ from jaxdn.runtime.malloc import tune_malloc
 from jaxdn.sequence.jobs import Job
 from jaxdn.sequence.run import denoise_files, select_backend
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import Candidate, candidate
+from jaxdn.zoo.ready import Model, find_model
 
 _OF_SCENES = ("width", "height", "animation", "seed")
 
@@ -64,7 +64,7 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
         print(f"{_count(written.sanitized, 'value')} sanitized: not usable numbers (NaN, infinite, negative ...)")
 
 
-def _show_job(job: Job, naming: ChannelNaming, method: Candidate) -> None:
+def _show_job(job: Job, naming: ChannelNaming, method: Model) -> None:
     """Print what is read of a shot."""
     single = len(job.shot.files) == 1
     mapping = read_channel_mapping(job.clip or job.exr_files[0], naming, single=single)
@@ -77,7 +77,7 @@ def _denoise_scene(options: Denoise, scene: str) -> None:
     from jaxdn.render.settings import RenderSettings
     from jaxdn.sequence.render_and_denoise import SceneSettings, denoise_scene
 
-    asks = getattr(candidate(options.method).denoiser, "samples", None) is not None
+    asks = getattr(find_model(options.method).denoiser, "samples", None) is not None
     budget = _budget(options)
     method, backend = select_backend(options.method, options.implementation, **(budget if asks else {}))
     size = {name: value for name in ("width", "height", "seed") if (value := getattr(options, name)) is not None}

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 from jaxdn.export.formats import onnx_model, stablehlo
 from jaxdn.export.step import Step, exported_step
 from jaxdn.runtime.atomic_files import write_atomically
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 
 Format = Literal["both", "stablehlo", "onnx"]
 
@@ -42,7 +42,7 @@ def export(
     """
     if size is not None and min(size) < 16:
         raise ValueError(f"--width, --height: expected at least 16 pixels each, got {size[1]} x {size[0]}.")
-    method = candidate(name)
+    method = find_model(name)
     if method.denoiser is None:
         raise ValueError(f"method {name!r}: expected one that denoises, such as svgf or steady-balanced.")
     progress("tracing the step")

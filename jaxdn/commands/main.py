@@ -106,10 +106,10 @@ def _compare(options: Compare) -> None:
     from jaxdn.data.clip.folder import find_clips
     from jaxdn.evaluation.compare import compare
     from jaxdn.evaluation.report import text_table, write_report
-    from jaxdn.zoo.ready import all_names, candidate
+    from jaxdn.zoo.ready import all_names, find_model
 
     out, names = check_folder(options.out), options.methods or all_names()
-    methods = [candidate(name) for name in names]
+    methods = [find_model(name) for name in names]
     folders = find_clips(options.clips)
     settings = {"clips": len(folders), "spp": options.spp, "methods": names}
     results = compare(methods, folders, title=f"Denoisers on {options.clips.name}", settings=settings, spp=options.spp)

@@ -11,7 +11,7 @@ from jaxdn.data.clip.folder import RECORD, frame_path, is_clip, read_frames, rea
 from jaxdn.data.clip.frames import StoredFrame, doubling_layers
 from jaxdn.data.errors import ClipError
 from jaxdn.data.foreign.import_exr import plain_frames
-from jaxdn.filters.time_reversal import turned
+from jaxdn.filters.time_reversal import reverse_time
 
 
 def open_frames(
@@ -58,7 +58,7 @@ def _turned(frames: Iterator[StoredFrame]) -> Iterator[StoredFrame]:
     """Frames that come from the last to the first, with time turned around."""
     after: Frame | None = None
     for stored in frames:
-        yield stored._replace(frame=turned(stored.frame, after))
+        yield stored._replace(frame=reverse_time(stored.frame, after))
         after = stored.frame
 
 

@@ -1,8 +1,8 @@
-"""What of a whole frame decides about each of its parts: its brightness, its depths, its height.
+"""Frame statistics: what of a whole frame decides about each of its pixels. Brightness, depths, height.
 
-A frame that is denoised part by part (:mod:`jaxdn.denoiser.tiles`) must be measured as a whole first. Everything here
-is a sum over pixels, or over blocks of 16x16 of them, so that the sums of parts that lie side by side add up to those
-of the frame.
+A frame that is denoised in tiles (:mod:`jaxdn.denoiser.tiles`) must be measured as a whole first. Everything here is a
+sum over pixels, or over blocks of 16x16 of them, so that the sums of tiles that lie side by side add up to those of the
+frame.
 """
 
 from collections.abc import Iterator
@@ -55,14 +55,19 @@ def measure_frame(light: jax.Array, depth: Array, frame: Frame) -> FrameStatisti
       depth: [H, W, 1], or None.
       frame: for reflectance and albedo, and its height.
     """
-    either = frame.reflectance is None or frame.albedo is None
-    other = 0.0 if either else jnp.sum(jnp.any(frame.reflectance != frame.albedo, axis=-1), dtype=light.dtype)
     return FrameStatistics(
         color.brightness(light),
         jnp.zeros(3, light.dtype) if depth is None else sum_depths(depth),
-        jnp.asarray(other, light.dtype),
+        jnp.asarray(count_reflectance_differs(frame), light.dtype),
         jnp.asarray(frame.radiance.shape[0], light.dtype),
     )
+
+
+def count_reflectance_differs(frame: Frame) -> jax.Array | float:
+    """:attr:`FrameStatistics.reflectance_differs` of a frame; 0 unless it has both buffers."""
+    if frame.reflectance is None or frame.albedo is None:
+        return 0.0
+    return jnp.sum(jnp.any(frame.reflectance != frame.albedo, axis=-1), dtype=frame.radiance.dtype)
 
 
 def geometric_mean_depth(depth: jax.Array) -> jax.Array:

@@ -19,7 +19,7 @@ from jaxdn.denoiser.rollout import denoise
 from jaxdn.evaluation.report import ClipResult, Results, Scores, TrainingCurve
 from jaxdn.evaluation.report.film import FRAMES, film
 from jaxdn.evaluation.report.results import headline_psnr
-from jaxdn.zoo.ready import OURS, Candidate
+from jaxdn.zoo.ready import DEFAULT_MODEL, Model
 
 Halves = tuple[Any, Any]
 
@@ -98,7 +98,7 @@ def unbiased_scores(
 
 
 def compare(
-    methods: Sequence[Candidate],
+    methods: Sequence[Model],
     folders: Sequence[Path],
     *,
     title: str,
@@ -148,12 +148,12 @@ def compare(
         clips.append(result)
     labels = [method.label for method in methods]
     known = {method.label: method.method.title for method in methods if method.method is not None}
-    opens_on = OURS if OURS in labels else _last_network(methods)
+    opens_on = DEFAULT_MODEL if DEFAULT_MODEL in labels else _last_network(methods)
     descriptions = {**known, **(about or {})}
     return Results(title, settings, describe_machine(), labels, clips, training or {}, descriptions, opens_on)
 
 
-def _last_network(methods: Sequence[Candidate]) -> str | None:
+def _last_network(methods: Sequence[Model]) -> str | None:
     """The last label of a network, which is what somebody brought to compare; None without any."""
     networks = [method.label for method in methods if method.method is not None and not method.method.filter]
     return networks[-1] if networks else None
@@ -166,7 +166,7 @@ def _compile(denoiser: Denoiser) -> Callable[[Params, Clip], jax.Array]:
 def _compare_on(
     evaluated: EvaluationClip,
     name: str,
-    methods: Sequence[Candidate],
+    methods: Sequence[Model],
     compiled: dict[str, Callable[[Params, Clip], jax.Array]],
     spp: int,
 ) -> ClipResult:

@@ -15,7 +15,7 @@ from jax import export
 
 from jaxdn.core.frame import BUFFERS, GUIDES, Frame
 from jaxdn.core.platform import portable
-from jaxdn.denoiser import Denoiser, Params, Recurrent
+from jaxdn.denoiser import Denoiser, Params, stages_of
 
 Arrays = dict[str, Any]
 MULTIPLES = (1, 16, 32)
@@ -44,7 +44,7 @@ def exported_step(
     """The step of a denoiser with these parameters.
 
     Args:
-      denoiser: made by :func:`jaxdn.denoiser.recurrent`.
+      denoiser: any.
       params: its parameters, constants of the program.
       buffers: those that frames will have besides ``radiance``; None: all that the denoiser reads.
       size: height and width; None: any.
@@ -87,20 +87,19 @@ def _traced(
     """The step for frames of one size, whose numbers may be symbols."""
     frame = {name: _spec((*size, BUFFERS[name].channels), BUFFERS[name].dtype) for name in buffers}
     with portable():
-        state = jax.eval_shape(lambda frame: denoiser.start(params, Frame(**frame)), frame)
-        if not isinstance(state, Recurrent):
-            raise ValueError("denoiser: expected one made by jaxdn.denoiser.recurrent, got another; make it so.")
-        leaves, tree = jax.tree.flatten(state.core)
-        places = ["".join(f".{_key(key)}" for key in path) for path, _ in jax.tree.leaves_with_path(state.core)]
+        stages = stages_of(denoiser)
+        state = jax.eval_shape(lambda frame: stages.start(params, Frame(**frame)), frame)
+        leaves, tree = jax.tree.flatten(state)
+        places = ["".join(f".{_key(key)}" for key in path) for path, _ in jax.tree.leaves_with_path(state)]
 
         def function(inputs: Arrays) -> Arrays:
-            core = jax.tree.unflatten(tree, [inputs[f"state{place}"] for place in places])
-            zero = jnp.zeros((), jnp.int32)
-            before = Recurrent(core, jnp.where(inputs["first"], zero, 1), zero)
+            before = jax.tree.unflatten(tree, [inputs[f"state{place}"] for place in places])
             with portable():
-                after, image = denoiser.step(params, before, Frame(**{name: inputs[name] for name in buffers}))
-            follow = dict(zip(places, jax.tree.leaves(after.core), strict=True))
-            return {"image": image, **{f"next{place}": follow[place] for place in places}, "sanitized": after.sanitized}
+                statistics, prepared, replaced = stages.prepare(Frame(**{name: inputs[name] for name in buffers}))
+                after, image, invalid = stages.step(params, before, prepared, inputs["first"], statistics)
+            follow = dict(zip(places, jax.tree.leaves(after), strict=True))
+            count = jnp.asarray(replaced + invalid, jnp.int32)
+            return {"image": image, **{f"next{place}": follow[place] for place in places}, "sanitized": count}
 
         specs = {f"state{place}": _spec(leaf.shape, leaf.dtype) for place, leaf in zip(places, leaves, strict=True)}
         inputs = {**frame, **specs, "first": _spec((), np.dtype(bool))}

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 
 from jaxdn.filters.edge_stopping import Weight
-from jaxdn.filters.stencil_tiles import canvas_for, guiding, weighted_sums
+from jaxdn.filters.stencil_tiles import pad_guides, plan_tiles, weighted_sums
 
 B3_SPLINE = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
 GAUSSIAN = np.array([0.279, 0.442, 0.279])
@@ -64,31 +64,31 @@ def edge_average(
     _, height, width = values.shape
     planes = values.shape[0] + counted
     dtype = values.dtype
-    canvas = canvas_for(height, width, taps, step_max=step_max)
+    tiles = plan_tiles(height, width, taps, step_max=step_max)
     inside = jnp.ones((height, width), dtype) if hit is None else hit.astype(dtype)
     # Masked pixels enter as zeros in the sums and in the sum of weights.
-    summed = [canvas.wide(plane * inside) for plane in values]
-    spread = None if variance is None else canvas.wide(variance * inside)
-    guides, inside = guiding(canvas, weights), canvas.wide(inside)
+    summed = [tiles.pad(plane * inside) for plane in values]
+    spread = None if variance is None else tiles.pad(variance * inside)
+    guides, inside = pad_guides(tiles, weights), tiles.pad(inside)
 
     def strip(top: jax.Array) -> tuple[jax.Array, jax.Array | None]:
-        sums = weighted_sums(canvas, top, taps, step, weights, guides, summed, inside, spread)
+        sums = weighted_sums(tiles, top, taps, step, weights, guides, summed, inside, spread)
         mean, filtered = sums.mean()
         return jnp.stack([*mean, *([sums.total] if counted else [])]), filtered
 
     def skipped(top: jax.Array) -> tuple[jax.Array, jax.Array | None]:
-        nothing = jnp.zeros((planes, canvas.rows, width), dtype)
-        return nothing, None if spread is None else jnp.zeros((canvas.rows, width), dtype)
+        nothing = jnp.zeros((planes, tiles.rows, width), dtype)
+        return nothing, None if spread is None else jnp.zeros((tiles.rows, width), dtype)
 
-    wanted = None if needed is None else canvas.tall(needed)
+    wanted = None if needed is None else tiles.pad_rows(needed)
 
     def one(top: jax.Array) -> tuple[jax.Array, jax.Array | None]:
         if wanted is None:
             return strip(top)
-        return lax.cond(jnp.any(canvas.row(top, wanted)), strip, skipped, top)
+        return lax.cond(jnp.any(tiles.row(top, wanted)), strip, skipped, top)
 
-    if canvas.strips == 1:
+    if tiles.strips == 1:
         return one(jnp.zeros((), jnp.int32))
-    mean, filtered = lax.map(one, canvas.rows * jnp.arange(canvas.strips, dtype=jnp.int32))
+    mean, filtered = lax.map(one, tiles.rows * jnp.arange(tiles.strips, dtype=jnp.int32))
     mean = mean.transpose(1, 0, 2, 3).reshape(planes, -1, width)[:, :height]
     return mean, None if filtered is None else filtered.reshape(-1, width)[:height]

@@ -11,7 +11,7 @@ from jaxdn import brdf
 from jaxdn.filters.accumulation import luminance
 from jaxdn.filters.blur import blur_variance
 from jaxdn.filters.edge_stopping import Weight, luminance_weight
-from jaxdn.filters.stencil_tiles import Guiding, canvas_for, guiding, weighted_sums
+from jaxdn.filters.stencil_tiles import PaddedGuides, pad_guides, plan_tiles, weighted_sums
 
 _Planes = tuple[list[jax.Array], list[jax.Array]]
 
@@ -72,31 +72,31 @@ def _levels(
     The planes stay on the canvas between the levels: to put them there again for each one took half of the time.
     """
     (height, width), levels = variance.shape, len(sigmas)
-    canvas = canvas_for(height, width, taps, step_max=2 ** (levels - 1))
-    guides = guiding(canvas, weights(jnp.zeros((), jnp.int32)))
-    inside = canvas.wide(jnp.ones((height, width), color.dtype) if hit is None else hit.astype(color.dtype))
+    tiles = plan_tiles(height, width, taps, step_max=2 ** (levels - 1))
+    guides = pad_guides(tiles, weights(jnp.zeros((), jnp.int32)))
+    inside = tiles.pad(jnp.ones((height, width), color.dtype) if hit is None else hit.astype(color.dtype))
 
     def filter_level(carry: _Planes, at: tuple[jax.Array, jax.Array]) -> tuple[_Planes, None]:
         (level, sigma), (planes, feedback) = at, carry
         *colors, variance, light = planes
-        deviation = jnp.sqrt(jnp.maximum(blur_variance(canvas.within(variance)), 1e-10))
-        alike = luminance_weight(canvas.within(light), deviation, sigma=sigma)
+        deviation = jnp.sqrt(jnp.maximum(blur_variance(tiles.crop(variance)), 1e-10))
+        alike = luminance_weight(tiles.crop(light), deviation, sigma=sigma)
         stops = [*weights(level), alike]
-        own = Guiding([*guides.there, [light]], [*guides.here, [canvas.tall(plane) for plane in alike.here]])
+        own = PaddedGuides([*guides.there, [light]], [*guides.here, [tiles.pad_rows(plane) for plane in alike.here]])
 
         def strip(top: jax.Array) -> list[jax.Array]:
-            mean, spread = weighted_sums(canvas, top, taps, 2**level, stops, own, colors, inside, variance).mean()
+            mean, spread = weighted_sums(tiles, top, taps, 2**level, stops, own, colors, inside, variance).mean()
             assert spread is not None
-            seen = canvas.shifted(top, inside, jnp.asarray(canvas.margin, jnp.int32)) > 0
+            seen = tiles.shifted(top, inside, jnp.asarray(tiles.margin, jnp.int32)) > 0
             return [jnp.where(seen, plane, 0.0) for plane in (*mean, spread, luminance(mean))]
 
-        new = canvas.painted(strip)
+        new = tiles.map_strips(strip)
         kept = [jnp.where(level + 1 == feedback_level, *pair) for pair in zip(new[:-2], feedback, strict=True)]
         return (new, kept), None
 
     # Masked pixels enter as zeros in the sums and in the sum of weights.
-    planes = [canvas.wide(plane) * inside for plane in (*color, variance, luminance(color))]
-    carry = planes, [canvas.wide(plane) for plane in feedback]
+    planes = [tiles.pad(plane) * inside for plane in (*color, variance, luminance(color))]
+    carry = planes, [tiles.pad(plane) for plane in feedback]
     carry, _ = lax.scan(filter_level, carry, (jnp.arange(levels, dtype=jnp.int32), sigmas))
-    last, kept = (jnp.stack([canvas.within(plane) for plane in each[: len(color)]]) for each in carry)
+    last, kept = (jnp.stack([tiles.crop(plane) for plane in each[: len(color)]]) for each in carry)
     return last, kept

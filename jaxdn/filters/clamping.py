@@ -20,7 +20,9 @@ _ROUNDING = 1e-4
 """Relative difference of two means in single precision that says nothing."""
 
 
-def neighbourhood(planes: jax.Array, hit: jax.Array | None, *, radius: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+def measure_neighbourhood(
+    planes: jax.Array, hit: jax.Array | None, *, radius: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Mean and standard deviation of every plane over a square of ``2 radius + 1`` pixels, and their number [H, W].
 
     Only pixels of the image with a surface (``hit`` [H, W] bool; None: all) count; all are 0 where there is none.
@@ -36,7 +38,7 @@ def neighbourhood(planes: jax.Array, hit: jax.Array | None, *, radius: int) -> t
     return mean, jnp.sqrt(jnp.maximum(square - mean * mean, _NO_SPREAD)), sums[-1]
 
 
-def contradiction(slow: jax.Array, fast: jax.Array, hit: jax.Array | None, *, sigma: float, radius: int) -> jax.Array:
+def detect_lag(slow: jax.Array, fast: jax.Array, hit: jax.Array | None, *, sigma: float, radius: int) -> jax.Array:
     """[H, W] in [0, 1]: how surely the slow history shows another brightness than the fast one around a pixel.
 
     ``d / (sigma e) - 1``, clipped, for the difference d of their means over a square of ``2 radius + 1`` pixels and the
@@ -50,7 +52,7 @@ def contradiction(slow: jax.Array, fast: jax.Array, hit: jax.Array | None, *, si
       sigma: standard errors that are not counted as a difference.
       radius: of the square.
     """
-    means, deviation, number = neighbourhood(jnp.stack([slow, fast]), hit, radius=radius)
+    means, deviation, number = measure_neighbourhood(jnp.stack([slow, fast]), hit, radius=radius)
     difference = jnp.abs(means[0] - means[1])
     # The mean's own rounding is no difference either.
     noise = sigma * deviation[1] / jnp.sqrt(jnp.maximum(number, 1.0)) + _ROUNDING * means[1]
@@ -68,13 +70,13 @@ def clamp_to_fast(
     clipping: Salvi 2016).
     """
     around = to_ycocg(fast, axis=0)
-    mean, deviation, _ = neighbourhood(around, hit, radius=radius)
+    mean, deviation, _ = measure_neighbourhood(around, hit, radius=radius)
     low = jnp.minimum(mean - sigma * deviation, around)
     high = jnp.maximum(mean + sigma * deviation, around)
     return jnp.maximum(from_ycocg(jnp.clip(to_ycocg(slow, axis=0), low, high), axis=0), 0.0)
 
 
-def without_fireflies(color: jax.Array, same: jax.Array | None) -> jax.Array:
+def clamp_fireflies(color: jax.Array, same: jax.Array | None) -> jax.Array:
     """Each channel of ``color`` [3, H, W] clamped to the range of the eight neighbours of the same surface.
 
     ``same`` [C, H, W]: planes that are equal on one surface (ids, whether there is one); None: all count. A pixel
@@ -90,7 +92,7 @@ def without_fireflies(color: jax.Array, same: jax.Array | None) -> jax.Array:
     return jnp.where(low <= high, jnp.clip(color, low, high), color)
 
 
-def without_specks(brightness: jax.Array, hit: jax.Array, sure: jax.Array) -> jax.Array:
+def firefly_attenuation(brightness: jax.Array, hit: jax.Array, sure: jax.Array) -> jax.Array:
     """[H, W] in [0, 1], the share of its light that a pixel keeps: none is brighter than all of its eight neighbours.
 
     What is left of a firefly after filtering is one pixel that had nobody to share it with.

@@ -39,15 +39,15 @@ class Weight(NamedTuple):
 
 
 def depth_weight(
-    depth: jax.Array, ids: jax.Array | None, *, sigma: float | jax.Array, height: jax.Array | None = None
+    depth: jax.Array, ids: jax.Array | None, *, sigma: float | jax.Array, height: jax.Array | float
 ) -> Weight:
     """``exp(-|z(p) - z(q)| / (sigma |grad z(p) . (p - q)| + eps))``, eps = 1e-3 z(p) |p - q| / H.
 
-    ``depth`` and ``ids`` [H, W, 1]; slopes are taken within an object (Schied et al. 2017, eq. 3). ``height`` is that
-    of the frame that they are a part of.
+    ``depth`` and ``ids`` [H, W, 1]; slopes are taken within an object (Schied et al. 2017, eq. 3). ``height`` is H of
+    the whole frame, of which they may be a tile.
     """
     layers = jnp.stack([depth[..., 0], *depth_slopes(depth, ids)])
-    share = 1e-3 / (depth.shape[0] if height is None else height)
+    share = 1e-3 / height
 
     def exponent(there: Planes, here: Planes, offset: Offset) -> jax.Array:
         z, slope_x, slope_y = here

@@ -50,7 +50,7 @@ def stratum_centers(buffer: Array) -> Array:
     return wide[1::STRATUM, 1::STRATUM]
 
 
-def replayed(gradient: jax.Array) -> Change:
+def compare_replayed(gradient: jax.Array) -> Change:
     """The change of replayed samples: ``Frame.luminance_gradient`` [H, W, 2] by strata."""
     delta = gradient[..., 0]
     # Luminance is not negative, so the larger one is at least the change.
@@ -59,7 +59,7 @@ def replayed(gradient: jax.Array) -> Change:
     return Change(delta, size)
 
 
-def observed(now: jax.Array, past: jax.Array, hit: jax.Array | None) -> Change:
+def compare_with_history(now: jax.Array, past: jax.Array, hit: jax.Array | None) -> Change:
     """The change of the frames' own luminance against that of the history, where no samples were replayed.
 
     The difference of both means over the stratum's pixels with a history.

@@ -11,8 +11,8 @@ from jax import lax
 from jaxdn import brdf
 from jaxdn.filters.atrous import edge_average, stencil
 from jaxdn.filters.edge_stopping import Weight
-from jaxdn.filters.isolated import alone, with_those_beside
-from jaxdn.filters.sparse import average_of_few, few_or_all
+from jaxdn.filters.isolated import fill_isolated, measure_isolation
+from jaxdn.filters.sparse import choose_sparse, sparse_edge_average
 
 _TAPS = np.array([tap for tap in stencil(2) if abs(tap[0] * tap[1]) < 4])
 """5x5 without the corners."""
@@ -27,7 +27,7 @@ def fix_history(
     frames: int,
     widest: int,
     texture: jax.Array | None = None,
-    beside: bool = True,
+    isolated: bool = True,
 ) -> jax.Array:
     """``color`` [3, H, W] where the history is longer than ``frames``, else an edge-stopped mean of 21 sparse taps.
 
@@ -41,7 +41,7 @@ def fix_history(
       frames: longest history that is fixed; 0: none.
       widest: twice the distance of the taps, in pixels, for a history of one frame.
       texture: [3, H, W] what a division left, averaged likewise and given back (:func:`jaxdn.brdf.restore`).
-      beside: a pixel that is alone gets the mean of those beside it (:mod:`jaxdn.filters.isolated`); not for
+      isolated: an isolated pixel gets the mean of those around it (:mod:`jaxdn.filters.isolated`); not for
         reflections.
     """
     if not frames:
@@ -56,7 +56,7 @@ def fix_history(
 
     def few() -> jax.Array:
         step = jnp.asarray(strides)[jnp.clip(whole - 1, 0, frames - 1).astype(jnp.int32)]
-        return average_of_few(planes, hit, weights, _TAPS, short, step=step)
+        return sparse_edge_average(planes, hit, weights, _TAPS, short, step=step)
 
     def many() -> jax.Array:
         def fill(filled: jax.Array, each: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
@@ -69,8 +69,8 @@ def fix_history(
         begun = jnp.concatenate([planes, jnp.ones_like(planes[:1])])
         return lax.scan(fill, begun, (jnp.asarray(numbers, length.dtype), jnp.asarray(strides)))[0]
 
-    mean = few_or_all(short, few, many)
+    mean = choose_sparse(short, few, many)
     mean, total = mean[:-1], mean[-1]
     filled = mean if texture is None else brdf.restore(mean[:3], texture, mean[3:])
     filled = jnp.where(short[None], filled, color)
-    return with_those_beside(filled, hit, alone(total, short)) if beside else filled
+    return fill_isolated(filled, hit, measure_isolation(total, short)) if isolated else filled

@@ -23,7 +23,7 @@ _FEW = 1 / 4
 """The share of pixels above which fetching the taps one by one takes longer."""
 
 
-def few_or_all(needed: jax.Array, few: Callable[[], Any], many: Callable[[], Any]) -> Any:
+def choose_sparse(needed: jax.Array, few: Callable[[], Any], many: Callable[[], Any]) -> Any:
     """``few()`` where few pixels are ``needed`` [H, W], else ``many()``; both give the same.
 
     Small images, and portable programs, whose images may be small, have ``many()`` alone.
@@ -33,7 +33,7 @@ def few_or_all(needed: jax.Array, few: Callable[[], Any], many: Callable[[], Any
     return lax.cond(jnp.mean(needed, dtype=jnp.float32) < _FEW, few, many)
 
 
-def average_of_few(
+def sparse_edge_average(
     values: jax.Array,
     hit: jax.Array | None,
     weights: Sequence[Weight],

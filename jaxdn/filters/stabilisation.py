@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn.filters.accumulation import luminance
-from jaxdn.filters.clamping import neighbourhood
+from jaxdn.filters.clamping import measure_neighbourhood
 
 _DARKEST = 1e-6
 """Colours of less luminance keep theirs: nothing is known of the hue of black."""
@@ -26,7 +26,9 @@ def stabilise(
       sigma: half size of the clamp.
     """
     level = luminance(color)
-    mean, deviation, _ = (each[0] if each.ndim == 3 else each for each in neighbourhood(level[None], hit, radius=1))
+    mean, deviation, _ = (
+        each[0] if each.ndim == 3 else each for each in measure_neighbourhood(level[None], hit, radius=1)
+    )
     low, high = jnp.minimum(mean - sigma * deviation, level), jnp.maximum(mean + sigma * deviation, level)
     steady = level + share * (jnp.clip(past, low, high) - level)
     lit = level > _DARKEST

@@ -1,4 +1,4 @@
-"""Planes of an image with zeros around it, and weighted sums over the taps of a stencil, strip by strip.
+"""Padded row tiles: planes of an image with zeros around it, and weighted sums over a stencil, strip by strip.
 
 Arrays here are planar, ``[C, H, W]``: the stencil then runs along contiguous rows and vectorises. For each
 strip of rows, a scan over the taps computes the weight of one tap while it adds up the tap before: written as a plain
@@ -23,8 +23,8 @@ NO_WEIGHT = 1e-10
 the square of their square, in that of a division by it: there are two divisions instead."""
 
 
-class Canvas(NamedTuple):
-    """How an image lies among zeros, which all taps outside it hit, and how it is parted into strips of rows."""
+class PaddedTiles(NamedTuple):
+    """How an image is padded by zeros, which all taps outside it hit, and divided into strips of rows."""
 
     height: int
     width: int
@@ -43,24 +43,24 @@ class Canvas(NamedTuple):
         """Rows of the last strip below the image."""
         return self.strips * self.rows - self.height
 
-    def wide(self, planes: jax.Array) -> jax.Array:
+    def pad(self, planes: jax.Array) -> jax.Array:
         """Planes [..., H, W] with zeros on all sides."""
         (y, x), whole = self.margin, [(0, 0)] * (planes.ndim - 2)
         return jnp.pad(planes, [*whole, (y, y + self.spare), (x, x)])
 
-    def tall(self, planes: jax.Array) -> jax.Array:
+    def pad_rows(self, planes: jax.Array) -> jax.Array:
         """Planes [..., H, W] with the spare rows alone."""
         return jnp.pad(planes, [*[(0, 0)] * (planes.ndim - 2), (0, self.spare), (0, 0)])
 
-    def within(self, wide: jax.Array) -> jax.Array:
-        """The image [..., H, W] of :meth:`wide` planes."""
+    def crop(self, wide: jax.Array) -> jax.Array:
+        """The image [..., H, W] of :meth:`pad` planes."""
         y, x = self.margin
         return wide[..., y : y + self.height, x : x + self.width]
 
-    def painted(self, strip: Callable[[jax.Array], list[jax.Array]]) -> list[jax.Array]:
+    def map_strips(self, strip: Callable[[jax.Array], list[jax.Array]]) -> list[jax.Array]:
         """Wide planes from ``strip``: first row -> [rows, W] of each plane, 0 below the image."""
         if self.strips == 1:
-            return [self.wide(plane) for plane in strip(jnp.zeros((), jnp.int32))]
+            return [self.pad(plane) for plane in strip(jnp.zeros((), jnp.int32))]
         y, x = self.margin
         shape = (self.strips * self.rows + 2 * y, self.width + 2 * x)
         tops = self.rows * jnp.arange(self.strips, dtype=jnp.int32)
@@ -73,25 +73,25 @@ class Canvas(NamedTuple):
         return lax.scan(paint, blank, tops)[0]
 
     def row(self, top: jax.Array, planes: jax.Array) -> jax.Array:
-        """The strip [..., rows, W] of :meth:`tall` planes whose first row is ``top``."""
+        """The strip [..., rows, W] of :meth:`pad_rows` planes whose first row is ``top``."""
         return lax.dynamic_slice_in_dim(planes, top, self.rows, axis=planes.ndim - 2)
 
     def shifted(self, top: jax.Array, wide: jax.Array, offset: jax.Array) -> jax.Array:
-        """The strip [rows, W] of a :meth:`wide` plane, ``offset`` (rows, columns, margins included) away."""
+        """The strip [rows, W] of a :meth:`pad` plane, ``offset`` (rows, columns, margins included) away."""
         return lax.dynamic_slice(wide, (top + offset[0], offset[1]), (self.rows, self.width))
 
 
-def canvas_for(height: int, width: int, taps: np.ndarray, *, step_max: int) -> Canvas:
+def plan_tiles(height: int, width: int, taps: np.ndarray, *, step_max: int) -> PaddedTiles:
     """The canvas of an image for ``taps``, rows of (dy, dx, h), that are up to ``step_max`` pixels apart.
 
     Strips are for the CPU's cache only; other devices take one strip.
     """
     rows = rows_per_tile(height, width, pixels=_STRIP_PIXELS, least=8)
     reach = np.abs(taps[:, :2]).max(axis=0).astype(int) * step_max
-    return Canvas(height, width, rows, (int(reach[0]), int(reach[1])))
+    return PaddedTiles(height, width, rows, (int(reach[0]), int(reach[1])))
 
 
-class Guiding(NamedTuple):
+class PaddedGuides(NamedTuple):
     """The planes that edge-stopping weights read."""
 
     there: list[list[jax.Array]]
@@ -100,11 +100,11 @@ class Guiding(NamedTuple):
     """Those that are read at the centre, tall."""
 
 
-def guiding(canvas: Canvas, weights: Sequence[Weight]) -> Guiding:
+def pad_guides(tiles: PaddedTiles, weights: Sequence[Weight]) -> PaddedGuides:
     """The planes of ``weights``, on the canvas."""
-    return Guiding(
-        [[canvas.wide(plane) for plane in one.there] for one in weights],
-        [[canvas.tall(plane) for plane in one.here] for one in weights],
+    return PaddedGuides(
+        [[tiles.pad(plane) for plane in one.there] for one in weights],
+        [[tiles.pad_rows(plane) for plane in one.here] for one in weights],
     )
 
 
@@ -127,12 +127,12 @@ class Sums(NamedTuple):
 
 
 def weighted_sums(
-    canvas: Canvas,
+    tiles: PaddedTiles,
     top: jax.Array,
     taps: np.ndarray,
     step: int | jax.Array,
     weights: Sequence[Weight],
-    guides: Guiding,
+    guides: PaddedGuides,
     planes: Sequence[jax.Array],
     inside: jax.Array,
     spread: jax.Array | None,
@@ -150,18 +150,18 @@ def weighted_sums(
       inside: wide, how much each pixel counts.
       spread: wide, the variance; None: it is not summed.
     """
-    dtype, shape = inside.dtype, (canvas.rows, canvas.width)
-    offsets = step * jnp.asarray(taps[:, :2], jnp.int32) + jnp.asarray(canvas.margin, jnp.int32)[None]
+    dtype, shape = inside.dtype, (tiles.rows, tiles.width)
+    offsets = step * jnp.asarray(taps[:, :2], jnp.int32) + jnp.asarray(tiles.margin, jnp.int32)[None]
     # Per tap: dx, dy and its length, all for step 1, and h.
     length = np.hypot(taps[:, 0], taps[:, 1])
     numbers = jnp.asarray(np.stack([taps[:, 1], taps[:, 0], length, taps[:, 2]], axis=1), dtype)
     numbers = numbers * jnp.where(jnp.arange(4) < 3, jnp.asarray(step, dtype), 1.0)[None]
-    centre: list[Planes] = [[canvas.row(top, plane) for plane in own] for own in guides.here]
+    centre: list[Planes] = [[tiles.row(top, plane) for plane in own] for own in guides.here]
     summed = [*planes, inside]
 
     def weigh(offset: jax.Array, number: jax.Array) -> jax.Array:
         tap, factor = Offset(number[0], number[1], number[2]), jnp.full(shape, number[3])
-        around = [[canvas.shifted(top, plane, offset) for plane in own] for own in guides.there]
+        around = [[tiles.shifted(top, plane, offset) for plane in own] for own in guides.there]
         samples = list(zip(weights, around, centre, strict=True))
         exponents = [one.exponent(there, here, tap) for one, there, here in samples if one.exponent]
         if exponents:
@@ -176,9 +176,9 @@ def weighted_sums(
     ) -> tuple[list[jax.Array], jax.Array | None]:
         total, squares = sums
         if spread is not None and squares is not None:
-            squares = squares + weight * weight * canvas.shifted(top, spread, offset)
+            squares = squares + weight * weight * tiles.shifted(top, spread, offset)
         return [
-            old + weight * canvas.shifted(top, plane, offset) for old, plane in zip(total, summed, strict=True)
+            old + weight * tiles.shifted(top, plane, offset) for old, plane in zip(total, summed, strict=True)
         ], squares
 
     def body(carry, tap):

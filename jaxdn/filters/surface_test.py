@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn.core.frame import FAR, Frame
-from jaxdn.denoiser.statistics import geometric_mean_depth, sum_depths
 
 
 class Guides(NamedTuple):
@@ -57,15 +56,13 @@ def surface_mask(depth: jax.Array | None, ids: jax.Array | None) -> jax.Array | 
     return None if not known else known[0] if len(known) == 1 else known[0] & known[1]
 
 
-def depth_feature(depth: jax.Array, *, scale: str = "geometric", middle: jax.Array | None = None) -> jax.Array:
-    """Depth as ``z / (z + g)`` in [0, 1); g is the geometric mean over surfaces, or 1 with ``"unit"``.
+def depth_feature(depth: jax.Array, mean: jax.Array | float) -> jax.Array:
+    """Depth as ``z / (z + mean)`` in [0, 1), for ``depth`` [H, W, 1] >= 0; 0 (the neutral value) gives 0.
 
-    ``depth`` [H, W, 1] >= 0; 0 (the neutral value) gives 0. The geometric mean makes the feature independent of
-    the scene's unit of length; ``middle`` is that of the frame that the depth is a part of.
+    With the frame's geometric mean over surfaces (:attr:`FrameStatistics.mean_depth`) it does not depend on the scene's
+    unit of length.
     """
-    if scale == "unit":
-        return depth / (depth + 1.0)
-    return depth / (depth + (geometric_mean_depth(sum_depths(depth)) if middle is None else middle))
+    return depth / (depth + mean)
 
 
 def cosine(first: jax.Array, second: jax.Array) -> jax.Array:

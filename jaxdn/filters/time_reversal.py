@@ -16,7 +16,7 @@ from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, expect_surface, guides_of, same_surface
 from jaxdn.ops.motion import find_targets
 
-SEEN_MOST = 8.0
+LENGTH_MAX = 8.0
 """More frames than this hardly make a history better: each new one counts a fifth or so (docs/how-to/two-passes.md)."""
 _DEPTH_TOLERANCE, _NORMAL_THRESHOLD = 0.02, 0.9
 _READS = frozenset({"normal", "depth", "previous_depth", "motion", "ids"})
@@ -24,7 +24,7 @@ _ONE_WAY = ("dual_motion", "visible", "luminance_gradient", "shadow_motion", "gl
 """What a frame tells about the one before it and not about the one after; left out, so that it is neutral."""
 
 
-def turned(frame: Frame, after: Frame | None, forward: Array = None) -> Frame:
+def reverse_time(frame: Frame, after: Frame | None, forward: Array = None) -> Frame:
     """A frame as if time ran backwards: ``motion`` leads to the frame after it, ``previous_depth`` is that frame's.
 
     The other buffers that compare with the frame before are left out. NumPy arrays in, NumPy arrays out.
@@ -46,12 +46,12 @@ def turned(frame: Frame, after: Frame | None, forward: Array = None) -> Frame:
         )
     if after is None:
         return frame._replace(**changed, motion=np.zeros_like(frame.motion), previous_depth=frame.depth)
-    motion, depth = jax.tree.map(np.asarray, _derived(only(frame, _READS), only(after, _READS)))
+    motion, depth = jax.tree.map(np.asarray, _derive_motion(only(frame, _READS), only(after, _READS)))
     return frame._replace(**changed, motion=motion, previous_depth=depth)
 
 
 @jax.jit
-def _derived(frame: Frame, after: Frame) -> tuple[jax.Array, jax.Array | None]:
+def _derive_motion(frame: Frame, after: Frame) -> tuple[jax.Array, jax.Array | None]:
     """Motion [H, W, 2] to the frame after, NaN for what is hidden there, and the depth [H, W, 1] of the point then."""
     frame, after = sanitize(frame)[0], sanitize(after)[0]
     height, width = frame.radiance.shape[:2]
@@ -87,22 +87,22 @@ def _derived(frame: Frame, after: Frame) -> tuple[jax.Array, jax.Array | None]:
     return moved, depth.reshape(height, width, 1)
 
 
-class Seen(NamedTuple):
+class HistoryLength(NamedTuple):
     """For how many frames in a row a pass has seen the point in each pixel."""
 
     number: jax.Array
-    """[H, W, 1], 1 for a point that has just come into view, at most :data:`SEEN_MOST`."""
+    """[H, W, 1], 1 for a point that has just come into view, at most :data:`LENGTH_MAX`."""
     guides: Guides
     """Of the same frame."""
 
 
 @jax.jit
-def seen(before: Seen | None, frame: Frame) -> Seen:
+def update_history_length(before: HistoryLength | None, frame: Frame) -> HistoryLength:
     """The same after one more frame; ``before`` is None at the first. Taps are tested as those of a history."""
     frame, _ = sanitize(only(frame, _READS))
     guides = guides_of(frame)
     if before is None:
-        return Seen(jnp.ones((*frame.radiance.shape[:2], 1), frame.radiance.dtype), guides)
+        return HistoryLength(jnp.ones((*frame.radiance.shape[:2], 1), frame.radiance.dtype), guides)
     past = reproject(
         before.number,
         before.guides,
@@ -111,7 +111,7 @@ def seen(before: Seen | None, frame: Frame) -> Seen:
         depth_tolerance=_DEPTH_TOLERANCE,
         normal_threshold=_NORMAL_THRESHOLD,
     )
-    return Seen(jnp.minimum(past.history + 1, SEEN_MOST), guides)
+    return HistoryLength(jnp.minimum(past.history + 1, LENGTH_MAX), guides)
 
 
 def blend(one: Array, other: Array, seen_by_one: Array, seen_by_other: Array) -> Array:

@@ -9,8 +9,8 @@ from jaxdn import brdf
 from jaxdn.filters.accumulation import luminance
 from jaxdn.filters.atrous import edge_average, stencil
 from jaxdn.filters.edge_stopping import Weight
-from jaxdn.filters.isolated import alone, with_those_beside
-from jaxdn.filters.sparse import average_of_few, few_or_all
+from jaxdn.filters.isolated import fill_isolated, measure_isolation
+from jaxdn.filters.sparse import choose_sparse, sparse_edge_average
 
 _ROUNDING = 1e-3
 """Frames that a length may lack through rounding: the mean of lengths of 4 is seldom exactly 4."""
@@ -23,7 +23,7 @@ def estimate_variance(
     *,
     short_history: int,
     texture: jax.Array | None = None,
-    beside: bool = True,
+    isolated: bool = True,
 ) -> tuple[jax.Array, jax.Array]:
     """Colour [3, H, W] and the variance [H, W] of its luminance, from a history of ``accumulate``.
 
@@ -32,7 +32,7 @@ def estimate_variance(
     division left is averaged likewise and given back to this colour (:func:`jaxdn.brdf.restore`); the deviation changes
     as grey light would.
 
-    ``beside`` gives a pixel that is alone the mean of those beside it (:mod:`jaxdn.filters.isolated`); not for
+    ``isolated`` gives an isolated pixel the mean of those around it (:mod:`jaxdn.filters.isolated`); not for
     reflections, which are sharp where they are alone.
     """
     color, moments, length = history[:3], history[3:5], history[5]
@@ -40,9 +40,9 @@ def estimate_variance(
     short = length < short_history - _ROUNDING
     needed = short if hit is None else short & hit
     planes = history[:5] if texture is None else jnp.concatenate([history[:5], texture])
-    mean = few_or_all(
+    mean = choose_sparse(
         needed,
-        lambda: average_of_few(planes, hit, weights, stencil(3), needed),
+        lambda: sparse_edge_average(planes, hit, weights, stencil(3), needed),
         lambda: edge_average(planes, hit, weights, stencil(3), needed=needed, counted=True)[0],
     )
     mean, total = mean[:-1], mean[-1]
@@ -51,8 +51,8 @@ def estimate_variance(
         around = brdf.restore(around, texture, mean[5:])
         spatial = spatial * brdf.restore(jnp.ones_like(spatial), luminance(texture), luminance(mean[5:])) ** 2
     color, variance = jnp.where(needed[None], around, color), jnp.where(needed, spatial, variance)
-    if not beside:
+    if not isolated:
         return color, variance
     planes = jnp.concatenate([color, variance[None]])
-    mixed = with_those_beside(planes, hit, alone(total, needed))
+    mixed = fill_isolated(planes, hit, measure_isolation(total, needed))
     return mixed[:3], mixed[3]

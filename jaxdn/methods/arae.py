@@ -14,6 +14,7 @@ import jax
 
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.surface_test import guides_of
 from jaxdn.methods import asvgf, rae, svgf
 from jaxdn.methods.demodulation import demodulated
@@ -50,13 +51,14 @@ def arae(options: rae.Options) -> Denoiser:
         return AraeState(svgf.start(params, frame), inner.start(params, frame))
 
     def step(
-        params: Params, state: AraeState, frame: Frame, first: jax.Array
+        params: Params, state: AraeState, frame: Frame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[AraeState, jax.Array, jax.Array]:
-        planes, invalid = asvgf.accumulated(_ACCUMULATION, state.light, frame, first)
+        planes, invalid = asvgf.accumulate(_ACCUMULATION, state.light, frame, first)
         history = planes.transpose(1, 2, 0)
         light = svgf.SvgfState(history, guides_of(frame))
-        hidden, image, lost = inner.step(params, state.hidden, frame._replace(radiance=history[..., :3]), first)
-        return AraeState(light, hidden), image, invalid + lost
+        measured, prepared = inner.prepare(frame._replace(radiance=history[..., :3]))
+        hidden, image, hidden_invalid = inner.step(params, state.hidden, prepared, first, measured)
+        return AraeState(light, hidden), image, invalid + hidden_invalid
 
     reads = inner.reads | svgf.READS | {"luminance_gradient"}
     return demodulated(recurrent(Core(start, step, reads, inner.init)), by=options.demodulate)

@@ -21,19 +21,20 @@ from jax import lax
 from jaxdn.core.frame import Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.accumulation import luminance
 from jaxdn.filters.gradients import (
     Change,
-    observed,
+    compare_replayed,
+    compare_with_history,
     reconstruct,
-    replayed,
     stratum_centers,
     to_pixels,
 )
 from jaxdn.filters.surface_test import surface_mask
 from jaxdn.methods import svgf
 from jaxdn.methods.demodulation import demodulated
-from jaxdn.methods.learnable_options import FITTING, LEARNED, moved, unmoved
+from jaxdn.methods.learnable_options import FITTING, LEARNABLE, apply_offsets, zero_offsets
 from jaxdn.methods.registry import method
 
 
@@ -41,7 +42,7 @@ from jaxdn.methods.registry import method
 class Options(svgf.Options):
     """The options of ``svgf``, and those of the gradients."""
 
-    alpha: Annotated[float, Range(0, 1, without_low=True), LEARNED] = 0.1
+    alpha: Annotated[float, Range(0, 1, without_low=True), LEARNABLE] = 0.1
     """Minimum weight of the new frame in colour, where light has not changed."""
     gradient_levels: Annotated[int, Range(0, 5)] = 3
     """Levels of the filter over strata: it averages over ``3 * 3^levels`` pixels in each direction."""
@@ -69,25 +70,25 @@ def asvgf(options: Options) -> Denoiser:
     """
 
     def step(
-        params: Params, state: svgf.SvgfState, frame: Frame, first: jax.Array
+        params: Params, state: svgf.SvgfState, frame: Frame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[svgf.SvgfState, jax.Array, jax.Array]:
-        fitted = moved(options, params)
-        history, invalid = accumulated(fitted, state, frame, first)
-        return (*svgf.filter_history(fitted, history, frame), invalid)
+        fitted = apply_offsets(options, params)
+        history, invalid = accumulate(fitted, state, frame, first)
+        return (*svgf.filter_history(fitted, history, frame, statistics), invalid)
 
     reads = svgf.READS | {"luminance_gradient"}
-    plain = recurrent(Core(svgf.start, step, reads, lambda key, frame: unmoved(options)))
+    plain = recurrent(Core(svgf.start, step, reads, lambda key, frame: zero_offsets(options)))
     return demodulated(plain, by=options.demodulate)
 
 
-def accumulated(options: Options, state: svgf.SvgfState, frame: Frame, first: jax.Array) -> tuple[jax.Array, jax.Array]:
+def accumulate(options: Options, state: svgf.SvgfState, frame: Frame, first: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The history [6, H, W] with the frame blended in, faster where light has changed; the number of invalid pixels."""
-    past, invalid = svgf.recall_history(options, state, frame, first)
-    change = 1.0 - (1.0 - changed(options, past, frame)) ** options.antilag
+    past, invalid = svgf.reproject_history(options, state, frame, first)
+    change = 1.0 - (1.0 - measure_change(options, past, frame)) ** options.antilag
     return svgf.blend(options, past, frame.radiance.transpose(2, 0, 1), change), invalid
 
 
-def changed(options: Options, past: jax.Array, frame: Frame) -> jax.Array:
+def measure_change(options: Options, past: jax.Array, frame: Frame) -> jax.Array:
     """lambda [H, W] in [0, 1]: the share by which light has changed since the previous frame.
 
     ``past`` is the fetched history [6, H, W].
@@ -95,7 +96,8 @@ def changed(options: Options, past: jax.Array, frame: Frame) -> jax.Array:
     now = frame.radiance.transpose(2, 0, 1)
     hit = surface_mask(frame.depth, frame.ids)
     depth, normal, ids = (stratum_centers(buffer) for buffer in (frame.depth, frame.normal, frame.ids))
-    weights = svgf.surface_weights(options, depth, normal, ids)
+    strata = depth if depth is not None else frame.radiance  # without depth there is no weight of it
+    weights = svgf.surface_weights(options, depth, normal, ids, strata.shape[0])
 
     def filtered(change: Change) -> jax.Array:
         return reconstruct(
@@ -107,13 +109,13 @@ def changed(options: Options, past: jax.Array, frame: Frame) -> jax.Array:
         )
 
     if frame.luminance_gradient is None:
-        share = filtered(observed(luminance(now), past, hit))
+        share = filtered(compare_with_history(luminance(now), past, hit))
     else:
-        change = replayed(frame.luminance_gradient)
+        change = compare_replayed(frame.luminance_gradient)
         share = lax.cond(
             jnp.any(change.size > 0),
             filtered,
-            lambda _: filtered(observed(luminance(now), past, hit)),
+            lambda _: filtered(compare_with_history(luminance(now), past, hit)),
             change,
         )
     return to_pixels(share, *now.shape[1:])

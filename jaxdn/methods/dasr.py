@@ -14,15 +14,17 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 
+from jaxdn import color
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods import direct
 from jaxdn.methods.demodulation import Demodulation, demodulated
 from jaxdn.methods.registry import method
-from jaxdn.methods.sampler import Sampling, mapped, sampler
+from jaxdn.methods.sampler import Sampling, allocate_samples, sampler
 from jaxdn.networks import LARGE, MULTIPLE, SMALL, Widths, pad
-from jaxdn.recipes.augmentation import STILL
+from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.recipes.objectives import compressed_illumination, pyramid_illumination
 from jaxdn.recipes.recipe import Recipe
 
@@ -37,7 +39,7 @@ class Options(Sampling):
     """Pixels without a surface (depth at ``FAR``) keep their radiance; or they are predicted as all others."""
     exposure: Literal["measured", "given"] = "measured"
     """The networks see radiance times :func:`jaxdn.color.exposure` of each frame; or radiance as it is given."""
-    demodulate: Demodulation | bool = "brdf"
+    demodulate: Demodulation = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     implementation: Literal["reference", "onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"] | None = None
     """Backend of the U-Nets: XLA, or on CPUs oneDNN in bfloat16 or float32 or ONNX Runtime (inference), or oneDNN
@@ -54,7 +56,7 @@ class Options(Sampling):
     presets={"paper": Options(background="filter", exposure="given", rounding="nearest", demodulate="none")},
     recipes={
         "usual": Recipe(pyramid_illumination()),
-        "paper": Recipe(compressed_illumination(), frames=1, decay=False, variation=STILL, average=0.0),
+        "paper": Recipe(compressed_illumination(), frames=1, decay=False, variation=NO_AUGMENTATION, average=0.0),
     },
     variants={"dasr-large": {"size": "large"}, "dasr-small": {"size": "small"}},
     backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
@@ -75,41 +77,47 @@ def dasr(options: Options) -> Denoiser:
     network = sampler(options, (3, *surfaces), size=options.size, **built)
     predictor = unet((3, *surfaces, 1), (3,), widths=widths, **built)
 
-    def seen(frame: Frame) -> direct.Light:
-        return direct.seen(frame, background=options.background, exposure=options.exposure, multiple=MULTIPLE)
+    def prepare(frame: Frame) -> tuple[FrameStatistics, direct.PreparedFrame]:
+        return direct.prepare(frame, background=options.background, multiple=MULTIPLE)
 
     def init(key: jax.Array, frame: Frame) -> Params:
         first, second = jax.random.split(key)
-        params = {"predictor": direct.beginning_grey(predictor.init(first), "head_0")}
+        params = {"predictor": direct.init_grey(predictor.init(first), "head_0")}
         return {**params, "sampler": network.init(second)} if options.adaptive else params
 
     def start(params: Params, frame: Frame) -> tuple[()]:
         return ()
 
-    def step(params: Params, state: tuple[()], frame: Frame, first: jax.Array) -> tuple[tuple[()], jax.Array, int]:
-        light = seen(frame)
+    def step(
+        params: Params, state: tuple[()], prepared: direct.PreparedFrame, first: jax.Array, statistics: FrameStatistics
+    ) -> tuple[tuple[()], jax.Array, int]:
+        frame, gain = prepared.frame, direct.choose_gain(options.exposure, statistics)
+        surfaces = _surfaces(frame, statistics)
         count = None if frame.sample_count is None else 1.0 / (1.0 + frame.sample_count)
-        groups = [light.compressed, *(None if group is None else pad(group) for group in (*_surfaces(frame), count))]
+        groups: list[jax.Array | None] = [color.compress(gain * prepared.light)]
+        groups += [None if group is None else pad(group) for group in (*surfaces, count)]
         features = [None if group is None else group[None] for group in groups]
         output = predictor.apply(params["predictor"], features)[0][0]
-        return (), direct.image_of(output, light, frame), 0
+        return (), direct.expand_output(output, prepared, gain), 0
 
     def samples(params: Params, state: tuple[()], frame: Frame, first: jax.Array, most: int) -> jax.Array:
         even = jnp.zeros_like(frame.radiance[..., :1])
         if not options.adaptive:
-            return mapped(options, even, most)
-        compressed = seen(frame).compressed[: even.shape[0], : even.shape[1]]
-        return network.counts(params["sampler"], [compressed, *_surfaces(frame)], jnp.asarray(False), most)
+            return allocate_samples(options, even, most)
+        statistics, prepared = prepare(frame)
+        light = color.compress(direct.choose_gain(options.exposure, statistics) * prepared.light)
+        features = [light[: even.shape[0], : even.shape[1]], *_surfaces(frame, statistics)]
+        return network.counts(params["sampler"], features, jnp.asarray(False), most)
 
     reads = frozenset({"albedo", "normal", "depth", "sample_count"})
-    core = Core(start, step, reads, init, samples)
+    core = Core(start, step, reads, init, samples, prepare)
     return demodulated(recurrent(core), by=options.demodulate)
 
 
-def _surfaces(frame: Frame) -> tuple[jax.Array | None, ...]:
+def _surfaces(frame: Frame, statistics: FrameStatistics) -> tuple[jax.Array | None, ...]:
     """What the networks see of the surfaces; 0 is the neutral value."""
     return (
         None if frame.albedo is None else frame.albedo - 1.0,
         frame.normal,
-        None if frame.depth is None else depth_feature(frame.depth),
+        None if frame.depth is None else depth_feature(frame.depth, statistics.mean_depth),
     )

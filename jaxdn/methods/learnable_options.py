@@ -1,7 +1,7 @@
 """Filters that learn: options that training moves within their declared ranges.
 
-A filter's constants (how fast its history follows, how strict its edges are) are options, marked ``LEARNED`` or
-``LEARNED_PER_LEVEL``. Its params hold for each of them one number x, or one for each level of the filter: how far
+A filter's constants (how fast its history follows, how strict its edges are) are options, marked ``LEARNABLE`` or
+``LEARNABLE_PER_LEVEL``. Its params hold for each of them one number x, or one for each level of the filter: how far
 training has moved the option from its value v. x = 0, and likewise an absent name, leaves it where it is; no x leaves
 its range. With a range from l to h, the odds ``(v - l) / (h - v)`` are multiplied by ``exp(x)``; without an upper
 end, ``v - l`` is. An option at the end of its range stays there.
@@ -22,13 +22,13 @@ from jaxdn.recipes.recipe import Recipe
 Options = TypeVar("Options")
 
 
-class Learned:
+class Learnable:
     """The mark of an option that training may move."""
 
 
-LEARNED = Learned()
+LEARNABLE = Learnable()
 """One number."""
-LEARNED_PER_LEVEL = Learned()
+LEARNABLE_PER_LEVEL = Learnable()
 """One number for each level of the filter, as many as the option ``levels`` says."""
 
 
@@ -36,13 +36,13 @@ FITTING = Recipe(pyramid_illumination(), steps=300, learning_rate=0.05, average=
 """How a filter's options are fitted: few numbers that all pixels share take large steps."""
 
 
-def unmoved(options: Any) -> Params:
+def zero_offsets(options: Any) -> Params:
     """The params of a filter before training: name -> 0, or [levels] zeros. An option that is None has none."""
-    counts = {name: () if mark is LEARNED else (options.levels,) for name, (mark, _) in _marked(options).items()}
+    counts = {name: () if mark is LEARNABLE else (options.levels,) for name, (mark, _) in _marked(options).items()}
     return {name: jnp.zeros(shape) for name, shape in counts.items() if 0 not in shape}
 
 
-def moved(options: Options, params: Params) -> Options:
+def apply_offsets(options: Options, params: Params) -> Options:
     """The options with those that ``params`` names as arrays, () or [levels]; the others as they are.
 
     Raises ValueError for a name that is not an option's that may be moved.
@@ -59,13 +59,13 @@ def at_level(value: Any, level: Any) -> Any:
     return value[level] if jnp.ndim(value) else value
 
 
-def _marked(options: Any) -> dict[str, tuple[Learned, Range]]:
+def _marked(options: Any) -> dict[str, tuple[Learnable, Range]]:
     """Name -> mark and range of the options that may be moved."""
     found = {}
     for name, hint in get_type_hints(type(options), include_extras=True).items():
         if get_origin(hint) is Annotated and getattr(options, name) is not None:
             facts = get_args(hint)[1:]
-            marks = [fact for fact in facts if isinstance(fact, Learned)]
+            marks = [fact for fact in facts if isinstance(fact, Learnable)]
             ranges = [fact for fact in facts if isinstance(fact, Range)]
             if marks:
                 found[name] = (marks[0], ranges[0])

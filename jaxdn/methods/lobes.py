@@ -1,4 +1,4 @@
-"""Diffuse and specular light apart, each divided by what its own lobes reflect, and their histories."""
+"""Signals: diffuse and specular light, each divided by what its own lobes reflect, and their reprojected histories."""
 
 from typing import NamedTuple
 
@@ -8,6 +8,7 @@ from jax import lax
 
 from jaxdn import brdf
 from jaxdn.core.frame import Frame
+from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, guides_of
 from jaxdn.filters.virtual_motion import closeness_of, diffuseness, virtual_motion
@@ -26,8 +27,8 @@ _ENOUGH = 0.01
 """Least weight that counts as history."""
 
 
-class Light(NamedTuple):
-    """Light of one kind of lobes, divided."""
+class DemodulatedLight(NamedTuple):
+    """A signal's light, divided by what its lobes reflect."""
 
     light: jax.Array
     """[3, H, W]."""
@@ -36,12 +37,14 @@ class Light(NamedTuple):
     texture: jax.Array | None = None
     """[3, H, W] what of its texture the division left (:func:`jaxdn.brdf.restore`); None: nothing."""
 
-    def whole(self, filtered: jax.Array) -> jax.Array:
+    def remodulate(self, filtered: jax.Array) -> jax.Array:
         """Filtered light as an image [H, W, 3]."""
         return (filtered if self.divisor is None else filtered * self.divisor).transpose(1, 2, 0)
 
 
-def apart(frame: Frame, by: Demodulation) -> tuple[Light, Light | None]:
+def split_signals(
+    frame: Frame, by: Demodulation, statistics: FrameStatistics
+) -> tuple[DemodulatedLight, DemodulatedLight | None]:
     """Diffuse and specular light of a frame; without ``specular`` all light is diffuse.
 
     ``by`` is as in :func:`jaxdn.methods.demodulation.demodulated`: ``"brdf"`` divides specular light by
@@ -57,7 +60,7 @@ def apart(frame: Frame, by: Demodulation) -> tuple[Light, Light | None]:
         known = jnp.zeros_like(frame.radiance) if part is None else part
         below = None if rest is None else brdf.divisor(rest), brdf.divisor(known)
         left = (
-            None if rest is None else texture_of(rest, frame, diffuse),
+            None if rest is None else texture_of(rest, frame, diffuse, statistics),
             None if part is None else brdf.texture_left(part, brdf.divisor(part)),
         )
     elif by == "albedo" and frame.albedo is not None:
@@ -72,14 +75,14 @@ def reflectances(frame: Frame) -> tuple[jax.Array | None, jax.Array | None]:
     return rest, part
 
 
-def _light(image: jax.Array, *of_surface: jax.Array | None) -> Light:
+def _light(image: jax.Array, *of_surface: jax.Array | None) -> DemodulatedLight:
     divisor = of_surface[0]
     planar = (None if each is None else each.transpose(2, 0, 1) for each in of_surface)
-    return Light((image if divisor is None else image / divisor).transpose(2, 0, 1), *planar)
+    return DemodulatedLight((image if divisor is None else image / divisor).transpose(2, 0, 1), *planar)
 
 
-class Histories(NamedTuple):
-    """What is left of both histories, planar; 0 where there is none."""
+class ReprojectedSignals(NamedTuple):
+    """The histories of both signals, planar; 0 where there is none."""
 
     diffuse: jax.Array
     """[C, H, W]."""
@@ -91,7 +94,7 @@ class Histories(NamedTuple):
     """How many pixels of the histories were not valid."""
 
 
-def recall_both(
+def reproject_signals(
     diffuse: jax.Array,
     specular: jax.Array | None,
     before: Guides,
@@ -101,7 +104,7 @@ def recall_both(
     length_plane: int,
     depth_tolerance: float,
     normal_threshold: float,
-) -> Histories:
+) -> ReprojectedSignals:
     """The histories [H, W, C] of diffuse and of specular light, which follows its virtual image.
 
     The last two planes of ``specular`` are its closeness and the roughness of its surface. It is fetched along the
@@ -117,13 +120,13 @@ def recall_both(
     )
     planes = surface.history.transpose(2, 0, 1)
     if specular is None:
-        return Histories(planes, None, None, surface.invalid)
+        return ReprojectedSignals(planes, None, None, surface.invalid)
     channels = diffuse.shape[-1]
-    past, seen = planes[channels:], surface.valid[..., 0]
+    past, valid = planes[channels:], surface.valid[..., 0]
     now = closeness_of(frame.specular_hit_distance, frame)
-    near = None if now is None else _tracked(now, past, frame, length_plane)
+    near = None if now is None else _track_closeness(now, past, frame, length_plane)
     if near is None or frame.roughness is None or frame.far_motion is None or frame.motion is None:
-        return Histories(planes[:channels], past, near, surface.invalid)
+        return ReprojectedSignals(planes[:channels], past, near, surface.invalid)
 
     # A constant, as motion is: where it is not finite, its gradient would not be either.
     target = lax.stop_gradient(virtual_motion(frame.motion, frame.far_motion, _stretch(frame), near))
@@ -133,19 +136,19 @@ def recall_both(
     virtual = found.history.transpose(2, 0, 1)
     alike = jnp.abs(virtual[-1] - frame.roughness[..., 0]) < _ALIKE_ROUGHNESS
     alike = alike & (jnp.abs(virtual[-2] - near) < _ALIKE_CLOSENESS) & found.valid[..., 0]
-    apart = jnp.sum((target - frame.motion) ** 2, axis=-1)
-    together = jnp.exp(-jnp.where(jnp.isfinite(apart), apart, 0.0))
+    distance = jnp.sum((target - frame.motion) ** 2, axis=-1)
+    together = jnp.exp(-jnp.where(jnp.isfinite(distance), distance, 0.0))
     stays = diffuseness(frame.roughness[..., 0])
-    shares = jnp.where(seen, stays + (1 - stays) * together, 0.0), jnp.where(alike, (1 - stays) * (1 - together), 0.0)
+    shares = jnp.where(valid, stays + (1 - stays) * together, 0.0), jnp.where(alike, (1 - stays) * (1 - together), 0.0)
     total = shares[0] + shares[1]
     some = total > _ENOUGH
     mixed = (shares[0][None] * past + shares[1][None] * virtual) / jnp.where(some, total, 1.0)[None]
     mixed = jnp.where(some[None], mixed, 0.0)
     mixed = mixed.at[length_plane].multiply(jnp.minimum(total, 1.0))
-    return Histories(planes[:channels], mixed, near, surface.invalid)
+    return ReprojectedSignals(planes[:channels], mixed, near, surface.invalid)
 
 
-def _tracked(now: jax.Array, past: jax.Array, frame: Frame, length_plane: int) -> jax.Array:
+def _track_closeness(now: jax.Array, past: jax.Array, frame: Frame, length_plane: int) -> jax.Array:
     """[H, W] closeness with less noise: blended into its history, the less so the smoother the surface is."""
     rough = 1.0 if frame.roughness is None else diffuseness(frame.roughness[..., 0])
     share = jnp.maximum(1.0 / (1.0 + past[length_plane]), 1.0 - rough)

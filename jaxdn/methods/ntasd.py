@@ -18,13 +18,13 @@ import jax.numpy as jnp
 from jaxdn import color
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.denoiser.statistics import FrameStatistics
+from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods import ntd
 from jaxdn.methods.demodulation import demodulated
 from jaxdn.methods.registry import method
-from jaxdn.methods.sampler import Sampling, gray, mapped, motion_feature, sampler
-from jaxdn.recipes.augmentation import STILL
+from jaxdn.methods.sampler import Sampling, allocate_samples, gray, motion_feature, sampler
+from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.recipes.objectives import last_frames, unbiased_illumination
 from jaxdn.recipes.recipe import Recipe
 
@@ -51,7 +51,7 @@ PAPER = Options(least=0, rounding="nearest", **ntd.AS_PUBLISHED)
     presets={"paper": PAPER},
     recipes={
         "usual": Recipe(unbiased_illumination()),
-        "paper": Recipe(last_frames(), frames=5, decay=False, variation=STILL, average=0.0),
+        "paper": Recipe(last_frames(), frames=5, decay=False, variation=NO_AUGMENTATION, average=0.0),
     },
     variants={"ntasd-large": {"size": "large"}, "ntasd-small": {"size": "small"}},
     backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
@@ -64,7 +64,7 @@ def ntasd(options: Options) -> Denoiser:
     sample_count. Raises ValueError for an unknown option and for a budget that the layers cannot give, and ``step`` for
     a frame of the wrong shape, never for its contents.
     """
-    inner = ntd.core_of(options, ntd.More((2, 1), _seen_of_samples, frozenset({"motion", "sample_count"})))
+    inner = ntd.core_of(options, ntd.ExtraFeatures((2, 1), _sample_features, frozenset({"motion", "sample_count"})))
     flagged = options.missing_history == "current"
     built: dict[str, Any] = {"size": options.size, "implementation": options.implementation}
     network = sampler(options, (1, 1, 3, 1, 2, *([1] if flagged else [])), **built)
@@ -78,32 +78,33 @@ def ntasd(options: Options) -> Denoiser:
         return inner.start(params["denoiser"], frame)
 
     def step(
-        params: Params, state: jax.Array, frame: Frame, first: jax.Array, whole: FrameStatistics
+        params: Params, state: jax.Array, prepared: ntd.PreparedFrame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[jax.Array, jax.Array, jax.Array | int]:
-        return inner.step(params["denoiser"], state, frame, first, whole)
+        return inner.step(params["denoiser"], state, prepared, first, statistics)
 
     def samples(params: Params, state: jax.Array, frame: Frame, first: jax.Array, most: int) -> jax.Array:
         dark = frame._replace(radiance=jnp.zeros_like(frame.radiance))  # nothing is rendered yet
         if not options.adaptive:
-            return mapped(options, dark.radiance[..., :1], most)
-        past, absent, _ = ntd.warped_history(options, state, dark, first)
+            return allocate_samples(options, dark.radiance[..., :1], most)
+        past, absent, _ = ntd.warp_history(options, state, dark, first)
         gain = color.exposure(past) if options.exposure == "measured" else 1.0
+        scale = measure_frame(past, frame.depth, frame).mean_depth if options.depth_scale == "geometric" else 1.0
         features = [
             gray(color.compress(gain * past)),
             None if frame.albedo is None else gray(frame.albedo) - 1.0,
             frame.normal,
-            None if frame.depth is None else depth_feature(frame.depth, scale=options.depth_scale),
+            None if frame.depth is None else depth_feature(frame.depth, scale),
             None if frame.motion is None else motion_feature(frame.motion),
         ]
         if flagged:
             features.append(absent.astype(past.dtype))
         return network.counts(params["sampler"], features, first, most)
 
-    core = Core(start, step, inner.reads, init, samples, inner.measure)
+    core = Core(start, step, inner.reads, init, samples, inner.prepare)
     return demodulated(recurrent(core), by=options.demodulate)
 
 
-def _seen_of_samples(frame: Frame) -> list[jax.Array | None]:
+def _sample_features(frame: Frame) -> list[jax.Array | None]:
     """Motion, and how noisy each pixel is: ``1 / (1 + n)`` for n samples."""
     return [
         None if frame.motion is None else motion_feature(frame.motion),

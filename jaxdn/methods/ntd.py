@@ -26,13 +26,13 @@ from jaxdn.denoiser.sanitize import sanitize_image
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.filters.surface_test import depth_feature, surface_mask
 from jaxdn.methods.demodulation import Demodulation, demodulated
-from jaxdn.methods.reconstruction import SCALES, Prediction, begin_blending, blend, heads_of
+from jaxdn.methods.reconstruction import SCALES, Prediction, blend, heads_of, init_bias
 from jaxdn.methods.registry import method
 from jaxdn.networks import LARGE, SMALL, Widths, crop, graph, pad
 from jaxdn.ops.motion import on_screen
 from jaxdn.ops.scales import downsample, fill_holes
 from jaxdn.ops.warp import warp
-from jaxdn.recipes.augmentation import STILL
+from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.recipes.objectives import indirect_illumination, unbiased_illumination
 from jaxdn.recipes.recipe import FINISH, Recipe
 
@@ -54,12 +54,9 @@ class Options:
     """D on each 2x2 block; the maximum (as in the paper) darkens."""
     up: Literal["bilinear", "nearest"] = "bilinear"
     """The upsampling U."""
-    pyramid: Literal["mean", "max"] = "mean"
-    """Downsampling of the noisy image to the coarser scales."""
-    domain: Literal["linear", "compressed"] = "linear"
-    """Kernels filter radiance, or compressed radiance (robust to fireflies, but it darkens)."""
     depth_scale: Literal["geometric", "unit"] = "geometric"
-    """Scaling of the depth feature, see :func:`jaxdn.filters.surface_test.depth_feature`."""
+    """The depth feature relative to the frame's geometric mean depth, or to 1, see
+    :func:`jaxdn.filters.surface_test.depth_feature`."""
     border: Literal["clamp", "zeros"] = "clamp"
     """Border of the warp."""
     first_frame: Literal["none", "noisy"] = "none"
@@ -84,12 +81,8 @@ class Options:
     the image; or radiance as it is given."""
     initialization: Literal["he", "xavier"] = "he"
     """Of the U-Net's weights, see :func:`jaxdn.networks.unet.draw_initial_weights`."""
-    demodulate: Demodulation | bool = "brdf"
+    demodulate: Demodulation = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
-    truncate: bool = False
-    """Stop the gradient at the history."""
-    compute_dtype: Literal["float32", "bfloat16"] | None = None
-    """Precision of the U-Net only; None is the images' dtype."""
     implementation: Literal["reference", "onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"] | None = None
     """Backend of the U-Net: XLA, or on CPUs oneDNN in bfloat16 or float32 (the extra ``onednn``) or ONNX Runtime (the
     extra ``onnx``) for inference, or oneDNN's convolutions for training. None is XLA."""
@@ -141,18 +134,18 @@ def guided_features(precisions: Params, guides: dict[str, jax.Array | None]) -> 
     return features
 
 
-def _guides(options: Options, frame: Frame, whole: FrameStatistics) -> dict[str, jax.Array | None]:
+def _guides(options: Options, frame: Frame, statistics: FrameStatistics) -> dict[str, jax.Array | None]:
     """The guides as the network and the prior see them, padded; 0 is the neutral value, None where one is absent."""
     reflectance = frame.albedo if frame.reflectance is None else frame.reflectance
-    middle, scale = whole.mean_depth, options.depth_scale
-    depth = None if frame.depth is None else depth_feature(frame.depth, scale=scale, middle=middle)
+    scale = statistics.mean_depth if options.depth_scale == "geometric" else 1.0
+    depth = None if frame.depth is None else depth_feature(frame.depth, scale)
     fractions = {"albedo": frame.albedo, "reflectance": reflectance, "roughness": frame.roughness}
     guides = {name: None if guide is None else guide - 1.0 for name, guide in fractions.items()}
     guides |= {"normal": frame.normal, "depth": depth}
     return {name: None if guide is None else pad(guide) for name, guide in guides.items()}
 
 
-def warped_history(
+def warp_history(
     options: Options, state: jax.Array, frame: Frame, first: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The history [H, W, 3] along the motion vectors, and the noisy frame where there is none.
@@ -162,19 +155,19 @@ def warped_history(
     noisy = frame.radiance
     absent = first if options.first_frame == "none" else jnp.zeros_like(first)
     absent = jnp.broadcast_to(absent, (*noisy.shape[:2], 1))
-    history = jax.lax.stop_gradient(state) if options.truncate else state
+    history = state
     vectors = frame.motion if frame.dual_motion is None else frame.dual_motion
     if vectors is not None:
         vectors = jax.lax.stop_gradient(vectors)
         history = warp(history, vectors, border=options.border)
-    sound = sanitize_image(history)
-    invalid = jnp.sum((sound != history) & ~first, dtype=jnp.int32)
-    recalled = jnp.where(first, noisy, sound)
+    valid = sanitize_image(history)
+    invalid = jnp.sum((valid != history) & ~first, dtype=jnp.int32)
+    history = jnp.where(first, noisy, valid)
     if vectors is not None and options.missing_history == "current":
-        lost = ~on_screen(vectors) & ~first
-        recalled = jnp.where(lost, noisy, recalled)
-        absent = absent | lost
-    return recalled, absent, invalid
+        off_screen = ~on_screen(vectors) & ~first
+        history = jnp.where(off_screen, noisy, history)
+        absent = absent | off_screen
+    return history, absent, invalid
 
 
 @method(
@@ -185,21 +178,21 @@ def warped_history(
         "usual": Recipe(unbiased_illumination()),
         "finish": FINISH,
         "without-occlusion": Recipe(unbiased_illumination(hidden=0.0)),
-        "paper": Recipe(indirect_illumination(), variation=STILL, average=0.0),
-        "paper-without-occlusion": Recipe(indirect_illumination(occlusion=False), variation=STILL, average=0.0),
+        "paper": Recipe(indirect_illumination(), variation=NO_AUGMENTATION, average=0.0),
+        "paper-without-occlusion": Recipe(
+            indirect_illumination(occlusion=False), variation=NO_AUGMENTATION, average=0.0
+        ),
         "parity": Recipe(
-            indirect_illumination(), learning_rate=1e-4, decay=False, clip_norm=0.0, variation=STILL, average=0.0
+            indirect_illumination(),
+            learning_rate=1e-4,
+            decay=False,
+            clip_norm=0.0,
+            variation=NO_AUGMENTATION,
+            average=0.0,
         ),
     },
     variants={"ntd-large": {"size": "large"}, "ntd-small": {"size": "small"}},
     backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
-    earlier={
-        "demodulate": "albedo",
-        "kernels": "plain",
-        "background": "filter",
-        "exposure": "given",
-        "initialization": "xavier",
-    },
 )
 def ntd(options: Options) -> Denoiser:
     """The neural temporal denoiser.
@@ -217,7 +210,7 @@ def ntd(options: Options) -> Denoiser:
     return demodulated(recurrent(core_of(options)), by=options.demodulate)
 
 
-class More(NamedTuple):
+class ExtraFeatures(NamedTuple):
     """Features that a method gives the network in addition."""
 
     groups: tuple[int, ...] = ()
@@ -228,17 +221,28 @@ class More(NamedTuple):
     """Buffers that they are made of."""
 
 
-NO_MORE = More()
+class PreparedFrame(NamedTuple):
+    """A frame, and what the network and the kernels see of its light."""
+
+    frame: Frame
+    """Its radiance bounded: divided by a small albedo it may be beyond what the network has ever seen."""
+    noisy: jax.Array
+    """[h, w, 3] padded, without the light of pixels that do not count."""
+    hit: jax.Array | None
+    """[H, W] bool, a surface is seen; None: pixels without one are filtered as all others."""
 
 
-def core_of(options: Options, more: More = NO_MORE) -> Core:
+NO_EXTRA_FEATURES = ExtraFeatures()
+
+
+def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES) -> Core:
     """The method without division and shared processing; its state is the last image [H, W, 3].
 
     Where ``sample_count`` is among the buffers read, pixels without samples are filled from their neighbours.
     """
     flagged, materials = options.missing_history == "current", options.guides == "materials"
     # What is optional comes last: weights trained without it can be continued with it.
-    groups = (3, 3, 3, 1, 3, *([1] if flagged else []), *([3, 1] if materials else []), *more.groups)
+    groups = (3, 3, 3, 1, 3, *([1] if flagged else []), *([3, 1] if materials else []), *extra.groups)
     fine, direct = options.alpha_at == "fine", options.prediction == "direct"
     heads = heads_of(options.prediction, fine=fine)
     # Flax is imported only when a network is built: filters without weights need only jax and numpy.
@@ -251,14 +255,14 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
     reads = frozenset({"albedo", "normal", "depth", "motion"})
     reads |= {"dual_motion"} if options.motion == "dual" else set()
     reads |= {"reflectance", "roughness"} if materials else set()
-    reads |= more.reads
+    reads |= extra.reads
 
     guided = options.kernels == "guided" and not direct
 
     def init(key: jax.Array, frame: Frame) -> Params:
         params = network.init(key)
         if options.initialization == "he":
-            params = begin_blending(params, options.prediction, fine=fine)
+            params = init_bias(params, options.prediction, fine=fine)
         return {**params, "guide": initial_precisions(options.guides)} if guided else params
 
     def start(params: Params, frame: Frame) -> jax.Array:
@@ -266,61 +270,52 @@ def core_of(options: Options, more: More = NO_MORE) -> Core:
 
     def predict(params: Params, features: list[jax.Array | None], dtype: jnp.dtype) -> list[jax.Array]:
         """The heads [H, W, c] for feature groups [H, W, c]."""
-        inner = jnp.dtype(jnp.bfloat16) if options.compute_dtype == "bfloat16" else dtype
-        batch = [None if group is None else group[None].astype(inner) for group in features]
+        batch = [None if group is None else group[None].astype(dtype) for group in features]
         weights = {name: part for name, part in params.items() if name != "guide"}
         return [head[0].astype(dtype) for head in network.apply(weights, batch)]
 
-    def light(frame: Frame) -> tuple[jax.Array, jax.Array | None]:
-        """The noisy light, padded, without that of pixels that do not count; bool [H, W], where a surface is."""
+    def prepare(frame: Frame) -> tuple[FrameStatistics, PreparedFrame]:
+        frame = frame._replace(radiance=jnp.minimum(frame.radiance, RADIANCE_MAX))
         hit = surface_mask(frame.depth, None) if options.background == "pass" else None
         noisy = pad(frame.radiance)
         if hit is not None:
             noisy = fill_holes(noisy, pad(hit[..., None]))
         if frame.sample_count is not None:
             noisy = fill_holes(noisy, pad(frame.sample_count > 0))
-        return noisy, hit
-
-    def measure(frame: Frame) -> FrameStatistics:
-        bounded = frame._replace(radiance=jnp.minimum(frame.radiance, RADIANCE_MAX))
-        return measure_frame(light(bounded)[0], frame.depth, frame)
+        return measure_frame(noisy, frame.depth, frame), PreparedFrame(frame, noisy, hit)
 
     def step(
-        params: Params, state: jax.Array, frame: Frame, first: jax.Array, whole: FrameStatistics
+        params: Params, state: jax.Array, prepared: PreparedFrame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        frame, noisy, hit = prepared
         size = frame.radiance.shape[:2]
-        # Divided by a small albedo it may be beyond what the network has ever seen.
-        frame = frame._replace(radiance=jnp.minimum(frame.radiance, RADIANCE_MAX))
-        recalled, absent, invalid = warped_history(options, state, frame, first)
-        seen = _guides(options, frame, whole)
-        (noisy, hit), recalled, absent = light(frame), pad(recalled), pad(absent)
+        history, absent, invalid = warp_history(options, state, frame, first)
+        guides = _guides(options, frame, statistics)
+        history, absent = pad(history), pad(absent)
         if hit is not None:
-            recalled = fill_holes(recalled, pad(hit[..., None]))
-        gain = whole.exposure if options.exposure == "measured" else 1.0
-        squeezed, squeezed_history = color.compress(gain * noisy), color.compress(gain * recalled)
-        features = [squeezed, seen["albedo"], seen["normal"], seen["depth"], squeezed_history]
+            history = fill_holes(history, pad(hit[..., None]))
+        gain = statistics.exposure if options.exposure == "measured" else 1.0
+        light = color.compress(gain * noisy)
+        features = [light, guides["albedo"], guides["normal"], guides["depth"], color.compress(gain * history)]
         if flagged:
             features.append(absent.astype(noisy.dtype))
         if materials:
-            features += [seen["reflectance"], seen["roughness"]]
-        features += [None if extra is None else pad(extra) for extra in more.of(frame)]
+            features += [guides["reflectance"], guides["roughness"]]
+        features += [None if feature is None else pad(feature) for feature in extra.of(frame)]
         predicted = predict(params, features, noisy.dtype)
-        guiding = guided_features(params["guide"] if guided else {}, seen)
 
         if direct:
             image = color.expand(predicted[0]) / gain
-        elif options.domain == "compressed":
-            blended = blend(options, predicted, guiding, squeezed, squeezed_history, absent)
-            image = color.expand(jnp.maximum(blended, 0.0)) / gain
         else:
-            image = blend(options, predicted, guiding, noisy, recalled, absent)
+            prior = guided_features(params["guide"] if guided else {}, guides)
+            image = blend(options, predicted, prior, noisy, history, absent)
         image = jnp.clip(crop(image, size), 0.0, RADIANCE_MAX)
         shown = image if hit is None else jnp.where(hit[..., None], image, frame.radiance)
         return image, shown, invalid
 
-    seen = graph.receptive_field_radius(graph.unet(1, heads, widths=widths, head_size=3))
-    return Core(start, step, reads, init, measure=measure, reach=seen + _FILTERS_REACH)
+    field = graph.receptive_field_radius(graph.unet(1, heads, widths=widths, head_size=3)) + _FILTERS_FIELD
+    return Core(start, step, reads, init, prepare=prepare, receptive_field=field)
 
 
-_FILTERS_REACH = 32
+_FILTERS_FIELD = 32
 """That of kernels of 5x5 pixels at three scales, of the images between these, and of blocks that are filled."""

@@ -14,14 +14,16 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
+from jaxdn import color
 from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods import direct
 from jaxdn.methods.demodulation import Demodulation, demodulated
 from jaxdn.methods.registry import method
 from jaxdn.networks import Widths, pad
-from jaxdn.recipes.augmentation import STILL
+from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.recipes.objectives import pyramid_illumination, recurrent_illumination
 from jaxdn.recipes.recipe import Recipe
 
@@ -49,7 +51,7 @@ class Options:
     exposure: Literal["measured", "given"] = "measured"
     """The network sees radiance times :func:`jaxdn.color.exposure` of each frame, so that twice the light gives twice
     the image where nothing is remembered; or radiance as it is given."""
-    demodulate: Demodulation | bool = "brdf"
+    demodulate: Demodulation = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     implementation: Literal["reference", "onednn"] | None = None
     """Backend of the network: XLA, or on CPUs oneDNN (training; the extra ``onednn``). None is XLA."""
@@ -62,7 +64,7 @@ PRESETS = {
 """The settings of Chaitanya et al. 2017, and those of the comparison in Hasselgren et al. 2020."""
 RECIPES = {
     "usual": Recipe(pyramid_illumination(), frames=7),
-    "paper": Recipe(recurrent_illumination(), crop=128, frames=7, decay=False, variation=STILL, average=0.0),
+    "paper": Recipe(recurrent_illumination(), crop=128, frames=7, decay=False, variation=NO_AUGMENTATION, average=0.0),
 }
 
 
@@ -97,29 +99,35 @@ def core_of(options: Options) -> Core:
     multiple = max(4, 2 ** (len(widths[0]) - 1))
 
     def init(key: jax.Array, frame: Frame) -> Params:
-        return direct.beginning_grey(network.init(key), "output")
+        return direct.init_grey(network.init(key), "output")
 
     def start(params: Params, frame: Frame) -> Hidden:
         height, width = (size + -size % multiple for size in frame.radiance.shape[:2])
         return network.start(1, height, width, frame.radiance.dtype)
 
-    def step(params: Params, state: Hidden, frame: Frame, first: jax.Array) -> tuple[Hidden, jax.Array, jax.Array]:
-        light = direct.seen(frame, background=options.background, exposure=options.exposure, multiple=multiple)
-        _check_size(state, light.compressed, frame.radiance.shape[:2])
+    def prepare(frame: Frame) -> tuple[FrameStatistics, direct.PreparedFrame]:
+        return direct.prepare(frame, background=options.background, multiple=multiple)
+
+    def step(
+        params: Params, state: Hidden, prepared: direct.PreparedFrame, first: jax.Array, statistics: FrameStatistics
+    ) -> tuple[Hidden, jax.Array, jax.Array]:
+        frame, gain = prepared.frame, direct.choose_gain(options.exposure, statistics)
+        light = color.compress(gain * prepared.light)
+        _check_size(state, light, frame.radiance.shape[:2])
         surfaces = [
             frame.normal,
-            None if frame.depth is None else depth_feature(frame.depth),
+            None if frame.depth is None else depth_feature(frame.depth, statistics.mean_depth),
             None if frame.roughness is None else frame.roughness - 1.0,
         ]
         if materials:
             surfaces.append(None if frame.albedo is None else frame.albedo - 1.0)
         padded = [None if group is None else pad(group, multiple)[None] for group in surfaces]
-        remembered, invalid = _sound(state)
-        output, kept = network.apply(params, [light.compressed[None], *padded], remembered)
-        return kept, direct.image_of(output[0], light, frame), invalid
+        hidden, invalid = _bound_hidden(state)
+        output, hidden = network.apply(params, [light[None], *padded], hidden)
+        return hidden, direct.expand_output(output[0], prepared, gain), invalid
 
     guides = {"normal", "depth", "roughness"} | ({"albedo"} if materials else set())
-    return Core(start, step, frozenset(guides), init)
+    return Core(start, step, frozenset(guides), init, prepare=prepare)
 
 
 def _check_size(state: Hidden, noisy: jax.Array, size: tuple[int, ...]) -> None:
@@ -130,7 +138,7 @@ def _check_size(state: Hidden, noisy: jax.Array, size: tuple[int, ...]) -> None:
         )
 
 
-def _sound(states: Hidden) -> tuple[Hidden, jax.Array]:
+def _bound_hidden(states: Hidden) -> tuple[Hidden, jax.Array]:
     """The hidden states without values that would stay for ever, and how many of these there were.
 
     Rectifiers have no upper end, so nothing but training keeps a state small.

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn.denoiser import Params
-from jaxdn.methods.direct import beginning_grey
+from jaxdn.methods.direct import init_grey
 from jaxdn.ops.kernel_prediction.softmax import softmax_filter
 from jaxdn.ops.scales import compose_scales, downsample
 
@@ -37,8 +37,6 @@ class Choices(Protocol):
     def down(self) -> Literal["mean", "max"]: ...
     @property
     def up(self) -> Literal["bilinear", "nearest"]: ...
-    @property
-    def pyramid(self) -> Literal["mean", "max"]: ...
 
 
 def heads_of(prediction: Prediction, *, fine: bool) -> tuple[int, ...]:
@@ -55,7 +53,7 @@ def heads_of(prediction: Prediction, *, fine: bool) -> tuple[int, ...]:
     return (kernels + 1, TAPS + 1, TAPS) if fine else (kernels, TAPS + 1, TAPS + 1)
 
 
-def begin_blending(params: Params, prediction: Prediction, *, fine: bool) -> Params:
+def init_bias(params: Params, prediction: Prediction, *, fine: bool) -> Params:
     """The weights with biases of the heads for which the first images are those of a plausible filter.
 
     The current frame has the weight 0.12 and coarser scales 0.88, where unbiased heads would give one half: measured on
@@ -63,7 +61,7 @@ def begin_blending(params: Params, prediction: Prediction, *, fine: bool) -> Par
     below 0 it is black, and nothing is learnt.
     """
     if prediction == "direct":
-        return beginning_grey(params, "head_0")
+        return init_grey(params, "head_0")
     biases: list[tuple[str, int, float]] = []
     if prediction != "one-scale":
         seams = (("head_0", -1), ("head_1", -1)) if fine else (("head_1", -1), ("head_2", -1))
@@ -80,26 +78,26 @@ def blend(
     heads: list[jax.Array],
     guiding: list[jax.Array | None],
     noisy: jax.Array,
-    recalled: jax.Array,
+    history: jax.Array,
     absent: jax.Array,
 ) -> jax.Array:
-    """The kernels applied, and the scales and the history blended, in the domain of the images.
+    """The kernels applied, and the scales and the history blended.
 
     Args:
       options: of the method.
       heads: logits, see :func:`heads_of`.
       guiding: features of the prior at full, half and quarter resolution; None for plain kernels.
-      noisy: [H, W, 3], in the domain that kernels work on.
-      recalled: [H, W, 3] the warped history, in the same domain.
+      noisy: [H, W, 3].
+      history: [H, W, 3], warped.
       absent: bool [H, W, 1], there is no history.
     """
     full, temporal = heads[0], options.prediction == "temporal"
-    images = jnp.stack([noisy, recalled]) if temporal else noisy[None]
+    images = jnp.stack([noisy, history]) if temporal else noisy[None]
     finest, *past = softmax_filter(images, full, features=guiding[0])
     if options.prediction == "one-scale":
         return finest
-    half = downsample(noisy, down=options.pyramid)
-    scales = [half, downsample(half, down=options.pyramid)]
+    half = downsample(noisy)
+    scales = [half, downsample(half)]
     middle, composed = (
         softmax_filter(image[None], head, features=guide)[0]
         for image, head, guide in zip(scales, heads[1:], guiding[1:], strict=True)

@@ -1,15 +1,26 @@
-"""The one table of methods: what each denoising system is called, what its options are, how it is trained and run.
+"""The registry of methods: what each denoising system is called, what its options are, how it is trained and run.
 
-A new method is one new file in this package. It declares its options as a frozen dataclass and decorates the function
-that makes a denoiser of them with :func:`method`; the command line, training, comparisons, chart, benchmark, hard
-cases and documentation read the table and know no method by name.
+A method is a file. It declares its options as a frozen dataclass and decorates the function that makes a denoiser of
+them with :func:`method`; the command line, training, comparisons, chart, benchmark, hard cases and documentation read
+the registry and know no method by name.
+
+The file lies in this package, or in any other. Another package names its methods as entry points of the group
+:data:`ENTRY_POINTS` in its pyproject.toml, and they have their names as soon as it is installed::
+
+    [project.entry-points."jaxdn.methods"]
+    running_mean = "mypackage.denoisers:running_mean"
+
+Without an entry point a method is called ``mypackage.denoisers:running_mean`` wherever a name of a method is wanted.
 """
 
 import dataclasses
+import functools
 import importlib
 import inspect
 import pkgutil
+import warnings
 from collections.abc import Callable, Mapping
+from importlib import metadata
 from types import MappingProxyType
 from typing import Any
 
@@ -19,15 +30,18 @@ from jaxdn.networks.backends import BACKENDS, Purpose
 from jaxdn.ops.dispatch.operation import REFERENCE, default_implementation
 from jaxdn.recipes.recipe import Recipe
 
+ENTRY_POINTS = "jaxdn.methods"
+"""The group of entry points of installed packages."""
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """One row of the table."""
+    """One row of the registry."""
 
     name: str
-    """The factory's name in :mod:`jaxdn.denoisers`, and that of the method on the command line."""
+    """The factory's name in :mod:`jaxdn.denoisers`, and that of the method on the command line: of a method that was
+    loaded from another package by its address, ``module:name``."""
     title: str
     """What it is and who described it, in a line."""
     factory: Callable[..., Denoiser]
@@ -42,8 +56,6 @@ class Method:
     """Names of weights that are or may be shipped -> options, from the most accurate to the fastest."""
     backends: tuple[str, ...]
     """Values of its option ``implementation`` besides XLA: names in :data:`jaxdn.networks.backends.BACKENDS`."""
-    earlier: Mapping[str, Any]
-    """Options that weights without a record of them were trained with, where the default is another today."""
     filter: bool
     """It denoises without training: its params are ``{}``, or move its options (``learnable_options``)."""
 
@@ -68,7 +80,7 @@ class Method:
             raise ValueError(f"{self.name}: expected a variant out of {', '.join(self.variants)}, got {name!r}.")
         return self.variants[name]
 
-    def made(self, given: Mapping[str, Any]) -> Any:
+    def parse_options(self, given: Mapping[str, Any]) -> Any:
         """The checked options, an instance of :attr:`options`, from ``given`` ones, among them ``preset``.
 
         Raises ValueError for an unknown option, preset or value.
@@ -80,19 +92,19 @@ class Method:
             base = self.presets[chosen]
         return declared.make(self.options, given, method=self.name, base=base)
 
-    def knows(self, option: str) -> bool:
+    def has_option(self, option: str) -> bool:
         """Whether it has an option of that name."""
-        return any(each.name == option for each in dataclasses.fields(self.options))
+        return any(field.name == option for field in dataclasses.fields(self.options))
 
-    def backend(self, purpose: Purpose, options: Mapping[str, Any] = _NOTHING) -> str | None:
+    def backend(self, purpose: Purpose) -> str | None:
         """The backend that runs it fastest here, for the option ``implementation``; None is XLA.
 
         It is None too where :func:`jaxdn.implementation` or its environment variable asks for references.
         """
-        if options.get("compute_dtype") not in (None, "float32") or default_implementation() == REFERENCE:
+        if default_implementation() == REFERENCE:
             return None
-        fitting = (BACKENDS[name] for name in self.backends if BACKENDS[name].purpose == purpose)
-        return next((each.name for each in fitting if each.available() and each.faster()), None)
+        backends = (BACKENDS[name] for name in self.backends if BACKENDS[name].purpose == purpose)
+        return next((backend.name for backend in backends if backend.available() and backend.faster()), None)
 
 
 _METHODS: dict[str, Method] = {}
@@ -106,14 +118,13 @@ def method(
     recipes: Mapping[str, Recipe] = _NOTHING,
     variants: Mapping[str, Mapping[str, Any]] = _NOTHING,
     backends: tuple[str, ...] = (),
-    earlier: Mapping[str, Any] = _NOTHING,
     filter: bool | None = None,
 ) -> Callable[[Callable[[Any], Denoiser]], Callable[..., Denoiser]]:
-    """Decorator: enter ``build(options) -> Denoiser`` in the table and make it a factory ``(**options) -> Denoiser``.
+    """Decorator: enter ``build(options) -> Denoiser`` in the registry, as a factory ``(**options) -> Denoiser``.
 
     The factory checks what it is given (:func:`jaxdn.core.options.make`), and takes ``preset=`` where there are
     presets. The arguments are the columns of :class:`Method`; the function's name is the method's. Without recipes it
-    is a filter.
+    is a filter. Raises ValueError for the name of another module's method.
     """
     ready = not recipes if filter is None else filter
 
@@ -121,7 +132,7 @@ def method(
         name = build.__name__
 
         def factory(**given: Any) -> Denoiser:
-            return build(row.made(given))
+            return build(row.parse_options(given))
 
         factory.__name__ = factory.__qualname__ = name
         factory.__module__ = build.__module__
@@ -130,13 +141,16 @@ def method(
         factory.__doc__ = f"{inspect.cleandoc(build.__doc__ or title)}\n\nOptions:\n\n{listed}"
         keyword = inspect.Parameter.KEYWORD_ONLY
         signature = [
-            inspect.Parameter(each.name, keyword, default=each.default, annotation=each.type)
-            for each in dataclasses.fields(options)
+            inspect.Parameter(field.name, keyword, default=field.default, annotation=field.type)
+            for field in dataclasses.fields(options)
         ]
         if presets:
             signature.append(inspect.Parameter("preset", keyword, default=None, annotation=str | None))
         factory.__signature__ = inspect.Signature(signature, return_annotation=Denoiser)  # type: ignore[attr-defined]
-        row = Method(name, title, factory, options, presets, recipes, variants, backends, earlier, ready)
+        if name in _METHODS and _METHODS[name].factory.__module__ != build.__module__:
+            other = _METHODS[name].factory.__module__
+            raise ValueError(f"method {name!r} of {build.__module__}: expected a name of its own; {other} has it too.")
+        row = Method(name, title, factory, options, presets, recipes, variants, backends, ready)
         _METHODS[name] = row
         return factory
 
@@ -144,16 +158,61 @@ def method(
 
 
 def methods() -> dict[str, Method]:
-    """All methods by name, in alphabetical order: those of this package, and those that other modules have entered."""
+    """All methods by name, in alphabetical order: those of this package, of entry points, and others that are imported.
+
+    An installed package whose methods cannot be imported is left out, with a warning.
+    """
     package = importlib.import_module(__package__)
     for module in pkgutil.iter_modules(package.__path__):
         importlib.import_module(f"{__package__}.{module.name}")
+    for entry in _entry_points():
+        try:
+            entry.load()
+        except Exception as error:  # whatever another package does wrong must not stop the commands
+            warnings.warn(f"method {entry.name!r} ({entry.value}) cannot be imported: {error!r}", stacklevel=2)
     return dict(sorted(_METHODS.items()))
 
 
+@functools.cache
+def _entry_points() -> tuple[metadata.EntryPoint, ...]:
+    """Those of installed packages; the search takes some milliseconds."""
+    return tuple(metadata.entry_points(group=ENTRY_POINTS))
+
+
 def method_named(name: str) -> Method:
-    """One row. Raises ValueError, naming the methods there are."""
+    """One row, by its name or by the address ``module:name``.
+
+    Raises ValueError for an unknown name, naming the methods there are, and for an address without a method.
+    """
+    if ":" in name:
+        return _method_at(name)
     known = methods()
     if name not in known:
-        raise ValueError(f"method {name!r}: expected one of {', '.join(known)}.")
+        raise ValueError(f"method {name!r}: expected one of {', '.join(known)}, or an address package.module:name.")
     return known[name]
+
+
+def is_method(name: str) -> bool:
+    """Whether :func:`method_named` knows a name; every address counts as one."""
+    return ":" in name or name in methods()
+
+
+def _method_at(address: str) -> Method:
+    """The method of an address; its row has the address as name, so that weights tell where the method is from."""
+    module, _, name = address.partition(":")
+    methods()  # before the module is imported, so that it is the one to be told that a name is taken
+    try:
+        factory = getattr(importlib.import_module(module), name, None)
+    except (ImportError, ValueError) as error:
+        raise ValueError(
+            f"method {address!r}: expected a module that can be imported, got {error}; install its package, or put its "
+            "folder on PYTHONPATH."
+        ) from error
+    for row in _METHODS.values():
+        if factory is not None and row.factory is factory:
+            named = module.startswith(f"{__package__}.") or any(entry.value == address for entry in _entry_points())
+            return row if named else dataclasses.replace(row, name=address)
+    raise ValueError(
+        f"method {address!r}: expected a function of {module} that jaxdn.methods.registry.method decorates, got "
+        f"{factory!r}."
+    )

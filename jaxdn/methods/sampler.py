@@ -63,12 +63,12 @@ def sampler(options: Sampling, groups: Sequence[int], *, size: str | Widths, imp
         present = next(group for group in features if group is not None)
         batch = [None if group is None else pad(group)[None] for group in features]
         logits = crop(network.apply(params, batch)[0][0], (present.shape[0], present.shape[1])).astype(present.dtype)
-        return mapped(options, jnp.where(even, 0.0, logits), most)
+        return allocate_samples(options, jnp.where(even, 0.0, logits), most)
 
     return Sampler(network.init, counts)
 
 
-def mapped(options: Sampling, logits: jax.Array, most: int) -> jax.Array:
+def allocate_samples(options: Sampling, logits: jax.Array, most: int) -> jax.Array:
     """The numbers of samples [H, W, 1] for logits [H, W, 1]."""
     counts = sample_map(logits, options.budget, least=options.least, most=most, rounding=options.rounding)
     # The image's slope by its number of samples is that of mixing; if noise falls as 1 / sqrt(s), it is half of it.

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxdn.core.frame import Array, Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
+from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.accumulation import accumulate
 from jaxdn.filters.atrous import B3_SPLINE, stencil
 from jaxdn.filters.cascade import cascade
@@ -30,7 +30,14 @@ from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, guides_of, surface_mask
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.methods.demodulation import Demodulation, demodulated, texture_left
-from jaxdn.methods.learnable_options import FITTING, LEARNED, LEARNED_PER_LEVEL, at_level, moved, unmoved
+from jaxdn.methods.learnable_options import (
+    FITTING,
+    LEARNABLE,
+    LEARNABLE_PER_LEVEL,
+    apply_offsets,
+    at_level,
+    zero_offsets,
+)
 from jaxdn.methods.registry import method
 
 READS = frozenset({"normal", "depth", "previous_depth", "motion", "ids"})
@@ -43,16 +50,16 @@ _SHARE = Range(0, 1, without_low=True)
 class Options:
     """The parameters, with the paper's defaults where it gives them, except for ``sigma_normal``."""
 
-    alpha: Annotated[float, _SHARE, LEARNED] = 0.2
+    alpha: Annotated[float, _SHARE, LEARNABLE] = 0.2
     """Minimum weight of the new frame in colour; the weight is ``max(alpha, 1 / N)`` at history length N."""
-    alpha_moments: Annotated[float, _SHARE, LEARNED] = 0.2
+    alpha_moments: Annotated[float, _SHARE, LEARNABLE] = 0.2
     """The same for the moments of luminance."""
-    sigma_depth: Annotated[float, _POSITIVE, LEARNED_PER_LEVEL] = 1.0
+    sigma_depth: Annotated[float, _POSITIVE, LEARNABLE_PER_LEVEL] = 1.0
     """Edge-stopping parameter for differences in depth."""
-    sigma_normal: Annotated[float, Range(0), LEARNED_PER_LEVEL] = 16.0
+    sigma_normal: Annotated[float, Range(0), LEARNABLE_PER_LEVEL] = 16.0
     """Exponent of the cosine of normals. The paper's 128 (``preset="paper"``) keeps light of one curved or bumpy
     surface apart: at 1 sample per pixel 16 has 1.6 dB more on held-out clips."""
-    sigma_luminance: Annotated[float, _POSITIVE, LEARNED_PER_LEVEL] = 4.0
+    sigma_luminance: Annotated[float, _POSITIVE, LEARNABLE_PER_LEVEL] = 4.0
     """Edge-stopping parameter for differences in luminance, in standard deviations."""
     levels: Annotated[int, Range(0, 10)] = 5
     """Levels of the a-trous filter."""
@@ -66,7 +73,7 @@ class Options:
     """Allowed relative difference of a history tap from the expected depth, in addition to the slope term."""
     normal_threshold: float = 0.9
     """A history tap is accepted above this cosine of normals."""
-    demodulate: Demodulation | bool = "brdf"
+    demodulate: Demodulation = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
 
     def __post_init__(self) -> None:
@@ -104,24 +111,21 @@ def svgf(options: Options) -> Denoiser:
     """
 
     def step(
-        params: Params, state: SvgfState, frame: Frame, first: jax.Array, whole: FrameStatistics
+        params: Params, state: SvgfState, frame: Frame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[SvgfState, jax.Array, jax.Array]:
-        fitted = moved(options, params)
-        past, invalid = recall_history(fitted, state, frame, first)
+        fitted = apply_offsets(options, params)
+        past, invalid = reproject_history(fitted, state, frame, first)
         history = blend(fitted, past, frame.radiance.transpose(2, 0, 1))
-        return (*filter_history(fitted, history, frame, whole), invalid)
-
-    def measure(frame: Frame) -> FrameStatistics:
-        return measure_frame(frame.radiance, None, frame)
+        return (*filter_history(fitted, history, frame, statistics), invalid)
 
     def init(key: jax.Array, frame: Frame) -> Params:
-        return unmoved(options)
+        return zero_offsets(options)
 
-    plain = recurrent(Core(start, step, READS, init, measure=measure, reach=_reach(options)))
-    return demodulated(plain, by=options.demodulate)
+    core = Core(start, step, READS, init, receptive_field=_receptive_field(options))
+    return demodulated(recurrent(core), by=options.demodulate)
 
 
-def _reach(options: Options) -> int:
+def _receptive_field(options: Options) -> int:
     """That of the levels, each with its blur of the variance, of 7x7 pixels and those beside them, and of slopes."""
     return 2 * (2**options.levels - 1) + options.levels + 6
 
@@ -132,7 +136,9 @@ def start(params: Params, frame: Frame) -> SvgfState:
     return SvgfState(nothing, jax.tree.map(jnp.zeros_like, guides_of(frame)))
 
 
-def recall_history(options: Options, state: SvgfState, frame: Frame, first: jax.Array) -> tuple[jax.Array, jax.Array]:
+def reproject_history(
+    options: Options, state: SvgfState, frame: Frame, first: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """The fetched history [6, H, W], 0 where missing; the number of invalid history pixels."""
     found = reproject(
         state.history,
@@ -159,11 +165,11 @@ def blend(options: Options, past: jax.Array, now: jax.Array, change: jax.Array |
 
 
 def surface_weights(
-    options: Options, depth: Array, normal: Array, ids: Array, level: Any = 0, height: jax.Array | None = None
+    options: Options, depth: Array, normal: Array, ids: Array, height: jax.Array | float, level: Any = 0
 ) -> list[Weight]:
     """The edge-stopping weights of depth [H, W, 1] and normals [H, W, 3] at one level, as far as present.
 
-    ``height`` is that of the frame that they are a part of.
+    ``height`` is H of the whole frame, of which they may be a tile.
     """
     weights: list[Weight] = []
     if depth is not None:
@@ -174,19 +180,15 @@ def surface_weights(
 
 
 def filter_history(
-    options: Options, history: jax.Array, frame: Frame, whole: FrameStatistics | None = None
+    options: Options, history: jax.Array, frame: Frame, statistics: FrameStatistics
 ) -> tuple[SvgfState, jax.Array]:
-    """The state after a frame and its image [H, W, 3], from the blended history [6, H, W].
-
-    ``whole`` is what was measured of the frame that this one is a part of.
-    """
+    """The state after a frame and its image [H, W, 3], from the blended history [6, H, W]."""
     hit = surface_mask(frame.depth, frame.ids)
-    texture = texture_left(frame, options.demodulate, whole)
+    texture = texture_left(frame, options.demodulate, statistics)
     texture = None if texture is None else texture.transpose(2, 0, 1)
 
     def weights(level: Any) -> list[Weight]:
-        height = None if whole is None else whole.height
-        return surface_weights(options, frame.depth, frame.normal, frame.ids, level, height)
+        return surface_weights(options, frame.depth, frame.normal, frame.ids, statistics.height, level)
 
     color, variance = estimate_variance(history, hit, weights(0), short_history=options.short_history, texture=texture)
     image, feedback = cascade(

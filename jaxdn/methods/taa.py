@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.core.options import Range
-from jaxdn.denoiser import Core, Denoiser, Params, RecurrentStep, State, recurrent
+from jaxdn.denoiser import Core, Denoiser, Params, Prepared, State, core_of, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.catmull_rom import warp_cubic
 from jaxdn.filters.neighbourhood import (
@@ -54,12 +54,6 @@ class Options:
     sharpening: Annotated[float, Range(0, 1)] = 0.0
     """How much of the difference from the 3x3 mean is added to the image, but not to the history."""
 
-    def __post_init__(self) -> None:
-        if self.after is not None and not isinstance(self.after.step, RecurrentStep):
-            raise ValueError(
-                "taa after: expected a denoiser made by jaxdn.denoiser.recurrent, got another; make it so."
-            )
-
 
 class TaaState(NamedTuple):
     """What is carried from one frame to the next."""
@@ -76,43 +70,52 @@ def taa(options: Options) -> Denoiser:
 
     Reads motion and depth, besides what the denoiser before reads. Without depth, edges do not take over the motion of
     the thing in front; without motion the image is taken to stand still.
-    Raises ValueError for options out of range, for a denoiser that :func:`jaxdn.denoiser.recurrent` did not make, and
-    for radiance that is not [H, W, 3].
+    Raises ValueError for options out of range and for radiance that is not [H, W, 3].
     """
-    before = Core(lambda params, frame: (), _noisy, frozenset(), reach=0)
+    before = Core(_start_noisy, _step_noisy, frozenset(), receptive_field=0)
     if options.after is not None:
-        assert isinstance(options.after.step, RecurrentStep)
-        before = options.after.step.core
+        before = core_of(options.after)
 
     def start(params: Params, frame: Frame) -> TaaState:
         nothing = jnp.zeros((*frame.radiance.shape[:2], 4), frame.radiance.dtype)
         return TaaState(before.start(params, frame), nothing)
 
+    def prepare(frame: Frame) -> tuple[FrameStatistics, tuple[Prepared, Frame]]:
+        statistics, prepared = before.prepare(frame)
+        return statistics, (prepared, frame)
+
     def step(
-        params: Params, state: TaaState, frame: Frame, first: jax.Array, *whole: FrameStatistics
+        params: Params, state: TaaState, prepared: tuple[Prepared, Frame], first: jax.Array, statistics: FrameStatistics
     ) -> tuple[TaaState, jax.Array, jax.Array | int]:
-        inner, image, lost = before.step(params, state.after, frame, first, *whole)
+        given, frame = prepared
+        inner, image, inner_invalid = before.step(params, state.after, given, first, statistics)
         image = jnp.clip(image, 0.0, RADIANCE_MAX)
         history, invalid = resolve(options, image, state.history, frame, first)
-        kept = history[..., :3]
-        return TaaState(inner, history), sharpened(kept, options.sharpening), lost + invalid
+        return TaaState(inner, history), sharpen(history[..., :3], options.sharpening), inner_invalid + invalid
 
     samples = None
     if before.samples is not None:
-        ask = before.samples
+        request = before.samples
 
         def samples(params: Params, state: TaaState, frame: Frame, first: jax.Array, most: int) -> jax.Array:
-            return ask(params, state.after, frame, first, most)
+            return request(params, state.after, frame, first, most)
 
-    reach = None if before.reach is None else before.reach + _REACH
-    return recurrent(Core(start, step, before.reads | READS, before.init, samples, before.measure, reach))
+    field = None if before.receptive_field is None else before.receptive_field + _RECEPTIVE_FIELD
+    mask = before.requires_validity_mask
+    return recurrent(Core(start, step, before.reads | READS, before.init, samples, prepare, field, mask))
 
 
-_REACH = 4
+_RECEPTIVE_FIELD = 4
 """That of the 3x3 pixels whose motion and colours count, and of the cubic interpolation."""
 
 
-def _noisy(params: Params, state: State, frame: Frame, first: jax.Array) -> tuple[State, jax.Array, int]:
+def _start_noisy(params: Params, frame: Frame) -> tuple[()]:
+    return ()
+
+
+def _step_noisy(
+    params: Params, state: State, frame: Frame, first: jax.Array, statistics: FrameStatistics
+) -> tuple[State, jax.Array, int]:
     return state, frame.radiance, 0
 
 
@@ -138,7 +141,7 @@ def resolve(
     return jnp.concatenate([share * image + (1.0 - share) * clipped, length], axis=-1), invalid
 
 
-def sharpened(image: jax.Array, strength: float) -> jax.Array:
+def sharpen(image: jax.Array, strength: float) -> jax.Array:
     """``image + strength (image - its 3x3 mean)``, within the extremes of the 3x3 neighbourhood: no halos."""
     if not strength:
         return image

@@ -29,6 +29,7 @@ from jaxdn import brdf
 from jaxdn.core.frame import Array, Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.denoiser.statistics import FrameStatistics, count_reflectance_differs
 from jaxdn.filters.accumulation import after_shift, luminance
 from jaxdn.filters.atrous import GAUSSIAN, stencil
 from jaxdn.filters.cascade import cascade
@@ -39,8 +40,8 @@ from jaxdn.filters.surface_test import Guides, expect_surface, guides_of, keep_s
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.methods import svgf
 from jaxdn.methods.demodulation import Demodulation
-from jaxdn.methods.learnable_options import FITTING, LEARNED, at_level, moved, unmoved
-from jaxdn.methods.lobes import Light, apart, reflectances
+from jaxdn.methods.learnable_options import FITTING, LEARNABLE, apply_offsets, at_level, zero_offsets
+from jaxdn.methods.lobes import DemodulatedLight, reflectances, split_signals
 from jaxdn.methods.registry import method
 
 READS = svgf.READS | {
@@ -58,15 +59,15 @@ _DARK = 1e-6
 class Options(svgf.Options):
     """The options of ``svgf``, and those of specular light."""
 
-    clamp_sigma: Annotated[float, Range(0, without_low=True), LEARNED] = 1.0
+    clamp_sigma: Annotated[float, Range(0, without_low=True), LEARNABLE] = 1.0
     """The history's share of shadows may be this many standard deviations from the mean of the frame's own over 5x5
     pixels: where none of them is shadowed, none has been."""
-    sigma_specular: Annotated[float, Range(0, without_low=True), LEARNED] = 2.0
+    sigma_specular: Annotated[float, Range(0, without_low=True), LEARNABLE] = 2.0
     """Edge-stopping parameter for differences in luminance, in standard deviations, of specular light: it has the
     textures and edges of what is reflected, which no buffer shows."""
-    lobe_fraction: Annotated[float, Range(0, without_low=True), LEARNED] = 2.0
+    lobe_fraction: Annotated[float, Range(0, without_low=True), LEARNABLE] = 2.0
     """For specular light, normals may differ by this fraction of the lobe's angle."""
-    roughness_fraction: Annotated[float, Range(0, without_low=True), LEARNED] = 1.0
+    roughness_fraction: Annotated[float, Range(0, without_low=True), LEARNABLE] = 1.0
     """For specular light, roughness may differ by this fraction."""
     demodulate: Demodulation = "brdf"
     """What light is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`; diffuse and specular
@@ -93,9 +94,9 @@ class _Parts(NamedTuple):
     rest: jax.Array
     shadowed: jax.Array | None
     unshadowed: jax.Array | None
-    diffuse: Light
+    diffuse: DemodulatedLight
     """All but specular light, with its divisor."""
-    shine: Light | None
+    shine: DemodulatedLight | None
     """Specular light."""
 
 
@@ -124,16 +125,18 @@ def trmv(given: Options) -> Denoiser:
         return TrmvState(nothing(9 if lit else 6), nothing(9) if lit else None, nothing(6) if shines else None, guides)
 
     def step(
-        params: Params, state: TrmvState, frame: Frame, first: jax.Array
+        params: Params, state: TrmvState, frame: Frame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[TrmvState, jax.Array, jax.Array]:
-        options = moved(given, params)
-        parts = _split(frame, options.demodulate)
+        options = apply_offsets(given, params)
+        parts = _split(frame, options.demodulate, statistics)
         state = _fitting(state, start(params, frame))
         along = frame.motion if frame.dual_motion is None else frame.dual_motion
         past, invalid = _recalled(options, state.rest, state.guides, frame, along, first)
         diffuse = frame._replace(radiance=parts.rest.transpose(1, 2, 0), reflectance=reflectances(frame)[0])
         # As in a wrapper by `demodulated`: the light is divided, and the reflectance is what it was divided by.
-        kept, image = svgf.filter_history(options, svgf.blend(options, past[:6], parts.rest), diffuse)
+        differs = jnp.asarray(count_reflectance_differs(diffuse), statistics.reflectance_differs.dtype)
+        of_diffuse = statistics._replace(reflectance_differs=differs)
+        kept, image = svgf.filter_history(options, svgf.blend(options, past[:6], parts.rest), diffuse, of_diffuse)
         rest, shadows, specular = kept.history, None, None
         hit = surface_mask(frame.depth, frame.ids)
 
@@ -141,27 +144,29 @@ def trmv(given: Options) -> Denoiser:
             free = _mean(options, past[6:], parts.unshadowed, past[_LENGTH])
             along = frame.motion if frame.shadow_motion is None else frame.shadow_motion
             past, lost = _recalled(options, state.shadows, state.guides, frame, along, first, any_surface=True)
-            shadows, lit = _shaded(options, past, parts, free, frame, hit)
+            shadows, lit = _shaded(options, past, parts, free, frame, hit, statistics.height)
             rest = jnp.concatenate([rest, free.transpose(1, 2, 0)], axis=-1)
             image, invalid = image + lit, invalid + lost
-        image = parts.diffuse.whole(image.transpose(2, 0, 1))
+        image = parts.diffuse.remodulate(image.transpose(2, 0, 1))
 
         if parts.shine is not None and state.specular is not None:
             along = frame.motion if frame.glossy_motion is None else frame.glossy_motion
             past, lost = _recalled(options, state.specular, state.guides, frame, along, first)
             history = svgf.blend(options, past, parts.shine.light)
-            image = image + parts.shine.whole(_mirrored(options, history, parts.shine.texture, frame, hit))
+            image = image + parts.shine.remodulate(
+                _mirrored(options, history, parts.shine.texture, frame, hit, statistics.height)
+            )
             specular = history.transpose(1, 2, 0)
             invalid = invalid + lost
         if hit is not None:
             image = jnp.where(hit[..., None], image, frame.radiance)
         return TrmvState(rest, shadows, specular, guides_of(frame)), image, invalid
 
-    return recurrent(Core(start, step, READS, lambda key, frame: unmoved(given)))
+    return recurrent(Core(start, step, READS, lambda key, frame: zero_offsets(given)))
 
 
-def _split(frame: Frame, by: Demodulation) -> _Parts:
-    diffuse, specular = apart(frame, by)
+def _split(frame: Frame, by: Demodulation, statistics: FrameStatistics) -> _Parts:
+    diffuse, specular = split_signals(frame, by, statistics)
     if frame.shadowed is None:
         return _Parts(diffuse.light, None, None, diffuse, specular)
 
@@ -227,6 +232,7 @@ def _shaded(
     free: jax.Array,
     frame: Frame,
     hit: jax.Array | None,
+    height: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """The history [H, W, 9] of shadows, and direct light [H, W, 3].
 
@@ -241,7 +247,7 @@ def _shaded(
     texture = parts.diffuse.texture
 
     def weights(level: Any) -> list[Weight]:
-        return svgf.surface_weights(options, frame.depth, frame.normal, frame.ids, level)
+        return svgf.surface_weights(options, frame.depth, frame.normal, frame.ids, height, level)
 
     def estimated(light: jax.Array) -> tuple[jax.Array, jax.Array]:
         planes = history.at[:3].set(light)
@@ -276,16 +282,21 @@ def _share(lit: jax.Array, free: jax.Array) -> jax.Array:
 
 
 def _mirrored(
-    options: Options, history: jax.Array, texture: jax.Array | None, frame: Frame, hit: jax.Array | None
+    options: Options,
+    history: jax.Array,
+    texture: jax.Array | None,
+    frame: Frame,
+    hit: jax.Array | None,
+    height: jax.Array,
 ) -> jax.Array:
     """Specular light [3, H, W], from its history [6, H, W].
 
     What is reflected has colours that no division removes: differences of channels stop the filter as those of
     luminance do.
     """
-    first = _lobe_weights(options, frame, 0)
+    first = _lobe_weights(options, frame, height, 0)
     short = options.short_history
-    color, variance = estimate_variance(history, hit, first, short_history=short, texture=texture, beside=False)
+    color, variance = estimate_variance(history, hit, first, short_history=short, texture=texture, isolated=False)
     deviation = jnp.sqrt(jnp.maximum(variance, 1e-10))
     hues = [luminance_weight(color[one] - color[1], deviation, sigma=options.sigma_specular) for one in (0, 2)]
     return _filtered(
@@ -293,13 +304,13 @@ def _mirrored(
         color,
         variance,
         hit,
-        lambda level: [*_lobe_weights(options, frame, level), *hues],
+        lambda level: [*_lobe_weights(options, frame, height, level), *hues],
         options.sigma_specular,
         texture,
     )
 
 
-def _lobe_weights(options: Options, frame: Frame, level: Any) -> list[Weight]:
+def _lobe_weights(options: Options, frame: Frame, height: jax.Array, level: Any) -> list[Weight]:
     """The edge-stopping weights of specular light; without roughness its lobes are as wide as diffuse ones."""
     weights: list[Weight] = []
     size = frame.radiance.shape[:2]
@@ -307,7 +318,8 @@ def _lobe_weights(options: Options, frame: Frame, level: Any) -> list[Weight]:
     if frame.roughness is not None:
         weights.append(roughness_weight(rough, fraction=options.roughness_fraction))
     if frame.depth is not None:
-        weights.append(depth_weight(frame.depth, frame.ids, sigma=at_level(options.sigma_depth, level)))
+        sigma = at_level(options.sigma_depth, level)
+        weights.append(depth_weight(frame.depth, frame.ids, sigma=sigma, height=height))
     if frame.normal is not None:
         weights.append(lobe_weight(frame.normal, rough, fraction=options.lobe_fraction))
     return weights

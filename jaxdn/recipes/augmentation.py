@@ -14,8 +14,8 @@ from jaxdn.core.frame import BUFFERS, RADIANCE_MAX, Clip, present, written_out
 from jaxdn.core.options import Range, check
 
 
-class Variation(NamedTuple):
-    """How far an element may be varied; ``STILL`` is no variation."""
+class Augmentation(NamedTuple):
+    """How far an element may be varied; ``NO_AUGMENTATION`` is no variation."""
 
     level: bool = True
     """All light is first brought to the same brightness, 0.18 in the geometric mean over the reference's blocks of
@@ -39,10 +39,10 @@ class Variation(NamedTuple):
 
     def check(self) -> None:
         """Raise ValueError, naming the field and what is allowed, for a value out of range."""
-        check(self._asdict(), get_type_hints(Variation, include_extras=True), of="variation")
+        check(self._asdict(), get_type_hints(Augmentation, include_extras=True), of="variation")
 
 
-STILL = Variation(False, 1.0, 1.0, False, False, 0.0, 0.0, 0.0)
+NO_AUGMENTATION = Augmentation(False, 1.0, 1.0, False, False, 0.0, 0.0, 0.0)
 
 GROUPS = (
     ("albedo", "reflectance", "specular_reflectance"),
@@ -54,7 +54,7 @@ GROUPS = (
 """Buffers that a renderer writes together or not at all."""
 
 
-def varied(clip: Clip, variation: Variation, rng: np.random.Generator) -> Clip:
+def augment_clip(clip: Clip, variation: Augmentation, rng: np.random.Generator) -> Clip:
     """The clip (NumPy arrays ``[T, H, W, C]``) with everything but ``beauty`` drawn from ``rng``.
 
     All its frames are varied alike, but for a shadow that crosses them. An absent buffer has its neutral value, which

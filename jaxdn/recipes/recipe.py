@@ -3,7 +3,7 @@
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
 from jaxdn.core.options import Range, check
-from jaxdn.recipes.augmentation import Variation
+from jaxdn.recipes.augmentation import Augmentation
 from jaxdn.recipes.objectives import Objective, pyramid_illumination
 
 
@@ -30,7 +30,7 @@ class Recipe(NamedTuple):
     rest of the newest. 0 keeps the newest."""
     spp: tuple[Annotated[int, Range(1)], ...] = (1,)
     """Samples per pixel of the noisy input; of several numbers, each element of a batch has one at random."""
-    variation: Variation = Variation()
+    variation: Augmentation = Augmentation()
     """What each element is varied by."""
     seed: Annotated[int, Range(0)] = 0
 
@@ -53,7 +53,7 @@ FINISH = Recipe(
     crop=128,
     average=0.995,
     spp=(1, 1, 1, 2, 4, 16),
-    variation=Variation(shadow=0.2),
+    variation=Augmentation(shadow=0.2),
 )
 """For weights that have been trained: whole clips, in which the widest filters have something to reach for; and
 light that changes, so that histories are given up as fast."""

@@ -103,7 +103,7 @@ def _filter(frame: Frame, beauty: jax.Array, light: jax.Array) -> jax.Array:
     hit = surface_mask(frame.depth, frame.ids)
     weights = [_color_weight(beauty)]
     if frame.depth is not None:
-        weights.append(depth_weight(frame.depth, frame.ids, sigma=_SIGMA_DEPTH))
+        weights.append(depth_weight(frame.depth, frame.ids, sigma=_SIGMA_DEPTH, height=frame.depth.shape[0]))
     if frame.normal is not None:
         weights.append(normal_weight(frame.normal, sigma=_SIGMA_NORMAL))
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxdn.core.frame import Frame
 from jaxdn.data.clip.frames import StoredFrame
 from jaxdn.data.exr.exr import to_half
-from jaxdn.filters.time_reversal import Seen, seen
+from jaxdn.filters.time_reversal import HistoryLength, update_history_length
 from jaxdn.filters.time_reversal import blend as blend_directions
 
 
@@ -19,7 +19,7 @@ class BackwardImages:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._seen: Seen | None = None
+        self._seen: HistoryLength | None = None
 
     def keep(self, index: int, image: np.ndarray, number: np.ndarray) -> None:
         """Store the image [H, W, 3] of a frame and for how many frames its points have been seen, [H, W, 1]."""
@@ -30,7 +30,7 @@ class BackwardImages:
 
         To be called for every frame in order; a frame that was not kept only counts as seen.
         """
-        self._seen = seen(self._seen, frame)
+        self._seen = update_history_length(self._seen, frame)
         file = self._file(index)
         if not file.is_file():
             return image
@@ -55,7 +55,7 @@ def backward_pass(
     ends. The memory is that of one frame.
 
     Args:
-      frames: indices and frames, with time turned around (:func:`jaxdn.filters.time_reversal.turned`).
+      frames: indices and frames, with time turned around (:func:`jaxdn.filters.time_reversal.reverse_time`).
       denoise: the image [H, W, 3] of each frame.
       wanted: indices of the frames whose images are kept; the others are for the history.
       folder: created if it is missing.
@@ -63,10 +63,10 @@ def backward_pass(
     folder.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=".backwards-", dir=folder) as place:
         images = BackwardImages(Path(place))
-        state: Seen | None = None
+        state: HistoryLength | None = None
         for index, stored in frames:
             image = denoise(stored)
-            state = seen(state, stored.frame)
+            state = update_history_length(state, stored.frame)
             if index in wanted:
                 images.keep(index, image, np.asarray(state.number))
         yield images

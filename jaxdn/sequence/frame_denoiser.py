@@ -15,7 +15,7 @@ from jaxdn.denoiser.sanitize import sanitize_image
 from jaxdn.denoiser.tiles import TiledStream, map_tiles, stream_tiled
 from jaxdn.sequence.james_stein import REACH, Confidence, JamesStein, combine, measure_confidence
 from jaxdn.sequence.memory_budget import GIB, choose_tile_side, estimate_bytes, measure_machine_memory
-from jaxdn.zoo.ready import Candidate
+from jaxdn.zoo.ready import Model
 
 _combine = jax.jit(combine, static_argnames="texture_unknown")
 _measure_confidence = jax.jit(measure_confidence)
@@ -39,7 +39,7 @@ class FrameDenoiser:
 
     def __init__(
         self,
-        method: Candidate,
+        method: Model,
         source: Path,
         *,
         channels: Callable[[], int],
@@ -104,7 +104,7 @@ class FrameDenoiser:
             (noisy, image),
             image.shape[:2],
             side=self._step.side,
-            margin=REACH,
+            halo=REACH,
         )
         return combined
 

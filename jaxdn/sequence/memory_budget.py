@@ -31,9 +31,9 @@ def estimate_bytes(height: int, width: int, channels: int) -> float:
 
 
 def choose_tile_side(limit: float, height: int, width: int, channels: int) -> int | None:
-    """The side of square windows with which frames are denoised within ``limit`` bytes; None: whole frames fit.
+    """The side of square tiles with which frames are denoised within ``limit`` bytes; None: whole frames fit.
 
-    It is 0 where even what windows leave out does not fit.
+    It is 0 where even what tiles leave out does not fit.
     """
     if estimate_bytes(height, width, channels) <= limit:
         return None

@@ -19,7 +19,7 @@ from jaxdn.sequence.frame_denoiser import light_of
 from jaxdn.sequence.render_jobs import plan_clip
 from jaxdn.sequence.run import Written
 from jaxdn.sequence.write_frames import name_channels, write_preview
-from jaxdn.zoo.ready import Candidate
+from jaxdn.zoo.ready import Model
 
 MOST = 64
 """Samples that one pixel may have, in budgets; at least this many."""
@@ -42,7 +42,7 @@ def denoise_scene(
     source: str,
     animation: Path | None,
     out: Path,
-    method: Candidate,
+    method: Model,
     settings: SceneSettings,
     *,
     on_frame: Callable[[Path, int, int], None] = lambda path, done, total: None,

@@ -10,7 +10,7 @@ from jaxdn.core.frame import OF_SAMPLES
 from jaxdn.data.clip.folder import begun_record
 from jaxdn.denoiser import Denoiser
 from jaxdn.effects import Effects, Plan, choose_all_effects, choose_effects, inspect, plan
-from jaxdn.methods.registry import methods
+from jaxdn.methods.registry import is_method, method_named
 from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES, THROUGH_CENTRES
 from jaxdn.planning.plan import SCORED
 from jaxdn.render.families import FAMILIES
@@ -21,7 +21,7 @@ from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.scenes.scene_file import SceneFile
 from jaxdn.render.settings import RenderSettings
 from jaxdn.render.worker_pool import ClipJob, render_clips
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 
 
 class PlannedClip(NamedTuple):
@@ -39,10 +39,13 @@ def find_denoiser(names: str) -> Denoiser | None:
     Of several names, separated by commas, it is the first, with all buffers that one of them reads. The weights do not
     matter here, so a learned method needs none. Raises ValueError for any other name.
     """
-    known = methods()
-    each = [known[name].factory() if name in known else candidate(name).denoiser for name in names.split(",")]
-    found = [one for one in each if one is not None]
-    return found[0]._replace(reads=frozenset[str]().union(*(one.reads for one in found))) if found else None
+    denoisers = []
+    for name in names.split(","):
+        by_name = is_method(name) and not name.endswith(".safetensors")
+        denoiser = method_named(name).factory() if by_name else find_model(name).denoiser
+        denoisers += [] if denoiser is None else [denoiser]
+    reads = frozenset[str]().union(*(denoiser.reads for denoiser in denoisers))
+    return denoisers[0]._replace(reads=reads) if denoisers else None
 
 
 def plan_clip(

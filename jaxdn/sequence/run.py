@@ -9,7 +9,7 @@ from jaxdn.sequence.frame_denoiser import FrameDenoiser
 from jaxdn.sequence.jobs import Job, find_jobs
 from jaxdn.sequence.segment import denoise_segment
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import Candidate, candidate
+from jaxdn.zoo.ready import Model, find_model
 
 
 class Written(NamedTuple):
@@ -22,29 +22,29 @@ class Written(NamedTuple):
     """Invalid values (NaN, infinite, negative ...) of frames and histories that were replaced."""
 
 
-def select_backend(name: str, implementation: str = "auto", **options: Any) -> tuple[Candidate, str]:
+def select_backend(name: str, implementation: str = "auto", **options: Any) -> tuple[Model, str]:
     """The candidate of that name on a backend, and the backend's name; "reference" is XLA.
 
-    ``options`` are given to it (:func:`jaxdn.zoo.ready.candidate`). ``"auto"`` is the fastest backend for inference
+    ``options`` are given to it (:func:`jaxdn.zoo.ready.find_model`). ``"auto"`` is the fastest backend for inference
     that the method has and that can run here. Raises ValueError for a name that is not a method, and for a backend that
     cannot run it.
     """
-    found = candidate(name, **options)
-    known = found.method is not None and found.method.knows("implementation")
+    found = find_model(name, **options)
+    known = found.method is not None and found.method.has_option("implementation")
     if implementation == "auto":
         backend = found.backend("inference")
         if backend is None:
             return found, "reference"
-        return candidate(name, implementation=backend, **options), backend
+        return find_model(name, implementation=backend, **options), backend
     if implementation == "reference" and not known:
         return found, implementation
-    return candidate(name, implementation=implementation, **options), implementation
+    return find_model(name, implementation=implementation, **options), implementation
 
 
 def denoise_files(
     sources: Sequence[Path],
     out: Path,
-    method: Candidate,
+    method: Model,
     settings: Settings = Settings(),  # noqa: B008, immutable
     *,
     on_job: Callable[[Job], object] = lambda job: None,

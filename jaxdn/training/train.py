@@ -51,7 +51,7 @@ def train(
     if time_limit is not None and not time_limit > 0:
         raise ValueError(f"time limit: expected more than 0, got {time_limit:g} s; leave it out for no limit.")
     label = out.name if label is None else label
-    backend = method.backend("training", options) if implementation == "auto" else implementation
+    backend = method.backend("training") if implementation == "auto" else implementation
     if backend not in (None, "reference"):
         denoiser = method.factory(**{**options, "implementation": backend})
         print(f"{label}: convolutions run on {backend}", flush=True)

@@ -1,4 +1,4 @@
-"""Denoisers that are ready to run: filters, shipped weights, weights in a file, and the noisy image itself.
+"""The model zoo: denoisers that are ready to run. Filters, shipped weights, weights in a file, the noisy image.
 
 The command line, comparisons, the chart, long runs and the hard cases look up names of methods here.
 """
@@ -12,18 +12,18 @@ import jax.numpy as jnp
 
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Denoiser, Params
-from jaxdn.methods.registry import Method, method_named, methods
+from jaxdn.methods.registry import Method, is_method, method_named, methods
 from jaxdn.networks.backends import Purpose
 from jaxdn.zoo.weights import describe, load_weights, shipped_names
 
 NOISY = "noisy"
 """The name of the noisy image itself."""
 
-OURS = "steady-balanced"
+DEFAULT_MODEL = "steady-balanced"
 """The shipped weights that reports open on: those that `jaxdn denoise` uses."""
 
 
-class Candidate(NamedTuple):
+class Model(NamedTuple):
     """A denoiser that is ready to run."""
 
     label: str
@@ -38,11 +38,13 @@ class Candidate(NamedTuple):
 
     def backend(self, purpose: Purpose = "inference") -> str | None:
         """The backend that runs it fastest here (:meth:`jaxdn.methods.registry.Method.backend`); None is XLA."""
-        return None if self.method is None else self.method.backend(purpose, self.options)
+        return None if self.method is None else self.method.backend(purpose)
 
 
-def candidate(name: str, **options: Any) -> Candidate:
+def find_model(name: str, **options: Any) -> Model:
     """``noisy``, a filter (``svgf``), shipped weights (``ntd-large``) or the path of a .safetensors file.
+
+    A filter of another package may be given by its address, ``package.module:name``.
 
     ``options`` are passed to the factory and replace those that the weights were saved with. Raises ValueError for any
     other name, for a learned method without weights, and for options that the method does not have.
@@ -50,16 +52,16 @@ def candidate(name: str, **options: Any) -> Candidate:
     if name == NOISY:
         if options:
             raise ValueError(f"{', '.join(options)}: expected a method, got {name!r}, which has no options.")
-        return Candidate(name, None, {})
-    if name in methods():
+        return Model(name, None, {})
+    if not name.endswith(".safetensors") and is_method(name):
         method = method_named(name)
         if not method.filter:
-            trained = [each for each in shipped_names() if describe(each)["factory"] == name]
+            trained = [shipped for shipped in shipped_names() if describe(shipped)["factory"] == name]
             raise ValueError(
                 f"method {name!r}: expected its weights, {', '.join([*trained, 'the path of a .safetensors file'])}; "
                 "`jaxdn train` makes some."
             )
-        return Candidate(name, method.factory(**options), {}, method, options)
+        return Model(name.rpartition(":")[2], method.factory(**options), {}, method, options)
     if not name.endswith(".safetensors") and name not in shipped_names():
         raise ValueError(
             f"method {name!r}: expected one of {', '.join(all_names())} or the path of a .safetensors file."
@@ -69,31 +71,33 @@ def candidate(name: str, **options: Any) -> Candidate:
     path = Path(name)
     # A run's folder is a better label than the file name, which is the same for all runs.
     label = path.parent.name if path.stem == "weights" else path.stem
-    return Candidate(label, denoiser, params, method_named(description["factory"]), description["options"] | options)
+    return Model(label, denoiser, params, method_named(description["factory"]), description["options"] | options)
 
 
-def untrained(method: Method, **options: Any) -> Candidate:
+def untrained_model(method: Method, **options: Any) -> Model:
     """A learned method in its smallest variant, with initial weights."""
     given = {**method.variant_named(None), **options}
     denoiser = method.factory(**given)
-    return Candidate(method.name, denoiser, denoiser.init(jax.random.key(0), _smallest()), method, given)
+    return Model(method.name, denoiser, denoiser.init(jax.random.key(0), _smallest()), method, given)
 
 
-def filters() -> list[str]:
+def filter_names() -> list[str]:
     """The names of the methods that denoise without training."""
     return [name for name, method in methods().items() if method.filter]
 
 
 def all_names() -> list[str]:
-    """Every name that :func:`candidate` knows: the noisy image, filters, and shipped weights."""
-    return [NOISY, *filters(), *shipped_names()]
+    """Every name that :func:`find_model` knows: the noisy image, filters, and shipped weights."""
+    return [NOISY, *filter_names(), *shipped_names()]
 
 
-def everything() -> Iterator[Candidate]:
+def all_models() -> Iterator[Model]:
     """Filters, shipped weights, and learned methods without shipped weights, with initial weights."""
-    yield from (candidate(name) for name in all_names() if name != NOISY)
+    yield from (find_model(name) for name in all_names() if name != NOISY)
     trained = {describe(name)["factory"] for name in shipped_names()}
-    yield from (untrained(method) for name, method in methods().items() if not method.filter and name not in trained)
+    yield from (
+        untrained_model(method) for name, method in methods().items() if not method.filter and name not in trained
+    )
 
 
 def _smallest() -> Frame:

@@ -57,14 +57,14 @@ def save_weights(
     Args:
       path: its suffix is replaced by ``.safetensors``; its folder is created if it is missing.
       params: what to save.
-      factory: a name in ``jaxdn.denoisers``.
+      factory: the method's name in ``jaxdn.denoisers``, or its address ``module:name``.
       options: keyword arguments of the factory. The JSON records every option, those not given with their defaults,
         as a later version may have others.
       record: how the weights were made (data, recipe, scores); further entries of the JSON.
 
     Raises ValueError for an unknown factory or option.
     """
-    options = dataclasses.asdict(method_named(factory).made(options))
+    options = dataclasses.asdict(method_named(factory).parse_options(options))
     path = Path(path).with_suffix(".safetensors")
     path.parent.mkdir(parents=True, exist_ok=True)
     description = json.dumps({"factory": factory, "options": options, **record}, indent=1, sort_keys=True) + "\n"
@@ -76,7 +76,7 @@ def load_weights(name_or_path: str | Path, **options_instead: Any) -> tuple[Deno
     """A denoiser and its parameters, by a shipped name (``"ntd-large"``) or the path of a .safetensors file.
 
     The factory and its options are read from the JSON file of the same name; ``options_instead`` replace them, such
-    as ``implementation="onnxruntime"`` or ``compute_dtype="bfloat16"``. Raises ValueError if no weights of that name
+    as ``implementation="onnxruntime"``. Raises ValueError if no weights of that name
     exist, a file cannot be read, the JSON names an unknown factory or option, or the weights are not those of the
     denoiser that it describes.
     """
@@ -146,7 +146,6 @@ def weights_path(name_or_path: str | Path) -> Path:
 def describe(name_or_path: str | Path) -> dict[str, Any]:
     """The JSON of weights: ``factory``, ``options``, and how they were trained.
 
-    An option that an earlier version did not record has the value that it had then (``Method.earlier``).
     Raises ValueError if it cannot be read or names an unknown method.
     """
     file = weights_path(name_or_path).with_suffix(".json")
@@ -159,9 +158,7 @@ def describe(name_or_path: str | Path) -> dict[str, Any]:
             f"'options', got {error!r}; copy both files together."
         ) from error
     try:
-        method = method_named(factory)
-        if "preset" not in options:  # a preset gives every option, in earlier versions too
-            options = {**method.earlier, **options}
+        method_named(factory)
     except ValueError as error:
         raise ValueError(f"weights {file}: factory: {error} They may come from a newer jaxdn.") from error
     return {**description, "factory": factory, "options": options}

@@ -15,14 +15,14 @@ from experiments.stability import long_runs
 from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.methods.registry import methods
-from jaxdn.zoo.ready import candidate, filters
+from jaxdn.zoo.ready import filter_names, find_model
 from jaxdn.zoo.weights import shipped_names
 
 SIZE = 32
 LONG, SHORT = 2000, 250
 """Frames; the long run is made of short ones, so that one program is compiled."""
 LIGHTEST = [list(method.variants)[-1] for method in methods().values() if method.variants]
-METHODS = [*filters(), *(name for name in LIGHTEST if name in shipped_names())]
+METHODS = [*filter_names(), *(name for name in LIGHTEST if name in shipped_names())]
 FADES = [*METHODS, *(name for name in shipped_names() if name.startswith("steady") and name not in METHODS)]
 """Those whose light has to fade when a lamp is switched off: every ``steady``, as each learns how fast it does."""
 FORGETS = {"ntd-small": 80, "relax": 155, "relax-fitted": 155}
@@ -63,7 +63,7 @@ def wall():
 @functools.cache
 def compiled(name):
     """``SHORT`` frames of a wall from any frame on, while the camera slides back and forth; and the first state."""
-    _, denoiser, params, *_ = candidate(name)
+    _, denoiser, params, *_ = find_model(name)
     base = jax.tree.map(jnp.asarray, wall())
 
     def body(settings, state, index):

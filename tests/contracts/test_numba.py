@@ -16,11 +16,11 @@ from jaxdn.core.frame import FAR, Frame
 from jaxdn.denoiser.statistics import sum_depths
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import guides_of
-from jaxdn.methods.steady.accumulation import Mean, Shown, accumulated, remembered
-from jaxdn.methods.steady.fireflies import dimmed
+from jaxdn.methods.steady.accumulation import FilteredLight, History, RunningMean, update_history, update_mean
+from jaxdn.methods.steady.fireflies import suppress_fireflies
 from jaxdn.methods.steady.levels import LEVELS
-from jaxdn.methods.steady.method import BEGIN, FEATURES, HALF_FEATURES, decisions
-from jaxdn.methods.steady.network_input import History, seen
+from jaxdn.methods.steady.method import FEATURES, HALF_FEATURES, INITIAL, split_heads
+from jaxdn.methods.steady.network_input import assemble_network_input
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
 from jaxdn.ops.dispatch import numba_call
@@ -125,7 +125,7 @@ def test_what_a_network_sees(gain, size, rng, both):
     geometry = tuple(jnp.asarray(rng.normal(size=(*size, count)), jnp.float32) for count in (3, 1))
     history, hit = of_earlier_frames(rng, *size), jnp.asarray(rng.random(size) > 0.1)
     given = geometry, jnp.asarray(light, jnp.float32), history, hit, jnp.float32(gain)
-    found, wanted = both(functools.partial(seen, multiple=16), *given)
+    found, wanted = both(functools.partial(assemble_network_input, multiple=16), *given)
     assert found.shape[0] % 16 == found.shape[1] % 16 == 0
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(found[..., 16:19], wanted[..., 16:19], rtol=3e-6, atol=1e-12)  # light
@@ -136,7 +136,7 @@ def test_the_running_mean(rng, both):
     light = jnp.asarray(10.0 ** rng.uniform(-4, 4, (14, 38, 3)), jnp.float32)
     history, hit = of_earlier_frames(rng, 14, 38), jnp.asarray(rng.random((14, 38)) > 0.1)
     follow = jnp.asarray(rng.uniform(0, 1, (14, 38)).round(1), jnp.float32)
-    found, wanted = both(functools.partial(accumulated, most=20.0), light, history, hit, follow)
+    found, wanted = both(functools.partial(update_mean, most=20.0), light, history, hit, follow)
     for one, other in zip(found, wanted, strict=True):
         np.testing.assert_allclose(one, other, rtol=2e-5, atol=2e-3)
     assert np.all(found.number[~np.asarray(history.valid)] == 1)
@@ -147,9 +147,9 @@ def test_the_running_mean(rng, both):
 def test_what_is_remembered(changed, rng, both):
     planes = [jnp.asarray(rng.uniform(-0.1, 2, (3, 14, 38)), jnp.float32) for _ in range(4)]
     square, number, feedback, blend = (jnp.asarray(rng.uniform(0, 1, (14, 38)), jnp.float32) for _ in range(4))
-    mean = Mean(planes[0], square, number, jnp.zeros((3, 7, 19)))
-    shown, history = Shown(*planes[1:3], planes[3] if changed else None), of_earlier_frames(rng, 14, 38)
-    program = functools.partial(remembered, most=1.5)
+    mean = RunningMean(planes[0], square, number, jnp.zeros((3, 7, 19)))
+    shown, history = FilteredLight(*planes[1:3], planes[3] if changed else None), of_earlier_frames(rng, 14, 38)
+    program = functools.partial(update_history, most=1.5)
     found, wanted = both(program, mean, shown, history, feedback, blend)
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
     np.testing.assert_array_equal(found[..., 3], square)
@@ -175,11 +175,13 @@ def test_single_bright_pixels(rng, both):
     light = rng.uniform(0, 1, (3, height, width)) ** 8
     light[:, 9:12] = 0.0
     level = np.einsum("c,cyx->yx", color.LUMINANCE, light)
-    mean = Mean(light, level**2 * rng.uniform(0.9, 1.5, level.shape), rng.choice([1.0, 2.0, 30.0], level.shape), light)
+    mean = RunningMean(
+        light, level**2 * rng.uniform(0.9, 1.5, level.shape), rng.choice([1.0, 2.0, 30.0], level.shape), light
+    )
     hit = rng.random((height, width)) > 0.2
     hit[4:7, 4:7] = np.eye(3)[1] * np.eye(3)[1][:, None] > 0  # a pixel without neighbours
     image = jnp.asarray(light * rng.uniform(0.5, 2, light.shape), jnp.float32)
-    found, wanted = both(dimmed, image, jnp.asarray(hit), jax.tree.map(jnp.float32, mean))
+    found, wanted = both(suppress_fireflies, image, jnp.asarray(hit), jax.tree.map(jnp.float32, mean))
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-9)
     kept = wanted.sum(0) / np.maximum(image.sum(0), 1e-30)
     assert kept[5, 5] == 1
@@ -187,9 +189,9 @@ def test_single_bright_pixels(rng, both):
 
 
 def test_what_is_decided(rng, both):
-    blocks, channels = (7, 19), 4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS + 1
+    blocks, channels = (7, 19), 4 * (FEATURES + len(INITIAL)) + HALF_FEATURES + 1 + LEVELS + 1
     head = jnp.asarray(rng.normal(scale=30.0, size=(16, 32, channels)), jnp.float32)
-    found, wanted = both(lambda head: decisions(head, blocks), head)
+    found, wanted = both(lambda head: split_heads(head, blocks), head)
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(wanted), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-12)
     np.testing.assert_array_equal(wanted[0].features, head[:7, :19, : 4 * FEATURES])

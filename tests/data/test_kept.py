@@ -19,7 +19,7 @@ from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import Candidate
+from jaxdn.zoo.ready import Model
 from tests import programs
 from tests.programs import PROGRAMS, truth, write_shot
 
@@ -57,7 +57,7 @@ def assert_same_but(source: Path, target: Path, changed: tuple[str, ...]) -> Non
     assert found == set(changed)
 
 
-def box_blur() -> Candidate:
+def box_blur() -> Model:
     """The smallest denoiser: what is kept does not depend on the method, and svgf takes half a minute to compile."""
 
     def step(params: Any, state: Any, frame: Frame, first: Any) -> Any:
@@ -67,7 +67,7 @@ def box_blur() -> Candidate:
         return state, sum(shifts) / 9, 0
 
     reads = frozenset({"motion", "albedo", "ids"})
-    return Candidate("blur", recurrent(Core(lambda params, frame: jnp.zeros(1), step, reads)), {})
+    return Model("blur", recurrent(Core(lambda params, frame: jnp.zeros(1), step, reads)), {})
 
 
 def denoise(source: Path, out: Path, **settings: Any) -> None:

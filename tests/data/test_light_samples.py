@@ -10,7 +10,7 @@ from jaxdn.clips import ClipError, training_batches
 from jaxdn.core.frame import Frame
 from jaxdn.data.training.cache import open_cached
 from jaxdn.data.training.light_samples import check_samples, sample_light
-from jaxdn.recipes.augmentation import STILL
+from jaxdn.recipes.augmentation import NO_AUGMENTATION
 
 COUNT, FRAMES, SIDE = 4, 3, 6
 EVERYTHING = (slice(None),) * 3
@@ -78,7 +78,9 @@ def test_batches_draw_new_noise_for_each_element(folder: Path) -> None:
     assert set(noisy) == {1.0, 2.0, 4.0, 8.0, 5.0}
     np.testing.assert_allclose(wanted[noisy == 5], 9)
     np.testing.assert_allclose(wanted[noisy != 5], 7)
-    whole = next(training_batches(folder, batch=8, crop=4, frames=2, seed=0, variation=STILL._replace(beauty=1.0)))
+    whole = next(
+        training_batches(folder, batch=8, crop=4, frames=2, seed=0, variation=NO_AUGMENTATION._replace(beauty=1.0))
+    )
     np.testing.assert_array_equal(whole.reference, 12)
     assert whole.frames.direct is not None
     with pytest.raises(ClipError, match="5 samples a pixel are not available"):

@@ -20,7 +20,7 @@ from jaxdn.data.training.cache import read_array, read_window
 from jaxdn.data.training.light_samples import sample_light
 from jaxdn.data.training.pack import Packing, open_clips, open_pack, write_pack
 from jaxdn.denoisers import svgf
-from jaxdn.recipes.augmentation import STILL
+from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.training.validation import load_validation
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -189,7 +189,7 @@ def test_what_must_be_exact_is(folder: Path, packed: Path) -> None:
 
 def test_batches_are_those_of_the_clips(folder: Path, packed: Path, tmp_path: Path) -> None:
     order = [folder / window.path.name[5:] for window in open_pack(packed)]
-    options = {"batch": 4, "crop": 16, "frames": 3, "seed": 5, "spp": (8,), "variation": STILL}
+    options = {"batch": 4, "crop": 16, "frames": 3, "seed": 5, "spp": (8,), "variation": NO_AUGMENTATION}
     buffers = {"albedo", "depth", "motion", "dual_motion", "visible"}
     one, other = (next(training_batches(place, buffers=buffers, **options)) for place in (order, [packed]))
     assert jax.tree.structure(one) == jax.tree.structure(other)

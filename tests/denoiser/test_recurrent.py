@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxdn.core.frame import RADIANCE_MAX, Clip, Frame, frame_at, present
-from jaxdn.denoiser import Core, Denoiser, Recurrent, RecurrentStep, recurrent
+from jaxdn.denoiser import Core, Recurrent, recurrent
 from jaxdn.denoiser.rollout import denoise, stream, unroll
 from jaxdn.methods.demodulation import demodulated
 from jaxdn.ops.sampling import from_layers
@@ -30,17 +30,18 @@ def core_of(step, *, reads=(), start=lambda params, frame: jnp.zeros(()), **othe
 def identity(**others):
     """Its image and its state are the frame's radiance."""
     return core_of(
-        lambda params, state, frame, first: (frame.radiance, frame.radiance, 0),
+        lambda params, state, frame, first, statistics: (frame.radiance, frame.radiance, 0),
         start=lambda params, frame: jnp.zeros_like(frame.radiance),
         **others,
     )
 
 
 def test_first_is_passed_once_and_age_counts_frames(rng):
-    core = core_of(lambda params, state, frame, first: (first, frame.radiance, 0), start=lambda params, frame: False)
+    core = core_of(
+        lambda params, state, frame, first, statistics: (first, frame.radiance, 0), start=lambda params, frame: False
+    )
     denoiser, frame = recurrent(core), frame_of(rng)
-    assert isinstance(denoiser.step, RecurrentStep)
-    assert denoiser.step.core is core
+    assert denoiser.core is core
     state = denoiser.start({}, frame)
     assert isinstance(state, Recurrent)
     assert (int(state.age), int(state.sanitized)) == (0, 0)
@@ -52,7 +53,7 @@ def test_first_is_passed_once_and_age_counts_frames(rng):
 
 
 def test_first_is_passed_under_scan_too(rng):
-    step = lambda params, state, frame, first: (state, jnp.where(first, 1.0, 2.0) + 0 * frame.radiance, 0)  # noqa: E731
+    step = lambda params, state, frame, first, statistics: (state, jnp.where(first, 1.0, 2.0) + 0 * frame.radiance, 0)  # noqa: E731
     frames = jax.tree.map(lambda *buffers: jnp.stack(buffers), *[frame_of(rng) for _ in range(3)])
     images = jax.jit(lambda frames: unroll(recurrent(core_of(step)), {}, frames))(frames)
     np.testing.assert_array_equal(images[:, 0, 0, 0], [1, 2, 2])
@@ -61,7 +62,7 @@ def test_first_is_passed_under_scan_too(rng):
 def test_the_core_sees_sanitized_buffers_and_only_those_that_it_reads(rng):
     seen = []
 
-    def step(params, state, frame, first):
+    def step(params, state, frame, first, statistics):
         seen.append(frame)
         return state, frame.radiance, 0
 
@@ -81,10 +82,10 @@ def test_the_core_sees_sanitized_buffers_and_only_those_that_it_reads(rng):
 @pytest.mark.parametrize("wrap", [lambda denoiser: denoiser, demodulated])
 @pytest.mark.parametrize("reads", [frozenset(), frozenset({"sample_count"})])
 def test_a_core_is_told_which_pixels_were_not_measured(reads, wrap):
-    def step(params, state, frame, first):
+    def step(params, state, frame, first, statistics):
         return frame.sample_count, frame.radiance, 0
 
-    core = Core(lambda params, frame: frame.radiance[..., :1], step, reads, counted=True)
+    core = Core(lambda params, frame: frame.radiance[..., :1], step, reads, requires_validity_mask=True)
     light = np.ones((1, 5, 3), np.float32)
     light[0, 1:4, 1] = np.nan, np.inf, -1.0
     frame = Frame(light, albedo=np.full_like(light, 0.5), sample_count=np.full((1, 5, 1), 3.0, np.float32))
@@ -102,7 +103,7 @@ def test_start_sees_sanitized_buffers_and_counts_nothing(rng):
 
 @pytest.mark.parametrize("lost", [2, jnp.asarray(2, jnp.int32)])
 def test_sanitized_values_of_frames_and_of_the_history_add_up(lost, rng):
-    core = core_of(lambda params, state, frame, first: (state, frame.radiance, lost))
+    core = core_of(lambda params, state, frame, first, statistics: (state, frame.radiance, lost))
     denoiser, frame = recurrent(core), frame_of(rng)
     broken = frame._replace(radiance=frame.radiance.at[1, 2].set(jnp.nan))
     state = denoiser.start({}, frame)
@@ -114,7 +115,10 @@ def test_sanitized_values_of_frames_and_of_the_history_add_up(lost, rng):
 def test_images_are_clamped_to_their_bounds(rng):
     given = np.array([-1e30, -1.0, -0.0, 0.0, 0.5, RADIANCE_MAX, 1e5, np.inf], np.float32)
     values = jnp.asarray(rng.choice(given, (*SIZE, 3)))
-    denoiser, frame = recurrent(core_of(lambda params, state, frame, first: (state, values, 0))), frame_of(rng)
+    denoiser, frame = (
+        recurrent(core_of(lambda params, state, frame, first, statistics: (state, values, 0))),
+        frame_of(rng),
+    )
     state, image = denoiser.step({}, denoiser.start({}, frame), frame)
     np.testing.assert_array_equal(image, np.clip(values, 0, RADIANCE_MAX))
     assert float(image.min()) == 0
@@ -123,7 +127,7 @@ def test_images_are_clamped_to_their_bounds(rng):
 
 
 def test_the_state_is_the_cores_own_and_is_not_clamped(rng):
-    core = core_of(lambda params, state, frame, first: (-5.0 * frame.radiance, -5.0 * frame.radiance, 0))
+    core = core_of(lambda params, state, frame, first, statistics: (-5.0 * frame.radiance, -5.0 * frame.radiance, 0))
     denoiser, frame = recurrent(core), frame_of(rng)
     state, image = denoiser.step({}, denoiser.start({}, frame), frame)
     np.testing.assert_array_equal(state.core, -5 * frame.radiance)
@@ -284,16 +288,6 @@ def test_a_wrapped_denoiser_can_be_wrapped_again(rng):
     np.testing.assert_allclose(image, frame.radiance, rtol=1e-6)
 
 
-def test_a_denoiser_not_made_by_recurrent_is_refused():
-    def step(params, state, frame):
-        return state, frame.radiance
-
-    bare = Denoiser(lambda key, frame: {}, lambda params, frame: 0, step, frozenset())
-    with pytest.raises(ValueError, match=r"demodulated: expected a denoiser made by jaxdn\.denoiser\.recurrent"):
-        demodulated(bare)
-    assert demodulated(bare, by="none") is bare
-
-
 # Requested samples.
 
 
@@ -303,7 +297,7 @@ def adaptive(wrap=lambda denoiser: denoiser):
     def samples(params, state, frame, first, most):
         return params["most"] * frame.radiance[..., :1] / (1 + frame.radiance[..., :1])
 
-    def step(params, state, frame, first):
+    def step(params, state, frame, first, statistics):
         image = params["gain"] * frame.radiance + 0.01 * jnp.where(first, 0.0, state)
         kept = image if frame.sample_count is None else image + 0 * frame.sample_count
         return kept, image, 0
@@ -365,7 +359,7 @@ def test_a_stream_gives_samples_as_a_clip_does(wrap, rng):
 def test_the_step_gets_the_actual_number_of_samples(rng):
     told = []
 
-    def step(params, state, frame, first):
+    def step(params, state, frame, first, statistics):
         jax.debug.callback(lambda counts: told.append(np.array(counts)), frame.sample_count)
         return state, frame.radiance, 0
 
@@ -383,7 +377,9 @@ def test_the_step_gets_the_actual_number_of_samples(rng):
 
 def test_layers_are_bounded_and_what_is_no_number_in_them_is_sanitized_and_counted(rng):
     """The largest number in every layer: eight of it are more than float32 has."""
-    core = core_of(lambda params, state, frame, first: (state, frame.radiance, 0), samples=lambda *given: 7.0 * ONES)
+    core = core_of(
+        lambda params, state, frame, first, statistics: (state, frame.radiance, 0), samples=lambda *given: 7.0 * ONES
+    )
     clip = layered(rng, count=1)
     bright = {n: layer.at[0, 0, 0].set(3e38).at[0, 0, 1].set(np.nan) for n, layer in clip.layers.items()}
     one = stream(recurrent(core), {})
@@ -410,7 +406,8 @@ def test_gradients_through_a_denoiser_that_requests_samples_are_finite(remateria
 
 def test_a_request_without_layers_raises(rng):
     denoiser, clip = adaptive(), layered(rng)
-    params, frame = denoiser.init(jax.random.key(0), None), frame_at(clip.frames, 0)
+    frame = frame_at(clip.frames, 0)
+    params = denoiser.init(jax.random.key(0), frame)
     with pytest.raises(ValueError, match="layers: expected independent noisy layers"):
         denoise(denoiser, params, clip._replace(layers=None))
     with pytest.raises(ValueError, match="layers: expected independent noisy layers"):

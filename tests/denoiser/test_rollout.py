@@ -79,7 +79,7 @@ def test_a_program_is_compiled_for_each_set_of_buffers_that_is_read(clip):
     """Only buffers that are read make a set; a repeated set is compiled once."""
     traced = []
 
-    def step(params, state, frame, first):
+    def step(params, state, frame, first, statistics):
         traced.append(frame)
         return state, frame.radiance, 0
 

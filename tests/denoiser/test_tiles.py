@@ -1,4 +1,4 @@
-"""Frames in parts: the image of the whole frame, for every method whose reach is known, and what decides about it."""
+"""Tiles: the image of the whole frame, for every method whose receptive field is known, and what decides about it."""
 
 import itertools
 from typing import Any
@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 
 from jaxdn import color
 from jaxdn.core.frame import FAR, Frame, only
-from jaxdn.denoiser import Denoiser
+from jaxdn.denoiser import Denoiser, stages_of
 from jaxdn.denoiser.rollout import stream
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.denoiser.tiles import GRID, find_history_halo, map_tiles, split_axis, stream_tiled
 from jaxdn.denoisers import asvgf, ntasd, ntd, steady, svgf, taa
-from jaxdn.filters.surface_test import depth_feature
 from jaxdn.sequence.james_stein import REACH, combine
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -76,21 +75,21 @@ def random_params(denoiser: Denoiser, frame: Frame) -> Any:
 
 @given(st.integers(1, 3000), st.integers(0, 200), st.integers(0, 900))
 @settings(max_examples=300, deadline=None)
-def test_windows_cover_all_and_have_their_margins(length: int, margin: int, more: int) -> None:
-    side = 2 * (margin + GRID) + GRID + more
-    found = split_axis(length, side, margin)
-    assert found[0].first == 0
-    assert found[-1].last == length
+def test_windows_cover_all_and_have_their_margins(length: int, halo: int, more: int) -> None:
+    side = 2 * (halo + GRID) + GRID + more
+    found = split_axis(length, side, halo)
+    assert found[0].keep_start == 0
+    assert found[-1].keep_stop == length
     for one, following in itertools.pairwise(found):
-        assert one.last == following.first
+        assert one.keep_stop == following.keep_start
     for one in found:
-        assert 0 <= one.start <= one.first < one.last <= one.stop <= length
+        assert 0 <= one.start <= one.keep_start < one.keep_stop <= one.stop <= length
         assert one.stop - one.start == found[0].stop - found[0].start <= side
         assert one.start % GRID == 0
-        assert one.start == 0 or one.first - one.start >= margin
-        assert one.stop == length or one.stop - one.last >= margin
-    with pytest.raises(ValueError, match=f"there is room for {2 * margin + GRID}"):
-        split_axis(length + 2 * margin + 2 * GRID, 2 * margin + GRID, margin)
+        assert one.start == 0 or one.keep_start - one.start >= halo
+        assert one.stop == length or one.stop - one.keep_stop >= halo
+    with pytest.raises(ValueError, match=f"got room for {2 * halo + GRID}"):
+        split_axis(length + 2 * halo + 2 * GRID, 2 * halo + GRID, halo)
 
 
 WITH_SLOW_ONES = [pytest.param(name, marks=[pytest.mark.slow] * (name in {"steady", "ntd"})) for name in METHODS]
@@ -106,40 +105,45 @@ WITH_SLOW_ONES = [pytest.param(name, marks=[pytest.mark.slow] * (name in {"stead
     ids=["all buffers", "no materials", "no geometry"],
 )
 @pytest.mark.parametrize("name", WITH_SLOW_ONES)
-def test_parts_make_the_image_of_the_whole_frame(name: str, without: tuple[str, ...], x64: None) -> None:
+def test_tiles_make_the_image_of_the_whole_frame(name: str, without: tuple[str, ...], x64: None) -> None:
     """With fewer buffers too: then other guides are compared. In float64: what is left is rounding alone."""
     denoiser = METHODS[name]()
-    reach = denoiser.step.core.reach
-    side = 2 * (reach + 10 + GRID) + 3 * GRID
+    field = denoiser.receptive_field
+    side = 2 * (field + 10 + GRID) + 3 * GRID
     width = side + 5 * GRID + 7
     some = [doubled(only(frame, frozenset(Frame._fields) - set(without))) for frame in frames(2, width)]
     params = random_params(denoiser, some[0])
-    whole, parts = stream(denoiser, params), stream_tiled(denoiser, params, side, (HEIGHT, width))
+    whole, tiles = stream(denoiser, params), stream_tiled(denoiser, params, side, (HEIGHT, width))
     for frame in some:
-        expected, image = np.asarray(whole(frame)), parts(frame)
+        expected, image = np.asarray(whole(frame)), tiles(frame)
         np.testing.assert_allclose(image, expected, rtol=1e-9, atol=1e-12)
-    assert parts.sanitized == whole.sanitized
-    assert parts.beyond_halo == 0
-    assert len(parts.programs) == 1
+    assert tiles.sanitized == whole.sanitized
+    assert tiles.beyond_halo == 0
+    assert len(tiles.programs) == 1
 
 
 @pytest.mark.parametrize("name", WITH_SLOW_ONES)
-def test_nothing_beyond_the_reach_decides_about_a_pixel(name: str, x64: None) -> None:
+def test_nothing_beyond_the_receptive_field_decides_about_a_pixel(name: str, x64: None) -> None:
     """Everything to the right of a column is other than it was, but not what is measured of the frame."""
     denoiser = METHODS[name]()
-    core, reach, at = denoiser.step.core, denoiser.step.core.reach, 48
-    width = at + reach + 4 * GRID
-    cut = at + reach + 7  # and 6.8 pixels as far as motion fetches
-    one, other = (doubled(only(each[0], core.reads)) for each in (frames(1, width), frames(1, width, seed=1)))
+    stages, field, at = stages_of(denoiser), denoiser.receptive_field, 48
+    assert field is not None
+    width = at + field + 4 * GRID
+    cut = at + field + 7  # and 6.8 pixels as far as motion fetches
+    one, other = (doubled(only(each[0], denoiser.reads)) for each in (frames(1, width), frames(1, width, seed=1)))
     changed = jax.tree.map(lambda a, b: np.concatenate([a[:, :cut], b[:, cut:]], axis=1), one, other)
     params = random_params(denoiser, one)
-    state = jax.tree.map(jnp.zeros_like, core.start(params, one))
-    step = jax.jit(lambda state, frame, whole: denoiser.step.part(params, state, frame, jnp.asarray(False), whole))
-    whole = None if core.measure is None else core.measure(denoiser.step.measured(one)[0])
-    state = jax.tree.map(jnp.asarray, step(state, one, whole)[0])
+    state = jax.tree.map(jnp.zeros_like, stages.start(params, one))
+    statistics = stages.prepare(one)[0]
+
+    @jax.jit
+    def step(state: Any, frame: Frame) -> Any:
+        return stages.step(params, state, stages.prepare(frame)[1], jnp.asarray(False), statistics)
+
+    state = jax.tree.map(jnp.asarray, step(state, one)[0])
     images = []
     for frame in (one, changed):
-        after, image, _ = step(state, denoiser.step.measured(frame)[0], whole)
+        after, image, _ = step(state, frame)
         images.append((after, image))
     kept = [jax.tree.map(lambda x: np.asarray(x)[:, :at], each) for each in images]
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12), *kept)
@@ -148,19 +152,19 @@ def test_nothing_beyond_the_reach_decides_about_a_pixel(name: str, x64: None) ->
 
 def test_history_from_too_far_away_is_counted_and_begins_anew() -> None:
     denoiser = svgf(levels=2)
-    side = 2 * (denoiser.step.core.reach + 20 + GRID) + GRID
+    side = 2 * (denoiser.receptive_field + 20 + GRID) + GRID
     clip = frames(2, 500)
     for frame in clip:
         # Ten stripes to the right there is the same thing, farther away.
         frame.motion[10:14, 100:120] = (170.0, 0.0)
         frame.previous_depth[10:14, 100:120] = frame.depth[10:14, 270:290]
         frame.motion[20:24, 480:490] = (170.0, 0.0)  # leaves the frame: has no history anyway
-    parts = stream_tiled(denoiser, {}, side, (HEIGHT, 500))
+    tiles = stream_tiled(denoiser, {}, side, (HEIGHT, 500))
     whole = stream(denoiser, {})
     for frame in clip:
-        image, expected = parts(frame), np.asarray(whole(frame))
-    assert parts.beyond_halo == 4 * 20
-    far = denoiser.step.core.reach
+        image, expected = tiles(frame), np.asarray(whole(frame))
+    assert tiles.beyond_halo == 4 * 20
+    far = denoiser.receptive_field
     apart = np.abs(image - expected).max(axis=-1) > 1e-3 * expected.mean()
     assert apart[10:14, 100:120].any()
     assert not apart[:, : 100 - far].any()
@@ -178,37 +182,35 @@ def test_how_far_history_is_fetched() -> None:
     assert find_history_halo(frame._replace(shadow_motion=2 * motion), 100) == (38, 0)
 
 
-def test_what_cannot_be_parted_is_refused() -> None:
-    for denoiser in (asvgf(), ntasd(size=TINY, budget=2.0)):
-        with pytest.raises(ValueError, match="cannot denoise a frame in parts"):
-            stream_tiled(denoiser, {}, 1024, (HEIGHT, 2000))
-    with pytest.raises(ValueError, match="there is room for 128"):
+def test_what_cannot_be_tiled_is_refused() -> None:
+    with pytest.raises(ValueError, match="tiles: expected a denoiser whose receptive_field is known, got None"):
+        stream_tiled(asvgf(), {}, 1024, (HEIGHT, 2000))
+    with pytest.raises(ValueError, match="tiles: expected a denoiser that requests no samples"):
+        stream_tiled(ntasd(size=TINY, budget=2.0), {}, 1024, (HEIGHT, 2000))
+    with pytest.raises(ValueError, match="got room for 128"):
         stream_tiled(svgf(), {}, 128, (HEIGHT, 2000))
     stream_tiled(svgf(), {}, 128, (HEIGHT, 128))
 
 
-def test_sums_of_parts_are_those_of_the_frame() -> None:
+def test_sums_of_tiles_are_those_of_the_frame() -> None:
     frame = frames(1, 4 * GRID, height=2 * GRID)[0]
-    parts = [jax.tree.map(lambda x, c=c: x[:, c : c + GRID], frame) for c in range(0, 4 * GRID, GRID)]
-    sums = [measure_frame(jnp.asarray(one.radiance), jnp.asarray(one.depth), one) for one in (frame, *parts)]
+    tiles = [jax.tree.map(lambda x, c=c: x[:, c : c + GRID], frame) for c in range(0, 4 * GRID, GRID)]
+    sums = [measure_frame(jnp.asarray(one.radiance), jnp.asarray(one.depth), one) for one in (frame, *tiles)]
     total: FrameStatistics = jax.tree.map(lambda *each: sum(each), *sums[1:])
     whole = sums[0]
-    for name in ("exposure", "middle_depth", "middle_inverse", "other"):
+    for name in ("exposure", "mean_depth", "mean_inverse_depth", "reflectance_differs"):
         np.testing.assert_allclose(getattr(total, name), getattr(whole, name), rtol=1e-5)
     np.testing.assert_allclose(whole.exposure, color.exposure(frame.radiance), rtol=1e-6)
     known = frame.depth[frame.depth < FAR].astype(np.float64)
     np.testing.assert_allclose(whole.mean_depth, np.exp(np.log(known).mean()), rtol=1e-5)
     np.testing.assert_allclose(whole.mean_inverse_depth, (1 / known).mean(), rtol=1e-5)
-    np.testing.assert_allclose(
-        depth_feature(frame.depth, middle=whole.mean_depth), depth_feature(frame.depth), rtol=1e-5
-    )
     differs = np.any(frame.reflectance != frame.albedo, axis=-1)
     assert whole.reflectance_differs == differs.sum() > 0
     assert measure_frame(frame.radiance, None, frame._replace(albedo=None)).reflectance_differs == 0
 
 
 @pytest.mark.parametrize("samples", [4, 4096])
-def test_the_safe_mixture_in_parts_is_that_of_the_whole_frame(samples: int) -> None:
+def test_the_safe_mixture_in_tiles_is_that_of_the_whole_frame(samples: int) -> None:
     rng = np.random.default_rng(0)
     height, width = 300, 411
     columns = np.arange(width, dtype=np.float32)
@@ -217,7 +219,7 @@ def test_the_safe_mixture_in_parts_is_that_of_the_whole_frame(samples: int) -> N
     denoised = (truth + 0.05 * np.cos(columns / 50)[None, :, None]).astype(np.float32)
     level = jnp.mean(jnp.asarray(denoised))
     found, others = map_tiles(
-        lambda given: (combine(*given, level), None), (noisy, denoised), (height, width), side=288, margin=REACH
+        lambda given: (combine(*given, level), None), (noisy, denoised), (height, width), side=288, halo=REACH
     )
     assert len(others) == 4
     expected = combine(noisy, denoised)

@@ -10,7 +10,7 @@ from jaxdn.data.clip.noise_floor import read_halves
 from jaxdn.evaluation.compare import compare
 from jaxdn.evaluation.report import sentences, text_table, write_report
 from jaxdn.evaluation.report.summary import headline
-from jaxdn.zoo.ready import Candidate
+from jaxdn.zoo.ready import Model
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -50,7 +50,7 @@ def test_a_clip_without_a_half_has_none(tmp_path):
 @pytest.mark.parametrize("halves", [True, False])
 def test_the_references_noise_is_not_in_the_score(tmp_path, halves):
     write(tmp_path / "clip", halves=halves)
-    noisy = Candidate("noisy", None, {}, None, {})
+    noisy = Model("noisy", None, {}, None, {})
     results = compare([noisy], [tmp_path / "clip"], title="", settings={}, log=lambda text: None)
     scores = results.clips[0].scores["noisy"]
     if not halves:
@@ -67,7 +67,7 @@ def test_the_references_noise_is_not_in_the_score(tmp_path, halves):
 def test_the_report_says_which_score_to_read(tmp_path, halves):
     write(tmp_path / "clip", halves=halves)
     said = []
-    noisy = Candidate("noisy", None, {}, None, {})
+    noisy = Model("noisy", None, {}, None, {})
     results = compare([noisy], [tmp_path / "clip"], title="", settings={}, log=said.append)
     assert headline(results).field == ("unbiased_psnr" if halves else "psnr")
     assert ("without the reference's noise" in said[0]) == halves

@@ -38,7 +38,7 @@ from jaxdn.denoiser.rollout import denoise
 from jaxdn.methods import registry
 from jaxdn.methods.registry import method, method_named, methods
 from jaxdn.networks.backends import BACKENDS
-from jaxdn.zoo.ready import Candidate, untrained
+from jaxdn.zoo.ready import Model, untrained_model
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -264,7 +264,7 @@ class NoOptions:
 def mean_of_two(samples=None):
     """A denoiser that averages with the frame before, times a gain."""
 
-    def step(params, state, frame, first):
+    def step(params, state, frame, first, statistics):
         image = params["gain"] * jnp.where(first, frame.radiance, 0.5 * (frame.radiance + state))
         return image, image, 0
 
@@ -290,7 +290,7 @@ def test_images_are_those_of_a_clip_without_history():
     """The same frames twice: nothing of the first run is left in the second."""
     denoiser = mean_of_two()
     frames = scene.clip(3, 16, 32).frames
-    images = way(Candidate("newcomer", denoiser, {"gain": jnp.ones(())})).images
+    images = way(Model("newcomer", denoiser, {"gain": jnp.ones(())})).images
     found = images(frames)
     np.testing.assert_allclose(found, denoise(denoiser, {"gain": 1.0}, Clip(frames)), rtol=1e-6)
     np.testing.assert_array_equal(images(frames), found)
@@ -310,8 +310,8 @@ def test_steps_with_known_parts_are_broken_down(denoisers):
     names = [subject.name for subject in subjects(denoisers, quick=True)]
     assert names == ["ntd-large, reference", "ntd-small, reference"]
     tiny = {"size": ((4,), (4,), (5,), (5,), (6,))}
-    assert not list(subjects([untrained(method_named("ntd"), **tiny, domain="compressed")]))
-    subject = next(subjects([untrained(method_named("ntd"), **tiny)]))
+    assert not list(subjects([untrained_model(method_named("ntd"), **tiny, prediction="direct")]))
+    subject = next(subjects([untrained_model(method_named("ntd"), **tiny)]))
     parts = breakdown(subject, frame_at(scene.clip(2, 16, 32).frames, 1), rounds=2)
     assert list(parts)[-1] == WHOLE
     assert len(parts) == 5

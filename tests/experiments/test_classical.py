@@ -5,7 +5,7 @@ import re
 import pytest
 
 from experiments.papers import classical
-from jaxdn.zoo.ready import NOISY, filters
+from jaxdn.zoo.ready import NOISY, filter_names
 
 WEIGHTS = "ntd-small"
 
@@ -34,7 +34,7 @@ def test_every_filter_is_scored_and_timed(tmp_path, capsys, monkeypatch):
         assert (tmp_path / "out" / light / "report.html").is_file()
         assert (tmp_path / "out" / light / "pictures" / "fruit-2000" / "trmv.png").is_file()
     rows = [line.split(" | ") for line in written.splitlines() if line.startswith("| ")]
-    for name in [*filters(), WEIGHTS]:
+    for name in [*filter_names(), WEIGHTS]:
         own = [row for row in rows if row[0] == f"| {name}"]
         assert len(own) == 2
         for row in own:

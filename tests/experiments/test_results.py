@@ -9,7 +9,7 @@ from experiments.papers.results import VIEWS, table
 from jaxdn import clips
 from jaxdn.core.frame import Frame
 from jaxdn.evaluation.compare import compare
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 
 SIDE = 8
 
@@ -59,7 +59,7 @@ def test_the_table_scores_what_a_view_reads(folder: Path) -> None:
     """The noisy image is off by 0.1 of indirect light, and by 0.2 of all light, from the mean of the references."""
     lines = {}
     for view in ("indirect", "beauty"):
-        noisy = [candidate("noisy")]
+        noisy = [find_model("noisy")]
         results = compare(noisy, [folder], title="", settings={}, read=VIEWS[view], say=lambda text: None)
         lines[view] = table(results).splitlines()[-1]
     psnr = {view: float(line.split("|")[2]) for view, line in lines.items()}

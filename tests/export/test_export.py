@@ -21,7 +21,7 @@ from jaxdn.data.exr.exr import read_exr
 from jaxdn.denoiser.rollout import stream
 from jaxdn.export.formats import onnx_model
 from jaxdn.export.step import Step
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 from tests.needs import require, require_module
 from tests.training.test_training import make_clip
 
@@ -36,7 +36,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples/cpp/denoise.cpp"
 def moving_clip(frames, size):
     """Every buffer that shipped methods read, with motion between pixels and a sky."""
     clip = make_clip(0, frames=frames, size=size)
-    reads = candidate("steady-balanced").denoiser.reads | candidate("ntd-small").denoiser.reads
+    reads = find_model("steady-balanced").denoiser.reads | find_model("ntd-small").denoiser.reads
     full = written_out(clip.frames, reads)
     rows, columns = np.mgrid[:size, :size].astype(np.float32)
     motion = np.stack([0.3 + 0.02 * columns, -0.7 + 0.01 * rows], axis=-1)
@@ -73,7 +73,7 @@ def run_onnx(file, frames, count):
 
 
 def expected(name, frames, count):
-    method = candidate(name)
+    method = find_model(name)
     step = stream(method.denoiser, method.params)
     return np.stack([step(frame_at(frames, index)) for index in range(count)])
 

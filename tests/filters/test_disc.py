@@ -62,7 +62,7 @@ def test_a_disc_matches_a_loop(rng, x64):
     values, hit = rng.exponential(size=(4, HEIGHT, WIDTH)), rng.random((HEIGHT, WIDTH)) < 0.8
     radius, angle = rng.uniform(0, 6, (HEIGHT, WIDTH)), rng.uniform(0, 7, (HEIGHT, WIDTH))
     weights = [
-        depth_weight(jnp.asarray(depth)[..., None], None, sigma=1.0),
+        depth_weight(jnp.asarray(depth)[..., None], None, sigma=1.0, height=len(depth)),
         normal_weight(jnp.asarray(normal), sigma=16.0),
     ]
     found = disc_average(jnp.asarray(values), jnp.asarray(hit), weights, jnp.asarray(radius), jnp.asarray(angle))
@@ -102,7 +102,9 @@ def test_gradients_reach_values_and_guides(rng, x64):
     radius, angle = (jnp.asarray(rng.uniform(1, 4, (HEIGHT, WIDTH))) for _ in range(2))
 
     def mean(values, depth):
-        return disc_average(values, None, [depth_weight(depth[..., None], None, sigma=1.0)], radius, angle)
+        return disc_average(
+            values, None, [depth_weight(depth[..., None], None, sigma=1.0, height=len(depth))], radius, angle
+        )
 
     check_grads(
         jax.jit(mean),

@@ -24,7 +24,7 @@ def drawn(rng):
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
     depth = jnp.asarray(rng.uniform(2, 3, (HEIGHT, WIDTH, 1)))
     weights = [
-        depth_weight(depth, None, sigma=1.0),
+        depth_weight(depth, None, sigma=1.0, height=depth.shape[0]),
         normal_weight(jnp.asarray(normal), sigma=16.0),
         luminance_weight(planes[0], planes[1], sigma=2.0),
     ]
@@ -37,14 +37,16 @@ def test_few_pixels_get_what_all_get(share, step, rng, x64):
     planes, hit, weights = drawn(rng)
     needed = jnp.asarray(rng.random((HEIGHT, WIDTH)) < share)
     every, _ = edge_average(planes, hit, weights, stencil(2), step=step, step_max=step, counted=True)
-    found = jax.jit(lambda: sparse.average_of_few(planes, hit, weights, stencil(2), needed, step=step))()
+    found = jax.jit(lambda: sparse.sparse_edge_average(planes, hit, weights, stencil(2), needed, step=step))()
     np.testing.assert_allclose(found, np.where(needed, every, 0.0), rtol=1e-12, atol=1e-14)
 
 
 def test_every_pixel_may_have_a_step_of_its_own(rng, x64):
     planes, hit, weights = drawn(rng)
     step = jnp.asarray(rng.integers(1, 4, (HEIGHT, WIDTH)))
-    found = sparse.average_of_few(planes, hit, weights, stencil(1), jnp.ones((HEIGHT, WIDTH), bool), step=step)[:-1]
+    found = sparse.sparse_edge_average(planes, hit, weights, stencil(1), jnp.ones((HEIGHT, WIDTH), bool), step=step)[
+        :-1
+    ]
     for each in (1, 2, 3):
         every, _ = edge_average(planes, hit, weights, stencil(1), step=each, step_max=3)
         own = step == each

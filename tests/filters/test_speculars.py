@@ -7,7 +7,13 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxdn.filters.atrous import edge_average, stencil
-from jaxdn.filters.clamping import clamp_to_fast, contradiction, neighbourhood, without_fireflies, without_specks
+from jaxdn.filters.clamping import (
+    clamp_fireflies,
+    clamp_to_fast,
+    detect_lag,
+    firefly_attenuation,
+    measure_neighbourhood,
+)
 from jaxdn.filters.edge_stopping import lobe_weight, normal_weight, roughness_weight
 from jaxdn.filters.history_fix import fix_history
 from jaxdn.filters.virtual_motion import closeness, diffuseness, virtual_motion
@@ -145,7 +151,7 @@ def test_histories_contradict_each_other_beyond_the_standard_error(x64, rng):
     slow, fast = rng.gamma(2.0, 1.0, (2, 9, 11))
     fast = fast + np.linspace(0, 3, 11)
     hit = rng.random((9, 11)) < 0.8
-    found = np.asarray(contradiction(slow, fast, jnp.asarray(hit), sigma=1.5, radius=1))
+    found = np.asarray(detect_lag(slow, fast, jnp.asarray(hit), sigma=1.5, radius=1))
     for y, x in np.ndindex(9, 11):
         window = slice(max(y - 1, 0), y + 2), slice(max(x - 1, 0), x + 2)
         inside = hit[window]
@@ -154,11 +160,11 @@ def test_histories_contradict_each_other_beyond_the_standard_error(x64, rng):
         noise = 1.5 * now.std() / np.sqrt(inside.sum()) + 1e-4 * now.mean()
         np.testing.assert_allclose(found[y, x], np.clip(difference / noise - 1, 0, 1), atol=1e-9)
     assert np.mean(found > 0.3) > 0.1
-    assert not np.any(contradiction(slow, slow, None, sigma=1.0, radius=3))
+    assert not np.any(detect_lag(slow, slow, None, sigma=1.0, radius=3))
 
 
 def test_neighbourhoods_without_a_surface_are_zero(rng):
-    mean, deviation, number = neighbourhood(rng.random((2, 5, 6)), jnp.zeros((5, 6), bool), radius=1)
+    mean, deviation, number = measure_neighbourhood(rng.random((2, 5, 6)), jnp.zeros((5, 6), bool), radius=1)
     assert not np.any(mean)
     assert not np.any(number)
     assert np.all(deviation <= 1e-4)
@@ -170,7 +176,7 @@ def test_fireflies_take_the_range_of_their_neighbours(rng):
     color[:, 0, 6] = -1.0
     ids = np.zeros((1, 6, 7), np.float32)
     ids[0, 5, 0] = 1  # alone on its surface
-    found = np.asarray(without_fireflies(color, jnp.asarray(ids)))
+    found = np.asarray(clamp_fireflies(color, jnp.asarray(ids)))
     for y, x in np.ndindex(6, 7):
         near = [
             color[:, v, u]
@@ -185,16 +191,16 @@ def test_no_pixel_is_brighter_than_all_of_its_neighbours_but_by_what_it_is_sure_
     brightness = (1e-9 * rng.random((8, 9))).astype(np.float32)  # no size of its own
     hit, sure = rng.random((8, 9)) < 0.8, np.where(rng.random((8, 9)) < 0.5, rng.random((8, 9)), -1.0)
     hit[:3, :3] = False
-    found = np.asarray(without_specks(brightness, hit, jnp.asarray(sure, jnp.float32)))
+    found = np.asarray(firefly_attenuation(brightness, hit, jnp.asarray(sure, jnp.float32)))
     for y, x in np.ndindex(8, 9):
         near = [brightness[v, u] for v, u in np.ndindex(8, 9) if max(abs(v - y), abs(u - x)) == 1 and hit[v, u]]
         expected = min(1.0, max(max(near) / brightness[y, x], sure[y, x])) if near else 1.0
         np.testing.assert_allclose(found[y, x], expected, rtol=1e-6)
     assert 0.05 < np.mean(found < 1) < 0.5
     nothing, everywhere = jnp.zeros((3, 3)), jnp.ones((3, 3), bool)
-    assert np.all(without_specks(nothing, everywhere, nothing) == 1)
+    assert np.all(firefly_attenuation(nothing, everywhere, nothing) == 1)
     faint = jnp.full((3, 3), 1e-30).at[1, 1].set(2e-30)
-    slope = jax.grad(lambda light: jnp.sum(light * without_specks(light, everywhere, nothing)))(faint)
+    slope = jax.grad(lambda light: jnp.sum(light * firefly_attenuation(light, everywhere, nothing)))(faint)
     assert np.all(np.isfinite(slope))
 
 
@@ -225,7 +231,7 @@ def test_a_short_history_alone_on_its_surface_gets_the_light_beside_it(rng):
     length = jnp.full((9, 9), 9.0).at[4, 4].set(1.0)
     weights = [normal_weight(jnp.asarray(normal), sigma=16.0)]
     found, kept = (
-        np.asarray(fix_history(color, length, None, weights, frames=4, widest=4, beside=beside))
+        np.asarray(fix_history(color, length, None, weights, frames=4, widest=4, isolated=beside))
         for beside in (True, False)
     )
     expected = np.array(color)
@@ -239,9 +245,9 @@ def test_gradients_of_every_part(x64, rng):
     check_grads(
         jax.jit(lambda a, b: clamp_to_fast(a, b, None, sigma=0.5)), (slow, fast), order=1, modes=["rev"], eps=1e-6
     )
-    check_grads(jax.jit(lambda a: without_fireflies(a, None)), (slow,), order=1, modes=["rev"], eps=1e-6)
+    check_grads(jax.jit(lambda a: clamp_fireflies(a, None)), (slow,), order=1, modes=["rev"], eps=1e-6)
     sure, seen = rng.uniform(0.1, 0.9, (4, 5)), jnp.ones((4, 5), bool)
-    check_grads(jax.jit(lambda a: a * without_specks(a, seen, sure)), (slow[0],), order=1, modes=["rev"], eps=1e-6)
+    check_grads(jax.jit(lambda a: a * firefly_attenuation(a, seen, sure)), (slow[0],), order=1, modes=["rev"], eps=1e-6)
     motion, far = rng.normal(size=(2, 4, 5, 2))
     near = rng.uniform(0.1, 0.9, (4, 5))
     check_grads(jax.jit(lambda m, f, c: virtual_motion(m, f, c + 0.5, c)), (motion, far, near), order=1, modes=["rev"])

@@ -85,7 +85,7 @@ def test_a_pixel_alone_is_no_dot(sample):
     history, weights = lone(sample)
     color, _ = estimate_variance(history, None, weights, short_history=SHORT)
     np.testing.assert_allclose(color, 1.0, rtol=1e-6)
-    kept, _ = estimate_variance(history, None, weights, short_history=SHORT, beside=False)
+    kept, _ = estimate_variance(history, None, weights, short_history=SHORT, isolated=False)
     np.testing.assert_allclose(kept[:, 5, 4], sample)
 
 

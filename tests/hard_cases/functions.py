@@ -43,15 +43,13 @@ class Function(NamedTuple):
     sanitizes: bool = False
     """Its result must always be finite; the others may pass on NaN or infinity of their input."""
     bounds: tuple[float, float] = (-np.inf, np.inf)
-    truth: Callable[[Any, Inputs], Any] | None = None
-    """The same without its reduced precision inside, for the comparison in double; None: ``run`` itself."""
     pictured: bool = False
     """Its result is shown as a picture."""
     kind: str = "operation"
 
 
 def list_denoisers() -> list[Function]:
-    """Every registered method, in its smallest variant, each precision, both ways to divide light and to filter it.
+    """Every registered method, in its smallest variant, both ways to divide light and to filter it.
 
     A network has the weights that training starts from; what may follow another method also follows svgf.
     """
@@ -70,16 +68,13 @@ def list_denoisers() -> list[Function]:
             kind="denoiser",
         )
         functions.append(usual)
-        if method.knows("compute_dtype"):
-            half = method.factory(**{**options, "compute_dtype": "bfloat16"})
-            functions.append(usual._replace(name=f"{name} bfloat16", run=_on_clips(half), truth=usual.run))
-        if method.knows("demodulate"):
+        if method.has_option("demodulate"):
             plain = method.factory(**{**options, "demodulate": "albedo"})
             functions.append(usual._replace(name=f"{name} by albedo", run=_on_clips(plain)))
-        if method.knows("after"):
+        if method.has_option("after"):
             after = method.factory(**{**options, "after": methods()["svgf"].factory()})
             functions.append(usual._replace(name=f"{name} after svgf", run=_on_clips(after)))
-        if method.knows("kernels"):
+        if method.has_option("kernels"):
             alone = method.factory(**{**options, "kernels": "plain", "background": "filter"})
             functions.append(usual._replace(name=f"{name} unguided", run=_on_clips(alone), begin=_beginning(alone)))
     return functions

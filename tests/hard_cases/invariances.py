@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from experiments.stability.invariances import measure_deviations as measure
-from jaxdn.zoo.ready import candidate, filters
+from jaxdn.zoo.ready import filter_names, find_model
 from jaxdn.zoo.weights import shipped_names
 from tests.hard_cases.inputs import good
 
@@ -26,8 +26,8 @@ class Deviation(NamedTuple):
 def measure_deviations() -> Iterator[Deviation]:
     """Every invariance for every network that has shipped weights, and for the filters to compare with."""
     clip = good(frames=FRAMES, height=HEIGHT, width=WIDTH).clip
-    for name in (*shipped_names(), *filters()):
-        one = candidate(name)
+    for name in (*shipped_names(), *filter_names()):
+        one = find_model(name)
         assert one.denoiser is not None
         found = measure(one.denoiser, one.params, clip)
         error = found.pop("error")

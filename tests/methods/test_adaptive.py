@@ -173,4 +173,4 @@ def test_options_that_make_no_sense_raise():
     for name in METHODS:
         with pytest.raises(ValueError, match=r"budget: expected a number > 0, got 0"):
             METHODS[name](budget=0)
-        assert methods()[name].made({"preset": "paper"}).rounding == "nearest"
+        assert methods()[name].parse_options({"preset": "paper"}).rounding == "nearest"

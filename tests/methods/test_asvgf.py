@@ -49,7 +49,7 @@ def test_strata_match_a_loop(shape, rng):
     plane = rng.normal(size=shape)
     np.testing.assert_allclose(gradients.stratum_sums(jnp.asarray(plane)), by_strata(plane), rtol=1e-5, atol=1e-6)
     gradient = sparse_gradient(rng, shape)
-    change = gradients.replayed(jnp.asarray(gradient))
+    change = gradients.compare_replayed(jnp.asarray(gradient))
     np.testing.assert_allclose(change.delta, by_strata(gradient[..., 0]), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(change.size, by_strata(gradient[..., 1]), rtol=1e-5, atol=1e-6)
     centers = gradients.stratum_centers(jnp.asarray(plane)[..., None])[..., 0]
@@ -62,7 +62,7 @@ def test_the_observed_change_matches_a_loop(rng):
     now, hit = rng.exponential(size=shape), rng.random(shape) < 0.8
     past = rng.exponential(size=(6, *shape))
     past[5] = rng.integers(0, 3, shape)
-    change = gradients.observed(jnp.asarray(now), jnp.asarray(past), jnp.asarray(hit))
+    change = gradients.compare_with_history(jnp.asarray(now), jnp.asarray(past), jnp.asarray(hit))
     there = hit & (past[5] > 0)
     count = np.maximum(by_strata(there), 1)
     new, old = by_strata(now * there) / count, by_strata(past[3] * there) / count
@@ -78,7 +78,7 @@ def test_the_reconstruction_matches_a_loop(significance, rng, x64):
     delta = rng.uniform(-1, 1, depth.shape) * size
     delta[5:, 7:], size[5:, 7:] = 0.0, 0.0  # a corner where nothing was replayed
     hit = ids >= 0
-    weights = [depth_weight(jnp.asarray(frame.depth), jnp.asarray(frame.ids), sigma=1.0)]
+    weights = [depth_weight(jnp.asarray(frame.depth), jnp.asarray(frame.ids), sigma=1.0, height=len(frame.depth))]
     weights.append(normal_weight(jnp.asarray(normal), sigma=128.0))
     found = gradients.reconstruct(
         gradients.Change(jnp.asarray(delta), jnp.asarray(size)),
@@ -145,7 +145,7 @@ def test_gradients_of_the_formulas(rng, x64):
     depth = jnp.asarray(rng.uniform(4, 5, (4, 5, 1)))
 
     def share(delta, size, depth):
-        weights = [depth_weight(depth, None, sigma=1.0)]
+        weights = [depth_weight(depth, None, sigma=1.0, height=len(depth))]
         return gradients.to_pixels(
             gradients.reconstruct(gradients.Change(delta, size), None, weights, levels=2, significance=0.5), 11, 14
         )
@@ -157,14 +157,16 @@ def test_gradients_of_the_formulas(rng, x64):
         return accumulate(past, now, alpha=0.1, alpha_moments=0.2, history_max=32, change=change)
 
     check_grads(blended, (past, now, jnp.asarray(rng.uniform(0.1, 0.9, (8, 7)))), order=1, modes=("rev",))
-    check_grads(lambda now, past: gradients.observed(now, past, None), (now[0], past), order=1, modes=("rev",))
+    check_grads(
+        lambda now, past: gradients.compare_with_history(now, past, None), (now[0], past), order=1, modes=("rev",)
+    )
 
 
 # The gradients' meaning.
 
 
 def whole_share(gradient, **options):
-    strata = gradients.replayed(jnp.asarray(gradient))
+    strata = gradients.compare_replayed(jnp.asarray(gradient))
     return np.asarray(gradients.reconstruct(strata, None, [], **{"levels": 3, "significance": 2.0, **options}))
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from jaxdn.core.frame import FAR, Frame
 from jaxdn.denoiser import Denoiser
-from jaxdn.methods.lobes import apart
+from jaxdn.methods.lobes import split_signals
 from jaxdn.methods.two_lobes.reblur import reblur
 from jaxdn.methods.two_lobes.relax import relax
 from tests.methods.lobe_scenes import HEIGHT, WIDTH, compiled, mirror_frames, neutral, run, scene
@@ -231,13 +231,15 @@ def test_gradients_reach_both_kinds_of_light(kind, x64, rng):
 @pytest.mark.parametrize("by", ["brdf", "albedo", "none"])
 def test_both_kinds_of_light_add_up(rng, by):
     frame = scene(rng, 1)[0]
-    diffuse, specular = apart(frame, by)
-    np.testing.assert_allclose(diffuse.whole(diffuse.light) + specular.whole(specular.light), frame.radiance, rtol=1e-6)
-    np.testing.assert_allclose(specular.whole(specular.light), frame.specular, rtol=1e-6)
+    diffuse, specular = split_signals(frame, by)
+    np.testing.assert_allclose(
+        diffuse.remodulate(diffuse.light) + specular.remodulate(specular.light), frame.radiance, rtol=1e-6
+    )
+    np.testing.assert_allclose(specular.remodulate(specular.light), frame.specular, rtol=1e-6)
 
 
 def test_specular_light_beyond_all_light_is_cut_off(rng):
     frame = scene(rng, 1)[0]
-    diffuse, specular = apart(frame._replace(specular=2 * frame.radiance + 1), "none")
+    diffuse, specular = split_signals(frame._replace(specular=2 * frame.radiance + 1), "none")
     assert not np.any(diffuse.light)
     np.testing.assert_array_equal(specular.light.transpose(1, 2, 0), frame.radiance)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from jaxdn.core.frame import Clip, Frame, frame_at
 from jaxdn.core.options import Range
 from jaxdn.denoiser.rollout import denoise
-from jaxdn.methods.learnable_options import LEARNED, LEARNED_PER_LEVEL, at_level, moved, unmoved
+from jaxdn.methods.learnable_options import LEARNABLE, LEARNABLE_PER_LEVEL, apply_offsets, at_level, zero_offsets
 from jaxdn.methods.registry import methods
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -21,27 +21,27 @@ pytestmark = pytest.mark.usefixtures("plain_programs")
 
 @dataclass(frozen=True)
 class Toy:
-    share: Annotated[float, Range(0, 1, without_low=True), LEARNED] = 0.2
-    sigma: Annotated[float, Range(0, without_low=True), LEARNED_PER_LEVEL] = 4.0
-    radius: Annotated[float, Range(1), LEARNED] = 3.0
-    absent: Annotated[float | None, Range(0), LEARNED] = None
+    share: Annotated[float, Range(0, 1, without_low=True), LEARNABLE] = 0.2
+    sigma: Annotated[float, Range(0, without_low=True), LEARNABLE_PER_LEVEL] = 4.0
+    radius: Annotated[float, Range(1), LEARNABLE] = 3.0
+    absent: Annotated[float | None, Range(0), LEARNABLE] = None
     levels: int = 3
     fixed: float = 5.0
 
 
 def test_before_training_nothing_is_moved():
-    params = unmoved(Toy())
+    params = zero_offsets(Toy())
     assert {name: array.shape for name, array in params.items()} == {"share": (), "sigma": (3,), "radius": ()}
-    assert "sigma" not in unmoved(Toy(levels=0))
-    found = moved(Toy(), params)
+    assert "sigma" not in zero_offsets(Toy(levels=0))
+    found = apply_offsets(Toy(), params)
     np.testing.assert_allclose([found.share, found.radius, *found.sigma], [0.2, 3.0, 4.0, 4.0, 4.0], rtol=1e-6)
-    assert moved(Toy(), {}) == Toy()
-    assert moved(Toy(), {"radius": jnp.zeros(())}).share == 0.2
+    assert apply_offsets(Toy(), {}) == Toy()
+    assert apply_offsets(Toy(), {"radius": jnp.zeros(())}).share == 0.2
 
 
 @given(st.floats(-60, 60), st.floats(0.001, 1.0))
 def test_no_parameter_leaves_its_range(offset, share):
-    found = moved(Toy(share=share), {"share": jnp.asarray(offset), "radius": jnp.asarray(offset)})
+    found = apply_offsets(Toy(share=share), {"share": jnp.asarray(offset), "radius": jnp.asarray(offset)})
     assert 0.0 <= float(found.share) <= 1.0
     assert float(found.radius) >= 1.0
     odds = np.exp(np.float64(offset)) * np.float64(share) / max(1.0 - share, 1e-300)
@@ -50,19 +50,19 @@ def test_no_parameter_leaves_its_range(offset, share):
 
 
 def test_an_option_at_the_end_of_its_range_stays_there_and_its_gradient_is_finite():
-    value, slope = jax.value_and_grad(lambda x: moved(Toy(share=1.0), {"share": x}).share)(jnp.asarray(2.0))
+    value, slope = jax.value_and_grad(lambda x: apply_offsets(Toy(share=1.0), {"share": x}).share)(jnp.asarray(2.0))
     assert (float(value), float(slope)) == (1.0, 0.0)
 
 
 def test_levels_have_values_of_their_own():
-    found = moved(Toy(), {"sigma": jnp.log(jnp.asarray([0.5, 1.0, 2.0]))})
+    found = apply_offsets(Toy(), {"sigma": jnp.log(jnp.asarray([0.5, 1.0, 2.0]))})
     np.testing.assert_allclose([at_level(found.sigma, level) for level in range(3)], [2.0, 4.0, 8.0], rtol=1e-6)
     assert at_level(Toy().sigma, 2) == 4.0
 
 
 def test_an_option_that_is_not_learned_is_refused():
     with pytest.raises(ValueError, match="expected params out of share, sigma, radius, got 'fixed'"):
-        moved(Toy(), {"fixed": jnp.zeros(())})
+        apply_offsets(Toy(), {"fixed": jnp.zeros(())})
 
 
 @pytest.mark.slow

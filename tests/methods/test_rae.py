@@ -13,6 +13,7 @@ from jax.test_util import check_grads
 from jaxdn.core.frame import FAR, Frame, frame_at
 from jaxdn.denoiser import Denoiser
 from jaxdn.denoiser.rollout import unroll
+from jaxdn.denoiser.statistics import measure_frame
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods.arae import arae
 from jaxdn.methods.rae import LARGE, SMALL, rae
@@ -112,7 +113,7 @@ def test_three_frames_are_those_of_the_numpy_network(rng, key):
     states = [np.zeros((12 >> stage, 16 >> stage, channels)) for stage, channels in enumerate(TINY[0])]
     for index, image in enumerate(found):
         frame = frame_at(frames, index)
-        depth = np.asarray(depth_feature(frame.depth))
+        depth = np.asarray(depth_feature(frame.depth, measure_frame(frame.radiance, frame.depth, frame).mean_depth))
         seen = [numpy_compress(np.asarray(frame.radiance, np.float64)), frame.normal, depth, frame.roughness - 1.0]
         seen = [np.pad(each, ((0, 2), (0, 3), (0, 0)), mode="edge") for each in seen]
         output, states = numpy_network(params, np.concatenate(seen, axis=-1), states)
@@ -223,7 +224,7 @@ def test_the_accumulation_gives_it_the_mean_of_all_frames(rng, key):
 def test_the_papers_settings_are_presets():
     for name in ("rae", "arae"):
         row = methods()[name]
-        assert row.made({"preset": "paper"}).demodulate == "albedo"
-        compared = row.made({"preset": "hasselgren"})
+        assert row.parse_options({"preset": "paper"}).demodulate == "albedo"
+        compared = row.parse_options({"preset": "hasselgren"})
         assert (compared.demodulate, compared.guides) == ("none", "materials")
         assert row.recipe_named("paper").frames == 7

@@ -274,7 +274,7 @@ def test_strips_do_not_show(rng, monkeypatch):
     depth = (3 + rng.random((19, 11, 1))).astype(np.float32)
     needed = np.zeros((19, 11), bool)
     needed[9, 4] = True
-    arguments = (values, None, [depth_weight(jnp.asarray(depth), None, sigma=1.0)], stencil(3))
+    arguments = (values, None, [depth_weight(jnp.asarray(depth), None, sigma=1.0, height=len(depth))], stencil(3))
     whole, _ = edge_average(*arguments)
     monkeypatch.setattr("jaxdn.filters.stencil_tiles._STRIP_PIXELS", 1)
     strips, _ = edge_average(*arguments)
@@ -293,7 +293,7 @@ def test_strips_of_a_cascade_do_not_show(rng, monkeypatch, masked):
     options = {"levels": 3, "sigma_luminance": 2.0, "feedback_level": 1}
 
     def filtered(color):
-        weights = [depth_weight(depth, None, sigma=1.0)]
+        weights = [depth_weight(depth, None, sigma=1.0, height=len(depth))]
         taps = stencil(2, kernel=B3_SPLINE)
         return jnp.stack(cascade(color, color[0] ** 2, hit, lambda level: weights, taps, **options))
 
@@ -576,7 +576,7 @@ def test_a_pixel_without_a_surface_among_strangers_spoils_no_gradient(rng):
     """Its neighbours weigh 1e-20 together, the square of which, 0 in single precision, divided the variance."""
     values = jnp.asarray(rng.uniform(1, 2, (3, 5, 5)), jnp.float32)
     hit = jnp.ones((5, 5), bool).at[2, 2].set(False)
-    depth = depth_weight(jnp.full((5, 5, 1), 2.0), None, sigma=1.0)
+    depth = depth_weight(jnp.full((5, 5, 1), 2.0), None, sigma=1.0, height=5)
     level = values[0].at[2, 2].add(46.0)
 
     def spread(values, level):

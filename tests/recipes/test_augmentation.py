@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxdn.core.frame import Clip, Frame
-from jaxdn.recipes.augmentation import GROUPS, STILL, Variation, varied
+from jaxdn.recipes.augmentation import GROUPS, NO_AUGMENTATION, Augmentation, augment_clip
 
 SHAPE = (2, 4, 5)
 
@@ -28,8 +28,8 @@ def clip(rng: np.random.Generator) -> Clip:
     return Clip(frames, reference, {1: frames.radiance, 2: reference})
 
 
-def one(variation: Variation, clip: Clip, seed: int = 0) -> Clip:
-    return varied(clip, variation, np.random.default_rng(seed))
+def one(variation: Augmentation, clip: Clip, seed: int = 0) -> Clip:
+    return augment_clip(clip, variation, np.random.default_rng(seed))
 
 
 def unchanged(found: Clip, clip: Clip, *names: str) -> None:
@@ -40,7 +40,7 @@ def unchanged(found: Clip, clip: Clip, *names: str) -> None:
 def test_exposure_and_tint_scale_all_light_by_the_same_factors_within_their_ranges(clip: Clip) -> None:
     factors = []
     for seed in range(40):
-        found = one(STILL._replace(exposure=64.0, tint=1.5), clip, seed)
+        found = one(NO_AUGMENTATION._replace(exposure=64.0, tint=1.5), clip, seed)
         gain = found.reference[0, 0, 0] / clip.reference[0, 0, 0]
         for image, before in (
             (found.reference, clip.reference),
@@ -60,7 +60,7 @@ def test_exposure_and_tint_scale_all_light_by_the_same_factors_within_their_rang
 def test_channels_are_exchanged_in_light_and_reflectance_alike(clip: Clip) -> None:
     orders = set()
     for seed in range(40):
-        found = one(STILL._replace(channels=True), clip, seed)
+        found = one(NO_AUGMENTATION._replace(channels=True), clip, seed)
         order = [int(np.argmin(np.abs(clip.reference[0, 0, 0] - value))) for value in found.reference[0, 0, 0]]
         orders.add(tuple(order))
         np.testing.assert_array_equal(found.reference, clip.reference[..., order])
@@ -71,7 +71,7 @@ def test_channels_are_exchanged_in_light_and_reflectance_alike(clip: Clip) -> No
 
 
 def test_normals_turn_rigidly_and_nothing_else_does(clip: Clip) -> None:
-    found = one(STILL._replace(rotation=True), clip)
+    found = one(NO_AUGMENTATION._replace(rotation=True), clip)
     before, after = (frames.normal.reshape(-1, 3) for frames in (clip.frames, found.frames))
     np.testing.assert_allclose(after @ after.T, before @ before.T, atol=1e-5)
     np.testing.assert_allclose(np.linalg.det(after[:3]), np.linalg.det(before[:3]), atol=1e-5)  # no mirror image
@@ -84,7 +84,7 @@ def test_a_shadow_crosses_all_light_alike_and_leaves_the_surfaces(rng: np.random
     clip = Clip(Frame(radiance=wide, albedo=wide, depth=wide[..., :1]), 2 * wide, {1: wide})
     changes, darkest = [], []
     for seed in range(60):
-        found = one(STILL._replace(shadow=1.0), clip, seed)
+        found = one(NO_AUGMENTATION._replace(shadow=1.0), clip, seed)
         left = found.reference / clip.reference
         assert left.max() <= 1 + 1e-5
         assert left.min() >= 1e-3 * (1 - 1e-3)
@@ -104,12 +104,14 @@ def test_a_shadow_crosses_all_light_alike_and_leaves_the_surfaces(rng: np.random
 
 
 def test_of_few_elements_some_have_a_shadow(clip: Clip) -> None:
-    same = [np.array_equal(one(STILL._replace(shadow=0.3), clip, s).reference, clip.reference) for s in range(100)]
+    same = [
+        np.array_equal(one(NO_AUGMENTATION._replace(shadow=0.3), clip, s).reference, clip.reference) for s in range(100)
+    ]
     assert 0.55 < np.mean(same) < 0.85
 
 
 def test_absent_buffers_have_their_neutral_values_in_whole_groups(clip: Clip) -> None:
-    found = one(STILL._replace(missing=1.0), clip)
+    found = one(NO_AUGMENTATION._replace(missing=1.0), clip)
     np.testing.assert_array_equal(found.frames.albedo, 1.0)
     np.testing.assert_array_equal(found.frames.reflectance, 1.0)
     np.testing.assert_array_equal(found.frames.roughness, 1.0)
@@ -117,21 +119,21 @@ def test_absent_buffers_have_their_neutral_values_in_whole_groups(clip: Clip) ->
         np.testing.assert_array_equal(getattr(found.frames, name), 0.0)
     assert found.frames.previous_depth is None  # what was not there does not appear
     unchanged(found, clip, "radiance", "visible", "direct")
-    half = [one(STILL._replace(missing=0.5), clip, seed).frames for seed in range(40)]
+    half = [one(NO_AUGMENTATION._replace(missing=0.5), clip, seed).frames for seed in range(40)]
     gone = np.array([[np.array_equal(f.albedo, np.ones_like(f.albedo)), not f.normal.any()] for f in half])
     assert {(bool(a), bool(n)) for a, n in gone} == {(False, False), (False, True), (True, False), (True, True)}
 
 
 def test_without_variation_nothing_changes(clip: Clip) -> None:
-    found = one(STILL, clip)
+    found = one(NO_AUGMENTATION, clip)
     np.testing.assert_array_equal(found.reference, clip.reference)
     unchanged(found, clip, *(name for name in Frame._fields if getattr(clip.frames, name) is not None))
 
 
 def test_values_out_of_range_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"variation exposure: expected a number >= 1, got 0\.5"):
-        Variation(exposure=0.5).check()
-    Variation().check()
+        Augmentation(exposure=0.5).check()
+    Augmentation().check()
     assert {name for group in GROUPS for name in group} <= set(Frame._fields)
 
 
@@ -140,9 +142,9 @@ def test_every_clip_gets_the_same_brightness(clip: Clip, rng: np.random.Generato
     wide[:, :16, :16] = 0  # black blocks have no say
     for factor in (1e-2, 1.0, 30.0):
         given = Clip(Frame(radiance=factor * wide), factor * wide)
-        found = one(STILL._replace(level=True), given)
+        found = one(NO_AUGMENTATION._replace(level=True), given)
         means = found.reference.mean((0, 3)).reshape(2, 16, 3, 16).mean((1, 3)).ravel()[1:]
         np.testing.assert_allclose(np.exp(np.mean(np.log(means))), 0.18, rtol=1e-4)
         np.testing.assert_allclose(found.frames.radiance, found.reference, rtol=1e-6)
     black = Clip(Frame(radiance=0 * wide), 0 * wide)
-    assert not one(STILL._replace(level=True), black).reference.any()
+    assert not one(NO_AUGMENTATION._replace(level=True), black).reference.any()

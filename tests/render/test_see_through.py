@@ -20,7 +20,7 @@ from jaxdn.render.settings import RenderSettings
 from jaxdn.render.worker_pool import render_clips
 from jaxdn.sequence.render_and_denoise import SceneSettings, denoise_scene
 from jaxdn.sequence.render_jobs import ClipSource, plan_jobs
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 from tests.render.render_scenes import HEIGHT, SQUARE_Z, WIDTH, Stage, grey, shift, turn
 
 SIZE: dict[str, Any] = {"width": WIDTH, "height": HEIGHT}
@@ -267,7 +267,7 @@ def test_a_scene_is_denoised_with_the_guides_of_what_is_seen(tmp_path):
     told: dict[str, list[str]] = {"svgf": [], "trmv": []}
     for name, lines in told.items():
         settings = SceneSettings(RenderSettings(width=16, height=16), frames=[0], budget=1)
-        denoise_scene(str(tmp_path / "checks.xml"), None, tmp_path / name, candidate(name), settings, log=lines.append)
+        denoise_scene(str(tmp_path / "checks.xml"), None, tmp_path / name, find_model(name), settings, log=lines.append)
     line = "guides of flat mirrors and glass are those of what they show"
     assert line in told["svgf"]
     assert line not in told["trmv"], "trmv follows reflections by the mirror's own guides"

@@ -12,7 +12,7 @@ from jaxdn.data.foreign.lighting import find_additive_layers
 from jaxdn.sequence.aov_decomposition import decompose, init_decomposition
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 from tests import programs
 from tests.data.test_kept import assert_same_but, box_blur
 from tests.programs import PROGRAMS, truth, write_shot
@@ -121,7 +121,7 @@ def test_what_has_no_parts_says_so(tmp_path: Path) -> None:
     clips.write_exr(tmp_path / "a.exr", programs.layer("", truth(0).light, "RGB"))
     told: list[str] = []
     settings = Settings(aovs="additive")
-    denoise_files([tmp_path / "a.exr"], tmp_path / "out", candidate("noisy"), settings, log=told.append)
+    denoise_files([tmp_path / "a.exr"], tmp_path / "out", find_model("noisy"), settings, log=told.append)
     assert told == ["--aovs additive: no layer is a part of the beauty; all stay as they are"]
     with pytest.raises(ValueError, match="leave out --only-beauty"):
-        denoise_files([tmp_path / "a.exr"], tmp_path / "out", candidate("noisy"), settings._replace(only_beauty=True))
+        denoise_files([tmp_path / "a.exr"], tmp_path / "out", find_model("noisy"), settings._replace(only_beauty=True))

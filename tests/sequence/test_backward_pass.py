@@ -15,12 +15,12 @@ from jaxdn import clips
 from jaxdn.core.frame import FAR, Frame
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.read import open_frames
-from jaxdn.filters.time_reversal import SEEN_MOST, blend, seen, turned
+from jaxdn.filters.time_reversal import LENGTH_MAX, blend, reverse_time, update_history_length
 from jaxdn.ops.motion import on_screen
 from jaxdn.sequence.jobs import WARM_UP
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 from tests.programs import PROGRAMS, truth, write_shot
 from tests.sequence.test_frames import part_of
 from tests.training.test_training import make_clip
@@ -40,7 +40,7 @@ def frame_of(index: int, **changes: Any) -> Frame:
 def test_vectors_to_the_next_frame_follow_from_those_of_the_next_frame(dropped: tuple[str, ...]) -> None:
     """Exactly, with any guide; what the square hides in the next frame has none. Without guides, that is not seen."""
     frames = [frame_of(index)._replace(**dict.fromkeys(dropped)) for index in (0, 1)]
-    found = turned(*frames).motion
+    found = reverse_time(*frames).motion
     now, after = truth(0), truth(1)
     hidden = (after.ids == 1) & (now.ids == 0)
     known = np.isfinite(found).all(axis=-1, keepdims=True)
@@ -55,7 +55,7 @@ def test_vectors_between_pixels_lead_to_where_the_point_is() -> None:
     rows, columns = np.mgrid[:20, :24].astype(np.float32)
     there = np.stack([columns, rows], axis=-1)
     light = np.ones((20, 24, 3), np.float32)
-    found = turned(Frame(light, motion=np.zeros_like(there)), Frame(light, motion=there / 1.1 - there)).motion
+    found = reverse_time(Frame(light, motion=np.zeros_like(there)), Frame(light, motion=there / 1.1 - there)).motion
     stays = np.asarray(on_screen(0.1 * there))[..., 0]
     assert np.isfinite(found[stays]).all()
     np.testing.assert_allclose(found[stays], 0.1 * there[stays], atol=0.1)
@@ -64,11 +64,11 @@ def test_vectors_between_pixels_lead_to_where_the_point_is() -> None:
 
 def test_without_motion_nothing_moves_and_what_tells_of_the_past_is_left_out() -> None:
     light = np.ones((4, 4, 3), np.float32)
-    still = turned(Frame(light, previous_depth=light[..., :1], luminance_gradient=light[..., :2]), Frame(light))
+    still = reverse_time(Frame(light, previous_depth=light[..., :1], luminance_gradient=light[..., :2]), Frame(light))
     assert still.motion is None
     assert still.previous_depth is None
     assert still.luminance_gradient is None
-    last = turned(frame_of(1, dual_motion=truth(1).motion), None)
+    last = reverse_time(frame_of(1, dual_motion=truth(1).motion), None)
     assert last.dual_motion is None
     assert not np.any(last.motion)
 
@@ -77,7 +77,10 @@ def test_broken_vectors_and_depths_stay_local() -> None:
     now, after = frame_of(0), frame_of(1)
     motion, depth = after.motion.copy(), after.depth.copy()
     motion[2, 2], motion[3, 3, 0], depth[4, 4], depth[5, 5] = np.nan, np.inf, np.nan, FAR
-    whole, broken = turned(now, after).motion, turned(now, after._replace(motion=motion, depth=depth)).motion
+    whole, broken = (
+        reverse_time(now, after).motion,
+        reverse_time(now, after._replace(motion=motion, depth=depth)).motion,
+    )
     differs = ~((whole == broken) | (np.isnan(whole) & np.isnan(broken))).all(axis=-1)
     assert differs.sum() <= 4
     assert np.isnan(broken[differs]).all()
@@ -87,15 +90,15 @@ def test_what_was_seen_longer_counts_more() -> None:
     """The numbers of a square that moves: it and the wall count on, what it uncovers begins anew."""
     state = None
     for index in range(3):
-        state = seen(state, frame_of(index))
+        state = update_history_length(state, frame_of(index))
     number = np.asarray(state.number)
     uncovered = (truth(1).ids == 1) & (truth(2).ids == 0)
     still = (truth(0).ids == truth(1).ids) & (truth(1).ids == truth(2).ids)
     assert np.all(number[uncovered] == 1)
     assert np.all(number[still & ~uncovered] == 3)
     for _ in range(40):
-        state = seen(state, frame_of(0)._replace(motion=None))
-    assert np.max(state.number) == SEEN_MOST
+        state = update_history_length(state, frame_of(0)._replace(motion=None))
+    assert np.max(state.number) == LENGTH_MAX
     one, two = np.full((1, 1, 3), 1.0), np.full((1, 1, 3), 3.0)
     np.testing.assert_allclose(blend(one, two, np.full((1, 1, 1), 1.0), np.full((1, 1, 1), 3.0)), 2.5)
 
@@ -139,7 +142,7 @@ def noisy_wall(folder: Path, count: int, seed: int = 0) -> Path:
 
 
 def denoised(source: Path, out: Path, name: str = "svgf", **settings: Any) -> list[np.ndarray]:
-    written = denoise_files([source], out, candidate(name), Settings(bidirectional=True, **settings))
+    written = denoise_files([source], out, find_model(name), Settings(bidirectional=True, **settings))
     assert not [path for path in out.rglob("*") if ".backwards" in path.name]
     return [np.stack([clips.read_exr(path)[letter] for letter in "RGB"], axis=-1) for path in written.files]
 
@@ -148,7 +151,7 @@ def test_the_first_frame_is_as_good_as_the_last_and_time_has_no_direction(tmp_pa
     source = noisy_wall(tmp_path / "in", 8)
     images = denoised(source, tmp_path / "out")
     errors = [float(np.sqrt(np.mean((image - 1) ** 2))) for image in images]
-    once = denoise_files([source], tmp_path / "once", candidate("svgf")).files[0]
+    once = denoise_files([source], tmp_path / "once", find_model("svgf")).files[0]
     assert errors[0] < 1.3 * errors[-1]
     assert errors[-1] < 1.3 * errors[0]
     assert errors[0] < 0.7 * np.sqrt(np.mean((clips.read_exr(once)["R"] - 1) ** 2))
@@ -178,11 +181,11 @@ def test_an_error_and_an_interrupt_leave_nothing_behind(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        denoise_files([source], tmp_path / "out", candidate("svgf"), Settings(bidirectional=True), on_frame=stop)
+        denoise_files([source], tmp_path / "out", find_model("svgf"), Settings(bidirectional=True), on_frame=stop)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.0000.exr"]
     (source / "a.0001.exr").write_bytes(b"broken")
     with pytest.raises(clips.ClipError, match=r"a\.0001"):
-        denoise_files([source], tmp_path / "bad", candidate("svgf"), Settings(bidirectional=True))
+        denoise_files([source], tmp_path / "bad", find_model("svgf"), Settings(bidirectional=True))
     assert list((tmp_path / "bad").iterdir()) == []
 
 

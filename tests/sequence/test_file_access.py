@@ -19,7 +19,7 @@ from jaxdn.data.read import read_clip
 from jaxdn.sequence.memory_budget import STEP, estimate_bytes
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 from tests.data.test_kept import box_blur
 from tests.programs import PROGRAMS, write_shot
 
@@ -90,7 +90,7 @@ def test_pixels_are_dropped_while_a_frame_is_denoised_in_tiles(tmp_path: Path, m
     limit = estimate_bytes(height, width, channels) - STEP * (height * width - 288 * 288)
     settings = Settings(naming=ChannelNaming("previous-current"), max_memory=limit, safe=False)
     with counted(monkeypatch, source) as counts:
-        denoise_files([source], tmp_path / "out", candidate("taa"), settings)
+        denoise_files([source], tmp_path / "out", find_model("taa"), settings)
     assert counts == expected(source, headers=1, decodes=2, results=2)
 
 

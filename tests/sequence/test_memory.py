@@ -1,4 +1,4 @@
-"""Memory: a sequence of any length takes that of a short one, and large frames that of their parts."""
+"""Memory: a sequence of any length takes that of a short one, and large frames that of their tiles."""
 
 import sys
 
@@ -12,7 +12,7 @@ from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.sequence.memory_budget import STEP, estimate_bytes
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 
 pytestmark = pytest.mark.usefixtures("compiled_anew")  # loading a program takes less memory than compiling it
 
@@ -43,12 +43,12 @@ def test_frames_in_parts_are_the_same_files(tmp_path):
     channels = len(ExrFile(tmp_path / "in/frame_0001.exr").windows)
     enough = estimate_bytes(height, width, channels)
     images, told = {}, []
-    for name, limit in (("whole", enough), ("parts", enough - STEP * (height * width - 288 * 288))):
+    for name, limit in (("whole", enough), ("tiles", enough - STEP * (height * width - 288 * 288))):
         settings = Settings(naming=ChannelNaming("previous-current"), max_memory=limit)
-        files = denoise_files([tmp_path / "in"], tmp_path / name, candidate("svgf"), settings, log=told.append).files
+        files = denoise_files([tmp_path / "in"], tmp_path / name, find_model("svgf"), settings, log=told.append).files
         images[name] = [np.stack([read_exr(file)[letter] for letter in "RGB"], axis=-1) for file in files]
     assert [line for line in told if "in tiles of at most 288 x 288 pixels" in line] == told[-2:-1]
-    np.testing.assert_allclose(images["parts"], images["whole"], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(images["tiles"], images["whole"], rtol=1e-4, atol=1e-5)
     assert np.abs(images["whole"][1] - images["whole"][0]).mean() > 1e-4, "the history of the first frame is used"
 
 
@@ -56,7 +56,7 @@ def test_too_little_memory_is_refused_before_anything_is_written(tmp_path):
     write_sequence(tmp_path / "in", 1, 200, 300)
     settings = Settings(naming=ChannelNaming("previous-current"), max_memory=0.61 * 2**30)
     with pytest.raises(ValueError, match=r"--max-memory 0.61: whole frames of 300 x 200 need .* there is room for"):
-        denoise_files([tmp_path / "in"], tmp_path / "out", candidate("svgf"), settings)
+        denoise_files([tmp_path / "in"], tmp_path / "out", find_model("svgf"), settings)
     assert not list((tmp_path / "out").glob("**/*.exr"))
 
 

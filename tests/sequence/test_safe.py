@@ -14,7 +14,7 @@ from jaxdn.render import ClipJob, render_clips
 from jaxdn.render.settings import RenderSettings
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
 
@@ -53,7 +53,7 @@ def decibels(files: list[Path]) -> list[float]:
 
 def denoise(source: Path, out: Path, **settings: Any) -> tuple[list[Path], list[str]]:
     told: list[str] = []
-    written = denoise_files([source], out, candidate("svgf"), Settings(**settings), log=told.append)
+    written = denoise_files([source], out, find_model("svgf"), Settings(**settings), log=told.append)
     return written.files, told
 
 
@@ -142,7 +142,7 @@ def test_no_rendered_frame_is_worse_than_it_was(
         clips.write_exr(tmp_path / "in" / file.name, light | {"all": rest, "none": {}, "turned": turned}[guides])
     convention = None if guides == "none" else "previous-current"
     files = denoise_files(
-        [tmp_path / "in"], tmp_path / "out", candidate(method), Settings(naming=ChannelNaming(convention))
+        [tmp_path / "in"], tmp_path / "out", find_model(method), Settings(naming=ChannelNaming(convention))
     ).files
     for file in files:
         there = clips.read_exr(rendered / file.name)

@@ -22,7 +22,7 @@ from jaxdn.training.log import Log, read_curve, read_log
 from jaxdn.training.loop import Every, InitialWeights, fit, read_resumed_from
 from jaxdn.training.train import train
 from jaxdn.training.validation import load_validation
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 from tests.training.test_training import TINY, make_clip
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -98,7 +98,7 @@ def test_the_options_of_a_filter_are_fitted_and_its_weights_denoise(clips, tmp_p
     method = method_named("svgf")
     recipe = method.recipe_named(None)._replace(steps=4, batch=2, crop=16, frames=3)
     weights = train(method, recipe, clips, tmp_path, options={"levels": 2})
-    fitted = candidate(str(weights))
+    fitted = find_model(str(weights))
     assert {name: array.shape for name, array in fitted.params.items()} == {
         **dict.fromkeys(("alpha", "alpha_moments"), ()),
         **dict.fromkeys(("sigma_depth", "sigma_normal", "sigma_luminance"), (2,)),
@@ -146,7 +146,7 @@ def test_training_stops_at_its_time_limit_and_goes_on_from_there(clips, tmp_path
 def gain():
     """The frame times a learned number: compiles at once, and the loop is the same."""
 
-    def step(params, state, frame, first):
+    def step(params, state, frame, first, statistics):
         image = params["gain"] * frame.radiance
         return image, image, 0
 

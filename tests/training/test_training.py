@@ -13,7 +13,7 @@ from jaxdn.denoiser.rollout import denoise
 from jaxdn.denoisers import ntd
 from jaxdn.methods.registry import method_named
 from jaxdn.ops.motion import occlusion_mask
-from jaxdn.recipes.augmentation import STILL
+from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.recipes.objectives import unbiased_illumination
 from jaxdn.training.step import clip_loss, init_state, make_train_step
 
@@ -187,7 +187,7 @@ def test_the_papers_recipe_is_constant_adam():
     assert parity.learning_rate == 1e-4
     assert not parity.decay
     assert parity.clip_norm == 0
-    assert parity.variation == STILL
+    assert parity.variation == NO_AUGMENTATION
     assert parity.average == 0
     assert parity.objective.name == RECIPE.objective.name  # the loss is the paper's own in both
 

@@ -13,7 +13,7 @@ from tests.training.test_training import make_clip
 
 
 def identity():
-    def step(params, state, frame, first):
+    def step(params, state, frame, first, statistics):
         return params["gain"] * frame.radiance, params["gain"] * frame.radiance, jnp.zeros((), jnp.int32)
 
     return recurrent(Core(lambda params, frame: frame.radiance, step, frozenset(), lambda key, frame: {}))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxdn
-from jaxdn.core.frame import FAR, Frame
+from jaxdn.core.frame import Frame
 from jaxdn.denoisers import ntd
 from jaxdn.zoo.weights import flatten, save_weights, shipped_names, starting_params, unflatten
 
@@ -17,16 +17,6 @@ TINY = ((4,), (4,), (4,), (4,), (4,))
 
 SAVED = {"size": TINY, "kernels": "guided", "background": "pass"}
 FRAME = Frame(radiance=np.ones((16, 16, 3), np.float32))
-
-EARLIER = {"kernels": "plain", "background": "filter", "exposure": "given"}
-"""What weights without a record of these options were trained with."""
-
-
-def saved_earlier(path, params, options):
-    """Weights whose JSON lacks the options that their version did not have."""
-    path = save_weights(path, params, factory="ntd", options={"size": TINY}, record={})
-    path.with_suffix(".json").write_text(json.dumps({"factory": "ntd", "options": {"size": TINY, **options}}))
-    return path
 
 
 @pytest.fixture
@@ -45,37 +35,8 @@ def test_round_trip(saved):
     assert image.shape == (16, 16, 3)
 
 
-@pytest.mark.parametrize(
-    ("earlier", "today"),
-    [
-        ({"demodulate": True}, "albedo"),
-        ({"demodulate": False}, "none"),
-        ({}, "albedo"),
-        ({"demodulate": "brdf"}, "brdf"),
-    ],
-)
-def test_weights_of_an_earlier_version_are_read(tmp_path, earlier, today):
-    """Whether to divide by the albedo was a yes or no, yes unless it was given; it has become what to divide by."""
-    params = ntd(size=TINY, kernels="plain").init(jax.random.key(0), FRAME)
-    saved = saved_earlier(tmp_path / "w", params, earlier)
-    frame = FRAME._replace(albedo=np.full((16, 16, 3), 0.1, np.float32))
-    images = []
-    for denoiser in (jaxdn.load_weights(saved)[0], ntd(size=TINY, **EARLIER, demodulate=today)):
-        images.append(denoiser.step(params, denoiser.start(params, frame), frame)[1])
-    np.testing.assert_array_equal(*images)
-
-
-def test_a_preset_of_an_earlier_version_keeps_what_it_divides_by(tmp_path):
-    """The exact paper settings divide by nothing, whatever the default was and is."""
-    options = {"size": TINY, "preset": "parity"}
-    params = ntd(**options).init(jax.random.key(0), FRAME)
-    saved = saved_earlier(tmp_path / "w", params, options)
-    assert jaxdn.load_weights(saved)[0].reads == ntd(**options).reads
-    assert "demodulate" not in jaxdn.zoo.weights.describe(saved)["options"]
-
-
 def test_defaults_are_recorded(tmp_path):
-    """An option that the caller left to its default is not taken for one that an earlier version did not have."""
+    """A later version may have other defaults: those of the version that wrote the weights stay with them."""
     options = {"size": TINY}
     params = ntd(**options).init(jax.random.key(0), FRAME)
     path = save_weights(tmp_path / "w", params, factory="ntd", options=options, record={})
@@ -103,23 +64,9 @@ def test_guided_kernels_continue_from_plain_ones(tmp_path):
     np.testing.assert_array_equal(more["reflectance"], np.full((3, 3), 3.0))
 
 
-def test_weights_without_a_record_of_guides_have_plain_kernels_and_filter_the_background(tmp_path, rng):
-    params = ntd(size=TINY, kernels="plain").init(jax.random.key(0), FRAME)
-    depth = np.full((16, 16, 1), 3.0, np.float32)
-    depth[:, 8:] = FAR
-    frame = FRAME._replace(radiance=rng.exponential(size=(16, 16, 3)).astype(np.float32), depth=depth)
-    images = []
-    for number, options in enumerate(({"demodulate": "brdf"}, {"demodulate": "brdf", **EARLIER})):
-        path = saved_earlier(tmp_path / str(number), params, options)
-        denoiser, loaded = jaxdn.load_weights(path)
-        images.append(denoiser.step(loaded, denoiser.start(loaded, frame), frame)[1])
-    np.testing.assert_array_equal(*images)
-    assert np.abs(images[0] - frame.radiance)[:, 8:].max() > 0.01
-
-
 def test_training_continues_from_weights_that_see_less(tmp_path, rng):
     """New guides begin with weights of zero: the first image is that of the old weights, whatever the guides show."""
-    options = {"size": TINY, **EARLIER, "demodulate": "albedo"}
+    options = {"size": TINY, "kernels": "plain", "background": "filter", "demodulate": "albedo"}
     params = ntd(**options).init(jax.random.key(0), FRAME)
     path = save_weights(tmp_path / "w", params, factory="ntd", options=options, record={})
     old, more = jaxdn.load_weights(path)[0], ntd(**options, guides="materials")

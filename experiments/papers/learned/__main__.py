@@ -23,7 +23,7 @@ from experiments.papers.preintegration import save_pictures
 from jaxdn.commands.errors import plain_errors
 from jaxdn.evaluation.compare import compare
 from jaxdn.evaluation.report import Results, write_report
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 
 TABLES = {
     file.__name__.rpartition(".")[2]: file.TABLE
@@ -50,7 +50,7 @@ def main(settings: Settings) -> None:
     tables = tables_named(settings.tables)
     folders = render_all(settings)
     rows = dict.fromkeys([*REFERENCES, *(row for one in tables for row in one.rows)])
-    methods = [trained(row, settings) if row in STAGES else candidate(row) for row in rows]
+    methods = [trained(row, settings) if row in STAGES else find_model(row) for row in rows]
     title = f"The papers' tables after {settings.steps} updates, {BUDGET} samples a pixel"
     found = compare(methods, folders, title=title, settings={"clips": len(folders)}, spp=BUDGET, read=read)
     page = write_report(found, settings.out)

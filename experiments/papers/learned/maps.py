@@ -17,16 +17,16 @@ from jaxdn.clips import read_clip
 from jaxdn.core.frame import Clip, frame_at, only
 from jaxdn.denoiser.rollout import render_requested
 from jaxdn.evaluation.report.images import save_png
-from jaxdn.zoo.ready import Candidate
+from jaxdn.zoo.ready import Model
 
 
-def asks(one: Candidate) -> bool:
+def asks(one: Model) -> bool:
     """Whether a method says where its samples go, unless it has been told to put as many everywhere."""
     uniform = one.options.get("adaptive") is False
     return one.denoiser is not None and one.denoiser.samples is not None and not uniform
 
 
-def counts_of(one: Candidate, clip: Clip) -> jax.Array:
+def counts_of(one: Model, clip: Clip) -> jax.Array:
     """[T, H, W, 1] the numbers of samples that each frame is given."""
     denoiser, params = one.denoiser, one.params
     assert denoiser is not None
@@ -47,7 +47,7 @@ def correlation(first: np.ndarray, second: np.ndarray) -> float:
         return float((first * second).sum() / np.sqrt((first**2).sum() * (second**2).sum()))
 
 
-def save_maps(asking: list[Candidate], folders: list[Path], out: Path) -> str:
+def save_maps(asking: list[Model], folders: list[Path], out: Path) -> str:
     """The map of the last frame of each clip as a picture, and its rank correlation with the noise, as Markdown.
 
     The noise is that of compressed radiance (:func:`variance_of`); it is saved as a picture too.

@@ -15,7 +15,7 @@ from jaxdn.denoiser.rollout import unroll
 from jaxdn.evaluation.compare import EvaluationClip, read_evaluation_clip
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import mean_scores
-from jaxdn.zoo.ready import candidate
+from jaxdn.zoo.ready import find_model
 
 
 class Claim(NamedTuple):
@@ -57,7 +57,7 @@ def read(folder: Path, *, spp: int, layers: bool = False) -> EvaluationClip:
 @cache
 def near() -> Callable[[Frame], jax.Array]:
     """Frames [T, ...] -> images near the truth: a shipped network, which none of the tables' networks shares."""
-    one = candidate("steady-balanced")
+    one = find_model("steady-balanced")
     assert one.denoiser is not None
     denoiser = one.denoiser
     return jax.jit(lambda frames: unroll(denoiser, one.params, frames))

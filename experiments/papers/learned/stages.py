@@ -12,7 +12,7 @@ from jaxdn.methods.registry import method_named
 from jaxdn.render.settings import RenderSettings
 from jaxdn.sequence.render_jobs import ClipSource, render
 from jaxdn.training.train import train
-from jaxdn.zoo.ready import Candidate, candidate
+from jaxdn.zoo.ready import Model, find_model
 
 FAMILIES = ("parlour", "fruit", "mobile", "pinkroom", "robot")
 HELD_OUT = ("parlour", "mobile", "pinkroom", "robot")
@@ -94,17 +94,20 @@ def render_all(settings: Settings) -> list[Path]:
     return find_clips(place)
 
 
-def trained(name: str, settings: Settings) -> Candidate:
+def trained(name: str, settings: Settings) -> Model:
     """A stage, trained if it is not."""
     stage = STAGES[name]
     method = method_named(stage.method)
     recipe = method.recipe_named(None)._replace(
-        steps=settings.steps, frames=settings.frames, average=0.99, spp=(1,) if method.knows("budget") else (BUDGET,)
+        steps=settings.steps,
+        frames=settings.frames,
+        average=0.99,
+        spp=(1,) if method.has_option("budget") else (BUDGET,),
     )
     out = settings.out / file_name(name)
     clips = clips_without(stage.without, find_clips(settings.data / "train"))
     weights = train(method, recipe, clips, out, options=stage.options, label=name)
-    return candidate(str(weights))._replace(label=name)
+    return find_model(str(weights))._replace(label=name)
 
 
 def clips_without(family: str | None, folders: Sequence[Path]) -> list[Path]:

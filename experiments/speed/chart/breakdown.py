@@ -17,6 +17,7 @@ from jaxdn.core.frame import FAR, Frame
 from jaxdn.core.options import make
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.denoiser.sanitize import sanitize, sanitize_image
+from jaxdn.denoiser.statistics import measure_frame
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods.ntd import guided_features
 from jaxdn.methods.reconstruction import TAPS
@@ -27,7 +28,7 @@ from jaxdn.ops.kernel_prediction.softmax import softmax_filter
 from jaxdn.ops.motion import on_screen
 from jaxdn.ops.scales import compose_scales, downsample, fill_holes
 from jaxdn.ops.warp import warp
-from jaxdn.zoo.ready import Candidate
+from jaxdn.zoo.ready import Model
 
 GROUPS = (3, 3, 3, 1, 3, 1)
 HEADS = (2 * TAPS + 1, TAPS + 1, TAPS + 1)
@@ -47,7 +48,7 @@ class Subject(NamedTuple):
     backend: str
 
 
-def subjects(denoisers: Sequence[Candidate], *, quick: bool = False) -> Iterator[Subject]:
+def subjects(denoisers: Sequence[Model], *, quick: bool = False) -> Iterator[Subject]:
     """Denoisers whose step has the parts below, in plain XLA and in each available backend (``quick``: only XLA).
 
     These are weights of ``ntd`` with its default options and any size of network: others change the parts.
@@ -110,8 +111,8 @@ def breakdown(subject: Subject, frame: Frame, *, rounds: int) -> dict[str, Timin
         frame, _ = sanitize(frame)
         known = frame.depth < FAR
         noisy, recalled = fill_holes(noisy, known), fill_holes(recalled, known)
-        gain = color.exposure(noisy)
-        seen = {"albedo": frame.albedo - 1.0, "normal": frame.normal, "depth": depth_feature(frame.depth)}
+        gain, scale = color.exposure(noisy), measure_frame(noisy, frame.depth, frame).mean_depth
+        seen = {"albedo": frame.albedo - 1.0, "normal": frame.normal, "depth": depth_feature(frame.depth, scale)}
         history = color.compress(gain * recalled)
         features = [color.compress(gain * noisy), *seen.values(), history, lost.astype(noisy.dtype)]
         layers = {name: part for name, part in params.items() if name != "guide"}

@@ -17,6 +17,6 @@ UNTRAINED: dict[str, Widths] = {
 def untrained() -> Iterator[Way]:
     """Networks of other widths with random weights: only time."""
     for name, widths in UNTRAINED.items():
-        made = way(ready.untrained(steps.METHOD, size=widths), scored=False)
+        made = way(ready.untrained_model(steps.METHOD, size=widths), scored=False)
         family = "untrained widths"
         yield made._replace(name=name, family=family, variant="untrained", group=family)

@@ -12,7 +12,7 @@ from experiments.speed.timing import Call
 from experiments.speed.works import steps
 from jaxdn.core.frame import BUFFERS, Frame, frame_at, only, written_out
 from jaxdn.denoiser.rollout import stream
-from jaxdn.zoo.ready import Candidate
+from jaxdn.zoo.ready import Model
 
 DENOISED_SPP = (1, 2, 4, 8)
 """Samples per pixel of the denoised images."""
@@ -62,7 +62,7 @@ def standing_still(frame: Frame, reads: frozenset[str]) -> Frame:
     return frame._replace(**dict.fromkeys(STILL))
 
 
-def way(candidate: Candidate, variant: str = PLAIN, *, prepare: Prepare = as_it_is, scored: bool = True) -> Way:
+def way(candidate: Model, variant: str = PLAIN, *, prepare: Prepare = as_it_is, scored: bool = True) -> Way:
     """The chart's entry for a denoiser of this package. Unless ``scored``, only its time is measured."""
     denoiser, params = candidate.denoiser, candidate.params
     if denoiser is None:

@@ -15,22 +15,22 @@ from jaxdn.core.frame import Frame, written_out
 from jaxdn.methods.registry import Method, methods
 from jaxdn.networks.backends import BACKENDS
 from jaxdn.zoo import ready
-from jaxdn.zoo.ready import Candidate
+from jaxdn.zoo.ready import Model
 
 
-def chosen(*, quick: bool = False) -> list[Candidate]:
+def chosen(*, quick: bool = False) -> list[Model]:
     """The denoisers to measure; ``quick``: only the fastest of each method.
 
     Those that request samples from the renderer are left out, see :func:`left_out`.
     """
-    found = [each for each in ready.everything() if not _requests_samples(each)]
+    found = [each for each in ready.all_models() if not _requests_samples(each)]
     if not quick:
         return found
     fastest = {_row(each).name: each.label for each in sorted(found, key=_place)}
     return [each for each in found if each.label in fastest.values()]
 
 
-def registered(denoisers: Sequence[Candidate]) -> Iterator[Way]:
+def registered(denoisers: Sequence[Model]) -> Iterator[Way]:
     """Every denoiser in all its variants: the plain form, other options of its method, other sets of buffers.
 
     Untrained methods are timed with initial weights and not scored.
@@ -44,16 +44,16 @@ def registered(denoisers: Sequence[Candidate]) -> Iterator[Way]:
         yield way(each, "still scene", prepare=standing_still, scored=False)
 
 
-def _row(candidate: Candidate) -> Method:
+def _row(candidate: Model) -> Method:
     assert candidate.method is not None  # only the noisy image has none, and it is not measured
     return candidate.method
 
 
-def _requests_samples(candidate: Candidate) -> bool:
+def _requests_samples(candidate: Model) -> bool:
     return candidate.denoiser is not None and candidate.denoiser.samples is not None
 
 
-def _place(candidate: Candidate) -> int:
+def _place(candidate: Model) -> int:
     """Its index among the variants of its method, which are ordered from the most accurate to the fastest.
 
     A filter's declared constants come last: they are compiled into its program, fitted ones are not.
@@ -69,14 +69,12 @@ def _alternatives(method: Method) -> dict[str, dict[str, Any]]:
     for name in method.backends:
         if BACKENDS[name].purpose == "inference" and BACKENDS[name].available():
             found[name] = {"implementation": name}
-    if method.knows("compute_dtype"):
-        found["bfloat16"] = {"compute_dtype": "bfloat16"}
-    if method.knows("demodulate"):
+    if method.has_option("demodulate"):
         found["not demodulated"] = {"demodulate": "none"}
     return found
 
 
-def _remade(candidate: Candidate, changed: Mapping[str, Any]) -> Candidate:
+def _remade(candidate: Model, changed: Mapping[str, Any]) -> Model:
     """The same weights, run with other options."""
     options = {**candidate.options, **changed}
     return candidate._replace(denoiser=_row(candidate).factory(**options), options=options)
@@ -106,7 +104,7 @@ def open_image_denoise() -> Iterator[Way]:
         yield Way(f"oidn {quality}", "Open Image Denoise", variant, named(guides), timed, images, group)
 
 
-def ways(denoisers: Sequence[Candidate], *, quick: bool = False) -> list[Way]:
+def ways(denoisers: Sequence[Model], *, quick: bool = False) -> list[Way]:
     """Every method that can be run here; ``quick``: only plain forms."""
     found = [*registered(denoisers), *open_image_denoise()]
     if quick:
@@ -121,7 +119,7 @@ def left_out() -> list[str]:
     for name, backend in BACKENDS.items():
         if name in wanted and backend.purpose == "inference" and not backend.available():
             sentences.append(f"{name} is not installed or does not run on jax's device: its rows are left out.")
-    for each in ready.everything():
+    for each in ready.all_models():
         if _requests_samples(each):
             sentences.append(
                 f"{each.label} requests samples from the renderer per pixel, but the compared images have the same "

@@ -22,7 +22,7 @@ from jaxdn.data.foreign.measured_motion import fitting_conventions
 from jaxdn.data.foreign.reflectance import check_fraction, derive_reflectance
 from jaxdn.data.foreign.shots import find_sequence
 from jaxdn.data.foreign.vectors import UnknownMotion, convert_cycles_forward, convert_motion, derive_dual_motion
-from jaxdn.filters.time_reversal import turned
+from jaxdn.filters.time_reversal import reverse_time
 
 
 def plain_frames(
@@ -41,7 +41,7 @@ def plain_frames(
     ``MOTION_CONVENTIONS``) and is needed as soon as there are any that are not Cycles' ``Vector``; ``"none"`` leaves
     them out, as they are of a single image if nothing is stated. The four components of ``Vector`` give dual motion
     vectors too. With ``backwards``, frames come from the last to the first, with time turned around
-    (:func:`jaxdn.filters.time_reversal.turned`). ``channels`` and ``layer``: see
+    (:func:`jaxdn.filters.time_reversal.reverse_time`). ``channels`` and ``layer``: see
     :func:`jaxdn.data.foreign.layers.detect_channels`; what they choose, see
     :func:`jaxdn.data.foreign.channel_mapping.read_channel_mapping`. ``log`` is called with lines about what is derived
     or left unused, when the first frame is read. Depth is taken for view-space z (0, far and infinite become ``FAR``);
@@ -119,7 +119,7 @@ class ForeignSequence:
                 yield frame
                 del frame
             elif turn > 0:
-                yield turned(frame, after, forward)
+                yield reverse_time(frame, after, forward)
                 after = frame
 
     def fitting_conventions(self) -> list[str]:

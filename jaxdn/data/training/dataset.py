@@ -20,7 +20,7 @@ from jaxdn.data.training.cache import CachedClip, read_window
 from jaxdn.data.training.light_samples import check_samples, sample_light
 from jaxdn.data.training.pack import open_clips
 from jaxdn.data.training.symmetries import transform_clip
-from jaxdn.recipes.augmentation import STILL, Variation, varied
+from jaxdn.recipes.augmentation import NO_AUGMENTATION, Augmentation, augment_clip
 
 
 def training_batches(
@@ -34,7 +34,7 @@ def training_batches(
     buffers: Sequence[str] | frozenset[str] | None = None,
     layers: bool = False,
     augment: bool = True,
-    variation: Variation = STILL,
+    variation: Augmentation = NO_AUGMENTATION,
     threads: int = 1,
 ) -> grain.DatasetIterator[Clip]:
     """An endless iterator over batches: a Clip of numpy arrays ``[B, T, H, W, C]``, reference included.
@@ -101,7 +101,7 @@ def training_batches(
         if augment:
             turns = int(rng.integers(4)) if height == width else 2 * int(rng.integers(2))
             clip = transform_clip(clip, flip=bool(rng.integers(2)), turns=turns)
-        return clip if variation == STILL else varied(clip, variation, rng)
+        return clip if variation == NO_AUGMENTATION else augment_clip(clip, variation, rng)
 
     sizes = (frames, height, width)
     # A clip of 30 frames is worth three of 10: the same number of frames is seen of every clip in proportion.

@@ -1,4 +1,4 @@
-"""Single bright pixels, taken away: what is left of fireflies that had nobody to share their light with."""
+"""Firefly suppression: what the filter leaves of a firefly is a single bright pixel, which is darkened."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.color import LUMINANCE, luminance_of_planes
-from jaxdn.filters.clamping import DARK, without_specks
-from jaxdn.methods.steady.accumulation import Mean
+from jaxdn.filters.clamping import DARK, firefly_attenuation
+from jaxdn.methods.steady.accumulation import RunningMean
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
 
@@ -24,33 +24,33 @@ _LEAST_VARIANCE = 1e-12
 
 
 @operation
-def dimmed(image: jax.Array, hit: jax.Array, mean: Mean) -> jax.Array:
-    """The image [3, H, W] >= 0 with :func:`jaxdn.filters.clamping.without_specks` by the mean of its channels.
+def suppress_fireflies(image: jax.Array, hit: jax.Array, mean: RunningMean) -> jax.Array:
+    """The image [3, H, W] >= 0 with :func:`jaxdn.filters.clamping.firefly_attenuation` by the mean of its channels.
 
     Of what the history shows a pixel is sure but for two deviations of the mean; of a single frame, of nothing. ``hit``
     [H, W] bool: a surface is seen.
     """
     level = luminance_of_planes(mean.light)
-    variance = jnp.maximum(mean.square - level**2, 0.0) / jnp.maximum(mean.number, 1.0)
+    variance = jnp.maximum(mean.square - level**2, 0.0) / jnp.maximum(mean.sample_count, 1.0)
     deviation = jnp.sqrt(variance + _LEAST_VARIANCE)
-    sure = jnp.where(mean.number > _SOME, 1.0 - _DEVIATIONS * deviation / jnp.maximum(level, _FAINTEST), 0.0)
-    return image * without_specks((image[0] + image[1] + image[2]) / 3.0, hit, sure)[None]
+    sure = jnp.where(mean.sample_count > _SOME, 1.0 - _DEVIATIONS * deviation / jnp.maximum(level, _FAINTEST), 0.0)
+    return image * firefly_attenuation((image[0] + image[1] + image[2]) / 3.0, hit, sure)[None]
 
 
-@numba_call.implements(dimmed)
-def _dim_by_numba(image: jax.Array, hit: jax.Array, mean: Mean) -> jax.Array:
-    from jaxdn.methods.steady.numba_fireflies import dimmed
+@numba_call.implements(suppress_fireflies)
+def _suppress_fireflies_by_numba(image: jax.Array, hit: jax.Array, mean: RunningMean) -> jax.Array:
+    from jaxdn.methods.steady.numba_fireflies import suppress_fireflies
 
     weights = np.asarray(LUMINANCE, np.float32)
     numbers = (np.float32(number) for number in (DARK, _SOME, _DEVIATIONS, _FAINTEST, _LEAST_VARIANCE))
-    arrays = [image, hit, mean.light, mean.square, mean.number]
-    return numba_call.call(dimmed, [image.shape], arrays, weights, *numbers, rows=hit.shape[0])[0]
+    arrays = [image, hit, mean.light, mean.square, mean.sample_count]
+    return numba_call.call(suppress_fireflies, [image.shape], arrays, weights, *numbers, rows=hit.shape[0])[0]
 
 
-@dimmed.example
+@suppress_fireflies.example
 def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
     light: Any = rng.random((3, height, width)) ** 8
     square = np.einsum("c,cyx->yx", LUMINANCE, light) ** 2 * rng.uniform(0.9, 1.5, (height, width))
     number: Any = rng.choice([1.0, 2.0, 30.0], (height, width))
     hit = rng.random((height, width)) > 0.2
-    yield Example((light * rng.uniform(0.5, 2, light.shape), hit, Mean(light, square, number, light)))
+    yield Example((light * rng.uniform(0.5, 2, light.shape), hit, RunningMean(light, square, number, light)))

@@ -1,8 +1,8 @@
-"""Light filtered by affinities at several levels: at full resolution, at half, and enlarged again along the guides.
+"""A filter pyramid: light filtered by affinities at full resolution, at half, and upsampled again along the guides.
 
 Every level is an :mod:`jaxdn.ops.affinity.filter` whose taps lie twice as far apart as those of the level before. How
 alike two pixels are is told by albedo, gloss, normal, depth and features that somebody has learned; how far each can be
-trusted and how much of each level it takes is decided for every pixel as well: by a network, in
+trusted and how much of each level it takes is parameters for every pixel as well: by a network, in
 :mod:`jaxdn.methods.steady.method`.
 
 What all levels together take away where light follows the guides is found by regression, and a share of it is given
@@ -20,7 +20,7 @@ from jaxdn.core.frame import FAR, Frame
 from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.surface_test import depth_slopes, surface_mask
 from jaxdn.methods.steady import lighting_change, regression
-from jaxdn.methods.steady.accumulation import Shown
+from jaxdn.methods.steady.accumulation import FilteredLight
 from jaxdn.networks import pad
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
@@ -43,7 +43,7 @@ class Surfaces(NamedTuple):
     albedo: jax.Array
     """[H, W, 3] what is reflected at all, less 1."""
     gloss: jax.Array
-    """[H, W, 1] how much of that is not diffuse: a metal frame on a wall as bright as it shows other light."""
+    """[H, W, 1] the specular share of the albedo: metal on a wall as bright as itself reflects other light."""
     normal: jax.Array
     roughness: jax.Array
     depth: jax.Array | None
@@ -55,23 +55,23 @@ class Surfaces(NamedTuple):
         return [(layout, self.albedo), (layout, self.gloss), (layout, self.normal)]
 
 
-class Decisions(NamedTuple):
-    """What is decided about the pixels of a frame."""
+class PredictedParameters(NamedTuple):
+    """What is parameters about the pixels of a frame."""
 
     features: jax.Array
     """[H/2, W/2, 4F] of all four pixels of a block (:func:`jaxdn.ops.scales.space_to_depth`)."""
     trust: jax.Array
     """[H, W] in [0, 1]."""
-    coarse: jax.Array
-    """[H, W] in [0, 1], how much of the image of the levels at half resolution is taken."""
+    coarse_weight: jax.Array
+    """[H, W] in [0, 1], the weight of the image of the levels at half resolution."""
     half_features: jax.Array
     """[H/2, W/2, G]."""
     half_trust: jax.Array
     """[H/2, W/2] in [0, 1]."""
-    take: list[jax.Array]
-    """Level at half resolution -> [H/2, W/2] in [0, 1]."""
-    back: jax.Array | None
-    """[H/2, W/2] in [0, 1], how much is given back of what all levels took away; None for nothing."""
+    level_weights: list[jax.Array]
+    """Level at half resolution -> its weight [H/2, W/2] in [0, 1]."""
+    regression_weight: jax.Array | None
+    """[H/2, W/2] in [0, 1], how much of the regression's correction is added; None: no regression."""
 
 
 def surfaces_of(frame: Frame) -> Surfaces:
@@ -94,69 +94,72 @@ def surfaces_of(frame: Frame) -> Surfaces:
     )
 
 
-def slanted(surfaces: Surfaces, whole: FrameStatistics) -> jax.Array:
+def compute_inverse_depth(surfaces: Surfaces, statistics: FrameStatistics) -> jax.Array:
     """[3, H, W] inverse depth relative to its mean, which is affine on planes, and its slopes; 0 without a surface."""
     depth = surfaces.depth
     if depth is None:
         return jnp.zeros((3, *surfaces.hit.shape), surfaces.normal.dtype)
     known = (depth > 0) & (depth < FAR)
-    inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0) / whole.mean_inverse_depth
+    inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0) / statistics.mean_inverse_depth
     return jnp.stack([inverse[..., 0], *depth_slopes(inverse, None)])
 
 
-def filtered(
+def filter_light(
     precisions: Mapping[str, Any],
     mean: jax.Array,
-    missed: jax.Array | None,
+    residual: jax.Array | None,
     texture: jax.Array | None,
     surfaces: Surfaces,
-    slanted: jax.Array,
-    decided: Decisions,
+    inverse_depth: jax.Array,
+    parameters: PredictedParameters,
     full_levels: int,
     floor: jax.Array,
-) -> Shown:
+) -> FilteredLight:
     """The light [3, H, W] ``mean`` after the levels at full resolution, and after all with a change, and the change.
 
-    ``missed`` [3, H/2, W/2] is how much more the newest frame shows than the mean; None leaves a change out.
+    ``residual`` [3, H/2, W/2] is how much more the newest frame shows than the mean; None leaves a change out.
     ``precisions`` are logarithms, one for full resolution and one for each level at half, of what the squares of
     differences in ``albedo``, ``gloss``, ``normal``, ``depth`` and ``learned`` features are multiplied by; and, as
-    ``regression``, the scales of :func:`jaxdn.methods.steady.regression.given_back`, whose ``floor`` is that here. The
-    image of the levels at half resolution is enlarged along the guides, and takes a share of every pixel. The
-    ``texture`` [H, W, 3] that a division of the light left is filtered likewise, and given back
+    ``regression``, the scales of :func:`jaxdn.methods.steady.regression.regress_residual`, whose ``floor`` is that
+    here. The image of the levels at half resolution is upsampled along the guides, and takes a share of every pixel.
+    The ``texture`` [H, W, 3] that a division of the light left is filtered likewise, and restored
     (:func:`jaxdn.brdf.restore`).
     """
     factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items() if name != "regression"}
-    at_full = _guide([*surfaces.guides(), ("blocks", decided.features)], slanted, decided.trust, surfaces.hit)
+    at_full = _guide(
+        [*surfaces.guides(), ("blocks", parameters.features)], inverse_depth, parameters.trust, surfaces.hit
+    )
     at_full = _at_level(at_full, factors, 0)
     parts = [("planes", mean)]
-    if decided.back is not None:
+    if parameters.regression_weight is not None:
         # Guides that light may follow go through the same filters as light, and so does texture.
-        parts.append(("planes", regression.guides_of(surfaces.normal, surfaces.gloss, slanted[0])))
+        parts.append(("planes", regression.regressors_of(surfaces.normal, surfaces.gloss, inverse_depth[0])))
     if texture is not None:
         parts.append(("pixels", texture))
     before = fine = join_planes(parts)
     for index in range(full_levels):
         fine = affinity_filter(fine, at_full, step=2**index)
-    found, alike = _from_half(fine, missed, surfaces, slanted, decided, factors, at_full)
-    image = fine + (decided.coarse * alike)[None] * (found[: fine.shape[0]] - fine)
-    change = None if missed is None else alike[None] * found[fine.shape[0] :]
+    found, alike = _filter_at_half(fine, residual, surfaces, inverse_depth, parameters, factors, at_full)
+    image = fine + (parameters.coarse_weight * alike)[None] * (found[: fine.shape[0]] - fine)
+    change = None if residual is None else alike[None] * found[fine.shape[0] :]
     light = image[:3]
-    if decided.back is not None:
-        given = regression.given_back(precisions["regression"], before, image, surfaces.hit, floor)
-        light = light + upsample(decided.back[..., None])[None, ..., 0] * given
+    if parameters.regression_weight is not None:
+        correction = regression.regress_residual(precisions["regression"], before, image, surfaces.hit, floor)
+        light = light + upsample(parameters.regression_weight[..., None])[None, ..., 0] * correction
     now = jnp.maximum(light if change is None else light + change, 0.0)
     if texture is None:
-        return Shown(fine[:3], now, change)
-    left = before[-3:]
-    return Shown(brdf.restore(fine[:3], left, fine[-3:]), brdf.restore(now, left, image[-3:]), change)
+        return FilteredLight(fine[:3], now, change)
+    texture_planes = before[-3:]
+    fine_light = brdf.restore(fine[:3], texture_planes, fine[-3:])
+    return FilteredLight(fine_light, brdf.restore(now, texture_planes, image[-3:]), change)
 
 
-def _from_half(
+def _filter_at_half(
     fine: jax.Array,
-    missed: jax.Array | None,
+    residual: jax.Array | None,
     surfaces: Surfaces,
-    slanted: jax.Array,
-    decided: Decisions,
+    inverse_depth: jax.Array,
+    parameters: PredictedParameters,
     factors: Mapping[str, jax.Array],
     at_full: Guide,
 ) -> tuple[jax.Array, jax.Array]:
@@ -164,18 +167,18 @@ def _from_half(
 
     They are followed by the three of the change, if there may be one.
     """
-    slanted_half = slanted[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
-    hit, own = _any_of_four(surfaces.hit), decided.half_features
+    inverse_depth_half = inverse_depth[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
+    hit, own = _any_of_four(surfaces.hit), parameters.half_features
     halved = join_planes(surfaces.guides("means"))
-    at_half = _guide([("planes", halved), ("pixels", own)], slanted_half, decided.half_trust, hit)
-    found = _coarse(_half(fine, surfaces.hit), _at_levels(at_half, factors), decided.take)
-    if missed is not None:
+    at_half = _guide([("planes", halved), ("pixels", own)], inverse_depth_half, parameters.half_trust, hit)
+    found = _filter_half(_downsample(fine, surfaces.hit), _at_levels(at_half, factors), parameters.level_weights)
+    if residual is not None:
         # By surfaces alone: what is learned knows a pixel's noise, and lets a bright sample count for less.
-        plain = _guide([("planes", halved)], slanted_half, jnp.ones_like(decided.half_trust), hit)
-        change = _change(missed, _at_levels(plain, factors), found[:3], hit)
+        plain = _guide([("planes", halved)], inverse_depth_half, jnp.ones_like(parameters.half_trust), hit)
+        change = _filter_change(residual, _at_levels(plain, factors), found[:3], hit)
         found = jnp.concatenate([found, change])
-    features = [("planes", halved), ("corners", decided.features)]
-    there = _guide(features, slanted[:, ::2, ::2], decided.half_trust, hit)
+    features = [("planes", halved), ("corners", parameters.features)]
+    there = _guide(features, inverse_depth[:, ::2, ::2], parameters.half_trust, hit)
     enlarged, weight = joint_bilateral_upsample(found, there, at_full)
     return enlarged, weight / (weight + _LIKENESS)
 
@@ -185,9 +188,9 @@ def _any_of_four(hit: jax.Array) -> jax.Array:
     return hit[::2, ::2] | hit[::2, 1::2] | hit[1::2, ::2] | hit[1::2, 1::2]
 
 
-def _guide(features: Sequence[Channels], slanted: jax.Array, trust: jax.Array, hit: jax.Array) -> Guide:
+def _guide(features: Sequence[Channels], inverse_depth: jax.Array, trust: jax.Array, hit: jax.Array) -> Guide:
     """Surfaces and what else is learned, not yet scaled; what is no surface gives nothing."""
-    return Guide(join_planes(features), slanted, (trust + _LEAST_TRUST) * hit)
+    return Guide(join_planes(features), inverse_depth, (trust + _LEAST_TRUST) * hit)
 
 
 def _at_level(guide: Guide, factors: Mapping[str, jax.Array], index: int) -> Guide:
@@ -201,7 +204,7 @@ def _at_levels(guide: Guide, factors: Mapping[str, jax.Array]) -> list[Guide]:
     return [_at_level(guide, factors, 1 + index) for index in range(LEVELS)]
 
 
-def _half(planes: jax.Array, hit: jax.Array) -> jax.Array:
+def _downsample(planes: jax.Array, hit: jax.Array) -> jax.Array:
     """[C, H/2, W/2] the means of those of four pixels that have a surface; 0 without any."""
 
     def four(planes: jax.Array) -> jax.Array:
@@ -211,26 +214,28 @@ def _half(planes: jax.Array, hit: jax.Array) -> jax.Array:
     return four(jnp.where(hit[None], planes, 0.0)) / jnp.maximum(four(hit.astype(planes.dtype)), 1.0)[None]
 
 
-def _coarse(planes: jax.Array, guides: list[Guide], take: list[jax.Array]) -> jax.Array:
+def _filter_half(planes: jax.Array, guides: list[Guide], level_weights: list[jax.Array]) -> jax.Array:
     """Light, and what else goes the same way, [C, H/2, W/2] after the levels at half resolution."""
     for index, guide in enumerate(guides):
-        planes = planes + take[index][None] * (affinity_filter(planes, guide, step=2**index) - planes)
+        planes = planes + level_weights[index][None] * (affinity_filter(planes, guide, step=2**index) - planes)
     return planes
 
 
-def _change(missed: jax.Array, guides: list[Guide], light: jax.Array, hit: jax.Array) -> jax.Array:
+def _filter_change(residual: jax.Array, guides: list[Guide], light: jax.Array, hit: jax.Array) -> jax.Array:
     """The change of light [3, H/2, W/2], told from what the mean lacks of the newest frame.
 
     Every level is taken whole: a single frame needs all of them, where a mean of many needs few.
     """
-    planes = lighting_change.halves(missed)
+    planes = lighting_change.split_checkerboard(residual)
     for index, guide in enumerate(guides):
         planes = affinity_filter(planes, guide, step=2**index)
-    return lighting_change.change(planes, light, hit)
+    return lighting_change.estimate_change(planes, light, hit)
 
 
-def reach(full_levels: int, *, back: bool, at_once: bool) -> int:
-    """How far, in pixels, :func:`filtered` sees; 16 of them for blocks, slopes and what is enlarged."""
+def receptive_field(full_levels: int, *, with_regression: bool, with_lighting_change: bool) -> int:
+    """How far, in pixels, :func:`filter_light` sees; 16 of them for blocks, slopes and what is upsampled."""
     half = sum(4 * 2**index for index in range(LEVELS))
-    more = max(regression.reach() if back else 0, 2 * lighting_change.reach() if at_once else 0)
+    more = regression.receptive_field() if with_regression else 0
+    if with_lighting_change:
+        more = max(more, 2 * lighting_change.receptive_field())
     return 2 * (2**full_levels - 1) + half + more + 16

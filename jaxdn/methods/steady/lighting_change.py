@@ -32,7 +32,7 @@ filter are clouds some 25 pixels wide: a smaller window, which knows few of them
 _NOTHING = 1e-12
 
 
-def halves(difference: jax.Array) -> jax.Array:
+def split_checkerboard(difference: jax.Array) -> jax.Array:
     """[8, H, W] the difference [3, H, W] at black squares; at white; luminance of both, its sign new in each row."""
     # Not jnp.indices, which has to know the size: an exported step serves all.
     rows, columns = (lax.broadcasted_iota(jnp.int32, difference.shape[1:], axis) for axis in (0, 1))
@@ -47,11 +47,11 @@ def _odd(numbers: jax.Array) -> jax.Array:
     return 2 * lax.shift_right_logical(numbers, jnp.ones_like(numbers)) != numbers
 
 
-def change(filtered: jax.Array, light: jax.Array, hit: jax.Array) -> jax.Array:
+def estimate_change(filtered: jax.Array, light: jax.Array, hit: jax.Array) -> jax.Array:
     """[3, H, W] the part of a filtered difference that is a change of light, between 0 and all of it.
 
     Args:
-      filtered: [8, H, W] what :func:`halves` made, after a filter.
+      filtered: [8, H, W] what :func:`split_checkerboard` made, after a filter.
       light: [3, H, W] >= 0 what the difference is one from, filtered likewise.
       hit: [H, W] bool, there is a surface; other pixels say nothing of noise.
     """
@@ -67,6 +67,6 @@ def change(filtered: jax.Array, light: jax.Array, hit: jax.Array) -> jax.Array:
     return of_white[None] * black + of_black[None] * white
 
 
-def reach() -> int:
-    """How far :func:`change` sees, in pixels."""
+def receptive_field() -> int:
+    """How far :func:`estimate_change` sees, in pixels."""
     return 2 * sum(_WINDOW)

@@ -3,13 +3,13 @@
 For each frame: divide by what surfaces reflect; fetch the history with a test of every tap; blend the noisy frame into
 a running mean whose effective number of samples is known per pixel; filter the mean by affinities, one or two levels at
 full resolution and four at half, each reaching twice as far as the one before (:mod:`jaxdn.methods.steady.levels`);
-give back what that took away where light follows the guides (:mod:`jaxdn.methods.steady.regression`); add what the mean
-lacks of a change of light (:mod:`jaxdn.methods.steady.lighting_change`); take single bright pixels away; blend the
-result with the last output.
+add again what that removed where light follows the guides (:mod:`jaxdn.methods.steady.regression`); add the change of
+the light that the mean lacks (:mod:`jaxdn.methods.steady.lighting_change`); suppress fireflies
+(:mod:`jaxdn.methods.steady.fireflies`); blend the result with the last output.
 
 What a hand-made filter leaves to constants, a U-Net at half resolution decides for every pixel: learned features that
-stop the filter beside albedo, gloss, normal and depth; how far a pixel can be trusted (a firefly is not); how fast both
-histories follow; how much of each level is taken, and given back. Its first decisions are plausible ones, so that
+stop the filter beside albedo, gloss, normal and depth; how far a pixel is trusted (a firefly is not); how fast both
+histories follow; the weight of each level and of the regression. What it predicts before training is plausible, so that
 training begins from a filter and not from noise.
 
 The filter is variance-guided filtering without its variance (Schied et al. 2017), with affinities of learned features
@@ -32,11 +32,20 @@ from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, depth_feature, guides_of
 from jaxdn.methods.demodulation import Demodulation, demodulated, texture_left
 from jaxdn.methods.registry import method
-from jaxdn.methods.steady import regression
-from jaxdn.methods.steady.accumulation import accumulated, remembered
-from jaxdn.methods.steady.fireflies import dimmed
-from jaxdn.methods.steady.levels import BLOCKS, LEVELS, Decisions, Surfaces, filtered, reach, slanted, surfaces_of
-from jaxdn.methods.steady.network_input import CHANNELS, DARK, History, seen
+from jaxdn.methods.steady.accumulation import History, update_history, update_mean
+from jaxdn.methods.steady.fireflies import suppress_fireflies
+from jaxdn.methods.steady.levels import (
+    BLOCKS,
+    LEVELS,
+    PredictedParameters,
+    Surfaces,
+    compute_inverse_depth,
+    filter_light,
+    receptive_field,
+    surfaces_of,
+)
+from jaxdn.methods.steady.network_input import CHANNELS, DARK, assemble_network_input
+from jaxdn.methods.steady.regression import SCALES
 from jaxdn.networks import Widths, crop, graph, pad
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
@@ -58,24 +67,26 @@ class Quality(NamedTuple):
     """Channels of the U-Net's convolutions, from half resolution down."""
     full_levels: int = 2
     """Levels of the filter at full resolution, taps 1, 2 ... pixels apart."""
-    back: bool = True
-    """What the filter took away where light follows the guides is found by regression, and a share is given back."""
-    at_once: bool = True
-    """What the mean lacks of a change of light is added in the frame that shows it."""
+    regression: bool = True
+    """What the filter removed where light follows the guides is estimated by regression, and a share is added again."""
+    lighting_change: bool = True
+    """A change of the light that the mean lacks is added in the frame that shows it."""
 
 
 QUALITIES = {
     "high": Quality(((48,), (64,), (80,), (96,), (96,))),
     "balanced": Quality(((32,), (48,), (64,), (64,), (64,))),
-    "fast": Quality(((16,), (24,), (32,), (32,), (32,)), full_levels=1, back=False, at_once=False),
+    "fast": Quality(((16,), (24,), (32,), (32,), (32,)), full_levels=1, regression=False, lighting_change=False),
 }
 
-BEGIN = {"trust": 4.0, "follow": 0.0, "blend": 0.0, "coarse": 4.0, "feedback": -4.0}
-"""Decisions for every pixel, one logit each, and what they are before training."""
-_PLACES = np.cumsum([4 * FEATURES, 4 * len(BEGIN), HALF_FEATURES]).tolist()
+INITIAL = {"trust": 4.0, "accumulation": 0.0, "output": 0.0, "coarse": 4.0, "feedback": -4.0}
+"""Parameters of every pixel, one logit each, and what they are before training: how far its light is trusted; the
+weight of the new frame in the mean, and of the new image in the last output; the weight of the levels at half
+resolution; the weight of the filtered light in the mean."""
+_SPLITS = np.cumsum([4 * FEATURES, 4 * len(INITIAL), HALF_FEATURES]).tolist()
 """Channels of the head from which on it says something else."""
-_TAKE, _BACK = 4.0, 3.0
-"""The same for how much of each level at half resolution is taken, and of what the filter took away is given back."""
+_LEVEL_WEIGHT, _REGRESSION_WEIGHT = 4.0, 3.0
+"""Initial logits of the weights of each level at half resolution, and of the regression."""
 PRECISIONS = {"albedo": 1.0, "gloss": 2.0, "normal": 1.0, "depth": 6.0, "learned": 0.0}
 """Guide of the filter -> the logarithm of its precision before training."""
 
@@ -88,7 +99,7 @@ class Options:
     """By name, or the network's widths as tuples, with the filter of ``"balanced"``."""
     history_max: Annotated[float, Range(1)] = 32.0
     """Largest effective number of samples of the running mean, in frames."""
-    demodulate: Demodulation | bool = "brdf"
+    demodulate: Demodulation = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     implementation: Literal["reference", "onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"] | None = None
     """Backend of the U-Net: XLA, or on CPUs oneDNN in bfloat16 or float32 or ONNX Runtime (inference) or oneDNN
@@ -123,7 +134,7 @@ def steady(options: Options) -> Denoiser:
     from jaxdn.networks.unet import unet
 
     quality = QUALITIES[options.quality] if isinstance(options.quality, str) else Quality(options.quality)
-    heads = (4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS + quality.back,)
+    heads = (4 * (FEATURES + len(INITIAL)) + HALF_FEATURES + 1 + LEVELS + quality.regression,)
     network = unet(
         (4 * 8 + CHANNELS,), heads, widths=quality.widths, head_size=1, implementation=options.implementation
     )
@@ -131,12 +142,12 @@ def steady(options: Options) -> Denoiser:
 
     def init(key: jax.Array, frame: Frame) -> Params:
         params = network.init(key)
-        pixel = [0.0] * FEATURES + list(BEGIN.values())
+        pixel = [0.0] * FEATURES + list(INITIAL.values())
         bias = [value for value in pixel for _ in range(4)] + [0.0] * HALF_FEATURES
-        bias += [BEGIN["trust"]] + [_TAKE] * LEVELS + [_BACK] * quality.back
+        bias += [INITIAL["trust"]] + [_LEVEL_WEIGHT] * LEVELS + [_REGRESSION_WEIGHT] * quality.regression
         precisions: Params = {name: jnp.full((1 + LEVELS,), value, jnp.float32) for name, value in PRECISIONS.items()}
-        if quality.back:
-            precisions["regression"] = jax.tree.map(jnp.float32, regression.SCALES)
+        if quality.regression:
+            precisions["regression"] = jax.tree.map(jnp.float32, SCALES)
         return {**params, "head_0": {**params["head_0"], "bias": jnp.asarray(bias, jnp.float32)}, "guide": precisions}
 
     def start(params: Params, frame: Frame) -> SteadyState:
@@ -144,96 +155,111 @@ def steady(options: Options) -> Denoiser:
         return SteadyState(nothing, jax.tree.map(jnp.zeros_like, guides_of(frame)))
 
     def step(
-        params: Params, state: SteadyState, frame: Frame, first: jax.Array, whole: FrameStatistics
+        params: Params, state: SteadyState, prepared: PreparedFrame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[SteadyState, jax.Array, jax.Array]:
-        size = frame.radiance.shape[:2]
-        recalled = reproject(state.history, state.guides, frame, first)
-        surfaces = surfaces_of(frame)
-        past = History(pad(recalled.history, BLOCKS), pad(recalled.valid, BLOCKS)[..., 0])
-        hit, known = surfaces.hit, _known(frame, surfaces)
+        frame, surfaces, known, noisy = prepared
+        size, hit = frame.radiance.shape[:2], surfaces.hit
+        history = reproject(state.history, state.guides, frame, first)
+        past = History(pad(history.history, BLOCKS), pad(history.valid, BLOCKS)[..., 0])
         # What was not measured is as it was: no light would be taken for a lamp that is switched off.
-        lost = hit & ~known & past.valid
-        noisy = jnp.where(lost[..., None], past.values[..., :3], _noisy(frame, known))
+        unmeasured = hit & ~known & past.valid
+        noisy = jnp.where(unmeasured[..., None], past.values[..., :3], noisy)
         weights = {name: part for name, part in params.items() if name != "guide"}
-        head = network.apply(weights, [_seen(noisy, past, surfaces, whole)[None]])[0][0]
-        decided, shares = decisions(head, (hit.shape[0] // 2, hit.shape[1] // 2))
-        mean = accumulated(noisy, past, hit, shares["follow"], most=options.history_max)
-        texture = texture_left(frame, options.demodulate, whole)
+        head = network.apply(weights, [_network_input(noisy, past, surfaces, statistics)[None]])[0][0]
+        parameters, shares = split_heads(head, (hit.shape[0] // 2, hit.shape[1] // 2))
+        mean = update_mean(noisy, past, hit, shares["accumulation"], most=options.history_max)
+        texture = texture_left(frame, options.demodulate, statistics)
         texture = None if texture is None else fill_holes(pad(texture, BLOCKS), hit[..., None])
-        given = mean.light, mean.missed if quality.at_once else None, texture, surfaces, slanted(surfaces, whole)
-        found = filtered(params["guide"], *given, decided, quality.full_levels, DARK / whole.exposure)
-        found = found._replace(image=dimmed(found.image, hit, mean))
-        kept = remembered(mean, found, past, shares["feedback"], shares["blend"], most=RADIANCE_MAX)
-        history = crop(kept, size)
-        image = jnp.where(crop(hit, size)[..., None], history[..., 5:], frame.radiance)
-        return SteadyState(history, guides_of(frame)), image, recalled.invalid
+        residual = mean.residual if quality.lighting_change else None
+        geometry = surfaces, compute_inverse_depth(surfaces, statistics)
+        floor = DARK / statistics.exposure
+        filtered = filter_light(
+            params["guide"], mean.light, residual, texture, *geometry, parameters, quality.full_levels, floor
+        )
+        filtered = filtered._replace(image=suppress_fireflies(filtered.image, hit, mean))
+        values = update_history(mean, filtered, past, shares["feedback"], shares["output"], most=RADIANCE_MAX)
+        values = crop(values, size)
+        image = jnp.where(crop(hit, size)[..., None], values[..., 5:], frame.radiance)
+        return SteadyState(values, guides_of(frame)), image, history.invalid
 
-    def measure(frame: Frame) -> FrameStatistics:
-        surfaces = surfaces_of(frame)
-        return measure_frame(_noisy(frame, _known(frame, surfaces)), surfaces.depth, frame)
-
-    network_sees = 2 * graph.receptive_field_radius(graph.unet(1, heads, widths=quality.widths, head_size=1))
-    far = reach(quality.full_levels, back=quality.back, at_once=quality.at_once)
-    core = Core(start, step, reads, init, measure=measure, reach=network_sees + far, counted=True)
+    network_field = 2 * graph.receptive_field_radius(graph.unet(1, heads, widths=quality.widths, head_size=1))
+    filter_field = receptive_field(
+        quality.full_levels, with_regression=quality.regression, with_lighting_change=quality.lighting_change
+    )
+    core = Core(start, step, reads, init, prepare=prepare, requires_validity_mask=True)
+    core = core._replace(receptive_field=network_field + filter_field)
     return demodulated(recurrent(core), by=options.demodulate)
 
 
-def _known(frame: Frame, surfaces: Surfaces) -> jax.Array:
+class PreparedFrame(NamedTuple):
+    """A frame, and what its statistics and its step both need of it; arrays are padded."""
+
+    frame: Frame
+    surfaces: Surfaces
+    known: jax.Array
     """[H, W] bool, there is a surface whose light was measured."""
-    if frame.sample_count is None:
-        return surfaces.hit
-    return surfaces.hit & pad(frame.sample_count > 0, BLOCKS)[..., 0]
+    noisy: jax.Array
+    """[H, W, 3] the light; where it is not known, that of known pixels near by."""
 
 
-def _noisy(frame: Frame, known: jax.Array) -> jax.Array:
+def prepare(frame: Frame) -> tuple[FrameStatistics, PreparedFrame]:
+    """The statistics of a frame's known light, and the frame with its surfaces."""
+    surfaces = surfaces_of(frame)
+    known = surfaces.hit
+    if frame.sample_count is not None:
+        known = known & pad(frame.sample_count > 0, BLOCKS)[..., 0]
     # Divided by a small reflectance it may be beyond what the network has ever seen.
-    return fill_holes(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), BLOCKS), known[..., None])
+    noisy = fill_holes(pad(jnp.minimum(frame.radiance, RADIANCE_MAX), BLOCKS), known[..., None])
+    return measure_frame(noisy, surfaces.depth, frame), PreparedFrame(frame, surfaces, known, noisy)
 
 
-def _seen(noisy: jax.Array, past: History, surfaces: Surfaces, whole: FrameStatistics) -> jax.Array:
-    """What the network sees: light at one brightness (:func:`jaxdn.color.exposure`), and depth of any unit."""
+def _network_input(noisy: jax.Array, past: History, surfaces: Surfaces, statistics: FrameStatistics) -> jax.Array:
+    """The network's input: light at one brightness (:func:`jaxdn.color.exposure`), and depth of any unit."""
     depth = surfaces.depth
-    closeness = jnp.zeros_like(noisy[..., :1]) if depth is None else depth_feature(depth, middle=whole.mean_depth)
-    geometry = surfaces.albedo, surfaces.normal, closeness, surfaces.roughness
-    return seen(geometry, noisy, past, surfaces.hit, whole.exposure, multiple=_MULTIPLE)
+    feature = jnp.zeros_like(noisy[..., :1]) if depth is None else depth_feature(depth, statistics.mean_depth)
+    geometry = surfaces.albedo, surfaces.normal, feature, surfaces.roughness
+    return assemble_network_input(geometry, noisy, past, surfaces.hit, statistics.exposure, multiple=_MULTIPLE)
 
 
-def decisions(head: jax.Array, size: tuple[int, int]) -> tuple[Decisions, dict[str, jax.Array]]:
-    """What the head says about as many blocks: about the filter, and the shares [H, W] in [0, 1] of :data:`BEGIN`."""
-    own, planes, half, (trust, *take) = _apart(head, size=size)
-    shares = dict(zip(BEGIN, planes, strict=True))
+def split_heads(head: jax.Array, size: tuple[int, int]) -> tuple[PredictedParameters, dict[str, jax.Array]]:
+    """The network's output for as many blocks: parameters of the filter, and the shares [H, W] of :data:`INITIAL`."""
+    features, planes, half_features, (half_trust, *weights) = _split_planes(head, size=size)
+    shares = dict(zip(INITIAL, planes, strict=True))
     # A pixel whose share knows of its own noise, follows bright samples more: its mean becomes too bright.
-    shares["follow"] = upsample(downsample(shares["follow"][..., None]))[..., 0]
-    back = take.pop() if len(take) > LEVELS else None
-    return Decisions(own, shares["trust"], shares["coarse"], half, trust, take, back), shares
+    shares["accumulation"] = upsample(downsample(shares["accumulation"][..., None]))[..., 0]
+    regression_weight = weights.pop() if len(weights) > LEVELS else None
+    parameters = PredictedParameters(
+        features, shares["trust"], shares["coarse"], half_features, half_trust, weights, regression_weight
+    )
+    return parameters, shares
 
 
-_Apart = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
-"""Features [H/2, W/2, 4F], shares of all pixels [len(BEGIN), H, W], features and shares [.., H/2, W/2] of blocks."""
+_Split = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
+"""Features [H/2, W/2, 4F], shares of all pixels [len(INITIAL), H, W], features and shares [.., H/2, W/2] of blocks."""
 
 
-@operation(name="split_decisions")
-def _apart(head: jax.Array, *, size: tuple[int, int]) -> _Apart:
+@operation(name="split_heads")
+def _split_planes(head: jax.Array, *, size: tuple[int, int]) -> _Split:
     # Splits, not slices: the gradient of a slice is an array of the whole size, and all of them are added.
-    own, logits, half, rest = jnp.split(crop(head, size), _PLACES, axis=-1)
+    own, logits, half, rest = jnp.split(crop(head, size), _SPLITS, axis=-1)
     # Before they are unfolded, while they lie side by side in memory.
     return own, join_planes([("blocks", jax.nn.sigmoid(logits))]), half, to_planes(jax.nn.sigmoid(rest))
 
 
-@numba_call.implements(_apart)
-def _apart_by_numba(head: jax.Array, *, size: tuple[int, int]) -> _Apart:
-    from jaxdn.methods.steady.numba_heads import decided
+@numba_call.implements(_split_planes)
+def _split_planes_by_numba(head: jax.Array, *, size: tuple[int, int]) -> _Split:
+    from jaxdn.methods.steady.numba_heads import split_heads
 
-    (height, width), (first, _, last) = size, _PLACES
-    shapes = [(*size, first), (len(BEGIN), 2 * height, 2 * width), (*size, HALF_FEATURES)]
+    (height, width), (first, _, last) = size, _SPLITS
+    shapes = [(*size, first), (len(INITIAL), 2 * height, 2 * width), (*size, HALF_FEATURES)]
     shapes.append((head.shape[-1] - last, height, width))
-    own, planes, half, rest = numba_call.call(decided, shapes, [head], rows=height)
+    own, planes, half, rest = numba_call.call(split_heads, shapes, [head], rows=height)
     return own, planes, half, rest
 
 
-@_apart.example
+@_split_planes.example
 def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
-    channels = int(_PLACES[-1]) + 1 + LEVELS + 1
+    channels = int(_SPLITS[-1]) + 1 + LEVELS + 1
     yield Example(
         (3 * rng.normal(size=(height + -height % 16, width + -width % 16, channels)),), {"size": (height, width)}
     )

@@ -1,13 +1,13 @@
-"""What a network at half resolution sees of a frame: surfaces, all four pixels of a block; light, mostly their mean."""
+"""The input of a network at half resolution: surfaces, all four pixels of a block; light, mostly their mean."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxdn import color
+from jaxdn.methods.steady.accumulation import History, draw_history
 from jaxdn.networks import pad
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
@@ -19,18 +19,8 @@ DARK = 1e-3
 """Light at the network's brightness that is as good as dark."""
 
 
-class History(NamedTuple):
-    """What is known of earlier frames."""
-
-    values: jax.Array
-    """[H, W, 8] the running mean of light (3) and of its luminance's square, the effective number of samples, the last
-    output (3); 0 where nothing is known."""
-    valid: jax.Array
-    """[H, W] bool, something is."""
-
-
 @operation
-def seen(
+def assemble_network_input(
     geometry: tuple[jax.Array, ...],
     noisy: jax.Array,
     history: History,
@@ -66,8 +56,8 @@ def seen(
     return pad(jnp.concatenate(found, axis=-1), multiple)
 
 
-@numba_call.implements(seen)
-def _see_by_numba(
+@numba_call.implements(assemble_network_input)
+def _assemble_network_input_by_numba(
     geometry: tuple[jax.Array, ...],
     noisy: jax.Array,
     history: History,
@@ -76,24 +66,19 @@ def _see_by_numba(
     *,
     multiple: int,
 ) -> jax.Array:
-    from jaxdn.methods.steady.numba_network_input import seen
+    from jaxdn.methods.steady.numba_network_input import assemble_network_input
 
     height, width = (side // 2 + -(side // 2) % multiple for side in noisy.shape[:2])
     channels = 4 * sum(each.shape[-1] for each in geometry) + CHANNELS
     numbers = (np.float32(value) for value in (DARK, *color.CURVE))
     arrays: list[numba_call.Given] = [geometry, noisy, *history, hit, jnp.reshape(gain, (1,))]
     weights = np.asarray(color.LUMINANCE, np.float32)
-    return numba_call.call(seen, [(height, width, channels)], arrays, weights, *numbers, rows=height)[0]
+    return numba_call.call(assemble_network_input, [(height, width, channels)], arrays, weights, *numbers, rows=height)[
+        0
+    ]
 
 
-def draw_history(rng: np.random.Generator, height: int, width: int) -> History:
-    """A history of which a fifth is not known, in NumPy's float64."""
-    valid: Any = rng.random((height, width)) > 0.2
-    values: Any = rng.random((height, width, 8)) + np.array([0.0, 0, 0, 2, 1, 0, 0, 0])
-    return History(values * valid[..., None], valid)
-
-
-@seen.example
+@assemble_network_input.example
 def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
     height, width = height + height % 2, width + width % 2
     geometry = rng.normal(size=(height, width, 3)), rng.random((height, width, 1))

@@ -6,7 +6,7 @@ from jaxdn.ops.dispatch.numba_rows import Array, loop, mean_of_blocks
 
 
 @loop
-def accumulated(
+def update_mean(
     top: int,
     bottom: int,
     noisy: Array,
@@ -55,7 +55,7 @@ def accumulated(
 
 
 @loop
-def remembered(
+def update_history(
     top: int,
     bottom: int,
     light: Array,

@@ -6,7 +6,7 @@ from jaxdn.ops.dispatch.numba_rows import Array, loop
 
 
 @loop
-def dimmed(
+def suppress_fireflies(
     top: int,
     bottom: int,
     image: Array,

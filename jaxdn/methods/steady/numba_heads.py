@@ -16,7 +16,7 @@ def _sigmoid(values: Array) -> None:
 
 
 @loop
-def decided(top: int, bottom: int, head: Array, own: Array, shares: Array, half: Array, rest: Array) -> None:
+def split_heads(top: int, bottom: int, head: Array, own: Array, shares: Array, half: Array, rest: Array) -> None:
     """Rows of a ``head`` [h, w, C], taken apart along its channels.
 
     ``own`` [h, w, ...] are the first of them, unchanged; ``shares`` [N, 2h, 2w] in [0, 1] the next 4N, of all pixels of

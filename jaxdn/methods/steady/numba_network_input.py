@@ -28,7 +28,7 @@ def _compress(light: Array, sums: Array, logarithms: Array, gamma: float, toe: f
 
 
 @loop
-def seen(
+def assemble_network_input(
     top: int,
     bottom: int,
     geometry: tuple[Array, ...],

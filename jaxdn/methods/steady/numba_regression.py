@@ -71,18 +71,18 @@ def moments(
 
 
 @loop
-def solved(top: int, bottom: int, system: Array, doubt: Array, expected: Array, out: Array) -> None:
-    """Rows of cells of ``out`` [K, 3, h, w]: see :func:`jaxdn.methods.steady.regression.solved`."""
+def solve(top: int, bottom: int, system: Array, ridge: Array, expected: Array, out: Array) -> None:
+    """Rows of cells of ``out`` [K, 3, h, w]: see :func:`jaxdn.methods.steady.regression.solve`."""
     count, columns = system.shape[0], system.shape[1]
     rows = np.empty((count, columns), np.float32)
     for y in range(top, bottom):
-        for x in range(doubt.shape[1]):
+        for x in range(ridge.shape[1]):
             for row in range(count):
                 for column in range(columns):
                     rows[row, column] = system[row, column, y, x]
-                rows[row, row] += doubt[y, x]
+                rows[row, row] += ridge[y, x]
                 for channel in range(columns - count):
-                    rows[row, count + channel] += doubt[y, x] * expected[row, channel, y, x]
+                    rows[row, count + channel] += ridge[y, x] * expected[row, channel, y, x]
             for pivot in range(count):
                 share = np.float32(1.0) / rows[pivot, pivot]
                 for column in range(columns):
@@ -104,7 +104,7 @@ def _add_between(total: Array, above: Array, below: Array, share: float, away: A
 
 
 @loop
-def explained(
+def predict(
     top: int,
     bottom: int,
     slopes: Array,

@@ -1,4 +1,4 @@
-"""What a filter takes away where light follows the guides: found by regression, and given back.
+"""Regression correction: what a filter removes where light follows the guides is estimated, and added again.
 
 A mean over neighbours is wrong where light is not the same on both sides: it flattens a ball, whose light follows its
 normal, and at the edge of a surface it takes from inside alone. Were light ``a + b . g`` with guides g (normal,
@@ -52,28 +52,28 @@ _TINY = 1e-8
 """Added too, where there is no surface."""
 
 
-def guides_of(normal: jax.Array, gloss: jax.Array, inverse: jax.Array) -> jax.Array:
+def regressors_of(normal: jax.Array, gloss: jax.Array, inverse: jax.Array) -> jax.Array:
     """[7, H, W] what light may follow, from [H, W, 3] normals, [H, W, 1] gloss and [H, W] inverse depth."""
     rows, columns = (_POSITION * lax.broadcasted_iota(inverse.dtype, inverse.shape, axis) for axis in (0, 1))
     rest = jnp.stack([columns, rows])
     return join_planes([("pixels", normal), ("planes", rest), ("pixels", gloss), ("planes", inverse[None])])
 
 
-def given_back(
+def regress_residual(
     scales: dict[str, jax.Array], before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array
 ) -> jax.Array:
     """[3, H, W] what to add to the filtered light; it may be negative.
 
     Args:
       scales: logarithms, see :data:`SCALES`.
-      before: [C, H, W] light >= 0 (3 planes) and guides of :func:`guides_of` (7); others are not read.
+      before: [C, H, W] light >= 0 (3 planes) and guides of :func:`regressors_of` (7); others are not read.
       after: the same after the filter.
       hit: [H, W] bool, there is a surface.
       floor: scalar > 0, light that is dark: brightness is relative to no less.
     """
     factors = jnp.concatenate([jnp.full(n, jnp.exp(scales[name])) for name, n in _CHANNELS.items()])
     given = before, after, hit, jnp.asarray(floor, before.dtype), factors
-    return _explained(_slopes(_moments(*given)), *given)
+    return _predict(_slopes(_moments(*given)), *given)
 
 
 def _level(after: jax.Array, floor: jax.Array) -> jax.Array:
@@ -81,7 +81,7 @@ def _level(after: jax.Array, floor: jax.Array) -> jax.Array:
     return jnp.mean(after[:3], axis=0) + floor
 
 
-def _away(before: jax.Array, after: jax.Array, hit: jax.Array, factors: jax.Array) -> jax.Array:
+def _residual_regressors(before: jax.Array, after: jax.Array, hit: jax.Array, factors: jax.Array) -> jax.Array:
     """[7, H, W] d."""
     guides = slice(3, 3 + GUIDES)
     return factors[:, None, None] * jnp.where(hit[None], before[guides] - after[guides], 0.0)
@@ -91,7 +91,7 @@ def _away(before: jax.Array, after: jax.Array, hit: jax.Array, factors: jax.Arra
 def _moments(before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array, factors: jax.Array) -> jax.Array:
     """[11, 11, h, w] means over cells of the products of d, r, and whether there is a surface, with each other."""
     rest = jnp.where(hit[None], before[:3] - after[:3], 0.0) / _level(after, floor)[None]
-    both = jnp.concatenate([_away(before, after, hit, factors), rest, hit[None].astype(rest.dtype)])
+    both = jnp.concatenate([_residual_regressors(before, after, hit, factors), rest, hit[None].astype(rest.dtype)])
     rows, columns = (-(-size // CELL) for size in hit.shape)
     wide = jnp.pad(both, ((0, 0), *((0, -size % CELL) for size in hit.shape)))
     cells = wide.reshape(-1, rows, CELL, columns, CELL).transpose(1, 3, 0, 2, 4).reshape(rows, columns, -1, CELL**2)
@@ -114,27 +114,27 @@ def _slopes(moments: jax.Array) -> jax.Array:
     """[7, 3, h, w] b of the smaller window, by the unit of each guide."""
     windows, pixels, wide = [], [], moments
     for step in _WINDOWS:
-        wide = _blurred(wide, step)
+        wide = _blur(wide, step)
         windows.append(wide)
         # That of independent pixels whose mean is as sure, for the one filter; those before add little.
         pixels.append((CELL * step / sum(np.square([SPLINE[abs(tap)] for tap in range(-2, 3)]))) ** 2)
     slopes = jnp.zeros((GUIDES, 3, *moments.shape[2:]), moments.dtype)
     for window, number in zip(reversed(windows), reversed(pixels), strict=True):
         variance = sum(window[index, index] for index in range(GUIDES, GUIDES + 3)) / 3.0
-        doubt = _DOUBT / number * variance + _LEAST * window[-1, -1] + _TINY
-        slopes = solved(window[:GUIDES, :-1], doubt, slopes)
+        ridge = _DOUBT / number * variance + _LEAST * window[-1, -1] + _TINY
+        slopes = solve(window[:GUIDES, :-1], ridge, slopes)
     return slopes
 
 
 @operation(name="regression_solve")
-def solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Array:
+def solve(system: jax.Array, ridge: jax.Array, expected: jax.Array) -> jax.Array:
     """b [7, 3, h, w] for all cells at once, from E[d d'] and E[d r'] side by side [7, 10, h, w], u [h, w] and b'.
 
     Gauss and Jordan's elimination, which needs no pivots as E[d d'] + u I is positive definite.
     """
     units = np.eye(GUIDES, dtype=system.dtype)[..., None, None]
-    believed = jnp.concatenate([jnp.broadcast_to(units, (GUIDES, GUIDES, *doubt.shape)), expected], axis=1)
-    system = system + doubt[None, None] * believed
+    prior = jnp.concatenate([jnp.broadcast_to(units, (GUIDES, GUIDES, *ridge.shape)), expected], axis=1)
+    system = system + ridge[None, None] * prior
     for index in range(GUIDES):
         row = system[index] / system[index, index][None]
         # Less the unit, so that what is left of the row itself is the row.
@@ -142,14 +142,14 @@ def solved(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Arra
     return system[:, GUIDES:]
 
 
-@numba_call.implements(solved)
-def _solve_by_numba(system: jax.Array, doubt: jax.Array, expected: jax.Array) -> jax.Array:
-    from jaxdn.methods.steady.numba_regression import solved
+@numba_call.implements(solve)
+def _solve_by_numba(system: jax.Array, ridge: jax.Array, expected: jax.Array) -> jax.Array:
+    from jaxdn.methods.steady.numba_regression import solve
 
-    return numba_call.call(solved, [expected.shape], [system, doubt, expected], rows=doubt.shape[0])[0]
+    return numba_call.call(solve, [expected.shape], [system, ridge, expected], rows=ridge.shape[0])[0]
 
 
-def _blurred(planes: jax.Array, step: int) -> jax.Array:
+def _blur(planes: jax.Array, step: int) -> jax.Array:
     """By the B3 spline, taps ``step`` apart; 0 beyond the border."""
     for axis in (-2, -1):
         size = planes.shape[axis]
@@ -160,17 +160,17 @@ def _blurred(planes: jax.Array, step: int) -> jax.Array:
 
 
 @operation(name="regression_explain")
-def _explained(
+def _predict(
     slopes: jax.Array, before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array, factors: jax.Array
 ) -> jax.Array:
     """[3, H, W] b . d, slopes interpolated between the centres of cells, times the brightness."""
     height, width = hit.shape
-    between = _between(_between(slopes, 2), 3)[..., :height, :width]
-    found = jnp.sum(between * _away(before, after, hit, factors)[:, None], axis=0)
+    between = _interpolate(_interpolate(slopes, 2), 3)[..., :height, :width]
+    found = jnp.sum(between * _residual_regressors(before, after, hit, factors)[:, None], axis=0)
     return _level(after, floor)[None] * found
 
 
-def _between(cells: jax.Array, axis: int) -> jax.Array:
+def _interpolate(cells: jax.Array, axis: int) -> jax.Array:
     """CELL times the size along an axis, linear, with edge clamp."""
     size = cells.shape[axis]
     first, last = (lax.slice_in_dim(cells, at, at + 1, axis=axis) for at in (0, size - 1))
@@ -184,18 +184,18 @@ def _between(cells: jax.Array, axis: int) -> jax.Array:
     return found.reshape(*cells.shape[:axis], CELL * size, *cells.shape[axis + 1 :])
 
 
-@numba_call.implements(_explained)
-def _explain_by_numba(
+@numba_call.implements(_predict)
+def _predict_by_numba(
     slopes: jax.Array, before: jax.Array, after: jax.Array, hit: jax.Array, floor: jax.Array, factors: jax.Array
 ) -> jax.Array:
-    from jaxdn.methods.steady.numba_regression import explained
+    from jaxdn.methods.steady.numba_regression import predict
 
-    arrays = [_between(slopes, 3), before, after, hit, floor.reshape(1), factors]
-    return numba_call.call(explained, [(3, *hit.shape)], arrays, CELL, rows=hit.shape[0])[0]
+    arrays = [_interpolate(slopes, 3), before, after, hit, floor.reshape(1), factors]
+    return numba_call.call(predict, [(3, *hit.shape)], arrays, CELL, rows=hit.shape[0])[0]
 
 
-def reach() -> int:
-    """How far :func:`given_back` sees, in pixels: the windows, and the cells that are interpolated."""
+def receptive_field() -> int:
+    """How far :func:`regress_residual` sees, in pixels: the windows, and the cells that are interpolated."""
     return CELL * (2 * sum(_WINDOWS) + 2)
 
 
@@ -210,13 +210,13 @@ def _moments_example(rng: np.random.Generator, height: int, width: int) -> Itera
     yield Example(_draw_planes(rng, height, width))
 
 
-@_explained.example
-def _explain_example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+@_predict.example
+def _predict_example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
     cells = -(-height // CELL), -(-width // CELL)
     yield Example((rng.normal(size=(GUIDES, 3, *cells)), *_draw_planes(rng, height, width)))
 
 
-@solved.example
+@solve.example
 def _solve_example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
     both = rng.normal(size=(GUIDES + 3, 32, height, width))
     system = np.einsum("inyx,jnyx->ijyx", both[:GUIDES], both) / 32

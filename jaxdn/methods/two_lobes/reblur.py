@@ -2,7 +2,7 @@
 
 For each frame and for both kinds of light, divided by what their lobes reflect: average four taps around each pixel;
 fetch the history, for reflections along the motion of their virtual image, and blend into a slow and into a fast
-running mean; let the slow one follow the fast one (:func:`jaxdn.methods.two_lobes.histories.respond`); blur by two
+running mean; let the slow one follow the fast one (:func:`jaxdn.methods.two_lobes.histories.correct_lag`); blur by two
 discs of eight taps, the second twice as wide as the first, whose radius shrinks with the number of frames accumulated
 and with the distance to what the light comes from; and steady the luminance.
 
@@ -23,16 +23,17 @@ from jaxdn import brdf
 from jaxdn.core.frame import Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
-from jaxdn.filters.clamping import without_fireflies
+from jaxdn.denoiser.statistics import FrameStatistics
+from jaxdn.filters.clamping import clamp_fireflies
 from jaxdn.filters.disc import TAPS, disc_average, rotations
 from jaxdn.filters.edge_stopping import closeness_weight
 from jaxdn.filters.stabilisation import stabilise
 from jaxdn.filters.virtual_motion import closeness_of
-from jaxdn.methods.learnable_options import FITTING, LEARNED, moved, unmoved
+from jaxdn.methods.learnable_options import FITTING, LEARNABLE, apply_offsets, zero_offsets
 from jaxdn.methods.lobes import READS
 from jaxdn.methods.registry import method
 from jaxdn.methods.two_lobes import histories
-from jaxdn.methods.two_lobes.histories import Kind, LobeState
+from jaxdn.methods.two_lobes.histories import LobeState, Signal
 
 _PLANES = 9
 """Planes of a history: colour (3), length in frames, fast colour (3), steady luminance, closeness of diffuse hits."""
@@ -51,7 +52,7 @@ class Options(histories.Options):
     """Radius in pixels of the first disc after it, for a history of one frame; of N frames: ``radius / sqrt(N)``."""
     radius_min: Annotated[float, Range(0)] = 1.0
     """It is at least this."""
-    stable_sigma: Annotated[float, Range(0), LEARNED] = 1.0
+    stable_sigma: Annotated[float, Range(0), LEARNABLE] = 1.0
     """Steady luminance may be this many standard deviations from the mean of 3x3 pixels."""
     stable_max: Annotated[int, Range(1)] = 30
     """Maximum length of the mean of luminance in frames; 1: it is not steadied."""
@@ -87,62 +88,64 @@ def reblur(options: Options) -> Denoiser:
         return ReblurState(histories.start(frame, _PLANES), jnp.zeros((), jnp.int32))
 
     def step(
-        params: Params, state: ReblurState, frame: Frame, first: jax.Array
+        params: Params, state: ReblurState, frame: Frame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[ReblurState, jax.Array, jax.Array]:
-        fitted = moved(options, params)
+        fitted = apply_offsets(options, params)
         number = jnp.where(first, 0, state.frame)
         near = closeness_of(frame.hit_distance, frame)
 
-        def one(kind: Kind) -> tuple[jax.Array, jax.Array]:
-            return _denoised(fitted, kind, near, number)
+        def filter_signal(signal: Signal) -> tuple[jax.Array, jax.Array]:
+            return _filter_signal(fitted, signal, near, number)
 
-        light, image, invalid = histories.step(fitted, one, state.light, frame, first, length_plane=_LENGTH)
+        light, image, invalid = histories.step(
+            fitted, filter_signal, state.light, frame, first, statistics, length_plane=_LENGTH
+        )
         return ReblurState(light, number + 1), image, invalid
 
-    return recurrent(Core(start, step, READS | {"hit_distance"}, lambda key, frame: unmoved(options)))
+    return recurrent(Core(start, step, READS | {"hit_distance"}, lambda key, frame: zero_offsets(options)))
 
 
-def _denoised(
-    options: Options, kind: Kind, diffuse_closeness: jax.Array | None, number: jax.Array
+def _filter_signal(
+    options: Options, signal: Signal, diffuse_closeness: jax.Array | None, number: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """The new history [9, H, W] of one kind of light, and its image [3, H, W]."""
-    now, past = kind.now.light, kind.past
+    now, past = signal.now.light, signal.past
     shape = now.shape[1:]
     length = jnp.minimum(past[_LENGTH] + 1.0, options.history_max)
     share = 1.0 / length
-    near = diffuse_closeness if kind.sticks is None else kind.closeness
+    near = diffuse_closeness if signal.diffuseness is None else signal.closeness
     kept = jnp.zeros(shape, now.dtype)
-    if kind.sticks is None and near is not None:
-        kept = near = _blended(past[8], near, share)
-    wide = jnp.ones(shape, now.dtype) if kind.sticks is None else kind.sticks
+    if signal.diffuseness is None and near is not None:
+        kept = near = _blend_closeness(past[8], near, share)
+    wide = jnp.ones(shape, now.dtype) if signal.diffuseness is None else signal.diffuseness
     far = wide if near is None else wide * jnp.sqrt(_hit_factor(near))
-    weights = list(kind.weights)
-    if kind.sticks is not None and near is not None:
+    weights = list(signal.weights)
+    if signal.diffuseness is not None and near is not None:
         weights.append(closeness_weight(near, tolerance=_ALIKE, least=_LEAST))
 
-    def blurred(light: jax.Array, radius: jax.Array, turn: int) -> jax.Array:
-        angle = rotations(shape, 6 * number + (3 if kind.sticks is None else 0) + turn, now.dtype)
-        texture = kind.now.texture
+    def blur(light: jax.Array, radius: jax.Array, turn: int) -> jax.Array:
+        angle = rotations(shape, 6 * number + (3 if signal.diffuseness is None else 0) + turn, now.dtype)
+        texture = signal.now.texture
         planes = light if texture is None else jnp.concatenate([light, texture])
-        mean = disc_average(planes, kind.hit, weights, radius, angle, taps=TAPS if turn else TAPS[:4])
+        mean = disc_average(planes, signal.hit, weights, radius, angle, taps=TAPS if turn else TAPS[:4])
         return mean if texture is None else brdf.restore(mean[:3], texture, mean[3:])
 
     if options.pre_radius:
-        now = blurred(now, options.pre_radius * far, 0)
+        now = blur(now, options.pre_radius * far, 0)
     slow = past[:3] + share[None] * (now - past[:3])
-    fast = histories.fast_mean(options, past[4:7], now, length)
-    held, length, _ = histories.respond(options, kind._replace(weights=weights), slow, fast, length)
+    fast = histories.update_fast_mean(options, past[4:7], now, length)
+    held, length, _ = histories.correct_lag(options, signal._replace(weights=weights), slow, fast, length)
     if options.anti_firefly:
-        held = without_fireflies(held, kind.same)
+        held = clamp_fireflies(held, signal.surface_planes)
     if options.radius:
         radius = jnp.maximum(options.radius * far / jnp.sqrt(length), options.radius_min * wide)
-        held = blurred(blurred(held, radius, 1), 2.0 * radius, 2)
-    seen = jnp.minimum(length, options.stable_max)
-    image, steady = stabilise(held, past[7], 1.0 - 1.0 / seen, kind.hit, sigma=options.stable_sigma)
+        held = blur(blur(held, radius, 1), 2.0 * radius, 2)
+    stable_length = jnp.minimum(length, options.stable_max)
+    image, steady = stabilise(held, past[7], 1.0 - 1.0 / stable_length, signal.hit, sigma=options.stable_sigma)
     return jnp.concatenate([held, length[None], fast, steady[None], kept[None]]), image
 
 
-def _blended(past: jax.Array, now: jax.Array, share: jax.Array) -> jax.Array:
+def _blend_closeness(past: jax.Array, now: jax.Array, share: jax.Array) -> jax.Array:
     """Closeness [H, W] with less noise; 0 means unknown in both."""
     mixed = jnp.where(past > 0, past + share * (now - past), now)
     return jnp.where(now > 0, mixed, past)

@@ -22,16 +22,17 @@ import jax.numpy as jnp
 from jaxdn.core.frame import Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.accumulation import accumulate, after_shift
 from jaxdn.filters.atrous import GAUSSIAN, stencil
 from jaxdn.filters.cascade import cascade
-from jaxdn.filters.clamping import without_fireflies
+from jaxdn.filters.clamping import clamp_fireflies
 from jaxdn.filters.variance import estimate_variance
-from jaxdn.methods.learnable_options import FITTING, LEARNED_PER_LEVEL, moved, unmoved
+from jaxdn.methods.learnable_options import FITTING, LEARNABLE_PER_LEVEL, apply_offsets, zero_offsets
 from jaxdn.methods.lobes import READS
 from jaxdn.methods.registry import method
 from jaxdn.methods.two_lobes import histories
-from jaxdn.methods.two_lobes.histories import Kind, LobeState
+from jaxdn.methods.two_lobes.histories import LobeState, Signal
 
 _PLANES = 9
 """Planes of a history: colour (3), two moments of its luminance, length in frames, fast colour (3)."""
@@ -48,9 +49,9 @@ class Options(histories.Options):
     """For N below this the variance is estimated from the 7x7 neighbourhood."""
     levels: Annotated[int, Range(0, 10)] = 5
     """Levels of the a-trous filter."""
-    sigma_diffuse: Annotated[float, _POSITIVE, LEARNED_PER_LEVEL] = 2.0
+    sigma_diffuse: Annotated[float, _POSITIVE, LEARNABLE_PER_LEVEL] = 2.0
     """Edge-stopping parameter for differences in luminance, in standard deviations, of diffuse light."""
-    sigma_specular: Annotated[float, _POSITIVE, LEARNED_PER_LEVEL] = 2.0
+    sigma_specular: Annotated[float, _POSITIVE, LEARNABLE_PER_LEVEL] = 2.0
     """The same of specular light."""
 
 
@@ -76,28 +77,29 @@ def relax(options: Options) -> Denoiser:
         return histories.start(frame, _PLANES)
 
     def step(
-        params: Params, state: LobeState, frame: Frame, first: jax.Array
+        params: Params, state: LobeState, frame: Frame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[LobeState, jax.Array, jax.Array]:
-        fitted = moved(options, params)
-        return histories.step(fitted, lambda kind: _denoised(fitted, kind), state, frame, first, length_plane=_LENGTH)
+        fitted = apply_offsets(options, params)
+        given = state, frame, first, statistics
+        return histories.step(fitted, lambda signal: _filter_signal(fitted, signal), *given, length_plane=_LENGTH)
 
-    return recurrent(Core(start, step, READS, lambda key, frame: unmoved(options)))
+    return recurrent(Core(start, step, READS, lambda key, frame: zero_offsets(options)))
 
 
-def _denoised(options: Options, kind: Kind) -> tuple[jax.Array, jax.Array]:
+def _filter_signal(options: Options, signal: Signal) -> tuple[jax.Array, jax.Array]:
     """The new history [9, H, W] of one kind of light, and its image [3, H, W]."""
-    now = kind.now.light
-    slow = accumulate(kind.past[:6], now, alpha=0.0, alpha_moments=0.0, history_max=options.history_max)
-    fast = histories.fast_mean(options, kind.past[6:9], now, slow[_LENGTH])
-    held, length, moved = histories.respond(options, kind, slow[:3], fast, slow[_LENGTH])
-    moments = after_shift(slow[3:5], moved)
+    now = signal.now.light
+    slow = accumulate(signal.past[:6], now, alpha=0.0, alpha_moments=0.0, history_max=options.history_max)
+    fast = histories.update_fast_mean(options, signal.past[6:9], now, slow[_LENGTH])
+    held, length, shift = histories.correct_lag(options, signal, slow[:3], fast, slow[_LENGTH])
+    moments = after_shift(slow[3:5], shift)
     history = jnp.concatenate([held, moments, length[None], fast])
-    calm = without_fireflies(held, kind.same) if options.anti_firefly else held
-    seen = jnp.concatenate([calm, moments, length[None]])
-    own: dict[str, Any] = {"texture": kind.now.texture}
-    short: dict[str, Any] = {"short_history": options.short_history, "beside": kind.sticks is None}
-    calm, variance = estimate_variance(seen, kind.hit, kind.weights, **short, **own)
-    sigma = options.sigma_diffuse if kind.sticks is None else options.sigma_specular
+    calm = clamp_fireflies(held, signal.surface_planes) if options.anti_firefly else held
+    calm_history = jnp.concatenate([calm, moments, length[None]])
+    own: dict[str, Any] = {"texture": signal.now.texture}
+    short: dict[str, Any] = {"short_history": options.short_history, "isolated": signal.diffuseness is None}
+    calm, variance = estimate_variance(calm_history, signal.hit, signal.weights, **short, **own)
+    sigma = options.sigma_diffuse if signal.diffuseness is None else options.sigma_specular
     own |= {"levels": options.levels, "sigma_luminance": sigma}
-    image, _ = cascade(calm, variance, kind.hit, lambda level: kind.weights, _TAPS, **own)
+    image, _ = cascade(calm, variance, signal.hit, lambda level: signal.weights, _TAPS, **own)
     return history, image

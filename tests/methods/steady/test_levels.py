@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.methods.steady.levels import LEVELS, Decisions, Surfaces, filtered
+from jaxdn.methods.steady.levels import LEVELS, PredictedParameters, Surfaces, filter_light
 from jaxdn.methods.steady.method import PRECISIONS
 from jaxdn.methods.steady.regression import SCALES
 
@@ -15,7 +15,7 @@ HEIGHT, WIDTH = 64, 96
 
 
 @functools.partial(jax.jit, static_argnames="full_levels")
-def through(light, back=None, *, missed=0.0, learned=0.0, edge=None, glossy=0.0, full_levels=1):
+def through(light, regression_weight=None, *, residual=0.0, learned=0.0, edge=None, glossy=0.0, full_levels=1):
     """The light of a wall, or of two that meet at the column ``edge``, after all levels, with nothing decided.
 
     The second wall is turned, or ``glossy`` and not turned. ``learned`` is a feature at half resolution.
@@ -30,20 +30,22 @@ def through(light, back=None, *, missed=0.0, learned=0.0, edge=None, glossy=0.0,
     normal = jnp.broadcast_to(jnp.where(glossy, jnp.asarray([0.0, 0.0, 1.0]), normal), nothing.shape)
     surfaces = Surfaces(nothing, gloss, normal, nothing[..., :1], None, hit)
     whole, part = jnp.ones((height, width)), jnp.ones(half)
-    decided = Decisions(
+    decided = PredictedParameters(
         jnp.zeros((*half, 4)),
         whole,
         whole,
         jnp.broadcast_to(learned, (*half, 1)),
         part,
         [part] * LEVELS,
-        None if back is None else back * part,
+        None if regression_weight is None else regression_weight * part,
     )
     precisions = {name: jnp.full(1 + LEVELS, 4.0 * value) for name, value in PRECISIONS.items()}
     precisions["regression"] = {name: jnp.zeros(()) for name in SCALES}
     flat = jnp.zeros((3, height, width))
-    missed = jnp.broadcast_to(missed, (3, *half))
-    found = filtered(precisions, light.transpose(2, 0, 1), missed, None, surfaces, flat, decided, full_levels, 1e-3)
+    residual = jnp.broadcast_to(residual, (3, *half))
+    found = filter_light(
+        precisions, light.transpose(2, 0, 1), residual, None, surfaces, flat, decided, full_levels, 1e-3
+    )
     return jax.tree.map(lambda planes: planes.transpose(1, 2, 0), found)
 
 
@@ -97,8 +99,8 @@ def test_what_is_learned_does_not_darken_a_change(rng):
     """A feature that knows which samples are bright makes them count for less in an image, and not in a change."""
     light = jnp.ones((HEIGHT, WIDTH, 3))
     bright = jnp.asarray(rng.uniform(size=(HEIGHT // 2, WIDTH // 2, 1)) < 0.1, jnp.float32)
-    missed = 0.5 + 2.0 * (bright[None, ..., 0] - 0.1)
-    plain, known = (through(light, missed=missed, learned=feature) for feature in (0.0, 3.0 * bright))
+    residual = 0.5 + 2.0 * (bright[None, ..., 0] - 0.1)
+    plain, known = (through(light, residual=residual, learned=feature) for feature in (0.0, 3.0 * bright))
     assert plain.change.mean() == pytest.approx(0.5, rel=0.1)
     np.testing.assert_allclose(known.change.mean(), plain.change.mean(), rtol=0.03)
     np.testing.assert_allclose(plain.image, 1.0 + plain.change, rtol=1e-5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from jaxdn.methods.steady.lighting_change import change, halves, reach
+from jaxdn.methods.steady.lighting_change import estimate_change, receptive_field, split_checkerboard
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
 
 SIZE = 96, 128
@@ -19,10 +19,10 @@ def noticed(difference, light=None, hit=None):
     light = jnp.ones_like(difference) if light is None else light
     hit = jnp.ones(size, bool) if hit is None else hit
     alike = Guide(jnp.zeros((1, *size)), jnp.zeros((3, *size)), hit * 1.0)
-    planes = halves(difference.transpose(2, 0, 1))
+    planes = split_checkerboard(difference.transpose(2, 0, 1))
     for step in (1, 2, 4, 8):
         planes = affinity_filter(planes, alike, step=step)
-    return change(planes, light.transpose(2, 0, 1), hit).transpose(1, 2, 0)
+    return estimate_change(planes, light.transpose(2, 0, 1), hit).transpose(1, 2, 0)
 
 
 def noise(rng, strength=1.0):
@@ -35,7 +35,7 @@ def test_halves_are_the_squares_of_a_checkerboard_and_signs_alternate_by_row(rng
     difference = rng.normal(size=(4, 6, 3)).astype(np.float32)
     rows, columns = np.mgrid[:4, :6]
     white = (rows + columns) % 2 == 1
-    found = np.asarray(halves(jnp.asarray(difference.transpose(2, 0, 1)))).transpose(1, 2, 0)
+    found = np.asarray(split_checkerboard(jnp.asarray(difference.transpose(2, 0, 1)))).transpose(1, 2, 0)
     np.testing.assert_array_equal(found[..., :3], np.where(white[..., None], 0, difference))
     np.testing.assert_array_equal(found[..., 3:6], np.where(white[..., None], difference, 0))
     level = difference @ np.float32([0.2126, 0.7152, 0.0722]) * (-1.0) ** rows
@@ -110,14 +110,16 @@ def test_no_further_than_it_says(rng):
     """Filtered differences beyond its reach change nothing."""
     filtered = jnp.asarray(rng.uniform(0.5, 1.5, (8, *SIZE)), jnp.float32).at[6:].mul(0.5)
     light, hit = jnp.ones((3, *SIZE)), jnp.ones(SIZE, bool)
-    plain, changed = (np.asarray(change(each, light, hit)) for each in (filtered, filtered.at[..., 64].mul(3.0)))
+    plain, changed = (
+        np.asarray(estimate_change(each, light, hit)) for each in (filtered, filtered.at[..., 64].mul(3.0))
+    )
     differs = np.flatnonzero((plain != changed).any(axis=(0, 1)))
-    assert differs.min() == 64 - reach()
-    assert differs.max() == 64 + reach()
+    assert differs.min() == 64 - receptive_field()
+    assert differs.max() == 64 + receptive_field()
 
 
 def test_gradients(rng, x64):
     filtered = jnp.asarray(rng.uniform(0.5, 1.5, (8, 12, 14))).at[6:].mul(0.4)
     light, hit = jnp.asarray(rng.uniform(0.5, 1.5, (3, 12, 14))), jnp.ones((12, 14), bool)
-    assert np.asarray(change(filtered, light, hit)).min() > 0
-    check_grads(lambda *given: change(*given, hit), (filtered, light), order=1, modes=["rev"], rtol=1e-5)
+    assert np.asarray(estimate_change(filtered, light, hit)).min() > 0
+    check_grads(lambda *given: estimate_change(*given, hit), (filtered, light), order=1, modes=["rev"], rtol=1e-5)

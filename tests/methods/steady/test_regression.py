@@ -9,7 +9,7 @@ import pytest
 from jax.test_util import check_grads
 
 from jaxdn.methods.steady import regression
-from jaxdn.methods.steady.regression import CELL, GUIDES, SCALES, guides_of, reach
+from jaxdn.methods.steady.regression import CELL, GUIDES, SCALES, receptive_field, regressors_of
 from jaxdn.ops.dispatch.operation import implementation
 
 SIZE = 96, 128
@@ -51,7 +51,7 @@ def ball(size=SIZE):
 def given(rng, light=None, size=SIZE):
     """Light, guides, and both filtered."""
     normal, gloss, inverse = ball(size)
-    guides = np.asarray(guides_of(*(jnp.asarray(each, jnp.float32) for each in (normal, gloss, inverse))))
+    guides = np.asarray(regressors_of(*(jnp.asarray(each, jnp.float32) for each in (normal, gloss, inverse))))
     if light is None:
         light = np.exp(rng.normal(size=(*size, 3))) * (1.0 + 0.5 * normal[..., :1])
     smooth = np.stack([blurred(light[..., channel]) for channel in range(3)], -1)
@@ -63,7 +63,7 @@ def given_back(scales, light, smooth, guides, smooth_guides, hit, floor):
     before, after = (
         jnp.concatenate([one.transpose(2, 0, 1), others]) for one, others in ((light, guides), (smooth, smooth_guides))
     )
-    return regression.given_back(scales, before, after, hit[..., 0], floor).transpose(1, 2, 0)
+    return regression.regress_residual(scales, before, after, hit[..., 0], floor).transpose(1, 2, 0)
 
 
 def added(arrays, *, scales=PLAIN, hit=None, floor=1e-3):
@@ -217,8 +217,8 @@ def test_no_further_than_it_says(rng):
     middle = 240
     plain, changed = (added([light, *arrays[1:]]) for light in (arrays[0], arrays[0].at[:, middle].mul(3.0)))
     differs = np.flatnonzero((plain != changed).any(axis=(0, 2)))
-    assert middle - reach() <= differs.min() < middle - reach() // 2
-    assert middle + reach() // 2 < differs.max() <= middle + reach()
+    assert middle - receptive_field() <= differs.min() < middle - receptive_field() // 2
+    assert middle + receptive_field() // 2 < differs.max() <= middle + receptive_field()
 
 
 def test_gradients(rng, x64):

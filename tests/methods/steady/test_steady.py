@@ -13,7 +13,7 @@ from jaxdn.core.frame import FAR, Frame, frame_at
 from jaxdn.denoiser import Denoiser
 from jaxdn.denoiser.rollout import unroll
 from jaxdn.methods.steady.levels import LEVELS
-from jaxdn.methods.steady.method import BEGIN, FEATURES, HALF_FEATURES, decisions, steady
+from jaxdn.methods.steady.method import FEATURES, HALF_FEATURES, INITIAL, split_heads, steady
 from jaxdn.ops.scales import space_to_depth
 
 pytestmark = pytest.mark.usefixtures("plain_programs")
@@ -210,10 +210,12 @@ def test_an_absent_buffer_equals_its_neutral_value(absent, rng, key):
 def test_the_share_of_the_newest_frame_hardly_knows_of_its_own_noise(rng):
     """Else bright samples count for more than dark ones, and the mean becomes too bright."""
     noise = rng.standard_normal((32, 32, 4))
-    where = 4 * (FEATURES + list(BEGIN).index("follow"))
-    head = np.zeros((32, 32, 4 * (FEATURES + len(BEGIN)) + HALF_FEATURES + 1 + LEVELS + 1))
+    where = 4 * (FEATURES + list(INITIAL).index("accumulation"))
+    head = np.zeros((32, 32, 4 * (FEATURES + len(INITIAL)) + HALF_FEATURES + 1 + LEVELS + 1))
     head[..., where : where + 4] = 2.0 * noise
-    share = np.asarray(space_to_depth(decisions(jnp.asarray(head, jnp.float32), (32, 32))[1]["follow"][..., None]))
+    share = np.asarray(
+        space_to_depth(split_heads(jnp.asarray(head, jnp.float32), (32, 32))[1]["accumulation"][..., None])
+    )
     alone = np.mean(noise / (1.0 + np.exp(-2.0 * noise)))
     assert share.std() > 0.05
     assert 0.0 < np.mean(noise * share) < 0.2 * alone
@@ -263,7 +265,7 @@ def test_every_quality_takes_fewer_operations_than_the_next(rng):
     fast, balanced, high = map(operations, ("fast", "balanced", "high"))
     assert fast < 0.5 * balanced
     assert balanced < 0.7 * high
-    assert steady(quality="fast").step.core.reach < steady(quality="balanced").step.core.reach
+    assert steady(quality="fast").receptive_field < steady(quality="balanced").receptive_field
 
 
 def test_new_parameters_and_loaded_ones_share_a_program(key):
