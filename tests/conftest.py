@@ -34,6 +34,9 @@ def pytest_configure(config: pytest.Config) -> None:
     # Most of a test's time is compilation, and most of it is the same as in the last run.
     jax.config.update("jax_compilation_cache_dir", str(config.rootpath / ".pytest_cache" / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+    # A program of a test runs once or twice: compiled without optimisation it has the same operations, and takes a
+    # third of the time. What users run is optimised: real processes compile so, and modules with optimised_programs.
+    jax.config.update("jax_disable_most_optimizations", True)
     _compile_quickly()
 
 
@@ -88,15 +91,11 @@ def key() -> jax.Array:
 
 
 @pytest.fixture(scope="module")
-def plain_programs() -> Iterator[None]:
-    """XLA compiles this module's programs without optimisation: operations the same, in half of the time.
-
-    For modules whose tests run large programs once or twice. What users run is optimised: real processes and all other
-    modules compile so.
-    """
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
+def optimised_programs() -> Iterator[None]:
+    """XLA optimises this module's programs: for those that run long enough to be worth it."""
     jax.config.update("jax_disable_most_optimizations", False)
+    yield
+    jax.config.update("jax_disable_most_optimizations", True)
 
 
 @pytest.fixture
@@ -131,7 +130,7 @@ def compiled_anew(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def plain_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processes compile without optimisation, as ``plain_programs`` has this one do.
+    """Processes compile without optimisation, as this one does.
 
     For tests of what a command does with the results of programs which other tests run as users do.
     """

@@ -21,8 +21,6 @@ from tests.hard_cases.functions import list_denoisers
 from tests.hard_cases.table import rows
 from tests.training.test_training import make_clip
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 TOY_METHOD = '''"""Half of the frame, half of the history, times a learned gain: a toy."""
 
 from dataclasses import dataclass

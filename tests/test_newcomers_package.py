@@ -27,8 +27,6 @@ from tests.needs import require_module
 from tests.training.test_training import make_clip
 
 onnxruntime = require_module("onnxruntime")
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 FILTER = '''"""Half of the frame and half of the history along the vectors: a filter of three functions."""
 
 from dataclasses import dataclass

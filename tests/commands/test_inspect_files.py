@@ -16,8 +16,6 @@ from jaxdn.methods.registry import methods
 from tests.programs import HEIGHT, PROGRAMS, WIDTH, write_shot
 from tests.training.test_training import make_clip
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 PLAN = ("integrator", "compiled", "rendered once", "on disk", "left out", "emission", "dual ", "uncertain", "effect")
 """Words of the effects and the plan of a scene."""
 UNSTATED = [name for name, program in PROGRAMS.items() if program.motion_convention]

@@ -25,8 +25,6 @@ from jaxdn.zoo.ready import all_names
 from jaxdn.zoo.weights import shipped_names
 from tests.training.test_training import make_clip
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 def jaxdn(*arguments, timeout=300):
     return subprocess.run(

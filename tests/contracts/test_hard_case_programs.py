@@ -14,8 +14,6 @@ from tests.hard_cases.inputs import good
 from tests.hard_cases.programs import Program, Widening
 from tests.hard_cases.table import cast, rows
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 NARROW = cast(good(), "bfloat16 inputs")
 CONSTANT = np.linspace(0.0, 1.0, 3)[None, None, None]
 

@@ -30,8 +30,6 @@ from tests.hard_cases.page import write_page
 from tests.hard_cases.programs import Widening
 from tests.hard_cases.table import PRECISIONS, cast, rows
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 def shapes(case):
     return [np.shape(leaf) for leaf in jax.tree.leaves(case.make(good()))]

@@ -13,8 +13,6 @@ from jaxdn.ops.kernel_prediction.softmax import softmax_filter
 from jaxdn.ops.warp import warp
 from tests.needs import NEEDS
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SIZES = [(6, 7), (1, 1), (1, 9)]
 
 

@@ -20,8 +20,6 @@ from jaxdn.core.frame import Clip, Frame
 from jaxdn.ops.motion import on_screen
 from jaxdn.ops.scales import downsample, upsample
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 T, H, W = 3, 6, 8
 AXES = {"left to right": (-2, (-1.0, 1.0)), "top to bottom": (-3, (1.0, -1.0))}
 seeds = st.integers(0, 2**32 - 1)

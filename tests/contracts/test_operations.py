@@ -16,8 +16,6 @@ from jaxdn.ops.affinity import pallas_kernels
 from jaxdn.ops.dispatch.operation import OPERATIONS, REFERENCE
 from tests.needs import NEEDS
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 methods()  # imports all of them, and what they are made of
 
 SIZES = [(5, 7), *(pytest.param(size, marks=pytest.mark.slow) for size in [(1, 1), (18, 33)])]

@@ -7,8 +7,6 @@ import pytest
 
 from jaxdn.core.frame import BUFFERS, GUIDES, Frame, frame_at, only, present, written_out
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SIZE = (4, 5)
 NUMBERS = [np, jnp]
 CHAINS = {

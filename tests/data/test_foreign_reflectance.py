@@ -13,8 +13,6 @@ from jaxdn.brdf import directional_albedo
 from jaxdn.clips import ClipError
 from jaxdn.data.evidence import read_clip_properties
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SIZE = (6, 8)
 EYE = np.array([1.0, 2.0, 5.0])
 

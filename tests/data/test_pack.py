@@ -23,8 +23,6 @@ from jaxdn.denoisers import svgf
 from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.training.validation import load_validation
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SIDE, FRAMES, DRAWS = 20, 4, 3
 SMALL = Packing(crop=8, frames=3)
 EVERYTHING = (slice(None),) * 3

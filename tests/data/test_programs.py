@@ -20,8 +20,6 @@ from tests import programs
 from tests.needs import require_module
 from tests.programs import FULL, HEIGHT, PROGRAMS, STEP, WIDTH, Truth, corner, truth, write_shot
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 @pytest.fixture(scope="module")
 def shots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:

@@ -20,8 +20,6 @@ from jaxdn.methods.registry import methods
 from jaxdn.runtime.optional import install
 from tests.training.test_training import make_clip
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 def write(path: Path, *layers: str, value: float = 0.5) -> Path:
     """A file of constant channels, each layer as ``name:letters``."""

@@ -16,8 +16,6 @@ from jaxdn.denoiser.tiles import GRID, stream_tiled
 from jaxdn.denoisers import demodulated, taa
 from jaxdn.export.step import exported_step
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 KEEP = 0.8
 SIZE = (38, 70)
 

@@ -13,8 +13,6 @@ from jaxdn.denoiser.rollout import denoise, stream, unroll
 from jaxdn.methods.demodulation import demodulated
 from jaxdn.ops.sampling import from_layers
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SIZE = (4, 6)
 BY_ALBEDO = partial(demodulated, by="albedo")
 

@@ -12,8 +12,6 @@ from jaxdn.denoisers import ntd, svgf
 from tests.hard_cases.inputs import good
 from tests.methods.test_ntd import TINY
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 COUNT = 4
 METHODS = {"svgf": lambda: svgf(levels=2), "ntd": lambda: ntd(size=TINY)}
 

@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 from jaxdn.core.frame import BUFFERS, FAR, RADIANCE_MAX, Frame
 from jaxdn.denoiser.sanitize import sanitize
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 sanitized = jax.jit(sanitize)
 
 

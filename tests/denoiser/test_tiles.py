@@ -19,8 +19,6 @@ from jaxdn.denoiser.tiles import GRID, find_history_halo, map_tiles, split_axis,
 from jaxdn.denoisers import asvgf, ntasd, ntd, steady, svgf, taa
 from jaxdn.sequence.james_stein import REACH, combine
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 TINY = ((4,), (4,), (4,), (4,), (4,))
 METHODS: dict[str, Any] = {
     "svgf": lambda: svgf(levels=3),

@@ -12,8 +12,6 @@ from jaxdn.evaluation.report import sentences, text_table, write_report
 from jaxdn.evaluation.report.summary import headline
 from jaxdn.zoo.ready import Model
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SHAPE = (2, 60, 80, 3)
 ERROR = 0.02
 """Of the image and of the reference, in linear light about 0.2, where the transfer curve is nearly straight."""

@@ -40,8 +40,6 @@ from jaxdn.methods.registry import method, method_named, methods
 from jaxdn.networks.backends import BACKENDS
 from jaxdn.zoo.ready import Model, untrained_model
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 DRAWN = ("taa", "ntd-small", "rae")
 """The methods of the chart that is really made."""
 SIZE, OWN = "1280x720", "64x64"

@@ -12,7 +12,7 @@ WEIGHTS = "ntd-small"
 
 @pytest.mark.slow
 @pytest.mark.needs("mitsuba")
-@pytest.mark.usefixtures("plain_programs", "plain_processes")
+@pytest.mark.usefixtures("plain_processes")
 def test_every_filter_is_scored_and_timed(tmp_path, capsys, monkeypatch):
     # One of the shipped weights stands for all, which take most of the time: it is timed on another engine.
     monkeypatch.setattr(classical, "shipped_names", lambda: [WEIGHTS])

@@ -14,7 +14,6 @@ from jaxdn.sequence.render_jobs import render
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("plain_programs")
 def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stages, "FAMILIES", ("fruit", "parlour"))
     monkeypatch.setattr(ntasd_holdout, "HELD_OUT", ("parlour",))

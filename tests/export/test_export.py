@@ -25,8 +25,6 @@ from jaxdn.zoo.ready import find_model
 from tests.needs import require, require_module
 from tests.training.test_training import make_clip
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 require("onnx")
 onnxruntime = require_module("onnxruntime")
 

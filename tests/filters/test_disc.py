@@ -10,8 +10,6 @@ from jaxdn.filters.disc import TAPS, disc_average, rotations
 from jaxdn.filters.edge_stopping import closeness_weight, depth_weight, normal_weight
 from jaxdn.filters.stabilisation import stabilise
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 HEIGHT, WIDTH = 9, 11
 

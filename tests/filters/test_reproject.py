@@ -14,8 +14,6 @@ from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, guides_of
 from jaxdn.ops.dispatch.row_tiles import map_row_tiles
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 HEIGHT, WIDTH = 7, 9
 
 

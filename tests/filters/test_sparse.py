@@ -12,8 +12,6 @@ from jaxdn.filters.history_fix import fix_history
 from jaxdn.filters.variance import estimate_variance
 from jaxdn.ops.dispatch.row_tiles import evaluate_sparsely
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 HEIGHT, WIDTH = 23, 17
 
 

@@ -18,8 +18,6 @@ from jaxdn.filters.edge_stopping import lobe_weight, normal_weight, roughness_we
 from jaxdn.filters.history_fix import fix_history
 from jaxdn.filters.virtual_motion import closeness, diffuseness, virtual_motion
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 FOCAL, SIZE = 160.0, np.array([320.0, 180.0])
 
 

@@ -8,8 +8,6 @@ from jaxdn.filters import sparse
 from jaxdn.filters.edge_stopping import normal_weight
 from jaxdn.filters.variance import estimate_variance
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 HEIGHT, WIDTH, SIGMA, SHORT = 11, 9, 16.0, 4
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 

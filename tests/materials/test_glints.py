@@ -11,8 +11,6 @@ from scipy import stats
 
 from jaxdn.materials import glints, microfacets
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 OPTIONS = ("lobe", "flakes", "bins")
 LEVEL = 6
 glint_distribution = jax.jit(glints.glint_distribution, static_argnames=OPTIONS)

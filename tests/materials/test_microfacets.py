@@ -9,8 +9,6 @@ from scipy.special import erfc
 
 from jaxdn.materials import microfacets
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 CELLS = 128
 
 

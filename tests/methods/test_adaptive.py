@@ -16,8 +16,6 @@ from jaxdn.methods.ntasd import ntasd
 from jaxdn.methods.registry import methods
 from jaxdn.ops.sampling import from_layers
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 TINY = ((4,), (4,), (5,), (5,), (6,))
 SIZE = (18, 21)
 """Not a multiple of what the networks work on."""

@@ -14,8 +14,6 @@ from jaxdn.filters.atrous import stencil
 from jaxdn.filters.edge_stopping import depth_weight, normal_weight
 from tests.methods.test_svgf import LUMINANCE, moving_frames, reference_average, reference_slopes
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 HEIGHT, WIDTH = 48, 63
 STRATA = (16, 21)
 

@@ -17,8 +17,6 @@ from jaxdn.methods.two_lobes.reblur import reblur
 from jaxdn.methods.two_lobes.relax import relax
 from tests.methods.lobe_scenes import HEIGHT, WIDTH, compiled, mirror_frames, neutral, run, scene
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 @dataclass(frozen=True)
 class Kind:

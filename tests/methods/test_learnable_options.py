@@ -16,8 +16,6 @@ from jaxdn.denoiser.rollout import denoise
 from jaxdn.methods.learnable_options import LEARNABLE, LEARNABLE_PER_LEVEL, apply_offsets, at_level, zero_offsets
 from jaxdn.methods.registry import methods
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 @dataclass(frozen=True)
 class Toy:

@@ -16,8 +16,6 @@ from jaxdn.denoiser.statistics import geometric_mean_depth, sum_depths
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods.ntd import guided_features, ntd
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 TINY = ((4,), (4,), (5,), (5,), (6,))
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},

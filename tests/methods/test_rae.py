@@ -21,8 +21,6 @@ from jaxdn.methods.registry import methods
 from jaxdn.networks.recurrent import recurrent_unet
 from jaxdn.networks.unet import count_weights
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 TINY = ((3, 4, 5), (5, 4), (4, 3))
 SIZE = (10, 13)
 """Not a multiple of what the network works on."""

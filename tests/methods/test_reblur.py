@@ -7,8 +7,6 @@ from jaxdn.core.frame import Frame
 from jaxdn.methods.two_lobes.reblur import reblur
 from tests.methods.lobe_scenes import mirror_frames, run
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 def test_light_that_doubles_arrives_within_the_slow_historys_length(rng):
     """Within 5 %; a running mean of 30 frames alone takes 89."""

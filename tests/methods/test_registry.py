@@ -28,8 +28,6 @@ from jaxdn.zoo.weights import save_weights
 from tests.methods.test_ntd import TINY
 from tests.needs import require
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 @dataclass(frozen=True)
 class Toys:

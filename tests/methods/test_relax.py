@@ -8,8 +8,6 @@ from jaxdn.methods.lobes import split_signals
 from jaxdn.methods.two_lobes.relax import relax
 from tests.methods.lobe_scenes import HEIGHT, WIDTH, mirror_frames, run
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 DEFAULT = relax()
 MEANS = relax(fix_frames=0, clamp_sigma=1e6, lag_sigma=1e6, short_history=0, levels=0, demodulate="none")
 """Nothing but running means."""

@@ -16,8 +16,6 @@ from jaxdn.filters.edge_stopping import Weight, depth_weight, luminance_weight
 from jaxdn.methods.registry import methods
 from jaxdn.methods.svgf import svgf
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 HEIGHT, WIDTH = 10, 12
 DENOISER = svgf(preset="paper", levels=3)

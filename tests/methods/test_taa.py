@@ -14,8 +14,6 @@ from jaxdn.filters.catmull_rom import warp_cubic
 from jaxdn.methods.taa import Options, resolve, sharpened
 from tests.methods.test_svgf import moving_frames
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 HEIGHT, WIDTH = 7, 9
 TO_YCOCG = np.array([[1, 2, 1], [2, 0, -2], [-1, 2, -1]]) / [[4], [4], [4]]
 

@@ -11,8 +11,6 @@ from jaxdn.methods.trmv import trmv
 from tests.methods.lobe_scenes import compiled, run
 from tests.methods.test_svgf import HEIGHT, WIDTH, moving_frames
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 DENOISER = trmv(levels=2)
 MEANS = {"levels": 0, "feedback_level": 0, "short_history": 0, "demodulate": "none"}
 """Nothing but running means."""

@@ -8,8 +8,6 @@ from jax.test_util import check_grads
 
 from jaxdn import color, losses
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SHAPE = (4, 5, 7, 3)
 
 spatial = jax.jit(losses.spatial)

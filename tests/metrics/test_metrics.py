@@ -12,8 +12,6 @@ from jaxdn import metrics
 from jaxdn.metrics.flip import flip_map
 from tests.needs import require_module
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SHAPE = (3, 14, 17, 3)
 
 METRICS = {

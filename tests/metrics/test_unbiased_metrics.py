@@ -8,8 +8,6 @@ from jax.test_util import check_grads
 
 from jaxdn import color, metrics
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SAMPLES = 128
 """In each half of a reference of 256 samples per pixel."""
 IMAGES = {

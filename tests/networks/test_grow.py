@@ -9,8 +9,6 @@ from jaxdn.networks.grow import grow
 from jaxdn.networks.unet import unet
 from jaxdn.zoo.weights import flatten, unflatten
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SMALL = ((4,), (3,), (4, 2), (4,), (5,))
 GROUPS, HEADS = (3, 2), (7, 4, 3)
 

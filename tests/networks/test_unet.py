@@ -14,8 +14,6 @@ from jaxdn.networks.unet import Network, count_weights, run_unet, unet
 from jaxdn.zoo.weights import flatten, load_weights
 from tests.needs import require
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 GROUPS = (3, 3, 3, 1, 3, 1)
 HEADS = (51, 26, 26)
 TINY = ((4, 5), (6,), (5,), (4, 4), (7,))

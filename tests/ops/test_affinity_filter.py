@@ -10,8 +10,6 @@ from jaxdn.ops.affinity import filter as module
 from jaxdn.ops.affinity.filter import SPLINE, Guide, affinity_filter
 from jaxdn.ops.dispatch.operation import OPERATIONS
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 def drawn(rng, height=9, width=11, *, features=3, channels=2):
     image = rng.normal(size=(channels, height, width))

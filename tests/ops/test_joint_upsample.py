@@ -10,8 +10,6 @@ from jaxdn.ops.affinity import joint_upsample as module
 from jaxdn.ops.affinity.filter import Guide
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 def drawn(rng, height=5, width=6, *, features=2):
     def guide(*size):

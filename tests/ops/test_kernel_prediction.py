@@ -12,8 +12,6 @@ from jaxdn.ops.kernel_prediction.apply import apply_kernels, normalize_kernels
 from jaxdn.ops.kernel_prediction.softmax import softmax_filter
 from jaxdn.ops.scales import compose_scales, downsample, fill_holes, upsample
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SCALES = [(down, up) for down in ("mean", "max") for up in ("bilinear", "nearest")]
 
 

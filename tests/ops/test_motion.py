@@ -8,8 +8,6 @@ import pytest
 from jaxdn.ops.motion import dual_motion, occlusion_mask
 from jaxdn.ops.warp import warp
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SIZE = 24
 
 

@@ -9,8 +9,6 @@ import pytest
 
 from jaxdn.ops.sampling import from_layers, sample_map
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SIZE = (4, 5)
 
 

@@ -11,8 +11,6 @@ from jax.test_util import check_grads
 from jaxdn.ops.motion import on_screen
 from jaxdn.ops.warp import warp
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 def _constant_motion(height, width, x, y):
     return jnp.broadcast_to(jnp.array([x, y], jnp.float32), (height, width, 2))

@@ -21,8 +21,6 @@ from jaxdn.render.scenes.scene_file import SceneFile
 from jaxdn.render.settings import RenderSettings
 from tests.needs import require_module
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 WIDTH, HEIGHT, FRAMES = 24, 16, 4
 LAYERS = [1, 2, 4]
 """Some methods request samples, four by default."""

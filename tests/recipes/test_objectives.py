@@ -10,8 +10,6 @@ from jaxdn.core.frame import Clip, Frame
 from jaxdn.methods.registry import methods
 from jaxdn.recipes.objectives import disocclusions, indirect_illumination, pyramid_illumination, recurrent_illumination
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SHAPE = (5, 6, 7)
 OBJECTIVE = indirect_illumination()
 

@@ -15,6 +15,7 @@ from tests.needs import require_module
 
 NAMES = sorted(FAMILIES)
 SEEDS = (0, 1, 7)
+pytestmark = pytest.mark.usefixtures("optimised_programs")  # a scene of glitter makes eight large normal maps
 
 
 @pytest.fixture

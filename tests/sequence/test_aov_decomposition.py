@@ -17,8 +17,6 @@ from tests import programs
 from tests.data.test_kept import assert_same_but, box_blur
 from tests.programs import PROGRAMS, truth, write_shot
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 def frame_of(index: int, samples: int = 4, **changes: object) -> Frame:
     scene = truth(index, samples)

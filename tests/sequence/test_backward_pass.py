@@ -25,8 +25,6 @@ from tests.programs import PROGRAMS, truth, write_shot
 from tests.sequence.test_frames import part_of
 from tests.training.test_training import make_clip
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 
 def frame_of(index: int, **changes: Any) -> Frame:
     """The scene of the programs' files as a frame of ours."""

@@ -19,8 +19,6 @@ from jaxdn.sequence.james_stein import (
     measure_confidence,
 )
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SIZE = (48, 64)
 mixed = jax.jit(combine, static_argnames="texture_unknown")
 

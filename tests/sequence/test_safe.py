@@ -16,8 +16,6 @@ from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import find_model
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 SIZE = (48, 64)
 
 

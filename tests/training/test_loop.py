@@ -25,8 +25,6 @@ from jaxdn.training.validation import load_validation
 from jaxdn.zoo.ready import find_model
 from tests.training.test_training import TINY, make_clip
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 METHOD = method_named("ntd")
 PLAIN = {"kernels": "plain", "background": "filter"}
 """Compiles sooner, and the loop is the same."""

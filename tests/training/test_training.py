@@ -17,8 +17,6 @@ from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.recipes.objectives import unbiased_illumination
 from jaxdn.training.step import clip_loss, init_state, make_train_step
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 TINY = ((4,), (4,), (4,), (4,), (4,))
 RECIPE = method_named("ntd").recipe_named("paper")._replace(steps=8, batch=2, crop=16, frames=4)
 

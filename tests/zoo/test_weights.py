@@ -11,8 +11,6 @@ from jaxdn.core.frame import Frame
 from jaxdn.denoisers import ntd
 from jaxdn.zoo.weights import flatten, save_weights, shipped_names, starting_params, unflatten
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 TINY = ((4,), (4,), (4,), (4,), (4,))
 
 SAVED = {"size": TINY, "kernels": "guided", "background": "pass"}

@@ -11,6 +11,7 @@ from jaxdn.methods.steady.levels import LEVELS, PredictedParameters, Surfaces, f
 from jaxdn.methods.steady.method import PRECISIONS
 from jaxdn.methods.steady.regression import SCALES
 
+pytestmark = pytest.mark.usefixtures("optimised_programs")  # two programs are compared bit by bit
 HEIGHT, WIDTH = 64, 96
 
 

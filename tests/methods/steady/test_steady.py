@@ -16,8 +16,6 @@ from jaxdn.methods.steady.levels import LEVELS
 from jaxdn.methods.steady.method import FEATURES, HALF_FEATURES, INITIAL, split_heads, steady
 from jaxdn.ops.scales import space_to_depth
 
-pytestmark = pytest.mark.usefixtures("plain_programs")
-
 TINY = ((4,), (4,), (4,), (4,), (4,))
 SIZE = (24, 40)
 """Not a multiple of what the network works on."""
