@@ -322,11 +322,3 @@ def test_the_compilers_alarm_is_silenced_before_jax_reads_the_setting():
     environment = {name: value for name, value in os.environ.items() if name != "TF_CPP_MIN_LOG_LEVEL"}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=environment)
     assert done.stdout.splitlines()[1:] == ["False 3"], done.stderr
-
-
-def test_the_help_does_not_wait_for_jax():
-    code = (
-        "import sys, jaxdn.commands.main; print([name for name in ('jax', 'numba', 'OpenEXR') if name in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
