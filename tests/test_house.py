@@ -1,6 +1,7 @@
 """The structure: imports point down, the core needs only jax and numpy, public names are where they should be."""
 
 import ast
+import functools
 import inspect
 import subprocess
 import sys
@@ -15,9 +16,14 @@ from tests.house import PACKAGES, ROOMS, ROOT, with_table
 PACKAGE = Path(jaxdn.__file__).parent
 
 
+@functools.cache
+def _parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
 def _imports(path: Path) -> set[str]:
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(_parsed(path)):
         if isinstance(node, ast.Import):
             found |= {name.name for name in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -27,11 +33,12 @@ def _imports(path: Path) -> set[str]:
 
 def _imported_by_name(path: Path) -> list[ast.expr]:
     """The arguments of all calls of ``import_module``."""
-    calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    calls = [node for node in ast.walk(_parsed(path)) if isinstance(node, ast.Call)]
     names = ((getattr(call.func, "attr", getattr(call.func, "id", "")), call) for call in calls)
     return [call.args[0] for name, call in names if name == "import_module"]
 
 
+@functools.cache
 def _room(module: str) -> str | None:
     """The room of ``a.b.c`` in jaxdn: itself, if it is on the map, else its folder; None for jaxdn itself."""
     if module in ROOMS or (PACKAGE / Path(*module.split("."))).is_dir():
@@ -44,6 +51,7 @@ def _own(path: Path) -> str:
     return ".".join(relative.parts[:-1] if relative.name == "__init__" else relative.parts)
 
 
+@functools.cache
 def _imported(name: str) -> str:
     """The room that ``jaxdn.a.b.c``, a module or something in it, is imported from."""
     parts = name.split(".")[1:]
@@ -95,7 +103,7 @@ def test_packages_import_by_name_only_from_themselves(path):
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_a_module_is_short_and_has_a_docstring(path):
     assert len(path.read_text().splitlines()) <= 450
-    assert ast.get_docstring(ast.parse(path.read_text())), "the first line says what the module is"
+    assert ast.get_docstring(_parsed(path)), "the first line says what the module is"
 
 
 ONLY_JAX = """

@@ -215,8 +215,13 @@ def test_filter_and_its_gradient(case, name, size, rng):
         np.testing.assert_allclose(np.sum(step * gradient), slope, rtol=1e-6, atol=1e-13)
 
 
+def seldom(case, name):
+    """The largest filter: its programs take seconds to trace."""
+    return pytest.param(case, name, marks=[pytest.mark.slow] * (case == "guided_filter_25_2_1_7"))
+
+
 @pytest.mark.usefixtures("x64")
-@pytest.mark.parametrize(("case", "name"), CASES + FILTERS)
+@pytest.mark.parametrize(("case", "name"), [*CASES, *(seldom(*filter) for filter in FILTERS)])
 def test_vmap_and_scan_change_nothing(case, name, rng):
     """grad(scan(vmap)) of three examples equals the sum, or the stack, of three gradients."""
     arguments, function, _ = _case(case, (5, 7), rng)
@@ -266,7 +271,7 @@ def test_a_named_implementation_runs_or_raises(op):
 
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("guided", [False, True])
-@pytest.mark.parametrize("height", [5, 7, 8])
+@pytest.mark.parametrize("height", [pytest.param(5, marks=pytest.mark.slow), 7, 8])
 def test_tiles_of_any_number_of_rows_are_the_whole_image(height, guided, rng, monkeypatch):
     """Two rows a tile: heights that they divide and others, whose last tile computes a row again."""
     monkeypatch.setattr("jaxdn.ops.kernel_prediction.softmax._TILE_LOGITS", 2 * 6 * 51)

@@ -31,16 +31,22 @@ from jaxdn.ops.scales import fill_holes
 pytestmark = pytest.mark.needs("numba")
 
 
+@functools.lru_cache(8)
+def program_of(function, name):
+    """The function, jitted apart from all else that is jitted of it."""
+    return jax.jit(lambda *given: function(*given))
+
+
 @pytest.fixture
 def both():
-    """The results of a function of arrays, once with the loops and once without, jitted anew."""
+    """The results of a function of arrays, once with the loops and once without: one program each for its shapes."""
 
     def run(function, *arguments):
         found = []
         for name, callbacks in (("auto", 1), ("reference", 0)):
             with implementation(name):
-                program = jax.jit(lambda *given: function(*given))
-                assert (str(jax.make_jaxpr(program)(*arguments)).count("callback[") > 0) == callbacks
+                program = program_of(function, name)
+                assert (str(program.trace(*arguments).jaxpr).count("callback[") > 0) == callbacks
                 found.append(jax.tree.map(np.asarray, program(*arguments)))
         return found
 
@@ -61,12 +67,13 @@ def drawn(rng, height, width, features=4):
 def test_a_level_of_the_filter(size, step, rng, both):
     image = jnp.asarray(10.0 ** rng.uniform(-4, 4, (3, *size)), jnp.float32)
     guide = drawn(rng, *size)._replace(scales=jnp.asarray([0.5, 1.0, 2.0, 0.1, 3.0]))
-    found, wanted = both(lambda image, guide: affinity_filter(image, guide, step=step), image, guide)
+
+    def filtered(image, guide):
+        return affinity_filter(image, guide, step=step), affinity_filter(image, guide.scaled(), step=step)
+
+    (found, multiplied), (wanted, _) = both(filtered, image, guide)
     np.testing.assert_allclose(found, wanted, rtol=3e-5)  # where all are unlike: a distance of 80 is rounded to 5e-6
-    given, multiplied = both(
-        lambda image, guide: (affinity_filter(image, guide), affinity_filter(image, guide.scaled())), image, guide
-    )[0]
-    np.testing.assert_allclose(given, multiplied, rtol=3e-5)
+    np.testing.assert_allclose(found, multiplied, rtol=3e-5)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 9), (17, 21)])
@@ -80,7 +87,10 @@ def test_the_enlarged_image(size, rng, both):
     assert ((weight == 0) == (sums == 0)).all()
 
 
-@pytest.mark.parametrize("left_out", ["", "depth", "normal", "ids", "motion", "previous_depth", "depth normal ids"])
+SELDOM = [pytest.param(name, marks=pytest.mark.slow) for name in ("depth", "normal", "ids", "previous_depth")]
+
+
+@pytest.mark.parametrize("left_out", ["", "motion", "depth normal ids", *SELDOM])
 @pytest.mark.parametrize("search_neighbours", [False, True])
 def test_the_recalled_history(left_out, search_neighbours, rng, both):
     height, width = 23, 31
@@ -117,6 +127,9 @@ def of_earlier_frames(rng, height, width, light=1.0):
     return History(jnp.asarray(np.where(valid[..., None], values, 0.0), jnp.float32), jnp.asarray(valid))
 
 
+SEEN = functools.partial(assemble_network_input, multiple=16)
+
+
 @pytest.mark.parametrize("gain", [1e-6, 1.0, 1e6, 1e30])
 @pytest.mark.parametrize("size", [(14, 38), (32, 64)])
 def test_what_a_network_sees(gain, size, rng, both):
@@ -125,7 +138,7 @@ def test_what_a_network_sees(gain, size, rng, both):
     geometry = tuple(jnp.asarray(rng.normal(size=(*size, count)), jnp.float32) for count in (3, 1))
     history, hit = of_earlier_frames(rng, *size), jnp.asarray(rng.random(size) > 0.1)
     given = geometry, jnp.asarray(light, jnp.float32), history, hit, jnp.float32(gain)
-    found, wanted = both(functools.partial(assemble_network_input, multiple=16), *given)
+    found, wanted = both(SEEN, *given)
     assert found.shape[0] % 16 == found.shape[1] % 16 == 0
     np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(found[..., 16:19], wanted[..., 16:19], rtol=3e-6, atol=1e-12)  # light
@@ -240,7 +253,9 @@ def test_pixels_that_are_not_known(rng, both):
     assert np.all(found[4:8, :8] == 0)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (3, 40), (37, 5), (33, 70)])
+@pytest.mark.parametrize(
+    "size", [(1, 1), (33, 70), *(pytest.param(size, marks=pytest.mark.slow) for size in ((3, 40), (37, 5)))]
+)
 @pytest.mark.parametrize("step", [1, 2, 8])
 def test_the_gradient_of_a_level_of_the_filter(size, step, rng, both):
     image, cotangent = (jnp.asarray(rng.uniform(-1, 1, (3, *size)), jnp.float32) for _ in range(2))

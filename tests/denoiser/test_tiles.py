@@ -132,7 +132,7 @@ def test_nothing_beyond_the_receptive_field_decides_about_a_pixel(name: str, x64
     changed = jax.tree.map(lambda a, b: np.concatenate([a[:, :cut], b[:, cut:]], axis=1), one, other)
     params = random_params(denoiser, one)
     state = jax.tree.map(jnp.zeros_like, stages.start(params, one))
-    statistics = stages.prepare(one)[0]
+    statistics = jax.jit(stages.prepare)(one)[0]
 
     @jax.jit
     def step(state: Any, frame: Frame) -> Any:
@@ -220,6 +220,6 @@ def test_the_safe_mixture_in_tiles_is_that_of_the_whole_frame(samples: int) -> N
         lambda given: (combine(*given, level), None), (noisy, denoised), (height, width), side=288, halo=REACH
     )
     assert len(others) == 4
-    expected = combine(noisy, denoised)
-    for name in ("share", "noise", "image"):
+    expected = jax.jit(combine)(noisy, denoised)
+    for name in ("noisy_weight", "noise", "image"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3, atol=1e-4)

@@ -222,6 +222,7 @@ def test_gradients(x64, rng):
     rough = rng.uniform(0.3, 0.9, (*shape, 1))
     for lobe in microfacets.LOBES:
 
+        @jax.jit
         def run(half, width, rough, lobe=lobe):
             return glint_distribution(half, jnp.asarray(position), width, rough, lobe=lobe)
 

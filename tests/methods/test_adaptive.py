@@ -63,7 +63,7 @@ def counts_of(denoiser: Denoiser, params: Any, clip: Clip) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("budget", [2.5, 4.0])
+@pytest.mark.parametrize("budget", [2.5, pytest.param(4.0, marks=pytest.mark.slow)])
 def test_every_frame_has_the_budget_and_every_pixel_its_own_number(name, budget, rng, key):
     denoiser, clip = METHODS[name](size=TINY, budget=budget), clip_of(rng)
     for counts in counts_of(denoiser, varied(denoiser, clip, key), clip)[1:]:
@@ -86,9 +86,10 @@ def test_without_a_sampler_all_pixels_have_the_budget(name, rng, key):
     even = jax.vmap(lambda layers: from_layers(layers, jnp.full((*SIZE, 1), 3.0))[0])(clip.layers)
     assert all(np.all(counts == 3) for counts in counts_of(denoiser, params, clip))
     # Then no radiance but that of the layers counts.
-    images = denoise(denoiser, params, clip)
+    run = jax.jit(lambda clip: denoise(denoiser, params, clip))
+    images = run(clip)
     other = clip._replace(frames=clip.frames._replace(radiance=even))
-    np.testing.assert_array_equal(images, denoise(denoiser, params, other))
+    np.testing.assert_array_equal(images, run(other))
 
 
 def test_dasr_sees_the_first_sample_and_no_other_frame(rng, key):
@@ -151,7 +152,7 @@ def test_pixels_without_samples_are_filled_from_their_neighbours(rng, key):
     params = varied(denoiser, clip, key)
     flat = clip._replace(layers={n: jnp.ones_like(layer) for n, layer in clip.layers.items()})
     assert counts_of(denoiser, params, flat)[1].min() == 0
-    images = denoise(denoiser, params, flat)
+    images = jax.jit(lambda clip: denoise(denoiser, params, clip))(flat)
     np.testing.assert_allclose(np.median(images, axis=(1, 2, 3)), 1.0, rtol=1e-3)
 
 

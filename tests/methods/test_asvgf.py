@@ -148,15 +148,18 @@ def test_gradients_of_the_formulas(rng, x64):
             gradients.reconstruct(gradients.Change(delta, size), None, weights, levels=2, significance=0.5), 11, 14
         )
 
-    check_grads(share, (*change, depth), order=1, modes=("rev",))
+    check_grads(jax.jit(share), (*change, depth), order=1, modes=("rev",))
     past, now = jnp.asarray(rng.uniform(1, 2, (6, 8, 7))), jnp.asarray(rng.uniform(1, 2, (3, 8, 7)))
 
     def blended(past, now, change):
         return accumulate(past, now, alpha=0.1, alpha_moments=0.2, history_max=32, change=change)
 
-    check_grads(blended, (past, now, jnp.asarray(rng.uniform(0.1, 0.9, (8, 7)))), order=1, modes=("rev",))
+    check_grads(jax.jit(blended), (past, now, jnp.asarray(rng.uniform(0.1, 0.9, (8, 7)))), order=1, modes=("rev",))
     check_grads(
-        lambda now, past: gradients.compare_with_history(now, past, None), (now[0], past), order=1, modes=("rev",)
+        jax.jit(lambda now, past: gradients.compare_with_history(now, past, None)),
+        (now[0], past),
+        order=1,
+        modes=("rev",),
     )
 
 

@@ -127,7 +127,14 @@ def test_by_default_the_error_of_a_static_scene_falls(kind, rng):
     assert np.mean(errors[20:]) < np.mean(errors[6:10]) < np.mean(errors[:3]) < np.var(noise) / 20
 
 
-@pytest.mark.parametrize("missing", [(), ("far_motion",), ("specular_hit_distance",), ("roughness",)])
+@pytest.mark.parametrize(
+    "missing",
+    [
+        (),
+        ("far_motion",),
+        *(pytest.param((name,), marks=pytest.mark.slow) for name in ("specular_hit_distance", "roughness")),
+    ],
+)
 def test_a_reflection_is_fetched_where_it_was(kind, rng, missing):
     sky, frames = mirror_frames(rng)
     frames = [frame._replace(**dict.fromkeys(missing)) for frame in frames]
@@ -170,11 +177,16 @@ def test_broken_history_is_dropped_where_it_is_broken(kind, rng, which):
     "names",
     [
         ("specular",),
-        ("specular_hit_distance", "hit_distance"),
-        ("far_motion",),
-        ("roughness",),
+        *(
+            pytest.param(names, marks=pytest.mark.slow)
+            for names in (
+                ("specular_hit_distance", "hit_distance"),
+                ("far_motion",),
+                ("roughness",),
+                ("ray_length", "reflectance", "albedo", "specular_reflectance"),
+            )
+        ),
         ("motion", "far_motion", "previous_depth"),
-        ("ray_length", "reflectance", "albedo", "specular_reflectance"),
     ],
     ids="-".join,
 )

@@ -182,6 +182,7 @@ def test_gradients_of_a_step(rng, x64):
     image, history, frame = moving(rng)
     frame = frame._replace(motion=np.nan_to_num(frame.motion))
 
+    @jax.jit
     def sharp(image, history):
         found, _ = resolve(Options(), image, history, frame, jnp.asarray(False))
         return sharpened(found[..., :3], 0.3)

@@ -1,5 +1,6 @@
 """The renderer's reflectance, against Monte Carlo averages, white furnaces and albedos."""
 
+import functools
 import warnings
 
 import numpy as np
@@ -44,6 +45,12 @@ def found(name):
     return there
 
 
+@functools.cache
+def measured(name):
+    """Measurements of a material, which two tests look at."""
+    return paper.measure(paper.materials()[name])
+
+
 def test_every_material_of_the_experiment_is_tested(fast):
     assert set(NAMES) == set(paper.materials())
 
@@ -52,7 +59,7 @@ def test_every_material_of_the_experiment_is_tested(fast):
 @pytest.mark.parametrize("name", NAMES)
 def test_reflectance_is_the_mean_of_independent_samples(fast, name):
     # Monte Carlo's own standard error at 4096 samples is about 0.003; 32 fixed samples are good to a few percent.
-    result = paper.measure(paper.materials()[name], furnace_samples=256)
+    result = measured(name)
     mean, worst = (0.015, 0.12) if name in AVERAGED else (0.004, 0.03)
     assert result.mean < mean
     assert result.worst < worst
@@ -63,7 +70,7 @@ def test_reflectance_is_the_mean_of_independent_samples(fast, name):
 def test_a_white_furnace_divided_by_the_reflectance_is_white(fast, name):
     # The furnace's noise at 1024 samples is 0.01 to 0.02. Light inside rough glass is partly lost on its way out.
     most = 0.06 if name in AVERAGED or name == "roughdielectric" else 0.03
-    assert paper.measure(paper.materials()[name]).furnace < most
+    assert measured(name).furnace < most
 
 
 @pytest.mark.parametrize("name", ["diffuse", "diffuse, textured"])

@@ -227,7 +227,7 @@ def test_gradients(rng, x64):
     hit = jnp.asarray(rng.uniform(size=(24, 20, 1)) < 0.9)
     # Guides vary by much here: the smallest share of noise would do.
     check_grads(
-        lambda scales, *given: given_back(scales, *given, hit, 0.01),
+        jax.jit(lambda scales, *given: given_back(scales, *given, hit, 0.01)),
         (scales, *arrays),
         order=1,
         modes=["rev"],
@@ -242,8 +242,9 @@ def test_its_gradient_in_single_precision_is_that_of_the_plain_form(rng):
     def loss(scales, arrays, hit):
         return jnp.sum(jnp.square(given_back(scales, *arrays, hit, jnp.float32(1e-3))))
 
+    gradient = jax.jit(jax.grad(loss, argnums=(0, 1)))
     for hit in (jnp.ones((32, 48, 1), bool), jnp.zeros((32, 48, 1), bool)):
-        found = jax.jit(jax.grad(loss, argnums=(0, 1)))(PLAIN, arrays, hit)
+        found = gradient(PLAIN, arrays, hit)
         assert all(np.isfinite(each).all() for each in jax.tree.leaves(found))
         assert any(np.abs(each).max() > 0 for each in jax.tree.leaves(found)) == bool(hit.all())
 
