@@ -1,1 +1,1 @@
-"""How an operation chooses among its implementations: the registry, the inference path, Numba calls by rows."""
+"""How an operation chooses among its implementations, and what these share: row tiles in XLA, Numba loops by rows."""

@@ -48,7 +48,8 @@ DEFAULTS = ("auto", REFERENCE)
 OPERATIONS: dict[str, "Operation[..., Any]"] = {}
 """Every operation of the modules that have been imported, by name."""
 
-# A part of the key of jax's caches: a jitted function is traced again where the default differs.
+# A part of the key of jax's caches: a jitted function is traced again where the default differs. (And once more if it
+# was traced before this module was imported, when the key did not have that part.)
 _default = jax.make_user_context(default_value=None)
 
 
