@@ -1,8 +1,9 @@
 """What tests need besides Python and the package's dependencies, and what happens where it is missing.
 
 :func:`require` skips a test where something is missing, which the summary of pytest lists with its reason. In CI (the
-variable ``CI`` is ``true``) it fails instead, unless :data:`NEEDS` says why CI cannot have it: a test that does not run
-there is not noticed for months. The marker ``needs`` calls it for a test or a module.
+variable ``CI`` is ``true``) it fails instead: a test that does not run there is not noticed for months. It is skipped
+in CI too if :data:`NEEDS` says why CI cannot have what it needs, or if the machine could not install it: the variable
+``JAXDN_TESTS_WITHOUT`` has its name (``llvm,browser``). The marker ``needs`` calls it for a test or a module.
 """
 
 import importlib
@@ -104,8 +105,9 @@ NEEDS = {
 """Name -> how a test finds out whether it is there."""
 
 
-def in_ci() -> bool:
-    return os.environ.get("CI", "").lower() in ("true", "1")
+def _has_to_be_there(name: str) -> bool:
+    without = [each.strip() for each in os.environ.get("JAXDN_TESTS_WITHOUT", "").split(",")]
+    return os.environ.get("CI", "").lower() in ("true", "1") and not NEEDS[name].not_in_ci and name not in without
 
 
 def require(*names: str) -> None:
@@ -114,7 +116,7 @@ def require(*names: str) -> None:
         need = NEEDS[name]
         if need.present():
             continue
-        if in_ci() and not need.not_in_ci:
+        if _has_to_be_there(name):
             pytest.fail(f"CI has no {name}, which it can install: {need.install}", pytrace=False)
         pytest.skip(f"no {name}: {need.install}", allow_module_level=True)
 

@@ -26,10 +26,14 @@ def test_locally_a_test_without_its_tool_is_skipped_with_advice(absent, monkeypa
 
 def test_in_ci_it_fails_unless_ci_cannot_have_it(absent, monkeypatch):
     monkeypatch.setenv("CI", "true")
+    monkeypatch.delenv("JAXDN_TESTS_WITHOUT", raising=False)
     with pytest.raises(pytest.fail.Exception, match="no a tool, which it can install: apt-get install a-tool"):
         require("a tool")
     with pytest.raises(pytest.skip.Exception, match="no a machine"):
         require("a machine")
+    monkeypatch.setenv("JAXDN_TESTS_WITHOUT", "llvm, a tool")
+    with pytest.raises(pytest.skip.Exception, match="no a tool"):
+        require("a tool")
 
 
 def test_what_is_there_is_imported():
