@@ -113,7 +113,7 @@ def test_a_table_is_made_once_for_a_material_and_again_for_another(fast, monkeyp
     from jaxdn.render.buffers import reflectance
 
     made = []
-    make = reflectance._table_at_once if FAST != "scalar_rgb" else reflectance._table_one_by_one
+    make = reflectance._make_table_at_once if FAST != "scalar_rgb" else reflectance._make_table_one_by_one
     monkeypatch.setattr(reflectance, make.__name__, lambda *args: made.append(1) or make(*args))
     monkeypatch.setattr(reflectance, "_made", {})
     base = paper.materials()["roughplastic"]
@@ -128,7 +128,7 @@ def test_a_material_that_cannot_be_averaged_is_named_once_and_its_albedo_used(fa
     from jaxdn.render.buffers import reflectance
 
     monkeypatch.setattr(reflectance, "_KNOWN", frozenset())
-    monkeypatch.setattr(reflectance, "_samples", lambda bsdf: False)
+    monkeypatch.setattr(reflectance, "_can_sample", lambda bsdf: False)
     with pytest.warns(UserWarning, match="ball: the reflectance of its material cannot be averaged"):
         there = found("roughplastic")
     np.testing.assert_array_equal(there.reflectance, there.albedo)
@@ -140,14 +140,14 @@ def test_a_material_that_cannot_be_averaged_is_named_once_and_its_albedo_used(fa
 def test_a_material_that_cannot_be_sampled_is_detected(fast):
     import mitsuba as mi
 
-    from jaxdn.render.buffers.reflectance import _samples
+    from jaxdn.render.buffers.reflectance import _can_sample
 
     class Broken:
         def sample(self, *args):
             raise NotImplementedError
 
-    assert not _samples(Broken())
-    assert _samples(mi.load_dict({"type": "roughplastic"}))
+    assert not _can_sample(Broken())
+    assert _can_sample(mi.load_dict({"type": "roughplastic"}))
 
 
 @pytest.mark.parametrize(
