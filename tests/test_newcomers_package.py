@@ -235,7 +235,7 @@ def test_weights_name_the_address_and_another_process_reads_them(install, clips,
             r"a function of jaxdn.methods.svgf that .*method decorates, got <class",
         ),
         ("jaxdn.methods.svgf:nothing", r"decorates, got None"),
-        (":svgf", r"expected a module that can be imported"),
+        (":svgf", r"decorates, got None"),
     ],
 )
 def test_an_address_without_a_method_says_what_is_wrong(name, message, tmp_path, capsys):

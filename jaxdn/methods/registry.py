@@ -198,12 +198,17 @@ def is_method(name: str) -> bool:
 
 
 def _method_at(address: str) -> Method:
-    """The method of an address; its row has the address as name, so that weights tell where the method is from."""
+    """The method of an address; its row has the address as name, so that weights tell where the method is from.
+
+    An address is an entry point that no package has declared.
+    """
     module, _, name = address.partition(":")
     methods()  # before the module is imported, so that it is the one to be told that a name is taken
     try:
-        factory = getattr(importlib.import_module(module), name, None)
-    except (ImportError, ValueError) as error:
+        factory = metadata.EntryPoint(name, address, ENTRY_POINTS).load() if module and name else None
+    except AttributeError:
+        factory = None
+    except ImportError as error:
         raise ValueError(
             f"method {address!r}: expected a module that can be imported, got {error}; install its package, or put its "
             "folder on PYTHONPATH."
