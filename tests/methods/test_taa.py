@@ -11,7 +11,7 @@ from jaxdn.denoiser import Core, recurrent
 from jaxdn.denoisers import svgf, taa
 from jaxdn.filters import neighbourhood
 from jaxdn.filters.catmull_rom import warp_cubic
-from jaxdn.methods.taa import Options, resolve, sharpened
+from jaxdn.methods.taa import Options, resolve, sharpen
 from tests.methods.test_svgf import moving_frames
 
 HEIGHT, WIDTH = 7, 9
@@ -185,7 +185,7 @@ def test_gradients_of_a_step(rng, x64):
     @jax.jit
     def sharp(image, history):
         found, _ = resolve(Options(), image, history, frame, jnp.asarray(False))
-        return sharpened(found[..., :3], 0.3)
+        return sharpen(found[..., :3], 0.3)
 
     check_grads(sharp, (jnp.asarray(image), jnp.asarray(history) + 0.1), order=1, modes=("rev",), eps=1e-6)
 
