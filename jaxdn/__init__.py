@@ -70,14 +70,16 @@ _ROOMS = ("brdf", "color", "losses", "metrics", "denoisers", "effects")
 __all__ = [*_HOMES, *_ROOMS, "__version__"]
 
 
-def __getattr__(name: str) -> Any:
-    if name in _HOMES:
-        value = getattr(importlib.import_module(f"jaxdn.{_HOMES[name]}"), name)
-        globals()[name] = value
-        return value
-    if name in _ROOMS:
-        return importlib.import_module(f"jaxdn.{name}")
-    raise AttributeError(f"module 'jaxdn' has no attribute {name!r}; it has {', '.join(sorted(__all__))}")
+if not TYPE_CHECKING:  # a checker shall report names that do not exist
+
+    def __getattr__(name: str) -> Any:
+        if name in _HOMES:
+            value = getattr(importlib.import_module(f"jaxdn.{_HOMES[name]}"), name)
+            globals()[name] = value
+            return value
+        if name in _ROOMS:
+            return importlib.import_module(f"jaxdn.{name}")
+        raise AttributeError(f"module 'jaxdn' has no attribute {name!r}; it has {', '.join(sorted(__all__))}")
 
 
 def __dir__() -> list[str]:

@@ -7,10 +7,12 @@ Pre-Integration Factorization"). For a microfacet lobe with Schlick's Fresnel te
 ``F0 A + B`` with two numbers that depend only on the cosine n.v and the roughness (Karis 2013).
 """
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +21,12 @@ import numpy as np
 from jaxdn.core.checks import check_image, check_option, check_same_size
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
+
+    Image = Float[Array, "H W 3"]
+
 
 Lobe = Literal["ggx", "ggx-correlated", "beckmann"]
 """GGX with Smith's separable shadowing (as in Mitsuba) or the height-correlated one, Beckmann (separable)."""
@@ -134,8 +142,13 @@ def albedo_table(lobe: Lobe = "ggx") -> np.ndarray:
 
 
 def directional_albedo(
-    albedo: jax.Array, specular: jax.Array, roughness: jax.Array, cosine: jax.Array, *, lobe: Lobe = "ggx"
-) -> jax.Array:
+    albedo: Float[Array, "... 3"],
+    specular: Float[Array, "... 3"],
+    roughness: Float[Array, "... 1"],
+    cosine: Float[Array, "... 1"],
+    *,
+    lobe: Lobe = "ggx",
+) -> Float[Array, "... 3"]:
     """``albedo + specular A + B`` [H, W, 3]: reflectance of a diffuse surface with a microfacet lobe in uniform light.
 
     Differentiable in all four. F0, roughness and cosines are clamped to the range that they can have. Raises ValueError
@@ -170,7 +183,7 @@ def _look_up(table: jax.Array, cosine: jax.Array, roughness: jax.Array) -> jax.A
     return (1 - down) * upper + down * lower
 
 
-def divisor(reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
+def divisor(reflectance: Image, *, floor: float = FLOOR) -> Image:
     """The divisor ``((reflectance^4 + floor^4) / (1 + floor^4))^(1/4)``: the reflectance itself where it is not small.
 
     For white, the neutral value of the buffer, it is 1.
@@ -183,13 +196,13 @@ def divisor(reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
     return larger * jnp.sqrt(jnp.sqrt(1 + (smaller / larger) ** 4)) / (1 + floor**4) ** 0.25
 
 
-def demodulate(radiance: jax.Array, reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
+def demodulate(radiance: Image, reflectance: Image, *, floor: float = FLOOR) -> Image:
     """Radiance [H, W, 3] divided by the surface's reflectance; finite for any reflectance >= 0."""
     check_same_size(radiance, reflectance, ("radiance", "reflectance"))
     return radiance / divisor(reflectance, floor=floor)
 
 
-def remodulate(light: jax.Array, reflectance: jax.Array, *, floor: float = FLOOR) -> jax.Array:
+def remodulate(light: Image, reflectance: Image, *, floor: float = FLOOR) -> Image:
     """The inverse of :func:`demodulate` with the same reflectance, up to rounding."""
     check_same_size(light, reflectance, ("light", "reflectance"))
     return light * divisor(reflectance, floor=floor)
@@ -243,7 +256,7 @@ def _texture_or_hue_by_numba(reflectance: jax.Array, light: jax.Array, hue: jax.
     return numba_call.call(texture, [reflectance.shape], arrays, *numbers, rows=reflectance.shape[0])[0]
 
 
-def restore(filtered: jax.Array, texture: jax.Array, filtered_texture: jax.Array) -> jax.Array:
+def restore(filtered: Image, texture: Image, filtered_texture: Image) -> Image:
     """The filtered light with the texture that the division left, which the filter has blurred: a ratio estimator.
 
     ``filtered * (texture + e) / (filtered_texture + e)``, e = 0.01, where both were filtered with the same weights. Of

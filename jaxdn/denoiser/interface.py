@@ -20,7 +20,7 @@ from jaxdn.core.frame import RADIANCE_MAX, Frame, only
 from jaxdn.denoiser.sanitize import sanitize
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 
-Params = Any
+Params = dict[str, Any]
 """Nested dicts of arrays; ``{}`` for a filter without weights."""
 State = Any
 """What is carried from one frame to the next: a flat pytree of few, large arrays."""

@@ -1,8 +1,10 @@
 """Stepping through a clip: as one scan, for training and notebooks, or frame by frame."""
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,10 @@ from jaxdn.core.checks import check_image
 from jaxdn.core.frame import RADIANCE_MAX, Clip, Frame, frame_at, only, present
 from jaxdn.denoiser import Denoiser, Params, State
 from jaxdn.ops.sampling import from_layers
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
+
 
 Layers = Mapping[int, Any] | None
 """Samples per pixel -> independent noisy radiance; see :class:`jaxdn.Clip`."""
@@ -57,7 +63,7 @@ def unroll(
     reference: jax.Array | None = None,
     *,
     rematerialize: bool = False,
-) -> jax.Array:
+) -> Float[Array, "T H W 3"]:
     """Denoise consecutive frames with one recurrent state; returns images ``[T, H, W, 3]``.
 
     ``start`` gets the first frame, then ``step`` is scanned over all T frames.
@@ -83,7 +89,7 @@ def unroll(
     return images
 
 
-def denoise(denoiser: Denoiser, params: Params, clip: Clip) -> jax.Array:
+def denoise(denoiser: Denoiser, params: Params, clip: Clip) -> Float[Array, "T H W 3"]:
     """Denoise a clip; returns linear radiance ``[T, H, W, 3]``, >= 0.
 
     ``clip.frames`` are T frames of linear radiance and any other buffers; those that ``denoiser.reads`` does not name

@@ -8,10 +8,17 @@ Positions are array indices: pixel (column, row) has its centre at (column, row)
 ``-0.5 <= x <= W - 0.5``, likewise y.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 import jax
 import jax.numpy as jnp
 
 from jaxdn.core.checks import check_image, check_same_size
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float, Shaped
 
 
 def _inside(position: jax.Array, height: int, width: int) -> jax.Array:
@@ -27,7 +34,9 @@ def _pixels(height: int, width: int, dtype: jnp.dtype) -> jax.Array:
     return jnp.stack([x, y], axis=-1)
 
 
-def dual_motion(motion: jax.Array, forward_motion: jax.Array, *, visible: jax.Array | None = None) -> jax.Array:
+def dual_motion(
+    motion: Float[Array, "H W 2"], forward_motion: Float[Array, "H W 2"], *, visible: Shaped[Array, "H W"] | None = None
+) -> Float[Array, "H W 2"]:
     """Dual motion vectors [H, W, 2] (Zeng et al. 2021, eq. 2), in pixels.
 
     For a point that was hidden, the traditional history ``p + motion(p)`` lies on its occluder. With the nearest pixel
@@ -64,7 +73,9 @@ def dual_motion(motion: jax.Array, forward_motion: jax.Array, *, visible: jax.Ar
     return jnp.where(use[..., None], dual, motion)
 
 
-def occlusion_mask(motion: jax.Array, dual_motion: jax.Array, *, threshold: float = 0.5) -> jax.Array:
+def occlusion_mask(
+    motion: Float[Array, "H W 2"], dual_motion: Float[Array, "H W 2"], *, threshold: float = 0.5
+) -> Float[Array, "H W 1"]:
     """Where the dual vector differs from the traditional one by more than ``threshold`` px: [H, W, 1] in {0, 1}.
 
     The paper multiplies images by the difference itself (Zeng et al. 2021, sec. 4.4), which has a sign and pixel units.

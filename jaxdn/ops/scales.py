@@ -1,6 +1,9 @@
 """Images at several scales: halving, doubling, and composing filtered scales."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
+from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +13,11 @@ from jaxdn.core.checks import check_image, check_option
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
 
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
 
-def downsample(image: jax.Array, *, down: str = "mean") -> jax.Array:
+
+def downsample(image: Float[Array, "H W C"], *, down: Literal["mean", "max"] = "mean") -> Float[Array, "H/2 W/2 C"]:
     """Halve [H, W, C] to [H/2, W/2, C] by the mean or the maximum of 2x2 blocks; odd sizes raise ValueError."""
     check_image(image, "image")
     check_option(down, "down", ("mean", "max"))
@@ -73,7 +79,9 @@ def _fill_holes_by_numba(image: jax.Array, known: jax.Array) -> jax.Array:
     return numba_call.call(fill_rows, [image.shape], [image, known[..., 0]], rows=image.shape[0] // 4)[0]
 
 
-def upsample(image: jax.Array, *, up: str = "bilinear") -> jax.Array:
+def upsample(
+    image: Float[Array, "H W C"], *, up: Literal["bilinear", "nearest"] = "bilinear"
+) -> Float[Array, "2*H 2*W C"]:
     """Double [H, W, C] to [2H, 2W, C]: bilinear with half-pixel centres and edge clamp, or nearest.
 
     Bilinear at twice the size has two weights only, 0.75 of the pixel that holds the sample and 0.25 of its neighbour,
@@ -99,8 +107,13 @@ def _double(image: jax.Array, axis: int) -> jax.Array:
 
 
 def compose_scales(
-    fine: jax.Array, coarse: jax.Array, alpha: jax.Array, *, down: str = "mean", up: str = "bilinear"
-) -> jax.Array:
+    fine: Float[Array, "H W C"],
+    coarse: Float[Array, "H/2 W/2 C"],
+    alpha: Float[Array, "... 1"],
+    *,
+    down: Literal["mean", "max"] = "mean",
+    up: Literal["bilinear", "nearest"] = "bilinear",
+) -> Float[Array, "H W C"]:
     """Replace the low frequencies of ``fine`` [H, W, C] by ``coarse`` [H/2, W/2, C] with weight ``alpha`` in [0, 1].
 
     With D the 2x2 ``down``-sampling and U the ``up``-sampling of this module:

@@ -4,8 +4,11 @@ The public :func:`warp` and its implementations: each samples at array positions
 image (0 <= x <= W - 1, likewise y).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
+from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +19,17 @@ from jaxdn.core.checks import check_image, check_option, check_same_size
 from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.motion import find_targets
 
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
 
-def warp(image: jax.Array, motion: jax.Array, *, border: str = "clamp", implementation: str | None = None) -> jax.Array:
+
+def warp(
+    image: Float[Array, "H W C"],
+    motion: Float[Array, "H W 2"],
+    *,
+    border: Literal["clamp", "zeros"] = "clamp",
+    implementation: str | None = None,
+) -> Float[Array, "H W C"]:
     """Fetch ``image`` [H, W, C] bilinearly at ``p + motion(p)``: the previous frame reprojected to this one.
 
     ``motion`` [H, W, 2] is (x, y) in pixels, y down, previous minus current. With border ``"clamp"`` the position is

@@ -6,8 +6,11 @@ keeps or recomputes K*K shifted images, and pads the gradient of each kernel sli
 multiply-adds for the image, K*K concatenated short sums for the kernels.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +19,11 @@ import numpy as np
 from jaxdn.core.checks import check_image, check_same_size
 from jaxdn.ops.dispatch.operation import Example, operation
 
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
 
-def normalize_kernels(logits: jax.Array) -> jax.Array:
+
+def normalize_kernels(logits: Float[Array, "H W K*K"]) -> Float[Array, "H W K*K"]:
     """Softmax over the taps: [H, W, K*K] logits -> weights >= 0 that sum to 1 (Vogels et al. 2018, "Denoising with
     Kernel Prediction and Asymmetric Loss Functions").
 
@@ -28,7 +34,9 @@ def normalize_kernels(logits: jax.Array) -> jax.Array:
     return jax.nn.softmax(logits.astype(jnp.promote_types(logits.dtype, jnp.float32)), axis=-1)
 
 
-def apply_kernels(image: jax.Array, kernels: jax.Array, *, implementation: str | None = None) -> jax.Array:
+def apply_kernels(
+    image: Float[Array, "H W C"], kernels: Float[Array, "H W K*K"], *, implementation: str | None = None
+) -> Float[Array, "H W C"]:
     """Filter every pixel with its own kernel: ``out(p) = sum_t kernels(p, t) * image(p + offset_t)``.
 
     image: [H, W, C], any colour space. kernels: [H, W, K*K] with K odd, taps row-major from -(K//2) to K//2, x fastest.
