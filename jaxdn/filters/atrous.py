@@ -42,7 +42,7 @@ def edge_average(
     step_max: int = 1,
     variance: jax.Array | None = None,
     needed: jax.Array | None = None,
-    counted: bool = False,
+    with_total: bool = False,
 ) -> tuple[jax.Array, jax.Array | None]:
     """Weighted mean of ``values`` [C, H, W] over ``taps``, and the variance of this mean.
 
@@ -59,10 +59,10 @@ def edge_average(
       step_max: the largest ``step``.
       variance: [H, W], becomes ``sum w^2 variance / (sum w)^2``.
       needed: [H, W] bool, strips of the image without a needed pixel are skipped and come back as 0.
-      counted: the mean gets another plane, the sum of weights.
+      with_total: the mean gets another plane, the sum of weights.
     """
     _, height, width = values.shape
-    planes = values.shape[0] + counted
+    planes = values.shape[0] + with_total
     dtype = values.dtype
     tiles = plan_tiles(height, width, taps, step_max=step_max)
     inside = jnp.ones((height, width), dtype) if hit is None else hit.astype(dtype)
@@ -74,7 +74,7 @@ def edge_average(
     def strip(top: jax.Array) -> tuple[jax.Array, jax.Array | None]:
         sums = weighted_sums(tiles, top, taps, step, weights, guides, summed, inside, spread)
         mean, filtered = sums.mean()
-        return jnp.stack([*mean, *([sums.total] if counted else [])]), filtered
+        return jnp.stack([*mean, *([sums.total] if with_total else [])]), filtered
 
     def skipped(top: jax.Array) -> tuple[jax.Array, jax.Array | None]:
         nothing = jnp.zeros((planes, tiles.rows, width), dtype)

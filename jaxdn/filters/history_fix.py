@@ -63,7 +63,7 @@ def fix_history(
             number, stride = each
             own = short & (whole == number)
             reach = dict[str, Any](step=stride, step_max=int(strides.max()))
-            mean, _ = edge_average(planes, hit, weights, _TAPS, needed=own, counted=True, **reach)
+            mean, _ = edge_average(planes, hit, weights, _TAPS, needed=own, with_total=True, **reach)
             return jnp.where(own[None], mean, filled), None
 
         begun = jnp.concatenate([planes, jnp.ones_like(planes[:1])])

@@ -27,7 +27,7 @@ def fill_isolated(planes: jax.Array, hit: jax.Array | None, isolation: jax.Array
     mean = choose_sparse(
         isolated,
         lambda: sparse_edge_average(planes, known, [], stencil(1), isolated),
-        lambda: edge_average(planes, known, [], stencil(1), needed=isolated, counted=True)[0],
+        lambda: edge_average(planes, known, [], stencil(1), needed=isolated, with_total=True)[0],
     )
     share = jnp.where(mean[-1] > NO_WEIGHT, isolation, 0.0)
     return planes + share[None] * (mean[:-1] - planes)

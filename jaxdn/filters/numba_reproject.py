@@ -28,13 +28,13 @@ def reproject(
     wanted_ids: Given,
     mean: Array,
     valid: Array,
-    unsound: Array,
+    invalid: Array,
     threshold: float,
     least: float,
     around: bool,
     lanes: tuple[int, ...],
 ) -> None:
-    """Rows of ``mean`` [H, W, C], ``valid`` [H, W] (1 or 0) and ``unsound`` [H]: how many pixels of ``history`` are.
+    """Rows of ``mean`` [H, W, C], ``valid`` [H, W] (1 or 0) and ``invalid`` [H]: how many pixels of ``history`` are.
 
     As :func:`jaxdn.filters.reproject.reproject_along` says: accepted taps of the target's cell, renormalised if their
     weights sum to ``least``; else, with ``around``, the mean of those of the 3x3 pixels around the target. ``lanes``
@@ -48,7 +48,7 @@ def reproject(
     bits, beyond, sign = history.view(np.uint32), np.uint32(0x00800000), np.uint32(0x80000000)
     weights = np.empty(4, np.float32)
     for i in range(top, bottom):
-        unsound[i] = zero
+        invalid[i] = zero
         for j in range(width):
             doubt = np.uint32(0)
             for channel in range(channels):
@@ -58,7 +58,7 @@ def reproject(
                 for channel in range(channels):
                     value = history[i, j, channel]
                     sound &= (value >= zero) & (value <= largest)
-                unsound[i] += zero if sound else one
+                invalid[i] += zero if sound else one
             valid[i, j] = zero
             if not inside[i, j]:
                 for channel in range(channels):

@@ -156,8 +156,8 @@ def _average_taps(given: _Request, *, rules: _Rules) -> _Output:
         valid = inside & accepted(packed, expected)
         mean = jnp.where(valid[..., None], history, 0.0)
     if rules.search_neighbours:
-        lost = inside & ~valid
-        search = history, packed, lost, expected, accepted
+        missing = inside & ~valid
+        search = history, packed, missing, expected, accepted
         more, found = _search_target(at, *search) if rules.moving else _search_pixel(*search)
         mean, valid = jnp.where(found[..., None], more, mean), valid | found
     return mean, valid, jnp.sum(~valid_history, dtype=jnp.int32)
@@ -230,11 +230,11 @@ def _search_target(
     at: _Position,
     history: jax.Array,
     packed: jax.Array,
-    lost: jax.Array,
+    missing: jax.Array,
     expected: ExpectedSurface,
     accepted: _Accepted,
 ) -> tuple[jax.Array, jax.Array]:
-    """The same for ``lost`` pixels alone, of the 3x3 pixels around their targets, which count alike."""
+    """The same for ``missing`` pixels alone, of the 3x3 pixels around their targets, which count alike."""
     height, width, channels = history.shape
     column, row = (jnp.floor(position + 0.5).astype(jnp.int32) for position in at)
     # At the border the window lies inside the image, and the pixels of it that are too far away do not count.
@@ -250,12 +250,12 @@ def _search_target(
             weights.append((near & accepted(taps[..., index, :], expected)).astype(history.dtype))
         return _mean(taps, weights, channels, least=1.0)
 
-    mean, found, weights = evaluate_sparsely(search, lost, ((row, column, top, left), expected))
+    mean, found, weights = evaluate_sparsely(search, missing, ((row, column, top, left), expected))
     return attach_mean_gradient(mean, history, top, left, weights), found
 
 
 def _search_pixel(
-    history: jax.Array, packed: jax.Array, lost: jax.Array, expected: ExpectedSurface, accepted: _Accepted
+    history: jax.Array, packed: jax.Array, missing: jax.Array, expected: ExpectedSurface, accepted: _Accepted
 ) -> tuple[jax.Array, jax.Array]:
     """The same where nothing moves: around the pixels themselves, without a gather."""
     height, width, _ = history.shape
@@ -267,7 +267,7 @@ def _search_pixel(
     def search(history: jax.Array) -> tuple[jax.Array, jax.Array]:
         total, count = jnp.zeros_like(history), jnp.zeros((height, width), history.dtype)
         for dy, dx in np.ndindex(3, 3):  # beyond the border there are zeros, which are not accepted
-            taken = lost & accepted(shifted(packed, dy, dx), expected)
+            taken = missing & accepted(shifted(packed, dy, dx), expected)
             total = total + jnp.where(taken[..., None], shifted(history, dy, dx), 0.0)
             count = count + taken
         found = count > 0
@@ -276,7 +276,7 @@ def _search_pixel(
     def nothing(history: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jnp.zeros_like(history), jnp.zeros((height, width), bool)
 
-    return lax.cond(jnp.any(lost), search, nothing, history)
+    return lax.cond(jnp.any(missing), search, nothing, history)
 
 
 def _mean(

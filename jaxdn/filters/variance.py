@@ -43,7 +43,7 @@ def estimate_variance(
     mean = choose_sparse(
         needed,
         lambda: sparse_edge_average(planes, hit, weights, stencil(3), needed),
-        lambda: edge_average(planes, hit, weights, stencil(3), needed=needed, counted=True)[0],
+        lambda: edge_average(planes, hit, weights, stencil(3), needed=needed, with_total=True)[0],
     )
     mean, total = mean[:-1], mean[-1]
     around, spatial = mean[:3], jnp.maximum(mean[4] - mean[3] ** 2, 0.0) * (short_history / length)

@@ -96,7 +96,7 @@ class _Parts(NamedTuple):
     unshadowed: jax.Array | None
     diffuse: DemodulatedLight
     """All but specular light, with its divisor."""
-    shine: DemodulatedLight | None
+    specular: DemodulatedLight | None
     """Specular light."""
 
 
@@ -129,9 +129,9 @@ def trmv(given: Options) -> Denoiser:
     ) -> tuple[TrmvState, jax.Array, jax.Array]:
         options = apply_offsets(given, params)
         parts = _split(frame, options.demodulate, statistics)
-        state = _fitting(state, start(params, frame))
+        state = _fit_state(state, start(params, frame))
         along = frame.motion if frame.dual_motion is None else frame.dual_motion
-        past, invalid = _recalled(options, state.rest, state.guides, frame, along, first)
+        past, invalid = _reproject_signal(options, state.rest, state.guides, frame, along, first)
         diffuse = frame._replace(radiance=parts.rest.transpose(1, 2, 0), reflectance=reflectances(frame)[0])
         # As in a wrapper by `demodulated`: the light is divided, and the reflectance is what it was divided by.
         differs = jnp.asarray(count_reflectance_differs(diffuse), statistics.reflectance_differs.dtype)
@@ -143,21 +143,23 @@ def trmv(given: Options) -> Denoiser:
         if parts.shadowed is not None and parts.unshadowed is not None and state.shadows is not None:
             free = _mean(options, past[6:], parts.unshadowed, past[_LENGTH])
             along = frame.motion if frame.shadow_motion is None else frame.shadow_motion
-            past, lost = _recalled(options, state.shadows, state.guides, frame, along, first, any_surface=True)
-            shadows, lit = _shaded(options, past, parts, free, frame, hit, statistics.height)
+            past, more_invalid = _reproject_signal(
+                options, state.shadows, state.guides, frame, along, first, any_surface=True
+            )
+            shadows, lit = _filter_shadows(options, past, parts, free, frame, hit, statistics.height)
             rest = jnp.concatenate([rest, free.transpose(1, 2, 0)], axis=-1)
-            image, invalid = image + lit, invalid + lost
+            image, invalid = image + lit, invalid + more_invalid
         image = parts.diffuse.remodulate(image.transpose(2, 0, 1))
 
-        if parts.shine is not None and state.specular is not None:
+        if parts.specular is not None and state.specular is not None:
             along = frame.motion if frame.glossy_motion is None else frame.glossy_motion
-            past, lost = _recalled(options, state.specular, state.guides, frame, along, first)
-            history = svgf.blend(options, past, parts.shine.light)
-            image = image + parts.shine.remodulate(
-                _mirrored(options, history, parts.shine.texture, frame, hit, statistics.height)
+            past, more_invalid = _reproject_signal(options, state.specular, state.guides, frame, along, first)
+            history = svgf.blend(options, past, parts.specular.light)
+            image = image + parts.specular.remodulate(
+                _filter_specular(options, history, parts.specular.texture, frame, hit, statistics.height)
             )
             specular = history.transpose(1, 2, 0)
-            invalid = invalid + lost
+            invalid = invalid + more_invalid
         if hit is not None:
             image = jnp.where(hit[..., None], image, frame.radiance)
         return TrmvState(rest, shadows, specular, guides_of(frame)), image, invalid
@@ -179,7 +181,7 @@ def _split(frame: Frame, by: Demodulation, statistics: FrameStatistics) -> _Part
     return _Parts(diffuse.light - shadowed, shadowed, unshadowed, diffuse, specular)
 
 
-def _fitting(state: TrmvState, begun: TrmvState) -> TrmvState:
+def _fit_state(state: TrmvState, begun: TrmvState) -> TrmvState:
     """The state with the histories that this frame needs; those that have come within the clip are empty."""
     rest, planes = state.rest, begun.rest.shape[-1]
     if rest.shape[-1] != planes:
@@ -189,7 +191,7 @@ def _fitting(state: TrmvState, begun: TrmvState) -> TrmvState:
     return TrmvState(rest, shadows, specular, state.guides)
 
 
-def _recalled(
+def _reproject_signal(
     options: Options,
     history: jax.Array,
     before: Guides,
@@ -225,7 +227,7 @@ def _mean(options: Options, past: jax.Array, now: jax.Array, length: jax.Array) 
     return past + share[None] * (now - past)
 
 
-def _shaded(
+def _filter_shadows(
     options: Options,
     past: jax.Array,
     parts: _Parts,
@@ -241,7 +243,7 @@ def _shaded(
     """
     assert parts.shadowed is not None
     assert parts.unshadowed is not None
-    held = _clamped(options, past, parts.shadowed, parts.unshadowed, hit)
+    held = _clamp_shadows(options, past, parts.shadowed, parts.unshadowed, hit)
     history = svgf.blend(options, held, parts.shadowed)
     under = _mean(options, past[6:], parts.unshadowed, past[_LENGTH])
     texture = parts.diffuse.texture
@@ -257,14 +259,16 @@ def _shaded(
     # The ratio needs the same neighbours for all.
     lights = [color, estimated(under)[0], estimated(free)[0]]
     planes = jnp.concatenate([*lights, *([] if texture is None else [texture])])
-    found = _filtered(options, planes, variance, hit, weights, options.sigma_luminance)
+    found = _apply_cascade(options, planes, variance, hit, weights, options.sigma_luminance)
     light = _share(found[:3], found[3:6]) * found[6:9]
     if texture is not None:
         light = brdf.restore(light, texture, found[9:])
     return jnp.concatenate([history, under]).transpose(1, 2, 0), light.transpose(1, 2, 0)
 
 
-def _clamped(options: Options, past: jax.Array, lit: jax.Array, free: jax.Array, hit: jax.Array | None) -> jax.Array:
+def _clamp_shadows(
+    options: Options, past: jax.Array, lit: jax.Array, free: jax.Array, hit: jax.Array | None
+) -> jax.Array:
     """The history [6, H, W] of light with its shadows, clamped to what the frame shows around each pixel."""
     shines = jnp.any(free > _DARK, axis=0)
     known = shines if hit is None else shines & hit
@@ -281,7 +285,7 @@ def _share(lit: jax.Array, free: jax.Array) -> jax.Array:
     return jnp.where(some, lit / jnp.where(some, free, 1.0), 1.0)
 
 
-def _mirrored(
+def _filter_specular(
     options: Options,
     history: jax.Array,
     texture: jax.Array | None,
@@ -299,7 +303,7 @@ def _mirrored(
     color, variance = estimate_variance(history, hit, first, short_history=short, texture=texture, isolated=False)
     deviation = jnp.sqrt(jnp.maximum(variance, 1e-10))
     hues = [luminance_weight(color[one] - color[1], deviation, sigma=options.sigma_specular) for one in (0, 2)]
-    return _filtered(
+    return _apply_cascade(
         options,
         color,
         variance,
@@ -325,7 +329,7 @@ def _lobe_weights(options: Options, frame: Frame, height: jax.Array, level: Any)
     return weights
 
 
-def _filtered(
+def _apply_cascade(
     options: Options,
     planes: jax.Array,
     variance: jax.Array,

@@ -34,7 +34,7 @@ def drawn(rng):
 def test_few_pixels_get_what_all_get(share, step, rng, x64):
     planes, hit, weights = drawn(rng)
     needed = jnp.asarray(rng.random((HEIGHT, WIDTH)) < share)
-    every, _ = edge_average(planes, hit, weights, stencil(2), step=step, step_max=step, counted=True)
+    every, _ = edge_average(planes, hit, weights, stencil(2), step=step, step_max=step, with_total=True)
     found = jax.jit(lambda: sparse.sparse_edge_average(planes, hit, weights, stencil(2), needed, step=step))()
     np.testing.assert_allclose(found, np.where(needed, every, 0.0), rtol=1e-12, atol=1e-14)
 
