@@ -1,0 +1,84 @@
+"""Lamps in rooms and daylight through windows, with strengths drawn by the seed."""
+
+import math
+from typing import Any
+
+from experiments.cycles.staging import materials, shapes
+from experiments.cycles.staging.rooms import Room
+from experiments.cycles.staging.stage import Point, Stage
+
+
+def hanging(stage: Stage, at: Point, watts: float, ceiling: float) -> Any:
+    """A lamp on a cord: a shade open below, a small bulb in it. Returns Blender's lamp."""
+    x, y, z = at
+    shade = materials.plain(stage, roughness=0.5) if stage.chance(0.6) else materials.metal(stage, 0.3)
+    stage.add(shapes.cylinder(0.005, ceiling - z, 8), materials.plain(stage, (0.02, 0.02, 0.02)), at)
+    wide = stage.between(0.12, 0.25)
+    profile = [(0.02, 0.1), (wide * 0.6, 0.06), (wide, -0.08), (wide * 0.97, -0.08), (wide * 0.57, 0.05), (0.02, 0.09)]
+    stage.add(shapes.turned(profile), shade, at, smooth=True)
+    return stage.lamp("POINT", (x, y, z - 0.03), watts, materials.warm(stage), shadow_soft_size=0.035)
+
+
+def standing(stage: Stage, at: Point, height: float, watts: float) -> Any:
+    """A floor or table lamp with a shade of paper that glows. Returns Blender's lamp."""
+    x, y, z = at
+    foot = materials.metal(stage, stage.between(0.1, 0.5))
+    stage.add(shapes.cylinder(0.12, 0.02, 24), foot, at, bevel=0.005)
+    stage.add(shapes.cylinder(0.012, height, 12), foot, at)
+    paper = materials.plain(stage, materials.pale(stage), 0.9, Transmission_Weight=0.0, Subsurface_Weight=0.0)
+    tint = materials.warm(stage)
+    wide, tall = stage.between(0.13, 0.2), stage.between(0.18, 0.3)
+    stage.add(shapes.turned([(wide, 0), (wide * 0.7, tall)]), paper, (x, y, z + height - 0.12), smooth=True)
+    bulb = materials.light(stage, tint, watts * 0.6)
+    stage.add(shapes.ball(0.03, 16), bulb, (x, y, z + height), smooth=True)
+    return stage.lamp("POINT", (x, y, z + height + 0.06), watts, tint, shadow_soft_size=0.03)
+
+
+def candle(stage: Stage, at: Point) -> Any:
+    """A candle: a small flame that shines. Returns the flame's thing."""
+    x, y, z = at
+    height = stage.between(0.08, 0.22)
+    stage.add(shapes.cylinder(0.022, height, 16), materials.plain(stage, (0.85, 0.8, 0.65), 0.5), at, bevel=0.004)
+    flame = [(0, 0), (0.006, 0.006), (0.008, 0.014), (0.004, 0.03), (0, 0.04)]
+    glow = materials.light(stage, (1.0, 0.5, 0.15), stage.log_between(250, 700))
+    return stage.add(shapes.turned(flame, 12), glow, (x, y, z + height + 0.008), smooth=True)
+
+
+def window(stage: Stage, room: Room, watts: float, *, side: int | None = None) -> Any:
+    """A bright window in a side wall: a lit pane of area light behind a cross of wood. Returns Blender's lamp."""
+    sign = side or stage.one_of([-1, 1])
+    wide, tall = stage.between(1.0, 2.0), stage.between(1.1, 1.6)
+    x, y, z = sign * (room.width / 2 - 0.03), stage.between(0.4, 0.7) * room.depth, 1.55
+    sky = (0.75, 0.87, 1.0) if stage.chance(0.6) else (1.0, 0.85, 0.65)
+    turn = (math.pi / 2, 0, -sign * math.pi / 2)
+    stage.add(shapes.sheet(wide, tall), materials.light(stage, sky, watts / 60), (x, y, z), turn=turn)
+    frame = materials.plain(stage, (0.8, 0.8, 0.78), 0.4)
+    inward = x - sign * 0.02
+    for shift in (-0.5, 0.0, 0.5):
+        stage.add(shapes.box(0.05, 0.06, tall + 0.06), frame, (inward, y + shift * wide, z - tall / 2 - 0.03))
+        stage.add(shapes.box(0.05, wide + 0.06, 0.06), frame, (inward, y, z + shift * tall - 0.03))
+    aim = (0.0, y, 0.6)
+    lamp = stage.lamp("AREA", (x - sign * 0.06, y, z), watts, sky, shape="RECTANGLE", size=wide, size_y=tall, aim=aim)
+    lamp.rotation_euler = (0, sign * math.pi / 2, 0)
+    return lamp
+
+
+def ceiling_panel(stage: Stage, room: Room, watts: float, color: Point = (1.0, 0.95, 0.88)) -> Any:
+    """A soft panel below the ceiling. Returns Blender's lamp."""
+    at = (stage.between(-0.8, 0.8), stage.between(0.45, 0.65) * room.depth, room.height - 0.06)
+    side = stage.between(0.3, 1.2)
+    panel = materials.light(stage, color, watts / (12 * side * side))
+    stage.add(shapes.box(side + 0.04, side + 0.04, 0.04), materials.metal(stage, 0.4), (*at[:2], at[2] + 0.01))
+    stage.add(shapes.sheet(side, side), panel, (*at[:2], at[2] + 0.005), turn=(math.pi, 0, 0))
+    return stage.lamp("AREA", at, watts, color, size=side)
+
+
+def spot(stage: Stage, at: Point, aim: Point, watts: float, degrees: float = 45.0) -> Any:
+    """A spotlight with a housing. Returns Blender's lamp."""
+    made = stage.lamp(
+        "SPOT", at, watts, materials.warm(stage), aim=aim, spot_size=math.radians(degrees), spot_blend=0.4, shadow_soft_size=0.03
+    )
+    housing = stage.add(shapes.cylinder(0.07, 0.16, 20), materials.metal(stage, 0.3, (0.1, 0.1, 0.1)), at)
+    housing.rotation_euler = made.rotation_euler
+    housing.location = made.matrix_basis @ __import__("mathutils").Vector((0, 0, 0.03))
+    return made
