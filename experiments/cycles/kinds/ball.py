@@ -31,7 +31,7 @@ def build(stage: Stage) -> None:
     if stage.chance(0.4):
         path = cameras.dolly(stage, at, aim, 0.0)
     else:
-        path = cameras.some_path(stage, at, aim, stage.between(0.15, 0.5))
+        path = cameras.some_path(stage, at, aim, stage.between(0.25, 0.8))
     cameras.film(stage, path, lens=stage.between(22, 30))
 
 

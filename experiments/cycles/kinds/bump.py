@@ -14,7 +14,7 @@ def build(stage: Stage) -> None:
     else:
         _hall_lamps(stage, room)
     w, d, _ = room
-    for _ in range(stage.count(9, 14)):
+    for _ in range(stage.count(14, 24)):
         x, y = stage.between(-0.36, 0.36) * w, stage.between(0.4, 0.85) * d
         size = stage.between(0.15, 0.4)
         made = rough_stone(stage, 6, 25) if stage.chance(0.6) else hammered(stage)
@@ -32,7 +32,7 @@ def build(stage: Stage) -> None:
             profile = [(0.22, 0), (0.22, 0.1), (0.15, 0.18), (0.13, 1.5), (0.2, 1.6), (0.2, 1.7), (0, 1.7)]
             stage.add(shapes.turned(profile), made, (x, y, 0), smooth=True)
     at = (stage.between(-0.2, 0.2) * w, stage.between(0.3, 0.9), stage.between(0.9, 1.6))
-    cameras.film(stage, cameras.some_path(stage, at, (0, 0.6 * d, 0.7), stage.between(0.3, 0.8)))
+    cameras.film(stage, cameras.some_path(stage, at, (0, 0.6 * d, 0.7), stage.between(0.5, 1.4)))
 
 
 def rough_stone(stage: Stage, low: float, high: float) -> object:

@@ -15,7 +15,7 @@ def build(stage: Stage) -> None:
     for side in (-1, 1):
         at = (side * stage.between(0.2, 0.36) * w, stage.between(0.2, 0.9), stage.between(1.1, 1.9))
         aim = (-side * stage.between(0.0, 0.9), stage.between(0.55, 0.8) * d, stage.between(0.7, 1.1))
-        views.append(cameras.some_path(stage, at, aim, stage.between(0.2, 0.7)))
+        views.append(cameras.some_path(stage, at, aim, stage.between(0.5, 1.4)))
     frame = stage.count(2 * stage.frames // 5, 3 * stage.frames // 5)
     cameras.film(stage, cameras.cut(*views, (frame - 1.5) / (stage.frames - 1)), lens=stage.between(20, 30))
     for curve in _camera_curves(stage):

@@ -12,7 +12,7 @@ def build(stage: Stage) -> None:
     room = rooms.shell(stage)
     rooms.furnish(stage, room)
     w, d, h = room
-    lamps.hanging(stage, (stage.between(-0.5, 0.5), 2.4, stage.between(1.9, 2.1)), stage.log_between(35, 80), h)
+    lamps.hanging(stage, (stage.between(-0.5, 0.5), 2.4, stage.between(1.9, 2.1)), stage.log_between(50, 130), h)
     if stage.chance(0.5):
         lamps.window(stage, room, stage.log_between(40, 120))
     _string_of_lights(stage, room)
@@ -29,7 +29,7 @@ def build(stage: Stage) -> None:
     at = (stage.between(-0.5, 0.5), stage.between(1.05, 1.3), stage.between(0.9, 1.1))
     aim = (stage.between(-0.2, 0.2), 2.3, 0.83)
     focus = math.dist(at, aim) * stage.between(0.7, 1.0)
-    path = cameras.some_path(stage, at, aim, stage.between(0.06, 0.2))
+    path = cameras.some_path(stage, at, aim, stage.between(0.1, 0.35))
     camera = cameras.film(stage, path, lens=stage.between(40, 70), focus=focus, stop=stage.log_between(0.5, 1.6))
     if stage.chance(0.5):
         reach = stage.between(-0.3, 0.5)

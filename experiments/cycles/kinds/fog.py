@@ -16,21 +16,21 @@ def build(stage: Stage) -> None:
 
 def park(stage: Stage) -> None:
     """A path with lamps between trees in the morning's fog."""
-    outside.overcast(stage)
+    outside.overcast(stage, stage.log_between(0.08, 0.5))
     outside.ground(stage, 100)
     air(stage, (0, 20, 0), (60, 70, 14), stage.log_between(0.015, 0.045))
     for side in (-1, 1):
         for i in range(5):
             outside.tree(stage, (side * stage.between(2.6, 5.0), 4 + 5 * i + stage.between(-1, 1), 0), stage.between(4, 7))
         for i in range(3):
-            outside.post(stage, (side * 1.8, 5 + 7 * i, 0), stage.log_between(100, 400))
+            outside.post(stage, (side * 1.8, 5 + 7 * i, 0), stage.log_between(300, 1200))
     outside.street(stage, 2.6, 60)
     if stage.chance(0.6):
         start = stage.between(10, 14)
         moving = outside.car(stage, (0.2, start, 0), 0.0, lit=True)
         stage.move(moving, lambda t: ((0.2, start - 4 * t, 0), None))
     at = (stage.between(-0.8, 0.8), stage.between(-2, 0), stage.between(1.4, 1.9))
-    cameras.film(stage, cameras.some_path(stage, at, (0, 12, 1.7), stage.between(0.4, 1.4)))
+    cameras.film(stage, cameras.some_path(stage, at, (0, 12, 1.7), stage.between(0.8, 2.4)))
 
 
 def hall(stage: Stage) -> None:
@@ -42,10 +42,10 @@ def hall(stage: Stage) -> None:
     for _ in range(stage.count(2, 4)):
         at = (stage.between(-0.45, 0.45) * w, stage.between(0.5, 0.95) * d, h - 0.25)
         aim = (stage.between(-0.3, 0.3) * w, stage.between(0.4, 0.8) * d, 0.2)
-        lamps.spot(stage, at, aim, stage.log_between(80, 300), stage.between(25, 55))
+        lamps.spot(stage, at, aim, stage.log_between(200, 700), stage.between(25, 55))
     lamps.ceiling_panel(stage, room, stage.log_between(8, 25))
     at = (stage.between(-0.3, 0.3) * w, stage.between(0.2, 0.6), stage.between(1.2, 1.7))
-    cameras.film(stage, cameras.some_path(stage, at, room.middle, stage.between(0.2, 0.7)), lens=stage.between(20, 28))
+    cameras.film(stage, cameras.some_path(stage, at, room.middle, stage.between(0.4, 1.4)), lens=stage.between(20, 28))
 
 
 def air(stage: Stage, at: Point, size: Point, density: float) -> None:

@@ -24,7 +24,7 @@ def build(stage: Stage) -> None:
         place = (middle[0] + stage.between(-0.6, 0.6), middle[1] + stage.between(-0.3, 0.3), 0.76)
         furniture.small_thing(stage, place, largest=0.18)
     at = (middle[0] + stage.between(-0.7, 0.7), stage.between(0.6, 1.1), stage.between(1.1, 1.45))
-    path = cameras.some_path(stage, at, (middle[0], 2.6, 0.92), stage.between(0.15, 0.5))
+    path = cameras.some_path(stage, at, (middle[0], 2.6, 0.92), stage.between(0.2, 0.7))
     cameras.film(stage, path, lens=stage.between(26, 36))
 
 

@@ -25,17 +25,17 @@ def build(stage: Stage) -> None:
     for x in (-0.7, 0.7):
         stage.add(shapes.box(0.06, 0.45, 0.42), materials.metal(stage, 0.5), (x, 6.15, 0))
     at = (stage.between(-1, 1), stage.between(-0.5, 0.8), stage.between(1.3, 1.8))
-    path = cameras.some_path(stage, at, (stage.between(-0.5, 0.5), 7, 1.7), stage.between(0.3, 1.0))
+    path = cameras.some_path(stage, at, (stage.between(-0.5, 0.5), 7, 1.7), stage.between(0.6, 1.8))
     cameras.film(stage, path, lens=stage.between(24, 34))
 
 
 def foliage_tree(stage: Stage, at: Point, height: float, *, breeze: bool = False) -> None:
-    """A tree with cut-out leaves: a few hundred sheets share each of three meshes."""
+    """A tree with cut-out leaves: every crown's sheets share one mesh and material."""
     bark = materials.patterned(stage, "noise", 8.0, [(0.06, 0.04, 0.03), (0.2, 0.15, 0.1)], roughness=0.95, bump=0.6)
     tips = outside.branches(stage, at, height, bark)
     shade = materials.green(stage)
     for tip in tips:
-        crown(stage, tip, 0.17 * height, stage.count(28, 45), shade, breeze=breeze)
+        crown(stage, tip, 0.15 * height, stage.count(70, 110), shade, breeze=breeze)
 
 
 def bush(stage: Stage, at: Point, size: float) -> None:
@@ -54,7 +54,7 @@ def crown(stage: Stage, middle: Point, spread: float, number: int, shade: materi
     for _ in range(number):
         at = stage.rng.normal(size=3) * spread * (0.6, 0.6, 0.45)
         turn = stage.rng.uniform(0, 2 * math.pi, 3)
-        size = stage.between(0.13, 0.26)
+        size = spread * stage.between(0.3, 0.55)
         if first is None:
             made = materials.cut_out(stage, tuple(min(1.0, c * stage.between(0.7, 1.3)) for c in shade))
             first = stage.add(shapes.sheet(1, 1), made, at, turn=turn, scale=(size,) * 3, parent=base)

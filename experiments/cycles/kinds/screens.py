@@ -25,7 +25,7 @@ def sign(stage: Stage, low: float, high: float) -> object:
 
 def _night(stage: Stage) -> None:
     stage.light_outside((0.1, 0.14, 0.3), stage.between(0.02, 0.1))
-    row_of_houses(stage, lit=0.35, posts=stage.log_between(60, 200))
+    row_of_houses(stage, lit=0.35, posts=stage.log_between(100, 400))
     for side in (-1, 1):
         for i in range(stage.count(2, 4)):
             place = (side * stage.between(4.4, 5.2), 3 + 6 * i + stage.between(-1, 1), stage.between(1.6, 3.6))
@@ -34,7 +34,7 @@ def _night(stage: Stage) -> None:
     moving = outside.car(stage, (-1.4, 12, 0), 0.0, lit=True)
     stage.move(moving, lambda t: ((-1.4, 13 - 4 * t, 0), None))
     at = (stage.between(-2, 2), stage.between(-5, -3), stage.between(1.4, 2.2))
-    cameras.film(stage, cameras.some_path(stage, at, (0, 12, 2.0), stage.between(0.4, 1.6)))
+    cameras.film(stage, cameras.some_path(stage, at, (0, 12, 2.0), stage.between(0.8, 3.0)))
 
 
 def _control_room(stage: Stage) -> None:
@@ -57,7 +57,7 @@ def _control_room(stage: Stage) -> None:
     if stage.chance(0.6):
         lamps.ceiling_panel(stage, room, stage.log_between(4, 20))
     at = (stage.between(-0.25, 0.25) * w, stage.between(0.2, 0.7), stage.between(1.4, 1.8))
-    cameras.film(stage, cameras.some_path(stage, at, (0, 0.7 * d, 1.2), stage.between(0.25, 0.8)))
+    cameras.film(stage, cameras.some_path(stage, at, (0, 0.7 * d, 1.2), stage.between(0.5, 1.4)))
 
 
 def _scroll(stage: Stage, screen: object) -> None:

@@ -17,7 +17,7 @@ def build(stage: Stage) -> None:
     stage.move(moving, lambda t: ((0.4, start + way * t, 0), None))
     at = (stage.between(-2.5, 2.5), stage.between(-5, -2), stage.between(1.4, 2.4))
     aim = (stage.between(-3, 3), 14.0, stage.between(1.5, 3.5))
-    cameras.film(stage, cameras.some_path(stage, at, aim, stage.between(0.4, 1.6)))
+    cameras.film(stage, cameras.some_path(stage, at, aim, stage.between(0.8, 3.0)))
 
 
 def row_of_houses(stage: Stage, *, lit: float = 0.0, posts: float = 0.0) -> None:

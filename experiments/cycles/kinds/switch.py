@@ -13,17 +13,17 @@ def build(stage: Stage) -> None:
     rooms.furnish(stage, room)
     w, d, h = room
     if stage.chance(0.5):
-        lamps.ceiling_panel(stage, room, stage.log_between(6, 20))
+        lamps.ceiling_panel(stage, room, stage.log_between(20, 60))
     else:
-        lamps.window(stage, room, stage.log_between(15, 50))
+        lamps.window(stage, room, stage.log_between(50, 130))
     steady = (-w / 2 + 0.7, stage.between(0.6, 0.85) * d, 0)
-    lamps.standing(stage, steady, 1.4, stage.log_between(10, 25))
-    switched = lamps.hanging(stage, (stage.between(-0.5, 0.5), 0.55 * d, h - 0.8), stage.log_between(50, 130), h)
+    lamps.standing(stage, steady, 1.4, stage.log_between(25, 60))
+    switched = lamps.hanging(stage, (stage.between(-0.5, 0.5), 0.55 * d, h - 0.8), stage.log_between(120, 300), h)
     change = stage.count(2 * stage.frames // 5, 3 * stage.frames // 5)
     first = stage.chance(0.5)
     switch(stage, switched.data, lambda frame: (frame >= change) != first)
     if stage.chance(0.4):
-        other = lamps.spot(stage, (w / 2 - 0.5, 0.4 * d, h - 0.3), (0.5, 0.7 * d, 0.0), stage.log_between(60, 160))
+        other = lamps.spot(stage, (w / 2 - 0.5, 0.4 * d, h - 0.3), (0.5, 0.7 * d, 0.0), stage.log_between(150, 400))
         pattern = stage.rng.random(stage.frames + 8) < 0.7
         switch(stage, other.data, lambda frame: bool(pattern[frame + 2]))
     view(stage, room)

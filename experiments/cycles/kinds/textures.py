@@ -31,7 +31,7 @@ def build(stage: Stage) -> None:
         else:
             furniture.vase(stage, (x, y, high), 2.4 * size, some_pattern(stage, 4, 20))
     at = (stage.between(-0.25, 0.25) * w, stage.between(0.2, 0.8), stage.between(1.3, 1.7))
-    cameras.film(stage, cameras.some_path(stage, at, (0, 0.65 * d, 1.0), stage.between(0.3, 0.9)))
+    cameras.film(stage, cameras.some_path(stage, at, (0, 0.65 * d, 1.0), stage.between(0.5, 1.6)))
 
 
 def some_pattern(stage: Stage, low: float, high: float, mix: float = 1.0) -> object:

@@ -21,15 +21,15 @@ def _room(stage: Stage) -> None:
         lamps.window(stage, room, stage.log_between(60, 180))
         lamps.ceiling_panel(stage, room, stage.log_between(20, 70))
     else:
-        lamps.hanging(stage, (0.3, 0.5 * d, h - 0.7), stage.log_between(40, 90), h)
-        lamps.ceiling_panel(stage, room, stage.log_between(10, 40))
+        lamps.hanging(stage, (0.3, 0.5 * d, h - 0.7), stage.log_between(80, 200), h)
+        lamps.ceiling_panel(stage, room, stage.log_between(20, 70))
     side = stage.one_of([-1, 1])
     y = stage.between(2.0, 2.6)
     start, end = (side * stage.between(0.7, 1.1), y, 0), (-side * stage.between(0.1, 0.6), y + stage.between(-0.3, 0.6), 0)
     figure.walker(stage, start, end)
     at = (stage.between(-0.15, 0.15) * w, -0.15, stage.between(1.2, 1.6))
     aim = (0.2 * side, 0.5 * d, 0.95)
-    cameras.film(stage, cameras.some_path(stage, at, aim, stage.between(0.15, 0.4)), lens=stage.between(18, 23))
+    cameras.film(stage, cameras.some_path(stage, at, aim, stage.between(0.25, 0.8)), lens=stage.between(18, 23))
 
 
 def _street(stage: Stage) -> None:
@@ -44,4 +44,4 @@ def _street(stage: Stage) -> None:
             x = stage.between(-1.8, 0.6)
             figure.walker(stage, (x, y, 0), (x + way, y, 0))
     at = (stage.between(-1.5, 1.5), stage.between(-3.5, -2), stage.between(1.4, 1.9))
-    cameras.film(stage, cameras.some_path(stage, at, (0, 6, 1.2), stage.between(0.3, 0.9)), lens=stage.between(26, 34))
+    cameras.film(stage, cameras.some_path(stage, at, (0, 6, 1.2), stage.between(0.5, 1.6)), lens=stage.between(26, 34))

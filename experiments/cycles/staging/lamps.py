@@ -3,6 +3,8 @@
 import math
 from typing import Any
 
+from mathutils import Vector
+
 from experiments.cycles.staging import materials, shapes
 from experiments.cycles.staging.rooms import Room
 from experiments.cycles.staging.stage import Point, Stage
@@ -40,7 +42,7 @@ def candle(stage: Stage, at: Point) -> Any:
     height = stage.between(0.08, 0.22)
     stage.add(shapes.cylinder(0.022, height, 16), materials.plain(stage, (0.85, 0.8, 0.65), 0.5), at, bevel=0.004)
     flame = [(0, 0), (0.006, 0.006), (0.008, 0.014), (0.004, 0.03), (0, 0.04)]
-    glow = materials.light(stage, (1.0, 0.5, 0.15), stage.log_between(250, 700))
+    glow = materials.light(stage, (1.0, 0.5, 0.15), stage.log_between(50, 180))
     return stage.add(shapes.turned(flame, 12), glow, (x, y, z + height + 0.008), smooth=True)
 
 
@@ -80,5 +82,5 @@ def spot(stage: Stage, at: Point, aim: Point, watts: float, degrees: float = 45.
     )
     housing = stage.add(shapes.cylinder(0.07, 0.16, 20), materials.metal(stage, 0.3, (0.1, 0.1, 0.1)), at)
     housing.rotation_euler = made.rotation_euler
-    housing.location = made.matrix_basis @ __import__("mathutils").Vector((0, 0, 0.03))
+    housing.location = Vector(at) + made.rotation_euler.to_matrix() @ Vector((0, 0, 0.03))
     return made

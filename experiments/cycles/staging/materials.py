@@ -69,8 +69,19 @@ def mirror(stage: Stage) -> Any:
 
 
 def glass(stage: Stage, tint: Color = (1.0, 1.0, 1.0), roughness: float = 0.0) -> Any:
-    """Clear, tinted or frosted glass."""
-    return plain(stage, tint, roughness, Transmission_Weight=1.0, IOR=stage.between(1.4, 1.6))
+    """Clear, tinted or frosted glass that lets light through to what it shades, without caustics.
+
+    For rays to lamps it is a tinted transparent surface: the usual way to light what stands behind glass.
+    """
+    made = plain(stage, tint, roughness, Transmission_Weight=1.0, IOR=stage.between(1.4, 1.6))
+    tree = made.node_tree
+    clear, mix = tree.nodes.new("ShaderNodeBsdfTransparent"), tree.nodes.new("ShaderNodeMixShader")
+    clear.inputs["Color"].default_value = (*(0.9 * c for c in tint), 1.0)
+    tree.links.new(tree.nodes.new("ShaderNodeLightPath").outputs["Is Shadow Ray"], mix.inputs["Fac"])
+    tree.links.new(tree.nodes["Principled BSDF"].outputs["BSDF"], mix.inputs[1])
+    tree.links.new(clear.outputs["BSDF"], mix.inputs[2])
+    tree.links.new(mix.outputs["Shader"], tree.nodes["Material Output"].inputs["Surface"])
+    return made
 
 
 def cloth(stage: Stage, base: Color | None = None) -> Any:

@@ -21,20 +21,20 @@ def daylight(stage: Stage, *, low: float = 15.0, high: float = 60.0, strength: f
     tree.nodes["Background"].inputs["Strength"].default_value = strength * stage.log_between(0.7, 1.4)
 
 
-def overcast(stage: Stage) -> None:
+def overcast(stage: Stage, strength: float) -> None:
     """A grey sky without sun."""
-    stage.light_outside((0.72, 0.8, 0.9), stage.between(0.4, 0.9))
+    stage.light_outside((0.72, 0.8, 0.9), strength)
 
 
 def ground(stage: Stage, size: float = 160.0) -> None:
     """Grass or earth with low hills far away."""
     shades = [materials.green(stage), materials.brown(stage)]
     made = materials.patterned(stage, "noise", stage.between(0.3, 1.2), shades, roughness=0.95, bump=0.5)
-    lift, phase = stage.between(0, 3), stage.between(0, 6)
+    lift, phase = stage.between(1, 5), stage.between(0, 6)
 
     def hills(x: Any, y: Any) -> Any:
         away = ((x**2 + y**2) ** 0.5 / (0.5 * size)) ** 3
-        return -0.02 + lift * away * (1 + 0.5 * ((x + phase) * 0.15))
+        return -0.02 + lift * away * (1.2 + np.sin(0.11 * x + phase) + np.cos(0.07 * y + 2 * phase))
 
     stage.add(shapes.surface(size, size, 40, hills), made, smooth=True)
 
@@ -108,10 +108,10 @@ def tree(stage: Stage, at: Point, height: float, *, leaf: Any = None) -> None:
     made = leaf or materials.plain(stage, materials.green(stage), 0.6)
     parts = []
     for tip in tips:
-        spread = 0.16 * height
-        for _ in range(stage.count(45, 70)):
-            shift = stage.rng.normal(size=3) * spread * (0.55, 0.55, 0.4)
-            parts.append((small_leaf(stage, stage.between(0.1, 0.2)), tuple(tip - (x, y, z) + shift)))
+        spread = 0.13 * height
+        for _ in range(stage.count(110, 170)):
+            shift = stage.rng.normal(size=3) * spread * (0.6, 0.6, 0.45)
+            parts.append((small_leaf(stage, height * stage.between(0.035, 0.06)), tuple(tip - (x, y, z) + shift)))
     stage.add(shapes.joined(parts), made, at)
 
 

@@ -69,6 +69,7 @@ class Stage:
         data.materials.append(material)
         if smooth:
             data.polygons.foreach_set("use_smooth", [True] * len(data.polygons))
+            data.set_sharp_from_angle(angle=math.radians(40))
         made = self._put(data, at, turn, scale, parent)
         if bevel:
             modifier = made.modifiers.new("bevel", "BEVEL")
