@@ -11,8 +11,8 @@ def build(stage: Stage) -> None:
     room = rooms.shell(stage)
     w, d, h = room
     rooms.furnish(stage, room, crowd=0.3)
-    lamps.window(stage, room, stage.log_between(60, 160))
-    lamps.ceiling_panel(stage, room, stage.log_between(25, 90))
+    lamps.window(stage, room, stage.log_between(100, 250))
+    lamps.ceiling_panel(stage, room, stage.log_between(50, 150))
     for x in (-0.25 * w, 0.2 * w):
         _mirror(stage, (x + stage.between(-0.2, 0.2), d - 0.05, stage.between(1.4, 1.7)))
     middle = (stage.between(-0.3, 0.3), 2.5, 0)
@@ -25,7 +25,7 @@ def build(stage: Stage) -> None:
         furniture.small_thing(stage, place, largest=0.18)
     at = (middle[0] + stage.between(-0.7, 0.7), stage.between(0.6, 1.1), stage.between(1.1, 1.45))
     path = cameras.some_path(stage, at, (middle[0], 2.6, 0.92), stage.between(0.2, 0.7))
-    cameras.film(stage, path, lens=stage.between(26, 36))
+    cameras.film(stage, path, lens=stage.between(36, 48))
 
 
 def _mirror(stage: Stage, at: Point) -> None:
