@@ -18,6 +18,7 @@ import bpy
 import numpy as np
 
 from experiments.cycles import reference as references
+from experiments.cycles.fingerprint import check_scene
 from experiments.cycles.levels import Level, levels
 from experiments.cycles.record import RECORD, write_record
 from experiments.cycles.sets import Clip, clip
@@ -33,6 +34,7 @@ def render_clip(folder: Path, of: Clip, level: int) -> None:
     wanted = levels(of)[level]
     folder.mkdir(parents=True, exist_ok=True)
     build(of)
+    check_scene(folder, of.frames)
     spent: dict[str, list[float]] = {}
     for samples, draws in wanted.draws:
         for draw in range(draws):
