@@ -10,9 +10,10 @@ from experiments.cycles.sets import LARGE, Clip, clip, kinds_of, rounds
 class Level(NamedTuple):
     """What a clip has when a step is done.
 
-    ``draws``: for each sample count, how many images of independent noise a frame. ``reference_frames``: the frames that
-    have references (numbers from 1), all if empty. ``decibels``: the PSNR of a reference's own noise, of x / (1 + x),
-    at which it is good enough; ``seconds``: the processor time after which a frame's reference is left as it is.
+    ``draws``: for each sample count, how many images of independent noise a frame. ``reference_frames``: the frames
+    that have references (numbers from 1), all if empty. ``decibels``: the PSNR of a reference's own noise, of
+    x / (1 + x), at which it is good enough; ``seconds``: the processor time after which a frame's reference is left
+    as it is.
     """
 
     draws: tuple[tuple[int, int], ...]

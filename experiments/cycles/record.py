@@ -13,12 +13,17 @@ RECORD = "cycles.json"
 
 
 def write_record(
-    path: Path, of: Clip, level: int, found: dict[int, Reference], spent: dict[str, list[float]], settings: dict[str, Any]
+    path: Path,
+    of: Clip,
+    level: int,
+    found: dict[int, Reference],
+    spent: dict[str, list[float]],
+    settings: dict[str, Any],
 ) -> None:
     """Write the record of a clip that has reached a level; it appears whole or not at all.
 
-    ``reference_noise_db`` is the PSNR of the mean error of the references' own noise in x / (1 + x), peak 1; seconds are
-    processor time a frame, of what this and earlier runs rendered.
+    ``reference_noise_db`` is the PSNR of the mean error of the references' own noise in x / (1 + x), peak 1; seconds
+    are processor time a frame, of what this and earlier runs rendered.
     """
     before = read_record(path) or {"seconds": {}}
     errors = {frame: noise(reference) for frame, reference in found.items()}

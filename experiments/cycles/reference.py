@@ -30,8 +30,10 @@ class Reference(NamedTuple):
         """Both together, weighted by their samples."""
         total = self.samples + other.samples
         share = np.float64(other.samples / total)
-        mixed = ((1 - share) * mine + share * theirs for mine, theirs in zip(self[:3], other[:3], strict=True))
-        return Reference(*mixed, total, self.draws + other.draws)
+        first, second, guides = (
+            (1 - share) * mine + share * theirs for mine, theirs in zip(self[:3], other[:3], strict=True)
+        )
+        return Reference(first, second, guides, total, self.draws + other.draws)
 
 
 def noise(reference: Reference) -> float:

@@ -1,6 +1,6 @@
 """Render what is missing of one clip up to a level; a process of its own, because ``bpy`` never gives memory back.
 
-    python -m experiments.cycles.shot FOLDER SET KIND SEED LEVEL
+python -m experiments.cycles.shot FOLDER SET KIND SEED LEVEL
 """
 
 import contextlib
@@ -141,7 +141,7 @@ def _halves(path: Path, of: Clip, frame: int, samples: int, draw: int) -> refere
         images.append(image.astype(np.float64))
         guides.append(references.guides(channels))
     scratch.unlink()
-    return references.Reference(*images, (guides[0] + guides[1]) / 2, samples, 1)
+    return references.Reference(images[0], images[1], (guides[0] + guides[1]) / 2, samples, 1)
 
 
 @contextlib.contextmanager

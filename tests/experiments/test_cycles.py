@@ -75,7 +75,7 @@ def test_the_first_steps_are_one_clip_of_each_kind_of_each_set() -> None:
 
 
 def test_any_prefix_of_the_training_set_is_balanced() -> None:
-    counts: Counter[str] = Counter({kind: 0 for kind in kinds_of("train")})
+    counts: Counter[str] = Counter(dict.fromkeys(kinds_of("train"), 0))
     for step in itertools.islice((step for step in steps(SETS) if step.clip.set == "train"), 200):
         counts[step.clip.kind] += 1
         assert max(counts.values()) - min(counts.values()) <= 1
@@ -95,7 +95,7 @@ def test_steps_of_given_kinds_and_seeds_end() -> None:
     ]
     levels_of_one = [(step.clip.seed, step.level) for step in steps(("test",), ("sun",), range(9000, 9001))]
     assert levels_of_one == [(9000, 0), (9000, 1), (9000, 2)]
-    large = [step for step in steps(("test",), ("sun",), range(9900, 9901))]
+    large = list(steps(("test",), ("sun",), range(9900, 9901)))
     assert [step.level for step in large] == [0, 1]
     assert large[0].clip.size == (1280, 720)
 
@@ -196,8 +196,20 @@ def test_a_record_says_what_a_clip_is_and_keeps_earlier_times(tmp_path: Path) ->
 
 
 def _command(folder: Path, python: Path, *more: str) -> subprocess.CompletedProcess[str]:
-    arguments = [sys.executable, "-m", "experiments.cycles", "render", "-o", str(folder), "--python", str(python), *more]
-    return subprocess.run(arguments, cwd=ROOT, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    arguments = [
+        sys.executable,
+        "-m",
+        "experiments.cycles",
+        "render",
+        "-o",
+        str(folder),
+        "--python",
+        str(python),
+        *more,
+    ]
+    return subprocess.run(
+        arguments, cwd=ROOT, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    )
 
 
 def test_a_run_skips_what_is_done_and_goes_on_after_a_failure(tmp_path: Path) -> None:

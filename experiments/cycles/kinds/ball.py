@@ -10,11 +10,11 @@ def build(stage: Stage) -> None:
     """A ball and a smaller one in a room with lamps of all sizes; the camera stays or follows."""
     room = rooms.shell(stage)
     rooms.furnish(stage, room, crowd=0.6)
-    w, d, h = room
+    _, d, h = room
     if stage.chance(0.5):
-        lamps.ceiling_panel(stage, room, stage.log_between(30, 110))
+        lamps.ceiling_panel(stage, room, stage.log_between(50, 150))
     else:
-        lamps.hanging(stage, (stage.between(-0.6, 0.6), 0.45 * d, h - 0.6), stage.log_between(40, 100), h)
+        lamps.hanging(stage, (stage.between(-0.6, 0.6), 0.45 * d, h - 0.6), stage.log_between(100, 260), h)
     if stage.chance(0.6):
         lamps.window(stage, room, stage.log_between(30, 120))
     y = stage.between(1.9, 2.5)

@@ -45,7 +45,7 @@ def _room(stage: Stage) -> None:
 def fan(stage: Stage, at: Point, ceiling: float) -> None:
     """A ceiling fan that turns."""
     base = stage.group(at)
-    x, y, z = at
+    z = at[2]
     made = materials.wood(stage)
     stage.add(shapes.cylinder(0.02, ceiling - z, 10), materials.metal(stage, 0.3), at)
     stage.add(shapes.cylinder(0.12, 0.1, 28), materials.metal(stage, 0.3), parent=base, bevel=0.02)
@@ -64,7 +64,12 @@ def _bouncing(stage: Stage, at: Point) -> None:
     shades = [materials.color(stage) for _ in range(3)]
     made = materials.patterned(stage, pattern, stage.between(4, 9), shades, roughness=0.3)
     body = stage.add(shapes.ball(radius), made, at, smooth=True)
-    speed, high, rate, phase = stage.between(-2.5, 2.5), stage.between(0.4, 1.4), stage.between(1, 3), stage.between(0, 1)
+    speed, high, rate, phase = (
+        stage.between(-2.5, 2.5),
+        stage.between(0.4, 1.4),
+        stage.between(1, 3),
+        stage.between(0, 1),
+    )
 
     def path(t: float) -> tuple[Point, Point]:
         part = (rate * t + phase) % 1.0

@@ -6,7 +6,11 @@ from experiments.cycles.staging.stage import Stage
 
 def build(stage: Stage) -> None:
     """Bumped surfaces everywhere, lit from the side by a sun (open courtyard) or by spots (hall)."""
-    room = rooms.shell(stage, floor=rough_stone(stage, 3, 7), walls=rough_stone(stage, 1.5, 5)) if stage.chance(0.5) else None
+    room = (
+        rooms.shell(stage, floor=rough_stone(stage, 3, 7), walls=rough_stone(stage, 1.5, 5))
+        if stage.chance(0.5)
+        else None
+    )
     if room is None:
         outside.daylight(stage, low=18, high=40)
         room = rooms.Room(8.0, 8.0, 3.5)

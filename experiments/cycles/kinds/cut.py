@@ -8,7 +8,7 @@ def build(stage: Stage) -> None:
     """A room with lamps and a window; two camera moves with a cut between two frames about the middle."""
     room = rooms.shell(stage)
     rooms.furnish(stage, room)
-    w, d, h = room
+    w, d, _ = room
     lamps.window(stage, room, stage.log_between(60, 160))
     lamps.ceiling_panel(stage, room, stage.log_between(25, 80))
     views = []
@@ -17,7 +17,7 @@ def build(stage: Stage) -> None:
         aim = (-side * stage.between(0.0, 0.9), stage.between(0.55, 0.8) * d, stage.between(0.7, 1.1))
         views.append(cameras.some_path(stage, at, aim, stage.between(0.5, 1.4)))
     frame = stage.count(2 * stage.frames // 5, 3 * stage.frames // 5)
-    cameras.film(stage, cameras.cut(*views, (frame - 1.5) / (stage.frames - 1)), lens=stage.between(20, 30))
+    cameras.film(stage, cameras.cut(views[0], views[1], (frame - 1.5) / (stage.frames - 1)), lens=stage.between(20, 30))
     for curve in _camera_curves(stage):
         for key in curve.keyframe_points:
             key.interpolation = "CONSTANT"

@@ -11,7 +11,7 @@ def build(stage: Stage) -> None:
     """A table seen from near, candles and strings of lights behind it, a focus that may be pulled."""
     room = rooms.shell(stage)
     rooms.furnish(stage, room)
-    w, d, h = room
+    h = room.height
     lamps.hanging(stage, (stage.between(-0.5, 0.5), 2.4, stage.between(1.9, 2.1)), stage.log_between(50, 130), h)
     if stage.chance(0.5):
         lamps.window(stage, room, stage.log_between(40, 120))

@@ -21,7 +21,9 @@ def park(stage: Stage) -> None:
     air(stage, (0, 20, 0), (60, 70, 14), stage.log_between(0.015, 0.045))
     for side in (-1, 1):
         for i in range(5):
-            outside.tree(stage, (side * stage.between(2.6, 5.0), 4 + 5 * i + stage.between(-1, 1), 0), stage.between(4, 7))
+            outside.tree(
+                stage, (side * stage.between(2.6, 5.0), 4 + 5 * i + stage.between(-1, 1), 0), stage.between(4, 7)
+            )
         for i in range(3):
             outside.post(stage, (side * 1.8, 5 + 7 * i, 0), stage.log_between(300, 1200))
     outside.street(stage, 2.6, 60)

@@ -9,7 +9,7 @@ from experiments.cycles.staging.stage import Point, Stage
 def build(stage: Stage) -> None:
     """A room with daylight and a panel; glass on the table, mirrors behind it."""
     room = rooms.shell(stage)
-    w, d, h = room
+    w, d, _ = room
     rooms.furnish(stage, room, crowd=0.3)
     lamps.window(stage, room, stage.log_between(100, 250))
     lamps.ceiling_panel(stage, room, stage.log_between(50, 150))
@@ -55,7 +55,15 @@ def bottle(stage: Stage, at: Point) -> None:
 def goblet(stage: Stage, at: Point) -> None:
     """A wine glass."""
     high, wide = stage.between(0.16, 0.22), stage.between(0.032, 0.044)
-    outer = [(0, 0), (wide, 0.003), (0.005, 0.012), (0.004, 0.45 * high), (wide * 0.8, 0.55 * high), (wide, 0.75 * high), (wide * 0.85, high)]
+    outer = [
+        (0, 0),
+        (wide, 0.003),
+        (0.005, 0.012),
+        (0.004, 0.45 * high),
+        (wide * 0.8, 0.55 * high),
+        (wide, 0.75 * high),
+        (wide * 0.85, high),
+    ]
     inner = [(r - 0.0015, z) for r, z in reversed(outer[4:])]
     stage.add(shapes.turned([*outer, *inner, (0, 0.49 * high)]), materials.glass(stage), at, smooth=True)
 

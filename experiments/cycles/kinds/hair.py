@@ -25,8 +25,8 @@ def build(stage: Stage) -> None:
         speed, shift = stage.between(-1.2, 1.2), stage.between(-0.15, 0.15)
         if i < 3:
             stage.move(body, lambda t, at=at, s=shift, v=speed: (at + (s * t, 0, 0), (0, 0, v * t)))  # type: ignore[misc]
-    at = (middle[0] + stage.between(-0.6, 0.6), stage.between(0.3, 0.7), stage.between(0.7, 1.1))
-    path = cameras.some_path(stage, at, tuple(middle + (0, 0.2, 0.25)), stage.between(0.15, 0.45))
+    eye = (middle[0] + stage.between(-0.6, 0.6), stage.between(0.3, 0.7), stage.between(0.7, 1.1))
+    path = cameras.some_path(stage, eye, middle + (0, 0.2, 0.25), stage.between(0.15, 0.45))
     cameras.film(stage, path, lens=stage.between(26, 38))
 
 
@@ -48,7 +48,9 @@ def fibre(stage: Stage) -> Any:
     return made
 
 
-def strands(stage: Stage, roots: np.ndarray, outward: np.ndarray, long: float, thick: float, made: Any, parent: Any) -> Any:
+def strands(
+    stage: Stage, roots: np.ndarray, outward: np.ndarray, long: float, thick: float, made: Any, parent: Any
+) -> Any:
     """Curves from roots [N, 3] along directions [N, 3] that bend down and part into tufts."""
     number, points = len(roots), 6
     tuft = stage.rng.normal(size=(max(number // 40, 1), 3))

@@ -15,7 +15,9 @@ def build(stage: Stage) -> None:
 def light_room(stage: Stage, room: rooms.Room) -> None:
     """A hanging lamp, lamps that stand about, a few candles."""
     w, d, h = room
-    lamps.hanging(stage, (stage.between(-0.6, 0.6), 0.58 * d, h - stage.between(0.7, 1.0)), stage.log_between(80, 220), h)
+    lamps.hanging(
+        stage, (stage.between(-0.6, 0.6), 0.58 * d, h - stage.between(0.7, 1.0)), stage.log_between(80, 220), h
+    )
     for side in (-1, 1):
         if stage.chance(0.8):
             place = (side * (w / 2 - stage.between(0.6, 0.9)), stage.between(0.45, 0.9) * d, 0)

@@ -12,7 +12,10 @@ def build(stage: Stage) -> None:
     """Trees near and far, bushes, a bench, the sun between the leaves; a breeze moves the nearest branches."""
     outside.daylight(stage, low=25, high=60)
     outside.ground(stage)
-    near = [(stage.between(-2.6, -1.2), stage.between(4.5, 6.5), 0), (stage.between(1.2, 2.8), stage.between(5, 8), 0)]
+    near = [
+        (stage.between(-2.6, -1.2), stage.between(4.5, 6.5), 0.0),
+        (stage.between(1.2, 2.8), stage.between(5, 8), 0.0),
+    ]
     for at in near:
         foliage_tree(stage, at, stage.between(3.2, 4.6), breeze=True)
     for _ in range(stage.count(4, 6)):
@@ -47,7 +50,9 @@ def bush(stage: Stage, at: Point, size: float) -> None:
         crown(stage, place, 0.35 * size, stage.count(40, 60), shade)
 
 
-def crown(stage: Stage, middle: Point, spread: float, number: int, shade: materials.Color, *, breeze: bool = False) -> None:
+def crown(
+    stage: Stage, middle: Point, spread: float, number: int, shade: materials.Color, *, breeze: bool = False
+) -> None:
     """A cloud of leaves about a point; with a breeze the cloud sways."""
     base = stage.group(middle)
     first = None

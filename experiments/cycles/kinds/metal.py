@@ -68,7 +68,14 @@ def _pipe(stage: Stage, room: rooms.Room, z: float, radius: float, y: float) -> 
     """A pipe along the back wall that bends up."""
     w, _, h = room
     bend = stage.between(-0.3, 0.3) * w
-    points = [(-w / 2, y, z), (bend - 0.3, y, z), (bend - 0.08, y, z), (bend, y, z + 0.08), (bend, y, z + 0.3), (bend, y, h)]
+    points = [
+        (-w / 2, y, z),
+        (bend - 0.3, y, z),
+        (bend - 0.08, y, z),
+        (bend, y, z + 0.08),
+        (bend, y, z + 0.3),
+        (bend, y, h),
+    ]
     stage.add(shapes.tube(points, [radius] * len(points), 20), brushed(stage), smooth=True)
     for x in (-0.4 * w, -0.2 * w):
         flange = shapes.cylinder(radius * 1.5, 0.05, 24)
@@ -79,7 +86,14 @@ def _drum(stage: Stage, at: Point) -> None:
     """An oil drum with ribs."""
     r, high = 0.26, stage.between(0.6, 0.9)
     profile = [(0, 0), (r, 0), (r, 0.3 * high), (r + 0.015, 0.33 * high), (r, 0.36 * high), (r, 0.64 * high)]
-    profile += [(r + 0.015, 0.67 * high), (r, 0.7 * high), (r, high), (r - 0.02, high), (r - 0.02, high - 0.02), (0, high - 0.02)]
+    profile += [
+        (r + 0.015, 0.67 * high),
+        (r, 0.7 * high),
+        (r, high),
+        (r - 0.02, high),
+        (r - 0.02, high - 0.02),
+        (0, high - 0.02),
+    ]
     stage.add(shapes.turned(profile, 40), brushed(stage), at)
 
 

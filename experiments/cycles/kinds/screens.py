@@ -30,7 +30,9 @@ def _night(stage: Stage) -> None:
         for i in range(stage.count(2, 4)):
             place = (side * stage.between(4.4, 5.2), 3 + 6 * i + stage.between(-1, 1), stage.between(1.6, 3.6))
             turn = (math.pi / 2, 0, -side * math.pi / 2 if stage.chance(0.5) else 0.0)
-            stage.add(shapes.sheet(stage.between(0.8, 2.2), stage.between(0.6, 1.4)), sign(stage, 2, 8), place, turn=turn)
+            stage.add(
+                shapes.sheet(stage.between(0.8, 2.2), stage.between(0.6, 1.4)), sign(stage, 2, 8), place, turn=turn
+            )
     moving = outside.car(stage, (-1.4, 12, 0), 0.0, lit=True)
     stage.move(moving, lambda t: ((-1.4, 13 - 4 * t, 0), None))
     at = (stage.between(-2, 2), stage.between(-5, -3), stage.between(1.4, 2.2))
@@ -39,14 +41,20 @@ def _night(stage: Stage) -> None:
 
 def _control_room(stage: Stage) -> None:
     room = rooms.shell(stage)
-    rooms.furnish(stage, room)
-    w, d, h = room
+    rooms.furnish(stage, room, back=False)
+    w, d, _ = room
     wide = stage.between(1.2, 1.8)
     for column in range(-1, 2):
         for z in (1.25, 2.05):
             at = (column * (wide + 0.08), d - 0.12, z)
-            stage.add(shapes.box(wide + 0.05, 0.08, 0.75), materials.plain(stage, (0.02, 0.02, 0.02), 0.3), (at[0], at[1] + 0.02, z - 0.375))
-            screen = stage.add(shapes.sheet(wide, 0.7), sign(stage, 1.0, 4.0), (at[0], at[1] - 0.03, z), turn=(math.pi / 2, 0, 0))
+            stage.add(
+                shapes.box(wide + 0.05, 0.08, 0.75),
+                materials.plain(stage, (0.02, 0.02, 0.02), 0.3),
+                (at[0], at[1] + 0.02, z - 0.375),
+            )
+            screen = stage.add(
+                shapes.sheet(wide, 0.7), sign(stage, 1.0, 4.0), (at[0], at[1] - 0.03, z), turn=(math.pi / 2, 0, 0)
+            )
             if stage.chance(0.6):
                 _scroll(stage, screen)
     furniture.table(stage, (0, 0.55 * d, 0), 2.4, 0.8, 0.75)

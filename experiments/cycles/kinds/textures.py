@@ -9,7 +9,7 @@ from experiments.cycles.staging.stage import Stage
 def build(stage: Stage) -> None:
     """Patterned walls and floor, plinths with patterned bodies, pictures, soft light."""
     room = rooms.shell(stage, floor=some_pattern(stage, 1.0, 4.0), walls=some_pattern(stage, 1.0, 5.0, mix=0.5))
-    w, d, h = room
+    w, d, _ = room
     lamps.ceiling_panel(stage, room, stage.log_between(70, 180))
     lamps.ceiling_panel(stage, room, stage.log_between(40, 120))
     for x in (-0.33 * w, 0.0, 0.33 * w):

@@ -25,7 +25,10 @@ def _room(stage: Stage) -> None:
         lamps.ceiling_panel(stage, room, stage.log_between(20, 70))
     side = stage.one_of([-1, 1])
     y = stage.between(2.0, 2.6)
-    start, end = (side * stage.between(0.7, 1.1), y, 0), (-side * stage.between(0.1, 0.6), y + stage.between(-0.3, 0.6), 0)
+    start, end = (
+        (side * stage.between(0.7, 1.1), y, 0),
+        (-side * stage.between(0.1, 0.6), y + stage.between(-0.3, 0.6), 0),
+    )
     figure.walker(stage, start, end)
     at = (stage.between(-0.15, 0.15) * w, -0.15, stage.between(1.2, 1.6))
     aim = (0.2 * side, 0.5 * d, 0.95)

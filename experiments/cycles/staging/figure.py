@@ -54,10 +54,21 @@ def _limbs(stage: Stage, size: float) -> dict[str, Any]:
     shoe = materials.plain(stage, materials.color(stage, (0.1, 0.6), (0.02, 0.2)), 0.4)
     hair = materials.plain(stage, materials.brown(stage), 0.6)
     body = stage.group()
-    trunk = [(0.0, -0.06), (0.15, -0.05), (0.165, 0.08), (0.14, 0.2), (0.18, 0.42), (0.12, 0.53), (0.05, 0.56), (0.05, 0.62)]
+    trunk = [
+        (0.0, -0.06),
+        (0.15, -0.05),
+        (0.165, 0.08),
+        (0.14, 0.2),
+        (0.18, 0.42),
+        (0.12, 0.53),
+        (0.05, 0.56),
+        (0.05, 0.62),
+    ]
     torso = stage.add(shapes.turned(_sized(trunk, size)), shirt, smooth=True, parent=body)
     torso.scale = (1.0, 0.68, 1.0)
-    stage.add(shapes.ball(0.112 * size), skin, (0, -0.01, 0.73 * size), scale=(0.88, 1.0, 1.15), smooth=True, parent=body)
+    stage.add(
+        shapes.ball(0.112 * size), skin, (0, -0.01, 0.73 * size), scale=(0.88, 1.0, 1.15), smooth=True, parent=body
+    )
     cap = shapes.turned(_sized([(0.118, 0.0), (0.112, 0.05), (0.07, 0.11), (0, 0.13)], size))
     stage.add(cap, hair, (0, 0.015, 0.74 * size), turn=(-0.35, 0, 0), smooth=True, parent=body)
     parts = {"body": body}
@@ -80,7 +91,14 @@ def _limbs(stage: Stage, size: float) -> dict[str, Any]:
 def _limb(stage: Stage, made: Any, joint: Any, long: float, radii: tuple[float, float]) -> None:
     """A limb with round ends that hangs from a joint."""
     wide, thin = radii
-    profile = [(0, -long - thin), (thin * 0.8, -long - 0.6 * thin), (thin, -long), (wide, -0.15 * long), (wide * 0.8, 0.5 * wide), (0, wide * 0.9)]
+    profile = [
+        (0, -long - thin),
+        (thin * 0.8, -long - 0.6 * thin),
+        (thin, -long),
+        (wide, -0.15 * long),
+        (wide * 0.8, 0.5 * wide),
+        (0, wide * 0.9),
+    ]
     stage.add(shapes.turned(profile, 20), made, smooth=True, parent=joint)
 
 

@@ -123,7 +123,10 @@ def small_thing(stage: Stage, at: Point, parent: Any = None, largest: float = 0.
             lambda: materials.plain(stage, roughness=stage.between(0.02, 0.2)),
             lambda: materials.metal(stage, stage.between(0.1, 0.5)),
             lambda: materials.patterned(
-                stage, stage.one_of(list(materials.PATTERNS)), stage.between(8, 40), [materials.color(stage)] * 2 + [materials.pale(stage)]
+                stage,
+                stage.one_of(list(materials.PATTERNS)),
+                stage.between(8, 40),
+                [materials.color(stage)] * 2 + [materials.pale(stage)],
             ),
         ]
     )()
@@ -156,7 +159,9 @@ def picture(stage: Stage, at: Point, heading: float, width: float, height: float
         [materials.color(stage) for _ in range(stage.count(2, 5))],
         roughness=stage.between(0.2, 0.8),
     )
-    stage.add(shapes.box(width + 0.06, 0.03, height + 0.06), frame, (0, 0, -height / 2 - 0.03), bevel=0.006, parent=base)
+    stage.add(
+        shapes.box(width + 0.06, 0.03, height + 0.06), frame, (0, 0, -height / 2 - 0.03), bevel=0.006, parent=base
+    )
     stage.add(shapes.sheet(width, height), motif, (0, -0.018, 0), turn=(math.pi / 2, 0, 0), parent=base)
 
 
@@ -164,7 +169,9 @@ def rug(stage: Stage, at: Point, length: float, depth: float) -> None:
     """A patterned rug."""
     shades = [materials.color(stage) for _ in range(stage.count(2, 4))]
     pattern = stage.one_of(["checker", "magic", "mosaic", "noise"])
-    made = materials.patterned(stage, pattern, stage.between(3, 8), shades, roughness=0.95, bump=0.3, bump_pattern="noise")
+    made = materials.patterned(
+        stage, pattern, stage.between(3, 8), shades, roughness=0.95, bump=0.3, bump_pattern="noise"
+    )
     stage.add(shapes.box(length, depth, 0.012), made, at, turn=(0, 0, stage.between(-0.2, 0.2)))
 
 
@@ -173,7 +180,14 @@ def plant_pot(stage: Stage, at: Point, height: float) -> None:
     pot = materials.plain(stage, roughness=stage.between(0.2, 0.9))
     x, y, z = at
     wide = 0.16 * height
-    profile = [(0, 0), (wide * 0.8, 0), (wide, 0.3 * height), (wide * 0.9, 0.3 * height), (wide * 0.85, 0.27 * height), (0, 0.27 * height)]
+    profile = [
+        (0, 0),
+        (wide * 0.8, 0),
+        (wide, 0.3 * height),
+        (wide * 0.9, 0.3 * height),
+        (wide * 0.85, 0.27 * height),
+        (0, 0.27 * height),
+    ]
     stage.add(shapes.turned(profile), pot, at, smooth=False)
     leaf = materials.plain(stage, materials.green(stage), stage.between(0.3, 0.7))
     parts = []

@@ -65,7 +65,7 @@ def window(stage: Stage, room: Room, watts: float, *, side: int | None = None) -
     return lamp
 
 
-def ceiling_panel(stage: Stage, room: Room, watts: float, color: Point = (1.0, 0.95, 0.88)) -> Any:
+def ceiling_panel(stage: Stage, room: Room, watts: float, color: materials.Color = (1.0, 0.95, 0.88)) -> Any:
     """A soft panel below the ceiling. Returns Blender's lamp."""
     at = (stage.between(-0.8, 0.8), stage.between(0.45, 0.65) * room.depth, room.height - 0.06)
     side = stage.between(0.3, 1.2)
@@ -78,7 +78,14 @@ def ceiling_panel(stage: Stage, room: Room, watts: float, color: Point = (1.0, 0
 def spot(stage: Stage, at: Point, aim: Point, watts: float, degrees: float = 45.0) -> Any:
     """A spotlight with a housing. Returns Blender's lamp."""
     made = stage.lamp(
-        "SPOT", at, watts, materials.warm(stage), aim=aim, spot_size=math.radians(degrees), spot_blend=0.4, shadow_soft_size=0.03
+        "SPOT",
+        at,
+        watts,
+        materials.warm(stage),
+        aim=aim,
+        spot_size=math.radians(degrees),
+        spot_blend=0.4,
+        shadow_soft_size=0.03,
     )
     housing = stage.add(shapes.cylinder(0.07, 0.16, 20), materials.metal(stage, 0.3, (0.1, 0.1, 0.1)), at)
     housing.rotation_euler = made.rotation_euler

@@ -8,7 +8,8 @@ import bpy
 
 from experiments.cycles.staging.stage import Stage
 
-Color = tuple[float, float, float]
+Color = Sequence[float]
+"""Linear red, green, blue."""
 
 PATTERNS = {
     "noise": ("ShaderNodeTexNoise", {"Detail": 5.0}, "Fac"),

@@ -55,7 +55,9 @@ def street(stage: Stage, width: float, length: float) -> None:
         stage.add(shapes.sheet(0.14, 2.2), paint, (0, 5 * i - 9, 0.004))
 
 
-def house(stage: Stage, at: Point, heading: float, width: float, depth: float, floors: int, *, lit: float = 0.0) -> None:
+def house(
+    stage: Stage, at: Point, heading: float, width: float, depth: float, floors: int, *, lit: float = 0.0
+) -> None:
     """A house with windows, a door and a roof; its front looks along -y; ``lit`` is the part of windows with light."""
     base = stage.group(at, (0, 0, heading))
     high = 3.0 * floors
@@ -64,7 +66,9 @@ def house(stage: Stage, at: Point, heading: float, width: float, depth: float, f
     wall = stage.one_of(
         [
             lambda: materials.plain(stage, shade, 0.9),
-            lambda: materials.patterned(stage, "noise", 6.0, [shade, materials.pale(stage)], roughness=0.9, mix=0.4, bump=0.2),
+            lambda: materials.patterned(
+                stage, "noise", 6.0, [shade, materials.pale(stage)], roughness=0.9, mix=0.4, bump=0.2
+            ),
             lambda: materials.patterned(stage, "cells", 1.2, brick, roughness=0.9, mix=0.5, bump=0.4),
         ]
     )()
@@ -127,9 +131,15 @@ def branches(stage: Stage, at: Point, height: float, bark: Any) -> list[Any]:
         t = stage.between(0.4, 0.95)
         start = root + height * 0.7 * t * (np.array([0, 0, 1.0]) + lean * t)
         heading = stage.between(0, 2 * math.pi)
-        out = np.array([math.cos(heading), math.sin(heading), stage.between(0.4, 1.1)]) * height * stage.between(0.2, 0.36)
+        out = (
+            np.array([math.cos(heading), math.sin(heading), stage.between(0.4, 1.1)])
+            * height
+            * stage.between(0.2, 0.36)
+        )
         points = [start + out * s + np.array([0, 0, 0.06 * height * s * s]) for s in np.linspace(0, 1, 5)]
-        stage.add(shapes.tube(points, [0.012 * height * (1 - 0.8 * s) for s in np.linspace(0, 1, 5)]), bark, smooth=True)
+        stage.add(
+            shapes.tube(points, [0.012 * height * (1 - 0.8 * s) for s in np.linspace(0, 1, 5)]), bark, smooth=True
+        )
         tips.append(points[-1])
     return tips
 
@@ -160,7 +170,9 @@ def post(stage: Stage, at: Point, watts: float = 0.0) -> None:
 def car(stage: Stage, at: Point, heading: float, *, lit: bool = False) -> Any:
     """A car of a rounded body, a cabin of dark glass and four wheels; returns the group that moves it."""
     base = stage.group(at, (0, 0, heading))
-    paint = materials.plain(stage, materials.color(stage, (0.0, 0.9), (0.05, 0.7)), stage.between(0.1, 0.4), Coat_Weight=1.0)
+    paint = materials.plain(
+        stage, materials.color(stage, (0.0, 0.9), (0.05, 0.7)), stage.between(0.1, 0.4), Coat_Weight=1.0
+    )
     glass = materials.plain(stage, (0.02, 0.025, 0.03), 0.03)
     black = materials.plain(stage, (0.015, 0.015, 0.015), 0.8)
     rim = materials.metal(stage, 0.25, (0.6, 0.6, 0.62))
@@ -192,7 +204,9 @@ def fence(stage: Stage, start: Point, end: Point) -> None:
         t = i / count
         place = tuple(a + t * (b - a) for a, b in zip(start, end, strict=True))
         if picket is None:
-            picket = stage.add(shapes.box(0.08, 0.02, stage.between(0.8, 1.2)), made, place, turn=(0, 0, heading), bevel=0.005)
+            picket = stage.add(
+                shapes.box(0.08, 0.02, stage.between(0.8, 1.2)), made, place, turn=(0, 0, heading), bevel=0.005
+            )
         else:
             stage.again(picket, place, turn=(0, 0, heading))
     middle = [(a + b) / 2 for a, b in zip(start, end, strict=True)]

@@ -60,23 +60,25 @@ def _floor(stage: Stage) -> Any:
     return stage.one_of(
         [
             lambda: materials.wood(stage),
-            lambda: materials.patterned(stage, "checker", stage.between(1, 3), tiles, roughness=stage.between(0.05, 0.4)),
+            lambda: materials.patterned(
+                stage, "checker", stage.between(1, 3), tiles, roughness=stage.between(0.05, 0.4)
+            ),
             lambda: materials.patterned(stage, "noise", stage.between(1, 4), tiles, roughness=0.6, wear=True),
         ]
     )()
 
 
-def furnish(stage: Stage, room: Room, *, crowd: float = 1.0) -> None:
-    """Things along the back and the sides, a group in the middle, pictures on the walls."""
+def furnish(stage: Stage, room: Room, *, crowd: float = 1.0, back: bool = True) -> None:
+    """Things along the sides and the back, a group in the middle, pictures on the walls."""
     w, d, h = room
-    _line_wall(stage, (-w / 2 + 0.3, w / 2 - 0.3), lambda x: ((x, d - 0.28, 0), 0.0), h, d)
+    if back:
+        _line_wall(stage, (-w / 2 + 0.3, w / 2 - 0.3), lambda x: ((x, d - 0.28, 0), 0.0), h)
     for side in (-1, 1):
         _line_wall(
             stage,
             (2.6, d - 0.9),
-            lambda y, side=side: ((side * (w / 2 - 0.28), y, 0), -side * math.pi / 2),  # type: ignore[misc]
+            lambda y, side=side: ((side * (w / 2 - 0.28), y, 0), -side * math.pi / 2),
             h,
-            w,
         )
     if stage.chance(0.75):
         furniture.rug(stage, (stage.between(-0.3, 0.3), 0.6 * d, 0), stage.between(2, 3), stage.between(1.5, 2.2))
@@ -96,7 +98,7 @@ def dining(stage: Stage, at: Point, crowd: float = 1.0) -> None:
     for sx in (-0.3, 0.3):
         for sy, heading in ((1, 0.0), (-1, math.pi)):
             if stage.chance(0.85):
-                place = (x + sx * length, y + sy * (depth / 2 + stage.between(0.1, 0.35)), 0)
+                place = (x + sx * length, y + sy * (depth / 2 + stage.between(0.1, 0.35)), 0.0)
                 furniture.chair(stage, place, heading + stage.between(-0.3, 0.3), wood, seat)
     for _ in range(int(crowd * stage.count(5, 10))):
         place = (x + stage.between(-0.4, 0.4) * length, y + stage.between(-0.38, 0.38) * depth, height)
@@ -116,7 +118,7 @@ def lounge(stage: Stage, at: Point, crowd: float = 1.0) -> None:
         furniture.small_thing(stage, place, largest=0.25)
 
 
-def _line_wall(stage: Stage, span: tuple[float, float], place: Any, height: float, across: float) -> None:
+def _line_wall(stage: Stage, span: tuple[float, float], place: Any, height: float) -> None:
     """Furniture along a wall, from one end of the span to the other."""
     start, end = span
     while start < end - 0.6:
@@ -132,7 +134,9 @@ def _line_wall(stage: Stage, span: tuple[float, float], place: Any, height: floa
         if kind in ("cabinet", "picture", "plant"):
             on_wall = _shifted(at, heading, 0.25)
             size = stage.between(0.35, min(0.8, width * 0.7))
-            furniture.picture(stage, (*on_wall, stage.between(1.5, 1.75)), heading, size, size * stage.between(0.7, 1.2))
+            furniture.picture(
+                stage, (*on_wall, stage.between(1.5, 1.75)), heading, size, size * stage.between(0.7, 1.2)
+            )
         start += width + 0.05
 
 

@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-Mesh = tuple[list[tuple[float, ...]], list[tuple[int, ...]]]
+Mesh = tuple[Sequence[Sequence[float]], Sequence[Sequence[int]]]
+"""Vertices in metres and faces of vertex numbers."""
 
 
 def box(x: float, y: float, z: float) -> Mesh:

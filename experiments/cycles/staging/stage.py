@@ -8,9 +8,9 @@ import bpy
 import numpy as np
 from mathutils import Euler, Vector
 
-Point = Sequence[float]
-Mesh = tuple[list[tuple[float, ...]], list[tuple[int, ...]]]
-"""Vertices in metres and faces of vertex numbers."""
+from experiments.cycles.staging.shapes import Mesh
+
+Point = Sequence[float] | np.ndarray
 
 
 class Stage:
