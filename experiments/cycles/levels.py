@@ -26,10 +26,10 @@ SOME = (5, 6, 14, 15, 23, 24)
 """Pairs of frames, for temporal errors: early, after the middle (where lights switch and shots are cut), late."""
 
 LEVELS = {
-    "train": (Level(((1, 2), (4, 1), (16, 1)), (), 48.0, 75.0),),
-    "validation": (Level(((1, 1), (4, 1), (16, 1)), SOME, 52.0, 180.0),),
+    "train": (Level(((1, 2), (4, 1), (16, 1)), (), 48.0, 60.0),),
+    "validation": (Level(((1, 1), (4, 1), (16, 1)), SOME, 52.0, 90.0),),
     "test": (
-        Level(((1, 1), (4, 1), (16, 1)), SOME, 52.0, 180.0),
+        Level(((1, 1), (4, 1), (16, 1)), SOME, 52.0, 90.0),
         Level(((1, 1), (4, 1), (16, 1), (64, 1)), SOME, 58.0, 900.0),
         Level(((1, 1), (4, 1), (16, 1), (64, 1)), (), 58.0, 900.0),
     ),
@@ -42,7 +42,7 @@ LARGE_LEVELS = (
 )
 """The steps of a clip of 1280x720: sixteen times the pixels."""
 
-TRAIN_CLIPS_BETWEEN = 12
+TRAIN_CLIPS_BETWEEN = 6
 """Training clips that come between two steps that refine the test set."""
 
 
@@ -62,7 +62,7 @@ def steps(sets: tuple[str, ...], kinds: tuple[str, ...] = (), seeds: range | Non
     """All steps in their order.
 
     First one test clip of each kind, coarsely; then a training clip of each kind, and a validation clip. After that
-    training clips, with one step of the rest of the test and validation sets after every dozen.
+    training clips, with one step of the rest of the test and validation sets after every six.
     """
     training = _clips("train", sets, kinds, seeds)
     testing = _testing(sets, kinds, seeds)
