@@ -3,7 +3,7 @@
 import math
 
 from experiments.cycles.kinds.metal import piece
-from experiments.cycles.staging import cameras, furniture, lamps, materials, rooms, shapes
+from experiments.cycles.staging import cameras, furniture, lamps, materials, rooms
 from experiments.cycles.staging.stage import Stage
 
 
@@ -43,11 +43,12 @@ def _string_of_lights(stage: Stage, room: rooms.Room) -> None:
     """Small coloured bulbs along the back wall."""
     w, d, h = room
     tints = [materials.warm(stage), materials.warm(stage), materials.color(stage, (0.5, 0.9), (0.9, 1.0))]
-    bulbs = [materials.light(stage, tint, stage.log_between(15, 50)) for tint in tints]
     sag = stage.between(0.1, 0.4)
     for row in range(stage.count(1, 3)):
         number = stage.count(9, 16)
         for i in range(number):
             t = i / (number - 1)
             z = h - 0.5 - 0.4 * row - sag * 4 * t * (1 - t)
-            stage.add(shapes.ball(0.022, 14), stage.one_of(bulbs), ((t - 0.5) * w * 0.9, d - 0.3, z), smooth=True)
+            place = ((t - 0.5) * w * 0.9, d - 0.3, z)
+            watts = stage.log_between(0.3, 1.0)
+            stage.lamp("POINT", place, watts, stage.one_of(tints), shadow_soft_size=0.022, seen=True)

@@ -18,7 +18,7 @@ def build(stage: Stage) -> None:
         lamps.window(stage, room, stage.log_between(50, 130))
     steady = (-w / 2 + 0.7, stage.between(0.6, 0.85) * d, 0)
     lamps.standing(stage, steady, 1.4, stage.log_between(25, 60))
-    switched = lamps.hanging(stage, (stage.between(-0.5, 0.5), 0.55 * d, h - 0.8), stage.log_between(120, 300), h)
+    switched = lamps.hanging(stage, (stage.between(-0.5, 0.5), 0.55 * d, h - 0.8), stage.log_between(60, 160), h)
     change = stage.count(2 * stage.frames // 5, 3 * stage.frames // 5)
     first = stage.chance(0.5)
     switch(stage, switched.data, lambda frame: (frame >= change) != first)

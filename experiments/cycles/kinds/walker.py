@@ -21,7 +21,7 @@ def _room(stage: Stage) -> None:
         lamps.window(stage, room, stage.log_between(60, 180))
         lamps.ceiling_panel(stage, room, stage.log_between(20, 70))
     else:
-        lamps.hanging(stage, (0.3, 0.5 * d, h - 0.7), stage.log_between(80, 200), h)
+        lamps.hanging(stage, (0.3, 0.5 * d, h - 0.7), stage.log_between(40, 110), h)
         lamps.ceiling_panel(stage, room, stage.log_between(20, 70))
     side = stage.one_of([-1, 1])
     y = stage.between(2.0, 2.6)

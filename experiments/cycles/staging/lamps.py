@@ -11,39 +11,35 @@ from experiments.cycles.staging.stage import Point, Stage
 
 
 def hanging(stage: Stage, at: Point, watts: float, ceiling: float) -> Any:
-    """A lamp on a cord: a shade open below, a small bulb in it. Returns Blender's lamp."""
+    """A glowing ball of five to eleven centimetres' radius on a cord. Returns Blender's lamp."""
     x, y, z = at
-    shade = materials.plain(stage, roughness=0.5) if stage.chance(0.6) else materials.metal(stage, 0.3)
-    stage.add(shapes.cylinder(0.005, ceiling - z, 8), materials.plain(stage, (0.02, 0.02, 0.02)), at)
-    wide = stage.between(0.12, 0.25)
-    profile = [(0.02, 0.1), (wide * 0.6, 0.06), (wide, -0.08), (wide * 0.97, -0.08), (wide * 0.57, 0.05), (0.02, 0.09)]
-    stage.add(shapes.turned(profile), shade, at, smooth=True)
-    return stage.lamp("POINT", (x, y, z - 0.03), watts, materials.warm(stage), shadow_soft_size=0.035)
+    radius = stage.between(0.05, 0.11)
+    cord, collar = materials.plain(stage, (0.02, 0.02, 0.02)), materials.metal(stage, stage.between(0.2, 0.5))
+    stage.add(shapes.cylinder(0.005, ceiling - z - radius, 8), cord, (x, y, z + radius))
+    stage.add(shapes.cylinder(0.02, 0.06, 16), collar, (x, y, z + radius))
+    return stage.lamp("POINT", at, watts, materials.warm(stage), shadow_soft_size=radius, seen=True)
 
 
 def standing(stage: Stage, at: Point, height: float, watts: float) -> Any:
-    """A floor or table lamp with a shade of paper that glows. Returns Blender's lamp."""
+    """A floor or table lamp: a glowing ball on a foot. Returns Blender's lamp."""
     x, y, z = at
-    foot = materials.metal(stage, stage.between(0.1, 0.5))
+    foot = materials.metal(stage, stage.between(0.1, 0.5)) if stage.chance(0.6) else materials.wood(stage)
+    radius = stage.between(0.06, 0.13)
     stage.add(shapes.cylinder(0.12, 0.02, 24), foot, at, bevel=0.005)
-    stage.add(shapes.cylinder(0.012, height, 12), foot, at)
-    paper = materials.plain(stage, materials.pale(stage), 0.9, Transmission_Weight=0.0, Subsurface_Weight=0.0)
-    tint = materials.warm(stage)
-    wide, tall = stage.between(0.13, 0.2), stage.between(0.18, 0.3)
-    stage.add(shapes.turned([(wide, 0), (wide * 0.7, tall)]), paper, (x, y, z + height - 0.12), smooth=True)
-    bulb = materials.light(stage, tint, watts * 0.6)
-    stage.add(shapes.ball(0.03, 16), bulb, (x, y, z + height), smooth=True)
-    return stage.lamp("POINT", (x, y, z + height + 0.06), watts, tint, shadow_soft_size=0.03)
+    stage.add(shapes.cylinder(0.012, height - radius, 12), foot, at)
+    place = (x, y, z + height)
+    return stage.lamp("POINT", place, watts, materials.warm(stage), shadow_soft_size=radius, seen=True)
 
 
 def candle(stage: Stage, at: Point) -> Any:
-    """A candle: a small flame that shines. Returns the flame's thing."""
+    """A candle with a small flame. Returns Blender's lamp."""
     x, y, z = at
     height = stage.between(0.08, 0.22)
     stage.add(shapes.cylinder(0.022, height, 16), materials.plain(stage, (0.85, 0.8, 0.65), 0.5), at, bevel=0.004)
-    flame = [(0, 0), (0.006, 0.006), (0.008, 0.014), (0.004, 0.03), (0, 0.04)]
-    glow = materials.light(stage, (1.0, 0.5, 0.15), stage.log_between(50, 180))
-    return stage.add(shapes.turned(flame, 12), glow, (x, y, z + height + 0.008), smooth=True)
+    stage.add(shapes.cylinder(0.001, 0.012, 6), materials.plain(stage, (0.01, 0.01, 0.01)), (x, y, z + height))
+    place = (x, y, z + height + 0.02)
+    tint = (1.0, stage.between(0.4, 0.6), 0.15)
+    return stage.lamp("POINT", place, stage.log_between(0.3, 1.2), tint, shadow_soft_size=0.01, seen=True)
 
 
 def window(stage: Stage, room: Room, watts: float, *, side: int | None = None) -> Any:
@@ -69,10 +65,8 @@ def ceiling_panel(stage: Stage, room: Room, watts: float, color: materials.Color
     """A soft panel below the ceiling. Returns Blender's lamp."""
     at = (stage.between(-0.8, 0.8), stage.between(0.45, 0.65) * room.depth, room.height - 0.06)
     side = stage.between(0.3, 1.2)
-    panel = materials.light(stage, color, watts / (12 * side * side))
     stage.add(shapes.box(side + 0.04, side + 0.04, 0.04), materials.metal(stage, 0.4), (*at[:2], at[2] + 0.01))
-    stage.add(shapes.sheet(side, side), panel, (*at[:2], at[2] + 0.005), turn=(math.pi, 0, 0))
-    return stage.lamp("AREA", at, watts, color, size=side)
+    return stage.lamp("AREA", at, watts, color, size=side, seen=True)
 
 
 def spot(stage: Stage, at: Point, aim: Point, watts: float, degrees: float = 45.0) -> Any:

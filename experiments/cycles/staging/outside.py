@@ -159,12 +159,12 @@ def post(stage: Stage, at: Point, watts: float = 0.0) -> None:
     x, y, z = at
     iron = materials.metal(stage, 0.5, (0.06, 0.07, 0.07))
     stage.add(shapes.turned([(0.09, 0), (0.07, 0.4), (0.035, 0.5), (0.03, 4.2)], 16), iron, at, smooth=True)
-    tint = materials.warm(stage)
-    head = materials.light(stage, tint, watts / 6) if watts else materials.plain(stage, (0.8, 0.8, 0.75), 0.3)
-    stage.add(shapes.ball(0.16, 20), head, (x, y, z + 4.35), smooth=True)
-    stage.add(shapes.turned([(0.26, 0), (0.03, 0.18)], 20), iron, (x, y, z + 4.48), smooth=True)
+    head = (x, y, z + 4.36)
     if watts:
-        stage.lamp("POINT", (x, y, z + 4.05), watts, tint, shadow_soft_size=0.08)
+        stage.lamp("POINT", head, watts, materials.warm(stage), shadow_soft_size=0.15, seen=True)
+    else:
+        stage.add(shapes.ball(0.15, 20), materials.plain(stage, (0.8, 0.8, 0.75), 0.3), head, smooth=True)
+    stage.add(shapes.turned([(0.26, 0), (0.03, 0.18)], 20), iron, (x, y, z + 4.48), smooth=True)
 
 
 def car(stage: Stage, at: Point, heading: float, *, lit: bool = False) -> Any:

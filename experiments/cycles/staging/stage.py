@@ -92,15 +92,17 @@ class Stage:
     def lamp(self, kind: str, at: Point, watts: float, color: Point, **options: Any) -> Any:
         """A lamp of Blender's (``POINT``, ``SPOT``, ``AREA``, ``SUN``); options are its properties.
 
-        It looks at ``aim`` where that is given.
+        It looks at ``aim`` where that is given. A ``seen`` one is seen by the camera: a ball or a panel that shines.
+        Such a lamp has far less noise than a mesh that shines, and than one in a shade, whose lit inside is found by
+        chance.
         """
-        aim = options.pop("aim", None)
-        parent = options.pop("parent", None)
+        aim, seen = options.pop("aim", None), options.pop("seen", False)
         data = bpy.data.lights.new("lamp", kind)
         data.energy, data.color = watts, tuple(color)
         for name, value in options.items():
             setattr(data, name, value)
-        made = self._put(data, at, (0, 0, 0), (1, 1, 1), parent)
+        made = self._put(data, at, (0, 0, 0), (1, 1, 1), None)
+        made.visible_camera = seen
         if aim is not None:
             made.rotation_euler = look(at, aim)
         return made
