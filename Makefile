@@ -9,7 +9,7 @@ train weights: export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 # XLA raises its errors; what it logs besides is an alarm at every compilation of more than two minutes.
 export TF_CPP_MIN_LOG_LEVEL ?= 3
 
-.PHONY: help setup train test test-slow bench chart compare papers hard-cases results lint format docs weights clean
+.PHONY: help setup train test test-slow bench chart compare papers hard-cases results cycles lint format docs weights clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -54,6 +54,21 @@ $(VENV)/tools: $(VENV)/ready
 		uv pip install --quiet --python $(BIN)/python --torch-backend cpu -c constraints.txt torch 2>/dev/null || \
 		echo "no CPU build of PyTorch could be installed: its rows will be left out"
 	@touch $@
+
+# Blender as a Python package asks for Python 3.11 and NumPy 1: an environment of its own, which nothing else needs.
+.venv-cycles/ready: experiments/cycles/requirements.txt
+	@echo "Setting up .venv-cycles (Blender's package bpy: 400 MB) ..."
+	@if command -v uv >/dev/null 2>&1; then \
+		uv venv --quiet --allow-existing --python 3.11 .venv-cycles && \
+		uv pip install --quiet --python .venv-cycles/bin/python -r experiments/cycles/requirements.txt; \
+	else \
+		python3.11 -m venv .venv-cycles && \
+		.venv-cycles/bin/python -m pip install --quiet -r experiments/cycles/requirements.txt; \
+	fi
+	@touch $@
+
+cycles: .venv-cycles/ready  ## render clips with Cycles into runs/cycles: the test set first; resumable (days)
+	nice .venv-cycles/bin/python -m experiments.cycles render --set test train validation -o runs/cycles $(SETTINGS)
 
 bench: $(VENV)/tools  ## time operations, steps and training, compared with PyTorch and Open Image Denoise: runs/bench.json
 	$(BIN)/python -m experiments.speed.bench $(SETTINGS)

@@ -1,1 +1,1 @@
-"""Experiments on papers, stability and speed, one file each; run with ``python -m experiments.GROUP.NAME``."""
+"""Experiments on papers, stability and speed, and clips of Cycles; run with ``python -m experiments.GROUP.NAME``."""

@@ -1,0 +1,106 @@
+"""What is rendered of a clip, in steps of rising cost, and the order in which clips and steps come."""
+
+from collections.abc import Iterator
+from itertools import chain, islice
+from typing import NamedTuple
+
+from experiments.cycles.sets import LARGE, Clip, clip, kinds_of, rounds
+
+
+class Level(NamedTuple):
+    """What a clip has when a step is done.
+
+    ``draws``: for each sample count, how many images of independent noise a frame. ``reference_frames``: the frames
+    that have references (numbers from 1), all if empty. ``decibels``: the PSNR of a reference's own noise, of
+    x / (1 + x), at which it is good enough; ``seconds``: the processor time after which a frame's reference is left
+    as it is.
+    """
+
+    draws: tuple[tuple[int, int], ...]
+    reference_frames: tuple[int, ...]
+    decibels: float
+    seconds: float
+
+
+SOME = (5, 6, 14, 15, 23, 24)
+"""Pairs of frames, for temporal errors: early, after the middle (where lights switch and shots are cut), late."""
+
+LEVELS = {
+    "train": (Level(((1, 2), (4, 1), (16, 1)), (), 48.0, 60.0),),
+    "validation": (Level(((1, 1), (4, 1), (16, 1)), SOME, 52.0, 90.0),),
+    "test": (
+        Level(((1, 1), (4, 1), (16, 1)), SOME, 52.0, 90.0),
+        Level(((1, 1), (4, 1), (16, 1), (64, 1)), SOME, 58.0, 900.0),
+        Level(((1, 1), (4, 1), (16, 1), (64, 1)), (), 58.0, 900.0),
+    ),
+}
+"""The steps of a set's clips, each having what the one before it has."""
+
+LARGE_LEVELS = (
+    Level(((1, 1), (4, 1), (16, 1)), SOME, 50.0, 900.0),
+    Level(((1, 1), (4, 1), (16, 1), (64, 1)), SOME, 56.0, 3600.0),
+)
+"""The steps of a clip of 1280x720: sixteen times the pixels."""
+
+TRAIN_CLIPS_BETWEEN = 6
+"""Training clips that come between two steps that refine the test set."""
+
+
+class Step(NamedTuple):
+    """A clip and how far to bring it."""
+
+    clip: Clip
+    level: int
+
+
+def levels(of: Clip) -> tuple[Level, ...]:
+    """The steps of a clip."""
+    return LARGE_LEVELS if of.seed in LARGE else LEVELS[of.set]
+
+
+def steps(sets: tuple[str, ...], kinds: tuple[str, ...] = (), seeds: range | None = None) -> Iterator[Step]:
+    """All steps in their order.
+
+    First one test clip of each kind, coarsely; then a training clip of each kind, and a validation clip. After that
+    training clips, with one step of the rest of the test and validation sets after every six.
+    """
+    training = _clips("train", sets, kinds, seeds)
+    testing = _testing(sets, kinds, seeds)
+    validation = (Step(one, 0) for one in _clips("validation", sets, kinds, seeds))
+    some = {name: len(_chosen(name, kinds)) if name in sets else 0 for name in ("train", "validation", "test")}
+    yield from islice(testing, some["test"])
+    yield from (Step(one, 0) for one in islice(training, some["train"]))
+    yield from islice(validation, some["validation"])
+    refining = chain(testing, validation)
+    while True:
+        batch = [Step(one, 0) for one in islice(training, TRAIN_CLIPS_BETWEEN)]
+        batch += islice(refining, 1)
+        if not batch:
+            return
+        yield from batch
+
+
+def _chosen(name: str, kinds: tuple[str, ...]) -> tuple[str, ...]:
+    """The kinds asked for, or all that a set may have."""
+    return kinds or kinds_of(name)
+
+
+def _clips(name: str, sets: tuple[str, ...], kinds: tuple[str, ...], seeds: range | None) -> Iterator[Clip]:
+    if name not in sets:
+        return iter(())
+    return chain.from_iterable(rounds(name, _chosen(name, kinds), seeds))
+
+
+def _testing(sets: tuple[str, ...], kinds: tuple[str, ...], seeds: range | None) -> Iterator[Step]:
+    """Test clips: a round coarsely, then finer, then two large ones, then all frames; then the next seeds likewise."""
+    if "test" not in sets:
+        return
+    for number, row in enumerate(rounds("test", _chosen("test", kinds), seeds)):
+        small = [one for one in row if one.seed not in LARGE]
+        yield from (Step(one, level) for level in (0, 1) for one in small)
+        if seeds is not None:
+            yield from (Step(one, level) for one in row if one.seed in LARGE for level in (0, 1))
+        elif number == 0:
+            large = [clip("test", kind, LARGE.start) for kind in ("lamps", "sun") if kind in _chosen("test", kinds)]
+            yield from (Step(one, 0) for one in large)
+        yield from (Step(one, 2) for one in small)
