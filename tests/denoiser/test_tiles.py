@@ -148,6 +148,7 @@ def test_nothing_beyond_the_receptive_field_decides_about_a_pixel(name: str, x64
     assert not np.allclose(images[0][1][:, cut + 8 :], images[1][1][:, cut + 8 :])
 
 
+@pytest.mark.slow
 def test_history_from_too_far_away_is_counted_and_begins_anew() -> None:
     denoiser = svgf(levels=2)
     side = 2 * (denoiser.receptive_field + 20 + GRID) + GRID

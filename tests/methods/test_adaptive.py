@@ -78,6 +78,7 @@ def test_the_first_frame_is_sampled_evenly(rng, key):
     assert len(np.unique(second)) > 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 def test_without_a_sampler_all_pixels_have_the_budget(name, rng, key):
     denoiser, clip = METHODS[name](size=TINY, adaptive=False, budget=3), clip_of(rng)

@@ -198,6 +198,7 @@ def test_none_is_the_neutral_value_written_out(kind, rng, names):
         np.testing.assert_allclose(first, second, rtol=2e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_specular_light_may_come_and_go_within_a_clip(kind, rng):
     frames = scene(rng, 4)
     frames[0] = frames[0]._replace(specular=None)

@@ -282,6 +282,7 @@ def test_strips_do_not_show(rng, monkeypatch):
     np.testing.assert_array_equal(some[:, 16:], 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masked", [True, False], ids=["with-background", "surfaces-alone"])
 def test_strips_of_a_cascade_do_not_show(rng, monkeypatch, masked):
     """Nor in its gradient; the last strip has rows below the image."""
@@ -511,6 +512,7 @@ def test_gradients_of_params(rng, x64):
     check_grads(mean, (params,), 1, ["rev"], eps=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite(rng):
     denoiser = svgf(levels=2)
     frames = moving_frames(rng, 2)

@@ -238,6 +238,7 @@ def test_a_backend_runs_the_same_network(
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), got, wanted)
 
 
+@pytest.mark.slow
 def test_onnxruntime_follows_the_weights_under_scan_and_vmap(rng: np.random.Generator, key: jax.Array) -> None:
     """The backend keeps weights in its own layout; new weights in the next call give the new image."""
     require("onnxruntime")

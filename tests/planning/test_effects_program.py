@@ -58,6 +58,7 @@ def test_without_disocclusion_the_step_has_the_gathers_of_one_warp(moving, gathe
     assert count("gather", text) == gathers_of_a_warp
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", jaxdn.denoisers.NAMES)
 def test_without_motion_there_is_no_gather(name):
     discs = {"radius": 0.0, "pre_radius": 0.0} if name == "reblur" else {}  # whose taps are strewn

@@ -54,6 +54,7 @@ def test_a_seed_always_gives_the_same_scene_and_another_seed_another(mitsuba: An
     assert np.abs(first - other).mean() > 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_indirect_light_is_well_exposed_whatever_the_lamp(mitsuba: Any, name: str) -> None:
     for lamp in ("up", "down", "window"):
@@ -261,6 +262,7 @@ def test_families_without_dimmers_have_no_changing_light() -> None:
     assert brightness(FAMILIES["pinkroom"](0), 3) == {}
 
 
+@pytest.mark.slow
 def test_parlours_differ_in_light_and_in_the_pace_of_the_camera() -> None:
     """Of 24 seeds some have lights that change within ten frames, and some cameras rest while others turn fast."""
     changing, turns = 0, []
@@ -331,6 +333,7 @@ def test_a_later_part_is_the_same_scene_from_there_on(name: str) -> None:
         scene_from_record({"family": name, "seed": 2, "start": -1})
 
 
+@pytest.mark.slow
 def test_a_later_part_is_rendered_with_its_motion(mitsuba: Any) -> None:
     """Also in its first frame nothing has moved, as in every clip."""
     from jaxdn.render.frame import render_frame

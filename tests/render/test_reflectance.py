@@ -21,6 +21,9 @@ NAMES = (
     *("principled", "principled, textured", "principled, clearcoat", "blendbsdf", "blendbsdf, textured", "mask"),
     *("bumpmap", "normalmap", "twosided", "dielectric", "thindielectric", "roughdielectric"),
 )
+FIRST = {"diffuse, textured", "roughconductor, GGX", "roughplastic", "principled", "mask", "bumpmap", "dielectric"}
+"""One of each kind, with the fast tests; the others with the slow ones."""
+IN_TURN = [pytest.param(name, marks=[pytest.mark.slow] * (name not in FIRST)) for name in NAMES]
 AVERAGED = {name for name in NAMES if "textured" in name or "anisotropic" in name or name in ("bumpmap", "normalmap")}
 needs_fast = pytest.mark.needs("llvm")  # scalar_rgb takes minutes
 
@@ -56,7 +59,7 @@ def test_every_material_of_the_experiment_is_tested(fast):
 
 
 @needs_fast
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", IN_TURN)
 def test_reflectance_is_the_mean_of_independent_samples(fast, name):
     # Monte Carlo's own standard error at 4096 samples is about 0.003; 32 fixed samples are good to a few percent.
     result = measured(name)
@@ -66,7 +69,7 @@ def test_reflectance_is_the_mean_of_independent_samples(fast, name):
 
 
 @needs_fast
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "mask"])
+@pytest.mark.parametrize("name", [each for each in IN_TURN if each.values[0] != "mask"])
 def test_a_white_furnace_divided_by_the_reflectance_is_white(fast, name):
     # The furnace's noise at 1024 samples is 0.01 to 0.02. Light inside rough glass is partly lost on its way out.
     most = 0.06 if name in AVERAGED or name == "roughdielectric" else 0.03
@@ -85,7 +88,7 @@ def test_a_diffuse_surface_has_its_albedo_in_the_slow_variant(scalar):
 
 
 @needs_fast
-@pytest.mark.parametrize("name", [name for name in NAMES if "roughd" not in name])
+@pytest.mark.parametrize("name", [each for each in IN_TURN if "roughd" not in each.values[0]])
 def test_both_variants_find_the_same(name):
     # The slow one makes its tables of 256 samples.
     images = []

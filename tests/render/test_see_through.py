@@ -155,6 +155,7 @@ def test_glass_shows_what_is_behind_it_less_what_it_reflects(kind):
     assert not set(np.unique(ids[through])) & set(np.unique(ids[~through]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "shape",
     [

@@ -116,6 +116,7 @@ def test_the_shadow_of_a_ball_is_found_where_it_lay(ball, lamp_step, camera):
     assert np.mean(hidden[row, column]) < 0.2  # the trail takes its history from beside the old shadow
 
 
+@pytest.mark.slow
 @needs_fast
 def test_under_a_sun_in_the_zenith_the_shadow_moves_as_the_ball_does():
     stage = scene(SUN)
@@ -130,6 +131,7 @@ def test_under_a_sun_in_the_zenith_the_shadow_moves_as_the_ball_does():
     np.testing.assert_allclose(found.frame.shadow_motion[shown], expected[shown], atol=1e-2)
 
 
+@pytest.mark.slow
 @needs_fast
 @pytest.mark.parametrize("light", [SUN, POINT, {"type": "constant", "radiance": {"type": "rgb", "value": 1.0}}])
 def test_what_stands_still_has_the_surfaces_vectors_exactly(light):
@@ -138,6 +140,7 @@ def test_what_stands_still_has_the_surfaces_vectors_exactly(light):
         np.testing.assert_array_equal(frame.shadow_motion, frame.motion)
 
 
+@pytest.mark.slow
 @needs_fast
 def test_light_without_shadow_is_what_a_scene_without_blocker_shows():
     lit = scene(POINT)
