@@ -24,7 +24,7 @@ from experiments.cycles.record import RECORD, write_record
 from experiments.cycles.sets import Clip, clip
 from experiments.cycles.staging.stage import Stage
 
-PASSES = Path(__file__).parents[2] / "docs" / "tutorials" / "blender_passes.py"
+PASSES = Path(__file__).parents[2] / "docs" / "how-to" / "blender_passes.py"
 PILOT = 16
 """Samples a pixel of the first two halves of a reference."""
 
