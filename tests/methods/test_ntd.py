@@ -26,6 +26,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "materials": {"guides": "materials"},
     "traditional": {"motion": "traditional", "demodulate": "none"},
 }
+SELDOM = sorted(VARIANTS.keys() - {"default", "plain"})
+"""Those that only the slow tests go through one by one: each is another program."""
 
 
 def tiny(**options: Any) -> Denoiser:
@@ -198,7 +200,7 @@ def test_alpha_weighs_the_current_frame_and_missing_history_is_not_used(
     assert image(50.0, 1000.0).max() < 20
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+@pytest.mark.parametrize("name", ["default", "plain", *(pytest.param(name, marks=pytest.mark.slow) for name in SELDOM)])
 def test_constant_radiance_stays(name: str, rng: np.random.Generator, key: jax.Array) -> None:
     """Softmax kernels, means and maxima keep a constant, including the border, whatever the network predicts."""
     denoiser = tiny(**VARIANTS[name])

@@ -61,12 +61,17 @@ def test_without_buffers_of_its_own_it_is_svgf(rng, by):
     [
         # Two at once where each is read by a part of light of its own: a step takes ten seconds to compile.
         ("shadowed", "unshadowed"),
-        ("unshadowed", "glossy_motion"),
-        ("specular",),
         ("specular", "specular_reflectance", "dual_motion"),
-        ("shadow_motion", "roughness"),
-        ("motion", "dual_motion", "shadow_motion", "glossy_motion", "previous_depth"),
-        ("albedo", "reflectance", "specular_reflectance"),
+        *(
+            pytest.param(names, marks=pytest.mark.slow)
+            for names in (
+                ("unshadowed", "glossy_motion"),
+                ("specular",),
+                ("shadow_motion", "roughness"),
+                ("motion", "dual_motion", "shadow_motion", "glossy_motion", "previous_depth"),
+                ("albedo", "reflectance", "specular_reflectance"),
+            )
+        ),
     ],
     ids="-".join,
 )
