@@ -20,6 +20,8 @@ import pytest
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "microsoft-edge")
 """Programs on the path that Playwright can drive."""
+WITH_BPY = Path(__file__).parents[1] / ".venv-cycles" / "bin" / "python"
+"""An interpreter of its own: ``bpy`` runs on one version of Python alone."""
 LLVM_15 = Path("/usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
 
 
@@ -99,6 +101,7 @@ NEEDS = {
         "the archive of an ONNX Runtime release; set CPATH to its folder include",
         "no package of pip or of Debian 12 has them",
     ),
+    "bpy": Need(lambda: _runs(str(WITH_BPY), "-c", "import bpy, OpenEXR"), "make .venv-cycles/ready"),
     "fcntl": Need(_package("fcntl"), "a Unix system"),
     "LLVM 15": Need(LLVM_15.exists, "apt-get install libllvm15", "it aborts the processes that find it"),
 }

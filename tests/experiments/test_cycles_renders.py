@@ -16,6 +16,7 @@ import pytest
 
 from experiments.cycles.reference import read, read_channels
 from experiments.cycles.sets import KINDS
+from tests.needs import NEEDS, WITH_BPY, require
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -33,19 +34,11 @@ levels.LEVELS.update(test=few)
 
 @pytest.fixture(scope="session")
 def blender() -> Path:
-    """An interpreter that has ``bpy``."""
-    python = ROOT / ".venv-cycles" / "bin" / "python"
-    if not _has_bpy(python):
-        made = subprocess.run(["make", ".venv-cycles/ready"], cwd=ROOT, capture_output=True, text=True, check=False)
-        if made.returncode or not _has_bpy(python):
-            pytest.skip(f"bpy cannot be installed here: {(made.stderr or made.stdout).strip()[-300:]}")
-    return python
-
-
-def _has_bpy(python: Path) -> bool:
-    if not python.exists():
-        return False
-    return subprocess.run([python, "-c", "import bpy, OpenEXR"], capture_output=True, check=False).returncode == 0
+    """An interpreter that has ``bpy``; it is made if it is not there."""
+    if not NEEDS["bpy"].present():
+        subprocess.run(["make", ".venv-cycles/ready"], cwd=ROOT, capture_output=True, check=False)
+    require("bpy")
+    return WITH_BPY
 
 
 def _run(python: Path, code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
