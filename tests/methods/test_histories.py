@@ -12,6 +12,7 @@ import pytest
 
 from jaxdn.core.frame import FAR, Frame
 from jaxdn.denoiser import Denoiser
+from jaxdn.denoiser.statistics import measure_frame
 from jaxdn.methods.lobes import split_signals
 from jaxdn.methods.two_lobes.reblur import reblur
 from jaxdn.methods.two_lobes.relax import relax
@@ -242,7 +243,7 @@ def test_gradients_reach_both_kinds_of_light(kind, x64, rng):
 @pytest.mark.parametrize("by", ["brdf", "albedo", "none"])
 def test_both_kinds_of_light_add_up(rng, by):
     frame = scene(rng, 1)[0]
-    diffuse, specular = split_signals(frame, by)
+    diffuse, specular = split_signals(frame, by, measure_frame(frame.radiance, None, frame))
     np.testing.assert_allclose(
         diffuse.remodulate(diffuse.light) + specular.remodulate(specular.light), frame.radiance, rtol=1e-6
     )
@@ -251,6 +252,7 @@ def test_both_kinds_of_light_add_up(rng, by):
 
 def test_specular_light_beyond_all_light_is_cut_off(rng):
     frame = scene(rng, 1)[0]
-    diffuse, specular = split_signals(frame._replace(specular=2 * frame.radiance + 1), "none")
+    frame = frame._replace(specular=2 * frame.radiance + 1)
+    diffuse, specular = split_signals(frame, "none", measure_frame(frame.radiance, None, frame))
     assert not np.any(diffuse.light)
     np.testing.assert_array_equal(specular.light.transpose(1, 2, 0), frame.radiance)

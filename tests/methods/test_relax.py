@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jaxdn.core.frame import Frame
+from jaxdn.denoiser.statistics import measure_frame
 from jaxdn.methods.lobes import split_signals
 from jaxdn.methods.two_lobes.relax import relax
 from tests.methods.lobe_scenes import HEIGHT, WIDTH, mirror_frames, run
@@ -25,7 +26,7 @@ def test_metal_darkens_no_diffuse_neighbour():
         specular_reflectance=np.where(metal, light * 2, 0.0),
         specular=np.where(metal, light, 0.0),
     )
-    diffuse, _ = split_signals(frame, "brdf")
+    diffuse, _ = split_signals(frame, "brdf", measure_frame(frame.radiance, None, frame))
     np.testing.assert_allclose(diffuse.texture[:, 0, 4:], 0.0, atol=1e-6)
     np.testing.assert_allclose(diffuse.texture[:, 0, :4], 1.0, rtol=1e-3)  # the divisor is a soft maximum
     # Giving back divides by one too, at each of eight averages.
