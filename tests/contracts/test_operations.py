@@ -86,7 +86,7 @@ def runner(operation, name, options):
 
 
 ROUNDING = 2e-6
-"""Of the largest gradient of all arguments: what rounding leaves of a gradient of 0, such as a single pixel's weights."""
+"""Of the largest gradient of all arguments: what rounding leaves of a gradient of 0, as of a single pixel's weights."""
 
 
 def assert_close(found, wanted, precision, *, rounding=0.0):
