@@ -141,6 +141,7 @@ _Output = tuple[jax.Array, jax.Array, jax.Array]
 
 @operation(name="reproject")
 def _average_taps(given: _Request, *, rules: _Rules) -> _Output:
+    """The mean of each target's accepted taps [H, W, C], where there is one [H, W], and how many pixels are invalid."""
     history, before, at, inside, expected = given
     valid_history = jnp.all(jnp.isfinite(history) & (history >= 0), axis=-1, keepdims=True)
     history = jnp.where(valid_history, history, 0.0)

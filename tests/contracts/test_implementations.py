@@ -11,7 +11,6 @@ from jaxdn.ops.dispatch.operation import OPERATIONS
 from jaxdn.ops.kernel_prediction.apply import apply_kernels
 from jaxdn.ops.kernel_prediction.softmax import softmax_filter
 from jaxdn.ops.warp import warp
-from tests.needs import NEEDS
 
 SIZES = [(6, 7), (1, 1), (1, 9)]
 
@@ -157,7 +156,7 @@ def runnable(op):
 
 
 CASES = [
-    pytest.param(case, name, marks=[pytest.mark.needs(name)] if name in NEEDS else [])
+    (case, name)
     for op, cases in {
         "warp": ("warp_clamp", "warp_zeros"),
         "apply_kernels": ("apply_kernels_1", "apply_kernels_25"),
@@ -165,8 +164,9 @@ CASES = [
     }.items()
     for case in cases
     for name, one in OPERATIONS[op].implementations.items()
-    if not one.refuses(np.float64(0))
+    if not one.dtypes
 ]
+"""Implementations of every dtype; those of float32 alone are compared in ``test_operations.py``."""
 
 
 FILTERS = [

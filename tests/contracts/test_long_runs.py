@@ -37,9 +37,10 @@ def test_filters_and_the_lightest_weights_are_tested():
 
 
 def test_the_experiment_follows_denoisers_without_a_state():
-    as_it_is = recurrent(
-        Core(lambda params, frame: {}, lambda p, state, frame, _: (state, frame.radiance, 0), frozenset())
-    )
+    def step(params, state, frame, first, statistics):
+        return state, frame.radiance, 0
+
+    as_it_is = recurrent(Core(lambda params, frame: {}, step, frozenset()))
     state, error, healthy, _ = long_runs.compiled(as_it_is, {}, 4)((0.7, 0.0, -1))
     assert state.tolist() == [0, 0, 0, 0]
     assert healthy.all()

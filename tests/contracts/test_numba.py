@@ -152,8 +152,8 @@ def test_the_running_mean(rng, both):
     found, wanted = both(functools.partial(update_mean, most=20.0), light, history, hit, follow)
     for one, other in zip(found, wanted, strict=True):
         np.testing.assert_allclose(one, other, rtol=2e-5, atol=2e-3)
-    assert np.all(found.number[~np.asarray(history.valid)] == 1)
-    assert 19.0 < found.number.max() <= 20.0
+    assert np.all(found.sample_count[~np.asarray(history.valid)] == 1)
+    assert 19.0 < found.sample_count.max() <= 20.0
 
 
 @pytest.mark.parametrize("changed", [False, True])

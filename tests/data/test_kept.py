@@ -60,7 +60,7 @@ def assert_same_but(source: Path, target: Path, changed: tuple[str, ...]) -> Non
 def box_blur() -> Model:
     """The smallest denoiser: what is kept does not depend on the method, and svgf takes half a minute to compile."""
 
-    def step(params: Any, state: Any, frame: Frame, first: Any) -> Any:
+    def step(params: Any, state: Any, frame: Frame, first: Any, statistics: Any) -> Any:
         padded = jnp.pad(frame.radiance, ((1, 1), (1, 1), (0, 0)), mode="edge")
         height, width = frame.radiance.shape[:2]
         shifts = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]

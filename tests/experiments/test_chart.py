@@ -232,7 +232,6 @@ def test_every_registered_method_is_there_with_its_variants(denoisers):
         assert found[f"{name}, still scene"].images is None
         assert "motion" in found[name].reads
         assert "luminance_gradient" not in found[name].reads, "it would be charged for what it does not read"
-    assert "ntd-large, bfloat16" in found
     assert ("ntd-large, onnxruntime" in found) == BACKENDS["onnxruntime"].available()
     assert found["ntd tiny"].images is None
     assert {each.method.name for each in denoisers} == set(methods()) - {"ntasd", "dasr"}

@@ -18,7 +18,10 @@ def clip(rng):
 
 
 def filter_of(change, *reads):
-    return recurrent(Core(lambda params, frame: jnp.zeros(()), lambda p, s, frame, first: (s, change(frame), 0), reads))
+    def step(params, state, frame, first, statistics):
+        return state, change(frame), 0
+
+    return recurrent(Core(lambda params, frame: jnp.zeros(()), step, reads))
 
 
 def test_every_change_is_changed_back(clip):

@@ -60,7 +60,7 @@ def test_the_table_scores_what_a_view_reads(folder: Path) -> None:
     lines = {}
     for view in ("indirect", "beauty"):
         noisy = [find_model("noisy")]
-        results = compare(noisy, [folder], title="", settings={}, read=VIEWS[view], say=lambda text: None)
+        results = compare(noisy, [folder], title="", settings={}, read=VIEWS[view], log=lambda text: None)
         lines[view] = table(results).splitlines()[-1]
     psnr = {view: float(line.split("|")[2]) for view, line in lines.items()}
     assert psnr["indirect"] > psnr["beauty"]

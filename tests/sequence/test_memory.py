@@ -55,7 +55,7 @@ def test_frames_in_parts_are_the_same_files(tmp_path):
 def test_too_little_memory_is_refused_before_anything_is_written(tmp_path):
     write_sequence(tmp_path / "in", 1, 200, 300)
     settings = Settings(naming=ChannelNaming("previous-current"), max_memory=0.61 * 2**30)
-    with pytest.raises(ValueError, match=r"--max-memory 0.61: whole frames of 300 x 200 need .* there is room for"):
+    with pytest.raises(ValueError, match=r"--max-memory 0.61: whole frames of 300 x 200 need .* got room for"):
         denoise_files([tmp_path / "in"], tmp_path / "out", find_model("svgf"), settings)
     assert not list((tmp_path / "out").glob("**/*.exr"))
 
