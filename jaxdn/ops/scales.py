@@ -60,6 +60,7 @@ def fill_holes(image: jax.Array, known: jax.Array, *, implementation: str | None
 
 @operation(name="fill_holes")
 def _fill_holes(image: jax.Array, known: jax.Array) -> jax.Array:
+    """:func:`fill_holes` of arrays whose shapes fit."""
     weight = jnp.asarray(known, image.dtype)
     total, means = jnp.where(known, image, 0.0), []
     for level in (1, 2):

@@ -240,6 +240,7 @@ _Split = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 
 @operation(name="split_heads")
 def _split_planes(head: jax.Array, *, size: tuple[int, int]) -> _Split:
+    """The network's output at half resolution [h, w, C], cropped, as the parts that the filter reads."""
     # Splits, not slices: the gradient of a slice is an array of the whole size, and all of them are added.
     own, logits, half, rest = jnp.split(crop(head, size), _SPLITS, axis=-1)
     # Before they are unfolded, while they lie side by side in memory.

@@ -32,6 +32,7 @@ def join_planes(parts: Sequence[Channels], *, implementation: str | None = None)
 
 @operation(name="join_planes")
 def _join_planes(*arrays: jax.Array, layouts: tuple[str, ...]) -> jax.Array:
+    """The planes of all arrays, one after the other, each converted from its layout."""
     return jnp.concatenate([_TO_PLANES[layout](array) for layout, array in zip(layouts, arrays, strict=True)])
 
 
