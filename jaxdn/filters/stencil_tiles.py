@@ -82,7 +82,7 @@ class PaddedTiles(NamedTuple):
 
 
 def plan_tiles(height: int, width: int, taps: np.ndarray, *, step_max: int) -> PaddedTiles:
-    """The canvas of an image for ``taps``, rows of (dy, dx, h), that are up to ``step_max`` pixels apart.
+    """The padded tiles of an image for ``taps``, rows of (dy, dx, h), that are up to ``step_max`` pixels apart.
 
     Strips are for the CPU's cache only; other devices take one strip.
     """
@@ -101,7 +101,7 @@ class PaddedGuides(NamedTuple):
 
 
 def pad_guides(tiles: PaddedTiles, weights: Sequence[Weight]) -> PaddedGuides:
-    """The planes of ``weights``, on the canvas."""
+    """The planes of ``weights``, on the padded tiles."""
     return PaddedGuides(
         [[tiles.pad(plane) for plane in one.there] for one in weights],
         [[tiles.pad_rows(plane) for plane in one.here] for one in weights],
@@ -140,7 +140,7 @@ def weighted_sums(
     """The sums of one strip, the centre of whose stencil has exactly its h.
 
     Args:
-      canvas: where all planes lie.
+      tiles: where all planes lie.
       top: first row of the strip in the image.
       taps: rows of (dy, dx, h), the centre first.
       step: their spacing; it may be traced.
