@@ -35,6 +35,7 @@ def write_record(
         "level": level,
         "frames": of.frames,
         "resolution": list(of.size),
+        "window": of.window._asdict(),
         "pixel_filter": list(of.pixel_filter),
         **settings,
         "reference_noise_db": round(decibels(float(np.mean(list(errors.values())))), 2),

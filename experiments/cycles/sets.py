@@ -1,5 +1,6 @@
 """Which clips there are: kinds, sets, their seeds, and what must never be trained on."""
 
+import random
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -37,6 +38,19 @@ SEEDS = {"train": range(0, 8000), "validation": range(8000, 9000), "test": range
 LARGE = range(9900, 10000)
 """Test seeds that are rendered at 1280x720 instead of 320x180."""
 
+WINDOW = (160, 128)
+"""Width and height of what is rendered of a training clip: a denoiser is trained on crops, and scenes count more than
+pixels."""
+
+
+class Window(NamedTuple):
+    """The pixels of a picture that are rendered: columns from ``left`` on, rows from ``top`` on."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
 
 class Clip(NamedTuple):
     """One clip: its set, kind and seed."""
@@ -52,13 +66,29 @@ class Clip(NamedTuple):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
+        """Width and height of the whole picture, in pixels."""
+        if self.set == "train":
+            return (640, 360) if self._draw().random() < 0.5 else (320, 180)
         return (1280, 720) if self.seed in LARGE else (320, 180)
 
     @property
+    def window(self) -> Window:
+        """What is rendered of the picture: a place at random in training, else all of it."""
+        (width, height), random_place = self.size, self._draw()
+        if self.set != "train":
+            return Window(0, 0, width, height)
+        random_place.random()  # the size took the first number
+        left, top = (random_place.randrange(whole - part + 1) for whole, part in zip(self.size, WINDOW, strict=True))
+        return Window(left, top, *WINDOW)
+
+    @property
     def frames(self) -> int:
-        """Frames of the clip. Half as many in training: twice as many scenes an hour."""
-        return 12 if self.set == "train" else 24
+        """Frames of the clip. Fewer in training: more scenes an hour."""
+        return 10 if self.set == "train" else 24
+
+    def _draw(self) -> random.Random:
+        """Random numbers of this clip alone."""
+        return random.Random(f"{self.set} {self.kind} {self.seed}")
 
     @property
     def pixel_filter(self) -> tuple[str, float]:

@@ -71,7 +71,20 @@ def build(of: Clip) -> None:
     scene.render.use_file_extension = False
     scene.render.resolution_x, scene.render.resolution_y = of.size
     scene.render.resolution_percentage = 100
+    show_window(of)
     scene.frame_start, scene.frame_end = 1, of.frames
+
+
+def show_window(of: Clip) -> None:
+    """Render the pixels of a clip's window alone; Blender counts rows from the bottom."""
+    render, (width, height), window = bpy.context.scene.render, of.size, of.window
+    render.use_border = render.use_crop_to_border = (window.width, window.height) != (width, height)
+    # Half a pixel inside, so that rounding never takes a neighbour.
+    inset = 0.25
+    render.border_min_x = (window.left + inset) / width
+    render.border_max_x = (window.left + window.width + inset) / width
+    render.border_min_y = (height - window.top - window.height + inset) / height
+    render.border_max_y = (height - window.top + inset) / height
 
 
 def settings() -> dict[str, Any]:

@@ -15,7 +15,7 @@ from experiments.cycles import reference
 from experiments.cycles.levels import SOME, TRAIN_CLIPS_BETWEEN, Step, levels, steps
 from experiments.cycles.record import RECORD, done, read_record, write_record
 from experiments.cycles.reference import Reference
-from experiments.cycles.sets import HELD_OUT, KINDS, LARGE, SEEDS, clip, kinds_of, rounds
+from experiments.cycles.sets import HELD_OUT, KINDS, LARGE, SEEDS, WINDOW, clip, kinds_of, rounds
 
 ROOT = Path(__file__).parents[2]
 SETS = ("train", "validation", "test")
@@ -64,6 +64,18 @@ def test_both_pixel_filters_have_half_of_every_round_and_of_every_kind() -> None
     for kind in KINDS:
         filters = Counter(clip("test", kind, seed).pixel_filter for seed in range(9000, 9010))
         assert filters == {("BOX", 1.0): 5, ("BLACKMAN_HARRIS", 1.5): 5}
+
+
+def test_training_clips_are_windows_at_places_of_their_own_inside_the_picture() -> None:
+    clips = [clip("train", "sun", seed) for seed in range(60)]
+    for one in clips:
+        assert (one.window.width, one.window.height) == WINDOW
+        assert 0 <= one.window.left <= one.size[0] - WINDOW[0]
+        assert 0 <= one.window.top <= one.size[1] - WINDOW[1]
+        assert one.window == clip("train", "sun", one.seed).window
+    assert len({one.window for one in clips}) > 50
+    assert 15 < sum(one.size == (640, 360) for one in clips) < 45
+    assert clip("test", "sun", 9000).window == (0, 0, 320, 180)
 
 
 def test_the_first_steps_are_one_clip_of_each_kind_of_each_set() -> None:

@@ -156,3 +156,23 @@ def test_nothing_outside_imports_bpy() -> None:
         assert "import bpy" not in path.read_text(), path
     code = "import sys, experiments.cycles.__main__, experiments.cycles.reference; assert 'bpy' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=ENVIRONMENT, check=True)
+
+
+@pytest.mark.slow
+def test_a_window_is_that_part_of_the_picture(blender: Path, tmp_path: Path) -> None:
+    code = """
+from pathlib import Path
+sets.WINDOW = (16, 8)
+of = sets.clip("train", "textures", 3)
+shot.build(of)
+shot.render(Path(sys.argv[1]) / "part.exr", 2, 1, 1)
+shot.bpy.context.scene.render.use_border = False
+shot.render(Path(sys.argv[1]) / "whole.exr", 2, 1, 1)
+print(*of.window, file=sys.stderr)
+sys.stdout.flush(); shot.os._exit(0)
+"""
+    left, top, width, height = map(int, _run(blender, code, str(tmp_path)).stderr.split()[-4:])
+    part, whole = (read_channels(tmp_path / f"{name}.exr")[0] for name in ("part", "whole"))
+    # The first sample goes through the pixel's centre, whatever its noise.
+    name = "ViewLayer.Depth.Z"
+    np.testing.assert_allclose(part[name], whole[name][top : top + height, left : left + width], rtol=1e-5)
