@@ -26,7 +26,7 @@ SOME = (5, 6, 14, 15, 23, 24)
 """Pairs of frames, for temporal errors: early, after the middle (where lights switch and shots are cut), late."""
 
 LEVELS = {
-    "train": (Level(((1, 2), (4, 1), (16, 1)), (), 46.0, 16.0),),
+    "train": (Level(((1, 2), (4, 1), (16, 1)), (), 42.0, 6.0),),
     "validation": (Level(((1, 1), (4, 1), (16, 1)), SOME, 52.0, 90.0),),
     "test": (
         Level(((1, 1), (4, 1), (16, 1)), SOME, 52.0, 90.0),
