@@ -29,7 +29,7 @@ ENGINES = {
     "onednn-float32": "oneDNN, float32",
     "xla": "XLA",
     "onnxruntime": "ONNX Runtime",
-    "xla without compiled loops": "XLA, no Numba kernels",
+    "reference": "XLA, no Numba kernels",
 }
 """Engine in the rows of ``frames`` -> column."""
 PEERS = {
@@ -174,7 +174,7 @@ def _is_best(
 
 
 def _frames(result: Result) -> list[str]:
-    """One table for each size: methods by engines, milliseconds and their ratio to the peer in the same run."""
+    """One table for each size: methods by engines, milliseconds, and their ratio to the peer if it ran in that run."""
     rows, tables = result["rows"], []
     for width, height in dict.fromkeys((row["width"], row["height"]) for row in rows):
         here = [row for row in rows if (row["width"], row["height"]) == (width, height)]
@@ -189,8 +189,8 @@ def _frames(result: Result) -> list[str]:
             [
                 f"`{method}`",
                 str(run),
-                *(_ratio(found.get(engine), reference[run]) for engine in engines),
-                _ms(reference[run]),
+                *(_ratio(found.get(engine), reference.get(run)) for engine in engines),
+                _ms(reference[run]) if run in reference else "",
             ]
             for (method, run), found in times.items()
         ]
@@ -249,8 +249,10 @@ def _ms(value: float) -> str:
     return f"{value:,.0f}" if value >= 100 else f"{value:.1f}"
 
 
-def _ratio(value: float | None, reference: float) -> str:
-    return "" if value is None else f"{_ms(value)} ({value / reference:.2f})"
+def _ratio(value: float | None, reference: float | None) -> str:
+    if value is None:
+        return ""
+    return _ms(value) if reference is None else f"{_ms(value)} ({value / reference:.2f})"
 
 
 def _notes(result: Result) -> str:

@@ -3,11 +3,12 @@
     python -m experiments.speed.bench                  # everything, 20 to 30 minutes on two cores
     python -m experiments.speed.bench --only steps     # one group
 
-Writes ``runs/bench.json``, a list of rows ``{"work", "implementation", "median_ms", "min_ms", "max_ms", "peak_mib",
-"against", "ratio"}`` with ``ratio`` = own median over that of ``against``, and prints a table. Every implementation has
-a process of its own (:mod:`experiments.speed.workers`) and runs in turns with those that it is compared with. Large
-buffers are in huge pages only in the rows that say so. The peers are optional (`make bench` installs them); the rows of
-what is missing or fails are left out with a message.
+Writes ``runs/bench.json`` in the format of docs/results (:mod:`experiments.measurement`), with rows ``{"work",
+"implementation", "median_ms", "min_ms", "max_ms", "peak_mib", "against", "ratio"}`` with ``ratio`` = own median over
+that of ``against``, and prints a table. Every implementation has a process of its own
+(:mod:`experiments.speed.workers`) and runs in turns with those that it is compared with. Large buffers are in huge
+pages only in the rows that say so. The peers are optional (`make bench` installs them); the rows of what is missing or
+fails are left out with a message.
 """
 
 import os
@@ -25,6 +26,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from experiments.measurement import describe_measurement
 from experiments.speed import peers, roofline
 from experiments.speed.roofline import Probe
 from experiments.speed.timing import Timing, summary
@@ -58,14 +60,24 @@ class Settings:
 class Report:
     """The rows so far, in a file that is complete after every workload."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.rows = path, []  # type: Path, list[Row]
+    def __init__(self, path: Path, command: str) -> None:
+        self.path, self.command, self.rows = path, command, []  # type: Path, str, list[Row]
         path.parent.mkdir(parents=True, exist_ok=True)
 
     def add(self, rows: Sequence[Row]) -> None:
         """Add the rows and rewrite the file."""
         self.rows.extend(rows)
-        write_json(self.path, self.rows)
+        write_json(
+            self.path,
+            describe_measurement(
+                *("bench", "Benchmark", "Speed", 310),
+                command=self.command,
+                what="Operations, steps and training. Ratios are the time of jaxdn divided by the time of the peer, "
+                "measured interleaved, each implementation in a process of its own. Below 1, jaxdn is faster. The "
+                "roofline counts each byte once and leaves out exponentials.",
+                rows=self.rows,
+            ),
+        )
 
 
 def row(work: str, name: str, timing: Timing, peak: float | None, against: str, other_ms: float) -> Row:
@@ -247,7 +259,8 @@ def groups(cache: Path, say: Callable[[str], None]) -> dict[str, Iterator[Callab
 def main(settings: Settings) -> None:
     """Run the groups, write the file after each workload, print the table."""
     began = time.monotonic()
-    console, report = Console(width=max(Console().width, 160)), Report(settings.out)
+    command = "make bench" if settings.only == "all" else f"python -m experiments.speed.bench --only {settings.only}"
+    console, report = Console(width=max(Console().width, 160)), Report(settings.out, command)
 
     def say(line: str) -> None:
         console.print(f"[{time.monotonic() - began:5.0f} s] {line}", highlight=False, markup=False)

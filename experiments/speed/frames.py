@@ -7,20 +7,22 @@ Memory is kept between frames as in `jaxdn denoise` (:mod:`jaxdn.runtime.malloc`
 
 Each implementation has a process of its own and runs in turns with the others (:mod:`experiments.speed.workers`).
 Prints a table for each size: the median of the turns in milliseconds, its ratio to Open Image Denoise, nanoseconds per
-pixel; writes ``runs/frames.json``.
+pixel; writes ``runs/frames.json`` in the format of docs/results (:mod:`experiments.measurement`).
 """
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
+from experiments.measurement import describe_measurement
 from experiments.speed import peers
 from experiments.speed.timing import Call
 from experiments.speed.workers import Team
@@ -106,6 +108,18 @@ def table(title: str, found: Mapping[str, float], pixels: int) -> Table:
     return shown
 
 
+def measurement(settings: Settings, rows: Sequence[Mapping[str, str | int | float]]) -> dict[str, Any]:
+    """The rows in the format of docs/results."""
+    return describe_measurement(
+        *("frames", "Time of a frame", "Speed", 300),
+        command=f"python -m experiments.speed.frames --methods {' '.join(settings.methods)} --sizes "
+        f"{' '.join(settings.sizes)} --rounds {settings.rounds}",
+        what=f"Medians of {settings.rounds} interleaved turns of one frame, each implementation in a process of its "
+        f"own, in ms. In brackets: the time relative to {OIDN} in the same run.",
+        rows=rows,
+    )
+
+
 def main(settings: Settings) -> None:
     """Measure, print, save."""
     console = Console()
@@ -114,9 +128,11 @@ def main(settings: Settings) -> None:
     for height, width in sizes:
         found = measured(settings.methods, height, width, rounds=settings.rounds, say=console.print)
         console.print(table(f"{width} x {height}", found, height * width))
-        rows += [{"width": width, "height": height, "implementation": name, "ms": ms} for name, ms in found.items()]
+        rows += [
+            {"run": 1, "width": width, "height": height, "implementation": name, "ms": ms} for name, ms in found.items()
+        ]
         settings.out.parent.mkdir(parents=True, exist_ok=True)
-        write_json(settings.out, rows)
+        write_json(settings.out, measurement(settings, rows))
 
 
 if __name__ == "__main__":

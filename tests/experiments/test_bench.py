@@ -1,6 +1,5 @@
 """Timing, workers in real processes, and the benchmark's rows, on workloads that take milliseconds."""
 
-import json
 import os
 import pickle
 import signal
@@ -16,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.results_page import read_results, results_page
 from experiments.speed import bench, peers, roofline
 from experiments.speed.timing import Timing, measure, peak_mib
 from experiments.speed.workers import Team, Worker, WorkerError, apart
@@ -180,10 +180,12 @@ def test_rows_of_a_real_workload(tmp_path, monkeypatch):
         assert row["work"] == "warp-24p"
         assert row["ratio"] == pytest.approx(row["median_ms"] / medians[row["against"]])
         assert row["peak_mib"] is None or row["peak_mib"] >= 0
-    report = bench.Report(tmp_path / "runs" / "bench.json")
+    report = bench.Report(tmp_path / "runs" / "bench.json", "make bench")
     report.add(rows[:1])
     report.add(rows[1:])
-    assert json.loads(report.path.read_text()) == rows
+    (result,) = read_results(report.path.parent)
+    assert result["rows"] == rows
+    assert f"| warp-24p | {rows[0]['implementation']} |" in results_page([result])
     assert [path.name for path in report.path.parent.iterdir()] == ["bench.json"]
     assert bench.table(rows).row_count == len(medians) - 1
 

@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from experiments.speed.frames import OIDN, Settings, builds, main, parsed
+from experiments.results_page import ENGINES, read_results, results_page
+from experiments.speed.frames import OIDN, Settings, builds, main, measurement, parsed
 from jaxdn.networks.backends import BACKENDS
 from jaxdn.ops.dispatch import numba_call
 
@@ -15,13 +16,25 @@ def test_every_engine_for_inference_that_runs_here_is_timed():
     methods = ("svgf", "steady-fast")
     without = [f"{name}, reference" for name in methods if not numba_call.unavailable()]
     assert found == {*(f"{name}, xla" for name in methods), *without, *(f"steady-fast, {name}" for name in backends)}
+    assert {label.partition(", ")[2] for label in found} <= ENGINES.keys(), "each has its column on the page of results"
+
+
+def test_the_page_of_results_reads_what_is_saved(tmp_path):
+    settings = Settings(["svgf", "taa"], ["8x4"], 3)
+    times = {"svgf, xla": 2.5, "svgf, reference": 5.0, "taa, xla": 1.0}
+    rows = [{"run": 1, "width": 8, "height": 4, "implementation": name, "ms": ms} for name, ms in times.items()]
+    (tmp_path / "frames.json").write_text(json.dumps(measurement(settings, rows)))
+    page = results_page(read_results(tmp_path))
+    assert "| `svgf` | 1 | 2.5 | 5.0 |  |" in page, "without Open Image Denoise there are no ratios"
+    assert "Medians of 3 interleaved turns" in page
+    assert "`python -m experiments.speed.frames --methods svgf taa --sizes 8x4 --rounds 3`" in page
 
 
 @pytest.mark.slow
 def test_figures_are_printed_and_saved(tmp_path, capsys):
     main(Settings(["taa"], ["48x32"], 2, tmp_path / "frames.json"))
-    rows = json.loads((tmp_path / "frames.json").read_text())
-    (own,) = [row for row in rows if row["implementation"] == "taa, xla"]
+    (result,) = read_results(tmp_path)
+    (own,) = [row for row in result["rows"] if row["implementation"] == "taa, xla"]
     assert (own["width"], own["height"]) == (48, 32)
     assert own["ms"] > 0
     printed = capsys.readouterr().out

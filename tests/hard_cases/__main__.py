@@ -7,18 +7,17 @@ An interrupted run goes on where it was, as long as neither the package nor the 
 """
 
 import math
-import subprocess
 import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from experiments.measurement import find_revision
 from jaxdn.commands.errors import plain_errors
 from jaxdn.evaluation.compare import describe_machine
 from jaxdn.runtime.atomic_files import write_json
@@ -112,7 +111,7 @@ def summarize(table: Sequence[Row], *, seconds: float, process_seconds: float) -
     """What a page of results needs: where and when the table was run, and how many cells had which verdict."""
     verdicts = Counter(row.verdict for row in table)
     return {
-        "revision": revision(),
+        "revision": find_revision(),
         "machine": describe_machine(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "functions": len({row.function for row in table}),
@@ -125,22 +124,6 @@ def summarize(table: Sequence[Row], *, seconds: float, process_seconds: float) -
         "seconds": round(seconds, 1),
         "process_seconds": round(process_seconds, 1),
     }
-
-
-def revision() -> str | None:
-    """The commit of the code, with ``-dirty`` if files differ from it; None without git."""
-    here = Path(__file__).parent
-    try:
-        done = subprocess.run(
-            ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
-            cwd=here,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return done.stdout.strip()
 
 
 if __name__ == "__main__":
