@@ -104,9 +104,10 @@ def firefly_attenuation(brightness: jax.Array, hit: jax.Array, sure: jax.Array) 
     """
     seen = jnp.where(hit, brightness, -1.0)[None]
     limit = functools.reduce(jnp.maximum, _neighbours(seen, beyond=-1.0))[0]
-    over = (limit >= 0) & (brightness > limit)
-    share = limit / jnp.where(over, jnp.maximum(brightness, DARK), 1.0)
-    return jnp.where(over, jnp.maximum(share, sure), 1.0)
+    # About 1 where the two are about equal, whichever is larger: a compiler may compute the comparison more than once,
+    # and round differently each time.
+    share = limit / jnp.maximum(brightness, DARK)
+    return jnp.where((limit >= 0) & (brightness > limit), jnp.maximum(share, sure), 1.0)
 
 
 def _neighbours(planes: jax.Array, *, beyond: float = 0.0) -> Iterator[jax.Array]:

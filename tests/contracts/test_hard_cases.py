@@ -49,22 +49,14 @@ INNER = {
 PLAIN = [one for one in OPERATIONS if not one.name.endswith(", masked")]
 
 
-KNOWN = {("steady", "constant", "bfloat16 inputs", "forward")}
-"""Red cells that are known and not mended. In a noise-free frame whose inputs are rounded, the double-precision program
-compiled without optimisation differs by 0.15 at 0.5 from the same program compiled with it, and from single precision,
-which agree within 1e-4: something that steady decides there hangs on the last bit. A cell that turns green has to be
-taken from this list."""
-
-
 def named(functions):
     return pytest.mark.parametrize("function", functions, ids=lambda one: one.name)
 
 
 def assert_green(function, cases=SAME_SIZE, *, precisions=("float32",), direction="forward"):
     found = rows(cases, [function], precisions=precisions, directions=(direction,))
-    red = {(row.function, row.case, row.precision, row.direction): row.reason for row in found if row.verdict == "red"}
-    known = {cell for cell in KNOWN if cell[0] == function.name and cell[2] in precisions and cell[3] == direction}
-    assert red.keys() == known, "\n".join(f"{', '.join(cell)}: {reason}" for cell, reason in red.items())
+    red = [row for row in found if row.verdict == "red"]
+    assert not red, "\n".join(f"{row.case}, {row.precision}, {row.direction}: {row.reason}" for row in red)
 
 
 # The reduced table. Its rule: the time goes into compiling, so what needs no further program is in it. Every function

@@ -17,6 +17,7 @@ from jaxdn.filters.clamping import (
 from jaxdn.filters.edge_stopping import lobe_weight, normal_weight, roughness_weight
 from jaxdn.filters.history_fix import fix_history
 from jaxdn.filters.virtual_motion import closeness, diffuseness, virtual_motion
+from tests.recomputing import evaluate_recomputing
 
 FOCAL, SIZE = 160.0, np.array([320.0, 180.0])
 
@@ -200,6 +201,12 @@ def test_no_pixel_is_brighter_than_all_of_its_neighbours_but_by_what_it_is_sure_
     faint = jnp.full((3, 3), 1e-30).at[1, 1].set(2e-30)
     slope = jax.grad(lambda light: jnp.sum(light * firefly_attenuation(light, everywhere, nothing)))(faint)
     assert np.all(np.isfinite(slope))
+
+
+def test_an_even_brightness_is_kept_however_often_a_compiler_computes_it(rng):
+    even, everywhere = np.full((8, 9), 0.7, np.float32), np.ones((8, 9), bool)
+    kept = evaluate_recomputing(firefly_attenuation, even, everywhere, np.zeros_like(even), rng=rng, rounding=1e-6)
+    np.testing.assert_allclose(kept, 1.0, rtol=2e-5)
 
 
 @pytest.mark.parametrize(("widest", "strides"), [(14, (7, 4, 3)), (4, (2, 1, 1))])
