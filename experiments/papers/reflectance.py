@@ -93,7 +93,7 @@ def monte_carlo(scene: Any, samples: int = SAMPLES) -> np.ndarray:
     import drjit as dr
     import mitsuba as mi
 
-    from jaxdn.render.tracing.radiance import make_camera_rays
+    from jaxdn.render.tracing.camera_rays import make_camera_rays
 
     lane = dr.arange(mi.UInt32, SIZE * SIZE * samples)
     pixel = lane // samples

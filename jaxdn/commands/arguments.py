@@ -87,6 +87,9 @@ class Render:
     """Light with noise: indirect light, with direct light beside it, or all that is reflected, with its shadows."""
     jitter: bool = False
     """Rays go through another point of the pixels in every frame, for taa; references are means over the pixels."""
+    pixel_filter: Literal["centre", "box", "gaussian", "blackman-harris"] = "centre"
+    """Rays through the pixels' centres, with clean guides, or means over filtered pixels, with guides as noisy as the
+    light, as Cycles and other renderers have them (blackman-harris: Cycles' default)."""
     see_through: bool = False
     """Guides of flat mirrors and of glass are those of what they show, so that it stays sharp; not for trmv, reblur."""
     max_depth: int | None = None

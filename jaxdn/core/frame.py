@@ -48,6 +48,9 @@ class Buffer(NamedTuple):
     """Rendered only for a denoiser that reads it, as few do."""
     of_samples: bool = False
     """It describes the very samples that ``radiance`` is the mean of: another noisy image has another one."""
+    averaged: bool = False
+    """Where a renderer filters its pixels, it is a mean over the samples of the pixel, as noisy as ``radiance``; the
+    other buffers are point samples."""
 
     @property
     def stored(self) -> Literal["half", "single", "flag", "id"]:
@@ -81,13 +84,13 @@ class Frame(NamedTuple):
 
     radiance: Annotated[Array, Buffer(3, "light")]
     """[H, W, 3] noisy radiance to denoise (for ``ntd``: the indirect part), linear Rec.709, >= 0."""
-    albedo: Annotated[Array, Buffer(3, "fraction", 1.0)] = None
+    albedo: Annotated[Array, Buffer(3, "fraction", 1.0, averaged=True)] = None
     """[H, W, 3] first-hit diffuse reflectance in [0, 1]; neutral: 1."""
-    normal: Annotated[Array, Buffer(3, "direction")] = None
+    normal: Annotated[Array, Buffer(3, "direction", averaged=True)] = None
     """[H, W, 3] unit world-space shading normal, zero where the ray left the scene; neutral: 0."""
     depth: Annotated[Array, Buffer(1, "distance")] = None
     """[H, W, 1] view-space z along the optical axis, > 0, ``FAR`` on a miss; neutral: 0."""
-    roughness: Annotated[Array, Buffer(1, "fraction", 1.0)] = None
+    roughness: Annotated[Array, Buffer(1, "fraction", 1.0, averaged=True)] = None
     """[H, W, 1] linear roughness r, GGX alpha = r * r; neutral: 1."""
     motion: Annotated[Array, Buffer(2, "vector")] = None
     """[H, W, 2] (x, y) px, y down, previous minus current; not finite where there is no history; neutral: 0."""
@@ -99,15 +102,15 @@ class Frame(NamedTuple):
     """[H, W, 1] view-space z that the point had in the previous frame; neutral: ``depth``."""
     ids: Annotated[Array, Buffer(1, "id", -1.0)] = None
     """[H, W, 1] int32 shape id, -1 for nothing (and where it is unknown)."""
-    direct: Annotated[Array, Buffer(3, "light")] = None
+    direct: Annotated[Array, Buffer(3, "light", averaged=True)] = None
     """[H, W, 3] directly reflected light; neutral: 0."""
-    emission: Annotated[Array, Buffer(3, "light")] = None
+    emission: Annotated[Array, Buffer(3, "light", averaged=True)] = None
     """[H, W, 3] light emitted towards the camera; neutral: 0."""
     specular: Annotated[Array, Buffer(3, "light", on_request=True, of_samples=True)] = None
     """[H, W, 3] the part of ``radiance`` whose last reflection was specular; the rest is diffuse; neutral: 0."""
-    reflectance: Annotated[Array, Buffer(3, "fraction", "albedo")] = None
+    reflectance: Annotated[Array, Buffer(3, "fraction", "albedo", averaged=True)] = None
     """[H, W, 3] share of uniform incident light that the surface reflects to the camera; neutral: ``albedo``."""
-    specular_reflectance: Annotated[Array, Buffer(3, "fraction", on_request=True)] = None
+    specular_reflectance: Annotated[Array, Buffer(3, "fraction", on_request=True, averaged=True)] = None
     """[H, W, 3] the specular lobes' part of ``reflectance``; neutral: 0."""
     hit_distance: Annotated[Array, Buffer(1, "distance", on_request=True, of_samples=True)] = None
     """[H, W, 1] length of the path's segment after the first hit, the mean over diffuse samples; ``FAR`` where it left
@@ -152,6 +155,9 @@ ON_REQUEST: frozenset[str] = frozenset(name for name, buffer in BUFFERS.items() 
 
 OF_SAMPLES: frozenset[str] = frozenset(name for name, buffer in BUFFERS.items() if buffer.of_samples)
 """The buffers that belong to one noisy image, and not to another of the same frame."""
+
+AVERAGED: tuple[str, ...] = tuple(name for name, buffer in BUFFERS.items() if buffer.averaged)
+"""The buffers that are means over the samples of a pixel where pixels are filtered."""
 
 
 class Clip(NamedTuple):

@@ -38,7 +38,7 @@ def render_sampled(
     The first sample counts: a pixel that gets n has the samples 0 ... n - 1 of its frame, the same as in a frame that
     has n of them everywhere. Buffers that describe one noisy image (:data:`jaxdn.core.frame.OF_SAMPLES`) are left out.
     Raises ValueError with a scalar variant of Mitsuba, which renders whole images only, and for settings with other
-    layers than one of one sample, with a reference, with draws, with jitter, or without a plan.
+    layers than one of one sample, with a reference, with draws, with jitter, with filtered pixels, or without a plan.
 
     Args:
       scene: to render.
@@ -47,8 +47,12 @@ def render_sampled(
       settings: how; their plan may let frames share the buffers of those before, which are then rendered again.
       previous: the ``view`` of the frame before.
     """
-    if settings.plan is None or settings.layers != (1,) or settings.reference_spp or settings.draws or settings.jitter:
-        raise ValueError("samples for each pixel: expected a plan, layers (1,), no reference, no draws and no jitter.")
+    others = settings.reference_spp or settings.draws or not settings.through_centres
+    if settings.plan is None or settings.layers != (1,) or others:
+        raise ValueError(
+            "samples for each pixel: expected a plan, layers (1,), no reference, no draws, no jitter and pixel_filter "
+            "'centre'."
+        )
     settings = replace(settings, plan=unshare_frames(settings.plan)).complete(scene)
     assert settings.plan is not None
     assert settings.max_depth is not None

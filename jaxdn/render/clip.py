@@ -107,6 +107,8 @@ def _write(path: Path, rendered: RenderedFrame) -> None:
         reference=rendered.reference,
         reference_half=rendered.reference_half,
         draws=rendered.draws,
+        layer_guides=rendered.layer_guides,
+        reference_guides=rendered.reference_guides,
     )
 
 
@@ -116,7 +118,7 @@ def _make_record(scene: AnimatedScene, frames: int, settings: RenderSettings) ->
         "name": scene.name,
         "frames": frames,
         **settings.record(),
-        "jittered": choose_tracer(settings.variant or "").jittered,
+        "jittered": choose_tracer(settings.variant or "").jittered or settings.pixel_filter != "centre",
         "cameras": [_record_camera(scene, frame) for frame in range(frames)],
         "scene": dict(scene.record),
         "versions": _list_versions(),
@@ -126,7 +128,10 @@ def _make_record(scene: AnimatedScene, frames: int, settings: RenderSettings) ->
 
 def _record_camera(scene: AnimatedScene, frame: int) -> dict[str, Any]:
     camera = scene.camera(frame)
-    return {"to_world": np.asarray(camera.to_world, np.float64).tolist(), "x_fov": float(camera.x_fov)}
+    record = {"to_world": np.asarray(camera.to_world, np.float64).tolist(), "x_fov": float(camera.x_fov)}
+    if camera.aperture_radius > 0:
+        record |= {"aperture_radius": camera.aperture_radius, "focus_distance": camera.focus_distance}
+    return record
 
 
 def _list_versions() -> dict[str, str]:

@@ -11,6 +11,7 @@ from jaxdn.render.buffers.frame_pair import BuiltFrame, FramePair
 from jaxdn.render.buffers.geometry import View, compute_far_motion, compute_motion, compute_ray_length
 from jaxdn.render.buffers.glossy_vectors import compute_glossy_motion
 from jaxdn.render.buffers.gradient_samples import compute_luminance_gradient
+from jaxdn.render.buffers.reflectance import Reflectances
 from jaxdn.render.buffers.shadow_vectors import compute_shadow_motion
 from jaxdn.render.frame_geometry import FrameGeometry, build_geometry
 from jaxdn.render.frame_request import DISOCCLUSION, GRADIENT, MOTION, VECTORS, FrameRequest, request_frame
@@ -37,6 +38,11 @@ class RenderedFrame(NamedTuple):
     """[H, W, 3] the same from the first half of its samples."""
     draws: np.ndarray | None
     """[n, H, W, 6] independent single samples of indirect and direct light."""
+    layer_guides: dict[int, dict[str, np.ndarray]]
+    """Samples per pixel -> the guides of that layer that are means over its samples; empty but for filtered pixels.
+    Those of the layer with the fewest are in ``frame``."""
+    reference_guides: dict[str, np.ndarray]
+    """The same of the reference; empty without one, too."""
     view: View | None
     """Input of the next frame's motion vectors; None if the plan needs no G-buffer."""
     bad_samples: int
@@ -49,10 +55,10 @@ def render_frame(
     """Render one frame of an animated scene: noisy layers, a reference, G-buffers and motion vectors.
 
     ``direct`` and ``emission`` are means over the reference's samples, or over the noisy ones if ``reference_spp`` is
-    0. The result depends only on the arguments: the same frame rendered again, alone or in another process, is the same
-    bit for bit. Raises ValueError for scenes with unsupported effects, and, with the scalar variant, for jitter, for
-    seeing through, and for a plan with buffers of samples (:data:`jaxdn.core.frame.OF_SAMPLES`), which it cannot
-    render.
+    0; with filtered pixels each image has its own (``layer_guides``). The result depends only on the arguments: the
+    same frame rendered again, alone or in another process, is the same bit for bit. Raises ValueError for scenes with
+    unsupported effects, and, with the scalar variant, for jitter, for seeing through, and for a plan with buffers of
+    samples (:data:`jaxdn.core.frame.OF_SAMPLES`), which it cannot render.
 
     Args:
       scene: to render.
@@ -64,18 +70,32 @@ def render_frame(
     tracer = choose_tracer(settings.variant or "")
     request = request_frame(settings, frame)
     geometry = build_geometry(scene, frame, settings, request, previous)
-    samples = trace_samples(tracer, geometry.scene, frame, settings, request)
+    asked = {"reflectance", "specular_reflectance"} & set(request.averaged)
+    reflectances = Reflectances(geometry.scene) if asked else None
+    samples = trace_samples(tracer, geometry.scene, frame, settings, request, reflectances)
     buffers = _average_light(samples, settings)
     buffers |= _describe_samples(samples.noisy[settings.layers[0]], settings.layers[0])
     buffers |= _describe_surfaces(geometry, request)
     buffers |= _follow_samples(tracer, geometry, frame, settings, request)
-    return _assemble(buffers, samples, geometry.view, settings, request)
+    guides = {count: _average_guides(sums, count, request) for count, sums in samples.noisy.items()}
+    buffers |= guides.pop(settings.layers[0])
+    rendered = _assemble(buffers, samples, geometry.view, settings, request)
+    clean = _average_guides(samples.best(), settings.reference_spp, request) if samples.halves else {}
+    return rendered._replace(layer_guides=guides if request.averaged else {}, reference_guides=clean)
 
 
 def _average_light(samples: FrameSamples, settings: RenderSettings) -> dict[str, np.ndarray]:
     """The light that has no noise."""
     sums, count = samples.best(), settings.reference_spp if samples.halves else sum(settings.layers)
     return {"direct": _to_single(sums.direct / count), "emission": _to_single(sums.emitted / count)}
+
+
+def _average_guides(sums: RadianceSums, count: int, request: FrameRequest) -> dict[str, np.ndarray]:
+    """The guides of one image of ``count`` samples that are means over these."""
+    found: dict[str, Any] = {"direct": sums.direct, "emission": sums.emitted}
+    if sums.surfaces is not None:
+        found |= sums.surfaces._asdict()
+    return {name: _to_single(found[name] / count) for name in request.averaged}
 
 
 def _describe_samples(noisy: RadianceSums, count: int) -> dict[str, np.ndarray]:
@@ -170,7 +190,7 @@ def _assemble(
         draws = np.stack([_to_single(np.concatenate([one.indirect, one.direct], -1)) for one in samples.singles])
     wanted = {name: buffer for name, buffer in buffers.items() if name in request.buffers | request.sampled}
     frame = Frame(radiance=layers[settings.layers[0]], **wanted)
-    return RenderedFrame(frame, layers, reference, half, draws, view, samples.bad())
+    return RenderedFrame(frame, layers, reference, half, draws, {}, {}, view, samples.bad())
 
 
 def _to_single(image: np.ndarray) -> np.ndarray:

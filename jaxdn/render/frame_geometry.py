@@ -10,6 +10,7 @@ from jaxdn.render.frame_request import FrameRequest
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.settings import RenderSettings
 from jaxdn.render.tracing import jitter as jitters
+from jaxdn.render.tracing.seeds import NOISY, SampleStream
 
 
 class FrameGeometry(NamedTuple):
@@ -35,7 +36,7 @@ def build_geometry(
         before = _build(scene, frame - 1, settings)
         previous = previous or _trace_view(scene, frame - 1, before, frozenset(), settings)
     built = _build(scene, frame, settings)
-    check_scene(built)
+    check_scene(built, filtered=settings.pixel_filter != "centre")
     if request.shared:
         return FrameGeometry(built, previous, before, previous)
     view = _trace_view(scene, frame, built, request.buffers, settings) if request.needs_view else None
@@ -51,11 +52,13 @@ def _trace_view(
     scene: AnimatedScene, frame: int, built: Any, buffers: frozenset[str], settings: RenderSettings
 ) -> View:
     """Trace the surfaces of a frame, with those of ``buffers`` that take more than a ray."""
+    camera = scene.camera(frame)
     gbuffer = trace_gbuffer(
         built,
         reflectance="reflectance" in buffers,
         specular="specular_reflectance" in buffers,
         see_through=settings.see_through,
+        lens=SampleStream(settings.seed, frame, NOISY) if camera.aperture_radius > 0 else None,
     )
     pose = {name: np.asarray(matrix, np.float64) for name, matrix in scene.pose(frame).items()}
-    return View(gbuffer, scene.camera(frame), pose)
+    return View(gbuffer, camera, pose)

@@ -2,11 +2,13 @@
 
 from typing import NamedTuple
 
-from jaxdn.core.frame import GUIDES, OF_SAMPLES, ON_REQUEST
-from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES, OF_SHADOWS
+from jaxdn.core.frame import AVERAGED, GUIDES, OF_SAMPLES, ON_REQUEST
+from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES, OF_SHADOWS, THROUGH_CENTRES
 from jaxdn.render.mitsuba.variant import advice, separates_lobes
 from jaxdn.render.settings import RenderSettings
+from jaxdn.render.tracing.pixel_filters import PixelFilter
 from jaxdn.render.tracing.radiance import NOTHING_ELSE, TraceRequest
+from jaxdn.render.tracing.surfaces import AveragesReflectance, SurfaceRequest
 
 DISOCCLUSION = frozenset({"dual_motion", "visible"})
 MOTION = frozenset({"motion", "previous_depth", "far_motion"}) | DISOCCLUSION
@@ -31,6 +33,13 @@ class FrameRequest(NamedTuple):
     """The noisy layers may hold light."""
     reflected: bool
     """They hold all light that surfaces reflect."""
+    pixel_filter: PixelFilter
+    """Where samples lie."""
+
+    @property
+    def averaged(self) -> tuple[str, ...]:
+        """The buffers that are means over the samples of each noisy image and of the reference."""
+        return () if self.pixel_filter == "centre" else tuple(name for name in AVERAGED if name in self.buffers)
 
     @property
     def needs_view(self) -> bool:
@@ -47,12 +56,18 @@ class FrameRequest(NamedTuple):
         """Whether the surfaces of the frame before are needed."""
         return self.needs_previous_scene or bool(self.buffers & MOTION)
 
-    @property
-    def samples(self) -> TraceRequest:
-        """What else is told of the samples of the noisy layer with the fewest."""
-        if not self.sampled:
+    def describe_samples(self, reflectances: AveragesReflectance | None) -> TraceRequest:
+        """What is asked of all samples; ``reflectances`` of the scene, where they are asked for."""
+        if self.pixel_filter == "centre":
             return NOTHING_ELSE
-        return TraceRequest(bool(self.sampled & LOBES), bool(self.sampled & OF_SHADOWS), self.reflected)
+        return TraceRequest(pixel_filter=self.pixel_filter, surfaces=SurfaceRequest(reflectances))
+
+    def describe_own_samples(self, others: TraceRequest) -> TraceRequest:
+        """What is asked of the samples of the noisy layer with the fewest, besides what is asked of the others."""
+        if not self.sampled:
+            return others
+        lobes, shadows = bool(self.sampled & LOBES), bool(self.sampled & OF_SHADOWS)
+        return others._replace(lobes=lobes, shadows=shadows, direct=self.reflected)
 
 
 def request_frame(settings: RenderSettings, frame: int) -> FrameRequest:
@@ -66,6 +81,8 @@ def request_frame(settings: RenderSettings, frame: int) -> FrameRequest:
         planned -= OF_PRIMARY_SURFACES
     if settings.light == "reflected":
         planned -= {"direct"}
+    if settings.pixel_filter != "centre":
+        planned -= THROUGH_CENTRES
     shared = plan is not None and plan.shared_with[frame] != frame
     request = FrameRequest(
         buffers=frozenset() if shared else planned - OF_SAMPLES,
@@ -74,6 +91,7 @@ def request_frame(settings: RenderSettings, frame: int) -> FrameRequest:
         lit=plan is None or plan.integrator != "none",
         noisy=plan is None or (plan.indirect and plan.integrator != "none"),
         reflected=settings.light == "reflected",
+        pixel_filter=settings.pixel_filter,
     )
     _check_variant(settings, request)
     return request

@@ -10,8 +10,9 @@ import numpy as np
 from jaxdn.render.frame_request import FrameRequest
 from jaxdn.render.settings import RenderSettings
 from jaxdn.render.tracing import jitter as jitters
-from jaxdn.render.tracing.radiance import NOTHING_ELSE, RadianceSums, TraceRequest, make_zero_radiance
+from jaxdn.render.tracing.radiance import RadianceSums, TraceRequest, make_zero_radiance
 from jaxdn.render.tracing.seeds import DRAWS, NOISY, REFERENCE, SampleStream
+from jaxdn.render.tracing.surfaces import AveragesReflectance
 from jaxdn.render.tracing.tracer import Tracer
 
 
@@ -35,7 +36,12 @@ class FrameSamples(NamedTuple):
 
 
 def trace_samples(
-    tracer: Tracer, built: Any, frame: int, settings: RenderSettings, request: FrameRequest
+    tracer: Tracer,
+    built: Any,
+    frame: int,
+    settings: RenderSettings,
+    request: FrameRequest,
+    reflectances: AveragesReflectance | None = None,
 ) -> FrameSamples:
     """Trace all samples of a frame.
 
@@ -45,11 +51,14 @@ def trace_samples(
       frame: index of the frame.
       settings: complete (:meth:`jaxdn.render.settings.RenderSettings.complete`).
       request: what the frame needs.
+      reflectances: of the scene, where guides of samples need them.
     """
-    lights = _FrameLight(tracer, built, frame, settings, request)
+    common = request.describe_samples(reflectances)
+    lights = _FrameLight(tracer, built, frame, settings, request, common)
+    own = request.describe_own_samples(common)
     # Layer n always holds the samples n-1 ... 2n-2: its image does not depend on the other layers.
     noisy = {
-        count: lights.trace(NOISY, count - 1, count, request.samples if count == settings.layers[0] else NOTHING_ELSE)
+        count: lights.trace(NOISY, count - 1, count, own if count == settings.layers[0] else common)
         for count in settings.layers
     }
     halves = lights.trace_halves() if settings.reference_spp and not request.shared else []
@@ -65,34 +74,39 @@ class _FrameLight(NamedTuple):
     frame: int
     settings: RenderSettings
     request: FrameRequest
+    common: TraceRequest
+    """What is asked of all samples."""
 
-    def trace(self, stream: int, first: int, count: int, request: TraceRequest = NOTHING_ELSE) -> RadianceSums:
+    def trace(self, stream: int, first: int, count: int, request: TraceRequest) -> RadianceSums:
         """Trace some samples of a stream."""
         # Without a reference the noisy layers are what direct and emitted light are the means of.
         black = stream == NOISY and not self.request.noisy and self.settings.reference_spp
-        if black or not self.request.lit:
+        if (black or not self.request.lit) and request.surfaces is None:
             return make_zero_radiance((self.settings.height, self.settings.width), request)
-        more = {} if request == NOTHING_ELSE else {"request": request}  # the scalar path tracer tells nothing else
-        numbers = self._numbers(stream)
-        return self.tracer.accumulate(self.built, numbers, first, count, max_depth=self.settings.max_depth, **more)
+        # Guides need their samples even in the dark.
+        depth = self.settings.max_depth if self.request.lit else 1
+        return self.tracer.accumulate(self.built, self._numbers(stream), first, count, max_depth=depth, request=request)
 
     def trace_sets(self, stream: int, count: int, sets: int) -> list[RadianceSums]:
         """Trace several sets of samples of a stream, one after the other."""
         if not self.request.lit:
-            return [self.trace(stream, 0, count)] * sets
-        numbers = self._numbers(stream)
-        return self.tracer.accumulate_sets(self.built, numbers, 0, count, sets, max_depth=self.settings.max_depth)
+            return [self.trace(stream, at, count, self.common) for at in range(0, sets * count, count)]
+        numbers, depth = self._numbers(stream), self.settings.max_depth
+        return self.tracer.accumulate_sets(self.built, numbers, 0, count, sets, max_depth=depth, request=self.common)
 
     def trace_halves(self) -> list[RadianceSums]:
         """Trace the two halves of the reference."""
         samples = self.settings.reference_spp
         middle = (samples + 1) // 2
         if self.settings.jitter:
-            halves = _trace_spread_halves(lambda first, count: self.trace(REFERENCE, first, count), samples, self.built)
+            halves = _trace_spread_halves(
+                lambda first, count: self.trace(REFERENCE, first, count, self.common), samples, self.built
+            )
             jitters.shift_principal_point(self.built, jitters.get_frame_offset(self.frame))
             return halves
         if samples % 2:
-            return [self.trace(REFERENCE, 0, middle), self.trace(REFERENCE, middle, samples - middle)]
+            parts = (0, middle), (middle, samples - middle)
+            return [self.trace(REFERENCE, first, count, self.common) for first, count in parts]
         return self.trace_sets(REFERENCE, middle, 2)
 
     def _numbers(self, stream: int) -> SampleStream:

@@ -9,6 +9,7 @@ import numpy as np
 from jaxdn.render.families import FAMILIES
 from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.animation import CameraKeys, RigidKeys, check_animation, read_animation
+from jaxdn.render.scenes.optics import ENTRIES, get_shutter, read_optics
 from jaxdn.render.scenes.scene import AnimatedScene, Camera, brightness
 from jaxdn.render.scenes.scene_file import SceneFile
 
@@ -32,8 +33,11 @@ def scene_from_record(record: Mapping[str, Any]) -> AnimatedScene:
     name = record["family"]
     if name not in FAMILIES:
         raise ValueError(f"scene record: unknown family {name!r}; expected one of {', '.join(sorted(FAMILIES))}.")
-    options = {key: value for key, value in record.items() if key != "family"}
-    return FAMILIES[name](**options)
+    options = {key: value for key, value in record.items() if key not in ("family", *ENTRIES)}
+    scene = FAMILIES[name](**options)
+    if set(record) & set(ENTRIES):
+        scene.set_optics(read_optics(record, f"scene record of {name!r}:"))
+    return scene
 
 
 def open_family(name: str, seed: int, animation: Any = None) -> AnimatedScene:
@@ -91,6 +95,7 @@ class TimeOffsetScene:
         self.name, self.max_depth = scene.name, scene.max_depth
         self.frames = max(scene.frames - start, 1)
         self.record: dict[str, Any] = {**scene.record, "start": start}
+        self.shutter = get_shutter(scene)
         self._scene, self._start = scene, start
 
     def build(self, frame: float, width: int, height: int) -> Any:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxdn.data.errors import ClipError
+from jaxdn.render.settings import LATER_SETTINGS
 
 _FREE = ("frames", "cameras", "versions", "bad_samples")
 """Entries of a record that may change when rendering is resumed."""
@@ -14,7 +15,7 @@ def check_resumable(folder: Path, wanted: Mapping[str, Any], begun: Mapping[str,
     """Raise ClipError if the frames in a folder were rendered with other settings, naming those; both are records."""
     # Frames may be added: what both records say about the same ones is compared.
     common = min(int(begun["frames"]), int(wanted["frames"]))
-    both = [{**record, "plan": _cut_plan(record.get("plan"), common)} for record in (begun, wanted)]
+    both = [{**LATER_SETTINGS, **record, "plan": _cut_plan(record.get("plan"), common)} for record in (begun, wanted)]
     names = [name for name in wanted if name not in _FREE]
     differing = [line for name in names for line in _describe_differences(name, both[0].get(name), both[1][name])]
     cameras = zip(begun.get("cameras", []), wanted["cameras"], strict=False)

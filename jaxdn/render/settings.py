@@ -9,6 +9,10 @@ from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES, OF_SHADOWS, THROUGH_CE
 from jaxdn.planning.plan import Plan, plan_from_record
 from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.scene import AnimatedScene
+from jaxdn.render.tracing.pixel_filters import PIXEL_FILTERS, PixelFilter
+
+LATER_SETTINGS: dict[str, Any] = {"pixel_filter": "centre"}
+"""Settings that clips of earlier versions do not record, and what they were rendered with."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,10 @@ class RenderSettings:
     jitter: bool = False
     """Rays go through another point of the pixels in every frame (:mod:`jaxdn.render.tracing.jitter`), and the
     reference is the mean over each pixel, instead of everything through the centres."""
+    pixel_filter: PixelFilter = "centre"
+    """Where the samples lie in and around their pixel (:mod:`jaxdn.render.tracing.pixel_filters`). With any but
+    ``"centre"`` the guides of :data:`jaxdn.core.frame.AVERAGED` are means over the samples of each image, as noisy as
+    those; all others are point samples at the pixels' centres."""
     see_through: bool = False
     """The guides of flat mirrors and of glass are those of what they show
     (:mod:`jaxdn.render.buffers.primary_surface_replacement`); not with the scalar variant."""
@@ -60,6 +68,9 @@ class RenderSettings:
         if self.draws < 0:
             raise ValueError(f"draws: expected 0 or more images of one sample each, got {self.draws}.")
         check_option(self.light, "light", ("indirect", "reflected"))
+        check_option(self.pixel_filter, "pixel_filter", PIXEL_FILTERS)
+        if self.pixel_filter != "centre":
+            self._check_filtered()
         if self.draws and self.light == "reflected":
             raise ValueError(
                 "draws: expected 0 with light 'reflected', as training draws indirect light; leave one out."
@@ -69,6 +80,22 @@ class RenderSettings:
         if self.plan is not None:
             self._check_plan(self.plan)
 
+    @property
+    def through_centres(self) -> bool:
+        """Whether all rays of all frames go through the centres of their pixels."""
+        return not self.jitter and self.pixel_filter == "centre"
+
+    def _check_filtered(self) -> None:
+        """Raise ValueError for what filtered pixels exclude."""
+        for name, what in (("jitter", "spreads rays over the pixels by itself"), ("see_through", "follows one ray")):
+            if getattr(self, name):
+                raise ValueError(f"{name}: expected pixel_filter 'centre', as it {what}, got {self.pixel_filter!r}.")
+        if self.draws:
+            raise ValueError(
+                f"draws: expected 0 with pixel_filter {self.pixel_filter!r}, as single samples have no guides of their "
+                "own; render layers instead."
+            )
+
     def _check_plan(self, plan: Plan) -> None:
         """Raise ValueError for a plan that was made for other settings."""
         buffers = set(plan.buffers)
@@ -76,8 +103,10 @@ class RenderSettings:
             raise ValueError(
                 f"plan: expected one that was made for light {self.light!r}; pass light={self.light!r} to effects.plan."
             )
-        if self.jitter and (THROUGH_CENTRES & buffers or plan.shared_with != tuple(range(len(plan.frames)))):
-            raise ValueError("plan: expected one that was made for jitter; pass jitter=True to effects.plan.")
+        shares = plan.shared_with != tuple(range(len(plan.frames)))
+        if not self.through_centres and (THROUGH_CENTRES & buffers or shares):
+            why = "jitter" if self.jitter else f"pixel_filter {self.pixel_filter!r}"
+            raise ValueError(f"plan: expected one that was made for {why}; pass jitter=True to effects.plan.")
         if self.see_through and OF_PRIMARY_SURFACES & buffers:
             raise ValueError("plan: expected one that was made to see through; pass see_through=True to effects.plan.")
 
@@ -88,7 +117,11 @@ class RenderSettings:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> "RenderSettings":
-        """The settings in a clip's record, which has other entries besides. Raises ValueError for missing entries."""
+        """The settings in a clip's record, which has other entries besides. Raises ValueError for missing entries.
+
+        Clips of earlier versions have no ``pixel_filter``: their rays went through the centres.
+        """
+        record = LATER_SETTINGS | dict(record)
         names = [field.name for field in fields(cls)]
         if missing := [name for name in names if name not in record]:
             raise ValueError(f"clip record: expected {', '.join(names)}; these are missing: {', '.join(missing)}.")

@@ -69,10 +69,11 @@ def plan_clip(
     """
 
     def make(detected: Effects, max_depth: int | None = settings.max_depth) -> PlannedClip:
-        light, jitter, see_through = settings.light, settings.jitter, settings.see_through
+        # Filtered samples go through other points in every frame, as jittered ones do.
+        jitter, through = not settings.through_centres, settings.see_through
         return PlannedClip(
             detected,
-            plan(detected, denoiser, max_depth=max_depth, light=light, jitter=jitter, see_through=see_through),
+            plan(detected, denoiser, max_depth=max_depth, light=settings.light, jitter=jitter, see_through=through),
         )
 
     if effects == "all":
@@ -151,8 +152,9 @@ def _find_reader(names: str, variant: str, settings: RenderSettings) -> Denoiser
     if not separates_lobes(variant) and (lost := reader.reads & OF_SAMPLES):
         print(f"{variant} cannot tell diffuse from specular light: {', '.join(sorted(lost))} left out")
         reader = reader._replace(reads=reader.reads - OF_SAMPLES)
-    if settings.jitter and (lost := reader.reads & THROUGH_CENTRES):
-        print(f"with jitter there is no {', '.join(sorted(lost))}: left out", flush=True)
+    if not settings.through_centres and (lost := reader.reads & THROUGH_CENTRES):
+        why = "with jitter" if settings.jitter else "where pixels are filtered"
+        print(f"{why} there is no {', '.join(sorted(lost))}: left out", flush=True)
     if settings.see_through and (lost := reader.reads & OF_PRIMARY_SURFACES):
         print(f"seen through, there is no {', '.join(sorted(lost))}: left out", flush=True)
     return reader._replace(reads=reader.reads | SCORED) if settings.reference_spp else reader

@@ -43,7 +43,7 @@ def test_offsets_repeat_and_spread_over_the_pixel():
 @pytest.mark.parametrize("variant", sorted({FAST, "scalar_rgb"}))
 def test_rays_go_through_the_offset_point(variant):
     use_variant(variant)
-    from jaxdn.render.tracing.radiance import make_camera_rays
+    from jaxdn.render.tracing.camera_rays import make_camera_rays
 
     point = (0.3, -0.2)
     plain, moved = Stage().build(0, WIDTH, HEIGHT), jitter.shift_principal_point(Stage().build(0, WIDTH, HEIGHT), point)

@@ -2,8 +2,11 @@
 
 Noisy radiance is stored as *independent* layers of 1, 2, 4, ... samples a pixel, so that one rendering gives every
 sample count up to their sum: ``n`` samples are ``sum(2^k * layer_k) / n`` over the bits of ``n`` (Hasselgren et al.
-2020, sec. 2.2). A buffer that is ``None`` has no channels in the file, and is read as ``None``. How a buffer is
-stored follows from its row in :data:`jaxdn.core.frame.BUFFERS`.
+2020, sec. 2.2). Where pixels were filtered, the guides that are means over samples (:data:`jaxdn.core.frame.AVERAGED`)
+are stored for every layer: those of the layer with the fewest samples under their own names, those of the others and of
+the reference behind that image's name (``noisy_4spp_albedo``, ``reference_albedo``); the guides of ``n`` samples are
+combined as the radiance is. A buffer that is ``None`` has no channels in the file, and is read as ``None``. How a
+buffer is stored follows from its row in :data:`jaxdn.core.frame.BUFFERS`.
 """
 
 import warnings
@@ -14,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdn.core.frame import BUFFERS, GUIDES, OF_SAMPLES, Buffer, Frame
+from jaxdn.core.frame import AVERAGED, BUFFERS, GUIDES, OF_SAMPLES, Buffer, Frame
 from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.exr import read_exr, to_half, write_exr
 
@@ -35,6 +38,11 @@ class StoredFrame(NamedTuple):
     """[H, W, 3] the mean of the first half of the reference's samples, to measure the reference's noise."""
     draws: np.ndarray | None = None
     """[n, H, W, 6] n independent samples of indirect (first three channels) and direct light, for training."""
+    layer_guides: Mapping[int, Mapping[str, np.ndarray]] = MappingProxyType({})
+    """The guides of each noisy image that are means over its samples, by its number of samples; empty where pixels were
+    not filtered."""
+    reference_guides: Mapping[str, np.ndarray] = MappingProxyType({})
+    """The same of the reference's samples: nearly free of noise."""
 
 
 def write_frame(
@@ -45,12 +53,15 @@ def write_frame(
     reference: Any = None,
     reference_half: Any = None,
     draws: Any = None,
+    layer_guides: Mapping[int, Mapping[str, Any]] = MappingProxyType({}),
+    reference_guides: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
     """Write one frame, completely or not at all.
 
     ``layers`` maps numbers of samples (1, 2, 4, ...) to independent noisy images [H, W, 3]; ``frame.radiance`` is
     not stored then. Without ``layers``, ``frame.radiance`` becomes the layer of one sample. ``draws`` [n, H, W, 6] are
-    further samples of indirect and direct light, one each. Each buffer is stored as
+    further samples of indirect and direct light, one each. ``layer_guides`` are guides by the numbers of samples of the
+    layers that they belong to; those of the layer with the fewest are in ``frame``. Each buffer is stored as
     :attr:`jaxdn.core.frame.Buffer.stored` says: light, fractions and directions in half precision (finite values beyond
     65504 are clamped; NaN and infinities are kept), distances and vectors in single precision. Raises ValueError for
     shapes that do not fit each other, OSError if the file cannot be written.
@@ -65,6 +76,9 @@ def write_frame(
     for index, draw in enumerate(() if draws is None else draws):
         images |= {name: (draw[..., part], _LIGHT) for name, part in _draw_names(index).items()}
     images |= {name: (getattr(frame, name), BUFFERS[name]) for name in GUIDES}
+    for samples, guides in layer_guides.items():
+        images |= {f"noisy_{samples}spp_{name}": (image, BUFFERS[name]) for name, image in guides.items()}
+    images |= {f"reference_{name}": (image, BUFFERS[name]) for name, image in reference_guides.items()}
     size = np.shape(next(iter(layers.values())))[:2]
     channels: dict[str, np.ndarray] = {}
     for name, (image, buffer) in images.items():
@@ -92,6 +106,8 @@ def read_frame(path: str | Path, *, spp: int = 1) -> StoredFrame:
     layers = {n: _required(path, channels, f"noisy_{n}spp", _LIGHT) for n in stored_layers(channels)}
     chosen = layers_for(spp, layers, path)
     buffers = {name: _optional(path, channels, name, BUFFERS[name]) for name in GUIDES}
+    guides = _read_layer_guides(path, channels, layers, buffers)
+    buffers |= {name: combine({n: guides[n][name] for n in chosen}) for name in guides.get(chosen[0], {})}
     others = [name for name in OF_SAMPLES if buffers[name] is not None]
     if others and chosen != [min(layers)]:
         buffers |= dict.fromkeys(others)
@@ -103,7 +119,39 @@ def read_frame(path: str | Path, *, spp: int = 1) -> StoredFrame:
         _optional(path, channels, "reference", _LIGHT),
         _optional(path, channels, "reference_half", _LIGHT),
         _read_draws(path, channels),
+        guides,
+        _read_guides(path, channels, "reference"),
     )
+
+
+def _read_layer_guides(
+    path: str | Path,
+    channels: Mapping[str, np.ndarray],
+    layers: Iterable[int],
+    buffers: Mapping[str, np.ndarray | None],
+) -> dict[int, dict[str, np.ndarray]]:
+    """The guides of each layer, if the layers have their own; of the one with the fewest samples they are ``buffers``.
+
+    A clip with one layer alone has none beside its buffers.
+    """
+    fewest, *others = sorted(layers)
+    found = {samples: _read_guides(path, channels, f"noisy_{samples}spp") for samples in others}
+    names = found[others[0]] if others else {}
+    if not names:
+        return {}
+    own = {name: buffer for name in names if (buffer := buffers[name]) is not None}
+    found = {fewest: own} | found
+    for samples, guides in found.items():
+        if set(guides) != set(names):
+            missing = ", ".join(sorted(set(names) ^ set(guides)))
+            raise ClipError(f"{path}: expected the same guides of every layer; {missing} differs in {samples} spp.")
+    return found
+
+
+def _read_guides(path: str | Path, channels: Mapping[str, np.ndarray], image: str) -> dict[str, np.ndarray]:
+    """The guides that belong to one image."""
+    found = {name: _optional(path, channels, f"{image}_{name}", BUFFERS[name]) for name in AVERAGED}
+    return {name: guide for name, guide in found.items() if guide is not None}
 
 
 def _draw_names(index: int) -> dict[str, slice]:

@@ -7,8 +7,9 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.buffers.geometry import View
+from jaxdn.render.tracing.camera_rays import make_camera_rays
 from jaxdn.render.tracing.lobes import make_generator
-from jaxdn.render.tracing.radiance import get_film_size, make_camera_rays
+from jaxdn.render.tracing.radiance import get_film_size
 from jaxdn.render.tracing.seeds import SampleStream
 
 

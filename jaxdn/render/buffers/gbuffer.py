@@ -23,8 +23,10 @@ from jaxdn.render.buffers.primary_surface_replacement import (
 )
 from jaxdn.render.buffers.reflectance import Reflectances
 from jaxdn.render.scenes.media import absorbs, list_media
+from jaxdn.render.tracing.camera_rays import draw_lens_points, make_camera_rays, sample_lens
 from jaxdn.render.tracing.light_samples import evaluate_diffuse_reflectance
-from jaxdn.render.tracing.radiance import make_camera_rays
+from jaxdn.render.tracing.seeds import SampleStream
+from jaxdn.render.tracing.surfaces import evaluate_roughness, read_surface
 
 
 class GBuffer(NamedTuple):
@@ -64,8 +66,11 @@ def list_shape_names(scene: Any) -> list[str]:
     return names
 
 
-def check_scene(scene: Any) -> None:
-    """Raise ValueError for effects that the tracers would otherwise silently ignore."""
+def check_scene(scene: Any, *, filtered: bool = False) -> None:
+    """Raise ValueError for effects that the tracers would otherwise silently ignore.
+
+    A lens needs ``filtered`` pixels: guides through the pixels' centres would show what is sharp.
+    """
     sensor = scene.sensors()[0]
     scattering = [name for name, medium in list_media(scene).items() if not absorbs(medium)]
     if scattering:
@@ -73,16 +78,30 @@ def check_scene(scene: Any) -> None:
             f"scene: participating media that scatter light (fog, smoke) are not supported yet, but {scattering[0]!r} "
             "has one; remove it, or set its albedo to 0."
         )
-    if sensor.needs_aperture_sample():
-        raise ValueError("scene: depth of field is not supported yet; expected a 'perspective' (pinhole) camera.")
+    if sensor.needs_aperture_sample() and not filtered:
+        raise ValueError(
+            "scene: depth of field needs filtered pixels, as its first hits are random; expected pixel_filter "
+            "'blackman-harris', 'gaussian' or 'box' (--pixel-filter), got 'centre'."
+        )
     if sensor.shutter_open_time() > 0:
-        raise ValueError("scene: motion blur is not supported yet; expected an instantaneous shutter.")
+        raise ValueError(
+            "scene: expected a sensor without a shutter, as Mitsuba moves nothing while it is open; set 'shutter' in "
+            "the animation instead."
+        )
 
 
 def trace_gbuffer(
-    scene: Any, *, reflectance: bool = False, specular: bool = False, see_through: bool = False
+    scene: Any,
+    *,
+    reflectance: bool = False,
+    specular: bool = False,
+    see_through: bool = False,
+    lens: SampleStream | None = None,
 ) -> GBuffer:
     """Trace one ray through the centre of every pixel of the scene's first sensor, with the current variant.
+
+    The rays go through the middle of its lens, or, with ``lens``, through the points of it that the first sample of
+    that stream takes.
 
     With ``reflectance`` (:mod:`jaxdn.render.buffers.reflectance`) a material that cannot be averaged gives one warning
     with the name of its shape, and its albedo is used; with ``specular`` there is its specular part as well. With
@@ -93,7 +112,8 @@ def trace_gbuffer(
     trace = _trace_one_by_one if str(mi.variant()).startswith("scalar") else _trace_all
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     reflectances = Reflectances(scene) if reflectance or specular else None
-    traced, replaced = trace(scene, reflectances, specular, see_through)
+    key = None if lens is None else lens.key()
+    traced, replaced = trace(scene, reflectances, specular, see_through, key)
     if replaced is not None:
         traced = map_to_images(traced, replaced)
     found = {name: buffer.reshape(height, width, -1) for name, buffer in traced.items()}
@@ -165,14 +185,15 @@ def _warn_of_albedo(shape: str) -> None:
 
 
 def _trace_all(
-    scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool
+    scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool, lens: tuple[int, int] | None
 ) -> tuple[dict[str, np.ndarray], ReplacedRays | None]:
     """All pixels at once; flat buffers of the hits of all rays, and how these were replaced."""
     sensor = scene.sensors()[0]
     width, height = (int(size) for size in sensor.film().crop_size())
     pixel = dr.arange(mi.UInt32, width * height)
     across = dr.opaque(mi.UInt32, width)
-    ray = make_camera_rays(sensor, pixel % across, pixel // across)
+    point = None if lens is None else sample_lens(pixel, mi.UInt32(0), lens)
+    ray = make_camera_rays(sensor, pixel % across, pixel // across, point)
     direction = ray.d
     replaced = replace_primary_surfaces(scene, ray, number_shapes) if see_through else None
     if replaced is not None:
@@ -181,20 +202,13 @@ def _trace_all(
     valid = hit.is_valid()
     bsdf = hit.bsdf(ray)
 
-    flags = bsdf.flags()
     albedo = evaluate_diffuse_reflectance(bsdf, hit, valid)
-    roughness = dr.select(mi.has_flag(flags, mi.BSDFFlags.Smooth), mi.Float(1.0), 0.0)
-    there = valid & bsdf.has_attribute("alpha", valid)
-    roughness = dr.select(there, dr.sqrt(dr.maximum(bsdf.eval_attribute_1("alpha", hit, there), 0.0)), roughness)
-    there = valid & bsdf.has_attribute("roughness", valid)
-    roughness = dr.select(there, bsdf.eval_attribute_1("roughness", hit, there), roughness)
-
     buffers: dict[str, Any] = {
         "albedo": albedo,
         "normal": hit.sh_frame.n,
         "position": hit.p,
         "direction": direction,
-        "roughness": roughness,
+        "roughness": evaluate_roughness(bsdf, hit, valid),
         "shape": number_shapes(hit),
     }
     if reflectances is not None:
@@ -233,7 +247,7 @@ def _rank_shapes(scene: Any) -> list[int]:
 
 
 def _trace_one_by_one(
-    scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool
+    scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool, lens: tuple[int, int] | None
 ) -> tuple[dict[str, np.ndarray], None]:
     """The same buffers, a pixel at a time, for the variant without vectorisation, which follows no rays."""
     if see_through:
@@ -246,9 +260,12 @@ def _trace_one_by_one(
     if reflectances is not None:
         arrays |= {name: np.zeros((width * height, 3)) for name in ("reflectance", "specular_reflectance")}
     arrays["ids"] = np.full(width * height, -1)
-    for pixel in range(width * height):
+    points = np.full((width * height, 2), 0.5)
+    if lens is not None:
+        points = draw_lens_points(np.arange(width * height), np.zeros(width * height, int), lens)
+    for pixel, point in enumerate(points.tolist()):
         row, column = divmod(pixel, width)
-        ray, _ = sensor.sample_ray(0.0, 0.5, [(column + 0.5) / width, (row + 0.5) / height], [0.5, 0.5])
+        ray, _ = sensor.sample_ray(0.0, 0.5, [(column + 0.5) / width, (row + 0.5) / height], point)
         arrays["direction"][pixel] = ray.d
         hit = scene.ray_intersect(ray)
         if not hit.is_valid():
@@ -257,7 +274,7 @@ def _trace_one_by_one(
         arrays["ids"][pixel] = by_shape.get(_get_id(owner), -1)
         arrays["position"][pixel] = hit.p
         arrays["normal"][pixel] = hit.sh_frame.n
-        albedo, arrays["roughness"][pixel] = _read_surface(hit)
+        albedo, arrays["roughness"][pixel] = read_surface(hit)
         arrays["albedo"][pixel] = albedo
         if reflectances is not None:
             found = reflectances.average_one(hit, hit.bsdf(), albedo)
@@ -268,22 +285,3 @@ def _trace_one_by_one(
 def _get_id(shape: Any) -> str:
     """Python wrappers of a shape are temporary; its id is not."""
     return str(shape.id())
-
-
-def _read_surface(hit: Any) -> tuple[np.ndarray, float]:
-    """Albedo and roughness of one hit."""
-    bsdf = hit.bsdf()
-    if bsdf is None:
-        return np.zeros(3), 1.0
-    flags = int(bsdf.flags())
-    albedo = np.zeros(3)
-    if flags & int(mi.BSDFFlags.Diffuse):
-        albedo = np.array(bsdf.eval_diffuse_reflectance(hit), np.float64)
-        for part in ("metallic", "spec_trans"):
-            if bsdf.has_attribute(part):
-                albedo = albedo * (1.0 - bsdf.eval_attribute_1(part, hit))
-    if bsdf.has_attribute("roughness"):
-        return albedo, bsdf.eval_attribute_1("roughness", hit)
-    if bsdf.has_attribute("alpha"):
-        return albedo, max(bsdf.eval_attribute_1("alpha", hit), 0.0) ** 0.5
-    return albedo, 1.0 if flags & int(mi.BSDFFlags.Smooth) else 0.0

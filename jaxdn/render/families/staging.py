@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxdn.render.families import textures
 from jaxdn.render.families.shapes import Mesh, boxes, dish, drum, holed_wall, ply_path
+from jaxdn.render.scenes.optics import ENTRIES, Optics, describe_optics
 from jaxdn.render.scenes.scene import Camera
 
 Motion = Callable[[float], np.ndarray]
@@ -183,6 +184,7 @@ class Stage:
         self.parts: dict[str, Part] = {}
         self.bounds = np.zeros((2, 3))
         self.view: Callable[[float], Camera] = lambda frame: Camera(np.eye(4), 60.0)
+        self.optics = Optics()
 
     def add(
         self,
@@ -210,8 +212,18 @@ class Stage:
         radiance = None if glow is None else np.asarray(glow, float)
         self.parts[name] = Part(shape, motion, callable(pose), material, radiance, dimmer)
 
+    def set_optics(self, optics: Optics) -> None:
+        """Give the scene a lens, a shutter and fog; they are in its record."""
+        self.optics = optics
+        self.record = {name: self.record[name] for name in self.record if name not in ENTRIES} | optics.record()
+
+    @property
+    def shutter(self) -> float:
+        """Time for which the shutter is open, in frames."""
+        return self.optics.shutter
+
     def camera(self, frame: float) -> Camera:
-        return self.view(frame)
+        return self.optics.focus(self.view(frame))
 
     def pose(self, frame: float) -> dict[str, np.ndarray]:
         return {name: part.pose(frame) for name, part in self.parts.items() if part.moves}
@@ -233,7 +245,7 @@ class Stage:
         film: dict[str, Any] = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
         film |= {"pixel_format": "rgb", "component_format": "float32"}
         sensor: dict[str, Any] = {
-            "type": "perspective",
+            **describe_optics(camera, self.optics.fog),
             "fov": camera.x_fov,
             "fov_axis": "x",
             "near_clip": 0.02,

@@ -10,7 +10,9 @@ One JSON object next to the scene file; every part is optional:
      "inserted": [{"id": "ball", "type": "sphere", "size": 0.4, "color": [0.8, 0.2, 0.1], "roughness": 0.3,
                    "keys": [{"frame": 0, "translation": [0, 0.2, 1]}, ...]}],
      "lights": {"lamp": [{"frame": 0, "scale": 1}, {"frame": 8, "scale": 0}]},
-     "materials": {"Oak": {"hue": 120, "saturation": 1.5, "tint": [1, 0.8, 0.6], "roughness": 0.3}}}
+     "materials": {"Oak": {"hue": 120, "saturation": 1.5, "tint": [1, 0.8, 0.6], "roughness": 0.3}},
+     "lens": {"aperture_radius": 0.05, "focus_distance": 2.5}, "shutter": 0.5,
+     "fog": {"density": 0.1, "albedo": [0.9, 0.9, 0.95]}}
 
 Camera keys have ``origin``, ``target``, ``up`` or a rigid camera-to-world ``matrix``, and ``fov``, the horizontal
 field of view in degrees. A shape's keys move it from its place in the scene file: a rotation about its ``pivot``,
@@ -20,6 +22,7 @@ linearly, rotations about one axis linearly in the angle, other rotations spheri
 last key nothing moves. ``lights`` names emitters, or shapes that emit, and scales their radiance: by one number, or by
 three for red, green and blue. ``materials`` names BSDFs, or shapes whose BSDF has no id, and changes their colours and
 roughness for the whole clip (:func:`jaxdn.render.scenes.material_overrides.override_materials` has the formula).
+``lens``, ``shutter`` and ``fog`` are described in :mod:`jaxdn.render.scenes.optics`.
 """
 
 import difflib
@@ -31,8 +34,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxdn.render.scenes import optics
+
 PRIMITIVES = ("sphere", "cube", "cylinder", "rectangle")
-_TOP = ("frames", "camera", "shapes", "inserted", "lights", "materials")
+_TOP = ("frames", "camera", "shapes", "inserted", "lights", "materials", *optics.ENTRIES)
 _LOOK = ("origin", "target", "up")
 _RIGID = ("frame", "translation", "axis", "angle")
 _MATERIAL = ("hue", "saturation", "tint", "roughness")
@@ -212,6 +217,7 @@ def check_animation(animation: Any, shape_ids: Iterable[str], *, has_camera: boo
             if (_numbers(scale if colored else [scale], 3 if colored else 1, f"{at} scale") < 0).any():
                 raise ValueError(f"{at} scale: expected a factor >= 0, got {scale!r}.")
     _check_materials(animation.get("materials", {}))
+    optics.read_optics(animation, "animation")
 
 
 def _check_materials(materials: Any) -> None:

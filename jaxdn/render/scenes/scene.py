@@ -12,12 +12,16 @@ import numpy as np
 
 
 class Camera(NamedTuple):
-    """A pinhole camera in Mitsuba's convention: it looks along its +z axis, +x points LEFT in the image and +y up."""
+    """A camera in Mitsuba's convention: it looks along its +z axis, +x points LEFT in the image and +y up."""
 
     to_world: np.ndarray
     """[4, 4] float64 camera to world, rigid."""
     x_fov: float
     """Horizontal field of view in degrees."""
+    aperture_radius: float = 0.0
+    """Of its lens, in scene units; 0: a pinhole."""
+    focus_distance: float = 1.0
+    """Along its axis, up to what the lens shows sharp."""
 
 
 @runtime_checkable
@@ -47,6 +51,8 @@ class AnimatedScene(Protocol):
         Only the ratios ``pose(i)[id] @ inv(pose(i - 1)[id])`` matter.
         """
         ...
+
+    # A scene may also have `brightness(frame)` (see below) and `shutter`, the time for which its shutter is open.
 
 
 def brightness(scene: AnimatedScene, frame: float) -> Mapping[str, float]:

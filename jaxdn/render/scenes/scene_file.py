@@ -23,6 +23,7 @@ from jaxdn.render.scenes.animation import (
     read_extents,
 )
 from jaxdn.render.scenes.lights import check_lights, list_lights, scale_light
+from jaxdn.render.scenes.optics import Lens, describe_optics, read_optics
 from jaxdn.render.scenes.scene import Camera
 from jaxdn.render.scenes.scene_parser import SceneParser
 
@@ -36,9 +37,9 @@ class SceneFile:
     Without ``animation_path`` the file ``<scene>.json`` next to the scene is used if there is one, and a scene without
     an animation is static. Shapes and lights without an id are named by the
     :class:`jaxdn.render.scenes.scene_parser.SceneParser`. The camera is the file's first sensor, which must be a
-    perspective one; its horizontal field of view is that of the file's own film at every image size. Raises ValueError
-    for files that cannot be read and animations that do not match the scene. Warns of what the file asks for and
-    rendering leaves out: a crop of the film, lights that are hidden.
+    perspective one or a thin lens; its horizontal field of view is that of the file's own film at every image size.
+    Raises ValueError for files that cannot be read and animations that do not match the scene. Warns of what the file
+    asks for and rendering leaves out: a crop of the film, lights that are hidden.
     """
 
     def __init__(self, path: Path | str, animation_path: Path | str | None = None) -> None:
@@ -69,6 +70,8 @@ class SceneFile:
         shapes = [name for name, child in self._shapes.items() if parser.plugin(child) != "shapegroup"]
         self._rest, self.near, self._far, self._medium = _read_camera(parser)
         check_animation(animation, shapes, has_camera=self._rest is not None)
+        self._optics = read_optics(animation, "animation")
+        self.shutter = self._optics.shutter
         if self._rest is None and "camera" not in animation:
             raise ValueError(
                 f"scene {path}: expected a perspective sensor or an animation with camera keys, got neither."
@@ -102,14 +105,16 @@ class SceneFile:
 
     def camera(self, frame: float) -> Camera:
         """The camera of one frame."""
-        fov = None if self._camera is None else self._camera.fov(frame)
         if self._camera is None:
             assert self._rest is not None
-            return self._rest
-        if fov is None:
-            assert self._rest is not None
-            fov = self._rest.x_fov
-        return Camera(self._camera(frame), fov)
+            return self._optics.focus(self._rest)
+        fov, path = self._camera.fov(frame), self._camera(frame)
+        if self._rest is not None:
+            return self._optics.focus(
+                self._rest._replace(to_world=path, x_fov=self._rest.x_fov if fov is None else fov)
+            )
+        assert fov is not None
+        return self._optics.focus(Camera(path, fov))
 
     def pose(self, frame: float) -> dict[str, np.ndarray]:
         """Shape id -> [4, 4] motion by the keys, from the shape's place in the file."""
@@ -177,8 +182,10 @@ class SceneFile:
 
         camera = self.camera(frame)
         film = {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}}
+        own = {} if self._medium is None else {"medium": self._parser.load_node(self._medium)}
         return {
-            "type": "perspective",
+            **own,
+            **describe_optics(camera, self._optics.fog),
             "fov": float(camera.x_fov),
             "fov_axis": "x",
             "near_clip": self.near,
@@ -186,7 +193,6 @@ class SceneFile:
             "to_world": mi.ScalarTransform4d(np.asarray(camera.to_world, np.float64)),
             "sampler": {"type": "independent"},
             "film": {**film, "pixel_format": "rgb", "component_format": "float32"},
-            **({} if self._medium is None else {"medium": self._parser.load_node(self._medium)}),
         }
 
 
@@ -200,13 +206,12 @@ def _read_camera(parser: SceneParser) -> tuple[Camera | None, float, float, int 
     sensors = parser.of_type("Sensor")
     if not sensors:
         return None, 1e-2, 1e4, None
-    if parser.plugin(sensors[0]) != "perspective":
-        raise ValueError(
-            f"scene sensor: expected a perspective one, got {parser.plugin(sensors[0])!r}; change its type."
-        )
+    kind = parser.plugin(sensors[0])
+    if kind not in ("perspective", "thinlens"):
+        raise ValueError(f"scene sensor: expected a perspective one or a thin lens, got {kind!r}; change its type.")
     loaded = parser.load_node(sensors[0])
     values, film = mi.traverse(loaded), loaded.film()
-    offset = [float(np.ravel(np.array(values[f"principal_point_offset_{axis}"]))[0]) for axis in "xy"]
+    offset = [_read_number(values, f"principal_point_offset_{axis}") for axis in "xy" if kind == "perspective"]
     if any(offset):
         raise ValueError(f"scene sensor: expected no principal point offset, got {offset}; remove it.")
     if list(film.crop_size()) != list(film.size()):
@@ -216,9 +221,16 @@ def _read_camera(parser: SceneParser) -> tuple[Camera | None, float, float, int 
             stacklevel=5,
         )
     media = [node for node in parser.references(sensors[0]) if parser.type_of(node) == "Medium"]
-    fov, near, far = (float(np.ravel(np.array(values[key]))[0]) for key in ("x_fov", "near_clip", "far_clip"))
+    fov, near, far = (_read_number(values, key) for key in ("x_fov", "near_clip", "far_clip"))
     matrix = np.array(loaded.world_transform().matrix, np.float64).reshape(4, 4)
-    return Camera(matrix, fov), near, far, media[0] if media else None
+    camera = Camera(matrix, fov)
+    if kind == "thinlens":
+        camera = Lens(*(_read_number(values, name) for name in Lens._fields)).fit(camera)
+    return camera, near, far, media[0] if media else None
+
+
+def _read_number(values: Any, key: str) -> float:
+    return float(np.ravel(np.array(values[key]))[0])
 
 
 def _read_path_length(parser: SceneParser) -> int:

@@ -2,11 +2,12 @@
 
 from typing import Any, NamedTuple
 
-import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.tracing.light_samples import Shadows, make_zero_shadows
 from jaxdn.render.tracing.lobes import Lobes, make_zero_lobes
+from jaxdn.render.tracing.pixel_filters import PixelFilter
+from jaxdn.render.tracing.surfaces import SurfaceRequest, SurfaceSums, make_zero_surfaces
 
 BRIGHTEST = 1e30
 """Samples at least this bright are treated as overflows, as the sum of a few would overflow."""
@@ -24,6 +25,8 @@ class RadianceSums(NamedTuple):
     """The same samples by the lobe of their first reflection; None if it was not requested."""
     shadows: Shadows | None = None
     """Their light straight from lights, with and without its shadows; None if it was not requested."""
+    surfaces: SurfaceSums | None = None
+    """The guides of the same samples; None if they were not requested."""
 
     def plus(self, other: "RadianceSums") -> "RadianceSums":
         """The sums over both sets of samples."""
@@ -34,11 +37,12 @@ class RadianceSums(NamedTuple):
             self.bad + other.bad,
             None if self.lobes is None or other.lobes is None else self.lobes.plus(other.lobes),
             None if self.shadows is None or other.shadows is None else self.shadows.plus(other.shadows),
+            None if self.surfaces is None or other.surfaces is None else self.surfaces.plus(other.surfaces),
         )
 
 
 class TraceRequest(NamedTuple):
-    """What else is to be told of samples."""
+    """Where samples lie in their pixels, and what else than their light is to be told of them."""
 
     lobes: bool = False
     """Diffuse and specular samples apart (``RadianceSums.lobes``)."""
@@ -46,6 +50,10 @@ class TraceRequest(NamedTuple):
     """Light with and without shadows (``RadianceSums.shadows``)."""
     direct: bool = False
     """The lobes' light is all that is reflected, not the indirect light alone."""
+    pixel_filter: PixelFilter = "centre"
+    """Where the samples lie."""
+    surfaces: SurfaceRequest | None = None
+    """Guides (``RadianceSums.surfaces``)."""
 
 
 class ReplayedPaths(NamedTuple):
@@ -64,18 +72,12 @@ def make_zero_radiance(shape: tuple[int, ...], request: TraceRequest = NOTHING_E
     """The sums over no samples."""
     emitted, direct, indirect = np.zeros((3, *shape, 3))
     lobes = make_zero_lobes(shape) if request.lobes else None
-    return RadianceSums(emitted, direct, indirect, 0, lobes, make_zero_shadows(shape) if request.shadows else None)
+    shadows = make_zero_shadows(shape) if request.shadows else None
+    surfaces = None if request.surfaces is None else make_zero_surfaces(shape, request.surfaces)
+    return RadianceSums(emitted, direct, indirect, 0, lobes, shadows, surfaces)
 
 
 def get_film_size(scene: Any) -> tuple[int, int]:
     """(height, width) of the film of a scene's first sensor, in pixels."""
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     return height, width
-
-
-def make_camera_rays(sensor: Any, column: Any, row: Any) -> Any:
-    """Rays through the centres of pixels of the sensor's film."""
-    width, height = sensor.film().crop_size()
-    position = mi.Point2f((mi.Float(column) + 0.5) / float(width), (mi.Float(row) + 0.5) / float(height))
-    ray: Any = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))[0]
-    return mi.Ray3f(ray)

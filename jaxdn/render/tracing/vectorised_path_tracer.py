@@ -1,9 +1,10 @@
 """A path tracer for Mitsuba's vectorised variants that separates emitted, direct and indirect light.
 
-One lane is one path through the centre of one pixel. The estimator is that of Mitsuba's ``path`` integrator (next-event
-estimation and BSDF sampling, balance heuristic; Veach 1997, sec. 9.2), so sums agree with it, but one pass gives all
-three parts, and the random numbers depend only on (pixel, sample, frame, seed). Which lobe a path took at its first hit
-is found by a second, short trace with the same numbers (:mod:`jaxdn.render.tracing.lobes`), where that is requested.
+One lane is one path through one pixel: through its centre, or a point that a filter draws. The estimator is that of
+Mitsuba's ``path`` integrator (next-event estimation and BSDF sampling, balance heuristic; Veach 1997, sec. 9.2), so
+sums agree with it, but one pass gives all three parts, and the random numbers depend only on (pixel, sample, frame,
+seed). Which lobe a path took at its first hit is found by a second, short trace with the same numbers
+(:mod:`jaxdn.render.tracing.lobes`), where that is requested.
 """
 
 from collections.abc import Callable, Iterable
@@ -14,8 +15,10 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.scenes.media import compute_transmittance, find_medium_behind, list_media
+from jaxdn.render.tracing.camera_rays import make_camera_rays, sample_camera_rays
 from jaxdn.render.tracing.light_samples import Shadows, sample_light, sum_shadows
 from jaxdn.render.tracing.lobes import Lobes, draw_bounce_numbers, make_generator, sum_lobes, trace_first_segment
+from jaxdn.render.tracing.pixel_filters import PixelFilter
 from jaxdn.render.tracing.radiance import (
     BRIGHTEST,
     NOTHING_ELSE,
@@ -23,11 +26,13 @@ from jaxdn.render.tracing.radiance import (
     ReplayedPaths,
     TraceRequest,
     get_film_size,
-    make_camera_rays,
     make_zero_radiance,
 )
 from jaxdn.render.tracing.seeds import SampleStream
+from jaxdn.render.tracing.surfaces import SurfaceRequest, SurfaceSums, evaluate_surfaces
 
+_TOLD = ("lobes", "shadows", "surfaces")
+"""What else than light :class:`jaxdn.render.tracing.radiance.RadianceSums` may hold."""
 MAX_LANES = 1 << 20
 """Paths traced at once: about 300 bytes of memory each."""
 
@@ -118,10 +123,11 @@ def _accumulate_chunk(
       request: what else is told of the samples.
     """
     pixel, sample = _number_lanes(first_pixel, pixels, first, count)
-    ray, parts, finite, bad = _trace_lanes(scene, pixel, sample, key, depth)
+    ray, parts, finite, bad = _trace_lanes(scene, pixel, sample, key, depth, request.pixel_filter)
     images = _sum_blocks(parts, count)
     found = _split_light(scene, ray, lambda: make_generator(pixel, sample, key), parts, finite, count, request)
-    return RadianceSums(images[0], images[1], images[2], int(dr.sum(bad)[0]), *found)
+    surfaces = None if request.surfaces is None else _sum_surfaces(scene, ray, count, request.surfaces)
+    return RadianceSums(images[0], images[1], images[2], int(dr.sum(bad)[0]), *found, surfaces)
 
 
 def _number_lanes(first_pixel: int, pixels: int, first: int, count: int) -> tuple[Any, Any]:
@@ -133,24 +139,28 @@ def _number_lanes(first_pixel: int, pixels: int, first: int, count: int) -> tupl
     return offset + dr.opaque(mi.UInt32, first_pixel), sample
 
 
+def _sum_surfaces(scene: Any, ray: Any, count: int, request: SurfaceRequest) -> SurfaceSums:
+    """Sum the guides of rays over every ``count`` lanes."""
+    parts = [[part] if dr.depth_v(part) == 1 else list(part) for part in evaluate_surfaces(scene, ray, request)]
+    dr.eval(parts)
+    return SurfaceSums(*_sum_blocks(parts, count))
+
+
 def _sum_blocks(parts: list[Any], count: int) -> list[np.ndarray]:
-    """Sum each part over every ``count`` lanes, [lanes / count, 3]."""
-    sums = [[dr.block_sum(part[channel], count) for channel in range(3)] for part in parts]
+    """Sum each part over every ``count`` lanes, [lanes / count, channels]."""
+    sums = [[dr.block_sum(channel, count) for channel in part] for part in parts]
     dr.eval(sums)
     return [np.stack([np.array(channel, np.float64) for channel in part], axis=-1) for part in sums]
 
 
 def _trace_lanes(
-    scene: Any, pixel: Any, sample: Any, key: tuple[int, int], depth: int
+    scene: Any, pixel: Any, sample: Any, key: tuple[int, int], depth: int, pixel_filter: PixelFilter = "centre"
 ) -> tuple[Any, list[Any], Any, Any]:
     """Trace one path a lane: its ray, its light (emitted, direct, indirect), and whether that is finite.
 
     Light that is not finite is 0, and the last result is 1 for it. Everything is evaluated.
     """
-    sensor = scene.sensors()[0]
-    width = dr.opaque(mi.UInt32, get_film_size(scene)[1])
-    row = pixel // width
-    ray = make_camera_rays(sensor, pixel - row * width, row)
+    ray = sample_camera_rays(scene, pixel, sample, key, pixel_filter)
     traced: Any = trace(scene, ray, make_generator(pixel, sample, key), dr.opaque(mi.UInt32, depth))
     # As light is not negative, NaN, infinities and values that could overflow a sum all fail this comparison.
     finite = dr.all(traced[0] + traced[1] + traced[2] < BRIGHTEST)
@@ -215,11 +225,8 @@ def accumulate(
         runs.append(total)
     parts = zip(*((run.emitted, run.direct, run.indirect) for run in runs), strict=True)
     images = [_to_image(part, height, width) for part in parts]
-    found = [run.lobes for run in runs if run.lobes is not None]
-    lobes = Lobes(*(_to_image(part, height, width) for part in zip(*found, strict=True))) if found else None
-    lamps = [run.shadows for run in runs if run.shadows is not None]
-    shadows = Shadows(*(_to_image(part, height, width) for part in zip(*lamps, strict=True))) if lamps else None
-    return RadianceSums(images[0], images[1], images[2], sum(run.bad for run in runs), lobes, shadows)
+    joined = [_join_images([getattr(run, name) for run in runs], height, width) for name in _TOLD]
+    return RadianceSums(images[0], images[1], images[2], sum(run.bad for run in runs), *joined)
 
 
 def accumulate_sets(
@@ -231,15 +238,17 @@ def accumulate_sets(
     *,
     max_depth: int,
     max_lanes: int = MAX_LANES,
+    request: TraceRequest = NOTHING_ELSE,
 ) -> list[RadianceSums]:
     """Sum ``sets`` sets of ``count`` samples, one after the other, each as :func:`accumulate` does.
 
     All at once where they fit into ``max_lanes``: for small images, to record the program takes longer than to run it.
     """
     height, width = get_film_size(scene)
-    if sets * count * width * height > max_lanes:
+    if sets * count * width * height > max_lanes or request != NOTHING_ELSE:
         starts = range(first, first + sets * count, count)
-        return [accumulate(scene, stream, at, count, max_depth=max_depth, max_lanes=max_lanes) for at in starts]
+        options: dict[str, Any] = {"max_depth": max_depth, "max_lanes": max_lanes, "request": request}
+        return [accumulate(scene, stream, at, count, **options) for at in starts]
     pixel, sample = _number_lanes(0, width * height, first, sets * count)
     _, parts, _, bad = _trace_lanes(scene, pixel, sample, stream.key(), max_depth)
     images = np.moveaxis(np.reshape(_sum_blocks(parts, count), (3, height, width, sets, 3)), 3, 0)
@@ -278,6 +287,14 @@ def accumulate_per_pixel(
         bad += int(dr.sum(wrong)[0])
     images = sums.reshape(3, *counts.shape, 3)
     return RadianceSums(images[0], images[1], images[2], bad)
+
+
+def _join_images(sums: list[Any], height: int, width: int) -> Any:
+    """Join flat sums, such as those of lobes, to sums over an image; None where there are none."""
+    if sums[0] is None:
+        return None
+    parts = zip(*sums, strict=True)
+    return type(sums[0])(*(None if part[0] is None else _to_image(part, height, width) for part in parts))
 
 
 def _to_image(parts: Iterable[np.ndarray], height: int, width: int) -> np.ndarray:
