@@ -1,0 +1,151 @@
+"""Denoisers on clips of Cycles, as a user runs them: real files through ``jaxdn denoise``, measured frame by frame.
+
+    python -m experiments.cycles.compare FOLDER/test -o runs/cycles-compare --methods svgf steady-balanced oidn
+
+For every clip, sample count and method the noisy files are denoised as ``jaxdn denoise`` does it, and scored on the
+frames that have references (:mod:`experiments.cycles.score`). One JSON file for each, so that a run goes on where it
+was; the denoised frames stay, to be looked at. ``--table`` prints what is there.
+"""
+
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from experiments.cycles import reference as references
+from experiments.cycles.record import RECORD, read_record
+from experiments.cycles.score import Scored, score
+from jaxdn.clips import open_frames, read_exr
+from jaxdn.commands.errors import plain_errors
+from jaxdn.runtime.atomic_files import write_json
+from jaxdn.sequence.run import denoise_files, select_backend
+from jaxdn.sequence.settings import Settings
+from jaxdn.zoo.ready import NOISY
+
+PLAIN = "+no-safe"
+"""Ending of a method that is run with ``--no-safe``."""
+
+
+@dataclass
+class Options:
+    """Compare methods on clips of Cycles."""
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """A set: the folder of clips, such as FOLDER/test."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("runs/cycles-compare")
+    """Denoised frames and scores."""
+    methods: list[str] = field(default_factory=lambda: [NOISY, "svgf", "steady-balanced" + PLAIN])
+    """Names as of ``jaxdn denoise --method``; with ``+no-safe`` at the end, without the safe step."""
+    spp: list[int] = field(default_factory=lambda: [1, 4, 16])
+    """Sample counts."""
+    kinds: list[str] = field(default_factory=list)
+    """Kinds of clips; default: all that are there."""
+    table: bool = False
+    """Measure nothing: print the means of what has been measured."""
+
+
+def main(options: Options) -> int:
+    """Measure what is missing, and print the table."""
+    clips = find_done(options.folder, options.kinds)
+    if not options.table:
+        for clip in clips:
+            for spp in options.spp:
+                for method in options.methods:
+                    measure(clip, spp, method, options.out)
+    rows = read_rows(options.out, [clip.name for clip in clips])
+    for spp in options.spp:
+        print_table([row for row in rows if row["spp"] == spp and row["method"] in options.methods], spp)
+    return 0
+
+
+def find_done(folder: Path, kinds: Sequence[str]) -> list[Path]:
+    """The clips of a set that have a record, of the kinds asked for. Raises ValueError where there is none."""
+    records = {path.parent: read_record(path) or {} for path in sorted(folder.glob(f"*/{RECORD}"))}
+    found = [clip for clip, record in records.items() if not kinds or record["kind"] in kinds]
+    if not found:
+        raise ValueError(f"{folder}: expected clips with a {RECORD}, found none; render some first: make cycles.")
+    return found
+
+
+def measure(clip: Path, spp: int, method: str, out: Path) -> None:
+    """Denoise a clip's frames of one sample count and write their scores, unless that is done or they do not exist."""
+    noisy, target = clip / f"{spp}spp-0", out / clip.name / f"{spp}spp" / method.replace("/", "_")
+    scored = sorted(int(path.stem) for path in (clip / "reference").glob("[0-9]*.exr"))
+    files = sorted(noisy.glob("*.exr"))
+    if not files or target.with_suffix(".json").is_file():
+        return
+    images = _denoised(files, target, method)
+    _, frames = open_frames(noisy)
+    motion = {number: stored.frame.motion for number, stored in enumerate(frames, 1)}
+    pairs = [number for number in _paired(scored)]
+    halves = [references.read(clip / "reference" / f"{number:04d}.exr") for number in pairs]
+    found = score([images[number] for number in pairs], halves, [motion[number] for number in pairs])
+    row = {"clip": clip.name, "kind": (read_record(clip / RECORD) or {})["kind"], "spp": spp, "method": method}
+    target.parent.mkdir(parents=True, exist_ok=True)
+    write_json(target.with_suffix(".json"), {**row, "frames": pairs, **found.figures(), "squares": found._asdict()})
+    print(f"{clip.name} {spp} spp {method}: {found.figures()}", flush=True)
+
+
+def _denoised(files: Sequence[Path], target: Path, method: str) -> dict[int, np.ndarray]:
+    """Number of a frame -> image, from the files that were written."""
+    if method == NOISY:
+        return {int(file.stem): _beauty(file) for file in files}
+    model, _ = select_backend(method.removesuffix(PLAIN))
+    target.mkdir(parents=True, exist_ok=True)
+    settings = Settings(only_beauty=True, safe=not method.endswith(PLAIN))
+    written = denoise_files([files[0].parent], target, model, settings)
+    return {int(file.stem): _beauty(file) for file in written.files}
+
+
+def _beauty(file: Path) -> np.ndarray:
+    """The radiance [H, W, 3] of a frame."""
+    channels = read_exr(file)
+    names = [name for name in channels if name.rpartition(".")[2] in "RGB" and ("Combined" in name or "." not in name)]
+    return np.stack([channels[name] for name in sorted(names, key=lambda name: "RGB".index(name[-1]))], axis=-1)
+
+
+def _paired(numbers: Iterable[int]) -> list[int]:
+    """Those of ascending numbers that come in pairs of neighbours, each in one pair."""
+    found: list[int] = []
+    rest = list(numbers)
+    while len(rest) > 1:
+        if rest[1] == rest[0] + 1:
+            found += rest[:2]
+            rest = rest[2:]
+        else:
+            rest = rest[1:]
+    return found
+
+
+def read_rows(out: Path, clips: Iterable[str]) -> list[dict[str, Any]]:
+    """The scores that have been written of clips."""
+    return [json.loads(path.read_text()) for clip in clips for path in sorted((out / clip).glob("*spp/*.json"))]
+
+
+def print_table(rows: Sequence[dict[str, Any]], spp: int) -> None:
+    """PSNR by kind and method, and the means of all figures."""
+    methods = sorted({row["method"] for row in rows}, key=[row["method"] for row in rows].index)
+    kinds = sorted({row["kind"] for row in rows})
+    if not rows:
+        return
+    width = max(map(len, methods)) + 2
+    print(f"\n{spp} samples".ljust(12) + "".join(method.rjust(width) for method in methods))
+    for kind in kinds:
+        values = [[row["psnr"] for row in rows if row["kind"] == kind and row["method"] == method] for method in methods]
+        print(kind.ljust(11) + "".join((f"{np.mean(of):.2f}" if of else "").rjust(width) for of in values))
+    for figure in ("psnr", *Scored._fields[1:]):
+        means = []
+        for method in methods:
+            of = [row[figure] for row in rows if row["method"] == method and row[figure] is not None]
+            means.append((f"{np.mean(of):.4f}" if figure == "flip" else f"{np.mean(of):.2f}") if of else "")
+        print(f"mean {figure}".ljust(14) + "".join(mean.rjust(width) for mean in means)[3:])
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        sys.exit(main(tyro.cli(Options, description=__doc__)))
