@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from jaxdn.filters.disc import TAPS, disc_average, rotations
 from jaxdn.filters.edge_stopping import closeness_weight, depth_weight, normal_weight
 from jaxdn.filters.stabilisation import stabilise
+from tests.gradients import check_gradients
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 HEIGHT, WIDTH = 9, 11
@@ -104,13 +104,7 @@ def test_gradients_reach_values_and_guides(rng, x64):
             values, None, [depth_weight(depth[..., None], None, sigma=1.0, height=len(depth))], radius, angle
         )
 
-    check_grads(
-        jax.jit(mean),
-        (jnp.asarray(rng.random((2, HEIGHT, WIDTH))), jnp.asarray(depth)),
-        order=1,
-        modes=("rev",),
-        eps=1e-7,
-    )
+    check_gradients(mean, (jnp.asarray(rng.random((2, HEIGHT, WIDTH))), jnp.asarray(depth)), eps=1e-7)
 
 
 def test_the_weight_of_closeness_is_its_formula(rng, x64):

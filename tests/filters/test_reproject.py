@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from jaxdn.core.frame import Frame
 from jaxdn.filters import reproject as module
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, guides_of
 from jaxdn.ops.dispatch.row_tiles import map_row_tiles
+from tests.gradients import check_gradients
 
 HEIGHT, WIDTH = 7, 9
 
@@ -88,7 +88,7 @@ def test_it_is_the_mean_of_the_taps_of_the_same_surface(guide, tile, search_neig
 def test_its_gradient(search_neighbours, rng, x64):
     history, frame = drawn(rng)
     function = jax.jit(lambda x: recalled(x, frame, search_neighbours=search_neighbours).history)
-    check_grads(function, (jnp.asarray(history),), order=1, modes=["rev"])
+    check_gradients(function, (jnp.asarray(history),))
     gradient = jax.grad(lambda x: function(x).sum())(jnp.asarray(history))
     np.testing.assert_allclose(
         gradient.sum(), 2 * recalled(history, frame, search_neighbours=search_neighbours).valid.sum()

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 from scipy.special import erfc
 
 from jaxdn.materials import microfacets
+from tests.gradients import check_gradients
 
 CELLS = 128
 
@@ -248,21 +248,21 @@ def test_gradients(x64, rng):
             def alpha(data, shadowing=shadowing, lobe=lobe):
                 return fit_alpha(extract_distribution(data, shadowing=shadowing), lobe=lobe)
 
-            check_grads(jax.jit(alpha), [data], order=1, modes=["rev"], atol=1e-5, rtol=1e-4)
+            check_gradients(alpha, [data], atol=1e-5, rtol=1e-4)
     difference = np.array([0.1, 0.7, 1.2])
     brdf = rng.uniform(0.0, 0.1, (3, 16, 2))
 
     def fresnel(brdf, data):
         return extract_fresnel(brdf, jnp.asarray(difference), extract_distribution(data))
 
-    check_grads(jax.jit(fresnel), [brdf, data], order=1, modes=["rev"], atol=1e-5, rtol=1e-4)
+    check_gradients(fresnel, [brdf, data], atol=1e-5, rtol=1e-4)
     half, roughness = rng.normal(0, 0.3, (2, 3, 3)) + [0, 0, 1], rng.uniform(0.2, 0.9, (2, 3, 1))
     for lobe in microfacets.LOBES:
 
         def d(half, roughness, lobe=lobe):
             return distribution(half, roughness, lobe=lobe)
 
-        check_grads(jax.jit(d), [half, roughness], order=1, modes=["rev"], atol=1e-5, rtol=1e-4)
+        check_gradients(d, [half, roughness], atol=1e-5, rtol=1e-4)
 
 
 def test_wrong_shapes_and_options_raise():

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from jaxdn.core.frame import Frame
 from jaxdn.denoisers import asvgf, svgf
@@ -12,6 +11,7 @@ from jaxdn.filters import gradients
 from jaxdn.filters.accumulation import accumulate
 from jaxdn.filters.atrous import stencil
 from jaxdn.filters.edge_stopping import depth_weight, normal_weight
+from tests.gradients import check_gradients
 from tests.methods.test_svgf import LUMINANCE, moving_frames, reference_average, reference_slopes
 
 HEIGHT, WIDTH = 48, 63
@@ -148,19 +148,14 @@ def test_gradients_of_the_formulas(rng, x64):
             gradients.reconstruct(gradients.Change(delta, size), None, weights, levels=2, significance=0.5), 11, 14
         )
 
-    check_grads(jax.jit(share), (*change, depth), order=1, modes=("rev",))
+    check_gradients(share, (*change, depth))
     past, now = jnp.asarray(rng.uniform(1, 2, (6, 8, 7))), jnp.asarray(rng.uniform(1, 2, (3, 8, 7)))
 
     def blended(past, now, change):
         return accumulate(past, now, alpha=0.1, alpha_moments=0.2, history_max=32, change=change)
 
-    check_grads(jax.jit(blended), (past, now, jnp.asarray(rng.uniform(0.1, 0.9, (8, 7)))), order=1, modes=("rev",))
-    check_grads(
-        jax.jit(lambda now, past: gradients.compare_with_history(now, past, None)),
-        (now[0], past),
-        order=1,
-        modes=("rev",),
-    )
+    check_gradients(blended, (past, now, jnp.asarray(rng.uniform(0.1, 0.9, (8, 7)))))
+    check_gradients(lambda now, past: gradients.compare_with_history(now, past, None), (now[0], past))
 
 
 # The gradients' meaning.

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, recurrent
@@ -12,6 +11,7 @@ from jaxdn.denoisers import svgf, taa
 from jaxdn.filters import neighbourhood
 from jaxdn.filters.catmull_rom import warp_cubic
 from jaxdn.methods.taa import Options, resolve, sharpen
+from tests.gradients import check_gradients
 from tests.methods.test_svgf import moving_frames
 
 HEIGHT, WIDTH = 7, 9
@@ -187,7 +187,7 @@ def test_gradients_of_a_step(rng, x64):
         found, _ = resolve(Options(), image, history, frame, jnp.asarray(False))
         return sharpen(found[..., :3], 0.3)
 
-    check_grads(sharp, (jnp.asarray(image), jnp.asarray(history) + 0.1), order=1, modes=("rev",), eps=1e-6)
+    check_gradients(sharp, (jnp.asarray(image), jnp.asarray(history) + 0.1), eps=1e-6)
 
 
 # The denoiser.

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from jaxdn import color, losses
+from tests.gradients import check_gradients
 
 SHAPE = (4, 5, 7, 3)
 
@@ -144,7 +144,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_derivatives(name: str, x64: None, rng: np.random.Generator) -> None:
     x, y = rng.random((3, 4, 5, 2)), rng.random((3, 4, 5, 2))
-    check_grads(jax.jit(CASES[name]), (x, y), order=1, modes=["rev"], eps=1e-7, atol=1e-6, rtol=1e-6)
+    check_gradients(CASES[name], (x, y), eps=1e-7, atol=1e-6, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from jax.test_util import check_grads
 
 from jaxdn import metrics
 from jaxdn.metrics.flip import flip_map
+from tests.gradients import check_gradients
 from tests.needs import require_module
 
 SHAPE = (3, 14, 17, 3)
@@ -240,7 +240,7 @@ def test_derivatives(name: str, x64: None, rng: np.random.Generator) -> None:
     x = y + rng.uniform(0.05, 0.15, y.shape)
     options = {"pixels_per_degree": 8.0} if name == "flip" else {}
     metric = jax.jit(lambda x, y: getattr(metrics, name)(x, y, **options))
-    check_grads(metric, (x, y), order=1, modes=["rev"], eps=1e-6, rtol=1e-4, atol=1e-5)
+    check_gradients(metric, (x, y), eps=1e-6, rtol=1e-4, atol=1e-5)
 
 
 @given(st.integers(0, 2**31), st.floats(0, 10))
@@ -326,7 +326,7 @@ def test_unbiased_mse_is_the_mean_product_inside_the_mask(rng):
     found = metrics.unbiased_mse(*broken, mask=jnp.asarray(mask))
     np.testing.assert_allclose(found, np.mean((x - a) * (x - b)), rtol=1e-5)
     assert float(metrics.unbiased_mse(*broken, mask=jnp.zeros(mask.shape))) == 0
-    check_grads(lambda x: metrics.unbiased_mse(x, first, second), (image,), order=1, modes=["rev"], rtol=1e-2)
+    check_gradients(lambda x: metrics.unbiased_mse(x, first, second), (image,), rtol=1e-2)
 
 
 def test_two_references_that_are_one_give_the_plain_error(rng):

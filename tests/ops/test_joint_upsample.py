@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from jaxdn.ops.affinity import joint_upsample as module
 from jaxdn.ops.affinity.filter import Guide
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
+from tests.gradients import check_gradients
 
 
 def drawn(rng, height=5, width=6, *, features=2):
@@ -58,7 +58,7 @@ def test_gradients(name, rng, x64):
         return joint_bilateral_upsample(coarse, Guide(*parts[:3]), fine, implementation=name)
 
     arguments = tuple(map(jnp.asarray, (coarse, *there[:3], *here[:2])))
-    check_grads(jax.jit(upsampled), arguments, order=1, modes=["rev"], atol=1e-5, rtol=1e-5)
+    check_gradients(upsampled, arguments, atol=1e-5, rtol=1e-5)
 
 
 def test_a_fine_pixel_that_nothing_resembles_has_no_weight(rng):

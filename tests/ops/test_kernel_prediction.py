@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from jax.test_util import check_grads
 
 from jaxdn.ops.kernel_prediction.apply import apply_kernels, normalize_kernels
 from jaxdn.ops.kernel_prediction.softmax import softmax_filter
 from jaxdn.ops.scales import compose_scales, downsample, fill_holes, upsample
+from tests.gradients import check_gradients
 
 SCALES = [(down, up) for down in ("mean", "max") for up in ("bilinear", "nearest")]
 
@@ -48,7 +48,7 @@ def test_gradients_of_guided_kernels(size, implementation, rng):
         filtered = softmax_filter(images, logits, features=features, taps=9, implementation=implementation)
         return jnp.tanh(filtered)
 
-    check_grads(jax.jit(filtered), (images, logits, features), order=1, modes=["rev"])
+    check_gradients(filtered, (images, logits, features))
 
 
 @pytest.mark.parametrize("implementation", ["reference", "row_tiles"])
@@ -126,7 +126,7 @@ def test_gradients_of_kernel_application(rng):
 
         return jax.lax.scan(again, image, length=2)[0]
 
-    check_grads(jax.jit(filtered), (image, logits), order=1, modes=["rev"])
+    check_gradients(filtered, (image, logits))
 
 
 def test_bilinear_upsampling_is_a_resize(rng):
@@ -173,11 +173,9 @@ def test_composition_is_the_formula(down, up, alpha_size, rng):
         expected = fine - alpha * larger(small) + alpha * larger(coarse)
     out = compose_scales(fine, coarse, alpha, down=down, up=up)
     np.testing.assert_allclose(out, expected, atol=1e-12)
-    check_grads(
-        jax.jit(lambda *arrays: jnp.sin(compose_scales(*arrays, down=down, up=up))),
+    check_gradients(
+        lambda *arrays: jnp.sin(compose_scales(*arrays, down=down, up=up)),
         tuple(map(jnp.asarray, (fine, coarse, alpha))),
-        order=1,
-        modes=["rev"],
     )
 
 

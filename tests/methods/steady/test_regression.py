@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.test_util import check_grads
 
 from jaxdn.methods.steady import regression
 from jaxdn.methods.steady.regression import CELL, GUIDES, SCALES, receptive_field, regressors_of
 from jaxdn.ops.dispatch.operation import implementation
+from tests.gradients import check_gradients
 
 SIZE = 96, 128
 PLAIN = {name: jnp.zeros(()) for name in SCALES}
@@ -226,13 +226,7 @@ def test_gradients(rng, x64):
     scales = {name: jnp.asarray(0.1) for name in SCALES}
     hit = jnp.asarray(rng.uniform(size=(24, 20, 1)) < 0.9)
     # Guides vary by much here: the smallest share of noise would do.
-    check_grads(
-        jax.jit(lambda scales, *given: given_back(scales, *given, hit, 0.01)),
-        (scales, *arrays),
-        order=1,
-        modes=["rev"],
-        rtol=1e-4,
-    )
+    check_gradients(lambda scales, *given: given_back(scales, *given, hit, 0.01), (scales, *arrays), rtol=1e-4)
 
 
 def test_its_gradient_in_single_precision_is_that_of_the_plain_form(rng):
