@@ -20,11 +20,11 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	@echo "Setting up $(VENV) (Python packages of constraints.txt; a minute or two) ..."
 	@if command -v uv >/dev/null 2>&1; then \
 		uv venv --quiet --allow-existing --python $(PYTHON) $(VENV) && \
-		uv pip install --quiet --python $(BIN)/python -c constraints.txt --group dev -e '.[render,train,peers,onnx,onednn]'; \
+		uv pip install --quiet --python $(BIN)/python -c constraints.txt --group dev -e '.[render,train,peers,onnx,onednn,oidn]'; \
 	else \
 		$(PYTHON) -m venv $(VENV) && \
 		$(BIN)/python -m pip install --quiet --upgrade -c constraints.txt pip && \
-		$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[render,train,peers,onnx,onednn]'; \
+		$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[render,train,peers,onnx,onednn,oidn]'; \
 	fi
 	@touch $@
 
@@ -46,10 +46,8 @@ hard-cases: setup  ## run every operation and denoiser on every hard case: runs/
 # Common alternatives to compare with. Only a CPU build of PyTorch is installed, from pip's configured index or else
 # through uv from PyTorch's own index: the default build brings gigabytes of CUDA packages.
 $(VENV)/tools: $(VENV)/ready
-	@echo "Adding PyTorch's CPU build and Open Image Denoise to compare with ..."
+	@echo "Adding PyTorch's CPU build to compare with ..."
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(BIN)/python -m ensurepip >/dev/null
-	@$(BIN)/python -m pip install --quiet -c constraints.txt pyoidn || \
-		echo "Open Image Denoise (pyoidn) could not be installed: its rows will be left out"
 	@$(BIN)/python -m pip install --quiet -c constraints.txt torch 2>/dev/null || \
 		uv pip install --quiet --python $(BIN)/python --torch-backend cpu -c constraints.txt torch 2>/dev/null || \
 		echo "no CPU build of PyTorch could be installed: its rows will be left out"

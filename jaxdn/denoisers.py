@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; tests/test_house.py com
     from jaxdn.methods.dasr import dasr as dasr
     from jaxdn.methods.ntasd import ntasd as ntasd
     from jaxdn.methods.ntd import ntd as ntd
+    from jaxdn.methods.oidn import oidn as oidn
     from jaxdn.methods.rae import rae as rae
     from jaxdn.methods.steady.method import steady as steady
     from jaxdn.methods.svgf import svgf as svgf

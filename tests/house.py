@@ -82,6 +82,7 @@ PACKAGES = {
     "PIL": {"evaluation.report"},
     "safetensors": {"zoo"},
     "tyro": {"commands"},
+    "pyoidn": {"ops"},
 }
 """Which rooms (with the folders in them) import which package from outside."""
 

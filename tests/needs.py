@@ -93,7 +93,7 @@ NEEDS = {
     "playwright": Need(_package("playwright"), "pip install --group dev"),
     "browser": Need(lambda: any(map(shutil.which, BROWSERS)), "apt-get install chromium"),
     "torch": Need(_package("torch"), "pip install -c constraints.txt torch (a CPU build)"),
-    "pyoidn": Need(_package("pyoidn"), "pip install pyoidn"),
+    "pyoidn": Need(_package("pyoidn"), "pip install -e '.[oidn]'"),
     "g++": Need(lambda: shutil.which("g++") is not None, "apt-get install g++ pkg-config"),
     "headers of OpenEXR": Need(lambda: _runs("pkg-config", "--exists", "OpenEXR"), "apt-get install libopenexr-dev"),
     "headers of ONNX Runtime": Need(

@@ -22,7 +22,6 @@ import tyro
 
 from experiments.papers import results, rooms
 from experiments.papers.preintegration import save_pictures
-from experiments.speed import peers
 from experiments.speed.timing import Call
 from experiments.speed.workers import Team
 from experiments.speed.works import steps
@@ -40,7 +39,6 @@ from jaxdn.zoo.weights import shipped_names
 FAMILIES = ("fruit", "robot", "mobile", "pinkroom", "parlour")
 SEED = 2000
 LIGHTS: tuple[NoisyLight, ...] = ("indirect", "reflected")
-PEER = "Open Image Denoise"
 AGAINST = "svgf"
 """The filter that the times of all others are compared with."""
 _WARM = 6
@@ -101,8 +99,6 @@ def step(folder: Path, name: str) -> Call:
     It has run before, so that histories are as long as in the middle of a clip: short ones take longer.
     """
     frame = jax.tree.map(jnp.asarray, frame_at(read_clip(folder).frames, 1))
-    if name == PEER:
-        return steps.open_image_denoise(frame, "high")
     method = find_model(name)
     backend = method.backend()
     if backend is not None:
@@ -126,11 +122,11 @@ def milliseconds(
 
 def main(settings: Settings) -> None:
     """Render, compare, time, report."""
-    methods = list(results.contestants([NOISY, *filter_names(), *shipped_names()]))
+    methods = list(map(find_model, [NOISY, *filter_names(), *shipped_names()]))
     jobs = {light: clips(settings, light) for light in LIGHTS}
     timed = timed_clip(settings)
     render_clips([*(job for own in jobs.values() for job in own), timed], workers=settings.workers)
-    names = [*filter_names(), *shipped_names(), *([] if "pyoidn" in peers.missing() else [PEER])]
+    names = [*filter_names(), *shipped_names()]
     times = milliseconds(Path(timed.folder), names, rounds=settings.rounds)
     own_ms = times.get(AGAINST, float("nan"))
     shown = {name: f"{ms:.0f} ({ms / own_ms:.2f})" for name, ms in times.items()}

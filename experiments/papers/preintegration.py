@@ -16,7 +16,6 @@ from typing import Annotated, get_args
 import numpy as np
 import tyro
 
-from experiments.speed import peers
 from jaxdn.clips import find_clips
 from jaxdn.commands.errors import plain_errors
 from jaxdn.evaluation.compare import compare
@@ -49,10 +48,8 @@ def contestants(weights: list[str]) -> Iterator[Model]:
                 yield find_model(name, demodulate=by)._replace(label=f"{name}, {by}")
     for name in (*shipped_names(), *weights):
         yield find_model(name)
-    if "pyoidn" not in peers.missing():
-        from experiments.speed.peers.oidn import frame_by_frame
-
-        yield Model("Open Image Denoise", frame_by_frame(), {})
+    if "oidn" in filter_names():
+        yield find_model("oidn")
 
 
 def file_name(label: str) -> str:

@@ -18,7 +18,6 @@ import numpy as np
 import tyro
 
 from experiments.papers.preintegration import save_pictures
-from experiments.speed import peers
 from jaxdn.clips import find_clips
 from jaxdn.commands.errors import plain_errors
 from jaxdn.core.frame import Frame
@@ -26,7 +25,7 @@ from jaxdn.data.clip.folder import read_frames
 from jaxdn.evaluation.compare import EvaluationClip, compare, read_evaluation_clip
 from jaxdn.evaluation.report import Results, write_report
 from jaxdn.evaluation.report.results import mean_scores
-from jaxdn.zoo.ready import NOISY, Model, filter_names, find_model
+from jaxdn.zoo.ready import NOISY, filter_names, find_model
 from jaxdn.zoo.weights import shipped_names
 
 Read = Callable[..., EvaluationClip]
@@ -98,21 +97,11 @@ class Settings:
     views: list[str] = field(default_factory=lambda: list(VIEWS))
     """Some of: indirect, beauty, beauty-without-depth, beauty-without-motion."""
     methods: list[str] = field(default_factory=lambda: [NOISY, *filter_names(), *shipped_names()])
-    """Filters and shipped weights to compare; Open Image Denoise comes in addition."""
+    """Filters and shipped weights to compare."""
     weights: list[str] = field(default_factory=list)
     """Files of weights to compare in addition to those that are shipped."""
     out: Path = Path("runs/results")
     """Folder for the reports and the pictures."""
-
-
-def contestants(names: list[str]) -> Iterator[Model]:
-    """Those with these names, and Open Image Denoise."""
-    for name in names:
-        yield find_model(name)
-    if "pyoidn" not in peers.missing():
-        from experiments.speed.peers.oidn import frame_by_frame
-
-        yield Model("Open Image Denoise", frame_by_frame(), {})
 
 
 def table(results: Results, more: Mapping[str, Mapping[str, str]] = _NOTHING) -> str:
@@ -137,7 +126,7 @@ def main(settings: Settings) -> None:
     if unknown:
         raise ValueError(f"--views: expected some of {', '.join(VIEWS)}, got {', '.join(unknown)}.")
     folders = [folder for place in settings.clips for folder in find_clips(place)]
-    methods = list(contestants(settings.methods + settings.weights))
+    methods = [find_model(name) for name in settings.methods + settings.weights]
     for view in settings.views:
         for spp in settings.spp:
             out, title = settings.out / f"{view}-{spp}", f"{view.replace('-', ' ')}, {spp} samples per pixel"

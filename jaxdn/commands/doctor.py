@@ -62,6 +62,7 @@ def _findings() -> Iterator[Finding]:
             yield Finding(f"backend for {backend.purpose}", "XLA, as on every GPU")
     yield from _operations()
     yield _packages("training", "train")
+    yield _packages("Open Image Denoise", "oidn")
     yield _renderer()
 
 

@@ -14,6 +14,11 @@ import jax
 ANY = "any"
 """The platform of portable programs."""
 
+
+class NotPortableError(ValueError):
+    """What was traced inside :func:`portable` runs in this process alone."""
+
+
 _portable: ContextVar[bool] = ContextVar("portable", default=False)
 
 

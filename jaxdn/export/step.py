@@ -14,7 +14,7 @@ import numpy as np
 from jax import export
 
 from jaxdn.core.frame import BUFFERS, GUIDES, Frame
-from jaxdn.core.platform import portable
+from jaxdn.core.platform import NotPortableError, portable
 from jaxdn.denoiser import Denoiser, Params, stages_of
 
 Arrays = dict[str, Any]
@@ -49,7 +49,8 @@ def exported_step(
       buffers: those that frames will have besides ``radiance``; None: all that the denoiser reads.
       size: height and width; None: any.
 
-    Raises ValueError for buffers that the denoiser does not read, and where a program for any size cannot be made.
+    Raises ValueError for buffers that the denoiser does not read, and where a program for any size, or any program that
+    leaves this process (NotPortableError), cannot be made.
     """
     wanted = _chosen(denoiser, buffers)
     if size is not None:
@@ -60,6 +61,8 @@ def exported_step(
         lengths: Any = export.symbolic_shape(text, constraints=[f"h >= {least}", f"w >= {least}"])
         try:
             return _traced(denoiser, params, wanted, lengths, multiple)
+        except NotPortableError:
+            raise
         except (TypeError, ValueError):  # a size had to be known
             continue
     raise ValueError("the step is not the same for all sizes; give --width and --height.")

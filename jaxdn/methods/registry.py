@@ -16,6 +16,7 @@ Without an entry point a method is called ``mypackage.denoisers:running_mean`` w
 import dataclasses
 import functools
 import importlib
+import importlib.util
 import inspect
 import pkgutil
 import warnings
@@ -29,6 +30,7 @@ from jaxdn.denoiser import Denoiser
 from jaxdn.networks.backends import BACKENDS, Purpose
 from jaxdn.ops.dispatch.operation import REFERENCE, default_implementation
 from jaxdn.recipes.recipe import Recipe
+from jaxdn.runtime.optional import find_group, install
 
 ENTRY_POINTS = "jaxdn.methods"
 """The group of entry points of installed packages."""
@@ -58,11 +60,30 @@ class Method:
     """Values of its option ``implementation`` besides XLA: names in :data:`jaxdn.networks.backends.BACKENDS`."""
     filter: bool
     """It denoises without training: its params are ``{}``, or move its options (``learnable_options``)."""
+    requires: str = ""
+    """The module of an optional package that it cannot run without."""
+    differentiable: bool = True
+    """Its images have gradients."""
 
     @property
     def learns(self) -> bool:
         """Whether it can be trained."""
         return bool(self.recipes)
+
+    @property
+    def installed(self) -> bool:
+        """Whether the package that it requires is there."""
+        return not self.requires or importlib.util.find_spec(self.requires) is not None
+
+    def require(self) -> None:
+        """Raise ModuleNotFoundError, saying what to install, unless it can run here."""
+        if not self.installed:
+            extra = find_group(self.requires)
+            advice = install(extra) if extra else f"install the package of {self.requires}"
+            raise ModuleNotFoundError(
+                f"{self.name}: expected the package {self.requires}, which is not installed: {advice}",
+                name=self.requires,
+            )
 
     def recipe_named(self, name: str | None) -> Recipe:
         """A recipe; None is the usual one. Raises ValueError, naming those there are."""
@@ -119,6 +140,8 @@ def method(
     variants: Mapping[str, Mapping[str, Any]] = _NOTHING,
     backends: tuple[str, ...] = (),
     filter: bool | None = None,
+    requires: str = "",
+    differentiable: bool = True,
 ) -> Callable[[Callable[[Any], Denoiser]], Callable[..., Denoiser]]:
     """Decorator: enter ``build(options) -> Denoiser`` in the registry, as a factory ``(**options) -> Denoiser``.
 
@@ -150,7 +173,9 @@ def method(
         if name in _METHODS and _METHODS[name].factory.__module__ != build.__module__:
             other = _METHODS[name].factory.__module__
             raise ValueError(f"method {name!r} of {build.__module__}: expected a name of its own; {other} has it too.")
-        row = Method(name, title, factory, options, presets, recipes, variants, backends, ready)
+        row = Method(
+            name, title, factory, options, presets, recipes, variants, backends, ready, requires, differentiable
+        )
         _METHODS[name] = row
         return factory
 

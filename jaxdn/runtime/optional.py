@@ -19,7 +19,8 @@ OPTIONAL_DEPENDENCIES: dict[str, DependencyGroup] = {
     ),
     "onnx": DependencyGroup(("onnxruntime", "onnx"), ("onnxruntime", "onnx")),
     "onednn": DependencyGroup(("onednn-cpu-gomp",), ()),
-    "bench": DependencyGroup(("torch", "pyoidn"), ("torch", "pyoidn")),
+    "oidn": DependencyGroup(("pyoidn",), ("pyoidn",)),
+    "bench": DependencyGroup(("torch",), ("torch",)),
 }
 
 

@@ -47,7 +47,8 @@ def find_model(name: str, **options: Any) -> Model:
     A filter of another package may be given by its address, ``package.module:name``.
 
     ``options`` are passed to the factory and replace those that the weights were saved with. Raises ValueError for any
-    other name, for a learned method without weights, and for options that the method does not have.
+    other name, for a learned method without weights, and for options that the method does not have, and
+    ModuleNotFoundError for a method whose package is not installed.
     """
     if name == NOISY:
         if options:
@@ -61,6 +62,7 @@ def find_model(name: str, **options: Any) -> Model:
                 f"method {name!r}: expected its weights, {', '.join([*trained, 'the path of a .safetensors file'])}; "
                 "`jaxdn train` makes some."
             )
+        method.require()
         return Model(name.rpartition(":")[2], method.factory(**options), {}, method, options)
     if not name.endswith(".safetensors") and name not in shipped_names():
         raise ValueError(
@@ -82,8 +84,8 @@ def untrained_model(method: Method, **options: Any) -> Model:
 
 
 def filter_names() -> list[str]:
-    """The names of the methods that denoise without training."""
-    return [name for name, method in methods().items() if method.filter]
+    """The names of the methods that denoise without training, and that can run here."""
+    return [name for name, method in methods().items() if method.filter and method.installed]
 
 
 def all_names() -> list[str]:

@@ -84,7 +84,9 @@ def test_operations_withstand_the_smallest_images(function):
 
 
 def test_every_denoiser_and_every_public_operation_is_tested():
-    assert {function.name.split()[0] for function in list_denoisers()} == set(methods())
+    assert {function.name.split()[0] for function in list_denoisers()} == {
+        name for name, row in methods().items() if row.installed
+    }
     tried = {function.name.split(",")[0].split(".")[-1] for function in list_operations()}
     modules = (
         *(brdf, color, glints, losses, metrics, microfacets, motion, numerics, scales),

@@ -175,4 +175,5 @@ def test_the_version_and_what_is_installed(capsys, monkeypatch):
     monkeypatch.setattr("jaxdn.commands.doctor.find_spec", lambda name: None)
     advice = {finding.what: finding.advice for finding in doctor()}
     assert advice["training"].endswith(install("train"))
+    assert advice["Open Image Denoise"].endswith(install("oidn"))
     assert advice["rendering"].endswith(install("render"))

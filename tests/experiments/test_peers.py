@@ -3,12 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from experiments.speed import peers
 from experiments.speed.works import scene
-from jaxdn.core.frame import Clip, Frame, frame_at
-from jaxdn.denoiser.rollout import denoise, stream
+from jaxdn.core.frame import Clip, frame_at
+from jaxdn.denoiser.rollout import stream
 from jaxdn.denoisers import ntd
 from jaxdn.methods.registry import method_named
 from jaxdn.ops.warp import warp
@@ -108,32 +107,6 @@ def test_pytorch_warps_off_screen_as_jaxdn_does(rng):
     np.testing.assert_allclose(theirs, warp(image, motion), atol=1e-5)
 
 
-@pytest.mark.parametrize("quality", ["high", "balanced", "fast"])
-def test_open_image_denoise_removes_noise(quality, rng):
-    require("pyoidn")
-    from experiments.speed.peers.oidn import oidn
-
-    clean = np.full((48, 64, 3), (2.0, 1.0, 0.5), np.float32)
-    noisy = (clean * rng.exponential(size=clean.shape)).astype(np.float32)
-    albedo, normal = np.full_like(clean, 0.5), np.zeros_like(clean)
-    normal[..., 2] = 1
-    image = oidn(48, 64, quality=quality)(noisy, albedo, normal)
-    assert image.shape == clean.shape
-    assert np.isfinite(image).all()
-    assert np.abs(image - clean).mean() < 0.15 * np.abs(noisy - clean).mean()
-
-
-def test_open_image_denoise_says_what_it_expects():
-    require("pyoidn")
-    from experiments.speed.peers.oidn import oidn
-
-    with pytest.raises(ValueError, match="balanced"):
-        oidn(16, 16, quality="best")
-    wrong = np.zeros((16, 8, 3), np.float32)
-    with pytest.raises(ValueError, match="color: expected"):
-        oidn(16, 16)(wrong, wrong, wrong)
-
-
 def test_missing_peers_are_reported(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert set(peers.missing()) == {"torch", "torch-compiled", "pyoidn"}
@@ -143,17 +116,3 @@ def test_missing_peers_are_reported(monkeypatch):
     monkeypatch.setattr("platform.system", lambda: "Linux")
     assert set(peers.missing()) == {"torch-compiled"}
     assert "g++" in peers.missing()["torch-compiled"]
-
-
-def test_open_image_denoise_runs_a_clip_as_any_denoiser_does(rng):
-    require("pyoidn")
-    from experiments.speed.peers.oidn import frame_by_frame, oidn
-
-    frames = Frame(
-        rng.exponential(size=(2, 32, 48, 3)).astype(np.float32),
-        albedo=rng.uniform(0.2, 0.9, (2, 32, 48, 3)).astype(np.float32),
-    )
-    images = jax.jit(lambda clip: denoise(frame_by_frame(), {}, clip))(Clip(frames))
-    run, no_normal = oidn(32, 48), np.zeros((32, 48, 3), np.float32)
-    for index in range(2):
-        np.testing.assert_array_equal(images[index], run(frames.radiance[index], frames.albedo[index], no_normal))

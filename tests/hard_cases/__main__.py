@@ -117,7 +117,7 @@ def summarize(table: Sequence[Row], *, seconds: float, process_seconds: float) -
         "functions": len({row.function for row in table}),
         "cases": len({row.case for row in table}),
         "cells": len(table),
-        **{verdict: verdicts[verdict] for verdict in ("green", "input", "red")},
+        **{verdict: verdicts[verdict] for verdict in ("green", "input", "none", "red")},
         "red_cells": [
             [row.function, row.case, row.precision, row.direction, row.reason] for row in table if row.verdict == "red"
         ],

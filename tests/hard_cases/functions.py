@@ -46,15 +46,19 @@ class Function(NamedTuple):
     pictured: bool = False
     """Its result is shown as a picture."""
     kind: str = "operation"
+    differentiable: bool = True
+    """It has gradients to test."""
 
 
 def list_denoisers() -> list[Function]:
-    """Every registered method, in its smallest variant, both ways to divide light and to filter it.
+    """Every registered method that can run here, in its smallest variant, both ways to divide light and to filter it.
 
     A network has the weights that training starts from; what may follow another method also follows svgf.
     """
     functions = []
     for name, method in methods().items():
+        if not method.installed:
+            continue
         options = method.variant_named(None)
         denoiser = method.factory(**options)
         begin = _beginning(denoiser)
@@ -66,6 +70,7 @@ def list_denoisers() -> list[Function]:
             bounds=(0.0, RADIANCE_MAX),
             pictured=True,
             kind="denoiser",
+            differentiable=method.differentiable,
         )
         functions.append(usual)
         if method.has_option("demodulate"):

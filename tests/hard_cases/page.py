@@ -15,7 +15,7 @@ from tests.hard_cases.table import DIRECTIONS, PRECISIONS, Row
 Pictures = Mapping[tuple[str, str], str]
 """(case, function) -> the address of a PNG."""
 
-_WORST = ("green", "input", "red")
+_WORST = ("none", "green", "input", "red")
 _STYLE = """
 body{font:14px/1.5 system-ui,sans-serif;margin:2em;color:#222;max-width:100%}p,li{max-width:52em}
 .wide{overflow:auto;max-height:85vh;width:fit-content;max-width:100%;border:1px solid #ccc}
@@ -26,7 +26,8 @@ td a:hover,th a:hover{text-decoration:underline}
 thead th{position:sticky;top:0;z-index:1;vertical-align:bottom}tbody th{position:sticky;left:0}
 thead th:first-child{left:0;z-index:2}.up{writing-mode:vertical-rl;transform:rotate(180deg);padding:4px 0}
 small{display:block;color:#777;line-height:1.1}
-.green{background:#dcefdc}.red{background:#f0a59b}.input{background:#e4e4e4}.key{padding:1px 8px}
+.green{background:#dcefdc}.red{background:#f0a59b}.input{background:#e4e4e4}
+.none{background:#f6f6f6}.key{padding:1px 8px}
 section{border-top:1px solid #ddd;padding:.5em 0;scroll-margin-top:1em}h3{margin:.3em 0}
 figure{display:inline-block;margin:0 10px 8px 0;vertical-align:top}figcaption{font-size:12px;color:#555}
 img{width:132px;max-height:132px;image-rendering:pixelated;display:block;border:1px solid #ccc}
@@ -52,7 +53,8 @@ def write_page(
 <p>{len(cases)} cases, {sum(map(len, kinds.values()))} functions, {len(table)} cells: <span class="green key">
 {counts["green"]} green</span> <span class="red key">{counts["red"]} red</span> <span class="input key">
 {counts["input"]} pass on</span> NaN or infinity of the input, or have no finite true value (the PSNR of identical
-images), as a pure function may and a denoiser may not. Compiled by jax {jax.__version__} for {jax.default_backend()}.
+images), as a pure function may and a denoiser may not;
+{counts["none"]} have no gradient. Compiled by jax {jax.__version__} for {jax.default_backend()}.
 </p>
 <p>Green is finite, within its bounds, and close to the same function in double precision. Numbers are the largest
 difference from it, relative to the largest value (small ones: bfloat16 inputs); – is

@@ -42,7 +42,7 @@ class Row(NamedTuple):
     error: float | None
     """Against double precision, where that is finite; None where there is nothing to compare."""
     verdict: str
-    """``green``, ``red``, or ``input`` where a pure function passes on NaN or infinity."""
+    """``green``, ``red``, ``input`` where a pure function passes on NaN or infinity, ``none`` without gradients."""
     reason: str
     """The reason of a verdict that is not green."""
 
@@ -69,6 +69,9 @@ def rows(
         widening = Widening(function.run)
         for direction in directions:
             forward = direction == "forward"
+            if not (forward or function.differentiable):
+                yield from _without_gradient(function, made, precisions)
+                continue
             run = Program(function.run if forward else gradient_of(function.run), compiler_options=AS_USERS)
             # The comparison runs once for each case: compiled without optimisation, in a fifth of the time.
             plain = {"xla_backend_optimization_level": 0, **SOON}
@@ -86,6 +89,14 @@ def rows(
                     yield _judge(name, function, precision, direction, found, truth, given)
                     if pictures is not None and function.pictured and forward and precision == "float32":
                         pictures[name, function.name] = np.asarray(found).reshape(-1, *found.shape[-3:])[-1]
+
+
+def _without_gradient(function: Function, cases: Iterable[str], precisions: Sequence[str]) -> Iterator[Row]:
+    for precision in precisions:
+        for case in cases:
+            yield Row(
+                *(case, function.name, function.kind, precision, "gradient", True, 0.0, None, "none", "no gradient")
+            )
 
 
 def cast(inputs: Inputs, precision: str) -> Inputs:

@@ -1,17 +1,11 @@
 """The compared methods, from the table of methods and the available weights: new ones are included automatically."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
-
-import numpy as np
+from typing import Any, get_args, get_type_hints
 
 from experiments.speed import peers
 from experiments.speed.chart import of_ntd
-from experiments.speed.chart.render_cost import named
 from experiments.speed.chart.way import ALL, PLAIN, Way, all_written_out, standing_still, way
-from experiments.speed.timing import Call
-from experiments.speed.works import steps
-from jaxdn.core.frame import Frame, written_out
 from jaxdn.methods.registry import Method, methods
 from jaxdn.networks.backends import BACKENDS
 from jaxdn.zoo import ready
@@ -71,6 +65,10 @@ def _alternatives(method: Method) -> dict[str, dict[str, Any]]:
             found[name] = {"implementation": name}
     if method.has_option("demodulate"):
         found["not demodulated"] = {"demodulate": "none"}
+    if method.filter and method.has_option("quality"):  # weights have one quality
+        usual = method.options().quality
+        choices = get_args(get_type_hints(method.options)["quality"])
+        found |= {quality: {"quality": quality} for quality in choices if quality != usual}
     return found
 
 
@@ -80,33 +78,9 @@ def _remade(candidate: Model, changed: Mapping[str, Any]) -> Model:
     return candidate._replace(denoiser=_row(candidate).factory(**options), options=options)
 
 
-def open_image_denoise() -> Iterator[Way]:
-    """Open Image Denoise with albedo and normals, in its three qualities."""
-    if "pyoidn" in peers.missing():
-        return
-    from experiments.speed.peers.oidn import oidn
-
-    # Interleaved with our weights, so that both are measured under the same machine conditions.
-    group = next(iter(ready.shipped_names()), "Open Image Denoise")
-    guides = ("albedo", "normal")
-    for quality in ("high", "balanced", "fast"):
-
-        def images(frames: Frame, quality: str = quality) -> np.ndarray:
-            frames = written_out(frames, guides)
-            arrays = [np.asarray(buffer, np.float32) for buffer in (frames.radiance, frames.albedo, frames.normal)]
-            denoise = oidn(*arrays[0].shape[1:3], quality=quality)
-            return np.stack([denoise(*frame).copy() for frame in zip(*arrays, strict=True)])
-
-        def timed(frame: Frame, quality: str = quality) -> Call:
-            return steps.open_image_denoise(frame, quality)
-
-        variant = PLAIN if quality == "high" else quality
-        yield Way(f"oidn {quality}", "Open Image Denoise", variant, named(guides), timed, images, group)
-
-
 def ways(denoisers: Sequence[Model], *, quick: bool = False) -> list[Way]:
     """Every method that can be run here; ``quick``: only plain forms."""
-    found = [*registered(denoisers), *open_image_denoise()]
+    found = list(registered(denoisers))
     if quick:
         return [each for each in found if each.variant == PLAIN]
     return [*found, *of_ntd.untrained()]

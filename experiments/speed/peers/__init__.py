@@ -10,13 +10,17 @@ import shutil
 _PACKAGES = {"torch": "PyTorch", "pyoidn": "Open Image Denoise (pyoidn)"}
 
 
+_MAKES = {"torch": "make bench", "pyoidn": "make setup"}
+"""Package -> the target that installs it."""
+
+
 def missing() -> dict[str, str]:
     """Peer -> a sentence why its rows are left out here; only peers that cannot be run.
 
     Peers are ``"torch"``, ``"torch-compiled"`` and ``"pyoidn"``.
     """
     reasons = {
-        package: f"{name} is not installed: `make bench` installs it; its rows are left out."
+        package: f"{name} is not installed: `{_MAKES[package]}` installs it; its rows are left out."
         for package, name in _PACKAGES.items()
         if importlib.util.find_spec(package) is None
     }

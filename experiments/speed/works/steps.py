@@ -16,6 +16,7 @@ from jaxdn.denoiser import Denoiser
 from jaxdn.methods.registry import method_named
 from jaxdn.networks import LARGE, SMALL
 from jaxdn.networks.backends import BACKENDS, Purpose
+from jaxdn.ops.oidn import Quality, Settings, denoise
 
 HEIGHT, WIDTH = 720, 1280
 WIDTHS = {"large": LARGE, "small": SMALL}
@@ -52,13 +53,12 @@ def recurrent(denoiser: Denoiser, params: Any, frame: Frame) -> Call:
     return call
 
 
-def open_image_denoise(frame: Frame, quality: str) -> Call:
-    """Open Image Denoise on radiance, albedo and normal; building the filter is not timed."""
-    from experiments.speed.peers.oidn import oidn
-
+def open_image_denoise(frame: Frame, quality: Quality) -> Call:
+    """Open Image Denoise on radiance, albedo and normal; building the network is not timed."""
     arrays = tuple(np.asarray(buffer, np.float32) for buffer in (frame.radiance, frame.albedo, frame.normal))
-    denoise = oidn(*arrays[0].shape[:2], quality=quality)
-    return lambda: denoise(*arrays)
+    call = partial(denoise, *arrays, settings=Settings(quality))
+    call()
+    return call
 
 
 @cache
@@ -105,7 +105,7 @@ def oidn_high(height: int, width: int) -> Call:
 
 
 def oidn_high_once(height: int, width: int) -> Any:
-    """The same with building the filter, which keeps its memory."""
+    """The same with building the network, which keeps its memory."""
     return oidn_high(height, width)()
 
 

@@ -1,0 +1,158 @@
+"""Binding of Open Image Denoise, a library of networks that denoise single images, by the package ``pyoidn``.
+
+Each call copies its images into buffers of the library's device, which may be a GPU, and copies the result back.
+Building a network takes longer than running it, so the last few are kept.
+
+Attila T. Áfra, "Intel Open Image Denoise", 2019-2025, https://www.openimagedenoise.org.
+"""
+
+import functools
+import importlib.util
+import os
+import threading
+import weakref
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from jaxdn.runtime.optional import install
+
+MODULE = "pyoidn"
+RECEPTIVE_FIELD = 96
+"""Radius in pixels, of all qualities: the overlap of the library's own tiles; 91 pixels are the farthest measured."""
+ALIGNMENT = 16
+"""The network halves an image four times, from its top left corner: tiles begin at multiples of this."""
+
+Quality = Literal["high", "balanced", "fast"]
+Auxiliary = Literal["noisy", "clean", "prefiltered"]
+Device = Literal["auto", "cpu", "cuda"]
+
+
+class Settings(NamedTuple):
+    """How an image is denoised."""
+
+    quality: Quality = "high"
+    hdr: bool = True
+    """Radiance may exceed 1; otherwise it is in [0, 1], encoded with the sRGB curve."""
+    auxiliary: Auxiliary = "noisy"
+    """What is known of albedo and normal: they may be noisy, they have no noise, or the library denoises them first."""
+    device: Device = "auto"
+    """``"auto"`` is an NVIDIA GPU if the library can use one, else the CPU."""
+
+
+def available() -> bool:
+    """Whether the package is installed."""
+    return importlib.util.find_spec(MODULE) is not None
+
+
+def library() -> Any:
+    """The package. Raises ModuleNotFoundError, saying what to install, where it is missing."""
+    try:
+        import pyoidn
+    except ModuleNotFoundError as error:
+        if error.name != MODULE:
+            raise
+        raise ModuleNotFoundError(
+            f"oidn: expected the package {MODULE} (Open Image Denoise), which is not installed: {install('oidn')}",
+            name=MODULE,
+        ) from error
+    return pyoidn
+
+
+def choose_device(device: Device) -> Literal["cpu", "cuda"]:
+    """The device that ``"auto"`` stands for here; any other name is that one."""
+    if device != "auto":
+        return device
+    return "cuda" if library().Device.is_cuda_available(0) else "cpu"
+
+
+def denoise(
+    color: np.ndarray,
+    albedo: np.ndarray | None = None,
+    normal: np.ndarray | None = None,
+    *,
+    settings: Settings = Settings(),  # noqa: B008, immutable
+    scale: float = float("nan"),
+) -> np.ndarray:
+    """The denoised image [H, W, 3] float32 of one frame.
+
+    Args:
+      color: [H, W, 3] linear radiance >= 0, or what :attr:`Settings.hdr` says.
+      albedo: [H, W, 3] in [0, 1]; None: the network for images without guides, or without this one.
+      normal: [H, W, 3] in [-1, 1], of any space; needs an albedo.
+      settings: see :class:`Settings`.
+      scale: the factor that makes radiance as bright as a photograph; NaN: the library measures it
+        (as :func:`jaxdn.color.exposure`).
+
+    Raises ModuleNotFoundError without the package, ValueError for images of different sizes, and RuntimeError with the
+    library's own message where it fails.
+    """
+    guides = {name: image for name, image in (("albedo", albedo), ("normal", normal)) if image is not None}
+    height, width = np.shape(color)[:2]
+    for name, image in {"color": color, **guides}.items():
+        if np.shape(image) != (height, width, 3):
+            raise ValueError(f"{name}: expected {(height, width, 3)} as the colour, got {np.shape(image)}.")
+    settings = settings._replace(device=choose_device(settings.device))
+    kernel_of = functools.partial(_kernel, height, width, settings)
+    if settings.auxiliary == "prefiltered":
+        guides = {name: kernel_of((name,))({name: image}) for name, image in guides.items()}
+    return kernel_of(("color", *guides))({"color": color, **guides}, scale)
+
+
+class _Kernel:
+    """One network of the library for images of one size, with its buffers. Its calls take turns."""
+
+    def __init__(self, height: int, width: int, settings: Settings, inputs: tuple[str, ...]) -> None:
+        oidn = library()
+        self._shape = (height, width, 3)
+        self._lock = threading.Lock()
+        types = {"cpu": oidn.OIDN_DEVICE_TYPE_CPU, "cuda": oidn.OIDN_DEVICE_TYPE_CUDA}
+        self._device = oidn.Device(types[settings.device])
+        if settings.device == "cpu":
+            self._device.set_int("numThreads", os.cpu_count() or 1)
+        self._device.commit()
+        self._check()
+        self._buffers = {name: oidn.Buffer(self._device, height * width * 12) for name in (*inputs, "output")}
+        self._filter = oidn.Filter(self._device, oidn.OIDN_FILTER_TYPE_RT)
+        for name, buffer in self._buffers.items():
+            self._filter.set_image(name, buffer, oidn.OIDN_FORMAT_FLOAT3, width, height)
+        qualities = {
+            "high": oidn.OIDN_QUALITY_HIGH,
+            "balanced": oidn.OIDN_QUALITY_BALANCED,
+            "fast": oidn.OIDN_QUALITY_FAST,
+        }
+        self._filter.set_quality(qualities[settings.quality])
+        self._has_color = "color" in inputs
+        if self._has_color:
+            self._filter.set_bool("hdr", settings.hdr)
+            self._filter.set_bool("cleanAux", settings.auxiliary != "noisy" and len(inputs) > 1)
+        self._filter.commit()
+        self._check()
+        weakref.finalize(self, _release, (self._filter, *self._buffers.values(), self._device))
+
+    def __call__(self, images: dict[str, np.ndarray], scale: float = float("nan")) -> np.ndarray:
+        output = np.empty(self._shape, np.float32)
+        with self._lock:
+            for name, image in images.items():
+                self._buffers[name].write(0, output.nbytes, np.ascontiguousarray(image, np.float32))
+            if self._has_color:
+                self._filter.set_float("inputScale", scale)
+                self._filter.commit()
+            self._filter.execute()
+            self._check()
+            self._buffers["output"].read(0, output.nbytes, output)
+        return output
+
+    def _check(self) -> None:
+        error = self._device.get_error()
+        if error is not None:
+            raise RuntimeError(f"Open Image Denoise: {error}")
+
+
+_kernel = functools.lru_cache(maxsize=4)(_Kernel)
+"""The last networks: of a frame, or a tile, and of its guides."""
+
+
+def _release(handles: tuple[Any, ...]) -> None:
+    for handle in handles:
+        handle.release()
