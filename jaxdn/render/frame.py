@@ -13,12 +13,14 @@ from jaxdn.render.buffers.glossy_vectors import compute_glossy_motion
 from jaxdn.render.buffers.gradient_samples import compute_luminance_gradient
 from jaxdn.render.buffers.reflectance import Reflectances
 from jaxdn.render.buffers.shadow_vectors import compute_shadow_motion
+from jaxdn.render.frame_blur import trace_blurred_samples
 from jaxdn.render.frame_geometry import FrameGeometry, build_geometry
 from jaxdn.render.frame_request import DISOCCLUSION, GRADIENT, MOTION, VECTORS, FrameRequest, request_frame
 from jaxdn.render.frame_samples import FrameSamples, trace_samples
+from jaxdn.render.scenes.optics import get_shutter
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.settings import RenderSettings
-from jaxdn.render.tracing.radiance import RadianceSums
+from jaxdn.render.tracing.radiance import RadianceSums, TraceRequest
 from jaxdn.render.tracing.seeds import NOISY, SampleStream
 from jaxdn.render.tracing.tracer import Tracer, choose_tracer
 
@@ -70,9 +72,7 @@ def render_frame(
     tracer = choose_tracer(settings.variant or "")
     request = request_frame(settings, frame)
     geometry = build_geometry(scene, frame, settings, request, previous)
-    asked = {"reflectance", "specular_reflectance"} & set(request.averaged)
-    reflectances = Reflectances(geometry.scene) if asked else None
-    samples = trace_samples(tracer, geometry.scene, frame, settings, request, reflectances)
+    samples = _trace_frame(tracer, scene, geometry.scene, frame, settings, request)
     buffers = _average_light(samples, settings)
     buffers |= _describe_samples(samples.noisy[settings.layers[0]], settings.layers[0])
     buffers |= _describe_surfaces(geometry, request)
@@ -82,6 +82,28 @@ def render_frame(
     rendered = _assemble(buffers, samples, geometry.view, settings, request)
     clean = _average_guides(samples.best(), settings.reference_spp, request) if samples.halves else {}
     return rendered._replace(layer_guides=guides if request.averaged else {}, reference_guides=clean)
+
+
+def _trace_frame(
+    tracer: Tracer, scene: AnimatedScene, built: Any, frame: int, settings: RenderSettings, request: FrameRequest
+) -> FrameSamples:
+    """Trace all samples of a frame: in its own ``mi.Scene``, or at several times while the shutter is open."""
+
+    def describe(of: Any) -> TraceRequest:
+        asked = {"reflectance", "specular_reflectance"} & set(request.averaged)
+        return request.describe_samples(Reflectances(of) if asked else None)
+
+    if get_shutter(scene) == 0.0:
+        return trace_samples(tracer, built, frame, settings, request, describe(built))
+    if settings.pixel_filter == "centre":
+        raise ValueError(
+            "scene: motion blur needs filtered pixels, as its first hits are random; expected pixel_filter "
+            "'blackman-harris', 'gaussian' or 'box' (--pixel-filter), got 'centre'."
+        )
+    if request.sampled:
+        names = ", ".join(sorted(request.sampled))
+        raise ValueError(f"plan: expected none of {names} with motion blur; plan without them.")
+    return trace_blurred_samples(tracer, scene, frame, settings, request, describe)
 
 
 def _average_light(samples: FrameSamples, settings: RenderSettings) -> dict[str, np.ndarray]:

@@ -12,7 +12,6 @@ from jaxdn.render.settings import RenderSettings
 from jaxdn.render.tracing import jitter as jitters
 from jaxdn.render.tracing.radiance import RadianceSums, TraceRequest, make_zero_radiance
 from jaxdn.render.tracing.seeds import DRAWS, NOISY, REFERENCE, SampleStream
-from jaxdn.render.tracing.surfaces import AveragesReflectance
 from jaxdn.render.tracing.tracer import Tracer
 
 
@@ -41,7 +40,7 @@ def trace_samples(
     frame: int,
     settings: RenderSettings,
     request: FrameRequest,
-    reflectances: AveragesReflectance | None = None,
+    common: TraceRequest,
 ) -> FrameSamples:
     """Trace all samples of a frame.
 
@@ -51,9 +50,8 @@ def trace_samples(
       frame: index of the frame.
       settings: complete (:meth:`jaxdn.render.settings.RenderSettings.complete`).
       request: what the frame needs.
-      reflectances: of the scene, where guides of samples need them.
+      common: what is asked of all samples.
     """
-    common = request.describe_samples(reflectances)
     lights = _FrameLight(tracer, built, frame, settings, request, common)
     own = request.describe_own_samples(common)
     # Layer n always holds the samples n-1 ... 2n-2: its image does not depend on the other layers.

@@ -12,6 +12,7 @@ class Tracer(NamedTuple):
 
     accumulate: Callable[..., RadianceSums]
     accumulate_sets: Callable[..., list[RadianceSums]]
+    accumulate_samples: Callable[..., RadianceSums]
     replay: Callable[..., ReplayedPaths]
     jittered: bool
     """It distributes its samples over the pixel."""
@@ -21,6 +22,7 @@ def choose_tracer(variant: str) -> Tracer:
     """The path tracer for a variant."""
     if variant.startswith("scalar"):
         scalar = scalar_path_tracer
-        return Tracer(scalar.accumulate, scalar.accumulate_sets, scalar.replay, True)
+        return Tracer(scalar.accumulate, scalar.accumulate_sets, scalar.accumulate_samples, scalar.replay, True)
     vectorised = vectorised_path_tracer
-    return Tracer(vectorised.accumulate, vectorised.accumulate_sets, vectorised.replay, False)
+    accumulate = vectorised.accumulate, vectorised.accumulate_sets, vectorised.accumulate_samples
+    return Tracer(*accumulate, vectorised.replay, False)

@@ -271,22 +271,53 @@ def accumulate_per_pixel(
     :func:`accumulate`, whose samples these are: a pixel's do not depend on how many others have.
     """
     number = np.asarray(counts, np.int64).reshape(-1)
-    sums = np.zeros((3, number.size, 3))
     ends = np.cumsum(number)
-    bad = 0
+    total = make_zero_radiance(counts.shape)
     for start in range(0, int(ends[-1]), max_lanes):
         lane = np.arange(start, min(start + max_lanes, int(ends[-1])))
         pixel = np.searchsorted(ends, lane, side="right")
         sample = lane - (ends - number)[pixel] + first
-        of_lane, number_of_lane = (mi.UInt32(each.astype(np.uint32)) for each in (pixel, sample))
-        _, parts, _, wrong = _trace_lanes(scene, of_lane, number_of_lane, stream.key(), max_depth)
-        for total, part in zip(sums, parts, strict=True):
-            light = np.array(part, np.float64).T
-            for channel in range(3):
-                total[:, channel] += np.bincount(pixel, light[:, channel], number.size)
-        bad += int(dr.sum(wrong)[0])
-    images = sums.reshape(3, *counts.shape, 3)
-    return RadianceSums(images[0], images[1], images[2], bad)
+        total = total.plus(accumulate_samples(scene, stream, pixel, sample, max_depth=max_depth))
+    return total
+
+
+def accumulate_samples(
+    scene: Any,
+    stream: SampleStream,
+    pixel: np.ndarray,
+    sample: np.ndarray,
+    *,
+    max_depth: int,
+    max_lanes: int = MAX_LANES,
+    request: TraceRequest = NOTHING_ELSE,
+) -> RadianceSums:
+    """Sum any samples [n] of pixels [n]: a pixel may have none. Lobes and shadows are not told.
+
+    The other arguments are those of :func:`accumulate`, whose samples these are.
+    """
+    size = get_film_size(scene)
+    total = make_zero_radiance((size[0] * size[1],), request)
+    for start in range(0, len(pixel), max_lanes):
+        part = slice(start, start + max_lanes)
+        of_lane, number = (mi.UInt32(each[part].astype(np.uint32)) for each in (pixel, sample))
+        ray, light, _, wrong = _trace_lanes(scene, of_lane, number, stream.key(), max_depth, request.pixel_filter)
+        images = [_sum_by_pixel(each, pixel[part], len(total.direct)) for each in light]
+        surfaces = None
+        if request.surfaces is not None:
+            guides = evaluate_surfaces(scene, ray, request.surfaces)
+            dr.eval(guides)
+            surfaces = SurfaceSums(*(_sum_by_pixel(each, pixel[part], len(total.direct)) for each in guides))
+        found = RadianceSums(images[0], images[1], images[2], int(dr.sum(wrong)[0]), surfaces=surfaces)
+        total = total.plus(found)
+    images = [part.reshape(*size, 3) for part in (total.emitted, total.direct, total.indirect)]
+    surfaces = None if total.surfaces is None else total.surfaces.change(lambda part: part.reshape(*size, -1))
+    return RadianceSums(images[0], images[1], images[2], total.bad, surfaces=surfaces)
+
+
+def _sum_by_pixel(values: Any, pixel: np.ndarray, pixels: int) -> np.ndarray:
+    """[pixels, channels] float64 the sums of values, one or several channels a lane, over the lanes of each pixel."""
+    channels = np.array(values, np.float64).reshape(-1, len(pixel))
+    return np.stack([np.bincount(pixel, channel, pixels) for channel in channels], axis=-1)
 
 
 def _join_images(sums: list[Any], height: int, width: int) -> Any:
