@@ -58,7 +58,8 @@ def test_pytorch_gives_the_same_images(key, x64):
             assert relative(other[0].movedim(0, -1), image) < 1e-6, (index, number)
 
 
-def test_pytorch_has_the_same_loss_and_gradients(key, x64):
+@pytest.mark.parametrize("progress", [0.0, 1.0])
+def test_pytorch_has_the_same_loss_and_gradients(progress, key, x64):
     require("torch")
     from experiments.speed.peers.pytorch_training import Trainer, batch_tensors
     from experiments.speed.peers.pytorch_training import clip_loss as peer_loss
@@ -69,13 +70,15 @@ def test_pytorch_has_the_same_loss_and_gradients(key, x64):
     params = lively(init_state(denoiser, RECIPE, batch).params, key)
 
     def batch_loss(params):
-        loss, psnr = jax.vmap(lambda clip: clip_loss(denoiser, params, clip, RECIPE.objective))(batch)
+        loss, psnr = jax.vmap(lambda clip: clip_loss(denoiser, params, clip, RECIPE.objective, progress=progress))(
+            batch
+        )
         return jnp.mean(loss), jnp.mean(psnr)
 
     (loss, _), gradient = jax.jit(jax.value_and_grad(batch_loss, has_aux=True))(params)
     trainer = Trainer(TINY, params, RECIPE)
     trainer.step.double()
-    theirs, _ = peer_loss(trainer.step, *batch_tensors(batch))
+    theirs, _ = peer_loss(trainer.step, *batch_tensors(batch), progress=progress)
     theirs.backward()
     assert relative(theirs.item(), loss) < 1e-6
     network = trainer.step.network

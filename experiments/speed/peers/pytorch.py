@@ -1,9 +1,9 @@
 """The recurrent ``ntd`` step in PyTorch, as a peer for speed: the same network, the same weights, the same image.
 
 Written for speed on the CPU, as a PyTorch user would: channels-last tensors, library operations wherever they exist,
-inference mode. Options are the defaults of :func:`jaxdn.denoisers.ntd`. Frames are assumed to be valid: the
-repairs that jaxdn does in every frame (non-finite values, normals not of unit length) are left out here, which is to
-PyTorch's advantage.
+inference mode. Options are the defaults of :func:`jaxdn.denoisers.ntd`, but for plain kernels and a background that is
+filtered as all else is. Frames are assumed to be valid: what jaxdn sanitizes in every frame (non-finite values, normals
+not of unit length) is left out here, which is to PyTorch's advantage.
 
 Tensors are ``[B, C, H, W]`` in channels-last memory; height and width are multiples of 16.
 """
@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from jaxdn.brdf import FLOOR
+from jaxdn.color import LUMINANCE
 from jaxdn.core.frame import FAR, RADIANCE_MAX, Frame
 from jaxdn.methods.reconstruction import TAPS
 from jaxdn.networks import LEVELS, Widths
@@ -28,7 +29,7 @@ FEATURES = 14
 """Compressed radiance 3, albedo 3, normal 3, depth 1, compressed history 3, missing history 1."""
 HEADS = (2 * TAPS + 1, TAPS + 1, TAPS + 1)
 
-BUFFERS = ("radiance", "albedo", "normal", "depth", "motion", "dual_motion")
+BUFFERS = ("radiance", "albedo", "normal", "depth", "dual_motion")
 """The buffers of a frame here: all that the network uses."""
 
 
@@ -124,6 +125,16 @@ def compress(x: Tensor) -> Tensor:
     return torch.where(x >= 0, y, -y)
 
 
+def exposure(radiance: Tensor) -> Tensor:
+    """``jaxdn.color.exposure``, [B, 1, 1, 1]: 0.18 over the geometric mean of the luminance of blocks that are lit."""
+    blocks = F.avg_pool2d(radiance.detach().clamp(max=RADIANCE_MAX), 16)
+    means = (blocks * blocks.new_tensor(LUMINANCE)[:, None, None]).sum(1, keepdim=True)
+    lit = means > 0
+    logarithms = torch.where(lit, torch.log(torch.where(lit, means, 1.0)), 0.0).sum((1, 2, 3), keepdim=True)
+    count = lit.sum((1, 2, 3), keepdim=True)
+    return torch.where(count > 0, 0.18 * torch.exp(-logarithms / count.clamp(min=1)), 1.0)
+
+
 def depth_feature(depth: Tensor) -> Tensor:
     """``z / (z + g)`` with the geometric mean g over surfaces, for each image."""
     known = (depth > 0) & (depth < FAR)
@@ -186,7 +197,7 @@ class Prepared(NamedTuple):
     noisy: Tensor
     """[B, 3, H, W] radiance divided by ``colors``."""
     colors: Tensor
-    recalled: Tensor
+    history: Tensor
     """[B, 3, H, W] warped history, the noisy pixel where it is missing."""
     absent: Tensor
     """bool [B, 1, H, W]: the history is missing."""
@@ -205,9 +216,11 @@ def prepare(state: State, frame: dict[str, Tensor]) -> Prepared:
     x, y = targets(motion)
     inside = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
     absent = ~inside[:, None] | state.first
-    recalled = torch.where(absent, noisy, warp(state.history, motion))
-    parts = [compress(noisy), albedo - 1.0, frame["normal"], depth_feature(frame["depth"]), compress(recalled)]
-    return Prepared(noisy, colors, recalled, absent, torch.cat([*parts, absent.to(noisy.dtype)], 1))
+    history = torch.where(absent, noisy, warp(state.history, motion))
+    gain = exposure(noisy)
+    light = compress(gain * noisy)
+    parts = [light, albedo - 1.0, frame["normal"], depth_feature(frame["depth"]), compress(gain * history)]
+    return Prepared(noisy, colors, history, absent, torch.cat([*parts, absent.to(noisy.dtype)], 1))
 
 
 def finish(filtered: list[Tensor], heads: list[Tensor], prepared: Prepared) -> tuple[Tensor, Tensor]:
@@ -261,7 +274,7 @@ class NTD(nn.Module):
         prepared = prepare(state, frame)
         heads: list[Tensor] = self.run_network(prepared.features)
         half = F.avg_pool2d(prepared.noisy, 2)
-        images = [F.avg_pool2d(half, 2), half, prepared.noisy, prepared.recalled]
+        images = [F.avg_pool2d(half, 2), half, prepared.noisy, prepared.history]
         full = heads[0]
         logits = [heads[2][:, :TAPS], heads[1][:, :TAPS], full[:, :TAPS], full[:, TAPS : 2 * TAPS]]
         images = [self.filtered(image, weights) for image, weights in zip(images, logits, strict=True)]
