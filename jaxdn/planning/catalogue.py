@@ -193,7 +193,13 @@ EFFECTS: tuple[Effect, ...] = (
     ),
     Effect("texture", "Diffuse reflectance varies over a surface: dividing by the albedo pays.", _detect_texture),
     Effect("environment", "Light comes from all around the scene.", _detect_environment),
-    Effect("media", "Light is scattered between surfaces: fog, smoke.", _detect_media, integrator="volpath"),
+    Effect(
+        "media",
+        "Light is scattered between surfaces: fog, smoke.",
+        _detect_media,
+        depth=DIRECT + 1,  # again and again
+        integrator="volpath",
+    ),
     Effect("emission", "A light is seen by the camera.", _detect_emission, frozenset({"emission"})),
 )
 """All effects, in the order in which they are listed."""

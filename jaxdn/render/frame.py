@@ -23,6 +23,7 @@ from jaxdn.render.settings import RenderSettings
 from jaxdn.render.tracing.radiance import RadianceSums, TraceRequest
 from jaxdn.render.tracing.seeds import NOISY, SampleStream
 from jaxdn.render.tracing.tracer import Tracer, choose_tracer
+from jaxdn.render.tracing.volume_path_tracer import scatters
 
 _SURFACE = ("albedo", "normal", "depth", "roughness", "reflectance", "specular_reflectance", "ids")
 
@@ -93,16 +94,17 @@ def _trace_frame(
         asked = {"reflectance", "specular_reflectance"} & set(request.averaged)
         return request.describe_samples(Reflectances(of) if asked else None)
 
-    if get_shutter(scene) == 0.0:
+    blurred = get_shutter(scene) > 0
+    if request.sampled and (blurred or scatters(built)):
+        names = ", ".join(sorted(request.sampled))
+        raise ValueError(f"plan: expected none of {names} with motion blur or fog; plan without them.")
+    if not blurred:
         return trace_samples(tracer, built, frame, settings, request, describe(built))
     if settings.pixel_filter == "centre":
         raise ValueError(
             "scene: motion blur needs filtered pixels, as its first hits are random; expected pixel_filter "
             "'blackman-harris', 'gaussian' or 'box' (--pixel-filter), got 'centre'."
         )
-    if request.sampled:
-        names = ", ".join(sorted(request.sampled))
-        raise ValueError(f"plan: expected none of {names} with motion blur; plan without them.")
     return trace_blurred_samples(tracer, scene, frame, settings, request, describe)
 
 

@@ -11,6 +11,7 @@ from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.settings import RenderSettings
 from jaxdn.render.tracing import jitter as jitters
 from jaxdn.render.tracing.seeds import NOISY, SampleStream
+from jaxdn.render.tracing.volume_path_tracer import scatters
 
 
 class FrameGeometry(NamedTuple):
@@ -58,7 +59,7 @@ def _trace_view(
         reflectance="reflectance" in buffers,
         specular="specular_reflectance" in buffers,
         see_through=settings.see_through,
-        lens=SampleStream(settings.seed, frame, NOISY) if camera.aperture_radius > 0 else None,
+        first=SampleStream(settings.seed, frame, NOISY) if camera.aperture_radius > 0 or scatters(built) else None,
     )
     pose = {name: np.asarray(matrix, np.float64) for name, matrix in scene.pose(frame).items()}
     return View(gbuffer, camera, pose)

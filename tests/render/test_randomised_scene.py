@@ -256,7 +256,7 @@ def test_the_command_refuses_what_it_cannot_do(folder, tmp_path, capsys, words, 
     assert not (tmp_path / "out").exists()
 
 
-def test_a_scene_without_free_space_or_with_fog_is_refused(folder, tmp_path):
+def test_a_scene_without_free_space_or_with_smoke_that_varies_is_refused(folder, tmp_path):
     from jaxdn.render.camera_paths.randomised_scene import randomise_scene
 
     (tmp_path / "wood.png").write_bytes((folder / "wood.png").read_bytes())
@@ -264,8 +264,9 @@ def test_a_scene_without_free_space_or_with_fog_is_refused(folder, tmp_path):
     path.write_text(room(camera=(0, 1000, 2000)))
     with pytest.raises(ValueError, match=r"expected free space around the scene's camera, found none"):
         randomise_scene(path, 0, 2)
-    path.write_text(room(fog='<medium type="homogeneous" name="interior"/>'))
-    with pytest.raises(ValueError, match="participating media that scatter light"):
+    grid = '<medium type="heterogeneous" name="interior"><volume type="constvolume" name="sigma_t"/></medium>'
+    path.write_text(room(fog=grid))
+    with pytest.raises(ValueError, match="media that vary in space are not supported"):
         randomise_scene(path, 0, 3)
     with pytest.raises(ValueError, match="tour frames: expected at least 1"):
         randomise_scene(path, 0, 0)

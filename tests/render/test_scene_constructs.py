@@ -261,13 +261,14 @@ def test_glass_that_absorbs_has_the_light_of_mitsubas_integrator_for_media(varia
     assert np.all(ours(SceneFile(path)) > 1.02 * found)
 
 
-def test_fog_is_refused_by_the_name_of_what_bounds_it(folder):
+def test_fog_without_filtered_pixels_is_refused_by_the_name_of_what_bounds_it(folder):
     from jaxdn.render.buffers.gbuffer import check_scene
 
     fog = GLASS.format(x=0, bsdf="dielectric").replace('name="albedo" value="0"', 'name="albedo" value="0.5"')
     scene = SceneFile(write(folder, LAMP.format(x=0, power=20) + fog))
-    with pytest.raises(ValueError, match=r"scatter light \(fog, smoke\) are not supported yet, but 'glass' has one"):
+    with pytest.raises(ValueError, match=r"fog \('glass' has it\) needs filtered pixels"):
         check_scene(scene.build(0, WIDTH, HEIGHT))
+    check_scene(scene.build(0, WIDTH, HEIGHT), filtered=True)
 
 
 def test_a_medium_around_the_camera_is_kept(folder):

@@ -25,8 +25,10 @@ from jaxdn.render.buffers.reflectance import Reflectances
 from jaxdn.render.scenes.media import absorbs, list_media
 from jaxdn.render.tracing.camera_rays import draw_lens_points, make_camera_rays, sample_lens
 from jaxdn.render.tracing.light_samples import evaluate_diffuse_reflectance
-from jaxdn.render.tracing.seeds import SampleStream
+from jaxdn.render.tracing.lobes import make_generator
+from jaxdn.render.tracing.seeds import SampleStream, tea
 from jaxdn.render.tracing.surfaces import evaluate_roughness, read_surface
+from jaxdn.render.tracing.volume_path_tracer import find_first_vertex, find_one_first_vertex, scatters
 
 
 class GBuffer(NamedTuple):
@@ -69,20 +71,24 @@ def list_shape_names(scene: Any) -> list[str]:
 def check_scene(scene: Any, *, filtered: bool = False) -> None:
     """Raise ValueError for effects that the tracers would otherwise silently ignore.
 
-    A lens needs ``filtered`` pixels: guides through the pixels' centres would show what is sharp.
+    A lens and fog need ``filtered`` pixels: their first hits are random, and guides through the pixels' centres would
+    know nothing of that.
     """
     sensor = scene.sensors()[0]
-    scattering = [name for name, medium in list_media(scene).items() if not absorbs(medium)]
-    if scattering:
+    scattering = {name: medium for name, medium in list_media(scene).items() if not absorbs(medium)}
+    varying = [name for name, medium in scattering.items() if not medium.is_homogeneous()]
+    if varying:
         raise ValueError(
-            f"scene: participating media that scatter light (fog, smoke) are not supported yet, but {scattering[0]!r} "
-            "has one; remove it, or set its albedo to 0."
+            f"scene: media that vary in space are not supported, but {varying[0]!r} has one; make it homogeneous, or "
+            "remove it."
         )
-    if sensor.needs_aperture_sample() and not filtered:
-        raise ValueError(
-            "scene: depth of field needs filtered pixels, as its first hits are random; expected pixel_filter "
-            "'blackman-harris', 'gaussian' or 'box' (--pixel-filter), got 'centre'."
-        )
+    fog = f"fog ({next(iter(scattering), '')!r} has it)"
+    for what, there in (("depth of field", sensor.needs_aperture_sample()), (fog, bool(scattering))):
+        if there and not filtered:
+            raise ValueError(
+                f"scene: {what} needs filtered pixels, as its first hits are random; expected pixel_filter "
+                "'blackman-harris', 'gaussian' or 'box' (--pixel-filter), got 'centre'."
+            )
     if sensor.shutter_open_time() > 0:
         raise ValueError(
             "scene: expected a sensor without a shutter, as Mitsuba moves nothing while it is open; set 'shutter' in "
@@ -96,12 +102,12 @@ def trace_gbuffer(
     reflectance: bool = False,
     specular: bool = False,
     see_through: bool = False,
-    lens: SampleStream | None = None,
+    first: SampleStream | None = None,
 ) -> GBuffer:
     """Trace one ray through the centre of every pixel of the scene's first sensor, with the current variant.
 
-    The rays go through the middle of its lens, or, with ``lens``, through the points of it that the first sample of
-    that stream takes.
+    The rays go through the middle of its lens and see through fog; with ``first`` they do as the first sample of that
+    stream: they go through a random point of the lens, and where fog scatters them they meet nothing.
 
     With ``reflectance`` (:mod:`jaxdn.render.buffers.reflectance`) a material that cannot be averaged gives one warning
     with the name of its shape, and its albedo is used; with ``specular`` there is its specular part as well. With
@@ -112,7 +118,7 @@ def trace_gbuffer(
     trace = _trace_one_by_one if str(mi.variant()).startswith("scalar") else _trace_all
     width, height = (int(size) for size in scene.sensors()[0].film().crop_size())
     reflectances = Reflectances(scene) if reflectance or specular else None
-    key = None if lens is None else lens.key()
+    key = None if first is None else first.key()
     traced, replaced = trace(scene, reflectances, specular, see_through, key)
     if replaced is not None:
         traced = map_to_images(traced, replaced)
@@ -185,21 +191,24 @@ def _warn_of_albedo(shape: str) -> None:
 
 
 def _trace_all(
-    scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool, lens: tuple[int, int] | None
+    scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool, first: tuple[int, int] | None
 ) -> tuple[dict[str, np.ndarray], ReplacedRays | None]:
     """All pixels at once; flat buffers of the hits of all rays, and how these were replaced."""
     sensor = scene.sensors()[0]
     width, height = (int(size) for size in sensor.film().crop_size())
     pixel = dr.arange(mi.UInt32, width * height)
     across = dr.opaque(mi.UInt32, width)
-    point = None if lens is None else sample_lens(pixel, mi.UInt32(0), lens)
+    point = None if first is None else sample_lens(pixel, mi.UInt32(0), first)
     ray = make_camera_rays(sensor, pixel % across, pixel // across, point)
     direction = ray.d
     replaced = replace_primary_surfaces(scene, ray, number_shapes) if see_through else None
     if replaced is not None:
         ray = replaced.ray
+    scattered: Any = mi.Bool(False)
+    if first is not None and scatters(scene):
+        ray, scattered, _ = find_first_vertex(scene, ray, make_generator(pixel, mi.UInt32(0), first))
     hit = scene.ray_intersect(ray)
-    valid = hit.is_valid()
+    valid = hit.is_valid() & ~scattered
     bsdf = hit.bsdf(ray)
 
     albedo = evaluate_diffuse_reflectance(bsdf, hit, valid)
@@ -209,7 +218,7 @@ def _trace_all(
         "position": hit.p,
         "direction": direction,
         "roughness": evaluate_roughness(bsdf, hit, valid),
-        "shape": number_shapes(hit),
+        "shape": dr.select(scattered, 0, number_shapes(hit)),
     }
     if reflectances is not None:
         whole, part = reflectances.average_pixels(hit, bsdf, valid, albedo)
@@ -247,7 +256,7 @@ def _rank_shapes(scene: Any) -> list[int]:
 
 
 def _trace_one_by_one(
-    scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool, lens: tuple[int, int] | None
+    scene: Any, reflectances: Reflectances | None, specular: bool, see_through: bool, first: tuple[int, int] | None
 ) -> tuple[dict[str, np.ndarray], None]:
     """The same buffers, a pixel at a time, for the variant without vectorisation, which follows no rays."""
     if see_through:
@@ -261,14 +270,18 @@ def _trace_one_by_one(
         arrays |= {name: np.zeros((width * height, 3)) for name in ("reflectance", "specular_reflectance")}
     arrays["ids"] = np.full(width * height, -1)
     points = np.full((width * height, 2), 0.5)
-    if lens is not None:
-        points = draw_lens_points(np.arange(width * height), np.zeros(width * height, int), lens)
+    if first is not None:
+        points = draw_lens_points(np.arange(width * height), np.zeros(width * height, int), first)
+    foggy = first is not None and scatters(scene)
     for pixel, point in enumerate(points.tolist()):
         row, column = divmod(pixel, width)
         ray, _ = sensor.sample_ray(0.0, 0.5, [(column + 0.5) / width, (row + 0.5) / height], point)
         arrays["direction"][pixel] = ray.d
-        hit = scene.ray_intersect(ray)
-        if not hit.is_valid():
+        if foggy and first is not None:
+            _, hit, fog = find_one_first_vertex(scene, mi.Ray3f(ray), tea(pixel ^ first[0], first[1])[0])
+        else:
+            hit, fog = scene.ray_intersect(ray), None
+        if not hit.is_valid() or fog is not None:
             continue
         owner = hit.instance if hit.instance is not None else hit.shape
         arrays["ids"][pixel] = by_shape.get(_get_id(owner), -1)

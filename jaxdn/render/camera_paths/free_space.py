@@ -110,7 +110,7 @@ class FreeSpace:
     def __init__(self, file: SceneFile) -> None:
         self.file = file
         self.scene = file.build(0, _GRID, _GRID)
-        check_scene(self.scene)
+        check_scene(self.scene, filtered=True)
         start = np.asarray(file.camera(0).to_world)
         self.near = file.near
         self.up = _find_nearest_axis(start[:3, 1])

@@ -21,6 +21,7 @@ from jaxdn.render.scenes.animation import CameraKeys, make_rotation
 from jaxdn.render.scenes.material_overrides import can_override, name_materials
 from jaxdn.render.scenes.scene import Camera
 from jaxdn.render.scenes.scene_file import SceneFile
+from jaxdn.render.tracing.volume_path_tracer import scatters
 
 _ATTEMPTS = 32
 _VIEWS = 48
@@ -200,10 +201,14 @@ def _render_luminance(space: FreeSpace, camera: Camera) -> np.ndarray:
         "sampler": {"type": "independent"},
         "film": {"type": "hdrfilm", "width": _SIDE, "height": _SIDE, "rfilter": {"type": "box"}},
     }
-    integrator = mi.load_dict({"type": "path", "max_depth": min(space.file.max_depth, 8)})
+    integrator = _make_integrator(space.scene, min(space.file.max_depth, 8))
     return _compute_luminance(
         mi.render(space.scene, sensor=mi.load_dict(sensor), integrator=integrator, spp=_SAMPLES, seed=mi.UInt32(0))
     )
+
+
+def _make_integrator(scene: Any, max_depth: int) -> Any:
+    return mi.load_dict({"type": "volpath" if scatters(scene) else "path", "max_depth": max_depth})
 
 
 def _render_lights(space: FreeSpace, camera: Camera) -> dict[str, np.ndarray]:
@@ -295,9 +300,10 @@ def _draw_materials(space: FreeSpace, rng: np.random.Generator) -> dict[str, dic
 
 def _measure_scene_level(scene: SceneFile, frame: int) -> float:
     """The level of light of one frame."""
-    return _measure_level(
-        _compute_luminance(mi.render(scene.build(frame, _SIDE, _SIDE), spp=_SAMPLES, seed=mi.UInt32(frame)))
-    )
+    built = scene.build(frame, _SIDE, _SIDE)
+    integrator = _make_integrator(built, scene.max_depth)
+    image = mi.render(built, integrator=integrator, spp=_SAMPLES, seed=mi.UInt32(frame))
+    return _measure_level(_compute_luminance(image))
 
 
 def _compute_luminance(image: Any) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""Media that only absorb light, such as coloured glass: Beer's law along every segment of a path.
+"""Media, and those that only absorb light, such as coloured glass: Beer's law along every segment of a path.
 
 Between two surfaces the transmittance of a homogeneous medium is ``exp(-sigma_t d)``, with its extinction ``sigma_t``
-for red, green and blue and the distance ``d``. Media that scatter light (fog, smoke) are not supported.
+for red, green and blue and the distance ``d``. Media that scatter light (fog, smoke) have a tracer of their own
+(:mod:`jaxdn.render.tracing.volume_path_tracer`).
 """
 
 from typing import Any

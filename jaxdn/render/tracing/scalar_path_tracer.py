@@ -116,7 +116,7 @@ def accumulate_samples(
         else:
             bad += 1
         if surfaces is not None and request.surfaces is not None:
-            _add_guides(surfaces, place, read_guides(scene.ray_intersect(ray), ray, request.surfaces))
+            _add_guides(surfaces, place, read_guides(scene, ray, request.surfaces, int(numbers[at])))
     images = sums.reshape(3, *size, 3)
     surfaces = None if surfaces is None else surfaces.change(lambda part: part.reshape(*size, -1))
     return RadianceSums(images[0], images[1], images[2], bad, surfaces=surfaces)
@@ -124,10 +124,10 @@ def accumulate_samples(
 
 def _trace_one(scene: Any, ray: Any, integrators: list[Any], sampler: Any, number: int) -> np.ndarray:
     """[integrators, 3] the light of one ray, with the same random numbers."""
-    found = []
+    found, medium = [], scene.sensors()[0].get_medium()
     for integrator in integrators:
         sampler.seed(number, 1)
-        found.append(np.array(integrator.sample(scene, sampler, ray)[0], np.float64))
+        found.append(np.array(integrator.sample(scene, sampler, ray, medium)[0], np.float64))
     return np.stack(found)
 
 

@@ -12,6 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from jaxdn.render.tracing.light_samples import evaluate_diffuse_reflectance
+from jaxdn.render.tracing.volume_path_tracer import find_first_vertex, find_one_first_vertex, scatters
 
 
 class AveragesReflectance(Protocol):
@@ -73,13 +74,19 @@ def evaluate_roughness(bsdf: Any, hit: Any, active: Any) -> Any:
     return dr.select(there, bsdf.eval_attribute_1("roughness", hit, there), roughness)
 
 
-def evaluate_surfaces(scene: Any, ray: Any, request: SurfaceRequest) -> list[Any]:
+def evaluate_surfaces(scene: Any, ray: Any, request: SurfaceRequest, numbers: Callable[[], Any]) -> list[Any]:
     """The parts of :class:`SurfaceSums` for every ray, three channels each but for the roughness, not evaluated yet.
 
-    Where a ray meets nothing the albedo is white, the normal 0 and the roughness 1, as in a G-buffer.
+    Where a ray meets nothing the albedo is white, the normal 0 and the roughness 1, as in a G-buffer. Where a medium
+    scatters it first, the albedo is the medium's and the normal points to the camera, as in Cycles. ``numbers`` makes
+    the generator that the paths begin with.
     """
+    foggy, fog = scatters(scene), mi.Spectrum(0.0)
+    scattered: Any = mi.Bool(False)
+    if foggy:
+        ray, scattered, fog = find_first_vertex(scene, ray, numbers())
     hit = scene.ray_intersect(ray, ray_flags=mi.RayFlags.All, coherent=True)
-    valid = hit.is_valid()
+    valid = hit.is_valid() & ~scattered
     bsdf = hit.bsdf(ray)
     albedo = evaluate_diffuse_reflectance(bsdf, hit, valid)
     normal = dr.select(dr.dot(hit.sh_frame.n, ray.d) > 0, -hit.sh_frame.n, hit.sh_frame.n)
@@ -94,6 +101,10 @@ def evaluate_surfaces(scene: Any, ray: Any, request: SurfaceRequest) -> list[Any
         reflected = dr.select(known, dr.clip(whole, 0.0, 1.0), parts[0])
         shine = dr.select(known & dr.all(dr.isfinite(specular)), dr.maximum(specular, 0.0), mi.Color3f(0.0))
         parts += [reflected, dr.minimum(shine, reflected)]
+    if foggy:
+        own = [mi.Color3f(_bound(fog, 0.0)), mi.Normal3f(-ray.d), mi.Float(1.0), mi.Color3f(_bound(fog, 0.0))]
+        own.append(mi.Color3f(0.0))
+        parts = [dr.select(scattered, mine, part) for mine, part in zip(own, parts, strict=False)]
     return parts
 
 
@@ -121,8 +132,16 @@ def read_surface(hit: Any) -> tuple[np.ndarray, float]:
     return albedo, 1.0 if flags & int(mi.BSDFFlags.Smooth) else 0.0
 
 
-def read_guides(hit: Any, ray: Any, request: SurfaceRequest) -> SurfaceSums:
-    """The guides of one sample by its first hit, as :func:`evaluate_surfaces` does."""
+def read_guides(scene: Any, ray: Any, request: SurfaceRequest, seed: int) -> SurfaceSums:
+    """The guides of one sample, as :func:`evaluate_surfaces` does; ``seed`` decides where media scatter it."""
+    fog = None
+    if scatters(scene):
+        ray, hit, fog = find_one_first_vertex(scene, ray, seed)
+    else:
+        hit = scene.ray_intersect(ray)
+    if fog is not None:
+        whole = (None, None) if request.reflectances is None else (np.clip(fog, 0.0, 1.0), np.zeros(3))
+        return SurfaceSums(np.clip(fog, 0.0, 1.0), -np.array(ray.d, np.float64), np.ones(1), *whole)
     if not hit.is_valid():
         missed = (None, None) if request.reflectances is None else (np.ones(3), np.zeros(3))
         return SurfaceSums(np.ones(3), np.zeros(3), np.ones(1), *missed)
@@ -133,8 +152,8 @@ def read_guides(hit: Any, ray: Any, request: SurfaceRequest) -> SurfaceSums:
     rough = np.clip(np.nan_to_num([roughness], nan=1.0), 0.0, 1.0)
     if request.reflectances is None:
         return SurfaceSums(bounded, normal, rough)
-    whole, specular = request.reflectances.average_one(hit, hit.bsdf(), albedo)
-    known = bool(np.all(np.isfinite(whole)))
-    reflected = np.clip(whole, 0.0, 1.0) if known else bounded
+    share, specular = request.reflectances.average_one(hit, hit.bsdf(), albedo)
+    known = bool(np.all(np.isfinite(share)))
+    reflected = np.clip(share, 0.0, 1.0) if known else bounded
     shine = np.maximum(specular, 0.0) if known and np.all(np.isfinite(specular)) else np.zeros(3)
     return SurfaceSums(bounded, normal, rough, reflected, np.minimum(shine, reflected))

@@ -8,6 +8,7 @@ seed). Which lobe a path took at its first hit is found by a second, short trace
 """
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -29,7 +30,8 @@ from jaxdn.render.tracing.radiance import (
     make_zero_radiance,
 )
 from jaxdn.render.tracing.seeds import SampleStream
-from jaxdn.render.tracing.surfaces import SurfaceRequest, SurfaceSums, evaluate_surfaces
+from jaxdn.render.tracing.surfaces import SurfaceSums, evaluate_surfaces
+from jaxdn.render.tracing.volume_path_tracer import scatters, trace_in_media
 
 _TOLD = ("lobes", "shadows", "surfaces")
 """What else than light :class:`jaxdn.render.tracing.radiance.RadianceSums` may hold."""
@@ -125,8 +127,15 @@ def _accumulate_chunk(
     pixel, sample = _number_lanes(first_pixel, pixels, first, count)
     ray, parts, finite, bad = _trace_lanes(scene, pixel, sample, key, depth, request.pixel_filter)
     images = _sum_blocks(parts, count)
-    found = _split_light(scene, ray, lambda: make_generator(pixel, sample, key), parts, finite, count, request)
-    surfaces = None if request.surfaces is None else _sum_surfaces(scene, ray, count, request.surfaces)
+
+    numbers = partial(make_generator, pixel, sample, key)
+    found = _split_light(scene, ray, numbers, parts, finite, count, request)
+    surfaces = None
+    if request.surfaces is not None:
+        guides = evaluate_surfaces(scene, ray, request.surfaces, numbers)
+        parts = [[part] if dr.depth_v(part) == 1 else list(part) for part in guides]
+        dr.eval(parts)
+        surfaces = SurfaceSums(*_sum_blocks(parts, count))
     return RadianceSums(images[0], images[1], images[2], int(dr.sum(bad)[0]), *found, surfaces)
 
 
@@ -137,13 +146,6 @@ def _number_lanes(first_pixel: int, pixels: int, first: int, count: int) -> tupl
     offset = lane // block
     sample = lane - offset * block + dr.opaque(mi.UInt32, first)
     return offset + dr.opaque(mi.UInt32, first_pixel), sample
-
-
-def _sum_surfaces(scene: Any, ray: Any, count: int, request: SurfaceRequest) -> SurfaceSums:
-    """Sum the guides of rays over every ``count`` lanes."""
-    parts = [[part] if dr.depth_v(part) == 1 else list(part) for part in evaluate_surfaces(scene, ray, request)]
-    dr.eval(parts)
-    return SurfaceSums(*_sum_blocks(parts, count))
 
 
 def _sum_blocks(parts: list[Any], count: int) -> list[np.ndarray]:
@@ -161,7 +163,8 @@ def _trace_lanes(
     Light that is not finite is 0, and the last result is 1 for it. Everything is evaluated.
     """
     ray = sample_camera_rays(scene, pixel, sample, key, pixel_filter)
-    traced: Any = trace(scene, ray, make_generator(pixel, sample, key), dr.opaque(mi.UInt32, depth))
+    follow: Any = trace_in_media if scatters(scene) else trace
+    traced: Any = follow(scene, ray, make_generator(pixel, sample, key), dr.opaque(mi.UInt32, depth))
     # As light is not negative, NaN, infinities and values that could overflow a sum all fail this comparison.
     finite = dr.all(traced[0] + traced[1] + traced[2] < BRIGHTEST)
     parts = [dr.select(finite, part, 0.0) for part in traced]
@@ -304,7 +307,8 @@ def accumulate_samples(
         images = [_sum_by_pixel(each, pixel[part], len(total.direct)) for each in light]
         surfaces = None
         if request.surfaces is not None:
-            guides = evaluate_surfaces(scene, ray, request.surfaces)
+            numbers = partial(make_generator, of_lane, number, stream.key())
+            guides = evaluate_surfaces(scene, ray, request.surfaces, numbers)
             dr.eval(guides)
             surfaces = SurfaceSums(*(_sum_by_pixel(each, pixel[part], len(total.direct)) for each in guides))
         found = RadianceSums(images[0], images[1], images[2], int(dr.sum(wrong)[0]), surfaces=surfaces)
