@@ -87,7 +87,7 @@ def measure(clip: Path, spp: int, method: str, out: Path) -> None:
     found = score([images[number] for number in pairs], halves, [motion[number] for number in pairs])
     row = {"clip": clip.name, "kind": (read_record(clip / RECORD) or {})["kind"], "spp": spp, "method": method}
     target.parent.mkdir(parents=True, exist_ok=True)
-    write_json(target.with_suffix(".json"), {**row, "frames": pairs, **found.figures(), "squares": found._asdict()})
+    write_json(target.with_suffix(".json"), {**row, "frames": pairs, **found.figures()})
     print(f"{clip.name} {spp} spp {method}: {found.figures()}", flush=True)
 
 
@@ -136,7 +136,9 @@ def print_table(rows: Sequence[dict[str, Any]], spp: int) -> None:
     width = max(map(len, methods)) + 2
     print(f"\n{spp} samples".ljust(12) + "".join(method.rjust(width) for method in methods))
     for kind in kinds:
-        values = [[row["psnr"] for row in rows if row["kind"] == kind and row["method"] == method] for method in methods]
+        values = [
+            [row["psnr"] for row in rows if row["kind"] == kind and row["method"] == method] for method in methods
+        ]
         print(kind.ljust(11) + "".join((f"{np.mean(of):.2f}" if of else "").rjust(width) for of in values))
     for figure in ("psnr", *Scored._fields[1:]):
         means = []

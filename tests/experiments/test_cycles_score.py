@@ -1,0 +1,148 @@
+"""Scores of images against references of two halves: what is measured is free of the references' own noise."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.cycles import compare
+from experiments.cycles import reference as references
+from experiments.cycles.reference import Reference, compress
+from experiments.cycles.score import Scored, find_changed, find_edges, score
+from jaxdn.clips import write_exr
+
+SIZE = (96, 128)
+
+
+def _truth(rng: np.random.Generator) -> np.ndarray:
+    """Light with edges, [H, W, 3]."""
+    light = np.full((*SIZE, 3), 0.3)
+    light[:, 40:] = 1.2
+    light[50:70, 20:90] = [0.1, 0.6, 2.0]
+    return light * rng.uniform(0.9, 1.1)
+
+
+def _reference(truth: np.ndarray, deviation: float, rng: np.random.Generator) -> Reference:
+    """Two halves whose noise is a share of the light, with guides that have an edge at column 40."""
+    halves = [truth * rng.gamma(1 / deviation**2, deviation**2, truth.shape) for _ in range(2)]
+    guides = np.zeros((*SIZE, 7))
+    guides[..., :3], guides[..., 5], guides[..., 6] = 0.5, 1.0, 4.0
+    guides[:, 40:, :3] = 0.2
+    return Reference(halves[0], halves[1], guides, 1, 1)
+
+
+def test_scores_do_not_depend_on_the_noise_of_the_reference() -> None:
+    rng = np.random.default_rng(0)
+    truths = [_truth(rng) for _ in range(8)]
+    images = [truth * rng.gamma(1e4, 1e-4, truth.shape) for truth in truths]
+    wanted = np.mean(
+        [np.mean((compress(image) - compress(truth)) ** 2) for image, truth in zip(images, truths, strict=True)]
+    )
+    noisy = [_reference(truth, 0.05, rng) for truth in truths]
+    own = np.mean(
+        [np.mean((compress(held.image) - compress(truth)) ** 2) for held, truth in zip(noisy, truths, strict=True)]
+    )
+    assert own > 5 * wanted  # a plain error would be that of the reference
+    found = score(images, noisy, [None] * 8)
+    assert found.error == pytest.approx(wanted, rel=0.15)
+    errors = [compress(image) - compress(truth) for image, truth in zip(images, truths, strict=True)]
+    changes = np.mean([np.mean((errors[i + 1] - errors[i]) ** 2) for i in range(0, 8, 2)])
+    assert found.temporal == pytest.approx(changes, rel=0.2)
+
+
+def test_edges_and_inside_are_scored_apart() -> None:
+    rng = np.random.default_rng(1)
+    truth = _truth(rng)
+    held = Reference(truth, truth, _reference(truth, 0.05, rng).guides, 1, 1)
+    edges = find_edges(held.guides)
+    assert edges[:, 39:41].all()
+    assert edges.sum() == 2 * SIZE[0]
+    image = truth.copy()
+    image[:, 39:41] *= 1.5
+    found = score([image, image], [held, held], [None, None])
+    assert found.inside == 0
+    assert found.edges == pytest.approx(np.mean((compress(image) - compress(truth))[:, 39:41] ** 2))
+    assert found.temporal == 0
+
+
+def test_the_trail_of_a_shadow_is_where_the_light_of_a_surface_changes() -> None:
+    rng = np.random.default_rng(2)
+    guides = _reference(_truth(rng), 0.05, rng).guides
+    guides[..., :3] = np.linspace(0.1, 0.9, SIZE[1])[:, None]  # a texture, so that vectors matter
+    shifted = np.roll(guides, 3, axis=1)
+    light = np.full((*SIZE, 3), 1.0)
+    shaded = light.copy()
+    shaded[20:40, 60:80] = 0.2
+    before, now = Reference(light, light, guides, 1, 1), Reference(shaded, shaded, shifted, 1, 1)
+    motion = np.zeros((*SIZE, 2), np.float32)
+    motion[..., 0] = -3.0  # previous minus current
+    changed = find_changed(before, now, motion)
+    assert changed[20:40, 60:80].all()
+    assert changed.sum() == 400
+    assert not find_changed(before, now, np.full((*SIZE, 2), np.nan, np.float32)).any()
+    late = score([light, light], [before, now], [motion, motion])
+    assert late.trail == pytest.approx(float((compress(np.array(1.0)) - compress(np.array(0.2))) ** 2), rel=1e-6)
+    assert np.isnan(score([light, shaded], [before, before], [motion, motion * 0]).trail)
+
+
+def test_figures_are_decibels_and_say_what_could_not_be_measured() -> None:
+    found = Scored(1e-3, np.nan, 1e-4, 1e-2, np.nan, 0.123456).figures()
+    assert found == {"psnr": 30.0, "edges": None, "inside": 40.0, "temporal": 20.0, "trail": None, "flip": 0.12346}
+
+
+def test_images_must_come_in_pairs() -> None:
+    held = _reference(_truth(np.random.default_rng(3)), 0.1, np.random.default_rng(3))
+    with pytest.raises(ValueError, match="pairs of frames"):
+        score([held.image], [held], [None])
+
+
+def test_pairs_are_neighbours_and_a_frame_is_in_one_of_them() -> None:
+    assert compare._paired([5, 6, 14, 15, 23, 24]) == [5, 6, 14, 15, 23, 24]
+    assert compare._paired([1, 3, 4, 5, 6, 9]) == [3, 4, 5, 6]
+    assert compare._paired([1, 2, 3]) == [1, 2]
+
+
+def test_a_folder_without_clips_says_how_to_make_some(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="make cycles"):
+        compare.find_done(tmp_path, [])
+
+
+def _write_clip(folder: Path, rng: np.random.Generator) -> None:
+    """A clip of four frames of 4 samples, as Cycles names its passes, with references of two of them."""
+    truth = np.tile(_truth(rng)[:32, 24:72], (1, 1, 1)).astype(np.float32)
+    guides = np.zeros((*truth.shape[:2], 7), np.float32)
+    guides[..., :3], guides[..., 5], guides[..., 6] = 0.5, 1.0, 4.0
+    (folder / "4spp-0").mkdir(parents=True)
+    (folder / "reference").mkdir()
+    for number in range(1, 5):
+        light = (truth * rng.gamma(4.0, 0.25, truth.shape)).astype(np.float32)
+        channels = {f"ViewLayer.Combined.{c}": light[..., i] for i, c in enumerate("RGB")}
+        channels |= {f"ViewLayer.Denoising Albedo.{c}": guides[..., i] for i, c in enumerate("RGB")}
+        channels |= {f"ViewLayer.Denoising Normal.{c}": guides[..., 3 + i] for i, c in enumerate("XYZ")}
+        channels |= {"ViewLayer.Depth.Z": guides[..., 6]}
+        channels |= {f"ViewLayer.Vector.{c}": np.zeros_like(guides[..., 0]) for c in "XYZW"}
+        write_exr(folder / "4spp-0" / f"{number:04d}.exr", channels)
+        if number in (2, 3):
+            halves = Reference(truth.astype(float), truth.astype(float), guides.astype(float), 64, 1)
+            references.write(folder / "reference" / f"{number:04d}.exr", halves)
+    (folder / "cycles.json").write_text('{"kind": "sun", "level": 0}')
+
+
+def test_methods_are_compared_on_files_and_a_second_run_measures_nothing_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _write_clip(tmp_path / "test" / "sun-9000", np.random.default_rng(4))
+    options = compare.Options(tmp_path / "test", tmp_path / "out", ["noisy", "svgf+no-safe"], [4])
+    assert compare.main(options) == 0
+    first = capsys.readouterr().out
+    rows = {row["method"]: row for row in compare.read_rows(tmp_path / "out", ["sun-9000"])}
+    assert rows.keys() == {"noisy", "svgf+no-safe"}
+    assert rows["svgf+no-safe"]["psnr"] > rows["noisy"]["psnr"] + 3
+    assert rows["noisy"]["frames"] == [2, 3]
+    assert first.count("sun-9000 4 spp") == 2
+    assert len(list((tmp_path / "out/sun-9000/4spp/svgf+no-safe").glob("*.exr"))) == 4
+    assert compare.main(options) == 0
+    again = capsys.readouterr().out
+    assert "sun-9000 4 spp" not in again
+    assert "4 samples" in again
+    assert "sun" in again
