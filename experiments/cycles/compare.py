@@ -82,7 +82,7 @@ def measure(clip: Path, spp: int, method: str, out: Path) -> None:
     images = _denoised(files, target, method)
     _, frames = open_frames(noisy)
     motion = {number: stored.frame.motion for number, stored in enumerate(frames, 1)}
-    pairs = [number for number in _paired(scored)]
+    pairs = _paired(scored)
     halves = [references.read(clip / "reference" / f"{number:04d}.exr") for number in pairs]
     found = score([images[number] for number in pairs], halves, [motion[number] for number in pairs])
     row = {"clip": clip.name, "kind": (read_record(clip / RECORD) or {})["kind"], "spp": spp, "method": method}

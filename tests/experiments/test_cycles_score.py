@@ -31,6 +31,11 @@ def _reference(truth: np.ndarray, deviation: float, rng: np.random.Generator) ->
     return Reference(halves[0], halves[1], guides, 1, 1)
 
 
+def _mean_square(images: list[np.ndarray], truths: list[np.ndarray]) -> float:
+    """Of x / (1 + x)."""
+    return float(np.mean([(compress(one) - compress(truth)) ** 2 for one, truth in zip(images, truths, strict=True)]))
+
+
 def test_scores_do_not_depend_on_the_noise_of_the_reference() -> None:
     rng = np.random.default_rng(0)
     truths = [_truth(rng) for _ in range(8)]
