@@ -18,6 +18,7 @@ from jaxdn.methods.registry import methods
 from jaxdn.zoo.ready import filter_names, find_model
 from jaxdn.zoo.weights import shipped_names
 
+pytestmark = pytest.mark.usefixtures("optimised_programs")  # they run for thousands of frames
 SIZE = 32
 LONG, SHORT = 2000, 250
 """Frames; the long run is made of short ones, so that one program is compiled."""
@@ -61,7 +62,7 @@ def wall():
     )
 
 
-@functools.cache
+@functools.lru_cache(maxsize=1)
 def compiled(name):
     """``SHORT`` frames of a wall from any frame on, while the camera slides back and forth; and the first state."""
     _, denoiser, params, *_ = find_model(name)
@@ -84,6 +85,12 @@ def compiled(name):
     return jax.jit(part), denoiser.start(params, base)
 
 
+@functools.lru_cache(maxsize=1)
+def clean(name):
+    """The run of ``SHORT`` frames without a poisoned one."""
+    return run(name, SHORT)
+
+
 def run(name, frames, *, speed=0.7, poison=0.0, at=-1, dark=10**6):
     """Mean and largest value of every output frame, whether all was finite, and every fourth pixel."""
     settings = (jnp.float32(speed), jnp.float32(poison), jnp.int32(at), jnp.int32(dark))
@@ -95,39 +102,43 @@ def run(name, frames, *, speed=0.7, poison=0.0, at=-1, dark=10**6):
     return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
 
 
+# With the scope of the module, pytest runs all tests of a method one after the other: it is compiled once.
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", METHODS)
-@pytest.mark.parametrize("speed", [0.0, 0.7])
-def test_two_thousand_frames_neither_diverge_nor_drift(name, speed):
-    mean, top, healthy, _ = run(name, LONG, speed=speed)
+@pytest.mark.parametrize(("speed", "frames"), [(0.0, LONG // 2), (0.7, LONG)])
+@pytest.mark.parametrize("name", METHODS, scope="module")
+def test_thousands_of_frames_neither_diverge_nor_drift(name, speed, frames):
+    mean, top, healthy, _ = run(name, frames, speed=speed)
     assert healthy.all()
     assert top.max() <= RADIANCE_MAX
     early, late = mean[100:300].mean(), mean[-200:].mean()
     print(
-        f"{name}, {speed} px: mean {early:.4f} after 100 frames, {late:.4f} after {LONG}, largest {top[100:].max():.3f}"
+        f"{name}, {speed} px: mean {early:.4f} after 100 frames, {late:.4f} after {frames}, "
+        f"largest {top[100:].max():.3f}"
     )
     assert late == pytest.approx(early, rel=0.02)
     assert top[100:].max() < 10
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("poison", [np.nan, np.inf, 1e30, -5.0])
+@pytest.mark.parametrize("name", METHODS, scope="module")
 def test_one_poisoned_frame_is_forgotten(name, poison):
     at = 60
-    clean = run(name, SHORT)
+    expected = clean(name)
     poisoned = run(name, SHORT, poison=poison, at=at)
     assert poisoned[2].all(), "state and image are always finite"
-    difference = np.abs(poisoned[3] - clean[3]).max(axis=(1, 2, 3)) / np.abs(clean[3]).mean(axis=(1, 2, 3))
+    difference = np.abs(poisoned[3] - expected[3]).max(axis=(1, 2, 3)) / np.abs(expected[3]).mean(axis=(1, 2, 3))
     bad = np.flatnonzero(difference > 0.01)
     recovered = int(bad.max()) + 1 - at if bad.size else 0
     print(f"{name}: {poison:g} forgotten to 1 % after {recovered} frames")
-    assert np.array_equal(poisoned[3][:at], clean[3][:at])
+    assert np.array_equal(poisoned[3][:at], expected[3][:at])
     assert recovered <= FORGETS.get(name, 120)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", FADES)
+@pytest.mark.parametrize("name", FADES, scope="module")
 def test_a_light_switched_off_fades(name):
     mean, _, healthy, _ = run(name, SHORT, dark=100)
     assert healthy.all()
