@@ -9,7 +9,7 @@ train weights: export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 # XLA raises its errors; what it logs besides is an alarm at every compilation of more than two minutes.
 export TF_CPP_MIN_LOG_LEVEL ?= 3
 
-.PHONY: help setup train test test-slow bench chart compare papers hard-cases results cycles lint format docs weights clean
+.PHONY: help setup train test test-slow test-all bench chart compare papers hard-cases results cycles lint format docs weights clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -39,6 +39,9 @@ test: setup  ## the tests (minutes)
 
 test-slow: setup  ## the slow tests: real training runs, the notebook, real processes
 	$(BIN)/python -m pytest -n 2 --dist worksteal -q -m slow $(SETTINGS)
+
+test-all: setup  ## both, in one run: tests that share a module share what it compiles
+	$(BIN)/python -m pytest -n 2 --dist worksteal -q $(SETTINGS)
 
 hard-cases: setup  ## run every operation and denoiser on every hard case: runs/hard-cases/table.html
 	$(BIN)/python -m tests.hard_cases $(SETTINGS)

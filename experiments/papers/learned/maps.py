@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from scipy.stats import rankdata
 
 from experiments.papers.learned.stages import BUDGET
 from experiments.papers.preintegration import file_name
@@ -41,10 +40,15 @@ def counts_of(one: Model, clip: Clip) -> jax.Array:
 
 def correlation(first: np.ndarray, second: np.ndarray) -> float:
     """Of the ranks of two images (Spearman); equal values have the mean of their ranks. NaN where one is constant."""
-    ranks = [rankdata(each.ravel()) for each in (first, second)]
-    first, second = (each - each.mean() for each in ranks)
+    first, second = (each - each.mean() for each in (_ranks(first), _ranks(second)))
     with np.errstate(invalid="ignore"):
         return float((first * second).sum() / np.sqrt((first**2).sum() * (second**2).sum()))
+
+
+def _ranks(values: np.ndarray) -> np.ndarray:
+    """1 for the smallest value of all; equal values have the mean of their ranks."""
+    _, place, count = np.unique(values.ravel(), return_inverse=True, return_counts=True)
+    return (np.cumsum(count) - (count - 1) / 2)[place]
 
 
 def save_maps(asking: list[Model], folders: list[Path], out: Path) -> str:
