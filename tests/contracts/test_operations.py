@@ -18,8 +18,9 @@ from tests.needs import NEEDS
 
 methods()  # imports all of them, and what they are made of
 
-SIZES = [(5, 7), *(pytest.param(size, marks=pytest.mark.slow) for size in [(1, 1), (18, 33)])]
-"""Odd, without an inside, and of several cells."""
+SIZE = (5, 7)
+OTHER_SIZES = [(1, 1), (18, 33)]
+"""Without an inside, and of several cells: not for references, which are compared with themselves in float64."""
 EXTRAS = {"onednn-float32": "onednn", "onednn-bfloat16": "bfloat16"}
 """Implementation -> what it needs (:mod:`tests.needs`), where that has another name."""
 PAIRS = [
@@ -104,10 +105,21 @@ def assert_close(found, wanted, precision, *, rounding=0.0):
         np.testing.assert_allclose(one, other, rtol=error, atol=least)
 
 
-@pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize(("operation", "name"), PAIRS)
-def test_value_and_gradient_are_those_of_the_reference(operation, name, size):
+def test_value_and_gradient_are_those_of_the_reference(operation, name):
     """Gradients of an implementation that computes more coarsely are those of the reference, and not coarse."""
+    assert_equals_reference(operation, name, SIZE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", OTHER_SIZES, ids=str)
+@pytest.mark.parametrize(("operation", "name"), [pair for pair in PAIRS if pair.values[1] != REFERENCE])
+def test_value_and_gradient_at_other_sizes_are_those_of_the_reference(operation, name, size):
+    assert_equals_reference(operation, name, size)
+
+
+def assert_equals_reference(operation, name, size):
+    """Value and gradient of an implementation for all examples of one size."""
     precision = OPERATIONS[operation].implementations[name].precision
     pairs = zip(examples(operation, *size, np.float32), expected(operation, *size), strict=True)
     for (arguments, options), (value, gradients) in pairs:
@@ -121,8 +133,8 @@ def test_value_and_gradient_are_those_of_the_reference(operation, name, size):
 def test_a_batch_is_its_examples_one_by_one(operation, name):
     """``jax.vmap`` of the named implementation, and of the one that None selects, in a scan."""
     precision = OPERATIONS[operation].implementations[name].precision
-    arguments, options = next(examples(operation, 5, 7, np.float32))
-    value, _ = expected(operation, 5, 7)[0]
+    arguments, options = next(examples(operation, *SIZE, np.float32))
+    value, _ = expected(operation, *SIZE)[0]
     batch = jax.tree.map(lambda leaf: np.stack([leaf, leaf[..., ::-1] if leaf.ndim else leaf]), arguments)
     found = jax.jit(jax.vmap(runner(operation, name, options)))(*batch)
     assert_close(jax.tree.map(lambda leaf: leaf[0], found), value, precision)
@@ -141,7 +153,7 @@ def test_every_operation_declares_examples():
 @pytest.mark.parametrize(("operation", "name"), PAIRS)
 def test_a_name_means_that_implementation_or_an_error(operation, name):
     one = OPERATIONS[operation].implementations[name]
-    arguments, options = next(examples(operation, 5, 7, np.float64))
+    arguments, options = next(examples(operation, *SIZE, np.float64))
     if not one.dtypes:
         return
     with jax.enable_x64(True), pytest.raises(ValueError, match=f"\"{name}\" takes float32, got float64.*'reference'"):
