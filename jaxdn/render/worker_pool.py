@@ -21,6 +21,7 @@ from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.render.mitsuba.variant import choose_variant
 from jaxdn.render.open_scene import scene_from_record
 from jaxdn.render.settings import RenderSettings
+from jaxdn.runtime.parent import end_with_parent
 
 _THREADS = 2
 """Renderer threads of each process. With only one, Mitsuba's loader waits forever for some scenes' textures."""
@@ -133,6 +134,7 @@ def _start_worker(job: ClipJob, *, threads: int) -> _Worker:
 def _render_in_worker(job: ClipJob, messages: Connection, threads: int) -> None:
     """Runs in a separate process: render one clip and report each frame."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
+    end_with_parent()
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     warnings.filterwarnings("ignore", message="scene ")  # whoever opened the scene has been warned
     try:
