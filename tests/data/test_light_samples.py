@@ -85,3 +85,51 @@ def test_batches_draw_new_noise_for_each_element(folder: Path) -> None:
     assert whole.frames.direct is not None
     with pytest.raises(ClipError, match="5 samples a pixel are not available"):
         training_batches(folder, batch=1, crop=4, frames=2, seed=0, spp=5)
+
+
+@pytest.fixture
+def filtered(tmp_path: Path) -> Path:
+    """A clip with filtered pixels: of the image of n samples, light is n, emission 10 n, and the albedo 1 / (1 + n)."""
+    home = tmp_path / "filtered" / "one"
+    home.mkdir(parents=True)
+    flat = np.ones((SIDE, SIDE, 3), np.float32)
+
+    def guides(samples: int) -> dict[str, np.ndarray]:
+        return {"albedo": flat / (1 + samples), "emission": 10.0 * samples * flat}
+
+    for t in range(FRAMES):
+        frame = Frame(radiance=flat, normal=flat, depth=flat[..., :1], **guides(1))
+        layers = {n: n * flat for n in (1, 2, 4)}
+        light = {"reference": 64 * flat, "reference_half": 63 * flat}
+        own = {n: guides(n) | {"normal": flat * (n == 1)} for n in layers}
+        own[2]["normal"] = own[4]["normal"] = np.broadcast_to(np.float32([0, 0, 1]), flat.shape)
+        path = clips.frame_path(home, t)
+        reference_guides = guides(64) | {"normal": flat}
+        clips.write_frame(path, frame, layers=layers, layer_guides=own, reference_guides=reference_guides, **light)
+    record = {"frames": FRAMES, "width": SIDE, "height": SIDE, "layers": [1, 2, 4], "reference_spp": 64}
+    clips.finish_record({**record, "pixel_filter": "box"}, home)
+    return tmp_path / "filtered"
+
+
+@pytest.mark.parametrize("beauty", [False, True])
+@pytest.mark.parametrize(
+    ("spp", "weights"), [(1, {1: 1}), (2, {2: 1}), (4, {4: 1}), (5, {1: 1 / 5, 4: 4 / 5}), (32, {})]
+)
+def test_guides_and_emission_of_filtered_pixels_are_those_of_the_same_samples(
+    spp: int, weights: dict[int, float], beauty: bool, filtered: Path
+) -> None:
+    source = {"batch": 1, "crop": SIDE, "frames": FRAMES, "seed": 0, "spp": spp, "threads": 0, "augment": False}
+    variation = NO_AUGMENTATION._replace(beauty=float(beauty))
+    batch = next(training_batches(filtered, buffers=("albedo", "normal"), variation=variation, **source))
+    light = sum(share * n for n, share in weights.items()) if weights else 63.0
+    emission = sum(share * 10 * n for n, share in weights.items()) if weights else 640.0
+    albedo = sum(share / (1 + n) for n, share in weights.items()) if weights else 1 / 65
+    reference = 64.0 if weights else 65.0  # the other half
+    np.testing.assert_allclose(batch.frames.radiance, light + beauty * emission, rtol=1e-3)
+    np.testing.assert_allclose(batch.reference, reference + beauty * 640, rtol=1e-3)
+    np.testing.assert_allclose(batch.frames.albedo, albedo, rtol=1e-3)
+    assert batch.frames.depth is None
+
+
+def test_other_clips_have_the_same_guides_at_every_sample_count(folder: Path) -> None:
+    assert not open_cached(folder / "one").filtered

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdn.core.frame import BUFFERS, GUIDES, OF_SAMPLES, Buffer, Clip, Frame, present, written_out
+from jaxdn.core.frame import AVERAGED, BUFFERS, GUIDES, OF_SAMPLES, Buffer, Clip, Frame, present, written_out
 from jaxdn.data.clip.folder import frame_path, read_frames, read_record
 from jaxdn.data.clip.frames import StoredFrame, combine, doubling_layers, layers_for
 from jaxdn.data.clip.record import is_planned
@@ -27,7 +27,7 @@ from jaxdn.data.errors import ClipError, read_json
 from jaxdn.data.exr.exr import to_half
 from jaxdn.runtime.atomic_files import write_json
 
-_VERSION = 2  # of the cache's layout; caches of other versions are not used
+_VERSION = 3  # of the cache's layout; caches of other versions are not used
 _LIGHT = BUFFERS["radiance"]
 _ONE_HEADER = threading.Lock()
 """NumPy parses a file's header as Python, which in CPython 3.11 fails now and then in several threads at once
@@ -49,7 +49,8 @@ class CachedClip(NamedTuple):
     shape: tuple[int, int, int]
     """Frames, height, width."""
     arrays: frozenset[str]
-    """The stored arrays: names of buffers, ``reference``, ``reference_half``, ``draws`` and ``noisy_<n>spp``."""
+    """The stored arrays: names of buffers, ``reference``, ``reference_half``, ``draws`` and ``noisy_<n>spp``; of a clip
+    with filtered pixels also the guides of each image, ``noisy_<n>spp_<buffer>`` and ``reference_<buffer>``."""
     layers: tuple[int, ...]
     """The sample counts of the noisy layers."""
     draws: int = 0
@@ -63,6 +64,11 @@ class CachedClip(NamedTuple):
     def buffers(self) -> frozenset[str]:
         """Names of the Frame buffers that are present, except ``radiance``."""
         return self.arrays & frozenset(GUIDES)
+
+    @property
+    def filtered(self) -> bool:
+        """Whether each image has its own guides, means over its samples."""
+        return any(f"reference_{name}" in self.arrays for name in AVERAGED)
 
     @property
     def half_spp(self) -> int:
@@ -106,9 +112,9 @@ def read_window(
 ) -> Clip:
     """The part ``window`` (frames, rows, columns) of a clip as a Clip of plain arrays with ``spp`` samples per pixel.
 
-    ``light``: noisy radiance and reference of the window, where they are not to be read (``spp`` is not used then). The
-    buffers of samples (:data:`jaxdn.core.frame.OF_SAMPLES`) are read only where the radiance is the layer they belong
-    to.
+    ``light``: noisy radiance and reference of the window, where they are not to be read. The buffers of samples
+    (:data:`jaxdn.core.frame.OF_SAMPLES`) are read only where the radiance is the layer they belong to. Where pixels
+    were filtered, guides are those of ``spp`` samples.
 
     Buffers have the dtypes of :attr:`jaxdn.core.frame.Buffer.dtype`. ``buffers`` names the ones to read (default:
     all there are); of a clip that was rendered by a plan, those that it lacks are written out. With ``layers`` the
@@ -117,7 +123,7 @@ def read_window(
     asked = set(clip.buffers) if buffers is None else set(buffers) & set(GUIDES)
     if light is not None or layers_for(spp, clip.layers, clip.path) != [min(clip.layers)]:
         asked -= OF_SAMPLES
-    guides = {name: read_array(clip, name, window) for name in clip.buffers & asked}
+    guides = {name: read_guide(clip, name, window, spp) for name in clip.buffers & asked}
     if light is None:
         reference = read_array(clip, "reference", window) if "reference" in clip.arrays else None
         light = read_layers(clip, window, spp), reference
@@ -134,6 +140,21 @@ def read_layers(clip: CachedClip, window: tuple[slice, ...], spp: int) -> np.nda
     """Noisy radiance of ``spp`` samples a pixel, combined from the layers."""
     chosen = layers_for(spp, clip.layers, clip.path)
     return combine({samples: read_array(clip, _noisy(samples), window) for samples in chosen})
+
+
+def read_guide(clip: CachedClip, name: str, window: tuple[slice, ...], spp: int) -> np.ndarray:
+    """The part ``window`` of a buffer; one that is a mean over samples, of ``spp`` of them.
+
+    Of the half of a reference there are no guides: those of all its samples are as good as free of noise, too.
+    """
+    if not clip.filtered or name not in AVERAGED:
+        return read_array(clip, name, window)
+    if spp == clip.half_spp:
+        return read_array(clip, f"reference_{name}", window)
+    fewest = min(clip.layers)
+    chosen = layers_for(spp, clip.layers, clip.path)
+    images = {n: read_array(clip, name if n == fewest else f"{_noisy(n)}_{name}", window) for n in chosen}
+    return combine(images).astype(BUFFERS[name].dtype, copy=False)
 
 
 def read_array(clip: CachedClip, name: str, window: tuple[Any, ...]) -> np.ndarray:
@@ -219,6 +240,11 @@ def _images(stored: StoredFrame) -> Iterator[tuple[str, np.ndarray, Buffer]]:
         yield _noisy(samples), image, _LIGHT
     for name in present(stored.frame):
         yield name, np.asarray(getattr(stored.frame, name)), BUFFERS[name]
+    fewest = min(stored.layers)
+    own = {_noisy(samples): guides for samples, guides in stored.layer_guides.items() if samples != fewest}
+    for which, guides in {**own, "reference": stored.reference_guides}.items():
+        for name, image in guides.items():
+            yield f"{which}_{name}", image, BUFFERS[name]
     for name in ("reference", "reference_half", "draws"):
         image = getattr(stored, name)
         if image is not None:

@@ -94,7 +94,7 @@ def training_batches(
             clip = read_window(source, window, spp=samples, buffers=names, layers=layers)
         else:
             light = sample_light(source, window, samples, rng, beauty=beauty)
-            clip = read_window(source, window, light=light, buffers=names, layers=layers)
+            clip = read_window(source, window, spp=samples, light=light, buffers=names, layers=layers)
         clip = clip._replace(frames=written_out(clip.frames, of_samples))
         if clip.layers is not None:
             clip = clip._replace(layers={count: clip.layers[count] for count in common})

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxdn.data.clip.frames import layers_for
 from jaxdn.data.errors import ClipError
-from jaxdn.data.training.cache import CachedClip, read_array, read_layers
+from jaxdn.data.training.cache import CachedClip, read_array, read_guide, read_layers
 
 Window = tuple[slice, ...]
 _BEAUTY = ("direct", "emission")
@@ -48,8 +48,8 @@ def sample_light(
       window: the part of it.
       spp: as :func:`check_samples` allows.
       rng: chooses among the single samples.
-      beauty: all light instead of the indirect part, if the clip has that many single samples; their direct light is
-        noisy too. Emitted light is added to both.
+      beauty: all light instead of the denoised part, if the clip has that many single samples, whose direct light is
+        noisy too, or if its pixels were filtered, so that each image has its own direct and emitted light.
     """
     if spp <= clip.draws:
         chosen = np.sort(rng.permutation(clip.draws)[:spp])
@@ -59,6 +59,16 @@ def sample_light(
             return Light(samples[..., :3], reference)
         direct, emission = (read_array(clip, name, window) if name in clip.arrays else 0.0 for name in _BEAUTY)
         return Light(samples[..., :3] + samples[..., 3:] + emission, reference + direct + emission)
+    light = _sample_stored(clip, window, spp)
+    if beauty and clip.filtered:
+        for name in set(_BEAUTY) & clip.arrays:
+            clean = read_array(clip, f"reference_{name}", window)
+            light = Light(light.noisy + read_guide(clip, name, window, spp), light.reference + clean)
+    return light
+
+
+def _sample_stored(clip: CachedClip, window: Window, spp: int) -> Light:
+    """Light of layers, or of the halves of the reference."""
     if spp == clip.half_spp:
         half, both = (read_array(clip, name, window) for name in ("reference_half", "reference"))
         shares = np.float32(spp), np.float32(clip.reference_spp)
