@@ -102,24 +102,32 @@ def draw_initial_weights(key: jax.Array, network: GraphSpec, *, scheme: str) -> 
     et al. 2015), and a tenth of ``sqrt(3 / fan_in)`` in the heads, so that every kernel begins nearly flat; with
     "xavier" it is ``sqrt(6 / (fan_in + fan_out))`` (Glorot and Bengio 2010), with which each convolution halves the
     signal's variance: the deep levels begin with gradients two orders of magnitude smaller and hardly learn.
-
-    All kernels are slices of one draw: with a generator for each, XLA takes twenty seconds to compile.
     """
     check_option(scheme, "initialization", ("he", "xavier"))
-    shapes = sorted(network.kernels().items())
-    draw = jax.random.uniform(key, (sum(math.prod(shape) for _, shape in shapes),), jnp.float32, -1, 1)
-    params: dict[str, Any] = {}
-    start = 0
-    for name, shape in shapes:
+    limits: dict[str, tuple[tuple[int, ...], float]] = {}
+    for name, shape in sorted(network.kernels().items()):
         area, inputs, outputs = shape[0] * shape[1], *shape[2:]
         he = 0.1 * math.sqrt(3 / (area * inputs)) if name in network.outputs else math.sqrt(6 / (area * inputs))
-        limit = he if scheme == "he" else math.sqrt(6 / (area * (inputs + outputs)))
-        end = start + math.prod(shape)
+        limits[name] = shape, he if scheme == "he" else math.sqrt(6 / (area * (inputs + outputs)))
+    params: dict[str, Any] = {}
+    for name, kernel in zip(limits, _draw_kernels(key, tuple(limits.values())), strict=True):
         level, _, layer = name.rpartition("/")
         place = params.setdefault(level, {}) if level else params
-        place[layer] = {"bias": jnp.zeros(outputs, jnp.float32), "kernel": limit * jnp.reshape(draw[start:end], shape)}
-        start = end
+        place[layer] = {"bias": jnp.zeros(kernel.shape[-1], jnp.float32), "kernel": kernel}
     return params
+
+
+@functools.partial(jax.jit, static_argnames="limits")
+def _draw_kernels(key: jax.Array, limits: tuple[tuple[tuple[int, ...], float], ...]) -> list[jax.Array]:
+    """A kernel for each (shape, limit), uniform within +-limit.
+
+    All are slices of one draw: with a generator for each, XLA takes twenty seconds to compile. One program: with one
+    for each operation on each kernel, a second.
+    """
+    sizes = [math.prod(shape) for shape, _ in limits]
+    draw = jax.random.uniform(key, (sum(sizes),), jnp.float32, -1, 1)
+    parts = jnp.split(draw, np.cumsum(sizes)[:-1])
+    return [limit * jnp.reshape(part, shape) for part, (shape, limit) in zip(parts, limits, strict=True)]
 
 
 Heads = tuple[jax.Array, ...]
