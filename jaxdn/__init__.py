@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # what type checkers and editors see; at run time each name i
     from jaxdn.denoiser.rollout import stream as stream
     from jaxdn.denoiser.rollout import unroll as unroll
     from jaxdn.filters.reproject import reproject as reproject
+    from jaxdn.methods.stabilised import stabilised as stabilised
     from jaxdn.ops.affinity.filter import affinity_filter as affinity_filter
     from jaxdn.ops.dispatch.operation import implementation as implementation
     from jaxdn.ops.kernel_prediction.apply import apply_kernels as apply_kernels
@@ -55,6 +56,7 @@ _HOMES = {
     "softmax_filter": "ops.kernel_prediction.softmax",
     "affinity_filter": "ops.affinity.filter",
     "reproject": "filters.reproject",
+    "stabilised": "methods.stabilised",
     "implementation": "ops.dispatch.operation",
     "compose_scales": "ops.scales",
     "denoise": "denoiser.rollout",

@@ -1,13 +1,14 @@
 """The factories of all methods, by name: ``jaxdn.denoisers.ntd(size="small")`` returns a :class:`jaxdn.Denoiser`.
 
 The factories come from the table of methods (:mod:`jaxdn.methods.registry`); :data:`NAMES` lists them. ``demodulated``
-wraps any denoiser. The methods are implemented in :mod:`jaxdn.methods`, one file each.
+and ``stabilised`` wrap any denoiser. The methods are implemented in :mod:`jaxdn.methods`, one file each.
 """
 
 from typing import TYPE_CHECKING, Any
 
 from jaxdn.methods.demodulation import demodulated as demodulated
 from jaxdn.methods.registry import methods
+from jaxdn.methods.stabilised import stabilised as stabilised
 
 if TYPE_CHECKING:  # what type checkers and editors see; tests/test_house.py compares it with the table of methods
     from jaxdn.methods.arae import arae as arae
@@ -31,8 +32,10 @@ def __getattr__(name: str) -> Any:
         return tuple(known)
     if name in known:
         return known[name].factory
-    raise AttributeError(f"module 'jaxdn.denoisers' has no attribute {name!r}; it has {', '.join(known)}, demodulated")
+    raise AttributeError(
+        f"module 'jaxdn.denoisers' has no attribute {name!r}; it has {', '.join(known)}, demodulated, stabilised"
+    )
 
 
 def __dir__() -> list[str]:
-    return [*methods(), "demodulated", "NAMES"]
+    return [*methods(), "demodulated", "stabilised", "NAMES"]

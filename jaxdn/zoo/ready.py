@@ -13,11 +13,15 @@ import jax.numpy as jnp
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.methods.registry import Method, is_method, method_named, methods
+from jaxdn.methods.stabilised import stabilised
 from jaxdn.networks.backends import Purpose
 from jaxdn.zoo.weights import describe, load_weights, shipped_names
 
 NOISY = "noisy"
 """The name of the noisy image itself."""
+
+STABILISED = "stabilised:"
+"""What stands before a name to have it stabilised (:func:`jaxdn.stabilised`)."""
 
 DEFAULT_MODEL = "steady-balanced"
 """The shipped weights that reports open on: those that `jaxdn denoise` uses."""
@@ -44,12 +48,18 @@ class Model(NamedTuple):
 def find_model(name: str, **options: Any) -> Model:
     """``noisy``, a filter (``svgf``), shipped weights (``ntd-large``) or the path of a .safetensors file.
 
-    A filter of another package may be given by its address, ``package.module:name``.
+    A filter of another package may be given by its address, ``package.module:name``. ``stabilised:`` before any of them
+    gives it a history (:func:`jaxdn.stabilised`).
 
     ``options`` are passed to the factory and replace those that the weights were saved with. Raises ValueError for any
     other name, for a learned method without weights, and for options that the method does not have, and
     ModuleNotFoundError for a method whose package is not installed.
     """
+    if name.startswith(STABILISED):
+        inner = find_model(name.removeprefix(STABILISED), **options)
+        if inner.denoiser is None:
+            raise ValueError(f"method {name!r}: expected a method that denoises after {STABILISED}, got {NOISY!r}.")
+        return inner._replace(label=f"stabilised-{inner.label}", denoiser=stabilised(inner.denoiser))
     if name == NOISY:
         if options:
             raise ValueError(f"{', '.join(options)}: expected a method, got {name!r}, which has no options.")

@@ -53,7 +53,8 @@ class Function(NamedTuple):
 def list_denoisers() -> list[Function]:
     """Every registered method that can run here, in its smallest variant, both ways to divide light and to filter it.
 
-    A network has the weights that training starts from; what may follow another method also follows svgf.
+    A network has the weights that training starts from; what may follow another method also follows svgf,
+    which is stabilised, too.
     """
     functions = []
     for name, method in methods().items():
@@ -82,6 +83,8 @@ def list_denoisers() -> list[Function]:
         if method.has_option("kernels"):
             alone = method.factory(**{**options, "kernels": "plain", "background": "filter"})
             functions.append(usual._replace(name=f"{name} unguided", run=_on_clips(alone), begin=_beginning(alone)))
+        if name == "svgf":
+            functions.append(usual._replace(name=f"{name} stabilised", run=_on_clips(jaxdn.stabilised(denoiser))))
     return functions
 
 

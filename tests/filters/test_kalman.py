@@ -1,0 +1,207 @@
+"""The gains of the Kalman filter: against float64 NumPy, and what they do on light whose truth is known."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxdn.filters.kalman import PLANES, RECEPTIVE_FIELD, box_sum, kalman_blend, measure_support
+
+SIZE = (48, 64)
+
+
+def window_sums(plane, radius):
+    """Sums over squares, pixel by pixel."""
+    height, width = plane.shape
+    wide = np.pad(plane, radius)
+    side = 2 * radius + 1
+    return np.array([[wide[y : y + side, x : x + side].sum() for x in range(width)] for y in range(height)])
+
+
+def blend_in_numpy(past, valid, image, noisy, exposure, history_max):
+    """The equations of the module's docstring, in the order in which they stand."""
+    d = np.where(valid, exposure * (image - past[:3]), 0)
+    e = np.where(valid, exposure * (noisy - past[:3]), 0)
+    before = np.where(valid, past[3], 0)
+    count = window_sums(np.ones(valid.shape), 3)
+    now = window_sums(((exposure * (noisy - image)) ** 2).mean(axis=0), 3) / count
+    kept = np.where(valid, (exposure * past[5]) ** 2, 0)
+    v = np.maximum(np.maximum(now, kept), 1e-8)
+    tracked = np.where(kept > 0, 0.8 * kept + 0.2 * now, now)
+    s = np.zeros(valid.shape)
+    for radius in (3, 7):
+        a, b = window_sums((d * e).sum(axis=0) / v, radius), window_sums((d * d).sum(axis=0) / v, radius)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            s = np.maximum(s, np.where(b > 0, a / b - 3.5 / np.sqrt(b), 0))
+    s = np.minimum(s, 1)
+    square = (d * d).mean(axis=0)
+    number = np.maximum(window_sums(valid.astype(float), 1), 1)
+    q = s**2 * window_sums(square, 1) / number
+    own = window_sums((1 - s**2) * square, 1) / number
+    r = np.where(valid, (exposure * past[4]) ** 2, 0)
+    around = window_sums((1 - s**2) * square, 7) / np.maximum(window_sums(valid.astype(float), 7), 1)
+    r = np.where(r > 0, r, around / 2)
+    p = before * r
+    with np.errstate(invalid="ignore"):
+        k = np.where(p + q + r > 0, (p + q) / (p + q + r), 1)
+    k = np.where(valid, np.maximum(k, 1 / history_max), 1)
+    color = np.where(valid, past[:3] + k * (image - past[:3]), image)
+    sample = np.minimum(own / (1 + before), 3 * r)
+    r = np.where(valid, 0.8 * r + 0.2 * sample, 0)
+    return np.concatenate([color, np.stack([k, np.sqrt(r) / exposure, np.sqrt(tracked) / exposure])])
+
+
+def draw_frame(rng, size=SIZE):
+    truth = rng.uniform(0.2, 1, (3, *size))
+    past = np.concatenate([truth + 0.05 * rng.normal(size=truth.shape), rng.uniform(0.1, 1, (3, *size))])
+    past[4:] *= rng.random((2, *size)) > 0.2
+    past[:3, 10:20, 10:30] *= 2  # a change
+    return np.maximum(past, 0), rng.random(size) > 0.1, truth * 1.01, truth * rng.exponential(size=truth.shape)
+
+
+@pytest.mark.parametrize("size", [SIZE, (1, 1), (3, 50)])
+def test_it_is_what_its_equations_say(size, rng, x64):
+    for history_max in (1, 16):
+        arguments = (*draw_frame(rng, size), 0.3)
+        found = kalman_blend(*map(jnp.asarray, arguments), history_max=history_max)
+        np.testing.assert_allclose(found, blend_in_numpy(*arguments, history_max), rtol=1e-9, atol=1e-12)
+
+
+def test_single_precision_is_enough(rng):
+    arguments = (*draw_frame(rng), 0.3)
+    single = kalman_blend(*map(jnp.asarray, arguments), history_max=16)
+    assert single.dtype == jnp.float32
+    np.testing.assert_allclose(single, blend_in_numpy(*arguments, 16), rtol=2e-3, atol=2e-4)
+
+
+@given(st.integers(0, 9), st.integers(1, 40), st.integers(1, 40))
+@settings(max_examples=30, deadline=None)
+def test_sums_of_windows_are_those_of_their_pixels(radius, height, width):
+    planes = np.random.default_rng(radius).normal(size=(2, height, width)).astype(np.float32)
+    expected = np.stack([window_sums(plane, radius) for plane in planes])
+    np.testing.assert_allclose(box_sum(jnp.asarray(planes), radius), expected, atol=1e-4)
+
+
+@given(st.floats(-12, 12), st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_gains_have_no_unit(exponent, seed):
+    """Light in any unit has the same gains: by powers of two to the last bit."""
+    past, valid, image, noisy = draw_frame(np.random.default_rng(seed), (16, 20))
+    unit = 2.0 ** round(exponent)
+    usual = kalman_blend(past, valid, image, noisy, jnp.float32(0.25), history_max=16)
+    scaled = past * np.array([unit] * 3 + [1] + [unit] * 2)[:, None, None]
+    other = kalman_blend(scaled, valid, unit * image, unit * noisy, jnp.float32(0.25 / unit), history_max=16)
+    np.testing.assert_allclose(other[3], usual[3], rtol=1e-6)
+    np.testing.assert_allclose(other[:3] / unit, usual[:3], rtol=1e-6)
+
+
+@given(st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_the_image_lies_between_the_new_one_and_the_history(seed):
+    past, valid, image, noisy = draw_frame(np.random.default_rng(seed), (16, 20))
+    found = np.asarray(kalman_blend(past, valid, image, noisy, jnp.float32(0.3), history_max=16))
+    low, high = np.minimum(past[:3], image), np.maximum(past[:3], image)
+    assert (found[:3] >= low - 1e-5).all()
+    assert (found[:3] <= high + 1e-5).all()
+    assert (found[3] >= 1 / 16 - 1e-6).all()
+    assert (found[3] <= 1).all()
+    np.testing.assert_array_equal(found[:3, ~valid], image.astype(np.float32)[:, ~valid])
+
+
+def test_nothing_farther_than_the_receptive_field_counts(rng):
+    past, valid, image, noisy = (np.asarray(each) for each in draw_frame(rng))
+    exposure = jnp.float32(0.3)
+    usual = kalman_blend(past, valid, image, noisy, exposure, history_max=16)
+    changed = noisy.copy()
+    changed[:, 0, 0] += 100
+    other = np.asarray(kalman_blend(past, valid, image, changed, exposure, history_max=16))
+    rows, columns = np.nonzero((other != np.asarray(usual)).any(axis=0))
+    assert 0 < max(rows.max(), columns.max()) <= RECEPTIVE_FIELD
+
+
+# Light whose truth is known. The denoiser's errors are made: noise of its own, blurred as a denoiser's are.
+
+
+def blur(noise):
+    """Errors that neighbours share, of deviation 1."""
+    for axis in (-1, -2):
+        noise = sum(np.roll(noise, shift, axis) for shift in range(-2, 3))
+    return noise / 5
+
+
+def run(truth, rng, error, noise, history_max=16):
+    """The images of a still camera over frames ``truth`` [T, 3, H, W], and the denoiser's own."""
+    blend = jax.jit(partial(kalman_blend, history_max=history_max))
+    past, found, alone = jnp.zeros((PLANES, *truth.shape[2:])), [], []
+    for index, light in enumerate(truth):
+        image = np.maximum(light * (1 + error * blur(rng.normal(size=light.shape))), 0)
+        noisy = light * (1 + noise * (rng.exponential(size=light.shape) - 1))
+        valid = np.full(light.shape[1:], index > 0)
+        past = blend(past, valid, image.astype(np.float32), noisy.astype(np.float32), jnp.float32(0.3))
+        found.append(np.asarray(past[:3]))
+        alone.append(image)
+    return np.stack(found), np.stack(alone)
+
+
+def mean_square(images, truth):
+    return np.mean((images - truth) ** 2)
+
+
+def test_errors_of_a_still_scene_fall_with_the_number_of_frames(rng):
+    """As one over it, but for what is taken for a change: within a factor of 1.6 after 8 frames, 2 after 16."""
+    truth = np.broadcast_to(rng.uniform(0.3, 1, (1, 3, *SIZE)), (16, 3, *SIZE))
+    found, alone = run(truth, rng, error=0.05, noise=0.7)
+    for frames, factor in ((2, 1.2), (8, 1.6), (16, 2.0)):
+        ratio = mean_square(found[frames - 1], truth[0]) / mean_square(alone[frames - 1], truth[0])
+        assert 0.8 < ratio * frames < factor, (frames, ratio * frames)
+
+
+@pytest.mark.parametrize(("factor", "noise"), [(0.3, 0.7), (3.0, 0.7), (0.7, 0.3)])
+def test_light_that_is_switched_is_there_at_once(factor, noise, rng):
+    """In the frame of the change no more than a tenth of the old light is left, and after three a fiftieth."""
+    truth = np.full((12, 3, *SIZE), 0.8)
+    truth[6:] *= factor
+    found, _ = run(truth, rng, error=0.03, noise=noise)
+    left = np.abs((found[6:] - truth[6:]).mean(axis=(1, 2, 3))) / np.abs(truth[6] - truth[5]).mean()
+    assert left[0] < 0.1
+    assert left[3] < 0.02
+
+
+def test_a_moving_shadow_does_not_trail(rng):
+    """What it leaves behind is within 1.3 times the denoiser's own error after two frames; a plain mean is far off."""
+    columns = np.arange(SIZE[1])
+    shadows = [(columns >= 3 * index) & (columns < 3 * index + 12) for index in range(14)]
+    truth = np.stack([np.broadcast_to(np.where(shadow, 0.2, 0.8), (3, *SIZE)) for shadow in shadows])
+    found, alone = run(truth, rng, error=0.05, noise=0.5)
+    mean = np.cumsum(alone, axis=0) / np.arange(1, 15)[:, None, None, None]
+    trail = shadows[10] & ~shadows[12]
+    errors = [mean_square(images[12][..., trail], truth[12][..., trail]) for images in (found, alone, mean)]
+    assert errors[0] < 1.3 * errors[1]
+    assert errors[2] > 10 * errors[1]
+    far = ~np.any(shadows, axis=0)
+    still = [mean_square(images[12][..., far], truth[12][..., far]) for images in (found, alone)]
+    assert still[0] < 0.3 * still[1]
+
+
+def test_frames_without_noise_stay_as_they_are(rng):
+    """Also where they change a little, and where the history is blurred."""
+    truth = rng.uniform(0.1, 1, (6, 3, *SIZE))
+    truth[1:3] = truth[0]
+    truth[4] = 1.01 * truth[3]
+    truth = truth.astype(np.float32)
+    found, _ = run(truth, rng, error=0.0, noise=0.0)
+    np.testing.assert_array_equal(found[:3], truth[:3])
+    np.testing.assert_allclose(found[3:], truth[3:], rtol=1e-3)
+
+
+def test_support_is_no_more_than_chance_where_nothing_changed(rng):
+    """Residuals of pure noise support less than a hundredth of the innovations."""
+    innovation = 0.05 * blur(rng.normal(size=(3, 96, 128))).astype(np.float32)
+    noise = 0.7 * rng.normal(size=innovation.shape).astype(np.float32)
+    variance = jnp.full((96, 128), 0.49)
+    assert measure_support(noise, innovation, variance).mean() < 0.01
+    assert measure_support(noise + 20 * innovation, 20 * innovation, variance).mean() > 0.7
