@@ -90,6 +90,8 @@ class Render:
     pixel_filter: Literal["centre", "box", "gaussian", "blackman-harris"] = "centre"
     """Rays through the pixels' centres, with clean guides, or means over filtered pixels, with guides as noisy as the
     light, as Cycles and other renderers have them (blackman-harris: Cycles' default)."""
+    random_optics: bool = False
+    """Each seed draws a lens, a shutter and fog, or none of them, for the family or the tour; with --pixel-filter."""
     see_through: bool = False
     """Guides of flat mirrors and of glass are those of what they show, so that it stays sharp; not for trmv, reblur."""
     max_depth: int | None = None

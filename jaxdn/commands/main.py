@@ -43,7 +43,14 @@ def _render(options: Render) -> None:
     )
     seeds = numbers(options.seeds, "--seeds")
     clips = ClipSource(
-        options.scene, seeds, options.frames, options.animation, options.tour, options.effects, options.denoiser
+        options.scene,
+        seeds,
+        options.frames,
+        options.animation,
+        options.tour,
+        options.effects,
+        options.denoiser,
+        options.random_optics,
     )
     render(clips, check_folder(options.out), settings, workers=options.workers)
 

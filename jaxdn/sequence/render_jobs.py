@@ -17,6 +17,7 @@ from jaxdn.render.families import FAMILIES
 from jaxdn.render.mitsuba.variant import choose_variant, separates_lobes, use_variant
 from jaxdn.render.open_scene import open_family
 from jaxdn.render.path_depth import PathDepth, measure_depth
+from jaxdn.render.scenes.optics import ENTRIES, get_shutter
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.scenes.scene_file import SceneFile
 from jaxdn.render.settings import RenderSettings
@@ -71,10 +72,11 @@ def plan_clip(
     def make(detected: Effects, max_depth: int | None = settings.max_depth) -> PlannedClip:
         # Filtered samples go through other points in every frame, as jittered ones do.
         jitter, through = not settings.through_centres, settings.see_through
-        return PlannedClip(
-            detected,
-            plan(detected, denoiser, max_depth=max_depth, light=settings.light, jitter=jitter, see_through=through),
-        )
+        made = plan(detected, denoiser, max_depth=max_depth, light=settings.light, jitter=jitter, see_through=through)
+        if get_shutter(scene) > 0 or "media" in detected.names:  # nothing is told of these samples
+            frames = tuple(tuple(name for name in frame if name not in OF_SAMPLES) for frame in made.frames)
+            made = made._replace(frames=frames)
+        return PlannedClip(detected, made)
 
     if effects == "all":
         return None if denoiser is None else make(choose_all_effects(frames))
@@ -109,6 +111,8 @@ class ClipSource(NamedTuple):
     denoiser: str | None = None
     """Names of the denoisers to render for, separated by commas (with a reference, what errors are reported by is
     rendered too); None: for any, without the buffers that only few read."""
+    random_optics: bool = False
+    """Every seed draws a lens, a shutter and fog (:mod:`jaxdn.render.camera_paths.random_optics`)."""
 
 
 def render(source: ClipSource, out: Path, settings: RenderSettings, *, workers: int | None = None) -> list[Path]:
@@ -127,7 +131,11 @@ def plan_jobs(source: ClipSource, out: Path, settings: RenderSettings) -> list[C
     options out of range.
     """
     check_at_least(1, frames=source.frames)
+    if source.random_optics:
+        _check_random_optics(source, settings)
     scenes = _randomise_scenes(source, out) if source.randomised else _open_scenes(source)
+    if source.random_optics:
+        scenes = _randomise_optics(scenes, source.frames)
     choice = choose_variant()
     print(f"rendering with Mitsuba's {choice.variant}: {choice.reason}", flush=True)
     reader = None if source.denoiser is None else _find_reader(source.denoiser, choice.variant, settings)
@@ -158,6 +166,27 @@ def _find_reader(names: str, variant: str, settings: RenderSettings) -> Denoiser
     if settings.see_through and (lost := reader.reads & OF_PRIMARY_SURFACES):
         print(f"seen through, there is no {', '.join(sorted(lost))}: left out", flush=True)
     return reader._replace(reads=reader.reads | SCORED) if settings.reference_spp else reader
+
+
+def _check_random_optics(source: ClipSource, settings: RenderSettings) -> None:
+    """Raise ValueError for what can have no random optics."""
+    if settings.pixel_filter == "centre":
+        raise ValueError(
+            "random optics: expected filtered pixels, as first hits are random; add --pixel-filter blackman-harris."
+        )
+    if not source.randomised and source.scene not in FAMILIES:
+        raise ValueError(f"random optics of {source.scene!r}: expected a family, or --tour, whose seeds give scenes.")
+
+
+def _randomise_optics(
+    scenes: Iterable[tuple[str, AnimatedScene, list[int]]], frames: int
+) -> Iterable[tuple[str, AnimatedScene, list[int]]]:
+    """The same scenes with the optics that their seeds draw."""
+    use_variant()
+    # Its names of Mitsuba exist only after a variant is chosen.
+    from jaxdn.render.camera_paths.random_optics import randomise_optics
+
+    return ((name, randomise_optics(scene, seeds[0], frames), seeds) for name, scene, seeds in scenes)
 
 
 def _open_scenes(source: ClipSource) -> Iterable[tuple[str, AnimatedScene, list[int]]]:
@@ -191,7 +220,8 @@ def _randomise_scenes(source: ClipSource, out: Path) -> Iterable[tuple[str, Anim
         begun = record.get("scene", {})
         same_file = "file" in begun and Path(begun["file"]).resolve() == Path(file).resolve()
         if same_file and "inserted" in begun.get("animation", {}) and record["frames"] == source.frames:
-            return SceneFile.from_record(begun)
+            own = {name: value for name, value in begun["animation"].items() if name not in ENTRIES}
+            return SceneFile.from_record({**begun, "animation": own})
         return randomise_scene(file, seed, source.frames)
 
     return ((one.name, one, [seed]) for seed, one in ((seed, scene(seed)) for seed in source.seeds))

@@ -235,7 +235,8 @@ class Stage:
     def build(self, frame: float, width: int, height: int) -> Any:
         import mitsuba as mi
 
-        return mi.load_dict(self.describe(frame, width, height), optimize=False)
+        # One object after the other: their numbers are a part of kernels, which another order would compile anew.
+        return mi.load_dict(self.describe(frame, width, height), optimize=False, parallel=False)
 
     def describe(self, frame: float, width: int, height: int) -> dict[str, Any]:
         """Mitsuba's dictionary of one frame; the shapes' keys are the ids that `pose` uses."""

@@ -150,8 +150,9 @@ class SceneFile:
             "animation_sensor": self._make_sensor(frame, width, height),
             "animation_integrator": {"type": "path", "max_depth": self.max_depth},
         }
-        # A key of this dictionary becomes the object's id.
-        return mi.load_dict({"type": "scene", **parts}, optimize=False)
+        # A key of this dictionary becomes the object's id. One after the other, so that their numbers, which are a part
+        # of kernels, are the same in every frame.
+        return mi.load_dict({"type": "scene", **parts}, optimize=False, parallel=False)
 
     def _load_changed(self, frame: float, still: Mapping[str, Any]) -> list[Any]:
         """The shapes and lamps of the file that move or change, in one frame."""
