@@ -86,6 +86,7 @@ def test_the_table_adds_no_energy(lobe):
     np.testing.assert_allclose(table[8:, 0].sum(-1), 1, atol=2e-3)  # a mirror reflects everything
 
 
+@pytest.mark.slow
 def test_the_stored_tables_are_what_the_function_makes():
     for lobe in brdf.LOBES:
         small = brdf.ggx_albedo_table(lobe=lobe, size=8, samples=brdf.SAMPLES)

@@ -283,6 +283,7 @@ def test_no_samples_are_those_of_the_neutral_value(rng):
 
 
 def test_no_buffer_has_to_be_there(rng):
+    """That of a frame without any of them is finite is a slow test."""
     denoiser = asvgf(levels=1)
     frames = [frame._replace(luminance_gradient=np.full((10, 12, 2), 0.5, np.float32)) for frame in moving_frames(rng)]
 
@@ -291,7 +292,12 @@ def test_no_buffer_has_to_be_there(rng):
 
     for name in denoiser.reads:
         assert shape_of(frames[0]._replace(**{name: None})) == (10, 12, 3)
-    bare = [Frame(frame.radiance) for frame in frames]
+
+
+@pytest.mark.slow
+def test_without_any_buffer_images_are_finite(rng):
+    denoiser = asvgf(levels=1)
+    bare = [Frame(frame.radiance) for frame in moving_frames(rng)]
     assert all(np.isfinite(image).all() for _, image in run(denoiser, bare))
 
 

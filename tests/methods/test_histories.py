@@ -185,9 +185,9 @@ def test_broken_history_is_dropped_where_it_is_broken(kind, rng, which):
                 ("far_motion",),
                 ("roughness",),
                 ("ray_length", "reflectance", "albedo", "specular_reflectance"),
+                ("motion", "far_motion", "previous_depth"),
             )
         ),
-        ("motion", "far_motion", "previous_depth"),
     ],
     ids="-".join,
 )

@@ -589,6 +589,7 @@ def test_a_pixel_without_a_surface_among_strangers_spoils_no_gradient(rng):
     assert all(jnp.isfinite(slope).all() for slope in slopes)
 
 
+@pytest.mark.slow
 def test_guides_that_come_and_go_are_not_tested_against_other_guides(rng):
     """Depth and normals (4 layers) in one frame, normals and ids (4 layers too) in the next: normals are shared."""
     frame = moving_frames(rng, 1)[0]._replace(motion=None, previous_depth=None, depth=None, ids=None)

@@ -61,10 +61,10 @@ def test_without_buffers_of_its_own_it_is_svgf(rng, by):
     [
         # Two at once where each is read by a part of light of its own: a step takes ten seconds to compile.
         ("shadowed", "unshadowed"),
-        ("specular", "specular_reflectance", "dual_motion"),
         *(
             pytest.param(names, marks=pytest.mark.slow)
             for names in (
+                ("specular", "specular_reflectance", "dual_motion"),
                 ("unshadowed", "glossy_motion"),
                 ("specular",),
                 ("shadow_motion", "roughness"),
@@ -152,6 +152,7 @@ def test_broken_history_is_dropped_where_it_is_broken(rng, which):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after.core))
 
 
+@pytest.mark.slow
 def test_parts_of_light_may_come_and_go_within_a_clip(rng):
     frames = all_light(rng, 4)
     for index in (0, 2):

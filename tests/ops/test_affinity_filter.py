@@ -53,14 +53,8 @@ def test_gradients(step, rng, x64):
     check_gradients(filtered, tuple(map(jnp.asarray, drawn(rng))), atol=1e-5, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("step", "size"),
-    [
-        pytest.param(1, (9, 11), marks=pytest.mark.slow),
-        (2, (5, 130)),
-        pytest.param(3, (20, 64), marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow  # test_operations.py compares them with the reference in all runs
+@pytest.mark.parametrize(("step", "size"), [(1, (9, 11)), (2, (5, 130)), (3, (20, 64))])
 def test_kernels_for_gpus_are_the_formula_and_have_its_gradient(step, size, rng, monkeypatch):
     """Interpreted where there is no GPU; gradients against those of the program that has no kernels."""
     image, *guide = (np.float32(each) for each in drawn(rng, *size))

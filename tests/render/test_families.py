@@ -43,7 +43,7 @@ def _render(mi: Any, scene: Stage, frame: int, *, max_depth: int | None = None, 
     return np.mean([np.array(mi.render(built, integrator=integrator, spp=1, seed=s)) for s in range(spp)], axis=0)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "glitter")) for name in NAMES])
 def test_a_seed_always_gives_the_same_scene_and_another_seed_another(mitsuba: Any, name: str) -> None:
     scenes = scene_of(name, SEEDS[0]), FAMILIES[name](SEEDS[0]), scene_of(name, SEEDS[1])
     first, again, other = (_render(mitsuba, scene, 5) for scene in scenes)

@@ -67,7 +67,7 @@ def compiled():
 
 def test_constant_light_comes_out_as_it_went_in(rng, key):
     frames = room(rng)
-    flat = frames._replace(radiance=jnp.full_like(frames.radiance, 0.5), albedo=None)
+    flat = frames._replace(radiance=jnp.full_like(frames.radiance, 0.5), albedo=jnp.ones_like(frames.albedo))
     np.testing.assert_allclose(denoised(flat, key=key), flat.radiance, rtol=1e-4)
 
 
@@ -110,7 +110,7 @@ def test_the_sky_passes_through_and_gives_nothing(rng, key):
     frames = frames._replace(
         radiance=jnp.where(sky, 1000.0, jnp.full_like(frames.radiance, 0.5)),
         depth=jnp.where(sky, FAR, frames.depth),
-        albedo=None,
+        albedo=jnp.ones_like(frames.albedo),
         ids=jnp.where(sky, -1, frames.ids),
     )
     np.testing.assert_allclose(denoised(frames, key=key), frames.radiance, rtol=1e-4)
@@ -165,7 +165,7 @@ def test_a_part_of_a_frame_without_a_valid_value_shows_what_was_known(rng):
 def test_invalid_pixels_of_the_first_frame_are_filled_from_their_neighbours(rng, key):
     frames = room(rng)
     invalid = jnp.asarray(rng.random((*SIZE, 1)) < 0.1)
-    flat = frames._replace(radiance=jnp.full_like(frames.radiance, 0.5), albedo=None)
+    flat = frames._replace(radiance=jnp.full_like(frames.radiance, 0.5), albedo=jnp.ones_like(frames.albedo))
     broken = flat._replace(radiance=flat.radiance.at[0].set(jnp.where(invalid, jnp.nan, flat.radiance[0])))
     np.testing.assert_allclose(denoised(broken, key=key), flat.radiance, rtol=1e-4)
 
