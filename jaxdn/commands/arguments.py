@@ -1,10 +1,13 @@
-"""What each command of ``jaxdn`` takes: its options, with their help."""
+"""What each command of ``jaxdn`` takes: its options, with their help; and what several commands make of theirs."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
+
+if TYPE_CHECKING:  # --help does not wait for jax
+    from jaxdn.data.foreign.classify import ChannelNaming
 
 _PATH = tyro.conf.Positional[Path]
 
@@ -312,3 +315,23 @@ class Doctor:
 
 COMMANDS = Inspect | Render | Pack | Train | Denoise | Compare | Export | Doctor
 """All of them, as tyro reads them from a command line."""
+
+
+def check_folder(out: Path) -> Path:
+    """``-o`` of a command that writes into a folder. Raises ValueError for a file, and for what is plainly its name."""
+    names = (".exr", ".png", ".safetensors", ".json", ".html", ".onnx", ".mlir", ".stablehlo")
+    if out.is_file() or out.suffix.lower() in names:
+        raise ValueError(f"-o {out}: expected a folder, got the name of a file.")
+    return out
+
+
+def name_channels(options: Inspect | Denoise) -> "ChannelNaming":
+    """What is stated about the channels of other renderers' files."""
+    from jaxdn.core.options import parse
+    from jaxdn.data.foreign.classify import ChannelNaming
+
+    return ChannelNaming(
+        options.motion_convention,
+        parse(options.channels, option="--channels", words=True),
+        options.layer,
+    )

@@ -2,9 +2,8 @@
 
 from typing import Any
 
-from jaxdn.commands.arguments import Denoise
+from jaxdn.commands.arguments import Denoise, check_folder, name_channels
 from jaxdn.commands.channel_table import show_channel_mapping
-from jaxdn.commands.options import check_folder, name_channels
 from jaxdn.commands.progress import reporter
 from jaxdn.core.options import numbers
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping

@@ -10,10 +10,20 @@ import tyro
 from rich.console import Console
 
 import jaxdn
-from jaxdn.commands.arguments import COMMANDS, Compare, Denoise, Doctor, Export, Inspect, Pack, Render, Train
-from jaxdn.commands.errors import plain_errors
-from jaxdn.commands.options import check_folder, name_channels
-from jaxdn.commands.pipe import end_with_reader
+from jaxdn.commands.arguments import (
+    COMMANDS,
+    Compare,
+    Denoise,
+    Doctor,
+    Export,
+    Inspect,
+    Pack,
+    Render,
+    Train,
+    check_folder,
+    name_channels,
+)
+from jaxdn.commands.errors import end_with_reader, plain_errors
 from jaxdn.runtime.interrupt import exit_on_interrupt
 
 

@@ -14,8 +14,16 @@ from jaxdn.render.buffers.gradient_samples import compute_luminance_gradient
 from jaxdn.render.buffers.reflectance import Reflectances
 from jaxdn.render.buffers.shadow_vectors import compute_shadow_motion
 from jaxdn.render.frame_blur import trace_blurred_samples
-from jaxdn.render.frame_geometry import FrameGeometry, build_geometry
-from jaxdn.render.frame_request import DISOCCLUSION, GRADIENT, MOTION, VECTORS, FrameRequest, request_frame
+from jaxdn.render.frame_request import (
+    DISOCCLUSION,
+    GRADIENT,
+    MOTION,
+    VECTORS,
+    FrameGeometry,
+    FrameRequest,
+    build_geometry,
+    request_frame,
+)
 from jaxdn.render.frame_samples import FrameSamples, trace_samples
 from jaxdn.render.scenes.optics import get_shutter
 from jaxdn.render.scenes.scene import AnimatedScene

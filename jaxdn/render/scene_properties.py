@@ -4,6 +4,7 @@ The scene is built once, for its first frame; later changes are read from its po
 brightness.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -13,11 +14,11 @@ import numpy as np
 from jaxdn.core.checks import check_at_least
 from jaxdn.planning.scene_properties import Light, Moment, SceneProperties, Surface
 from jaxdn.render.mitsuba.variant import use_variant
-from jaxdn.render.scenes.scene import AnimatedScene, brightness
-from jaxdn.render.scenes.visibility import corners, fills_view, may_be_seen, moved
+from jaxdn.render.scenes.scene import AnimatedScene, Camera, brightness
 
 _LOOK = 16
 """Height of the inspected image, in pixels."""
+_NEAR = 1e-6
 
 
 def read_scene_properties(
@@ -111,7 +112,7 @@ class _ShapePlaces:
         self.squares: dict[str, np.ndarray] = {}
         for name, shape in shapes.items():
             box = shape.bbox()
-            self.boxes[name] = corners(np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel())
+            self.boxes[name] = _corners(np.array(box.min, np.float64).ravel(), np.array(box.max, np.float64).ravel())
             if shape.class_name() == "Rectangle":
                 self.squares[name] = _read_to_world(shape)
 
@@ -121,8 +122,8 @@ class _ShapePlaces:
 
     def on_screen(self, name: str, frame: float) -> bool:
         """Whether a shape's box may be in view."""
-        points = moved(self.boxes[name], self.compute_place(name, self.pose(frame)))
-        return may_be_seen(points, self.camera(frame), self.size)
+        points = _moved(self.boxes[name], self.compute_place(name, self.pose(frame)))
+        return _may_be_seen(points, self.camera(frame), self.size)
 
     def describe_moment(self, frame: int, lights: Sequence[Light]) -> Moment:
         """The changes between a frame and the one before it."""
@@ -150,7 +151,7 @@ class _ShapePlaces:
             return False
         name = there.pop()
         return all(
-            fills_view(self.compute_place(name, self.pose(at)) @ self.squares[name], self.camera(at), self.size)
+            _fills_view(self.compute_place(name, self.pose(at)) @ self.squares[name], self.camera(at), self.size)
             for at in (frame - 1, frame)
         )
 
@@ -181,3 +182,54 @@ def _interreflects(
     others = [stage.boxes[light.name] for light in lights if light.name in shapes and light.name != name]
     others += [np.asarray(stage.scene.camera(frame).to_world)[None, :3, 3] for frame in range(stage.scene.frames)]
     return any(np.all(box.max(axis=0) >= low) and np.all(box.min(axis=0) <= high) for box in others)
+
+
+def _corners(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The eight corners [8, 3] of a box."""
+    return np.array([np.where(pick, high, low) for pick in itertools.product((False, True), repeat=3)])
+
+
+def _moved(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Points [N, 3] under a [4, 4] motion."""
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def _may_be_seen(points: np.ndarray, camera: Camera, size: tuple[int, int]) -> bool:
+    """Whether the convex hull of points [N, 3] may be in the view of ``size`` (height, width).
+
+    False only where all of them lie on the outer side of one of the view's five planes.
+    """
+    local = _to_camera(points, camera)
+    across, up = _slopes(camera, size)
+    x, y, z = local.T
+    outside = (z <= _NEAR, x > across * z, -x > across * z, y > up * z, -y > up * z)
+    return not any(np.all(side) for side in outside)
+
+
+def _fills_view(to_world: np.ndarray, camera: Camera, size: tuple[int, int]) -> bool:
+    """Whether the square [-1, 1]^2 at z = 0, placed by a [4, 4] matrix, covers the whole image.
+
+    It is convex: if the four corners of the image see it, all pixels do.
+    """
+    across, up = _slopes(camera, size)
+    inverse = np.linalg.inv(to_world) @ np.asarray(camera.to_world, np.float64)
+    origin = inverse[:3, 3]
+    for x, y in ((across, up), (-across, up), (across, -up), (-across, -up)):
+        direction = inverse[:3, :3] @ np.array([x, y, 1.0])
+        if abs(direction[2]) < 1e-12:
+            return False
+        distance = -origin[2] / direction[2]
+        point = origin + distance * direction
+        if distance <= _NEAR or np.any(np.abs(point[:2]) > 1.0):
+            return False
+    return True
+
+
+def _to_camera(points: np.ndarray, camera: Camera) -> np.ndarray:
+    return _moved(points, np.linalg.inv(np.asarray(camera.to_world, np.float64)))
+
+
+def _slopes(camera: Camera, size: tuple[int, int]) -> tuple[float, float]:
+    """Half width and half height of the view at distance 1."""
+    across = float(np.tan(np.radians(camera.x_fov) / 2))
+    return across, across * size[0] / size[1]

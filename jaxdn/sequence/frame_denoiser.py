@@ -1,5 +1,7 @@
-"""A denoiser on its way through consecutive frames, in tiles where memory asks for them."""
+"""A denoiser on its way through consecutive frames: whole, or in tiles of the same image where memory asks for them."""
 
+import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,10 +14,20 @@ from jaxdn.core.frame import Frame
 from jaxdn.data.clip.frames import StoredFrame, doubling_layers
 from jaxdn.denoiser.rollout import Layers, Stream, stream
 from jaxdn.denoiser.sanitize import sanitize_image
-from jaxdn.denoiser.tiles import TiledStream, map_tiles, stream_tiled
+from jaxdn.denoiser.tiles import GRID, TiledStream, map_tiles, stream_tiled
 from jaxdn.sequence.james_stein import REACH, Confidence, JamesStein, combine, measure_confidence
-from jaxdn.sequence.memory_budget import GIB, choose_tile_side, estimate_bytes, measure_machine_memory
 from jaxdn.zoo.ready import Model
+
+GIB = 2**30
+PROGRAM = 0.6 * GIB
+"""Bytes of the program itself, with XLA and what it compiles."""
+HELD = 140
+"""Bytes a pixel of what is there however a frame is denoised: its buffers, the state before and after, the image."""
+CHANNEL = 8
+"""Bytes a pixel of each channel of a file while it is written and read back."""
+STEP = 1100
+"""Bytes a pixel of what is denoised at once, a window or the whole frame. All four are upper bounds for the shipped
+methods on two cores, by ``python -m experiments.stability.memory``."""
 
 _combine = jax.jit(combine, static_argnames="texture_unknown")
 _measure_confidence = jax.jit(measure_confidence)
@@ -143,3 +155,31 @@ class FrameDenoiser:
 def light_of(radiance: np.ndarray | None) -> Any:
     """Radiance that can be added: non-finite or negative values become 0, an absent part is 0."""
     return 0.0 if radiance is None else np.asarray(sanitize_image(radiance), np.float32)
+
+
+def measure_machine_memory() -> float:
+    """Bytes of memory of this machine; infinite where the system does not tell."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, OSError, ValueError):  # not on Unix
+        return math.inf
+
+
+def estimate_bytes(height: int, width: int, channels: int) -> float:
+    """Bytes that denoising whole frames needs, of files with so many channels."""
+    return _beside_step(height, width, channels) + STEP * height * width
+
+
+def choose_tile_side(limit: float, height: int, width: int, channels: int) -> int | None:
+    """The side of square tiles with which frames are denoised within ``limit`` bytes; None: whole frames fit.
+
+    It is 0 where even what tiles leave out does not fit.
+    """
+    if estimate_bytes(height, width, channels) <= limit:
+        return None
+    left = limit - _beside_step(height, width, channels)
+    return int(math.sqrt(max(left, 0) / STEP)) // GRID * GRID
+
+
+def _beside_step(height: int, width: int, channels: int) -> float:
+    return PROGRAM + (HELD + CHANNEL * channels) * height * width

@@ -9,8 +9,7 @@ import numpy as np
 from jaxdn import color
 from jaxdn.core.frame import Frame
 from jaxdn.data.exr.exr import write_exr
-from jaxdn.data.exr.file import ExrFile
-from jaxdn.data.exr.windows import Window
+from jaxdn.data.exr.file import ExrFile, Window
 from jaxdn.data.foreign.result import write_result
 from jaxdn.evaluation.report.images import save_png
 from jaxdn.sequence.additive_aovs import AdditiveAovs

@@ -54,7 +54,7 @@ def test_messages_without_a_reader_too():
 def test_more_than_a_buffer_while_it_works():
     work = """
 from jaxdn.commands.errors import plain_errors
-from jaxdn.commands.pipe import end_with_reader
+from jaxdn.commands.errors import end_with_reader
 with end_with_reader(), plain_errors():
     for line in range(100_000):
         print(line)
@@ -66,7 +66,7 @@ def test_a_pipe_to_another_process_is_an_error():
     work = """
 import os
 from jaxdn.commands.errors import plain_errors
-from jaxdn.commands.pipe import end_with_reader
+from jaxdn.commands.errors import end_with_reader
 reader, writer = os.pipe()
 os.close(reader)
 with end_with_reader(), plain_errors():

@@ -12,8 +12,7 @@ import pytest
 from jaxdn import clips
 from jaxdn.core.frame import Frame
 from jaxdn.data.exr.exr import rewrite_exr
-from jaxdn.data.exr.file import ExrFile
-from jaxdn.data.exr.windows import Window
+from jaxdn.data.exr.file import ExrFile, Window
 from jaxdn.data.foreign.classify import UNNAMED, ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.denoiser import Core, recurrent

@@ -16,7 +16,7 @@ from jaxdn.data.clip.folder import refuse_unfinished
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.read import read_clip
-from jaxdn.sequence.memory_budget import STEP, estimate_bytes
+from jaxdn.sequence.frame_denoiser import STEP, estimate_bytes
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import find_model

@@ -9,7 +9,7 @@ from experiments.stability.memory import peak_mib, write_sequence
 from jaxdn.clips import read_exr
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.classify import ChannelNaming
-from jaxdn.sequence.memory_budget import STEP, estimate_bytes
+from jaxdn.sequence.frame_denoiser import STEP, estimate_bytes
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import find_model

@@ -14,8 +14,7 @@ import numpy as np
 
 from jaxdn.core.frame import BUFFERS, FAR, Buffer, Frame, present
 from jaxdn.data.errors import ClipError
-from jaxdn.data.exr.file import ExrFile
-from jaxdn.data.exr.windows import Window, union_of
+from jaxdn.data.exr.file import ExrFile, Window, union_of
 from jaxdn.data.foreign.classify import ChannelMapping, ChannelNaming, classify_channels
 from jaxdn.data.foreign.layers import Channels, is_cryptomatte, layer_of, stack_channels
 from jaxdn.data.foreign.measured_motion import fitting_conventions

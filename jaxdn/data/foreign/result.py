@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxdn.data.exr.exr import rewrite_exr
-from jaxdn.data.exr.file import ExrFile
-from jaxdn.data.exr.windows import Window, crop
+from jaxdn.data.exr.file import ExrFile, Window, crop
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.layers import Channels, beauty_channels, group_layers, layer_of
 
