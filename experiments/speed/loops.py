@@ -25,17 +25,20 @@ from jaxdn.core.frame import Frame
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import guides_of
 from jaxdn.methods.steady import regression
-from jaxdn.methods.steady.accumulation import History, RunningMean, update_mean
-from jaxdn.methods.steady.fireflies import suppress_fireflies
+from jaxdn.methods.steady.accumulation import (
+    History,
+    RunningMean,
+    assemble_network_input,
+    suppress_fireflies,
+    update_mean,
+)
 from jaxdn.methods.steady.levels import LEVELS
 from jaxdn.methods.steady.method import FEATURES, HALF_FEATURES, INITIAL, split_heads
-from jaxdn.methods.steady.network_input import assemble_network_input
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import implementation
-from jaxdn.ops.layout.planar import join_planes
-from jaxdn.ops.scales import fill_holes
+from jaxdn.ops.scales import fill_holes, join_planes
 from jaxdn.runtime.malloc import tune_malloc
 
 Work = tuple[Callable[..., Any], tuple[Any, ...]]

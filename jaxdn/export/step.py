@@ -14,8 +14,8 @@ import numpy as np
 from jax import export
 
 from jaxdn.core.frame import BUFFERS, GUIDES, Frame
-from jaxdn.core.platform import NotPortableError, portable
 from jaxdn.denoiser import Denoiser, Params, stages_of
+from jaxdn.ops.dispatch.operation import NotPortableError, portable
 
 Arrays = dict[str, Any]
 MULTIPLES = (1, 16, 32)

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.core.platform import ANY, platform
 from jaxdn.filters.edge_stopping import Offset, Weight
 from jaxdn.filters.stencil_tiles import NO_WEIGHT
+from jaxdn.ops.dispatch.operation import ANY, platform
 from jaxdn.ops.dispatch.row_tiles import evaluate_sparsely
 
 _WORTH = 100_000

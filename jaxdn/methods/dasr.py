@@ -23,7 +23,8 @@ from jaxdn.methods import direct
 from jaxdn.methods.demodulation import Demodulation, demodulated
 from jaxdn.methods.registry import method
 from jaxdn.methods.sampler import Sampling, allocate_samples, sampler
-from jaxdn.networks import LARGE, MULTIPLE, SMALL, Widths, pad
+from jaxdn.networks import LARGE, MULTIPLE, SMALL, Widths
+from jaxdn.ops.scales import pad
 from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.recipes.objectives import compressed_illumination, pyramid_illumination
 from jaxdn.recipes.recipe import Recipe
@@ -95,7 +96,7 @@ def dasr(options: Options) -> Denoiser:
         surfaces = _surfaces(frame, statistics)
         count = None if frame.sample_count is None else 1.0 / (1.0 + frame.sample_count)
         groups: list[jax.Array | None] = [color.compress(gain * prepared.light)]
-        groups += [None if group is None else pad(group) for group in (*surfaces, count)]
+        groups += [None if group is None else pad(group, MULTIPLE) for group in (*surfaces, count)]
         features = [None if group is None else group[None] for group in groups]
         output = predictor.apply(params["predictor"], features)[0][0]
         return (), direct.expand_output(output, prepared, gain), 0

@@ -14,8 +14,7 @@ from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.denoiser import Params
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.filters.surface_test import surface_mask
-from jaxdn.networks import crop, pad
-from jaxdn.ops.scales import fill_holes
+from jaxdn.ops.scales import crop, fill_holes, pad
 
 
 class PreparedFrame(NamedTuple):

@@ -28,9 +28,9 @@ from jaxdn.filters.surface_test import depth_feature, surface_mask
 from jaxdn.methods.demodulation import Demodulation, demodulated
 from jaxdn.methods.reconstruction import SCALES, Prediction, blend, heads_of, init_bias
 from jaxdn.methods.registry import method
-from jaxdn.networks import LARGE, SMALL, Widths, crop, graph, pad
+from jaxdn.networks import LARGE, MULTIPLE, SMALL, Widths, graph
 from jaxdn.ops.motion import on_screen
-from jaxdn.ops.scales import downsample, fill_holes
+from jaxdn.ops.scales import crop, downsample, fill_holes, pad
 from jaxdn.ops.warp import warp
 from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.recipes.objectives import indirect_illumination, unbiased_illumination
@@ -142,7 +142,7 @@ def _guides(options: Options, frame: Frame, statistics: FrameStatistics) -> dict
     fractions = {"albedo": frame.albedo, "reflectance": reflectance, "roughness": frame.roughness}
     guides = {name: None if guide is None else guide - 1.0 for name, guide in fractions.items()}
     guides |= {"normal": frame.normal, "depth": depth}
-    return {name: None if guide is None else pad(guide) for name, guide in guides.items()}
+    return {name: None if guide is None else pad(guide, MULTIPLE) for name, guide in guides.items()}
 
 
 def warp_history(
@@ -277,11 +277,11 @@ def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES) -> Core:
     def prepare(frame: Frame) -> tuple[FrameStatistics, PreparedFrame]:
         frame = frame._replace(radiance=jnp.minimum(frame.radiance, RADIANCE_MAX))
         hit = surface_mask(frame.depth, None) if options.background == "pass" else None
-        noisy = pad(frame.radiance)
+        noisy = pad(frame.radiance, MULTIPLE)
         if hit is not None:
-            noisy = fill_holes(noisy, pad(hit[..., None]))
+            noisy = fill_holes(noisy, pad(hit[..., None], MULTIPLE))
         if frame.sample_count is not None:
-            noisy = fill_holes(noisy, pad(frame.sample_count > 0))
+            noisy = fill_holes(noisy, pad(frame.sample_count > 0, MULTIPLE))
         return measure_frame(noisy, frame.depth, frame), PreparedFrame(frame, noisy, hit)
 
     def step(
@@ -291,9 +291,9 @@ def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES) -> Core:
         size = frame.radiance.shape[:2]
         history, absent, invalid = warp_history(options, state, frame, first)
         guides = _guides(options, frame, statistics)
-        history, absent = pad(history), pad(absent)
+        history, absent = pad(history, MULTIPLE), pad(absent, MULTIPLE)
         if hit is not None:
-            history = fill_holes(history, pad(hit[..., None]))
+            history = fill_holes(history, pad(hit[..., None], MULTIPLE))
         gain = statistics.exposure if options.exposure == "measured" else 1.0
         light = color.compress(gain * noisy)
         features = [light, guides["albedo"], guides["normal"], guides["depth"], color.compress(gain * history)]
@@ -301,7 +301,7 @@ def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES) -> Core:
             features.append(absent.astype(noisy.dtype))
         if materials:
             features += [guides["reflectance"], guides["roughness"]]
-        features += [None if feature is None else pad(feature) for feature in extra.of(frame)]
+        features += [None if feature is None else pad(feature, MULTIPLE) for feature in extra.of(frame)]
         predicted = predict(params, features, noisy.dtype)
 
         if direct:

@@ -18,11 +18,11 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
 from jaxdn.core.frame import Frame, written_out
-from jaxdn.core.platform import ANY, NotPortableError, platform
 from jaxdn.denoiser import Core, Denoiser, Params, State, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.methods.registry import method
 from jaxdn.ops import oidn as binding
+from jaxdn.ops.dispatch.operation import ANY, NotPortableError, platform
 
 Guides = Literal["both", "albedo", "none"]
 _READS: dict[Guides, tuple[str, ...]] = {"both": ("albedo", "normal"), "albedo": ("albedo",), "none": ()}

@@ -22,7 +22,8 @@ from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods import direct
 from jaxdn.methods.demodulation import Demodulation, demodulated
 from jaxdn.methods.registry import method
-from jaxdn.networks import Widths, pad
+from jaxdn.networks import Widths
+from jaxdn.ops.scales import pad
 from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.recipes.objectives import pyramid_illumination, recurrent_illumination
 from jaxdn.recipes.recipe import Recipe

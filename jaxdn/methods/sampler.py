@@ -17,8 +17,9 @@ from jax import lax
 
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Params
-from jaxdn.networks import LARGE, Widths, crop, pad
+from jaxdn.networks import LARGE, MULTIPLE, Widths
 from jaxdn.ops.sampling import sample_map
+from jaxdn.ops.scales import crop, pad
 
 SMALL: Widths = ((8,), (16, 16), (24, 24), (32, 32), (32, 32))
 """Half of the widths of the denoiser's: it only has to find where noise will be."""
@@ -61,7 +62,7 @@ def sampler(options: Sampling, groups: Sequence[int], *, size: str | Widths, imp
 
     def counts(params: Params, features: Sequence[jax.Array | None], even: jax.Array, most: int) -> jax.Array:
         present = next(group for group in features if group is not None)
-        batch = [None if group is None else pad(group)[None] for group in features]
+        batch = [None if group is None else pad(group, MULTIPLE)[None] for group in features]
         logits = crop(network.apply(params, batch)[0][0], (present.shape[0], present.shape[1])).astype(present.dtype)
         return allocate_samples(options, jnp.where(even, 0.0, logits), most)
 

@@ -1,8 +1,13 @@
-"""Images at several scales: halving, doubling, and composing filtered scales."""
+"""Images at several scales and layouts: padded, halved, doubled, composed of filtered scales, joined as planes.
+
+Filters work on planes ``[C, H, W]``. XLA:CPU does not vectorise what it transposes, and computes what it fuses into
+arrays side by side once for each of the channels: a compiled loop keeps both apart.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Literal
 
 import jax
@@ -15,6 +20,26 @@ from jaxdn.ops.dispatch.operation import Example, operation
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Float
+
+LAYOUTS = ("planes", "pixels", "blocks", "corners", "means")
+"""Names of layouts, in the order of their numbers in :mod:`jaxdn.ops.numba_scales`."""
+
+Channels = tuple[str, jax.Array]
+"""A layout and an array: ``"planes"`` [C, H, W], ``"pixels"`` [H, W, C], ``"blocks"`` [H/2, W/2, 4C] made as by
+:func:`space_to_depth`; or what is averaged over blocks of 2x2 pixels: ``"corners"`` [H, W, 4C] made
+likewise, or ``"means"`` [2H, 2W, C]."""
+
+
+def pad(image: jax.Array, multiple: int) -> jax.Array:
+    """[H, W, C] with height and width made multiples of ``multiple`` by repeating the last row and column."""
+    height, width = image.shape[:2]
+    below, right = -height % multiple, -width % multiple
+    return jnp.pad(image, ((0, below), (0, right), (0, 0)), mode="edge") if below or right else image
+
+
+def crop(image: jax.Array, size: tuple[int, int]) -> jax.Array:
+    """The first rows and columns, ``size`` of them: the inverse of :func:`pad`."""
+    return image[: size[0], : size[1]]
 
 
 def downsample(image: Float[Array, "H W C"], *, down: Literal["mean", "max"] = "mean") -> Float[Array, "H/2 W/2 C"]:
@@ -75,7 +100,7 @@ def _fill_holes(image: jax.Array, known: jax.Array) -> jax.Array:
 
 @numba_call.implements(_fill_holes)
 def _fill_holes_by_numba(image: jax.Array, known: jax.Array) -> jax.Array:
-    from jaxdn.ops.numba_fill import fill_rows
+    from jaxdn.ops.numba_scales import fill_rows
 
     return numba_call.call(fill_rows, [image.shape], [image, known[..., 0]], rows=image.shape[0] // 4)[0]
 
@@ -159,7 +184,64 @@ def _check_even(height: int, width: int, name: str) -> None:
         )
 
 
+def join_planes(parts: Sequence[Channels], *, implementation: str | None = None) -> jax.Array:
+    """[C, H, W] the channels of all parts, in their order; all parts have to be of one size."""
+    layouts, arrays = zip(*parts, strict=True)
+    return _join_planes(*arrays, layouts=layouts, implementation=implementation)
+
+
+@operation(name="join_planes")
+def _join_planes(*arrays: jax.Array, layouts: tuple[str, ...]) -> jax.Array:
+    """The planes of all arrays, one after the other, each converted from its layout."""
+    return jnp.concatenate([_TO_PLANES[layout](array) for layout, array in zip(layouts, arrays, strict=True)])
+
+
+@numba_call.implements(_join_planes)
+def _join_planes_by_numba(*arrays: jax.Array, layouts: tuple[str, ...]) -> jax.Array:
+    from jaxdn.ops.numba_scales import join_rows
+
+    reference = functools.partial(_join_planes, layouts=layouts, implementation="reference")
+    shape = jax.eval_shape(reference, *arrays).shape
+    return numba_call.call(join_rows, [shape], [arrays], tuple(map(LAYOUTS.index, layouts)), rows=shape[1])[0]
+
+
+def to_planes(image: jax.Array) -> jax.Array:
+    """[H, W, C] as [C, H, W]."""
+    return image.transpose(2, 0, 1)
+
+
+def _depth_to_space(blocks: jax.Array) -> jax.Array:
+    height, width, channels = blocks.shape
+    parts = blocks.reshape(height, width, channels // 4, 2, 2).transpose(2, 0, 3, 1, 4)
+    return parts.reshape(channels // 4, 2 * height, 2 * width)
+
+
+def _average_corners(blocks: jax.Array) -> jax.Array:
+    return jnp.mean(blocks.reshape(*blocks.shape[:2], -1, 4), axis=-1)
+
+
+_TO_PLANES = {
+    "planes": lambda array: array,
+    "pixels": to_planes,
+    "blocks": _depth_to_space,
+    "corners": lambda array: to_planes(_average_corners(array)),
+    "means": lambda array: to_planes(downsample(array)),
+}
+
+
 @_fill_holes.example
-def _example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+def _fill_holes_example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
     size = height + -height % 4, width + -width % 4
     yield Example((rng.random((*size, 3)), rng.random((*size, 1)) > 0.6))
+
+
+@_join_planes.example
+def _join_planes_example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    shapes = {
+        "planes": (2, 2 * height, 2 * width),
+        "pixels": (2 * height, 2 * width, 3),
+        "blocks": (height, width, 8),
+        "corners": (2 * height, 2 * width, 4),
+        "means": (4 * height, 4 * width, 2),
+    }
+    yield Example(tuple(map(rng.random, shapes.values())), {"layouts": tuple(shapes)})

@@ -15,7 +15,6 @@ from jaxdn.core.frame import FAR, RADIANCE_MAX, Clip, Frame
 from jaxdn.denoiser.sanitize import sanitize
 from jaxdn.materials import glints, microfacets
 from jaxdn.methods.registry import methods
-from jaxdn.networks import pad
 from jaxdn.ops import scales
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
 from jaxdn.ops.kernel_prediction.softmax import softmax_filter
@@ -219,7 +218,7 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
     def filled(inputs: Inputs) -> jax.Array:
         frames = inputs.clip.frames
         known = frames.depth[-1] < FAR
-        return scales.fill_holes(pad(frames.radiance[-1]), pad(known))
+        return scales.fill_holes(scales.pad(frames.radiance[-1], 16), scales.pad(known, 16))
 
     return {
         **{f"warp, {border}": partial(warped, border=border) for border in _BORDERS},

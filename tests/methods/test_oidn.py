@@ -12,7 +12,6 @@ import jaxdn
 from jaxdn import color
 from jaxdn.commands.main import main
 from jaxdn.core.frame import Clip, Frame, frame_at
-from jaxdn.core.platform import NotPortableError
 from jaxdn.data.clip.folder import write_clip
 from jaxdn.denoiser.rollout import stream
 from jaxdn.denoiser.tiles import GRID, stream_tiled
@@ -20,6 +19,7 @@ from jaxdn.denoisers import demodulated, oidn
 from jaxdn.export.step import exported_step
 from jaxdn.methods.registry import method_named
 from jaxdn.ops import oidn as binding
+from jaxdn.ops.dispatch.operation import NotPortableError
 from jaxdn.zoo.ready import filter_names, find_model
 from tests.needs import require
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 import jaxdn
-from jaxdn.core.platform import portable
 from jaxdn.methods.registry import method_named
-from jaxdn.ops.dispatch.operation import OPERATIONS, operation
+from jaxdn.ops.dispatch.operation import OPERATIONS, operation, portable
 
 pytestmark = pytest.mark.usefixtures("cpu")
 

@@ -21,11 +21,9 @@ from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.surface_test import depth_slopes, surface_mask
 from jaxdn.methods.steady import lighting_change, regression
 from jaxdn.methods.steady.accumulation import FilteredLight
-from jaxdn.networks import pad
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
-from jaxdn.ops.layout.planar import Channels, join_planes
-from jaxdn.ops.scales import upsample
+from jaxdn.ops.scales import Channels, join_planes, pad, upsample
 
 LEVELS = 4
 """Levels at half resolution, taps 2, 4, 8 and 16 pixels apart."""
@@ -51,7 +49,7 @@ class Surfaces(NamedTuple):
     """[H, W] bool, there is a surface."""
 
     def guides(self, layout: str = "pixels") -> list[Channels]:
-        """Albedo, gloss and normal, parts of planes (:mod:`jaxdn.ops.layout.planar`)."""
+        """Albedo, gloss and normal, parts of planes (:mod:`jaxdn.ops.scales`)."""
         return [(layout, self.albedo), (layout, self.gloss), (layout, self.normal)]
 
 

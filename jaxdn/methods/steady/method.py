@@ -4,8 +4,8 @@ For each frame: divide by what surfaces reflect; fetch the history with a test o
 a running mean whose effective number of samples is known per pixel; filter the mean by affinities, one or two levels at
 full resolution and four at half, each reaching twice as far as the one before (:mod:`jaxdn.methods.steady.levels`);
 add again what that removed where light follows the guides (:mod:`jaxdn.methods.steady.regression`); add the change of
-the light that the mean lacks (:mod:`jaxdn.methods.steady.lighting_change`); suppress fireflies
-(:mod:`jaxdn.methods.steady.fireflies`); blend the result with the last output.
+the light that the mean lacks (:mod:`jaxdn.methods.steady.lighting_change`); suppress fireflies;
+blend the result with the last output.
 
 What a hand-made filter leaves to constants, a U-Net at half resolution decides for every pixel: learned features that
 stop the filter beside albedo, gloss, normal and depth; how far a pixel is trusted (a firefly is not); how fast both
@@ -32,8 +32,15 @@ from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, depth_feature, guides_of
 from jaxdn.methods.demodulation import Demodulation, demodulated, texture_left
 from jaxdn.methods.registry import method
-from jaxdn.methods.steady.accumulation import History, update_history, update_mean
-from jaxdn.methods.steady.fireflies import suppress_fireflies
+from jaxdn.methods.steady.accumulation import (
+    CHANNELS,
+    DARK,
+    History,
+    assemble_network_input,
+    suppress_fireflies,
+    update_history,
+    update_mean,
+)
 from jaxdn.methods.steady.levels import (
     BLOCKS,
     LEVELS,
@@ -44,13 +51,11 @@ from jaxdn.methods.steady.levels import (
     receptive_field,
     surfaces_of,
 )
-from jaxdn.methods.steady.network_input import CHANNELS, DARK, assemble_network_input
 from jaxdn.methods.steady.regression import SCALES
-from jaxdn.networks import Widths, crop, graph, pad
+from jaxdn.networks import Widths, graph
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
-from jaxdn.ops.layout.planar import join_planes, to_planes
-from jaxdn.ops.scales import downsample, fill_holes, upsample
+from jaxdn.ops.scales import crop, downsample, fill_holes, join_planes, pad, to_planes, upsample
 from jaxdn.recipes.objectives import pyramid_illumination
 from jaxdn.recipes.recipe import FINISH, Recipe
 
@@ -249,7 +254,7 @@ def _split_planes(head: jax.Array, *, size: tuple[int, int]) -> _Split:
 
 @numba_call.implements(_split_planes)
 def _split_planes_by_numba(head: jax.Array, *, size: tuple[int, int]) -> _Split:
-    from jaxdn.methods.steady.numba_heads import split_heads
+    from jaxdn.methods.steady.numba_kernels import split_heads
 
     (height, width), (first, _, last) = size, _SPLITS
     shapes = [(*size, first), (len(INITIAL), 2 * height, 2 * width), (*size, HALF_FEATURES)]

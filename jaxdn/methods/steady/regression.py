@@ -32,7 +32,7 @@ from jax import lax
 from jaxdn.ops.affinity.filter import SPLINE
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
-from jaxdn.ops.layout.planar import join_planes
+from jaxdn.ops.scales import join_planes
 
 SCALES = {"normal": 0.0, "position": 0.0, "gloss": 0.0, "depth": 0.0}
 """Logarithms of what the guides are multiplied by before training: more, and their slope is believed sooner."""

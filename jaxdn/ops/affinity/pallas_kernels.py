@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdn.core.platform import platform
+from jaxdn.ops.dispatch.operation import platform
 
 _BLOCK = 64
 """Pixels of a row that one block of threads has."""

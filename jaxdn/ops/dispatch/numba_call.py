@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-from jaxdn.core.platform import platform
-from jaxdn.ops.dispatch.operation import Operation
+from jaxdn.ops.dispatch.operation import Operation, platform
 
 Given = jax.Array | tuple[jax.Array, ...] | None
 

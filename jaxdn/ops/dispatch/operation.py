@@ -19,21 +19,23 @@ Positional arguments of an operation are pytrees of arrays; keywords are constan
   that has a gradient computes value and gradient. Training differentiates programs of many clips at once, for which
   XLA is as fast.
 
-The choice is made during tracing and costs nothing at run time. :func:`implementation` sets the default of a block,
-the environment variable ``JAXDN_IMPLEMENTATION`` that of a process.
+The choice is made during tracing and costs nothing at run time. It depends on the :func:`platform`: on CPUs work runs
+by strips of rows that fit into the cache, and their number depends on the image's size. A program that is exported
+should run anywhere and for images of any size, so it is traced without all of that.
+
+:func:`implementation` sets the default of a block, the environment variable ``JAXDN_IMPLEMENTATION`` that of a process.
 """
 
 import functools
 import os
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
+from contextvars import ContextVar
 from typing import Any, Generic, NamedTuple, ParamSpec, TypeVar, overload
 
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
-
-from jaxdn.core.platform import platform
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -45,12 +47,35 @@ VARIABLE = "JAXDN_IMPLEMENTATION"
 """Environment variable: ``auto`` or ``reference``."""
 DEFAULTS = ("auto", REFERENCE)
 
+ANY = "any"
+"""The platform of portable programs."""
+
 OPERATIONS: dict[str, "Operation[..., Any]"] = {}
 """Every operation of the modules that have been imported, by name."""
 
 # A part of the key of jax's caches: a jitted function is traced again where the default differs. (And once more if it
 # was traced before this module was imported, when the key did not have that part.)
 _default = jax.make_user_context(default_value=None)
+_portable: ContextVar[bool] = ContextVar("portable", default=False)
+
+
+class NotPortableError(ValueError):
+    """What was traced inside :func:`portable` runs in this process alone."""
+
+
+def platform() -> str:
+    """``"cpu"``, ``"gpu"`` or ``"tpu"``, where jax computes; :data:`ANY` inside :func:`portable`."""
+    return ANY if _portable.get() else jax.default_backend()
+
+
+@contextmanager
+def portable() -> Iterator[None]:
+    """Inside, programs are traced for any platform: reference implementations, and no strips."""
+    token = _portable.set(True)
+    try:
+        yield
+    finally:
+        _portable.reset(token)
 
 
 def implementation(name: str) -> AbstractContextManager[None]:

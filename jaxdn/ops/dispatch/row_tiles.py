@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdn.core.platform import platform
+from jaxdn.ops.dispatch.operation import platform
 
 Arrays = Any
 """A pytree of arrays [H, ...]."""

@@ -1,1 +1,0 @@
-"""Conversions of memory layout: planes, and blocks of pixels as channels."""
