@@ -111,7 +111,7 @@ def _trace_frame(
     if settings.pixel_filter == "centre":
         raise ValueError(
             "scene: motion blur needs filtered pixels, as its first hits are random; expected pixel_filter "
-            "'blackman-harris', 'gaussian' or 'box' (--pixel-filter), got 'centre'."
+            "'blackman-harris', 'gaussian' or 'box' (`jaxdn render --pixel-filter`), got 'centre'."
         )
     return trace_blurred_samples(tracer, scene, frame, settings, request, describe)
 

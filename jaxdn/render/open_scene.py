@@ -9,7 +9,7 @@ import numpy as np
 from jaxdn.render.families import FAMILIES
 from jaxdn.render.mitsuba.variant import use_variant
 from jaxdn.render.scenes.animation import CameraKeys, RigidKeys, check_animation, read_animation
-from jaxdn.render.scenes.optics import ENTRIES, get_shutter, read_optics
+from jaxdn.render.scenes.optics import ENTRIES, Lens, get_shutter, read_optics
 from jaxdn.render.scenes.scene import AnimatedScene, Camera, brightness
 from jaxdn.render.scenes.scene_file import SceneFile
 
@@ -148,14 +148,14 @@ class LoadedScene:
         import mitsuba as mi
 
         sensor = self._scene.sensors()[0]
-        rest = Camera(
-            np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4),
-            float(np.ravel(np.array(mi.traverse(sensor)["x_fov"]))[0]),
-        )
+        values = mi.traverse(sensor)
+        names = ("x_fov", *(Lens._fields if sensor.needs_aperture_sample() else ()))
+        sizes = [float(np.ravel(np.array(values[name]))[0]) for name in names]
+        rest = Camera(np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4), *sizes)
         if self._camera is None:
             return rest
         fov = self._camera.fov(frame)
-        return Camera(self._camera(frame), rest.x_fov if fov is None else fov)
+        return rest._replace(to_world=self._camera(frame), x_fov=rest.x_fov if fov is None else fov)
 
     def pose(self, frame: float) -> dict[str, np.ndarray]:
         """Shape id -> [4, 4] motion by the keys."""

@@ -1,11 +1,14 @@
 """Pixel filters: their moments, what edges, guides and lenses make of them, in clips as well as in frames."""
 
+import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from jaxdn.data.clip.folder import read_frames, read_record
+from jaxdn.data.errors import ClipError
 from jaxdn.render.clip import render_clip
 from jaxdn.render.frame import render_frame
 from jaxdn.render.mitsuba.variant import choose_variant, use_variant
@@ -223,7 +226,14 @@ def test_what_filtered_pixels_exclude():
         RenderSettings(pixel_filter="mitchell")  # type: ignore[arg-type]
 
 
-def test_clips_of_earlier_versions_went_through_the_centres():
-    record = RenderSettings().record()
+def test_clips_of_earlier_versions_went_through_the_centres(tmp_path):
+    settings = RenderSettings(max_depth=2, variant="scalar_rgb", **SIZE)
+    render_clip(Stage(), tmp_path, settings, frames=1)
+    record = read_record(tmp_path)
     del record["pixel_filter"]
-    assert RenderSettings.from_record(record) == RenderSettings(pixel_filter="centre")
+    (tmp_path / "clip.json").write_text(json.dumps(record))
+    assert RenderSettings.from_record(record) == settings
+    with pytest.raises(ClipError, match="pixel_filter: centre there, box wanted"):
+        render_clip(Stage(), tmp_path, replace(settings, pixel_filter="box"), frames=2)
+    render_clip(Stage(), tmp_path, settings, frames=2)
+    assert read_record(tmp_path)["frames"] == 2

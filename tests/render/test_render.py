@@ -334,8 +334,8 @@ def test_a_scene_that_fails_is_named_with_its_frame(tmp_path: Path) -> None:
 
 
 UNSUPPORTED: dict[str, dict[str, Any]] = {
-    "media": {
-        "fog": {
+    "fog": {
+        "mist": {
             "type": "sphere",
             "center": [0, 0, 4],
             "bsdf": {"type": "null"},
@@ -343,12 +343,12 @@ UNSUPPORTED: dict[str, dict[str, Any]] = {
         }
     },
     "depth of field": {"sensor": {"type": "thinlens", "aperture_radius": 0.1, "focus_distance": 3.0}},
-    "motion blur": {"sensor": {"type": "perspective", "shutter_open": 0.0, "shutter_close": 1.0}},
+    "without a shutter": {"sensor": {"type": "perspective", "shutter_open": 0.0, "shutter_close": 1.0}},
 }
 
 
 @pytest.mark.parametrize("effect", UNSUPPORTED)
-def test_unsupported_effects_raise(variant: str, effect: str) -> None:
+def test_effects_that_need_filtered_pixels_or_are_not_supported_raise(variant: str, effect: str) -> None:
     extra = UNSUPPORTED[effect]
     if "sensor" in extra:
         film = {"type": "hdrfilm", "width": WIDTH, "height": HEIGHT, "rfilter": {"type": "box"}}

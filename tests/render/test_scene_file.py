@@ -285,3 +285,25 @@ def test_a_scene_opens_before_a_variant_was_chosen(tmp_path):
     code = f"from jaxdn.render.scenes.scene_file import SceneFile; print(SceneFile({str(path)!r}).frames)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.stdout.strip() == "1", done.stderr
+
+
+def test_a_thin_lens_of_the_file_or_of_the_animation_is_the_cameras(folder):
+    path = folder / "scene.xml"
+    lens = '<sensor type="thinlens"><float name="aperture_radius" value="0.1"/><float name="focus_distance" value="4"/>'
+    path.write_text(OLD.replace('<sensor type="perspective">', lens.replace("_r", "R").replace("_d", "D")))
+    file = SceneFile(path)
+    assert file.camera(0)[1:] == pytest.approx((50.0, 0.1, 4.0))
+    sensor = file.build(0, 8, 6).sensors()[0]
+    assert sensor.needs_aperture_sample()
+    assert mi.traverse(sensor)["focus_distance"] == pytest.approx(4.0)
+    own = {"lens": {"aperture_radius": 0.3, "focus_distance": 2.0}, "shutter": 0.5}
+    keys = {"camera": [{"frame": 0, "origin": [0, 1, 6], "target": [0, 1, 0]}]}
+    moved = animated(folder, {**own, **keys, "fog": {"density": 0.2, "albedo": [0.5, 0.6, 0.7]}})
+    assert moved.camera(0)[1:] == pytest.approx((50.0, 0.3, 2.0))
+    assert moved.shutter == 0.5
+    assert moved.record["animation"]["shutter"] == 0.5
+    medium = moved.build(0, 8, 6).sensors()[0].get_medium()
+    assert mi.traverse(medium)["sigma_t.value.value"] == pytest.approx(0.2)
+    for wrong in ({"lens": {"aperture_radius": 0.3}}, {"fog": {"density": -1, "albedo": [0, 0, 0]}}, {"shutter": 2}):
+        with pytest.raises(ValueError, match=f"animation {next(iter(wrong))}"):
+            animated(folder, wrong)

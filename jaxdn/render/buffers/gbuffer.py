@@ -87,7 +87,7 @@ def check_scene(scene: Any, *, filtered: bool = False) -> None:
         if there and not filtered:
             raise ValueError(
                 f"scene: {what} needs filtered pixels, as its first hits are random; expected pixel_filter "
-                "'blackman-harris', 'gaussian' or 'box' (--pixel-filter), got 'centre'."
+                "'blackman-harris', 'gaussian' or 'box' (`jaxdn render --pixel-filter`), got 'centre'."
             )
     if sensor.shutter_open_time() > 0:
         raise ValueError(
