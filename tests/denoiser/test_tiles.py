@@ -97,14 +97,15 @@ WITH_SLOW_ONES = [pytest.param(name, marks=[pytest.mark.slow] * (name in {"stead
     "without",
     [
         (),
-        pytest.param(("reflectance", "normal"), marks=pytest.mark.slow),
-        pytest.param(("motion", "dual_motion", "ids", "depth", "previous_depth"), marks=pytest.mark.slow),
+        pytest.param(
+            ("reflectance", "normal", "motion", "dual_motion", "ids", "depth", "previous_depth"), marks=pytest.mark.slow
+        ),
     ],
-    ids=["all buffers", "no materials", "no geometry"],
+    ids=["all buffers", "few buffers"],
 )
 @pytest.mark.parametrize("name", WITH_SLOW_ONES)
 def test_tiles_make_the_image_of_the_whole_frame(name: str, without: tuple[str, ...], x64: None) -> None:
-    """With fewer buffers too: then other guides are compared. In float64: what is left is rounding alone."""
+    """With few buffers too: then few guides stop a filter. In float64: what is left is rounding alone."""
     denoiser = METHODS[name]()
     field = denoiser.receptive_field
     side = 2 * (field + 10 + GRID) + 3 * GRID

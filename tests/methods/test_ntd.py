@@ -1,5 +1,6 @@
 """The neural temporal denoiser: its data flow against NumPy, hard cases, and gradients through time."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -30,7 +31,9 @@ SELDOM = sorted(VARIANTS.keys() - {"default", "plain"})
 """Those that only the slow tests go through one by one: each is another program."""
 
 
+@functools.cache
 def tiny(**options: Any) -> Denoiser:
+    """The same one for the same options, so that its programs are compiled once."""
     return ntd(size=TINY, **options)
 
 
@@ -58,8 +61,15 @@ def initial(denoiser: Denoiser, key: jax.Array, frames: Frame) -> Any:
     return jax.tree.map(lambda leaf: 1.5 * leaf + 0.1 * jax.random.normal(key, leaf.shape), params)
 
 
+@functools.cache
 def run(denoiser: Denoiser) -> Callable[[Any, Frame], jax.Array]:
+    """Images of params and frames."""
     return jax.jit(lambda params, frames: unroll(denoiser, params, frames))
+
+
+@functools.cache
+def stepped(denoiser: Denoiser) -> Callable[[Any, Any, Frame], Any]:
+    return jax.jit(denoiser.step)
 
 
 # The processing of a frame, in NumPy.
@@ -115,7 +125,7 @@ def test_data_flow_with_known_heads(options: dict[str, Any], rng: np.random.Gene
     for level, head in enumerate(heads):
         params[f"head_{level}"]["bias"] = jnp.asarray(head, jnp.float32)
     state = Recurrent(jnp.asarray(history, jnp.float32), jnp.asarray(3), jnp.asarray(0))
-    after, image = jax.jit(denoiser.step)(params, state, frame)
+    after, image = stepped(denoiser)(params, state, frame)
 
     scales = [noisy, half(noisy, "mean"), half(half(noisy, "mean"), "mean")]
     full, middle, coarse = (box(scale, softmax(head[:25])) for scale, head in zip(scales, heads, strict=True))
@@ -145,7 +155,7 @@ def test_less_than_all_kernels_with_known_heads(prediction: Any, rng: np.random.
     for name, head in heads.items():
         params[name]["bias"] = jnp.asarray(head, jnp.float32)
     state = Recurrent(jnp.asarray(history, jnp.float32), jnp.asarray(3), jnp.asarray(0))
-    _, image = jax.jit(denoiser.step)(params, state, frame)
+    _, image = stepped(denoiser)(params, state, frame)
     if prediction == "direct":
         wanted = np.broadcast_to(np.expm1(np.maximum(heads["head_0"], 0) ** 2.2), noisy.shape)
     else:
@@ -164,9 +174,15 @@ def test_less_than_all_kernels_with_known_heads(prediction: Any, rng: np.random.
 def test_less_than_all_kernels_begins_plausibly_and_learns(prediction: Any, rng: np.random.Generator) -> None:
     denoiser, frames = tiny(prediction=prediction), random_frames(rng)
     params = denoiser.init(jax.random.key(0), frame_at(frames, 0))
-    images = run(denoiser)(params, frames)
+
+    @jax.jit
+    @functools.partial(jax.grad, has_aux=True)
+    def slopes_and_images(params: Any) -> tuple[jax.Array, jax.Array]:
+        images = unroll(denoiser, params, frames)
+        return jnp.sum(jnp.sqrt(images + 1)), images
+
+    slopes, images = slopes_and_images(params)
     assert 0.3 < float(jnp.mean(images) / jnp.mean(frames.radiance)) < 3
-    slopes = jax.jit(jax.grad(lambda params: jnp.sum(jnp.sqrt(unroll(denoiser, params, frames) + 1))))(params)
     assert all(np.abs(slopes[name]["kernel"]).max() > 0 for name in slopes if name.startswith("head"))
     assert ("guide" in params) == (prediction != "direct")
 
@@ -186,7 +202,7 @@ def test_alpha_weighs_the_current_frame_and_missing_history_is_not_used(
     params, frame = initial(denoiser, key, frames), frame_at(frames, 1)
     broken = frame.dual_motion.at[4, 5].set(jnp.nan).at[9, 9].set(jnp.asarray([40.0, 0.0]))
     frame = frame._replace(dual_motion=jnp.clip(broken, -1e3, 1e3))
-    step = jax.jit(denoiser.step)
+    step = stepped(denoiser)
 
     def image(logit: float, level: float) -> np.ndarray:
         state = Recurrent(jnp.full((16, 16, 3), level), jnp.asarray(1), jnp.asarray(0))
@@ -255,7 +271,7 @@ def test_without_motion_nothing_is_gathered(rng: np.random.Generator, key: jax.A
     params = denoiser.init(key, frame)
 
     def text(frame: Frame) -> str:
-        return jax.jit(denoiser.step).lower(params, denoiser.start(params, frame), frame).as_text()
+        return stepped(denoiser).lower(params, denoiser.start(params, frame), frame).as_text()
 
     assert "gather" in text(frame)
     assert "gather" not in text(frame._replace(motion=None, dual_motion=None))
@@ -280,7 +296,7 @@ def test_first_frame_uses_no_history_and_no_motion(
     denoiser = tiny(preset=preset)
     frames = random_frames(rng)
     params, frame = initial(denoiser, key, frames), frame_at(frames, 0)
-    step = jax.jit(denoiser.step)
+    step = stepped(denoiser)
     start = denoiser.start(params, frame)
     _, image = step(params, start, frame)
     poisoned = start._replace(core=jnp.full_like(start.core, jnp.nan))
@@ -297,7 +313,7 @@ def test_poison_stays_finite_and_is_counted(rng: np.random.Generator, key: jax.A
     frames = random_frames(rng)
     params = initial(denoiser, key, frames)
     gradient = jax.jit(jax.value_and_grad(lambda params, frames: jnp.sum(jnp.log1p(unroll(denoiser, params, frames)))))
-    step = jax.jit(denoiser.step)
+    step = stepped(denoiser)
     for name in ("radiance", "albedo", "normal", "depth", "motion", "dual_motion"):
         for value in POISON:
             buffer = getattr(frames, name).at[0, 3, 4, 0].set(value)
@@ -336,19 +352,19 @@ def test_gradient_through_time(name: str, rng: np.random.Generator, key: jax.Arr
             images.append(image)
         return jnp.mean(weights * jnp.stack(images))
 
-    gradient = jax.jit(jax.grad(scanned))(params)
+    value_and_gradient = jax.jit(jax.value_and_grad(scanned))
+    gradient = value_and_gradient(params)[1]
     flat = jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(gradient)])
     assert jnp.linalg.norm(flat) > 1e-3
     if name == "default":
         same = jax.jit(jax.grad(looped))(params)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-12), gradient, same)
-    value = jax.jit(scanned)
     for seed in range(3):
         keys = jax.random.split(jax.random.key(seed), len(jax.tree.leaves(params)))
         keys = jax.tree.unflatten(jax.tree.structure(params), list(keys))
         way = jax.tree.map(lambda key, leaf: jax.random.normal(key, leaf.shape, leaf.dtype), keys, params)
         ahead, behind = (jax.tree.map(lambda p, d, s=s: p + s * d, params, way) for s in (1e-7, -1e-7))
-        measured = (value(ahead) - value(behind)) / 2e-7
+        measured = (value_and_gradient(ahead)[0] - value_and_gradient(behind)[0]) / 2e-7
         claimed = sum(jnp.vdot(a, b) for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(way), strict=True))
         np.testing.assert_allclose(measured, claimed, rtol=1e-5, atol=1e-7)
 
@@ -436,7 +452,7 @@ def test_guided_kernels_keep_two_surfaces_apart(rng: np.random.Generator) -> Non
         params = {
             name: part if name == "guide" else jax.tree.map(jnp.zeros_like, part) for name, part in params.items()
         }
-        _, image = jax.jit(denoiser.step)(params, denoiser.start(params, frame), frame)
+        _, image = stepped(denoiser)(params, denoiser.start(params, frame), frame)
         errors[kernels] = np.abs(np.asarray(image) - (1 + 9 * right))[:, 16:48].max()
     assert errors["guided"] < 0.5
     assert errors["plain"] > 1.5
