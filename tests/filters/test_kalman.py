@@ -32,6 +32,7 @@ def blend_in_numpy(past, valid, image, noisy, exposure, history_max):
     kept = np.where(valid, (exposure * past[5]) ** 2, 0)
     v = np.maximum(np.maximum(now, kept), 1e-8)
     tracked = np.where(kept > 0, 0.8 * kept + 0.2 * now, now)
+    e = np.clip(e, -3 * np.sqrt(v), 3 * np.sqrt(v))
     s = np.zeros(valid.shape)
     for radius in (3, 7):
         a, b = window_sums((d * e).sum(axis=0) / v, radius), window_sums((d * d).sum(axis=0) / v, radius)
