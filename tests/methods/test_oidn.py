@@ -13,6 +13,7 @@ from jaxdn import color
 from jaxdn.commands.main import main
 from jaxdn.core.frame import Clip, Frame, frame_at
 from jaxdn.data.clip.folder import write_clip
+from jaxdn.data.exr.exr import read_exr
 from jaxdn.denoiser.rollout import stream
 from jaxdn.denoiser.tiles import GRID, stream_tiled
 from jaxdn.denoisers import demodulated, oidn
@@ -170,8 +171,6 @@ def test_files_are_denoised_by_name(library, rng, tmp_path, capsys):
     write_clip(Clip(frames), tmp_path / "noisy")
     main(["denoise", str(tmp_path / "noisy"), "-o", str(tmp_path / "out"), "--method", "oidn", "--no-safe"])
     assert "denoised by oidn" in capsys.readouterr().out
-    from jaxdn.data.exr.exr import read_exr
-
     stored = jaxdn.read_clip(tmp_path / "noisy")
     expected = jaxdn.denoise(oidn(), {}, stored)
     for index in range(2):

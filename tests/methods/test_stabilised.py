@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 import jaxdn
+from jaxdn.commands.main import main
 from jaxdn.core.frame import Clip, Frame, frame_at
+from jaxdn.data.clip.folder import write_clip
+from jaxdn.data.exr.exr import read_exr
 from jaxdn.denoiser import Core, Denoiser, recurrent
 from jaxdn.denoiser.rollout import stream
 from jaxdn.denoiser.tiles import GRID, stream_tiled
@@ -164,6 +167,17 @@ def test_it_is_chosen_by_name():
     with pytest.raises(ValueError, match="method 'magic': expected one of noisy"):
         find_model("stabilised:magic")
     assert jaxdn.denoisers.stabilised is jaxdn.stabilised
+
+
+def test_files_are_denoised_by_name(rng, tmp_path, capsys):
+    frames, _ = rolling(rng, 3)
+    write_clip(Clip(frames._replace(direct=None)), tmp_path / "noisy")
+    main(["denoise", str(tmp_path / "noisy"), "-o", str(tmp_path / "out"), "--method", "stabilised:svgf", "--no-safe"])
+    assert "3 frames denoised by stabilised:svgf" in capsys.readouterr().out
+    expected = jaxdn.denoise(jaxdn.stabilised(svgf()), {}, jaxdn.read_clip(tmp_path / "noisy"))
+    layers = read_exr(tmp_path / "out" / "frame_0002.exr")
+    image = np.stack([layers[f"denoised.{channel}"] for channel in "RGB"], axis=-1)
+    np.testing.assert_allclose(image, expected[2], rtol=2e-3, atol=1e-3)
 
 
 def test_a_history_without_frames_is_refused():
