@@ -160,7 +160,7 @@ class Train:
     """Folder of held-out clips, or a file of `jaxdn pack`, for validation, used whole; its PSNR is free of the noise of
     references that keep one half (those of `jaxdn render` do)."""
     method: str = "ntd"
-    """Method to train, by default ntd (`jaxdn denoise` takes steady-balanced by default, of the method steady); an
+    """Method to train, by default ntd (`jaxdn denoise` uses weights of the method steady by itself); an
     unknown name lists the available ones."""
     variant: str | None = None
     """One of the method's variants (ntd-large, ntd-small); default: the fastest."""
@@ -215,10 +215,11 @@ class Denoise:
     scene (.xml), or family of scenes, to be rendered."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the denoised frames; for a single frame, also the name of an EXR file."""
-    method: str = "steady-balanced"
+    method: str = "auto"
     """Shipped weights (ntd-large, ntd-small, relax-fitted, steady-balanced, steady-fast, steady-high, svgf-fitted), a
-    filter (svgf, asvgf, taa), the path of a .safetensors file, or a filter of another package (package.module:name); an
-    unknown name lists all. By default steady-balanced, while `jaxdn train` trains ntd."""
+    filter (svgf, asvgf, taa, oidn), the path of a .safetensors file, or a filter of another package
+    (package.module:name); an unknown name lists all. auto: on other renderers' files oidn, if the extra of that name is
+    installed; else, and on jaxdn's own clips, steady-balanced."""
     bidirectional: bool = False
     """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
     frames are about as good as the last."""

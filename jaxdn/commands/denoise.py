@@ -1,18 +1,20 @@
 """``jaxdn denoise``: frames that are there, or a scene that is rendered for the denoiser."""
 
+from dataclasses import replace
 from typing import Any
 
 from jaxdn.commands.arguments import Denoise, check_folder, name_channels
 from jaxdn.commands.channel_table import show_channel_mapping
 from jaxdn.commands.progress import reporter
 from jaxdn.core.options import numbers
+from jaxdn.data.clip.folder import is_clip
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.runtime.malloc import tune_malloc
 from jaxdn.sequence.jobs import Job
 from jaxdn.sequence.run import denoise_files, select_backend
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import Model, find_model
+from jaxdn.zoo.ready import AUTO, Model, choose_model, find_model
 
 _OF_SCENES = ("width", "height", "animation", "seed")
 
@@ -23,10 +25,20 @@ def run_denoise(options: Denoise) -> None:
         tune_malloc()
     naming = name_channels(options)
     scene = _scene_of(options)
+    if options.method == AUTO:
+        options = _choose_method(options, of_scene=scene is not None)
     if scene is None:
         _denoise_files(options, naming)
     else:
         _denoise_scene(options, scene)
+
+
+def _choose_method(options: Denoise, *, of_scene: bool) -> Denoise:
+    """The options with the method that is best for what they name; it is printed."""
+    own = of_scene or options.implementation != "auto" or any(is_clip(path) for path in options.clips)
+    choice = choose_model(own_clips=own)
+    print(f"method: {choice.name} ({choice.reason})")
+    return replace(options, method=choice.name)
 
 
 def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:

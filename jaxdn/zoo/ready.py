@@ -15,6 +15,7 @@ from jaxdn.denoiser import Denoiser, Params
 from jaxdn.methods.registry import Method, is_method, method_named, methods
 from jaxdn.methods.stabilised import stabilised
 from jaxdn.networks.backends import Purpose
+from jaxdn.runtime.optional import install
 from jaxdn.zoo.weights import describe, load_weights, shipped_names
 
 NOISY = "noisy"
@@ -24,7 +25,14 @@ STABILISED = "stabilised:"
 """What stands before a name to have it stabilised (:func:`jaxdn.stabilised`)."""
 
 DEFAULT_MODEL = "steady-balanced"
-"""The shipped weights that reports open on: those that `jaxdn denoise` uses."""
+"""The shipped weights that reports open on: those that `jaxdn denoise` uses on our own clips."""
+
+BEST_ELSEWHERE = "oidn"
+"""What is best on frames of Cycles that nothing here was trained on or chosen by (``docs/results``): what `jaxdn
+denoise` uses on other renderers' files, where it is installed."""
+
+AUTO = "auto"
+"""The name that leaves the choice to :func:`choose_model`."""
 
 
 class Model(NamedTuple):
@@ -43,6 +51,24 @@ class Model(NamedTuple):
     def backend(self, purpose: Purpose = "inference") -> str | None:
         """The backend that runs it fastest here (:meth:`jaxdn.methods.registry.Method.backend`); None is XLA."""
         return None if self.method is None else self.method.backend(purpose)
+
+
+class Choice(NamedTuple):
+    """What :func:`choose_model` chose."""
+
+    name: str
+    reason: str
+    """For a person, with what to do for another choice."""
+
+
+def choose_model(*, own_clips: bool) -> Choice:
+    """What is best for the frames at hand: clips of our own renderer, or other renderers' files."""
+    if own_clips:
+        return Choice(DEFAULT_MODEL, "best on clips that jaxdn renders")
+    best = method_named(BEST_ELSEWHERE)
+    if best.installed:
+        return Choice(BEST_ELSEWHERE, f"best on frames of other renderers; of our own methods {DEFAULT_MODEL} is")
+    return Choice(DEFAULT_MODEL, f"{BEST_ELSEWHERE} is better on such frames: {install(BEST_ELSEWHERE)}")
 
 
 def find_model(name: str, **options: Any) -> Model:
