@@ -43,7 +43,7 @@ class Inspect:
     json: bool = False
     """Print only one JSON object: {"effects": [...], "plan": {...}, "uncertain": [...]}, of a clip also "sources". Of
     files of other renderers {"frames": 8, "width": 320, "height": 180, "sources": [...], "missing": {...}, "notes":
-    [...], "fitting_conventions": [...]}, the last null where there is nothing to state."""
+    [...], "unusable": {...}, "fitting_conventions": [...]}, the last null where there is nothing to state."""
     motion_convention: str | None = None
     """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
     channels: list[str] = field(default_factory=list)
@@ -229,6 +229,9 @@ class Denoise:
     """Numbers of the frames to denoise, such as 7 or 10-40; frames before them are read for their history."""
     skip_existing: bool = False
     """Leave out frames whose result is there already."""
+    strict: bool = False
+    """End at an EXR file that is empty, damaged, or has another size or other passes than most; by default such files
+    are left out as missing frames, and named."""
     only_beauty: bool = False
     """Of EXR files of other renderers, write the denoised beauty and its alpha alone, without the other layers."""
     max_memory: float | None = None

@@ -49,6 +49,7 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
         naming=naming,
         frames=_frames(options),
         skip_existing=options.skip_existing,
+        strict=options.strict,
         only_beauty=options.only_beauty,
         aovs=options.aovs,
         preview=options.preview,
@@ -66,6 +67,9 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
             on_frame=report.on_frame,
             log=report.log,
         )
+    if written.left_out:
+        names = ", ".join(path.name for path in written.left_out[:8]) + (" ..." if len(written.left_out) > 8 else "")
+        print(f"left out as missing: {_count(len(written.left_out), 'frame')}: {names} (--strict: end there)")
     if not written.files:
         print(f"nothing to do in {options.out}")
         return
@@ -78,7 +82,7 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
 def _show_job(job: Job, naming: ChannelNaming, method: Model) -> None:
     """Print what is read of a shot."""
     single = len(job.shot.files) == 1
-    mapping = read_channel_mapping(job.clip or job.exr_files[0], naming, single=single)
+    mapping = read_channel_mapping(job.clip or job.files[0], naming, single=single)
     reads = frozenset[str]() if method.denoiser is None else method.denoiser.reads
     show_channel_mapping(job.source, mapping, reads=reads, single=single)
 

@@ -11,6 +11,7 @@ from jaxdn.data.foreign.channel_mapping import UNSTATED, read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.foreign.shots import find_sequence
+from jaxdn.data.foreign.soundness import find_unusable
 from jaxdn.data.foreign.vectors import CHOICES
 
 
@@ -19,8 +20,8 @@ def inspect_files(source: str, *, reads: frozenset[str] | None, as_json: bool, n
 
     Only the first two files are read, of the others the headers. Raises ClipError as
     :func:`jaxdn.data.foreign.channel_mapping.read_channel_mapping` and
-    :meth:`jaxdn.data.foreign.import_exr.ForeignSequence.fitting_conventions` do, for files of different sizes, and for
-    a clip of ours that was not finished.
+    :meth:`jaxdn.data.foreign.import_exr.ForeignSequence.fitting_conventions` do, where no file is usable, and for a
+    clip of ours that was not finished.
 
     Args:
       source: a folder of, a pattern for, or the name of EXR files.
@@ -30,7 +31,10 @@ def inspect_files(source: str, *, reads: frozenset[str] | None, as_json: bool, n
     """
     refuse_unfinished(source)
     files = find_sequence(source)
-    sequence = ForeignSequence([ExrFile(file) for file in files], naming)
+    opened = [ExrFile(file) for file in files]
+    unusable = {files[index].name: reason for index, reason in find_unusable(opened, naming).items()}
+    opened = [file for file in opened if file.path.name not in unusable]
+    sequence = ForeignSequence(opened, naming)
     notes: list[str] = []
     mapping = read_channel_mapping(sequence.files[0], naming, log=notes.append if as_json else print)
     if not as_json:
@@ -39,17 +43,20 @@ def inspect_files(source: str, *, reads: frozenset[str] | None, as_json: bool, n
     unstated = any(mapped.convention == UNSTATED for mapped in mapping)
     fitting = sequence.fitting_conventions() if unstated else None
     if not as_json:
-        print(f"{len(files)} {'frame' if len(files) == 1 else 'frames'} of {width} x {height} pixels")
+        print(f"{len(opened)} {'frame' if len(opened) == 1 else 'frames'} of {width} x {height} pixels")
+        for name, reason in unusable.items():
+            print(f"{name} counts as a missing frame: {reason}")
         if fitting is not None:
-            print("\n".join(_to_state(files, fitting)))
+            print("\n".join(_to_state([file.path for file in opened], fitting)))
         return
     record = {
-        "frames": len(files),
+        "frames": len(opened),
         "width": width,
         "height": height,
         "sources": [mapped._asdict() for mapped in mapping],
         "missing": missing(mapping, reads),
         "notes": notes,
+        "unusable": unusable,
         "fitting_conventions": fitting,
     }
     print(json.dumps(record, indent=1))

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from jaxdn.data.clip.frames import StoredFrame
 from jaxdn.data.exr.exr import to_half
 from jaxdn.filters.time_reversal import HistoryLength, update_history_length
 from jaxdn.filters.time_reversal import blend as blend_directions
+from jaxdn.runtime.scratch import scratch_folder
 
 
 class BackwardImages:
@@ -52,7 +52,7 @@ def backward_pass(
     """Denoise frames from the last to the first, and give their images for as long as the block lasts.
 
     They wait in half precision in a hidden folder below ``folder``, 8 bytes a pixel, which is removed however the block
-    ends. The memory is that of one frame.
+    ends (of a killed process by the next, :mod:`jaxdn.runtime.scratch`). The memory is that of one frame.
 
     Args:
       frames: indices and frames, with time turned around (:func:`jaxdn.filters.time_reversal.reverse_time`).
@@ -61,8 +61,8 @@ def backward_pass(
       folder: created if it is missing.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=".backwards-", dir=folder) as place:
-        images = BackwardImages(Path(place))
+    with scratch_folder(folder, ".backwards-") as place:
+        images = BackwardImages(place)
         state: HistoryLength | None = None
         for index, stored in frames:
             image = denoise(stored)

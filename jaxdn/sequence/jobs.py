@@ -1,8 +1,7 @@
 """What ``jaxdn denoise`` has to do: which frames of which shots, where they are written, and what is there already."""
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from os.path import commonpath
 from pathlib import Path
@@ -33,20 +32,31 @@ class Job:
     """Indices of the frames to write."""
     notes: tuple[str, ...]
     """What a user should know, in sentences."""
+    files: tuple[ExrFile, ...] = ()
+    """The files, each to be opened once; of a clip of ours none."""
 
     @property
     def source(self) -> Path:
         """What tells of which layers it consists: the clip's folder, or the first file."""
         return self.clip or self.shot.files[0]
 
-    @cached_property
-    def exr_files(self) -> tuple[ExrFile, ...]:
-        """The files, each to be opened once."""
-        return tuple(ExrFile(file) for file in self.shot.files)
-
     def count_channels(self) -> int:
         """The number of channels of the first file."""
-        return len(self.exr_files[0].windows)
+        first = self.files[0] if self.files else ExrFile(self.shot.files[0])
+        return len(first.windows)
+
+    def without(self, indices: Collection[int]) -> "Job":
+        """The same job without some of its frames."""
+        kept = [index for index in range(len(self.shot.files)) if index not in indices]
+        numbers = tuple(self.shot.numbers[index] for index in kept) if self.shot.numbers else ()
+        shot = self.shot._replace(files=tuple(self.shot.files[index] for index in kept), numbers=numbers)
+        return replace(
+            self,
+            shot=shot,
+            targets=tuple(self.targets[index] for index in kept),
+            wanted=frozenset(new for new, index in enumerate(kept) if index in self.wanted),
+            files=tuple(self.files[index] for index in kept),
+        )
 
     def segments(self, *, both_directions: bool = False) -> Iterator[range]:
         """Indices of consecutive frames, each after the first with a history: the wanted ones and their warm-up.
@@ -117,7 +127,8 @@ def find_jobs(
         wanted = frozenset(index for index in chosen if not (skip_existing and targets[index].is_file()))
         named |= bool(chosen) or not set(missing(shot.numbers)).isdisjoint(frames or ())
         notes = _notes(shot, among_others=len(found) > 1, existing=len(chosen) - len(wanted))
-        jobs.append(Job(shot, clip, targets, wanted, notes))
+        files = () if clip is not None else tuple(ExrFile(file) for file in shot.files)
+        jobs.append(Job(shot, clip, targets, wanted, notes, files))
     _check_targets(jobs)
     inputs = {file.resolve() for shot, _ in found for file in shot.files}
     if {target.resolve() for job in jobs for target in job.targets} & inputs or out.resolve() in inputs:

@@ -38,7 +38,7 @@ def denoise_segment(
         source, writer = _ClipFrames(job.clip, segment, settings.spp), ClipWriter(settings)
     else:
         check_single_layer(job.shot.files[segment.start : segment.stop], settings.spp)
-        sequence = ForeignSequence(job.exr_files[segment.start : segment.stop], settings.naming)
+        sequence = ForeignSequence(job.files[segment.start : segment.stop], settings.naming)
         source, writer = _ForeignFrames(sequence, segment), ForeignWriter(sequence.window, settings, log)
     with ExitStack() as stack:
         backward: BackwardImages | None = None
@@ -56,6 +56,7 @@ def denoise_segment(
             if path is not None:
                 yield path
         report.finish()
+        source.finish(log)
 
 
 class FrameOutput(NamedTuple):
@@ -158,6 +159,9 @@ class _ClipFrames:
         """None: a result is a new file."""
         return None
 
+    def finish(self, log: Callable[[str], None]) -> None:
+        """After the last frame; what is replaced in frames of ours is counted by the step."""
+
 
 class _ForeignFrames:
     """Frames of another renderer, whose results are written into copies of their files."""
@@ -173,3 +177,8 @@ class _ForeignFrames:
     def file(self, index: int) -> ExrFile | None:
         """The file of a frame."""
         return self._sequence.files[index - self._start]
+
+    def finish(self, log: Callable[[str], None]) -> None:
+        """After the last frame: how much was clamped in all."""
+        for line in self._sequence.repairs.totals():
+            log(line)

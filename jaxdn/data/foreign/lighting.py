@@ -16,6 +16,8 @@ SLACK = 0.1
 """By so much fractions may leave [0, 1]: pixel filters with negative lobes overshoot at edges."""
 _PART = 0.999
 """Share of pixels where a part of the beauty is not brighter than it; the rest may be clamped in one of them alone."""
+_CLEARLY = 0.1
+"""Share of pixels that are brighter than the beauty in what is surely no part of it."""
 _NOISE = 0.25
 """Median deviation of a pixel from its four neighbours, relative to them, that no texture has over half of an image.
 
@@ -41,6 +43,12 @@ def explain_light(values: np.ndarray, beauty: np.ndarray) -> str | None:
     if _is_part(values, beauty):
         return "it is nowhere brighter than the beauty, as a part of it is"
     return None
+
+
+def is_clearly_brighter(values: np.ndarray, beauty: np.ndarray) -> bool:
+    """Whether many pixels of a layer [H, W, 3] are brighter than the beauty, so that it is surely no part of it."""
+    lit = np.any(values > 0, axis=-1)
+    return bool(lit.any() and np.mean(np.any(values > 1.1 * beauty + 1e-3, axis=-1)[lit]) > _CLEARLY)
 
 
 def find_additive_layers(
