@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn import brdf
-from jaxdn.filters.accumulation import luminance
+from jaxdn.filters.accumulation import texture_ratio
 from jaxdn.filters.atrous import edge_average, stencil
 from jaxdn.filters.edge_stopping import Weight
 from jaxdn.filters.isolated import fill_isolated, measure_isolation
@@ -49,7 +49,7 @@ def estimate_variance(
     around, spatial = mean[:3], jnp.maximum(mean[4] - mean[3] ** 2, 0.0) * (short_history / length)
     if texture is not None:
         around = brdf.restore(around, texture, mean[5:])
-        spatial = spatial * brdf.restore(jnp.ones_like(spatial), luminance(texture), luminance(mean[5:])) ** 2
+        spatial = spatial * texture_ratio(mean[5:], texture) ** 2
     color, variance = jnp.where(needed[None], around, color), jnp.where(needed, spatial, variance)
     if not isolated:
         return color, variance
