@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Mapping
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.core.frame import Frame
@@ -9,6 +10,7 @@ from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.layers import Channels, beauty_channels, stack_channels
 from jaxdn.data.foreign.lighting import find_additive_layers, find_beauty_copies
 from jaxdn.sequence.aov_decomposition import DecompositionState, decompose, init_decomposition
+from jaxdn.sequence.light_range import choose_exponent
 
 
 class AdditiveAovs:
@@ -18,6 +20,7 @@ class AdditiveAovs:
         self._naming, self._log = naming, log
         self._layers: dict[str, Channels] | None = None
         self._state: DecompositionState | None = None
+        self._exponent: int | None = None  # of the unit in which the history is
 
     def denoise(self, pixels: Mapping[str, np.ndarray], frame: Frame, image: np.ndarray) -> dict[str, np.ndarray]:
         """Layer -> denoised image [H, W, 3], of the channels of a file, its frame and its denoised beauty.
@@ -28,12 +31,24 @@ class AdditiveAovs:
             self._layers = self._find(pixels)
         if not self._layers:
             return {}
+        exponent = self._follow_light(np.asarray(frame.radiance))
         noisy = np.stack([stack_channels(pixels, channels).astype(np.float32) for channels in self._layers.values()])
         state = init_decomposition(frame, len(noisy)) if self._state is None else self._state
         # Without what the decomposition does not read, a step is compiled once for all denoisers.
-        guides = Frame(frame.radiance, depth=frame.depth, normal=frame.normal, ids=frame.ids, motion=frame.motion)
-        self._state, images = decompose(state, guides, image, noisy)
-        return dict(zip(self._layers, np.asarray(images), strict=True))
+        radiance, beauty, layers = (np.ldexp(light, exponent) for light in (frame.radiance, image, noisy))
+        guides = Frame(radiance, depth=frame.depth, normal=frame.normal, ids=frame.ids, motion=frame.motion)
+        self._state, images = decompose(state, guides, beauty, layers)
+        return dict(zip(self._layers, np.ldexp(np.asarray(images), -exponent), strict=True))
+
+    def _follow_light(self, radiance: np.ndarray) -> int:
+        """The exponent for the next frame; the history is brought to its unit."""
+        exponent = choose_exponent(radiance, self._exponent)
+        if self._state is not None and self._exponent is not None and exponent not in (None, self._exponent):
+            light, length = np.split(np.asarray(self._state.history), [-1], axis=-1)
+            history = np.concatenate([np.ldexp(light, exponent - self._exponent), length], axis=-1)
+            self._state = self._state._replace(history=jnp.asarray(history))
+        self._exponent = exponent
+        return 0 if exponent is None else exponent
 
     def _find(self, pixels: Mapping[str, np.ndarray]) -> dict[str, Channels]:
         names = list(pixels)

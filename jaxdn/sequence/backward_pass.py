@@ -13,6 +13,9 @@ from jaxdn.filters.time_reversal import HistoryLength, update_history_length
 from jaxdn.filters.time_reversal import blend as blend_directions
 from jaxdn.runtime.scratch import scratch_folder
 
+_HALF_OCTAVES = 15
+"""Values below 2 to this power fit into half precision."""
+
 
 class BackwardImages:
     """The images of the backward pass of consecutive frames, and how they are blended with those of the forward one."""
@@ -23,7 +26,10 @@ class BackwardImages:
 
     def keep(self, index: int, image: np.ndarray, number: np.ndarray) -> None:
         """Store the image [H, W, 3] of a frame and for how many frames its points have been seen, [H, W, 1]."""
-        np.save(self._file(index), to_half(np.concatenate([image, number], axis=-1)))
+        # Scaled so that the largest value fits: 2^29 times darker ones are still exact to 11 bits.
+        exponent = _HALF_OCTAVES - int(np.frexp(np.max(np.abs(image), initial=0.0))[1])
+        half = np.concatenate([np.ldexp(np.asarray(image, np.float32), exponent), number], axis=-1)
+        np.savez(self._file(index), images=to_half(half), exponent=exponent)
 
     def blend(self, index: int, frame: Frame, image: np.ndarray) -> np.ndarray:
         """The image of the forward pass blended with that of the backward one, which is removed.
@@ -34,12 +40,14 @@ class BackwardImages:
         file = self._file(index)
         if not file.is_file():
             return image
-        stored = np.load(file).astype(np.float32)
+        with np.load(file) as there:
+            stored, exponent = there["images"].astype(np.float32), int(there["exponent"])
         file.unlink()
-        return np.asarray(blend_directions(image, stored[..., :3], np.asarray(self._seen.number), stored[..., 3:]))
+        other = np.ldexp(stored[..., :3], -exponent)
+        return np.asarray(blend_directions(image, other, np.asarray(self._seen.number), stored[..., 3:]))
 
     def _file(self, index: int) -> Path:
-        return self._folder / f"{index}.npy"
+        return self._folder / f"{index}.npz"
 
 
 @contextmanager

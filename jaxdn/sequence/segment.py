@@ -120,7 +120,7 @@ class _FallbackReport:
         if index == min(self._job.wanted):
             noise = f"noise is about {confidence.noise:.1%} of the light"
             self._log(f"{file.name}: {noise}; {fallback.kept:.0%} of the frame is kept (--no-safe: nothing)")
-        if confidence.fallback > 0 and index in self._job.wanted:
+        if max(confidence.doubt, confidence.fallback) > 0.5 and index in self._job.wanted:
             if not self._doubtful:
                 self._log(_explain_fallback(file, fallback))
             self._doubtful.append(file)
@@ -139,9 +139,10 @@ def _explain_fallback(file: Path, fallback: Fallback) -> str:
         if fallback.texture_unknown
         else "do albedo, normals and depth belong to this frame?"
     )
+    kept = max(fallback.kept, confidence.fallback)
     return (
         f"{file.name}: the denoised image differs by {confidence.lost:.0%} of the light, of which noise explains "
-        f"{confidence.noise:.0%}: {reason} {confidence.fallback:.0%} of the result is the frame as it came"
+        f"{confidence.noise:.0%}: {reason} {kept:.0%} of the result is the frame as it came"
     )
 
 
