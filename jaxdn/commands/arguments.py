@@ -28,9 +28,9 @@ class Inspect:
     jaxdn inspect "shots/*.exr" --channels albedo=diffuseFilter
     """
 
-    scene: tyro.conf.Positional[str]
-    """A Mitsuba scene (.xml), a family, the folder of a finished clip, or EXR files of any renderer: a folder, or a
-    pattern in quotes."""
+    scene: tyro.conf.Positional[list[str]]
+    """A Mitsuba scene (.xml), a family, the folder of a finished clip, or EXR files of any renderer: a folder, a
+    pattern, or their names."""
     animation: Path | None = None
     """Animation file for a scene file."""
     denoiser: str | None = None
@@ -43,7 +43,8 @@ class Inspect:
     json: bool = False
     """Print only one JSON object: {"effects": [...], "plan": {...}, "uncertain": [...]}, of a clip also "sources". Of
     files of other renderers {"frames": 8, "width": 320, "height": 180, "sources": [...], "missing": {...}, "notes":
-    [...], "unusable": {...}, "fitting_conventions": [...]}, the last null where there is nothing to state."""
+    [...], "unusable": {...}, "fitting_conventions": [...]}, the last null where there is nothing to
+    state; of several shots {"shots": [...]}."""
     motion_convention: str | None = None
     """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
     channels: list[str] = field(default_factory=list)

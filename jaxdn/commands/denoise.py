@@ -8,6 +8,7 @@ from jaxdn.commands.channel_table import show_channel_mapping
 from jaxdn.commands.progress import reporter
 from jaxdn.core.options import numbers
 from jaxdn.data.clip.folder import is_clip
+from jaxdn.data.errors import DamagedFile
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.runtime.malloc import tune_malloc
@@ -82,9 +83,16 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
 def _show_job(job: Job, naming: ChannelNaming, method: Model) -> None:
     """Print what is read of a shot."""
     single = len(job.shot.files) == 1
-    mapping = read_channel_mapping(job.clip or job.files[0], naming, single=single)
     reads = frozenset[str]() if method.denoiser is None else method.denoiser.reads
-    show_channel_mapping(job.source, mapping, reads=reads, single=single)
+    for source in [job.clip] if job.clip is not None else job.files:
+        try:
+            mapping = read_channel_mapping(source, naming, single=single)
+        except DamagedFile:  # told when its turn comes
+            if source is job.files[-1]:
+                raise
+            continue
+        show_channel_mapping(job.source, mapping, reads=reads, single=single)
+        return
 
 
 def _denoise_scene(options: Denoise, scene: str) -> None:

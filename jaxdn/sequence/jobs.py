@@ -1,7 +1,9 @@
 """What ``jaxdn denoise`` has to do: which frames of which shots, where they are written, and what is there already."""
 
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+import math
+import os
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from os.path import commonpath
 from pathlib import Path
@@ -34,6 +36,8 @@ class Job:
     """What a user should know, in sentences."""
     files: tuple[ExrFile, ...] = ()
     """The files, each to be opened once; of a clip of ours none."""
+    copies: Mapping[Path, tuple[Path, ...]] = field(default_factory=dict)
+    """Target -> further files to write with the same result, of frames that are held."""
 
     @property
     def source(self) -> Path:
@@ -64,7 +68,9 @@ class Job:
         With ``both_directions`` there are as many frames after the last wanted one.
         """
         last = len(self.shot.files) - 1
-        breaks = {index + 1 for index, (one, next_) in enumerate(pairwise(self.shot.numbers)) if next_ != one + 1}
+        breaks = {
+            index + 1 for index, (one, next_) in enumerate(pairwise(self.shot.numbers)) if next_ != one + self.shot.step
+        }
         start: int | None = None
         for index in range(last + 1):
             if start is not None and index in breaks:
@@ -103,8 +109,8 @@ def find_jobs(
     """
     if not sources:
         raise ValueError("expected a folder, a pattern or a file to denoise, got none; name one.")
-    found = [shot for source in sources for shot in _shots(source)]
-    together = Path(commonpath([str(file.resolve().parent) for shot, _ in found for file in shot.files]))
+    found = [shot for source in _gather(sources) for shot in _shots(source)]
+    together = Path(commonpath([os.path.dirname(os.path.abspath(file)) for shot, _ in found for file in shot.files]))
     single = out.suffix.lower() == ".exr"
     if out.suffix.lower() in _OTHER_IMAGES:
         raise ValueError(
@@ -117,18 +123,19 @@ def find_jobs(
     jobs = []
     named = frames is None
     for shot, clip in found:
-        below = [out / file.resolve().relative_to(together) for file in shot.files]
-        targets = (out,) if single else tuple(path.with_suffix(".exr") for path in below)
+        # Links keep their own names: a store's are hashes.
+        below = [out / Path(os.path.abspath(file)).relative_to(together) for file in shot.files]
+        targets = (out,) if single else tuple(map(_as_exr, below))
         chosen = [
             index
             for index in range(len(targets))
-            if frames is None or set(shot.numbers[index : index + 1]) & set(frames)
+            if frames is None or set(map(math.floor, shot.numbers[index : index + 1])) & set(frames)
         ]
         wanted = frozenset(index for index in chosen if not (skip_existing and targets[index].is_file()))
         named |= bool(chosen) or not set(missing(shot.numbers)).isdisjoint(frames or ())
         notes = _notes(shot, among_others=len(found) > 1, existing=len(chosen) - len(wanted))
         files = () if clip is not None else tuple(ExrFile(file) for file in shot.files)
-        jobs.append(Job(shot, clip, targets, wanted, notes, files))
+        jobs.append(_hold(Job(shot, clip, targets, wanted, notes, files)))
     _check_targets(jobs)
     inputs = {file.resolve() for shot, _ in found for file in shot.files}
     if {target.resolve() for job in jobs for target in job.targets} & inputs or out.resolve() in inputs:
@@ -139,7 +146,47 @@ def find_jobs(
     return jobs
 
 
-def _shots(source: Path) -> list[tuple[Shot, Path | None]]:
+def _gather(sources: Sequence[Path]) -> list[Path | list[Path]]:
+    """The sources, with all files that are named one by one, as a shell expands a pattern, in place of the first."""
+    gathered: list[Path | list[Path]] = []
+    files: list[Path] = []
+    for source in sources:
+        if not source.is_file():
+            gathered.append(source)
+            continue
+        if not files:
+            gathered.append(files)
+        files.append(source)
+    return gathered
+
+
+def _as_exr(path: Path) -> Path:
+    return path if path.suffix.lower() == ".exr" else path.with_suffix(".exr")
+
+
+def _hold(job: Job) -> Job:
+    """The job with frames that are the file before once more (a link of a farm) as copies of that frame's result."""
+    held: dict[int, int] = {}
+    for index in range(1, len(job.files)):
+        before, now = job.shot.files[index - 1], job.shot.files[index]
+        if now.exists() and before.exists() and now.samefile(before):
+            held[index] = held.get(index - 1, index - 1)
+    if not held:
+        return job
+    copies: dict[Path, tuple[Path, ...]] = {}
+    notes = list(job.notes)
+    for index, source in held.items():
+        if index in job.wanted:
+            copies[job.targets[source]] = (*copies.get(job.targets[source], ()), job.targets[index])
+        names = job.shot.files[index].name, job.shot.files[source].name
+        notes.append(f"{names[0]} is {names[1]} once more, and so is its result; after it there is no history at first")
+    wanted = job.wanted | {source for index, source in held.items() if index in job.wanted}
+    return replace(job, wanted=wanted, copies=copies, notes=tuple(notes)).without(held)
+
+
+def _shots(source: Path | list[Path]) -> list[tuple[Shot, Path | None]]:
+    if isinstance(source, list):
+        return [(shot, None) for shot in find_shots(source)]
     if is_clip(source):
         count = read_record(source)["frames"]
         return [(Shot(tuple(frame_path(source, index) for index in range(count)), tuple(range(count))), source)]

@@ -1,11 +1,13 @@
 """``jaxdn denoise``: noisy clips in, denoised EXR frames out, one frame at a time."""
 
+import shutil
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxdn.data.errors import DamagedFile
+from jaxdn.runtime.atomic_files import atomic_write
 from jaxdn.sequence.frame_denoiser import FrameDenoiser
 from jaxdn.sequence.jobs import Job, find_jobs
 from jaxdn.sequence.missing_frames import explain_left_out, leave_out_unusable, segments_around
@@ -81,7 +83,8 @@ def denoise_files(
     jobs = find_jobs(sources, out, frames=settings.frames, skip_existing=settings.skip_existing)
     _refuse_unused(jobs, settings)
     checked = [leave_out_unusable(job, settings) for job in jobs]
-    run = _Run(method, settings, sum(len(job.wanted) for job, _ in checked), on_frame, log)
+    total = sum(len(job.wanted) + sum(map(len, job.copies.values())) for job, _ in checked)
+    run = _Run(method, settings, total, on_frame, log)
     for job, reasons in checked:
         for note in job.notes:
             log(note)
@@ -133,7 +136,8 @@ class _Run:
                 segments[:0] = segments_around(job, segment, index, self.files)
                 if not segments and len(self.files) == before:
                     raise
-                self._total -= index in job.wanted
+                if index in job.wanted:
+                    self._total -= 1 + len(job.copies.get(job.targets[index], ()))
                 self.leave_out(error.path, error.reason)
 
     def _denoise_segment(self, job: Job, segment: range, log: Callable[[str], None]) -> None:
@@ -146,11 +150,22 @@ class _Run:
         try:
             with closing(denoise_segment(job, segment, denoisers, settings, log)) as paths:
                 for path in paths:
-                    self.files.append(path)
-                    self._on_frame(path, len(self.files), self._total)
+                    for written in (path, *job.copies.get(path, ())):
+                        if written != path:
+                            _copy(path, written)
+                        self.files.append(written)
+                        self._on_frame(written, len(self.files), self._total)
         finally:
             self.programs |= {program for denoiser in denoisers for program in denoiser.programs}
             self.sanitized += denoisers[0].sanitized  # the other direction repairs the same frames
+
+
+def _copy(result: Path, target: Path) -> None:
+    """The result of one frame as that of another, with its preview."""
+    for suffix in (result.suffix, ".png"):
+        if result.with_suffix(suffix).is_file():
+            with atomic_write(target.with_suffix(suffix)) as temporary:
+                shutil.copyfile(result.with_suffix(suffix), temporary)
 
 
 def _once(log: Callable[[str], None]) -> Callable[[str], None]:

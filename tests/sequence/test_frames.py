@@ -195,7 +195,7 @@ def test_a_frame_that_is_named_twice_is_refused(tmp_path: Path, capsys: Any) -> 
     image = source / "a.0001.EXR"
     image.write_bytes((source / "a.0001.exr").read_bytes())
     message = refused(capsys, source / "a.0001.exr", image, "-o", tmp_path / "out", "--method", "noisy")
-    assert f"{tmp_path}/out/a.0001.exr: expected the result of one frame" in message
+    assert f"{image}: expected one file for each frame, but {source}/a.0001.exr has the same number" in message
     assert not (tmp_path / "out").exists()
 
 

@@ -120,11 +120,12 @@ def test_most_frames_say_what_the_shot_is_among_those_that_are_read(tmp_path: Pa
 
 def test_the_command_line_ends_with_their_names(tmp_path: Path, capsys: Any) -> None:
     source = shot(tmp_path / "in", DAMAGES["placeholder"][0], 1, 4)
+    rot(source / "s.0002.exr")
     command = ["denoise", str(source), "-o", str(tmp_path / "out"), "--method", "noisy"]
     main.main(command)
     text = " ".join(capsys.readouterr().out.split())
-    assert "left out as missing: 2 frames: s.0001.exr, s.0004.exr (--strict: end there)" in text
-    assert "3 frames denoised by noisy" in text
+    assert "left out as missing: 3 frames: s.0001.exr, s.0004.exr, s.0002.exr (--strict: end there)" in text
+    assert "2 frames denoised by noisy" in text
     with pytest.raises(SystemExit) as ended:
         main.main([*command, "--strict"])
     assert ended.value.code == 2
