@@ -50,6 +50,16 @@ def init_decomposition(frame: Frame, count: int) -> DecompositionState:
     return DecompositionState(nothing, jax.tree.map(jnp.zeros_like, guides_of(sanitize(frame)[0])))
 
 
+def add_layers(state: DecompositionState, count: int) -> DecompositionState:
+    """The state for ``count`` layers, of which those that are new have been black so far."""
+    old = state.history.shape[-1] - 4
+    black = jnp.zeros((*state.history.shape[:2], 3 * count - old), state.history.dtype)
+    if not black.size:
+        return state
+    history = jnp.concatenate([state.history[..., :old], black, state.history[..., old:]], axis=-1)
+    return state._replace(history=history)
+
+
 @jax.jit
 def decompose(
     state: DecompositionState, frame: Frame, beauty: jax.Array, layers: jax.Array
