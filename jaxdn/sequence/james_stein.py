@@ -45,8 +45,10 @@ from jaxdn.filters.atrous import B3_SPLINE
 
 GAINS = (0.8907**2, 0.2007**2, 0.0856**2, 0.0413**2, 0.0009009)
 """Variance of each band, and of the rest, of white noise of variance 1, in two dimensions (Starck and Murtagh)."""
-DOUBT = (1.0, 2.0, 3.0, 4.0, math.inf)
-"""A band's c - 1, times the root of the number of values. Coarser bands have fewer independent ones."""
+DOUBT = (4.0, 8.0, 16.0, 32.0, math.inf)
+"""A band's c - 1, times the root of the number of values: twice as much for each band, whose values are as many times
+fewer independent ones. With 1 instead of 4, a denoiser that is 25 dB better than its input loses 1.8 dB, and Cycles
+frames gain 0.2 dB more."""
 MOST_DOUBT = 9.0
 RADII = (7, 7, 7, 15, 15)
 """Of each band's window: 2 r + 1 pixels a side."""
