@@ -98,7 +98,7 @@ def test_everything_stays_in_the_room_for_120_frames(name: str) -> None:
         low, high = scene.bounds
         eyes = []
         for frame in range(0, 121):
-            to_world, fov = scene.camera(frame)
+            to_world, fov, *_ = scene.camera(frame)
             np.testing.assert_allclose(to_world[:3, :3] @ to_world[:3, :3].T, np.eye(3), atol=1e-12)
             assert 30 < fov < 90
             eyes.append(to_world[:3, 3])
