@@ -14,7 +14,7 @@ from docs.figures import before_after, front_page, vectors
 from jaxdn.clips import write_clip
 from jaxdn.commands.arguments import COMMANDS, Denoise
 from jaxdn.methods.registry import methods
-from jaxdn.zoo.ready import DEFAULT_MODEL
+from jaxdn.zoo.ready import AUTO, DEFAULT_MODEL, choose_model
 from tests.training.test_training import make_clip
 
 ROOT = Path(__file__).parents[2]
@@ -86,8 +86,9 @@ def test_the_pictures_are_small():
     assert sum(sizes.values()) < 1_500_000
 
 
-def test_the_default_of_denoise_is_what_reports_open_on():
-    assert Denoise.__dataclass_fields__["method"].default == DEFAULT_MODEL
+def test_the_default_of_denoise_on_our_clips_is_what_reports_open_on():
+    assert Denoise.__dataclass_fields__["method"].default == AUTO
+    assert choose_model(own_clips=True).name == DEFAULT_MODEL
 
 
 def test_the_tutorials_denoiser_runs_and_learns(tmp_path, monkeypatch, capsys):
