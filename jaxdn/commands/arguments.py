@@ -48,7 +48,8 @@ class Inspect:
     motion_convention: str | None = None
     """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
     channels: list[str] = field(default_factory=list)
-    """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out."""
+    """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out;
+    "buffer=PATTERN.exr" reads it from files of its own."""
     layer: str | None = None
     """For files of other renderers: the view layer or part to look for buffers in."""
 
@@ -248,7 +249,8 @@ class Denoise:
     motion_convention: str | None = None
     """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
     channels: list[str] = field(default_factory=list)
-    """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out."""
+    """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out;
+    "buffer=PATTERN.exr" reads it from files of its own."""
     layer: str | None = None
     """For files of other renderers: the view layer or part to look for buffers in."""
     implementation: str = "auto"

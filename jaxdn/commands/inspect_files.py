@@ -8,10 +8,11 @@ from typing import Any
 from jaxdn.commands.channel_table import missing, show_channel_mapping
 from jaxdn.data.clip.folder import refuse_unfinished
 from jaxdn.data.errors import DamagedFile
-from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import UNSTATED, MappedBuffer, read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
+from jaxdn.data.foreign.passes import join_passes
+from jaxdn.data.foreign.shot_files import open_files
 from jaxdn.data.foreign.shots import Shot, find_shots, ranges
 from jaxdn.data.foreign.shots import missing as missing_numbers
 from jaxdn.data.foreign.soundness import find_unusable
@@ -36,7 +37,9 @@ def inspect_files(
     """
     if isinstance(source, str):
         refuse_unfinished(source)
-    shots = find_shots(source)
+    shots, notes = join_passes(find_shots(source), naming.pass_files)
+    if not as_json:
+        print("".join(f"{note}\n" for note in notes), end="")
     records = [_inspect_shot(shot, reads, naming, quiet=as_json) for shot in shots]
     if as_json:
         several = {"shots": [{"shot": shot.label, **record} for shot, record in zip(shots, records, strict=True)]}
@@ -45,7 +48,7 @@ def inspect_files(
 
 def _inspect_shot(shot: Shot, reads: frozenset[str] | None, naming: ChannelNaming, *, quiet: bool) -> dict[str, Any]:
     """What is read of a shot, for JSON; printed too unless ``quiet``."""
-    every = [ExrFile(file) for file in shot.files]
+    every = open_files(shot)
     unusable = {every[index].path.name: reason for index, reason in find_unusable(every, naming).items()}
     opened = [file for file in every if file.path.name not in unusable]
     notes: list[str] = []

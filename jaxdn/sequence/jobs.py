@@ -10,6 +10,8 @@ from pathlib import Path
 
 from jaxdn.data.clip.folder import frame_path, is_clip, read_record, refuse_unfinished
 from jaxdn.data.exr.file import ExrFile
+from jaxdn.data.foreign.passes import join_passes
+from jaxdn.data.foreign.shot_files import open_files
 from jaxdn.data.foreign.shots import Shot, find_shots, missing, ranges
 
 WARM_UP = 16
@@ -91,7 +93,12 @@ class Job:
 
 
 def find_jobs(
-    sources: Sequence[Path], out: Path, *, frames: Collection[int] | None = None, skip_existing: bool = False
+    sources: Sequence[Path],
+    out: Path,
+    *,
+    frames: Collection[int] | None = None,
+    skip_existing: bool = False,
+    pass_files: Mapping[str, str] | None = None,
 ) -> list[Job]:
     """The shots of folders, patterns and files; several sequences in a folder are several shots.
 
@@ -106,10 +113,15 @@ def find_jobs(
       out: a folder; for a single frame also the name of an EXR file.
       frames: numbers of the frames to denoise; None: all.
       skip_existing: leave out what is there already.
+      pass_files: buffer -> pattern for the files that have it, of other renderers' frames.
     """
     if not sources:
         raise ValueError("expected a folder, a pattern or a file to denoise, got none; name one.")
     found = [shot for source in _gather(sources) for shot in _shots(source)]
+    joined, joints = join_passes([shot for shot, clip in found if clip is None], pass_files or {})
+    places = {shot.files[0]: place for place, (shot, _) in enumerate(found)}
+    found = [one for one in found if one[1] is not None] + [(shot, None) for shot in joined]
+    found.sort(key=lambda one: places[one[0].files[0]])
     together = Path(commonpath([os.path.dirname(os.path.abspath(file)) for shot, _ in found for file in shot.files]))
     single = out.suffix.lower() == ".exr"
     if out.suffix.lower() in _OTHER_IMAGES:
@@ -120,7 +132,7 @@ def find_jobs(
     if single and count > 1:
         raise ValueError(f"{out}: expected a folder for {count} frames, got the name of one EXR file.")
     _check_folder(out.parent if single else out)
-    jobs = []
+    jobs: list[Job] = []
     named = frames is None
     for shot, clip in found:
         # Links keep their own names: a store's are hashes.
@@ -133,8 +145,11 @@ def find_jobs(
         ]
         wanted = frozenset(index for index in chosen if not (skip_existing and targets[index].is_file()))
         named |= bool(chosen) or not set(missing(shot.numbers)).isdisjoint(frames or ())
-        notes = _notes(shot, among_others=len(found) > 1, existing=len(chosen) - len(wanted))
-        files = () if clip is not None else tuple(ExrFile(file) for file in shot.files)
+        notes = (
+            *(joints if not jobs else ()),
+            *_notes(shot, among_others=len(found) > 1, existing=len(chosen) - len(wanted)),
+        )
+        files = () if clip is not None else open_files(shot)
         jobs.append(_hold(Job(shot, clip, targets, wanted, notes, files)))
     _check_targets(jobs)
     inputs = {file.resolve() for shot, _ in found for file in shot.files}

@@ -1,6 +1,6 @@
 """Files of other renderers that count as missing frames of their shot: empty, damaged, or different from the others."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from jaxdn.data.errors import ClipError
@@ -9,7 +9,32 @@ from jaxdn.sequence.jobs import Job
 from jaxdn.sequence.settings import Settings
 
 
-def leave_out_unusable(job: Job, settings: Settings) -> tuple[Job, dict[Path, str]]:
+def leave_out_unusable(
+    jobs: Sequence[Job], settings: Settings, log: Callable[[str], None]
+) -> list[tuple[Job, dict[Path, str]]]:
+    """The jobs without the files whose headers tell that they are no frames of their shot, and why, in words.
+
+    A shot of which nothing is left (a data pass, say) is left out with a line. Raises ClipError where the settings are
+    strict, and where nothing is left of all shots.
+    """
+    checked, errors = [], []
+    for job in jobs:
+        try:
+            checked.append(_leave_out(job, settings))
+        except ClipError as error:
+            if settings.strict:
+                raise
+            errors.append((job, error))
+    if errors and not checked:
+        raise errors[0][1]
+    for job, reason in errors:
+        for note in job.notes:
+            log(note)
+        log(f"{job.shot.label} is left out: {reason}")
+    return checked
+
+
+def _leave_out(job: Job, settings: Settings) -> tuple[Job, dict[Path, str]]:
     """The job without the files whose headers tell that they are no frames of the shot, and why, in words.
 
     Only what is read is looked at. Raises ClipError for the first such file where the settings are strict, and where

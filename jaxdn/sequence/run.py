@@ -80,9 +80,15 @@ def denoise_files(
     """
     if settings.aovs == "additive" and settings.only_beauty:
         raise ValueError("--aovs additive: expected the other layers to be written; leave out --only-beauty.")
-    jobs = find_jobs(sources, out, frames=settings.frames, skip_existing=settings.skip_existing)
+    jobs = find_jobs(
+        sources,
+        out,
+        frames=settings.frames,
+        skip_existing=settings.skip_existing,
+        pass_files=settings.naming.pass_files,
+    )
     _refuse_unused(jobs, settings)
-    checked = [leave_out_unusable(job, settings) for job in jobs]
+    checked = leave_out_unusable(jobs, settings, log)
     total = sum(len(job.wanted) + sum(map(len, job.copies.values())) for job, _ in checked)
     run = _Run(method, settings, total, on_frame, log)
     for job, reasons in checked:

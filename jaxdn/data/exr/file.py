@@ -106,6 +106,11 @@ class ExrFile:
         self._layout: tuple[Window, dict[str, Window]] | None = None
 
     @property
+    def paths(self) -> tuple[Path, ...]:
+        """The files that are read: this one."""
+        return (self.path,)
+
+    @property
     def display(self) -> Window:
         """The display window: the picture."""
         return self._read_layout()[0]

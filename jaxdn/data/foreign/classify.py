@@ -21,12 +21,17 @@ class ChannelNaming:
     motion_convention: str | None = None
     """Of the motion vectors: a key of :data:`jaxdn.data.foreign.vectors.CHOICES`; None: nobody has stated it."""
     channels: Mapping[str, str] | None = None
-    """Buffer -> the layer it is read from, or ``"none"``."""
+    """Buffer -> the layer it is read from, ``"none"``, or a pattern for the EXR files that have it."""
     layer: str | None = None
     """The view layer or part that the other buffers are looked for in."""
 
     def __post_init__(self) -> None:
         check_convention(self.motion_convention)
+
+    @property
+    def pass_files(self) -> dict[str, str]:
+        """Buffer -> pattern, of those that lie in files of their own."""
+        return {name: layer for name, layer in (self.channels or {}).items() if layer.lower().endswith(".exr")}
 
     @property
     def options(self) -> list[str]:

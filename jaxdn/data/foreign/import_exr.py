@@ -20,7 +20,7 @@ from jaxdn.data.foreign.layers import Channels, is_cryptomatte, layer_of, stack_
 from jaxdn.data.foreign.measured_motion import fitting_conventions
 from jaxdn.data.foreign.reflectance import derive_reflectance
 from jaxdn.data.foreign.repairs import FRACTIONS, Repairs
-from jaxdn.data.foreign.shots import find_sequence
+from jaxdn.data.foreign.shot_files import find_sequence, open_files
 from jaxdn.data.foreign.vectors import UnknownMotion, convert_cycles_forward, convert_motion, derive_dual_motion
 from jaxdn.filters.time_reversal import reverse_time
 
@@ -54,8 +54,11 @@ def plain_frames(
     cannot be read or differs from the first.
     """
     naming = ChannelNaming(motion_convention, channels, layer)
-    files = find_sequence(path) if isinstance(path, str | Path) else list(path)
-    return files, ForeignSequence([ExrFile(file) for file in files], naming).frames(backwards=backwards, log=log)
+    if isinstance(path, str | Path):
+        opened = open_files(find_sequence(path, naming.pass_files))
+    else:
+        opened = tuple(ExrFile(file) for file in path)
+    return [file.path for file in opened], ForeignSequence(opened, naming).frames(backwards=backwards, log=log)
 
 
 class ForeignSequence:

@@ -4,7 +4,7 @@ import glob
 import math
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
@@ -27,6 +27,8 @@ class Shot(NamedTuple):
     """Empty for an image without a number."""
     name: str = ""
     """Of its files, with ``#`` for the number, without the suffix; "" for clips of ours."""
+    passes: tuple[Mapping[str, Path], ...] = ()
+    """Of each frame, layer -> a further file that has it (:mod:`jaxdn.data.foreign.passes`); empty: there are none."""
 
     @property
     def label(self) -> str:
@@ -76,29 +78,12 @@ def find_shots(path: str | Path | Sequence[Path]) -> list[Shot]:
     return [*shots, *single]
 
 
-def find_sequence(path: str | Path | Sequence[Path]) -> list[Path]:
-    """The EXR files of one sequence in the order of their frame numbers.
-
-    ``path`` is a folder, a pattern or one file, or several files. Raises ClipError if there are none, if they belong to
-    several sequences, or if frame numbers are missing.
-    """
-    shots = find_shots(path)
-    if len(shots) == 1 and len(shots[0].files) == 1:
-        return list(shots[0].files)
-    for shot in shots:
-        if not shot.numbers:
-            raise ClipError(
-                f"{shot.files[0]}: expected a file name that ends in a frame number, such as shot_0001.exr."
-            )
-    if len(shots) > 1:
-        names = ", ".join(sorted(shot.name.removesuffix("#") for shot in shots))
-        raise ClipError(f"{path}: expected one sequence, got several: {names}; use a pattern.")
-    (shot,) = shots
+def refuse_gaps(path: str | Path | Sequence[Path], shot: Shot) -> None:
+    """Raise ClipError for a shot, found at a path, in which frame numbers are missing."""
     gaps = missing(shot.numbers)
     if gaps:
         shown = ", ".join(map(_text, gaps[:8])) + (" ..." if len(gaps) > 8 else "")
         raise ClipError(f"{path}: frames are missing between {shot.numbers[0]} and {shot.numbers[-1]}: {shown}.")
-    return list(shot.files)
 
 
 def frame_step(numbers: Sequence[Number]) -> Fraction:

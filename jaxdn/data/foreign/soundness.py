@@ -25,20 +25,22 @@ def find_unusable(files: Sequence[ExrFile], naming: ChannelNaming) -> dict[int, 
     known: dict[tuple[str, ...], frozenset[str]] = {}
     for index, file in enumerate(files):
         try:
-            check_complete(file.path)
+            for path in file.paths:
+                check_complete(path)
             names = tuple(file.windows)
             if names not in known:
                 known[names] = frozenset(naming.detect(names))
             looks[index] = file.display, known[names]
         except DamagedFile as error:
-            reasons[index] = error.reason
+            reasons[index] = error.reason if error.path == file.path else f"{error.path.name}: {error.reason}"
         except OSError as error:
             reasons[index] = error.strerror or str(error)
         except ClipError as error:
             reasons[index] = str(error).removeprefix(f"{file.path}: ").removesuffix(".")
     if not looks:
         raise ClipError(f"{files[0].path}: {reasons[0]}.")
-    usual = Counter(looks.values()).most_common(1)[0][0]  # of several equally common ones the first
+    counts = Counter(looks.values())
+    usual = max(counts, key=lambda look: (counts[look], len(look[1])))  # of equals the one with the most buffers
     differing = {index: _explain(look, usual) for index, look in looks.items() if look != usual}
     return dict(sorted((reasons | differing).items()))
 
