@@ -135,7 +135,7 @@ def _scene_of(options: Denoise) -> str | None:
 
 def _frames(options: Denoise) -> list[int] | None:
     """The numbers of the frames to denoise; None: all."""
-    return numbers(options.frames, "--frames") if options.frames else None
+    return numbers(options.frames, "--frames", negative=True) if options.frames else None
 
 
 def _budget(options: Denoise) -> dict[str, Any]:

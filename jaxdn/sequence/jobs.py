@@ -184,7 +184,8 @@ def _hold(job: Job) -> Job:
     held: dict[int, int] = {}
     for index in range(1, len(job.files)):
         before, now = job.shot.files[index - 1], job.shot.files[index]
-        if now.exists() and before.exists() and now.samefile(before):
+        linked = now.is_symlink() or before.is_symlink()
+        if linked and now.exists() and before.exists() and now.samefile(before):
             held[index] = held.get(index - 1, index - 1)
     if not held:
         return job

@@ -10,6 +10,7 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.commands import main
+from jaxdn.core.options import numbers
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import find_model
@@ -63,11 +64,10 @@ def test_links_keep_their_own_names(tmp_path: Path) -> None:
     assert brightness(tmp_path / "0" / "s.0002.exr") == 2.0
 
 
-@pytest.mark.parametrize("link", [os.symlink, os.link])
-def test_a_held_frame_is_that_frame(link: Any, tmp_path: Path) -> None:
+def test_a_held_frame_is_that_frame(tmp_path: Path) -> None:
     source = write(tmp_path / "in", "s.0001.exr", "s.0002.exr", "s.0005.exr")
-    link(source / "s.0002.exr", source / "s.0003.exr")
-    link(source / "s.0002.exr", source / "s.0004.exr")
+    os.symlink(source / "s.0002.exr", source / "s.0003.exr")
+    os.symlink("s.0003.exr", source / "s.0004.exr")
     files, told = denoise([source], tmp_path / "out", preview=True)
     assert files == [f"s.{number:04d}.exr" for number in range(1, 6)]
     assert [brightness(tmp_path / "out" / name) for name in files] == [1.0, 2.0, 2.0, 2.0, 3.0]
@@ -92,3 +92,14 @@ def test_inspect_takes_files_and_several_shots(tmp_path: Path, capsys: Any) -> N
         main.main(["inspect", "fruit", "robot"])
     assert ended.value.code == 2
     assert "fruit: expected one scene" in capsys.readouterr().err
+
+
+def test_numbers_below_zero_can_be_named(tmp_path: Path) -> None:
+    source = write(tmp_path / "in", *(f"s.{number:05d}.exr" for number in range(-3, 3)))
+    for word, names in {"-3": ["s.-0003.exr"], "-1-1": ["s.-0001.exr", "s.00000.exr", "s.00001.exr"]}.items():
+        main.main(["denoise", str(source), "-o", str(tmp_path / word), "--method", "noisy", f"--frames={word}"])
+        assert sorted(path.name for path in (tmp_path / word).iterdir()) == names
+    with pytest.raises(ValueError, match="expected a range from low to high, got '-1--3'"):
+        numbers(["-1--3"], "--frames", negative=True)
+    with pytest.raises(ValueError, match="expected whole numbers >= 0"):
+        numbers(["-1"], "--seeds")
