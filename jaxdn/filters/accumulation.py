@@ -31,12 +31,13 @@ def accumulate(
     texture: jax.Array | None = None,
     change: jax.Array | None = None,
 ) -> jax.Array:
-    """The history [9, H, W] with colour ``now`` [3, H, W] blended in (Schied et al. 2017, sec. 4.1 and 4.2).
+    """The history [9, H, W] with colour ``now`` [3, H, W] blended in.
 
     Planes are colour, the first and second moment of its luminance, the history length N in frames, and the mean
     texture (3). The new frame has the weight ``a = max(alpha, 1 / N)``: without a history, the result is the new frame.
-    Where light has changed by a share ``c``, the weight is ``(1 - c) a + c`` (Schied et al. 2018), and N becomes ``N /
-    (1 - c + c N)``, the length that this share is worth.
+    (Schied et al. 2017, sec. 4.1 and 4.2, have a constant alpha; 1 / N is that of later implementations.) Where light
+    has changed by a share ``c``, the weight is ``(1 - c) a + c`` (Schied et al. 2018), and N becomes ``N / (1 - c + c
+    N)``, the length that this share is worth.
 
     Args:
       past: the history [9, H, W], 0 where there is none; its first six planes suffice without ``texture``.

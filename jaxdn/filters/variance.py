@@ -28,7 +28,8 @@ def estimate_variance(
     """Colour [3, H, W] and the variance [H, W] of its luminance, from a history of ``accumulate``.
 
     Where the length N is less than ``short_history``, both are those of the edge-stopped 7x7 neighbourhood, and the
-    variance is multiplied by ``short_history / N`` (Schied et al. 2017, sec. 4.2). The ``texture`` [3, H, W] that a
+    variance is multiplied by ``short_history / N``. (Schied et al. 2017, sec. 4.2, take the variance alone from there;
+    the colour and the factor are those of later implementations.) The ``texture`` [3, H, W] that a
     division left is averaged likewise and given back to this colour (:func:`jaxdn.brdf.restore`); the deviation changes
     as grey light would.
 

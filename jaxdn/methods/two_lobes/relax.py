@@ -1,11 +1,11 @@
 """``relax``: a variance-guided filter for diffuse and specular light apart, whose fast history holds the slow one.
 
 For each frame and for both kinds of light, divided by what their lobes reflect: fetch the history, for reflections
-along the motion of their virtual image; blend the frame into a slow and into a fast running mean; fill what has hardly
-any history from far around; where the fast mean contradicts the slow one, go on from the fast one, and clamp the slow
-mean to what the fast one shows near by, so that light that changed does not linger; on request, remove fireflies;
-estimate the variance, and apply a-trous levels guided by it, for reflections as narrow in normals and roughness as
-their lobe is.
+along the motion of their virtual image; blend the frame into a slow and into a fast running mean; where the fast mean
+contradicts the slow one, go on from the fast one; fill what has hardly any history from far around; clamp the slow mean
+to what the fast one shows near by, so that light that changed does not linger; on request, remove fireflies; estimate
+the variance, and apply a-trous levels guided by it, for reflections as narrow in normals and roughness as their lobe
+is.
 
 The history is the clamped mean, before the spatial filter: unlike in ``svgf``, nothing filtered is fed back.
 
