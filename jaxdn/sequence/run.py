@@ -127,7 +127,10 @@ class _Run:
         self._log(explain_left_out(path, reason))
 
     def denoise(self, job: Job) -> None:
-        """Denoise a shot; what cannot be decoded counts as missing. Raises DamagedFile where nothing else is left."""
+        """Denoise a shot; a file of another renderer that cannot be decoded counts as missing.
+
+        Raises DamagedFile for one of a clip of ours, and where nothing else is left.
+        """
         log_once = _once(self._log)
         before = len(self.files)
         segments = list(job.segments(both_directions=self._settings.bidirectional))
@@ -136,7 +139,7 @@ class _Run:
             try:
                 self._denoise_segment(job, segment, log_once)
             except DamagedFile as error:
-                if self._settings.strict or error.path not in job.shot.files:
+                if self._settings.strict or job.clip is not None or error.path not in job.shot.files:
                     raise
                 index = job.shot.files.index(error.path)
                 segments[:0] = segments_around(job, segment, index, self.files)
