@@ -8,7 +8,10 @@ import pytest
 from jaxdn import clips
 from jaxdn.clips import ClipError
 from jaxdn.core.frame import Frame
+from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
+from jaxdn.data.foreign.classify import UNNAMED
+from jaxdn.data.foreign.import_exr import ForeignSequence
 from tests.programs import HEIGHT, WIDTH, Channels, layer, truth
 
 BLACK = np.zeros((HEIGHT, WIDTH, 3))
@@ -125,6 +128,18 @@ def test_odd_pixels_are_clamped_counted_and_told(tmp_path: Path) -> None:
     clips.write_exr(tmp_path / "s.0001.exr", blender(0, roughness=45 * rough))
     with pytest.raises(ClipError, match=r"s\.0001\.exr: roughness: expected values in \[0, 1\] .* got 22\.5 to 58\.5"):
         next(clips.plain_frames(tmp_path)[1])
+
+
+def test_clamped_pixels_are_counted_once_in_both_directions(tmp_path: Path) -> None:
+    rough = np.full((HEIGHT, WIDTH, 1), 0.5)
+    rough[5, 5:7] = -0.3
+    read(tmp_path, blender(0, roughness=rough), blender(1), blender(2, roughness=rough))
+    sequence = ForeignSequence([ExrFile(path) for path in sorted(tmp_path.iterdir())], UNNAMED)
+    told: list[str] = []
+    for backwards in (True, False):
+        assert len(list(sequence.frames(backwards=backwards, log=told.append))) == 3
+    assert told == ["roughness: 2 pixels of 'V.Denoising Roughness' beyond [0, 1], such as -0.3: clamped"]
+    assert list(sequence.repairs.totals()) == ["roughness: 4 pixels of 2 frames were clamped to [0, 1]"]
 
 
 def test_a_lamp_in_an_albedo_that_is_named_outright_ends_nothing(tmp_path: Path) -> None:
