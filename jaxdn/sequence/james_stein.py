@@ -21,13 +21,14 @@ V is the less of two estimates in windows, but at least half of the second:
 * by direction: the mean of squared second differences of d (Immerkaer, "Fast Noise Variance Estimation", 1996), along
   that of four directions in which it is smallest, because edges are smooth along themselves.
 
-The first alone would be 0 where all was blurred. Both hold for renderers that filter their pixels by drawing samples
+The first alone would be 0 where all was blurred. Texture of single pixels looks like noise to both, but it is seldom
+everywhere, and noise is: of little noise, V is at most that of the quietest block of surfaces around. Of much noise
+this would be far too little, because few samples are mostly dark, with a few bright ones. Both hold for renderers that filter their pixels by drawing samples
 from the filter, as Cycles and our renderer do: the noise of two pixels is independent. Neither is moved by single
 values, because d is Winsorized (Tukey 1962): it counts as at most :data:`BOUND` times the light, unless most of the
 3x3 pixels around agree. Light is that of the denoised image plus a share of its median, which no lamp moves.
 
-Texture of single pixels looks like noise at any scale. What tells it apart are flat places without noise: where many of
-the blocks around have none, the image is kept as it is. Where nothing was rendered, as in a sky, that says nothing.
+Where many of the blocks around have no noise at all, the image is kept as it is. Where nothing was rendered, as in a sky, that says nothing.
 """
 
 import functools
@@ -68,13 +69,19 @@ BLOCK = 8
 """Side of the blocks that may be without noise, in pixels."""
 CLEAN = (0.01, 0.02)
 """Noise, as a share of the light, up to which a block has none, and from which it has some."""
+LITTLE = (0.2, 0.3)
+"""Noise, as a share of the light, up to which that of the quietest block counts, and from which it does not."""
+QUIET = 2
+"""Blocks on each side of a pixel's own among which the quietest is sought."""
+_QUIETEST = 1.88
+"""Variance of grey Gaussian noise, relative to the mean of the least of its measured ones in so many blocks."""
 MANY = (0.25, 0.5)
 """Share of such blocks around from which on pixels begin to be kept, and from which on they are."""
 AROUND = 4
 """Blocks on each side of a pixel's own that are looked at."""
 LOST, LOST_TO_NOISE, USELESS = (0.25, 0.35), (0.9, 1.2), (2.4, 3.0)
 """Detail, as a share of the light and relative to the noise, up to which a denoised frame is trusted, and from which
-not; and relative to the noise, from which on nothing of it is taken. Frames of 96 x 96 pixels lose 0.14 to 0.29 with
+not; and relative to noise that is not little, from which on nothing of it is taken. Frames of 96 x 96 pixels lose 0.14 to 0.29 with
 their own guides, 0.37 to 0.52 with guides turned by 180 degrees."""
 RISK = (0.6, 0.9)
 """Estimated error of the combined image, relative to that of the noisy one, up to which the frame is trusted, and from
@@ -144,12 +151,14 @@ def combine(
     change, common = _winsorize(whole)
     curved = _second_differences(change)
     bands = _split(change)
-    weights, variance = _weigh(bands, _split(whole)[-1], curved)
+    variance = _measure_noise(bands, curved, surface)
+    weights = _weigh(bands, _split(whole)[-1], variance)
     kept = sum(weight * band for weight, band in zip(weights, bands, strict=True))
     own = sum(weight * center for weight, center in zip(weights, _CENTERS, strict=True))
-    own, kept = jnp.where(usable, own, 0.0), jnp.where(usable, kept, 0.0)
-    clean = jnp.where(usable & common, _clean(curved, surface), 0.0)
+    clean = _clean(curved, surface)
     own, kept = own + clean * (1 - own), kept + clean * (change - kept)
+    # A firefly among quiet blocks is noise none the less.
+    own, kept, clean = (jnp.where(usable & common, part, 0.0) for part in (own, kept, clean))
     # Stein's estimate: the mean square of what is left, less the noise in it, of which `own` stays in the image.
     risk = _mean_square(change - kept) + (2 * own - 1) * variance
     lost = jnp.sqrt(jnp.maximum(_window(_mean_square(change), RADII[0]) - variance, 0.0))
@@ -170,8 +179,9 @@ def measure_confidence(combined: JamesStein) -> Confidence:
     relative = jnp.sum(combined.risk) / jnp.where(noisy_risk > 0, noisy_risk, 1.0)
     much, ratio = 1 - _falling(lost, *LOST), lost / jnp.maximum(noise, 1e-6)
     risky = (1 - _falling(relative, *RISK)) * _falling(noise, *MUCH)
-    useless = much * (1 - _falling(ratio, *USELESS))
-    return Confidence(noise, lost, much * (1 - _falling(ratio, *LOST_TO_NOISE)), jnp.maximum(risky, useless))
+    doubt = 1 - _falling(ratio, *LOST_TO_NOISE)
+    useless = jnp.maximum(1 - _falling(ratio, *USELESS), _falling(noise, *LITTLE) * doubt)
+    return Confidence(noise, lost, much * doubt, jnp.maximum(risky, much * useless))
 
 
 def measure_level(denoised: jax.Array) -> jax.Array:
@@ -242,28 +252,47 @@ def _second_differences(change: jax.Array) -> jax.Array:
     return jnp.concatenate([_mean_square(one) / 6 for one in along], axis=-1)
 
 
-def _weigh(bands: list[jax.Array], rest: jax.Array, curved: jax.Array) -> tuple[list[jax.Array], jax.Array]:
-    """The weight of each band and the variance of noise, [H, W, 1] each.
+def _measure_noise(bands: list[jax.Array], curved: jax.Array, surface: jax.Array | None) -> jax.Array:
+    """V of each pixel, [H, W, 1]."""
+    finest, next_one = (_window(_mean_square(band), RADII[0]) for band in bands[:2])
+    by_scale = jnp.maximum(finest - SLOPE * next_one, 0.0) / (GAINS[0] - SLOPE * GAINS[1])
+    by_direction = _DIRECTION_BIAS * jnp.min(_window(curved, RADII[0]), axis=-1, keepdims=True)
+    variance = jnp.clip(by_scale, _LEAST * by_direction, by_direction)
+    little = _falling(jnp.sqrt(by_direction), *LITTLE)
+    return variance + little * (jnp.minimum(variance, _quietest(curved, surface)) - variance)
+
+
+def _quietest(curved: jax.Array, surface: jax.Array | None) -> jax.Array:
+    """The least noise of a block of surfaces near each pixel, [H, W, 1], without its bias; interpolated between them.
+
+    A sky has none, and says nothing of what is beside it. It is very large where there is no such block.
+    """
+    blocks = jnp.min(_mean_blocks(curved), axis=-1)
+    if surface is not None:
+        blocks = jnp.where(_mean_blocks(surface.astype(curved.dtype))[..., 0] == 1, blocks, 1e9)
+    side = 2 * QUIET + 1
+    least = jax.lax.reduce_window(blocks, jnp.inf, jax.lax.min, (side, side), (1, 1), "SAME")
+    return _QUIETEST * _enlarge(least[..., None], curved.shape[:2])
+
+
+def _weigh(bands: list[jax.Array], rest: jax.Array, variance: jax.Array) -> list[jax.Array]:
+    """The weight of each band, [H, W, 1] each.
 
     Where Winsorizing cut off light, the mean of what it left is too low: by how much tells ``rest`` [H, W, C], that of
     the whole change. It counts as noise of the bands' rest. Of much noise that rest is not kept at all: the mean of
     noisy over denoised light is not 1, where noise is left in both.
     """
-    squares = [_mean_square(band) for band in bands]
-    finest, next_one = (_window(square, RADII[0]) for square in squares[:2])
-    by_scale = jnp.maximum(finest - SLOPE * next_one, 0.0) / (GAINS[0] - SLOPE * GAINS[1])
-    by_direction = _DIRECTION_BIAS * jnp.min(_window(curved, RADII[0]), axis=-1, keepdims=True)
-    variance = jnp.clip(by_scale, _LEAST * by_direction, by_direction)
     cut = [0.0] * (len(bands) - 1) + [_window(_mean_square(rest - bands[-1]), RADII[-1])]
     weights = []
-    for square, bias, gain, doubt, radius in zip(squares, cut, GAINS, DOUBT, RADII, strict=True):
+    for band, bias, gain, doubt, radius in zip(bands, cut, GAINS, DOUBT, RADII, strict=True):
+        square = _mean_square(band)
         energy, fourth = _window(square, radius), _window(square**2, radius)
         noise = bias + gain * (variance if radius == RADII[0] else _window(variance, radius))
         number = (2 * radius + 1) ** 2 * energy**2 / jnp.where(fourth > 0, fourth, 1.0)
         excess = jnp.minimum(doubt / jnp.sqrt(jnp.maximum(number, 1.0)), MOST_DOUBT)
         weights.append(jnp.clip(1 - (1 + excess) * noise / jnp.where(energy > 0, energy, 1.0), 0.0, 1.0))
     weights[-1] = weights[-1] * _falling(jnp.sqrt(variance), *MUCH)
-    return weights, variance
+    return weights
 
 
 def _clean(curved: jax.Array, surface: jax.Array | None) -> jax.Array:
@@ -271,16 +300,20 @@ def _clean(curved: jax.Array, surface: jax.Array | None) -> jax.Array:
 
     Between blocks it is interpolated, before it is decided.
     """
-    height, width = curved.shape[:2]
     quiet = _falling(jnp.sqrt(jnp.min(_mean_blocks(curved), axis=-1, keepdims=True)), *CLEAN)
     known = jnp.ones_like(quiet)
     if surface is not None:
         known = (_mean_blocks(surface.astype(curved.dtype)) > 0.5).astype(curved.dtype)
     number = _window(known, AROUND)
     share = _window(quiet * known, AROUND) / jnp.where(number > 0, number, 1.0)
-    rows, columns = share.shape[:2]
-    wide = jax.image.resize(share, (rows * BLOCK, columns * BLOCK, 1), "linear")[:height, :width]
-    return 1 - _falling(wide, *MANY)
+    return 1 - _falling(_enlarge(share, curved.shape[:2]), *MANY)
+
+
+def _enlarge(blocks: jax.Array, size: tuple[int, ...]) -> jax.Array:
+    """[H, W, 1] blocks of :data:`BLOCK` pixels a side, interpolated."""
+    rows, columns = blocks.shape[:2]
+    height, width = size
+    return jax.image.resize(blocks, (rows * BLOCK, columns * BLOCK, 1), "linear")[:height, :width]
 
 
 def _mean_blocks(image: jax.Array) -> jax.Array:

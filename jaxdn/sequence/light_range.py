@@ -10,7 +10,7 @@ frame ``x`` is split with an exact power of two, ``g = 2^e``, into four parts:
 ``bounded`` alone is denoised. The image is ``denoised / g`` with the three others:
 
 * lamps: what is bright and has no noise, because three pixels around are as bright to a hundredth, and the edge of one
-  pixel around such a group. The denoiser sees at most :data:`LAMP` of it, and it comes back as it was;
+  pixel around such a group. The denoiser sees at most :data:`BRIGHTEST` of it, and it comes back as it was;
 * the excess over the limit elsewhere, as far as three pixels of the 3x3 around have as much of it. A firefly is one
   pixel, and is not given back;
 * the negative part ``n``, which is as noisy as the light. Its share of the light hardly is, as one factor of noise is
@@ -39,6 +39,10 @@ _GROUP = 3
 """Pixels of a 3x3 window that must be as bright for light beyond the limit to be a lamp's."""
 LAMP = 8 * LEVEL
 """Luminance, at the usual level, from which on light without noise is a lamp's."""
+BRIGHTEST = 256 * LEVEL
+"""Luminance, at the usual level, of the brightest lamp that denoisers see. What a lamp lights up is found by its
+brightness, too: in six clips with lamps Open Image Denoise loses up to 2.4 dB at 8 times the level, 0.5 at 64 times,
+0.03 at this."""
 _ALIKE = 0.01
 """Relative difference of luminances up to which two pixels are equally bright. Of noise of 10 % of the light, 1 % of
 the pixels have three such neighbours."""
@@ -69,7 +73,7 @@ def choose_exponent(radiance: np.ndarray, before: int | None) -> int | None:
 def bound_light(stored: StoredFrame, exponent: int) -> StoredFrame:
     """The frame with all its light times 2^exponent, within ``RADIANCE_MAX``; radiance and layers are not negative.
 
-    Lamps have at most the luminance :data:`LAMP`, in their own colour. What is not finite stays, so that denoisers see
+    Lamps have at most the luminance :data:`BRIGHTEST`, in their own colour. What is not finite stays, so that denoisers see
     that it is no measurement.
     """
     frame = stored.frame
@@ -126,10 +130,10 @@ def find_lamps(radiance: np.ndarray, exponent: int) -> np.ndarray:
 
 
 def _dim(radiance: np.ndarray, lamps: np.ndarray, exponent: int) -> np.ndarray:
-    """The frame with the luminance of lamps brought down to :data:`LAMP`."""
-    light = radiance @ np.asarray(LUMINANCE, np.float32)
-    factor = np.float32(math.ldexp(LAMP, -exponent)) / np.where(lamps, light[..., None], 1)
-    return np.where(lamps, radiance * factor, radiance)
+    """The frame with the luminance of lamps brought down to :data:`BRIGHTEST`."""
+    most = np.float32(math.ldexp(BRIGHTEST, -exponent))
+    light = (radiance @ np.asarray(LUMINANCE, np.float32))[..., None]
+    return np.where(lamps, radiance * (most / np.maximum(light, most)), radiance)
 
 
 def _denoise_negative(negative: np.ndarray, positive: np.ndarray, image: np.ndarray) -> np.ndarray:

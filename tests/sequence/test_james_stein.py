@@ -14,9 +14,11 @@ from jaxdn.sequence.james_stein import (
     CLEAN,
     DOUBT,
     GAINS,
+    LITTLE,
     MANY,
     MOST_DOUBT,
     MUCH,
+    QUIET,
     RADII,
     SLOPE,
     combine,
@@ -102,6 +104,19 @@ def reference(noisy, denoised):
     by_scale = (window(squares[0], 7) - SLOPE * window(squares[1], 7)) / (GAINS[0] - SLOPE * GAINS[1])
     by_direction = 1.1 * np.min([window(one, 7) for one in curved], axis=0)
     variance = np.clip(by_scale, by_direction / 2, by_direction)
+    blocks = np.min(
+        [c.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK).mean(axis=(1, 3)) for c in curved], axis=0
+    )
+    around = [
+        [
+            blocks[max(y - QUIET, 0) : y + QUIET + 1, max(x - QUIET, 0) : x + QUIET + 1].min()
+            for x in range(width // BLOCK)
+        ]
+        for y in range(height // BLOCK)
+    ]
+    quietest = 1.88 * np.asarray(jax.image.resize(np.array(around), (height, width), "linear"))
+    little = falling(np.sqrt(by_direction), *LITTLE)
+    variance = little * np.minimum(variance, quietest) + (1 - little) * variance
     cut = window(np.mean((whole - smooth[-1]) ** 2, axis=-1), RADII[-1])
     kept, weights = 0, []
     for band, square, gain, doubt, radius in zip(bands, squares, GAINS, DOUBT, RADII, strict=True):
@@ -113,10 +128,9 @@ def reference(noisy, denoised):
         if band is bands[-1]:
             weights[-1] *= falling(np.sqrt(variance), *MUCH)
         kept = kept + weights[-1][..., None] * band
-    blocks = [c.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK).mean(axis=(1, 3)) for c in curved]
-    share = window(falling(np.sqrt(np.min(blocks, axis=0)), *CLEAN), AROUND)
+    share = window(falling(np.sqrt(blocks), *CLEAN), AROUND)
     share = np.asarray(jax.image.resize(share, (height, width), "linear"))
-    clean = np.where(common, 1 - falling(share, *MANY), 0)
+    clean = 1 - falling(share, *MANY)
     # of the pixel itself, each band has the square of what a line of it has
     line = [1.0]
     taps = np.array([1.0])
@@ -128,10 +142,11 @@ def reference(noisy, denoised):
     centers = [*(one - other for one, other in pairwise(line)), line[-1]]
     own = sum(weight * center for weight, center in zip(weights, centers, strict=True))
     kept = kept + clean[..., None] * (change - kept)
-    return denoised + light * kept, own + clean * (1 - own), np.sqrt(variance)
+    own = own + clean * (1 - own)
+    return denoised + light * np.where(common[..., None], kept, 0), np.where(common, own, 0), np.sqrt(variance)
 
 
-@pytest.mark.parametrize("deviation", [0.005, 0.015, 0.05, 0.4, 0.8])
+@pytest.mark.parametrize("deviation", [0.005, 0.015, 0.05, 0.25, 0.4, 0.8])
 def test_the_mixture_is_that_of_numpy(rng, deviation):
     truth, blurred = (image[:32, :40] for image in box(32, 40))
     noisy = (truth * rng.gamma(deviation**-2, deviation**2, truth.shape)).astype(np.float32)
