@@ -23,12 +23,14 @@ V is the less of two estimates in windows, but at least half of the second:
 
 The first alone would be 0 where all was blurred. Texture of single pixels looks like noise to both, but it is seldom
 everywhere, and noise is: of little noise, V is at most that of the quietest block of surfaces around. Of much noise
-this would be far too little, because few samples are mostly dark, with a few bright ones. Both hold for renderers that filter their pixels by drawing samples
-from the filter, as Cycles and our renderer do: the noise of two pixels is independent. Neither is moved by single
-values, because d is Winsorized (Tukey 1962): it counts as at most :data:`BOUND` times the light, unless most of the
-3x3 pixels around agree. Light is that of the denoised image plus a share of its median, which no lamp moves.
+this would be far too little, because few samples are mostly dark, with a few bright ones. Both hold for renderers that
+filter their pixels by drawing samples from the filter, as Cycles and our renderer do: the noise of two pixels is
+independent. Neither is moved by single values, because d is Winsorized (Tukey 1962): it counts as at most :data:`BOUND`
+times the light, unless most of the 3x3 pixels around agree. Light is that of the denoised image plus a share of its
+median, which no lamp moves.
 
-Where many of the blocks around have no noise at all, the image is kept as it is. Where nothing was rendered, as in a sky, that says nothing.
+Where many of the blocks around have no noise at all, the image is kept as it is. Where nothing was rendered, as in a
+sky, that says nothing.
 """
 
 import functools
@@ -81,8 +83,8 @@ AROUND = 4
 """Blocks on each side of a pixel's own that are looked at."""
 LOST, LOST_TO_NOISE, USELESS = (0.25, 0.35), (0.9, 1.2), (2.4, 3.0)
 """Detail, as a share of the light and relative to the noise, up to which a denoised frame is trusted, and from which
-not; and relative to noise that is not little, from which on nothing of it is taken. Frames of 96 x 96 pixels lose 0.14 to 0.29 with
-their own guides, 0.37 to 0.52 with guides turned by 180 degrees."""
+not; and relative to noise that is not little, from which on nothing of it is taken. Frames of 96 x 96 pixels lose 0.14
+to 0.29 with their own guides, 0.37 to 0.52 with guides turned by 180 degrees."""
 RISK = (0.6, 0.9)
 """Estimated error of the combined image, relative to that of the noisy one, up to which the frame is trusted, and from
 which it comes back as it came. Frames with their own guides have 0 to 0.45."""

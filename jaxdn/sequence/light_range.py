@@ -73,8 +73,8 @@ def choose_exponent(radiance: np.ndarray, before: int | None) -> int | None:
 def bound_light(stored: StoredFrame, exponent: int) -> StoredFrame:
     """The frame with all its light times 2^exponent, within ``RADIANCE_MAX``; radiance and layers are not negative.
 
-    Lamps have at most the luminance :data:`BRIGHTEST`, in their own colour. What is not finite stays, so that denoisers see
-    that it is no measurement.
+    Lamps have at most the luminance :data:`BRIGHTEST`, in their own colour. What is not finite stays, so that denoisers
+    see that it is no measurement.
     """
     frame = stored.frame
     most = math.ldexp(RADIANCE_MAX, -exponent)
