@@ -212,7 +212,7 @@ def test_ctrl_c_in_the_backward_pass_leaves_nothing_behind(tmp_path: Path) -> No
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     until = time.monotonic() + 240
-    while not list(out.glob(".backwards-*/*.npy")) and time.monotonic() < until:
+    while not list(out.glob(".backwards-*/*.npz")) and time.monotonic() < until:
         time.sleep(0.01)
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
