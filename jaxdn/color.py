@@ -44,7 +44,7 @@ def compress(x: Float[Array, ...]) -> Float[Array, ...]:
     still has a gradient. Value and slope are finite for every float; infinity counts as the largest finite number
     (7.7 in float32). NaN stays NaN.
 
-    Hasselgren et al. 2020, "Neural Temporal Adaptive Sampling and Denoising", sec. 2.1; the toe and the odd
+    Hasselgren et al. 2020, "Neural Temporal Adaptive Sampling and Denoising", sec. 2.2; the toe and the odd
     continuation are ours.
     """
     x = _floating(x)

@@ -4,7 +4,8 @@
 
 For every clip, sample count and method the noisy files are denoised as ``jaxdn denoise`` does it, and scored on the
 frames that have references (:mod:`experiments.cycles.score`). One JSON file for each, so that a run goes on where it
-was; the denoised frames stay, to be looked at. ``--table`` prints what is there.
+was; the denoised frames stay, to be looked at. ``--table`` prints what is there. The tables are written as
+``quality-cycles.json`` and ``quality-cycles-kinds.json``, in the format of docs/results.
 """
 
 import json
@@ -20,6 +21,7 @@ import tyro
 from experiments.cycles import reference as references
 from experiments.cycles.record import RECORD, read_record
 from experiments.cycles.score import Scored, score
+from experiments.measurement import describe_measurement
 from jaxdn.clips import open_frames, read_exr
 from jaxdn.commands.errors import plain_errors
 from jaxdn.runtime.atomic_files import write_json
@@ -60,6 +62,8 @@ def main(options: Options) -> int:
     rows = read_rows(options.out, [clip.name for clip in clips])
     for spp in options.spp:
         print_table([row for row in rows if row["spp"] == spp and row["method"] in options.methods], spp)
+    for name, measurement in (("cycles", means), ("cycles-kinds", kinds)):
+        write_json(options.out / f"quality-{name}.json", measurement(rows, options))
     return 0
 
 
@@ -146,6 +150,79 @@ def print_table(rows: Sequence[dict[str, Any]], spp: int) -> None:
             of = [row[figure] for row in rows if row["method"] == method and row[figure] is not None]
             means.append((f"{np.mean(of):.4f}" if figure == "flip" else f"{np.mean(of):.2f}") if of else "")
         print(f"mean {figure}".ljust(14) + "".join(mean.rjust(width) for mean in means)[3:])
+
+
+FIGURES = {
+    "psnr": "PSNR",
+    "edges": "at edges",
+    "inside": "elsewhere",
+    "temporal": "temporal",
+    "trail": "where light just changed",
+    "flip": "FLIP",
+}
+"""Figure -> column."""
+
+
+def means(rows: Sequence[dict[str, Any]], options: Options) -> dict[str, Any]:
+    """The means over all clips: a row for each sample count and method."""
+    columns: list[dict[str, Any]] = [{"name": "samples"}, {"name": "method"}]
+    for name, title in FIGURES.items():
+        style = {"decimals": 3, "best": "lower"} if name == "flip" else {"decimals": 2, "best": "higher"}
+        columns.append({"name": title, **style})
+    lines = [
+        [spp, f"`{method}`", *(_mean(row[name] for row in rows if _is(row, spp, method)) for name in FIGURES)]
+        for spp in options.spp
+        for method in options.methods
+    ]
+    what = (
+        f"Means over {_count(rows)} of Blender's Cycles that nothing was trained on or chosen by (`make cycles`), as a "
+        "user runs them: `jaxdn denoise` on the files, all light; `+no-safe` is `--no-safe`. PSNR of x / (1 + x) in "
+        "dB, without the references' noise; *edges* are the tenth of the pixels whose guides differ most from their "
+        "neighbours'; *temporal* is the PSNR of the change between two frames."
+    )
+    return {
+        **_describe("Cycles frames", 10, what, lines, options),
+        "columns": columns,
+        "group": "samples",
+        "readme": {},
+    }
+
+
+def kinds(rows: Sequence[dict[str, Any]], options: Options) -> dict[str, Any]:
+    """PSNR: a row for each kind and sample count, a column for each method."""
+    columns: list[dict[str, Any]] = [{"name": "kind"}, {"name": "samples"}]
+    columns += [{"name": f"`{method}`", "decimals": 2} for method in options.methods]
+    lines = [
+        [
+            kind,
+            spp,
+            *(_mean(row["psnr"] for row in rows if row["kind"] == kind and _is(row, spp, m)) for m in options.methods),
+        ]
+        for kind in sorted({row["kind"] for row in rows})
+        for spp in options.spp
+    ]
+    what = f"The PSNR of the table above, by kind; {_count(rows)}."
+    described = _describe("Kinds of Cycles frames", 11, what, lines, options)
+    return {**described, "columns": columns, "best_in_row": "higher"}
+
+
+def _describe(title: str, order: int, what: str, rows: Sequence[Any], options: Options) -> dict[str, Any]:
+    command = f"python -m experiments.cycles.compare {options.folder.name} --methods {' '.join(options.methods)}"
+    return describe_measurement("table", title, "Quality", order, command=command, what=what, rows=rows)
+
+
+def _is(row: dict[str, Any], spp: int, method: str) -> bool:
+    return bool(row["spp"] == spp and row["method"] == method)
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    there = [value for value in values if value is not None]
+    return round(float(np.mean(there)), 4) if there else None
+
+
+def _count(rows: Sequence[dict[str, Any]]) -> str:
+    clips, kinds = ({row[name] for row in rows} for name in ("clip", "kind"))
+    return f"{len(clips)} clip{'s' * (len(clips) > 1)} of {len(kinds)} kind{'s' * (len(kinds) > 1)}"
 
 
 if __name__ == "__main__":

@@ -125,8 +125,8 @@ class Settings:
     """Render clips, train the denoiser and its ablations, evaluate them on held-out clips, write a report."""
 
     preset: Literal["demo", "specialist"] = "demo"
-    """demo: SMALL networks that go on from shipped weights on eight small clips. specialist: the paper's own protocol,
-    trained and tested on different clips of one scene."""
+    """demo: SMALL networks that go on from shipped weights on eight small clips. specialist: trained and
+    tested on different clips of one scene, which no paper does; the loss and the optimiser's kind are the paper's."""
     name: str | None = None
     """Folder under runs/ for weights, logs and the report; default: the preset's name."""
     only: Literal["all", "render", "train", "report"] = "all"

@@ -28,9 +28,9 @@ class Inspect:
     jaxdn inspect "shots/*.exr" --channels albedo=diffuseFilter
     """
 
-    scene: tyro.conf.Positional[str]
-    """A Mitsuba scene (.xml), a family, the folder of a finished clip, or EXR files of any renderer: a folder, or a
-    pattern in quotes."""
+    scene: tyro.conf.Positional[list[str]]
+    """A Mitsuba scene (.xml), a family, the folder of a finished clip, or EXR files of any renderer: a folder, a
+    pattern, or their names."""
     animation: Path | None = None
     """Animation file for a scene file."""
     denoiser: str | None = None
@@ -43,11 +43,13 @@ class Inspect:
     json: bool = False
     """Print only one JSON object: {"effects": [...], "plan": {...}, "uncertain": [...]}, of a clip also "sources". Of
     files of other renderers {"frames": 8, "width": 320, "height": 180, "sources": [...], "missing": {...}, "notes":
-    [...], "fitting_conventions": [...]}, the last null where there is nothing to state."""
+    [...], "unusable": {...}, "fitting_conventions": [...]}, the last null where there is nothing to
+    state; of several shots {"shots": [...]}."""
     motion_convention: str | None = None
     """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
     channels: list[str] = field(default_factory=list)
-    """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out."""
+    """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out;
+    "buffer=PATTERN.exr" reads it from files of its own."""
     layer: str | None = None
     """For files of other renderers: the view layer or part to look for buffers in."""
 
@@ -229,6 +231,9 @@ class Denoise:
     """Numbers of the frames to denoise, such as 7 or 10-40; frames before them are read for their history."""
     skip_existing: bool = False
     """Leave out frames whose result is there already."""
+    strict: bool = False
+    """End at an EXR file that is empty, damaged, or has another size or other passes than most; by default such files
+    are left out as missing frames, and named."""
     only_beauty: bool = False
     """Of EXR files of other renderers, write the denoised beauty and its alpha alone, without the other layers."""
     max_memory: float | None = None
@@ -244,7 +249,8 @@ class Denoise:
     motion_convention: str | None = None
     """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
     channels: list[str] = field(default_factory=list)
-    """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out."""
+    """For files of other renderers: buffer=layer, if a layer is not found by its name; buffer=none leaves one out;
+    "buffer=PATTERN.exr" reads it from files of its own."""
     layer: str | None = None
     """For files of other renderers: the view layer or part to look for buffers in."""
     implementation: str = "auto"

@@ -8,6 +8,7 @@ from jaxdn.commands.channel_table import show_channel_mapping
 from jaxdn.commands.progress import reporter
 from jaxdn.core.options import numbers
 from jaxdn.data.clip.folder import is_clip
+from jaxdn.data.errors import DamagedFile
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.runtime.malloc import tune_malloc
@@ -49,6 +50,7 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
         naming=naming,
         frames=_frames(options),
         skip_existing=options.skip_existing,
+        strict=options.strict,
         only_beauty=options.only_beauty,
         aovs=options.aovs,
         preview=options.preview,
@@ -66,6 +68,9 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
             on_frame=report.on_frame,
             log=report.log,
         )
+    if written.left_out:
+        names = ", ".join(path.name for path in written.left_out[:8]) + (" ..." if len(written.left_out) > 8 else "")
+        print(f"left out as missing: {_count(len(written.left_out), 'frame')}: {names} (--strict: end there)")
     if not written.files:
         print(f"nothing to do in {options.out}")
         return
@@ -78,9 +83,16 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
 def _show_job(job: Job, naming: ChannelNaming, method: Model) -> None:
     """Print what is read of a shot."""
     single = len(job.shot.files) == 1
-    mapping = read_channel_mapping(job.clip or job.exr_files[0], naming, single=single)
     reads = frozenset[str]() if method.denoiser is None else method.denoiser.reads
-    show_channel_mapping(job.source, mapping, reads=reads, single=single)
+    for source in [job.clip] if job.clip is not None else job.files:
+        try:
+            mapping = read_channel_mapping(source, naming, single=single)
+        except DamagedFile:  # told when its turn comes
+            if source is job.files[-1]:
+                raise
+            continue
+        show_channel_mapping(job.source, mapping, reads=reads, single=single)
+        return
 
 
 def _denoise_scene(options: Denoise, scene: str) -> None:
@@ -123,7 +135,7 @@ def _scene_of(options: Denoise) -> str | None:
 
 def _frames(options: Denoise) -> list[int] | None:
     """The numbers of the frames to denoise; None: all."""
-    return numbers(options.frames, "--frames") if options.frames else None
+    return numbers(options.frames, "--frames", negative=True) if options.frames else None
 
 
 def _budget(options: Denoise) -> dict[str, Any]:

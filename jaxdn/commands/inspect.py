@@ -6,7 +6,7 @@ Of files of other renderers: what is read from them (:mod:`jaxdn.commands.inspec
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ EVERYTHING = plan(choose_all_effects(1))
 
 
 def inspect_to_terminal(
-    source: str,
+    sources: Sequence[str],
     *,
     animation: Path | None,
     denoiser: str | None,
@@ -47,7 +47,8 @@ def inspect_to_terminal(
     Of a finished clip, first what is read from which layer; of files of other renderers, only that and what is missing.
 
     Args:
-      source: a Mitsuba scene (.xml), a family, a finished clip, or a folder of or pattern for EXR files.
+      sources: a Mitsuba scene (.xml), a family, a finished clip, or a folder of or pattern for EXR files; or the names
+        of several EXR files.
       animation: animation file for a scene file.
       denoiser: name of the denoiser to plan for; None: for every buffer that a denoiser may read.
       width: in pixels.
@@ -57,12 +58,16 @@ def inspect_to_terminal(
       naming: what is stated about the channels of other renderers' files.
     """
     reader = None if denoiser is None else find_denoiser(denoiser)
+    source = sources[0]
+    if other := [name for name in sources if len(sources) > 1 and not Path(name).is_file()]:
+        raise ValueError(f"{other[0]}: expected one scene, clip, folder or pattern, or several EXR files; name one.")
     clip = is_clip(source)
-    if not clip and (Path(source).is_dir() or source.endswith(".exr")):
+    if not clip and (len(sources) > 1 or Path(source).is_dir() or source.lower().endswith(".exr")):
         if animation is not None or frames is not None:
             raise ValueError(f"{source}: expected none of --animation, --frames, which are for scenes and own clips.")
         reads = None if reader is None else reader.reads
-        inspect_files(source, reads=reads, as_json=as_json, naming=naming)
+        named = source if len(sources) == 1 else [Path(name) for name in sources]
+        inspect_files(named, reads=reads, as_json=as_json, naming=naming)
         return
     if not clip and naming.options:
         raise ValueError(

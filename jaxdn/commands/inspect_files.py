@@ -3,56 +3,90 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from jaxdn.commands.channel_table import missing, show_channel_mapping
 from jaxdn.data.clip.folder import refuse_unfinished
-from jaxdn.data.exr.file import ExrFile
-from jaxdn.data.foreign.channel_mapping import UNSTATED, read_channel_mapping
+from jaxdn.data.errors import DamagedFile
+from jaxdn.data.foreign.channel_mapping import UNSTATED, MappedBuffer, read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
-from jaxdn.data.foreign.shots import find_sequence
+from jaxdn.data.foreign.passes import join_passes
+from jaxdn.data.foreign.shot_files import open_files
+from jaxdn.data.foreign.shots import Shot, find_shots, ranges
+from jaxdn.data.foreign.shots import missing as missing_numbers
+from jaxdn.data.foreign.soundness import find_unusable
 from jaxdn.data.foreign.vectors import CHOICES
 
 
-def inspect_files(source: str, *, reads: frozenset[str] | None, as_json: bool, naming: ChannelNaming) -> None:
-    """Print what is read of a sequence, what is missing, and which conventions motion vectors may have.
+def inspect_files(
+    source: str | Sequence[Path], *, reads: frozenset[str] | None, as_json: bool, naming: ChannelNaming
+) -> None:
+    """Print what is read of each shot, what is missing, and which conventions motion vectors may have.
 
-    Only the first two files are read, of the others the headers. Raises ClipError as
+    Only the first two files of a shot are read, of the others the headers. Raises ClipError as
     :func:`jaxdn.data.foreign.channel_mapping.read_channel_mapping` and
-    :meth:`jaxdn.data.foreign.import_exr.ForeignSequence.fitting_conventions` do, for files of different sizes, and for
-    a clip of ours that was not finished.
+    :meth:`jaxdn.data.foreign.import_exr.ForeignSequence.fitting_conventions` do, where no file is usable, and for a
+    clip of ours that was not finished.
 
     Args:
-      source: a folder of, a pattern for, or the name of EXR files.
+      source: a folder of, a pattern for, or the name of EXR files; or several files.
       reads: what a denoiser reads; None: any.
-      as_json: print only one JSON object, with the same.
+      as_json: print only one JSON object, with the same; of several shots, one that lists theirs.
       naming: what is stated about the channels.
     """
-    refuse_unfinished(source)
-    files = find_sequence(source)
-    sequence = ForeignSequence([ExrFile(file) for file in files], naming)
-    notes: list[str] = []
-    mapping = read_channel_mapping(sequence.files[0], naming, log=notes.append if as_json else print)
+    if isinstance(source, str):
+        refuse_unfinished(source)
+    shots, notes = join_passes(find_shots(source), naming.pass_files)
     if not as_json:
-        show_channel_mapping(source, mapping, reads=reads)
+        print("".join(f"{note}\n" for note in notes), end="")
+    records = [_inspect_shot(shot, reads, naming, quiet=as_json) for shot in shots]
+    if as_json:
+        several = {"shots": [{"shot": shot.label, **record} for shot, record in zip(shots, records, strict=True)]}
+        print(json.dumps(records[0] if len(shots) == 1 else several, indent=1))
+
+
+def _inspect_shot(shot: Shot, reads: frozenset[str] | None, naming: ChannelNaming, *, quiet: bool) -> dict[str, Any]:
+    """What is read of a shot, for JSON; printed too unless ``quiet``."""
+    every = open_files(shot)
+    unusable = {every[index].path.name: reason for index, reason in find_unusable(every, naming).items()}
+    opened = [file for file in every if file.path.name not in unusable]
+    notes: list[str] = []
+    mapping: list[MappedBuffer] | None = None
+    while mapping is None:
+        try:
+            mapping = read_channel_mapping(opened[0], naming, log=notes.append)
+        except DamagedFile as error:
+            unusable[error.path.name] = error.reason
+            if len(opened) == 1:
+                raise
+            del opened[0]
+    sequence = ForeignSequence(opened, naming)
     height, width = sequence.window.size
     unstated = any(mapped.convention == UNSTATED for mapped in mapping)
     fitting = sequence.fitting_conventions() if unstated else None
-    if not as_json:
-        print(f"{len(files)} {'frame' if len(files) == 1 else 'frames'} of {width} x {height} pixels")
+    gaps = f"{ranges(missing_numbers(shot.numbers))} missing" if missing_numbers(shot.numbers) else None
+    if not quiet:
+        for note in notes:
+            print(note)
+        show_channel_mapping(shot.label, mapping, reads=reads)
+        print(f"{len(opened)} {'frame' if len(opened) == 1 else 'frames'} of {width} x {height} pixels")
+        for name, reason in unusable.items():
+            print(f"{name} counts as a missing frame: {reason}")
+        if gaps is not None:
+            print(f"{gaps}; after a gap there is no history at first")
         if fitting is not None:
-            print("\n".join(_to_state(files, fitting)))
-        return
-    record = {
-        "frames": len(files),
+            print("\n".join(_to_state([file.path for file in opened], fitting)))
+    return {
+        "frames": len(opened),
         "width": width,
         "height": height,
         "sources": [mapped._asdict() for mapped in mapping],
         "missing": missing(mapping, reads),
-        "notes": notes,
+        "notes": notes if gaps is None else [*notes, gaps],
+        "unusable": unusable,
         "fitting_conventions": fitting,
     }
-    print(json.dumps(record, indent=1))
 
 
 def _to_state(files: Sequence[Path], fitting: Sequence[str]) -> list[str]:

@@ -7,6 +7,7 @@ Only a field's annotation is declared: ``Literal`` for a choice, ``Annotated[flo
 import dataclasses
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -54,16 +55,21 @@ def check(values: Mapping[str, Any], hints: Mapping[str, Any], *, of: str) -> No
             raise ValueError(f"{of} {name}: expected {_expected(hints[name])}, got {value!r}.")
 
 
-def numbers(words: list[str], option: str) -> list[int]:
-    """The whole numbers of words such as 3 and 0-49, whose ends count. Raises ValueError for anything else."""
+def numbers(words: list[str], option: str, *, negative: bool = False) -> list[int]:
+    """The whole numbers of words such as 3 and 0-49, whose ends count. Raises ValueError for anything else.
+
+    With ``negative``, numbers may be below 0: -3, -3-2, -3--1.
+    """
+    minus, least = ("-?", "") if negative else ("", " >= 0")
     found: list[int] = []
     for word in words:
-        first, _, last = word.partition("-")
-        if not first.isdecimal() or not (last or first).isdecimal() or word.endswith("-"):
-            raise ValueError(f"{option}: expected whole numbers >= 0 or ranges such as 0-49, got {word!r}.")
-        if last and int(last) < int(first):
+        match = re.fullmatch(rf"({minus}[0-9]+)(?:-({minus}[0-9]+))?", word)
+        if match is None:
+            raise ValueError(f"{option}: expected whole numbers{least} or ranges such as 0-49, got {word!r}.")
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last < first:
             raise ValueError(f"{option}: expected a range from low to high, got {word!r}; swap its ends.")
-        found += range(int(first), int(last or first) + 1)
+        found += range(first, last + 1)
     return found
 
 

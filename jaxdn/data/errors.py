@@ -9,6 +9,14 @@ class ClipError(ValueError):
     """A clip, frame or record that cannot be used; the message names the file, the reason and what to do."""
 
 
+class DamagedFile(ClipError):
+    """A file that is missing, incomplete, damaged, or no OpenEXR file: of a sequence, a missing frame."""
+
+    def __init__(self, path: Path, reason: str) -> None:
+        super().__init__(f"{path}: {reason}.")
+        self.path, self.reason = path, reason
+
+
 def read_json(path: str | Path) -> Any:
     """Read strict JSON. Raises ClipError, naming the file and the place, if it is missing or broken."""
     path = Path(path)

@@ -35,7 +35,7 @@ def render_requested(
       denoiser: what requests samples.
       params: its parameters.
       state: before this frame.
-      frame: [H, W, C], with the radiance rendered before.
+      frame: [H, W, C]; the denoiser sees the layer of one sample in place of its radiance.
       layers: samples per pixel -> independent radiance [H, W, 3].
       reference: [H, W, 3], for a gradient of the image with respect to the numbers of samples.
     """
@@ -46,7 +46,8 @@ def render_requested(
             "layers: expected independent noisy layers, as this denoiser requests samples, or frames that have been "
             "rendered as requested, with sample_count; got neither."
         )
-    wanted = denoiser.samples(params, state, only(frame, denoiser.reads), sum(layers))
+    rendered_first = frame if 1 not in layers else frame._replace(radiance=layers[1])
+    wanted = denoiser.samples(params, state, only(rendered_first, denoiser.reads), sum(layers))
     # Their sum must not overflow; what is not a number stays, to be sanitized and counted in the step.
     bounded = {
         n: jnp.where(jnp.isfinite(layer), jnp.minimum(layer, RADIANCE_MAX), layer) for n, layer in layers.items()

@@ -1,9 +1,16 @@
-"""Blending a new frame into its history: colour, moments of luminance, history length, as planes [6, H, W]."""
+"""Blending a new frame into its history: colour, moments of luminance, history length, texture, as planes [9, H, W].
+
+The texture is what dividing by a reflectance left of it (:func:`jaxdn.brdf.texture_left`). Light of another frame had
+that of its own reflectance, so it is averaged with the weights of the light; then :func:`with_texture` tells what the
+history is with the texture of today.
+"""
 
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+
+from jaxdn import brdf
 
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 
@@ -21,21 +28,24 @@ def accumulate(
     alpha: float,
     alpha_moments: float,
     history_max: int,
+    texture: jax.Array | None = None,
     change: jax.Array | None = None,
 ) -> jax.Array:
-    """The history [6, H, W] with colour ``now`` [3, H, W] blended in (Schied et al. 2017, sec. 4.1 and 4.2).
+    """The history [9, H, W] with colour ``now`` [3, H, W] blended in.
 
-    Planes are colour, the first and second moment of its luminance, and the history length N in frames. The new frame
-    has the weight ``a = max(alpha, 1 / N)``: without a history, the result is the new frame. Where light has changed by
-    a share ``c``, the weight is ``(1 - c) a + c`` (Schied et al. 2018), and N becomes ``N / (1 - c + c N)``, the
-    length that this share is worth.
+    Planes are colour, the first and second moment of its luminance, the history length N in frames, and the mean
+    texture (3). The new frame has the weight ``a = max(alpha, 1 / N)``: without a history, the result is the new frame.
+    (Schied et al. 2017, sec. 4.1 and 4.2, have a constant alpha; 1 / N is that of later implementations.) Where light
+    has changed by a share ``c``, the weight is ``(1 - c) a + c`` (Schied et al. 2018), and N becomes ``N / (1 - c + c
+    N)``, the length that this share is worth.
 
     Args:
-      past: the history [6, H, W], 0 where there is none.
+      past: the history [9, H, W], 0 where there is none; its first six planes suffice without ``texture``.
       now: colour of the new frame [3, H, W].
       alpha: minimum weight of the new frame in colour.
       alpha_moments: minimum weight of the new frame in the moments.
       history_max: maximum of N.
+      texture: [3, H, W] what a division left in the new frame; None: the history has no such planes.
       change: [H, W] in [0, 1], the share by which the history is outdated; None: nothing has changed.
     """
     level = luminance(now)
@@ -48,7 +58,27 @@ def accumulate(
         length = length / (1.0 - change + change * length)
     color = past[:3] + share[None] * (now - past[:3])
     moments = past[3:5] + share_moments[None] * (jnp.stack([level, level * level]) - past[3:5])
-    return jnp.concatenate([color, moments, length[None]])
+    planes = [color, moments, length[None]]
+    if texture is not None:
+        planes.append(past[6:9] + share[None] * (texture - past[6:9]))
+    return jnp.concatenate(planes)
+
+
+def with_texture(history: jax.Array, before: jax.Array, after: jax.Array) -> jax.Array:
+    """A history [6, H, W] of light that had the texture ``before`` [3, H, W], as that of light with ``after``.
+
+    Colour is restored by :func:`jaxdn.brdf.restore`, the moments as grey light would be; the length stays. Exchanging
+    ``before`` and ``after`` is the inverse.
+    """
+    grey = texture_ratio(before, after)
+    colour = brdf.restore(history[:3], after, before)
+    return jnp.concatenate([colour, jnp.stack([history[3] * grey, history[4] * grey * grey, history[5]])])
+
+
+def texture_ratio(before: jax.Array, after: jax.Array) -> jax.Array:
+    """By what [H, W] grey light changes whose texture was ``before`` [3, H, W] and is ``after``."""
+    old = luminance(before)
+    return brdf.restore(jnp.ones_like(old), luminance(after), old)
 
 
 def after_shift(moments: jax.Array, shift: jax.Array) -> jax.Array:

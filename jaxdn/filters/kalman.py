@@ -11,12 +11,17 @@ For a pixel with new image y, noisy radiance x, history h, and the windows W of 
 * regression of the residual on the innovation, ``a = sum_W e d / v``, ``b = sum_W d^2 / v``: its slope ``a / b`` has
   the standard error ``1 / sqrt(b)``;
 * support ``s = max_W (a / b - 3.5 / sqrt(b))`` in [0, 1]: the share of the innovation that is surely a change;
-* process noise ``q = s^2 mean(d^2)`` over 3x3 pixels;
+* process noise ``q = s^2 mean(d^2)`` over 3x3 pixels, plus ``b^2 (2 - k')^2 / k'`` for the last gain k';
 * gain ``k = (p + q) / (p + q + r)``, image ``h + k d``, and error variance ``p' = k r`` of the next history.
 
+b is what one fetch of the history errs by (:mod:`jaxdn.filters.resampling`), in every frame alike: a history of gain k
+errs by ``b (1 - k) / k``, besides the variance ``r k / (2 - k)``. Of the gains that stay, the one with the smallest
+sum of squares has ``b^2 / r = k^3 / ((1 - k) (2 - k)^2)``, to which this process noise leads.
+
 r is the variance of the new image's own errors, as far as they differ from frame to frame: the mean of ``(1 - s^2)
-d^2 / (1 + p / r)`` along motion. The gain follows 1, 1/2, 1/3 ... on a still surface. All thresholds are relative: k
-does not depend on the unit of radiance.
+d^2 / (1 + p / r + (b / k')^2 / r)`` along motion; after the first frame half the mean of ``(1 - s^2) d^2 - (b / k')^2``
+over 15x15 pixels. The gain follows 1, 1/2, 1/3 ... on a still surface. All thresholds are relative: k does not depend
+on the unit of radiance.
 
 Rudolf Kalman, "A New Approach to Linear Filtering and Prediction Problems", 1960; gains from innovations: Raman Mehra,
 "Approaches to Adaptive Filtering", 1972.
@@ -51,6 +56,7 @@ def kalman_blend(
     image: jax.Array,
     noisy: jax.Array,
     exposure: jax.Array,
+    fetch_error: jax.Array | None = None,
     *,
     history_max: int,
 ) -> jax.Array:
@@ -64,21 +70,31 @@ def kalman_blend(
       image: [3, H, W] the new image.
       noisy: [3, H, W] the radiance that it was made of.
       exposure: scalar, the factor that makes radiance as bright as a photograph.
+      fetch_error: [H, W] the square of what the fetch of the history errs by; None: nothing moves.
       history_max: the gain is at least its inverse.
     """
+    bias = jnp.zeros_like(image[0]) if fetch_error is None else exposure**2 * fetch_error
     gain, flicker, noise = jax.lax.stop_gradient(
-        _update(past, valid, exposure * image, exposure * noisy, exposure, history_max)
+        _update(past, valid, exposure * image, exposure * noisy, exposure, bias, history_max)
     )
     color = image + (1.0 - gain)[None] * jnp.where(valid[None], past[:3] - image, 0.0)
     return jnp.concatenate([color, jnp.stack([gain, flicker / exposure, noise / exposure])])
 
 
 def _update(
-    past: jax.Array, valid: jax.Array, image: jax.Array, noisy: jax.Array, exposure: jax.Array, history_max: int
+    past: jax.Array,
+    valid: jax.Array,
+    image: jax.Array,
+    noisy: jax.Array,
+    exposure: jax.Array,
+    bias: jax.Array,
+    history_max: int,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The gain, and the deviations of the image's own errors and of the noise, each [H, W], all times ``exposure``."""
     inside = valid.astype(image.dtype)
     before = jnp.where(valid, past[3], 0.0)
+    last = jnp.maximum(before, 1.0 / history_max)
+    drift, total_bias = (jnp.where(valid, bias * factor, 0.0) for factor in ((2.0 - last) ** 2 / last, 1.0 / last**2))
     innovation = (image - exposure * past[:3]) * inside[None]
     residual = (noisy - exposure * past[:3]) * inside[None]
     noise, tracked_noise = _measure_noise(image, noisy, jnp.where(valid, (exposure * past[5]) ** 2, 0.0))
@@ -89,13 +105,14 @@ def _update(
     changed, own = (each / jnp.maximum(number, 1.0) for each in sums)
     flicker = jnp.where(valid, (exposure * past[4]) ** 2, 0.0)
     # After one frame the innovation has the errors of two images.
-    around = box_sum(jnp.stack([unexplained, inside]), max(_WINDOWS))
+    around = box_sum(jnp.stack([jnp.maximum(unexplained - total_bias, 0.0), inside]), max(_WINDOWS))
     flicker = jnp.where(flicker > 0, flicker, 0.5 * around[0] / jnp.maximum(around[1], 1.0))
-    error = before * flicker + support**2 * changed
+    error = before * flicker + support**2 * changed + drift
     total = error + flicker
     gain = jnp.where(total > 0, error / jnp.where(total > 0, total, 1.0), 1.0)
     gain = jnp.where(valid, jnp.maximum(gain, 1.0 / history_max), 1.0)
-    sample = jnp.minimum(own / (1.0 + before), _MOST_GROWTH * flicker)
+    some = jnp.where(flicker > 0, flicker, 1.0)
+    sample = jnp.minimum(own / (1.0 + before + total_bias / some), _MOST_GROWTH * flicker)
     flicker = jnp.where(valid, flicker + _SHARE * (sample - flicker), 0.0)
     return gain, _root(flicker), _root(tracked_noise)
 

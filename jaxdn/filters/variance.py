@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn import brdf
-from jaxdn.filters.accumulation import luminance
+from jaxdn.filters.accumulation import texture_ratio
 from jaxdn.filters.atrous import edge_average, stencil
 from jaxdn.filters.edge_stopping import Weight
 from jaxdn.filters.isolated import fill_isolated, measure_isolation
@@ -28,7 +28,8 @@ def estimate_variance(
     """Colour [3, H, W] and the variance [H, W] of its luminance, from a history of ``accumulate``.
 
     Where the length N is less than ``short_history``, both are those of the edge-stopped 7x7 neighbourhood, and the
-    variance is multiplied by ``short_history / N`` (Schied et al. 2017, sec. 4.2). The ``texture`` [3, H, W] that a
+    variance is multiplied by ``short_history / N``. (Schied et al. 2017, sec. 4.2, take the variance alone from there;
+    the colour and the factor are those of later implementations.) The ``texture`` [3, H, W] that a
     division left is averaged likewise and given back to this colour (:func:`jaxdn.brdf.restore`); the deviation changes
     as grey light would.
 
@@ -49,7 +50,7 @@ def estimate_variance(
     around, spatial = mean[:3], jnp.maximum(mean[4] - mean[3] ** 2, 0.0) * (short_history / length)
     if texture is not None:
         around = brdf.restore(around, texture, mean[5:])
-        spatial = spatial * brdf.restore(jnp.ones_like(spatial), luminance(texture), luminance(mean[5:])) ** 2
+        spatial = spatial * texture_ratio(mean[5:], texture) ** 2
     color, variance = jnp.where(needed[None], around, color), jnp.where(needed, spatial, variance)
     if not isolated:
         return color, variance

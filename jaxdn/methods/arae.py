@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 
+from jaxdn import brdf
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics
@@ -53,10 +54,11 @@ def arae(options: rae.Options) -> Denoiser:
     def step(
         params: Params, state: AraeState, frame: Frame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[AraeState, jax.Array, jax.Array]:
-        planes, invalid = asvgf.accumulate(_ACCUMULATION, state.light, frame, first)
-        history = planes.transpose(1, 2, 0)
-        light = svgf.SvgfState(history, guides_of(frame))
-        measured, prepared = inner.prepare(frame._replace(radiance=history[..., :3]))
+        texture = svgf.planar_texture(frame, options.demodulate, statistics)
+        history, invalid = asvgf.accumulate(_ACCUMULATION, state.light, frame, texture, first)
+        light = svgf.SvgfState(history.transpose(1, 2, 0), guides_of(frame))
+        mean = brdf.restore(history[:3], texture, history[6:])
+        measured, prepared = inner.prepare(frame._replace(radiance=mean.transpose(1, 2, 0)))
         hidden, image, hidden_invalid = inner.step(params, state.hidden, prepared, first, measured)
         return AraeState(light, hidden), image, invalid + hidden_invalid
 

@@ -22,7 +22,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics
-from jaxdn.filters.accumulation import luminance
+from jaxdn.filters.accumulation import luminance, with_texture
 from jaxdn.filters.gradients import (
     Change,
     compare_replayed,
@@ -73,25 +73,32 @@ def asvgf(options: Options) -> Denoiser:
         params: Params, state: svgf.SvgfState, frame: Frame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[svgf.SvgfState, jax.Array, jax.Array]:
         fitted = apply_offsets(options, params)
-        history, invalid = accumulate(fitted, state, frame, first)
-        return (*svgf.filter_history(fitted, history, frame, statistics), invalid)
+        texture = svgf.planar_texture(frame, fitted.demodulate, statistics)
+        history, invalid = accumulate(fitted, state, frame, texture, first)
+        return (*svgf.filter_history(fitted, history, frame, texture, statistics), invalid)
 
     reads = svgf.READS | {"luminance_gradient"}
     plain = recurrent(Core(svgf.start, step, reads, lambda key, frame: zero_offsets(options)))
     return demodulated(plain, by=options.demodulate)
 
 
-def accumulate(options: Options, state: svgf.SvgfState, frame: Frame, first: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The history [6, H, W] with the frame blended in, faster where light has changed; the number of invalid pixels."""
+def accumulate(
+    options: Options, state: svgf.SvgfState, frame: Frame, texture: jax.Array, first: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The history [9, H, W] with the frame blended in, faster where light has changed; the number of invalid pixels.
+
+    ``texture`` [3, H, W] is what the division left in the frame.
+    """
     past, invalid = svgf.reproject_history(options, state, frame, first)
-    change = 1.0 - (1.0 - measure_change(options, past, frame)) ** options.antilag
-    return svgf.blend(options, past, frame.radiance.transpose(2, 0, 1), change), invalid
+    today = with_texture(past[:6], past[6:], texture)
+    change = 1.0 - (1.0 - measure_change(options, today, frame)) ** options.antilag
+    return svgf.blend(options, past, frame.radiance.transpose(2, 0, 1), texture, change), invalid
 
 
 def measure_change(options: Options, past: jax.Array, frame: Frame) -> jax.Array:
     """lambda [H, W] in [0, 1]: the share by which light has changed since the previous frame.
 
-    ``past`` is the fetched history [6, H, W].
+    ``past`` is the fetched history [6, H, W], with the texture of the frame.
     """
     now = frame.radiance.transpose(2, 0, 1)
     hit = surface_mask(frame.depth, frame.ids)

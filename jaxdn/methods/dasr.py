@@ -22,7 +22,7 @@ from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods import direct
 from jaxdn.methods.demodulation import Demodulation, demodulated
 from jaxdn.methods.registry import method
-from jaxdn.methods.sampler import Sampling, allocate_samples, sampler
+from jaxdn.methods.sampler import Sampling, allocate_after_first, allocate_samples, sampler
 from jaxdn.networks import LARGE, MULTIPLE, SMALL, Widths
 from jaxdn.ops.scales import pad
 from jaxdn.recipes.augmentation import NO_AUGMENTATION
@@ -40,6 +40,8 @@ class Options(Sampling):
     """Pixels without a surface (depth at ``FAR``) keep their radiance; or they are predicted as all others."""
     exposure: Literal["measured", "given"] = "measured"
     """The networks see radiance times :func:`jaxdn.color.exposure` of each frame; or radiance as it is given."""
+    initialization: Literal["he", "xavier"] = "he"
+    """Initial weights of both U-Nets; xavier (as in the paper) gives deep levels tiny gradients."""
     demodulate: Demodulation = "brdf"
     """What radiance is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`."""
     implementation: Literal["reference", "onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"] | None = None
@@ -49,15 +51,25 @@ class Options(Sampling):
     def __post_init__(self) -> None:
         if self.least < 1:
             raise ValueError(f"least: expected at least 1, the sample that is rendered first, got {self.least}.")
+        if self.least % 2 == 0:
+            raise ValueError(
+                f"least: expected an odd number, the sample that is rendered first and pairs, got {self.least}."
+            )
 
 
 @method(
     Options,
     title="Deep adaptive sampling and reconstruction (Kuznetsov et al. 2018)",
-    presets={"paper": Options(background="filter", exposure="given", rounding="nearest", demodulate="none")},
+    presets={
+        "paper": Options(
+            background="filter", exposure="given", initialization="xavier", rounding="nearest", demodulate="none"
+        )
+    },
     recipes={
         "usual": Recipe(pyramid_illumination()),
-        "paper": Recipe(compressed_illumination(), frames=1, decay=False, variation=NO_AUGMENTATION, average=0.0),
+        "paper": Recipe(
+            compressed_illumination(), frames=1, decay=False, clip_norm=0.0, variation=NO_AUGMENTATION, average=0.0
+        ),
     },
     variants={"dasr-large": {"size": "large"}, "dasr-small": {"size": "small"}},
     backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
@@ -65,7 +77,8 @@ class Options(Sampling):
 def dasr(options: Options) -> Denoiser:
     """Adaptive sampling of single frames; it requests samples, from stored layers of 1, 2, 4, ... or from the renderer.
 
-    ``budget`` counts the sample that is rendered first; a frame's radiance before the request is that sample.
+    ``budget`` counts the sample that is rendered first: the layer of one sample. Its numbers of samples are odd, that
+    one and pairs of further ones, as layers hold the first sample in odd numbers alone.
     ``params`` has the two networks, "sampler" (absent with ``adaptive=False``) and "predictor". Reads albedo, normal,
     depth and sample_count. Raises ValueError for options out of range and for a budget that the layers cannot give, and
     ``step`` for a frame of the wrong shape, never for its contents.
@@ -73,9 +86,9 @@ def dasr(options: Options) -> Denoiser:
     from jaxdn.networks.unet import unet
 
     widths = {"large": LARGE, "small": SMALL}[options.size] if isinstance(options.size, str) else options.size
-    built: dict[str, Any] = {"implementation": options.implementation}
+    built: dict[str, Any] = {"initialization": options.initialization, "implementation": options.implementation}
     surfaces = (3, 3, 1)
-    network = sampler(options, (3, *surfaces), size=options.size, **built)
+    network = sampler(options, (3, *surfaces), size=options.size, allocate=allocate_after_first, **built)
     predictor = unet((3, *surfaces, 1), (3,), widths=widths, **built)
 
     def prepare(frame: Frame) -> tuple[FrameStatistics, direct.PreparedFrame]:

@@ -21,8 +21,10 @@ Demodulation = Literal["brdf", "albedo", "none"]
 def demodulated(denoiser: Denoiser, *, by: Demodulation = "brdf") -> Denoiser:
     """The denoiser applied to radiance divided by what the surface reflects; its image is multiplied by the same again.
 
-    Textures are thus removed before filtering and cannot be blurred. The state, including the history, is demodulated
-    too. ``by`` is
+    Textures are thus removed before filtering and cannot be blurred. What a denoiser keeps is divided too, each frame
+    by its own divisor. The divisor of a dark surface is larger than its reflectance, so some of its texture is left
+    (:func:`texture_left`). The filters of this library average that as they average light, over pixels and frames, and
+    so it is not blurred; a denoiser that does not mixes dark textures of several frames. ``by`` is
 
     * ``"brdf"``: :func:`jaxdn.brdf.demodulate` by the frame's ``reflectance``, by its albedo where that is absent;
     * ``"albedo"``: by the albedo where that exceeds 0.01 and by 1 elsewhere: on dark and on glossy surfaces the divided

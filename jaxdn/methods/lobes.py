@@ -37,6 +37,10 @@ class DemodulatedLight(NamedTuple):
     texture: jax.Array | None = None
     """[3, H, W] what of its texture the division left (:func:`jaxdn.brdf.restore`); None: nothing."""
 
+    def known_texture(self) -> jax.Array:
+        """The texture [3, H, W]; 1 where the division left nothing."""
+        return jnp.ones_like(self.light) if self.texture is None else self.texture
+
     def remodulate(self, filtered: jax.Array) -> jax.Array:
         """Filtered light as an image [H, W, 3]."""
         return (filtered if self.divisor is None else filtered * self.divisor).transpose(1, 2, 0)

@@ -36,12 +36,13 @@ class Options(ntd.Options, Sampling):
     motion: Literal["dual", "traditional"] = "traditional"
     """Vectors that warp the history."""
     alpha_at: Literal["coarse", "fine"] = "fine"
-    """The blending weight of two scales: for each fine pixel (eq. 3), or at the coarse scale."""
+    """The blending weight of two scales: for each fine pixel, or at the coarse scale, as the channels of the paper's
+    heads say; with its nearest U both are its eq. 3."""
     up: Literal["bilinear", "nearest"] = "nearest"
     """The upsampling U of coarser scales."""
 
 
-PAPER = Options(least=0, rounding="nearest", **ntd.AS_PUBLISHED)
+PAPER = Options(alpha_at="coarse", least=0, rounding="nearest", **ntd.AS_PUBLISHED)
 """The settings of Hasselgren et al. 2020, as far as they are known."""
 
 
@@ -51,7 +52,7 @@ PAPER = Options(least=0, rounding="nearest", **ntd.AS_PUBLISHED)
     presets={"paper": PAPER},
     recipes={
         "usual": Recipe(unbiased_illumination()),
-        "paper": Recipe(last_frames(), frames=5, decay=False, variation=NO_AUGMENTATION, average=0.0),
+        "paper": Recipe(last_frames(), frames=5, decay=False, clip_norm=0.0, variation=NO_AUGMENTATION, average=0.0),
     },
     variants={"ntasd-large": {"size": "large"}, "ntasd-small": {"size": "small"}},
     backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
@@ -66,8 +67,8 @@ def ntasd(options: Options) -> Denoiser:
     """
     inner = ntd.core_of(options, ntd.ExtraFeatures((2, 1), _sample_features, frozenset({"motion", "sample_count"})))
     flagged = options.missing_history == "current"
-    built: dict[str, Any] = {"size": options.size, "implementation": options.implementation}
-    network = sampler(options, (1, 1, 3, 1, 2, *([1] if flagged else [])), **built)
+    built: dict[str, Any] = {name: getattr(options, name) for name in ("size", "initialization", "implementation")}
+    network = sampler(options, (1, 1, 3, 1, 2, *([1] if flagged else [])), allocate=allocate_samples, **built)
 
     def init(key: jax.Array, frame: Frame) -> Params:
         first, second = jax.random.split(key)

@@ -65,7 +65,9 @@ PRESETS = {
 """The settings of Chaitanya et al. 2017, and those of the comparison in Hasselgren et al. 2020."""
 RECIPES = {
     "usual": Recipe(pyramid_illumination(), frames=7),
-    "paper": Recipe(recurrent_illumination(), crop=128, frames=7, decay=False, variation=NO_AUGMENTATION, average=0.0),
+    "paper": Recipe(
+        recurrent_illumination(), crop=128, frames=7, decay=False, clip_norm=0.0, variation=NO_AUGMENTATION, average=0.0
+    ),
 }
 
 
@@ -81,9 +83,10 @@ def rae(options: Options) -> Denoiser:
     """The recurrent autoencoder.
 
     Light is compressed (:func:`jaxdn.color.compress`) before the network sees it, and the network predicts compressed
-    light. Normals are in world space, where the paper has them in the camera's: training turns them. Reads albedo,
-    reflectance, normal, depth and roughness; an absent buffer is neutral. Raises ValueError for an unknown option, and
-    ``step`` for a frame of the wrong shape or of another size than the first, never for its contents.
+    light. Normals are in world space, where the paper has them in the camera's: the recipe "usual" turns them at
+    random, "paper" does not. Reads albedo, reflectance, normal, depth and roughness; an absent buffer is neutral.
+    Raises ValueError for an unknown option, and ``step`` for a frame of the wrong shape or of another size than the
+    first, never for its contents.
     """
     return demodulated(recurrent(core_of(options)), by=options.demodulate)
 

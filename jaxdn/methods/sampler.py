@@ -18,7 +18,7 @@ from jax import lax
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Params
 from jaxdn.networks import LARGE, MULTIPLE, Widths
-from jaxdn.ops.sampling import sample_map
+from jaxdn.ops.sampling import check_budget, sample_map
 from jaxdn.ops.scales import crop, pad
 
 SMALL: Widths = ((8,), (16, 16), (24, 24), (32, 32), (32, 32))
@@ -53,25 +53,57 @@ class Sampler(NamedTuple):
     pixels alike."""
 
 
-def sampler(options: Sampling, groups: Sequence[int], *, size: str | Widths, implementation: str | None) -> Sampler:
-    """The network for feature groups of these channel counts."""
+Allocation = Callable[[Sampling, jax.Array, int], jax.Array]
+"""(options, logits [H, W, 1], most) -> [H, W, 1] numbers of samples."""
+
+
+def sampler(
+    options: Sampling,
+    groups: Sequence[int],
+    *,
+    size: str | Widths,
+    initialization: str,
+    implementation: str | None,
+    allocate: Allocation,
+) -> Sampler:
+    """The network for feature groups of these channel counts, whose output ``allocate`` turns into numbers."""
     from jaxdn.networks.unet import unet
 
     widths = {"large": LARGE, "small": SMALL}[size] if isinstance(size, str) else size
-    network = unet(groups, (1,), widths=widths, implementation=implementation)
+    network = unet(groups, (1,), widths=widths, initialization=initialization, implementation=implementation)
 
     def counts(params: Params, features: Sequence[jax.Array | None], even: jax.Array, most: int) -> jax.Array:
         present = next(group for group in features if group is not None)
         batch = [None if group is None else pad(group, MULTIPLE)[None] for group in features]
         logits = crop(network.apply(params, batch)[0][0], (present.shape[0], present.shape[1])).astype(present.dtype)
-        return allocate_samples(options, jnp.where(even, 0.0, logits), most)
+        return allocate(options, jnp.where(even, 0.0, logits), most)
 
     return Sampler(network.init, counts)
 
 
 def allocate_samples(options: Sampling, logits: jax.Array, most: int) -> jax.Array:
     """The numbers of samples [H, W, 1] for logits [H, W, 1]."""
-    counts = sample_map(logits, options.budget, least=options.least, most=most, rounding=options.rounding)
+    return _with_slope(
+        options, sample_map(logits, options.budget, least=options.least, most=most, rounding=options.rounding)
+    )
+
+
+def allocate_after_first(options: Sampling, logits: jax.Array, most: int) -> jax.Array:
+    """The numbers of samples [H, W, 1] where one is rendered first: that one, and as many pairs as the budget has.
+
+    Stored layers of 1, 2, 4, ... samples hold the first sample in odd numbers alone; in even ones it would be rendered
+    for the decision and not be in the image. Raises ValueError as :func:`jaxdn.ops.sampling.sample_map`.
+    """
+    check_budget(options.budget, least=options.least, most=most)
+    most = (most - 1) // 2
+    mean = min((options.budget - 1.0) / 2.0, most)
+    if not mean:
+        return jnp.ones_like(logits)
+    pairs = sample_map(logits, mean, least=(options.least - 1) // 2, most=most, rounding=options.rounding)
+    return _with_slope(options, 1.0 + 2.0 * pairs)
+
+
+def _with_slope(options: Sampling, counts: jax.Array) -> jax.Array:
     # The image's slope by its number of samples is that of mixing; if noise falls as 1 / sqrt(s), it is half of it.
     return 0.5 * (counts + lax.stop_gradient(counts)) if options.slope == "amplitude" else counts
 

@@ -18,11 +18,12 @@ from typing import Annotated, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxdn import brdf
 from jaxdn.core.frame import Array, Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics
-from jaxdn.filters.accumulation import accumulate
+from jaxdn.filters.accumulation import accumulate, with_texture
 from jaxdn.filters.atrous import B3_SPLINE, stencil
 from jaxdn.filters.cascade import cascade
 from jaxdn.filters.edge_stopping import Weight, depth_weight, normal_weight
@@ -41,6 +42,8 @@ from jaxdn.methods.learnable_options import (
 from jaxdn.methods.registry import method
 
 READS = frozenset({"normal", "depth", "previous_depth", "motion", "ids"})
+PLANES = 9
+"""Of a history, as of :func:`jaxdn.filters.accumulation.accumulate`."""
 _TAPS = stencil(2, kernel=B3_SPLINE)
 _POSITIVE = Range(0, without_low=True)
 _SHARE = Range(0, 1, without_low=True)
@@ -88,7 +91,8 @@ class SvgfState(NamedTuple):
     """What is carried from one frame to the next."""
 
     history: jax.Array
-    """[H, W, 6] demodulated colour, first and second moment of its luminance, history length in frames."""
+    """[H, W, 9] demodulated colour, first and second moment of its luminance, history length in frames; the texture
+    (3) that the division left in this light."""
     guides: Guides
     """Depth, normal and ids of the previous frame, as far as present."""
 
@@ -115,8 +119,9 @@ def svgf(options: Options) -> Denoiser:
     ) -> tuple[SvgfState, jax.Array, jax.Array]:
         fitted = apply_offsets(options, params)
         past, invalid = reproject_history(fitted, state, frame, first)
-        history = blend(fitted, past, frame.radiance.transpose(2, 0, 1))
-        return (*filter_history(fitted, history, frame, statistics), invalid)
+        texture = planar_texture(frame, fitted.demodulate, statistics)
+        history = blend(fitted, past, frame.radiance.transpose(2, 0, 1), texture)
+        return (*filter_history(fitted, history, frame, texture, statistics), invalid)
 
     def init(key: jax.Array, frame: Frame) -> Params:
         return zero_offsets(options)
@@ -132,14 +137,14 @@ def _receptive_field(options: Options) -> int:
 
 def start(params: Params, frame: Frame) -> SvgfState:
     """No history."""
-    nothing = jnp.zeros((*frame.radiance.shape[:2], 6), frame.radiance.dtype)
+    nothing = jnp.zeros((*frame.radiance.shape[:2], PLANES), frame.radiance.dtype)
     return SvgfState(nothing, jax.tree.map(jnp.zeros_like, guides_of(frame)))
 
 
 def reproject_history(
     options: Options, state: SvgfState, frame: Frame, first: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The fetched history [6, H, W], 0 where missing; the number of invalid history pixels."""
+    """The fetched history [9, H, W], 0 where missing; the number of invalid history pixels."""
     found = reproject(
         state.history,
         state.guides,
@@ -152,14 +157,23 @@ def reproject_history(
     return found.history.transpose(2, 0, 1), found.invalid
 
 
-def blend(options: Options, past: jax.Array, now: jax.Array, change: jax.Array | None = None) -> jax.Array:
-    """The history [6, H, W] with light [3, H, W] blended in; ``change`` as in ``accumulate``."""
+def planar_texture(frame: Frame, by: Demodulation, statistics: FrameStatistics) -> jax.Array:
+    """The texture [3, H, W] that the division leaves in a frame inside ``demodulated``; 1 if it leaves none."""
+    texture = texture_left(frame, by, statistics)
+    return jnp.ones_like(frame.radiance).transpose(2, 0, 1) if texture is None else texture.transpose(2, 0, 1)
+
+
+def blend(
+    options: Options, past: jax.Array, now: jax.Array, texture: jax.Array, change: jax.Array | None = None
+) -> jax.Array:
+    """The history [9, H, W] with light [3, H, W] blended in; ``texture`` and ``change`` as in ``accumulate``."""
     return accumulate(
         past,
         now,
         alpha=options.alpha,
         alpha_moments=options.alpha_moments,
         history_max=options.history_max,
+        texture=texture,
         change=change,
     )
 
@@ -180,17 +194,20 @@ def surface_weights(
 
 
 def filter_history(
-    options: Options, history: jax.Array, frame: Frame, statistics: FrameStatistics
+    options: Options, history: jax.Array, frame: Frame, texture: jax.Array, statistics: FrameStatistics
 ) -> tuple[SvgfState, jax.Array]:
-    """The state after a frame and its image [H, W, 3], from the blended history [6, H, W]."""
+    """The state after a frame and its image [H, W, 3], from the blended history [9, H, W].
+
+    Light is filtered with the ``texture`` [3, H, W] of the frame, and kept with that of its history.
+    """
     hit = surface_mask(frame.depth, frame.ids)
-    texture = texture_left(frame, options.demodulate, statistics)
-    texture = None if texture is None else texture.transpose(2, 0, 1)
+    mean_texture = history[6:]
+    today = with_texture(history[:6], mean_texture, texture)
 
     def weights(level: Any) -> list[Weight]:
         return surface_weights(options, frame.depth, frame.normal, frame.ids, statistics.height, level)
 
-    color, variance = estimate_variance(history, hit, weights(0), short_history=options.short_history, texture=texture)
+    color, variance = estimate_variance(today, hit, weights(0), short_history=options.short_history, texture=texture)
     image, feedback = cascade(
         color,
         variance,
@@ -200,11 +217,11 @@ def filter_history(
         levels=options.levels,
         sigma_luminance=options.sigma_luminance,
         texture=texture,
-        feedback=color if options.feedback_level else history[:3],
+        feedback=color if options.feedback_level else today[:3],
         feedback_level=options.feedback_level,
     )
     image = image.transpose(1, 2, 0)
     if hit is not None:
         image = jnp.where(hit[..., None], image, frame.radiance)
-    kept = jnp.concatenate([feedback, history[3:]]).transpose(1, 2, 0)
+    kept = jnp.concatenate([brdf.restore(feedback, mean_texture, texture), history[3:]]).transpose(1, 2, 0)
     return SvgfState(kept, guides_of(frame)), image

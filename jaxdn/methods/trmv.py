@@ -30,7 +30,7 @@ from jaxdn.core.frame import Array, Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics, count_reflectance_differs
-from jaxdn.filters.accumulation import after_shift, luminance
+from jaxdn.filters.accumulation import after_shift, luminance, with_texture
 from jaxdn.filters.atrous import GAUSSIAN, stencil
 from jaxdn.filters.cascade import cascade
 from jaxdn.filters.clamping import clamp_to_fast
@@ -78,12 +78,12 @@ class TrmvState(NamedTuple):
     """What is carried from one frame to the next."""
 
     rest: jax.Array
-    """[H, W, 6], with shadows [H, W, 9]: divided colour, first and second moment of its luminance, history length;
-    unshadowed light along the same vectors."""
+    """[H, W, 9] as of ``svgf``; with shadows [H, W, 12]: unshadowed light, too, along the same vectors, of the same
+    texture."""
     shadows: jax.Array | None
-    """[H, W, 9] the same of light with its shadows, and unshadowed light along the shadow vectors; None without."""
+    """[H, W, 12] the same of light with its shadows, and unshadowed light along the shadow vectors; None without."""
     specular: jax.Array | None
-    """[H, W, 6] the same of specular light; None without."""
+    """[H, W, 9] the same of specular light; None without."""
     guides: Guides
     """Depth, normal and ids of the previous frame, as far as present."""
 
@@ -122,7 +122,9 @@ def trmv(given: Options) -> Denoiser:
 
         guides = jax.tree.map(jnp.zeros_like, guides_of(frame))
         lit, shines = frame.shadowed is not None, frame.specular is not None
-        return TrmvState(nothing(9 if lit else 6), nothing(9) if lit else None, nothing(6) if shines else None, guides)
+        return TrmvState(
+            nothing(12 if lit else 9), nothing(12) if lit else None, nothing(9) if shines else None, guides
+        )
 
     def step(
         params: Params, state: TrmvState, frame: Frame, first: jax.Array, statistics: FrameStatistics
@@ -136,27 +138,32 @@ def trmv(given: Options) -> Denoiser:
         # As in a wrapper by `demodulated`: the light is divided, and the reflectance is what it was divided by.
         differs = jnp.asarray(count_reflectance_differs(diffuse), statistics.reflectance_differs.dtype)
         of_diffuse = statistics._replace(reflectance_differs=differs)
-        kept, image = svgf.filter_history(options, svgf.blend(options, past[:6], parts.rest), diffuse, of_diffuse)
+        texture = svgf.planar_texture(diffuse, options.demodulate, of_diffuse)
+        history = svgf.blend(options, past[:9], parts.rest, texture)
+        kept, image = svgf.filter_history(options, history, diffuse, texture, of_diffuse)
         rest, shadows, specular = kept.history, None, None
         hit = surface_mask(frame.depth, frame.ids)
 
         if parts.shadowed is not None and parts.unshadowed is not None and state.shadows is not None:
-            free = _mean(options, past[6:], parts.unshadowed, past[_LENGTH])
+            unshadowed = _mean(options, past[9:], parts.unshadowed, past[_LENGTH])
+            free = brdf.restore(unshadowed, texture, history[6:])
             along = frame.motion if frame.shadow_motion is None else frame.shadow_motion
             past, more_invalid = _reproject_signal(
                 options, state.shadows, state.guides, frame, along, first, any_surface=True
             )
             shadows, lit = _filter_shadows(options, past, parts, free, frame, hit, statistics.height)
-            rest = jnp.concatenate([rest, free.transpose(1, 2, 0)], axis=-1)
+            rest = jnp.concatenate([rest, unshadowed.transpose(1, 2, 0)], axis=-1)
             image, invalid = image + lit, invalid + more_invalid
         image = parts.diffuse.remodulate(image.transpose(2, 0, 1))
 
         if parts.specular is not None and state.specular is not None:
             along = frame.motion if frame.glossy_motion is None else frame.glossy_motion
             past, more_invalid = _reproject_signal(options, state.specular, state.guides, frame, along, first)
-            history = svgf.blend(options, past, parts.specular.light)
+            texture = parts.specular.known_texture()
+            history = svgf.blend(options, past, parts.specular.light, texture)
+            today = with_texture(history[:6], history[6:], texture)
             image = image + parts.specular.remodulate(
-                _filter_specular(options, history, parts.specular.texture, frame, hit, statistics.height)
+                _filter_specular(options, today, texture, frame, hit, statistics.height)
             )
             specular = history.transpose(1, 2, 0)
             invalid = invalid + more_invalid
@@ -185,7 +192,7 @@ def _fit_state(state: TrmvState, begun: TrmvState) -> TrmvState:
     """The state with the histories that this frame needs; those that have come within the clip are empty."""
     rest, planes = state.rest, begun.rest.shape[-1]
     if rest.shape[-1] != planes:
-        rest = jnp.concatenate([rest[..., :6], begun.rest[..., 6:]], axis=-1)
+        rest = jnp.concatenate([rest[..., :9], begun.rest[..., 9:]], axis=-1)
     shadows = begun.shadows if state.shadows is None or begun.shadows is None else state.shadows
     specular = begun.specular if state.specular is None or begun.specular is None else state.specular
     return TrmvState(rest, shadows, specular, state.guides)
@@ -236,7 +243,7 @@ def _filter_shadows(
     hit: jax.Array | None,
     height: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """The history [H, W, 9] of shadows, and direct light [H, W, 3].
+    """The history [H, W, 12] of shadows, and direct light [H, W, 3].
 
     The share that shadows leave is S / U, with S light and U unshadowed light, both fetched along the shadow vectors
     and filtered with the same weights; it multiplies the unshadowed light that moves with the surface (``free``).
@@ -244,39 +251,38 @@ def _filter_shadows(
     assert parts.shadowed is not None
     assert parts.unshadowed is not None
     held = _clamp_shadows(options, past, parts.shadowed, parts.unshadowed, hit)
-    history = svgf.blend(options, held, parts.shadowed)
-    under = _mean(options, past[6:], parts.unshadowed, past[_LENGTH])
-    texture = parts.diffuse.texture
+    texture = parts.diffuse.known_texture()
+    history = svgf.blend(options, held, parts.shadowed, texture)
+    under = _mean(options, past[9:], parts.unshadowed, past[_LENGTH])
+    today = with_texture(history[:6], history[6:], texture)
 
     def weights(level: Any) -> list[Weight]:
         return svgf.surface_weights(options, frame.depth, frame.normal, frame.ids, height, level)
 
     def estimated(light: jax.Array) -> tuple[jax.Array, jax.Array]:
-        planes = history.at[:3].set(light)
+        planes = today.at[:3].set(light)
         return estimate_variance(planes, hit, weights(0), short_history=options.short_history, texture=texture)
 
-    color, variance = estimated(history[:3])
+    color, variance = estimated(today[:3])
     # The ratio needs the same neighbours for all.
-    lights = [color, estimated(under)[0], estimated(free)[0]]
-    planes = jnp.concatenate([*lights, *([] if texture is None else [texture])])
+    lights = [color, estimated(brdf.restore(under, texture, history[6:]))[0], estimated(free)[0]]
+    planes = jnp.concatenate([*lights, texture])
     found = _apply_cascade(options, planes, variance, hit, weights, options.sigma_luminance)
-    light = _share(found[:3], found[3:6]) * found[6:9]
-    if texture is not None:
-        light = brdf.restore(light, texture, found[9:])
+    light = brdf.restore(_share(found[:3], found[3:6]) * found[6:9], texture, found[9:])
     return jnp.concatenate([history, under]).transpose(1, 2, 0), light.transpose(1, 2, 0)
 
 
 def _clamp_shadows(
     options: Options, past: jax.Array, lit: jax.Array, free: jax.Array, hit: jax.Array | None
 ) -> jax.Array:
-    """The history [6, H, W] of light with its shadows, clamped to what the frame shows around each pixel."""
+    """The history [9, H, W] of light with its shadows, clamped to what the frame shows around each pixel."""
     shines = jnp.any(free > _DARK, axis=0)
     known = shines if hit is None else shines & hit
-    before = _share(past[:3], past[6:])
+    before = _share(past[:3], past[9:])
     held = clamp_to_fast(before, _share(lit, free), known, sigma=options.clamp_sigma)
-    color = past[:3] + (held - before) * past[6:]
+    color = past[:3] + (held - before) * past[9:]
     moments = after_shift(past[3:5], luminance(color) - luminance(past))
-    return jnp.concatenate([jnp.maximum(color, 0.0), moments, past[5:6]])
+    return jnp.concatenate([jnp.maximum(color, 0.0), moments, past[5:9]])
 
 
 def _share(lit: jax.Array, free: jax.Array) -> jax.Array:
@@ -288,7 +294,7 @@ def _share(lit: jax.Array, free: jax.Array) -> jax.Array:
 def _filter_specular(
     options: Options,
     history: jax.Array,
-    texture: jax.Array | None,
+    texture: jax.Array,
     frame: Frame,
     hit: jax.Array | None,
     height: jax.Array,

@@ -131,7 +131,7 @@ def unet(inputs: int, heads: Sequence[int], *, widths: Widths, head_size: Litera
     """The U-Net: five resolution levels, heads on the last decoder levels, from full resolution down.
 
     Architecture (Zeng et al. 2021, sec. 4.3 and fig. 6, after Hasselgren et al. 2020): 3x3 convolutions, LeakyReLU, 2x2
-    max-pooling down, nearest upsampling and skip concatenation up. The papers give no widths.
+    max-pooling down, nearest upsampling and skip concatenation up. Widths are in figures alone.
     """
     builder = _GraphBuilder(inputs)
     skips = [builder.level("encoder_0", widths[0], FEATURES)]

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxdn.core.checks import check_image, check_option
+from jaxdn.ops.scales import crop, fill_holes, pad
 
 
 def from_layers(
@@ -21,8 +22,9 @@ def from_layers(
 
     ``layers`` maps powers of two to independent images [H, W, 3] of that many samples. Counts are rounded and clamped
     to the layers' sum; a pixel without samples is 0. With the ``reference`` [H, W, 3], what the layers converge to, the
-    image has a gradient with respect to the counts (:func:`more_samples`); without, no gradient flows into them. Raises
-    ValueError unless the layers are 1, 2, 4, ... without a gap.
+    image has a gradient with respect to the counts (:func:`more_samples`), that of a pixel without samples as if it
+    were filled from its neighbours (:func:`jaxdn.ops.scales.fill_holes`), as denoisers fill it. Without, no gradient
+    flows into them. Raises ValueError unless the layers are 1, 2, 4, ... without a gap.
     """
     expected = [1 << bit for bit in range(len(layers))]
     if sorted(layers) != expected or not layers:
@@ -34,7 +36,14 @@ def from_layers(
         total = total + jnp.where((whole & samples) > 0, samples * layers[samples], 0.0)
     taken = whole.astype(total.dtype)
     image = total / jnp.maximum(taken, 1.0)
-    return (image if reference is None else more_samples(image, taken, counts, reference)), taken
+    if reference is None:
+        return image, taken
+    seen = taken > 0
+    filled = lax.stop_gradient(
+        crop(fill_holes(pad(image, _BLOCK), pad(seen, _BLOCK)), (image.shape[0], image.shape[1]))
+    )
+    none = more_samples(filled, taken, counts, reference) - filled
+    return jnp.where(seen, more_samples(image, taken, counts, reference), none), taken
 
 
 @jax.custom_vjp
@@ -69,6 +78,19 @@ def _of_samples(given: tuple[jax.Array, ...], slope: jax.Array) -> tuple[jax.Arr
 more_samples.defvjp(_more_samples, _of_samples)
 
 
+_BLOCK = 4
+"""Pixels of the largest blocks that are filled."""
+
+
+def check_budget(budget: float, *, least: int, most: int) -> None:
+    """Raise ValueError for a mean number of samples that is not within the fewest and the most of a pixel."""
+    if not (least <= budget <= most and budget > 0):
+        raise ValueError(
+            f"budget: expected a mean number of samples above 0 from {least} to {most}, the fewest and the most that a "
+            f"pixel can have, got {budget:g}. A clip has as many as all its layers: `jaxdn render --layers 1 2 4 8`."
+        )
+
+
 def sample_map(logits: jax.Array, budget: float, *, least: int = 0, most: int, rounding: str = "exact") -> jax.Array:
     """Whole numbers of samples [H, W, 1] from ``least`` to ``most``, ``budget`` in the mean: a softmax over the image.
 
@@ -86,11 +108,7 @@ def sample_map(logits: jax.Array, budget: float, *, least: int = 0, most: int, r
     """
     check_image(logits, "logits", channels=1)
     check_option(rounding, "rounding", ("exact", "nearest"))
-    if not (least <= budget <= most and budget > 0):
-        raise ValueError(
-            f"budget: expected a mean number of samples above 0 from {least} to {most}, the fewest and the most that a "
-            f"pixel can have, got {budget:g}. A clip has as many as all its layers: `jaxdn render --layers 1 2 4 8`."
-        )
+    check_budget(budget, least=least, most=most)
     logits = jnp.asarray(logits)
     logits = jnp.where(jnp.isfinite(logits), logits, 0.0).astype(jnp.promote_types(logits.dtype, jnp.float32))
     logits = jnp.maximum(logits, lax.stop_gradient(jnp.max(logits)) - _REACH)

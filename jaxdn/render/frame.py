@@ -190,7 +190,9 @@ def _follow_samples(
     if GRADIENT in followed:
         assert settings.max_depth is not None
         buffers[GRADIENT] = (
-            compute_luminance_gradient(tracer.replay, frames, max_depth=settings.max_depth)
+            compute_luminance_gradient(
+                tracer.replay, frames, max_depth=settings.max_depth, with_direct=settings.light == "reflected"
+            )
             if request.noisy
             else np.zeros((settings.height, settings.width, 2), np.float32)
         )

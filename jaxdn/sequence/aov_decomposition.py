@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxdn.core.frame import Frame
-from jaxdn.denoiser.sanitize import sanitize, sanitize_image
+from jaxdn.denoiser.sanitize import sanitize
 from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
 from jaxdn.filters.edge_stopping import Offset, Planes, Weight, depth_weight, normal_weight
 from jaxdn.filters.reproject import reproject
@@ -50,6 +50,16 @@ def init_decomposition(frame: Frame, count: int) -> DecompositionState:
     return DecompositionState(nothing, jax.tree.map(jnp.zeros_like, guides_of(sanitize(frame)[0])))
 
 
+def add_layers(state: DecompositionState, count: int) -> DecompositionState:
+    """The state for ``count`` layers, of which those that are new have been black so far."""
+    old = state.history.shape[-1] - 4
+    black = jnp.zeros((*state.history.shape[:2], 3 * count - old), state.history.dtype)
+    if not black.size:
+        return state
+    history = jnp.concatenate([state.history[..., :old], black, state.history[..., old:]], axis=-1)
+    return state._replace(history=history)
+
+
 @jax.jit
 def decompose(
     state: DecompositionState, frame: Frame, beauty: jax.Array, layers: jax.Array
@@ -58,28 +68,34 @@ def decompose(
 
     Args:
       state: after the frame before; :func:`init_decomposition` before the first.
-      frame: the noisy frame; its radiance is what the layers are parts of.
+      frame: the noisy frame; its radiance is what the layers are parts of, of about the brightness of a photograph
+        (:mod:`jaxdn.sequence.light_range`). Values that are not finite count as 0.
       beauty: the denoised radiance.
       layers: [n, H, W, 3] noisy.
     """
-    frame, _ = sanitize(frame)
-    layers = sanitize_image(layers).astype(jnp.float32)
-    noisy = jnp.concatenate([*layers, frame.radiance], axis=-1)
+    light, layers = (_finite(image) for image in (frame.radiance, layers))
+    frame = sanitize(frame)[0]
+    noisy = jnp.concatenate([*layers, light], axis=-1)
     blended = _blend(state, frame, noisy)
     filtered = _filter(frame, beauty, blended[..., :-1])
     hit = surface_mask(frame.depth, frame.ids)
     if hit is not None:  # what has no surface is not filtered
         filtered = jnp.where(hit[..., None], filtered, noisy)
     total = filtered[..., -3:]
-    dark = total <= _DARK
+    dark = jnp.abs(total) <= _DARK
     grey_total = jnp.sum(total, axis=-1, keepdims=True)
 
     def share(layer: jax.Array) -> jax.Array:
-        grey = jnp.sum(layer, axis=-1, keepdims=True) / jnp.where(grey_total > 0, grey_total, 1.0)
+        grey = jnp.sum(layer, axis=-1, keepdims=True) / jnp.where(grey_total != 0, grey_total, 1.0)
         return beauty * jnp.where(dark, grey, layer / jnp.where(dark, 1.0, total))
 
     images = jnp.stack([share(filtered[..., 3 * i : 3 * i + 3]) for i in range(layers.shape[0])])
     return DecompositionState(blended, guides_of(frame)), images
+
+
+def _finite(light: jax.Array) -> jax.Array:
+    """Without limits, and negative where it is: clamped parts would not add up to the clamped whole."""
+    return jnp.where(jnp.isfinite(light), light, 0.0).astype(jnp.float32)
 
 
 def _blend(state: DecompositionState, frame: Frame, noisy: jax.Array) -> jax.Array:

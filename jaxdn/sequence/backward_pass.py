@@ -3,7 +3,6 @@
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -12,6 +11,10 @@ from jaxdn.data.clip.frames import StoredFrame
 from jaxdn.data.exr.exr import to_half
 from jaxdn.filters.time_reversal import HistoryLength, update_history_length
 from jaxdn.filters.time_reversal import blend as blend_directions
+from jaxdn.runtime.scratch import scratch_folder
+
+_HALF_OCTAVES = 15
+"""Values below 2 to this power fit into half precision."""
 
 
 class BackwardImages:
@@ -23,7 +26,10 @@ class BackwardImages:
 
     def keep(self, index: int, image: np.ndarray, number: np.ndarray) -> None:
         """Store the image [H, W, 3] of a frame and for how many frames its points have been seen, [H, W, 1]."""
-        np.save(self._file(index), to_half(np.concatenate([image, number], axis=-1)))
+        # Scaled so that the largest value fits: 2^29 times darker ones are still exact to 11 bits.
+        exponent = _HALF_OCTAVES - int(np.frexp(np.max(np.abs(image), initial=0.0))[1])
+        half = np.concatenate([np.ldexp(np.asarray(image, np.float32), exponent), number], axis=-1)
+        np.savez(self._file(index), images=to_half(half), exponent=exponent)
 
     def blend(self, index: int, frame: Frame, image: np.ndarray) -> np.ndarray:
         """The image of the forward pass blended with that of the backward one, which is removed.
@@ -34,12 +40,14 @@ class BackwardImages:
         file = self._file(index)
         if not file.is_file():
             return image
-        stored = np.load(file).astype(np.float32)
+        with np.load(file) as there:
+            stored, exponent = there["images"].astype(np.float32), int(there["exponent"])
         file.unlink()
-        return np.asarray(blend_directions(image, stored[..., :3], np.asarray(self._seen.number), stored[..., 3:]))
+        other = np.ldexp(stored[..., :3], -exponent)
+        return np.asarray(blend_directions(image, other, np.asarray(self._seen.number), stored[..., 3:]))
 
     def _file(self, index: int) -> Path:
-        return self._folder / f"{index}.npy"
+        return self._folder / f"{index}.npz"
 
 
 @contextmanager
@@ -52,7 +60,7 @@ def backward_pass(
     """Denoise frames from the last to the first, and give their images for as long as the block lasts.
 
     They wait in half precision in a hidden folder below ``folder``, 8 bytes a pixel, which is removed however the block
-    ends. The memory is that of one frame.
+    ends (of a killed process by the next, :mod:`jaxdn.runtime.scratch`). The memory is that of one frame.
 
     Args:
       frames: indices and frames, with time turned around (:func:`jaxdn.filters.time_reversal.reverse_time`).
@@ -61,8 +69,8 @@ def backward_pass(
       folder: created if it is missing.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory(prefix=".backwards-", dir=folder) as place:
-        images = BackwardImages(Path(place))
+    with scratch_folder(folder, ".backwards-") as place:
+        images = BackwardImages(place)
         state: HistoryLength | None = None
         for index, stored in frames:
             image = denoise(stored)

@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn.core.frame import Frame
+from jaxdn.core.frame import FAR, Frame
 from jaxdn.data.clip.frames import StoredFrame, doubling_layers
 from jaxdn.denoiser.rollout import Layers, Stream, stream
-from jaxdn.denoiser.sanitize import sanitize_image
 from jaxdn.denoiser.tiles import GRID, TiledStream, map_tiles, stream_tiled
-from jaxdn.sequence.james_stein import REACH, Confidence, JamesStein, combine, measure_confidence
+from jaxdn.sequence.james_stein import REACH, Confidence, JamesStein, combine, measure_confidence, measure_level
+from jaxdn.sequence.light_range import DRIFT, bound_light, choose_exponent, restore_lamps, restore_light
 from jaxdn.zoo.ready import Model
 
 GIB = 2**30
@@ -29,7 +29,7 @@ STEP = 1100
 """Bytes a pixel of what is denoised at once, a window or the whole frame. All four are upper bounds for the shipped
 methods on two cores, by ``python -m experiments.stability.memory``."""
 
-_combine = jax.jit(combine, static_argnames="texture_unknown")
+_combine = jax.jit(combine)
 _measure_confidence = jax.jit(measure_confidence)
 
 
@@ -63,11 +63,19 @@ class FrameDenoiser:
         self._limit, self._log = limit, log
         self._step: Stream | TiledStream | None = None
         self._lost_pixels = 0
+        self._exponent: int | None = None  # of the unit in which this step's history is
+        self._programs: set[tuple[str, ...]] = set()  # of the steps before this one
+        self._sanitized = 0
 
     def __call__(self, stored: StoredFrame) -> np.ndarray:
         """The image of the next frame. Raises ValueError where a limit that was given cannot be kept."""
         if self._method.denoiser is None:
             return np.asarray(light_of(stored.frame.radiance))
+        exponent = self._follow_light(stored.frame.radiance)
+        image = self._denoise(bound_light(stored, exponent))
+        return restore_light(image, np.asarray(stored.frame.radiance), exponent)
+
+    def _denoise(self, stored: StoredFrame) -> np.ndarray:
         step = self._prepare(stored.frame)
         if isinstance(step, Stream):
             return np.asarray(step(stored.frame, self._layers(stored)))
@@ -76,6 +84,16 @@ class FrameDenoiser:
             self._lost_pixels = step.beyond_halo
             self._log(f"{self._lost_pixels} pixels move too far for the tiles and begin anew; give more --max-memory")
         return image
+
+    def _follow_light(self, radiance: np.ndarray) -> int:
+        """The exponent for the next frame; where it is another one, the history ends, as it is in another unit."""
+        exponent = choose_exponent(np.asarray(radiance), self._exponent)
+        if self._exponent is not None and exponent != self._exponent and self._step is not None:
+            self._log(f"the light changes by more than a factor of {2**DRIFT}: there the history begins anew")
+            self._programs, self._sanitized = self.programs, self.sanitized
+            self._step = None
+        self._exponent = exponent
+        return 0 if exponent is None else exponent
 
     def is_tiled(self, frame: Frame) -> bool:
         """Whether frames like this one are denoised in tiles. Raises as the call does."""
@@ -89,31 +107,32 @@ class FrameDenoiser:
     @property
     def programs(self) -> set[tuple[str, ...]]:
         """The sets of buffers that a step was compiled for."""
-        return set() if self._step is None else self._step.programs
+        return self._programs | (set() if self._step is None else self._step.programs)
 
     @property
     def sanitized(self) -> int:
         """Invalid values that were replaced."""
-        return 0 if self._step is None else self._step.sanitized
+        return self._sanitized + (0 if self._step is None else self._step.sanitized)
 
     def blend_fallback(self, frame: Frame, image: np.ndarray) -> tuple[np.ndarray, Fallback]:
         """The image of a frame with what is no noise as it was, and why (:mod:`jaxdn.sequence.james_stein`)."""
         noisy = np.asarray(frame.radiance)
-        texture_unknown = frame.albedo is None and frame.reflectance is None
-        combined = self._combine(noisy, image, texture_unknown=texture_unknown)
+        combined = self._combine(noisy, image, None if frame.depth is None else np.asarray(frame.depth) < FAR)
         confidence: Confidence = jax.device_get(_measure_confidence(combined))
         image = np.asarray(combined.image)
         if confidence.fallback > 0:
             image = image + np.float32(confidence.fallback) * (np.asarray(light_of(noisy)) - image)
+        image = restore_lamps(image, noisy, self._exponent or 0)
+        texture_unknown = frame.albedo is None and frame.reflectance is None
         return image, Fallback(confidence, float(np.mean(combined.noisy_weight)), texture_unknown)
 
-    def _combine(self, noisy: np.ndarray, image: np.ndarray, *, texture_unknown: bool) -> JamesStein:
+    def _combine(self, noisy: np.ndarray, image: np.ndarray, surface: np.ndarray | None) -> JamesStein:
         if not isinstance(self._step, TiledStream):
-            return _combine(noisy, image, texture_unknown=texture_unknown)
-        mean_light = jnp.asarray(np.mean(image, dtype=np.float64), jnp.float32)
+            return _combine(noisy, image, surface=surface)
+        level = measure_level(jnp.asarray(image))
         combined, _ = map_tiles(
-            lambda images: (_combine(*images, mean_light, texture_unknown=texture_unknown), None),
-            (noisy, image),
+            lambda given: (_combine(given[0], given[1], level, given[2]), None),
+            (noisy, image, surface),
             image.shape[:2],
             side=self._step.side,
             halo=REACH,
@@ -153,8 +172,8 @@ class FrameDenoiser:
 
 
 def light_of(radiance: np.ndarray | None) -> Any:
-    """Radiance that can be added: non-finite or negative values become 0, an absent part is 0."""
-    return 0.0 if radiance is None else np.asarray(sanitize_image(radiance), np.float32)
+    """Radiance that can be added: values that are not finite become 0, an absent part is 0."""
+    return 0.0 if radiance is None else np.where(np.isfinite(radiance), radiance, 0).astype(np.float32)
 
 
 def measure_machine_memory() -> float:

@@ -1,25 +1,41 @@
 """A noisy image and what a denoiser made of it, combined so that the result is not worse than either.
 
-What a denoiser changes, ``d = noisy - denoised``, is noise that it took away and detail that it lost. With the noise's
-variance ``V``, the best mixture ``denoised + w d`` has the weight that James and Stein's estimator has,
+What a denoiser changes, ``d = noisy - denoised``, is noise that it took away and detail that it lost. Both are apart
+in scale. Noise differs from pixel to pixel and is gone in a mean; a shadow, a highlight or a reflection that was
+blurred is a few pixels wide. So d, relative to the light, is split by the a-trous wavelet transform with the B3 spline
+(Holschneider et al. 1989; Starck and Murtagh, "Image restoration with noise suppression using the wavelet transform",
+1994): ``d = D0 + D1 + D2 + D3 + rest``. Of white noise with the variance V, band b has ``GAINS[b] V``: 0.79, 0.040,
+0.0073, 0.0017, and the rest 0.00055. Each gets the weight of James and Stein's estimator,
 
-    w = max(0, 1 - c V / mean(d^2)),
+    w_b = max(0, 1 - c_b GAINS[b] V / E_b),    c_b = 1 + DOUBT[b] / sqrt(n),
 
-where the mean is over a window: nothing of ``d`` where all of it is noise, all where none is (Efron and Morris,
-"Stein's estimation rule and its competitors", 1973; for renderings: Gu et al., "Neural James-Stein Combiner for
-Unbiased and Biased Renderings", 2022, whose V comes from the renderer's samples).
+where E_b is the band's mean square in a window and n the number of equal values with the same fourth moment, by which
+E_b is uncertain (Efron and Morris, "Stein's estimation rule and its competitors", 1973; for renderings, with variances
+from the renderer: Gu et al., "Neural James-Stein Combiner for Unbiased and Biased Renderings", 2022). What is kept of
+the coarse bands brings hardly any noise with it: of a mean over 8x8 pixels, 1/64.
 
-Here V comes from the image alone. Noise of a renderer without a pixel filter differs from pixel to pixel, lost detail
-mostly does not: V is the mean of squared second differences of ``d``, which are free of slopes (Immerkaer, "Fast Noise
-Variance Estimation", 1996, whose mask is the same in two dimensions), along that of four directions in which it is
-smallest, because edges are smooth along themselves.
+V is the less of two estimates in windows, but at least half of the second:
 
-Texture of single pixels has no such direction, but it is seldom everywhere, and noise is: where there is little noise,
-V is that of the quietest block of pixels around. Of much noise this would be far too little, because few samples are
-mostly dark, with a few bright ones: there the mean of the whole window counts.
+* by scale: lost detail has at least ``SLOPE`` times as much energy in the finest band as in the next one, where noise
+  has 20 times. ``E_0 = GAINS[0] V + SLOPE x`` and ``E_1 = GAINS[1] V + x`` give V;
+* by direction: the mean of squared second differences of d (Immerkaer, "Fast Noise Variance Estimation", 1996), along
+  that of four directions in which it is smallest, because edges are smooth along themselves.
+
+The first alone would be 0 where all was blurred. Texture of single pixels looks like noise to both, but it is seldom
+everywhere, and noise is: of little noise, V is at most that of the quietest block of surfaces around. Of much noise
+this would be far too little, because few samples are mostly dark, with a few bright ones. Both hold for renderers that
+filter their pixels by drawing samples from the filter, as Cycles and our renderer do: the noise of two pixels is
+independent. Neither is moved by single values, because d is Winsorized (Tukey 1962): it counts as at most :data:`BOUND`
+times the light, unless most of the 3x3 pixels around agree. Light is that of the denoised image plus a share of its
+median, which no lamp moves.
+
+Where many of the blocks around have no noise at all, the image is kept as it is. Where nothing was rendered, as in a
+sky, that says nothing.
 """
 
 import functools
+import math
+from itertools import pairwise
 from typing import NamedTuple
 
 import jax
@@ -27,53 +43,74 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.core.checks import check_image, check_same_size
-from jaxdn.core.frame import RADIANCE_MAX
 from jaxdn.core.separable import correlate
+from jaxdn.filters.atrous import B3_SPLINE
 
-RADIUS = 7
-"""Windows have 2 RADIUS + 1 = 15 pixels a side."""
-DOUBT, MOST = 2.0, 2.0
-"""c = 1 + DOUBT / sqrt(n), at most 1 + MOST: V is uncertain by the inverse root of the number n of values it is from.
-Where there is little noise, the quietest block decides, and c - 1 is half of that."""
-CLEAN, NOISY = 0.02, 0.06
-"""Noise, as a share of the light, up to which a region is left as it is, and from which the weight above decides."""
-BLOCK = 32
-"""Side of the regions whose noise is judged, in pixels."""
-REACH = 2 * BLOCK + RADIUS + 1
-"""In pixels: the next region, with the windows of its pixels."""
-_DARK = 0.05
-"""Differences are relative to the light plus this share of the image's mean."""
-_WHITE, _STRONG = 0.7, 0.1
-"""What is so much noise of so large a mean square is not kept in a clean region either: a firefly."""
-_OUTLIER, _ISOLATED = 50.0, 0.4
-"""A pixel that is brighter than what was made of it, by so many times the mean square around it, is a firefly too, if
-it is isolated: its second differences are large in all directions (two thirds of its square for a single pixel)."""
+GAINS = (0.8907**2, 0.2007**2, 0.0856**2, 0.0413**2, 0.0009009)
+"""Variance of each band, and of the rest, of white noise of variance 1, in two dimensions (Starck and Murtagh)."""
+DOUBT = (4.0, 8.0, 16.0, 32.0, math.inf)
+"""A band's c - 1, times the root of the number of values: twice as much for each band, whose values are as many times
+fewer independent ones. With 1 instead of 4, a denoiser that is 25 dB better than its input loses 1.8 dB, and Cycles
+frames gain 0.2 dB more."""
+MOST_DOUBT = 9.0
+RADII = (7, 7, 7, 15, 15)
+"""Of each band's window: 2 r + 1 pixels a side."""
+SLOPE = 2.0
+"""Least energy of lost detail in the finest band, relative to the next one. In frames of Cycles and of our renderer
+it is 3 to 18, of strongly blurred ones 1 to 2."""
+BOUND = 3.0
+"""d counts as at most so many times the light."""
+_DIRECTION_BIAS = 1.1
+"""One over the mean of the least of four measured variances of noise in a window, relative to its variance."""
+_LEAST = 0.5
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+_DARK = 0.05
+"""Differences are relative to the light plus this share of the image's median."""
 
-QUIET = 8
-"""Side of the blocks whose noise is compared, in pixels; :data:`BLOCK` is a multiple of it."""
-LITTLE, MUCH = 0.4, 0.6
-"""Noise, as a share of the light, up to which that of the quietest block counts, and from which that of the window."""
-LOST, LOST_TO_NOISE = (0.25, 0.35), (0.9, 1.2)
+BLOCK = 8
+"""Side of the blocks that may be without noise, in pixels."""
+CLEAN = (0.01, 0.02)
+"""Noise, as a share of the light, up to which a block has none, and from which it has some."""
+LITTLE = (0.2, 0.3)
+"""Noise, as a share of the light, up to which that of the quietest block counts, and from which it does not."""
+QUIET = 2
+"""Blocks on each side of a pixel's own among which the quietest is sought."""
+_QUIETEST = 1.88
+"""Variance of grey Gaussian noise, relative to the mean of the least of its measured ones in so many blocks."""
+MANY = (0.25, 0.5)
+"""Share of such blocks around from which on pixels begin to be kept, and from which on they are."""
+AROUND = 4
+"""Blocks on each side of a pixel's own that are looked at."""
+LOST, LOST_TO_NOISE, USELESS = (0.25, 0.35), (0.9, 1.2), (2.4, 3.0)
 """Detail, as a share of the light and relative to the noise, up to which a denoised frame is trusted, and from which
-not. Frames of 96 x 96 pixels lose 0.14 to 0.29 with their own guides, 0.37 to 0.52 with guides turned by 180 degrees.
-"""
-_LEAST = {1: 1.68, 2: 1.88}
-"""Blocks around a pixel's own on each side -> variance of grey Gaussian noise, relative to the mean of the least of
-their measured ones."""
+not; and relative to noise that is not little, from which on nothing of it is taken. Frames of 96 x 96 pixels lose 0.14
+to 0.29 with their own guides, 0.37 to 0.52 with guides turned by 180 degrees."""
+RISK = (0.6, 0.9)
+"""Estimated error of the combined image, relative to that of the noisy one, up to which the frame is trusted, and from
+which it comes back as it came. Frames with their own guides have 0 to 0.45."""
+MUCH = (0.4, 0.6)
+"""Noise up to which means of relative changes say something, and from which they do not: neither is the rest kept then,
+nor is a frame with so much noise in the median mistrusted."""
+REACH = 64
+"""Pixels farther away do not decide about one: the bands reach 30 and their windows 15, blocks and what is
+interpolated between them 52."""
 
 
 class JamesStein(NamedTuple):
-    """The combined image and what it was decided by."""
+    """The combined image and what it was decided by; all but the image are [H, W, 1]."""
 
     image: jax.Array
     """[H, W, 3]."""
     noisy_weight: jax.Array
-    """[H, W, 1] in [0, 1], how much of the noisy image is in it."""
+    """In [0, 1], how much of the noisy pixel is in it."""
     noise: jax.Array
-    """[H, W, 1] the noisy image's noise (standard deviation), as a share of the light."""
+    """The noisy image's noise (standard deviation), as a share of the light."""
     lost: jax.Array
-    """[H, W, 1] what else the denoiser changed, in the same unit: detail, or what its guides drew into the image."""
+    """What else the denoiser changed, in the same unit: detail, or what its guides drew into the image."""
+    risk: jax.Array
+    """Estimated squared error of the combined image, as it is seen (:func:`_visibility`)."""
+    noisy_risk: jax.Array
+    """The same of the noisy image."""
 
 
 class Confidence(NamedTuple):
@@ -83,6 +120,8 @@ class Confidence(NamedTuple):
     """The median of its noise."""
     lost: jax.Array
     """The root of the mean square of what was lost."""
+    doubt: jax.Array
+    """In [0, 1], whether more was lost than noise explains, as with guides of another picture."""
     fallback: jax.Array
     """In [0, 1], the weight of the noisy image against the combined one; 0 is full confidence."""
 
@@ -90,58 +129,120 @@ class Confidence(NamedTuple):
 def combine(
     noisy: jax.Array,
     denoised: jax.Array,
-    mean_light: jax.Array | float | None = None,
-    *,
-    texture_unknown: bool = False,
+    level: jax.Array | float | None = None,
+    surface: jax.Array | None = None,
 ) -> JamesStein:
-    """The mixture of a noisy image [H, W, 3] and its denoised version, linear radiance >= 0.
+    """The mixture of a noisy image [H, W, 3] and its denoised version, linear radiance of any unit.
 
-    Noisy values that are not finite, negative or above ``RADIANCE_MAX`` are not used. Pixels up to :data:`REACH` away
-    decide about one, and ``mean_light``. Raises ValueError for other shapes.
+    Noisy values that are not finite are not used. Pixels up to :data:`REACH` away decide about one, and ``level``.
+    Raises ValueError for other shapes.
 
     Args:
       noisy: what was rendered.
       denoised: what was made of it.
-      mean_light: the mean of the denoised image, or of the one that it is a tile of; None: it is the whole one.
-      texture_unknown: no guide told the denoiser of textures. It has lost them, and quiet blocks are sought farther
-        away.
+      level: :func:`measure_level` of the denoised image, or of the one that it is a tile of; None: it is the whole one.
+      surface: [H, W, 1] bool, where anything was rendered; None: everywhere.
     """
     check_image(noisy, "noisy", channels=3)
     check_same_size(noisy, denoised, ("noisy", "denoised"))
-    usable = jnp.all(jnp.isfinite(noisy) & (noisy >= 0) & (noisy <= RADIANCE_MAX), axis=-1, keepdims=True)
-    change = jnp.where(usable, noisy - denoised, 0.0)
-    light = jnp.mean(denoised, axis=-1, keepdims=True)
-    light = light + _DARK * (jnp.mean(light) if mean_light is None else mean_light)
-    # Limited, so that the fourth power is finite.
-    relative = jnp.clip(change / jnp.where(light > 0, light, 1.0), -1e4, 1e4)
-    energy, variance, number = _moments(relative, texture_unknown=texture_unknown)
-    doubt = jnp.minimum(DOUBT / jnp.sqrt(number), MOST) * (1 - 0.5 * _falling(jnp.sqrt(variance), LITTLE, MUCH))
-    weight = jnp.clip(1 - (1 + doubt) * variance / jnp.where(energy > 0, energy, 1.0), 0.0, 1.0)
-    firefly = (variance > _WHITE * energy) & (energy > _STRONG)
-    kept = jnp.where(firefly, 0.0, _clean(jnp.sqrt(variance)))
-    weight = weight + (1 - weight) * kept
-    lost = jnp.sqrt(jnp.maximum(energy - variance, 0.0))
-    return JamesStein(denoised + weight * change, jnp.where(usable, weight, 0.0), jnp.sqrt(variance), lost)
+    usable = jnp.all(jnp.isfinite(noisy), axis=-1, keepdims=True)
+    level = measure_level(denoised) if level is None else level
+    light = jnp.maximum(jnp.mean(denoised, axis=-1, keepdims=True), 0.0) + _DARK * level
+    light = jnp.where(light > 0, light, 1.0)
+    whole = jnp.where(usable, noisy - denoised, 0.0) / light
+    change, common = _winsorize(whole)
+    curved = _second_differences(change)
+    bands = _split(change)
+    variance = _measure_noise(bands, curved, surface)
+    weights = _weigh(bands, _split(whole)[-1], variance)
+    kept = sum(weight * band for weight, band in zip(weights, bands, strict=True))
+    own = sum(weight * center for weight, center in zip(weights, _CENTERS, strict=True))
+    clean = _clean(curved, surface)
+    own, kept = own + clean * (1 - own), kept + clean * (change - kept)
+    # A firefly among quiet blocks is noise none the less.
+    own, kept, clean = (jnp.where(usable & common, part, 0.0) for part in (own, kept, clean))
+    # Stein's estimate: the mean square of what is left, less the noise in it, of which `own` stays in the image.
+    risk = _mean_square(change - kept) + (2 * own - 1) * variance
+    lost = jnp.sqrt(jnp.maximum(_window(_mean_square(change), RADII[0]) - variance, 0.0))
+    image = jnp.where(clean == 1, noisy, denoised + light * kept)
+    seen = _visibility(light, level)
+    return JamesStein(image, own, jnp.sqrt(variance), lost, seen * risk, seen * variance)
 
 
 def measure_confidence(combined: JamesStein) -> Confidence:
-    """Whether a denoised frame is to be trusted at all: not where more of it is lost than noise was taken away.
+    """Whether a denoised frame is to be trusted, and the combined one at all.
 
-    Guides of another picture draw their own edges everywhere, textures that no guide tells of are lost everywhere, and
-    in either case what was drawn counts as noise, so that pixel by pixel too much of it stays. Up to :data:`LOST` all
-    is well.
+    Guides of another picture draw their own edges everywhere: more is lost than noise was taken away. Part of that
+    counts as noise, so that too much of it stays. Where the combined image's estimated error is about that of the noisy
+    one, the noisy one is the result.
     """
     noise, lost = jnp.median(combined.noise), jnp.sqrt(jnp.mean(combined.lost**2))
-    relative = lost / jnp.maximum(noise, 1e-6)
-    fallback = (1 - _falling(lost, *LOST)) * (1 - _falling(relative, *LOST_TO_NOISE))
-    return Confidence(noise, lost, fallback)
+    noisy_risk = jnp.sum(combined.noisy_risk)
+    relative = jnp.sum(combined.risk) / jnp.where(noisy_risk > 0, noisy_risk, 1.0)
+    much, ratio = 1 - _falling(lost, *LOST), lost / jnp.maximum(noise, 1e-6)
+    risky = (1 - _falling(relative, *RISK)) * _falling(noise, *MUCH)
+    doubt = 1 - _falling(ratio, *LOST_TO_NOISE)
+    useless = jnp.maximum(1 - _falling(ratio, *USELESS), _falling(noise, *LITTLE) * doubt)
+    return Confidence(noise, lost, much * doubt, jnp.maximum(risky, much * useless))
 
 
-def _moments(change: jax.Array, *, texture_unknown: bool = False) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Of each pixel's window, [H, W, 1] each: the mean square, the variance of noise, and the number of values.
+def measure_level(denoised: jax.Array) -> jax.Array:
+    """The median light of an image [H, W, 3] where it is lit; 0 for a black one."""
+    light = jnp.mean(denoised, axis=-1)
+    return jnp.nan_to_num(jnp.nanmedian(jnp.where(light > 0, light, jnp.nan)))
 
-    The number is that of equal values with the same fourth moment: 1 if all is in one pixel.
-    """
+
+def _winsorize(change: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Changes within :data:`BOUND`, or the median size of the 3x3 around if that is more; and [H, W, 1] which were."""
+    size = jnp.mean(jnp.abs(change), axis=-1)
+    height, width = size.shape
+    padded = jnp.pad(size, 1, mode="edge")
+    around = jnp.stack([padded[dy : dy + height, dx : dx + width] for dy, dx in np.ndindex(3, 3)])
+    bound = jnp.maximum(jnp.median(around, axis=0), BOUND)[..., None]
+    # Of a size of which the fourth power is finite.
+    bounded = jnp.clip(jnp.clip(change, -bound, bound), -1e8, 1e8)
+    return bounded, jnp.all(jnp.abs(change) <= bound, axis=-1, keepdims=True)
+
+
+def _split(image: jax.Array) -> list[jax.Array]:
+    """The bands [H, W, C] of an image, the finest first, and the rest; they add up to it."""
+    bands = []
+    for band in range(len(GAINS) - 1):
+        smooth = _smooth(image, 2**band)
+        bands.append(image - smooth)
+        image = smooth
+    return [*bands, image]
+
+
+def _smooth(image: jax.Array, step: int) -> jax.Array:
+    """[H, W, C] filtered with the B3 spline, whose taps are ``step`` apart, mirrored at the border."""
+    for axis in (-3, -2):
+        widths = [(0, 0)] * 3
+        widths[axis] = (2 * step, 2 * step)
+        wide, length = jnp.pad(image, widths, mode="symmetric"), image.shape[axis]
+        parts = [jax.lax.slice_in_dim(wide, k * step, k * step + length, axis=axis + 3) for k in range(5)]
+        image = functools.reduce(jnp.add, (float(tap) * part for tap, part in zip(B3_SPLINE, parts, strict=True)))
+    return image
+
+
+def _centers() -> tuple[float, ...]:
+    """What a pixel of each band, and of the rest, has of the pixel itself."""
+    impulse = np.zeros((1, 129))
+    impulse[0, 64] = 1
+    line = [impulse[0]]
+    for band in range(len(GAINS) - 1):
+        spread = np.zeros(4 * 2**band + 1)
+        spread[:: 2**band] = B3_SPLINE
+        line.append(np.convolve(line[-1], spread, mode="same"))
+    bands = [one[64] ** 2 - other[64] ** 2 for one, other in pairwise(line)]
+    return tuple(map(float, [*bands, line[-1][64] ** 2]))
+
+
+_CENTERS = _centers()
+
+
+def _second_differences(change: jax.Array) -> jax.Array:
+    """[H, W, 4] the squares of a change's second differences along each direction; the mean is V for noise."""
     height, width = change.shape[:2]
     # Mirrored: repeated pixels at the border would look smooth.
     padded = jnp.pad(change, ((1, 1), (1, 1), (0, 0)), mode="reflect")
@@ -149,54 +250,101 @@ def _moments(change: jax.Array, *, texture_unknown: bool = False) -> tuple[jax.A
     def at(dy: int, dx: int) -> jax.Array:
         return padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
 
-    curved = [at(dy, dx) - 2 * change + at(-dy, -dx) for dy, dx in _DIRECTIONS]
-    curved = [jnp.mean(one**2, axis=-1) / 6 for one in curved]
-    square = jnp.mean(change**2, axis=-1)
-    moments = [jnp.ones_like(square), square, square**2, *curved]
-    planes = jnp.pad(jnp.stack(moments, axis=-1), ((RADIUS, RADIUS), (RADIUS, RADIUS), (0, 0)))
-    for axis in (-3, -2):
-        planes = correlate(planes, np.ones((2 * RADIUS + 1, 1)), axis=axis)
-    count, energy, fourth, variance = planes[..., :1], planes[..., 1:2], planes[..., 2:3], planes[..., 3:]
-    number = jnp.where(fourth > 0, energy**2 / jnp.where(fourth > 0, fourth, 1.0), count)
-    energy, variance = energy / count, jnp.min(variance, axis=-1, keepdims=True) / count
-    little = _falling(jnp.sqrt(variance), LITTLE, MUCH)
-    isolated = functools.reduce(jnp.minimum, curved) > _ISOLATED * square
-    outlier = (square > _OUTLIER * energy[..., 0]) & isolated & (jnp.mean(change, axis=-1) > 0)
-    quiet = jnp.minimum(variance, _quietest(curved, around=2 if texture_unknown else 1))
-    return energy, variance + jnp.where(outlier[..., None], 0.0, little) * (quiet - variance), jnp.maximum(number, 1.0)
+    along = [at(dy, dx) - 2 * change + at(-dy, -dx) for dy, dx in _DIRECTIONS]
+    return jnp.concatenate([_mean_square(one) / 6 for one in along], axis=-1)
 
 
-def _quietest(squares: list[jax.Array], *, around: int) -> jax.Array:
-    """The least mean of squares [H, W] over blocks near each pixel and over directions, [H, W, 1], without its bias.
+def _measure_noise(bands: list[jax.Array], curved: jax.Array, surface: jax.Array | None) -> jax.Array:
+    """V of each pixel, [H, W, 1]."""
+    finest, next_one = (_window(_mean_square(band), RADII[0]) for band in bands[:2])
+    by_scale = jnp.maximum(finest - SLOPE * next_one, 0.0) / (GAINS[0] - SLOPE * GAINS[1])
+    by_direction = _DIRECTION_BIAS * jnp.min(_window(curved, RADII[0]), axis=-1, keepdims=True)
+    variance = jnp.clip(by_scale, _LEAST * by_direction, by_direction)
+    little = _falling(jnp.sqrt(by_direction), *LITTLE)
+    return variance + little * (jnp.minimum(variance, _quietest(curved, surface)) - variance)
 
-    The block of a pixel and ``around`` more on each side are compared, and what is found is interpolated.
+
+def _quietest(curved: jax.Array, surface: jax.Array | None) -> jax.Array:
+    """The least noise of a block of surfaces near each pixel, [H, W, 1], without its bias; interpolated between them.
+
+    A sky has none, and says nothing of what is beside it. It is very large where there is no such block.
     """
-    height, width = squares[0].shape
-    rows, columns = -(-height // QUIET), -(-width // QUIET)
-    widths = ((0, rows * QUIET - height), (0, columns * QUIET - width))
-    padded = jnp.pad(jnp.stack(squares), ((0, 0), *widths), mode="edge")
-    least = jnp.min(jnp.mean(padded.reshape(-1, rows, QUIET, columns, QUIET), axis=(2, 4)), axis=0)
-    side = 2 * around + 1
-    least = jax.lax.reduce_window(least, jnp.inf, jax.lax.min, (side, side), (1, 1), "SAME")
-    return _LEAST[around] * _enlarged(least, QUIET)[:height, :width]
+    blocks = jnp.min(_mean_blocks(curved), axis=-1)
+    if surface is not None:
+        blocks = jnp.where(_mean_blocks(surface.astype(curved.dtype))[..., 0] == 1, blocks, 1e9)
+    side = 2 * QUIET + 1
+    least = jax.lax.reduce_window(blocks, jnp.inf, jax.lax.min, (side, side), (1, 1), "SAME")
+    return _QUIETEST * _enlarge(least[..., None], curved.shape[:2])
 
 
-def _clean(noise: jax.Array) -> jax.Array:
-    """How clean a region is, [H, W, 1] in [0, 1], by the median noise [H, W, 1] of blocks, interpolated between them.
+def _weigh(bands: list[jax.Array], rest: jax.Array, variance: jax.Array) -> list[jax.Array]:
+    """The weight of each band, [H, W, 1] each.
 
-    A region whose flat parts are without noise has none at its edges either, whatever was lost there.
+    Where Winsorizing cut off light, the mean of what it left is too low: by how much tells ``rest`` [H, W, C], that of
+    the whole change. It counts as noise of the bands' rest. Of much noise that rest is not kept at all: the mean of
+    noisy over denoised light is not 1, where noise is left in both.
     """
-    height, width = noise.shape[:2]
+    cut = [0.0] * (len(bands) - 1) + [_window(_mean_square(rest - bands[-1]), RADII[-1])]
+    weights = []
+    for band, bias, gain, doubt, radius in zip(bands, cut, GAINS, DOUBT, RADII, strict=True):
+        square = _mean_square(band)
+        energy, fourth = _window(square, radius), _window(square**2, radius)
+        noise = bias + gain * (variance if radius == RADII[0] else _window(variance, radius))
+        number = (2 * radius + 1) ** 2 * energy**2 / jnp.where(fourth > 0, fourth, 1.0)
+        excess = jnp.minimum(doubt / jnp.sqrt(jnp.maximum(number, 1.0)), MOST_DOUBT)
+        weights.append(jnp.clip(1 - (1 + excess) * noise / jnp.where(energy > 0, energy, 1.0), 0.0, 1.0))
+    weights[-1] = weights[-1] * _falling(jnp.sqrt(variance), *MUCH)
+    return weights
+
+
+def _clean(curved: jax.Array, surface: jax.Array | None) -> jax.Array:
+    """How far pixels are among blocks without noise, [H, W, 1] in [0, 1]: by their share of the blocks with surfaces.
+
+    Between blocks it is interpolated, before it is decided.
+    """
+    quiet = _falling(jnp.sqrt(jnp.min(_mean_blocks(curved), axis=-1, keepdims=True)), *CLEAN)
+    known = jnp.ones_like(quiet)
+    if surface is not None:
+        known = (_mean_blocks(surface.astype(curved.dtype)) > 0.5).astype(curved.dtype)
+    number = _window(known, AROUND)
+    share = _window(quiet * known, AROUND) / jnp.where(number > 0, number, 1.0)
+    return 1 - _falling(_enlarge(share, curved.shape[:2]), *MANY)
+
+
+def _enlarge(blocks: jax.Array, size: tuple[int, ...]) -> jax.Array:
+    """[H, W, 1] blocks of :data:`BLOCK` pixels a side, interpolated."""
+    rows, columns = blocks.shape[:2]
+    height, width = size
+    return jax.image.resize(blocks, (rows * BLOCK, columns * BLOCK, 1), "linear")[:height, :width]
+
+
+def _mean_blocks(image: jax.Array) -> jax.Array:
+    """[h, w, C] the means of blocks of [H, W, C]; at the end of the frame the last pixels are repeated."""
+    height, width, channels = image.shape
     rows, columns = -(-height // BLOCK), -(-width // BLOCK)
-    widths = ((0, rows * BLOCK - height), (0, columns * BLOCK - width))
-    blocks = jnp.pad(noise[..., 0], widths, mode="edge").reshape(rows, BLOCK, columns, BLOCK)
-    return _falling(_enlarged(jnp.median(blocks, axis=(1, 3)), BLOCK)[:height, :width], CLEAN, NOISY)
+    widths = ((0, rows * BLOCK - height), (0, columns * BLOCK - width), (0, 0))
+    return jnp.mean(jnp.pad(image, widths, mode="edge").reshape(rows, BLOCK, columns, BLOCK, channels), axis=(1, 3))
 
 
-def _enlarged(blocks: jax.Array, side: int) -> jax.Array:
-    """[h, w] interpolated to [side h, side w, 1]."""
-    height, width = blocks.shape
-    return jax.image.resize(blocks, (side * height, side * width), "linear")[..., None]
+def _window(image: jax.Array, radius: int) -> jax.Array:
+    """Means over windows of 2 radius + 1 pixels a side, of what of them is in the image [H, W, C]."""
+    ones = jnp.ones((*image.shape[:2], 1), image.dtype)
+    planes = jnp.concatenate([image, ones], axis=-1)
+    planes = jnp.pad(planes, ((radius, radius), (radius, radius), (0, 0)))
+    for axis in (-3, -2):
+        planes = correlate(planes, np.ones((2 * radius + 1, 1)), axis=axis)
+    return planes[..., :-1] / planes[..., -1:]
+
+
+def _mean_square(image: jax.Array) -> jax.Array:
+    """[H, W, 1] over the colours."""
+    return jnp.mean(image**2, axis=-1, keepdims=True)
+
+
+def _visibility(light: jax.Array, level: jax.Array | float) -> jax.Array:
+    """The squared slope of x / (1 + x) over log x, where x is the light with the level at middle grey."""
+    x = 0.18 * light / jnp.where(jnp.asarray(level) > 0, level, 1.0)
+    return (x / (1 + x) ** 2) ** 2
 
 
 def _falling(x: jax.Array, low: float, high: float) -> jax.Array:

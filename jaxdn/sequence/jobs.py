@@ -1,14 +1,17 @@
 """What ``jaxdn denoise`` has to do: which frames of which shots, where they are written, and what is there already."""
 
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+import math
+import os
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from os.path import commonpath
 from pathlib import Path
 
 from jaxdn.data.clip.folder import frame_path, is_clip, read_record, refuse_unfinished
 from jaxdn.data.exr.file import ExrFile
+from jaxdn.data.foreign.passes import join_passes
+from jaxdn.data.foreign.shot_files import open_files
 from jaxdn.data.foreign.shots import Shot, find_shots, missing, ranges
 
 WARM_UP = 16
@@ -33,20 +36,33 @@ class Job:
     """Indices of the frames to write."""
     notes: tuple[str, ...]
     """What a user should know, in sentences."""
+    files: tuple[ExrFile, ...] = ()
+    """The files, each to be opened once; of a clip of ours none."""
+    copies: Mapping[Path, tuple[Path, ...]] = field(default_factory=dict)
+    """Target -> further files to write with the same result, of frames that are held."""
 
     @property
     def source(self) -> Path:
         """What tells of which layers it consists: the clip's folder, or the first file."""
         return self.clip or self.shot.files[0]
 
-    @cached_property
-    def exr_files(self) -> tuple[ExrFile, ...]:
-        """The files, each to be opened once."""
-        return tuple(ExrFile(file) for file in self.shot.files)
-
     def count_channels(self) -> int:
         """The number of channels of the first file."""
-        return len(self.exr_files[0].windows)
+        first = self.files[0] if self.files else ExrFile(self.shot.files[0])
+        return len(first.windows)
+
+    def without(self, indices: Collection[int]) -> "Job":
+        """The same job without some of its frames."""
+        kept = [index for index in range(len(self.shot.files)) if index not in indices]
+        numbers = tuple(self.shot.numbers[index] for index in kept) if self.shot.numbers else ()
+        shot = self.shot._replace(files=tuple(self.shot.files[index] for index in kept), numbers=numbers)
+        return replace(
+            self,
+            shot=shot,
+            targets=tuple(self.targets[index] for index in kept),
+            wanted=frozenset(new for new, index in enumerate(kept) if index in self.wanted),
+            files=tuple(self.files[index] for index in kept),
+        )
 
     def segments(self, *, both_directions: bool = False) -> Iterator[range]:
         """Indices of consecutive frames, each after the first with a history: the wanted ones and their warm-up.
@@ -54,7 +70,9 @@ class Job:
         With ``both_directions`` there are as many frames after the last wanted one.
         """
         last = len(self.shot.files) - 1
-        breaks = {index + 1 for index, (one, next_) in enumerate(pairwise(self.shot.numbers)) if next_ != one + 1}
+        breaks = {
+            index + 1 for index, (one, next_) in enumerate(pairwise(self.shot.numbers)) if next_ != one + self.shot.step
+        }
         start: int | None = None
         for index in range(last + 1):
             if start is not None and index in breaks:
@@ -75,7 +93,12 @@ class Job:
 
 
 def find_jobs(
-    sources: Sequence[Path], out: Path, *, frames: Collection[int] | None = None, skip_existing: bool = False
+    sources: Sequence[Path],
+    out: Path,
+    *,
+    frames: Collection[int] | None = None,
+    skip_existing: bool = False,
+    pass_files: Mapping[str, str] | None = None,
 ) -> list[Job]:
     """The shots of folders, patterns and files; several sequences in a folder are several shots.
 
@@ -90,11 +113,16 @@ def find_jobs(
       out: a folder; for a single frame also the name of an EXR file.
       frames: numbers of the frames to denoise; None: all.
       skip_existing: leave out what is there already.
+      pass_files: buffer -> pattern for the files that have it, of other renderers' frames.
     """
     if not sources:
         raise ValueError("expected a folder, a pattern or a file to denoise, got none; name one.")
-    found = [shot for source in sources for shot in _shots(source)]
-    together = Path(commonpath([str(file.resolve().parent) for shot, _ in found for file in shot.files]))
+    found = [shot for source in _gather(sources) for shot in _shots(source)]
+    joined, joints = join_passes([shot for shot, clip in found if clip is None], pass_files or {})
+    places = {shot.files[0]: place for place, (shot, _) in enumerate(found)}
+    found = [one for one in found if one[1] is not None] + [(shot, None) for shot in joined]
+    found.sort(key=lambda one: places[one[0].files[0]])
+    together = Path(commonpath([os.path.dirname(os.path.abspath(file)) for shot, _ in found for file in shot.files]))
     single = out.suffix.lower() == ".exr"
     if out.suffix.lower() in _OTHER_IMAGES:
         raise ValueError(
@@ -104,20 +132,25 @@ def find_jobs(
     if single and count > 1:
         raise ValueError(f"{out}: expected a folder for {count} frames, got the name of one EXR file.")
     _check_folder(out.parent if single else out)
-    jobs = []
+    jobs: list[Job] = []
     named = frames is None
     for shot, clip in found:
-        below = [out / file.resolve().relative_to(together) for file in shot.files]
-        targets = (out,) if single else tuple(path.with_suffix(".exr") for path in below)
+        # Links keep their own names: a store's are hashes.
+        below = [out / Path(os.path.abspath(file)).relative_to(together) for file in shot.files]
+        targets = (out,) if single else tuple(map(_as_exr, below))
         chosen = [
             index
             for index in range(len(targets))
-            if frames is None or set(shot.numbers[index : index + 1]) & set(frames)
+            if frames is None or set(map(math.floor, shot.numbers[index : index + 1])) & set(frames)
         ]
         wanted = frozenset(index for index in chosen if not (skip_existing and targets[index].is_file()))
         named |= bool(chosen) or not set(missing(shot.numbers)).isdisjoint(frames or ())
-        notes = _notes(shot, among_others=len(found) > 1, existing=len(chosen) - len(wanted))
-        jobs.append(Job(shot, clip, targets, wanted, notes))
+        notes = (
+            *(joints if not jobs else ()),
+            *_notes(shot, among_others=len(found) > 1, existing=len(chosen) - len(wanted)),
+        )
+        files = () if clip is not None else open_files(shot)
+        jobs.append(_hold(Job(shot, clip, targets, wanted, notes, files)))
     _check_targets(jobs)
     inputs = {file.resolve() for shot, _ in found for file in shot.files}
     if {target.resolve() for job in jobs for target in job.targets} & inputs or out.resolve() in inputs:
@@ -128,7 +161,48 @@ def find_jobs(
     return jobs
 
 
-def _shots(source: Path) -> list[tuple[Shot, Path | None]]:
+def _gather(sources: Sequence[Path]) -> list[Path | list[Path]]:
+    """The sources, with all files that are named one by one, as a shell expands a pattern, in place of the first."""
+    gathered: list[Path | list[Path]] = []
+    files: list[Path] = []
+    for source in sources:
+        if not source.is_file():
+            gathered.append(source)
+            continue
+        if not files:
+            gathered.append(files)
+        files.append(source)
+    return gathered
+
+
+def _as_exr(path: Path) -> Path:
+    return path if path.suffix.lower() == ".exr" else path.with_suffix(".exr")
+
+
+def _hold(job: Job) -> Job:
+    """The job with frames that are the file before once more (a link of a farm) as copies of that frame's result."""
+    held: dict[int, int] = {}
+    for index in range(1, len(job.files)):
+        before, now = job.shot.files[index - 1], job.shot.files[index]
+        linked = now.is_symlink() or before.is_symlink()
+        if linked and now.exists() and before.exists() and now.samefile(before):
+            held[index] = held.get(index - 1, index - 1)
+    if not held:
+        return job
+    copies: dict[Path, tuple[Path, ...]] = {}
+    notes = list(job.notes)
+    for index, source in held.items():
+        if index in job.wanted:
+            copies[job.targets[source]] = (*copies.get(job.targets[source], ()), job.targets[index])
+        names = job.shot.files[index].name, job.shot.files[source].name
+        notes.append(f"{names[0]} is {names[1]} once more, and so is its result; after it there is no history at first")
+    wanted = job.wanted | {source for index, source in held.items() if index in job.wanted}
+    return replace(job, wanted=wanted, copies=copies, notes=tuple(notes)).without(held)
+
+
+def _shots(source: Path | list[Path]) -> list[tuple[Shot, Path | None]]:
+    if isinstance(source, list):
+        return [(shot, None) for shot in find_shots(source)]
     if is_clip(source):
         count = read_record(source)["frames"]
         return [(Shot(tuple(frame_path(source, index) for index in range(count)), tuple(range(count))), source)]

@@ -1,12 +1,16 @@
 """``jaxdn denoise``: noisy clips in, denoised EXR frames out, one frame at a time."""
 
+import shutil
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxdn.data.errors import DamagedFile
+from jaxdn.runtime.atomic_files import atomic_write
 from jaxdn.sequence.frame_denoiser import FrameDenoiser
 from jaxdn.sequence.jobs import Job, find_jobs
+from jaxdn.sequence.missing_frames import explain_left_out, leave_out_unusable, segments_around
 from jaxdn.sequence.segment import denoise_segment
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import Model, find_model
@@ -20,6 +24,8 @@ class Written(NamedTuple):
     """Steps that were compiled: one for each distinct set of buffers among the frames."""
     sanitized: int
     """Invalid values (NaN, infinite, negative ...) of frames and histories that were replaced."""
+    left_out: Sequence[Path] = ()
+    """Files of other renderers that count as missing frames: damaged, or different from the others."""
 
 
 def select_backend(name: str, implementation: str = "auto", **options: Any) -> tuple[Model, str]:
@@ -58,8 +64,9 @@ def denoise_files(
     denoised radiance with the directly reflected and the emitted light added back, and ``denoised.R/G/B``, the denoised
     part alone. What is no noise is kept as it was (``settings.safe``). Frames are read, denoised and written one at a
     time, so that a sequence of any length takes the memory of one. Files are never left incomplete. Where frames are
-    missing, the history begins anew. Raises ValueError for input that cannot be read or is inconsistent, before the
-    frame concerned is written.
+    missing, the history begins anew. Files of other renderers that are damaged, of another size or with other buffers
+    than most of their shot count as missing, unless ``settings.strict``. Raises ValueError for input that cannot be
+    read or is inconsistent, before the frame concerned is written.
 
     Args:
       sources: folders of clips, and folders of, patterns for, or names of EXR files.
@@ -73,30 +80,101 @@ def denoise_files(
     """
     if settings.aovs == "additive" and settings.only_beauty:
         raise ValueError("--aovs additive: expected the other layers to be written; leave out --only-beauty.")
-    jobs = find_jobs(sources, out, frames=settings.frames, skip_existing=settings.skip_existing)
+    jobs = find_jobs(
+        sources,
+        out,
+        frames=settings.frames,
+        skip_existing=settings.skip_existing,
+        pass_files=settings.naming.pass_files,
+    )
     _refuse_unused(jobs, settings)
-    total = sum(len(job.wanted) for job in jobs)
-    files: list[Path] = []
-    programs: set[tuple[str, ...]] = set()
-    sanitized = 0
-    for job in jobs:
+    checked = leave_out_unusable(jobs, settings, log)
+    total = sum(len(job.wanted) + sum(map(len, job.copies.values())) for job, _ in checked)
+    run = _Run(method, settings, total, on_frame, log)
+    for job, reasons in checked:
         for note in job.notes:
             log(note)
+        for path, reason in reasons.items():
+            run.leave_out(path, reason)
         if job.wanted:
             on_job(job)
-        log_once = _once(log)
-        for segment in job.segments(both_directions=settings.bidirectional):
-            denoisers = [
-                FrameDenoiser(method, job.source, channels=job.count_channels, limit=settings.max_memory, log=log_once)
-                for _ in range(1 + settings.bidirectional)
-            ]
-            with closing(denoise_segment(job, segment, denoisers, settings, log_once)) as paths:
+        run.denoise(job)
+    return Written(run.files, len(run.programs), run.sanitized, run.left_out)
+
+
+class _Run:
+    """The shots that are denoised with one method, and what has become of them so far."""
+
+    def __init__(
+        self,
+        method: Model,
+        settings: Settings,
+        total: int,
+        on_frame: Callable[[Path, int, int], None],
+        log: Callable[[str], None],
+    ) -> None:
+        """``total``: the number of frames to write. The others as :func:`denoise_files` takes them."""
+        self._method, self._settings, self._total = method, settings, total
+        self._on_frame, self._log = on_frame, log
+        self.files: list[Path] = []
+        self.left_out: list[Path] = []
+        self.programs: set[tuple[str, ...]] = set()
+        self.sanitized = 0
+
+    def leave_out(self, path: Path, reason: str) -> None:
+        """Tell that a file counts as a missing frame."""
+        self.left_out.append(path)
+        self._log(explain_left_out(path, reason))
+
+    def denoise(self, job: Job) -> None:
+        """Denoise a shot; a file of another renderer that cannot be decoded counts as missing.
+
+        Raises DamagedFile for one of a clip of ours, and where nothing else is left.
+        """
+        log_once = _once(self._log)
+        before = len(self.files)
+        segments = list(job.segments(both_directions=self._settings.bidirectional))
+        while segments:
+            segment = segments.pop(0)
+            try:
+                self._denoise_segment(job, segment, log_once)
+            except DamagedFile as error:
+                if self._settings.strict or job.clip is not None or error.path not in job.shot.files:
+                    raise
+                index = job.shot.files.index(error.path)
+                segments[:0] = segments_around(job, segment, index, self.files)
+                if not segments and len(self.files) == before:
+                    raise
+                if index in job.wanted:
+                    self._total -= 1 + len(job.copies.get(job.targets[index], ()))
+                self.leave_out(error.path, error.reason)
+
+    def _denoise_segment(self, job: Job, segment: range, log: Callable[[str], None]) -> None:
+        """Denoise consecutive frames of a shot, from a new history."""
+        settings = self._settings
+        denoisers = [
+            FrameDenoiser(self._method, job.source, channels=job.count_channels, limit=settings.max_memory, log=log)
+            for _ in range(1 + settings.bidirectional)
+        ]
+        try:
+            with closing(denoise_segment(job, segment, denoisers, settings, log)) as paths:
                 for path in paths:
-                    files.append(path)
-                    on_frame(path, len(files), total)
-            programs |= {program for denoiser in denoisers for program in denoiser.programs}
-            sanitized += denoisers[0].sanitized  # the other direction repairs the same frames
-    return Written(files, len(programs), sanitized)
+                    for written in (path, *job.copies.get(path, ())):
+                        if written != path:
+                            _copy(path, written)
+                        self.files.append(written)
+                        self._on_frame(written, len(self.files), self._total)
+        finally:
+            self.programs |= {program for denoiser in denoisers for program in denoiser.programs}
+            self.sanitized += denoisers[0].sanitized  # the other direction repairs the same frames
+
+
+def _copy(result: Path, target: Path) -> None:
+    """The result of one frame as that of another, with its preview."""
+    for suffix in (result.suffix, ".png"):
+        if result.with_suffix(suffix).is_file():
+            with atomic_write(target.with_suffix(suffix)) as temporary:
+                shutil.copyfile(result.with_suffix(suffix), temporary)
 
 
 def _once(log: Callable[[str], None]) -> Callable[[str], None]:

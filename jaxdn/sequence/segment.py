@@ -38,7 +38,7 @@ def denoise_segment(
         source, writer = _ClipFrames(job.clip, segment, settings.spp), ClipWriter(settings)
     else:
         check_single_layer(job.shot.files[segment.start : segment.stop], settings.spp)
-        sequence = ForeignSequence(job.exr_files[segment.start : segment.stop], settings.naming)
+        sequence = ForeignSequence(job.files[segment.start : segment.stop], settings.naming)
         source, writer = _ForeignFrames(sequence, segment), ForeignWriter(sequence.window, settings, log)
     with ExitStack() as stack:
         backward: BackwardImages | None = None
@@ -56,6 +56,7 @@ def denoise_segment(
             if path is not None:
                 yield path
         report.finish()
+        source.finish(log)
 
 
 class FrameOutput(NamedTuple):
@@ -119,7 +120,7 @@ class _FallbackReport:
         if index == min(self._job.wanted):
             noise = f"noise is about {confidence.noise:.1%} of the light"
             self._log(f"{file.name}: {noise}; {fallback.kept:.0%} of the frame is kept (--no-safe: nothing)")
-        if confidence.fallback > 0 and index in self._job.wanted:
+        if max(confidence.doubt, confidence.fallback) > 0.5 and index in self._job.wanted:
             if not self._doubtful:
                 self._log(_explain_fallback(file, fallback))
             self._doubtful.append(file)
@@ -138,9 +139,10 @@ def _explain_fallback(file: Path, fallback: Fallback) -> str:
         if fallback.texture_unknown
         else "do albedo, normals and depth belong to this frame?"
     )
+    kept = max(fallback.kept, confidence.fallback)
     return (
         f"{file.name}: the denoised image differs by {confidence.lost:.0%} of the light, of which noise explains "
-        f"{confidence.noise:.0%}: {reason} {confidence.fallback:.0%} of the result is the frame as it came"
+        f"{confidence.noise:.0%}: {reason} {kept:.0%} of the result is the frame as it came"
     )
 
 
@@ -158,6 +160,9 @@ class _ClipFrames:
         """None: a result is a new file."""
         return None
 
+    def finish(self, log: Callable[[str], None]) -> None:
+        """After the last frame; what is replaced in frames of ours is counted by the step."""
+
 
 class _ForeignFrames:
     """Frames of another renderer, whose results are written into copies of their files."""
@@ -173,3 +178,8 @@ class _ForeignFrames:
     def file(self, index: int) -> ExrFile | None:
         """The file of a frame."""
         return self._sequence.files[index - self._start]
+
+    def finish(self, log: Callable[[str], None]) -> None:
+        """After the last frame: how much was clamped in all."""
+        for line in self._sequence.repairs.totals():
+            log(line)

@@ -17,6 +17,8 @@ class Settings(NamedTuple):
     """Numbers of the frames to denoise; None: all."""
     skip_existing: bool = False
     """Leave out what is there already."""
+    strict: bool = False
+    """End at a file of another renderer that is damaged or differs from the others, instead of leaving it out."""
     only_beauty: bool = False
     """Of files of other renderers, write the denoised beauty and its alpha alone."""
     aovs: Literal["keep", "additive"] = "keep"

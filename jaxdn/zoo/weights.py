@@ -166,7 +166,13 @@ def describe(name_or_path: str | Path) -> dict[str, Any]:
 
 def _check_params(flat: dict[str, np.ndarray], denoiser: Denoiser, path: Path, instead: dict[str, Any]) -> None:
     """Raise ValueError unless the arrays have the names, shapes and types of the denoiser's initial parameters."""
-    wanted = _initial_shapes(denoiser)
+    try:
+        wanted = _initial_shapes(denoiser)
+    except OverflowError as error:
+        raise ValueError(
+            f"weights {path.with_suffix('.json')}: expected sizes of layers that fit in memory, got far larger ones "
+            f"({error}); copy the file again."
+        ) from error
     found = {name: (array.shape, array.dtype) for name, array in flat.items()}
     if found != wanted:
         differing = sorted(name for name in {*found, *wanted} if found.get(name) != wanted.get(name))

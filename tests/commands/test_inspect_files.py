@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from jaxdn import clips
@@ -86,7 +85,16 @@ def test_what_is_stated_is_not_asked_for(name: str, shots: dict[str, Path], run:
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_json_says_the_same_as_the_text(name: str, shots: dict[str, Path], run: Any) -> None:
     text, record = run(shots[name]), json.loads(run(shots[name], "--json"))
-    assert set(record) == {"frames", "width", "height", "sources", "missing", "notes", "fitting_conventions"}
+    assert set(record) == {
+        "frames",
+        "width",
+        "height",
+        "sources",
+        "missing",
+        "notes",
+        "fitting_conventions",
+        "unusable",
+    }
     assert record["sources"] == [
         {**one._asdict(), "channels": list(one.channels)} for one in read_channel_mapping(shots[name])
     ]
@@ -126,17 +134,6 @@ def test_where_nothing_moves_that_is_said(tmp_path: Path, run: Any) -> None:
     text = run(tmp_path)
     assert proposed(text) == [*MOTION_CONVENTIONS, "none"]
     assert "None brings shot.0001.exr and shot.0002.exr onto each other" in text
-
-
-@pytest.mark.parametrize("command", [("inspect",), ("denoise", "-o", "out", "--method", "svgf")])
-def test_a_second_frame_with_other_channels_is_named(command: tuple[str, ...], tmp_path: Path, fails: Any) -> None:
-    PROGRAMS["RenderMan"].write(tmp_path / "shot.0001.exr", 0)
-    PROGRAMS["RenderMan"].write(tmp_path / "all.exr", 1)
-    there = clips.read_exr(tmp_path / "all.exr")
-    left = {name: np.ascontiguousarray(pixels) for name, pixels in there.items() if not name.startswith("albedo")}
-    clips.write_exr(tmp_path / "shot.0002.exr", left)
-    message = fails(*command, tmp_path / "shot.*.exr")
-    assert "shot.0002.exr: expected the channels of the first frame, but albedo.b, albedo.g, albedo.r" in message
 
 
 def test_a_convention_that_does_not_exist_lists_those_that_do(shots: dict[str, Path], fails: Any) -> None:

@@ -176,7 +176,7 @@ def test_denoise_plain_exr_files_with_the_shipped_network(tmp_path):
         done = jaxdn("denoise", tmp_path / "shot_*.exr", "-o", out, "--method", "ntd-small", "--implementation", engine)
         assert done.returncode == 0, done.stderr
         assert f"({engine}, 1 program compiled)" in done.stdout
-        assert "6 values sanitized: not usable numbers" in done.stdout
+        assert "4 values sanitized: not usable numbers" in done.stdout  # negative light is usable: it comes back
         with OpenEXR.File(str(out / "shot_0001.exr"), separate_channels=True) as file:
             reds.append(file.channels()["R"].pixels)
     assert reds[0].shape == (33, 57)

@@ -88,9 +88,9 @@ def test_arnolds_total_is_not_added_to_its_part(tmp_path, scene):
     frame, lines = read(write(tmp_path / "b.exr", *both))
     assert frame.reflectance is None
     assert frame.specular_reflectance is None
-    np.testing.assert_allclose(frame.albedo, scene["diffuse"] + scene["specular"], atol=1e-6)
-    assert "not used: 'specular_albedo'" in lines[-1]
-    assert "--channels specular_reflectance=specular_albedo" in lines[-1]
+    np.testing.assert_allclose(frame.albedo, np.minimum(scene["diffuse"] + scene["specular"], 1), atol=1e-6)
+    (unused,) = [line for line in lines if "not used: 'specular_albedo'" in line]
+    assert "--channels specular_reflectance=specular_albedo" in unused
 
 
 def test_layers_that_are_named_are_taken_at_their_word(tmp_path, scene):
@@ -195,7 +195,7 @@ def test_values_of_another_kind_are_refused(tmp_path, scene, name, value, messag
         "F0": 0.2 * scene["specular"],
         "specular_albedo": scene["specular"],
     }
-    given[name][2, 3, 0] = value
+    given[name][2:, :, 0] = value  # not one odd pixel, which is clamped
     layers = [layer("", scene["light"]), layer("diffuse_albedo", scene["diffuse"])]
     layers += [{"roughness.R": given["roughness"][..., 0]}]
     layers += [layer("specular_albedo", given["specular_albedo"])] if name == "specular_albedo" else []

@@ -22,11 +22,14 @@ from tests.training.test_training import make_clip
 
 
 def write(path: Path, *layers: str, value: float = 0.5) -> Path:
-    """A file of constant channels, each layer as ``name:letters``."""
+    """A file of constant channels, but for normals (which would be an empty layer), each layer as ``name:letters``."""
     names = [f"{name}.{letter}" if name else letter for name, _, letters in (one.partition(":") for one in layers)
              for letter in letters]  # fmt: skip
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     pixels = {name: np.full((16, 16), value, np.float32) for name in names}
+    for name in names:
+        if "Normal" in name:
+            pixels[name] += np.linspace(0, 0.1, 16, dtype=np.float32)
     OpenEXR.File(header, pixels).write(str(path))
     return path
 

@@ -17,7 +17,7 @@ from jaxdn.denoiser.rollout import stream
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.denoiser.tiles import GRID, find_history_halo, map_tiles, split_axis, stream_tiled
 from jaxdn.denoisers import asvgf, ntasd, ntd, steady, svgf, taa
-from jaxdn.sequence.james_stein import REACH, combine
+from jaxdn.sequence.james_stein import REACH, combine, measure_level
 
 TINY = ((4,), (4,), (4,), (4,), (4,))
 METHODS: dict[str, Any] = {
@@ -217,7 +217,7 @@ def test_the_safe_mixture_in_tiles_is_that_of_the_whole_frame(samples: int) -> N
     truth = np.broadcast_to((1 + np.sin(columns / 9))[None, :, None], (height, width, 3))
     noisy = (truth * rng.gamma(samples, 1 / samples, truth.shape)).astype(np.float32)
     denoised = (truth + 0.05 * np.cos(columns / 50)[None, :, None]).astype(np.float32)
-    level = jnp.mean(jnp.asarray(denoised))
+    level = measure_level(jnp.asarray(denoised))
     found, others = map_tiles(
         lambda given: (combine(*given, level), None), (noisy, denoised), (height, width), side=288, halo=REACH
     )

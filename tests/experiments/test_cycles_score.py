@@ -9,6 +9,7 @@ from experiments.cycles import compare
 from experiments.cycles import reference as references
 from experiments.cycles.reference import Reference, compress
 from experiments.cycles.score import Scored, find_changed, find_edges, score
+from experiments.results_page import read_results, results_page
 from jaxdn.clips import write_exr
 
 SIZE = (96, 128)
@@ -151,3 +152,11 @@ def test_methods_are_compared_on_files_and_a_second_run_measures_nothing_again(
     assert "sun-9000 4 spp" not in again
     assert "4 samples" in again
     assert "sun" in again
+    results = {result["file"]: result for result in read_results(tmp_path / "out")}
+    row = results["quality-cycles.json"]["rows"][1]
+    assert row[:2] == [4, "`svgf+no-safe`"]
+    assert row[2] == pytest.approx(rows["svgf+no-safe"]["psnr"], abs=1e-3)
+    assert results["quality-cycles-kinds.json"]["rows"] == [["sun", 4, *(rows[m]["psnr"] for m in options.methods)]]
+    page = results_page(list(results.values()))
+    assert "1 clip of 1 kind" in page
+    assert "| sun | 4 |" in page

@@ -24,6 +24,7 @@ def _write(folder: Path, name: str) -> None:
             channels = {f"ViewLayer.Combined.{c}": (1 + samples) * ones for c in "RGB"}
             channels |= {f"ViewLayer.Denoising Albedo.{c}": samples / 20 * ones for c in "RGB"}
             channels |= {f"ViewLayer.Denoising Normal.{c}": ones * (c == "Z") for c in "XYZ"}
+            channels["ViewLayer.Denoising Normal.X"] += np.linspace(0, 0.1, SIZE[1], dtype=np.float32)  # not empty
             channels |= {"ViewLayer.Depth.Z": number * ones}
             channels |= {f"ViewLayer.Vector.{c}": (c == "X") * ones for c in "XYZW"}
             write_exr(folder / f"{samples}spp-0" / f"{number:04d}.exr", channels)

@@ -22,7 +22,7 @@ def window_sums(plane, radius):
     return np.array([[wide[y : y + side, x : x + side].sum() for x in range(width)] for y in range(height)])
 
 
-def blend_in_numpy(past, valid, image, noisy, exposure, history_max):
+def blend_in_numpy(past, valid, image, noisy, exposure, fetch_error, history_max):
     """The equations of the module's docstring, in the order in which they stand."""
     d = np.where(valid, exposure * (image - past[:3]), 0)
     e = np.where(valid, exposure * (noisy - past[:3]), 0)
@@ -44,14 +44,20 @@ def blend_in_numpy(past, valid, image, noisy, exposure, history_max):
     q = s**2 * window_sums(square, 1) / number
     own = window_sums((1 - s**2) * square, 1) / number
     r = np.where(valid, (exposure * past[4]) ** 2, 0)
-    around = window_sums((1 - s**2) * square, 7) / np.maximum(window_sums(valid.astype(float), 7), 1)
+    last = np.maximum(before, 1 / history_max)
+    bias = np.where(valid, exposure**2 * fetch_error, 0)
+    around = window_sums(np.maximum((1 - s**2) * square - bias / last**2, 0), 7) / np.maximum(
+        window_sums(valid.astype(float), 7), 1
+    )
     r = np.where(r > 0, r, around / 2)
     p = before * r
+    q = q + bias * (2 - last) ** 2 / last
     with np.errstate(invalid="ignore"):
         k = np.where(p + q + r > 0, (p + q) / (p + q + r), 1)
     k = np.where(valid, np.maximum(k, 1 / history_max), 1)
     color = np.where(valid, past[:3] + k * (image - past[:3]), image)
-    sample = np.minimum(own / (1 + before), 3 * r)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sample = np.where(r > 0, np.minimum(own / (1 + before + bias / last**2 / r), 3 * r), 0)
     r = np.where(valid, 0.8 * r + 0.2 * sample, 0)
     return np.concatenate([color, np.stack([k, np.sqrt(r) / exposure, np.sqrt(tracked) / exposure])])
 
@@ -67,7 +73,7 @@ def draw_frame(rng, size=SIZE):
 @pytest.mark.parametrize("size", [SIZE, (1, 1), (3, 50)])
 def test_it_is_what_its_equations_say(size, rng, x64):
     for history_max in (1, 16):
-        arguments = (*draw_frame(rng, size), 0.3)
+        arguments = (*draw_frame(rng, size), 0.3, 0.01 * rng.random(size) * (rng.random(size) > 0.5))
         found = kalman_blend(*map(jnp.asarray, arguments), history_max=history_max)
         np.testing.assert_allclose(found, blend_in_numpy(*arguments, history_max), rtol=1e-9, atol=1e-12)
 
@@ -76,7 +82,7 @@ def test_single_precision_is_enough(rng):
     arguments = (*draw_frame(rng), 0.3)
     single = kalman_blend(*map(jnp.asarray, arguments), history_max=16)
     assert single.dtype == jnp.float32
-    np.testing.assert_allclose(single, blend_in_numpy(*arguments, 16), rtol=2e-3, atol=2e-4)
+    np.testing.assert_allclose(single, blend_in_numpy(*arguments, 0.0, 16), rtol=2e-3, atol=2e-4)
 
 
 @given(st.integers(0, 9), st.integers(1, 40), st.integers(1, 40))
@@ -98,6 +104,23 @@ def test_gains_have_no_unit(exponent, seed):
     other = kalman_blend(scaled, valid, unit * image, unit * noisy, jnp.float32(0.25 / unit), history_max=16)
     np.testing.assert_allclose(other[3], usual[3], rtol=1e-6)
     np.testing.assert_allclose(other[:3] / unit, usual[:3], rtol=1e-6)
+
+
+@pytest.mark.parametrize("ratio", [0.001, 0.01, 0.1, 1.0, 10.0])
+def test_the_gain_that_stays_has_the_least_error(ratio, rng):
+    """Where every fetch errs by b alike: that of the minimum of ``(b (1 - k) / k)^2 + r k / (2 - k)``."""
+    bias, size = np.sqrt(ratio) * 0.03, (40, 40)
+    blend = jax.jit(partial(kalman_blend, history_max=100))
+    past, gains = jnp.zeros((PLANES, *size)), []
+    for index in range(60):
+        image = (0.5 + 0.03 * rng.normal(size=(3, *size))).astype(np.float32)
+        noisy = (0.5 + rng.normal(size=(3, *size))).astype(np.float32)
+        fetched = past.at[:3].add(bias)
+        past = blend(fetched, np.full(size, index > 0), image, noisy, jnp.float32(1), jnp.full(size, bias**2))
+        gains.append(float(jnp.median(past[3])))
+    grid = np.linspace(0.01, 1, 1000)
+    best = grid[np.argmin(ratio * (1 - grid) ** 2 / grid**2 + grid / (2 - grid))]
+    assert abs(np.mean(gains[40:]) - best) < 0.06 + 0.05 * best, (np.mean(gains[40:]), best)
 
 
 @given(st.integers(0, 1000))

@@ -66,8 +66,10 @@ def counts_of(denoiser: Denoiser, params: Any, clip: Clip) -> list[np.ndarray]:
 @pytest.mark.parametrize("budget", [2.5, pytest.param(4.0, marks=pytest.mark.slow)])
 def test_every_frame_has_the_budget_and_every_pixel_its_own_number(name, budget, rng, key):
     denoiser, clip = METHODS[name](size=TINY, budget=budget), clip_of(rng)
+    pairs = round((budget - 1) / 2 * clip.frames.depth[0].size)
+    total = 2 * pairs + clip.frames.depth[0].size if name == "dasr" else round(budget * clip.frames.depth[0].size)
     for counts in counts_of(denoiser, varied(denoiser, clip, key), clip)[1:]:
-        assert counts.sum() == round(budget * counts.size)
+        assert counts.sum() == total
         assert 1 <= counts.min() < budget < counts.max() <= 15
 
 
@@ -99,9 +101,42 @@ def test_dasr_sees_the_first_sample_and_no_other_frame(rng, key):
     backwards = jax.tree.map(lambda leaf: leaf[::-1], clip)
     run = jax.jit(lambda clip: denoise(denoiser, params, clip))
     np.testing.assert_allclose(run(backwards)[::-1], run(clip), rtol=1e-5, atol=1e-6)
-    brighter = clip._replace(frames=clip.frames._replace(radiance=clip.frames.radiance.at[:, :9].multiply(5.0)))
-    plain, moved = (counts_of(denoiser, params, each)[0] for each in (clip, brighter))
+    brighter = clip._replace(layers={**clip.layers, 1: clip.layers[1].at[:, :9].multiply(5.0)})
+    # Whatever the radiance is that the clip was read with.
+    other = clip._replace(frames=clip.frames._replace(radiance=clip.layers[4]))
+    plain, moved, same = (counts_of(denoiser, params, each)[0] for each in (clip, brighter, other))
     assert np.any(plain != moved)
+    np.testing.assert_array_equal(plain, same)
+
+
+@pytest.mark.parametrize("options", [{}, {"budget": 1}, {"least": 3, "budget": 5}, {"preset": "paper"}], ids=str)
+def test_the_first_sample_of_dasr_is_in_its_image_and_in_its_budget(options, rng, key):
+    """Layers are the samples of a number's binary digits: that of one sample is in the odd numbers alone."""
+    denoiser, clip = dasr(size=TINY, **options), clip_of(rng)
+    for counts in counts_of(denoiser, varied(denoiser, clip, key), clip):
+        np.testing.assert_array_equal(counts % 2, 1)
+        assert counts.min() >= options.get("least", 1)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_of_the_paper_every_network_begins_as_glorot_and_bengio_say(name, rng, key):
+    """Weights of a convolution are uniform within sqrt(6 / (fan in + fan out)) (Hasselgren et al. 2020, sec. 2.2)."""
+    denoiser = METHODS[name](size=TINY, preset="paper")
+    params = denoiser.init(key, frame_at(clip_of(rng).frames, 0))
+    assert len(params) == 2
+    kernels = [leaf for leaf in jax.tree.leaves(params) if leaf.ndim == 4]
+    assert len(kernels) >= 20
+    for kernel in kernels:
+        area = kernel.shape[0] * kernel.shape[1]
+        limit = np.sqrt(6 / (area * (kernel.shape[2] + kernel.shape[3])))
+        assert 0.8 * limit < np.abs(kernel).max() <= limit
+
+
+def test_of_the_paper_the_heads_are_51_26_and_26_channels(rng, key):
+    """Hasselgren et al. 2020, sec. 2.1: alpha belongs to the coarser scales, and to the finest the history's."""
+    denoiser = ntasd(size=TINY, preset="paper")
+    heads = denoiser.init(key, frame_at(clip_of(rng).frames, 0))["denoiser"]
+    assert [len(heads[f"head_{scale}"]["bias"]) for scale in range(3)] == [51, 26, 26]
 
 
 @pytest.mark.slow
@@ -122,7 +157,7 @@ def test_samples_learn_to_go_where_noise_is(name, rng, key):
 
     params = denoiser.init(key, frame_at(clip.frames, 0))
     state = rule.init(params)
-    for _ in range(60):
+    for _ in range(200):
         params, state = update(params, state)
     counts = counts_of(denoiser, params, clip)[-1]
     assert counts[:, 16:].mean() > 1.5 * counts[:, :16].mean()
@@ -157,6 +192,24 @@ def test_pixels_without_samples_are_filled_from_their_neighbours(rng, key):
     np.testing.assert_allclose(np.median(images, axis=(1, 2, 3)), 1.0, rtol=1e-3)
 
 
+def test_pixels_without_samples_learn_what_a_sample_would_bring(rng, key):
+    """They are filled; a sample would move what fills them towards the reference."""
+    denoiser, clip = ntasd(size=TINY, least=0, budget=1, demodulate="none"), clip_of(rng, 1)
+    params, frame = varied(denoiser, clip, key), frame_at(clip.frames, 0)
+    layers, reference = {1: jnp.ones((*SIZE, 3))}, jnp.full((*SIZE, 3), 0.25)
+    counts = jnp.ones((*SIZE, 1)).at[5, 6].set(0.0)
+
+    def image(counts):
+        radiance, taken = from_layers(layers, counts, reference=reference)
+        given = only(frame._replace(radiance=radiance, sample_count=taken), denoiser.reads)
+        return denoiser.step(params, denoiser.start(params, given), given)[1]
+
+    # Of an image that is 1 everywhere, and a pixel that would be 0.25: brighter images want fewer of its samples.
+    slope = jax.jit(jax.grad(lambda counts: jnp.sum(image(counts))))(counts)
+    assert slope[5, 6, 0] < 0
+    np.testing.assert_allclose(slope[5, 6, 0], slope[8:12, 8:12].mean(), rtol=0.9)
+
+
 @pytest.mark.parametrize("name", METHODS)
 def test_a_budget_that_the_layers_cannot_give_raises(name, rng, key):
     denoiser, clip = METHODS[name](size=TINY, budget=16), clip_of(rng)
@@ -167,9 +220,17 @@ def test_a_budget_that_the_layers_cannot_give_raises(name, rng, key):
         denoise(denoiser, params, clip._replace(layers=None))
 
 
+@pytest.mark.parametrize("name", ["ntasd", "dasr", "rae", "arae"])
+def test_no_paper_clips_gradients_or_lets_the_rate_fall(name):
+    recipe = methods()[name].recipe_named("paper")
+    assert (recipe.clip_norm, recipe.decay, recipe.average) == (0.0, False, 0.0)
+
+
 def test_options_that_make_no_sense_raise():
     with pytest.raises(ValueError, match=r"least: expected at least 1, the sample that is rendered first, got 0"):
         dasr(least=0)
+    with pytest.raises(ValueError, match=r"least: expected an odd number, .* got 2"):
+        dasr(least=2)
     for name in METHODS:
         with pytest.raises(ValueError, match=r"budget: expected a number > 0, got 0"):
             METHODS[name](budget=0)

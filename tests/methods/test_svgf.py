@@ -120,7 +120,7 @@ def reference_history(past, frame, p, expected_tolerance):
 
     row, column = y + m[1], x + m[0]
     top, left = int(np.floor(row)), int(np.floor(column))
-    total, weights = np.zeros(6), 0.0
+    total, weights = np.zeros(9), 0.0
     for v in (top, top + 1):
         for u in (left, left + 1):
             share = (1 - abs(row - v)) * (1 - abs(column - u))
@@ -146,18 +146,25 @@ def reference_step(past, frame, levels=3):
     divisor = ((frame.albedo**4 + 0.15**4) / (1 + 0.15**4)) ** 0.25
     incident = frame.radiance / divisor
     light = incident @ LUMINANCE
-    history = np.zeros((HEIGHT, WIDTH, 6))
+    left = np.minimum(frame.albedo / divisor, 1.0)
+    left = (left + 0.3) / (left.max(-1, keepdims=True) + 0.3)
+    history = np.zeros((HEIGHT, WIDTH, 9))
     for p in np.ndindex(HEIGHT, WIDTH):
         fetched = None if past is None else reference_history(past, frame, p, (expected, tolerance))
         now = np.concatenate([incident[p], [light[p], light[p] ** 2]])
         if fetched is None:
-            history[p] = [*now, 1.0]
+            history[p] = [*now, 1.0, *left[p]]
         else:
             length = min(fetched[5] + 1, 32)
             share = max(0.2, 1 / length)
-            history[p] = [*((1 - share) * fetched[:5] + share * now), length]
-    left = np.minimum(frame.albedo / divisor, 1.0)
-    left = (left + 0.3) / (left.max(-1, keepdims=True) + 0.3)
+            mean, texture = (1 - share) * fetched[:5] + share * now, (1 - share) * fetched[6:] + share * left[p]
+            history[p] = [*mean, length, *texture]
+    # The history's light had the mean texture; that of this frame is filtered.
+    mean_texture, kept_moments = history[..., 6:].copy(), history[..., 3:5].copy()
+    grey = (left @ LUMINANCE + 0.01) / (mean_texture @ LUMINANCE + 0.01)
+    history[..., :3] *= (left + 0.01) / (mean_texture + 0.01)
+    history[..., 3] *= grey
+    history[..., 4] *= grey**2
     color = np.concatenate([history[..., :3], left], axis=-1)
     variance = np.maximum(history[..., 4] - history[..., 3] ** 2, 0)
     seven = [(dy, dx, 1.0) for dy in range(-3, 4) for dx in range(-3, 4)]
@@ -184,7 +191,8 @@ def reference_step(past, frame, levels=3):
             feedback = color
     color, feedback = (one[..., :3] * (left + 0.01) / (one[..., 3:] + 0.01) for one in (color, feedback))
     image = np.where(hit[..., None], color * divisor, frame.radiance)
-    kept = np.concatenate([feedback, history[..., 3:]], axis=-1)
+    feedback = feedback * (mean_texture + 0.01) / (left + 0.01)
+    kept = np.concatenate([feedback, kept_moments, history[..., 5:]], axis=-1)
     return (kept, depth, frame.normal, ids), image, hit
 
 

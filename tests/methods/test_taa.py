@@ -268,7 +268,7 @@ def test_after_a_denoiser_it_smooths_that_ones_images(rng):
     for image, expected in zip(images, run(taa(), alone)[1], strict=True):
         np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-5)
     assert taa(after=before).reads == before.reads | {"motion", "depth"}
-    assert state.core.after.history.shape[-1] == 6
+    assert state.core.after.history.shape[-1] == 6 + 3  # the texture of the light, too
 
 
 def test_after_a_denoiser_its_parameters_samples_and_sanitizing_stay_its_own(rng):

@@ -46,8 +46,8 @@ def variant(request: pytest.FixtureRequest) -> str:
     return use_variant(request.param)
 
 
-def gradient(scene: Stage, variant: str, frame: int = 1) -> np.ndarray:
-    found = render_frame(scene, frame, RenderSettings(variant=variant, **SIZE)).frame.luminance_gradient
+def gradient(scene: Stage, variant: str, frame: int = 1, **settings: Any) -> np.ndarray:
+    found = render_frame(scene, frame, RenderSettings(variant=variant, **SIZE | settings)).frame.luminance_gradient
     assert found is not None
     assert found.shape == (HEIGHT, WIDTH, 2)
     assert found.dtype == np.float32
@@ -78,6 +78,24 @@ def test_a_light_switched_off_takes_everything(variant: str) -> None:
     delta, size = np.moveaxis(gradient(Lamp(1, 0), variant), -1, 0)
     assert (delta < 0).any()
     np.testing.assert_array_equal(-delta, size)
+
+
+@pytest.mark.parametrize("max_depth", [2, 4])
+def test_of_reflected_light_the_direct_part_is_replayed_too(variant: str, max_depth: int) -> None:
+    """Light straight from the lamp reaches nearly every stratum, and with two path lengths there is no other."""
+    delta, size = np.moveaxis(gradient(Lamp(1, 2), variant, light="reflected", max_depth=max_depth), -1, 0)
+    lit = size > 0
+    assert lit.sum() > 0.8 * np.prod(STRATA)
+    np.testing.assert_allclose(delta[lit], 0.5 * size[lit], rtol=1e-5)
+    assert (gradient(Lamp(1, 2), variant)[..., 1] > 0).sum() < lit.sum()
+
+
+def test_of_reflected_light_the_samples_are_those_of_the_previous_noisy_image() -> None:
+    require("llvm")  # scalar variants cannot replay the samples of their images
+    variant = choose_variant().variant
+    size = gradient(Lamp(1, 0), variant, light="reflected")[..., 1]
+    image = render_frame(Lamp(1, 0), 0, RenderSettings(variant=variant, light="reflected", **SIZE)).frame.radiance
+    np.testing.assert_allclose(size[size > 0], (image @ LUMINANCE)[size > 0], rtol=1e-5)
 
 
 def test_the_samples_are_those_of_the_previous_noisy_image() -> None:
@@ -134,7 +152,7 @@ def test_what_is_hidden_now_is_left_out() -> None:
 
     scenes = [slid.build(frame, WIDTH, HEIGHT) for frame in (0, 1)]
     frames = FramePair(BuiltFrame(scenes[0], first), BuiltFrame(scenes[1], second), SampleStream(5, 1, NOISY), 0)
-    buffer = compute_luminance_gradient(replay, frames, max_depth=4)
+    buffer = compute_luminance_gradient(replay, frames, max_depth=4, with_direct=False)
     kept = np.argwhere(buffer[..., 1] > 0)
     # Where the wall was and the square is now, only samples of the square remain.
     now = second.gbuffer.ids[..., 0] == second.gbuffer.names.index("square")
@@ -210,5 +228,6 @@ def test_a_sample_that_is_not_finite_says_nothing(variant: str) -> None:
         np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), -1).reshape(-1, 2),
         np.arange(WIDTH * HEIGHT),
         max_depth=4,
+        with_direct=True,
     )
     assert np.isfinite(found.light).all()

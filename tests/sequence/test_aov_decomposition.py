@@ -9,7 +9,7 @@ from jaxdn import clips
 from jaxdn.core.frame import Frame
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.lighting import find_additive_layers
-from jaxdn.sequence.aov_decomposition import decompose, init_decomposition
+from jaxdn.sequence.aov_decomposition import add_layers, decompose, init_decomposition
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import find_model
@@ -123,3 +123,51 @@ def test_what_has_no_parts_says_so(tmp_path: Path) -> None:
     assert told == ["--aovs additive: no layer is a part of the beauty; all stay as they are"]
     with pytest.raises(ValueError, match="leave out --only-beauty"):
         denoise_files([tmp_path / "a.exr"], tmp_path / "out", find_model("noisy"), settings._replace(only_beauty=True))
+
+
+def lit_later(folder: Path, lit: dict[str, list[bool]]) -> Path:
+    """Frames whose beauty is the sum of light groups, each lit in some of them."""
+    folder.mkdir()
+    for index, now in enumerate(zip(*lit.values(), strict=True)):
+        scene = truth(index)
+        share = dict(zip(lit, ([scene.diffuse, scene.light - scene.diffuse]), strict=True))
+        groups = {name: share[name] * on for name, on in zip(lit, now, strict=True)}
+        channels = programs.layer("", sum(groups.values()), "RGB") | programs.layer("Z", scene.depth, "Z")
+        for name, light in groups.items():
+            channels |= programs.layer(name, light, "RGB")
+        clips.write_exr(folder / f"s.{index + 1:04d}.exr", channels)
+    return folder
+
+
+LIT_LATER = {
+    "a fade from black": ({"diffuse": [False, True, True, True], "specular": [False, True, True, True]}, {}),
+    "a light switched on": ({"key": [True, True, True, True], "fill": [False, False, True, True]}, {}),
+    "a part of the shot": ({"key": [True, True, True, True], "fill": [False, False, True, True]}, {"frames": [4]}),
+}
+
+
+@pytest.mark.parametrize("case", LIT_LATER)
+def test_a_light_that_is_switched_on_later_is_a_part_from_then_on(case: str, tmp_path: Path) -> None:
+    lit, settings = LIT_LATER[case]
+    source, told = lit_later(tmp_path / "in", lit), list[str]()
+    denoise_files([source], tmp_path / "out", box_blur(), Settings(aovs="additive", **settings), log=told.append)
+    assert any("from here on denoised with the beauty" in line for line in told)
+    for file in sorted((tmp_path / "out").iterdir()):
+        after = clips.read_exr(file)
+        for letter in "RGB":
+            total = sum(after[f"{name}.{letter}"].astype(np.float64) for name in lit)
+            np.testing.assert_allclose(total, after[letter], rtol=1e-5, atol=1e-6)
+        before = clips.read_exr(source / file.name)
+        assert before["R"].max() == 0 or np.abs(after["R"] - before["R"]).max() > 0.01  # denoised
+
+
+def test_layers_that_are_added_have_been_black(rng: np.random.Generator) -> None:
+    """The same as with the black layer from the first frame on."""
+    frames = [frame_of(index) for index in range(2)]
+    beauty = np.asarray(frames[0].radiance)
+    first, second = beauty * 0.3, beauty * 0.7
+    state, _ = decompose(init_decomposition(frames[0], 1), frames[0], beauty, first[None])
+    _, added = decompose(add_layers(state, 2), frames[1], beauty, np.stack([first, second]))
+    state, _ = decompose(init_decomposition(frames[0], 2), frames[0], beauty, np.stack([first, 0 * first]))
+    _, always = decompose(state, frames[1], beauty, np.stack([first, second]))
+    np.testing.assert_allclose(added, always, rtol=1e-5, atol=1e-6)

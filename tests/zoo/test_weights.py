@@ -105,6 +105,15 @@ def test_an_unknown_name_says_which_are_shipped():
         jaxdn.load_weights("ntd-gigantic")
 
 
+def test_sizes_that_no_machine_can_hold(saved):
+    path, _ = saved
+    described = json.loads(path.with_suffix(".json").read_text())
+    described["options"]["size"] = [[4], [4], [4], [4], [10**30]]
+    path.with_suffix(".json").write_text(json.dumps(described))
+    with pytest.raises(ValueError, match=r"w\.json: expected sizes of layers that fit in memory"):
+        jaxdn.load_weights(path)
+
+
 def test_truncated_weights(saved):
     path, _ = saved
     whole = path.read_bytes()

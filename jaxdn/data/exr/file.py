@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import OpenEXR
 
-from jaxdn.data.errors import ClipError
+from jaxdn.data.errors import ClipError, DamagedFile
 
 _SIDE_LIMIT = 1 << 16  # a larger size in a header counts as damaged, before memory is allocated for it
 _UNREADABLE = (RuntimeError, ValueError, KeyError, IndexError, TypeError, MemoryError, UnicodeDecodeError)
@@ -106,6 +106,11 @@ class ExrFile:
         self._layout: tuple[Window, dict[str, Window]] | None = None
 
     @property
+    def paths(self) -> tuple[Path, ...]:
+        """The files that are read: this one."""
+        return (self.path,)
+
+    @property
     def display(self) -> Window:
         """The display window: the picture."""
         return self._read_layout()[0]
@@ -164,10 +169,10 @@ class ExrFile:
 
     def _read_headers(self) -> list[dict[str, Any]]:
         if not self.path.is_file():
-            raise ClipError(f"{self.path}: there is no such file.")
+            raise DamagedFile(self.path, "there is no such file")
         headers = _open(self.path, lambda file: [dict(part.header) for part in file.parts], header_only=True)
         if not headers:
-            raise ClipError(f"{self.path}: the file has no parts; write the frame again.")
+            raise DamagedFile(self.path, "the file has no parts; write the frame again")
         for header in headers:
             _check_header(self.path, header)
         self._sound = True
@@ -198,12 +203,12 @@ def _open(path: Path, read: Callable[[Any], _T], **options: Any) -> _T:
     except ClipError:
         raise
     except _UNREADABLE as error:
-        raise ClipError(f"{path}: not readable as OpenEXR ({error}); write the frame again.") from error
+        raise DamagedFile(path, f"not readable as OpenEXR ({error}); write the frame again") from error
 
 
 def _decode(path: Path, file: Any) -> list[ExrPart]:
     if not file.parts:
-        raise ClipError(f"{path}: the pixel data is truncated or damaged; write the frame again.")
+        raise DamagedFile(path, "the pixel data is truncated or damaged; write the frame again")
     parts = []
     for part in file.parts:
         channels = []
@@ -221,14 +226,14 @@ def _decode(path: Path, file: Any) -> list[ExrPart]:
 def _check_header(path: Path, header: Mapping[str, Any]) -> None:
     window = header.get("dataWindow")
     if not isinstance(window, tuple) or len(window) != 2:
-        raise ClipError(f"{path}: the header has no data window; the file is damaged.")
+        raise DamagedFile(path, "the header has no data window; the file is damaged")
     low, high = (np.asarray(corner, np.int64) for corner in window)
     sides = high - low + 1
     tiles = header.get("tiles")
     if tiles is not None and tiles.mode != OpenEXR.ONE_LEVEL:
         raise ClipError(f"{path}: tiles in several levels (a mipmap) cannot be read; save it with one level.")
     if sides.min() < 1 or sides.max() > _SIDE_LIMIT:
-        raise ClipError(f"{path}: the header claims {sides[0]} x {sides[1]} pixels; the file is damaged.")
+        raise DamagedFile(path, f"the header claims {sides[0]} x {sides[1]} pixels; the file is damaged")
 
 
 def _full_name(header: Mapping[str, object], name: str, parts: int) -> str:

@@ -8,18 +8,19 @@ Channels are found by their names (:mod:`jaxdn.data.foreign.layers`), motion vec
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from jaxdn.core.frame import BUFFERS, FAR, Buffer, Frame, present
+from jaxdn.core.frame import BUFFERS, FAR, Buffer, Frame
 from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.file import ExrFile, Window, union_of
 from jaxdn.data.foreign.classify import ChannelMapping, ChannelNaming, classify_channels
+from jaxdn.data.foreign.decisions import Decisions
 from jaxdn.data.foreign.layers import Channels, is_cryptomatte, layer_of, stack_channels
 from jaxdn.data.foreign.measured_motion import fitting_conventions
-from jaxdn.data.foreign.reflectance import check_fraction, derive_reflectance
-from jaxdn.data.foreign.shots import find_sequence
+from jaxdn.data.foreign.reflectance import derive_reflectance
+from jaxdn.data.foreign.repairs import FRACTIONS, Repairs
+from jaxdn.data.foreign.shot_files import find_sequence, open_files
 from jaxdn.data.foreign.vectors import UnknownMotion, convert_cycles_forward, convert_motion, derive_dual_motion
 from jaxdn.filters.time_reversal import reverse_time
 
@@ -44,15 +45,20 @@ def plain_frames(
     :func:`jaxdn.data.foreign.layers.detect_channels`; what they choose, see
     :func:`jaxdn.data.foreign.channel_mapping.read_channel_mapping`. ``log`` is called with lines about what is derived
     or left unused, when the first frame is read. Depth is taken for view-space z (0, far and infinite become ``FAR``);
-    ids count from 1 with 0 for nothing, or are those of a Cryptomatte, and are left out of all frames if they say
-    nothing in the first. Normals are expected in world space, roughness linear (GGX alpha is its square).
+    ids count from 1 with 0 for nothing, or are those of a Cryptomatte. A buffer in which no frame has had anything yet
+    is left out (:mod:`jaxdn.data.foreign.decisions`); values that are no fractions are clamped and counted
+    (:mod:`jaxdn.data.foreign.repairs`). Normals are expected in world space, roughness linear (GGX alpha is its
+    square).
 
     Raises ClipError at once where the files are no sequence, and, naming the file, when a frame is asked for that
     cannot be read or differs from the first.
     """
     naming = ChannelNaming(motion_convention, channels, layer)
-    files = find_sequence(path) if isinstance(path, str | Path) else list(path)
-    return files, ForeignSequence([ExrFile(file) for file in files], naming).frames(backwards=backwards, log=log)
+    if isinstance(path, str | Path):
+        opened = open_files(find_sequence(path, naming.pass_files))
+    else:
+        opened = tuple(ExrFile(file) for file in path)
+    return [file.path for file in opened], ForeignSequence(opened, naming).frames(backwards=backwards, log=log)
 
 
 class ForeignSequence:
@@ -60,6 +66,10 @@ class ForeignSequence:
 
     def __init__(self, files: Sequence[ExrFile], naming: ChannelNaming) -> None:
         self.files, self.naming = files, naming
+        self.repairs = Repairs()
+        self._decisions = Decisions()
+        self._named: tuple[str, ...] | None = None
+        self._told: set[str] = set()
 
     @cached_property
     def window(self) -> Window:
@@ -96,21 +106,15 @@ class ForeignSequence:
 
         With ``keep_pixels``, the file of a frame that is given stays decoded until the caller drops it.
         """
-        first: _First | None = None
+        self.repairs.restart()
         forward: np.ndarray | None = None
         after: Frame | None = None
-        # The first file decides for all, so it is read first in either direction.
+        # The first file says which buffers all have, so it is read first in either direction.
         for turn, file in enumerate([self.files[0], *reversed(self.files)] if backwards else self.files):
             before = forward
-            frame, mapping, derived, forward = self._read(file, first, before)
-            if first is None:
-                for line in [*mapping.notes, *derived]:
-                    log(line)
-                # Renderers write zeros where nobody asked for ids. Whether all frames do is not known before the end.
-                silent = frame.ids is not None and bool(np.all(frame.ids < 0))
-                first = _First(present(frame), silent, mapping.rejected)
-            _check_like_first(file.path, frame, first)
-            frame = frame._replace(ids=None) if first.silent else frame
+            frame, lines, forward = self._read(file, before)
+            for line in lines:
+                log(line if file is self.files[0] else f"{file.path.name}: {line}")
             # Of large frames, memory is what there is least of.
             if not keep_pixels:
                 file.drop()
@@ -137,24 +141,26 @@ class ForeignSequence:
             raise ClipError(f"{self.files[1].path}: {missing}")
         return fitting_conventions(before, now, buffers)
 
-    def _read(
-        self, file: ExrFile, first: "_First | None", forward: np.ndarray | None
-    ) -> tuple[Frame, ChannelMapping, list[str], np.ndarray | None]:
-        """A frame, its channels, what was derived in words, and its forward displacement; that of the frame before."""
+    def _read(self, file: ExrFile, forward: np.ndarray | None) -> tuple[Frame, list[str], np.ndarray | None]:
+        """A frame, what was derived or left out in words, and its forward displacement; that of the frame before."""
         pixels = file.placed(self.window)
         try:
-            # What the first frame decides is decided for all: a lighting pass is light in every frame.
-            rejected = None if first is None else first.rejected
-            mapping = classify_channels(pixels, self.naming, rejected=rejected, single=len(self.files) == 1)
-            frame, derived = _make_frame(file, pixels, mapping)
+            single = len(self.files) == 1
+            mapping = classify_channels(pixels, self.naming, decisions=self._decisions, single=single)
+            if self._named is None:
+                self._named = mapping.named
+            _check_like_first(mapping.named, self._named)
+            frame, derived = _make_frame(file, pixels, mapping, self.repairs)
         except UnknownMotion as error:
             raise UnknownMotion(f"{file.path}: {self._advise_convention()}{error}") from error
         except ClipError as error:
             raise ClipError(f"{file.path}: {error}") from error
+        lines = [*mapping.notes, *self.repairs.news(), *(line for line in derived if line not in self._told)]
+        self._told.update(derived)
         if mapping.forward is None:
-            return frame, mapping, derived, None
+            return frame, lines, None
         frame = frame._replace(dual_motion=derive_dual_motion(frame.motion, forward))
-        return frame, mapping, derived, convert_cycles_forward(stack_channels(pixels, mapping.forward))
+        return frame, lines, convert_cycles_forward(stack_channels(pixels, mapping.forward))
 
     def _advise_convention(self) -> str:
         """What the first two frames tell about the convention of their motion vectors, as a line; "" for nothing."""
@@ -165,24 +171,17 @@ class ForeignSequence:
         return f"{named} fits {self.files[0].path.name} and {self.files[1].path.name}.\n"
 
 
-class _First(NamedTuple):
-    """What all later frames have in common with the first."""
-
-    buffers: tuple[str, ...]
-    silent: bool
-    """Its ids say nothing."""
-    rejected: frozenset[str]
-
-
-def _make_frame(file: ExrFile, pixels: Mapping[str, np.ndarray], mapping: ChannelMapping) -> tuple[Frame, list[str]]:
+def _make_frame(
+    file: ExrFile, pixels: Mapping[str, np.ndarray], mapping: ChannelMapping, repairs: Repairs
+) -> tuple[Frame, list[str]]:
     """One frame, and in words what was derived, or left unused."""
     buffers = {
         name: _converted(name, stack_channels(pixels, channels), channels, mapping.convention)
         for name, channels in mapping.buffers.items()
     }
-    for name in {"roughness", "specular_reflectance"} & set(buffers):
-        buffers[name] = check_fraction(name, layer_of(mapping.buffers[name]), buffers[name])
-    frame, derived = derive_reflectance(Frame(**buffers), mapping.buffers, pixels, file.header)
+    for name in set(FRACTIONS) & set(buffers):
+        buffers[name] = repairs.clamp(name, layer_of(mapping.buffers[name]), buffers[name])
+    frame, derived = derive_reflectance(Frame(**buffers), mapping.buffers, pixels, file.header, repairs)
     return frame, [] if derived is None else [derived]
 
 
@@ -205,7 +204,7 @@ def _converted(name: str, image: np.ndarray, channels: Channels, convention: str
     return image
 
 
-def _check_like_first(file: Path, frame: Frame, first: _First) -> None:
-    differing = sorted(set(present(frame)) ^ set(first.buffers))
+def _check_like_first(named: tuple[str, ...], first: tuple[str, ...]) -> None:
+    differing = sorted(set(named) ^ set(first))
     if differing:
-        raise ClipError(f"{file}: expected the same buffers as in the first frame, but {', '.join(differing)} differs.")
+        raise ClipError(f"expected the same buffers as in the first frame, but {', '.join(differing)} differs.")

@@ -6,7 +6,7 @@ A lighting pass in place of the albedo would be divided out of the beauty, noise
 filter: the image would stay as noisy as it was.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -16,6 +16,8 @@ SLACK = 0.1
 """By so much fractions may leave [0, 1]: pixel filters with negative lobes overshoot at edges."""
 _PART = 0.999
 """Share of pixels where a part of the beauty is not brighter than it; the rest may be clamped in one of them alone."""
+_CLEARLY = 0.1
+"""Share of pixels that are brighter than the beauty in what is surely no part of it."""
 _NOISE = 0.25
 """Median deviation of a pixel from its four neighbours, relative to them, that no texture has over half of an image.
 
@@ -43,32 +45,54 @@ def explain_light(values: np.ndarray, beauty: np.ndarray) -> str | None:
     return None
 
 
+def is_clearly_brighter(values: np.ndarray, beauty: np.ndarray) -> bool:
+    """Whether many pixels of a layer [H, W, 3] are brighter than the beauty, so that it is surely no part of it."""
+    lit = np.any(values > 0, axis=-1)
+    return bool(lit.any() and np.mean(np.any(values > 1.1 * beauty + 1e-3, axis=-1)[lit]) > _CLEARLY)
+
+
 def find_additive_layers(
     pixels: Mapping[str, np.ndarray], beauty: Channels, buffers: Mapping[str, Channels]
 ) -> dict[str, Channels]:
     """Layer -> channels of the additive parts of the beauty: coloured, never negative, nowhere brighter than it.
 
+    Takes what :func:`coloured_layers` takes.
+    """
+    radiance = stack_channels(pixels, buffers["radiance"])
+    layers = coloured_layers(pixels, beauty, buffers)
+    return {name: channels for name, channels in layers.items() if is_additive(pixels, channels, radiance)}
+
+
+def coloured_layers(names: Iterable[str], beauty: Channels, buffers: Mapping[str, Channels]) -> dict[str, Channels]:
+    """Layer -> channels of what may be an additive part of the beauty, by names alone.
+
     Left out are layers that are read as something else, whose names are those of guides, or that hold variances, and
     ``Noisy Image``, which is to stay as it is.
 
     Args:
-      pixels: every channel of the file.
+      names: of every channel of the file.
       beauty: the channels of the beauty, which is no part of itself.
       buffers: buffer -> channels that are read.
     """
-    known = {name for buffer, names in LAYERS.items() if buffer != "radiance" for name in names} - {"diffuse"}
+    known = {name for buffer, layers in LAYERS.items() if buffer != "radiance" for name in layers} - {"diffuse"}
     read = {channel for channels in buffers.values() for channel in channels} | set(beauty)
-    radiance = stack_channels(pixels, buffers["radiance"])
-    additive = {}
-    for layer, group in group_layers(list(pixels)).items():
+    found: dict[str, Channels] = {}
+    for layer, group in group_layers(list(names)).items():
         last = layer.rpartition(".")[2].lower()
         channels = tuple(group[letter] for letter in "rgb" if letter in group)
-        if len(channels) < 3 or read & set(channels) or last in known or any(word in last for word in _NO_LIGHT):
-            continue
-        values = stack_channels(pixels, channels)
-        if np.nanmin(values) >= 0 and _is_part(values, radiance):
-            additive[layer] = channels
-    return additive
+        if len(channels) == 3 and not (
+            read & set(channels) or last in known or any(word in last for word in _NO_LIGHT)
+        ):
+            found[layer] = channels
+    return found
+
+
+def is_additive(pixels: Mapping[str, np.ndarray], channels: Channels, beauty: np.ndarray) -> bool | None:
+    """Whether a layer is a part of the beauty [H, W, 3], by its values; None: it is black, which tells nothing."""
+    values = stack_channels(pixels, channels)
+    if not np.any((values != 0) & ~np.isnan(values)):
+        return None
+    return bool(np.nanmin(values) >= 0) and _is_part(values, beauty)
 
 
 def find_beauty_copies(

@@ -15,17 +15,8 @@ import numpy as np
 
 from jaxdn.brdf import directional_albedo
 from jaxdn.core.frame import BUFFERS, Frame
-from jaxdn.data.errors import ClipError
-from jaxdn.data.foreign.layers import (
-    NOT_WANTED,
-    Channels,
-    advise_naming,
-    find_layer,
-    group_layers,
-    layer_of,
-    stack_channels,
-)
-from jaxdn.data.foreign.lighting import SLACK
+from jaxdn.data.foreign.layers import Channels, find_layer, group_layers, layer_of, stack_channels
+from jaxdn.data.foreign.repairs import Repairs
 
 _POINT = BUFFERS["normal"]
 """Positions have the components of a direction."""
@@ -37,24 +28,12 @@ _F0 = ("f0", "specular_f0")
 """Specular colours at normal incidence."""
 
 
-def check_fraction(name: str, layer: str, values: np.ndarray) -> np.ndarray:
-    """``values`` in [0, 1], what a pixel filter overshot cut off. Raises ClipError where they are of another kind."""
-    known = values[np.isfinite(values)]
-    if known.size and not (known.min() >= -SLACK and known.max() <= 1 + SLACK):
-        advice = "rename it if it is something else"
-        if name in BUFFERS:
-            advice = f"{advise_naming(name)}, or leave it out: --channels {name}={NOT_WANTED}"
-        raise ClipError(
-            f"{name}: expected values in [0, 1] in layer {layer!r}, got {known.min():g} to {known.max():g}; {advice}."
-        )
-    return np.clip(values, 0.0, 1.0)
-
-
 def derive_reflectance(
     frame: Frame,
     buffers: Mapping[str, Channels],
     pixels: Mapping[str, np.ndarray],
     header: Mapping[str, Any],
+    repairs: Repairs,
 ) -> tuple[Frame, str | None]:
     """The frame with ``reflectance`` and ``specular_reflectance`` where its file tells them, and how in a sentence.
 
@@ -63,6 +42,7 @@ def derive_reflectance(
       buffers: buffer -> channels it was read from.
       pixels: every channel of the file.
       header: of the file.
+      repairs: what is clamped is counted there.
     """
     if frame.albedo is None:
         return frame._replace(specular_reflectance=None), None
@@ -80,7 +60,7 @@ def derive_reflectance(
         cosine, where = _cosine(frame, buffers, pixels, header)
         if cosine is None:
             return frame, f"not used: {layer!r}, as what it reflects depends on the angle of view, and {where}"
-        specular = _lobe(check_fraction("F0", layer, stack_channels(pixels, color)), frame.roughness, cosine)
+        specular = _lobe(repairs.clamp("F0", layer, stack_channels(pixels, color)), frame.roughness, cosine)
         how = f"{diffuse!r} + GGX lobe of F0 {layer!r}, roughness {layer_of(buffers['roughness'])!r} and {where}"
     reflectance = np.clip(albedo + specular, 0.0, 1.0)
     return frame._replace(reflectance=reflectance, specular_reflectance=specular), f"derived: reflectance = {how}"

@@ -1,20 +1,34 @@
 """Which EXR files are frames of one shot: by their names, ``shot_0001.exr`` ...; gaps, and files without a number."""
 
 import glob
+import math
+import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
 from jaxdn.data.errors import ClipError
+from jaxdn.data.foreign.frame_names import read_frame_names
+
+Number = int | Fraction
+"""Of a frame; a fraction between two frames that are counted."""
+
+_PLACEHOLDER = re.compile(r"#+|@+|%0?\d*d|\$F\d*|<frame>|<f\d*>", re.IGNORECASE)
+"""How programs write the place of a frame's number."""
 
 
 class Shot(NamedTuple):
     """Files of one name and their frame numbers, ascending; an image without a number is a shot of its own."""
 
     files: tuple[Path, ...]
-    numbers: tuple[int, ...]
+    numbers: tuple[Number, ...]
     """Empty for an image without a number."""
+    name: str = ""
+    """Of its files, with ``#`` for the number, without the suffix; "" for clips of ours."""
+    passes: tuple[Mapping[str, Path], ...] = ()
+    """Of each frame, layer -> a further file that has it (:mod:`jaxdn.data.foreign.passes`); empty: there are none."""
 
     @property
     def label(self) -> str:
@@ -22,80 +36,118 @@ class Shot(NamedTuple):
         first = self.files[0]
         if len(self.files) == 1:
             return str(first)
-        return f"{first.parent / _prefix(first)}#{first.suffix} {ranges(self.numbers)}"
+        name = self.name or re.sub(r"\d+$", "#", first.stem)
+        return f"{first.parent / name}{first.suffix} {ranges(self.numbers)}"
+
+    @property
+    def step(self) -> Fraction:
+        """Between consecutive frames: 1, or less where there are subframes."""
+        return frame_step(self.numbers)
 
 
-def find_shots(path: str | Path) -> list[Shot]:
-    """The shots of a folder or a glob pattern, or the one of a file. Raises ClipError if there are no EXR files."""
-    path = Path(path)
-    if path.is_dir():
-        files = sorted(file for file in path.iterdir() if file.suffix.lower() == ".exr" and file.name[0] != ".")
-    elif path.is_file():
-        files = [path]
+def find_shots(path: str | Path | Sequence[Path]) -> list[Shot]:
+    """The shots of a folder or a pattern, or those of files. Raises ClipError if there are no EXR files.
+
+    In a pattern, ``*``, ``?`` and ``[...]`` are those of a shell, and ``####``, ``%04d``, ``$F4`` and ``<frame>`` stand
+    for a number. Folders whose names have brackets in them are taken as they are called.
+    """
+    if not isinstance(path, str | Path):
+        files = list(path)
+    elif Path(path).is_dir():
+        files = sorted(file for file in Path(path).iterdir() if file.suffix.lower() == ".exr" and file.name[0] != ".")
+    elif Path(path).is_file():
+        files = [Path(path)]
     else:
-        files = sorted(Path(name) for name in glob.glob(str(path)))
+        files = _expand(Path(path))
     if not files:
         raise ClipError(f"{path}: expected a folder of EXR files, a pattern that fits some, or one; found none.")
-    numbered: dict[tuple[Path, str], dict[int, Path]] = {}
+    numbered: dict[tuple[Path, str, str], dict[Number, Path]] = {}
     single = []
-    for file in files:
-        number = _number(file)
+    for file, name, number in read_frame_names(_once(files)):
         if number is None:
             single.append(Shot((file,), ()))
             continue
-        frames = numbered.setdefault((file.parent, _prefix(file)), {})
+        frames = numbered.setdefault((file.parent, name, file.suffix.lower()), {})
         if number in frames:
             raise ClipError(f"{file}: expected one file for each frame, but {frames[number]} has the same number.")
-        frames[number] = file
-    shots = [Shot(tuple(frames[n] for n in sorted(frames)), tuple(sorted(frames))) for frames in numbered.values()]
+        frames[int(number) if number.denominator == 1 else number] = file
+    shots = [
+        Shot(tuple(frames[n] for n in sorted(frames)), tuple(sorted(frames)), name)
+        for (_, name, _), frames in numbered.items()
+    ]
     return [*shots, *single]
 
 
-def find_sequence(path: str | Path) -> list[Path]:
-    """The EXR files of one sequence in the order of their frame numbers.
-
-    ``path`` is a folder, a glob pattern or one file. Raises ClipError if there are none, if they belong to several
-    sequences, or if frame numbers are missing.
-    """
-    shots = find_shots(path)
-    if len(shots) == 1 and len(shots[0].files) == 1:
-        return list(shots[0].files)
-    for shot in shots:
-        if not shot.numbers:
-            raise ClipError(
-                f"{shot.files[0]}: expected a file name that ends in a frame number, such as shot_0001.exr."
-            )
-    if len(shots) > 1:
-        names = ", ".join(sorted(_prefix(shot.files[0]) for shot in shots))
-        raise ClipError(f"{path}: expected one sequence, got several: {names}; use a pattern.")
-    (shot,) = shots
+def refuse_gaps(path: str | Path | Sequence[Path], shot: Shot) -> None:
+    """Raise ClipError for a shot, found at a path, in which frame numbers are missing."""
     gaps = missing(shot.numbers)
     if gaps:
-        shown = ", ".join(map(str, gaps[:8])) + (" ..." if len(gaps) > 8 else "")
+        shown = ", ".join(map(_text, gaps[:8])) + (" ..." if len(gaps) > 8 else "")
         raise ClipError(f"{path}: frames are missing between {shot.numbers[0]} and {shot.numbers[-1]}: {shown}.")
-    return list(shot.files)
 
 
-def missing(numbers: Sequence[int]) -> list[int]:
+def frame_step(numbers: Sequence[Number]) -> Fraction:
+    """Between consecutive frames: 1, or less where some numbers are fractions."""
+    return Fraction(1, math.lcm(*(number.denominator for number in numbers)))
+
+
+def missing(numbers: Sequence[Number]) -> list[Number]:
     """The numbers that lie between others and are not there."""
-    return sorted(set(range(min(numbers), max(numbers) + 1)) - set(numbers)) if numbers else []
+    if not numbers:
+        return []
+    first, step, there = min(numbers), frame_step(numbers), set(numbers)
+    if step == 1:
+        return sorted(set(range(int(first), int(max(numbers)) + 1)) - there)
+    expected = (first + i * step for i in range(int((max(numbers) - first) / step) + 1))
+    return [number for number in expected if number not in there]
 
 
-def ranges(numbers: Iterable[int]) -> str:
-    """``0-3, 7``."""
-    parts: list[list[int]] = []
+def ranges(numbers: Iterable[Number]) -> str:
+    """``0-3, 7``; with numbers below 0, ``-3 to 2, 7``."""
+    numbers = list(numbers)
+    step = frame_step(numbers)
+    parts: list[list[Number]] = []
     for number in numbers:
-        if parts and number == parts[-1][-1] + 1:
+        if parts and number == parts[-1][-1] + step:
             parts[-1] = [parts[-1][0], number]
         else:
             parts.append([number])
-    return ", ".join("-".join(map(str, part)) for part in parts)
+    dash = " to " if any(number < 0 for number in numbers) else "-"
+    return ", ".join(dash.join(map(_text, part)) for part in parts)
 
 
-def _number(file: Path) -> int | None:
-    match = re.search(r"(\d+)$", file.stem)
-    return None if match is None else int(match[1])
+def _text(number: Number) -> str:
+    return str(number) if number.denominator == 1 else f"{float(number):.4g}"
 
 
-def _prefix(file: Path) -> str:
-    return re.sub(r"\d+$", "", file.stem)
+def _once(files: Iterable[Path]) -> list[Path]:
+    """The files. Raises ClipError for one that is there twice."""
+    seen: set[str] = set()
+    kept = []
+    for file in files:
+        place = os.path.abspath(file)
+        if place in seen:
+            raise ClipError(f"{file}: expected every frame once, got it twice; name it once.")
+        seen.add(place)
+        kept.append(file)
+    return kept
+
+
+def _expand(pattern: Path) -> list[Path]:
+    """The files that fit a pattern; parts of it that are there are no patterns, whatever is in their names."""
+    literal, rest = Path(), list(pattern.parts)
+    while rest and (literal / rest[0]).exists():
+        literal /= rest.pop(0)
+    shells = [_PLACEHOLDER.sub("*", part) for part in rest]
+    found = [Path(name) for name in glob.glob(os.path.join(glob.escape(str(literal)), *shells))]
+    if rest and (place := _PLACEHOLDER.search(rest[-1])):
+        tail = rest[-1][place.end() :].rpartition("*")[2]
+        found = [file for file in found if _counts(file.name, rest[-1][: place.start()], tail)]
+    files = [file for file in sorted(found) if file.is_file()]
+    return [file for file in files if file.suffix.lower() == ".exr"] or files
+
+
+def _counts(name: str, before: str, tail: str) -> bool:
+    """Whether a name has a number where a pattern asks for one: between what is before it and its end."""
+    middle = name[len(before) :].removesuffix(tail) if "*" not in before else name.removesuffix(tail)
+    return re.fullmatch(r"-?\d+(\.\d+)?" if "*" not in before else r".*\d", middle) is not None

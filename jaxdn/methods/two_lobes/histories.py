@@ -10,6 +10,7 @@ from typing import Annotated, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxdn import brdf
 from jaxdn.core.frame import Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser.statistics import FrameStatistics
@@ -175,10 +176,15 @@ def _weights(options: Options, frame: Frame, height: jax.Array) -> tuple[list[We
     return diffuse, specular
 
 
-def update_fast_mean(options: Options, past: jax.Array, now: jax.Array, length: jax.Array) -> jax.Array:
-    """The fast history [3, H, W] with colour ``now`` blended in; ``length`` [H, W] is that of the slow one."""
-    share = jnp.maximum(1.0 / options.fast_max, 1.0 / length)
-    return past + share[None] * (now - past)
+def update_fast_mean(
+    options: Options, past: jax.Array, past_texture: jax.Array, now: jax.Array, texture: jax.Array, length: jax.Array
+) -> jax.Array:
+    """The fast history [3, H, W] with colour ``now`` blended in, with the ``texture`` [3, H, W] of the frame.
+
+    ``past_texture`` [3, H, W] is that of the past, ``length`` [H, W] that of the slow history.
+    """
+    share = jnp.maximum(1.0 / options.fast_max, 1.0 / length)[None]
+    return brdf.restore(past + share * (now - past), texture, past_texture + share * (texture - past_texture))
 
 
 class CorrectedHistory(NamedTuple):

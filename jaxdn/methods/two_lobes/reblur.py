@@ -24,6 +24,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics
+from jaxdn.filters.accumulation import texture_ratio
 from jaxdn.filters.clamping import clamp_fireflies
 from jaxdn.filters.disc import TAPS, disc_average, rotations
 from jaxdn.filters.edge_stopping import closeness_weight
@@ -35,8 +36,10 @@ from jaxdn.methods.registry import method
 from jaxdn.methods.two_lobes import histories
 from jaxdn.methods.two_lobes.histories import LobeState, Signal
 
-_PLANES = 9
-"""Planes of a history: colour (3), length in frames, fast colour (3), steady luminance, closeness of diffuse hits."""
+_PLANES = 12
+"""Planes of a history: colour (3), length in frames, fast colour (3), steady luminance, closeness of diffuse hits, and
+the texture (3) of both colours and of the luminance.
+"""
 _LENGTH = 3
 _ALIKE, _LEAST = 0.2, 0.1
 """How much closeness may differ between taps of a reflection, and the weight of a tap that differs more."""
@@ -108,8 +111,8 @@ def reblur(options: Options) -> Denoiser:
 def _filter_signal(
     options: Options, signal: Signal, diffuse_closeness: jax.Array | None, number: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The new history [9, H, W] of one kind of light, and its image [3, H, W]."""
-    now, past = signal.now.light, signal.past
+    """The new history [12, H, W] of one kind of light, and its image [3, H, W]."""
+    now, texture, past = signal.now.light, signal.now.known_texture(), signal.past
     shape = now.shape[1:]
     length = jnp.minimum(past[_LENGTH] + 1.0, options.history_max)
     share = 1.0 / length
@@ -125,15 +128,16 @@ def _filter_signal(
 
     def blur(light: jax.Array, radius: jax.Array, turn: int) -> jax.Array:
         angle = rotations(shape, 6 * number + (3 if signal.diffuseness is None else 0) + turn, now.dtype)
-        texture = signal.now.texture
-        planes = light if texture is None else jnp.concatenate([light, texture])
+        planes = jnp.concatenate([light, texture])
         mean = disc_average(planes, signal.hit, weights, radius, angle, taps=TAPS if turn else TAPS[:4])
-        return mean if texture is None else brdf.restore(mean[:3], texture, mean[3:])
+        return brdf.restore(mean[:3], texture, mean[3:])
 
     if options.pre_radius:
         now = blur(now, options.pre_radius * far, 0)
-    slow = past[:3] + share[None] * (now - past[:3])
-    fast = histories.update_fast_mean(options, past[4:7], now, length)
+    past_texture = past[9:12]
+    mean_texture = past_texture + share[None] * (texture - past_texture)
+    slow = brdf.restore(past[:3] + share[None] * (now - past[:3]), texture, mean_texture)
+    fast = histories.update_fast_mean(options, past[4:7], past_texture, now, texture, length)
     held, length, _ = histories.correct_lag(options, signal._replace(weights=weights), slow, fast, length)
     if options.anti_firefly:
         held = clamp_fireflies(held, signal.surface_planes)
@@ -141,8 +145,11 @@ def _filter_signal(
         radius = jnp.maximum(options.radius * far / jnp.sqrt(length), options.radius_min * wide)
         held = blur(blur(held, radius, 1), 2.0 * radius, 2)
     stable_length = jnp.minimum(length, options.stable_max)
-    image, steady = stabilise(held, past[7], 1.0 - 1.0 / stable_length, signal.hit, sigma=options.stable_sigma)
-    return jnp.concatenate([held, length[None], fast, steady[None], kept[None]]), image
+    past_steady = past[7] * texture_ratio(past_texture, texture)
+    image, steady = stabilise(held, past_steady, 1.0 - 1.0 / stable_length, signal.hit, sigma=options.stable_sigma)
+    steady = steady * texture_ratio(texture, mean_texture)
+    colours = [brdf.restore(light, mean_texture, texture) for light in (held, fast)]
+    return jnp.concatenate([colours[0], length[None], colours[1], steady[None], kept[None], mean_texture]), image
 
 
 def _blend_closeness(past: jax.Array, now: jax.Array, share: jax.Array) -> jax.Array:

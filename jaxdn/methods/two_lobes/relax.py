@@ -1,11 +1,11 @@
 """``relax``: a variance-guided filter for diffuse and specular light apart, whose fast history holds the slow one.
 
 For each frame and for both kinds of light, divided by what their lobes reflect: fetch the history, for reflections
-along the motion of their virtual image; blend the frame into a slow and into a fast running mean; fill what has hardly
-any history from far around; where the fast mean contradicts the slow one, go on from the fast one, and clamp the slow
-mean to what the fast one shows near by, so that light that changed does not linger; on request, remove fireflies;
-estimate the variance, and apply a-trous levels guided by it, for reflections as narrow in normals and roughness as
-their lobe is.
+along the motion of their virtual image; blend the frame into a slow and into a fast running mean; where the fast mean
+contradicts the slow one, go on from the fast one; fill what has hardly any history from far around; clamp the slow mean
+to what the fast one shows near by, so that light that changed does not linger; on request, remove fireflies; estimate
+the variance, and apply a-trous levels guided by it, for reflections as narrow in normals and roughness as their lobe
+is.
 
 The history is the clamped mean, before the spatial filter: unlike in ``svgf``, nothing filtered is fed back.
 
@@ -19,11 +19,12 @@ from typing import Annotated, Any
 import jax
 import jax.numpy as jnp
 
+from jaxdn import brdf
 from jaxdn.core.frame import Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics
-from jaxdn.filters.accumulation import accumulate, after_shift
+from jaxdn.filters.accumulation import accumulate, after_shift, with_texture
 from jaxdn.filters.atrous import GAUSSIAN, stencil
 from jaxdn.filters.cascade import cascade
 from jaxdn.filters.clamping import clamp_fireflies
@@ -34,8 +35,11 @@ from jaxdn.methods.registry import method
 from jaxdn.methods.two_lobes import histories
 from jaxdn.methods.two_lobes.histories import LobeState, Signal
 
-_PLANES = 9
-"""Planes of a history: colour (3), two moments of its luminance, length in frames, fast colour (3)."""
+_PLANES = 12
+"""Planes of a history: colour (3), two moments of its luminance, length in frames, texture (3), fast colour (3).
+
+The texture is that of both colours and of the moments.
+"""
 _LENGTH = 5
 _TAPS = stencil(1, kernel=GAUSSIAN)
 _POSITIVE = Range(0, without_low=True)
@@ -87,13 +91,17 @@ def relax(options: Options) -> Denoiser:
 
 
 def _filter_signal(options: Options, signal: Signal) -> tuple[jax.Array, jax.Array]:
-    """The new history [9, H, W] of one kind of light, and its image [3, H, W]."""
-    now = signal.now.light
-    slow = accumulate(signal.past[:6], now, alpha=0.0, alpha_moments=0.0, history_max=options.history_max)
-    fast = histories.update_fast_mean(options, signal.past[6:9], now, slow[_LENGTH])
+    """The new history [12, H, W] of one kind of light, and its image [3, H, W]."""
+    now, texture, past = signal.now.light, signal.now.known_texture(), signal.past
+    means: dict[str, Any] = {"alpha": 0.0, "alpha_moments": 0.0, "history_max": options.history_max}
+    blended = accumulate(past[:9], now, texture=texture, **means)
+    mean_texture = blended[6:]
+    slow = with_texture(blended[:6], mean_texture, texture)
+    fast = histories.update_fast_mean(options, past[9:12], past[6:9], now, texture, slow[_LENGTH])
     held, length, shift = histories.correct_lag(options, signal, slow[:3], fast, slow[_LENGTH])
     moments = after_shift(slow[3:5], shift)
-    history = jnp.concatenate([held, moments, length[None], fast])
+    today = jnp.concatenate([held, moments, length[None]])
+    kept = with_texture(today, texture, mean_texture), mean_texture, brdf.restore(fast, mean_texture, texture)
     calm = clamp_fireflies(held, signal.surface_planes) if options.anti_firefly else held
     calm_history = jnp.concatenate([calm, moments, length[None]])
     own: dict[str, Any] = {"texture": signal.now.texture}
@@ -102,4 +110,4 @@ def _filter_signal(options: Options, signal: Signal) -> tuple[jax.Array, jax.Arr
     sigma = options.sigma_diffuse if signal.diffuseness is None else options.sigma_specular
     own |= {"levels": options.levels, "sigma_luminance": sigma}
     image, _ = cascade(calm, variance, signal.hit, lambda level: signal.weights, _TAPS, **own)
-    return history, image
+    return jnp.concatenate(kept), image

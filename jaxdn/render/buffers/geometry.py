@@ -93,7 +93,7 @@ def compute_motion(current: View, previous: View, *, disocclusion: bool = True) 
     A point counts as seen before if the *nearest* pixel of the previous frame shows the same shape, with normals within
     ``SAME_NORMAL`` and within ``SAME_PLANE`` of z of the point's plane. Where that pixel is sky while the point is not,
     nothing can have covered it, so a match in any of the four surrounding pixels is enough.
-    Source: Zeng et al. 2021, eq. 1 and 2. Raises ValueError if the two frames differ in size or shapes.
+    Raises ValueError if the two frames differ in size or shapes.
     """
     now, before = current.gbuffer, previous.gbuffer
     if now.names != before.names or now.ids.shape != before.ids.shape:

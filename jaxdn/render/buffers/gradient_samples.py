@@ -36,7 +36,7 @@ class GradientPoints(NamedTuple):
     """[n] view-space z there."""
 
 
-def compute_luminance_gradient(replay: Replay, frames: FramePair, *, max_depth: int) -> np.ndarray:
+def compute_luminance_gradient(replay: Replay, frames: FramePair, *, max_depth: int, with_direct: bool) -> np.ndarray:
     """Compute this buffer [H, W, 2]: change of the samples' luminance, and the larger luminance of both frames.
 
     It is scattered to the pixels that the points have reached, at most one in each stratum, and 0 elsewhere: where
@@ -47,6 +47,7 @@ def compute_luminance_gradient(replay: Replay, frames: FramePair, *, max_depth: 
       replay: of the tracer.
       frames: the two frames, and the sample of the previous frame's noisy image that is replayed.
       max_depth: path length.
+      with_direct: the noisy image holds all reflected light, not the indirect light alone.
     """
     previous, current = frames.previous, frames.current
     height, width = current.view.gbuffer.ids.shape[:2]
@@ -55,8 +56,9 @@ def compute_luminance_gradient(replay: Replay, frames: FramePair, *, max_depth: 
         return np.zeros((height, width, 2), np.float32)
     start = np.stack([points.pixel % width, points.pixel // width], -1) + 0.5
     numbers = frames.noise._replace(frame=frames.noise.frame - 1), frames.sample
-    old = replay(previous.scene, *numbers, start, points.pixel, max_depth=max_depth)
-    new = replay(current.scene, *numbers, points.target, points.pixel, max_depth=max_depth)
+    of_light = {"max_depth": max_depth, "with_direct": with_direct}
+    old = replay(previous.scene, *numbers, start, points.pixel, **of_light)
+    new = replay(current.scene, *numbers, points.target, points.pixel, **of_light)
     # Through the same point the ray hits this point, unless something is in between now.
     seen = np.linalg.norm(new.position - points.position, axis=-1) <= SAME_PLANE * points.depth
     first, second = old.light @ LUMINANCE, new.light @ LUMINANCE

@@ -1,7 +1,7 @@
 """The reflectance of the surface in every pixel: the share F_b of uniform incident light that it reflects.
 
 ``F_b(w_o) = integral of f_r(w_i, w_o) cos(theta_i) dw_i`` is the mean of the weights f cos / pdf that ``bsdf.sample``
-gives (Zhuang et al. 2021, eq. 5), so it agrees with the renderer, which samples the same BSDF. It is found in one of
+gives (Zhuang et al. 2021, eq. 7), so it agrees with the renderer, which samples the same BSDF. It is found in one of
 three ways, depending on the material:
 
 * diffuse: the albedo, which is its F_b;

@@ -60,7 +60,7 @@ class ReplayedPaths(NamedTuple):
     """Paths that were traced with the random numbers of others."""
 
     light: np.ndarray
-    """[n, 3] float64 indirect radiance; 0 where it was not finite."""
+    """[n, 3] float64 radiance, indirect or all that is reflected; 0 where it was not finite."""
     position: np.ndarray
     """[n, 3] float64 what the camera ray hit; NaN where it hit nothing."""
 

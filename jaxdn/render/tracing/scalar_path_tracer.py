@@ -138,7 +138,14 @@ def _add_guides(sums: SurfaceSums, place: int, one: SurfaceSums) -> None:
 
 
 def replay(
-    scene: Any, stream: SampleStream, sample: int, target: np.ndarray, pixel: np.ndarray, *, max_depth: int
+    scene: Any,
+    stream: SampleStream,
+    sample: int,
+    target: np.ndarray,
+    pixel: np.ndarray,
+    *,
+    max_depth: int,
+    with_direct: bool,
 ) -> ReplayedPaths:
     """Trace paths through any points of the image with reproducible random numbers.
 
@@ -147,13 +154,14 @@ def replay(
     each block of pixels.
     """
     sensor, key = scene.sensors()[0], stream.key()
-    deep, two, _ = _make_integrators(scene, max_depth)
+    deep, two, one = _make_integrators(scene, max_depth)
+    left_out = one if with_direct else two
     sampler: Any = mi.load_dict({"type": "independent"})
     light, position = np.zeros((len(pixel), 3)), np.full((len(pixel), 3), np.nan)
     for index, (x, y) in enumerate(target):
         ray = make_camera_rays(sensor, float(x) - 0.5, float(y) - 0.5)
         number = tea(key[0] ^ int(pixel[index]), key[1] ^ sample)[0]
-        parts = _trace_one(scene, ray, [deep, two], sampler, number)
+        parts = _trace_one(scene, ray, [deep, left_out], sampler, number)
         if np.all(parts[0] < BRIGHTEST):
             light[index] = np.maximum(parts[0] - parts[1], 0.0)
         hit = scene.ray_intersect(ray)

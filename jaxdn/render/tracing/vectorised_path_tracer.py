@@ -338,7 +338,14 @@ def _to_image(parts: Iterable[np.ndarray], height: int, width: int) -> np.ndarra
 
 
 def replay(
-    scene: Any, stream: SampleStream, sample: int, target: np.ndarray, pixel: np.ndarray, *, max_depth: int
+    scene: Any,
+    stream: SampleStream,
+    sample: int,
+    target: np.ndarray,
+    pixel: np.ndarray,
+    *,
+    max_depth: int,
+    with_direct: bool,
 ) -> ReplayedPaths:
     """Trace paths through any points of the image, each with the random numbers of one sample of one pixel.
 
@@ -349,12 +356,14 @@ def replay(
       target: [n, 2] (x, y) on the film; pixel centres are at 0.5.
       pixel: [n] index of the pixel whose numbers are used.
       max_depth: path length.
+      with_direct: their light is all that is reflected, not the indirect light alone.
     """
     column, row = (mi.Float((target[:, axis] - 0.5).astype(np.float32)) for axis in range(2))
     ray = make_camera_rays(scene.sensors()[0], column, row)
     numbers = make_generator(mi.UInt32(pixel.astype(np.uint32)), dr.opaque(mi.UInt32, sample), stream.key())
     emitted, direct, indirect = trace(scene, ray, numbers, dr.opaque(mi.UInt32, max_depth))
-    light = dr.select(dr.all(emitted + direct + indirect < BRIGHTEST), indirect, 0.0)
+    wanted = direct + indirect if with_direct else indirect
+    light = dr.select(dr.all(emitted + direct + indirect < BRIGHTEST), wanted, 0.0)
     hit = scene.ray_intersect(ray)
     position = dr.select(hit.is_valid(), hit.p, dr.nan)
     dr.eval(light, position)

@@ -1,0 +1,78 @@
+"""A folder for files of one run, which goes with it; what a killed run left behind is removed by the next."""
+
+import os
+import secrets
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def scratch_folder(parent: Path, prefix: str) -> Iterator[Path]:
+    """A new folder ``parent/prefix...``, removed when the block is left, however it is left.
+
+    A killed process cannot remove its folder. The next one does: it finds the folders whose process has gone by the
+    lock on the file beside each of them, which the system gives up with the process. Folders of other processes that
+    still work stay, also those of other machines that share a disk with locks.
+    """
+    _remove_abandoned(parent, prefix)
+    lock, handle = _new_lock(parent, prefix)
+    folder = lock.with_suffix("")
+    try:
+        folder.mkdir()
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(handle)
+        lock.unlink(missing_ok=True)
+
+
+def _new_lock(parent: Path, prefix: str) -> tuple[Path, int]:
+    """A file that is locked before anybody can see its folder, and its handle."""
+    while True:
+        lock = parent / f"{prefix}{secrets.token_hex(4)}.lock"
+        handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_RDWR)
+        _try_lock(handle)
+        if lock.exists():  # else another process has taken it for abandoned, before it was locked
+            return lock, handle
+        os.close(handle)
+
+
+def _remove_abandoned(parent: Path, prefix: str) -> None:
+    """Remove the folders, and the files beside them, whose process has gone."""
+    names = {path.name.removesuffix(".lock") for path in parent.iterdir() if path.name.startswith(prefix)}
+    for name in names:
+        lock = parent / f"{name}.lock"
+        try:
+            handle = os.open(lock, os.O_RDWR)
+        except FileNotFoundError:  # the lock comes before the folder and goes after it
+            shutil.rmtree(parent / name, ignore_errors=True)
+            continue
+        except OSError:
+            continue
+        try:
+            free = _try_lock(handle)
+            if free:
+                shutil.rmtree(parent / name, ignore_errors=True)
+        finally:
+            os.close(handle)
+        if free:
+            lock.unlink(missing_ok=True)
+
+
+def _try_lock(handle: int) -> bool:
+    """Lock a file for as long as it is open in this process; False if another has locked it, or nobody can."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True

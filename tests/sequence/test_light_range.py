@@ -1,0 +1,181 @@
+"""Any unit and range of light: what denoisers cannot take is set aside and comes back. Arrays and real files."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxdn import clips, color
+from jaxdn.core.frame import RADIANCE_MAX, Frame
+from jaxdn.data.clip.frames import StoredFrame
+from jaxdn.metrics import psnr
+from jaxdn.sequence.light_range import (
+    BRIGHTEST,
+    DRIFT,
+    LEVEL,
+    bound_light,
+    choose_exponent,
+    find_lamps,
+    restore_light,
+)
+from jaxdn.sequence.run import denoise_files
+from jaxdn.sequence.settings import Settings
+from jaxdn.zoo.ready import find_model
+from tests.sequence.test_safe import picture
+
+SIZE = (48, 64)
+LAMP_PIXELS = np.s_[2:7, 52:57]
+
+
+def grey(rng: np.random.Generator, level: float = LEVEL, samples: float = 4) -> np.ndarray:
+    noise = rng.gamma(samples, 1 / samples, (*SIZE, 1))
+    return np.repeat(level * noise, 3, axis=-1).astype(np.float32)
+
+
+def write(folder: Path, scale: float, *, samples: int | None = 4, dtype: type = np.float32, lamp: float = 0) -> Path:
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for frame in range(3):
+        light = picture(frame)
+        if samples is not None:
+            light = light * rng.gamma(samples, 1 / samples, (*SIZE, 1))
+        albedo = np.full(SIZE, 0.5, np.float32)
+        albedo[LAMP_PIXELS] = 1
+        if lamp:
+            light[LAMP_PIXELS] = lamp
+        planes = np.moveaxis((scale * light).astype(dtype), -1, 0)
+        guides = {f"albedo.{letter}": albedo for letter in "RGB"}
+        clips.write_exr(folder / f"a.{frame:04d}.exr", dict(zip("RGB", planes, strict=True)) | guides)
+    return folder
+
+
+def denoise(source: Path, *, method: str = "svgf", **settings: bool) -> tuple[list[np.ndarray], list[str]]:
+    told: list[str] = []
+    out = source.with_name(f"{source.name}-out{len(list(source.parent.iterdir()))}")
+    files = denoise_files([source], out, find_model(method), Settings(**settings), log=told.append).files
+    return [np.stack([clips.read_exr(file)[letter] for letter in "RGB"], axis=-1) for file in files], told
+
+
+def decibels(image: np.ndarray, frame: int) -> float:
+    return float(psnr(color.tonemap(image), color.tonemap(picture(frame))))
+
+
+@pytest.mark.parametrize("bidirectional", [False, True])
+def test_results_scale_with_their_input(tmp_path: Path, bidirectional: bool) -> None:
+    """By powers of two exactly, by others nearly; float32 files."""
+    usual, _ = denoise(write(tmp_path / "usual", 1.0), bidirectional=bidirectional)
+    for name, scale in (("small", 2.0**-30), ("large", 2.0**40), ("1e-9", 1e-9), ("1e12", 1e12)):
+        images, _ = denoise(write(tmp_path / name, scale), bidirectional=bidirectional)
+        for frame, (image, wanted) in enumerate(zip(images, usual, strict=True)):
+            if name in ("small", "large"):
+                np.testing.assert_allclose(image, scale * wanted, rtol=1e-6)
+            assert abs(decibels(image / np.float32(scale), frame) - decibels(wanted, frame)) < 0.2
+
+
+@pytest.mark.parametrize("safe", [True, False])
+@pytest.mark.parametrize("method", ["oidn", "steady-balanced"])
+def test_a_lamp_comes_back_and_its_brightness_does_not_matter(tmp_path: Path, method: str, safe: bool) -> None:
+    """Beside the sun the rest of a frame is nearly as good as beside a bulb."""
+    rest = np.ones(SIZE, bool)
+    rest[LAMP_PIXELS] = False
+
+    def measure(lamp: float) -> list[float]:
+        images, _ = denoise(write(tmp_path / f"{lamp:g}", 1.0, lamp=lamp), method=method, safe=safe)
+        for frame, image in enumerate(images):
+            np.testing.assert_allclose(image[LAMP_PIXELS], lamp, rtol=1e-6)
+            image[~rest] = picture(frame)[~rest]
+        return [decibels(image, frame) for frame, image in enumerate(images)]
+
+    bulb = measure(12.0)
+    for bright in (3000.0, 2e6):
+        assert all(other > one - 1.0 for one, other in zip(bulb, measure(bright), strict=True))
+
+
+def test_half_files_are_clamped_when_they_are_written(tmp_path: Path) -> None:
+    """A denoised frame, and one that comes back."""
+    images, _ = denoise(write(tmp_path / "half", 40000.0, dtype=np.float16))
+    assert images[0].dtype == np.float16
+    assert np.isfinite(images[0]).all()
+    images, _ = denoise(write(tmp_path / "lamp", 1.0, samples=None, dtype=np.float16, lamp=RADIANCE_MAX))
+    assert images[0].max() == RADIANCE_MAX
+
+
+def test_negative_light_comes_back(tmp_path: Path) -> None:
+    """Without noise exactly, noisy with less noise than it had."""
+    turn = np.linalg.inv([[0.6131, 0.3395, 0.0474], [0.0702, 0.9164, 0.0134], [0.0206, 0.1096, 0.8698]])
+
+    def wide(frame: int) -> np.ndarray:
+        return (picture(frame) * [0.05, 0.9, 0.1]) @ turn.T
+
+    rng = np.random.default_rng(0)
+    for name, samples in (("clean", None), ("noisy", 4)):
+        (tmp_path / name).mkdir()
+        for frame in range(3):
+            noise = 1 if samples is None else rng.gamma(samples, 1 / samples, (*SIZE, 1))
+            light = (wide(frame) * noise).astype(np.float32)
+            assert light.min() < -0.01
+            clips.write_exr(
+                tmp_path / name / f"a.{frame:04d}.exr", dict(zip("RGB", np.moveaxis(light, -1, 0), strict=True))
+            )
+    for image, frame in zip(denoise(tmp_path / "clean")[0], range(3), strict=True):
+        np.testing.assert_allclose(image, wide(frame), rtol=1e-5, atol=1e-7)
+    for safe in (True, False):
+        image, wanted = denoise(tmp_path / "noisy", safe=safe)[0][-1], wide(2)
+        noisy = clips.read_exr(tmp_path / "noisy" / "a.0002.exr")["R"]
+        assert np.mean((image[..., 0] - wanted[..., 0]) ** 2) < 0.4 * np.mean((noisy - wanted[..., 0]) ** 2)
+        assert abs(image[..., 0].mean() / wanted[..., 0].mean() - 1) < 0.1
+
+
+def test_the_factor_follows_the_median_and_stays(rng: np.random.Generator) -> None:
+    dark = grey(rng, 1e-6)
+    assert choose_exponent(np.zeros_like(dark), None) is None
+    assert choose_exponent(np.full_like(dark, np.nan), 3) == 3
+    exponent = choose_exponent(dark, None)
+    assert exponent == round(np.log2(LEVEL / 1e-6))
+    dark[LAMP_PIXELS] = 1e6
+    assert choose_exponent(dark, None) == exponent
+    assert choose_exponent(dark * 2.0 ** (DRIFT - 1), exponent) == exponent
+    assert choose_exponent(dark * 2.0 ** (DRIFT + 1), exponent) == exponent - DRIFT - 1
+
+
+def test_light_that_drifts_begins_the_history_anew_and_says_so(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    for frame in range(4):
+        light = np.full(SIZE, 1e-3 if frame < 2 else 1e3, np.float32)
+        clips.write_exr(tmp_path / "in" / f"a.{frame:04d}.exr", dict.fromkeys("RGB", light))
+    images, told = denoise(tmp_path / "in", method="taa", safe=False)
+    for image, light in zip(images, (1e-3, 1e-3, 1e3, 1e3), strict=True):
+        np.testing.assert_allclose(image, light, rtol=1e-5)
+    assert sum("the light changes by more than a factor of 256" in line for line in told) == 1
+
+
+def test_what_was_bounded_is_restored(rng: np.random.Generator) -> None:
+    light = grey(rng)
+    light[LAMP_PIXELS] = [3e6, 2e6, 1e6]
+    light[30, 10] = 5e6  # a firefly
+    light[10:20, 10:20] *= 1e7  # noisy, beyond the limit
+    light[40, 40] = [-0.02, 0.3, 0.1]
+    light[45, 5] = np.nan
+    lamps = find_lamps(light, 0)[..., 0]
+    assert lamps[LAMP_PIXELS].all()
+    assert lamps.sum() <= 25 + 3
+    bounded = np.asarray(bound_light(StoredFrame(Frame(light)), 0).frame.radiance)
+    assert np.isnan(bounded[45, 5]).all()
+    known = np.isfinite(bounded)
+    assert bounded[known].min() >= 0
+    assert bounded[known].max() <= RADIANCE_MAX
+    np.testing.assert_allclose(bounded[LAMP_PIXELS] @ color.LUMINANCE, BRIGHTEST, rtol=1e-5)
+    image = restore_light(np.nan_to_num(bounded), light, 0)
+    np.testing.assert_allclose(image[LAMP_PIXELS], light[LAMP_PIXELS], rtol=1e-6)
+    np.testing.assert_allclose(image[30, 10], RADIANCE_MAX)
+    assert np.median(image[10:20, 10:20] / light[10:20, 10:20]) > 0.9
+    ordinary = np.ones(SIZE, bool)
+    ordinary[LAMP_PIXELS] = ordinary[10:20, 10:20] = ordinary[30, 10] = ordinary[45, 5] = False
+    ordinary[39:42, 39:42] = False
+    np.testing.assert_array_equal(image[ordinary], light[ordinary])
+    assert -0.02 < image[40, 40, 0] < 0
+
+
+def test_ordinary_frames_are_not_copied(rng: np.random.Generator) -> None:
+    stored = StoredFrame(Frame(grey(rng)))
+    assert bound_light(stored, 0) is stored

@@ -1,0 +1,152 @@
+"""A file for each pass: one frame by their names or by patterns that are stated, and never a picture of data."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jaxdn import clips
+from jaxdn.commands import main
+from jaxdn.data.foreign.classify import ChannelNaming
+from jaxdn.data.foreign.passes import read_pass_name
+from jaxdn.data.foreign.shots import Shot
+from jaxdn.sequence.run import denoise_files
+from jaxdn.sequence.settings import Settings
+from tests.data.test_kept import box_blur
+from tests.programs import Channels, layer, truth
+
+FRAMES = 3
+Place = Callable[[str, int], str]
+
+
+def passes(frame: int) -> dict[str, Channels]:
+    """Each pass as a file has it: three channels, or Z alone."""
+    now = truth(frame)
+    rgba = np.concatenate([now.light, now.alpha], axis=-1)
+    return {
+        "beauty": layer("", rgba, "RGBA"),
+        "albedo": layer("", now.albedo, "RGB"),
+        "normal": layer("", now.normal, "RGB"),
+        "depth": layer("", now.depth, "RGB"),
+    }
+
+
+def write(folder: Path, place: Place, frames: int = FRAMES, **more: Channels) -> Path:
+    """Every pass of every frame in a file of its own."""
+    for frame in range(1, frames + 1):
+        for name, channels in (passes(frame) | more).items():
+            path = folder / place(name, frame)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            clips.write_exr(path, channels)
+    return folder
+
+
+PLACES: dict[str, tuple[Place, str]] = {
+    "name.number": (lambda name, frame: f"{name}.{frame:04d}.exr", "beauty.{:04d}.exr"),
+    "shot_name_number": (lambda name, frame: f"sh010_{name}_{frame:04d}.exr", "sh010_beauty_{:04d}.exr"),
+    "number.name": (lambda name, frame: f"sh010.{frame:04d}.{name}.exr", "sh010.{:04d}.beauty.exr"),
+    "nameNumber": (lambda name, frame: f"{name.title()}{frame:04d}.exr", "Beauty{:04d}.exr"),
+    "the picture without a name": (
+        lambda name, frame: f"sh.{frame:04d}.exr" if name == "beauty" else f"sh.{name}.{frame:04d}.exr",
+        "sh.{:04d}.exr",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", PLACES)
+def test_passes_in_files_of_their_own_are_one_frame(case: str, tmp_path: Path) -> None:
+    place, result = PLACES[case]
+    source, told = write(tmp_path / "in", place), list[str]()
+    written = denoise_files([source], tmp_path / "out", box_blur(), Settings(), log=told.append)
+    expected = [result.format(number) for number in range(1, FRAMES + 1)]
+    assert [path.name for path in written.files] == expected
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == expected
+    assert "a file for each pass" in told[0]
+    after, before = clips.read_exr(tmp_path / "out" / expected[0]), clips.read_exr(source / expected[0])
+    assert set(after) == set("RGBA")
+    np.testing.assert_array_equal(after["A"], before["A"])
+    assert np.abs(after["R"] - before["R"]).max() > 0.01
+    clip = clips.read_clip(source)
+    np.testing.assert_allclose(clip.frames.albedo[0], truth(1).albedo, rtol=1e-6)
+    np.testing.assert_allclose(clip.frames.normal[0], truth(1).normal, rtol=1e-6)
+    np.testing.assert_allclose(clip.frames.depth[0], truth(1).depth, rtol=1e-6)
+
+
+def test_a_folder_for_each_pass(tmp_path: Path) -> None:
+    source = write(tmp_path / "in", lambda name, frame: f"{name}/sh.{frame:04d}.exr")
+    told: list[str] = []
+    sources = [source / name for name in ("beauty", "albedo", "normal")]
+    written = denoise_files(sources, tmp_path / "out", box_blur(), log=told.append)
+    assert [path.name for path in written.files] == [f"sh.{number:04d}.exr" for number in range(1, FRAMES + 1)]
+    assert "albedo from sh.0001.exr, normal from sh.0001.exr" in told[0]
+
+
+@pytest.mark.parametrize("pattern", ["*_colours.exr", "####_colours.exr"])
+def test_patterns_name_the_files_of_a_pass(pattern: str, tmp_path: Path, capsys: Any) -> None:
+    source = write(tmp_path / "in", lambda name, frame: f"{frame:04d}_{'colours' if name == 'albedo' else name}.exr")
+    channels = {"albedo": str(source / pattern)}
+    clip = clips.read_clip(source, channels=channels)
+    np.testing.assert_allclose(clip.frames.albedo[1], truth(2).albedo, rtol=1e-6)
+    denoise_files([source], tmp_path / "out", box_blur(), Settings(naming=ChannelNaming(channels=channels)))
+    assert len(list((tmp_path / "out").iterdir())) == FRAMES
+    main.main(["inspect", str(source), "--channels", f"albedo={source / pattern}"])
+    assert "share of light" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main.main(["inspect", str(source), "--channels", f"albedo={source}/none_*.exr"])
+    assert "none_*.exr: expected a folder of EXR files, a pattern" in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_frame_without_one_of_its_passes_is_missing(tmp_path: Path) -> None:
+    source, told = write(tmp_path / "in", PLACES["name.number"][0]), list[str]()
+    (source / "albedo.0001.exr").unlink()
+    (source / "normal.0003.exr").write_bytes(b"")
+    written = denoise_files([source], tmp_path / "out", box_blur(), log=told.append)
+    assert [path.name for path in written.files] == ["beauty.0002.exr"]
+    assert [path.name for path in written.left_out] == ["beauty.0001.exr", "beauty.0003.exr"]
+    assert any("a file without albedo" in line for line in told)
+    assert any("normal.0003.exr: the file is empty (0 bytes)" in line for line in told)
+
+
+def test_a_data_pass_is_never_a_picture(tmp_path: Path, capsys: Any) -> None:
+    depth = layer("", truth(1).depth, "Z")
+    source = write(tmp_path / "in", lambda name, frame: f"{name}.{frame:04d}.exr", aaa=depth)
+    (tmp_path / "in" / "other_albedo.0001.exr").write_bytes((source / "albedo.0001.exr").read_bytes())
+    told: list[str] = []
+    written = denoise_files([source], tmp_path / "out", box_blur(), log=told.append)
+    assert {path.name.partition(".")[0] for path in written.files} == {"beauty"}
+    assert any("aaa.#.exr 1-3 is left out: " in line and "no radiance" in line for line in told)
+    assert any("other_albedo.0001.exr: not a picture but a data pass (albedo), left out" in line for line in told)
+    with pytest.raises(SystemExit) as ended:
+        main.main(["denoise", str(source / "albedo.*.exr"), "-o", str(tmp_path / "no"), "--method", "noisy"])
+    assert ended.value.code == 2
+    assert "not a picture but a data pass (albedo)" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "no").exists()
+
+
+def test_whole_frames_are_frames_whatever_they_are_called(tmp_path: Path) -> None:
+    now = truth(1)
+    channels = layer("", now.light, "RGB") | layer("N", now.normal, "XYZ")
+    for name in ("albedo.0001.exr", "beauty.0001.exr", "motion_0001.exr"):
+        (tmp_path / "in").mkdir(exist_ok=True)
+        clips.write_exr(tmp_path / "in" / name, channels)
+    assert len(denoise_files([tmp_path / "in"], tmp_path / "out", box_blur()).files) == 3
+    clips.write_exr(tmp_path / "vector_0001.exr", layer("", now.light, "RGB"))  # a shot may be called so
+    assert len(denoise_files([tmp_path / "vector_0001.exr"], tmp_path / "out", box_blur()).files) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "word", "buffer"),
+    [
+        ("sh_Denoising Albedo#", "denoising albedo", "albedo"),
+        ("sh.diffuseFilter.#", "diffusefilter", "albedo"),
+        ("sh_Z_#", "z", "depth"),
+        ("Image#", "image", "radiance"),
+        ("normality_#", "", None),
+        ("beautyshot.#", "", None),
+    ],
+)
+def test_words_for_passes_stand_alone(name: str, word: str, buffer: str | None) -> None:
+    found = read_pass_name(Shot((Path(f"{name}.exr"),), (1,), name))
+    assert (found.word, found.buffer) == (word, buffer)
