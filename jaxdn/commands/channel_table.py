@@ -17,6 +17,7 @@ CONSEQUENCES: dict[str, str] = {
     "roughness": "every surface counts as diffuse: sharp reflections are blurred",
     "motion": "everything counts as still: what moves leaves trails",
     "ids": "things that touch are told apart by their normals and depths alone",
+    "specular_hit_distance": "reflections are looked for where their surface was",
     "specular_reflectance": "light is divided by the albedo alone: more noise stays on glossy surfaces",
 }
 """What it costs not to have a buffer that other renderers have a name for."""

@@ -20,7 +20,7 @@ from jaxdn.core.frame import BUFFERS, OF_SAMPLES
 from jaxdn.data.clip.folder import is_clip
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
-from jaxdn.data.foreign.shots import ranges
+from jaxdn.data.foreign.shots import is_named, ranges
 from jaxdn.denoiser import Denoiser
 from jaxdn.effects import EFFECTS, Plan, choose_all_effects, inspect, plan
 from jaxdn.render.open_scene import open_scene
@@ -59,7 +59,7 @@ def inspect_to_terminal(
     """
     reader = None if denoiser is None else find_denoiser(denoiser)
     source = sources[0]
-    if other := [name for name in sources if len(sources) > 1 and not Path(name).is_file()]:
+    if other := [name for name in sources if len(sources) > 1 and not is_named(Path(name))]:
         raise ValueError(f"{other[0]}: expected one scene, clip, folder or pattern, or several EXR files; name one.")
     clip = is_clip(source)
     if not clip and (len(sources) > 1 or Path(source).is_dir() or source.lower().endswith(".exr")):

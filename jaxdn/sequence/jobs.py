@@ -12,7 +12,7 @@ from jaxdn.data.clip.folder import frame_path, is_clip, read_record, refuse_unfi
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.passes import join_passes
 from jaxdn.data.foreign.shot_files import open_files
-from jaxdn.data.foreign.shots import Shot, find_shots, missing, ranges
+from jaxdn.data.foreign.shots import Shot, find_shots, is_named, missing, ranges
 
 WARM_UP = 16
 """Frames before a wanted one that are read for its history where only a part of a shot is denoised. After so many,
@@ -166,7 +166,7 @@ def _gather(sources: Sequence[Path]) -> list[Path | list[Path]]:
     gathered: list[Path | list[Path]] = []
     files: list[Path] = []
     for source in sources:
-        if not source.is_file():
+        if not is_named(source):
             gathered.append(source)
             continue
         if not files:

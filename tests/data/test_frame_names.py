@@ -37,6 +37,13 @@ CASES = {
     "thirds": ([f"s.{n}.exr" for n in ("007.00", "007.33", "007.67", "008.00")],
                {"s.#": [7, Fraction(22, 3), Fraction(23, 3), 8]}),
     "negative halves": (["s.-1.5.exr", "s.-1.0.exr", "s.0.0.exr"], {"s.#": [Fraction(-3, 2), -1, 0]}),
+    "whole frames without a zero": (["s.11.exr", "s.11.5.exr", "s.12.exr"], {"s.#": [11, Fraction(23, 2), 12]}),
+    "whole frames, and a pass": (["s.1.v3.exr", "s.1.25.v3.exr", "s.1.5.v3.exr", "s.1.75.v3.exr", "s.2.v3.exr"],
+                                 {"s.#.v3": [1, Fraction(5, 4), Fraction(3, 2), Fraction(7, 4), 2]}),
+    "a shot beside its takes": (["s.1.exr", "s.2.exr", "s.2.0001.exr"], {"s.#": [1, 2], "s.2.#": [1]}),
+    "round brackets": (["still (1).exr", "still (2).exr"], {"still (#)": [1, 2]}),
+    "square brackets": (["s [0001].exr", "s [0002].exr"], {"s [#]": [1, 2]}),
+    "a size is no frame": (["s_2048x1024.exr", "s_512x256.exr"], {"s_2048x1024": [None], "s_512x256": [None]}),
     "takes are no subframes": (["1.0001.exr", "1.0002.exr", "2.0001.exr"], {"1.#": [1, 2], "2.#": [1]}),
     "upper case": (["S_01.EXR", "S_02.EXR"], {"S_#": [1, 2]}),
     "no number": (["still.exr", "v2_final.exr"], {"still": [None], "v2_final": [None]}),
@@ -75,6 +82,13 @@ def test_folders_with_brackets_and_placeholders_of_numbers(pattern: str, tmp_pat
 def test_a_placeholder_is_a_number(tmp_path: Path) -> None:
     touch(tmp_path, "s.001.exr", "s.left.exr")
     assert [file.name for shot in find_shots(tmp_path / "s.###.exr") for file in shot.files] == ["s.001.exr"]
+
+
+@pytest.mark.parametrize("pattern", ["*.exr", "s.###.exr", "*.EXR"])
+def test_a_pattern_fits_both_cases_of_exr(pattern: str, tmp_path: Path) -> None:
+    touch(tmp_path, "s.001.EXR", "s.002.EXR", "s.001.png")
+    (shot,) = find_shots(tmp_path / pattern)
+    assert [file.name for file in shot.files] == ["s.001.EXR", "s.002.EXR"]
 
 
 def test_files_that_are_named_one_by_one(tmp_path: Path) -> None:

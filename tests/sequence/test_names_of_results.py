@@ -64,6 +64,18 @@ def test_links_keep_their_own_names(tmp_path: Path) -> None:
     assert brightness(tmp_path / "0" / "s.0002.exr") == 2.0
 
 
+def test_a_link_to_a_file_that_is_missing_is_a_missing_frame(tmp_path: Path, capsys: Any) -> None:
+    source = write(tmp_path / "in", "s.0001.exr", "s.0003.exr")
+    os.symlink(tmp_path / "nowhere.exr", source / "s.0002.exr")
+    names = [source / f"s.{number:04d}.exr" for number in (1, 2, 3)]
+    for number, sources in enumerate(([source], [source / "*.exr"], names)):
+        files, told = denoise(sources, tmp_path / str(number))
+        assert files == ["s.0001.exr", "s.0003.exr"]
+        assert any("s.0002.exr is left out, as a missing frame: No such file" in line for line in told)
+    main.main(["inspect", *map(str, names)])
+    assert "s.0002.exr counts as a missing frame: No such file" in capsys.readouterr().out
+
+
 def test_a_held_frame_is_that_frame(tmp_path: Path) -> None:
     source = write(tmp_path / "in", "s.0001.exr", "s.0002.exr", "s.0005.exr")
     os.symlink(source / "s.0002.exr", source / "s.0003.exr")

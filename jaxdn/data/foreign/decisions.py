@@ -116,6 +116,7 @@ _SAID = {
     "normal": "",
     "depth": "",
     "roughness": "",
+    "specular_hit_distance": "",
     "motion": "; right where nothing moves, but Blender writes zeros where motion blur is on: "
     "what moves leaves trails then, so render without motion blur, or add it afterwards",
 }
@@ -134,7 +135,7 @@ def _explain_empty(name: str, values: np.ndarray) -> str | None:
     return "0 everywhere" if name in _ZEROS and not np.any((values != 0) & known) else None
 
 
-_ZEROS = ("albedo", "depth", "roughness", "motion", "ids")
+_ZEROS = ("albedo", "depth", "roughness", "motion", "ids", "specular_hit_distance")
 """Buffers that are empty where they are 0 everywhere; no specular reflectance is one, too."""
 
 

@@ -1,17 +1,20 @@
 """Frame numbers in the names of files: ``shot_0001.exr``, ``shot.-003.exr``, ``0001_L.exr``, ``shot.0001.beauty.exr``.
 
 Which of several numbers counts the frames is told by the files together: it is the last one that differs among names
-that are otherwise alike. Numbers between dots may be subframes, ``shot.12.50.exr``.
+that are otherwise alike. Numbers between dots may be subframes, ``shot.12.50.exr``; whole frames between them may lack
+the zero, ``shot.12.exr``, as Houdini's ``$FF`` writes them.
 """
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
 _RUN = re.compile(r"(?:(?:^|(?<=[._-]))-)?\d+")
 """A number; a minus belongs to it after a separator or at the beginning."""
+_ENDS = "._- ()[]{}#,+=@"
+"""What a name is parted by."""
 _INSIDE = 4
 """Digits of a number that counts frames though letters touch it and more follows, as in ``frame0001_left``."""
 
@@ -28,30 +31,60 @@ class FrameName(NamedTuple):
 
 def read_frame_names(files: Iterable[Path]) -> list[FrameName]:
     """The shot and the frame number of each file, in the order of the files."""
-    groups: dict[tuple[Path, str, str], list[Path]] = {}
+    files = list(files)
+    groups: dict[_Alike, dict[Path, str]] = {}
     for file in files:
-        groups.setdefault((file.parent, _RUN.sub("#", file.stem), file.suffix.lower()), []).append(file)
+        alike = _Alike(file.parent, _RUN.sub("#", file.stem), file.suffix.lower())
+        groups.setdefault(alike, {})[file] = file.stem
+    for alike in [alike for alike in groups if alike.name.count("#.#") == 1]:
+        _add_whole_frames(groups, alike)
     named = {name.file: name for group in groups.values() for name in _read_group(group)}
-    return [named[file] for group in groups.values() for file in group]
+    return [named[file] for file in files]
 
 
-def _read_group(files: Sequence[Path]) -> list[FrameName]:
-    """Names that are alike but for their numbers."""
-    runs = [list(_RUN.finditer(file.stem)) for file in files]
+class _Alike(NamedTuple):
+    """What names have in common that are alike but for their numbers."""
+
+    folder: Path
+    name: str
+    """With ``#`` for each number."""
+    suffix: str
+
+
+def _add_whole_frames(groups: dict[_Alike, dict[Path, str]], alike: _Alike) -> None:
+    """Give subframes the whole frames between them that lack the zero, as files of their group."""
+    whole = alike._replace(name=alike.name.replace("#.#", "#"))
+    place = alike.name[: alike.name.index("#.#")].count("#")
+    both = dict(groups[alike])
+    for file, stem in groups.get(whole, {}).items():
+        end = list(_RUN.finditer(stem))[place].end()
+        both[file] = f"{stem[:end]}.0{stem[end:]}"
+    if len(both) == len(groups[alike]):
+        return
+    runs = [list(_RUN.finditer(stem)) for stem in both.values()]
+    if _subframes(list(both.values()), runs, place + 1) is not None:
+        groups[alike] = both
+        del groups[whole]
+
+
+def _read_group(files: Mapping[Path, str]) -> list[FrameName]:
+    """Names that are alike but for their numbers: file -> its stem."""
+    stems = list(files.values())
+    runs = [list(_RUN.finditer(stem)) for stem in stems]
     values = [[int(run[0]) for run in each] for each in runs]
     places = range(len(runs[0]))
     varying = [place for place in places if len({each[place] for each in values}) > 1]
-    ranks = {place: _rank(runs[0], place, files[0].stem) for place in places}
+    ranks = {place: _rank(runs[0], place, stems[0]) for place in places}
     # A number that differs comes first, but for one that letters touch: of sh0010_0001, sh0020_0001 it is the shot's.
     scores = [(rank + 1.5 * (rank > 0 and place in varying), place) for place, rank in ranks.items()]
     rank, place = max(scores, default=(0, -1))
     if rank == 0:
-        return [FrameName(file, file.stem, None) for file in files]
-    parts = _subframes(files, runs, place) if place - 1 in varying else None
+        return [FrameName(file, stem, None) for file, stem in files.items()]
+    parts = _subframes(stems, runs, place) if place > 0 else None
     names = []
     for index, (file, found) in enumerate(zip(files, runs, strict=True)):
         start = found[place].start() if parts is None else found[place - 1].start()
-        shot = f"{file.stem[:start]}#{file.stem[found[place].end() :]}"
+        shot = f"{stems[index][:start]}#{stems[index][found[place].end() :]}"
         names.append(FrameName(file, shot, Fraction(values[index][place]) if parts is None else parts[index]))
     return names
 
@@ -61,20 +94,24 @@ def _rank(runs: Sequence[re.Match[str]], place: int, stem: str) -> int:
     run = runs[place]
     before, after = stem[: run.start()][-1:], stem[run.end() :][:1]
     digits = len(run[0].lstrip("-"))
-    if before in "._-" and after in "._-":  # "" is in every string: the beginning, and the end
+    if before in _ENDS and after in _ENDS:  # "" is in every string: the beginning, and the end
         return 3
+    if re.search(r"\dx$", stem[: run.start()]) or re.match(r"x\d", stem[run.end() :]):  # a size, 2048x1024
+        return 0
     if not after:
         return 3 if digits > 2 else 2
     return 1 if digits >= _INSIDE else 0
 
 
-def _subframes(files: Sequence[Path], runs: Sequence[Sequence[re.Match[str]]], place: int) -> list[Fraction] | None:
+def _subframes(stems: Sequence[str], runs: Sequence[Sequence[re.Match[str]]], place: int) -> list[Fraction] | None:
     """Numbers with fractions, where the last two numbers are that: 1.0, 1.5, 2.0, or 1.00, 1.33, 1.67; None elsewhere.
 
     Fractions are those of equal steps from 0 on. Others are no fractions but frames of numbered shots.
     """
     first, second = runs[0][place - 1], runs[0][place]
-    if files[0].stem[first.end() : second.start()] != "." or any(run[place][0].startswith("-") for run in runs):
+    if stems[0][first.end() : second.start()] != "." or any(run[place][0].startswith("-") for run in runs):
+        return None
+    if len({run[place - 1][0] for run in runs}) == 1:  # of one number there are versions, not parts
         return None
     digits = {run[place][0] for run in runs}
     decimals = sorted({Fraction(int(text), 10 ** len(text)) for text in digits})

@@ -198,6 +198,8 @@ def _converted(name: str, image: np.ndarray, channels: Channels, convention: str
     if buffer.kind == "vector" and convention is not None:
         return convert_motion(image, convention)
     if buffer.kind == "distance":
+        if name == "specular_hit_distance":  # here 0 is unknown, and not far away
+            return np.clip(np.nan_to_num(image, posinf=FAR, neginf=0), 0, np.float32(FAR))
         image = np.abs(image)  # some cameras look along -z
         # Where there is nothing, programs write 0, infinity or a large number.
         return np.where(np.isfinite(image) & (image > 0) & (image < FAR), image, np.float32(FAR))

@@ -1,8 +1,9 @@
 """Which channels of another renderer's EXR file make up which buffer, by their names.
 
-The names are those that Blender Cycles, pbrt, Arnold, V-Ray, RenderMan, Houdini, Mitsuba, Corona, Falcor and the tools
-of Open Image Denoise use, a view layer's name in front or not. ``docs/how-to/denoise-sequence.md`` has what is read of
-each program.
+The names are those that Blender Cycles, pbrt, Arnold, V-Ray, RenderMan, Houdini, Mitsuba, Corona, LuxCore, Unreal,
+Falcor, the tools of Open Image Denoise and the real-time denoisers (DLSS, FSR, MetalFX, NRD) use, a view layer's name
+in front or not. Case, spaces, ``_`` and ``-`` make no difference. ``docs/how-to/denoise-sequence.md`` has what is read
+of each program.
 """
 
 import re
@@ -18,8 +19,28 @@ Channels = tuple[str, ...]
 Groups = Mapping[str, Mapping[str, str]]
 """Layer -> component, lower case -> full name of the channel."""
 
+NORMAL_ROUGHNESS = "normal_roughness"
+"""Normals with the roughness as the fourth component (DLSS, NRD)."""
+
 LAYERS: dict[str, tuple[str, ...]] = {
-    "radiance": ("noisy image", "", "beauty", "rgba", "combined", "color", "ci", "c", "rgb_color"),
+    "radiance": (
+        "noisy image",
+        "",
+        "beauty",
+        "rgba",
+        "combined",
+        "color",
+        "ci",
+        "c",
+        "rgb_color",
+        "finalimage",
+        "finalimagemovierenderqueue_beauty",
+        "radiance",
+        "noisy",
+        "noisy_color",
+        "rgb",
+        "image",
+    ),
     "albedo": (
         "albedo",
         "denoising albedo",
@@ -29,6 +50,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "visiblediffuse",
         "diffusefilter",
         "vraydiffusefilter",
+        "cshading_albedo",
         "diffcol",
         "diffuse color",
         "diffuse",  # V-Ray for Maya's filter, others' lighting: jaxdn.data.foreign.reflectance tells them apart
@@ -47,8 +69,29 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "__nworld",
         "vraynormals",
         "hitn",
+        "avg_shading_normal",
+        "shading_normal",
+        "world_normal",
+        "cgeometry_normalsshading",
+        NORMAL_ROUGHNESS,
+        "normals_roughness",
     ),
-    "depth": ("depth", "z", "zfiltered", "zdepth", "vrayzdepth", "pz", "hitpz", "denoising depth", "dd", "dd.y"),
+    "depth": (
+        "depth",
+        "z",
+        "zfiltered",
+        "zdepth",
+        "vrayzdepth",
+        "pz",
+        "hitpz",
+        "denoising depth",
+        "dd",
+        "dd.y",
+        "linear_depth",
+        "view_z",
+        "cgeometry_zdepth",
+        "finalimagemovierenderqueue_worlddepth",
+    ),
     "roughness": ("denoising roughness", "roughness", "specular_roughness"),
     "motion": (
         "vector",
@@ -60,6 +103,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "motionvectors",
         "velocity",
         "vrayvelocity",
+        "mv",
+        "cgeometry_velocity",
     ),
     "ids": (
         "ids",
@@ -84,6 +129,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "reflectionfilter",
         "vrayreflectionfilter",
     ),
+    "specular_hit_distance": ("specular_hit_distance", "spec_hit_distance", "spec_hit_dist", "specular_hit_dist"),
 }
 """The buffers that other renderers have a name for, with the names of their layers: lower case, the first that is
 there is taken."""
@@ -134,6 +180,8 @@ def detect_channels(
         )
         if fitting:
             found[buffer] = fitting
+    if "roughness" not in found and "roughness" not in stated and "normal" in found:
+        found |= _packed_roughness(inside, found["normal"])
     if "radiance" not in found:
         raise ClipError(f"no radiance among the channels {', '.join(sorted(names))}; {advise_naming('radiance')}.")
     return _with_partner(inside, found, stated)
@@ -159,6 +207,17 @@ def group_layers(names: Sequence[str]) -> Groups:
     return groups
 
 
+def plain(name: str) -> str:
+    """A name in lower case, without what programs part its words by; dots stay."""
+    return re.sub(r"[\s_-]", "", name.lower())
+
+
+def is_called(layer: str, name: str) -> bool:
+    """Whether a layer has a name, a view layer's or part's in front or not."""
+    given, wanted = plain(layer), plain(name)
+    return given == wanted or (wanted != "" and given.endswith("." + wanted))
+
+
 def find_layer(
     groups: Groups, layers: Sequence[str], buffer: Buffer, what: str = "", hint: str = ""
 ) -> Channels | None:
@@ -169,15 +228,14 @@ def find_layer(
     for wanted in layers:
         fitting = {}
         for layer, group in groups.items():
-            lower = layer.lower()
-            if lower == wanted or (wanted and lower.endswith("." + wanted)):
+            if is_called(layer, wanted):
                 channels = _fitting(group, buffer)
                 if channels:
                     fitting[layer] = channels
         # Blender's compositor output stands next to the view layer that it was made from.
         rendered = {layer: channels for layer, channels in fitting.items() if not layer.startswith("Composite.")}
         fitting = rendered or fitting
-        exact = {layer: channels for layer, channels in fitting.items() if layer.lower() == wanted}
+        exact = {layer: channels for layer, channels in fitting.items() if plain(layer) == plain(wanted)}
         fitting = exact or fitting
         if len(set(fitting.values())) > 1:
             raise ClipError(f"{what}{' and '.join(map(repr, sorted(fitting)))} fit equally well{hint}.")
@@ -238,13 +296,22 @@ def _with_partner(groups: Groups, found: dict[str, Channels], stated: Mapping[st
     """Albedo and specular albedo of one program, or no specular albedo; what was named outright stays."""
     if "specular_reflectance" not in found or "specular_reflectance" in stated:
         return found
-    specular = layer_of(found["specular_reflectance"]).lower()
-    name = next(name for name in _DIFFUSE_PARTNERS if specular == name or specular.endswith("." + name))
-    wanted = specular.removesuffix(name) + _DIFFUSE_PARTNERS[name]
+    specular = plain(layer_of(found["specular_reflectance"]))
+    name = next(name for name in _DIFFUSE_PARTNERS if is_called(specular, name))
+    wanted = specular.removesuffix(plain(name)) + _DIFFUSE_PARTNERS[name]
     partner = find_layer(groups, (wanted,), BUFFERS["albedo"])
     if partner is not None and ("albedo" not in stated or found.get("albedo") == partner):
         return {**found, "albedo": partner}
     return {buffer: channels for buffer, channels in found.items() if buffer != "specular_reflectance"}
+
+
+def _packed_roughness(groups: Groups, normal: Channels) -> dict[str, Channels]:
+    """The roughness in the fourth component of normals whose name says so."""
+    layer = layer_of(normal)
+    fourth = groups.get(layer, {}).get("a") or groups.get(layer, {}).get("w")
+    if fourth is None or not plain(layer).endswith("roughness"):
+        return {}
+    return {"roughness": (fourth,)}
 
 
 def _components(buffer: Buffer) -> tuple[Channels, ...]:

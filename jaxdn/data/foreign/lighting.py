@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from jaxdn.data.foreign.layers import LAYERS, Channels, group_layers, stack_channels
+from jaxdn.data.foreign.layers import LAYERS, Channels, group_layers, plain, stack_channels
 
 SLACK = 0.1
 """By so much fractions may leave [0, 1]: pixel filters with negative lobes overshoot at edges."""
@@ -74,14 +74,14 @@ def coloured_layers(names: Iterable[str], beauty: Channels, buffers: Mapping[str
       beauty: the channels of the beauty, which is no part of itself.
       buffers: buffer -> channels that are read.
     """
-    known = {name for buffer, layers in LAYERS.items() if buffer != "radiance" for name in layers} - {"diffuse"}
+    known = {plain(name) for buffer, layers in LAYERS.items() if buffer != "radiance" for name in layers} - {"diffuse"}
     read = {channel for channels in buffers.values() for channel in channels} | set(beauty)
     found: dict[str, Channels] = {}
     for layer, group in group_layers(list(names)).items():
         last = layer.rpartition(".")[2].lower()
         channels = tuple(group[letter] for letter in "rgb" if letter in group)
         if len(channels) == 3 and not (
-            read & set(channels) or last in known or any(word in last for word in _NO_LIGHT)
+            read & set(channels) or plain(last) in known or any(word in last for word in _NO_LIGHT)
         ):
             found[layer] = channels
     return found

@@ -13,7 +13,7 @@ from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.layers import LAYERS, UNSURE_ALBEDO
 from jaxdn.data.foreign.shots import Shot, find_shots
 
-_BEAUTY = [*(name for name in LAYERS["radiance"] if name), "image"]
+_BEAUTY = [name for name in LAYERS["radiance"] if name]
 """Words in the names of files that hold the picture, the best first."""
 _UNSURE = {UNSURE_ALBEDO, "motion", "vector", "velocity", "backward", "id", "ids", "object id", "normal", "normals"}
 """Words that are names of shots, too: such files alone are pictures, unless one of a picture is beside them."""

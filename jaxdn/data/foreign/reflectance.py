@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxdn.brdf import directional_albedo
 from jaxdn.core.frame import BUFFERS, Frame
-from jaxdn.data.foreign.layers import Channels, find_layer, group_layers, layer_of, stack_channels
+from jaxdn.data.foreign.layers import Channels, find_layer, group_layers, is_called, layer_of, stack_channels
 from jaxdn.data.foreign.repairs import Repairs
 
 _POINT = BUFFERS["normal"]
@@ -120,4 +120,4 @@ def _camera_place(matrix: Any) -> np.ndarray | None:
 
 
 def _is_one_of(layer: str, names: Sequence[str]) -> bool:
-    return any(layer.lower() == name or layer.lower().endswith("." + name) for name in names)
+    return any(is_called(layer, name) for name in names)

@@ -17,6 +17,7 @@ Number = int | Fraction
 
 _PLACEHOLDER = re.compile(r"#+|@+|%0?\d*d|\$F\d*|<frame>|<f\d*>", re.IGNORECASE)
 """How programs write the place of a frame's number."""
+_SUFFIX = re.compile(r"\.exr$", re.IGNORECASE)
 
 
 class Shot(NamedTuple):
@@ -49,13 +50,13 @@ def find_shots(path: str | Path | Sequence[Path]) -> list[Shot]:
     """The shots of a folder or a pattern, or those of files. Raises ClipError if there are no EXR files.
 
     In a pattern, ``*``, ``?`` and ``[...]`` are those of a shell, and ``####``, ``%04d``, ``$F4`` and ``<frame>`` stand
-    for a number. Folders whose names have brackets in them are taken as they are called.
+    for a number; ``.exr`` fits ``.EXR`` too. Folders whose names have brackets in them are taken as they are called.
     """
     if not isinstance(path, str | Path):
         files = list(path)
     elif Path(path).is_dir():
         files = sorted(file for file in Path(path).iterdir() if file.suffix.lower() == ".exr" and file.name[0] != ".")
-    elif Path(path).is_file():
+    elif is_named(Path(path)):
         files = [Path(path)]
     else:
         files = _expand(Path(path))
@@ -76,6 +77,11 @@ def find_shots(path: str | Path | Sequence[Path]) -> list[Shot]:
         for (_, name, _), frames in numbered.items()
     ]
     return [*shots, *single]
+
+
+def is_named(path: Path) -> bool:
+    """Whether a path is the name of a file, and no pattern: also a link to a file that is missing."""
+    return path.is_file() or (path.is_symlink() and not path.exists())
 
 
 def refuse_gaps(path: str | Path | Sequence[Path], shot: Shot) -> None:
@@ -138,16 +144,16 @@ def _expand(pattern: Path) -> list[Path]:
     literal, rest = Path(), list(pattern.parts)
     while rest and (literal / rest[0]).exists():
         literal /= rest.pop(0)
-    shells = [_PLACEHOLDER.sub("*", part) for part in rest]
+    shells = [_SUFFIX.sub("[.][eE][xX][rR]", _PLACEHOLDER.sub("*", part)) for part in rest]
     found = [Path(name) for name in glob.glob(os.path.join(glob.escape(str(literal)), *shells))]
     if rest and (place := _PLACEHOLDER.search(rest[-1])):
         tail = rest[-1][place.end() :].rpartition("*")[2]
         found = [file for file in found if _counts(file.name, rest[-1][: place.start()], tail)]
-    files = [file for file in sorted(found) if file.is_file()]
+    files = [file for file in sorted(found) if is_named(file)]
     return [file for file in files if file.suffix.lower() == ".exr"] or files
 
 
 def _counts(name: str, before: str, tail: str) -> bool:
     """Whether a name has a number where a pattern asks for one: between what is before it and its end."""
-    middle = name[len(before) :].removesuffix(tail) if "*" not in before else name.removesuffix(tail)
+    middle = (name[len(before) :] if "*" not in before else name).lower().removesuffix(tail.lower())
     return re.fullmatch(r"-?\d+(\.\d+)?" if "*" not in before else r".*\d", middle) is not None
