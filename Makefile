@@ -9,7 +9,7 @@ train weights: export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 # XLA raises its errors; what it logs besides is an alarm at every compilation of more than two minutes.
 export TF_CPP_MIN_LOG_LEVEL ?= 3
 
-.PHONY: help setup train test test-slow test-all bench chart compare papers hard-cases results cycles lint format docs weights clean
+.PHONY: help setup train test test-slow test-all bench chart compare papers hard-cases results cycles lint format docs weights blender-addon clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -85,6 +85,9 @@ compare: $(VENV)/tools  ## the filters side by side, errors and times: runs/comp
 
 results: setup  ## docs/results/index.md and the tables of the README, from docs/results/*.json
 	$(BIN)/python -m experiments.results_page
+
+blender-addon:  ## build the zip of the Blender extension into dist/
+	$(PYTHON) examples/blender/build.py -o dist
 
 lint: setup  ## ruff and the type checker
 	$(BIN)/ruff check .

@@ -5,6 +5,7 @@ Markers: ``slow`` (more than 10 s), ``browser`` (opens a page in one), ``needs("
 
 import gc
 import os
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from tests.compiling import FLAGS, join_flags
-from tests.needs import require
+from tests.needs import NEEDS, WITH_BPY, require
 
 hypothesis.settings.register_profile(
     "jaxdn",
@@ -43,6 +44,16 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     for mark in item.iter_markers("needs"):
         require(*mark.args)
+
+
+@pytest.fixture(scope="session")
+def blender() -> Path:
+    """An interpreter that has ``bpy``, in an environment of its own, which is made if it is not there."""
+    if not NEEDS["bpy"].present():
+        root = Path(__file__).parents[1]
+        subprocess.run(["make", ".venv-cycles/ready"], cwd=root, capture_output=True, check=False)
+    require("bpy")
+    return WITH_BPY
 
 
 def _compile_quickly() -> None:

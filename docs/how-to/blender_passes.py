@@ -8,6 +8,8 @@ import bpy
 scene = bpy.context.scene
 scene.render.engine = "CYCLES"
 scene.render.use_motion_blur = False  # with it Blender writes no motion vectors
+scene.render.use_compositing = False  # the file has to hold the renderer's own passes
+scene.render.use_sequencer = False
 scene.cycles.samples = 4
 scene.cycles.use_adaptive_sampling = False
 scene.cycles.use_denoising = False

@@ -1,6 +1,6 @@
 """Clips of Cycles, rendered by the real Blender at a few pixels: passes, noise, motion, runs that are killed.
 
-Blender's package needs Python 3.11 and an environment of its own, ``.venv-cycles``: made here where it is missing.
+Blender's package needs Python 3.11 and an environment of its own, ``.venv-cycles`` (the fixture ``blender``).
 """
 
 import json
@@ -16,7 +16,6 @@ import pytest
 
 from experiments.cycles.reference import read, read_channels
 from experiments.cycles.sets import KINDS
-from tests.needs import NEEDS, WITH_BPY, require
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT)}
@@ -30,15 +29,6 @@ few = (levels.Level(((1, 2), (4, 1)), (2, 3), 30.0, 5.0), levels.Level(((1, 2), 
 levels.LEVELS.update(test=few)
 """
 """Clips of 32x18 pixels and four frames, with two levels that take seconds."""
-
-
-@pytest.fixture(scope="session")
-def blender() -> Path:
-    """An interpreter that has ``bpy``; it is made if it is not there."""
-    if not NEEDS["bpy"].present():
-        subprocess.run(["make", ".venv-cycles/ready"], cwd=ROOT, capture_output=True, check=False)
-    require("bpy")
-    return WITH_BPY
 
 
 def _run(python: Path, code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
