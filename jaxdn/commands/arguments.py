@@ -242,6 +242,8 @@ class Denoise:
     aovs: Literal["keep", "additive"] = "keep"
     """Other layers of light in such files: keep them as they are, or (additive) denoise those that are parts of the
     beauty so that they still add up to it."""
+    alpha: bool = False
+    """Denoise the alpha of such files too, with weights of the denoised beauty; by default it stays as it is."""
     spp: int = 1
     """Samples per pixel to take from the clip's layers."""
     preview: bool = False

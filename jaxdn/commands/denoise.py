@@ -53,6 +53,7 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
         strict=options.strict,
         only_beauty=options.only_beauty,
         aovs=options.aovs,
+        alpha=options.alpha,
         preview=options.preview,
         bidirectional=options.bidirectional,
         safe=options.safe,

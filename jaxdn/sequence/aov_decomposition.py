@@ -11,6 +11,7 @@ It is not the denoiser's own kernel: where the denoiser divides by albedos, clam
 there is no one kernel to apply to a part.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -76,9 +77,9 @@ def decompose(
     light, layers = (_finite(image) for image in (frame.radiance, layers))
     frame = sanitize(frame)[0]
     noisy = jnp.concatenate([*layers, light], axis=-1)
-    blended = _blend(state, frame, noisy)
-    filtered = _filter(frame, beauty, blended[..., :-1])
+    blended = blend_history(state.history, state.guides, frame, noisy)
     hit = surface_mask(frame.depth, frame.ids)
+    filtered = filter_edges(frame, beauty, blended[..., :-1], hit)
     if hit is not None:  # what has no surface is not filtered
         filtered = jnp.where(hit[..., None], filtered, noisy)
     total = filtered[..., -3:]
@@ -98,11 +99,14 @@ def _finite(light: jax.Array) -> jax.Array:
     return jnp.where(jnp.isfinite(light), light, 0.0).astype(jnp.float32)
 
 
-def _blend(state: DecompositionState, frame: Frame, noisy: jax.Array) -> jax.Array:
-    """The history with a frame's light blended in: a mean over the frames in which a point was seen."""
+def blend_history(history: jax.Array, guides: Guides, frame: Frame, noisy: jax.Array) -> jax.Array:
+    """The history [H, W, C + 1] with a frame's light [H, W, C] blended in: a mean over the frames that saw a point.
+
+    Its last channel is the number of those frames; ``guides`` are those of the frame before.
+    """
     past = reproject(
-        state.history,
-        state.guides,
+        history,
+        guides,
         frame,
         jnp.asarray(False),
         depth_tolerance=_DEPTH_TOLERANCE,
@@ -114,10 +118,14 @@ def _blend(state: DecompositionState, frame: Frame, noisy: jax.Array) -> jax.Arr
     return jnp.concatenate([past[..., :-1] + weight * (noisy - past[..., :-1]), length], axis=-1)
 
 
-def _filter(frame: Frame, beauty: jax.Array, light: jax.Array) -> jax.Array:
-    """An a-trous cascade over [H, W, C], whose weights stop at surfaces and at edges of the denoised beauty."""
-    hit = surface_mask(frame.depth, frame.ids)
-    weights = [_color_weight(beauty)]
+def filter_edges(
+    frame: Frame, beauty: jax.Array, light: jax.Array, hit: jax.Array | None, more: Sequence[Weight] = ()
+) -> jax.Array:
+    """An a-trous cascade over [H, W, C], whose weights stop at surfaces and at edges of the denoised beauty.
+
+    ``hit`` [H, W] bool: which pixels are filtered and taken; None: all. ``more`` are further weights.
+    """
+    weights = [_color_weight(beauty), *more]
     if frame.depth is not None:
         weights.append(depth_weight(frame.depth, frame.ids, sigma=_SIGMA_DEPTH, height=frame.depth.shape[0]))
     if frame.normal is not None:
@@ -132,7 +140,7 @@ def _filter(frame: Frame, beauty: jax.Array, light: jax.Array) -> jax.Array:
 
 def _color_weight(image: jax.Array) -> Weight:
     """``exp(-sum_c |i_c(p) - i_c(q)| / (_EDGE i_c(p) + 1e-4))`` of a noise-free image [H, W, 3]."""
-    planes = image.transpose(2, 0, 1)
+    planes = jnp.maximum(image, 0.0).transpose(2, 0, 1)  # the ringing of a pixel filter is below 0
     here = jnp.concatenate([planes, 1.0 / (_EDGE * planes + 1e-4)])
 
     def exponent(there: Planes, here: Planes, offset: Offset) -> jax.Array:

@@ -24,6 +24,8 @@ class Settings(NamedTuple):
     aovs: Literal["keep", "additive"] = "keep"
     """What becomes of the other layers of light in files of other renderers: they stay, or are denoised too, so that
     they still add up to the beauty (:mod:`jaxdn.sequence.aov_decomposition`)."""
+    alpha: bool = False
+    """Denoise the alpha of such files too (:mod:`jaxdn.sequence.alpha`)."""
     preview: bool = False
     """Write a PNG next to each frame."""
     bidirectional: bool = False

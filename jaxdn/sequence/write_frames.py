@@ -10,9 +10,11 @@ from jaxdn import color
 from jaxdn.core.frame import Frame
 from jaxdn.data.exr.exr import write_exr
 from jaxdn.data.exr.file import ExrFile, Window
+from jaxdn.data.foreign.layers import find_alpha
 from jaxdn.data.foreign.result import write_result
 from jaxdn.evaluation.report.images import save_png
 from jaxdn.sequence.additive_aovs import AdditiveAovs
+from jaxdn.sequence.alpha import AlphaDenoiser
 from jaxdn.sequence.frame_denoiser import light_of
 from jaxdn.sequence.settings import Settings
 
@@ -38,28 +40,41 @@ class ClipWriter:
 
 
 class ForeignWriter:
-    """Writes frames of another renderer, with their additive layers denoised where the settings say so."""
+    """Writes frames of another renderer, with their additive layers and alpha denoised where the settings say so."""
 
     def __init__(self, window: Window, settings: Settings, log: Callable[[str], None]) -> None:
         self._window, self._settings, self._log = window, settings, log
-        self.has_history = settings.aovs == "additive"
-        self._aovs = AdditiveAovs(settings.naming, log) if self.has_history else None
+        self.has_history = settings.aovs == "additive" or settings.alpha
+        self._aovs = AdditiveAovs(settings.naming, log) if settings.aovs == "additive" else None
+        self._alpha = AlphaDenoiser(safe=settings.safe) if settings.alpha else None
 
     def write(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> None:
         """Denoise the additive layers of a frame, and write all; without a target they are for the history alone."""
         assert source is not None
         layers = {} if self._aovs is None else self._aovs.denoise(source.placed(self._window), frame, image)
+        alpha = self._denoise_alpha(source, frame, image)
         if target is None:
             return
         beauty = compose_beauty(frame, image)
         target.parent.mkdir(parents=True, exist_ok=True)
         images, settings = {"": beauty, **layers}, self._settings
         for note in write_result(
-            source, target, images, self._window, settings.naming, only_beauty=settings.only_beauty
+            source, target, images, self._window, settings.naming, alpha=alpha, only_beauty=settings.only_beauty
         ):
             self._log(note)
         if settings.preview:
             write_preview(target, beauty)
+
+    def _denoise_alpha(self, source: ExrFile, frame: Frame, image: np.ndarray) -> np.ndarray | None:
+        """The denoised alpha [H, W] of a frame; None: nobody asked, or there is none."""
+        if self._alpha is None:
+            return None
+        names = list(source.windows)
+        channel = find_alpha(names, self._settings.naming.detect(names)["radiance"])
+        if channel is None:
+            self._log("--alpha: there is no alpha beside the beauty")
+            return None
+        return self._alpha.denoise(source.placed(self._window)[channel], frame, compose_beauty(frame, image))
 
 
 def compose_beauty(frame: Frame, image: np.ndarray) -> Any:

@@ -284,6 +284,13 @@ def beauty_channels(names: Sequence[str], buffers: Mapping[str, Channels]) -> Ch
     return read
 
 
+def find_alpha(names: Sequence[str], beauty: Channels) -> str | None:
+    """The alpha beside a beauty, or that of the file's own image; None if there is none."""
+    groups = group_layers(names)
+    beside = groups[layer_of(beauty) if "." in beauty[0] else ""]
+    return beside.get("a") or groups.get("", {}).get("a")
+
+
 def unpaired_specular(names: Sequence[str], found: Mapping[str, Channels]) -> str | None:
     """The layer of a specular albedo that was left out, as no diffuse albedo belongs to it; None if there is none."""
     if "specular_reflectance" in found:

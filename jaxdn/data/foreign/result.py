@@ -8,7 +8,7 @@ import numpy as np
 from jaxdn.data.exr.exr import rewrite_exr
 from jaxdn.data.exr.file import ExrFile, Window, crop
 from jaxdn.data.foreign.classify import ChannelNaming
-from jaxdn.data.foreign.layers import Channels, beauty_channels, group_layers, layer_of
+from jaxdn.data.foreign.layers import Channels, beauty_channels, find_alpha, group_layers
 
 
 def write_result(
@@ -18,6 +18,7 @@ def write_result(
     window: Window,
     naming: ChannelNaming,
     *,
+    alpha: np.ndarray | None = None,
     only_beauty: bool = False,
 ) -> list[str]:
     """Write a file's denoised beauty, with all other layers, metadata, windows and parts of the file; or alone.
@@ -30,6 +31,7 @@ def write_result(
       images: layer -> denoised image [H, W, 3] of the window; "" is the beauty.
       window: which pixels of the picture the images are (:attr:`jaxdn.data.foreign.import_exr.ForeignSequence.window`).
       naming: how the beauty was found.
+      alpha: denoised alpha [H, W] of the window, beside the beauty; None: it stays.
       only_beauty: write R, G, B, and A where there is one, and nothing else.
     """
     source.decode()  # first, as the windows are those of the decoded headers then
@@ -42,11 +44,12 @@ def write_result(
         channels = _color(groups, layer) if layer else beauty
         for channel, pixels in zip(channels, np.moveaxis(image, -1, 0), strict=True):
             replaced[channel] = crop(pixels, window, windows[channel])
+    beside = find_alpha(names, beauty)
+    if alpha is not None and beside is not None:
+        replaced[beside] = crop(alpha, window, windows[beside])
     if not only_beauty:
         return rewrite_exr(source, target, replaced)
-    beside = groups[layer_of(beauty) if "." in beauty[0] else ""]
-    alpha = beside.get("a") or groups.get("", {}).get("a")
-    kept = dict(zip(beauty, "RGB", strict=True)) | ({} if alpha is None else {alpha: "A"})
+    kept = dict(zip(beauty, "RGB", strict=True)) | ({} if beside is None else {beside: "A"})
     return rewrite_exr(source, target, replaced, only=kept)
 
 
