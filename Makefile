@@ -20,11 +20,11 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	@echo "Setting up $(VENV) (Python packages of constraints.txt; a minute or two) ..."
 	@if command -v uv >/dev/null 2>&1; then \
 		uv venv --quiet --allow-existing --python $(PYTHON) $(VENV) && \
-		uv pip install --quiet --python $(BIN)/python -c constraints.txt --group dev -e '.[render,train,peers,onnx,onednn,oidn]'; \
+		uv pip install --quiet --python $(BIN)/python -c constraints.txt --group dev -e '.[render,train,peers,onnx,onednn,oidn,farm]'; \
 	else \
 		$(PYTHON) -m venv $(VENV) && \
 		$(BIN)/python -m pip install --quiet --upgrade -c constraints.txt pip && \
-		$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[render,train,peers,onnx,onednn,oidn]'; \
+		$(BIN)/python -m pip install --quiet -c constraints.txt --group dev -e '.[render,train,peers,onnx,onednn,oidn,farm]'; \
 	fi
 	@touch $@
 

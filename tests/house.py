@@ -82,6 +82,7 @@ PACKAGES = {
     "safetensors": {"zoo"},
     "tyro": {"commands"},
     "pyoidn": {"ops"},
+    "distributed": {"commands"},
 }
 """Which rooms (with the folders in them) import which package from outside."""
 

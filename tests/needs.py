@@ -94,6 +94,7 @@ NEEDS = {
     "browser": Need(lambda: any(map(shutil.which, BROWSERS)), "apt-get install chromium"),
     "torch": Need(_package("torch"), "pip install -c constraints.txt torch (a CPU build)"),
     "pyoidn": Need(_package("pyoidn"), "pip install -e '.[oidn]'"),
+    "distributed": Need(_package("distributed"), "pip install -e '.[farm]'"),
     "g++": Need(lambda: shutil.which("g++") is not None, "apt-get install g++ pkg-config"),
     "headers of OpenEXR": Need(lambda: _runs("pkg-config", "--exists", "OpenEXR"), "apt-get install libopenexr-dev"),
     "headers of ONNX Runtime": Need(

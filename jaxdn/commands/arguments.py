@@ -107,7 +107,14 @@ class Render:
     """Render only what this denoiser (svgf, relax ...) reads, or several (svgf,relax); default: all but what few
     denoisers read."""
     workers: int | None = None
-    """Number of processes; default: the number of cores."""
+    """Number of processes on this machine; default: the number of cores."""
+    scheduler: str | None = None
+    """Render on the machines of a Dask cluster that share this disk: its scheduler's address (tcp://head:8786) or
+    scheduler file (.json)."""
+    frames_per_task: int | None = None
+    """With --scheduler: several machines render one clip, each so many of its frames; default: one renders all."""
+    threads_per_clip: int | None = None
+    """Renderer threads of each process, at least 2; default: 2, or all cores for one clip on this machine."""
 
 
 @dataclass

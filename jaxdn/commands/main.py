@@ -62,7 +62,18 @@ def _render(options: Render) -> None:
         options.denoiser,
         options.random_optics,
     )
-    render(clips, check_folder(options.out), settings, workers=options.workers)
+    out, threads = check_folder(options.out), options.threads_per_clip
+    if options.scheduler is None:
+        if options.frames_per_task is not None:
+            raise ValueError("--frames-per-task: expected none without --scheduler; leave it out.")
+        render(clips, out, settings, workers=options.workers, threads=threads)
+        return
+    if options.workers is not None:
+        raise ValueError("--workers: expected none with --scheduler, whose workers render; leave it out.")
+    from jaxdn.commands.scheduler import open_scheduler
+
+    with open_scheduler(options.scheduler) as executor:
+        render(clips, out, settings, executor=executor, threads=threads, frames_per_task=options.frames_per_task)
 
 
 def _pack(options: Pack) -> None:

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxdn.render.clip import render_clip as render_clip
+    from jaxdn.render.clip_job import ClipJob as ClipJob
+    from jaxdn.render.clip_job import UnplannedClip as UnplannedClip
     from jaxdn.render.frame import render_frame as render_frame
     from jaxdn.render.mitsuba.variant import choose_variant as choose_variant
     from jaxdn.render.mitsuba.variant import use_variant as use_variant
@@ -15,7 +17,6 @@ if TYPE_CHECKING:
     from jaxdn.render.scenes.scene import AnimatedScene as AnimatedScene
     from jaxdn.render.scenes.scene import Camera as Camera
     from jaxdn.render.settings import RenderSettings as RenderSettings
-    from jaxdn.render.worker_pool import ClipJob as ClipJob
     from jaxdn.render.worker_pool import render_clips as render_clips
 
 _HOMES = {
@@ -24,7 +25,8 @@ _HOMES = {
     "scene_from_record": "open_scene",
     "choose_variant": "mitsuba.variant",
     "use_variant": "mitsuba.variant",
-    "ClipJob": "worker_pool",
+    "ClipJob": "clip_job",
+    "UnplannedClip": "clip_job",
     "render_clips": "worker_pool",
     "render_clip": "clip",
     "render_frame": "frame",

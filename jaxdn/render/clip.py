@@ -1,6 +1,7 @@
 """Render a clip into a folder of OpenEXR frames, resumable at any point."""
 
 import importlib.metadata
+import json
 import platform
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,9 +10,11 @@ from typing import Any
 import numpy as np
 
 from jaxdn.core.checks import check_at_least
-from jaxdn.data.clip.folder import begin_record, begun_record, finish_record, frame_path, is_clip
+from jaxdn.data.clip.folder import begin_record, begun_record, count_frames, finish_record, frame_path, is_clip
 from jaxdn.data.clip.frames import read_frame, write_frame
+from jaxdn.data.clip.record import FORMAT
 from jaxdn.data.errors import ClipError
+from jaxdn.render.bad_samples import count_noted, note_bad_samples, remove_notes
 from jaxdn.render.buffers.geometry import View
 from jaxdn.render.frame import RenderedFrame, render_frame
 from jaxdn.render.mitsuba.errors import RenderError
@@ -19,6 +22,7 @@ from jaxdn.render.resume import check_resumable
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.settings import RenderSettings
 from jaxdn.render.tracing.tracer import choose_tracer
+from jaxdn.runtime.atomic_files import remove_abandoned
 
 
 def render_clip(
@@ -27,6 +31,7 @@ def render_clip(
     settings: RenderSettings,
     *,
     frames: int | None = None,
+    only: range | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Path:
     """Render the frames 0 ... ``frames`` - 1 into ``folder``: one ``frame_0000.exr`` each, and then ``clip.json``.
@@ -41,7 +46,9 @@ def render_clip(
       folder: of the clip.
       settings: how; they are stored in the record.
       frames: number of frames; default: that of the scene.
-      progress: called with the index of every frame that is finished or already exists.
+      only: render only these of the frames; default: all. Whoever renders the last one makes the folder a clip: several
+        processes may render ranges of one clip, which comes out bit for bit as from one.
+      progress: called with the index of every frame, of ``only``, that is finished or already exists.
     """
     folder = Path(folder)
     frames = scene.frames if frames is None else frames
@@ -50,20 +57,54 @@ def render_clip(
         raise ValueError(f"plan: expected one for {frames} frames, got one for {len(settings.plan.frames)}.")
     settings = settings.complete(scene)
     record = _make_record(scene, frames, settings)
+    only = range(frames) if only is None else only
+    if not all(0 <= frame < frames for frame in only):
+        raise ValueError(f"only: expected frames from 0 to {frames - 1}, got {only}.")
+    progress = progress or (lambda frame: None)
+    if _begin(folder, record):
+        _render_missing(scene, folder, settings, only, progress)
+        finish_clip(folder)
+    else:
+        for frame in only:
+            progress(frame)
+    return folder
+
+
+def _begin(folder: Path, record: dict[str, Any]) -> bool:
+    """Begin or resume a clip with its record; False if it has all its frames already.
+
+    To begin a record removes ``clip.json``. A second renderer of a clip, which may be killed at any time, must not do
+    that to a clip that the first one has finished: it begins none that has all frames, and none that is begun already.
+    """
+    finished = is_clip(folder)  # asked first: a clip that is finished from now on was begun with this record
     before = begun_record(folder)
     if before is not None:
         check_resumable(folder, record, before)
         record["bad_samples"] = before.get("bad_samples", 0)
-    progress = progress or (lambda frame: None)
-    # To begin a record removes clip.json: a second renderer of a finished clip that is killed must not have done so.
-    if before is not None and _has_frames(folder, before, frames):
-        for frame in range(frames):
-            progress(frame)
-        return folder
-    begin_record(record, folder)
-    _render_missing(scene, folder, settings, record, progress)
-    finish_record(record, folder)
-    return folder
+        if _has_frames(folder, before, record["frames"]):
+            return False
+    if finished or before != json.loads(json.dumps({"format": FORMAT, **record})):
+        begin_record(record, folder)
+    return True
+
+
+def finish_clip(folder: str | Path) -> bool:
+    """Make a folder whose frames are all there a clip; False if it lacks some. A clip is left as it is.
+
+    Its record gets the number of samples that were not finite. What killed processes left behind is removed.
+    """
+    folder = Path(folder)
+    if is_clip(folder):
+        return True
+    record = begun_record(folder)
+    if record is None or count_frames(folder, record["frames"]) < record["frames"]:
+        return False
+    record["bad_samples"] = record.get("bad_samples", 0) + count_noted(folder)
+    if not is_clip(folder):  # else another process has finished it, and removes its notes
+        finish_record(record, folder)
+        remove_notes(folder)
+        remove_abandoned(folder)
+    return True
 
 
 def _has_frames(folder: Path, begun: Mapping[str, Any], frames: int) -> bool:
@@ -76,26 +117,25 @@ def _render_missing(
     scene: AnimatedScene,
     folder: Path,
     settings: RenderSettings,
-    record: dict[str, Any],
+    only: range,
     progress: Callable[[int], None],
 ) -> None:
-    """Render the frames that a folder lacks; samples that were not finite are counted in its record."""
+    """Render those of the frames ``only`` that a folder lacks, and note how many samples were not finite."""
     previous: View | None = None
-    for frame in range(record["frames"]):
+    for frame in only:
         path = frame_path(folder, frame)
         if _is_complete(path):
             previous = None
         else:
             try:
                 rendered = render_frame(scene, frame, settings, previous=previous)
+                if rendered.bad_samples:
+                    note_bad_samples(folder, frame, rendered.bad_samples)
                 _write(path, rendered)
             except Exception as error:
                 reason = f"{type(error).__name__}: {error}"
                 raise RenderError(f"clip {scene.name!r} in {folder}, frame {frame}: {reason}") from error
             previous = rendered.view
-            if rendered.bad_samples:
-                record["bad_samples"] += rendered.bad_samples
-                begin_record(record, folder)
         progress(frame)
 
 

@@ -41,12 +41,17 @@ def scene_from_record(record: Mapping[str, Any]) -> AnimatedScene:
 
 
 def open_family(name: str, seed: int, animation: Any = None) -> AnimatedScene:
-    """A scene of a family. Raises ValueError for an animation, which belongs to scene files: families move already."""
+    """A scene of a family. Raises as :func:`check_no_animation` does."""
+    check_no_animation(name, animation)
+    return scene_from_record({"family": name, "seed": seed})
+
+
+def check_no_animation(name: str, animation: Any) -> None:
+    """Raise ValueError for an animation of a family: it belongs to scene files, and families move already."""
     if animation is not None:
         raise ValueError(
             f"animation {animation}: expected none for the family {name!r}, which moves already; leave it out."
         )
-    return scene_from_record({"family": name, "seed": seed})
 
 
 def open_scene(scene: Any, animation: Any = None) -> AnimatedScene:

@@ -1,4 +1,4 @@
-"""Render many clips in parallel by a pool of workers, one process a clip.
+"""Render many clips in parallel, one process a clip: on this machine, or by an executor on others.
 
 Several processes with few threads are about a third faster than one process with many, and a process that dies affects
 only one clip. A frame's file gets its name when it is complete, so an interrupted rendering can always be resumed.
@@ -7,35 +7,23 @@ only one clip. A frame's file gets its name when it is complete, so an interrupt
 import multiprocessing
 import os
 import signal
-import warnings
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
+from concurrent.futures import Executor
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from jaxdn.data.clip.folder import begun_record, frame_path, is_clip, read_record
+from jaxdn.core.checks import check_at_least
+from jaxdn.render.clip_job import ClipJob, UnplannedClip, describe_death, is_finished, keep_variant, render_job
+from jaxdn.render.executor import render_by_executor
+from jaxdn.render.frame_counter import open_counter
 from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.render.mitsuba.variant import choose_variant
-from jaxdn.render.open_scene import scene_from_record
-from jaxdn.render.settings import RenderSettings
 from jaxdn.runtime.parent import end_with_parent
 
 _THREADS = 2
 """Renderer threads of each process. With only one, Mitsuba's loader waits forever for some scenes' textures."""
-
-
-class ClipJob(NamedTuple):
-    """One clip to render."""
-
-    scene: dict[str, Any]
-    """The record of the scene, such as ``{"family": "robot", "seed": 3}``."""
-    folder: str
-    frames: int
-    settings: RenderSettings
-    """Without a variant, that is the one that the clip in the folder was started with, else the fastest that works."""
 
 
 class _Worker(NamedTuple):
@@ -47,24 +35,61 @@ class _Worker(NamedTuple):
 
 
 def render_clips(
-    jobs: Iterable[ClipJob],
+    jobs: Iterable[ClipJob | UnplannedClip],
     *,
     workers: int | None = None,
+    executor: Executor | None = None,
+    threads: int | None = None,
+    frames_per_task: int | None = None,
     progress: bool | Callable[[int, int], None] = True,
 ) -> list[Path]:
     """Render clips in ``workers`` processes (default: one for every core) and return their folders.
 
-    ``progress`` shows the frames done, the total and the time left, or is called with the first two. Ctrl-C stops the
-    processes and keeps every finished frame; another call resumes. A failed clip does not stop the others: at the end
-    RenderError names each failed clip, its frame and the reason.
+    Ctrl-C stops the processes and keeps every finished frame; another call resumes. A failed clip does not stop the
+    others: at the end RenderError names each failed clip, its frame and the reason.
+
+    Args:
+      jobs: the clips, each with a folder of its own.
+      workers: number of processes on this machine.
+      executor: renders elsewhere instead: any executor of PEP 3148, such as that of a Dask cluster. The machines share
+        the disk with the clips and the scenes, under the same paths. Each of its tasks renders a clip in a process of
+        its own, with the Mitsuba variant that is chosen here. Ctrl-C cancels the tasks that have not begun.
+      threads: renderer threads of each process, at least 2; default: 2, and for one process on this machine all cores.
+      frames_per_task: with an executor, a clip is rendered in ranges of so many frames, a task each, bit-equal to one
+        task for all; default: all its frames.
+      progress: shows the frames done, the total and the time left, or is called with the first two. With an executor
+        frames are counted on the disk.
     """
-    waiting = [_keep_variant(job) for job in jobs]
+    waiting = list(jobs)
     folders = [job.folder for job in waiting]
     if len({os.path.abspath(folder) for folder in folders}) != len(folders):
         raise ValueError("render_clips: expected a different folder for every clip.")
-    total = sum(job.frames for job in waiting)
-    waiting = [job for job in waiting if not _is_finished(job)]
+    check_at_least(2, threads=_THREADS if threads is None else threads)
+    if executor is None and frames_per_task is not None:
+        raise ValueError("frames_per_task: expected none without an executor; leave it out, or pass an executor.")
+    if executor is not None and workers is not None:
+        raise ValueError("workers: expected none with an executor, which has its own; leave it out.")
+    if executor is not None:
+        check_at_least(1, frames_per_task=1 if frames_per_task is None else frames_per_task)
+        failures = render_by_executor(
+            executor, waiting, threads=threads or _THREADS, frames_per_task=frames_per_task, progress=progress
+        )
+    else:
+        planned = [job.plan() if isinstance(job, UnplannedClip) else job for job in waiting]
+        failures = _render_here(planned, workers, threads, progress)
+    if failures:
+        raise RenderError(f"{len(failures)} of {len(folders)} clips failed:\n" + "\n".join(failures))
+    return [Path(folder) for folder in folders]
+
+
+def _render_here(
+    jobs: Sequence[ClipJob], workers: int | None, threads: int | None, progress: bool | Callable[[int, int], None]
+) -> list[str]:
+    """Render in processes of this machine; returns the reasons of the clips that failed."""
+    total = sum(job.frames for job in jobs)
+    waiting = [job for job in map(keep_variant, jobs) if not is_finished(job)]
     limit = max(1, min(workers or os.cpu_count() or 1, len(waiting)))
+    threads = threads or (_THREADS if limit > 1 else 0)
     for job in waiting:
         try:
             choose_variant(job.settings.variant)  # probed once, here: the processes inherit the result
@@ -74,12 +99,12 @@ def render_clips(
     done = total - sum(job.frames for job in waiting)
     running: list[_Worker] = []
     failures: list[str] = []
-    with _open_display(progress, total) as show:
+    with open_counter(progress, total) as show:
         show(done, total)
         try:
             while waiting or running:
                 while waiting and len(running) < limit:
-                    running.append(_start_worker(waiting.pop(0), threads=_THREADS if limit > 1 else 0))
+                    running.append(_start_worker(waiting.pop(0), threads=threads))
                 wait([item for worker in running for item in (worker.messages, worker.process.sentinel)])
                 for worker in list(running):
                     frames, failure, ended = _read_messages(worker)
@@ -96,29 +121,7 @@ def render_clips(
                 worker.process.terminate()
             for worker in running:
                 worker.process.join()
-    if failures:
-        raise RenderError(f"{len(failures)} of {len(folders)} clips failed:\n" + "\n".join(failures))
-    return [Path(folder) for folder in folders]
-
-
-def _keep_variant(job: ClipJob) -> ClipJob:
-    """The job with a variant: a clip is completed, and checked for completeness, with the one it was started with."""
-    begun = begun_record(job.folder) if job.settings.variant is None else None
-    return job if begun is None else job._replace(settings=replace(job.settings, variant=begun.get("variant")))
-
-
-def _is_finished(job: ClipJob) -> bool:
-    """Whether the clip exists with all its frames and the wanted settings; this needs no separate process."""
-    if not is_clip(job.folder):
-        return False
-    record = read_record(job.folder)
-    wanted = {"scene": job.scene, "frames": job.frames, **job.settings.record()}
-    # What a job leaves open was chosen when the clip was started.
-    open_names = {name for name in ("max_depth", "variant") if wanted[name] is None}
-    # A frame's file gets its name only when it is complete.
-    return all(record.get(name) == value for name, value in wanted.items() if name not in open_names) and all(
-        frame_path(job.folder, frame).is_file() for frame in range(job.frames)
-    )
+    return failures
 
 
 def _start_worker(job: ClipJob, *, threads: int) -> _Worker:
@@ -135,22 +138,8 @@ def _render_in_worker(job: ClipJob, messages: Connection, threads: int) -> None:
     """Runs in a separate process: render one clip and report each frame."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
     end_with_parent()
-    os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    warnings.filterwarnings("ignore", message="scene ")  # whoever opened the scene has been warned
     try:
-        from jaxdn.render.clip import render_clip
-        from jaxdn.render.mitsuba.variant import use_variant
-
-        use_variant(job.settings.variant)
-        if threads:
-            import drjit
-
-            drjit.set_thread_count(threads)
-        try:
-            scene = scene_from_record(job.scene)
-        except Exception as error:
-            raise ValueError(f"clip in {job.folder}: the scene {job.scene} does not load: {error}") from error
-        render_clip(scene, job.folder, job.settings, frames=job.frames, progress=messages.send)
+        render_job(job, threads=threads, progress=messages.send)
         messages.send("done")
     except BaseException as error:
         messages.send(f"{error}" if str(error) else repr(error))
@@ -169,57 +158,10 @@ def _read_messages(worker: _Worker) -> tuple[int, str, bool]:
         except (EOFError, OSError):
             # The pipe was closed without a message: the process was ended from outside.
             worker.process.join()
-            return frames, _describe_death(worker), True
+            frame = worker.finished[-1] + 1 if worker.finished else 0
+            return frames, describe_death(worker.job.folder, frame, worker.process.exitcode), True
         if isinstance(message, int):
             worker.finished.append(message)
             frames += 1
         else:
             return frames, "" if message == "done" else message, True
-
-
-def _describe_death(worker: _Worker) -> str:
-    code = worker.process.exitcode
-    cause = f"exit code {code}"
-    if code is not None and code < 0:
-        cause = signal.Signals(-code).name
-        cause += {"SIGKILL": " (out of memory?)", "SIGABRT": " (an LLVM that does not work?)"}.get(cause, "")
-    frame = worker.finished[-1] + 1 if worker.finished else 0
-    return f"clip in {worker.job.folder}, frame {frame}: the renderer's process died: {cause}. Start again to resume."
-
-
-def _open_display(
-    progress: bool | Callable[[int, int], None], total: int
-) -> AbstractContextManager[Callable[[int, int], None]]:
-    if progress is not True:
-        return nullcontext(progress if callable(progress) else lambda done, total: None)
-    return _Bar(total)
-
-
-class _Bar:
-    """A progress bar: frames done, total, elapsed and remaining time."""
-
-    def __init__(self, total: int) -> None:
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
-
-        columns: Sequence[Any] = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-        self._bar = Progress("rendering frames", *columns)
-        self._bar.disable = not self._bar.console.is_terminal
-        self._task = self._bar.add_task("frames", total=total)
-        self._tenths = -1
-
-    def __enter__(self) -> Callable[[int, int], None]:
-        self._bar.start()
-        return self._show if self._bar.console.is_terminal else self._say
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def _show(self, done: int, total: int) -> None:
-        self._bar.update(self._task, completed=done, total=total)
-
-    def _say(self, done: int, total: int) -> None:
-        """Print a line per tenth where there is no terminal for a bar."""
-        self._show(done, total)
-        if 10 * done // max(total, 1) > self._tenths:
-            self._tenths = 10 * done // max(total, 1)
-            print(f"rendered {done} of {total} frames", flush=True)

@@ -2,11 +2,16 @@
 
 import json
 import os
+import platform
+import re
 import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+_ABANDONED_S = 24 * 3600
 
 
 @contextmanager
@@ -53,8 +58,9 @@ def _renamed(paths: Sequence[Path]) -> Iterator[list[Path]]:
     for path in paths:
         if not path.parent.is_dir():
             raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; create it first.")
-    # Two processes, or two threads of one, may write the same file: each needs its own temporary file.
-    temporaries = [path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}.tmp") for path in paths]
+    # Two machines, processes, or threads of one, may write the same file: each needs its own temporary file.
+    writer = f"{_host()}.{os.getpid()}.{threading.get_ident()}"
+    temporaries = [path.with_name(f".{path.name}.{writer}.tmp") for path in paths]
     try:
         yield temporaries
         for temporary in temporaries:
@@ -64,6 +70,38 @@ def _renamed(paths: Sequence[Path]) -> Iterator[list[Path]]:
     finally:
         for temporary in temporaries:
             temporary.unlink(missing_ok=True)
+
+
+def remove_abandoned(folder: str | Path) -> None:
+    """Remove the temporary files that killed processes left in a folder: of this machine, and any that is a day old."""
+    for path in Path(folder).glob(".*.tmp"):
+        match = re.fullmatch(r"\..+\.(?P<host>[\w-]+)\.(?P<process>\d+)\.\d+\.tmp", path.name)
+        if match is None:
+            continue
+        try:
+            old = time.time() - path.stat().st_mtime > _ABANDONED_S
+            if old or (match["host"] == _host() and not _runs(int(match["process"]))):
+                path.unlink()
+        except FileNotFoundError:
+            continue
+
+
+def _host() -> str:
+    """This machine's name, as a part of a file's name: process numbers say nothing on a shared disk."""
+    return re.sub(r"[^\w-]", "-", platform.node(), flags=re.ASCII)[:40] or "here"
+
+
+def _runs(process: int) -> bool:
+    """Whether a process of this machine may still run."""
+    if os.name == "nt":  # where the call below would send Ctrl-C
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def _sync(path: Path) -> None:

@@ -20,6 +20,7 @@ OPTIONAL_DEPENDENCIES: dict[str, DependencyGroup] = {
     "onnx": DependencyGroup(("onnxruntime", "onnx"), ("onnxruntime", "onnx")),
     "onednn": DependencyGroup(("onednn-cpu-gomp",), ()),
     "oidn": DependencyGroup(("pyoidn",), ("pyoidn",)),
+    "farm": DependencyGroup(("distributed",), ("distributed", "dask")),
     "bench": DependencyGroup(("torch",), ("torch",)),
 }
 

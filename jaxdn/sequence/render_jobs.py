@@ -1,6 +1,8 @@
 """``jaxdn render``: animated clips by Mitsuba, with only the effects that their scenes have."""
 
+import functools
 from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -13,15 +15,16 @@ from jaxdn.effects import Effects, Plan, choose_all_effects, choose_effects, ins
 from jaxdn.methods.registry import is_method, method_named
 from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES, THROUGH_CENTRES
 from jaxdn.planning.plan import SCORED
+from jaxdn.render.clip_job import ClipJob, UnplannedClip
 from jaxdn.render.families import FAMILIES
-from jaxdn.render.mitsuba.variant import choose_variant, separates_lobes, use_variant
-from jaxdn.render.open_scene import open_family
+from jaxdn.render.mitsuba.variant import choose_variant, pin_variant, separates_lobes, use_variant
+from jaxdn.render.open_scene import check_no_animation, open_family
 from jaxdn.render.path_depth import PathDepth, measure_depth
 from jaxdn.render.scenes.optics import ENTRIES, get_shutter
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.scenes.scene_file import SceneFile
 from jaxdn.render.settings import RenderSettings
-from jaxdn.render.worker_pool import ClipJob, render_clips
+from jaxdn.render.worker_pool import render_clips
 from jaxdn.zoo.ready import find_model
 
 
@@ -115,13 +118,50 @@ class ClipSource(NamedTuple):
     """Every seed draws a lens, a shutter and fog (:mod:`jaxdn.render.camera_paths.random_optics`)."""
 
 
-def render(source: ClipSource, out: Path, settings: RenderSettings, *, workers: int | None = None) -> list[Path]:
+def render(
+    source: ClipSource,
+    out: Path,
+    settings: RenderSettings,
+    *,
+    workers: int | None = None,
+    executor: Executor | None = None,
+    threads: int | None = None,
+    frames_per_task: int | None = None,
+) -> list[Path]:
     """Render clips into folders ``out/<scene>-<seed>``, or resume them, and return these folders.
 
-    ``workers`` is the number of processes, by default that of cores. Raises as :func:`plan_jobs` does, and RenderError,
-    at the end, for clips that failed.
+    With an ``executor`` each clip is planned where it is rendered, unless one plan serves all. The other options are
+    those of :func:`jaxdn.render.worker_pool.render_clips`. Raises as :func:`plan_jobs` does, and RenderError, at the
+    end, for clips that failed.
     """
-    return render_clips(plan_jobs(source, out, settings), workers=workers)
+    here = executor is None or not (source.randomised or source.scene in FAMILIES)
+    jobs: Sequence[ClipJob | UnplannedClip] = (
+        plan_jobs(source, out, settings) if here else _list_unplanned(source, out, settings)
+    )
+    return render_clips(jobs, workers=workers, executor=executor, threads=threads, frames_per_task=frames_per_task)
+
+
+def _list_unplanned(source: ClipSource, out: Path, settings: RenderSettings) -> list[UnplannedClip]:
+    """The clips whose scenes differ, each to be planned by the process that renders it. Raises as plan_jobs does."""
+    _check_source(source, settings)
+    if source.denoiser is not None:
+        find_denoiser(source.denoiser)
+    print(f"rendering with Mitsuba's {pin_variant()} on all machines; each clip is planned where it is rendered")
+    name = SceneFile.name_of(source.scene) if source.randomised else source.scene
+    return [
+        UnplannedClip(
+            str(out / f"{name}-{seed}"),
+            source.frames,
+            functools.partial(_plan_job, source._replace(seeds=[seed]), out, settings),
+        )
+        for seed in source.seeds
+    ]
+
+
+def _plan_job(source: ClipSource, out: Path, settings: RenderSettings) -> ClipJob:
+    """The job of a source with one seed."""
+    (job,) = plan_jobs(source, out, settings)
+    return job
 
 
 def plan_jobs(source: ClipSource, out: Path, settings: RenderSettings) -> list[ClipJob]:
@@ -130,9 +170,7 @@ def plan_jobs(source: ClipSource, out: Path, settings: RenderSettings) -> list[C
     Prints the Mitsuba variant and each clip's effects. Raises ValueError for a source that is not a scene and for
     options out of range.
     """
-    check_at_least(1, frames=source.frames)
-    if source.random_optics:
-        _check_random_optics(source, settings)
+    _check_source(source, settings)
     scenes = _randomise_scenes(source, out) if source.randomised else _open_scenes(source)
     if source.random_optics:
         scenes = _randomise_optics(scenes, source.frames)
@@ -168,6 +206,29 @@ def _find_reader(names: str, variant: str, settings: RenderSettings) -> Denoiser
     return reader._replace(reads=reader.reads | SCORED) if settings.reference_spp else reader
 
 
+def _check_source(source: ClipSource, settings: RenderSettings) -> None:
+    """Raise ValueError for a source that is no scene, and for options that it cannot have."""
+    check_at_least(1, frames=source.frames)
+    if source.random_optics:
+        _check_random_optics(source, settings)
+    name, animation = source.scene, source.animation
+    if source.randomised:
+        if not name.endswith(".xml"):
+            raise ValueError(f"tour of {name!r}: expected a Mitsuba scene (.xml); leave --tour out for a family.")
+        if animation is not None:
+            raise ValueError(
+                f"animation {animation}: expected none with --tour, which makes its own; leave one of them out."
+            )
+        if not Path(name).is_file():
+            raise ValueError(f"scene {name}: expected a Mitsuba scene (.xml), found no file.")
+    elif name in FAMILIES:
+        check_no_animation(name, animation)
+    elif not name.endswith(".xml"):
+        raise ValueError(
+            f"scene {name!r}: expected a family ({', '.join(sorted(FAMILIES))}) or a Mitsuba scene (.xml)."
+        )
+
+
 def _check_random_optics(source: ClipSource, settings: RenderSettings) -> None:
     """Raise ValueError for what can have no random optics."""
     if settings.pixel_filter == "centre":
@@ -194,23 +255,13 @@ def _open_scenes(source: ClipSource) -> Iterable[tuple[str, AnimatedScene, list[
     name, animation = source.scene, source.animation
     if name in FAMILIES:  # built one at a time: there may be hundreds
         return ((name, open_family(name, seed, animation), [seed]) for seed in source.seeds)
-    if name.endswith(".xml"):
-        scene = SceneFile(Path(name), animation)
-        return [(scene.name, scene, list(source.seeds))]
-    raise ValueError(f"scene {name!r}: expected a family ({', '.join(sorted(FAMILIES))}) or a Mitsuba scene (.xml).")
+    scene = SceneFile(Path(name), animation)
+    return [(scene.name, scene, list(source.seeds))]
 
 
 def _randomise_scenes(source: ClipSource, out: Path) -> Iterable[tuple[str, AnimatedScene, list[int]]]:
     """As :func:`_open_scenes`, animated by each seed; an animation in a folder's record is not searched again."""
     file = source.scene
-    if not file.endswith(".xml"):
-        raise ValueError(f"tour of {file!r}: expected a Mitsuba scene (.xml); leave --tour out for a family.")
-    if source.animation is not None:
-        raise ValueError(
-            f"animation {source.animation}: expected none with --tour, which makes its own; leave one of them out."
-        )
-    if not Path(file).is_file():
-        raise ValueError(f"scene {file}: expected a Mitsuba scene (.xml), found no file.")
     use_variant()
     # Its names of Mitsuba exist only after a variant is chosen.
     from jaxdn.render.camera_paths.randomised_scene import randomise_scene

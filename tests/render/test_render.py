@@ -19,6 +19,7 @@ from jaxdn.core.frame import present
 from jaxdn.data.clip.folder import begun_record, is_clip, read_record
 from jaxdn.render import worker_pool
 from jaxdn.render.clip import render_clip
+from jaxdn.render.clip_job import ClipJob, is_finished, keep_variant
 from jaxdn.render.frame import RenderedFrame, render_frame
 from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.render.mitsuba.variant import choose_variant, list_llvm_candidates, use_variant
@@ -300,14 +301,14 @@ def test_a_clip_is_finished_with_all_its_frames_and_the_same_settings_alone(tmp_
     scene = {"family": "fruit", "seed": 0}
     settings = RenderSettings(plan=effects.plan(effects.choose_effects(["indirect"], 2)), **SIZE)
     render_clip(scene_from_record(scene), tmp_path, replace(settings, variant="scalar_rgb"), frames=2)
-    job = worker_pool.ClipJob(scene, str(tmp_path), 2, settings)
-    assert worker_pool._is_finished(job)
+    job = ClipJob(scene, str(tmp_path), 2, settings)
+    assert is_finished(job)
     (tmp_path / "frame_0001.exr").unlink()
-    assert not worker_pool._is_finished(job)
+    assert not is_finished(job)
     render_clip(scene_from_record(scene), tmp_path, replace(settings, variant="scalar_rgb"), frames=2)
-    assert worker_pool._is_finished(job)
+    assert is_finished(job)
     for change in ({"seed": 1}, {"plan": None}, {"max_depth": 2}, {"variant": "llvm_ad_rgb"}, {"draws": 1}):
-        assert not worker_pool._is_finished(job._replace(settings=replace(settings, **change)))
+        assert not is_finished(job._replace(settings=replace(settings, **change)))
 
 
 def test_other_settings_in_the_same_folder_raise(tmp_path: Path) -> None:
@@ -444,7 +445,7 @@ def test_the_users_choice_wins_and_old_libraries_are_not_candidates(monkeypatch:
 
 
 def test_a_worker_that_dies_is_reported_with_its_clip(tmp_path: Path) -> None:
-    job = worker_pool.ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "lost"), 4, RenderSettings(**SIZE))
+    job = ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "lost"), 4, RenderSettings(**SIZE))
     worker = worker_pool._start_worker(job, threads=1)
     worker.process.kill()
     deadline, failure, ended = time.monotonic() + 60, "", False
@@ -471,13 +472,13 @@ def begin(folder: Path, scene: dict[str, Any], variant: str) -> None:
 def test_a_job_keeps_the_variant_that_its_clip_was_started_with(tmp_path: Path) -> None:
     scene = {"family": "fruit", "seed": 0}
     begin(tmp_path, scene, "scalar_rgb")
-    job = worker_pool.ClipJob(scene, str(tmp_path), 2, RenderSettings(**SIZE))
-    assert worker_pool._keep_variant(job).settings.variant == "scalar_rgb"
+    job = ClipJob(scene, str(tmp_path), 2, RenderSettings(**SIZE))
+    assert keep_variant(job).settings.variant == "scalar_rgb"
     assert (
-        worker_pool._keep_variant(job._replace(settings=replace(job.settings, variant="llvm_ad_rgb"))).settings.variant
+        keep_variant(job._replace(settings=replace(job.settings, variant="llvm_ad_rgb"))).settings.variant
         == "llvm_ad_rgb"
     )
-    assert worker_pool._keep_variant(job._replace(folder=str(tmp_path / "new"))).settings.variant is None
+    assert keep_variant(job._replace(folder=str(tmp_path / "new"))).settings.variant is None
 
 
 def test_a_clip_started_with_a_variant_that_does_not_run_here_is_named(tmp_path: Path) -> None:
@@ -485,7 +486,7 @@ def test_a_clip_started_with_a_variant_that_does_not_run_here_is_named(tmp_path:
     begin(tmp_path, scene, "scalar_rgb")
     file = tmp_path / "clip.unfinished.json"
     file.write_text(file.read_text().replace("scalar_rgb", "vulkan_rgb"))
-    job = worker_pool.ClipJob(scene, str(tmp_path), 2, RenderSettings(**SIZE))
+    job = ClipJob(scene, str(tmp_path), 2, RenderSettings(**SIZE))
     with pytest.raises(ValueError, match=rf"{tmp_path.name}.*vulkan_rgb"):
         worker_pool.render_clips([job], progress=False)
 
@@ -494,7 +495,7 @@ def test_a_clip_started_with_a_variant_that_does_not_run_here_is_named(tmp_path:
 def test_an_interrupted_clip_is_finished_with_the_variant_it_was_started_with(tmp_path: Path) -> None:
     scene = {"family": "fruit", "seed": 0}
     begin(tmp_path, scene, "scalar_rgb")
-    worker_pool.render_clips([worker_pool.ClipJob(scene, str(tmp_path), 2, RenderSettings(**SIZE))], progress=False)
+    worker_pool.render_clips([ClipJob(scene, str(tmp_path), 2, RenderSettings(**SIZE))], progress=False)
     assert is_clip(tmp_path)
     record = begun_record(tmp_path)
     assert record is not None
@@ -503,8 +504,8 @@ def test_an_interrupted_clip_is_finished_with_the_variant_it_was_started_with(tm
 
 @pytest.mark.slow
 def test_clips_are_rendered_in_parallel_and_failures_do_not_stop_the_others(tmp_path: Path) -> None:
-    good = worker_pool.ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "good"), 2, RenderSettings(**SIZE))
-    bad = worker_pool.ClipJob({"family": "nothing"}, str(tmp_path / "bad"), 2, RenderSettings(**SIZE))
+    good = ClipJob({"family": "fruit", "seed": 0}, str(tmp_path / "good"), 2, RenderSettings(**SIZE))
+    bad = ClipJob({"family": "nothing"}, str(tmp_path / "bad"), 2, RenderSettings(**SIZE))
     steps: list[tuple[int, int]] = []
     with pytest.raises(RenderError, match=r"1 of 2(.|\n)*bad(.|\n)*'nothing'"):
         worker_pool.render_clips([bad, good], workers=2, progress=lambda done, total: steps.append((done, total)))
@@ -518,8 +519,6 @@ def test_clips_are_rendered_in_parallel_and_failures_do_not_stop_the_others(tmp_
 
 @pytest.mark.slow
 def test_a_finished_clip_needs_no_process(tmp_path, monkeypatch):
-    from jaxdn.render import ClipJob, worker_pool
-
     job = ClipJob(
         {"family": "fruit", "seed": 0},
         str(tmp_path / "c"),

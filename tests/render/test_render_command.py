@@ -37,7 +37,7 @@ def counted(monkeypatch):
     count("SceneFile", "opened")
     count("open_family", "opened")
     count("inspect", "planned")
-    monkeypatch.setattr(command, "render_clips", lambda jobs, workers: seen["jobs"].extend(jobs) or [])
+    monkeypatch.setattr(command, "render_clips", lambda jobs, **options: seen["jobs"].extend(jobs) or [])
     return seen
 
 

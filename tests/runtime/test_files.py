@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -132,3 +134,31 @@ def test_values_without_a_json_form_are_refused_by_name(folder: Path, value: obj
     with pytest.raises(ValueError, match=r"a: cannot be written as JSON .*finite numbers"):
         write_json(folder / "a", {"value": value})
     assert contents(folder) == OLD
+
+
+def test_what_killed_processes_left_behind_is_removed_and_nothing_of_living_ones(tmp_path: Path) -> None:
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    host = atomic_files._host()
+    names = {
+        f".a.exr.{host}.{dead.pid}.1.tmp": os.name == "nt",  # where nobody can tell
+        f".a.exr.{host}.{os.getpid()}.1.tmp": True,
+        f".a.exr.another-{host}.{dead.pid}.1.tmp": True,
+        ".a.exr.elsewhere.7.1.tmp": False,  # a day old
+        ".mine.tmp": True,
+    }
+    for name in names:
+        (tmp_path / name).write_text("half")
+    os.utime(tmp_path / ".a.exr.elsewhere.7.1.tmp", (0, 0))
+    atomic_files.remove_abandoned(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {name for name, kept in names.items() if kept}
+
+
+def test_temporary_names_differ_between_machines(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = set()
+    for host in ("node-1", "node-2", "", "a strange/name", "n" * 300):
+        monkeypatch.setattr("platform.node", lambda host=host: host)
+        with atomic_write(folder / "a") as temporary:
+            temporary.write_text("new")
+            names.add(temporary.name)
+    assert len(names) == 5

@@ -208,6 +208,11 @@ def _checked_buffers(stored: StoredFrame, wanted: set[str], file: Path) -> Store
     return stored._replace(frame=only(stored.frame, frozenset(wanted)))
 
 
+def count_frames(path: str | Path, frames: int) -> int:
+    """How many of a clip's first frames are there, whether it is finished or not; 0 for a folder that is missing."""
+    return sum(index < frames for index, _ in _numbered(Path(path)))
+
+
 def refuse_unfinished(path: str | Path) -> None:
     """Raise ClipError if a folder is one of our clips whose rendering was interrupted."""
     if _looks_unfinished(path):

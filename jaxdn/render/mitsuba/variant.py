@@ -124,8 +124,8 @@ def choose_variant(requested: str | None = None) -> Choice:
     if importlib.util.find_spec("mitsuba") is None:  # every probe below would fail, which says nothing about LLVM
         raise ModuleNotFoundError("No module named 'mitsuba'", name="mitsuba")
     requested = requested or os.environ.get(OVERRIDE) or None
-    if requested is not None and requested not in VARIANTS:
-        raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {requested!r}.")
+    if requested is not None:
+        _check_name(requested)
     if requested not in _choice:
         entry = f"{_FOUND}_{requested or 'fastest'}".upper()
         inherited = os.environ.get(entry, "").split("|", 2)
@@ -135,6 +135,20 @@ def choose_variant(requested: str | None = None) -> Choice:
             _choice[requested] = _find(requested)
             os.environ[entry] = "|".join(_choice[requested])
     return _choice[requested]
+
+
+def pin_variant() -> str:
+    """The variant for other machines, which must not choose each its own: ``JAXDN_VARIANT``, which need not run here,
+    else that of :func:`choose_variant`. Raises ValueError if it is unknown.
+    """
+    variant = os.environ.get(OVERRIDE) or choose_variant().variant
+    _check_name(variant)
+    return variant
+
+
+def _check_name(variant: str) -> None:
+    if variant not in VARIANTS:
+        raise ValueError(f"variant: expected one of {', '.join(VARIANTS)}, got {variant!r}.")
 
 
 def use_variant(requested: str | None = None) -> str:
