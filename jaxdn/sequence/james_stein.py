@@ -22,9 +22,12 @@ V is the less of two estimates in windows, but at least half of the second:
   that of four directions in which it is smallest, because edges are smooth along themselves.
 
 The first alone would be 0 where all was blurred. Texture of single pixels looks like noise to both, but it is seldom
-everywhere, and noise is: of little noise, V is at most that of the quietest block of surfaces around. Of much noise
-this would be far too little, because few samples are mostly dark, with a few bright ones. Both hold for renderers that
-filter their pixels by drawing samples from the filter, as Cycles and our renderer do: the noise of two pixels is
+everywhere, and noise is: of little noise, V is at most that of the quietest block of surfaces around. Noise differs
+from place to place, too, so that this holds only where the denoiser blurred, because then band 2 has more energy than
+noise explains, or where the quietest block has a small part of the noise (:data:`QUIETER`). A brighter block tells how
+much noise there is in light, not in its share: sun beside a shadow adds light without noise. Of much noise all this
+would be far too little, because few samples are mostly dark, with a few bright ones. The first two hold for renderers
+that filter their pixels by drawing samples from the filter, as Cycles and our renderer do: the noise of two pixels is
 independent. Neither is moved by single values, because d is Winsorized (Tukey 1962): it counts as at most :data:`BOUND`
 times the light, unless most of the 3x3 pixels around agree. Light is that of the denoised image plus a share of its
 median, which no lamp moves.
@@ -43,6 +46,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.core.checks import check_image, check_same_size
+from jaxdn.core.medians import median, median_3x3
 from jaxdn.core.separable import correlate
 from jaxdn.filters.atrous import B3_SPLINE
 
@@ -79,6 +83,14 @@ QUIET = 2
 """Blocks on each side of a pixel's own among which the quietest is sought."""
 _QUIETEST = 1.88
 """Variance of grey Gaussian noise, relative to the mean of the least of its measured ones in so many blocks."""
+BLURRED = (1.0, 1.6)
+"""Energy of the third band, relative to that of noise, up to which the denoiser blurred nothing here, and from which it
+did: half of the pixels of Open Image Denoise have 0.3 to 0.8, of ``svgf`` 3 to 12."""
+QUIETER = (0.08, 0.16)
+"""Noise (variance) of the quietest block around, relative to a pixel's, up to which that counts although nothing was
+blurred, and from which it does not. Rendered noise differs by so much where the light does."""
+_NO_BLOCK = 1e9
+_TINY = 1e-12
 MANY = (0.25, 0.5)
 """Share of such blocks around from which on pixels begin to be kept, and from which on they are."""
 AROUND = 4
@@ -155,7 +167,7 @@ def combine(
     change, common = _winsorize(whole)
     curved = _second_differences(change)
     bands = _split(change)
-    variance = _measure_noise(bands, curved, surface)
+    variance = _measure_noise(bands, curved, light, surface)
     weights = _weigh(bands, _split(whole)[-1], variance)
     kept = sum(weight * band for weight, band in zip(weights, bands, strict=True))
     own = sum(weight * center for weight, center in zip(weights, _CENTERS, strict=True))
@@ -192,7 +204,7 @@ def measure_confidence(combined: JamesStein) -> Confidence:
     counts as noise, so that too much of it stays. Where the combined image's estimated error is about that of the noisy
     one, the noisy one is the result.
     """
-    noise, lost = jnp.median(combined.noise), jnp.sqrt(jnp.mean(combined.lost**2))
+    noise, lost = median(combined.noise), jnp.sqrt(jnp.mean(combined.lost**2))
     noisy_risk = jnp.sum(combined.noisy_risk)
     relative = jnp.sum(combined.risk) / jnp.where(noisy_risk > 0, noisy_risk, 1.0)
     much, ratio = 1 - _falling(lost, *LOST), lost / jnp.maximum(noise, 1e-6)
@@ -205,16 +217,13 @@ def measure_confidence(combined: JamesStein) -> Confidence:
 def measure_level(denoised: jax.Array) -> jax.Array:
     """The median light of an image [H, W, 3] where it is lit; 0 for a black one."""
     light = jnp.mean(denoised, axis=-1)
-    return jnp.nan_to_num(jnp.nanmedian(jnp.where(light > 0, light, jnp.nan)))
+    return jnp.nan_to_num(median(jnp.maximum(light, 0.0), light > 0))
 
 
 def _winsorize(change: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Changes within :data:`BOUND`, or the median size of the 3x3 around if that is more; and [H, W, 1] which were."""
     size = jnp.mean(jnp.abs(change), axis=-1)
-    height, width = size.shape
-    padded = jnp.pad(size, 1, mode="edge")
-    around = jnp.stack([padded[dy : dy + height, dx : dx + width] for dy, dx in np.ndindex(3, 3)])
-    bound = jnp.maximum(jnp.median(around, axis=0), BOUND)[..., None]
+    bound = jnp.maximum(median_3x3(size), BOUND)[..., None]
     # Of a size of which the fourth power is finite.
     bounded = jnp.clip(jnp.clip(change, -bound, bound), -1e8, 1e8)
     return bounded, jnp.all(jnp.abs(change) <= bound, axis=-1, keepdims=True)
@@ -270,26 +279,34 @@ def _second_differences(change: jax.Array) -> jax.Array:
     return jnp.concatenate([_mean_square(one) / 6 for one in along], axis=-1)
 
 
-def _measure_noise(bands: list[jax.Array], curved: jax.Array, surface: jax.Array | None) -> jax.Array:
+def _measure_noise(bands: list[jax.Array], curved: jax.Array, light: jax.Array, surface: jax.Array | None) -> jax.Array:
     """V of each pixel, [H, W, 1]."""
-    finest, next_one = (_window(_mean_square(band), RADII[0]) for band in bands[:2])
+    finest, next_one, third = (_window(_mean_square(band), RADII[0]) for band in bands[:3])
     by_scale = jnp.maximum(finest - SLOPE * next_one, 0.0) / (GAINS[0] - SLOPE * GAINS[1])
     by_direction = _DIRECTION_BIAS * jnp.min(_window(curved, RADII[0]), axis=-1, keepdims=True)
     variance = jnp.clip(by_scale, _LEAST * by_direction, by_direction)
-    little = _falling(jnp.sqrt(by_direction), *LITTLE)
-    return variance + little * (jnp.minimum(variance, _quietest(curved, surface)) - variance)
+    quiet, some = _quietest(curved, light, surface), jnp.maximum(by_direction, _TINY)
+    blurred = 1 - _falling(third / (GAINS[2] * some), *BLURRED)
+    texture = jnp.maximum(blurred, _falling(quiet / some, *QUIETER)) * _falling(jnp.sqrt(by_direction), *LITTLE)
+    return variance + texture * (jnp.minimum(variance, quiet) - variance)
 
 
-def _quietest(curved: jax.Array, surface: jax.Array | None) -> jax.Array:
-    """The least noise of a block of surfaces near each pixel, [H, W, 1], without its bias; interpolated between them.
+def _quietest(curved: jax.Array, light: jax.Array, surface: jax.Array | None) -> jax.Array:
+    """The least noise that blocks of surfaces near each pixel [H, W, 1] allow, without bias; interpolated between them.
 
-    A sky has none, and says nothing of what is beside it. It is very large where there is no such block.
+    A sky has no noise, and says nothing of what is beside it. The result is very large where there is no such block. A
+    brighter block says how much noise there is in light, not in its share: where a sun adds light without noise, that
+    share is smaller.
     """
-    blocks = jnp.min(_mean_blocks(curved), axis=-1)
+    blocks, bright = jnp.min(_mean_blocks(curved), axis=-1), _mean_blocks(light)[..., 0]
     if surface is not None:
-        blocks = jnp.where(_mean_blocks(surface.astype(curved.dtype))[..., 0] == 1, blocks, 1e9)
-    side = 2 * QUIET + 1
-    least = jax.lax.reduce_window(blocks, jnp.inf, jax.lax.min, (side, side), (1, 1), "SAME")
+        blocks = jnp.where(_mean_blocks(surface.astype(curved.dtype))[..., 0] == 1, blocks, _NO_BLOCK)
+    rows, columns = blocks.shape
+    around = [jnp.pad(image, QUIET, constant_values=value) for image, value in ((blocks, _NO_BLOCK), (bright, 0.0))]
+    least = jnp.full_like(blocks, _NO_BLOCK)
+    for dy, dx in np.ndindex(2 * QUIET + 1, 2 * QUIET + 1):
+        noise, other = (image[dy : dy + rows, dx : dx + columns] for image in around)
+        least = jnp.minimum(least, noise * jnp.maximum(other / bright, 1.0) ** 2)
     return _QUIETEST * _enlarge(least[..., None], curved.shape[:2])
 
 

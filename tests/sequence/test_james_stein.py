@@ -10,6 +10,7 @@ import pytest
 from jaxdn.sequence.james_stein import (
     AROUND,
     BLOCK,
+    BLURRED,
     BOUND,
     CLEAN,
     DOUBT,
@@ -19,6 +20,7 @@ from jaxdn.sequence.james_stein import (
     MOST_DOUBT,
     MUCH,
     QUIET,
+    QUIETER,
     RADII,
     SLOPE,
     combine,
@@ -72,6 +74,11 @@ def window(image, radius):
     )
 
 
+def near(blocks, y, x):
+    """The blocks among which the quietest is sought."""
+    return blocks[max(y - QUIET, 0) : y + QUIET + 1, max(x - QUIET, 0) : x + QUIET + 1]
+
+
 def falling(x, low, high):
     part = np.clip((high - x) / (high - low), 0, 1)
     return part * part * (3 - 2 * part)
@@ -107,15 +114,18 @@ def reference(noisy, denoised):
     blocks = np.min(
         [c.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK).mean(axis=(1, 3)) for c in curved], axis=0
     )
+    bright = light[..., 0].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK).mean(axis=(1, 3))
     around = [
         [
-            blocks[max(y - QUIET, 0) : y + QUIET + 1, max(x - QUIET, 0) : x + QUIET + 1].min()
+            (near(blocks, y, x) * np.maximum(near(bright, y, x) / bright[y, x], 1) ** 2).min()
             for x in range(width // BLOCK)
         ]
         for y in range(height // BLOCK)
     ]
     quietest = 1.88 * np.asarray(jax.image.resize(np.array(around), (height, width), "linear"))
-    little = falling(np.sqrt(by_direction), *LITTLE)
+    blurred = 1 - falling(window(squares[2], 7) / (GAINS[2] * by_direction), *BLURRED)
+    texture = np.maximum(blurred, falling(quietest / by_direction, *QUIETER))
+    little = texture * falling(np.sqrt(by_direction), *LITTLE)
     variance = little * np.minimum(variance, quietest) + (1 - little) * variance
     cut = window(np.mean((whole - smooth[-1]) ** 2, axis=-1), RADII[-1])
     kept, weights = 0, []
@@ -192,6 +202,16 @@ def test_texture_of_single_pixels_comes_back_where_blocks_without_noise_are_near
     textured = np.arange(truth.shape[1])[None, :, None] < 64
     sky = np.broadcast_to(textured, truth[..., :1].shape)
     assert mse(mixed(truth, wall, surface=sky).image[:, :64], truth[:, :64]) > 0.5 * mse(wall[:, :64], truth[:, :64])
+
+
+@pytest.mark.parametrize("sun", [1.0, 4.0])
+def test_noise_that_differs_from_place_to_place_does_not_come_back(rng, sun):
+    """Quiet blocks beside noisy ones, also where sun is beside shadow: only a denoiser that blurred has lost texture."""
+    columns = np.arange(128)[None, :, None] // 16 % 2
+    truth = np.broadcast_to(np.where(columns, 0.3, 0.3 * sun), (96, 128, 3)).astype(np.float32)
+    noise = np.where(columns, 0.15, 0.06 / sun) * rng.standard_normal((96, 128, 1))
+    noisy = (truth * (1 + noise)).astype(np.float32)
+    assert mse(mixed(noisy, truth).image, truth) < 0.2 * mse(noisy, truth)
 
 
 @pytest.mark.parametrize("samples", [0.5, 4, 64])
