@@ -206,7 +206,7 @@ def test_texture_of_single_pixels_comes_back_where_blocks_without_noise_are_near
 
 @pytest.mark.parametrize("sun", [1.0, 4.0])
 def test_noise_that_differs_from_place_to_place_does_not_come_back(rng, sun):
-    """Quiet blocks beside noisy ones, also where sun is beside shadow: only a denoiser that blurred has lost texture."""
+    """Quiet blocks beside noisy ones, also where sun is beside shadow: only who blurred lost texture."""
     columns = np.arange(128)[None, :, None] // 16 % 2
     truth = np.broadcast_to(np.where(columns, 0.3, 0.3 * sun), (96, 128, 3)).astype(np.float32)
     noise = np.where(columns, 0.15, 0.06 / sun) * rng.standard_normal((96, 128, 1))
