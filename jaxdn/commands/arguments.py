@@ -52,6 +52,8 @@ class Inspect:
     "buffer=PATTERN.exr" reads it from files of its own."""
     layer: str | None = None
     """For files of other renderers: the view layer or part to look for buffers in."""
+    view: str | None = None
+    """For files of other renderers with several views (stereo): the only one to read; default: every view."""
 
 
 @dataclass
@@ -262,6 +264,8 @@ class Denoise:
     "buffer=PATTERN.exr" reads it from files of its own."""
     layer: str | None = None
     """For files of other renderers: the view layer or part to look for buffers in."""
+    view: str | None = None
+    """For files of other renderers with several views (stereo): the only one to read; default: every view."""
     implementation: str = "auto"
     """Backend for the network: reference (XLA), onednn-bfloat16 (CPUs with AVX-512 BF16 or AMX; the extra onednn),
     onednn-float32 (CPUs; the extra onednn), onnxruntime (CPUs; the extra onnx); auto: the fastest available."""
@@ -350,4 +354,5 @@ def name_channels(options: Inspect | Denoise) -> "ChannelNaming":
         options.motion_convention,
         parse(options.channels, option="--channels", words=True),
         options.layer,
+        options.view,
     )

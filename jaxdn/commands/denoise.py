@@ -85,15 +85,19 @@ def _show_job(job: Job, naming: ChannelNaming, method: Model) -> None:
     """Print what is read of a shot."""
     single = len(job.shot.files) == 1
     reads = frozenset[str]() if method.denoiser is None else method.denoiser.reads
-    for source in [job.clip] if job.clip is not None else job.files:
-        try:
-            mapping = read_channel_mapping(source, naming, single=single)
-        except DamagedFile:  # told when its turn comes
-            if source is job.files[-1]:
-                raise
-            continue
-        show_channel_mapping(job.source, mapping, reads=reads, single=single)
-        return
+    if job.clip is not None:
+        show_channel_mapping(job.source, read_channel_mapping(job.clip, naming), reads=reads)
+    for view, files in job.views.items():
+        title = f"{job.source}{view and f' ({view})'}"
+        for source in files:
+            try:
+                mapping = read_channel_mapping(source, naming, single=single)
+            except DamagedFile:  # told when its turn comes
+                if source is files[-1]:
+                    raise
+                continue
+            show_channel_mapping(title, mapping, reads=reads, single=single)
+            break
 
 
 def _denoise_scene(options: Denoise, scene: str) -> None:

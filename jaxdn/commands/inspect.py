@@ -71,12 +71,13 @@ def inspect_to_terminal(
         return
     if not clip and naming.options:
         raise ValueError(
-            f"scene {source!r}: expected none of --channels, --layer, --motion-convention, which are for EXR files."
+            f"scene {source!r}: expected none of --channels, --layer, --motion-convention, --view, which are for EXR "
+            "files."
         )
     if clip and naming.options:
         raise ValueError(
-            f"{source}: expected none of --channels, --layer, --motion-convention, which are for files of other "
-            "renderers; it is a clip of jaxdn's own."
+            f"{source}: expected none of --channels, --layer, --motion-convention, --view, which are for files of "
+            "other renderers; it is a clip of jaxdn's own."
         )
     if clip and not as_json:
         reads = None if reader is None else reader.reads

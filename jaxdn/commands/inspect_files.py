@@ -8,15 +8,16 @@ from typing import Any
 from jaxdn.commands.channel_table import missing, show_channel_mapping
 from jaxdn.data.clip.folder import refuse_unfinished
 from jaxdn.data.errors import DamagedFile
+from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import UNSTATED, MappedBuffer, read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.foreign.passes import join_passes
-from jaxdn.data.foreign.shot_files import open_files
 from jaxdn.data.foreign.shots import Shot, find_shots, ranges
 from jaxdn.data.foreign.shots import missing as missing_numbers
 from jaxdn.data.foreign.soundness import find_unusable
 from jaxdn.data.foreign.vectors import CHOICES
+from jaxdn.data.foreign.views import open_views, select_view
 
 
 def inspect_files(
@@ -40,15 +41,26 @@ def inspect_files(
     shots, notes = join_passes(find_shots(source), naming.pass_files)
     if not as_json:
         print("".join(f"{note}\n" for note in notes), end="")
-    records = [_inspect_shot(shot, reads, naming, quiet=as_json) for shot in shots]
+    records = {}
+    for shot in select_view(shots, naming.view):
+        for view, files in open_views(shot, naming.view).items():
+            label = f"{shot.label}{view and f' ({view})'}"
+            records[label] = _inspect_shot(shot, files, label, reads, naming, quiet=as_json)
     if as_json:
-        several = {"shots": [{"shot": shot.label, **record} for shot, record in zip(shots, records, strict=True)]}
-        print(json.dumps(records[0] if len(shots) == 1 else several, indent=1))
+        several = {"shots": [{"shot": label, **record} for label, record in records.items()]}
+        print(json.dumps(several if len(records) > 1 else next(iter(records.values())), indent=1))
 
 
-def _inspect_shot(shot: Shot, reads: frozenset[str] | None, naming: ChannelNaming, *, quiet: bool) -> dict[str, Any]:
-    """What is read of a shot, for JSON; printed too unless ``quiet``."""
-    every = open_files(shot)
+def _inspect_shot(
+    shot: Shot,
+    every: Sequence[ExrFile],
+    label: str,
+    reads: frozenset[str] | None,
+    naming: ChannelNaming,
+    *,
+    quiet: bool,
+) -> dict[str, Any]:
+    """What is read of a shot, or of one view of it, for JSON; printed too unless ``quiet``."""
     unusable = {every[index].path.name: reason for index, reason in find_unusable(every, naming).items()}
     opened = [file for file in every if file.path.name not in unusable]
     notes: list[str] = []
@@ -69,7 +81,7 @@ def _inspect_shot(shot: Shot, reads: frozenset[str] | None, naming: ChannelNamin
     if not quiet:
         for note in notes:
             print(note)
-        show_channel_mapping(shot.label, mapping, reads=reads)
+        show_channel_mapping(label, mapping, reads=reads)
         print(f"{len(opened)} {'frame' if len(opened) == 1 else 'frames'} of {width} x {height} pixels")
         for name, reason in unusable.items():
             print(f"{name} counts as a missing frame: {reason}")

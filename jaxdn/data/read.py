@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -21,6 +22,7 @@ def open_frames(
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
     layer: str | None = None,
+    view: str | None = None,
     part: range | None = None,
     backwards: bool = False,
     log: Callable[[str], None] = lambda line: None,
@@ -41,7 +43,13 @@ def open_frames(
         refuse_unfinished(path)
     check_single_layer(path, spp)
     files, plain = plain_frames(
-        path, motion_convention=motion_convention, channels=channels, layer=layer, backwards=backwards, log=log
+        path,
+        motion_convention=motion_convention,
+        channels=channels,
+        layer=layer,
+        view=view,
+        backwards=backwards,
+        log=log,
     )
     # Unlike the variable of a loop, this does not keep a frame while the next one is read.
     return files, map(StoredFrame, plain)
@@ -70,6 +78,7 @@ def read_clip(
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
     layer: str | None = None,
+    view: str | None = None,
 ) -> Clip:
     """Read a clip as NumPy arrays, with the dtypes of :attr:`jaxdn.core.frame.Buffer.dtype`.
 
@@ -77,13 +86,14 @@ def read_clip(
 
     ``path`` is the folder of a clip, of which ``spp`` samples a pixel are read, and with ``layers`` the independent
     noisy layers of 1, 2, 4, ... samples too (``Clip.layers``); or a folder of, or a glob pattern for, the EXR files of
-    another renderer, whose channels are found by their names (``motion_convention``, ``channels`` and ``layer``: see
+    another renderer, whose channels are found by their names (``motion_convention``, ``channels``, ``layer``, ``view``:
     :func:`jaxdn.data.foreign.import_exr.plain_frames`).
 
     Raises ClipError, naming the file and the reason: no such folder, no ``clip.json``, another format version, missing
     or unreadable frames, missing channels, frames that differ in size or channels, ``spp`` or ``layers`` not available.
     """
-    _, opened = open_frames(path, spp=spp, motion_convention=motion_convention, channels=channels, layer=layer)
+    naming: dict[str, Any] = {"motion_convention": motion_convention, "channels": channels, "layer": layer}
+    _, opened = open_frames(path, spp=spp, view=view, **naming)
     stored = list(opened)
     counts = doubling_layers(stored[0].layers, path) if layers else []
     named = {name for one in stored for name in present(one.frame)}

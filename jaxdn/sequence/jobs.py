@@ -11,8 +11,8 @@ from pathlib import Path
 from jaxdn.data.clip.folder import frame_path, is_clip, read_record, refuse_unfinished
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.passes import join_passes
-from jaxdn.data.foreign.shot_files import open_files
 from jaxdn.data.foreign.shots import Shot, find_shots, is_named, missing, ranges
+from jaxdn.data.foreign.views import open_views, select_view
 
 WARM_UP = 16
 """Frames before a wanted one that are read for its history where only a part of a shot is denoised. After so many,
@@ -41,6 +41,9 @@ class Job:
     copies: Mapping[Path, tuple[Path, ...]] = field(default_factory=dict)
     """Target -> further files to write with the same result, of frames that are held."""
 
+    views: Mapping[str, tuple[ExrFile, ...]] = field(default_factory=dict)
+    """View -> its files, each to be opened once; "" for files without views; of a clip of ours none."""
+
     @property
     def source(self) -> Path:
         """What tells of which layers it consists: the clip's folder, or the first file."""
@@ -56,13 +59,19 @@ class Job:
         kept = [index for index in range(len(self.shot.files)) if index not in indices]
         numbers = tuple(self.shot.numbers[index] for index in kept) if self.shot.numbers else ()
         shot = self.shot._replace(files=tuple(self.shot.files[index] for index in kept), numbers=numbers)
+        views = {view: tuple(files[index] for index in kept) for view, files in self.views.items()}
         return replace(
             self,
+            views=views,
             shot=shot,
             targets=tuple(self.targets[index] for index in kept),
             wanted=frozenset(new for new, index in enumerate(kept) if index in self.wanted),
             files=tuple(self.files[index] for index in kept),
         )
+
+    def of_view(self, view: str) -> "Job":
+        """The same job with the files of one view."""
+        return replace(self, files=self.views[view])
 
     def segments(self, *, both_directions: bool = False) -> Iterator[range]:
         """Indices of consecutive frames, each after the first with a history: the wanted ones and their warm-up.
@@ -99,6 +108,7 @@ def find_jobs(
     frames: Collection[int] | None = None,
     skip_existing: bool = False,
     pass_files: Mapping[str, str] | None = None,
+    view: str | None = None,
 ) -> list[Job]:
     """The shots of folders, patterns and files; several sequences in a folder are several shots.
 
@@ -114,11 +124,13 @@ def find_jobs(
       frames: numbers of the frames to denoise; None: all.
       skip_existing: leave out what is there already.
       pass_files: buffer -> pattern for the files that have it, of other renderers' frames.
+      view: the only one to denoise of files with several (:mod:`jaxdn.data.foreign.views`); None: each.
     """
     if not sources:
         raise ValueError("expected a folder, a pattern or a file to denoise, got none; name one.")
     found = [shot for source in _gather(sources) for shot in _shots(source)]
     joined, joints = join_passes([shot for shot, clip in found if clip is None], pass_files or {})
+    joined = select_view(joined, view)
     places = {shot.files[0]: place for place, (shot, _) in enumerate(found)}
     found = [one for one in found if one[1] is not None] + [(shot, None) for shot in joined]
     found.sort(key=lambda one: places[one[0].files[0]])
@@ -149,8 +161,8 @@ def find_jobs(
             *(joints if not jobs else ()),
             *_notes(shot, among_others=len(found) > 1, existing=len(chosen) - len(wanted)),
         )
-        files = () if clip is not None else open_files(shot)
-        jobs.append(_hold(Job(shot, clip, targets, wanted, notes, files)))
+        views = {} if clip is not None else open_views(shot, view)
+        jobs.append(_hold(Job(shot, clip, targets, wanted, notes, next(iter(views.values()), ()), views=views)))
     _check_targets(jobs)
     inputs = {file.resolve() for shot, _ in found for file in shot.files}
     if {target.resolve() for job in jobs for target in job.targets} & inputs or out.resolve() in inputs:

@@ -43,7 +43,9 @@ def _leave_out(job: Job, settings: Settings) -> tuple[Job, dict[Path, str]]:
     needed = sorted({index for part in job.segments(both_directions=settings.bidirectional) for index in part})
     if job.clip is not None or not needed:
         return job, {}
-    found = find_unusable([job.files[index] for index in needed], settings.naming)
+    found: dict[int, str] = {}
+    for files in job.views.values():
+        found = find_unusable([files[index] for index in needed], settings.naming) | found
     unusable = {needed[index]: reason for index, reason in found.items()}
     reasons = {job.shot.files[index]: reason for index, reason in unusable.items()}
     if reasons and (settings.strict or job.wanted <= set(unusable)):

@@ -2,7 +2,8 @@
 
 import shutil
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from jaxdn.sequence.jobs import Job, find_jobs
 from jaxdn.sequence.missing_frames import explain_left_out, leave_out_unusable, segments_around
 from jaxdn.sequence.segment import denoise_segment
 from jaxdn.sequence.settings import Settings
+from jaxdn.sequence.write_frames import SharedResult
 from jaxdn.zoo.ready import Model, find_model
 
 
@@ -86,6 +88,7 @@ def denoise_files(
         frames=settings.frames,
         skip_existing=settings.skip_existing,
         pass_files=settings.naming.pass_files,
+        view=settings.naming.view,
     )
     _refuse_unused(jobs, settings)
     checked = leave_out_unusable(jobs, settings, log)
@@ -151,22 +154,51 @@ class _Run:
 
     def _denoise_segment(self, job: Job, segment: range, log: Callable[[str], None]) -> None:
         """Denoise consecutive frames of a shot, from a new history."""
-        settings = self._settings
-        denoisers = [
-            FrameDenoiser(self._method, job.source, channels=job.count_channels, limit=settings.max_memory, log=log)
-            for _ in range(1 + settings.bidirectional)
-        ]
+        views = list(job.views) or [""]
+        limit = self._settings.max_memory
+        make = partial(
+            FrameDenoiser,
+            self._method,
+            job.source,
+            channels=job.count_channels,
+            limit=None if limit is None else limit / len(views),
+        )
+        logs = {view: log if view == "" else _with_view(view, log) for view in views}
+        denoisers = {view: [make(log=logs[view]) for _ in range(1 + self._settings.bidirectional)] for view in views}
         try:
-            with closing(denoise_segment(job, segment, denoisers, settings, log)) as paths:
-                for path in paths:
+            with ExitStack() as stack:
+                result = SharedResult(views) if len(views) > 1 else None
+                running = [
+                    stack.enter_context(
+                        closing(
+                            denoise_segment(
+                                job.of_view(view) if job.views else job,
+                                segment,
+                                denoisers[view],
+                                self._settings,
+                                logs[view],
+                                result,
+                            )
+                        )
+                    )
+                    for view in views
+                ]
+                # Frame by frame, so that a file has all of its views when it is written.
+                for path, *_ in zip(*running, strict=True):
                     for written in (path, *job.copies.get(path, ())):
                         if written != path:
                             _copy(path, written)
                         self.files.append(written)
                         self._on_frame(written, len(self.files), self._total)
         finally:
-            self.programs |= {program for denoiser in denoisers for program in denoiser.programs}
-            self.sanitized += denoisers[0].sanitized  # the other direction repairs the same frames
+            for view in views:
+                self.programs |= {program for denoiser in denoisers[view] for program in denoiser.programs}
+                self.sanitized += denoisers[view][0].sanitized  # the other direction repairs the same frames
+
+
+def _with_view(view: str, log: Callable[[str], None]) -> Callable[[str], None]:
+    """The callback with a view's name before its lines."""
+    return lambda line: log(f"{view}: {line}")
 
 
 def _copy(result: Path, target: Path) -> None:

@@ -16,13 +16,20 @@ from jaxdn.sequence.backward_pass import BackwardImages, backward_pass
 from jaxdn.sequence.frame_denoiser import Fallback, FrameDenoiser
 from jaxdn.sequence.jobs import Job
 from jaxdn.sequence.settings import Settings
-from jaxdn.sequence.write_frames import ClipWriter, ForeignWriter
+from jaxdn.sequence.write_frames import ClipWriter, ForeignWriter, SharedResult
 
 
 def denoise_segment(
-    job: Job, segment: range, denoisers: Sequence[FrameDenoiser], settings: Settings, log: Callable[[str], None]
+    job: Job,
+    segment: range,
+    denoisers: Sequence[FrameDenoiser],
+    settings: Settings,
+    log: Callable[[str], None],
+    result: SharedResult | None = None,
 ) -> Generator[Path, None, None]:
     """Denoise consecutive frames of a shot; yields the files as they are written.
+
+    With a ``result`` the job is one view of its files: they are written when the last view of a frame has come.
 
     Args:
       job: the shot.
@@ -30,6 +37,7 @@ def denoise_segment(
       denoisers: the forward one, and with ``settings.bidirectional`` the backward one.
       settings: what is read and written.
       log: called with lines for the user.
+      result: shared by the views of one file; None: there is one.
     """
     wanted = [index for index in segment if index in job.wanted]
     source: _ClipFrames | _ForeignFrames
@@ -39,7 +47,7 @@ def denoise_segment(
     else:
         check_single_layer(job.shot.files[segment.start : segment.stop], settings.spp)
         sequence = ForeignSequence(job.files[segment.start : segment.stop], settings.naming)
-        source, writer = _ForeignFrames(sequence, segment), ForeignWriter(sequence.window, settings, log)
+        source, writer = _ForeignFrames(sequence, segment), ForeignWriter(sequence.window, settings, log, result)
     with ExitStack() as stack:
         backward: BackwardImages | None = None
         if settings.bidirectional:

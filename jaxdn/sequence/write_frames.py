@@ -1,6 +1,6 @@
 """Denoised frames as files: new ones for our clips, copies of the source with another beauty for other renderers."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,8 @@ from jaxdn.core.frame import Frame
 from jaxdn.data.exr.exr import write_exr
 from jaxdn.data.exr.file import ExrFile, Window
 from jaxdn.data.foreign.layers import find_alpha
-from jaxdn.data.foreign.result import write_result
+from jaxdn.data.foreign.result import NewPixels, replace_channels, write_result
+from jaxdn.data.foreign.views import ViewFile
 from jaxdn.evaluation.report.images import save_png
 from jaxdn.sequence.additive_aovs import AdditiveAovs
 from jaxdn.sequence.alpha import AlphaDenoiser
@@ -42,11 +43,15 @@ class ClipWriter:
 class ForeignWriter:
     """Writes frames of another renderer, with their additive layers and alpha denoised where the settings say so."""
 
-    def __init__(self, window: Window, settings: Settings, log: Callable[[str], None]) -> None:
+    def __init__(
+        self, window: Window, settings: Settings, log: Callable[[str], None], result: "SharedResult | None" = None
+    ) -> None:
+        """``result``: of a view among several, what is written together with the others."""
         self._window, self._settings, self._log = window, settings, log
         self.has_history = settings.aovs == "additive" or settings.alpha
         self._aovs = AdditiveAovs(settings.naming, log) if settings.aovs == "additive" else None
         self._alpha = AlphaDenoiser(safe=settings.safe) if settings.alpha else None
+        self._result = result
 
     def write(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> None:
         """Denoise the additive layers of a frame, and write all; without a target they are for the history alone."""
@@ -57,13 +62,18 @@ class ForeignWriter:
             return
         beauty = compose_beauty(frame, image)
         target.parent.mkdir(parents=True, exist_ok=True)
-        images, settings = {"": beauty, **layers}, self._settings
-        for note in write_result(
-            source, target, images, self._window, settings.naming, alpha=alpha, only_beauty=settings.only_beauty
-        ):
-            self._log(note)
+        settings = self._settings
+        own = replace_channels(source, {"": beauty, **layers}, self._window, settings.naming, alpha=alpha)
+        new: NewPixels | None = own
+        preview = target
+        if self._result is not None and isinstance(source, ViewFile):
+            new, preview = self._result.join(source.view, own), target.with_name(f"{target.stem}.{source.view}.exr")
         if settings.preview:
-            write_preview(target, beauty)
+            write_preview(preview, beauty)
+        if new is None:
+            return
+        for note in write_result(source, target, new, only_beauty=settings.only_beauty):
+            self._log(note)
 
     def _denoise_alpha(self, source: ExrFile, frame: Frame, image: np.ndarray) -> np.ndarray | None:
         """The denoised alpha [H, W] of a frame; None: nobody asked, or there is none."""
@@ -75,6 +85,20 @@ class ForeignWriter:
             self._log("--alpha: there is no alpha beside the beauty")
             return None
         return self._alpha.denoise(source.placed(self._window)[channel], frame, compose_beauty(frame, image))
+
+
+class SharedResult:
+    """The views of one file, which come one after the other, frame by frame."""
+
+    def __init__(self, views: Sequence[str]) -> None:
+        self._views = tuple(views)
+        self._joined: NewPixels | None = None
+
+    def join(self, view: str, new: NewPixels) -> NewPixels | None:
+        """What is new in all views of a frame; None until the last one has come."""
+        joined = None if view == self._views[0] else self._joined
+        self._joined = new if joined is None else joined.with_view(view, new)
+        return self._joined if view == self._views[-1] else None
 
 
 def compose_beauty(frame: Frame, image: np.ndarray) -> Any:

@@ -91,10 +91,11 @@ def rewrite_exr(
       source: the file.
       target: the file to write.
       replaced: full name of a channel, as :func:`read_exr` gives it -> pixels of the size of its data window.
-      only: full name -> new name of the channels to write, all of one part; None: all.
+      only: full name -> new name of the channels to write; None: all. What lies in one part is a file of one part.
     """
     notes: dict[str, None] = {}
     written = []
+    several = only is not None and sum(not set(only).isdisjoint(name for name, *_ in p[1]) for p in source.decode()) > 1
     for header, channels in source.decode():
         kept = {}
         for full, name, pixels in channels:
@@ -105,7 +106,7 @@ def rewrite_exr(
                 kept[name if only is None else only[full]] = np.ascontiguousarray(pixels)
         if only is None and header["compression"] in _LOSSY:
             notes["the file's compression loses precision: its other layers are compressed once more"] = None
-        gone = _WRITERS_OWN if only is None else (*_WRITERS_OWN, *_ABOUT_LAYERS)
+        gone = _WRITERS_OWN if only is None else (*_WRITERS_OWN, *_ABOUT_LAYERS[: 1 if several else None])
         if kept:
             # "cryptomatte/1a2b3c4/manifest" is about a layer, too
             written.append(({key: value for key, value in header.items() if key.partition("/")[0] not in gone}, kept))

@@ -103,6 +103,7 @@ class ExrFile:
         self.path = Path(path)
         self._sound = False
         self._parts: list[ExrPart] | None = None
+        self._headers: list[dict[str, Any]] | None = None
         self._layout: tuple[Window, dict[str, Window]] | None = None
 
     @property
@@ -137,9 +138,22 @@ class ExrFile:
         return found
 
     @property
+    def headers(self) -> list[dict[str, Any]]:
+        """The attributes of each part."""
+        if self._parts is not None:
+            return [part.header for part in self._parts]
+        if self._headers is None:
+            self._headers = self._read_headers()
+        return self._headers
+
+    def full_name(self, name: str) -> str:
+        """The name that a channel has in :meth:`decode`: this one."""
+        return name
+
+    @property
     def header(self) -> dict[str, Any]:
         """The attributes of the first part, such as ``worldToCamera``."""
-        return self._read_headers()[0] if self._parts is None else self._parts[0].header
+        return self.headers[0]
 
     def placed(self, window: Window) -> Mapping[str, np.ndarray]:
         """The channels as images of a window that holds theirs; 0 where the file has no pixel."""
@@ -147,7 +161,7 @@ class ExrFile:
 
     def drop(self) -> None:
         """Forget all that was read; it is read again if somebody asks for it."""
-        self._parts = self._layout = None
+        self._parts = self._layout = self._headers = None
 
     def drop_windows(self) -> None:
         """Forget the windows alone: of a thousand files they take memory too."""
@@ -155,7 +169,7 @@ class ExrFile:
 
     def _read_layout(self) -> tuple[Window, dict[str, Window]]:
         if self._layout is None:
-            headers = self._read_headers() if self._parts is None else [part.header for part in self._parts]
+            headers = self.headers
             self._layout = (
                 window_of(headers[0], "displayWindow"),
                 {
@@ -165,6 +179,7 @@ class ExrFile:
                     if (channel.xSampling, channel.ySampling) == (1, 1)
                 },
             )
+            self._headers = None  # a Cryptomatte's manifest is large
         return self._layout
 
     def _read_headers(self) -> list[dict[str, Any]]:

@@ -13,8 +13,9 @@ from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.classify import UNNAMED, ChannelNaming, classify_channels
 from jaxdn.data.foreign.layers import Channels, is_cryptomatte, last_name, layer_of
 from jaxdn.data.foreign.reflectance import CAMERA_NORMALS
-from jaxdn.data.foreign.shot_files import find_sequence, open_files
+from jaxdn.data.foreign.shot_files import find_sequence
 from jaxdn.data.foreign.vectors import MOTION_CONVENTIONS, UnknownMotion, find_motion_convention
+from jaxdn.data.foreign.views import open_views
 
 OWN = "previous-current"
 """The convention of the motion vectors in jaxdn's own clips."""
@@ -50,7 +51,8 @@ def read_channel_mapping(
         return _map_foreign(source, naming, single=single, log=log)
     if is_clip(source):
         return _map_own(list(ExrFile(frame_path(source, 0)).windows))
-    return _map_foreign(open_files(find_sequence(source, naming.pass_files))[0], naming, single=single, log=log)
+    first = next(iter(open_views(find_sequence(source, naming.pass_files), naming.view).values()))[0]
+    return _map_foreign(first, naming, single=single, log=log)
 
 
 def _map_foreign(

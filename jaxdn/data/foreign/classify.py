@@ -24,6 +24,8 @@ class ChannelNaming:
     """Buffer -> the layer it is read from, ``"none"``, or a pattern for the EXR files that have it."""
     layer: str | None = None
     """The view layer or part that the other buffers are looked for in."""
+    view: str | None = None
+    """The only view to read, of files with several, as of a stereo camera; None: each."""
 
     def __post_init__(self) -> None:
         check_convention(self.motion_convention)
@@ -39,6 +41,7 @@ class ChannelNaming:
         stated = {
             "--channels": self.channels,
             "--layer": self.layer,
+            "--view": self.view,
             "--motion-convention": self.motion_convention,
         }
         return [option for option, value in stated.items() if value]

@@ -20,8 +20,9 @@ from jaxdn.data.foreign.layers import Channels, is_cryptomatte, layer_of, stack_
 from jaxdn.data.foreign.measured_motion import fitting_conventions
 from jaxdn.data.foreign.reflectance import derive_reflectance
 from jaxdn.data.foreign.repairs import FRACTIONS, Repairs
-from jaxdn.data.foreign.shot_files import find_sequence, open_files
+from jaxdn.data.foreign.shot_files import find_sequence
 from jaxdn.data.foreign.vectors import UnknownMotion, convert_cycles_forward, convert_motion, derive_dual_motion
+from jaxdn.data.foreign.views import open_views
 from jaxdn.filters.time_reversal import reverse_time
 
 
@@ -31,6 +32,7 @@ def plain_frames(
     motion_convention: str | None = None,
     channels: Mapping[str, str] | None = None,
     layer: str | None = None,
+    view: str | None = None,
     backwards: bool = False,
     log: Callable[[str], None] = lambda line: None,
 ) -> tuple[list[Path], Iterator[Frame]]:
@@ -43,7 +45,8 @@ def plain_frames(
     vectors too. With ``backwards``, frames come from the last to the first, with time turned around
     (:func:`jaxdn.filters.time_reversal.reverse_time`). ``channels`` and ``layer``: see
     :func:`jaxdn.data.foreign.layers.detect_channels`; what they choose, see
-    :func:`jaxdn.data.foreign.channel_mapping.read_channel_mapping`. ``log`` is called with lines about what is derived
+    :func:`jaxdn.data.foreign.channel_mapping.read_channel_mapping`. Of files with several views (stereo), ``view`` is
+    read, by default the first (:mod:`jaxdn.data.foreign.views`). ``log`` is called with lines about what is derived
     or left unused, when the first frame is read. Depth is taken for view-space z (0, far and infinite become ``FAR``);
     ids count from 1 with 0 for nothing, or are those of a Cryptomatte. A buffer in which no frame has had anything yet
     is left out (:mod:`jaxdn.data.foreign.decisions`); values that are no fractions are clamped and counted
@@ -53,9 +56,9 @@ def plain_frames(
     Raises ClipError at once where the files are no sequence, and, naming the file, when a frame is asked for that
     cannot be read or differs from the first.
     """
-    naming = ChannelNaming(motion_convention, channels, layer)
+    naming = ChannelNaming(motion_convention, channels, layer, view)
     if isinstance(path, str | Path):
-        opened = open_files(find_sequence(path, naming.pass_files))
+        opened = next(iter(open_views(find_sequence(path, naming.pass_files), view).values()))
     else:
         opened = tuple(ExrFile(file) for file in path)
     return [file.path for file in opened], ForeignSequence(opened, naming).frames(backwards=backwards, log=log)

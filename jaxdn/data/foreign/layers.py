@@ -104,6 +104,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "velocity",
         "vrayvelocity",
         "mv",
+        "forward",
         "cgeometry_velocity",
     ),
     "ids": (

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,28 +12,36 @@ from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.layers import Channels, beauty_channels, find_alpha, group_layers
 
 
-def write_result(
+class NewPixels(NamedTuple):
+    """What is new in a file; channels by the names that they have in it."""
+
+    replaced: dict[str, np.ndarray]
+    """Channel -> pixels of its data window."""
+    beauty: dict[str, str]
+    """Channel -> R, G, B or A, of the beauty and of the alpha beside it."""
+
+    def with_view(self, view: str, other: "NewPixels") -> "NewPixels":
+        """These with those of another view of the same file."""
+        named = {channel: f"{view}.{letter}" for channel, letter in other.beauty.items()}
+        return NewPixels(self.replaced | other.replaced, self.beauty | named)
+
+
+def replace_channels(
     source: ExrFile,
-    target: Path,
     images: Mapping[str, np.ndarray],
     window: Window,
     naming: ChannelNaming,
     *,
     alpha: np.ndarray | None = None,
-    only_beauty: bool = False,
-) -> list[str]:
-    """Write a file's denoised beauty, with all other layers, metadata, windows and parts of the file; or alone.
-
-    Returns what could not be kept, in sentences. Raises as :func:`jaxdn.data.exr.exr.rewrite_exr` does.
+) -> NewPixels:
+    """What denoised images are in their file. Raises as its channels do.
 
     Args:
-      source: the renderer's file.
-      target: the file to write.
+      source: the renderer's file, or a view of it.
       images: layer -> denoised image [H, W, 3] of the window; "" is the beauty.
       window: which pixels of the picture the images are (:attr:`jaxdn.data.foreign.import_exr.ForeignSequence.window`).
       naming: how the beauty was found.
       alpha: denoised alpha [H, W] of the window, beside the beauty; None: it stays.
-      only_beauty: write R, G, B, and A where there is one, and nothing else.
     """
     source.decode()  # first, as the windows are those of the decoded headers then
     windows = source.windows
@@ -47,10 +56,25 @@ def write_result(
     beside = find_alpha(names, beauty)
     if alpha is not None and beside is not None:
         replaced[beside] = crop(alpha, window, windows[beside])
-    if not only_beauty:
-        return rewrite_exr(source, target, replaced)
     kept = dict(zip(beauty, "RGB", strict=True)) | ({} if beside is None else {beside: "A"})
-    return rewrite_exr(source, target, replaced, only=kept)
+    return NewPixels(
+        {source.full_name(name): pixels for name, pixels in replaced.items()},
+        {source.full_name(name): letter for name, letter in kept.items()},
+    )
+
+
+def write_result(source: ExrFile, target: Path, new: NewPixels, *, only_beauty: bool = False) -> list[str]:
+    """Write a file with new pixels, and all other layers, metadata, windows and parts of it.
+
+    Returns what could not be kept, in sentences. Raises as :func:`jaxdn.data.exr.exr.rewrite_exr` does.
+
+    Args:
+      source: the renderer's file.
+      target: the file to write.
+      new: what is new.
+      only_beauty: write R, G, B, and A where there is one, and nothing else.
+    """
+    return rewrite_exr(source, target, new.replaced, only=new.beauty if only_beauty else None)
 
 
 def _color(groups: Mapping[str, Mapping[str, str]], layer: str) -> Channels:
