@@ -201,6 +201,8 @@ class Train:
     """Samples per pixel of the noisy input; of several numbers, each clip of a batch has one at random."""
     time_limit: float | None = None
     """Minutes after which training stops and writes its weights; the same command goes on from there."""
+    devices: int = 1
+    """GPUs of this machine to divide each batch among; the number of clips per update is a multiple of it."""
     implementation: str = "auto"
     """Backend for convolutions: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest available."""
 

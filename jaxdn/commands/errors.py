@@ -14,7 +14,7 @@ from typing import Any, NoReturn, TextIO
 from rich.console import Console
 
 from jaxdn.render.mitsuba.errors import RenderError
-from jaxdn.runtime.interrupt import EXIT_CODE, keep_interrupts
+from jaxdn.runtime.interrupt import EXIT_CODE, TERMINATED_EXIT_CODE, Terminated, keep_interrupts
 from jaxdn.runtime.optional import find_group, install
 
 NO_READER = 141
@@ -27,8 +27,8 @@ _RICH = 1
 def plain_errors() -> Iterator[None]:
     """Turn errors that a user can fix (wrong input, missing or unwritable file) into one message and exit code 2.
 
-    Anything else is a bug and keeps its traceback. Ctrl-C ends with exit code 130, as shells expect. Warnings are one
-    line each, without the place in the code.
+    Anything else is a bug and keeps its traceback. Ctrl-C ends with exit code 130, as shells expect, and SIGTERM, where
+    it is handled, with 143. Warnings are one line each, without the place in the code.
     """
     before = warnings.formatwarning
     warnings.formatwarning = _line
@@ -48,9 +48,9 @@ def plain_errors() -> Iterator[None]:
         if extra is None:
             raise
         _end(f"this needs the package {package!r}, which is not installed: {install(extra)}")
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         Console(stderr=True).print("jaxdn: interrupted; what is finished is kept.", highlight=False)
-        sys.exit(EXIT_CODE)
+        sys.exit(TERMINATED_EXIT_CODE if isinstance(interrupt, Terminated) else EXIT_CODE)
     finally:
         warnings.formatwarning = before
 

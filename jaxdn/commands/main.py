@@ -120,6 +120,7 @@ def _train(options: Train) -> None:
         validation=[options.validation] if options.validation else [],
         implementation=options.implementation,
         time_limit=None if options.time_limit is None else 60 * options.time_limit,
+        devices=options.devices,
     )
     print(f"{path}: denoise with `jaxdn denoise CLIP -o OUT --method {path}`")
 

@@ -1,4 +1,4 @@
-"""Ctrl-C: as a request to stop after the current piece of work, and never lost."""
+"""Ctrl-C and SIGTERM: as requests to stop after the current piece of work; and Ctrl-C never lost."""
 
 import _thread
 import os
@@ -12,35 +12,50 @@ from typing import Any
 
 EXIT_CODE = 130
 """Of a process that Ctrl-C has ended, as shells expect it."""
+TERMINATED_EXIT_CODE = 143
+"""Of a process that SIGTERM has ended: a batch system that takes its machine back, or its time is over."""
 _AGAIN_S = 0.05
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, where it is handled as Ctrl-C is."""
 
 
 class Interrupt:
     """While it is entered, the first Ctrl-C only sets :attr:`asked`; a second one raises KeyboardInterrupt at once.
 
-    Python receives signals in the main thread alone: in any other one this changes nothing.
+    SIGTERM is a first Ctrl-C, however often it comes. Python receives signals in the main thread alone: in any other
+    one this changes nothing.
     """
 
     def __init__(self, on_first: Callable[[], None]):
-        """``on_first`` is called at the first Ctrl-C, so that it does not seem to be ignored."""
+        """``on_first`` is called at the first signal, so that it does not seem to be ignored."""
         self.asked = False
         self._on_first = on_first
-        self._before: Any = None
+        self._terminated = False
+        self._before: dict[int, Any] = {}
 
     def __enter__(self) -> "Interrupt":
         if threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGINT, self._note)
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._before[number] = signal.signal(number, self._note)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def raise_if_asked(self) -> None:
+        """Raise KeyboardInterrupt where the work stops, or Terminated if SIGTERM asked for it."""
+        if self.asked:
+            raise Terminated if self._terminated else KeyboardInterrupt
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        if self.asked:
+        if self.asked and number == signal.SIGINT:
             raise KeyboardInterrupt
-        self.asked = True
-        self._on_first()
+        if not self.asked:
+            self.asked, self._terminated = True, number == signal.SIGTERM
+            self._on_first()
 
 
 @contextmanager
@@ -85,8 +100,8 @@ def exit_on_interrupt() -> Iterator[None]:
     try:
         yield
     except SystemExit as ended:
-        if ended.code == EXIT_CODE:
+        if ended.code in (EXIT_CODE, TERMINATED_EXIT_CODE):
             sys.stdout.flush()
             sys.stderr.flush()
-            os._exit(EXIT_CODE)
+            os._exit(ended.code)
         raise

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
 from jaxdn.core.frame import Clip
 from jaxdn.denoiser import Denoiser, Params
@@ -16,6 +17,7 @@ from jaxdn.recipes.recipe import Recipe
 from jaxdn.runtime.atomic_files import write_json
 from jaxdn.runtime.interrupt import Interrupt
 from jaxdn.training.checkpoint import Checkpoints
+from jaxdn.training.devices import divide, make_mesh, put_on_all, take_from_first
 from jaxdn.training.log import Log
 from jaxdn.training.progress import ProgressBar
 from jaxdn.training.step import Report, TrainState, init_state, init_state_from, make_train_step
@@ -61,11 +63,13 @@ def fit(
     validation: Sequence[ValidationClip] = (),
     every: Every = Every(),  # noqa: B008, immutable
     time_limit: float | None = None,
+    devices: int = 1,
 ) -> TrainState:
     """Train to ``recipe.steps`` updates, resuming from the newest checkpoint in ``folder`` to the same result.
 
-    A run that was started with fewer steps goes on to ``recipe.steps``, along the schedule of that many. On Ctrl-C the
-    update is finished, logged and saved before KeyboardInterrupt is raised; at the time limit the state is returned.
+    A run that was started with fewer steps goes on to ``recipe.steps``, along the schedule of that many. On Ctrl-C, or
+    SIGTERM, the update is finished, logged and saved before KeyboardInterrupt (:class:`jaxdn.runtime.interrupt.
+    Terminated`) is raised; at the time limit the state is returned.
     Raises ValueError for impossible values in the recipe, and, with what to change, after many updates in a row that
     changed nothing.
 
@@ -79,12 +83,14 @@ def fit(
       validation: see :func:`jaxdn.training.validation.load_validation`.
       every: updates between log entries, validations and checkpoints.
       time_limit: seconds after which no further update begins, counted from the call; None: no limit.
+      devices: number of devices that each batch is divided among; a run may go on with another number.
     """
     recipe.check()
     end = math.inf if time_limit is None else time.monotonic() + time_limit
+    mesh = make_mesh(devices, recipe.batch)
     folder.mkdir(parents=True, exist_ok=True)
     extended = _record_recipe(folder / "recipe.json", recipe, None if start is None else start.name)
-    run = _Run(denoiser, recipe, batches, folder, start)
+    run = _Run(denoiser, recipe, batches, folder, start, mesh)
     validate = make_validation(denoiser, validation)
     divergence = _Divergence(label, recipe, run.step, int(run.state.skipped))
     with (
@@ -104,7 +110,7 @@ def fit(
                 if logs:
                     run.log.write(step=run.step, loss=float(report.loss), last_frame_psnr=float(report.validation_psnr))
                 if validation and run.is_due(every.validation):
-                    psnr = validate(run.state.average)
+                    psnr = validate(take_from_first(run.state.average, mesh))
                     run.log.write(step=run.step, validation_psnr=psnr)
                     progress.validated(psnr)
                 if logs:  # after the validation: the last line shows the last one
@@ -113,8 +119,7 @@ def fit(
                     divergence.check(run.step, skipped=skipped, norm=float(report.gradient_norm))
                 if run.is_due(every.checkpoint):
                     run.save()
-            if stop.asked:
-                raise KeyboardInterrupt
+            stop.raise_if_asked()
         except KeyboardInterrupt:
             if run.is_between_updates():
                 run.save()
@@ -137,15 +142,22 @@ class _Run:
     """A run in its folder: the state and the position in the data after ``step`` updates, its log and checkpoints."""
 
     def __init__(
-        self, denoiser: Denoiser, recipe: Recipe, batches: ResumableBatches, folder: Path, start: InitialWeights | None
+        self,
+        denoiser: Denoiser,
+        recipe: Recipe,
+        batches: ResumableBatches,
+        folder: Path,
+        start: InitialWeights | None,
+        mesh: Mesh | None,
     ) -> None:
-        self._batches, self._steps = batches, recipe.steps
+        self._batches, self._steps, self._mesh = batches, recipe.steps, mesh
         self._checkpoints = Checkpoints(folder / "checkpoints")
         first_position = batches.get_state()
         state = init_state(denoiser, recipe, next(batches))
         batches.set_state(first_position)
         if start is not None:
             state = init_state_from(jax.tree.map(jnp.array, start.params), recipe)
+        state = put_on_all(state, mesh)
         restored = self._checkpoints.restore(state)
         if restored is not None:
             state, position = restored
@@ -153,13 +165,13 @@ class _Run:
         self.state = state
         self.step = self._saved = int(state.step)
         self.log = Log(folder / "log.jsonl", keep_until=self.step)
-        self._train_step = make_train_step(denoiser, recipe)
+        self._train_step = make_train_step(denoiser, recipe, mesh)
         # An interrupt may come between the batch and its update: this position always belongs to finished updates.
         self._position = batches.get_state()
 
     def update(self) -> Report:
         """One update with the next batch."""
-        batch = next(self._batches)
+        batch = divide(next(self._batches), self._mesh)
         self.state, report = self._train_step(self.state, batch)
         self.step, self._position = self.step + 1, self._batches.get_state()
         return report

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh
 
 from jaxdn import color, metrics
 from jaxdn.core.frame import Clip
@@ -16,6 +17,7 @@ from jaxdn.denoiser.rollout import unroll
 from jaxdn.denoiser.sanitize import sanitize_image
 from jaxdn.recipes.objectives import Objective
 from jaxdn.recipes.recipe import Recipe
+from jaxdn.training.devices import CLIPS, DIVIDED, ON_ALL
 from jaxdn.training.xla_flags import training_options
 
 
@@ -94,8 +96,13 @@ def init_state_from(params: Params, recipe: Recipe) -> TrainState:
     return TrainState(params, jax.tree.map(jnp.copy, params), optimizer(recipe).init(params), zero, jnp.copy(zero))
 
 
-def make_train_step(denoiser: Denoiser, recipe: Recipe) -> Callable[[TrainState, Clip], tuple[TrainState, Report]]:
+def make_train_step(
+    denoiser: Denoiser, recipe: Recipe, mesh: Mesh | None = None
+) -> Callable[[TrainState, Clip], tuple[TrainState, Report]]:
     """The jitted update ``(state, batch of clips) -> (state, report)``; the old state's memory is donated.
+
+    With a mesh (:mod:`jaxdn.training.devices`) each device takes its clips of the batch, and the mean of their
+    gradients is all that the devices exchange: once an update, four bytes a weight.
 
     An update that is not finite, or whose loss is not, is skipped: weights and optimiser stay as they were, and
     ``skipped`` counts it.
@@ -111,9 +118,19 @@ def make_train_step(denoiser: Denoiser, recipe: Recipe) -> Callable[[TrainState,
         loss, psnr = jax.vmap(one)(batch)
         return jnp.mean(loss), jnp.mean(psnr)
 
+    def find_gradient(params: Params, batch: Clip, progress: jax.Array) -> Any:
+        found = jax.value_and_grad(batch_loss, has_aux=True)(params, batch, progress)
+        return found if mesh is None else jax.lax.pmean(found, CLIPS)
+
+    if mesh is not None:
+        # XLA cannot divide the kernels that it does not know, and would gather all clips on each device. What it checks
+        # of the outputs, that they are the same everywhere, follows from the mean.
+        specs: dict[str, Any] = {"in_specs": (ON_ALL, DIVIDED, ON_ALL), "out_specs": ON_ALL, "check_vma": False}
+        find_gradient = jax.shard_map(find_gradient, mesh=mesh, **specs)
+
     def train_step(state: TrainState, batch: Clip) -> tuple[TrainState, Report]:
         progress = state.step / max(recipe.steps, 1)
-        (loss, psnr), gradient = jax.value_and_grad(batch_loss, has_aux=True)(state.params, batch, progress)
+        (loss, psnr), gradient = find_gradient(state.params, batch, progress)
         norm = optax.tree.norm(gradient)
         updates, optimizer_state = update_rule.update(gradient, state.optimizer, state.params)
         params = optax.apply_updates(state.params, updates)

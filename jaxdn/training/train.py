@@ -9,6 +9,7 @@ from jaxdn.data.training.dataset import training_batches
 from jaxdn.denoiser import Denoiser
 from jaxdn.methods.registry import Method
 from jaxdn.recipes.recipe import Recipe
+from jaxdn.training.devices import make_mesh
 from jaxdn.training.loop import InitialWeights, ResumableBatches, fit, read_resumed_from
 from jaxdn.training.validation import load_validation
 from jaxdn.zoo.weights import save_weights, starting_params
@@ -25,6 +26,7 @@ def train(
     validation: Sequence[Path] = (),
     implementation: str = "auto",
     time_limit: float | None = None,
+    devices: int = 1,
     label: str | None = None,
     record: Mapping[str, Any] | None = None,
 ) -> Path:
@@ -45,11 +47,13 @@ def train(
       validation: folders of held-out clips, or packed sets, used whole.
       implementation: the backend for training; "auto" is the method's fastest that is available here.
       time_limit: seconds after which training stops; the weights of that moment are written all the same.
+      devices: number of devices that each batch is divided among.
       label: the run's name in messages; default: that of its folder.
       record: further entries of the weights' JSON.
     """
     if time_limit is not None and not time_limit > 0:
         raise ValueError(f"time limit: expected more than 0, got {time_limit:g} s; leave it out for no limit.")
+    make_mesh(devices, recipe.batch)  # refused before clips are read
     label = out.name if label is None else label
     backend = method.backend("training") if implementation == "auto" else implementation
     if backend not in (None, "reference"):
@@ -61,7 +65,17 @@ def train(
     batches = recipe_batches(denoiser, recipe, clips)
     held_out = load_validation(denoiser, validation, spp=min(recipe.spp))
     first = None if start is None else InitialWeights(str(start), starting_params(start, denoiser))
-    state = fit(denoiser, recipe, batches, out, label=label, start=first, validation=held_out, time_limit=time_limit)
+    state = fit(
+        denoiser,
+        recipe,
+        batches,
+        out,
+        label=label,
+        start=first,
+        validation=held_out,
+        time_limit=time_limit,
+        devices=devices,
+    )
     origin: dict[str, Any] = {} if first is None else {"start": first.name}
     if earlier := read_resumed_from(out):
         origin["begun_with"] = earlier

@@ -13,6 +13,7 @@ import pytest
 from jax.experimental.buffer_callback import buffer_callback
 
 from jaxdn.commands.errors import plain_errors
+from jaxdn.runtime.interrupt import Interrupt
 
 
 @pytest.fixture
@@ -124,3 +125,22 @@ def test_a_process_ends_while_a_program_is_compiled():
         done = subprocess.run([sys.executable, "-c", _COMPILING], capture_output=True, text=True, check=False)
         assert done.returncode == 130, done.stderr
         assert done.stderr.endswith("jaxdn: interrupted; what is finished is kept.\n")
+
+
+def _be_told(stop, *numbers):
+    with plain_errors(), stop:
+        stop.raise_if_asked()
+        for number in numbers:
+            signal.raise_signal(number)
+        stop.raise_if_asked()
+
+
+def test_sigterm_is_a_first_ctrl_c_however_often_it_comes():
+    said = []
+    with pytest.raises(SystemExit) as ended:
+        _be_told(Interrupt(lambda: said.append("stopping")), signal.SIGTERM, signal.SIGTERM)
+    assert ended.value.code == 143
+    assert said == ["stopping"]
+    with pytest.raises(SystemExit) as ended:  # somebody does not want to wait
+        _be_told(Interrupt(lambda: None), signal.SIGTERM, signal.SIGINT)
+    assert ended.value.code == 130

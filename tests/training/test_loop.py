@@ -17,6 +17,7 @@ from jaxdn.denoisers import ntd
 from jaxdn.methods.registry import method_named
 from jaxdn.recipes.objectives import Objective
 from jaxdn.recipes.recipe import Recipe
+from jaxdn.runtime.interrupt import Terminated
 from jaxdn.training import loop as loop
 from jaxdn.training.log import Log, read_curve, read_log
 from jaxdn.training.loop import Every, InitialWeights, fit, read_resumed_from
@@ -170,33 +171,35 @@ def run_gain(clips, folder, recipe=SHORT, source=None, **options):
     )
 
 
-def test_ctrl_c_on_a_logging_step_keeps_its_log_entry(clips, tmp_path, monkeypatch):
-    before = signal.getsignal(signal.SIGINT)  # ignored in a process that a shell put into the background
+@pytest.mark.parametrize(("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
+def test_a_signal_on_a_logging_step_keeps_its_log_entry(number, error, clips, tmp_path, monkeypatch):
+    before = signal.getsignal(number)  # SIGINT is ignored in a process that a shell put into the background
     whole = run_gain(clips, tmp_path / "whole")
     write = Log.write
 
     def interrupted(log, **entry):
         if entry["step"] == 2:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.raise_signal(number)
         write(log, **entry)
 
     monkeypatch.setattr(Log, "write", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt) as stopped:
         run_gain(clips, tmp_path / "stopped")
+    assert stopped.type is error
     assert read_curve(tmp_path / "stopped").step == [2]
     monkeypatch.undo()
     continued = run_gain(clips, tmp_path / "stopped")
     assert read_curve(tmp_path / "stopped") == read_curve(tmp_path / "whole")
     np.testing.assert_array_equal(continued.params["gain"], whole.params["gain"])
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before
 
 
 def test_a_second_ctrl_c_stops_at_once_and_the_run_still_ends_the_same(clips, tmp_path, monkeypatch):
     whole = run_gain(clips, tmp_path / "whole")
     make = loop.make_train_step
 
-    def interrupting(denoiser, recipe):
-        step = make(denoiser, recipe)
+    def interrupting(*arguments):
+        step = make(*arguments)
 
         def twice(state, batch):
             given = int(state.step)
