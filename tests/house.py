@@ -63,6 +63,7 @@ ROOMS: dict[str, Room] = {
     "render": Room(8, "frames, clips, the worker pool"),
     "effects": Room(9, "public face of planning"),
     "evaluation": Room(9, "denoisers compared on clips"),
+    "evaluation.overlay": Room(9, "the validation page of a shot"),
     "training": Room(9, "the training loop"),
     "sequence": Room(10, "files in, files out"),
     "commands": Room(11, "the command line"),

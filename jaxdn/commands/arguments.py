@@ -26,6 +26,8 @@ class Inspect:
     jaxdn inspect data/test/fruit-200 --json
 
     jaxdn inspect "shots/*.exr" --channels albedo=diffuseFilter
+
+    jaxdn inspect "shots/*.exr" --overlay checked
     """
 
     scene: tyro.conf.Positional[list[str]]
@@ -54,6 +56,9 @@ class Inspect:
     """For files of other renderers: the view layer or part to look for buffers in."""
     view: str | None = None
     """For files of other renderers with several views (stereo): the only one to read; default: every view."""
+    overlay: Path | None = None
+    """For files of other renderers: measure every frame, and write a page (overlay.html) into this folder, with what
+    is wrong and what to do, and EXR layers of motion, history, noise and fireflies."""
 
 
 @dataclass

@@ -41,6 +41,7 @@ def inspect_to_terminal(
     frames: int | None,
     as_json: bool,
     naming: ChannelNaming,
+    overlay: Path | None = None,
 ) -> None:
     """Print the table of effects and the plan for a scene, a family or a finished clip.
 
@@ -56,6 +57,7 @@ def inspect_to_terminal(
       frames: number of frames to inspect; None: all.
       as_json: print only one JSON object.
       naming: what is stated about the channels of other renderers' files.
+      overlay: folder for the validation page of such files; None: there is none.
     """
     reader = None if denoiser is None else find_denoiser(denoiser)
     source = sources[0]
@@ -67,8 +69,10 @@ def inspect_to_terminal(
             raise ValueError(f"{source}: expected none of --animation, --frames, which are for scenes and own clips.")
         reads = None if reader is None else reader.reads
         named = source if len(sources) == 1 else [Path(name) for name in sources]
-        inspect_files(named, reads=reads, as_json=as_json, naming=naming)
+        inspect_files(named, reads=reads, as_json=as_json, naming=naming, overlay=overlay)
         return
+    if overlay is not None:
+        raise ValueError(f"--overlay: expected EXR files of other renderers, got {source}; leave it out.")
     if not clip and naming.options:
         raise ValueError(
             f"scene {source!r}: expected none of --channels, --layer, --motion-convention, --view, which are for EXR "

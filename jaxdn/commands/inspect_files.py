@@ -1,11 +1,16 @@
 """``jaxdn inspect`` on files of other renderers: what is read from where, what is missing, and what is to be stated."""
 
+import itertools
 import json
-from collections.abc import Sequence
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxdn.commands.channel_table import missing, show_channel_mapping
+from jaxdn.commands.progress import reporter
 from jaxdn.data.clip.folder import refuse_unfinished
 from jaxdn.data.errors import DamagedFile
 from jaxdn.data.exr.file import ExrFile
@@ -16,17 +21,25 @@ from jaxdn.data.foreign.passes import join_passes
 from jaxdn.data.foreign.shots import Shot, find_shots, ranges
 from jaxdn.data.foreign.shots import missing as missing_numbers
 from jaxdn.data.foreign.soundness import find_unusable
-from jaxdn.data.foreign.vectors import CHOICES
+from jaxdn.data.foreign.vectors import CHOICES, MOTION_CONVENTIONS
 from jaxdn.data.foreign.views import open_views, select_view
+
+if TYPE_CHECKING:
+    from jaxdn.evaluation.overlay import Overlay
 
 
 def inspect_files(
-    source: str | Sequence[Path], *, reads: frozenset[str] | None, as_json: bool, naming: ChannelNaming
+    source: str | Sequence[Path],
+    *,
+    reads: frozenset[str] | None,
+    as_json: bool,
+    naming: ChannelNaming,
+    overlay: Path | None = None,
 ) -> None:
     """Print what is read of each shot, what is missing, and which conventions motion vectors may have.
 
-    Only the first two files of a shot are read, of the others the headers. Raises ClipError as
-    :func:`jaxdn.data.foreign.channel_mapping.read_channel_mapping` and
+    Only the first two files of a shot are read, of the others the headers, unless there is an ``overlay``. Raises
+    ClipError as :func:`jaxdn.data.foreign.channel_mapping.read_channel_mapping` and
     :meth:`jaxdn.data.foreign.import_exr.ForeignSequence.fitting_conventions` do, where no file is usable, and for a
     clip of ours that was not finished.
 
@@ -35,20 +48,36 @@ def inspect_files(
       reads: what a denoiser reads; None: any.
       as_json: print only one JSON object, with the same; of several shots, one that lists theirs.
       naming: what is stated about the channels.
+      overlay: folder for the validation page; of several shots, for a folder of each.
     """
     if isinstance(source, str):
         refuse_unfinished(source)
     shots, notes = join_passes(find_shots(source), naming.pass_files)
     if not as_json:
         print("".join(f"{note}\n" for note in notes), end="")
+    views = [
+        (shot, view, files)
+        for shot in select_view(shots, naming.view)
+        for view, files in open_views(shot, naming.view).items()
+    ]
+    folders = _overlay_folders([f"{shot.name or shot.files[0].stem} {view}" for shot, view, _ in views], overlay)
     records = {}
-    for shot in select_view(shots, naming.view):
-        for view, files in open_views(shot, naming.view).items():
+    # OpenEXR prints about damaged files, which would be no JSON.
+    with redirect_stdout(sys.stderr) if as_json else nullcontext():
+        for (shot, view, files), folder in zip(views, folders, strict=True):
             label = f"{shot.label}{view and f' ({view})'}"
-            records[label] = _inspect_shot(shot, files, label, reads, naming, quiet=as_json)
+            records[label] = _inspect_shot(shot, files, label, reads, naming, folder, quiet=as_json)
     if as_json:
         several = {"shots": [{"shot": label, **record} for label, record in records.items()]}
         print(json.dumps(several if len(records) > 1 else next(iter(records.values())), indent=1))
+
+
+def _overlay_folders(names: Sequence[str], overlay: Path | None) -> list[Path | None]:
+    """Of each shot or view of these names, the folder for its validation page."""
+    if overlay is None or len(names) == 1:
+        return [overlay] * len(names)
+    plain = [re.sub(r"[^\w.-]+", "_", name).strip("._") or "shot" for name in names]
+    return [overlay / (name if plain.count(name) == 1 else f"{name}_{index}") for index, name in enumerate(plain)]
 
 
 def _inspect_shot(
@@ -57,6 +86,7 @@ def _inspect_shot(
     label: str,
     reads: frozenset[str] | None,
     naming: ChannelNaming,
+    overlay: Path | None,
     *,
     quiet: bool,
 ) -> dict[str, Any]:
@@ -89,6 +119,9 @@ def _inspect_shot(
             print(f"{gaps}; after a gap there is no history at first")
         if fitting is not None:
             print("\n".join(_to_state([file.path for file in opened], fitting)))
+    checked = (
+        None if overlay is None else _check(shot, label, opened, naming, mapping, unusable, gaps, overlay, quiet=quiet)
+    )
     return {
         "frames": len(opened),
         "width": width,
@@ -98,7 +131,51 @@ def _inspect_shot(
         "notes": notes if gaps is None else [*notes, gaps],
         "unusable": unusable,
         "fitting_conventions": fitting,
-    }
+    } | ({} if checked is None else {"overlay": str(checked.page), "findings": [f._asdict() for f in checked.findings]})
+
+
+def _check(
+    shot: Shot,
+    label: str,
+    opened: Sequence[ExrFile],
+    naming: ChannelNaming,
+    mapping: Sequence[MappedBuffer],
+    unusable: Mapping[str, str],
+    gaps: str | None,
+    out: Path,
+    *,
+    quiet: bool,
+) -> "Overlay":
+    """The validation page of a shot; what was found is printed unless ``quiet``."""
+    from jaxdn.evaluation.overlay import write_overlay  # --help and the table do not wait for jax
+
+    said = next((mapped.convention for mapped in mapping if mapped.buffer == "motion"), None)
+    count = itertools.count(1)
+    with nullcontext() if quiet else reporter("overlay") as report:
+        checked = write_overlay(
+            opened,
+            naming,
+            mapping,
+            out,
+            title=label,
+            convention=next((name for name, words in MOTION_CONVENTIONS.items() if words == said), None),
+            unusable=unusable,
+            missing=(gaps or "").removesuffix(" missing"),
+            breaks=_without_one_before(shot, opened),
+            on_frame=lambda path: None if report is None else report.on_frame(path, next(count), len(opened)),
+        )
+    if not quiet:
+        for finding in checked.findings:
+            print(f"{finding.name}: {finding.evidence} {finding.remedy}")
+        print(f"{len(checked.findings)} finding{'s' * (len(checked.findings) != 1)}; page: {checked.page}")
+    return checked
+
+
+def _without_one_before(shot: Shot, opened: Sequence[ExrFile]) -> set[Path]:
+    """The files that are frames of a shot and do not follow another one."""
+    numbers = dict(zip(shot.files, shot.numbers, strict=False))
+    there = {numbers[file.path] for file in opened if file.path in numbers}
+    return {file.path for file in opened if file.path in numbers and numbers[file.path] - shot.step not in there}
 
 
 def _to_state(files: Sequence[Path], fitting: Sequence[str]) -> list[str]:

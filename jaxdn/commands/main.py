@@ -39,6 +39,7 @@ def _inspect(options: Inspect) -> None:
         frames=options.frames,
         as_json=options.json,
         naming=name_channels(options),
+        overlay=options.overlay,
     )
 
 

@@ -112,7 +112,7 @@ def page(results: Results) -> str:
             "<body><main>",
             *body,
             "</main>",
-            _json_script(data, 'id="page-data"'),
+            json_script(data, 'id="page-data"'),
             f"<script>\n{here.joinpath('player.js').read_text('utf-8')}</script>",
             f"<script>\n{here.joinpath('page.js').read_text('utf-8')}</script>",
             "</body></html>",
@@ -286,7 +286,7 @@ def _clip(
         f'{notice}{still}<div class="views"></div><h3>Scores on this clip</h3>'
         f"{_table(clip.scores, columns(results), results, clip.noise_floor_psnr)}"
         '<div class="curves"></div>'
-        f"{_json_script(data)}</details>"
+        f"{json_script(data)}</details>"
     ), spent
 
 
@@ -402,7 +402,7 @@ def _scale_bar(scale: float) -> str:
     return f'<span class="scale">0 {bar} {scale:g} and above</span>'
 
 
-def _json_script(data: Any, attributes: str = "") -> str:
+def json_script(data: Any, attributes: str = "") -> str:
     """Data inside the page; no ``<`` survives, so no text in it can end the element."""
     text = json.dumps(json_ready(data), allow_nan=False, ensure_ascii=False, separators=(",", ":"))
     text = text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
