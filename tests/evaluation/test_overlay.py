@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,6 @@ from jaxdn.evaluation.overlay.camera import Camera, camera_motion, read_camera
 from jaxdn.evaluation.overlay.evidence import fireflies, noise_map
 from jaxdn.evaluation.overlay.findings import Known, find_all
 from jaxdn.evaluation.overlay.motion_search import box_mean, measure_motion
-from tests.needs import BROWSERS, require
 
 HEIGHT, WIDTH = 72, 96
 STEP = (3, -2)
@@ -389,25 +389,24 @@ def test_vectors_without_the_camera_are_a_finding():
 
 
 @pytest.mark.browser
-def test_the_page_plays_in_a_browser(tmp_path, inspect):
-    require("browser", "playwright")
-    from playwright.sync_api import sync_playwright
-
+def test_the_page_plays_in_a_browser(tmp_path, inspect, browser):
     record = inspect(write_shot(tmp_path / "shot"))
-    executable = next(path for path in map(shutil.which, BROWSERS) if path)
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=executable, args=["--no-sandbox"])
-        page = browser.new_page()
-        complaints = []
-        page.on("pageerror", lambda error: complaints.append(str(error)))
-        page.on("console", lambda line: complaints.append(line.text) if line.type == "error" else None)
-        page.goto(f"file://{record['overlay']}")
-        assert "shot_0002.exr (2 of 4)" in page.inner_text("#player")
-        page.keyboard.press(".")
-        assert "shot_0003.exr (3 of 4)" in page.inner_text("#player")
-        page.select_option("select >> nth=0", "given motion")
-        assert page.eval_on_selector("#player img", "image => image.naturalWidth") == WIDTH
-        page.click("#player button")
-        page.wait_for_function("document.querySelector('#player .count').textContent.includes('(1 of 4)')")
-        browser.close()
+    page = browser.new_page()
+    page.set_default_timeout(180_000)  # a busy machine is no fault of the page
+    complaints, requests = [], []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("console", lambda line: complaints.append(line.text) if line.type != "log" else None)
+    page.on("request", lambda request: requests.append(request.url[:80]))
+    page.goto(Path(record["overlay"]).as_uri())
+    assert "shot_0002.exr (2 of 4)" in page.inner_text("#player")
+    page.keyboard.press(".")
+    assert "shot_0003.exr (3 of 4)" in page.inner_text("#player")
+    page.select_option("select >> nth=0", "given motion")
+    picture = page.locator("#player img").first
+    assert picture.evaluate("image => image.decode().then(() => image.naturalWidth)") == WIDTH
+    assert "the colour is the direction" in page.inner_text("#player")
+    page.click("#player button")
+    page.locator("#player .count", has_text="(1 of 4)").wait_for()
+    page.close()
     assert complaints == []
+    assert [url for url in requests if not url.startswith(("file:", "data:"))] == []

@@ -4,7 +4,6 @@ import io
 import json
 import math
 import re
-import shutil
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from jaxdn.evaluation.report import film as films
 from jaxdn.evaluation.report import images as pictures
 from jaxdn.evaluation.report import page as page_module
 from jaxdn.evaluation.report.summary import headline, sentences, show, text_table
-from tests.needs import BROWSERS, require, require_module
 
 METHODS = ["noisy", "svgf", "ntd A", "ntd B", "ntd C"]
 QUALITY = {"noisy": 0.22, "svgf": 0.055, "ntd A": 0.034, "ntd B": 0.03, "ntd C": 0.026}
@@ -492,18 +490,6 @@ def test_films_of_different_lengths_are_refused(tmp_path):
 
 
 # ---- in a browser --------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def browser():
-    require("browser")
-    executable = next(filter(None, map(shutil.which, BROWSERS)))
-    driver = require_module("playwright.sync_api")
-    flags = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run"]
-    with driver.sync_playwright() as playwright:
-        running = playwright.chromium.launch(executable_path=executable, args=flags)
-        yield running
-        running.close()
 
 
 @pytest.fixture
