@@ -260,6 +260,9 @@ class Denoise:
     beauty so that they still add up to it."""
     alpha: bool = False
     """Denoise the alpha of such files too, with weights of the denoised beauty; by default it stays as it is."""
+    wrap: bool = False
+    """Such files are equirectangular panoramas, whose left edge continues at the right one; their attribute envmap says
+    so, too."""
     spp: int = 1
     """Samples per pixel to take from the clip's layers."""
     preview: bool = False

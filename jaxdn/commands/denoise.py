@@ -54,6 +54,7 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
         only_beauty=options.only_beauty,
         aovs=options.aovs,
         alpha=options.alpha,
+        wrap=options.wrap,
         preview=options.preview,
         bidirectional=options.bidirectional,
         safe=options.safe,

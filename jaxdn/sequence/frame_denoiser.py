@@ -105,6 +105,11 @@ class FrameDenoiser:
         return self._method.denoiser is not None
 
     @property
+    def receptive_field(self) -> int | None:
+        """How many pixels around a pixel decide about it; None: unknown."""
+        return None if self._method.denoiser is None else self._method.denoiser.receptive_field
+
+    @property
     def programs(self) -> set[tuple[str, ...]]:
         """The sets of buffers that a step was compiled for."""
         return self._programs | (set() if self._step is None else self._step.programs)

@@ -223,7 +223,12 @@ def _once(log: Callable[[str], None]) -> Callable[[str], None]:
 
 def _refuse_unused(jobs: Sequence[Job], settings: Settings) -> None:
     """Raise ValueError for settings that are for files of other renderers where there are only clips of ours."""
-    others = {"--aovs": settings.aovs != "keep", "--only-beauty": settings.only_beauty, "--alpha": settings.alpha}
+    others = {
+        "--aovs": settings.aovs != "keep",
+        "--only-beauty": settings.only_beauty,
+        "--alpha": settings.alpha,
+        "--wrap": settings.wrap,
+    }
     unused = [*settings.naming.options, *(option for option, given in others.items() if given)]
     if unused and all(job.clip is not None for job in jobs):
         raise ValueError(

@@ -15,6 +15,7 @@ from jaxdn.data.read import check_single_layer, open_frames
 from jaxdn.sequence.backward_pass import BackwardImages, backward_pass
 from jaxdn.sequence.frame_denoiser import Fallback, FrameDenoiser
 from jaxdn.sequence.jobs import Job
+from jaxdn.sequence.panorama import Panorama, find_panorama
 from jaxdn.sequence.settings import Settings
 from jaxdn.sequence.write_frames import ClipWriter, ForeignWriter, SharedResult
 
@@ -47,7 +48,11 @@ def denoise_segment(
     else:
         check_single_layer(job.shot.files[segment.start : segment.stop], settings.spp)
         sequence = ForeignSequence(job.files[segment.start : segment.stop], settings.naming)
-        source, writer = _ForeignFrames(sequence, segment), ForeignWriter(sequence.window, settings, log, result)
+        panorama = find_panorama(
+            sequence.files[0], sequence.window, denoisers[0].receptive_field, stated=settings.wrap, log=log
+        )
+        source = _ForeignFrames(sequence, segment, panorama)
+        writer = ForeignWriter(sequence.window, settings, log, result, panorama)
     with ExitStack() as stack:
         backward: BackwardImages | None = None
         if settings.bidirectional:
@@ -175,12 +180,15 @@ class _ClipFrames:
 class _ForeignFrames:
     """Frames of another renderer, whose results are written into copies of their files."""
 
-    def __init__(self, sequence: ForeignSequence, segment: range) -> None:
-        self._sequence, self._start = sequence, segment.start
+    def __init__(self, sequence: ForeignSequence, segment: range, panorama: Panorama | None) -> None:
+        """``panorama``: its frames are widened."""
+        self._sequence, self._start, self._panorama = sequence, segment.start, panorama
 
     def read(self, log: Callable[[str], None], *, backwards: bool = False) -> Iterator[StoredFrame]:
         """The frames, or the same from the last to the first with time turned around; forwards, files stay decoded."""
         frames = self._sequence.frames(backwards=backwards, keep_pixels=not backwards, log=log)
+        if self._panorama is not None:
+            frames = map(self._panorama.widen_frame, frames)
         return map(StoredFrame, frames)  # unlike a loop, this keeps no frame while the next one is read
 
     def file(self, index: int) -> ExrFile | None:

@@ -26,6 +26,9 @@ class Settings(NamedTuple):
     they still add up to the beauty (:mod:`jaxdn.sequence.aov_decomposition`)."""
     alpha: bool = False
     """Denoise the alpha of such files too (:mod:`jaxdn.sequence.alpha`)."""
+    wrap: bool = False
+    """The left edge of such files continues at the right one (:mod:`jaxdn.sequence.panorama`), as it does anyway where
+    their attribute ``envmap`` says so."""
     preview: bool = False
     """Write a PNG next to each frame."""
     bidirectional: bool = False

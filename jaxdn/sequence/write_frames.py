@@ -1,6 +1,6 @@
 """Denoised frames as files: new ones for our clips, copies of the source with another beauty for other renderers."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from jaxdn.evaluation.report.images import save_png
 from jaxdn.sequence.additive_aovs import AdditiveAovs
 from jaxdn.sequence.alpha import AlphaDenoiser
 from jaxdn.sequence.frame_denoiser import light_of
+from jaxdn.sequence.panorama import Panorama
 from jaxdn.sequence.settings import Settings
 
 
@@ -44,23 +45,31 @@ class ForeignWriter:
     """Writes frames of another renderer, with their additive layers and alpha denoised where the settings say so."""
 
     def __init__(
-        self, window: Window, settings: Settings, log: Callable[[str], None], result: "SharedResult | None" = None
+        self,
+        window: Window,
+        settings: Settings,
+        log: Callable[[str], None],
+        result: "SharedResult | None" = None,
+        panorama: Panorama | None = None,
     ) -> None:
-        """``result``: of a view among several, what is written together with the others."""
+        """``result``: of a view among several, what is written with the others; ``panorama``: frames are widened."""
         self._window, self._settings, self._log = window, settings, log
         self.has_history = settings.aovs == "additive" or settings.alpha
         self._aovs = AdditiveAovs(settings.naming, log) if settings.aovs == "additive" else None
         self._alpha = AlphaDenoiser(safe=settings.safe) if settings.alpha else None
-        self._result = result
+        self._result, self._panorama = result, panorama
 
     def write(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> None:
         """Denoise the additive layers of a frame, and write all; without a target they are for the history alone."""
         assert source is not None
-        layers = {} if self._aovs is None else self._aovs.denoise(source.placed(self._window), frame, image)
+        layers = {} if self._aovs is None else self._aovs.denoise(self._place(source), frame, image)
         alpha = self._denoise_alpha(source, frame, image)
         if target is None:
             return
         beauty = compose_beauty(frame, image)
+        if self._panorama is not None:
+            beauty, alpha = self._panorama.cut(beauty), None if alpha is None else self._panorama.cut(alpha)
+            layers = {name: self._panorama.cut(layer) for name, layer in layers.items()}
         target.parent.mkdir(parents=True, exist_ok=True)
         settings = self._settings
         own = replace_channels(source, {"": beauty, **layers}, self._window, settings.naming, alpha=alpha)
@@ -84,7 +93,12 @@ class ForeignWriter:
         if channel is None:
             self._log("--alpha: there is no alpha beside the beauty")
             return None
-        return self._alpha.denoise(source.placed(self._window)[channel], frame, compose_beauty(frame, image))
+        return self._alpha.denoise(self._place(source)[channel], frame, compose_beauty(frame, image))
+
+    def _place(self, source: ExrFile) -> Mapping[str, np.ndarray]:
+        """The channels of a file as frames have them."""
+        placed = source.placed(self._window)
+        return placed if self._panorama is None else self._panorama.widen_channels(placed)
 
 
 class SharedResult:

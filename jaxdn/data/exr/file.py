@@ -15,6 +15,8 @@ import OpenEXR
 from jaxdn.data.errors import ClipError, DamagedFile
 
 _SIDE_LIMIT = 1 << 16  # a larger size in a header counts as damaged, before memory is allocated for it
+_LATLONG = 0
+"""The value of the attribute ``envmap`` for a panorama; 1 is a cube."""
 _UNREADABLE = (RuntimeError, ValueError, KeyError, IndexError, TypeError, MemoryError, UnicodeDecodeError)
 _T = TypeVar("_T")
 
@@ -102,6 +104,7 @@ class ExrFile:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._sound = False
+        self._latlong = False
         self._parts: list[ExrPart] | None = None
         self._headers: list[dict[str, Any]] | None = None
         self._layout: tuple[Window, dict[str, Window]] | None = None
@@ -110,6 +113,13 @@ class ExrFile:
     def paths(self) -> tuple[Path, ...]:
         """The files that are read: this one."""
         return (self.path,)
+
+    @property
+    def is_panorama(self) -> bool:
+        """Whether the attribute ``envmap`` says that the picture is an equirectangular panorama."""
+        if not self._sound:
+            self._read_headers()
+        return self._latlong
 
     @property
     def display(self) -> Window:
@@ -190,6 +200,8 @@ class ExrFile:
             raise DamagedFile(self.path, "the file has no parts; write the frame again")
         for header in headers:
             _check_header(self.path, header)
+        envmap: Any = headers[0].get("envmap")  # an enumeration, or a number
+        self._latlong = envmap is not None and int(getattr(envmap, "value", envmap)) == _LATLONG
         self._sound = True
         return headers
 
