@@ -120,7 +120,9 @@ def _inspect_shot(
         if fitting is not None:
             print("\n".join(_to_state([file.path for file in opened], fitting)))
     checked = (
-        None if overlay is None else _check(shot, label, opened, naming, mapping, unusable, gaps, overlay, quiet=quiet)
+        None
+        if overlay is None
+        else _check(shot, label, opened, naming, mapping, unusable, gaps, fitting, overlay, quiet=quiet)
     )
     return {
         "frames": len(opened),
@@ -142,6 +144,7 @@ def _check(
     mapping: Sequence[MappedBuffer],
     unusable: Mapping[str, str],
     gaps: str | None,
+    fitting: Sequence[str] | None,
     out: Path,
     *,
     quiet: bool,
@@ -162,6 +165,7 @@ def _check(
             unusable=unusable,
             missing=(gaps or "").removesuffix(" missing"),
             breaks=_without_one_before(shot, opened),
+            unexplained=fitting,
             on_frame=lambda path: None if report is None else report.on_frame(path, next(count), len(opened)),
         )
     if not quiet:

@@ -54,7 +54,7 @@ def frame_of(index):
 
 
 LETTERS = {"Combined": "RGB", "Depth": "Z", "Vector": "XYZW", "Object Index": "X"}
-LETTERS |= {"Denoising Albedo": "RGB", "Denoising Normal": "XYZ"}
+LETTERS |= {"Denoising Albedo": "RGB", "Denoising Normal": "XYZ", "motion": "XY"}
 
 
 def write_frame(path, layers):
@@ -149,6 +149,20 @@ def test_vectors_with_x_and_y_swapped(tmp_path, inspect):
     assert names(record) == ["flipped vectors"]
     assert "--motion-convention rows-columns" in record["findings"][0]["remedy"]
     assert inspect(shot, "--motion-convention", "rows-columns")["findings"] == []
+
+
+def test_vectors_that_nobody_has_explained(tmp_path, inspect):
+    def rename(index, layers):
+        return {name: image for name, image in layers.items() if name != "Vector"} | {
+            "motion": layers["Vector"][..., :2] * (1, -1)
+        }
+
+    shot = write_shot(tmp_path / "shot", rename)
+    record = inspect(shot)
+    assert names(record) == ["vectors without a meaning"]
+    assert "State --motion-convention previous-current: " in record["findings"][0]["remedy"]
+    assert "motion.X" not in read_exr(tmp_path / "overlay" / "shot_0003.exr")
+    assert inspect(shot, "--motion-convention", "previous-current")["findings"] == []
 
 
 def test_vectors_of_another_size(tmp_path, inspect):

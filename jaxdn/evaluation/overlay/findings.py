@@ -47,6 +47,9 @@ class Known(NamedTuple):
     """File -> why it is no frame of the shot."""
     missing: str
     """The numbers of missing frames, in words; empty: none."""
+    unexplained: Sequence[str] | None = None
+    """Of vectors whose convention nobody has stated, so that they were left out, the conventions that fit; None: there
+    are no such vectors."""
 
 
 def find_all(names: Sequence[str], figures: Sequence[Mapping[str, float]], known: Known) -> list[Finding]:
@@ -105,6 +108,8 @@ def _brightness(names: Sequence[str], figures: Sequence[Mapping[str, float]]) ->
 
 def _motion(mean: Mapping[str, float], known: Known) -> list[Finding]:
     """Vectors that mean something else, or are missing."""
+    if known.unexplained is not None:
+        return [_unexplained_motion(known.unexplained)]
     if "left as given" not in mean and "disagrees" not in mean:
         if mean.get("measured motion", 0.0) > MANY:
             return [_missing_motion(mean)]
@@ -123,6 +128,15 @@ def _motion(mean: Mapping[str, float], known: Known) -> list[Finding]:
     if mean.get("disagrees", 0.0) > MANY and ratio < CLEARLY:
         return [_disagreeing_motion(mean, ratio)]
     return []
+
+
+def _unexplained_motion(fitting: Sequence[str]) -> Finding:
+    named = " or ".join(f"--motion-convention {name}" for name in fitting)
+    return Finding(
+        "vectors without a meaning",
+        "The files have motion vectors, and nothing says what they mean. They are left out here.",
+        f"State {named}: so the first frames come onto each other." if fitting else "State --motion-convention.",
+    )
 
 
 def _missing_motion(mean: Mapping[str, float]) -> Finding:

@@ -1,7 +1,7 @@
 """Measure a shot, and write what was found: EXR layers beside each other, and one page."""
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,6 +65,7 @@ def write_overlay(
     unusable: Mapping[str, str] | None = None,
     missing: str = "",
     breaks: Collection[Path] = (),
+    unexplained: Sequence[str] | None = None,
     on_frame: Callable[[Path], object] = lambda path: None,
 ) -> Overlay:
     """Write ``out/NAME.exr`` for each frame and ``out/overlay.html``; returns what was found.
@@ -82,12 +83,15 @@ def write_overlay(
       unusable: file -> why it is no frame.
       missing: numbers of frames that are missing, in words.
       breaks: files whose frame before is not there: they have no history.
+      unexplained: of vectors whose convention nobody has stated, the conventions that fit; they are left out. None:
+        there are no such vectors.
       on_frame: called with each file of layers that was written.
     """
     if any(file.path.parent.absolute() == out.absolute() for file in files):
         raise ValueError(f"--overlay {out}: expected another folder than that of the shot; name one of its own.")
     out.mkdir(parents=True, exist_ok=True)
     unusable = dict(unusable or {})
+    naming = naming if unexplained is None else replace(naming, motion_convention="none")
     albedo = next((mapped.channels for mapped in mapping if mapped.buffer == "albedo"), None)
     measurer, films = Measurer(), _Films()
     names: list[str] = []
@@ -104,7 +108,7 @@ def write_overlay(
         on_frame(path)
     if not names:
         raise ClipError(f"{title}: expected frames that can be read, found none.")
-    findings = find_all(names, figures, Known(convention, unusable, missing))
+    findings = find_all(names, figures, Known(convention, unusable, missing, unexplained))
     facts = {mapped.buffer: f"{mapped.layer} ({', '.join(mapped.channels)}): {mapped.convention}" for mapped in mapping}
     page = overlay_page(title, names, figures, findings, films.views, facts)
     write_atomically({out / PAGE: page.encode("utf-8", "replace")})
