@@ -95,6 +95,8 @@ NEEDS = {
     "torch": Need(_package("torch"), "pip install -c constraints.txt torch (a CPU build)"),
     "pyoidn": Need(_package("pyoidn"), "pip install -e '.[oidn]'"),
     "distributed": Need(_package("distributed"), "pip install -e '.[farm]'"),
+    "openjd": Need(_package("openjd"), "pip install --group dev"),
+    "bash": Need(lambda: shutil.which("bash") is not None, "a Unix system"),
     "g++": Need(lambda: shutil.which("g++") is not None, "apt-get install g++ pkg-config"),
     "headers of OpenEXR": Need(lambda: _runs("pkg-config", "--exists", "OpenEXR"), "apt-get install libopenexr-dev"),
     "headers of ONNX Runtime": Need(

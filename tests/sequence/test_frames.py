@@ -233,9 +233,11 @@ def test_the_command_line(tmp_path: Path, capsys: Any) -> None:
     lines = capsys.readouterr().out
     assert "\x1b" not in lines
     assert "\r" not in lines
-    assert re.search(r"^frame 1 of 3: \S+a\.0002\.exr, \d+\.\d s$", lines, re.MULTILINE)
-    assert re.search(r"^frame 2 of 3: \S+a\.0003\.exr, \d+\.\d s, about \d+ s left$", lines, re.MULTILINE)
-    assert re.search(r"^frame 3 of 3: \S+a\.0005\.exr, \d+\.\d s$", lines, re.MULTILINE)
+    assert re.search(r"^frame 1 of 3: \S+a\.0002\.exr, \d+\.\d s; Progress: 33%$", lines, re.MULTILINE)
+    assert re.search(
+        r"^frame 2 of 3: \S+a\.0003\.exr, \d+\.\d s, about \d+ s left; Progress: 66%$", lines, re.MULTILINE
+    )
+    assert re.search(r"^frame 3 of 3: \S+a\.0005\.exr, \d+\.\d s; Progress: 100%$", lines, re.MULTILINE)
     with pytest.raises(SystemExit) as ended:
         main.main(["denoise", str(source), "-o", str(out), "--frames", "3-x"])
     assert ended.value.code == 2
