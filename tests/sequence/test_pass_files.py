@@ -132,8 +132,9 @@ def test_whole_frames_are_frames_whatever_they_are_called(tmp_path: Path) -> Non
         (tmp_path / "in").mkdir(exist_ok=True)
         clips.write_exr(tmp_path / "in" / name, channels)
     assert len(denoise_files([tmp_path / "in"], tmp_path / "out", box_blur()).files) == 3
-    clips.write_exr(tmp_path / "vector_0001.exr", layer("", now.light, "RGB"))  # a shot may be called so
-    assert len(denoise_files([tmp_path / "vector_0001.exr"], tmp_path / "out", box_blur()).files) == 1
+    for name in ("vector_0001.exr", "forward_0001.exr"):  # a shot may be called so
+        clips.write_exr(tmp_path / name, layer("", now.light, "RGB"))
+        assert len(denoise_files([tmp_path / name], tmp_path / "out", box_blur()).files) == 1
 
 
 @pytest.mark.parametrize(

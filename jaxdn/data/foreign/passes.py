@@ -15,7 +15,8 @@ from jaxdn.data.foreign.shots import Shot, find_shots
 
 _BEAUTY = [name for name in LAYERS["radiance"] if name]
 """Words in the names of files that hold the picture, the best first."""
-_UNSURE = {UNSURE_ALBEDO, "motion", "vector", "velocity", "backward", "id", "ids", "object id", "normal", "normals"}
+_MOTION = {"motion", "vector", "velocity", "backward", "forward"}
+_UNSURE = _MOTION | {UNSURE_ALBEDO, "id", "ids", "object id", "normal", "normals"}
 """Words that are names of shots, too: such files alone are pictures, unless one of a picture is beside them."""
 _SHORT = 4
 """Letters; shorter words tell nothing of a file that stands alone."""
