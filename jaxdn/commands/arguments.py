@@ -342,6 +342,15 @@ class Export:
 class Doctor:
     """Show what this machine computes, denoises, trains and renders with, and what to install for more."""
 
+    warm: bool = False
+    """Compile what `jaxdn denoise` runs on other renderers' frames, and keep it: for images and farms."""
+    method: str = "auto"
+    """With --warm: the method, as of `jaxdn denoise`."""
+    width: int = 1920
+    """With --warm: the width of the frames in pixels."""
+    height: int = 1080
+    """With --warm: the height."""
+
 
 COMMANDS = Inspect | Render | Pack | Train | Denoise | Compare | Export | Doctor
 """All of them, as tyro reads them from a command line."""

@@ -25,6 +25,10 @@ from jaxdn.commands.arguments import (
 )
 from jaxdn.commands.errors import end_with_reader, plain_errors
 from jaxdn.runtime.interrupt import exit_on_interrupt
+from jaxdn.runtime.program_cache import keep_programs
+
+_COMPUTING = (Train, Denoise, Compare, Doctor)
+"""Commands whose programs are worth keeping between runs."""
 
 
 def _inspect(options: Inspect) -> None:
@@ -174,6 +178,10 @@ def _doctor(options: Doctor) -> None:
     from jaxdn.commands.doctor import doctor
 
     doctor()
+    if options.warm:
+        from jaxdn.commands.warm import warm
+
+        warm((options.height, options.width), options.method)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -201,6 +209,8 @@ def main(arguments: list[str] | None = None) -> None:
         args=arguments,
     )
     with plain_errors():
+        if isinstance(options, _COMPUTING):
+            keep_programs()
         run[type(options)](options)
 
 

@@ -15,13 +15,13 @@ from typing import Any, Literal, NoReturn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.buffer_callback import buffer_callback
 
 from jaxdn.core.frame import Frame, written_out
 from jaxdn.denoiser import Core, Denoiser, Params, State, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.methods.registry import method
 from jaxdn.ops import oidn as binding
+from jaxdn.ops.dispatch.host_call import call_host, name_of
 from jaxdn.ops.dispatch.operation import ANY, NotPortableError, platform
 
 Guides = Literal["both", "albedo", "none"]
@@ -92,12 +92,12 @@ def _denoise(settings: binding.Settings, scale: jax.Array, *images: jax.Array) -
     def call(scale: Any, *images: Any) -> np.ndarray:
         return binding.denoise(*map(np.asarray, images), settings=settings, scale=float(np.asarray(scale)))
 
-    def fill(context: Any, result: Any, *given: Any) -> None:
-        np.copyto(np.asarray(result), call(*given))
+    def fill(results: list[np.ndarray], *given: np.ndarray) -> None:
+        np.copyto(results[0], call(*given))
 
     like = jax.ShapeDtypeStruct(images[0].shape, jnp.float32)
     if platform() == "cpu":  # the program's own memory; arrays of jax may wait for a thread that waits for this call
-        image = buffer_callback(fill, like, vmap_method="sequential")(scale, *images)
+        (image,) = call_host(name_of(binding.denoise, *settings), fill, [like], scale, *images)
     else:
         image = jax.pure_callback(call, like, scale, *images, vmap_method="sequential")
     return image.astype(images[0].dtype)

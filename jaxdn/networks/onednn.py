@@ -11,6 +11,7 @@ All primitives are made once for a shape, on memory of their own, and run one af
 :mod:`jaxdn.ops.onednn.layers`.
 """
 
+import hashlib
 import math
 import threading
 from collections.abc import Callable, Sequence
@@ -20,9 +21,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.buffer_callback import buffer_callback
 
 from jaxdn.networks.graph import FEATURES, GraphSpec, Weights, evaluate, output_shapes, same_weights
+from jaxdn.ops.dispatch.host_call import call_host
 from jaxdn.ops.onednn import layers
 from jaxdn.ops.onednn import library as dnnl
 
@@ -204,16 +205,14 @@ class Session:
         self._program: Any = None
         self._lock = threading.Lock()
 
-    def __call__(self, context: Any, outputs: Sequence[Any], features: Any, *weights: Any) -> None:
+    def __call__(self, outputs: Sequence[np.ndarray], features: np.ndarray, *weights: np.ndarray) -> None:
         """Fill ``outputs``; the arguments are views of XLA's own buffers."""
         with self._lock:
-            given = [np.asarray(weight) for weight in weights]
-            if not same_weights(given, self._weights):
-                self._weights = [weight.copy() for weight in given]
+            if not same_weights(list(weights), self._weights):
+                self._weights = [weight.copy() for weight in weights]
                 self._program = self._describe(self._weights)
-            heads = [dnnl.address_of(np.asarray(output)) for output in outputs]
             with dnnl.LOCK:
-                self._program(dnnl.address_of(np.asarray(features)), heads)
+                self._program(dnnl.address_of(features), [dnnl.address_of(output) for output in outputs])
 
 
 def run(
@@ -225,4 +224,6 @@ def run(
     shape = features.shape
     session = Session(lambda leaves: Program(network, jax.tree.unflatten(tree, leaves), shape, precision))
     results = [jax.ShapeDtypeStruct(each, jnp.float32) for each in output_shapes(network, shape)]
-    return tuple(buffer_callback(session, results, vmap_method="sequential")(features, *leaves))
+    # One session for all programs of this network and shape; where their weights differ, each makes its own again.
+    made = hashlib.sha256(repr((network, str(tree), shape, precision.backend)).encode()).hexdigest()[:32]
+    return tuple(call_host(f"{__name__}:{made}", session, results, features, *leaves))

@@ -48,10 +48,10 @@ def both():
 
     def run(function, *arguments):
         found = []
-        for name, callbacks in (("auto", 1), ("reference", 0)):
+        for name, calls in (("auto", 1), ("reference", 0)):
             with implementation(name):
                 program = program_of(function, name)
-                assert (str(program.trace(*arguments).jaxpr).count("callback[") > 0) == callbacks
+                assert (str(program.trace(*arguments).jaxpr).count("ffi_call[") > 0) == calls
                 found.append(jax.tree.map(np.asarray, program(*arguments)))
         return found
 
@@ -301,7 +301,7 @@ def test_what_has_no_loop_for_its_gradient_is_left_to_jax(rng, both):
 
     given = coarse, there, fine
     program = jax.grad(loss, argnums=(0, 1, 2))
-    assert "callback[" not in str(jax.make_jaxpr(program)(*given))
+    assert "ffi_call[" not in str(jax.make_jaxpr(program)(*given))
     found = program(*given)
     with implementation("reference"):
         expected = program(*given)
@@ -310,7 +310,7 @@ def test_what_has_no_loop_for_its_gradient_is_left_to_jax(rng, both):
 
     two = jax.tree.map(lambda each: jnp.stack([each, each[..., ::-1]]), given)
     batched = jax.vmap(joint_bilateral_upsample)
-    assert "callback[" not in str(jax.make_jaxpr(batched)(*two))
+    assert "ffi_call[" not in str(jax.make_jaxpr(batched)(*two))
     alone = both(joint_bilateral_upsample, *jax.tree.map(lambda each: each[1], two))[0]
     np.testing.assert_allclose(batched(*two)[0][1], alone[0], rtol=3e-5)
 

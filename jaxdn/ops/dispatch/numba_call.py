@@ -10,8 +10,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.buffer_callback import buffer_callback
 
+from jaxdn.ops.dispatch.host_call import call_host, name_of
 from jaxdn.ops.dispatch.operation import Operation, platform
 
 Given = jax.Array | tuple[jax.Array, ...] | None
@@ -57,9 +57,10 @@ def call(
       least: rows of a tile, where a loop does more for its first ones.
     """
 
-    def work(context: Any, results: Any, *given: Any) -> None:
-        read = jax.tree.map(np.asarray, given)
-        written = [np.asarray(each) for each in results]
+    leaves, structure = jax.tree.flatten(tuple(arrays))
+
+    def work(written: list[np.ndarray], *given: np.ndarray) -> None:
+        read = jax.tree.unflatten(structure, given)
         pool, threads = _pool()
         # Several tiles for each thread, as some take longer.
         height = max(least, -(-rows // (4 * threads)))
@@ -73,7 +74,8 @@ def call(
             wait(tiles)
 
     kinds = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
-    return list(buffer_callback(work, kinds, vmap_method="sequential")(*arrays))
+    name = name_of(getattr(loop, "py_func", loop), str(structure), numbers, rows, least)
+    return call_host(name, work, kinds, *leaves)
 
 
 @functools.cache

@@ -1,0 +1,63 @@
+"""Compiled programs, kept between runs: a farm runs a process a frame, and compiling takes longer than denoising.
+
+jax keeps programs in a folder by all that goes into them, its own version included, but not by the CPU that their code
+is for: on a home folder that several machines share, each kind of CPU has a folder of its own.
+"""
+
+import hashlib
+import os
+import platform
+import sys
+from importlib import metadata
+from pathlib import Path
+
+VARIABLE = "JAXDN_CACHE_DIR"
+"""Environment variable: the folder of what is kept between runs; empty: nothing is kept."""
+_NEVER_S = 1e9
+
+
+def keep_programs() -> Path | None:
+    """Let jax find compiled programs in a folder, and write new ones there if it can; returns the folder.
+
+    None: nothing is kept, because no folder can be made or :data:`VARIABLE` is empty, or jax's own variable
+    ``JAX_COMPILATION_CACHE_DIR`` says where.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ or os.environ.get(VARIABLE) == "":
+        return None
+    folder = cache_folder() / f"programs-{metadata.version('jaxlib')}-{_describe_cpu()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:  # read-only, or no home
+        if not folder.is_dir():
+            return None
+    import jax
+
+    writable = os.access(folder, os.W_OK)
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    # Reading takes milliseconds, also of small programs; without a limit each run writes what is missing.
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0 if writable else _NEVER_S)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    return folder
+
+
+def cache_folder() -> Path:
+    """The folder of :data:`VARIABLE`, or the user's own as the system has it."""
+    if given := os.environ.get(VARIABLE):
+        return Path(given)
+    home = Path(os.path.expanduser("~"))
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local") / "jaxdn" / "cache"
+    if sys.platform == "darwin":
+        return home / "Library" / "Caches" / "jaxdn"
+    return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache") / "jaxdn"
+
+
+def _describe_cpu() -> str:
+    """What differs between CPUs that run different code: name and instructions, shortened."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    told = {line.split(":")[0].strip(): line for line in reversed(lines) if ":" in line}  # of the first core
+    parts = [told.get(name, "") for name in ("model name", "flags", "Features", "CPU part")]
+    return hashlib.sha256("\n".join([platform.machine(), platform.processor(), *parts]).encode()).hexdigest()[:16]
