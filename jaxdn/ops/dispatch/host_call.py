@@ -26,6 +26,8 @@ Work = Callable[..., None]
 
 _TARGET = "jaxdn_host_call"
 _METADATA, _UNKNOWN_ERROR = 1, 2
+_KNOWN_VERSIONS = ((0, 3), (0, 4), (0, 5))
+"""Of the interface, whose structures are those below: jax 0.10 has (0, 3), jax 0.12 has (0, 5)."""
 _DTYPES = {
     1: np.bool_, 2: np.int8, 3: np.int16, 4: np.int32, 5: np.int64, 6: np.uint8, 7: np.uint16, 8: np.uint32,
     9: np.uint64, 10: np.float16, 11: np.float32, 12: np.float64, 16: ml_dtypes.bfloat16,
@@ -228,7 +230,7 @@ def _version() -> tuple[int, int]:
 def _register() -> bool:
     """Whether XLA takes the handler."""
     try:
-        if _version()[0] != 0:
+        if _version() not in _KNOWN_VERSIONS:
             return False
         jax.ffi.register_ffi_target(_TARGET, jax.ffi.pycapsule(_handle), platform="cpu")
     except (OSError, IndexError, ValueError, RuntimeError):
