@@ -13,6 +13,7 @@ from jaxdn.methods.stabilised import stabilised as stabilised
 if TYPE_CHECKING:  # what type checkers and editors see; tests/test_house.py compares it with the table of methods
     from jaxdn.methods.arae import arae as arae
     from jaxdn.methods.asvgf import asvgf as asvgf
+    from jaxdn.methods.combiner.method import combiner as combiner
     from jaxdn.methods.dasr import dasr as dasr
     from jaxdn.methods.ntasd import ntasd as ntasd
     from jaxdn.methods.ntd import ntd as ntd

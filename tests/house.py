@@ -49,6 +49,7 @@ ROOMS: dict[str, Room] = {
     "data.foreign": Room(5, "EXR sequences of other renderers"),
     "data.read": Room(6, "frames and clips from anywhere"),
     "data.training": Room(6, "caches, packs, batches"),
+    "methods.combiner": Room(6, "combiner, with its parts"),
     "methods.steady": Room(6, "steady, with its parts"),
     "methods.two_lobes": Room(6, "relax, reblur, and their histories"),
     "denoisers": Room(7, "the methods as functions"),

@@ -17,19 +17,15 @@ from jaxdn.denoiser import Core, Denoiser, Params, Prepared, State, core_of, rec
 from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters import albedo_history, kalman
 from jaxdn.filters.albedo_history import follow_albedo, measure_share
-from jaxdn.filters.catmull_rom import warp_cubic
 from jaxdn.filters.kalman import kalman_blend
-from jaxdn.filters.reproject import reproject
-from jaxdn.filters.resampling import find_beyond, find_whole, measure_fetch_error
+from jaxdn.filters.resampling import find_whole, measure_fetch_error
+from jaxdn.filters.sharp_history import TAPS, fetch_sharply
 from jaxdn.filters.surface_test import Guides, guides_of
+from jaxdn.ops.scales import to_planes
 
 _READS = frozenset({"albedo", "normal", "depth", "previous_depth", "motion", "ids"})
-_TAPS = 2
-"""Radius in pixels of a cubic fetch."""
-RECEPTIVE_FIELD = kalman.RECEPTIVE_FIELD + albedo_history.RECEPTIVE_FIELD + _TAPS
+RECEPTIVE_FIELD = kalman.RECEPTIVE_FIELD + albedo_history.RECEPTIVE_FIELD + TAPS
 """Radius in pixels of all that decides about one, besides the denoiser's."""
-_WHOLE = 0.999
-"""The mean of all accepted taps that are whole, rounded."""
 
 
 class StabilisedState(NamedTuple):
@@ -108,9 +104,10 @@ def _blend(
     state: StabilisedState, frame: Frame, image: jax.Array, first: jax.Array, exposure: jax.Array, history_max: int
 ) -> tuple[jax.Array, jax.Array]:
     """The next history, and how many pixels of the last one were invalid."""
-    fetched, valid, cubic, invalid = _fetch(state, frame, first)
     colors = _count_colors(frame)
-    past, tracked, whole_before = fetched[:colors], fetched[colors:-1], fetched[-1] > _WHOLE
+    found = fetch_sharply(state.history, state.guides, frame, first, colors=colors)
+    fetched, valid = to_planes(found.values), found.valid
+    past, tracked = fetched[:colors], fetched[colors:-1]
     whole = find_whole(frame)
     planes, share, albedo, before = image.transpose(2, 0, 1), jnp.zeros_like(fetched[0]), None, None
     color = past[:3]
@@ -121,7 +118,7 @@ def _blend(
         before = before + share[None] * (albedo - before)
     error = None
     if frame.motion is not None:
-        error = measure_fetch_error(planes, albedo, share, frame.motion, cubic, whole & whole_before)
+        error = measure_fetch_error(planes, albedo, share, frame.motion, found.cubic, whole & found.whole)
     blended = kalman_blend(
         jnp.concatenate([color, tracked]),
         valid,
@@ -134,23 +131,4 @@ def _blend(
     parts = [blended[:3], blended[3:], whole[None].astype(image.dtype)]
     if albedo is not None and before is not None:
         parts.insert(1, albedo + (1.0 - blended[3:4]) * jnp.where(valid[None], before - albedo, 0.0))
-    return jnp.concatenate(parts).transpose(1, 2, 0), invalid
-
-
-def _fetch(state: StabilisedState, frame: Frame, first: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """The history where it is now [C, H, W], where there is one, where it was fetched by cubics, [H, W] each; and how
-    many pixels of it were invalid.
-
-    Where the nearest four pixels are whole, all sixteen show one surface, and cubics need no test.
-    """
-    found = reproject(state.history, state.guides, frame, first)
-    history, valid = found.history, found.valid[..., 0]
-    cubic = jnp.zeros_like(valid)
-    if frame.motion is not None:
-        colors = _count_colors(frame)
-        sharp = warp_cubic(state.history[..., :colors], frame.motion)
-        inside = find_beyond(jnp.where(jnp.isfinite(frame.motion), frame.motion, 0.0)) == 0
-        cubic = valid & inside & (history[..., -1] > _WHOLE) & jnp.all(jnp.isfinite(sharp), axis=-1)
-        light = jnp.where(cubic[..., None], sharp, history[..., :colors])
-        history = jnp.concatenate([light, history[..., colors:]], axis=-1)
-    return history.transpose(2, 0, 1), valid, cubic, found.invalid
+    return jnp.concatenate(parts).transpose(1, 2, 0), found.invalid

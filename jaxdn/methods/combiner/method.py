@@ -1,0 +1,263 @@
+"""``combiner``: Open Image Denoise, and what the samples and earlier frames know better, mixed pixel by pixel.
+
+For each frame: the library denoises it alone (the *prior*); the history is fetched along motion, sharply; the noisy
+frame, the prior and the guides are blended into running means (:mod:`jaxdn.methods.combiner.history`); affinities
+filter the means of noisy light and of the prior's images, at full and at half resolution
+(:mod:`jaxdn.methods.combiner.candidates`). The image is a mean of eight candidates: the prior, the last image, the
+means, the filtered ones, and the prior with the correction that filtered samples tell of.
+
+A U-Net at half resolution decides for every pixel: the weights of the candidates, how fast the means follow, the
+filter's features and how far a pixel is trusted. What it predicts before training is plausible: mostly the prior and
+what was shown.
+"""
+
+import functools
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdn import color
+from jaxdn.core.frame import RADIANCE_MAX, Frame
+from jaxdn.core.options import Range
+from jaxdn.denoiser import Core, Denoiser, Params, core_of, recurrent
+from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
+from jaxdn.filters.sharp_history import TAPS
+from jaxdn.filters.surface_test import depth_feature
+from jaxdn.methods.combiner.candidates import (
+    LEVELS,
+    FilterParameters,
+    make_candidates,
+    receptive_field,
+)
+from jaxdn.methods.combiner.history import (
+    CombinerState,
+    Means,
+    Past,
+    fetch_past,
+    keep_history,
+    measure_now,
+    start_history,
+    update_means,
+)
+from jaxdn.methods.oidn import oidn
+from jaxdn.methods.registry import method
+from jaxdn.networks import Widths, graph
+from jaxdn.ops import oidn as binding
+from jaxdn.ops.scales import crop, downsample, fill_holes, join_planes, pad, space_to_depth, to_planes, upsample
+from jaxdn.recipes.augmentation import Augmentation
+from jaxdn.recipes.objectives import pyramid_illumination
+from jaxdn.recipes.recipe import Recipe
+
+WIDTHS: dict[str, Widths] = {
+    "high": ((32,), (48,), (64,), (64,), (64,)),
+    "fast": ((16,), (24,), (32,), (32,), (32,)),
+}
+"""Channels of the U-Net's convolutions, from half resolution down."""
+FEATURES, HALF_FEATURES = 5, 8
+"""Learned features at full and at half resolution."""
+INITIAL = {
+    "trust": 4.0,
+    "follow": 0.0,
+    "prior": 1.5,
+    "shown": 0.5,
+    "mean": -5.0,
+    "fine": -3.0,
+    "coarse": -4.0,
+    "fine correction": -0.5,
+    "coarse correction": -0.5,
+    "prior mean": 1.0,
+}
+"""Parameters of every pixel, one logit each, and what they are before training: how far its light is trusted; the
+share of the new frame in the means; the weights of the candidates."""
+PRECISIONS = {"albedo": 1.0, "normal": 1.0, "light": 4.0, "depth": 6.0, "learned": 0.0}
+"""Guide of the filter -> the logarithm of its precision before training."""
+_LEVEL_WEIGHT = 4.0
+"""Initial logit of the weight of each level at half resolution."""
+_SPLITS = np.cumsum([4 * FEATURES, 4 * len(INITIAL), HALF_FEATURES]).tolist()
+"""Channels of the head from which on it says something else."""
+_MULTIPLE, _BLOCKS = 16, 4
+"""What height and width are multiples of: of the network's input, at half resolution; of the filter's planes."""
+_DARK = 1e-3
+"""Light at the network's brightness that is as good as dark."""
+_LEAST_ALBEDO = 0.03
+"""Added to the albedo before light is divided by it."""
+INPUTS = {"geometry": 32, "light": 20, "prior": 18}
+"""Groups of the network's input channels."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """The network's size and what it does not decide."""
+
+    quality: Literal["fast", "high"] | Widths = "high"
+    """By name, or the network's widths as tuples."""
+    history_max: Annotated[float, Range(1)] = 32.0
+    """Largest effective number of samples of the running means, in frames."""
+    device: binding.Device = "auto"
+    """Where Open Image Denoise computes: ``"auto"`` is an NVIDIA GPU if it can use one, else the CPU."""
+    implementation: Literal["reference", "onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"] | None = None
+    """Backend of the U-Net: XLA, or on CPUs oneDNN in bfloat16 or float32 or ONNX Runtime (inference) or oneDNN
+    (training). None is XLA."""
+
+
+RECIPE = Recipe(
+    pyramid_illumination(logarithm=True),
+    steps=4000,
+    learning_rate=6e-4,
+    decay=False,
+    batch=2,
+    crop=128,
+    frames=8,
+    average=0.995,
+    spp=(1, 4, 16),
+    variation=Augmentation(shadow=0.1),
+)
+"""A constant rate and a running mean of the weights: a run can be stopped and continued at any time."""
+
+
+@method(
+    Options,
+    title="A network that combines Open Image Denoise with samples and history",
+    recipes={"usual": RECIPE},
+    backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
+    requires=binding.MODULE,
+    differentiable=False,
+)
+def combiner(options: Options) -> Denoiser:
+    """The denoiser, of all light.
+
+    Reads albedo, normal, roughness, depth, previous_depth, motion and ids; without a buffer, what it would guide or
+    test is left out. Trained by gradients of its weights; the prior has none, so the image has no gradient by the
+    frame. Raises ModuleNotFoundError where ``pyoidn`` is missing, when a step is traced; ValueError for an unknown
+    option, and ``step`` for a frame of the wrong shape, never for its contents.
+    """
+    # Flax is imported only when a network is built: filters without weights need only jax and numpy.
+    from jaxdn.networks.unet import unet
+
+    widths = WIDTHS[options.quality] if isinstance(options.quality, str) else options.quality
+    heads = (4 * (FEATURES + len(INITIAL)) + HALF_FEATURES + 1 + LEVELS,)
+    groups = tuple(INPUTS.values())
+    network = unet(groups, heads, widths=widths, head_size=1, implementation=options.implementation)
+    library = core_of(oidn(device=options.device))
+    reads = frozenset({"albedo", "normal", "roughness", "depth", "previous_depth", "motion", "ids"})
+
+    def init(key: jax.Array, frame: Frame) -> Params:
+        params = network.init(key)
+        pixel = [0.0] * FEATURES + list(INITIAL.values())
+        bias = [value for value in pixel for _ in range(4)] + [0.0] * HALF_FEATURES
+        bias += [INITIAL["trust"]] + [_LEVEL_WEIGHT] * LEVELS
+        precisions = {name: jnp.full((1 + LEVELS,), value, jnp.float32) for name, value in PRECISIONS.items()}
+        return {**params, "head_0": {**params["head_0"], "bias": jnp.asarray(bias, jnp.float32)}, "guide": precisions}
+
+    def start(params: Params, frame: Frame) -> CombinerState:
+        return start_history(frame)
+
+    def step(
+        params: Params, state: CombinerState, frame: Frame, first: jax.Array, statistics: FrameStatistics
+    ) -> tuple[CombinerState, jax.Array, jax.Array]:
+        size = frame.radiance.shape[:2]
+        prior = to_planes(jnp.clip(library.step({}, (), frame, first, statistics)[1], 0.0, RADIANCE_MAX))
+        now = measure_now(frame, jax.lax.stop_gradient(prior))
+        past = fetch_past(state, frame, now, first)
+        weights = {name: part for name, part in params.items() if name != "guide"}
+        inputs = _assemble_network_input(frame, now, past, statistics)
+        head = network.apply(weights, [group[None] for group in inputs])[0][0]
+        padded = tuple(side + -side % _BLOCKS for side in size)
+        parameters, follow, shares = _split_head(head, padded)
+        means = update_means(now, past, crop_planes(follow, size), most=options.history_max)
+        wide_means, wide_past, wide_prior = (pad_planes(each) for each in (means, past, now.prior))
+        depth = None if frame.depth is None else pad(frame.depth, _BLOCKS)
+        found = make_candidates(params["guide"], wide_means, wide_past, wide_prior, depth, parameters, statistics)
+        mixed = functools.reduce(jnp.add, (share[None] * each for share, each in zip(shares, found, strict=True)))
+        image = crop_planes(mixed, size)
+        image = jnp.clip(image, 0.0, RADIANCE_MAX)
+        return keep_history(frame, means, image), image.transpose(1, 2, 0), past.invalid
+
+    network_field = 2 * graph.receptive_field_radius(graph.unet(1, heads, widths=widths, head_size=1))
+    core = Core(start, step, reads, init, prepare=prepare, requires_validity_mask=True)
+    return recurrent(core._replace(receptive_field=binding.RECEPTIVE_FIELD + network_field + receptive_field() + TAPS))
+
+
+def prepare(frame: Frame) -> tuple[FrameStatistics, Frame]:
+    """The statistics of a frame's known light, and the frame with that near by where light is not known."""
+    size = frame.radiance.shape[:2]
+    light = frame.radiance
+    if frame.sample_count is not None:
+        known = pad(frame.sample_count, _BLOCKS) > 0
+        light = crop(fill_holes(pad(light, _BLOCKS), known), size)
+    return measure_frame(light, frame.depth, frame), frame._replace(radiance=light)
+
+
+def _assemble_network_input(
+    frame: Frame, now: Means, past: Past, statistics: FrameStatistics
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The groups of :data:`INPUTS` [h, w, C], by blocks of 2x2 pixels, padded by the edge.
+
+    Surfaces; light divided by the albedo: noisy, the mean and what was shown, at one brightness
+    (:func:`jaxdn.color.exposure`) and compressed; light as it is: the prior, its mean and what was shown, and where
+    there is a history.
+    """
+    gain, like = statistics.exposure, now.light[:1]
+    nearness = like * 0 if frame.depth is None else to_planes(depth_feature(frame.depth, statistics.mean_depth))
+    roughness = like * 0 if frame.roughness is None else to_planes(frame.roughness) - 1.0
+    geometry = now.albedo - 1.0, now.normal, nearness, roughness
+    albedo = past.means.albedo + _LEAST_ALBEDO
+    divided = [color.compress(gain * light / albedo) for light in (now.light, past.means.light, past.shown)]
+    level = color.luminance_of_planes(past.means.light)
+    spread = jnp.sqrt(jnp.maximum(past.means.square - level**2, 0.0) + 1e-12) / (level + _DARK / gain)
+    count = jnp.where(past.valid, past.means.count, 0.0)
+    facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + count), jnp.ones_like(level)]
+    plain = [color.compress(gain * light) for light in (now.prior, past.means.prior, past.shown)]
+    valid = past.valid[None].astype(like.dtype)
+
+    def by_blocks(planes: list[jax.Array]) -> list[jax.Array]:
+        return [_even(each) for each in planes]
+
+    four = [space_to_depth(each) for each in by_blocks([color.luminance_of_planes(one)[None] for one in divided[::2]])]
+    own = [space_to_depth(each) for each in by_blocks([color.luminance_of_planes(one)[None] for one in plain[::2]])]
+    groups = (
+        [space_to_depth(each) for each in by_blocks(list(geometry))],
+        [downsample(each) for each in by_blocks([*divided, *(fact[None] for fact in facts)])] + four,
+        [downsample(each) for each in by_blocks([*plain, valid])] + own,
+    )
+    found = [pad(jnp.concatenate(group, axis=-1), _MULTIPLE) for group in groups]
+    return found[0], found[1], found[2]
+
+
+def _even(planes: jax.Array) -> jax.Array:
+    """[H, W, C] of planes, its sides padded to even numbers."""
+    return pad(planes.transpose(1, 2, 0), 2)
+
+
+def _split_head(head: jax.Array, size: tuple[int, int]) -> tuple[FilterParameters, jax.Array, jax.Array]:
+    """Of the network's output: the filter's parameters, the share [H, W] of the new frame, weights [8, H, W]."""
+    height, width = size[0] // 2, size[1] // 2
+    own, logits, half, rest = jnp.split(crop(head, (height, width)), _SPLITS, axis=-1)
+    planes = join_planes([("blocks", logits)])
+    trust, follow = jax.nn.sigmoid(planes[0]), jax.nn.sigmoid(planes[1])
+    # A pixel whose share knows of its own noise, follows bright samples more: its mean becomes too bright.
+    follow = upsample(downsample(follow[..., None]))[..., 0]
+    shares = jax.nn.softmax(planes[2:], axis=0)
+    rest = jax.nn.sigmoid(to_planes(rest))
+    return FilterParameters(own, trust, half, rest[0], rest[1:]), follow, shares
+
+
+def pad_planes(tree: jax.Array | Means | Past) -> jax.Array | Means | Past:
+    """All planes [..., H, W], padded by the edge to multiples of 4; scalars are left."""
+
+    def one(planes: jax.Array) -> jax.Array:
+        if planes.ndim < 2:
+            return planes
+        below, right = (-side % _BLOCKS for side in planes.shape[-2:])
+        wide = [(0, 0)] * (planes.ndim - 2) + [(0, below), (0, right)]
+        return jnp.pad(planes, wide, mode="edge") if below or right else planes
+
+    return jax.tree.map(one, tree)
+
+
+def crop_planes(planes: jax.Array, size: tuple[int, int]) -> jax.Array:
+    """The first rows and columns of planes [..., H, W]."""
+    return planes[..., : size[0], : size[1]]
