@@ -88,8 +88,8 @@ def fetch_past(state: CombinerState, frame: Frame, now: Means, first: jax.Array)
     values, valid = to_planes(found.values), found.valid
     light, prior, albedo, normal, shown = jnp.split(values[:COLORS], 5)
     means = Means(light, prior, albedo, 2.0 * normal - 1.0, *values[COLORS:-1])
-    means = jax.tree.map(lambda then, new: jnp.where(valid, then, new), means, now)
-    return Past(means, jnp.where(valid, shown, now.prior), valid, found.invalid)
+    means = jax.tree.map(lambda then, new: jnp.where(jnp.broadcast_to(valid, new.shape), then, new), means, now)
+    return Past(means, jnp.where(valid[None], shown, now.prior), valid, found.invalid)
 
 
 def update_means(now: Means, past: Past, follow: jax.Array, *, most: float) -> Means:
@@ -101,7 +101,11 @@ def update_means(now: Means, past: Past, follow: jax.Array, *, most: float) -> M
     """
     count = jnp.maximum(past.means.count, _LEAST_COUNT)
     share = jnp.where(past.valid, follow / (follow + count * (1.0 - follow)), 1.0)
-    mixed = jax.tree.map(lambda then, new: then + share * (new - then), past.means, now)
+
+    def mix(then: jax.Array, new: jax.Array) -> jax.Array:
+        return then + jnp.broadcast_to(share, new.shape) * (new - then)
+
+    mixed = jax.tree.map(mix, past.means, now)
     variance = jnp.square(1.0 - share) / count + share**2
     return mixed._replace(count=jnp.where(past.valid, jnp.minimum(1.0 / variance, most), 1.0))
 

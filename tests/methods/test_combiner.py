@@ -1,0 +1,241 @@
+"""The combiner: means of the history by independent NumPy, candidates, the mixture, what it refuses to spread."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.test_util import check_grads
+
+from experiments.cycles.combiner_start import take_over
+from jaxdn.core.frame import Clip, Frame, frame_at
+from jaxdn.denoiser.rollout import denoise
+from jaxdn.denoisers import combiner, oidn
+from jaxdn.methods.combiner.candidates import CANDIDATES, FilterParameters, make_candidates
+from jaxdn.methods.combiner.history import (
+    Means,
+    Past,
+    fetch_past,
+    keep_history,
+    measure_now,
+    start_history,
+    update_means,
+)
+from jaxdn.methods.combiner.method import INITIAL, prepare
+from jaxdn.zoo.weights import load_weights, save_weights
+from tests.needs import require
+
+SIZE = (40, 54)  # the width is no multiple of 4
+
+
+def clip_of(rng, count=3, size=SIZE):
+    """Noise around a gradient, on one plane that stands still."""
+    truth = np.linspace(0.5, 2.0, size[1])[None, :, None] * np.array([1.0, 0.8, 0.5])
+    noise = rng.exponential(size=(count, *size, 3))
+    return Frame(
+        (truth * noise).astype(np.float32),
+        albedo=np.full((count, *size, 3), 0.6, np.float32),
+        normal=np.broadcast_to(np.float32([0, 0, 1]), (count, *size, 3)),
+        depth=np.full((count, *size, 1), 3.0, np.float32),
+        motion=np.zeros((count, *size, 2), np.float32),
+    )
+
+
+def deciding(weights_of_candidates, follow=0.0):
+    """The parameters of a network that decides the same everywhere."""
+    frame = Frame(jnp.zeros((16, 16, 3)))
+    params = combiner(quality="fast").init(jax.random.key(0), frame)
+    logits = {**dict.fromkeys(CANDIDATES, -1e3), "trust": 4.0, "follow": follow, **weights_of_candidates}
+    bias = np.array(params["head_0"]["bias"])
+    features = (bias.size - 8 - 1 - 4 - 4 * len(INITIAL)) // 4
+    bias[4 * features : 4 * (features + len(INITIAL))] = np.repeat([logits[name] for name in INITIAL], 4)
+    head = {"kernel": jnp.zeros_like(params["head_0"]["kernel"]), "bias": jnp.asarray(bias)}
+    return {**params, "head_0": head}
+
+
+def run(denoiser, params, frames):
+    """The images of a clip."""
+    return np.asarray(denoise(denoiser, params, Clip(frames, frames.radiance)), np.float64)
+
+
+def draw_means(rng, size, *, count=None):
+    light, prior, albedo, normal = rng.uniform(0, 2, (4, 3, *size))
+    counts = rng.uniform(1, 9, size) if count is None else np.full(size, count)
+    return Means(light, prior, albedo / 2, normal - 1, rng.uniform(4, 5, size), counts)
+
+
+def draw_past(rng, size):
+    return Past(draw_means(rng, size), rng.uniform(0, 2, (3, *size)), rng.random(size) > 0.3, jnp.zeros((), jnp.int32))
+
+
+def test_means_follow_by_the_shares_of_an_independent_computation(rng):
+    size, most = (5, 6), 7.0
+    now, past, follow = draw_means(rng, size, count=1.0), draw_past(rng, size), rng.uniform(0.05, 0.95, size)
+    found = update_means(now, past, follow, most=most)
+    count = past.means.count
+    odds = follow / (1 - follow) / count  # of the new frame against the mean of `count`
+    share = np.where(past.valid, odds / (1 + odds), 1.0)
+    for name in ("light", "prior", "albedo", "normal", "square"):
+        expected = (1 - share) * getattr(past.means, name) + share * getattr(now, name)
+        np.testing.assert_allclose(getattr(found, name), expected, rtol=1e-5, atol=1e-6)
+    number = np.where(past.valid, np.minimum(1 / ((1 - share) ** 2 / count + share**2), most), 1.0)
+    np.testing.assert_allclose(found.count, number, rtol=1e-5)
+
+
+def test_gradients_of_the_means(rng):
+    with jax.enable_x64(True):
+        now, past = draw_means(rng, (3, 4), count=1.0), draw_past(rng, (3, 4))
+
+        def light(follow):
+            found = update_means(now, past, follow, most=1e3)
+            return found.light, found.square, found.count
+
+        check_grads(light, (rng.uniform(0.2, 0.8, (3, 4)),), order=1, modes=["rev"])
+
+
+def test_the_light_of_a_still_clip_is_its_arithmetic_mean(rng):
+    clip = clip_of(rng, count=4)
+    frames = [prepare(jax.tree.map(jnp.asarray, frame_at(clip, index)))[1] for index in range(4)]
+    state = start_history(frames[0])
+    for index, frame in enumerate(frames):
+        now = measure_now(frame, jnp.full((3, *SIZE), float(index)))
+        means = update_means(now, fetch_past(state, frame, now, index == 0), jnp.full(SIZE, 0.5), most=32.0)
+        state = keep_history(frame, means, now.prior)
+    planes = np.mean(clip.radiance, axis=0, dtype=np.float64).transpose(2, 0, 1)
+    np.testing.assert_allclose(means.light, planes, rtol=1e-4)
+    np.testing.assert_allclose(means.prior, 1.5, rtol=1e-5)
+    np.testing.assert_allclose(means.count, 4.0, rtol=1e-5)
+
+
+def test_another_depth_ends_a_history_and_another_normal_does_not(rng):
+    first, second = (jax.tree.map(jnp.asarray, frame_at(clip_of(rng), index)) for index in range(2))
+    second = second._replace(
+        depth=second.depth.at[:, 30:].set(9.0), normal=second.normal.at[:20].set(jnp.array([1.0, 0, 0]))
+    )
+    now = measure_now(first, jnp.zeros((3, *SIZE)))
+    kept = keep_history(first, now, now.prior)
+    past = fetch_past(kept, second, measure_now(second, now.prior), False)
+    # Beside the new edge the depth has a slope, which widens the tolerance.
+    assert np.asarray(past.valid)[:, :29].all() and not np.asarray(past.valid)[:, 31:].any()
+
+
+def candidates_of(rng, means, past, prior):
+    parameters = FilterParameters(
+        jnp.zeros((8, 10, 20)), jnp.ones((16, 20)), jnp.zeros((8, 10, 8)), jnp.ones((8, 10)), jnp.ones((4, 8, 10))
+    )
+    precisions = {name: jnp.full(5, -9.0) for name in ("albedo", "normal", "light", "depth", "learned")}
+    statistics, _ = prepare(Frame(jnp.ones((16, 20, 3))))
+    found = make_candidates(precisions, means, past, prior, None, parameters, statistics)
+    return dict(zip(CANDIDATES, found, strict=True))
+
+
+def test_a_correction_is_what_the_samples_have_more_than_the_prior(rng):
+    """Where both means differ by a constant, filters that see no difference add just that to the prior."""
+    planes = [jax.tree.map(jnp.float32, each) for each in (draw_means(rng, (16, 20)), draw_past(rng, (16, 20)))]
+    means, past = planes[0], planes[1]._replace(valid=jnp.ones((16, 20), bool))
+    means = means._replace(light=means.prior + 0.25)
+    prior = jnp.asarray(rng.uniform(0, 2, (3, 16, 20)), jnp.float32)
+    found = candidates_of(rng, means, past, prior)
+    for name in ("fine correction", "coarse correction"):
+        np.testing.assert_allclose(found[name], prior + 0.25, atol=1e-4)
+    assert float(jnp.std(found["coarse"])) < 0.2 * float(jnp.std(found["mean"]))
+    np.testing.assert_array_equal(found["prior"], prior)
+    np.testing.assert_array_equal(found["shown"], past.shown)
+    np.testing.assert_array_equal(found["mean"], means.light)
+    np.testing.assert_array_equal(found["prior mean"], means.prior)
+
+
+def test_a_network_that_trusts_the_prior_alone_shows_it(rng):
+    require("pyoidn")
+    clip = clip_of(rng)
+    images = run(combiner(quality="fast"), deciding({"prior": 0.0}), clip)
+    np.testing.assert_allclose(images, run(oidn(), {}, clip), atol=1e-5)
+
+
+def test_mixtures_are_means_of_the_candidates_by_their_logits(rng):
+    require("pyoidn")
+    clip, denoiser = clip_of(rng), combiner(quality="fast")
+
+    def images(**logits):
+        return run(denoiser, deciding(logits), clip)
+
+    share = 1 / (1 + np.exp(-1.0))
+    mixed = share * images(mean=0.0) + (1 - share) * images(prior=0.0)
+    np.testing.assert_allclose(images(mean=1.0, prior=0.0), mixed, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_a_compiled_step_is_the_step(rng):
+    """XLA once summed the stacked candidates wrongly."""
+    require("pyoidn")
+    clip, denoiser = clip_of(rng), combiner(quality="fast")
+    params = denoiser.init(jax.random.key(1), frame_at(clip, 0))
+    plain = compiled = denoiser.start(params, frame_at(clip, 0))
+    for index in range(3):
+        frame = jax.tree.map(jnp.asarray, frame_at(clip, index))
+        plain, expected = denoiser.step(params, plain, frame)
+        compiled, found = jax.jit(denoiser.step)(params, compiled, frame)
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+
+
+def test_light_that_was_not_measured_does_not_spread(rng):
+    require("pyoidn")
+    clip, denoiser = clip_of(rng), combiner(quality="fast")
+    params = denoiser.init(jax.random.key(1), frame_at(clip, 0))
+    holes = clip.radiance.copy()
+    holes[:, 10:12, 10:12] = np.nan
+    images = run(denoiser, params, clip._replace(radiance=holes))
+    whole = run(denoiser, params, clip)
+    assert np.isfinite(images).all()
+    np.testing.assert_allclose(images.mean(), whole.mean(), rtol=0.02)
+
+
+@pytest.mark.slow
+def test_every_part_of_the_weights_learns(rng):
+    require("pyoidn")
+    clip, denoiser = jax.tree.map(jnp.asarray, clip_of(rng)), combiner(quality="fast")
+    normal = jnp.asarray(rng.normal(size=clip.normal.shape), jnp.float32)
+    rough = {"albedo": rng.random(clip.albedo.shape), "depth": rng.uniform(2, 4, clip.depth.shape)}
+    clip = clip._replace(normal=normal, **{name: jnp.asarray(each, jnp.float32) for name, each in rough.items()})
+    params = denoiser.init(jax.random.key(1), frame_at(clip, 0))
+    truth = jnp.mean(clip.radiance, axis=0)
+
+    @jax.jit
+    def loss(params):
+        state, total = denoiser.start(params, frame_at(clip, 0)), 0.0
+        for index in range(2):
+            state, image = denoiser.step(params, state, frame_at(clip, index))
+            total += jnp.mean((image - truth) ** 2)
+        return total
+
+    gradients = jax.grad(loss)(params)
+    for path, leaf in jax.tree_util.tree_flatten_with_path(gradients)[0]:
+        assert np.isfinite(leaf).all(), path
+        assert np.any(np.asarray(leaf) != 0), path
+
+
+def test_the_first_weights_take_over_what_steady_knows():
+    steady = load_weights("steady-balanced")[1]
+    params = take_over(steady)
+    like = combiner().init(jax.random.key(0), Frame(jnp.zeros((16, 16, 3))))
+    assert jax.tree.map(jnp.shape, params) == jax.tree.map(jnp.shape, like)
+    kernel = np.asarray(params["encoder_0"]["convolution_0"]["kernel"])
+    np.testing.assert_array_equal(kernel[:, :, :52], steady["encoder_0"]["convolution_0"]["kernel"])
+    assert not kernel[:, :, 52:].any()
+    np.testing.assert_array_equal(params["head_0"]["bias"][:28], steady["head_0"]["bias"][:28])
+    np.testing.assert_array_equal(params["head_0"]["bias"][28:60], like["head_0"]["bias"][28:60])
+    np.testing.assert_array_equal(params["head_0"]["bias"][60:], steady["head_0"]["bias"][40:53])
+    np.testing.assert_array_equal(params["guide"]["albedo"], steady["guide"]["albedo"])
+
+
+def test_weights_are_saved_and_loaded(tmp_path, rng):
+    frame = Frame(jnp.zeros((16, 16, 3)))
+    params = combiner(quality="fast").init(jax.random.key(0), frame)
+    path = save_weights(tmp_path / "w", params, factory="combiner", options={"quality": "fast"}, record={})
+    loaded = load_weights(path)[1]
+    jax.tree.map(np.testing.assert_array_equal, loaded, params)
+
+
+@pytest.mark.parametrize("given", [{"quality": "low"}, {"history_max": 0}, {"device": "tpu"}])
+def test_unknown_settings_are_refused(given):
+    with pytest.raises(ValueError, match=next(iter(given))):
+        combiner(**given)
