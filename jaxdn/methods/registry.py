@@ -75,13 +75,17 @@ class Method:
         """Whether the package that it requires is there."""
         return not self.requires or importlib.util.find_spec(self.requires) is not None
 
+    @property
+    def remedy(self) -> str:
+        """What brings the package that it requires."""
+        extra = find_group(self.requires)
+        return install(extra) if extra else f"install the package of {self.requires}"
+
     def require(self) -> None:
         """Raise ModuleNotFoundError, saying what to install, unless it can run here."""
         if not self.installed:
-            extra = find_group(self.requires)
-            advice = install(extra) if extra else f"install the package of {self.requires}"
             raise ModuleNotFoundError(
-                f"{self.name}: expected the package {self.requires}, which is not installed: {advice}",
+                f"{self.name}: expected the package {self.requires}, which is not installed: {self.remedy}",
                 name=self.requires,
             )
 

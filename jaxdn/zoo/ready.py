@@ -15,7 +15,6 @@ from jaxdn.denoiser import Denoiser, Params
 from jaxdn.methods.registry import Method, is_method, method_named, methods
 from jaxdn.methods.stabilised import stabilised
 from jaxdn.networks.backends import Purpose
-from jaxdn.runtime.optional import install
 from jaxdn.zoo.weights import describe, load_weights, shipped_names
 
 NOISY = "noisy"
@@ -27,9 +26,9 @@ STABILISED = "stabilised:"
 DEFAULT_MODEL = "steady-balanced"
 """The shipped weights that reports open on: those that `jaxdn denoise` uses on our own clips."""
 
-BEST_ELSEWHERE = "oidn"
+BEST_ELSEWHERE = "combiner-high"
 """What is best on frames of Cycles that nothing here was trained on or chosen by (``docs/results``): what `jaxdn
-denoise` uses on other renderers' files, where it is installed."""
+denoise` uses on other renderers' files, where its package is installed."""
 
 AUTO = "auto"
 """The name that leaves the choice to :func:`choose_model`."""
@@ -65,10 +64,10 @@ def choose_model(*, own_clips: bool) -> Choice:
     """What is best for the frames at hand: clips of our own renderer, or other renderers' files."""
     if own_clips:
         return Choice(DEFAULT_MODEL, "best on clips that jaxdn renders")
-    best = method_named(BEST_ELSEWHERE)
+    best = _method_of(BEST_ELSEWHERE)
     if best.installed:
-        return Choice(BEST_ELSEWHERE, f"best on frames of other renderers; of our own methods {DEFAULT_MODEL} is")
-    return Choice(DEFAULT_MODEL, f"{BEST_ELSEWHERE} is better on such frames: {install(BEST_ELSEWHERE)}")
+        return Choice(BEST_ELSEWHERE, f"best on frames of other renderers; {DEFAULT_MODEL} is on our own clips")
+    return Choice(DEFAULT_MODEL, f"{BEST_ELSEWHERE} is better on such frames: {best.remedy}")
 
 
 def find_model(name: str, **options: Any) -> Model:
@@ -93,7 +92,7 @@ def find_model(name: str, **options: Any) -> Model:
     if not name.endswith(".safetensors") and is_method(name):
         method = method_named(name)
         if not method.filter:
-            trained = [shipped for shipped in shipped_names() if describe(shipped)["factory"] == name]
+            trained = [shipped for shipped in shipped_names() if _method_of(shipped).name == name]
             raise ValueError(
                 f"method {name!r}: expected its weights, {', '.join([*trained, 'the path of a .safetensors file'])}; "
                 "`jaxdn train` makes some."
@@ -104,12 +103,13 @@ def find_model(name: str, **options: Any) -> Model:
         raise ValueError(
             f"method {name!r}: expected one of {', '.join(all_names())} or the path of a .safetensors file."
         )
+    method = _method_of(name)
+    method.require()
     denoiser, params = load_weights(name, **options)
-    description = describe(name)
     path = Path(name)
     # A run's folder is a better label than the file name, which is the same for all runs.
     label = path.parent.name if path.stem == "weights" else path.stem
-    return Model(label, denoiser, params, method_named(description["factory"]), description["options"] | options)
+    return Model(label, denoiser, params, method, describe(name)["options"] | options)
 
 
 def untrained_model(method: Method, **options: Any) -> Model:
@@ -126,16 +126,25 @@ def filter_names() -> list[str]:
 
 def all_names() -> list[str]:
     """Every name that :func:`find_model` knows: the noisy image, filters, and shipped weights."""
-    return [NOISY, *filter_names(), *shipped_names()]
+    return [NOISY, *filter_names(), *ready_names()]
+
+
+def ready_names() -> list[str]:
+    """The names of the shipped weights whose methods can run here."""
+    return [name for name in shipped_names() if _method_of(name).installed]
 
 
 def all_models() -> Iterator[Model]:
     """Filters, shipped weights, and learned methods without shipped weights, with initial weights."""
     yield from (find_model(name) for name in all_names() if name != NOISY)
-    trained = {describe(name)["factory"] for name in shipped_names()}
-    yield from (
-        untrained_model(method) for name, method in methods().items() if not method.filter and name not in trained
-    )
+    trained = {_method_of(name).name for name in shipped_names()}
+    untrained = (method for method in methods().values() if not method.filter and method.name not in trained)
+    yield from (untrained_model(method) for method in untrained if method.installed)
+
+
+def _method_of(weights: str | Path) -> Method:
+    """The method of shipped weights, or of a file."""
+    return method_named(describe(weights)["factory"])
 
 
 def _smallest() -> Frame:

@@ -122,6 +122,7 @@ RECIPE = Recipe(
     Options,
     title="A network that combines Open Image Denoise with samples and history",
     recipes={"usual": RECIPE},
+    variants={f"combiner-{quality}": {"quality": quality} for quality in WIDTHS},
     backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),
     requires=binding.MODULE,
     differentiable=False,
