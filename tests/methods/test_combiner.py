@@ -71,14 +71,14 @@ def test_means_follow_by_the_shares_of_an_independent_computation(rng):
     size, most = (5, 6), 7.0
     now, past, follow = draw_means(rng, size, count=1.0), draw_past(rng, size), rng.uniform(0.05, 0.95, size)
     found = update_means(now, past, follow, most=most)
-    count = past.means.count
+    count = past.means.number
     odds = follow / (1 - follow) / count  # of the new frame against the mean of `count`
     share = np.where(past.valid, odds / (1 + odds), 1.0)
     for name in ("light", "prior", "albedo", "normal", "square"):
         expected = (1 - share) * getattr(past.means, name) + share * getattr(now, name)
         np.testing.assert_allclose(getattr(found, name), expected, rtol=1e-5, atol=1e-6)
     number = np.where(past.valid, np.minimum(1 / ((1 - share) ** 2 / count + share**2), most), 1.0)
-    np.testing.assert_allclose(found.count, number, rtol=1e-5)
+    np.testing.assert_allclose(found.number, number, rtol=1e-5)
 
 
 def test_gradients_of_the_means(rng):
@@ -87,7 +87,7 @@ def test_gradients_of_the_means(rng):
 
         def light(follow):
             found = update_means(now, past, follow, most=1e3)
-            return found.light, found.square, found.count
+            return found.light, found.square, found.number
 
         check_grads(light, (rng.uniform(0.2, 0.8, (3, 4)),), order=1, modes=["rev"])
 
@@ -103,7 +103,7 @@ def test_the_light_of_a_still_clip_is_its_arithmetic_mean(rng):
     planes = np.mean(clip.radiance, axis=0, dtype=np.float64).transpose(2, 0, 1)
     np.testing.assert_allclose(means.light, planes, rtol=1e-4)
     np.testing.assert_allclose(means.prior, 1.5, rtol=1e-5)
-    np.testing.assert_allclose(means.count, 4.0, rtol=1e-5)
+    np.testing.assert_allclose(means.number, 4.0, rtol=1e-5)
 
 
 def test_another_depth_ends_a_history_and_another_normal_does_not(rng):
@@ -115,7 +115,8 @@ def test_another_depth_ends_a_history_and_another_normal_does_not(rng):
     kept = keep_history(first, now, now.prior)
     past = fetch_past(kept, second, measure_now(second, now.prior), False)
     # Beside the new edge the depth has a slope, which widens the tolerance.
-    assert np.asarray(past.valid)[:, :29].all() and not np.asarray(past.valid)[:, 31:].any()
+    assert np.asarray(past.valid)[:, :29].all()
+    assert not np.asarray(past.valid)[:, 31:].any()
 
 
 def candidates_of(rng, means, past, prior):

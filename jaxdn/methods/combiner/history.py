@@ -45,7 +45,7 @@ class Means(NamedTuple):
     """[3, H, W]; its length is below 1 where normals differ."""
     square: jax.Array
     """[H, W] of the noisy luminance's square."""
-    count: jax.Array
+    number: jax.Array
     """[H, W] effective number of samples, in frames."""
 
 
@@ -82,7 +82,7 @@ def measure_now(frame: Frame, prior: jax.Array) -> Means:
 
 
 def fetch_past(state: CombinerState, frame: Frame, now: Means, first: jax.Array) -> Past:
-    """The history of every pixel. A pixel whose light was not measured (``sample_count`` 0) has none of its own."""
+    """The history of every pixel, where it is now."""
     plain = frame._replace(normal=None)
     found: SharpHistory = fetch_sharply(state.history, state.guides, plain, first, colors=COLORS)
     values, valid = to_planes(found.values), found.valid
@@ -99,7 +99,7 @@ def update_means(now: Means, past: Past, follow: jax.Array, *, most: float) -> M
     and its logit is added to that of the weight. With weights 1 - a and a, the variance is ``(1 - a)^2 / N + a^2`` of a
     frame's: the effective number is its inverse, but at most ``most``.
     """
-    count = jnp.maximum(past.means.count, _LEAST_COUNT)
+    count = jnp.maximum(past.means.number, _LEAST_COUNT)
     share = jnp.where(past.valid, follow / (follow + count * (1.0 - follow)), 1.0)
 
     def mix(then: jax.Array, new: jax.Array) -> jax.Array:
@@ -107,7 +107,7 @@ def update_means(now: Means, past: Past, follow: jax.Array, *, most: float) -> M
 
     mixed = jax.tree.map(mix, past.means, now)
     variance = jnp.square(1.0 - share) / count + share**2
-    return mixed._replace(count=jnp.where(past.valid, jnp.minimum(1.0 / variance, most), 1.0))
+    return mixed._replace(number=jnp.where(past.valid, jnp.minimum(1.0 / variance, most), 1.0))
 
 
 def keep_history(frame: Frame, means: Means, shown: jax.Array) -> CombinerState:
@@ -115,6 +115,6 @@ def keep_history(frame: Frame, means: Means, shown: jax.Array) -> CombinerState:
     normal = jnp.clip(0.5 * (means.normal + 1.0), 0.0, 1.0)
     colors = [jnp.maximum(each, 0.0) for each in (means.light, means.prior, means.albedo)]
     whole = find_whole(frame._replace(normal=None)).astype(shown.dtype)
-    rest = jnp.stack([jnp.maximum(means.square, 0.0), means.count, whole])
+    rest = jnp.stack([jnp.maximum(means.square, 0.0), means.number, whole])
     history = jnp.concatenate([*colors, normal, shown, rest])
     return CombinerState(history.transpose(1, 2, 0), tested_guides(frame))

@@ -13,7 +13,7 @@ what was shown.
 
 import functools
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -86,6 +86,8 @@ _LEAST_ALBEDO = 0.03
 """Added to the albedo before light is divided by it."""
 INPUTS = {"geometry": 32, "light": 20, "prior": 18}
 """Groups of the network's input channels."""
+
+_Planes = TypeVar("_Planes", jax.Array, Means, Past)
 
 
 @dataclass(frozen=True)
@@ -169,9 +171,9 @@ def combiner(options: Options) -> Denoiser:
         padded = tuple(side + -side % _BLOCKS for side in size)
         parameters, follow, shares = _split_head(head, padded)
         means = update_means(now, past, crop_planes(follow, size), most=options.history_max)
-        wide_means, wide_past, wide_prior = (pad_planes(each) for each in (means, past, now.prior))
         depth = None if frame.depth is None else pad(frame.depth, _BLOCKS)
-        found = make_candidates(params["guide"], wide_means, wide_past, wide_prior, depth, parameters, statistics)
+        wide = pad_planes(means), pad_planes(past), pad_planes(now.prior)
+        found = make_candidates(params["guide"], *wide, depth, parameters, statistics)
         mixed = functools.reduce(jnp.add, (share[None] * each for share, each in zip(shares, found, strict=True)))
         image = crop_planes(mixed, size)
         image = jnp.clip(image, 0.0, RADIANCE_MAX)
@@ -209,7 +211,7 @@ def _assemble_network_input(
     divided = [color.compress(gain * light / albedo) for light in (now.light, past.means.light, past.shown)]
     level = color.luminance_of_planes(past.means.light)
     spread = jnp.sqrt(jnp.maximum(past.means.square - level**2, 0.0) + 1e-12) / (level + _DARK / gain)
-    count = jnp.where(past.valid, past.means.count, 0.0)
+    count = jnp.where(past.valid, past.means.number, 0.0)
     facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + count), jnp.ones_like(level)]
     plain = [color.compress(gain * light) for light in (now.prior, past.means.prior, past.shown)]
     valid = past.valid[None].astype(like.dtype)
@@ -246,7 +248,7 @@ def _split_head(head: jax.Array, size: tuple[int, int]) -> tuple[FilterParameter
     return FilterParameters(own, trust, half, rest[0], rest[1:]), follow, shares
 
 
-def pad_planes(tree: jax.Array | Means | Past) -> jax.Array | Means | Past:
+def pad_planes(tree: _Planes) -> _Planes:
     """All planes [..., H, W], padded by the edge to multiples of 4; scalars are left."""
 
     def one(planes: jax.Array) -> jax.Array:
@@ -256,7 +258,8 @@ def pad_planes(tree: jax.Array | Means | Past) -> jax.Array | Means | Past:
         wide = [(0, 0)] * (planes.ndim - 2) + [(0, below), (0, right)]
         return jnp.pad(planes, wide, mode="edge") if below or right else planes
 
-    return jax.tree.map(one, tree)
+    padded: _Planes = jax.tree.map(one, tree)
+    return padded
 
 
 def crop_planes(planes: jax.Array, size: tuple[int, int]) -> jax.Array:
