@@ -28,16 +28,22 @@ RECEPTIVE_FIELD = kalman.RECEPTIVE_FIELD + albedo_history.RECEPTIVE_FIELD + TAPS
 """Radius in pixels of all that decides about one, besides the denoiser's."""
 
 
+class StableHistory(NamedTuple):
+    """What is kept of the images."""
+
+    values: jax.Array
+    """[H, W, 7 or 10] colour; its albedo, if the frames have one; 3 as of :func:`jaxdn.filters.kalman.kalman_blend`;
+    1 where all 3x3 pixels showed one surface, else 0."""
+    guides: Guides
+    """Of the previous frame, as far as present."""
+
+
 class StabilisedState(NamedTuple):
     """What is carried from one frame to the next."""
 
     inner: State
     """Of the denoiser that is stabilised."""
-    history: jax.Array
-    """[H, W, 7 or 10] colour; its albedo, if the frames have one; 3 as of :func:`jaxdn.filters.kalman.kalman_blend`;
-    1 where all 3x3 pixels showed one surface, else 0."""
-    guides: Guides
-    """Of the previous frame, as far as present."""
+    history: StableHistory
 
 
 def stabilised(denoiser: Denoiser, *, history_max: int = 16) -> Denoiser:
@@ -63,8 +69,7 @@ def stabilised(denoiser: Denoiser, *, history_max: int = 16) -> Denoiser:
     core = core_of(denoiser)
 
     def start(params: Params, frame: Frame) -> StabilisedState:
-        nothing = jnp.zeros((*frame.radiance.shape[:2], 4 + _count_colors(frame)), frame.radiance.dtype)
-        return StabilisedState(core.start(params, frame), nothing, jax.tree.map(jnp.zeros_like, guides_of(frame)))
+        return StabilisedState(core.start(params, frame), start_history(frame))
 
     def prepare(frame: Frame) -> tuple[FrameStatistics, tuple[Prepared, Frame]]:
         statistics, prepared = core.prepare(frame)
@@ -80,8 +85,10 @@ def stabilised(denoiser: Denoiser, *, history_max: int = 16) -> Denoiser:
         given, frame = prepared
         inner, image, inner_invalid = core.step(params, state.inner, given, first, statistics)
         image = jnp.clip(image, 0.0, RADIANCE_MAX)
-        history, invalid = _blend(state, frame, image, first, statistics.exposure, history_max)
-        return StabilisedState(inner, history, guides_of(frame)), history[..., :3], inner_invalid + invalid
+        history, image, invalid = blend_image(
+            state.history, frame, image, first, statistics.exposure, history_max=history_max
+        )
+        return StabilisedState(inner, history), image, inner_invalid + invalid
 
     samples = None
     if core.samples is not None:
@@ -100,22 +107,28 @@ def _count_colors(frame: Frame) -> int:
     return 3 if frame.albedo is None else 6
 
 
-def _blend(
-    state: StabilisedState, frame: Frame, image: jax.Array, first: jax.Array, exposure: jax.Array, history_max: int
-) -> tuple[jax.Array, jax.Array]:
-    """The next history, and how many pixels of the last one were invalid."""
+def start_history(frame: Frame) -> StableHistory:
+    """The history before the first frame."""
+    nothing = jnp.zeros((*frame.radiance.shape[:2], 4 + _count_colors(frame)), frame.radiance.dtype)
+    return StableHistory(nothing, jax.tree.map(jnp.zeros_like, guides_of(frame)))
+
+
+def blend_image(
+    before: StableHistory, frame: Frame, image: jax.Array, first: jax.Array, exposure: jax.Array, *, history_max: int
+) -> tuple[StableHistory, jax.Array, jax.Array]:
+    """The next history, the blended image [H, W, 3], and how many pixels of the last history were invalid."""
     colors = _count_colors(frame)
-    found = fetch_sharply(state.history, state.guides, frame, first, colors=colors)
+    found = fetch_sharply(before.values, before.guides, frame, first, colors=colors)
     fetched, valid = to_planes(found.values), found.valid
     past, tracked = fetched[:colors], fetched[colors:-1]
     whole = find_whole(frame)
-    planes, share, albedo, before = image.transpose(2, 0, 1), jnp.zeros_like(fetched[0]), None, None
+    planes, share, albedo, then = image.transpose(2, 0, 1), jnp.zeros_like(fetched[0]), None, None
     color = past[:3]
     if frame.albedo is not None:
-        albedo, before = frame.albedo.transpose(2, 0, 1), past[3:]
-        share = jax.lax.stop_gradient(measure_share(color, before, albedo, planes, exposure)) * valid
-        color = follow_albedo(color, before, albedo, share)
-        before = before + share[None] * (albedo - before)
+        albedo, then = frame.albedo.transpose(2, 0, 1), past[3:]
+        share = jax.lax.stop_gradient(measure_share(color, then, albedo, planes, exposure)) * valid
+        color = follow_albedo(color, then, albedo, share)
+        then = then + share[None] * (albedo - then)
     error = None
     if frame.motion is not None:
         error = measure_fetch_error(planes, albedo, share, frame.motion, found.cubic, whole & found.whole)
@@ -129,6 +142,7 @@ def _blend(
         history_max=history_max,
     )
     parts = [blended[:3], blended[3:], whole[None].astype(image.dtype)]
-    if albedo is not None and before is not None:
-        parts.insert(1, albedo + (1.0 - blended[3:4]) * jnp.where(valid[None], before - albedo, 0.0))
-    return jnp.concatenate(parts).transpose(1, 2, 0), found.invalid
+    if albedo is not None and then is not None:
+        parts.insert(1, albedo + (1.0 - blended[3:4]) * jnp.where(valid[None], then - albedo, 0.0))
+    values = jnp.concatenate(parts).transpose(1, 2, 0)
+    return StableHistory(values, guides_of(frame)), values[..., :3], found.invalid

@@ -1,4 +1,4 @@
-"""The images that the result is mixed of: the prior, the history, and means that affinities have filtered.
+"""The images that the result is mixed of: the prior, stabilised too, and means that affinities have filtered.
 
 Filtered means are of two kinds. A filter of noisy light itself has the light's own detail, and blurs it. A *correction*
 adds to the prior what the same filter finds between the mean of noisy light and that of the prior's images: its error,
@@ -16,14 +16,14 @@ from jaxdn import color
 from jaxdn.core.frame import FAR
 from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.surface_test import depth_slopes
-from jaxdn.methods.combiner.history import Means, Past
+from jaxdn.methods.combiner.history import Means
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
 from jaxdn.ops.scales import join_planes
 
 CANDIDATES = (
     "prior",
-    "shown",
+    "stabilised",
     "mean",
     "fine",
     "coarse",
@@ -60,8 +60,8 @@ class FilterParameters(NamedTuple):
 def make_candidates(
     precisions: Mapping[str, jax.Array],
     means: Means,
-    past: Past,
     prior: jax.Array,
+    stable: jax.Array,
     depth: jax.Array | None,
     parameters: FilterParameters,
     statistics: FrameStatistics,
@@ -70,7 +70,8 @@ def make_candidates(
 
     ``precisions`` [1 + LEVELS] of albedo, normal, light, depth and learned features are logarithms, one for full
     resolution and one for each level at half, of what squares of differences are multiplied by. Light is compared as
-    the mean of the prior's images, at the frame's exposure and compressed. ``prior`` [3, H, W] is of this frame.
+    the mean of the prior's images, at the frame's exposure and compressed. ``prior`` and ``stable``, the stabilised
+    prior, [3, H, W] are of this frame.
     """
     factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items()}
     inverse_depth = measure_inverse_depth(depth, statistics, means.light)
@@ -82,7 +83,7 @@ def make_candidates(
     for index in range(FULL_LEVELS):
         fine = affinity_filter(fine, at_full, step=2**index)
     coarse = _filter_at_half(fine, surfaces, inverse_depth, at_full, parameters, factors)
-    found = [prior, past.shown, both[:3], fine[:3], coarse[:3]]
+    found = [prior, stable, both[:3], fine[:3], coarse[:3]]
     found += [prior + filtered[:3] - filtered[3:] for filtered in (fine, coarse)]
     return [*found, means.prior]
 

@@ -1,14 +1,14 @@
 """``combiner``: Open Image Denoise, and what the samples and earlier frames know better, mixed pixel by pixel.
 
-For each frame: the library denoises it alone (the *prior*); the history is fetched along motion, sharply; the noisy
-frame, the prior and the guides are blended into running means (:mod:`jaxdn.methods.combiner.history`); affinities
-filter the means of noisy light and of the prior's images, at full and at half resolution
-(:mod:`jaxdn.methods.combiner.candidates`). The image is a mean of eight candidates: the prior, the last image, the
-means, the filtered ones, and the prior with the correction that filtered samples tell of.
+For each frame: the library denoises it alone (the *prior*), and a history stabilises that
+(:mod:`jaxdn.methods.stabilised`); the noisy frame, the prior and the guides are blended into running means along motion
+(:mod:`jaxdn.methods.combiner.history`); affinities filter the means of noisy light and of the prior's images, at full
+and at half resolution (:mod:`jaxdn.methods.combiner.candidates`). The image is a mean of eight candidates: the prior,
+the stabilised one, the means, the filtered ones, and the prior with the correction that filtered samples tell of.
 
 A U-Net at half resolution decides for every pixel: the weights of the candidates, how fast the means follow, the
-filter's features and how far a pixel is trusted. What it predicts before training is plausible: mostly the prior and
-what was shown.
+filter's features and how far a pixel is trusted. What it predicts before training is plausible: mostly the
+stabilised prior.
 """
 
 import functools
@@ -24,7 +24,6 @@ from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, core_of, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
-from jaxdn.filters.sharp_history import TAPS
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods.combiner.candidates import (
     LEVELS,
@@ -44,6 +43,8 @@ from jaxdn.methods.combiner.history import (
 )
 from jaxdn.methods.oidn import oidn
 from jaxdn.methods.registry import method
+from jaxdn.methods.stabilised import RECEPTIVE_FIELD as STABILISED_FIELD
+from jaxdn.methods.stabilised import blend_image
 from jaxdn.networks import Widths, graph
 from jaxdn.ops import oidn as binding
 from jaxdn.ops.scales import crop, downsample, fill_holes, join_planes, pad, space_to_depth, to_planes, upsample
@@ -61,19 +62,21 @@ FEATURES, HALF_FEATURES = 5, 8
 INITIAL = {
     "trust": 4.0,
     "follow": 0.0,
-    "prior": 1.5,
-    "shown": 0.5,
+    "prior": -1.0,
+    "stabilised": 1.0,
     "mean": -5.0,
     "fine": -3.0,
     "coarse": -4.0,
-    "fine correction": -0.5,
-    "coarse correction": -0.5,
+    "fine correction": -2.5,
+    "coarse correction": -2.0,
     "prior mean": 1.0,
 }
 """Parameters of every pixel, one logit each, and what they are before training: how far its light is trusted; the
 share of the new frame in the means; the weights of the candidates."""
 PRECISIONS = {"albedo": 1.0, "normal": 1.0, "light": 4.0, "depth": 6.0, "learned": 0.0}
 """Guide of the filter -> the logarithm of its precision before training."""
+HISTORY_MAX = 16
+"""Frames of which the stabilised prior is a mean at most."""
 _LEVEL_WEIGHT = 4.0
 """Initial logit of the weight of each level at half resolution."""
 _SPLITS = np.cumsum([4 * FEATURES, 4 * len(INITIAL), HALF_FEATURES]).tolist()
@@ -87,7 +90,7 @@ _LEAST_ALBEDO = 0.03
 INPUTS = {"geometry": 32, "light": 20, "prior": 18}
 """Groups of the network's input channels."""
 
-_Planes = TypeVar("_Planes", jax.Array, Means, Past)
+_Planes = TypeVar("_Planes", jax.Array, Means)
 
 
 @dataclass(frozen=True)
@@ -163,23 +166,28 @@ def combiner(options: Options) -> Denoiser:
     ) -> tuple[CombinerState, jax.Array, jax.Array]:
         size = frame.radiance.shape[:2]
         prior = to_planes(jnp.clip(library.step({}, (), frame, first, statistics)[1], 0.0, RADIANCE_MAX))
+        kept = state.stable, frame, prior.transpose(1, 2, 0), first, statistics.exposure
+        stable, steady_prior, invalid = blend_image(*kept, history_max=HISTORY_MAX)
         now = measure_now(frame, jax.lax.stop_gradient(prior))
         past = fetch_past(state, frame, now, first)
         weights = {name: part for name, part in params.items() if name != "guide"}
-        inputs = _assemble_network_input(frame, now, past, statistics)
+        steady = jax.lax.stop_gradient(to_planes(steady_prior))
+        inputs = _assemble_network_input(frame, now, past, steady, statistics)
         head = network.apply(weights, [group[None] for group in inputs])[0][0]
         padded = tuple(side + -side % _BLOCKS for side in size)
         parameters, follow, shares = _split_head(head, padded)
         means = update_means(now, past, crop_planes(follow, size), most=options.history_max)
         depth = None if frame.depth is None else pad(frame.depth, _BLOCKS)
-        wide = pad_planes(means), pad_planes(past), pad_planes(now.prior)
+        wide = pad_planes(means), pad_planes(now.prior), pad_planes(steady)
         found = make_candidates(params["guide"], *wide, depth, parameters, statistics)
         image = jnp.clip(crop_planes(_mix(shares, found, statistics.exposure), size), 0.0, RADIANCE_MAX)
-        return keep_history(frame, means, image), image.transpose(1, 2, 0), past.invalid
+        return keep_history(frame, means, stable), image.transpose(1, 2, 0), past.invalid + invalid
 
     network_field = 2 * graph.receptive_field_radius(graph.unet(1, heads, widths=widths, head_size=1))
     core = Core(start, step, reads, init, prepare=prepare, requires_validity_mask=True)
-    return recurrent(core._replace(receptive_field=binding.RECEPTIVE_FIELD + network_field + receptive_field() + TAPS))
+    return recurrent(
+        core._replace(receptive_field=binding.RECEPTIVE_FIELD + STABILISED_FIELD + network_field + receptive_field())
+    )
 
 
 def prepare(frame: Frame) -> tuple[FrameStatistics, Frame]:
@@ -193,12 +201,12 @@ def prepare(frame: Frame) -> tuple[FrameStatistics, Frame]:
 
 
 def _assemble_network_input(
-    frame: Frame, now: Means, past: Past, statistics: FrameStatistics
+    frame: Frame, now: Means, past: Past, stable: jax.Array, statistics: FrameStatistics
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The groups of :data:`INPUTS` [h, w, C], by blocks of 2x2 pixels, padded by the edge.
 
-    Surfaces; light divided by the albedo: noisy, the mean and what was shown, at one brightness
-    (:func:`jaxdn.color.exposure`) and compressed; light as it is: the prior, its mean and what was shown, and where
+    Surfaces; light divided by the albedo: noisy, the mean and the stabilised prior, at one brightness
+    (:func:`jaxdn.color.exposure`) and compressed; light as it is: the prior, its mean and the stabilised one, and where
     there is a history.
     """
     gain, like = statistics.exposure, now.light[:1]
@@ -206,12 +214,12 @@ def _assemble_network_input(
     roughness = like * 0 if frame.roughness is None else to_planes(frame.roughness) - 1.0
     geometry = now.albedo - 1.0, now.normal, nearness, roughness
     albedo = past.means.albedo + _LEAST_ALBEDO
-    divided = [color.compress(gain * light / albedo) for light in (now.light, past.means.light, past.shown)]
+    divided = [color.compress(gain * light / albedo) for light in (now.light, past.means.light, stable)]
     level = color.luminance_of_planes(past.means.light)
     spread = jnp.sqrt(jnp.maximum(past.means.square - level**2, 0.0) + 1e-12) / (level + _DARK / gain)
     count = jnp.where(past.valid, past.means.number, 0.0)
     facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + count), jnp.ones_like(level)]
-    plain = [color.compress(gain * light) for light in (now.prior, past.means.prior, past.shown)]
+    plain = [color.compress(gain * light) for light in (now.prior, past.means.prior, stable)]
     valid = past.valid[None].astype(like.dtype)
 
     def by_blocks(planes: list[jax.Array]) -> list[jax.Array]:
