@@ -9,7 +9,7 @@ from jax.test_util import check_grads
 from experiments.cycles.combiner_start import take_over
 from jaxdn.core.frame import Clip, Frame, frame_at
 from jaxdn.denoiser.rollout import denoise
-from jaxdn.denoisers import combiner, oidn
+from jaxdn.denoisers import combiner, oidn, stabilised
 from jaxdn.methods.combiner.candidates import CANDIDATES, FilterParameters, make_candidates
 from jaxdn.methods.combiner.history import (
     Means,
@@ -57,6 +57,12 @@ def run(denoiser, params, frames):
     return np.asarray(denoise(denoiser, params, Clip(frames, frames.radiance)), np.float64)
 
 
+def gains(frames):
+    """[T, 1, 1, 1] the factor that brings each frame to the network's brightness."""
+    of = (prepare(jax.tree.map(jnp.asarray, frame_at(frames, index)))[0] for index in range(len(frames.radiance)))
+    return np.array([float(statistics.exposure) for statistics in of]).reshape(-1, 1, 1, 1)
+
+
 def draw_means(rng, size, *, count=None):
     light, prior, albedo, normal = rng.uniform(0, 2, (4, 3, *size))
     counts = rng.uniform(1, 9, size) if count is None else np.full(size, count)
@@ -64,7 +70,7 @@ def draw_means(rng, size, *, count=None):
 
 
 def draw_past(rng, size):
-    return Past(draw_means(rng, size), rng.uniform(0, 2, (3, *size)), rng.random(size) > 0.3, jnp.zeros((), jnp.int32))
+    return Past(draw_means(rng, size), rng.random(size) > 0.3, jnp.zeros((), jnp.int32))
 
 
 def test_means_follow_by_the_shares_of_an_independent_computation(rng):
@@ -99,7 +105,7 @@ def test_the_light_of_a_still_clip_is_its_arithmetic_mean(rng):
     for index, frame in enumerate(frames):
         now = measure_now(frame, jnp.full((3, *SIZE), float(index)))
         means = update_means(now, fetch_past(state, frame, now, index == 0), jnp.full(SIZE, 0.5), most=32.0)
-        state = keep_history(frame, means, now.prior)
+        state = keep_history(frame, means, state.stable)
     planes = np.mean(clip.radiance, axis=0, dtype=np.float64).transpose(2, 0, 1)
     np.testing.assert_allclose(means.light, planes, rtol=1e-4)
     np.testing.assert_allclose(means.prior, 1.5, rtol=1e-5)
@@ -112,35 +118,34 @@ def test_another_depth_ends_a_history_and_another_normal_does_not(rng):
         depth=second.depth.at[:, 30:].set(9.0), normal=second.normal.at[:20].set(jnp.array([1.0, 0, 0]))
     )
     now = measure_now(first, jnp.zeros((3, *SIZE)))
-    kept = keep_history(first, now, now.prior)
+    kept = keep_history(first, now, start_history(first).stable)
     past = fetch_past(kept, second, measure_now(second, now.prior), False)
     # Beside the new edge the depth has a slope, which widens the tolerance.
     assert np.asarray(past.valid)[:, :29].all()
     assert not np.asarray(past.valid)[:, 31:].any()
 
 
-def candidates_of(rng, means, past, prior):
+def candidates_of(means, prior, stable):
     parameters = FilterParameters(
         jnp.zeros((8, 10, 20)), jnp.ones((16, 20)), jnp.zeros((8, 10, 8)), jnp.ones((8, 10)), jnp.ones((4, 8, 10))
     )
     precisions = {name: jnp.full(5, -9.0) for name in ("albedo", "normal", "light", "depth", "learned")}
     statistics, _ = prepare(Frame(jnp.ones((16, 20, 3))))
-    found = make_candidates(precisions, means, past, prior, None, parameters, statistics)
+    found = make_candidates(precisions, means, prior, stable, None, parameters, statistics)
     return dict(zip(CANDIDATES, found, strict=True))
 
 
 def test_a_correction_is_what_the_samples_have_more_than_the_prior(rng):
     """Where both means differ by a constant, filters that see no difference add just that to the prior."""
-    planes = [jax.tree.map(jnp.float32, each) for each in (draw_means(rng, (16, 20)), draw_past(rng, (16, 20)))]
-    means, past = planes[0], planes[1]._replace(valid=jnp.ones((16, 20), bool))
+    means = jax.tree.map(jnp.float32, draw_means(rng, (16, 20)))
     means = means._replace(light=means.prior + 0.25)
-    prior = jnp.asarray(rng.uniform(0, 2, (3, 16, 20)), jnp.float32)
-    found = candidates_of(rng, means, past, prior)
+    prior, stable = jnp.asarray(rng.uniform(0, 2, (2, 3, 16, 20)), jnp.float32)
+    found = candidates_of(means, prior, stable)
     for name in ("fine correction", "coarse correction"):
         np.testing.assert_allclose(found[name], prior + 0.25, atol=1e-4)
     assert float(jnp.std(found["coarse"])) < 0.2 * float(jnp.std(found["mean"]))
     np.testing.assert_array_equal(found["prior"], prior)
-    np.testing.assert_array_equal(found["shown"], past.shown)
+    np.testing.assert_array_equal(found["stabilised"], stable)
     np.testing.assert_array_equal(found["mean"], means.light)
     np.testing.assert_array_equal(found["prior mean"], means.prior)
 
@@ -152,16 +157,24 @@ def test_a_network_that_trusts_the_prior_alone_shows_it(rng):
     np.testing.assert_allclose(images, run(oidn(), {}, clip), atol=1e-5)
 
 
-def test_mixtures_are_means_of_the_candidates_by_their_logits(rng):
+def test_mixtures_are_means_of_logarithms_by_the_logits(rng):
     require("pyoidn")
     clip, denoiser = clip_of(rng), combiner(quality="fast")
 
     def images(**logits):
         return run(denoiser, deciding(logits), clip)
 
-    share = 1 / (1 + np.exp(-1.0))
-    mixed = share * images(mean=0.0) + (1 - share) * images(prior=0.0)
-    np.testing.assert_allclose(images(mean=1.0, prior=0.0), mixed, atol=2e-5)
+    share, gain = 1 / (1 + np.exp(-1.0)), gains(clip)
+    mean, prior = (np.log1p(gain * each) for each in (images(mean=0.0), images(prior=0.0)))
+    mixed = np.expm1(share * mean + (1 - share) * prior) / gain
+    np.testing.assert_allclose(images(mean=1.0, prior=0.0), mixed, rtol=2e-4, atol=2e-5)
+
+
+def test_a_network_that_trusts_the_stabilised_prior_alone_shows_it(rng):
+    require("pyoidn")
+    clip = clip_of(rng)
+    images = run(combiner(quality="fast"), deciding({"stabilised": 0.0}), clip)
+    np.testing.assert_allclose(images, run(stabilised(oidn()), {}, clip), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow
