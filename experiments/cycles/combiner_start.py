@@ -1,6 +1,7 @@
 """Weights that the training of ``combiner`` starts from: what ``steady`` has learned about the same inputs.
 
-    python -m experiments.cycles.combiner_start -o runs/start.safetensors        # then: jaxdn train --variant combiner-high --start ...
+    python -m experiments.cycles.combiner_start -o runs/start.safetensors
+    jaxdn train data/cycles --method combiner --variant combiner-high --start runs/start.safetensors -o runs/combiner
 
 The first groups of its input are those of steady's network, its U-Net has the widths of ``steady-balanced``, and parts
 of its head say the same: features of the filter, trust, how fast the mean follows. These are copied; what is new begins
