@@ -9,7 +9,7 @@ train weights: export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 # XLA raises its errors; what it logs besides is an alarm at every compilation of more than two minutes.
 export TF_CPP_MIN_LOG_LEVEL ?= 3
 
-.PHONY: help setup train test test-slow test-all bench chart compare papers hard-cases results cycles lint format docs weights blender-addon clean
+.PHONY: help setup train test test-slow test-all bench chart compare papers hard-cases mutants results cycles lint format docs weights blender-addon clean
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -45,6 +45,9 @@ test-all: setup  ## both, in one run: tests that share a module share what it co
 
 hard-cases: setup  ## run every operation and denoiser on every hard case: runs/hard-cases/table.html
 	$(BIN)/python -m tests.hard_cases $(SETTINGS)
+
+mutants: setup  ## change the code in known wrong ways and see that tests fail (tens of minutes; SETTINGS=NAME for some)
+	$(BIN)/python -m tests.mutants $(SETTINGS)
 
 # Common alternatives to compare with. Only a CPU build of PyTorch is installed, from pip's configured index or else
 # through uv from PyTorch's own index: the default build brings gigabytes of CUDA packages.

@@ -9,7 +9,7 @@ import optax
 import pytest
 
 from jaxdn.core.frame import Clip, Frame, frame_at, only
-from jaxdn.denoiser import Denoiser, State
+from jaxdn.denoiser import Denoiser, Recurrent, State
 from jaxdn.denoiser.rollout import denoise, render_requested, unroll
 from jaxdn.methods.dasr import dasr
 from jaxdn.methods.ntasd import ntasd
@@ -78,6 +78,24 @@ def test_the_first_frame_is_sampled_evenly(rng, key):
     first, second, _ = counts_of(denoiser, varied(denoiser, clip, key), clip)
     np.testing.assert_array_equal(first, 4)
     assert len(np.unique(second)) > 2
+
+
+def test_the_sampler_of_ntasd_sees_the_last_image_along_the_vectors(rng, key):
+    """Another last image gives other numbers of samples, and so do other vectors."""
+    denoiser, clip = ntasd(size=TINY, demodulate="none", exposure="given"), clip_of(rng, 1, (16, 32))
+    params, frame = varied(denoiser, clip, key), frame_at(clip.frames, 0)
+    past = jnp.asarray(rng.exponential(size=(16, 32, 3)), jnp.float32)
+
+    @jax.jit
+    def counts(past, shift):
+        motion = jnp.broadcast_to(jnp.asarray(shift, jnp.float32), (16, 32, 2))
+        state = Recurrent(past, jnp.asarray(3), jnp.asarray(0))
+        layers = {samples: layer[0] for samples, layer in clip.layers.items()}
+        return render_requested(denoiser, params, state, frame._replace(motion=motion), layers).sample_count
+
+    still = counts(past, [0.0, 0.0])
+    assert np.any(counts(4.0 * past, [0.0, 0.0]) != still)
+    assert np.any(counts(past, [8.0, 0.0]) != still)
 
 
 @pytest.mark.slow

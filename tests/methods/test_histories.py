@@ -242,6 +242,18 @@ def test_gradients_reach_both_kinds_of_light(kind, x64, rng):
     np.testing.assert_allclose(np.sum(found[0] * direction), slope, rtol=2e-2)
 
 
+def test_specular_light_is_not_mixed_with_that_of_another_roughness(kind):
+    """A bright rough half beside a dark smooth one: as wide as diffuse light, it would go there."""
+    left = (np.arange(WIDTH) < WIDTH // 2)[None, :, None] & np.ones((HEIGHT, 1, 1), bool)
+    light = np.where(left, 1.0, 0.0).astype(np.float32) * np.ones(3, np.float32)
+    frame = Frame(light, specular=light, roughness=np.where(left, 0.9, 0.3).astype(np.float32))
+
+    def leaked(frame):
+        return run(kind.default, [frame])[1][0][:, WIDTH // 2 :].mean()
+
+    assert leaked(frame) < 0.5 * leaked(frame._replace(specular=0 * light))
+
+
 @pytest.mark.parametrize("by", ["brdf", "albedo", "none"])
 def test_both_kinds_of_light_add_up(rng, by):
     frame = scene(rng, 1)[0]

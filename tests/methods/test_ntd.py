@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from jaxdn import brdf
-from jaxdn.core.frame import FAR, Frame, frame_at
+from jaxdn.core.frame import FAR, Frame, frame_at, only
 from jaxdn.denoiser import Denoiser, Recurrent
 from jaxdn.denoiser.rollout import unroll
 from jaxdn.denoiser.statistics import geometric_mean_depth, sum_depths
 from jaxdn.filters.surface_test import depth_feature
+from jaxdn.methods.ntasd import ntasd
 from jaxdn.methods.ntd import guided_features, ntd
 
 TINY = ((4,), (4,), (5,), (5,), (6,))
@@ -185,6 +186,24 @@ def test_less_than_all_kernels_begins_plausibly_and_learns(prediction: Any, rng:
     assert 0.3 < float(jnp.mean(images) / jnp.mean(frames.radiance)) < 3
     assert all(np.abs(slopes[name]["kernel"]).max() > 0 for name in slopes if name.startswith("head"))
     assert ("guide" in params) == (prediction != "direct")
+
+
+@pytest.mark.parametrize(("method", "buffer"), [(ntd, "dual_motion"), (ntasd, "motion")], ids=["ntd", "ntasd"])
+def test_the_history_lies_where_the_vector_points(method: Any, buffer: str, rng: np.random.Generator) -> None:
+    """Of a pixel p at p + vector, x to the right and y down: heads that show the history alone."""
+    denoiser = method(size=TINY, kernels="plain", demodulate="none")
+    noisy, history = rng.exponential(size=(2, 16, 32, 3)).astype(np.float32)
+    vectors = {"motion": jnp.zeros((16, 32, 2)), "dual_motion": jnp.zeros((16, 32, 2))}
+    vectors[buffer] = jnp.broadcast_to(jnp.asarray([3.0, -2.0]), (16, 32, 2))
+    frame = Frame(jnp.asarray(noisy), **vectors, sample_count=jnp.ones((16, 32, 1)))
+    frame = only(frame, denoiser.reads)
+    params = jax.tree.map(jnp.zeros_like, denoiser.init(jax.random.key(0), frame))
+    network = params["denoiser"] if method is ntasd else params
+    bias = network["head_0"]["bias"]
+    network["head_0"]["bias"] = bias.at[25 + 12].set(50.0).at[50].set(-50.0)
+    state = Recurrent(jnp.asarray(history), jnp.asarray(3), jnp.asarray(0))
+    _, image = stepped(denoiser)(params, state, frame)
+    np.testing.assert_allclose(image[2:, :-3], history[:-2, 3:], rtol=1e-5)
 
 
 def blending(params: Any, logit: float) -> Any:

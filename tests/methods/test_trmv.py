@@ -16,6 +16,8 @@ MEANS = {"levels": 0, "feedback_level": 0, "short_history": 0, "demodulate": "no
 """Nothing but running means."""
 UNHELD = {**MEANS, "clamp_sigma": 1e6}
 """Nor is the share of shadows clamped."""
+FETCHED, HELD = trmv(**UNHELD), trmv(**MEANS)
+FILTERED = trmv(**(MEANS | {"levels": 2}))
 
 
 def all_light(rng, count=3, dtype=np.float32):
@@ -247,6 +249,67 @@ def test_a_shadow_that_moves_leaves_no_trail(rng):
     # With neither vectors nor clamp it is as late as svgf.
     blind = [frame._replace(shadow_motion=None) for frame in clip[0]], *clip[1:]
     assert trail_error(trmv(clamp_sigma=1e6), blind) > 0.7 * theirs
+
+
+def light_with_vectors(lit, free, rest, *, shadow, dual):
+    """A frame without noise of [H, W] light straight from lights, without its shadows, and of all other light."""
+    planes = {"radiance": lit + rest, "shadowed": lit, "unshadowed": free}
+    buffers = {name: each[..., None] * np.ones(3) for name, each in planes.items()}
+    vectors = {"motion": [0.0, 0.0], "shadow_motion": shadow, "dual_motion": dual}
+    buffers |= {name: np.broadcast_to(vector, (*lit.shape, 2)) for name, vector in vectors.items()}
+    return Frame(**{name: np.asarray(each, np.float32) for name, each in buffers.items()})
+
+
+def test_a_shadow_brings_its_share_and_no_light_of_where_it_was():
+    """It moves by 2 px a frame from dim to bright light; what it leaves is a share of the light that is there."""
+    _, x = np.mgrid[:16, :48]
+    free = np.where(x < 24, 0.2, 1.0)
+    frames = [
+        light_with_vectors(
+            free * (0.55 + 0.4 * np.sin((x - 2 * index) / 3)), free, 0 * free, shadow=[-2.0, 0.0], dual=[0.0, 0.0]
+        )
+        for index in range(6)
+    ]
+    for frame, image in zip(frames, run(FETCHED, frames)[1], strict=True):
+        np.testing.assert_allclose(image[:, 4:], frame.radiance[:, 4:], rtol=0.01)
+
+
+def test_the_share_of_a_shadow_is_held_to_what_the_frame_shows():
+    """A shadow that is gone without a vector: where no pixel around is shadowed, none has been."""
+    free = np.full((16, 48), 0.7)
+    shadowed, lit = (
+        light_with_vectors(light, free, 0 * free, shadow=[0.0, 0.0], dual=[0.0, 0.0]) for light in (0 * free, free)
+    )
+    np.testing.assert_allclose(run(HELD, [shadowed] * 4 + [lit])[1][-1], 0.7, rtol=1e-4)
+
+
+def glossy(light):
+    """A frame of specular light [H, W, 3] on a rough surface."""
+    light = np.asarray(light, np.float32)
+    return Frame(light, specular=light, roughness=np.ones_like(light[..., :1]))
+
+
+def test_nothing_that_was_filtered_in_space_comes_back(rng):
+    frames = [glossy(rng.gamma(2.0, 0.5, (16, 24, 3))) for _ in range(2)]
+    plain, filtered = (run(denoiser, frames) for denoiser in (HELD, FILTERED))
+    assert np.abs(plain[1][-1] - filtered[1][-1]).max() > 0.1
+    np.testing.assert_allclose(plain[0].core.specular, filtered[0].core.specular, rtol=1e-5, atol=1e-6)
+
+
+def test_reflections_of_another_colour_are_not_mixed():
+    """Red beside blue of the same luminance and without noise: no buffer tells them apart."""
+    red, blue = np.array([0.5, 0.1, 0.1]), np.array([0.1, 0.1, 0.1 + 0.4 * 0.2126 / 0.0722])
+    light = np.where((np.arange(24) < 12)[None, :, None], red, blue) * np.ones((16, 1, 1))
+    np.testing.assert_allclose(run(FILTERED, [glossy(light)] * 2)[1][-1], light, rtol=0.01)
+
+
+def test_other_light_is_fetched_along_the_dual_vectors(rng):
+    lights = rng.uniform(0.5, 1.5, (2, 16, 48)).astype(np.float32)
+    dark = np.zeros((16, 48))
+    frames = [light_with_vectors(dark, dark, light, shadow=[0.0, 0.0], dual=[3.0, -1.0]) for light in lights]
+    image = run(FETCHED, frames)[1][-1]
+    expected = 0.5 * (lights[1, 1:, :-3] + lights[0, :-1, 3:])
+    np.testing.assert_allclose(image[1:, :-3, 0], expected, rtol=1e-5)
 
 
 def test_a_shadow_is_not_fetched_from_another_surface(rng):

@@ -10,7 +10,14 @@ import pytest
 from jaxdn import losses
 from jaxdn.core.frame import Clip, Frame
 from jaxdn.methods.registry import methods
-from jaxdn.recipes.objectives import disocclusions, indirect_illumination, pyramid_illumination, recurrent_illumination
+from jaxdn.recipes.objectives import (
+    compressed_illumination,
+    disocclusions,
+    indirect_illumination,
+    last_frames,
+    pyramid_illumination,
+    recurrent_illumination,
+)
 
 SHAPE = (5, 6, 7)
 OBJECTIVE = indirect_illumination()
@@ -160,3 +167,18 @@ def test_the_recurrent_objective_weighs_later_frames_more(rng):
         loss = jax.jit(recurrent_illumination(operator=operator).loss)
         found = loss(jnp.asarray(images), clip, jnp.asarray(0.5))
         assert float(found) == pytest.approx(total, rel=1e-4)
+
+
+def test_the_last_frames_cost_their_error_and_that_of_their_change(images, clip):
+    """Hasselgren et al. 2020, eq. 4: of five frames the last one in space, the last two in time; no other."""
+    error = numpy_compress(images) - numpy_compress(clip.reference)
+    found, slope = jax.value_and_grad(last_frames().loss)(images, clip, jnp.asarray(0.5))
+    np.testing.assert_allclose(found, np.abs(error[-1]).mean() + np.abs(error[-1] - error[-2]).mean(), rtol=1e-5)
+    np.testing.assert_array_equal(slope[:-2], 0)
+    assert np.abs(slope[-2]).max() > 0
+
+
+def test_single_frames_cost_their_compressed_error(images, clip):
+    error = numpy_compress(images) - numpy_compress(clip.reference)
+    found = compressed_illumination().loss(images, clip, jnp.asarray(0.5))
+    np.testing.assert_allclose(found, np.abs(error).mean(), rtol=1e-5)
