@@ -15,8 +15,7 @@ ROWS, COLUMNS = 48, 64
 EDGE = np.where(np.arange(COLUMNS) < COLUMNS // 2, 1.0, 2.0)[None, :, None] * np.ones((ROWS, 1, 3), np.float32)
 SPREADS = {"four taps": (4 * np.exp(-0.66) / 2, 1 + 4 * np.exp(-0.66))}
 SPREADS["eight taps"] = tuple(
-    one + more
-    for one, more in zip(SPREADS["four taps"], (4 * np.exp(-0.165) / 8, 4 * np.exp(-0.165)), strict=True)
+    one + more for one, more in zip(SPREADS["four taps"], (4 * np.exp(-0.165) / 8, 4 * np.exp(-0.165)), strict=True)
 )
 """Of a disc of radius 1 whose taps have the weight exp(-0.66 r^2): the weighted sum of x^2, and that of the weights.
 
@@ -51,7 +50,9 @@ def after_edges(denoiser, frames_before, *, turned=0):
     light = state.core.light
     planes = light.diffuse.at[..., :3].set(frame.radiance).at[..., 4:7].set(frame.radiance)
     light = light._replace(diffuse=planes.at[..., 3].set(frames_before))
-    state, image = step({}, state._replace(core=state.core._replace(light=light, frame=state.core.frame + turned)), frame)
+    state, image = step(
+        {}, state._replace(core=state.core._replace(light=light, frame=state.core.frame + turned)), frame
+    )
     return state, np.asarray(image)
 
 

@@ -1,7 +1,7 @@
 """Make every mutant in a copy of the tree and run the tests that have to fail with it: ``make mutants``.
 
-    python -m tests.mutants                  # all of them; an hour on two cores
-    python -m tests.mutants reblur trmv      # those with one of these words in their names
+python -m tests.mutants                  # all of them; an hour on two cores
+python -m tests.mutants reblur trmv      # those with one of these words in their names
 """
 
 import os

@@ -7,7 +7,27 @@ _OF_ADAPTIVE = "tests/methods/test_adaptive.py::"
 _OF_NTD = "tests/methods/test_ntd.py::"
 _OF_OBJECTIVES = "tests/recipes/test_objectives.py::"
 
+_OF_PAPERS = "tests/docs/test_papers.py::"
+
+_PUBLISHED = (
+    mutant(
+        f"{name} in no preset of a paper",
+        _NTD,
+        f'    "{name}": "{value}",\n',
+        "",
+        _OF_PAPERS + "test_a_fact_is_that_of_the_code",
+    )
+    for name, value in (("kernels", "plain"), ("exposure", "given"), ("initialization", "xavier"))
+)
 LEARNED = (
+    *_PUBLISHED,
+    mutant(
+        "the threshold of the occlusion mask is another",
+        "jaxdn/ops/motion.py",
+        "threshold: float = 0.5",
+        "threshold: float = 1.0",
+        _OF_PAPERS + "test_a_fact_is_that_of_the_code",
+    ),
     mutant(
         "ntd and ntasd: the history is fetched along the opposite vector",
         _NTD,

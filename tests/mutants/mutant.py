@@ -19,7 +19,7 @@ class Edit(NamedTuple):
         text = (root / self.file).read_text(encoding="utf-8")
         if text.count(self.old) != 1:
             raise ValueError(
-                f"{self.file}: expected the text of a mutant once, found it {text.count(self.old)} times: {self.old!r}. "
+                f"{self.file}: expected the text of a mutant once, got it {text.count(self.old)} times: {self.old!r}. "
                 "Where the code has changed, its mutant in tests/mutants has to follow."
             )
         return text.replace(self.old, self.new)
