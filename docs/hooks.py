@@ -5,7 +5,8 @@ A page asks for a part by a comment on a line of its own:
 * ``<!-- api: jaxdn.filters -->``: every module of a package, or one module;
 * ``<!-- options of methods -->``: every method of the registry with its options;
 * ``<!-- buffers -->``: the table of buffers;
-* ``<!-- help: denoise -->``: what ``jaxdn denoise --help`` prints.
+* ``<!-- help: denoise -->``: what ``jaxdn denoise --help`` prints;
+* ``<!-- paper: ntd -->``: the facts of a paper, with their state here; ``<!-- papers -->``: how many there are of each.
 
 Roles in docstrings (``:func:`jaxdn.warp```) become links where the page of that name exists.
 """
@@ -14,6 +15,8 @@ import contextlib
 import io
 import os
 import re
+import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -88,6 +91,43 @@ def _help(match: re.Match[str]) -> str:
     return f"```text\n{text.getvalue().strip()}\n```"
 
 
+STATUSES = ("as published", "preset", "ours", "not stated")
+"""Of a fact in ``docs/papers/facts.toml``, which says what they mean."""
+
+
+def read_papers() -> dict[str, dict[str, Any]]:
+    """The papers by the name of their page, as ``docs/papers/facts.toml`` has them."""
+    return tomllib.loads((ROOT / "docs" / "papers" / "facts.toml").read_text(encoding="utf-8"))
+
+
+def _papers(_: re.Match[str]) -> str:
+    rows = []
+    for name, paper in read_papers().items():
+        counts = [sum(fact["status"] == status for fact in paper["facts"]) for status in STATUSES]
+        rows.append([f"[{paper['title']}]({name}.md)", paper["by"], *map(str, counts)])
+    return _table(["Paper", "By", "As published", "Option or preset", "Ours", "Not stated"], rows)
+
+
+def _paper(match: re.Match[str]) -> str:
+    paper = read_papers()[match[1]]
+    rows = []
+    for fact in paper["facts"]:
+        settings = [f"`{name}={value!r}`" for name, value in fact.get("options", {}).items()]
+        settings += [f"recipe: `{name}` {value!r}" for name, value in fact.get("recipe", {}).items()]
+        here = "; ".join(part for part in (fact["here"], ", ".join(settings)) if part)
+        code = fact["code"].replace(":", ".")
+        rows.append([fact["says"], fact["at"], _status(fact, paper), here, f":func:`{code}`"])
+    return _table(["Paper", "Where", "Status", "Here", "Code"], rows)
+
+
+def _status(fact: Mapping[str, Any], paper: Mapping[str, Any]) -> str:
+    if fact["status"] != "preset":
+        return str(fact["status"])
+    ways = [f"`preset={fact.get('preset', paper['preset'])!r}`"] if "options" in fact else []
+    ways += [f"`--recipe {paper['recipe']}`"] if "recipe" in fact else []
+    return ", ".join(ways)
+
+
 def _table(head: list[str], rows: list[list[str]]) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows]) + "\n"
 
@@ -97,4 +137,6 @@ PARTS = {
     r"options of methods": _options,
     r"buffers": _buffers,
     r"help: (\w+)": _help,
+    r"paper: (\w+)": _paper,
+    r"papers": _papers,
 }
