@@ -78,6 +78,7 @@ PACKAGES = {
     "drjit": {"render"},
     "OpenEXR": {"data.exr"},
     "grain": {"data.training"},
+    "array_record": {"data.training"},
     "orbax": {"training"},
     "matplotlib": {"evaluation.report"},
     "PIL": {"evaluation.report"},

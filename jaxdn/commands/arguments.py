@@ -126,11 +126,14 @@ class Render:
 
 @dataclass
 class Pack:
-    """Pack random windows of rendered clips into one compact file, to train on a machine that clips are too large for.
+    """Pack random windows of rendered clips, to train on machines that clips are too large for: into one compact file,
+    or, exact and for sets of any size, into a folder of shards.
 
     For example:
 
     jaxdn pack data/train -o train.pack --mib 50 --crop 64 --draws 2
+
+    jaxdn pack data/train -o shards/train --format arrayrecord --mib 200000 --crop 128
 
     jaxdn train train.pack -o runs/mine
     """
@@ -138,9 +141,12 @@ class Pack:
     clips: tyro.conf.Positional[list[Path]]
     """Folders of clips."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-    """The file to write."""
+    """The file to write, or with `--format arrayrecord` the folder."""
     mib: float
-    """Largest size of the file in MiB."""
+    """Largest size of it in MiB."""
+    format: Literal["file", "arrayrecord"] = "file"
+    """One file of rounded values, unpacked where it is used first; or shards of exact values (ArrayRecord, zstd), read
+    where they lie. Not on Windows."""
     crop: int = 64
     """Width and height of the windows, in pixels; training may crop them further."""
     frames: int = 10
@@ -148,7 +154,7 @@ class Pack:
     draws: int = 2
     """Single samples to store of each window; 0: the layer of one sample instead."""
     buffers: list[str] | None = None
-    """Buffers to store; default: those that every variant of ntd is trained with."""
+    """Buffers to store; default: those that every variant of ntd is trained with, with arrayrecord all."""
     indirect_only: bool = False
     """Leave out direct and emitted light: smaller, but nothing can be trained on all light."""
     without_half: bool = False
@@ -169,7 +175,7 @@ class Train:
     """
 
     clips: tyro.conf.Positional[list[Path]]
-    """Folders of clips, or files of `jaxdn pack`, to train on."""
+    """Folders of clips, or what `jaxdn pack` has written, to train on."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The run's folder: checkpoints, log, and finally weights.safetensors with its JSON."""
     validation: Path | None = None

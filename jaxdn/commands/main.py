@@ -83,13 +83,16 @@ def _render(options: Render) -> None:
 
 def _pack(options: Pack) -> None:
     from jaxdn.commands.pack import pack
-    from jaxdn.data.training.pack import USUAL, Packing
+    from jaxdn.core.frame import GUIDES
+    from jaxdn.data.training.windows import USUAL, Packing
 
     packing = Packing(
         crop=options.crop,
         frames=options.frames,
         draws=options.draws,
-        buffers=USUAL if options.buffers is None else tuple(options.buffers),
+        buffers=(USUAL if options.format == "file" else tuple(GUIDES))
+        if options.buffers is None
+        else tuple(options.buffers),
         direct=not options.indirect_only,
         half=not options.without_half,
         seed=options.seed,
@@ -100,6 +103,7 @@ def _pack(options: Pack) -> None:
             options.out,
             packing,
             mib=options.mib,
+            format=options.format,
             progress=lambda windows, size: status.update(f"{windows} windows, {size / 2**20:.1f} MiB"),
         )
     print(f"{options.out}: {packed.windows} windows of {packed.clips} clips, {packed.size / 2**20:.1f} MiB")

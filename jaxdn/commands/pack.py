@@ -1,10 +1,14 @@
-"""``jaxdn pack``: a training set in one compact file, to train on a machine behind a thin line."""
+"""``jaxdn pack``: a training set in one compact file, or exact and in shards, to train on other machines."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal
 
 from jaxdn.data.errors import ClipError
-from jaxdn.data.training.pack import Packed, Packing, open_clips, write_pack
+from jaxdn.data.training.open_clips import open_clips
+from jaxdn.data.training.pack import write_pack
+from jaxdn.data.training.shards import write_shards
+from jaxdn.data.training.windows import Packed, Packing
 
 
 def pack(
@@ -13,17 +17,20 @@ def pack(
     packing: Packing,
     *,
     mib: float,
+    format: Literal["file", "arrayrecord"] = "file",
     progress: Callable[[int, int], None] = lambda windows, size: None,
 ) -> Packed:
-    """Pack random windows of clips into the file ``out`` of at most ``mib`` MiB, in a folder that is made if missing.
+    """Pack random windows of clips into ``out``, of at most ``mib`` MiB, in a folder that is made if missing.
 
-    ``places`` are as for :func:`jaxdn.clips.training_batches`. Raises as :func:`jaxdn.data.training.pack.write_pack`
-    does, and ValueError for a size that is not positive.
+    ``out`` is one compact file, or with ``arrayrecord`` a folder of shards. ``places`` are as for
+    :func:`jaxdn.clips.training_batches`. Raises as :func:`jaxdn.data.training.pack.write_pack` and
+    :func:`jaxdn.data.training.shards.write_shards` do, and ValueError for a size that is not positive.
     """
-    if not 0 < mib < 2**20:
-        raise ValueError(f"--mib: expected more than 0 MiB and less than 2^20, got {mib:g}.")
+    if not 0 < mib < 2**30:
+        raise ValueError(f"--mib: expected more than 0 MiB and less than 2^30, got {mib:g}.")
     clips = [clip for place in places for clip in open_clips(place)]
     if not clips:
         raise ClipError("clips: expected at least one folder, got none.")
     out.parent.mkdir(parents=True, exist_ok=True)
-    return write_pack(out, clips, size=int(mib * 2**20), packing=packing, progress=progress)
+    write = write_pack if format == "file" else write_shards
+    return write(out, clips, size=int(mib * 2**20), packing=packing, progress=progress)

@@ -12,7 +12,7 @@ from jaxdn import color, metrics
 from jaxdn.core.frame import Clip
 from jaxdn.data.clip.noise_floor import second_half
 from jaxdn.data.training.cache import CachedClip, read_array, read_window
-from jaxdn.data.training.pack import open_clips
+from jaxdn.data.training.open_clips import open_clips
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.denoiser.rollout import denoise
 

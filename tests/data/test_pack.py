@@ -18,7 +18,9 @@ from jaxdn.core.frame import BUFFERS, FAR, Frame
 from jaxdn.data.training import compact
 from jaxdn.data.training.cache import read_array, read_window
 from jaxdn.data.training.light_samples import sample_light
-from jaxdn.data.training.pack import Packing, open_clips, open_pack, write_pack
+from jaxdn.data.training.open_clips import open_clips
+from jaxdn.data.training.pack import open_pack, write_pack
+from jaxdn.data.training.windows import Packing
 from jaxdn.denoisers import svgf
 from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.training.validation import load_validation

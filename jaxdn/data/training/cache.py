@@ -15,7 +15,7 @@ import threading
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -29,23 +29,42 @@ from jaxdn.runtime.atomic_files import write_json
 
 _VERSION = 3  # of the cache's layout; caches of other versions are not used
 _LIGHT = BUFFERS["radiance"]
+"""How noisy layers and references are stored."""
 _ONE_HEADER = threading.Lock()
 """NumPy parses a file's header as Python, which in CPython 3.11 fails now and then in several threads at once
 (SystemError: AST constructor recursion depth mismatch)."""
-"""How noisy layers and references are stored."""
 
 
-class CachedClip(NamedTuple):
-    """One clip, ready for random access; files are opened only by :func:`read_window`.
+class ArrayStore(Protocol):
+    """Where the arrays of a clip are."""
+
+    def read(self, name: str, window: tuple[Any, ...]) -> np.ndarray:
+        """The part ``window`` of an array, as it is stored."""
+
+
+class ArrayFiles(NamedTuple):
+    """Arrays as ``.npy`` files in a folder, mapped into memory only while they are read.
 
     A memory map holds a file handle for as long as it lives, and a few hundred clips of a dozen buffers would need more
     of them than a process may have.
     """
 
+    folder: Path
+
+    def read(self, name: str, window: tuple[Any, ...]) -> np.ndarray:
+        """The part ``window`` of an array, as a view of its file."""
+        with _ONE_HEADER:
+            whole = np.load(self.folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+        return whole[window]
+
+
+class CachedClip(NamedTuple):
+    """One clip, ready for random access; files are opened only by :func:`read_window`."""
+
     path: Path
     """The clip's own folder."""
-    home: Path
-    """Its cache."""
+    store: ArrayStore
+    """Its arrays."""
     shape: tuple[int, int, int]
     """Frames, height, width."""
     arrays: frozenset[str]
@@ -97,7 +116,7 @@ def open_cached(path: str | Path, *, cache: str | Path | None = None) -> CachedC
     shape = (record["frames"], record["height"], record["width"])
     counts = facts["draws"], int(record.get("reference_spp", 0))
     return CachedClip(
-        path, home, shape, frozenset(facts["arrays"]), tuple(facts["layers"]), *counts, is_planned(record)
+        path, ArrayFiles(home), shape, frozenset(facts["arrays"]), tuple(facts["layers"]), *counts, is_planned(record)
     )
 
 
@@ -159,9 +178,12 @@ def read_guide(clip: CachedClip, name: str, window: tuple[slice, ...], spp: int)
 
 def read_array(clip: CachedClip, name: str, window: tuple[Any, ...]) -> np.ndarray:
     """The part ``window`` of one stored array, in the dtype of its buffer."""
-    with _ONE_HEADER:
-        whole = np.load(clip.home / f"{name}.npy", mmap_mode="r", allow_pickle=False)
-    return np.array(whole[window], BUFFERS.get(name, _LIGHT).dtype)
+    return np.array(clip.store.read(name, window), BUFFERS.get(name, _LIGHT).dtype)
+
+
+def read_stored(clip: CachedClip, name: str, window: tuple[Any, ...]) -> np.ndarray:
+    """The part ``window`` of one stored array, in the precision it is stored in."""
+    return np.array(clip.store.read(name, window))
 
 
 def ensure_cache(

@@ -6,6 +6,7 @@ position in the stream: two streams with the same arguments are equal, and one r
 exactly where the other was.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from jaxdn.data.clip.frames import doubling_layers
 from jaxdn.data.errors import ClipError
 from jaxdn.data.training.cache import CachedClip, read_window
 from jaxdn.data.training.light_samples import check_samples, sample_light
-from jaxdn.data.training.pack import open_clips
+from jaxdn.data.training.open_clips import open_clips
 from jaxdn.data.training.symmetries import transform_clip
 from jaxdn.recipes.augmentation import NO_AUGMENTATION, Augmentation, augment_clip
 
@@ -36,11 +37,13 @@ def training_batches(
     augment: bool = True,
     variation: Augmentation = NO_AUGMENTATION,
     threads: int = 1,
+    process: tuple[int, int] = (0, 1),
 ) -> grain.DatasetIterator[Clip]:
     """An endless iterator over batches: a Clip of numpy arrays ``[B, T, H, W, C]``, reference included.
 
     Args:
-      clips: a folder of clips, one clip, a packed set (:mod:`jaxdn.data.training.pack`), or a list of these.
+      clips: a folder of clips, one clip, a packed set (:mod:`jaxdn.data.training.pack`), a set in shards
+        (:mod:`jaxdn.data.training.shards`), or a list of these.
       batch: elements of a batch.
       crop: side of the square crop, or (height, width), in pixels.
       frames: consecutive frames of each element.
@@ -53,6 +56,9 @@ def training_batches(
       augment: flips and quarter turns (no odd turns for a crop that is not square).
       variation: of light, normals and the buffers that are there.
       threads: batches prepared in advance, each by its own thread; 0 prepares them when requested.
+      process: index and number of processes that read one stream together: each gets every so many-th element of a
+        batch, prepares nothing of the others', and all together have the batch of one process alone. The position is
+        the same in all of them and counts whole batches, so that another number of processes may go on from it.
 
     Buffers that belong to one noisy image (:data:`jaxdn.core.frame.OF_SAMPLES`: specular light, shadows) come with that
     image, the layer with the fewest samples, instead of noise drawn anew; with all other noise they are neutral.
@@ -67,6 +73,9 @@ def training_batches(
     for name, value in (("batch", batch), ("crop", height), ("crop", width), ("frames", frames)):
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise ValueError(f"{name}: expected a whole number of at least 1, got {value!r}.")
+    index, count = process
+    if not 0 <= index < count or batch % count:
+        raise ValueError(f"batch: expected a multiple of the {count} processes, got {batch}; change one of them.")
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed: expected 0 to 2^32 - 1, got {seed}.")
     counts = (spp,) if isinstance(spp, int) else tuple(spp)
@@ -108,8 +117,10 @@ def training_batches(
     indices = [index for index, source in enumerate(sources) for _ in range(source.shape[0] // frames)]
     # `repeat` before `random_map`: its generator is seeded by the position in the endless stream.
     stream = grain.MapDataset.source(indices).seed(seed).shuffle().repeat(None).random_map(element)
+    # After `random_map`: an element is the same whoever prepares it.
+    own = stream[index::count] if count > 1 else stream
     # An endless stream has no incomplete last batch, but rounding its length up overflows for batches of one.
-    batches = stream.batch(batch, drop_remainder=True, batch_fn=_stack)
+    batches = own.batch(batch // count, drop_remainder=True, batch_fn=_stack)
     # Grain's own default is to keep 500 elements ready, which are batches here.
     options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=threads)
     return iter(batches.to_iter_dataset(options))
@@ -143,7 +154,8 @@ def _common_buffers(clips: Sequence[CachedClip], wanted: Sequence[str] | frozens
         return clip.buffers if wanted is None else clip.buffers & frozenset(wanted)
 
     sets = [offered(clip) for clip in clips]
-    union, usual = frozenset().union(*sets), max(sets, key=sets.count)
+    ((usual, _),) = Counter(sets).most_common(1)
+    union = frozenset().union(*sets)
     for expected in (usual, union):
         for clip, found in zip(clips, sets, strict=True):
             if found != expected and not clip.planned:

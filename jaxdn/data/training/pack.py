@@ -9,68 +9,30 @@ The file is ``jaxdnpk1``, the SHA-256 of all that follows, the length of the ind
 import hashlib
 import json
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from jaxdn.core.checks import check_at_least
 from jaxdn.core.frame import BUFFERS, GUIDES
-from jaxdn.data.clip.folder import find_clips
 from jaxdn.data.errors import ClipError, read_json
-from jaxdn.data.training.cache import CachedClip, ensure_cache, open_cached, read_array
+from jaxdn.data.training.cache import ArrayFiles, CachedClip, ensure_cache, read_array
 from jaxdn.data.training.compact import CODES, compress, decompress
+from jaxdn.data.training.windows import Packed, Packing, check_packable, choose_windows
 from jaxdn.runtime.atomic_files import write_atomically
 
 _MAGIC = b"jaxdnpk1"
 _HEADER = len(_MAGIC) + 32 + 8
-
-USUAL = ("albedo", "normal", "depth", "roughness", "motion", "dual_motion", "visible", "reflectance")
-"""What every variant of ``ntd`` and its objectives read."""
 
 _NOISY = "noisy_1spp"
 _PARTS = {"draws": slice(0, 3), "draws_direct": slice(3, 6)}
 """Arrays of single samples, and their channels in the cache."""
 
 
-class Packing(NamedTuple):
-    """What is taken from each clip."""
-
-    crop: int = 64
-    """Side of the square windows, in pixels."""
-    frames: int = 10
-    """Consecutive frames of a window; of a shorter clip all."""
-    draws: int = 2
-    """Single samples; 0: the clips' layer of one sample instead."""
-    buffers: tuple[str, ...] = USUAL
-    direct: bool = True
-    """With the direct light of the single samples, and the buffers ``direct`` and ``emission``."""
-    half: bool = True
-    """With the reference's first half, for training on inputs of half its samples."""
-    seed: int = 0
-    """Of the windows."""
-
-
-class Packed(NamedTuple):
-    """What :func:`write_pack` has written."""
-
-    windows: int
-    clips: int
-    """Clips that at least one window is of."""
-    size: int
-    """Of the file, in bytes."""
-
-
 Stored = list[tuple[str, str, bytes]]
 """Name, way and data of each array of a window."""
-
-
-def open_clips(place: str | Path) -> list[CachedClip]:
-    """The clips of a folder, one clip, or the windows of a packed set. Raises ClipError as these do."""
-    place = Path(place)
-    return open_pack(place) if place.is_file() else [open_cached(path) for path in find_clips(place)]
 
 
 def write_pack(
@@ -90,12 +52,12 @@ def write_pack(
     cannot be written.
     """
     for clip in clips:
-        _check(clip, packing)
+        check_packable(clip, packing)
     entries: list[dict[str, Any]] = []
     blobs: list[bytes] = []
     index, total = _packed_index(entries), _HEADER
     with ThreadPoolExecutor() as pool:
-        for clip, window, rng in _windows(clips, packing):
+        for clip, window, rng in choose_windows(clips, packing):
             stored = _stored(clip, window, packing, rng, pool)
             entry = _entry(clip, window, packing, stored)
             longer = _packed_index([*entries, entry])
@@ -132,47 +94,10 @@ def open_pack(path: str | Path, *, cache: str | Path | None = None) -> list[Cach
         where = path / f"{number:04d}-{entry['clip']}"
         arrays, layers = frozenset(entry["arrays"]), tuple(entry["layers"])
         counts = entry["draws"], entry["reference_spp"], entry["planned"]
-        clips.append(CachedClip(where, _folder(home, number), tuple(entry["shape"]), arrays, layers, *counts))
+        clips.append(
+            CachedClip(where, ArrayFiles(_folder(home, number)), tuple(entry["shape"]), arrays, layers, *counts)
+        )
     return clips
-
-
-def _check(clip: CachedClip, packing: Packing) -> None:
-    unknown = set(packing.buffers) - set(GUIDES)
-    if unknown:
-        raise ValueError(f"buffers: expected some of {', '.join(GUIDES)}, got {', '.join(sorted(unknown))}.")
-    check_at_least(1, crop=packing.crop, frames=packing.frames)
-    check_at_least(0, draws=packing.draws)
-    if min(clip.shape[1:]) < packing.crop:
-        raise ClipError(
-            f"{clip.path}: expected at least {packing.crop} x {packing.crop} pixels for the crop, got {clip.shape[2]} "
-            f"x {clip.shape[1]}; make it smaller (--crop {min(clip.shape[1:])})."
-        )
-    if "reference" not in clip.arrays:
-        raise ClipError(f"{clip.path}: there is no reference to train towards; render the clip with one.")
-    if clip.draws < packing.draws or (not packing.draws and 1 not in clip.layers):
-        raise ClipError(
-            f"{clip.path}: expected {packing.draws or 'a layer of 1'} single samples, got {clip.draws} and layers of "
-            f"{', '.join(map(str, clip.layers))} samples; ask for other --draws, or render the clip with more."
-        )
-
-
-def _windows(
-    clips: Sequence[CachedClip], packing: Packing
-) -> Iterator[tuple[CachedClip, tuple[slice, ...], np.random.Generator]]:
-    """Different windows in rounds, each with one of every clip; the end is a round that had no new one."""
-    rng = np.random.default_rng(packing.seed)
-    taken: set[tuple[int, ...]] = set()
-    found = True
-    while found:
-        found = False
-        for chosen in map(int, rng.permutation(len(clips))):
-            clip = clips[chosen]
-            sizes = (min(packing.frames, clip.shape[0]), packing.crop, packing.crop)
-            starts = [int(rng.integers(has - wants + 1)) for has, wants in zip(clip.shape, sizes, strict=True)]
-            if (chosen, *starts) not in taken:
-                found = True
-                taken.add((chosen, *starts))
-                yield clip, tuple(slice(start, start + n) for start, n in zip(starts, sizes, strict=True)), rng
 
 
 def _stored(
