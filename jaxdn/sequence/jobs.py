@@ -165,6 +165,7 @@ def find_jobs(
         jobs.append(_hold(Job(shot, clip, targets, wanted, notes, next(iter(views.values()), ()), views=views)))
     _check_targets(jobs)
     inputs = {file.resolve() for shot, _ in found for file in shot.files}
+    inputs |= {file.resolve() for shot, _ in found for each in shot.passes for file in each.values()}
     if {target.resolve() for job in jobs for target in job.targets} & inputs or out.resolve() in inputs:
         raise ValueError(f"{out}: expected another place than the input's, whose frames would be overwritten.")
     if frames is not None and not named:

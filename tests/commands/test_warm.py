@@ -6,8 +6,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from jaxdn.clips import write_exr
+from jaxdn.clips import read_clip, write_exr
+from jaxdn.commands.warm import draw_passes
+from jaxdn.core.frame import present
 
 SIZE = ["--width", "64", "--height", "48"]
 
@@ -25,22 +28,56 @@ def steps(folder: Path) -> list[str]:
     return sorted(name for name in found if name.startswith(("jit__step", "jit__start", "jit_combine")))
 
 
-def test_denoise_finds_what_doctor_compiled(tmp_path: Path) -> None:
-    """Of files of that size with those passes."""
-    warmed = run(tmp_path / "kept", "doctor", "--warm", "--method", "taa", *SIZE)
-    assert warmed.returncode == 0, warmed.stderr
-    assert "taa is compiled for 64 x 48" in warmed.stdout
-    kept = steps(tmp_path / "kept")
-    assert {name.rpartition("-")[0].rpartition("-")[0] for name in kept} == {"jit__start", "jit__step", "jit_combine"}
+PASSES = {
+    "Combined": "RGB",
+    "Denoising Albedo": "RGB",
+    "Denoising Normal": "XYZ",
+    "Depth": "Z",
+    "Vector": "XYZW",
+    "IndexOB": "X",
+}
+"""Blender's, and their components."""
+
+
+def write_frame(path: Path, *, numbered: bool) -> None:
+    """A frame as Blender writes it, whose objects have numbers or have not."""
     rng = np.random.default_rng(0)
-    channels = {"Combined": "RGB", "Denoising Albedo": "RGB", "Denoising Normal": "XYZ", "Depth": "Z", "Vector": "XYZW"}
-    names = [f"ViewLayer.{name}.{letter}" for name, letters in channels.items() for letter in letters]
-    write_exr(tmp_path / "a.0001.exr", {name: rng.uniform(0.1, 1, (48, 64)).astype(np.float32) for name in names})
-    done = run(
-        tmp_path / "kept", "denoise", str(tmp_path / "a.0001.exr"), "-o", str(tmp_path / "out"), "--method", "taa"
-    )
-    assert done.returncode == 0, done.stderr
-    assert steps(tmp_path / "kept") == kept
+    channels = {
+        f"ViewLayer.{name}.{letter}": rng.uniform(0.1, 1, (48, 64)).astype(np.float32)
+        for name, letters in PASSES.items()
+        for letter in letters
+    }
+    channels["ViewLayer.IndexOB.X"] = rng.integers(0, 3, (48, 64)).astype(np.float32) * numbered
+    write_exr(path, channels)
+
+
+@pytest.mark.parametrize("objects", [1, 2])
+def test_no_pass_of_a_drawn_frame_counts_as_missing(tmp_path: Path, objects: int) -> None:
+    """All of Blender's, but for the indices of objects that nobody has numbered."""
+    write_exr(tmp_path / "a.exr", draw_passes(16, 24, objects, seed=0))
+    frame = read_clip(tmp_path / "a.exr").frames
+    passes = {"albedo", "normal", "depth", "motion", "dual_motion"} | ({"ids"} if objects > 1 else set())
+    assert passes <= set(present(frame))
+    assert "ids" in passes or frame.ids is None
+
+
+@pytest.mark.slow
+def test_denoise_finds_what_doctor_compiled(tmp_path: Path) -> None:
+    """Of files of that size with Blender's passes, of a method that reads them, whether objects have numbers or not."""
+    kept = tmp_path / "kept"
+    warmed = run(kept, "doctor", "--warm", "--method", "svgf", *SIZE)
+    assert warmed.returncode == 0, warmed.stderr
+    assert "svgf is compiled for 64 x 48" in warmed.stdout
+    programs = steps(kept)
+    names = {name.rpartition("-")[0].rpartition("-")[0] for name in programs}
+    assert names == {"jit__start", "jit__step", "jit_combine"}
+    for name, numbered in (("plain", False), ("numbered", True)):
+        write_frame(tmp_path / f"{name}.0001.exr", numbered=numbered)
+        out = str(tmp_path / name)
+        done = run(kept, "denoise", str(tmp_path / f"{name}.0001.exr"), "-o", out, "--method", "svgf")
+        assert done.returncode == 0, done.stderr
+        assert "counts as missing" not in done.stdout
+        assert steps(kept) == programs, name
 
 
 def test_what_cannot_be_compiled_is_told(tmp_path: Path) -> None:

@@ -317,6 +317,24 @@ def test_what_has_no_overlay_is_refused(tmp_path, capsys):
     assert sorted(path.suffix for path in shot.iterdir()) == [".exr", ".exr"]
 
 
+def test_no_file_that_is_read_is_overwritten(tmp_path, capsys):
+    """However its folder is called; nor a file of a single pass."""
+    shot = write_shot(tmp_path / "shot", lambda index, layers: layers | {"Denoising Albedo": None}, frames=2)
+    for path in shot.iterdir():
+        (tmp_path / "albedo").mkdir(exist_ok=True)
+        rgb = frame_of(0)["Denoising Albedo"].astype(np.float32)
+        write_exr(tmp_path / "albedo" / path.name, {letter: rgb[..., i].copy() for i, letter in enumerate("RGB")})
+    (tmp_path / "link").symlink_to(shot)
+    before = {path: path.read_bytes() for path in tmp_path.glob("*/*.exr")}
+    naming = ["--channels", f"albedo={tmp_path / 'albedo'}/*.exr"]
+    for out, options in (("link", []), ("albedo/../shot", []), ("albedo", naming)):
+        with pytest.raises(SystemExit) as ended:
+            main.main(["inspect", str(shot), "--overlay", str(tmp_path / out), *options])
+        assert ended.value.code == 2
+        assert "expected another folder than that of the shot" in " ".join(capsys.readouterr().err.split())
+        assert {path: path.read_bytes() for path in tmp_path.glob("*/*.exr")} == before
+
+
 def test_motion_is_found_between_pixels(rng):
     x, y = np.meshgrid(np.arange(80.0), np.arange(64.0))
     waves = rng.uniform(0.15, 0.6, (12, 2)), rng.uniform(0, 6.28, 12)

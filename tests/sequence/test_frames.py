@@ -173,6 +173,16 @@ def test_no_input_is_overwritten(tmp_path: Path) -> None:
     assert not (tmp_path / "x.exr").exists()
 
 
+def test_no_file_of_a_pass_is_overwritten(tmp_path: Path) -> None:
+    """Of passes in folders of their own, under one name."""
+    for name in ("beauty", "albedo"):
+        numbered(tmp_path / name, [1, 2])
+    stated = {"albedo": str(tmp_path / "albedo" / "*.exr")}
+    with pytest.raises(ValueError, match="expected another place than the input's"):
+        find_jobs([tmp_path / "beauty"], tmp_path / "albedo", pass_files=stated)
+    assert len(find_jobs([tmp_path / "beauty"], tmp_path / "out", pass_files=stated)) == 1
+
+
 def refused(capsys: Any, *arguments: Any) -> str:
     """The message of a `jaxdn denoise` that ends with exit code 2."""
     with pytest.raises(SystemExit) as ended:

@@ -70,8 +70,9 @@ def write_overlay(
 ) -> Overlay:
     """Write ``out/NAME.exr`` for each frame and ``out/overlay.html``; returns what was found.
 
-    A file that cannot be decoded is a frame that differs; the history begins anew after it. Raises ValueError for the
-    folder of the shot itself, and ClipError as :meth:`jaxdn.data.foreign.import_exr.ForeignSequence.frames` does.
+    A file that cannot be decoded is a frame that differs; the history begins anew after it. Raises ValueError for a
+    folder that the shot is read from, and ClipError as
+    :meth:`jaxdn.data.foreign.import_exr.ForeignSequence.frames` does.
 
     Args:
       files: of the shot, those that can be its frames.
@@ -87,7 +88,7 @@ def write_overlay(
         there are no such vectors.
       on_frame: called with each file of layers that was written.
     """
-    if any(file.path.parent.absolute() == out.absolute() for file in files):
+    if any(path.resolve().parent == out.resolve() for file in files for path in file.paths):
         raise ValueError(f"--overlay {out}: expected another folder than that of the shot; name one of its own.")
     out.mkdir(parents=True, exist_ok=True)
     unusable = dict(unusable or {})
