@@ -114,7 +114,7 @@ PRESETS = {
         train=ClipSet(_parts("pinkroom", range(0, 400, 20)), size=96, frames=10, reference_spp=96),
         validation=ClipSet(_parts("pinkroom", range(500, 501)), size=96, frames=10, reference_spp=96),
         tests=(ClipSet(_parts("pinkroom", range(600, 680, 20)), size=96, frames=10, reference_spp=128),),
-        runs=tuple(_abc(400, ("paper-without-occlusion", "paper")).values()),
+        runs=tuple(_abc(400, ("paper-loss-without-occlusion", "paper-loss")).values()),
         learning={"learning_rate": 2e-3, "crop": 48},
     ),
 }

@@ -46,7 +46,7 @@ def good_files(folder: Path) -> dict[str, list[bytes]]:
     params = ntd(size=((1,),) * 5).init(jax.random.key(0), Frame(light[0]))
     save_weights(folder / "weights.safetensors", params, factory="ntd", options=tiny, record={})
     description = json.loads((folder / "weights.json").read_bytes())
-    richer = description | {"options": tiny | {"motion": "dual", "preset": "parity", "demodulate": "none"}}
+    richer = description | {"options": tiny | {"motion": "dual", "preset": "paper", "demodulate": "none"}}
     ours = read_exr(folder / "clip" / "frame_0000.exr")
     files = {
         "exr": _exr_files(folder, ours),

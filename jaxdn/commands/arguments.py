@@ -187,12 +187,12 @@ class Train:
     variant: str | None = None
     """One of the method's variants (ntd-large, ntd-small); default: the fastest."""
     set: list[str] = field(default_factory=list)
-    """Options of the method as option=value, such as motion=traditional preset=parity; an unknown name lists them."""
+    """Options of the method as option=value, such as motion=traditional preset=paper; an unknown name lists them."""
     start: str | None = None
     """Shipped weights or a .safetensors file to continue from; default: new weights."""
     recipe: str | None = None
-    """One of the method's recipes; for ntd: usual, without-occlusion, paper, paper-without-occlusion, parity; for
-    steady: usual, finish (goes on from trained weights, in crops of 128). Default: the usual one."""
+    """One of the method's recipes; for ntd: usual, finish, without-occlusion, paper-loss, paper-loss-without-occlusion,
+    paper; for steady: usual, finish (goes on from trained weights, in crops of 128). Default: the usual one."""
     steps: int | None = None
     """Parameter updates, more than before to go on with a finished run; default, as for the next seven options: as in
     the recipe."""

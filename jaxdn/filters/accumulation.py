@@ -28,6 +28,7 @@ def accumulate(
     alpha: float,
     alpha_moments: float,
     history_max: int,
+    ramp: bool = True,
     texture: jax.Array | None = None,
     change: jax.Array | None = None,
 ) -> jax.Array:
@@ -35,9 +36,9 @@ def accumulate(
 
     Planes are colour, the first and second moment of its luminance, the history length N in frames, and the mean
     texture (3). The new frame has the weight ``a = max(alpha, 1 / N)``: without a history, the result is the new frame.
-    (Schied et al. 2017, sec. 4.1 and 4.2, have a constant alpha; 1 / N is that of later implementations.) Where light
-    has changed by a share ``c``, the weight is ``(1 - c) a + c`` (Schied et al. 2018), and N becomes ``N / (1 - c + c
-    N)``, the length that this share is worth.
+    (Schied et al. 2017, sec. 4.1 and 4.2, have a constant alpha; 1 / N is that of later implementations.) Without
+    ``ramp`` it is alpha wherever there is a history. Where light has changed by a share ``c``, the weight is ``(1 - c)
+    a + c`` (Schied et al. 2018), and N becomes ``N / (1 - c + c N)``, the length that this share is worth.
 
     Args:
       past: the history [9, H, W], 0 where there is none; its first six planes suffice without ``texture``.
@@ -45,13 +46,15 @@ def accumulate(
       alpha: minimum weight of the new frame in colour.
       alpha_moments: minimum weight of the new frame in the moments.
       history_max: maximum of N.
+      ramp: the weight is at least 1 / N.
       texture: [3, H, W] what a division left in the new frame; None: the history has no such planes.
       change: [H, W] in [0, 1], the share by which the history is outdated; None: nothing has changed.
     """
     level = luminance(now)
     length = jnp.minimum(past[5] + 1.0, history_max)
-    share = jnp.maximum(alpha, 1.0 / length)
-    share_moments = jnp.maximum(alpha_moments, 1.0 / length)
+    least = least_share(past[5], length, ramp=ramp)
+    share = jnp.maximum(alpha, least)
+    share_moments = jnp.maximum(alpha_moments, least)
     if change is not None:
         share = share + change * (1.0 - share)
         share_moments = share_moments + change * (1.0 - share_moments)
@@ -62,6 +65,14 @@ def accumulate(
     if texture is not None:
         planes.append(past[6:9] + share[None] * (texture - past[6:9]))
     return jnp.concatenate(planes)
+
+
+def least_share(past: jax.Array, length: jax.Array, *, ramp: bool) -> jax.Array:
+    """[H, W] what a new frame weighs at least: 1 / ``length``, or without ``ramp`` 1 where there is no ``past`` else 0.
+
+    Both are lengths [H, W] in frames, before and after the frame.
+    """
+    return 1.0 / length if ramp else (past <= 0).astype(length.dtype)
 
 
 def with_texture(history: jax.Array, before: jax.Array, after: jax.Array) -> jax.Array:

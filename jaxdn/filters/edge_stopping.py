@@ -57,6 +57,22 @@ def depth_weight(
     return Weight(layers[:1], layers, exponent)
 
 
+def plane_weight(depth: jax.Array, ids: jax.Array | None, *, tolerance: float) -> Weight:
+    """1 within ``tolerance`` z(p) of the plane of a pixel's surface, 0 beyond: ``|z(q) - z(p) - grad z(p) . (q - p)|``.
+
+    ``depth`` and ``ids`` [H, W, 1]; slopes are taken within an object, distances along the depth. After the test of
+    NRD's ReLAX, which takes them across the plane.
+    """
+    layers = jnp.stack([depth[..., 0], *depth_slopes(depth, ids)])
+
+    def factor(there: Planes, here: Planes, offset: Offset) -> jax.Array:
+        z, slope_x, slope_y = here
+        away = jnp.abs(there[0] - z - slope_x * offset.x - slope_y * offset.y)
+        return (away <= tolerance * z).astype(depth.dtype)
+
+    return Weight(layers[:1], layers, factor=factor)
+
+
 def normal_weight(normal: jax.Array, *, sigma: float | jax.Array) -> Weight:
     """``max(0, n(p) . n(q)) ** sigma`` for unit normals [H, W, 3] (Schied et al. 2017, eq. 4).
 

@@ -12,8 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-Box = Literal["variance", "minmax"]
+Box = Literal["variance", "minmax", "rounded"]
 """How the neighbourhood limits the history, see :func:`box_around`."""
+_PLUS = (0, 2, 4, 5, 7)
+"""Of :func:`neighbours`, the pixel itself and the four that share a side with it."""
 
 
 def to_ycocg(image: jax.Array, *, axis: int = -1) -> jax.Array:
@@ -53,10 +55,15 @@ def extremes_around(image: jax.Array) -> tuple[jax.Array, jax.Array]:
 def box_around(image: jax.Array, box: Box, gamma: float) -> tuple[jax.Array, jax.Array]:
     """Centre and half size [H, W, 3] of the box of colours in the 3x3 neighbourhood.
 
-    ``"variance"``: mean and ``gamma`` standard deviations; ``"minmax"``: from the smallest to the largest value.
+    ``"variance"``: mean and ``gamma`` standard deviations; ``"minmax"``: from the smallest to the largest value;
+    ``"rounded"``: the mean of that box and of the one of the pixel and the four beside it (Karis 2014).
     """
-    if box == "minmax":
+    if box != "variance":
         low, high = extremes_around(image)
+        if box == "rounded":
+            plus = [near for index, near in enumerate(neighbours(image)) if index in _PLUS]
+            low = (low + reduce(jnp.minimum, plus)) / 2
+            high = (high + reduce(jnp.maximum, plus)) / 2
         return (low + high) / 2, (high - low) / 2
     mean = mean_around(image)
     # Differences are squared, not values: the variance of bright pixels does not cancel.

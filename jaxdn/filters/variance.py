@@ -1,6 +1,7 @@
 """Variance of a pixel's luminance: from its history, or from its neighbours while the history is short."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,8 @@ from jaxdn.filters.edge_stopping import Weight
 from jaxdn.filters.isolated import fill_isolated, measure_isolation
 from jaxdn.filters.sparse import choose_sparse, sparse_edge_average
 
+Spatial = Literal["image", "variance"]
+"""What a short history takes from its neighbours, see :func:`estimate_variance`."""
 _ROUNDING = 1e-3
 """Frames that a length may lack through rounding: the mean of lengths of 4 is seldom exactly 4."""
 
@@ -22,19 +25,20 @@ def estimate_variance(
     weights: Sequence[Weight],
     *,
     short_history: int,
+    spatial: Spatial = "image",
     texture: jax.Array | None = None,
     isolated: bool = True,
 ) -> tuple[jax.Array, jax.Array]:
     """Colour [3, H, W] and the variance [H, W] of its luminance, from a history of ``accumulate``.
 
     Where the length N is less than ``short_history``, both are those of the edge-stopped 7x7 neighbourhood, and the
-    variance is multiplied by ``short_history / N``. (Schied et al. 2017, sec. 4.2, take the variance alone from there;
-    the colour and the factor are those of later implementations.) The ``texture`` [3, H, W] that a
-    division left is averaged likewise and given back to this colour (:func:`jaxdn.brdf.restore`); the deviation changes
-    as grey light would.
+    variance is multiplied by ``short_history / N``. (Schied et al. 2017, sec. 4.2, take the variance alone from there,
+    as it is: ``spatial="variance"``; the colour and the factor are those of later implementations.) The ``texture`` [3,
+    H, W] that a division left is averaged likewise and given back to this colour (:func:`jaxdn.brdf.restore`); the
+    deviation changes as grey light would.
 
-    ``isolated`` gives an isolated pixel the mean of those around it (:mod:`jaxdn.filters.isolated`); not for
-    reflections, which are sharp where they are alone.
+    With ``spatial="image"``, ``isolated`` gives an isolated pixel the mean of those around it
+    (:mod:`jaxdn.filters.isolated`); not for reflections, which are sharp where they are alone.
     """
     color, moments, length = history[:3], history[3:5], history[5]
     variance = jnp.maximum(moments[1] - moments[0] ** 2, 0.0)
@@ -47,11 +51,16 @@ def estimate_variance(
         lambda: edge_average(planes, hit, weights, stencil(3), needed=needed, with_total=True)[0],
     )
     mean, total = mean[:-1], mean[-1]
-    around, spatial = mean[:3], jnp.maximum(mean[4] - mean[3] ** 2, 0.0) * (short_history / length)
+    around, spread = mean[:3], jnp.maximum(mean[4] - mean[3] ** 2, 0.0)
+    if spatial == "image":
+        spread = spread * (short_history / length)
     if texture is not None:
         around = brdf.restore(around, texture, mean[5:])
-        spatial = spatial * texture_ratio(mean[5:], texture) ** 2
-    color, variance = jnp.where(needed[None], around, color), jnp.where(needed, spatial, variance)
+        spread = spread * texture_ratio(mean[5:], texture) ** 2
+    variance = jnp.where(needed, spread, variance)
+    if spatial == "variance":
+        return color, variance
+    color = jnp.where(needed[None], around, color)
     if not isolated:
         return color, variance
     planes = jnp.concatenate([color, variance[None]])

@@ -12,7 +12,7 @@ Christoph Schied et al., "Gradient Estimation for Real-Time Adaptive Temporal Fi
 """
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
@@ -25,15 +25,16 @@ from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.accumulation import luminance, with_texture
 from jaxdn.filters.gradients import (
     Change,
+    Enlarging,
     compare_replayed,
     compare_with_history,
+    measure_light,
     reconstruct,
     stratum_centers,
     to_pixels,
 )
 from jaxdn.filters.surface_test import surface_mask
 from jaxdn.methods import svgf
-from jaxdn.methods.demodulation import demodulated
 from jaxdn.methods.learnable_options import FITTING, LEARNABLE, apply_offsets, zero_offsets
 from jaxdn.methods.registry import method
 
@@ -45,19 +46,46 @@ class Options(svgf.Options):
     alpha: Annotated[float, Range(0, 1, without_low=True), LEARNABLE] = 0.1
     """Minimum weight of the new frame in colour, where light has not changed."""
     gradient_levels: Annotated[int, Range(0, 5)] = 3
-    """Levels of the filter over strata: it averages over ``3 * 3^levels`` pixels in each direction."""
+    """Levels of the filter over strata: it averages over ``3 * gradient_spacing^levels`` pixels in each direction."""
+    gradient_spacing: Annotated[int, Range(2, 3)] = 3
+    """Taps of level i of that filter are ``gradient_spacing^i`` strata apart."""
+    gradient_stops: Literal["surface", "light"] = "surface"
+    """What stops that filter: differences of depth and normals, or of depth and of the frame's luminance (three
+    deviations): then it does not average over the edges of shadows."""
+    gradient_enlarging: Enlarging = "bilinear"
+    """How strata become pixels."""
     significance: Annotated[float, Range(0)] = 2.0
     """Standard deviations up to which a change is taken for noise; from twice as many on it counts in full. With 0, as
     in the paper, every path that differs by chance shortens the history."""
     antilag: Annotated[float, Range(1)] = 4.0
     """The history keeps the share ``(1 - lambda)^antilag``, where lambda is the share by which light has changed. With
-    the paper's 1 (``preset="paper"``) light that doubles leaves half of the history."""
+    the paper's 1 light that doubles leaves half of the history."""
+
+
+PAPER = Options(
+    **svgf.AS_PUBLISHED | {"ramp": True, "spatial": "image"},
+    apart=True,
+    antialiasing=True,
+    alpha_moments=0.6,
+    history_max=64,
+    gradient_levels=5,
+    gradient_spacing=2,
+    gradient_stops="light",
+    gradient_enlarging="nearest",
+    significance=0.0,
+    antilag=1.0,
+)
+"""The settings of Schied et al. 2018: lambda is taken as it is, and alpha is 0.1. What the paper leaves open is that of
+the code its author released (KIT, 2018): 1 / N in short histories, whose colour comes from neighbours, at least 0.6 of
+the new frame in the moments, 64 frames, gradients averaged by five levels of 3x3 taps 2^i strata apart, stopped by
+depth and by three deviations of luminance, and each stratum's value for all of its pixels. The rest is SVGF's
+preset."""
 
 
 @method(
     Options,
     title="SVGF that adapts to changes of light (Schied et al. 2018)",
-    presets={"paper": Options(sigma_normal=128.0, significance=0.0, antilag=1.0)},
+    presets={"paper": PAPER},
     recipes={"usual": FITTING},
     filter=True,
 )
@@ -78,8 +106,7 @@ def asvgf(options: Options) -> Denoiser:
         return (*svgf.filter_history(fitted, history, frame, texture, statistics), invalid)
 
     reads = svgf.READS | {"luminance_gradient"}
-    plain = recurrent(Core(svgf.start, step, reads, lambda key, frame: zero_offsets(options)))
-    return demodulated(plain, by=options.demodulate)
+    return svgf.complete(options, recurrent(Core(svgf.start, step, reads, lambda key, frame: zero_offsets(options))))
 
 
 def accumulate(
@@ -104,7 +131,9 @@ def measure_change(options: Options, past: jax.Array, frame: Frame) -> jax.Array
     hit = surface_mask(frame.depth, frame.ids)
     depth, normal, ids = (stratum_centers(buffer) for buffer in (frame.depth, frame.normal, frame.ids))
     strata = depth if depth is not None else frame.radiance  # without depth there is no weight of it
-    weights = svgf.surface_weights(options, depth, normal, ids, strata.shape[0])
+    by_light = options.gradient_stops == "light"
+    light = measure_light(luminance(now), frame.ids) if by_light else None
+    weights = svgf.surface_weights(options, depth, None if by_light else normal, ids, strata.shape[0])
 
     def filtered(change: Change) -> jax.Array:
         return reconstruct(
@@ -113,6 +142,8 @@ def measure_change(options: Options, past: jax.Array, frame: Frame) -> jax.Array
             weights,
             levels=options.gradient_levels,
             significance=options.significance,
+            spacing=options.gradient_spacing,
+            light=light,
         )
 
     if frame.luminance_gradient is None:
@@ -125,4 +156,4 @@ def measure_change(options: Options, past: jax.Array, frame: Frame) -> jax.Array
             lambda _: filtered(compare_with_history(luminance(now), past, hit)),
             change,
         )
-    return to_pixels(share, *now.shape[1:])
+    return to_pixels(share, *now.shape[1:], enlarging=options.gradient_enlarging)

@@ -2,7 +2,7 @@
 
 A U-Net predicts, for every pixel, 5x5 softmax kernels for the noisy image at three scales, one 5x5 kernel for the
 previous output warped by *dual* motion vectors, and how to blend them. Details that the paper leaves open are options;
-``preset="parity"`` takes the paper's where it states them; the documentation lists what it leaves open.
+``preset="paper"`` takes the paper's where it states them; the documentation lists what it leaves open.
 
 Beyond the paper, the kernels are guided: what the buffers show of two surfaces is compared before the network's logits,
 so that it need not learn where edges are (:func:`jaxdn.ops.kernel_prediction.softmax.softmax_filter`).
@@ -100,7 +100,7 @@ AS_PUBLISHED: dict[str, Any] = {
     "demodulate": "none",
 }
 """The settings that this paper and that of ``ntasd`` share."""
-PARITY = Options(down="max", **AS_PUBLISHED)
+PAPER = Options(down="max", **AS_PUBLISHED)
 """The settings of the paper: D is max-pooling (eq. 4), taps outside the image are 0, the first history is noisy."""
 
 
@@ -173,16 +173,16 @@ def warp_history(
 @method(
     Options,
     title="Neural temporal denoising for indirect illumination (Zeng et al. 2021)",
-    presets={"parity": PARITY},
+    presets={"paper": PAPER},
     recipes={
         "usual": Recipe(unbiased_illumination()),
         "finish": FINISH,
         "without-occlusion": Recipe(unbiased_illumination(hidden=0.0)),
-        "paper": Recipe(indirect_illumination(), variation=NO_AUGMENTATION, average=0.0),
-        "paper-without-occlusion": Recipe(
+        "paper-loss": Recipe(indirect_illumination(), variation=NO_AUGMENTATION, average=0.0),
+        "paper-loss-without-occlusion": Recipe(
             indirect_illumination(occlusion=False), variation=NO_AUGMENTATION, average=0.0
         ),
-        "parity": Recipe(
+        "paper": Recipe(
             indirect_illumination(),
             learning_rate=1e-4,
             decay=False,
@@ -204,7 +204,7 @@ def ntd(options: Options) -> Denoiser:
     Guided kernels have learned precisions in ``params["guide"]`` beside the network's weights. Training may continue
     from weights with plain kernels (``jaxdn train --start``); the first image then differs by the prior.
 
-    The paper trains with Adam at a constant 1e-4 for 200 epochs of 142 clips; the recipe "parity" has this rate, but
+    The paper trains with Adam at a constant 1e-4 for 200 epochs of 142 clips; the recipe "paper" has this rate, but
     2,000 updates of 4 windows, which are 56 such epochs (``--steps 7100`` are 200). Raises ValueError for an unknown
     option, and ``step`` for a frame of the wrong shape, never for its contents.
     """

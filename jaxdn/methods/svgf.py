@@ -29,7 +29,7 @@ from jaxdn.filters.cascade import cascade
 from jaxdn.filters.edge_stopping import Weight, depth_weight, normal_weight
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, guides_of, surface_mask
-from jaxdn.filters.variance import estimate_variance
+from jaxdn.filters.variance import Spatial, estimate_variance
 from jaxdn.methods.demodulation import Demodulation, demodulated, texture_left
 from jaxdn.methods.learnable_options import (
     FITTING,
@@ -39,7 +39,9 @@ from jaxdn.methods.learnable_options import (
     at_level,
     zero_offsets,
 )
+from jaxdn.methods.light_apart import light_apart
 from jaxdn.methods.registry import method
+from jaxdn.methods.taa import taa
 
 READS = frozenset({"normal", "depth", "previous_depth", "motion", "ids"})
 PLANES = 9
@@ -50,18 +52,21 @@ _SHARE = Range(0, 1, without_low=True)
 
 
 @dataclass(frozen=True)
-class Options:
-    """The parameters, with the paper's defaults where it gives them, except for ``sigma_normal``."""
+class SharedOptions:
+    """The parameters of ``svgf`` that all filters made of its parts have."""
 
     alpha: Annotated[float, _SHARE, LEARNABLE] = 0.2
     """Minimum weight of the new frame in colour; the weight is ``max(alpha, 1 / N)`` at history length N."""
+    ramp: bool = True
+    """The new frame weighs at least 1 / N. Without, it is alpha from the second frame on, as in the paper (sec. 4.1):
+    more noise in short histories, and the first frame weighs more than any other."""
     alpha_moments: Annotated[float, _SHARE, LEARNABLE] = 0.2
     """The same for the moments of luminance."""
     sigma_depth: Annotated[float, _POSITIVE, LEARNABLE_PER_LEVEL] = 1.0
     """Edge-stopping parameter for differences in depth."""
     sigma_normal: Annotated[float, Range(0), LEARNABLE_PER_LEVEL] = 16.0
-    """Exponent of the cosine of normals. The paper's 128 (``preset="paper"``) keeps light of one curved or bumpy
-    surface apart: at 1 sample per pixel 16 has 1.6 dB more on held-out clips."""
+    """Exponent of the cosine of normals. The paper's 128 keeps light of one curved or bumpy surface apart: at 1 sample
+    per pixel 16 has 1.6 dB more on held-out clips."""
     sigma_luminance: Annotated[float, _POSITIVE, LEARNABLE_PER_LEVEL] = 4.0
     """Edge-stopping parameter for differences in luminance, in standard deviations."""
     levels: Annotated[int, Range(0, 10)] = 5
@@ -72,6 +77,9 @@ class Options:
     """Maximum history length N in frames."""
     short_history: Annotated[int, Range(0)] = 4
     """For N below this the variance is estimated from the 7x7 neighbourhood."""
+    spatial: Spatial = "image"
+    """What such a short history takes from there: colour and variance, the latter times ``short_history / N``, with
+    light for isolated pixels; or the ``"variance"`` alone, as in the paper (sec. 4.2)."""
     depth_tolerance: Annotated[float, Range(0)] = 0.02
     """Allowed relative difference of a history tap from the expected depth, in addition to the slope term."""
     normal_threshold: float = 0.9
@@ -87,6 +95,30 @@ class Options:
             )
 
 
+@dataclass(frozen=True)
+class Options(SharedOptions):
+    """The parameters, with the paper's defaults where it gives them, except for ``sigma_normal``."""
+
+    apart: bool = False
+    """Direct light (``shadowed``) and all other light are two signals with histories and variances of their own, as in
+    the paper (sec. 3), where the frames have it; twice the time."""
+    antialiasing: bool = False
+    """The image goes through ``taa(preset="paper")``: in tone-mapped light, as the paper's last stage."""
+
+
+AS_PUBLISHED: dict[str, Any] = {
+    "ramp": False,
+    "spatial": "variance",
+    "sigma_normal": 128.0,
+    "demodulate": "albedo",
+}
+"""What the paper does and the defaults do not: a constant weight (sec. 4.1), the variance alone from neighbours (sec.
+4.2), the exponent of normals (sec. 4.4), and light divided by the albedo (sec. 3). Its other numbers are the defaults:
+alpha 0.2 for colour and moments, sigmas 1 and 4, five levels, the image of the first as history."""
+PAPER = Options(apart=True, antialiasing=True, **AS_PUBLISHED)
+"""The settings of Schied et al. 2017."""
+
+
 class SvgfState(NamedTuple):
     """What is carried from one frame to the next."""
 
@@ -100,7 +132,7 @@ class SvgfState(NamedTuple):
 @method(
     Options,
     title="Spatiotemporal variance-guided filtering (Schied et al. 2017)",
-    presets={"paper": Options(sigma_normal=128.0)},
+    presets={"paper": PAPER},
     recipes={"usual": FITTING},
     variants={"svgf-fitted": {}},
     filter=True,
@@ -109,9 +141,8 @@ def svgf(options: Options) -> Denoiser:
     """SVGF, a filter that needs no weights: ``params`` are ``{}``, or move alpha, alpha_moments and the sigmas.
 
     Reads reflectance, albedo, normal, depth, previous_depth, motion and ids; without a buffer, its test or weight is
-    left out.
-    Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for options out of range and
-    radiance that is not [H, W, 3].
+    left out. With ``apart`` it reads shadowed, too. Pixels without a surface (depth at ``FAR`` or id -1) pass through.
+    Raises ValueError for options out of range and radiance that is not [H, W, 3].
     """
 
     def step(
@@ -127,7 +158,15 @@ def svgf(options: Options) -> Denoiser:
         return zero_offsets(options)
 
     core = Core(start, step, READS, init, receptive_field=_receptive_field(options))
-    return demodulated(recurrent(core), by=options.demodulate)
+    return complete(options, recurrent(core))
+
+
+def complete(options: Options, denoiser: Denoiser) -> Denoiser:
+    """A filter of divided light with what surrounds it: the division, signals apart, antialiasing."""
+    whole = demodulated(denoiser, by=options.demodulate)
+    if options.apart:
+        whole = light_apart(whole)
+    return taa(preset="paper", after=whole) if options.antialiasing else whole
 
 
 def _receptive_field(options: Options) -> int:
@@ -142,7 +181,7 @@ def start(params: Params, frame: Frame) -> SvgfState:
 
 
 def reproject_history(
-    options: Options, state: SvgfState, frame: Frame, first: jax.Array
+    options: SharedOptions, state: SvgfState, frame: Frame, first: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """The fetched history [9, H, W], 0 where missing; the number of invalid history pixels."""
     found = reproject(
@@ -164,7 +203,7 @@ def planar_texture(frame: Frame, by: Demodulation, statistics: FrameStatistics) 
 
 
 def blend(
-    options: Options, past: jax.Array, now: jax.Array, texture: jax.Array, change: jax.Array | None = None
+    options: SharedOptions, past: jax.Array, now: jax.Array, texture: jax.Array, change: jax.Array | None = None
 ) -> jax.Array:
     """The history [9, H, W] with light [3, H, W] blended in; ``texture`` and ``change`` as in ``accumulate``."""
     return accumulate(
@@ -173,13 +212,14 @@ def blend(
         alpha=options.alpha,
         alpha_moments=options.alpha_moments,
         history_max=options.history_max,
+        ramp=options.ramp,
         texture=texture,
         change=change,
     )
 
 
 def surface_weights(
-    options: Options, depth: Array, normal: Array, ids: Array, height: jax.Array | float, level: Any = 0
+    options: SharedOptions, depth: Array, normal: Array, ids: Array, height: jax.Array | float, level: Any = 0
 ) -> list[Weight]:
     """The edge-stopping weights of depth [H, W, 1] and normals [H, W, 3] at one level, as far as present.
 
@@ -194,7 +234,7 @@ def surface_weights(
 
 
 def filter_history(
-    options: Options, history: jax.Array, frame: Frame, texture: jax.Array, statistics: FrameStatistics
+    options: SharedOptions, history: jax.Array, frame: Frame, texture: jax.Array, statistics: FrameStatistics
 ) -> tuple[SvgfState, jax.Array]:
     """The state after a frame and its image [H, W, 3], from the blended history [9, H, W].
 
@@ -207,7 +247,8 @@ def filter_history(
     def weights(level: Any) -> list[Weight]:
         return surface_weights(options, frame.depth, frame.normal, frame.ids, statistics.height, level)
 
-    color, variance = estimate_variance(today, hit, weights(0), short_history=options.short_history, texture=texture)
+    short: dict[str, Any] = {"short_history": options.short_history, "spatial": options.spatial}
+    color, variance = estimate_variance(today, hit, weights(0), texture=texture, **short)
     image, feedback = cascade(
         color,
         variance,

@@ -30,7 +30,7 @@ from jaxdn.core.frame import Array, Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics, count_reflectance_differs
-from jaxdn.filters.accumulation import after_shift, luminance, with_texture
+from jaxdn.filters.accumulation import after_shift, least_share, luminance, with_texture
 from jaxdn.filters.atrous import GAUSSIAN, stencil
 from jaxdn.filters.cascade import cascade
 from jaxdn.filters.clamping import clamp_to_fast
@@ -56,8 +56,11 @@ _DARK = 1e-6
 
 
 @dataclass(frozen=True)
-class Options(svgf.Options):
-    """The options of ``svgf``, and those of specular light."""
+class Options(svgf.SharedOptions):
+    """The options that filters made of the parts of ``svgf`` share, and those of the vectors."""
+
+    dual_tested: bool = True
+    """What a dual vector leads to must show the same shape and normal; or it is taken as it is, as in the paper."""
 
     clamp_sigma: Annotated[float, Range(0, without_low=True), LEARNABLE] = 1.0
     """The history's share of shadows may be this many standard deviations from the mean of the frame's own over 5x5
@@ -72,6 +75,12 @@ class Options(svgf.Options):
     demodulate: Demodulation = "brdf"
     """What light is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`; diffuse and specular
     light each by its own part."""
+
+
+PAPER = Options(dual_tested=False, **svgf.AS_PUBLISHED)
+"""The settings of the paper as far as they are known: dual vectors are followed without a test (eq. 6). The paper
+filters as SVGF does, so the rest is SVGF's preset; what follows which vector and how the parts are put together is
+ours."""
 
 
 class TrmvState(NamedTuple):
@@ -103,6 +112,7 @@ class _Parts(NamedTuple):
 @method(
     Options,
     title="Motion vectors of shadows and reflections (Zeng, Liu et al. 2021)",
+    presets={"paper": PAPER},
     recipes={"usual": FITTING},
     filter=True,
 )
@@ -133,7 +143,8 @@ def trmv(given: Options) -> Denoiser:
         parts = _split(frame, options.demodulate, statistics)
         state = _fit_state(state, start(params, frame))
         along = frame.motion if frame.dual_motion is None else frame.dual_motion
-        past, invalid = _reproject_signal(options, state.rest, state.guides, frame, along, first)
+        untested = not options.dual_tested
+        past, invalid = _reproject_signal(options, state.rest, state.guides, frame, along, first, untested=untested)
         diffuse = frame._replace(radiance=parts.rest.transpose(1, 2, 0), reflectance=reflectances(frame)[0])
         # As in a wrapper by `demodulated`: the light is divided, and the reflectance is what it was divided by.
         differs = jnp.asarray(count_reflectance_differs(diffuse), statistics.reflectance_differs.dtype)
@@ -207,11 +218,13 @@ def _reproject_signal(
     first: jax.Array,
     *,
     any_surface: bool = False,
+    untested: bool = False,
 ) -> tuple[jax.Array, jax.Array]:
     """The history [C, H, W] fetched along a vector, 0 where missing; how many of its pixels were invalid.
 
     Where the vector is that of the surface, taps must show the same surface, as in ``svgf``. Elsewhere they show
     another place of it, whose depth tells nothing, or with ``any_surface`` one beside it: normals must agree there.
+    With ``untested`` whatever they show there counts, and normals are tested nowhere.
     """
     expected = expect_surface(frame, before, depth_tolerance=options.depth_tolerance)
     if vector is not None:
@@ -219,8 +232,10 @@ def _reproject_signal(
         elsewhere = jnp.any(jnp.isfinite(vector) & (vector != still), axis=-1)
         if expected.tolerance is not None:
             expected = expected._replace(tolerance=jnp.where(elsewhere, jnp.inf, expected.tolerance))
-        if any_surface and expected.ids is not None:
+        if (any_surface or untested) and expected.ids is not None:
             expected = expected._replace(ids=jnp.where(elsewhere, jnp.nan, expected.ids))
+        if untested:
+            expected = expected._replace(normal=None)
     before = keep_shared(before, guides_of(frame))
     found = reproject_along(
         history, before, vector, expected, first, normal_threshold=options.normal_threshold, search_neighbours=True
@@ -230,7 +245,8 @@ def _reproject_signal(
 
 def _mean(options: Options, past: jax.Array, now: jax.Array, length: jax.Array) -> jax.Array:
     """The running mean of colour [3, H, W] with the weights that ``accumulate`` has at a past of ``length``."""
-    share = jnp.maximum(options.alpha, 1.0 / jnp.minimum(length + 1.0, options.history_max))
+    least = least_share(length, jnp.minimum(length + 1.0, options.history_max), ramp=options.ramp)
+    share = jnp.maximum(options.alpha, least)
     return past + share[None] * (now - past)
 
 
@@ -261,7 +277,8 @@ def _filter_shadows(
 
     def estimated(light: jax.Array) -> tuple[jax.Array, jax.Array]:
         planes = today.at[:3].set(light)
-        return estimate_variance(planes, hit, weights(0), short_history=options.short_history, texture=texture)
+        short: dict[str, Any] = {"short_history": options.short_history, "spatial": options.spatial}
+        return estimate_variance(planes, hit, weights(0), texture=texture, **short)
 
     color, variance = estimated(today[:3])
     # The ratio needs the same neighbours for all.
@@ -305,8 +322,8 @@ def _filter_specular(
     luminance do.
     """
     first = _lobe_weights(options, frame, height, 0)
-    short = options.short_history
-    color, variance = estimate_variance(history, hit, first, short_history=short, texture=texture, isolated=False)
+    short: dict[str, Any] = {"short_history": options.short_history, "spatial": options.spatial}
+    color, variance = estimate_variance(history, hit, first, texture=texture, isolated=False, **short)
     deviation = jnp.sqrt(jnp.maximum(variance, 1e-10))
     hues = [luminance_weight(color[one] - color[1], deviation, sigma=options.sigma_specular) for one in (0, 2)]
     return _apply_cascade(

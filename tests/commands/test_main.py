@@ -202,7 +202,7 @@ def test_train_denoise_and_compare_with_new_weights(tmp_path):
     write_clip(make_clip(0, frames=10, size=20), tmp_path / "clips" / "square")
     few = ("--steps", "2", "--batch", "1", "--crop", "16")
     options = ("--variant", "ntd-small", "--set", "size=[[4], [4], [4], [4], [4]]", "motion=traditional")
-    recipe = ("--recipe", "paper-without-occlusion")
+    recipe = ("--recipe", "paper-loss-without-occlusion")
     train = ("train", tmp_path / "clips", "-o", tmp_path / "mine", *options, *recipe, *few)
     done = jaxdn(*train)
     assert done.returncode == 0, done.stderr
@@ -275,7 +275,7 @@ def test_compare_ends_with_a_report(clip, tmp_path):
         (("train", "CLIP", "-o", "out", "--variant", "ntd-huge"), "expected a variant out of ntd-large, ntd-small"),
         (
             ("train", "CLIP", "-o", "out", "--recipe", "wild"),
-            "paper-without-occlusion, parity, got 'wild'",
+            "paper-loss-without-occlusion, paper, got 'wild'",
         ),
         (("train", "CLIP", "-o", "out", "--set", "motoin=dual"), "expected options out of size, motion,"),
         (("train", "CLIP", "-o", "out", "--set", "motion=wild"), "motion: expected one of 'dual', 'traditional'"),

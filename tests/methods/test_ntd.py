@@ -21,7 +21,7 @@ from jaxdn.methods.ntd import guided_features, ntd
 TINY = ((4,), (4,), (5,), (5,), (6,))
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
-    "parity": {"preset": "parity"},
+    "paper": {"preset": "paper"},
     "fine": {"alpha_at": "fine", "up": "nearest", "first_frame": "noisy"},
     "max": {"down": "max", "depth_scale": "unit", "missing_history": "blend"},
     "plain": {"kernels": "plain", "background": "filter", "exposure": "given"},
@@ -109,8 +109,8 @@ def sigmoid(logit: float) -> float:
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"alpha_at": "fine", "up": "nearest", "down": "max"}, {"preset": "parity"}],
-    ids=["default", "fine", "parity"],
+    [{}, {"alpha_at": "fine", "up": "nearest", "down": "max"}, {"preset": "paper"}],
+    ids=["default", "fine", "paper"],
 )
 def test_data_flow_with_known_heads(options: dict[str, Any], rng: np.random.Generator) -> None:
     """Zero weights and chosen biases: the heads are constants, and the image can be computed by hand."""
@@ -241,9 +241,9 @@ def test_constant_radiance_stays(name: str, rng: np.random.Generator, key: jax.A
     denoiser = tiny(**VARIANTS[name])
     frames = random_frames(rng, (19, 21))
     frames = frames._replace(radiance=jnp.full_like(frames.radiance, 0.7))
-    if name == "parity":  # the paper's zeros beyond the border are not constant
+    if name == "paper":  # the paper's zeros beyond the border are not constant
         frames = frames._replace(motion=None, dual_motion=None)
-    usual = "none" if name == "parity" else "brdf"
+    usual = "none" if name == "paper" else "brdf"
     if VARIANTS[name].get("demodulate", usual) != "none":  # divided radiance is what is constant here
         frames = frames._replace(radiance=0.7 * brdf.divisor(frames.albedo))
     images = run(denoiser)(initial(denoiser, key, frames), frames)
@@ -261,7 +261,7 @@ def test_any_size(size: tuple[int, int], rng: np.random.Generator, key: jax.Arra
     assert np.std(images) > 0
 
 
-@pytest.mark.parametrize("preset", [None, "parity"])
+@pytest.mark.parametrize("preset", [None, "paper"])
 def test_none_is_the_neutral_value_written_out(preset: str | None, rng: np.random.Generator, key: jax.Array) -> None:
     denoiser = tiny(preset=preset)
     frames = random_frames(rng)
@@ -308,7 +308,7 @@ def test_dual_motion_falls_back_and_traditional_ignores_it(rng: np.random.Genera
     assert np.abs(with_dual - fallen_back).max() > 1e-3
 
 
-@pytest.mark.parametrize("preset", [None, "parity"])
+@pytest.mark.parametrize("preset", [None, "paper"])
 def test_first_frame_uses_no_history_and_no_motion(
     preset: str | None, rng: np.random.Generator, key: jax.Array
 ) -> None:
@@ -353,7 +353,7 @@ def test_poison_stays_finite_and_is_counted(rng: np.random.Generator, key: jax.A
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["default", "parity"])
+@pytest.mark.parametrize("name", ["default", "paper"])
 def test_gradient_through_time(name: str, rng: np.random.Generator, key: jax.Array, x64: None) -> None:
     """Scan and unrolled loop agree, and with central differences along random directions."""
     denoiser = tiny(**VARIANTS[name])

@@ -17,7 +17,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.core.options import Range, describe, make, parse
 from jaxdn.denoiser import Core, Denoiser, recurrent
 from jaxdn.methods import registry
-from jaxdn.methods.ntd import PARITY, Options
+from jaxdn.methods.ntd import PAPER, Options
 from jaxdn.methods.registry import method, method_named, methods
 from jaxdn.networks.backends import BACKENDS, Backend
 from jaxdn.ops.onednn import library
@@ -129,7 +129,7 @@ def built(monkeypatch, factory_of_ntd):
     seen = []
     monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
 
-    @method(Options, title="A spy", presets={"parity": PARITY})
+    @method(Options, title="A spy", presets={"paper": PAPER})
     def spy(options):
         seen.append(options)
         return recurrent(Core(lambda p, f: 0, lambda p, s, f, first, statistics: (s, f.radiance, 0), frozenset()))
@@ -143,9 +143,9 @@ def built(monkeypatch, factory_of_ntd):
     [
         ({}, Options()),
         ({"preset": None}, Options()),
-        ({"preset": "parity"}, PARITY),
-        ({"preset": "parity", "down": "mean"}, dataclasses.replace(PARITY, down="mean")),
-        ({"preset": "parity", "demodulate": "albedo"}, dataclasses.replace(PARITY, demodulate="albedo")),
+        ({"preset": "paper"}, PAPER),
+        ({"preset": "paper", "down": "mean"}, dataclasses.replace(PAPER, down="mean")),
+        ({"preset": "paper", "demodulate": "albedo"}, dataclasses.replace(PAPER, demodulate="albedo")),
         ({"size": [[4], [4]], "down": "max"}, Options(size=((4,), (4,)), down="max")),
     ],
 )
@@ -153,29 +153,29 @@ def test_presets_are_what_the_given_options_override(given, expected, monkeypatc
     assert built(monkeypatch, lambda factory: factory(**given)) == expected
 
 
-def test_ntds_own_preset_is_parity(rng):
-    """Not the spy's: with the options of PARITY written out it computes the same, and with others it does not."""
+def test_ntds_own_preset_is_that_of_the_paper(rng):
+    """Not the spy's: with the options of PAPER written out it computes the same, and with others it does not."""
     frame = Frame(jnp.asarray(rng.exponential(size=(16, 16, 3)), jnp.float32), depth=jnp.full((16, 16, 1), 4.0))
     names = ("down", "depth_scale", "border", "first_frame", "missing_history")
     names += ("kernels", "background", "exposure", "initialization", "demodulate")
-    written = {name: getattr(PARITY, name) for name in names}
-    assert dataclasses.replace(Options(), **written) == PARITY
+    written = {name: getattr(PAPER, name) for name in names}
+    assert dataclasses.replace(Options(), **written) == PAPER
     ntd = jaxdn.denoisers.ntd
     images = []
-    for options in ({"preset": "parity"}, written, {**written, "down": "mean"}, {"preset": "parity", "down": "mean"}):
+    for options in ({"preset": "paper"}, written, {**written, "down": "mean"}, {"preset": "paper", "down": "mean"}):
         denoiser = ntd(size=TINY, **options)
         params = denoiser.init(jax.random.key(0), frame)
         images.append(np.asarray(jax.jit(denoiser.step)(params, denoiser.start(params, frame), frame)[1]))
     np.testing.assert_array_equal(images[0], images[1])
     np.testing.assert_array_equal(images[2], images[3])
     assert np.abs(images[0] - images[2]).max() > 1e-4
-    with pytest.raises(ValueError, match="ntd preset: expected one of parity, got 'paper'"):
-        ntd(preset="paper")
+    with pytest.raises(ValueError, match="ntd preset: expected one of paper, got 'parity'"):
+        ntd(preset="parity")
 
 
 def test_a_method_without_presets_has_no_such_option(toy):
     with pytest.raises(ValueError, match=r"toy: expected options out of .*'preset'"):
-        toy(preset="parity")
+        toy(preset="paper")
 
 
 @pytest.mark.parametrize("row", methods().values(), ids=lambda row: row.name)

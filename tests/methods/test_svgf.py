@@ -18,7 +18,7 @@ from tests.gradients import check_gradients
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 HEIGHT, WIDTH = 10, 12
-DENOISER = svgf(preset="paper", levels=3)
+DENOISER = svgf(sigma_normal=128.0, levels=3)
 STEP = jax.jit(DENOISER.step)
 LEARNING = svgf(levels=3)
 
@@ -135,7 +135,8 @@ def reference_history(past, frame, p, expected_tolerance):
     return np.mean(found, axis=0) if found else None
 
 
-def reference_step(past, frame, levels=3):
+def reference_step(past, frame, levels=3, *, published=False):
+    """One frame; ``published``: a constant weight, the variance alone from neighbours, light divided by the albedo."""
     frame = Frame(*(None if b is None else np.asarray(b, np.float64) for b in frame))
     ids, depth = frame.ids[..., 0], frame.depth[..., 0]
     hit = (ids >= 0) & (depth < FAR)
@@ -148,6 +149,10 @@ def reference_step(past, frame, levels=3):
     light = incident @ LUMINANCE
     left = np.minimum(frame.albedo / divisor, 1.0)
     left = (left + 0.3) / (left.max(-1, keepdims=True) + 0.3)
+    if published:
+        divisor, left = np.where(frame.albedo > 0.01, frame.albedo, 1.0), np.ones_like(left)
+        incident = frame.radiance / divisor
+        light = incident @ LUMINANCE
     history = np.zeros((HEIGHT, WIDTH, 9))
     for p in np.ndindex(HEIGHT, WIDTH):
         fetched = None if past is None else reference_history(past, frame, p, (expected, tolerance))
@@ -156,7 +161,7 @@ def reference_step(past, frame, levels=3):
             history[p] = [*now, 1.0, *left[p]]
         else:
             length = min(fetched[5] + 1, 32)
-            share = max(0.2, 1 / length)
+            share = 0.2 if published else max(0.2, 1 / length)
             mean, texture = (1 - share) * fetched[:5] + share * now, (1 - share) * fetched[6:] + share * left[p]
             history[p] = [*mean, length, *texture]
     # The history's light had the mean texture; that of this frame is filtered.
@@ -171,6 +176,9 @@ def reference_step(past, frame, levels=3):
     for p in np.ndindex(HEIGHT, WIDTH):
         if history[p][5] < 4 and hit[p]:
             mean, _ = reference_average(np.concatenate([history[..., :5], left], axis=-1), seven, p, geometry)
+            if published:
+                variance[p] = max(0, mean[4] - mean[3] ** 2)
+                continue
             color[p][:3] = mean[:3] * (left[p] + 0.01) / (mean[5:] + 0.01)
             grey = (left[p] @ LUMINANCE + 0.01) / (mean[5:] @ LUMINANCE + 0.01)
             variance[p] = max(0, mean[4] - mean[3] ** 2) * 4 / history[p][5] * grey**2
@@ -242,7 +250,7 @@ def test_colours_of_a_texture_do_not_run(rng, levels):
     squares = np.float32([[0.26, 0.002, 0.36], [0.8, 0.8, 0.8], [0.5, 0.01, 0.02], [0.4, 0.6, 0.5]])
     albedo = squares[np.indices((HEIGHT, WIDTH)).sum(0) % 4]
     frame = Frame(radiance=0.4 * albedo, albedo=albedo, reflectance=albedo + np.float32(1e-4))
-    denoiser = svgf(preset="paper", levels=levels, feedback_level=min(levels, 1))
+    denoiser = svgf(sigma_normal=128.0, levels=levels, feedback_level=min(levels, 1))
     state, step = denoiser.start({}, frame), jax.jit(denoiser.step)
     for _ in range(3):
         state, image = step({}, state, frame)

@@ -51,7 +51,7 @@ def reference_fetch(image, motion):
     return out, inside
 
 
-def reference_resolve(image, history, frame, *, alpha=0.1, box="variance", gamma=1.0, first=False):
+def reference_resolve(image, history, frame, *, alpha=0.1, box="variance", gamma=1.0, ramp=True, first=False):
     motion, depth = np.asarray(frame.motion, np.float64), np.asarray(frame.depth, np.float64)
     nearest = np.zeros_like(motion)
     for y, x in np.ndindex(HEIGHT, WIDTH):
@@ -67,12 +67,16 @@ def reference_resolve(image, history, frame, *, alpha=0.1, box="variance", gamma
         center, size = colors.mean(0), gamma * colors.std(0)
         if box == "minmax":
             center, size = (colors.max(0) + colors.min(0)) / 2, (colors.max(0) - colors.min(0)) / 2
+        if box == "rounded":
+            plus = colors[[1, 3, 4, 5, 7]]
+            high, low = (colors.max(0) + plus.max(0)) / 2, (colors.min(0) + plus.min(0)) / 2
+            center, size = (high + low) / 2, (high - low) / 2
         offset = TO_YCOCG @ past[y, x, :3] - center
         smallest = 1e-3 * abs(center[0]) + 1e-6
         clipped = center + offset / max(1, np.max(np.abs(offset) / np.maximum(size, smallest)))
         clipped = np.maximum(np.linalg.inv(TO_YCOCG) @ clipped, 0)
         length = min(past[y, x, 3], 1 / alpha) + 1
-        share = max(alpha, 1 / length)
+        share = max(alpha, 1 / length) if ramp else alpha if past[y, x, 3] > 0 else 1.0
         out[y, x] = [*(share * image[y, x] + (1 - share) * clipped), length]
     return out
 
@@ -166,7 +170,9 @@ def test_a_pixel_takes_the_motion_of_the_nearest_thing_beside_it():
     np.testing.assert_array_equal(found[:2], motion[:2])
 
 
-@pytest.mark.parametrize("options", [{}, {"box": "minmax", "alpha": 0.3}, {"gamma": 2.0}])
+@pytest.mark.parametrize(
+    "options", [{}, {"box": "minmax", "alpha": 0.3}, {"gamma": 2.0}, {"box": "rounded", "ramp": False}]
+)
 @pytest.mark.parametrize("first", [False, True])
 def test_a_step_matches_a_loop(options, first, rng):
     image, history, frame = moving(rng, np.float32)

@@ -5,7 +5,7 @@ Each kind of light has a slow and a fast running mean; the fast one tells where 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,14 @@ from jaxdn.core.options import Range
 from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters.accumulation import luminance
 from jaxdn.filters.clamping import clamp_to_fast, detect_lag
-from jaxdn.filters.edge_stopping import Weight, depth_weight, lobe_weight, normal_weight, roughness_weight
+from jaxdn.filters.edge_stopping import (
+    Weight,
+    depth_weight,
+    lobe_weight,
+    normal_weight,
+    plane_weight,
+    roughness_weight,
+)
 from jaxdn.filters.history_fix import fix_history
 from jaxdn.filters.surface_test import Guides, guides_of, surface_mask
 from jaxdn.filters.virtual_motion import diffuseness
@@ -51,6 +58,9 @@ class Options:
     darkens it: noise of few samples is mostly such peaks."""
     sigma_depth: Annotated[float, _POSITIVE, LEARNABLE] = 1.0
     """Edge-stopping parameter for differences in depth."""
+    plane_tolerance: Annotated[float, Range(0)] = 0.0
+    """Instead of that weight, taps count that are within this share of the depth of the plane of the pixel's surface;
+    0: no such test."""
     sigma_normal: Annotated[float, Range(0), LEARNABLE] = 16.0
     """Exponent of the cosine of normals, for diffuse light."""
     lobe_fraction: Annotated[float, _POSITIVE, LEARNABLE] = 2.0
@@ -64,6 +74,17 @@ class Options:
     demodulate: Demodulation = "brdf"
     """What light is divided by before it is filtered, see :func:`jaxdn.denoisers.demodulated`; diffuse and specular
     light each by its own part."""
+
+
+AS_PUBLISHED: dict[str, Any] = {
+    "history_max": 30,
+    "fast_max": 6,
+    "fix_widest": 14,
+    "clamp_sigma": 2.0,
+    "roughness_fraction": 0.15,
+}
+"""Constants of NRD 4.14 (2025) that ReLAX and ReBLUR share, from its public settings: lengths of both histories, the
+width of the taps that fill, the clamp, and the tolerance of roughness."""
 
 
 class LobeState(NamedTuple):
@@ -165,7 +186,9 @@ def _roughness(frame: Frame) -> jax.Array:
 def _weights(options: Options, frame: Frame, height: jax.Array) -> tuple[list[Weight], list[Weight]]:
     """Edge-stopping weights of diffuse and of specular light."""
     diffuse: list[Weight] = []
-    if frame.depth is not None:
+    if frame.depth is not None and options.plane_tolerance:
+        diffuse.append(plane_weight(frame.depth, frame.ids, tolerance=options.plane_tolerance))
+    elif frame.depth is not None:
         diffuse.append(depth_weight(frame.depth, frame.ids, sigma=options.sigma_depth, height=height))
     specular = list(diffuse)
     if frame.normal is not None:

@@ -61,6 +61,21 @@ class Options(histories.Options):
     """Maximum length of the mean of luminance in frames; 1: it is not steadied."""
 
 
+PAPER = Options(
+    fix_frames=3,
+    lobe_fraction=0.15,
+    plane_tolerance=0.02,
+    pre_radius=30.0,
+    radius=30.0,
+    radius_min=1.0,
+    stable_max=63,
+    **histories.AS_PUBLISHED,
+)
+"""The constants of ReBLUR in NRD 4.14, which no paper describes: three frames are filled, discs of 30 pixels before the
+accumulation (of diffuse light; NRD has 50 for specular light) and after it, at least 1, a luminance of 63 frames, 0.15
+of the lobe's angle, and planes within 0.02 of the depth."""
+
+
 class ReblurState(NamedTuple):
     """What is carried from one frame to the next."""
 
@@ -73,6 +88,7 @@ class ReblurState(NamedTuple):
 @method(
     Options,
     title="Diffuse and specular light apart, a recurrent blur by rotated discs (after ReBLUR)",
+    presets={"paper": PAPER},
     recipes={"usual": FITTING},
     filter=True,
 )

@@ -59,9 +59,23 @@ class Options(histories.Options):
     """The same of specular light."""
 
 
+PAPER = Options(
+    fix_frames=4,
+    short_history=3,
+    sigma_specular=1.0,
+    lobe_fraction=0.5,
+    plane_tolerance=0.003,
+    **histories.AS_PUBLISHED,
+)
+"""The constants of ReLAX in NRD 4.14, which no paper describes: four frames are filled, neighbours give the variance of
+fewer than three, sigmas 2 of diffuse (the default) and 1 of specular light, half of the lobe's angle, and planes within
+0.003 of the depth."""
+
+
 @method(
     Options,
     title="Diffuse and specular light apart, a slow history clamped to a fast one (after ReLAX)",
+    presets={"paper": PAPER},
     recipes={"usual": FITTING},
     variants={"relax-fitted": {}},
     filter=True,
