@@ -2,6 +2,10 @@
 
 jax keeps programs in a folder by all that goes into them, its own version included, but not by the CPU that their code
 is for: on a home folder that several machines share, each kind of CPU has a folder of its own.
+
+jax writes a program under its name, and never again where there is a file: what a killed process or a full disk leaves
+would be half a program for good, which every later process cannot read. So programs get their names when they are
+complete, here too (:mod:`jaxdn.runtime.atomic_files`).
 """
 
 import hashlib
@@ -10,6 +14,9 @@ import platform
 import sys
 from importlib import metadata
 from pathlib import Path
+from typing import Any
+
+from jaxdn.runtime.atomic_files import atomic_write, remove_abandoned
 
 VARIABLE = "JAXDN_CACHE_DIR"
 """Environment variable: the folder of what is kept between runs; empty: nothing is kept."""
@@ -33,11 +40,40 @@ def keep_programs() -> Path | None:
     import jax
 
     writable = os.access(folder, os.W_OK)
+    if writable:
+        _write_completely()
+        remove_abandoned(folder)
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # Reading takes milliseconds, also of small programs; without a limit each run writes what is missing.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0 if writable else _NEVER_S)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     return folder
+
+
+def _write_completely() -> None:
+    """Let jax's store of programs write each file completely or not at all; a jax with another store keeps its own way.
+
+    A store of limited size (``JAX_COMPILATION_CACHE_MAX_SIZE``) has locks, and stays as it is.
+    """
+    try:
+        from jax._src import lru_cache
+    except ImportError:
+        return
+    kind: Any = lru_cache.LRUCache
+    in_place = kind.put
+    if in_place.__module__ == __name__:  # done before
+        return
+
+    def put(store: Any, key: str, value: bytes) -> None:
+        if not key or getattr(store, "eviction_enabled", True):
+            in_place(store, key, value)
+            return
+        path = Path(str(store.path)) / f"{key}-cache"
+        if not path.exists():
+            with atomic_write(path) as temporary:
+                temporary.write_bytes(value)
+
+    kind.put = put
 
 
 def cache_folder() -> Path:

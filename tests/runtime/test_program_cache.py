@@ -1,11 +1,18 @@
 """Where compiled programs are kept."""
 
+import errno
 import os
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 from jaxdn.runtime import program_cache
+from jaxdn.runtime.atomic_files import _host
 from jaxdn.runtime.program_cache import VARIABLE, cache_folder, keep_programs
 
 _SETTINGS = (
@@ -61,6 +68,47 @@ def test_a_folder_that_cannot_be_written_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert keep_programs() == folder
     assert jax.config.jax_persistent_cache_min_compile_time_secs > 1e6
+
+
+def compile_new(seed):
+    """Compile a program that no other test has."""
+    return jax.jit(lambda x: x * seed + 1)(jnp.ones(3))
+
+
+@pytest.fixture
+def kept(tmp_path, monkeypatch):
+    """An own folder that jax has opened."""
+    monkeypatch.setenv(VARIABLE, str(tmp_path))
+    compilation_cache.reset_cache()
+    yield keep_programs()
+    compilation_cache.reset_cache()
+
+
+def test_half_a_program_is_never_kept(kept, monkeypatch):
+    """Of a disk that is full while it is written; the next process writes it."""
+    write = Path.write_bytes
+
+    def fill(path, content):
+        write(path, content[: len(content) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr(Path, "write_bytes", fill)
+        with pytest.warns(UserWarning, match="No space left on device"):
+            compile_new(0.1)
+    assert list(kept.iterdir()) == []
+    jax.clear_caches()
+    compile_new(0.1)
+    names = [path.name for path in kept.iterdir()]
+    assert any(name.startswith("jit__lambda") and name.endswith("-cache") for name in names), names
+
+
+def test_what_killed_processes_left_is_removed(kept):
+    killed = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
+    left = kept / f".jit_step-0a-cache.{_host()}.{int(killed.stdout)}.1.tmp"
+    left.touch()
+    keep_programs()
+    assert not left.exists()
 
 
 @pytest.mark.parametrize(
