@@ -62,6 +62,7 @@ class FrameDenoiser:
         self._method, self._source, self._count_channels = method, source, channels
         self._limit, self._log = limit, log
         self._step: Stream | TiledStream | None = None
+        self._room: bool | None = None
         self._lost_pixels = 0
         self._exponent: int | None = None  # of the unit in which this step's history is
         self._programs: set[tuple[str, ...]] = set()  # of the steps before this one
@@ -98,6 +99,16 @@ class FrameDenoiser:
     def is_tiled(self, frame: Frame) -> bool:
         """Whether frames like this one are denoised in tiles. Raises as the call does."""
         return self.denoises and isinstance(self._prepare(frame), TiledStream)
+
+    def leaves_room(self, frame: Frame) -> bool:
+        """Whether memory is enough for three frames like this one: one is read, one denoised and one written.
+
+        It is asked once; later frames of the sequence get the same answer.
+        """
+        if self._room is None:
+            size = *frame.radiance.shape[:2], self._count_channels()
+            self._room = estimate_bytes(*size) + _beside_step(*size) - PROGRAM <= self._limit_bytes()
+        return self._room
 
     @property
     def denoises(self) -> bool:
@@ -156,10 +167,13 @@ class FrameDenoiser:
             self._step = self._choose_step(*frame.radiance.shape[:2])
         return self._step
 
+    def _limit_bytes(self) -> float:
+        return measure_machine_memory() / 2 if self._limit is None else self._limit
+
     def _choose_step(self, height: int, width: int) -> Stream | TiledStream:
         denoiser, params = self._method.denoiser, self._method.params
         assert denoiser is not None
-        limit = measure_machine_memory() / 2 if self._limit is None else self._limit
+        limit = self._limit_bytes()
         size = height, width, self._count_channels()
         side = choose_tile_side(limit, *size)
         if side is None:

@@ -1,7 +1,7 @@
 """``jaxdn denoise``: noisy clips in, denoised EXR frames out, one frame at a time."""
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 
 from jaxdn.data.errors import DamagedFile
 from jaxdn.runtime.atomic_files import atomic_write
+from jaxdn.runtime.overlap import Behind
 from jaxdn.sequence.frame_denoiser import FrameDenoiser
 from jaxdn.sequence.jobs import Job, find_jobs
 from jaxdn.sequence.missing_frames import explain_left_out, leave_out_unusable, segments_around
 from jaxdn.sequence.segment import denoise_segment
 from jaxdn.sequence.settings import Settings
-from jaxdn.sequence.write_frames import SharedResult
+from jaxdn.sequence.write_frames import SharedResult, Write
 from jaxdn.zoo.ready import Model, find_model
 
 
@@ -64,11 +65,12 @@ def denoise_files(
     A frame of another renderer is its own file with the denoised beauty in place of the noisy one
     (:func:`jaxdn.data.foreign.result.write_result`). A frame of one of our clips has the channels ``R, G, B``, the
     denoised radiance with the directly reflected and the emitted light added back, and ``denoised.R/G/B``, the denoised
-    part alone. What is no noise is kept as it was (``settings.safe``). Frames are read, denoised and written one at a
-    time, so that a sequence of any length takes the memory of one. Files are never left incomplete. Where frames are
-    missing, the history begins anew. Files of other renderers that are damaged, of another size or with other buffers
-    than most of their shot count as missing, unless ``settings.strict``. Raises ValueError for input that cannot be
-    read or is inconsistent, before the frame concerned is written.
+    part alone. What is no noise is kept as it was (``settings.safe``). While a frame is denoised, the next one is read
+    and the one before is written, so that a sequence of any length takes the memory of three frames, or of one where
+    that is all there is. Files are never left incomplete. Where frames are missing, the history begins anew. Files of
+    other renderers that are damaged, of another size or with other buffers than most of their shot count as missing,
+    unless ``settings.strict``. Raises ValueError for input that cannot be read or is inconsistent, before the frame
+    concerned is written.
 
     Args:
       sources: folders of clips, and folders of, patterns for, or names of EXR files.
@@ -156,44 +158,69 @@ class _Run:
         """Denoise consecutive frames of a shot, from a new history."""
         views = list(job.views) or [""]
         limit = self._settings.max_memory
-        make = partial(
-            FrameDenoiser,
-            self._method,
-            job.source,
-            channels=job.count_channels,
-            limit=None if limit is None else limit / len(views),
-        )
-        logs = {view: log if view == "" else _with_view(view, log) for view in views}
-        denoisers = {view: [make(log=logs[view]) for _ in range(1 + self._settings.bidirectional)] for view in views}
-        try:
-            with ExitStack() as stack:
-                result = SharedResult(views) if len(views) > 1 else None
-                running = [
-                    stack.enter_context(
-                        closing(
-                            denoise_segment(
-                                job.of_view(view) if job.views else job,
-                                segment,
-                                denoisers[view],
-                                self._settings,
-                                logs[view],
-                                result,
-                            )
+        with Behind[list[Sequence[str]]]() as behind, ExitStack() as stack:
+
+            def log_in_order(line: str) -> None:
+                behind.finish()  # what a frame before has to tell comes first
+                log(line)
+
+            make = partial(
+                FrameDenoiser,
+                self._method,
+                job.source,
+                channels=job.count_channels,
+                limit=None if limit is None else limit / len(views),
+            )
+            logs = {view: log_in_order if view == "" else _with_view(view, log_in_order) for view in views}
+            both = range(1 + self._settings.bidirectional)
+            denoisers = {view: [make(log=logs[view]) for _ in both] for view in views}
+            stack.callback(self._count, denoisers)
+            result = SharedResult(views) if len(views) > 1 else None
+            running = [
+                stack.enter_context(
+                    closing(
+                        denoise_segment(
+                            job.of_view(view) if job.views else job,
+                            segment,
+                            denoisers[view],
+                            self._settings,
+                            logs[view],
+                            result,
                         )
                     )
-                    for view in views
-                ]
-                # Frame by frame, so that a file has all of its views when it is written.
-                for path, *_ in zip(*running, strict=True):
-                    for written in (path, *job.copies.get(path, ())):
-                        if written != path:
-                            _copy(path, written)
-                        self.files.append(written)
-                        self._on_frame(written, len(self.files), self._total)
-        finally:
-            for view in views:
-                self.programs |= {program for denoiser in denoisers[view] for program in denoiser.programs}
-                self.sanitized += denoisers[view][0].sanitized  # the other direction repairs the same frames
+                )
+                for view in views
+            ]
+            # Frame by frame, so that a file has all of its views when it is written.
+            while pending := [one for view in running if (one := next(view, None)) is not None]:
+                path, beside = pending[0].target, pending[0].beside
+                done = partial(self._tell, path, job.copies.get(path, ()), list(logs.values()))
+                behind.start(partial(_write, [one.write for one in pending]), done, beside=beside)
+                del pending, done  # and what is to be written
+
+    def _tell(
+        self, path: Path, copies: Sequence[Path], logs: Sequence[Callable[[str], None]], notes: list[Sequence[str]]
+    ) -> None:
+        """A file is written, with these notes about each view: copy it for frames that are held, and tell."""
+        for log, lines in zip(logs, notes, strict=True):
+            for line in lines:
+                log(line)
+        for written in (path, *copies):
+            if written != path:
+                _copy(path, written)
+            self.files.append(written)
+            self._on_frame(written, len(self.files), self._total)
+
+    def _count(self, denoisers: Mapping[str, Sequence[FrameDenoiser]]) -> None:
+        """Add what the denoisers of each view have counted."""
+        for each in denoisers.values():
+            self.programs |= {program for denoiser in each for program in denoiser.programs}
+            self.sanitized += each[0].sanitized  # the other direction repairs the same frames
+
+
+def _write(views: list[Write]) -> list[Sequence[str]]:
+    """Write a file; the lines about each of its views. The list is empty then, so that nothing is held any longer."""
+    return [views.pop(0)() for _ in range(len(views))]
 
 
 def _with_view(view: str, log: Callable[[str], None]) -> Callable[[str], None]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -12,12 +13,22 @@ from jaxdn.data.clip.frames import StoredFrame
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.read import check_single_layer, open_frames
+from jaxdn.runtime.overlap import read_ahead
 from jaxdn.sequence.backward_pass import BackwardImages, backward_pass
 from jaxdn.sequence.frame_denoiser import Fallback, FrameDenoiser
 from jaxdn.sequence.jobs import Job
 from jaxdn.sequence.panorama import Panorama, find_panorama
 from jaxdn.sequence.settings import Settings
-from jaxdn.sequence.write_frames import ClipWriter, ForeignWriter, SharedResult
+from jaxdn.sequence.write_frames import ClipWriter, ForeignWriter, SharedResult, Write
+
+
+class PendingFile(NamedTuple):
+    """A denoised frame that is to be written."""
+
+    target: Path
+    write: Write
+    beside: bool
+    """Whether memory is enough to write it while the next frame is denoised."""
 
 
 def denoise_segment(
@@ -27,8 +38,8 @@ def denoise_segment(
     settings: Settings,
     log: Callable[[str], None],
     result: SharedResult | None = None,
-) -> Generator[Path, None, None]:
-    """Denoise consecutive frames of a shot; yields the files as they are written.
+) -> Generator[PendingFile, None, None]:
+    """Denoise consecutive frames of a shot; yields the files to write. The next frame is read meanwhile.
 
     With a ``result`` the job is one view of its files: they are written when the last view of a frame has come.
 
@@ -53,21 +64,29 @@ def denoise_segment(
         )
         source = _ForeignFrames(sequence, segment, panorama)
         writer = ForeignWriter(sequence.window, settings, log, result, panorama)
+
+    def roomy(stored: StoredFrame) -> bool:
+        return denoisers[0].leaves_room(stored.frame)
+
     with ExitStack() as stack:
         backward: BackwardImages | None = None
         if settings.bidirectional:
             log(f"backwards first, through {segment.stop - wanted[0]} frames; nothing is written meanwhile")
-            reversed_frames = zip(reversed(segment), source.read(log, backwards=True), strict=True)
-            needed = islice(reversed_frames, segment.stop - wanted[0])
+            reversed_frames = stack.enter_context(
+                read_ahead(partial(source.read, count=segment.stop - wanted[0], backwards=True), log, beside=roomy)
+            )
             folder = job.targets[wanted[0]].parent
-            backward = stack.enter_context(backward_pass(needed, denoisers[1], wanted, folder))
+            numbered = zip(reversed(segment), reversed_frames, strict=False)
+            backward = stack.enter_context(backward_pass(numbered, denoisers[1], wanted, folder))
         steps = _ForwardSteps(job, denoisers[0], backward, safe=settings.safe)
         report = _FallbackReport(job, log)
-        frames = source.read(log)
-        for index in range(segment.start, wanted[-1] + 1):
-            path = _denoise_frame(index, next(frames), source.file(index), steps, writer, report)
-            if path is not None:
-                yield path
+        needed = range(segment.start, wanted[-1] + 1)
+        frames = stack.enter_context(read_ahead(partial(source.read, count=len(needed)), log, beside=roomy))
+        for index in needed:
+            write = _denoise_frame(index, next(frames), source.file(index), steps, writer, report)
+            if write is not None:
+                yield write
+                del write  # and what it is to write
         report.finish()
         source.finish(log)
 
@@ -88,8 +107,8 @@ def _denoise_frame(
     steps: "_ForwardSteps",
     writer: "ClipWriter | ForeignWriter",
     report: "_FallbackReport",
-) -> Path | None:
-    """Denoise a frame, and write it if it is wanted. What this leaves in memory is gone when it returns."""
+) -> PendingFile | None:
+    """Denoise a frame; what is to be written, if it is wanted. All else is gone from memory when this returns."""
     target = steps.job.targets[index] if index in steps.job.wanted else None
     needs_pixels = target is not None or writer.has_history
     # First whether frames are tiled: it is asked with the number of channels, which a file knows as long as it is open.
@@ -98,10 +117,10 @@ def _denoise_frame(
     output = steps.denoise(index, stored)
     if output.fallback is not None:
         report.observe(index, output.fallback)
-    writer.write(target, file, stored.frame, output.image)
-    if file is not None:
-        file.drop()
-    return target
+    write = writer.prepare(target, file, stored.frame, output.image)
+    if target is None or write is None:
+        return None
+    return PendingFile(target, write, steps.denoiser.leaves_room(stored.frame))
 
 
 class _ForwardSteps:
@@ -165,9 +184,10 @@ class _ClipFrames:
     def __init__(self, clip: Path, segment: range, spp: int) -> None:
         self._clip, self._segment, self._spp = clip, segment, spp
 
-    def read(self, log: Callable[[str], None], *, backwards: bool = False) -> Iterator[StoredFrame]:
-        """The frames, or the same from the last to the first with time turned around."""
-        return open_frames(self._clip, spp=self._spp, part=self._segment, backwards=backwards, log=log)[1]
+    def read(self, log: Callable[[str], None], *, count: int, backwards: bool = False) -> Iterator[StoredFrame]:
+        """So many frames, or the same from the last backwards with time turned around."""
+        frames = open_frames(self._clip, spp=self._spp, part=self._segment, backwards=backwards, log=log)[1]
+        return islice(frames, count)
 
     def file(self, index: int) -> ExrFile | None:
         """None: a result is a new file."""
@@ -184,12 +204,12 @@ class _ForeignFrames:
         """``panorama``: its frames are widened."""
         self._sequence, self._start, self._panorama = sequence, segment.start, panorama
 
-    def read(self, log: Callable[[str], None], *, backwards: bool = False) -> Iterator[StoredFrame]:
-        """The frames, or the same from the last to the first with time turned around; forwards, files stay decoded."""
+    def read(self, log: Callable[[str], None], *, count: int, backwards: bool = False) -> Iterator[StoredFrame]:
+        """So many frames, or the same from the last backwards with time turned around; forwards, files stay decoded."""
         frames = self._sequence.frames(backwards=backwards, keep_pixels=not backwards, log=log)
         if self._panorama is not None:
             frames = map(self._panorama.widen_frame, frames)
-        return map(StoredFrame, frames)  # unlike a loop, this keeps no frame while the next one is read
+        return map(StoredFrame, islice(frames, count))  # unlike a loop, this keeps no frame while the next one is read
 
     def file(self, index: int) -> ExrFile | None:
         """The file of a frame."""

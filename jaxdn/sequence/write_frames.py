@@ -1,6 +1,7 @@
 """Denoised frames as files: new ones for our clips, copies of the source with another beauty for other renderers."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ from jaxdn.sequence.frame_denoiser import light_of
 from jaxdn.sequence.panorama import Panorama
 from jaxdn.sequence.settings import Settings
 
+Write = Callable[[], Sequence[str]]
+"""Writes a file, in any thread; returns lines for the user about what could not be kept."""
+
 
 class ClipWriter:
     """Writes frames of our clips."""
@@ -30,15 +34,17 @@ class ClipWriter:
     def __init__(self, settings: Settings) -> None:
         self._preview = settings.preview
 
-    def write(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> None:
-        """Write the denoised image [H, W, 3] of a frame; nothing without a target."""
-        if target is None:
-            return
+    def prepare(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> Write | None:
+        """What writes the denoised image [H, W, 3] of a frame; None without a target."""
+        return None if target is None else partial(self._write, target, frame, image)
+
+    def _write(self, target: Path, frame: Frame, image: np.ndarray) -> Sequence[str]:
         beauty = compose_beauty(frame, image)
         target.parent.mkdir(parents=True, exist_ok=True)
         write_exr(target, name_channels("", beauty) | name_channels("denoised.", image))
         if self._preview:
             write_preview(target, beauty)
+        return ()
 
 
 class ForeignWriter:
@@ -59,30 +65,38 @@ class ForeignWriter:
         self._alpha = AlphaDenoiser(safe=settings.safe) if settings.alpha else None
         self._result, self._panorama = result, panorama
 
-    def write(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> None:
-        """Denoise the additive layers of a frame, and write all; without a target they are for the history alone."""
+    def prepare(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> Write | None:
+        """Denoise the additive layers of a frame; what writes all, and then drops the source's pixels.
+
+        None: without a target they are for the history alone.
+        """
         assert source is not None
         layers = {} if self._aovs is None else self._aovs.denoise(self._place(source), frame, image)
         alpha = self._denoise_alpha(source, frame, image)
         if target is None:
-            return
+            source.drop()
+            return None
         beauty = compose_beauty(frame, image)
         if self._panorama is not None:
             beauty, alpha = self._panorama.cut(beauty), None if alpha is None else self._panorama.cut(alpha)
             layers = {name: self._panorama.cut(layer) for name, layer in layers.items()}
+        return partial(self._write, target, source, {"": beauty, **layers}, alpha)
+
+    def _write(
+        self, target: Path, source: ExrFile, images: Mapping[str, np.ndarray], alpha: np.ndarray | None
+    ) -> Sequence[str]:
         target.parent.mkdir(parents=True, exist_ok=True)
         settings = self._settings
-        own = replace_channels(source, {"": beauty, **layers}, self._window, settings.naming, alpha=alpha)
+        own = replace_channels(source, images, self._window, settings.naming, alpha=alpha)
         new: NewPixels | None = own
         preview = target
         if self._result is not None and isinstance(source, ViewFile):
             new, preview = self._result.join(source.view, own), target.with_name(f"{target.stem}.{source.view}.exr")
         if settings.preview:
-            write_preview(preview, beauty)
-        if new is None:
-            return
-        for note in write_result(source, target, new, only_beauty=settings.only_beauty):
-            self._log(note)
+            write_preview(preview, images[""])
+        notes = [] if new is None else write_result(source, target, new, only_beauty=settings.only_beauty)
+        source.drop()
+        return notes
 
     def _denoise_alpha(self, source: ExrFile, frame: Frame, image: np.ndarray) -> np.ndarray | None:
         """The denoised alpha [H, W] of a frame; None: nobody asked, or there is none."""
