@@ -44,7 +44,7 @@ HEAD = """# Results
 `make results` writes this page and the tables of the README from `docs/results/*.json`. Do not edit it.
 PSNR is in dB and higher is better. Lower is better for FLIP, L1 and relative MSE. *Disoccluded* pixels are those that
 the previous frame did not see. The revision is that of the commit that recorded the numbers. The best value of a
-column, or of a row of the first table, is bold.
+column, of each group of its rows, or of a row that compares methods, is bold.
 """
 
 Result = Mapping[str, Any]
@@ -125,9 +125,9 @@ def _choose(
         methods = {row[names.index("method")]: row for row in kept}
         kept = [methods[name] for name in rows]
     places = [names.index(name) for name in columns or names]
-    chosen = {key: value for key, value in result.items() if key not in ("group", "row_revisions")}
+    left_out = {"row_revisions"} | ({"group"} if result.get("group") not in (columns or names) else set())
     return {
-        **chosen,
+        **{key: value for key, value in result.items() if key not in left_out},
         "columns": [result["columns"][place] for place in places],
         "rows": [[row[place] for place in places] for row in kept],
     }

@@ -42,6 +42,25 @@ def test_commands_parse(page):
             tyro.cli(COMMANDS, args=shlex.split(line, comments=True)[1:])
 
 
+@pytest.mark.parametrize("page", PAGES, ids=pytest_id)
+def test_every_table_has_a_head(page):
+    """An empty line ends a table: rows below it would be shown as text."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+    tables = re.findall(r"(?:^\|.*\n)+", text, flags=re.M)
+    assert [table for table in tables if not re.match(r".*\n\|[ :|-]+\n", table)] == []
+
+
+def test_the_readmes_commands_read_what_earlier_ones_wrote():
+    """Typed one after the other; ``make train`` writes data/demo."""
+    made: set[str] = set()
+    for block in re.findall(r"```\w*\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.S):
+        for line in block.replace("\\\n", " ").splitlines():
+            made |= {"data/demo"} if line.startswith("make train") else set()
+            made |= (written := set(re.findall(r" -o (data/\S+)", line)))
+            read = set(re.findall(r"data/[\w/-]+", line)) - written
+            assert not {path for path in read if not path.startswith(tuple(made))}, line
+
+
 @pytest.mark.parametrize("name", sorted(methods()))
 def test_every_method_has_a_page_with_the_same_headings(name):
     page = (ROOT / "docs" / "concepts" / "methods" / f"{name}.md").read_text()

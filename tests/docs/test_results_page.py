@@ -80,6 +80,11 @@ def test_the_best_is_that_of_its_group(tmp_path):
     page = results_page.results_page(written(tmp_path, grouped))
     bold = [[cell.startswith("**") for cell in row] for row in rows_of(page)]
     assert bold[2:] == [[False, True, False], [False, False, True], [False, True, True]]
+    block = results_page.readme_block(written(tmp_path, {**grouped, "readme": {}}))
+    assert rows_of(block) == rows_of(page)
+    without = {"columns": ["PSNR"]}  # the column of the groups is not shown
+    block = results_page.readme_block(written(tmp_path, {**grouped, "readme": without}))
+    assert [row[0] for row in rows_of(block)[2:]] == ["**30.0**", "29.0", "20.0"]
 
 
 def test_the_best_of_a_row_is_bold(tmp_path):
