@@ -6,6 +6,8 @@ BIN := $(VENV)/bin
 SETTINGS ?=
 # Huge pages for large buffers (glibc; ignored elsewhere): a train step takes 0.87 of the time. The bench measures both.
 train weights: export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
+# A test run starts hundreds of processes: from its source the package takes each of them two seconds longer to import.
+unexport PYTHONDONTWRITEBYTECODE
 # XLA raises its errors; what it logs besides is an alarm at every compilation of more than two minutes.
 export TF_CPP_MIN_LOG_LEVEL ?= 3
 

@@ -7,6 +7,8 @@ XLA ends a process whose ``XLA_FLAGS`` have a flag that it does not know: hence 
 the emitters.
 """
 
+from typing import Any
+
 import jax
 
 _KNOWN = jax.__version_info__ < (0, 11)
@@ -26,3 +28,17 @@ def join_flags(*flags: str | None) -> str:
     the process if there is no such file.
     """
     return " ".join(words for some in flags if (words := (some or "").strip()))
+
+
+compiled: list[float] = []
+"""How long each program took that this process has compiled, or loaded, since the list was cleared; seconds."""
+
+
+def count_programs() -> None:
+    """From now on :data:`compiled` grows."""
+
+    def append(event: str, seconds: float, **more: Any) -> None:
+        if event == "/jax/core/compile/backend_compile_duration":
+            compiled.append(seconds)
+
+    jax.monitoring.register_event_duration_secs_listener(append)

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.compiling import FLAGS, join_flags
+from tests.compiling import FLAGS, compiled, count_programs, join_flags
 from tests.needs import NEEDS, WITH_BPY, require
 
 hypothesis.settings.register_profile(
@@ -38,6 +38,7 @@ def pytest_configure(config: pytest.Config) -> None:
     # A program of a test runs once or twice: compiled without optimisation it has the same operations, and takes a
     # third of the time. What users run is optimised: real processes compile so, and modules with optimised_programs.
     jax.config.update("jax_disable_most_optimizations", True)
+    count_programs()
     _compile_quickly()
 
 
@@ -73,6 +74,8 @@ def _compile_quickly() -> None:
 
 MOST_MAPS = 20_000
 """Pieces of memory that a process may map before its compiled programs are forgotten."""
+LOOK_EVERY = 200
+"""Programs from one look at the pieces to the next: at 20,000 a look takes 20 ms, longer than most tests."""
 
 
 @pytest.fixture(autouse=True)
@@ -83,6 +86,9 @@ def forgotten_programs() -> Iterator[None]:
     default), and the next one that is compiled crashes it.
     """
     yield
+    if len(compiled) < LOOK_EVERY:
+        return
+    compiled.clear()
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MOST_MAPS:
         jax.clear_caches()
@@ -141,8 +147,9 @@ def compiled_anew(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def plain_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processes compile without optimisation, as this one does.
+    """Processes compile without optimisation and fusion emitters, as this one does.
 
     For tests of what a command does with the results of programs which other tests run as users do.
     """
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+    monkeypatch.setenv("XLA_FLAGS", join_flags(os.environ.get("XLA_FLAGS"), FLAGS))

@@ -1,12 +1,14 @@
-"""The flags with which XLA compiles in tests."""
+"""The flags with which XLA compiles in tests, and the count of what it compiles."""
 
 import os
 import subprocess
 import sys
 
+import jax
+import numpy as np
 import pytest
 
-from tests.compiling import FLAGS, join_flags
+from tests.compiling import FLAGS, compiled, join_flags
 
 
 @pytest.mark.parametrize(
@@ -24,10 +26,23 @@ def test_flags_begin_with_a_flag_or_are_empty(flags, joined):
     assert join_flags(*flags) == joined
 
 
-@pytest.mark.parametrize("before", [None, "", "--xla_cpu_enable_fast_math=false"])
+@pytest.mark.parametrize("before", [None, "--xla_cpu_enable_fast_math=false"])
 def test_this_version_of_xla_knows_the_flags(before):
     """A process of its own: XLA reads its flags once, and ends the process at one that it does not know."""
     program = "import jax; print(jax.jit(lambda x: x + 1)(1.0))"
     environment = os.environ | {"XLA_FLAGS": join_flags(before, FLAGS)}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, "2.0"), done.stderr
+
+
+def test_compiled_programs_are_counted():
+    """Whatever jax calls the event: at too many programs that are not forgotten the process would crash."""
+    image, before = np.ones(5, np.float32), len(compiled)
+    program = jax.jit(lambda x: 3 * x + 2)
+    np.testing.assert_array_equal(np.asarray(program(image)), 5)
+    assert len(compiled) == before + 1
+    program(image)
+    assert len(compiled) == before + 1
+    jax.clear_caches()
+    program(image)
+    assert len(compiled) == before + 2, "forgotten, and compiled anew"

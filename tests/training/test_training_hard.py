@@ -16,7 +16,6 @@ from jaxdn.training.checkpoint import Checkpoints
 from jaxdn.training.log import Log, read_curve
 from jaxdn.training.loop import Every, fit
 from jaxdn.training.step import clip_loss, init_state
-from tests.compiling import FLAGS
 from tests.training import test_loop
 from tests.training.test_checkpoint import torn
 from tests.training.test_training import make_clip
@@ -112,10 +111,8 @@ def test_with_the_newest_checkpoint_truncated_it_continues_from_the_previous_one
 
 
 @pytest.mark.slow
-def test_a_killed_process_loses_only_the_steps_since_its_last_checkpoint(tmp_path, monkeypatch):
-    # Each of the three processes compiles the step anew: without optimisation, in a third of the time.
-    monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-    monkeypatch.setenv("XLA_FLAGS", FLAGS)
+@pytest.mark.usefixtures("plain_processes")  # three processes compile the step
+def test_a_killed_process_loses_only_the_steps_since_its_last_checkpoint(tmp_path):
     kills.make_clips(tmp_path / "clips")
     sizes = kills.Sizes(steps=60, checkpoint_every=5)
     kills.start(tmp_path / "clips", tmp_path / "calm", sizes).communicate()
