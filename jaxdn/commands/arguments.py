@@ -204,6 +204,8 @@ class Train:
     """Consecutive frames of a clip per update."""
     learning_rate: float | None = None
     """Peak learning rate."""
+    scale_rate: Literal["no", "sqrt", "linear"] = "no"
+    """Multiply the recipe's learning rate by what --batch is of the recipe's batch, or by the square root of it."""
     rematerialize: bool | None = None
     """Recompute in the backward pass: a quarter of the memory for 1.1 to 1.4 times the time."""
     seed: int | None = None
@@ -212,8 +214,18 @@ class Train:
     """Samples per pixel of the noisy input; of several numbers, each clip of a batch has one at random."""
     time_limit: float | None = None
     """Minutes after which training stops and writes its weights; the same command goes on from there."""
-    devices: int = 1
-    """GPUs of this machine to divide each batch among; the number of clips per update is a multiple of it."""
+    devices: int | None = None
+    """GPUs of this machine to divide each batch among; the number of clips per update is a multiple of it. Default: 1,
+    or with --distributed all that each process has."""
+    distributed: bool = False
+    """This process is one of several that train together, on one machine or many, which share the run's folder. Slurm,
+    Open MPI and Kubernetes are recognised."""
+    coordinator: str | None = None
+    """With --distributed, where no such system says it: HOST:PORT of process 0."""
+    processes: int | None = None
+    """With --coordinator: the number of processes."""
+    process: int | None = None
+    """With --coordinator: which of them this is, from 0."""
     implementation: str = "auto"
     """Backend for convolutions: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest available."""
 

@@ -31,6 +31,10 @@ _COMPUTING = (Train, Denoise, Compare, Doctor)
 """Commands whose programs are worth keeping between runs."""
 
 
+_POWERS = {"sqrt": 0.5, "linear": 1.0}
+"""Of the batch, by which `--scale-rate` scales the learning rate."""
+
+
 def _inspect(options: Inspect) -> None:
     from jaxdn.commands.inspect import inspect_to_terminal
 
@@ -110,14 +114,32 @@ def _pack(options: Pack) -> None:
 
 
 def _train(options: Train) -> None:
+    given = options.coordinator, options.processes, options.process
+    if not options.distributed:
+        if any(value is not None for value in given):
+            raise ValueError("--coordinator, --processes, --process: expected --distributed too; give it, or none.")
+        _train_here(options)
+        return
+    from jaxdn.commands.distributed import Place, join_processes
+
+    with join_processes(Place(*given)):
+        _train_here(options)
+
+
+def _train_here(options: Train) -> None:
     from jaxdn.core.options import parse
     from jaxdn.methods.registry import method_named
+    from jaxdn.training.processes import writes
     from jaxdn.training.train import train
 
     method = method_named(options.method)
     recipe = method.recipe_named(options.recipe)
     changed = {name: getattr(options, name) for name in recipe._fields if hasattr(options, name)}
     changed["spp"] = None if options.spp is None else tuple(options.spp)
+    if options.scale_rate != "no":
+        if options.learning_rate is not None:
+            raise ValueError("--scale-rate: expected none with --learning-rate, which is the rate; leave one out.")
+        changed["learning_rate"] = recipe.scaled_rate(options.batch or recipe.batch, _POWERS[options.scale_rate])
     recipe = recipe._replace(**{name: value for name, value in changed.items() if value is not None})
     path = train(
         method,
@@ -131,7 +153,8 @@ def _train(options: Train) -> None:
         time_limit=None if options.time_limit is None else 60 * options.time_limit,
         devices=options.devices,
     )
-    print(f"{path}: denoise with `jaxdn denoise CLIP -o OUT --method {path}`")
+    if writes():
+        print(f"{path}: denoise with `jaxdn denoise CLIP -o OUT --method {path}`")
 
 
 def _denoise(options: Denoise) -> None:

@@ -31,8 +31,9 @@ class Interrupt:
     def __init__(self, on_first: Callable[[], None]):
         """``on_first`` is called at the first signal, so that it does not seem to be ignored."""
         self.asked = False
+        self.terminated = False
+        """Whether it was SIGTERM that asked."""
         self._on_first = on_first
-        self._terminated = False
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> "Interrupt":
@@ -43,18 +44,22 @@ class Interrupt:
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._before.items():
-            signal.signal(number, handler)
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)  # None: not Python's own
 
     def raise_if_asked(self) -> None:
         """Raise KeyboardInterrupt where the work stops, or Terminated if SIGTERM asked for it."""
         if self.asked:
-            raise Terminated if self._terminated else KeyboardInterrupt
+            raise Terminated if self.terminated else KeyboardInterrupt
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         if self.asked and number == signal.SIGINT:
             raise KeyboardInterrupt
+        self.ask(terminated=number == signal.SIGTERM)
+
+    def ask(self, *, terminated: bool) -> None:
+        """What a first signal does; also of one that another process was sent."""
         if not self.asked:
-            self.asked, self._terminated = True, number == signal.SIGTERM
+            self.asked, self.terminated = True, terminated
             self._on_first()
 
 

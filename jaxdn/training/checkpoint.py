@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from jaxdn.training.processes import wait_for_all, writes
 from jaxdn.training.step import TrainState
 
 _DIGEST = "sha256"
@@ -22,7 +23,7 @@ class Checkpoints:
 
     Orbax writes each under a temporary name and renames it when it is complete: a run killed while writing resumes from
     the one before. Each contains a digest of its values, which also detects damaged files that can still be parsed.
-    Saving is asynchronous; :meth:`close` waits for it.
+    Saving is asynchronous; :meth:`close` waits for it. Several processes do all of this together, and one writes.
     """
 
     def __init__(self, folder: Path):
@@ -78,8 +79,10 @@ class Checkpoints:
 
     def _put_aside(self, step: int, reason: Exception, *, continues: int) -> None:
         aside = self._folder.parent / f"damaged-{step}"
-        shutil.rmtree(aside, ignore_errors=True)
-        shutil.move(self._folder / str(step), aside)
+        if writes():
+            shutil.rmtree(aside, ignore_errors=True)
+            shutil.move(self._folder / str(step), aside)
+        wait_for_all(f"damaged-{step}")
         warnings.warn(
             f"checkpoint {self._folder / str(step)} is damaged ({_short(reason)}) and was moved to {aside}; training "
             f"continues from the checkpoint after {continues} updates.",

@@ -1,4 +1,7 @@
-"""The devices of a training run: the clips of a batch are divided among them, everything else is on each of them."""
+"""The devices of a training run: the clips of a batch are divided among them, everything else is on each of them.
+
+They may belong to several processes (:mod:`jaxdn.training.processes`): then each process has its part of every batch.
+"""
 
 from typing import Any, TypeVar
 
@@ -13,20 +16,27 @@ DIVIDED, ON_ALL = PartitionSpec(CLIPS), PartitionSpec()
 _Tree = TypeVar("_Tree")
 
 
-def make_mesh(devices: int, batch: int) -> Mesh | None:
-    """The first ``devices`` devices that jax has in this process; None for one, which needs no mesh.
+def make_mesh(devices: int | None, batch: int) -> Mesh | None:
+    """The first ``devices`` devices of each process (None: one, or all where there are several processes).
 
-    Raises ValueError for a number that jax does not have, and unless it divides the batch.
+    None for one device altogether, which needs no mesh. Raises ValueError for a number that jax does not have, and
+    unless they divide the batch.
     """
-    there = jax.local_devices()
+    there, processes = jax.local_devices(), jax.process_count()
+    if devices is None:
+        devices = len(there) if processes > 1 else 1
     if not 1 <= devices <= len(there):
         raise ValueError(
             f"devices: expected 1 to {len(there)}, as jax has {len(there)} of {there[0].device_kind!r} here, got "
             f"{devices}; give another number."
         )
-    if batch % devices:
-        raise ValueError(f"batch: expected a multiple of the {devices} devices, got {batch}; change one of them.")
-    return Mesh(np.asarray(there[:devices]), (CLIPS,)) if devices > 1 else None
+    count = devices * processes
+    if batch % count:
+        which = f"{count} devices" if processes == 1 else f"{count} devices of {processes} processes"
+        raise ValueError(f"batch: expected a multiple of the {which}, got {batch}; change one of them.")
+    of_each = [[one for one in jax.devices() if one.process_index == index] for index in range(processes)]
+    chosen = [one for some in of_each for one in some[:devices]]
+    return Mesh(np.asarray(chosen), (CLIPS,)) if count > 1 else None
 
 
 def put_on_all(tree: _Tree, mesh: Mesh | None) -> _Tree:
@@ -35,12 +45,15 @@ def put_on_all(tree: _Tree, mesh: Mesh | None) -> _Tree:
 
 
 def divide(batch: _Tree, mesh: Mesh | None) -> _Tree:
-    """A batch whose elements are divided among the devices, in order."""
-    return batch if mesh is None else jax.device_put(batch, NamedSharding(mesh, DIVIDED))
+    """A batch whose elements are divided among the devices, in order; ``batch`` is this process's part of it."""
+    if mesh is None:
+        return batch
+    place = NamedSharding(mesh, DIVIDED)
+    return jax.tree.map(lambda part: jax.make_array_from_process_local_data(place, part), batch)
 
 
 def take_from_first(tree: _Tree, mesh: Mesh | None) -> _Tree:
-    """Arrays that are on all devices, as arrays of the first: what is computed with them is computed once."""
+    """Arrays that are on all devices, as arrays of one of this process: what is computed with them is computed once."""
     return tree if mesh is None else jax.tree.map(_take_first_shard, tree)
 
 

@@ -19,6 +19,7 @@ from jaxdn.runtime.interrupt import Interrupt
 from jaxdn.training.checkpoint import Checkpoints
 from jaxdn.training.devices import divide, make_mesh, put_on_all, take_from_first
 from jaxdn.training.log import Log
+from jaxdn.training.processes import Stopping, writes
 from jaxdn.training.progress import ProgressBar
 from jaxdn.training.step import Report, TrainState, init_state, init_state_from, make_train_step
 from jaxdn.training.validation import ValidationClip, make_validation
@@ -63,13 +64,14 @@ def fit(
     validation: Sequence[ValidationClip] = (),
     every: Every = Every(),  # noqa: B008, immutable
     time_limit: float | None = None,
-    devices: int = 1,
+    devices: int | None = None,
 ) -> TrainState:
     """Train to ``recipe.steps`` updates, resuming from the newest checkpoint in ``folder`` to the same result.
 
     A run that was started with fewer steps goes on to ``recipe.steps``, along the schedule of that many. On Ctrl-C, or
     SIGTERM, the update is finished, logged and saved before KeyboardInterrupt (:class:`jaxdn.runtime.interrupt.
-    Terminated`) is raised; at the time limit the state is returned.
+    Terminated`) is raised; at the time limit the state is returned. Of several processes (:mod:`jaxdn.training.
+    processes`) all stop where one is asked to, and the first writes.
     Raises ValueError for impossible values in the recipe, and, with what to change, after many updates in a row that
     changed nothing.
 
@@ -83,7 +85,8 @@ def fit(
       validation: see :func:`jaxdn.training.validation.load_validation`.
       every: updates between log entries, validations and checkpoints.
       time_limit: seconds after which no further update begins, counted from the call; None: no limit.
-      devices: number of devices that each batch is divided among; a run may go on with another number.
+      devices: number of devices, of each process, that each batch is divided among (:func:`jaxdn.training.devices.
+        make_mesh`); a run may go on with another number, and with another number of processes.
     """
     recipe.check()
     end = math.inf if time_limit is None else time.monotonic() + time_limit
@@ -94,7 +97,7 @@ def fit(
     validate = make_validation(denoiser, validation)
     divergence = _Divergence(label, recipe, run.step, int(run.state.skipped))
     with (
-        ProgressBar(label, recipe, run.step) as progress,
+        ProgressBar(label, recipe, run.step, shown=writes()) as progress,
         Interrupt(
             lambda: progress.print(f"{label}: stopping after this update; press Ctrl-C again to lose it")
         ) as stop,
@@ -103,15 +106,17 @@ def fit(
             progress.print(
                 f"{label}: begun with {extended} steps, goes on to {recipe.steps} along their learning rates"
             )
+        stopping, together = Stopping(stop, end), jax.process_count() == 1
         try:
-            while run.step < recipe.steps and time.monotonic() < end and not stop.asked:
+            while run.step < recipe.steps and not stopping.is_agreed():
                 report = run.update()
                 logs = run.is_due(every.log)
                 if logs:
-                    run.log.write(step=run.step, loss=float(report.loss), last_frame_psnr=float(report.validation_psnr))
+                    psnr = float(report.validation_psnr)
+                    run.write_log(step=run.step, loss=float(report.loss), last_frame_psnr=psnr)
                 if validation and run.is_due(every.validation):
                     psnr = validate(take_from_first(run.state.average, mesh))
-                    run.log.write(step=run.step, validation_psnr=psnr)
+                    run.write_log(step=run.step, validation_psnr=psnr)
                     progress.validated(psnr)
                 if logs:  # after the validation: the last line shows the last one
                     skipped = int(run.state.skipped)
@@ -119,9 +124,10 @@ def fit(
                     divergence.check(run.step, skipped=skipped, norm=float(report.gradient_norm))
                 if run.is_due(every.checkpoint):
                     run.save()
+            together = True  # all processes are here, after the same update
             stop.raise_if_asked()
         except KeyboardInterrupt:
-            if run.is_between_updates():
+            if together and run.is_between_updates():
                 run.save()
             progress.print(
                 f"{label}: stopped after {run.step} of {recipe.steps} steps; the same command continues there."
@@ -164,7 +170,7 @@ class _Run:
             batches.set_state(position)
         self.state = state
         self.step = self._saved = int(state.step)
-        self.log = Log(folder / "log.jsonl", keep_until=self.step)
+        self._log = Log(folder / "log.jsonl", keep_until=self.step) if writes() else None
         self._train_step = make_train_step(denoiser, recipe, mesh)
         # An interrupt may come between the batch and its update: this position always belongs to finished updates.
         self._position = batches.get_state()
@@ -184,6 +190,11 @@ class _Run:
         """Whether the state is that after ``step`` updates: a second Ctrl-C may come while one takes its memory."""
         return not any(leaf.is_deleted() for leaf in jax.tree.leaves(self.state)) and int(self.state.step) == self.step
 
+    def write_log(self, **entry: Any) -> None:
+        """One entry of the log."""
+        if self._log is not None:
+            self._log.write(**entry)
+
     def save(self) -> None:
         """A checkpoint, unless this step has one."""
         if self._saved < self.step:
@@ -193,7 +204,8 @@ class _Run:
     def close(self) -> None:
         """Wait until everything is on disk."""
         self._checkpoints.close()
-        self.log.close()
+        if self._log is not None:
+            self._log.close()
 
 
 def _record_recipe(path: Path, recipe: Recipe, start: str | None) -> int | None:
@@ -217,7 +229,8 @@ def _record_recipe(path: Path, recipe: Recipe, start: str | None) -> int | None:
             )
         else:
             return None
-    write_json(path, wanted)
+    if writes():
+        write_json(path, wanted)
     return extended
 
 

@@ -12,8 +12,8 @@ from jaxdn.recipes.recipe import Recipe
 class ProgressBar:
     """A bar with loss, validation PSNR, frames/s and time left; plain lines without a terminal."""
 
-    def __init__(self, label: str, recipe: Recipe, start: int):
-        self._label, self._recipe, self._first = label, recipe, start
+    def __init__(self, label: str, recipe: Recipe, start: int, *, shown: bool = True):
+        self._label, self._recipe, self._first, self._shown = label, recipe, start, shown
         self._validation = float("nan")
         self._console = Console(stderr=False)
         self._began: float | None = None
@@ -24,7 +24,7 @@ class ProgressBar:
             TextColumn("{task.completed}/{task.total} steps  {task.fields[state]}"),
             TimeRemainingColumn(),
             console=self._console,
-            disable=not sys.stdout.isatty(),
+            disable=not (shown and sys.stdout.isatty()),
         )
         self._task = self._bar.add_task(label, total=recipe.steps, completed=start, state="compiling ...")
 
@@ -41,7 +41,8 @@ class ProgressBar:
 
     def print(self, line: str) -> None:
         """Print one line above the bar."""
-        self._console.print(line, highlight=False, markup=False)
+        if self._shown:
+            self._console.print(line, highlight=False, markup=False)
 
     def validated(self, psnr: float) -> None:
         """Keep the newest validation PSNR."""

@@ -5,12 +5,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from jaxdn.data.training.dataset import training_batches
 from jaxdn.denoiser import Denoiser
 from jaxdn.methods.registry import Method
 from jaxdn.recipes.recipe import Recipe
 from jaxdn.training.devices import make_mesh
 from jaxdn.training.loop import InitialWeights, ResumableBatches, fit, read_resumed_from
+from jaxdn.training.processes import writes
 from jaxdn.training.validation import load_validation
 from jaxdn.zoo.weights import save_weights, starting_params
 
@@ -26,7 +29,7 @@ def train(
     validation: Sequence[Path] = (),
     implementation: str = "auto",
     time_limit: float | None = None,
-    devices: int = 1,
+    devices: int | None = None,
     label: str | None = None,
     record: Mapping[str, Any] | None = None,
 ) -> Path:
@@ -47,7 +50,8 @@ def train(
       validation: folders of held-out clips, or packed sets, used whole.
       implementation: the backend for training; "auto" is the method's fastest that is available here.
       time_limit: seconds after which training stops; the weights of that moment are written all the same.
-      devices: number of devices that each batch is divided among.
+      devices: number of devices, of each process, that each batch is divided among; default: one, or all of each
+        process where there are several.
       label: the run's name in messages; default: that of its folder.
       record: further entries of the weights' JSON.
     """
@@ -57,13 +61,13 @@ def train(
     label = out.name if label is None else label
     backend = method.backend("training") if implementation == "auto" else implementation
     if backend not in (None, "reference"):
-        denoiser = method.factory(**{**options, "implementation": backend})
-        print(f"{label}: convolutions run on {backend}", flush=True)
+        denoiser, engine = method.factory(**{**options, "implementation": backend}), f"convolutions run on {backend}"
     else:
-        denoiser = method.factory(**options)
-        print(f"{label}: everything runs on XLA", flush=True)
+        denoiser, engine = method.factory(**options), "everything runs on XLA"
+    if writes():
+        print(f"{label}: {engine}", flush=True)
     batches = recipe_batches(denoiser, recipe, clips)
-    held_out = load_validation(denoiser, validation, spp=min(recipe.spp))
+    held_out = load_validation(denoiser, validation, spp=min(recipe.spp)) if writes() else []
     first = None if start is None else InitialWeights(str(start), starting_params(start, denoiser))
     state = fit(
         denoiser,
@@ -86,13 +90,15 @@ def train(
         **origin,
         **(record or {}),
     }
-    return save_weights(
-        out / "weights.safetensors", state.average, factory=method.name, options=dict(options), record=about
-    )
+    path = out / "weights.safetensors"
+    if writes():
+        save_weights(path, state.average, factory=method.name, options=dict(options), record=about)
+    return path
 
 
 def recipe_batches(denoiser: Denoiser, recipe: Recipe, clips: Sequence[Path]) -> ResumableBatches:
-    """The batches that a recipe asks for, with the buffers that the denoiser and the objective read, without end.
+    """The batches that a recipe asks for, with the buffers that the denoiser and the objective read, without end: of
+    each the part of this process.
 
     ``clips`` are folders of clips, or packed sets.
     """
@@ -106,5 +112,6 @@ def recipe_batches(denoiser: Denoiser, recipe: Recipe, clips: Sequence[Path]) ->
         spp=recipe.spp,
         layers=denoiser.samples is not None,
         variation=recipe.variation,
+        process=(jax.process_index(), jax.process_count()),
         threads=max(1, (os.cpu_count() or 1) // 2),  # a GPU takes a hundred elements a second, a thread makes twelve
     )

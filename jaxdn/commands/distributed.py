@@ -1,0 +1,71 @@
+"""``--distributed``: this process joins others, of this machine or of many, and leaves when all are done."""
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import jax
+
+LOST_EXIT_CODE = 1
+"""Of a process whose others have gone: the same commands, given again, go on from the newest checkpoint."""
+_HEARTBEAT_S = 60
+"""After so long without a sign of life a process counts as lost."""
+
+
+class Place(NamedTuple):
+    """Where the processes meet, as :func:`jax.distributed.initialize` names it; None is found by jax: Slurm, Open MPI,
+    Kubernetes."""
+
+    coordinator: str | None = None
+    processes: int | None = None
+    process: int | None = None
+
+
+@contextmanager
+def join_processes(place: Place) -> Iterator[None]:
+    """Join the processes of a run, and wait for the others at the end.
+
+    Where another process is lost, this one ends with a message and exit code 1, or is ended by jax with 134. Raises
+    ValueError for a place that is incomplete, and where no cluster is found.
+    """
+    given = place.coordinator, place.processes, place.process
+    if any(value is not None for value in given) and None in given:
+        raise ValueError(
+            "--distributed: expected all of --coordinator, --processes and --process, or none where jax finds them "
+            "(Slurm, Open MPI, Kubernetes), got some; give the others too."
+        )
+    # Signals are agreed upon by the training loop; jax's own service would take SIGTERM away from it.
+    if hasattr(jax.config, "jax_enable_preemption_service"):
+        jax.config.update("jax_enable_preemption_service", False)
+    try:
+        jax.distributed.initialize(
+            *given, heartbeat_timeout_seconds=_HEARTBEAT_S, shutdown_timeout_seconds=_HEARTBEAT_S
+        )
+    except ValueError as error:
+        raise ValueError(
+            f"--distributed: jax cannot tell which processes there are ({error}). Start it under Slurm, Open MPI or "
+            "Kubernetes, or give --coordinator HOST:PORT, --processes and --process."
+        ) from error
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        _end_alone(error)
+    try:
+        jax.distributed.shutdown()
+    except jax.errors.JaxRuntimeError as error:
+        _end_alone(error)
+
+
+def _end_alone(error: Exception) -> None:
+    """End at once: whatever else waits for the lost process would wait for minutes."""
+    told = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+    print(
+        f"jaxdn: another process of this run has gone, or cannot be reached ({told}). Give the same commands again: "
+        "training goes on from the newest checkpoint.",
+        file=sys.stderr,
+        flush=True,
+    )
+    sys.stdout.flush()
+    os._exit(LOST_EXIT_CODE)

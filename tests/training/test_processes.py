@@ -1,0 +1,217 @@
+"""Training in several processes: real ones, with the weights of one process; stopped, killed and gone on from."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from jaxdn.clips import write_clip
+from jaxdn.commands import main
+from jaxdn.training.log import read_log
+from tests.training.test_training import make_clip
+
+ROOT = Path(__file__).parents[2]
+UPDATES = 5
+
+# The method of another package, which compiles at once. It says which files its process opens to write.
+METHOD = '''
+import os, sys
+from dataclasses import dataclass
+import jax, jax.numpy as jnp
+from jaxdn import Core, recurrent
+from jaxdn.methods.registry import method
+from jaxdn.recipes.objectives import Objective
+from jaxdn.recipes.recipe import Recipe
+
+def told(event, arguments):
+    if event == "open" and isinstance(arguments[1], str) and set(arguments[1]) & set("wax"):
+        print("writes", arguments[0], file=sys.stderr)
+
+sys.addaudithook(told)
+
+@dataclass(frozen=True)
+class Options:
+    width: int = 3
+
+def squares(images, clip, progress):
+    return jnp.mean((images - clip.reference) ** 2)
+
+@method(Options, title="A learned kernel", recipes={"usual": Recipe(Objective("squares", squares), decay=False)})
+def kernel(options):
+    """A kernel."""
+    def step(params, state, frame, first, statistics):
+        image = jax.lax.conv_general_dilated(
+            frame.radiance[None], params["kernel"], (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))[0]
+        image = 0.5 * (image + jnp.where(first, image, state))
+        return image, image, 0
+    def init(key, frame):
+        return {"kernel": 0.2 * jax.random.normal(key, (options.width, options.width, 3, 3))}
+    return recurrent(Core(lambda params, frame: frame.radiance, step, frozenset(), init))
+'''
+
+ALONE = """
+import sys
+from jaxdn.commands.main import main
+for run in sys.argv[1:]:
+    main(run.split("|"))
+"""
+
+
+def give(clips: Path, run: Path, *more: object) -> list[str]:
+    options = ["--method", "learned_kernel:kernel", "--batch", "8", "--crop", "16", "--frames", "2"]
+    return ["train", str(clips), "-o", str(run), *options, *map(str, more)]
+
+
+class Pair:
+    """Two processes of one run."""
+
+    def __init__(self, home: Path, arguments: Sequence[str]) -> None:
+        with socket.socket() as one:
+            one.bind(("127.0.0.1", 0))
+            place = f"127.0.0.1:{one.getsockname()[1]}"
+        environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": f"{ROOT}{os.pathsep}{home}"}
+        self.errors = [home / f"errors-{time.monotonic_ns()}-{index}" for index in range(2)]
+        self.processes = []
+        for index, errors in enumerate(self.errors):
+            command = [sys.executable, "-m", "jaxdn.commands.main", *arguments, "--distributed"]
+            command += ["--coordinator", place, "--processes", "2", "--process", str(index)]
+            with errors.open("w") as out:
+                self.processes.append(subprocess.Popen(command, env=environment, stdout=out, stderr=out))
+
+    def wait_for(self, run: Path, step: int) -> None:
+        end = time.monotonic() + 300
+        while not any(entry["step"] >= step for entry in read_log(run / "log.jsonl")):
+            assert all(process.poll() is None for process in self.processes), self.tell()
+            assert time.monotonic() < end, self.tell()
+            time.sleep(0.05)
+
+    def end(self, seconds: float = 300) -> list[int]:
+        """The exit codes."""
+        end = time.monotonic() + seconds
+        try:
+            return [process.wait(max(0.1, end - time.monotonic())) for process in self.processes]
+        except subprocess.TimeoutExpired as error:
+            raise AssertionError(self.tell()) from error
+        finally:
+            for process in self.processes:
+                process.kill()
+
+    def tell(self) -> str:
+        return "\n".join(path.read_text()[-3000:] for path in self.errors)
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    home = tmp_path_factory.mktemp("processes")
+    for seed in range(4):
+        write_clip(make_clip(seed, size=20, frames=4), home / "clips" / f"clip-{seed}")
+    (home / "learned_kernel.py").write_text(METHOD)
+    return home
+
+
+def run_alone(home: Path, *runs: Sequence[str]) -> None:
+    """Runs one after the other in one process of eight devices."""
+    environment = os.environ | {
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": "--xla_force_host_platform_device_count=8",
+        "PYTHONPATH": f"{ROOT}{os.pathsep}{home}",
+    }
+    command = [sys.executable, "-c", ALONE, *("|".join(run) for run in runs)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+def weights(run: Path) -> np.ndarray:
+    arrays = load_file(run / "weights.safetensors")
+    return np.concatenate([np.ravel(arrays[name]) for name in sorted(arrays)])
+
+
+def distance(run: Path, other: Path) -> float:
+    return float(np.linalg.norm(weights(run) - weights(other)) / np.linalg.norm(weights(other)))
+
+
+@pytest.mark.slow
+def test_two_processes_and_any_number_of_devices_learn_the_same(home: Path) -> None:
+    pair = Pair(home, give(home / "clips", home / "two", "--steps", UPDATES, "--validation", home / "clips"))
+    assert pair.end() == [0, 0], pair.tell()
+    first, second = (path.read_text() for path in pair.errors)
+    assert f"writes {home / 'two'}" in first
+    assert f"{home / 'two'}" not in second
+    assert "step 5/5" in first
+    assert "step" not in second
+    moved = Pair(home, give(home / "clips", home / "moved", "--steps", 2))
+    assert moved.end() == [0, 0], moved.tell()
+    steps = ("--steps", UPDATES)
+    run_alone(
+        home,
+        give(home / "clips", home / "one", *steps),
+        give(home / "clips", home / "devices-2", *steps, "--devices", 2),
+        give(home / "clips", home / "devices-8", *steps, "--devices", 8),
+        give(home / "clips", home / "moved", "--steps", 3),
+        give(home / "clips", home / "moved", "--steps", UPDATES, "--devices", 8),
+    )
+    assert np.ptp(weights(home / "one")) > 0.1
+    for name in ("two", "devices-2", "devices-8", "moved"):
+        assert distance(home / name, home / "one") < 1e-6, name
+    one, two = (read_log(home / name / "log.jsonl") for name in ("one", "two"))
+    assert [entry["loss"] for entry in one if "loss" in entry] == pytest.approx(
+        [entry["loss"] for entry in two if "loss" in entry], rel=1e-6
+    )
+    assert [entry["step"] for entry in two if "validation_psnr" in entry] == [UPDATES]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="signals are those of Unix")
+def test_a_signal_at_one_process_stops_both_and_a_lost_one_ends_the_other(home: Path) -> None:
+    long = give(home / "clips", home / "long", "--steps", 10**6)
+    pair = Pair(home, long)
+    pair.wait_for(home / "long", 20)
+    pair.processes[1].send_signal(signal.SIGTERM)
+    assert pair.end() == [143, 143], pair.tell()
+    saved = max(int(path.name) for path in (home / "long" / "checkpoints").iterdir())
+    assert f"stopped after {saved} of 1000000 steps; the same command continues there" in pair.tell()
+
+    again = Pair(home, long)
+    again.wait_for(home / "long", saved + 21)
+    again.processes[0].send_signal(signal.SIGINT)
+    assert again.end() == [130, 130], again.tell()
+    newer = max(int(path.name) for path in (home / "long" / "checkpoints").iterdir())
+    assert newer > saved
+
+    killed = Pair(home, long)
+    killed.wait_for(home / "long", newer + 101)
+    killed.processes[1].kill()
+    codes = killed.end(120)
+    assert codes[1] == -signal.SIGKILL
+    assert codes[0] in (1, 134, -signal.SIGABRT), killed.tell()
+    newest = max(int(path.name) for path in (home / "long" / "checkpoints").iterdir() if path.name.isdigit())
+    assert newest > newer
+    run_alone(home, give(home / "clips", home / "long", "--steps", 10**6, "--time-limit", "0.00001"))
+    assert json.loads((home / "long" / "weights.json").read_text())["updates"] == newest
+
+
+@pytest.mark.parametrize(
+    ("more", "problem"),
+    [
+        (["--coordinator", "127.0.0.1:1"], "expected --distributed too"),
+        (["--distributed", "--coordinator", "127.0.0.1:1"], "expected all of --coordinator, --processes and --process"),
+        (["--scale-rate", "linear", "--learning-rate", "0.1"], "--scale-rate: expected none with --learning-rate"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(
+    more: list[str], problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main.main(["train", str(tmp_path / "clips"), "-o", str(tmp_path / "run"), *more])
+    assert ended.value.code == 2
+    assert problem in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "run").exists()
