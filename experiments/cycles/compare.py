@@ -98,15 +98,15 @@ def measure(clip: Path, spp: int, method: str, out: Path) -> None:
 def _denoised(files: Sequence[Path], target: Path, method: str) -> dict[int, np.ndarray]:
     """Number of a frame -> image, from the files that were written."""
     if method == NOISY:
-        return {int(file.stem): _beauty(file) for file in files}
+        return {int(file.stem): read_beauty(file) for file in files}
     model, _ = select_backend(method.removesuffix(PLAIN))
     target.mkdir(parents=True, exist_ok=True)
     settings = Settings(only_beauty=True, safe=not method.endswith(PLAIN))
     written = denoise_files([files[0].parent], target, model, settings)
-    return {int(file.stem): _beauty(file) for file in written.files}
+    return {int(file.stem): read_beauty(file) for file in written.files}
 
 
-def _beauty(file: Path) -> np.ndarray:
+def read_beauty(file: Path) -> np.ndarray:
     """The radiance [H, W, 3] of a frame."""
     channels = read_exr(file)
     names = [name for name in channels if name.rpartition(".")[2] in "RGB" and ("Combined" in name or "." not in name)]

@@ -54,9 +54,10 @@ def render_clip(folder: Path, of: Clip, level: int) -> None:
     write_record(folder / RECORD, of, level, found, spent, settings())
 
 
-def build(of: Clip) -> None:
-    """The scene of a clip, with the passes of the tutorial's script and this clip's pixels."""
-    stage = Stage(of.kind, of.seed, of.frames)
+def build(of: Clip, frames: int | None = None) -> None:
+    """The scene of a clip, with the passes of the tutorial's script and this clip's pixels; ``frames``: of so many."""
+    frames = of.frames if frames is None else frames
+    stage = Stage(of.kind, of.seed, frames)
     scene = stage.scene
     importlib.import_module(f"experiments.cycles.kinds.{of.kind}").build(stage)
     blurred = scene.render.use_motion_blur
@@ -72,7 +73,7 @@ def build(of: Clip) -> None:
     scene.render.resolution_x, scene.render.resolution_y = of.size
     scene.render.resolution_percentage = 100
     show_window(of)
-    scene.frame_start, scene.frame_end = 1, of.frames
+    scene.frame_start, scene.frame_end = 1, frames
 
 
 def show_window(of: Clip) -> None:

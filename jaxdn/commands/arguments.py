@@ -281,6 +281,10 @@ class Denoise:
     wrap: bool = False
     """Such files are equirectangular panoramas, whose left edge continues at the right one; their attribute envmap says
     so, too."""
+    reblur: list[str] | None = None
+    """Put motion blur and depth of field into the denoised frames, by motion vectors and depth, as such files say
+    what the camera does, or as stated: shutter=0.5 (part of a frame), fstop=2.8 lens=50 (mm) focus=3.2 (scene units)
+    sensor=36 (mm) metres=1 (of a scene unit)."""
     spp: int = 1
     """Samples per pixel to take from the clip's layers."""
     preview: bool = False

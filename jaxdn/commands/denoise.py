@@ -6,13 +6,14 @@ from typing import Any
 from jaxdn.commands.arguments import Denoise, check_folder, name_channels
 from jaxdn.commands.channel_table import show_channel_mapping
 from jaxdn.commands.progress import reporter
-from jaxdn.core.options import numbers
+from jaxdn.core.options import make, numbers, parse
 from jaxdn.data.clip.folder import is_clip
 from jaxdn.data.errors import DamagedFile
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.runtime.malloc import tune_malloc
 from jaxdn.sequence.jobs import Job
+from jaxdn.sequence.optics import Optics
 from jaxdn.sequence.run import denoise_files, select_backend
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import AUTO, Model, choose_model, find_model
@@ -55,6 +56,9 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
         aovs=options.aovs,
         alpha=options.alpha,
         wrap=options.wrap,
+        reblur=None
+        if options.reblur is None
+        else make(Optics, parse(options.reblur, option="--reblur"), method="--reblur"),
         preview=options.preview,
         bidirectional=options.bidirectional,
         safe=options.safe,

@@ -255,6 +255,7 @@ def _refuse_unused(jobs: Sequence[Job], settings: Settings) -> None:
         "--only-beauty": settings.only_beauty,
         "--alpha": settings.alpha,
         "--wrap": settings.wrap,
+        "--reblur": settings.reblur is not None,
     }
     unused = [*settings.naming.options, *(option for option, given in others.items() if given)]
     if unused and all(job.clip is not None for job in jobs):

@@ -4,6 +4,7 @@ from collections.abc import Collection
 from typing import Literal, NamedTuple
 
 from jaxdn.data.foreign.classify import UNNAMED, ChannelNaming
+from jaxdn.sequence.optics import Optics
 
 
 class Settings(NamedTuple):
@@ -29,6 +30,8 @@ class Settings(NamedTuple):
     wrap: bool = False
     """The left edge of such files continues at the right one (:mod:`jaxdn.sequence.panorama`), as it does anyway where
     their attribute ``envmap`` says so."""
+    reblur: Optics | None = None
+    """Put motion blur and depth of field into what is written of such files (:mod:`jaxdn.sequence.optics`)."""
     preview: bool = False
     """Write a PNG next to each frame."""
     bidirectional: bool = False

@@ -18,6 +18,7 @@ from jaxdn.evaluation.report.images import save_png
 from jaxdn.sequence.additive_aovs import AdditiveAovs
 from jaxdn.sequence.alpha import AlphaDenoiser
 from jaxdn.sequence.frame_denoiser import light_of
+from jaxdn.sequence.optics import CameraBlur
 from jaxdn.sequence.panorama import Panorama
 from jaxdn.sequence.settings import Settings
 
@@ -63,6 +64,7 @@ class ForeignWriter:
         self.has_history = settings.aovs == "additive" or settings.alpha
         self._aovs = AdditiveAovs(settings.naming, log) if settings.aovs == "additive" else None
         self._alpha = AlphaDenoiser(safe=settings.safe) if settings.alpha else None
+        self._blur = None if settings.reblur is None else CameraBlur(settings.reblur, log)
         self._result, self._panorama = result, panorama
 
     def prepare(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> Write | None:
@@ -77,6 +79,8 @@ class ForeignWriter:
             source.drop()
             return None
         beauty = compose_beauty(frame, image)
+        if self._blur is not None:
+            beauty, alpha, layers = self._reblur(self._blur, source, frame, beauty, alpha, layers)
         if self._panorama is not None:
             beauty, alpha = self._panorama.cut(beauty), None if alpha is None else self._panorama.cut(alpha)
             layers = {name: self._panorama.cut(layer) for name, layer in layers.items()}
@@ -102,12 +106,33 @@ class ForeignWriter:
         """The denoised alpha [H, W] of a frame; None: nobody asked, or there is none."""
         if self._alpha is None:
             return None
-        names = list(source.windows)
-        channel = find_alpha(names, self._settings.naming.detect(names)["radiance"])
-        if channel is None:
+        noisy = self._read_alpha(source)
+        if noisy is None:
             self._log("--alpha: there is no alpha beside the beauty")
             return None
-        return self._alpha.denoise(self._place(source)[channel], frame, compose_beauty(frame, image))
+        return self._alpha.denoise(noisy, frame, compose_beauty(frame, image))
+
+    def _read_alpha(self, source: ExrFile) -> np.ndarray | None:
+        """The alpha [H, W] beside the beauty of a frame, if there is one."""
+        names = list(source.windows)
+        channel = find_alpha(names, self._settings.naming.detect(names)["radiance"])
+        return None if channel is None else self._place(source)[channel]
+
+    def _reblur(
+        self,
+        camera: CameraBlur,
+        source: ExrFile,
+        frame: Frame,
+        beauty: np.ndarray,
+        alpha: np.ndarray | None,
+        layers: Mapping[str, np.ndarray],
+    ) -> tuple[np.ndarray, np.ndarray | None, dict[str, np.ndarray]]:
+        """Beauty, alpha and layers as the camera sees them; the alpha of the file where it is not denoised."""
+        alpha = self._read_alpha(source) if alpha is None else alpha
+        beside = {} if alpha is None else {" alpha": alpha[..., None]}  # no layer's name begins with a space
+        blurred = camera.blur(source, frame, {"": np.asarray(beauty), **layers, **beside})
+        covered = blurred.pop(" alpha", None)
+        return blurred.pop(""), None if covered is None else covered[..., 0], blurred
 
     def _place(self, source: ExrFile) -> Mapping[str, np.ndarray]:
         """The channels of a file as frames have them."""

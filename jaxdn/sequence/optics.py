@@ -1,0 +1,157 @@
+"""Motion blur and depth of field, put back after sharp frames are denoised (``jaxdn denoise --reblur``).
+
+What the camera does is stated, or said by the file with OpenEXR's standard attributes: ``expTime`` (s) and
+``framesPerSecond``, or ``shutterAngle`` (degrees); ``aperture`` (f-number), ``focus`` (m), and
+``pinholeFocalLength``, ``effectiveFocalLength`` or ``nominalFocalLength`` (mm) with ``sensorPhotositePitch`` (um) or
+``sensorOverallDimensions`` (mm). The filter is :mod:`jaxdn.filters.camera_blur`.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+from fractions import Fraction
+from typing import Annotated, Any
+
+import numpy as np
+
+from jaxdn.core.frame import Frame
+from jaxdn.core.options import Range
+from jaxdn.data.exr.file import ExrFile
+from jaxdn.filters.camera_blur import LONGEST, WIDEST, blur_lens, blur_motion, confusion_radius
+
+_ABOVE_0 = Range(0.0, without_low=True)
+_FULL_FRAME = 36.0
+_STATE = "--reblur shutter=0.5 for motion blur, --reblur fstop=2.8 lens=50 focus=3.2 for depth of field"
+
+
+@dataclass(frozen=True)
+class Optics:
+    """What a camera does; None: as the files say, and what they do not say is not done."""
+
+    shutter: Annotated[float, Range(0.0, 1.0)] | None = None
+    """The part of the time between two frames that the shutter is open: 0.5 is 180 degrees."""
+    fstop: Annotated[float, _ABOVE_0] | None = None
+    """The f-number: the focal length divided by the diameter of the lens."""
+    lens: Annotated[float, _ABOVE_0] | None = None
+    """The focal length in mm."""
+    sensor: Annotated[float, _ABOVE_0] | None = None
+    """Of what the picture shows, the width on the sensor in mm; usually 36."""
+    focus: Annotated[float, _ABOVE_0] | None = None
+    """The distance of what is sharp, in units of the scene's depth."""
+    metres: Annotated[float, _ABOVE_0] | None = None
+    """Metres of such a unit; usually 1."""
+
+
+def read_optics(file: ExrFile, given: Optics) -> Optics:
+    """What is ``given``, else what the file says; a panorama has no lens.
+
+    Raises ValueError where neither says anything, or only half of what depth of field needs.
+    """
+    told = _read(file.header, _width(file), given.metres or 1.0)
+    if file.is_panorama:
+        told = replace(told, fstop=None)
+        if given.fstop is not None:
+            raise ValueError(f"{file.path}: --reblur fstop: expected a picture of a lens, got a panorama; leave it out.")
+    stated = {each.name: value for each in fields(given) if (value := getattr(given, each.name)) is not None}
+    optics = replace(told, **stated)
+    if optics.fstop is not None and (missing := [name for name in ("lens", "focus") if getattr(optics, name) is None]):
+        raise ValueError(
+            f"{file.path}: --reblur fstop={optics.fstop:g}: expected {' and '.join(missing)} too: {_STATE}."
+        )
+    if optics.fstop is None and optics.shutter is None:
+        raise ValueError(f"{file.path}: --reblur: expected a shutter or a lens, and the file names none: {_STATE}.")
+    return optics
+
+
+def _read(header: Mapping[str, Any], width: int, metres: float) -> Optics:
+    """What a header says, of a picture of so many pixels in a row."""
+    exposure, rate, angle = (_number(header, name) for name in ("expTime", "framesPerSecond", "shutterAngle"))
+    shutter = exposure * rate if exposure and rate else angle / 360 if angle else None
+    lengths = [_number(header, f"{kind}FocalLength") for kind in ("pinhole", "effective", "nominal")]
+    pitch, size = _number(header, "sensorPhotositePitch"), header.get("sensorOverallDimensions")
+    sensor = pitch * width / 1000 if pitch else None if size is None else float(size[0]) or None
+    focus = _number(header, "focus")
+    return Optics(
+        shutter=None if shutter is None else min(shutter, 1.0),
+        fstop=_number(header, "aperture"),
+        lens=next((length for length in lengths if length), None),
+        sensor=sensor,
+        focus=None if focus is None else focus / metres,
+    )
+
+
+def _number(header: Mapping[str, Any], name: str) -> float | None:
+    value = header.get(name)
+    usable = isinstance(value, int | float | Fraction) and 0 < value < float("inf")
+    return float(value) if usable else None
+
+
+class CameraBlur:
+    """Blurs the images of consecutive frames."""
+
+    def __init__(self, given: Optics, log: Callable[[str], None]) -> None:
+        """``log`` is called with what is done to the first frame, and where something is cut."""
+        self._given, self._log = given, log
+        self._told: set[str] = set()
+
+    def blur(self, file: ExrFile, frame: Frame, images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Images [H, W, C] by any names, as the camera of the file's frame would have taken them.
+
+        Depth of field comes first, then motion blur. Raises ValueError where buffers are missing, and as
+        :func:`read_optics` does.
+        """
+        optics = read_optics(file, self._given)
+        if frame.depth is not None:
+            depth = np.asarray(frame.depth, np.float32)
+        elif optics.fstop is None:
+            depth = np.ones((*frame.radiance.shape[:2], 1), np.float32)
+            self._tell("no depth", "--reblur: there is no depth, so of things that cross the faster is in front")
+        else:
+            raise ValueError(f"{file.path}: --reblur fstop: expected depth; name it, --channels depth=LAYER.")
+        stacked = np.concatenate(list(images.values()), axis=-1).astype(np.float32)
+        if optics.fstop is not None:
+            radius = np.asarray(confusion_radius(depth, optics.focus, _radius_far_away(optics, file)))
+            self._tell_size("lens", f"f/{optics.fstop:g}", 2 * float(radius.max()), 2 * WIDEST)
+            stacked = np.asarray(blur_lens(stacked, radius, depth))
+        if optics.shutter is not None:
+            motion = _motion_of(file, frame)
+            longest = optics.shutter * float(np.max(np.linalg.norm(motion, axis=-1)))
+            self._tell_size("shutter", f"shutter {optics.shutter:g}", longest, LONGEST)
+            stacked = np.asarray(blur_motion(stacked, motion, depth, optics.shutter))
+        ends = np.cumsum([image.shape[-1] for image in images.values()])
+        return dict(zip(images, np.split(stacked, ends[:-1], axis=-1), strict=True))
+
+    def _tell_size(self, what: str, setting: str, size: float, most: float) -> None:
+        self._tell(what, f"--reblur: {setting}: what is sharp spreads over up to {size:.0f} pixels in the first frame")
+        if size > most:
+            self._tell(f"{what} cut", f"--reblur: {setting}: {size:.0f} pixels are cut to {most:.0f}")
+
+    def _tell(self, what: str, line: str) -> None:
+        """Log a line, the first of its kind."""
+        if what not in self._told:
+            self._told.add(what)
+            self._log(line)
+
+
+def _radius_far_away(optics: Optics, file: ExrFile) -> float:
+    """The radius of the circle of confusion of what is infinitely far away, in pixels."""
+    assert optics.fstop is not None
+    assert optics.lens is not None
+    assert optics.focus is not None
+    diameter = optics.lens / optics.fstop / 1000 / (optics.metres or 1.0)
+    focal_pixels = optics.lens / (optics.sensor or _FULL_FRAME) * _width(file)
+    return diameter * focal_pixels / (2 * optics.focus)
+
+
+def _motion_of(file: ExrFile, frame: Frame) -> np.ndarray:
+    """Vectors [H, W, 2], 0 where they are not known. Raises ValueError where there are none."""
+    if frame.motion is None:
+        raise ValueError(
+            f"{file.path}: --reblur shutter: expected motion vectors; render them (Blender: with motion blur off), or "
+            "name them, --channels motion=LAYER."
+        )
+    return np.where(np.isfinite(frame.motion), frame.motion, 0).astype(np.float32)
+
+
+def _width(file: ExrFile) -> int:
+    """Pixels in a row of the picture."""
+    return file.display.right - file.display.left + 1
