@@ -85,8 +85,8 @@ def _score(frames: Path, clip: Path, out: Path, method: str, reblur: Optics | No
 def _describe(rows: list[list[Any]], method: str, options: Options) -> dict[str, Any]:
     titles = ("PSNR", "at edges", "elsewhere", "temporal")
     columns: list[dict[str, Any]] = [{"name": name} for name in ("clip", "samples", "frames")]
-    columns += [{"name": title, "decimals": 2, "best": "higher"} for title in titles]
-    columns += [{"name": "FLIP", "decimals": 3, "best": "lower"}]
+    columns += [{"name": title, "decimals": 2} for title in titles]
+    columns += [{"name": "FLIP", "decimals": 3}]
     what = (
         f"Frames of Cycles with motion blur or depth of field, against sharp frames that `jaxdn denoise --reblur` "
         f"blurs; {method}, as a user runs it. References are blurred by Cycles. PSNR of x / (1 + x) in dB, without the "
@@ -94,7 +94,7 @@ def _describe(rows: list[list[Any]], method: str, options: Options) -> dict[str,
     )
     command = f"python -m experiments.cycles.blurred FOLDER/train FOLDER/sharp --clips {' '.join(options.clips)}"
     described = describe_measurement("table", "Reblurred frames", "Sequences", 215, command=command, what=what, rows=rows)
-    return {**described, "columns": columns, "group": "clip", "readme": {}}
+    return {**described, "columns": columns}
 
 
 if __name__ == "__main__":
