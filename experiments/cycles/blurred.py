@@ -93,7 +93,8 @@ def _describe(rows: list[list[Any]], method: str, options: Options) -> dict[str,
         "references' noise."
     )
     command = f"python -m experiments.cycles.blurred FOLDER/train FOLDER/sharp --clips {' '.join(options.clips)}"
-    described = describe_measurement("table", "Reblurred frames", "Sequences", 215, command=command, what=what, rows=rows)
+    title = "Reblurred frames"
+    described = describe_measurement("table", title, "Sequences", 215, command=command, what=what, rows=rows)
     return {**described, "columns": columns}
 
 

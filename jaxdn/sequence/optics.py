@@ -50,7 +50,7 @@ def read_optics(file: ExrFile, given: Optics) -> Optics:
     if file.is_panorama:
         told = replace(told, fstop=None)
         if given.fstop is not None:
-            raise ValueError(f"{file.path}: --reblur fstop: expected a picture of a lens, got a panorama; leave it out.")
+            raise ValueError(f"{file.path}: --reblur fstop: a panorama has no lens; leave it out.")
     stated = {each.name: value for each in fields(given) if (value := getattr(given, each.name)) is not None}
     optics = replace(told, **stated)
     if optics.fstop is not None and (missing := [name for name in ("lens", "focus") if getattr(optics, name) is None]):
