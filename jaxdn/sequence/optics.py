@@ -11,6 +11,7 @@ from dataclasses import dataclass, fields, replace
 from fractions import Fraction
 from typing import Annotated, Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.core.frame import Frame
@@ -81,8 +82,7 @@ def _read(header: Mapping[str, Any], width: int, metres: float) -> Optics:
 
 def _number(header: Mapping[str, Any], name: str) -> float | None:
     value = header.get(name)
-    usable = isinstance(value, int | float | Fraction) and 0 < value < float("inf")
-    return float(value) if usable else None
+    return float(value) if isinstance(value, int | float | Fraction) and 0 < value < float("inf") else None
 
 
 class CameraBlur:
@@ -109,7 +109,7 @@ class CameraBlur:
             raise ValueError(f"{file.path}: --reblur fstop: expected depth; name it, --channels depth=LAYER.")
         stacked = np.concatenate(list(images.values()), axis=-1).astype(np.float32)
         if optics.fstop is not None:
-            radius = np.asarray(confusion_radius(depth, optics.focus, _radius_far_away(optics, file)))
+            radius = _find_radius(optics, file, depth)
             self._tell_size("lens", f"f/{optics.fstop:g}", 2 * float(radius.max()), 2 * WIDEST)
             stacked = np.asarray(blur_lens(stacked, radius, depth))
         if optics.shutter is not None:
@@ -132,14 +132,14 @@ class CameraBlur:
             self._log(line)
 
 
-def _radius_far_away(optics: Optics, file: ExrFile) -> float:
-    """The radius of the circle of confusion of what is infinitely far away, in pixels."""
+def _find_radius(optics: Optics, file: ExrFile, depth: np.ndarray) -> np.ndarray:
+    """The radius [H, W, 1] of the circles of confusion in pixels, of things in a depth [H, W, 1]."""
     assert optics.fstop is not None
     assert optics.lens is not None
     assert optics.focus is not None
     diameter = optics.lens / optics.fstop / 1000 / (optics.metres or 1.0)
     focal_pixels = optics.lens / (optics.sensor or _FULL_FRAME) * _width(file)
-    return diameter * focal_pixels / (2 * optics.focus)
+    return np.asarray(confusion_radius(jnp.asarray(depth), optics.focus, diameter * focal_pixels / (2 * optics.focus)))
 
 
 def _motion_of(file: ExrFile, frame: Frame) -> np.ndarray:
