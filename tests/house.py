@@ -68,6 +68,7 @@ ROOMS: dict[str, Room] = {
     "training": Room(9, "the training loop"),
     "sequence": Room(10, "files in, files out"),
     "commands": Room(11, "the command line"),
+    "__main__": Room(12, "`python -m jaxdn`"),
 }
 
 PACKAGES = {

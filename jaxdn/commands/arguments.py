@@ -378,11 +378,11 @@ COMMANDS = Inspect | Render | Pack | Train | Denoise | Compare | Export | Doctor
 """All of them, as tyro reads them from a command line."""
 
 
-def check_folder(out: Path) -> Path:
-    """``-o`` of a command that writes into a folder. Raises ValueError for a file, and for what is plainly its name."""
+def check_folder(out: Path, option: str = "-o") -> Path:
+    """The folder that an option names. Raises ValueError for a file, and for what is plainly the name of one."""
     names = (".exr", ".png", ".safetensors", ".json", ".html", ".onnx", ".mlir", ".stablehlo")
     if out.is_file() or out.suffix.lower() in names:
-        raise ValueError(f"-o {out}: expected a folder, got the name of a file.")
+        raise ValueError(f"{option} {out}: expected a folder, got the name of a file; name another.")
     return out
 
 

@@ -47,7 +47,7 @@ def _inspect(options: Inspect) -> None:
         frames=options.frames,
         as_json=options.json,
         naming=name_channels(options),
-        overlay=options.overlay,
+        overlay=None if options.overlay is None else check_folder(options.overlay, "--overlay"),
     )
 
 
@@ -204,6 +204,10 @@ def _export(options: Export) -> None:
 def _doctor(options: Doctor) -> None:
     from jaxdn.commands.doctor import doctor
 
+    usual = vars(Doctor())
+    given = [name for name, value in vars(options).items() if value != usual[name]]
+    if given and not options.warm:
+        raise ValueError(f"--{given[0]}: expected --warm with it; add that, or leave it out.")
     doctor()
     if options.warm:
         from jaxdn.commands.warm import warm

@@ -16,6 +16,7 @@ import OpenEXR
 import pytest
 from safetensors.numpy import load_file
 
+from jaxdn import __version__
 from jaxdn.clips import write_clip
 from jaxdn.commands import main
 from jaxdn.core.frame import Clip, Frame
@@ -316,6 +317,11 @@ def test_sizes_that_differ_are_refused(clip, tmp_path, capsys):
     write_clip(Clip(Frame(radiance=small.frames.radiance)), tmp_path / "small")
     (mixed / "frame_0002.exr").write_bytes((tmp_path / "small" / "frame_0000.exr").read_bytes())
     assert "frame_0002.exr" in told_here(capsys, "denoise", mixed, "-o", tmp_path / "out", "--method", "svgf")
+
+
+def test_the_package_runs_as_the_command():
+    done = subprocess.run([sys.executable, "-m", "jaxdn", "--version"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, f"jaxdn {__version__}\n"), done.stderr
 
 
 def test_the_compilers_alarm_is_silenced_before_jax_reads_the_setting():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxdn.clips import read_clip, write_exr
+from jaxdn.commands import main
 from jaxdn.commands.warm import draw_passes
 from jaxdn.core.frame import present
 
@@ -89,3 +90,12 @@ def test_what_cannot_be_compiled_is_told(tmp_path: Path) -> None:
         assert done.returncode == 2
         assert message in " ".join(done.stderr.split())
         assert "Traceback" not in done.stderr
+
+
+def test_options_of_warm_alone_are_refused_without_it(capsys) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main.main(["doctor", "--height", "1200"])
+    assert ended.value.code == 2
+    told = capsys.readouterr()
+    assert "--height: expected --warm with it" in " ".join(told.err.split())
+    assert told.out == ""

@@ -308,7 +308,12 @@ def test_several_shots_have_a_folder_each(tmp_path, capsys):
 
 def test_what_has_no_overlay_is_refused(tmp_path, capsys):
     shot = write_shot(tmp_path / "shot", frames=2)
-    for arguments in (["fruit", "--overlay", str(tmp_path / "out")], [str(shot), "--overlay", str(shot)]):
+    taken = shot / "shot_0001.exr"
+    for arguments in (
+        ["fruit", "--overlay", str(tmp_path / "out")],
+        [str(shot), "--overlay", str(shot)],
+        [str(shot), "--overlay", str(taken)],
+    ):
         with pytest.raises(SystemExit) as ended:
             main.main(["inspect", *arguments])
         assert ended.value.code == 2
