@@ -48,6 +48,9 @@ class Options:
     """The U-Net's widths, by name or as tuples (see :func:`jaxdn.networks.unet.unet`)."""
     motion: Literal["dual", "traditional"] = "dual"
     """Vectors that warp the history: ``dual_motion`` (``motion`` if it is absent), or always ``motion``."""
+    history: Literal["warped", "none"] = "warped"
+    """The last image, along these vectors; or every frame is a first frame (the networks without recurrence that
+    Hasselgren et al. 2020 compare with)."""
     alpha_at: Literal["coarse", "fine"] = "coarse"
     """The blending weight of two scales: inside U, at the coarse scale; or outside it, for each fine pixel."""
     down: Literal["mean", "max"] = "mean"
@@ -153,10 +156,12 @@ def warp_history(
     Also where it is missing (bool [H, W, 1]), and how many of its values were invalid.
     """
     noisy = frame.radiance
+    vectors = frame.motion if frame.dual_motion is None else frame.dual_motion
+    if options.history == "none":
+        first, vectors = jnp.ones_like(first), None
     absent = first if options.first_frame == "none" else jnp.zeros_like(first)
     absent = jnp.broadcast_to(absent, (*noisy.shape[:2], 1))
     history = state
-    vectors = frame.motion if frame.dual_motion is None else frame.dual_motion
     if vectors is not None:
         vectors = jax.lax.stop_gradient(vectors)
         history = warp(history, vectors, border=options.border)

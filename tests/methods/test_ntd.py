@@ -206,6 +206,21 @@ def test_the_history_lies_where_the_vector_points(method: Any, buffer: str, rng:
     np.testing.assert_allclose(image[2:, :-3], history[:-2, 3:], rtol=1e-5)
 
 
+@pytest.mark.parametrize("preset", [None, "parity"])
+def test_without_a_history_every_frame_is_a_first_one(
+    preset: str | None, rng: np.random.Generator, key: jax.Array
+) -> None:
+    """Whatever came before; the networks without recurrence that papers compare with."""
+    denoiser, usual = (tiny(preset=preset, **more) for more in ({"history": "none"}, {}))
+    frames = random_frames(rng)
+    params, frame = initial(usual, key, frames), frame_at(frames, 1)
+    start = usual.start(params, frame)
+    later = start._replace(core=jnp.full_like(start.core, 7.0), age=start.age + 3)
+    _, expected = stepped(usual)(params, start, frame)
+    np.testing.assert_allclose(stepped(denoiser)(params, later, frame)[1], expected, rtol=1e-5, atol=1e-6)
+    assert np.abs(stepped(usual)(params, later, frame)[1] - expected).max() > 0.01
+
+
 def blending(params: Any, logit: float) -> Any:
     """The same parameters with alpha^t the same everywhere."""
     head = params["head_0"]

@@ -23,7 +23,7 @@ from tests.mutants.learned import LEARNED
 from tests.mutants.mutant import ROOT, Mutant
 
 MUTANTS: tuple[Mutant, ...] = (*FILTERS, *LEARNED)
-_COPIED = ("jaxdn", "tests", "experiments")
+_COPIED = ("jaxdn", "tests", "experiments", "docs")
 _PASSED, _FAILED = 0, 1
 """Exit codes of pytest."""
 

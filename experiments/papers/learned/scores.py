@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.papers import results
+from experiments.papers.learned.stages import BUDGET, objective_of
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser.rollout import unroll
 from jaxdn.evaluation.compare import EvaluationClip, read_evaluation_clip
@@ -36,6 +37,8 @@ class Table(NamedTuple):
     text: Callable[[Results], str]
     """The results of all rows -> the table as Markdown."""
     claims: Callable[[Results], list[Claim]]
+    spp: int = BUDGET
+    """Samples a pixel of what the methods are given."""
 
 
 def read(folder: Path, *, spp: int, layers: bool = False) -> EvaluationClip:
@@ -69,10 +72,16 @@ def rows_of(found: Results, labels: Iterable[str]) -> Results:
 
 
 def ordinary(found: Results, labels: Iterable[str]) -> str:
-    """PSNR, temporal PSNR and others with relative MSE, in the mean over the clips, as Markdown."""
+    """PSNR, temporal PSNR and others with what each is trained by, in the mean over the clips, as Markdown."""
     some = rows_of(found, labels)
-    errors = {label: f"{one.unbiased_relative_mse:.4f}" for label, one in mean_scores(some).items()}
-    return results.table(some, {"relative MSE": errors})
+    means = mean_scores(some)
+    columns = {
+        "relative MSE": {label: f"{one.unbiased_relative_mse:.4f}" for label, one in means.items()},
+        "MSE": {label: f"{one.unbiased_mse:.5f}" for label, one in means.items()},
+        "SSIM": {label: f"{one.ssim:.4f}" for label, one in means.items()},
+        "trained by": {label: objective_of(label) for label in means},
+    }
+    return results.table(some, columns)
 
 
 def over_frames(found: Results, labels: Iterable[str]) -> str:

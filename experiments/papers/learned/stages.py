@@ -19,7 +19,7 @@ HELD_OUT = ("parlour", "mobile", "pinkroom", "robot")
 """The families that :data:`STAGES` leave out of training, one each."""
 LAYERS = (1, 2, 4, 8, 16, 32)
 BUDGET = 4
-"""Samples a pixel: the same everywhere, or in the mean for those who ask for samples."""
+"""Samples a pixel: the same everywhere, or in the mean for those who ask for samples. One table has another number."""
 TRAINED = "ntd,rae,arae,ntasd,dasr,svgf,steady"
 """The methods whose buffers the training clips have."""
 COMPARED = f"{TRAINED},asvgf,trmv"
@@ -34,22 +34,33 @@ class Stage(NamedTuple):
     options: dict[str, Any]
     without: str | None = None
     """The family whose clips are left out."""
+    only: str | None = None
+    """The family whose clips alone are trained on."""
+    recipe: str | None = None
+    """Of the method; None: the usual one."""
+    spp: int = BUDGET
+    """Samples a pixel of what it is trained on, if it asks for none."""
 
 
-_UNIFORM = Stage("ntasd", {"size": "small", "adaptive": False})
+_OPTIONS = {"size": "small", "adaptive": False}
+_UNIFORM = Stage("ntasd", _OPTIONS)
+_SINGLE_FRAMES = {**_OPTIONS, "history": "none"}
 STAGES = {
     "ntasd": Stage("ntasd", {"size": "small"}),
+    "ntasd, large": Stage("ntasd", {"size": "large"}),
     "ntasd, uniform": _UNIFORM,
     "ntasd, uniform, large": Stage("ntasd", {"size": "large", "adaptive": False}),
-    "ntasd, three scales": Stage("ntasd", {"size": "small", "prediction": "three-scales"}),
-    "ntasd, one scale": Stage("ntasd", {"size": "small", "prediction": "one-scale"}),
-    "ntasd, direct": Stage("ntasd", {"size": "small", "prediction": "direct"}),
+    "single frames, three scales": Stage("ntasd", {**_SINGLE_FRAMES, "prediction": "three-scales"}),
+    "single frames, direct": Stage("ntasd", {**_SINGLE_FRAMES, "prediction": "direct"}),
+    "ntasd, uniform, 1 sample": Stage("ntasd", {**_OPTIONS, "budget": 1.0}, recipe="without-occlusion"),
+    "ntd, 1 sample": Stage("ntd", {"size": "small"}, spp=1),
     "dasr": Stage("dasr", {"size": "small"}),
     "dasr, uniform": Stage("dasr", {"size": "small", "adaptive": False}),
     "ntd": Stage("ntd", {"size": "small"}),
     "rae": Stage("rae", {"size": "small"}),
     "arae": Stage("arae", {"size": "small"}),
     **{f"ntasd, uniform, without {family}": _UNIFORM._replace(without=family) for family in HELD_OUT},
+    **{f"ntasd, uniform, only {family}": _UNIFORM._replace(only=family) for family in HELD_OUT},
 }
 
 
@@ -98,18 +109,26 @@ def trained(name: str, settings: Settings) -> Model:
     """A stage, trained if it is not."""
     stage = STAGES[name]
     method = method_named(stage.method)
-    recipe = method.recipe_named(None)._replace(
+    recipe = method.recipe_named(stage.recipe)._replace(
         steps=settings.steps,
         frames=settings.frames,
         average=0.99,
-        spp=(1,) if method.has_option("budget") else (BUDGET,),
+        spp=(1,) if method.has_option("budget") else (stage.spp,),
     )
     out = settings.out / file_name(name)
-    clips = clips_without(stage.without, find_clips(settings.data / "train"))
+    clips = clips_of(stage, find_clips(settings.data / "train"))
     weights = train(method, recipe, clips, out, options=stage.options, label=name)
     return find_model(str(weights))._replace(label=name)
 
 
-def clips_without(family: str | None, folders: Sequence[Path]) -> list[Path]:
-    """Those that are not of the family; rendered clips are named after it and their seed."""
-    return [folder for folder in folders if family is None or not folder.name.startswith(f"{family}-")]
+def clips_of(stage: Stage, folders: Sequence[Path]) -> list[Path]:
+    """Those that a stage is trained on; rendered clips are named after their family and their seed."""
+    kept = [folder for folder in folders if stage.only is None or folder.name.startswith(f"{stage.only}-")]
+    return [folder for folder in kept if stage.without is None or not folder.name.startswith(f"{stage.without}-")]
+
+
+def objective_of(name: str) -> str:
+    """The name of what a stage is trained by; empty for a method that is not trained here."""
+    if name not in STAGES:
+        return ""
+    return method_named(STAGES[name].method).recipe_named(STAGES[name].recipe).objective.name
