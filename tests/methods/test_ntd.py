@@ -206,7 +206,7 @@ def test_the_history_lies_where_the_vector_points(method: Any, buffer: str, rng:
     np.testing.assert_allclose(image[2:, :-3], history[:-2, 3:], rtol=1e-5)
 
 
-@pytest.mark.parametrize("preset", [None, "parity"])
+@pytest.mark.parametrize("preset", [None, "paper"])
 def test_without_a_history_every_frame_is_a_first_one(
     preset: str | None, rng: np.random.Generator, key: jax.Array
 ) -> None:
