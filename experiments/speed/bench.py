@@ -1,6 +1,6 @@
 """`make bench`: the speed of jaxdn on this machine, compared with its roofline, PyTorch and Open Image Denoise.
 
-    python -m experiments.speed.bench                  # everything, 20 to 30 minutes on two cores
+    python -m experiments.speed.bench                  # everything, half an hour on two cores
     python -m experiments.speed.bench --only steps     # one group
 
 Writes ``runs/bench.json`` in the format of docs/results (:mod:`experiments.measurement`), with rows ``{"work",
@@ -31,13 +31,13 @@ from experiments.speed import peers, roofline
 from experiments.speed.roofline import Probe
 from experiments.speed.timing import Timing, summary
 from experiments.speed.workers import Team, WorkerError, apart
-from experiments.speed.works import Work, compilation, input_share, operations, steps, train_steps
+from experiments.speed.works import Work, compilation, files, input_share, operations, steps, train_steps
 from jaxdn.commands.errors import plain_errors
 from jaxdn.runtime.atomic_files import write_json
 
 Row = dict[str, Any]
 
-BUDGET_S = {"steps": 180, "operations": 300, "train": 240, "input": 90, "compile": 60}
+BUDGET_S = {"steps": 180, "operations": 300, "train": 240, "input": 90, "compile": 60, "files": 300}
 """Seconds for each group, in the order in which they run: a workload starts only while its group has time left.
 Compiling in advance does not count; on two cores it takes about as long as all of this."""
 ONE_WORK_S = {"steps": 45, "operations": 6, "train": 60}
@@ -52,7 +52,7 @@ COMPILE_S = 240
 class Settings:
     """Time jaxdn, compared with its roofline, PyTorch and Open Image Denoise; write runs/bench.json."""
 
-    only: Literal["all", "steps", "operations", "train", "compile", "input"] = "all"
+    only: Literal["all", "steps", "operations", "train", "compile", "input", "files"] = "all"
     """Run one group of workloads."""
     out: Path = Path("runs/bench.json")
 
@@ -190,6 +190,27 @@ def input_rows(say: Callable[[str], None]) -> list[Row]:
     ]
 
 
+def file_rows(methods: Sequence[str], say: Callable[[str], None], **options: Any) -> list[Row]:
+    """From command to file, in turns with Open Image Denoise; ``options`` as :func:`files.measure` takes them."""
+    if not files.measurable() or "pyoidn" in peers.missing():
+        say("files: left out: expected pyoidn, and a system that tells what a child process took")
+        return []
+    with tempfile.TemporaryDirectory() as place:
+        try:
+            taken = files.measure([files.PEER, *methods], Path(place), **options)
+        except RuntimeError as error:
+            say(f"files: {', '.join(methods)} is left out: {error}")
+            return []
+    rows = []
+    for work, found in files.timings(taken, **{k: v for k, v in options.items() if k == "frames"}).items():
+        other = found[files.PEER][0]
+        rows += [row(work, name, timing, peak, files.PEER, other.median_ms) for name, (timing, peak) in found.items()]
+    for each in rows:
+        if each["work"] == "files-frame":
+            say(f"{each['implementation']}: {1e3 / each['median_ms']:.2f} frames a second")
+    return rows
+
+
 def table(rows: Sequence[Row]) -> Table:
     """One line for each workload and implementation, a column for each peer."""
     against = list(dict.fromkeys(row["against"] for row in rows))
@@ -253,6 +274,7 @@ def groups(cache: Path, say: Callable[[str], None]) -> dict[str, Iterator[Callab
         "train": timed("train", compiled(train_steps.works, cache, taken, say=say)),
         "input": iter([partial(input_rows, say)]),
         "compile": (partial(compile_rows, program, cache, taken, say=say) for program in COMPILED),
+        "files": (partial(file_rows, (method,), say) for method in files.METHODS),
     }
 
 
