@@ -14,7 +14,7 @@ from jaxdn.commands.progress import reporter
 from jaxdn.data.clip.folder import refuse_unfinished
 from jaxdn.data.errors import DamagedFile
 from jaxdn.data.exr.file import ExrFile
-from jaxdn.data.foreign.channel_mapping import UNSTATED, MappedBuffer, read_channel_mapping
+from jaxdn.data.foreign.channel_mapping import MappedBuffer, lacks_convention, read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.foreign.passes import join_passes
@@ -105,7 +105,8 @@ def _inspect_shot(
             del opened[0]
     sequence = ForeignSequence(opened, naming)
     height, width = sequence.window.size
-    unstated = any(mapped.convention == UNSTATED for mapped in mapping)
+    # Vectors of 0, as a first frame has them, count as missing in its table.
+    unstated = lacks_convention(opened[0], naming)
     fitting = sequence.fitting_conventions() if unstated else None
     gaps = f"{ranges(missing_numbers(shot.numbers))} missing" if missing_numbers(shot.numbers) else None
     if not quiet:

@@ -3,9 +3,9 @@
 jax keeps programs in a folder by all that goes into them, its own version included, but not by the CPU that their code
 is for: on a home folder that several machines share, each kind of CPU has a folder of its own.
 
-jax writes a program under its name, and never again where there is a file: what a killed process or a full disk leaves
-would be half a program for good, which every later process cannot read. So programs get their names when they are
-complete, here too (:mod:`jaxdn.runtime.atomic_files`).
+jax writes a program under its name, and never again where there is a file: what a killed process, a full or a failing
+disk leaves would be half a program for good, which every later process compiles anew. So programs get their names when
+they are complete, here too (:mod:`jaxdn.runtime.atomic_files`), and take the place of one that cannot be read.
 """
 
 import hashlib
@@ -68,10 +68,9 @@ def _write_completely() -> None:
         if not key or getattr(store, "eviction_enabled", True):
             in_place(store, key, value)
             return
-        path = Path(str(store.path)) / f"{key}-cache"
-        if not path.exists():
-            with atomic_write(path) as temporary:
-                temporary.write_bytes(value)
+        # Where there is a file already, it could not be read, or another process has compiled the same.
+        with atomic_write(Path(str(store.path)) / f"{key}-cache") as temporary:
+            temporary.write_bytes(value)
 
     kind.put = put
 

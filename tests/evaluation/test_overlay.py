@@ -165,6 +165,21 @@ def test_vectors_that_nobody_has_explained(tmp_path, inspect):
     assert inspect(shot, "--motion-convention", "previous-current")["findings"] == []
 
 
+def test_vectors_that_nobody_has_explained_and_the_first_frame_lacks(tmp_path, inspect, capsys):
+    """Vectors of a first frame are 0: there is no frame before it."""
+
+    def rename(index, layers):
+        vectors = layers["Vector"][..., :2] * (1, -1) * (index > 0)
+        return {name: image for name, image in layers.items() if name != "Vector"} | {"motion": vectors}
+
+    shot = write_shot(tmp_path / "shot", rename)
+    record = inspect(shot)
+    assert record["fitting_conventions"] == ["previous-current"]
+    assert names(record) == ["vectors without a meaning"]
+    main.main(["inspect", str(shot)])
+    assert "--motion-convention previous-current" in capsys.readouterr().out
+
+
 def test_vectors_of_another_size(tmp_path, inspect):
     """As of a picture of three times the size."""
     record = inspect(write_shot(tmp_path / "shot", lambda index, layers: layers | {"Vector": 3 * layers["Vector"]}))

@@ -4,6 +4,7 @@ import errno
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import jax
@@ -101,6 +102,21 @@ def test_half_a_program_is_never_kept(kept, monkeypatch):
     compile_new(0.1)
     names = [path.name for path in kept.iterdir()]
     assert any(name.startswith("jit__lambda") and name.endswith("-cache") for name in names), names
+
+
+def test_a_program_that_cannot_be_read_is_written_again(kept):
+    compile_new(0.2)
+    (program,) = kept.glob("jit__lambda*-cache")
+    whole = program.read_bytes()
+    program.write_bytes(whole[:100])
+    jax.clear_caches()
+    with pytest.warns(UserWarning, match="Error reading"):
+        compile_new(0.2)
+    assert len(program.read_bytes()) > 100
+    jax.clear_caches()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        compile_new(0.2)
 
 
 def test_what_killed_processes_left_is_removed(kept):

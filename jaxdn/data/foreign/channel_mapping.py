@@ -55,17 +55,23 @@ def read_channel_mapping(
     return _map_foreign(first, naming, single=single, log=log)
 
 
+def lacks_convention(file: ExrFile, naming: ChannelNaming, *, single: bool = False) -> bool:
+    """Whether a file of another renderer has motion vectors, be they 0, and nothing says what they mean."""
+    pixels = file.pixels
+    try:
+        find_motion_convention(naming.detect(list(pixels)), pixels, naming.motion_convention, single=single)
+    except UnknownMotion:
+        return True
+    return False
+
+
 def _map_foreign(
     file: ExrFile, naming: ChannelNaming, *, single: bool, log: Callable[[str], None]
 ) -> list[MappedBuffer]:
     """From which channels the buffers of another renderer's file are read."""
     pixels = file.pixels
-    unknown = False
     try:
-        try:
-            find_motion_convention(naming.detect(list(pixels)), pixels, naming.motion_convention, single=single)
-        except UnknownMotion:
-            unknown = True
+        unknown = lacks_convention(file, naming, single=single)
         assumed = replace(naming, motion_convention=OWN) if unknown else naming
         mapping = classify_channels(pixels, assumed, single=single)
     except ClipError as error:
