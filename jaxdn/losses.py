@@ -33,8 +33,12 @@ if TYPE_CHECKING:
     Scalar: TypeAlias = Float[Array, ""]
 
 
-def unbiased(denoised: jax.Array, reference: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The pair (denoised, reference) as compressed near the denoised image: both times ``compress'(denoised)``.
+def unbiased(
+    denoised: jax.Array, reference: jax.Array, *, curve: Literal["compress", "reinhard"] = "compress"
+) -> tuple[jax.Array, jax.Array]:
+    """The pair (denoised, reference) as compressed near the denoised image: both times ``curve'(denoised)``.
+
+    The curve is :func:`jaxdn.color.compress`, or Reinhard's ``x / (1 + x)``, of which PSNR is measured.
 
     The slope has no gradient of its own, so that the target appears only linearly: squared, the difference is to first
     order that of the compressed images, but noise in the target, which compression would turn into a bias, averages
@@ -45,8 +49,12 @@ def unbiased(denoised: jax.Array, reference: jax.Array) -> tuple[jax.Array, jax.
     light from the brightest pixels of hard scenes; how much has not been measured.
     """
     fixed = jax.lax.stop_gradient(denoised)
+    check_option(curve, "curve", ("compress", "reinhard"))
     point = jnp.clip(fixed, 0.02, RADIANCE_MAX)
-    _, slope = jax.jvp(color.compress, (point,), (jnp.ones_like(point),))
+    if curve == "reinhard":
+        slope = jnp.square(1.0 / (1.0 + point))
+    else:
+        _, slope = jax.jvp(color.compress, (point,), (jnp.ones_like(point),))
     return denoised * slope, jnp.minimum(reference, 10.0 * (fixed + 0.1)) * slope
 
 

@@ -5,8 +5,7 @@
 
 The first groups of its input are those of steady's network, its U-Net has the widths of ``steady-balanced``, and parts
 of its head say the same: features of the filter, trust, how fast the mean follows. These are copied; what is new begins
-as ever, with no weight on inputs that steady does not have, and the same weights of
-the candidates everywhere.
+as ever, with no weight on inputs that steady does not have. So does the network that chooses among the candidates.
 """
 
 import sys
@@ -47,7 +46,7 @@ def main(options: Options) -> int:
 def take_over(steady: Params) -> Params:
     """Parameters of ``combiner()`` with those of ``steady(quality="balanced")`` where they say the same."""
     new = combiner().init(jax.random.key(0), Frame(jnp.zeros((16, 16, 3))))
-    params = {**steady, "guide": {**new["guide"]}, "head_0": {}}
+    params = {**steady, "guide": {**new["guide"]}, "choice": new["choice"], "head_0": {}}
     for name in new["guide"].keys() & steady["guide"].keys():
         params["guide"][name] = steady["guide"][name]
     first, widened = steady["encoder_0"]["convolution_0"], new["encoder_0"]["convolution_0"]

@@ -100,6 +100,23 @@ def pyramid_illumination(*, temporal: float = 1.0, logarithm: bool = False) -> O
     return Objective(f"logarithm of {name}", loss)
 
 
+def squared_illumination(*, temporal: float = 1.0) -> Objective:
+    """Half of the logarithm of the mean square of each frame's error, and of that of the frames' differences.
+
+    Errors are those of ``x / (1 + x)``, linear in the target (:func:`jaxdn.losses.unbiased`): what PSNR measures, whose
+    squares count few pixels with large errors, edges of lamps and silhouettes, as much as all others.
+    """
+
+    def loss(images: jax.Array, clip: Clip, progress: jax.Array) -> jax.Array:
+        denoised, wanted = losses.unbiased(images, clip.reference, curve="reinhard")
+        total = losses.spatial(denoised, wanted, squared=True)
+        if images.shape[0] > 1:
+            total += temporal * losses.temporal(denoised, wanted, squared=True)
+        return 0.5 * jnp.log(total + _NO_SQUARE)
+
+    return Objective(f"logarithm of squared illumination, changes {temporal:g}", loss)
+
+
 def recurrent_illumination(*, operator: Literal["difference", "hfen"] = "hfen") -> Objective:
     """``0.8 spatial + 0.1 gradient + 0.1 temporal`` on compressed radiance, later frames more (Chaitanya et al. 2017).
 
@@ -145,6 +162,8 @@ def last_frames() -> Objective:
     return Objective("last frames", loss)
 
 
+_NO_SQUARE = 1e-6
+"""Mean square of errors below which less is worth little."""
 _NO_ERROR = 1e-3
 """Added to a distance before its logarithm, about that of two images of 8 bits."""
 _SQUARES = 8.0

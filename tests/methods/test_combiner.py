@@ -11,6 +11,7 @@ from jaxdn.core.frame import Clip, Frame, frame_at
 from jaxdn.denoiser.rollout import denoise
 from jaxdn.denoisers import combiner, oidn, stabilised
 from jaxdn.methods.combiner.candidates import CANDIDATES, FilterParameters, make_candidates
+from jaxdn.methods.combiner.choice import RADII, assemble_evidence, count_inputs
 from jaxdn.methods.combiner.history import (
     Means,
     Past,
@@ -20,7 +21,7 @@ from jaxdn.methods.combiner.history import (
     start_history,
     update_means,
 )
-from jaxdn.methods.combiner.method import INITIAL, prepare
+from jaxdn.methods.combiner.method import FEATURES, INITIAL, prepare
 from jaxdn.zoo.weights import load_weights, save_weights
 from tests.needs import require
 
@@ -44,12 +45,15 @@ def deciding(weights_of_candidates, follow=0.0):
     """The parameters of a network that decides the same everywhere."""
     frame = Frame(jnp.zeros((16, 16, 3)))
     params = combiner(quality="fast").init(jax.random.key(0), frame)
-    logits = {**dict.fromkeys(CANDIDATES, -1e3), "trust": 4.0, "follow": follow, **weights_of_candidates}
+    logits = {**dict.fromkeys(CANDIDATES, -1e3), **weights_of_candidates}
     bias = np.array(params["head_0"]["bias"])
-    features = (bias.size - 8 - 1 - 4 - 4 * len(INITIAL)) // 4
-    bias[4 * features : 4 * (features + len(INITIAL))] = np.repeat([logits[name] for name in INITIAL], 4)
+    bias[4 * FEATURES : 4 * (FEATURES + len(INITIAL))] = np.repeat([4.0, follow], 4)
     head = {"kernel": jnp.zeros_like(params["head_0"]["kernel"]), "bias": jnp.asarray(bias)}
-    return {**params, "head_0": head}
+    shares = {
+        "kernel": jnp.zeros_like(params["choice"]["head_0"]["kernel"]),
+        "bias": jnp.asarray(np.repeat([logits[name] for name in CANDIDATES], 4), jnp.float32),
+    }
+    return {**params, "head_0": head, "choice": {**params["choice"], "head_0": shares}}
 
 
 def run(denoiser, params, frames):
@@ -236,9 +240,68 @@ def test_the_first_weights_take_over_what_steady_knows():
     np.testing.assert_array_equal(kernel[:, :, :52], steady["encoder_0"]["convolution_0"]["kernel"])
     assert not kernel[:, :, 52:].any()
     np.testing.assert_array_equal(params["head_0"]["bias"][:28], steady["head_0"]["bias"][:28])
-    np.testing.assert_array_equal(params["head_0"]["bias"][28:60], like["head_0"]["bias"][28:60])
-    np.testing.assert_array_equal(params["head_0"]["bias"][60:], steady["head_0"]["bias"][40:53])
+    np.testing.assert_array_equal(params["head_0"]["bias"][28:], steady["head_0"]["bias"][40:53])
+    jax.tree.map(np.testing.assert_array_equal, params["choice"], like["choice"])
     np.testing.assert_array_equal(params["guide"]["albedo"], steady["guide"]["albedo"])
+
+
+def evidence_of(rng, candidates, noisy, gain=1.0):
+    """The maps of slopes and errors [windows, candidates but the prior, h, w], of an area without borders."""
+    size = noisy.shape[1:]
+    groups = assemble_evidence(
+        [jnp.asarray(each, jnp.float32) for each in candidates],
+        jnp.asarray(noisy, jnp.float32),
+        *jnp.asarray(rng.random((2, 3, *size)), jnp.float32),
+        jnp.ones(size),
+        jnp.float32(gain),
+    )
+    assert tuple(group.shape[-1] for group in groups) == count_inputs()
+    maps = np.asarray(groups[1], np.float64)[: size[0] // 2, : size[1] // 2, :-1]
+    return maps.reshape(*maps.shape[:2], len(candidates) - 1, len(RADII), 2).transpose(4, 3, 2, 0, 1)
+
+
+def test_the_slope_tells_which_candidate_the_light_is_of(rng):
+    """Noisy light around the third candidate: 1 for that, the share of its part for others, 0 for what is no part."""
+    size, count = (64, 64), len(CANDIDATES)
+    prior = np.full((3, *size), 0.8)
+    waves = 0.1 * rng.choice([-1.0, 1.0], (2, 3, *size))
+    others = [prior, prior + waves[0], prior + 2 * waves[0], prior + waves[1]]
+    candidates = [prior, *others, *[prior] * (count - 5)]
+    noisy = prior + waves[0] + rng.normal(0, 0.05, (3, *size))
+    slopes, errors = evidence_of(rng, candidates, noisy)[:, -1, :, 8:-8, 8:-8]  # windows of 14 x 14 pixels
+    np.testing.assert_allclose(slopes[1].mean(), 1.0, atol=0.02)
+    np.testing.assert_allclose(slopes[2].mean(), 0.5, atol=0.02)
+    np.testing.assert_allclose(slopes[3].mean(), 0.0, atol=0.06)  # four standard errors of ten windows apart
+    assert not slopes[0].any()
+    # Of the third wave, all that varies is noise: the slope's scatter is what its error says.
+    np.testing.assert_allclose(np.std(slopes[3]), errors[3].mean(), rtol=0.3)
+
+
+def test_the_slope_is_that_of_an_independent_computation(rng):
+    size, gain = (48, 64), 0.7
+    candidates = rng.uniform(0.2, 1.2, (len(CANDIDATES), 3, *size))
+    noisy = rng.exponential(1.0, (3, *size))
+    slopes, _ = evidence_of(rng, candidates, noisy, gain)[:, 0]
+    weight = gain / (1 + gain * candidates[0]) ** 2
+    most = 3 * weight * (candidates[0] + 0.2 / gain)
+    residual = np.clip(weight * (noisy - candidates[0]), -most, most)
+    rows, columns = slice(2 * 10 - 2, 2 * 10 + 4), slice(2 * 7 - 2, 2 * 7 + 4)  # 3x3 blocks around that of (10, 7)
+    for index, candidate in enumerate(candidates[1:]):
+        difference = np.clip(weight * (candidate - candidates[0]), -most, most)[:, rows, columns]
+        own = np.sum(difference**2) / 4 + 9e-5
+        expected = np.sum(difference * residual[:, rows, columns]) / 4 / own
+        np.testing.assert_allclose(slopes[index, 10, 7], np.clip(expected, -1, 2), rtol=1e-3, atol=1e-4)
+
+
+def test_gradients_of_the_evidence(rng):
+    with jax.enable_x64(True):
+        candidates = jnp.asarray(rng.uniform(0.3, 1.0, (len(CANDIDATES), 3, 16, 16)))
+        noisy, guides = jnp.asarray(rng.uniform(0.3, 1.0, (3, 16, 16))), jnp.asarray(rng.random((2, 3, 16, 16)))
+
+        def groups(candidates):
+            return assemble_evidence(list(candidates), noisy, *guides, jnp.ones((16, 16)), jnp.asarray(1.0))
+
+        check_grads(groups, (candidates,), order=1, modes=["rev"], atol=1e-3, rtol=1e-3)
 
 
 def test_weights_are_saved_and_loaded(tmp_path, rng):

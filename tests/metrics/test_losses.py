@@ -232,6 +232,10 @@ def test_the_unbiased_pair_is_the_compressed_pair_to_first_order(rng: np.random.
     first, second = losses.unbiased(jnp.asarray(x), jnp.asarray(y))
     wanted = np.asarray(color.compress(x), np.float64) - np.asarray(color.compress(y), np.float64)
     np.testing.assert_allclose(first - second, wanted, rtol=2e-2, atol=2e-5)
+    first, second = losses.unbiased(jnp.asarray(x), jnp.asarray(y), curve="reinhard")
+    np.testing.assert_allclose(
+        first - second, np.float64(x) / (1.0 + x) - np.float64(y) / (1.0 + y), rtol=2e-2, atol=2e-5
+    )
     # One firefly in the target weighs as much as some hundred pixels, not as the whole image.
     image, firefly = jnp.full(SHAPE, 0.2), jnp.full(SHAPE, 0.3).at[0, 0, 0].set(60000.0)
     gap = np.subtract(*losses.unbiased(image, firefly))

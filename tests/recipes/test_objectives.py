@@ -17,6 +17,7 @@ from jaxdn.recipes.objectives import (
     last_frames,
     pyramid_illumination,
     recurrent_illumination,
+    squared_illumination,
 )
 
 SHAPE = (5, 6, 7)
@@ -118,6 +119,20 @@ def test_both_halves_of_training_are_one_program(images, clip):
     for progress in (0.0, 0.25, 0.5, 1.0):
         loss(images, clip, jnp.asarray(progress))
     assert loss._cache_size() == 1
+
+
+def test_squared_illumination_is_what_psnr_measures_of_frames_and_of_their_changes(images, clip):
+    """Of images near their targets: the slope of x / (1 + x) there is that of the image."""
+    near = clip._replace(reference=np.maximum(images * 1.001, 0.0))
+    found = squared_illumination(temporal=0.5).loss(jnp.maximum(images, 0.0), near, jnp.asarray(0.0))
+    image, target = (np.asarray(np.maximum(each, 0.0), np.float64) for each in (images, near.reference))
+    error = image / (1 + image) - target / (1 + target)
+    expected = np.mean(error**2) + 0.5 * np.mean(np.diff(error, axis=0) ** 2)
+    np.testing.assert_allclose(np.exp(2 * found) - 1e-6, expected, rtol=0.05)
+    one = jax.tree.map(lambda buffer: buffer[:1], near)
+    alone = squared_illumination().loss(jnp.maximum(images[:1], 0.0), one, jnp.asarray(0.0))
+    np.testing.assert_allclose(np.exp(2 * alone) - 1e-6, np.mean(error[:1] ** 2), rtol=0.05)
+    assert np.all(np.isfinite(jax.grad(squared_illumination().loss)(clip.reference, clip, jnp.asarray(0.0))))
 
 
 def test_pyramid_illumination_is_the_pyramid_of_frames_and_of_their_changes(images, clip):

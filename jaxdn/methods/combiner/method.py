@@ -6,9 +6,10 @@ For each frame: the library denoises it alone (the *prior*), and a history stabi
 and at half resolution (:mod:`jaxdn.methods.combiner.candidates`). The image is a mean of eight candidates: the prior,
 the stabilised one, the means, the filtered ones, and the prior with the correction that filtered samples tell of.
 
-A U-Net at half resolution decides for every pixel: the weights of the candidates, how fast the means follow, the
-filter's features and how far a pixel is trusted. What it predicts before training is plausible: mostly the
-stabilised prior.
+A U-Net at half resolution decides for every pixel how fast the means follow, the filter's features and how far a pixel
+is trusted. A second, smaller one sees the candidates and what noisy light says about each, and decides their weights
+(:mod:`jaxdn.methods.combiner.choice`). What both predict before training is plausible: mostly the stabilised prior and
+the mean of priors.
 """
 
 import functools
@@ -25,7 +26,9 @@ from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, core_of, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.filters.surface_test import depth_feature
+from jaxdn.methods.combiner import choice
 from jaxdn.methods.combiner.candidates import (
+    CANDIDATES,
     LEVELS,
     FilterParameters,
     make_candidates,
@@ -49,7 +52,7 @@ from jaxdn.networks import Widths, graph
 from jaxdn.ops import oidn as binding
 from jaxdn.ops.scales import crop, downsample, fill_holes, join_planes, pad, space_to_depth, to_planes, upsample
 from jaxdn.recipes.augmentation import Augmentation
-from jaxdn.recipes.objectives import pyramid_illumination
+from jaxdn.recipes.objectives import squared_illumination
 from jaxdn.recipes.recipe import Recipe
 
 WIDTHS: dict[str, Widths] = {
@@ -57,22 +60,13 @@ WIDTHS: dict[str, Widths] = {
     "fast": ((16,), (24,), (32,), (32,), (32,)),
 }
 """Channels of the U-Net's convolutions, from half resolution down."""
+CHOICE_WIDTHS: dict[str, Widths] = {"high": ((32,),) * 5, "fast": ((16,),) * 5}
+"""Channels of the second network."""
 FEATURES, HALF_FEATURES = 5, 8
 """Learned features at full and at half resolution."""
-INITIAL = {
-    "trust": 4.0,
-    "follow": 0.0,
-    "prior": -1.0,
-    "stabilised": 1.0,
-    "mean": -5.0,
-    "fine": -3.0,
-    "coarse": -4.0,
-    "fine correction": -2.5,
-    "coarse correction": -2.0,
-    "prior mean": 1.0,
-}
+INITIAL = {"trust": 4.0, "follow": 0.0}
 """Parameters of every pixel, one logit each, and what they are before training: how far its light is trusted; the
-share of the new frame in the means; the weights of the candidates."""
+share of the new frame in the means."""
 PRECISIONS = {"albedo": 1.0, "normal": 1.0, "light": 4.0, "depth": 6.0, "learned": 0.0}
 """Guide of the filter -> the logarithm of its precision before training."""
 HISTORY_MAX = 16
@@ -98,7 +92,7 @@ class Options:
     """The network's size and what it does not decide."""
 
     quality: Literal["fast", "high"] | Widths = "high"
-    """By name, or the network's widths as tuples."""
+    """By name, or the first network's widths as tuples; the second is then that of ``"high"``."""
     history_max: Annotated[float, Range(1)] = 32.0
     """Largest effective number of samples of the running means, in frames."""
     device: binding.Device = "auto"
@@ -109,7 +103,7 @@ class Options:
 
 
 RECIPE = Recipe(
-    pyramid_illumination(logarithm=True),
+    squared_illumination(),
     steps=4000,
     learning_rate=6e-4,
     decay=False,
@@ -144,19 +138,24 @@ def combiner(options: Options) -> Denoiser:
     from jaxdn.networks.unet import unet
 
     widths = WIDTHS[options.quality] if isinstance(options.quality, str) else options.quality
+    choice_widths = CHOICE_WIDTHS[options.quality if isinstance(options.quality, str) else "high"]
     heads = (4 * (FEATURES + len(INITIAL)) + HALF_FEATURES + 1 + LEVELS,)
     groups = tuple(INPUTS.values())
     network = unet(groups, heads, widths=widths, head_size=1, implementation=options.implementation)
+    choice_shape = choice.count_inputs(), (4 * len(CANDIDATES),)
+    chooser = unet(*choice_shape, widths=choice_widths, head_size=1, implementation=options.implementation)
     library = core_of(oidn(device=options.device))
     reads = frozenset({"albedo", "normal", "roughness", "depth", "previous_depth", "motion", "ids"})
 
     def init(key: jax.Array, frame: Frame) -> Params:
         params = network.init(key)
+        chosen = choice.begin(chooser.init(jax.random.fold_in(key, 1)))
         pixel = [0.0] * FEATURES + list(INITIAL.values())
         bias = [value for value in pixel for _ in range(4)] + [0.0] * HALF_FEATURES
         bias += [INITIAL["trust"]] + [_LEVEL_WEIGHT] * LEVELS
         precisions = {name: jnp.full((1 + LEVELS,), value, jnp.float32) for name, value in PRECISIONS.items()}
-        return {**params, "head_0": {**params["head_0"], "bias": jnp.asarray(bias, jnp.float32)}, "guide": precisions}
+        head = {**params["head_0"], "bias": jnp.asarray(bias, jnp.float32)}
+        return {**params, "head_0": head, "guide": precisions, "choice": chosen}
 
     def start(params: Params, frame: Frame) -> CombinerState:
         return start_history(frame)
@@ -170,24 +169,29 @@ def combiner(options: Options) -> Denoiser:
         stable, steady_prior, invalid = blend_image(*kept, history_max=HISTORY_MAX)
         now = measure_now(frame, jax.lax.stop_gradient(prior))
         past = fetch_past(state, frame, now, first)
-        weights = {name: part for name, part in params.items() if name != "guide"}
+        weights = {name: part for name, part in params.items() if name not in ("guide", "choice")}
         steady = jax.lax.stop_gradient(to_planes(steady_prior))
         inputs = _assemble_network_input(frame, now, past, steady, statistics)
         head = network.apply(weights, [group[None] for group in inputs])[0][0]
         padded = tuple(side + -side % _BLOCKS for side in size)
-        parameters, follow, shares = _split_head(head, padded)
+        parameters, follow = _split_head(head, padded)
         means = update_means(now, past, crop_planes(follow, size), most=options.history_max)
         depth = None if frame.depth is None else pad(frame.depth, _BLOCKS)
-        wide = pad_planes(means), pad_planes(now.prior), pad_planes(steady)
-        found = make_candidates(params["guide"], *wide, depth, parameters, statistics)
-        image = jnp.clip(crop_planes(_mix(shares, found, statistics.exposure), size), 0.0, RADIANCE_MAX)
+        wide, gain = pad_planes(means), statistics.exposure
+        found = make_candidates(
+            params["guide"], wide, pad_planes(now.prior), pad_planes(steady), depth, parameters, statistics
+        )
+        evidence = choice.assemble_evidence(found, pad_planes(now.light), wide.albedo, wide.normal, wide.number, gain)
+        chosen = chooser.apply(params["choice"], [group[None] for group in evidence])[0][0]
+        mixed = _mix(choice.split_shares(chosen, padded), found, gain)
+        image = jnp.clip(crop_planes(mixed, size), 0.0, RADIANCE_MAX)
         return keep_history(frame, means, stable), image.transpose(1, 2, 0), past.invalid + invalid
 
     network_field = 2 * graph.receptive_field_radius(graph.unet(1, heads, widths=widths, head_size=1))
+    network_field += 2 * graph.receptive_field_radius(graph.unet(1, choice_shape[1], widths=choice_widths, head_size=1))
+    field = binding.RECEPTIVE_FIELD + STABILISED_FIELD + network_field + receptive_field() + choice.RECEPTIVE_FIELD
     core = Core(start, step, reads, init, prepare=prepare, requires_validity_mask=True)
-    return recurrent(
-        core._replace(receptive_field=binding.RECEPTIVE_FIELD + STABILISED_FIELD + network_field + receptive_field())
-    )
+    return recurrent(core._replace(receptive_field=field))
 
 
 def prepare(frame: Frame) -> tuple[FrameStatistics, Frame]:
@@ -241,17 +245,16 @@ def _even(planes: jax.Array) -> jax.Array:
     return pad(planes.transpose(1, 2, 0), 2)
 
 
-def _split_head(head: jax.Array, size: tuple[int, int]) -> tuple[FilterParameters, jax.Array, jax.Array]:
-    """Of the network's output: the filter's parameters, the share [H, W] of the new frame, weights [8, H, W]."""
+def _split_head(head: jax.Array, size: tuple[int, int]) -> tuple[FilterParameters, jax.Array]:
+    """Of the first network's output: the filter's parameters, and the share [H, W] of the new frame."""
     height, width = size[0] // 2, size[1] // 2
     own, logits, half, rest = jnp.split(crop(head, (height, width)), _SPLITS, axis=-1)
     planes = join_planes([("blocks", logits)])
     trust, follow = jax.nn.sigmoid(planes[0]), jax.nn.sigmoid(planes[1])
     # A pixel whose share knows of its own noise, follows bright samples more: its mean becomes too bright.
     follow = upsample(downsample(follow[..., None]))[..., 0]
-    shares = jax.nn.softmax(planes[2:], axis=0)
     rest = jax.nn.sigmoid(to_planes(rest))
-    return FilterParameters(own, trust, half, rest[0], rest[1:]), follow, shares
+    return FilterParameters(own, trust, half, rest[0], rest[1:]), follow
 
 
 def _mix(shares: jax.Array, candidates: list[jax.Array], gain: jax.Array) -> jax.Array:
