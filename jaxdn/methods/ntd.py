@@ -26,6 +26,8 @@ from jaxdn.denoiser.sanitize import sanitize_image
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.filters.surface_test import depth_feature, surface_mask
 from jaxdn.methods.demodulation import Demodulation, demodulated
+from jaxdn.methods.history_vectors import READS as VECTORS_READ
+from jaxdn.methods.history_vectors import Vectors, choose_vectors
 from jaxdn.methods.reconstruction import SCALES, Prediction, blend, heads_of, init_bias
 from jaxdn.methods.registry import method
 from jaxdn.networks import LARGE, MULTIPLE, SMALL, Widths, graph
@@ -46,8 +48,9 @@ class Options:
 
     size: Literal["large", "small"] | Widths = "large"
     """The U-Net's widths, by name or as tuples (see :func:`jaxdn.networks.unet.unet`)."""
-    motion: Literal["dual", "traditional"] = "dual"
-    """Vectors that warp the history: ``dual_motion`` (``motion`` if it is absent), or always ``motion``."""
+    motion: Vectors = "dual"
+    """Vectors that warp the history: dual ones, those of the surface, or those of shadows and reflections where one
+    passes (:func:`jaxdn.methods.history_vectors.choose_vectors`)."""
     history: Literal["warped", "none"] = "warped"
     """The last image, along these vectors; or every frame is a first frame (the networks without recurrence that
     Hasselgren et al. 2020 compare with)."""
@@ -156,7 +159,7 @@ def warp_history(
     Also where it is missing (bool [H, W, 1]), and how many of its values were invalid.
     """
     noisy = frame.radiance
-    vectors = frame.motion if frame.dual_motion is None else frame.dual_motion
+    vectors = choose_vectors(frame, options.motion)
     if options.history == "none":
         first, vectors = jnp.ones_like(first), None
     absent = first if options.first_frame == "none" else jnp.zeros_like(first)
@@ -258,8 +261,7 @@ def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES) -> Core:
     widths = sizes[options.size] if isinstance(options.size, str) else options.size
     scheme, backend = options.initialization, options.implementation
     network = unet(groups, heads, widths=widths, initialization=scheme, implementation=backend)
-    reads = frozenset({"albedo", "normal", "depth", "motion"})
-    reads |= {"dual_motion"} if options.motion == "dual" else set()
+    reads = frozenset({"albedo", "normal", "depth"}) | VECTORS_READ[options.motion]
     reads |= {"reflectance", "roughness"} if materials else set()
     reads |= extra.reads
 

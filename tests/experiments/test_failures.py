@@ -1,0 +1,110 @@
+"""The failures that the papers name: affected pixels, the share of an old image, fallbacks, the table."""
+
+import json
+
+import numpy as np
+import pytest
+
+from experiments.papers.failures import __main__ as failures
+from experiments.papers.failures import measure
+from experiments.papers.failures.scenes import MOVING, SCENES
+from jaxdn.core.frame import Frame
+
+
+def test_affected_is_what_was_hidden_or_shows_other_light_than_its_surface_did():
+    """A bright square steps by two pixels, and its vectors say so; a shadow falls on what rests."""
+    reference, motion = np.ones((3, 20, 24, 3)), np.zeros((3, 20, 24, 2), np.float32)
+    visible = np.ones((3, 20, 24, 1), bool)
+    for frame in range(3):
+        left = 4 + 2 * frame
+        reference[frame, 3:9, left : left + 6] = 4.0
+        motion[frame, 3:9, left : left + 6, 0] = -2.0
+        visible[frame, 3:9, left - 2 : left] = frame == 0
+    reference[2, 12:18, 10:20] = 0.3
+    found = measure.affected_pixels(reference, Frame(reference, motion=motion, visible=visible), moving=2)
+    assert not found[0].any()
+    assert found[1, 3:9, 4:6].all()  # hidden a frame ago
+    assert not found[1, 5:7, 8:10].any()  # the square takes its light with it
+    assert found[2, 13:17, 11:19].all()
+    assert not found[1:, 0].any()
+    assert not measure.affected_pixels(reference, Frame(reference, motion=motion, visible=visible), moving=1)[2].any()
+
+
+def test_the_share_of_an_old_image_is_found_in_noise(rng):
+    old, new = rng.random((2, 40, 50, 3))
+    where = rng.random((40, 50)) < 0.5
+    for share in (0.0, 0.3, 1.0):
+        image = new + share * (old - new) + 0.3 * rng.normal(size=new.shape)
+        assert measure.share_of_old(image, old, new, where) == pytest.approx(share, abs=0.03)
+    image[~where] = 100.0
+    assert measure.share_of_old(image, old, new, where) == pytest.approx(1.0, abs=0.03)
+
+
+def test_the_response_is_the_first_frame_with_a_tenth_left():
+    old, new = np.full((8, 9, 3), 0.8), np.full((8, 9, 3), 0.1)
+    reference = np.stack([old] * 3 + [new] * 6)
+    affected = np.zeros((9, 8, 9), bool)
+    affected[3] = True
+
+    def measured(weight):
+        images = [*reference[:3]]
+        for wanted in reference[3:]:
+            images.append(weight * wanted + (1 - weight) * images[-1])
+        return measure.measure_failure(np.stack(images), reference, affected, moving=3)
+
+    assert measured(1.0).response == 0
+    assert measured(0.5).response == 4  # 0.1 + 0.7 / 32, in sRGB
+    assert measured(0.1).response is None
+    assert measured(1.0).psnr > 100 > measured(0.5).psnr > measured(0.1).psnr
+
+
+def test_fallbacks_are_hidden_pixels_with_the_vector_of_their_surface():
+    visible = np.ones((2, 4, 6, 1), bool)
+    visible[1, :, 1:4] = False
+    motion = np.full((2, 4, 6, 2), -0.5, np.float32)
+    dual = motion.copy()
+    dual[1, :, 2:4] = 1.0
+    frame = Frame(np.ones((2, 4, 6, 3)), motion=motion, dual_motion=dual, visible=visible)
+    assert measure.count_fallbacks(frame) == (12, 4)
+    off = motion.copy()
+    off[1, :, 1] = -9.0  # the traditional target is off screen: nothing is known of its occluder
+    assert measure.count_fallbacks(frame._replace(motion=off, dual_motion=off)) == (12, 8)
+
+
+@pytest.mark.slow
+@pytest.mark.needs("llvm")
+def test_the_clips_fail_what_they_are_for(tmp_path, capsys):
+    """Dual vectors leave the image, light changes where nothing moves; the table has a row a method."""
+    out = tmp_path / "out"
+    scenes = ["border", "shadow"]
+    failures.main(failures.Settings(quick=True, scenes=scenes, methods=["noisy", "svgf"], data=tmp_path, out=out))
+    found = json.loads((out / "failures.json").read_text())
+    assert found["counts"]["border"]["dual vector leaves the image"] > 50
+    assert found["counts"]["shadow"]["hidden"] == 0
+    assert found["counts"]["shadow"]["affected"] > 50
+    assert [column["name"] for column in found["columns"]] == ["method", *scenes]
+    rows = {row[0]: row[1:] for row in found["rows"]}
+    assert set(rows) == {"noisy", "svgf"}
+    assert rows["noisy"][1].endswith("/ 0")  # a frame without a history has nothing old
+    assert not rows["svgf"][1].endswith("/ 0")
+    assert (out / "pictures" / "shadow" / "svgf.png").is_file()
+    assert len(capsys.readouterr().out.splitlines()) >= 6
+
+
+def test_every_scene_moves_and_then_rests():
+    for make, _ in SCENES.values():
+        stage = make()
+        poses = [stage.pose(frame) for frame in (MOVING - 1, MOVING, MOVING + 3)]
+        assert poses[0], stage.name
+        assert all(np.any(poses[0][name] != poses[1][name]) for name in poses[0]), stage.name
+        for name in poses[0]:
+            np.testing.assert_array_equal(poses[1][name], poses[2][name])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [({"scenes": ["fog"]}, "--scenes: expected some of border"), ({"frames": 8}, "--frames: expected more than the 8")],
+)
+def test_what_cannot_be_measured_is_told(wrong, words):
+    with pytest.raises(ValueError, match=words):
+        failures.main(failures.Settings(**wrong))
