@@ -45,9 +45,9 @@ class Denoiser(NamedTuple):
     """Names of the Frame buffers, in addition to ``radiance``, that it can use."""
     samples: Callable[[Params, State, Frame, int], jax.Array] | None = None
     """(params, state, frame, most) -> [H, W, 1] samples per pixel that it requests from the renderer before ``step``
-    (rounded to whole numbers); a pixel can have ``most``. Here the frame's radiance is what has been rendered before;
-    in ``step`` it is the mean of the requested samples, with ``sample_count``. None: no request, the radiance is used
-    as it is."""
+    (fractions are rounded up with their probability); a pixel can have ``most``. Here the frame's radiance is what has
+    been rendered before; in ``step`` it is the mean of the requested samples, with ``sample_count``. None: no request,
+    the radiance is used as it is."""
     receptive_field: int | None = None
     """Radius in pixels: what is farther from a pixel than this does not change its image. Excepted are the history,
     which may come from as much farther as vectors are long, and the frame's statistics (:class:`Core`). None: it is
@@ -55,6 +55,8 @@ class Denoiser(NamedTuple):
     core: "Core | None" = None
     """The method inside the processing that all share, for wrappers; :func:`recurrent` sets it. None: there is no such
     processing, and wrappers take the functions above. Who replaces one of these replaces the core, too."""
+    sees_sample: bool = True
+    """``samples`` looks at the frame's radiance: a sample of every pixel has to be rendered before it is called."""
 
 
 class Core(NamedTuple):
@@ -81,6 +83,8 @@ class Core(NamedTuple):
     """Its frames always have a ``sample_count``, whether or not it reads one: 0 where the radiance is no measurement,
     because a value was not finite, elsewhere the given one if it reads that, else 1. Without it such pixels look like
     pixels without light."""
+    sees_sample: bool = True
+    """As of :class:`Denoiser`."""
 
 
 class Recurrent(NamedTuple):
@@ -114,7 +118,7 @@ def recurrent(core: Core) -> Denoiser:
         def samples(params: Params, state: Recurrent, frame: Frame, most: int) -> jax.Array:
             return core_samples(params, state.core, sanitize(check_frame(frame, core.reads))[0], state.age == 0, most)
 
-    return Denoiser(core.init, start, step, core.reads, samples, core.receptive_field, core)
+    return Denoiser(core.init, start, step, core.reads, samples, core.receptive_field, core, core.sees_sample)
 
 
 class Stages(NamedTuple):
@@ -165,7 +169,7 @@ def core_of(denoiser: Denoiser) -> Core:
             return request(params, begin(params, state, frame, first), only(frame, denoiser.reads), most)
 
     core = Core(denoiser.start, step, denoiser.reads, denoiser.init, samples)
-    return core._replace(receptive_field=denoiser.receptive_field)
+    return core._replace(receptive_field=denoiser.receptive_field, sees_sample=denoiser.sees_sample)
 
 
 def _shared_stages(core: Core) -> Stages:

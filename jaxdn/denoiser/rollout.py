@@ -12,8 +12,8 @@ from jax import lax
 
 from jaxdn.core.checks import check_image
 from jaxdn.core.frame import RADIANCE_MAX, Clip, Frame, frame_at, only, present
-from jaxdn.denoiser import Denoiser, Params, State
-from jaxdn.ops.sampling import from_layers
+from jaxdn.denoiser import Denoiser, Params, Recurrent, State
+from jaxdn.ops.sampling import from_layers, random_numbers, round_stochastically
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Float
@@ -52,8 +52,14 @@ def render_requested(
     bounded = {
         n: jnp.where(jnp.isfinite(layer), jnp.minimum(layer, RADIANCE_MAX), layer) for n, layer in layers.items()
     }
-    radiance, counts = from_layers(bounded, wanted, reference=reference)
+    uniform = random_numbers(frame.radiance.shape[0], frame.radiance.shape[1], _age(state))
+    radiance, counts = from_layers(bounded, wanted, reference=reference, uniform=uniform)
     return only(frame._replace(radiance=radiance, sample_count=counts), denoiser.reads)
+
+
+def _age(state: State) -> jax.Array | int:
+    """How many frames a state has seen, for random numbers that are others in every frame; 0 where it does not tell."""
+    return state.age if isinstance(state, Recurrent) else 0
 
 
 def unroll(
@@ -122,7 +128,9 @@ def _step(denoiser: Denoiser, params: Params, state: State, frame: Frame, layers
 @functools.partial(jax.jit, static_argnums=(0, 4))
 def _ask(denoiser: Denoiser, params: Params, state: State, frame: Frame, most: int) -> jax.Array:
     assert denoiser.samples is not None
-    return jnp.clip(jnp.round(denoiser.samples(params, state, frame, most)), 0, most)
+    wanted = denoiser.samples(params, state, frame, most)
+    uniform = random_numbers(wanted.shape[0], wanted.shape[1], _age(state))
+    return jnp.clip(round_stochastically(wanted, uniform), 0, most)
 
 
 class Stream:
@@ -145,7 +153,8 @@ class Stream:
         return image
 
     def ask(self, frame: Frame, most: int) -> jax.Array | None:
-        """The whole numbers of samples [H, W, 1] that the denoiser requests for the next frame; None without a request.
+        """The numbers of samples [H, W, 1], rounded to whole ones, that the denoiser requests for the next frame; None
+        without a request.
 
         The frame's radiance is what has been rendered before; a pixel can have ``most`` samples. Then call with the
         frame as rendered with these, and its ``sample_count``.

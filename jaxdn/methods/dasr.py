@@ -55,6 +55,10 @@ class Options(Sampling):
             raise ValueError(
                 f"least: expected an odd number, the sample that is rendered first and pairs, got {self.least}."
             )
+        if self.rounding == "stochastic":
+            raise ValueError(
+                "rounding: expected 'exact' or 'nearest', as the numbers of samples are odd, got 'stochastic'."
+            )
 
 
 @method(

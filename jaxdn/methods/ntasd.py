@@ -22,6 +22,7 @@ from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods import ntd
 from jaxdn.methods.demodulation import demodulated
+from jaxdn.methods.history_vectors import Vectors
 from jaxdn.methods.registry import method
 from jaxdn.methods.sampler import Sampling, allocate_samples, gray, motion_feature, sampler
 from jaxdn.recipes.augmentation import NO_AUGMENTATION
@@ -33,7 +34,7 @@ from jaxdn.recipes.recipe import Recipe
 class Options(ntd.Options, Sampling):
     """The options of ``ntd``, of which some have other defaults here, and those of the samples."""
 
-    motion: Literal["dual", "traditional"] = "traditional"
+    motion: Vectors = "traditional"
     """Vectors that warp the history."""
     alpha_at: Literal["coarse", "fine"] = "fine"
     """The blending weight of two scales: for each fine pixel, or at the coarse scale, as the channels of the paper's
@@ -102,7 +103,7 @@ def ntasd(options: Options) -> Denoiser:
             features.append(absent.astype(past.dtype))
         return network.counts(params["sampler"], features, first, most)
 
-    core = Core(start, step, inner.reads, init, samples, inner.prepare)
+    core = Core(start, step, inner.reads, init, samples, inner.prepare, sees_sample=False)
     return demodulated(recurrent(core), by=options.demodulate)
 
 

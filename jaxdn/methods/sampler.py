@@ -37,11 +37,13 @@ class Sampling:
     """Mean number of samples per pixel."""
     least: Annotated[int, Range(0)] = 1
     """Every pixel has at least this many samples; 0 in the paper."""
-    rounding: Literal["exact", "nearest"] = "exact"
-    """The budget is kept exactly, or about (as in the paper), see :func:`jaxdn.ops.sampling.sample_map`."""
+    rounding: Literal["exact", "nearest", "stochastic"] = "exact"
+    """The budget is kept exactly, or about (as in the paper); or the map keeps fractions, which are rounded up with
+    their probability when a frame is rendered: for budgets below one sample, with ``least`` 0. See
+    :func:`jaxdn.ops.sampling.sample_map`."""
     slope: Literal["mixing", "amplitude"] = "mixing"
     """What one more sample does to the image in training, see :func:`jaxdn.ops.sampling.more_samples`: a sample without
-    noise is mixed in, or the noise falls as the root of the number."""
+    noise is mixed in, or the noise falls as the root of the number. Fractions have the slope of their two numbers."""
 
 
 class Sampler(NamedTuple):
@@ -105,6 +107,8 @@ def allocate_after_first(options: Sampling, logits: jax.Array, most: int) -> jax
 
 def _with_slope(options: Sampling, counts: jax.Array) -> jax.Array:
     # The image's slope by its number of samples is that of mixing; if noise falls as 1 / sqrt(s), it is half of it.
+    if options.rounding == "stochastic":
+        return counts
     return 0.5 * (counts + lax.stop_gradient(counts)) if options.slope == "amplitude" else counts
 
 

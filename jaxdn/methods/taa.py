@@ -119,7 +119,8 @@ def taa(options: Options) -> Denoiser:
 
     field = None if before.receptive_field is None else before.receptive_field + _RECEPTIVE_FIELD
     mask = before.requires_validity_mask
-    return recurrent(Core(start, step, before.reads | READS, before.init, samples, prepare, field, mask))
+    sees = before.sees_sample
+    return recurrent(Core(start, step, before.reads | READS, before.init, samples, prepare, field, mask, sees))
 
 
 _RECEPTIVE_FIELD = 4

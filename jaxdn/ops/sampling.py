@@ -16,7 +16,11 @@ from jaxdn.ops.scales import crop, fill_holes, pad
 
 
 def from_layers(
-    layers: Mapping[int, jax.Array], counts: jax.Array, *, reference: jax.Array | None = None
+    layers: Mapping[int, jax.Array],
+    counts: jax.Array,
+    *,
+    reference: jax.Array | None = None,
+    uniform: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """The image [H, W, 3] with ``counts`` [H, W, 1] samples per pixel, and the actual counts.
 
@@ -25,17 +29,21 @@ def from_layers(
     image has a gradient with respect to the counts (:func:`more_samples`), that of a pixel without samples as if it
     were filled from its neighbours (:func:`jaxdn.ops.scales.fill_holes`), as denoisers fill it. Without, no gradient
     flows into them. Raises ValueError unless the layers are 1, 2, 4, ... without a gap.
+
+    With ``uniform`` [H, W, 1], random numbers in [0, 1), fractions are rounded stochastically, down to k or up to
+    k + 1 (:func:`round_stochastically`), and those have another gradient, of which no reference is needed but whether
+    there is one: ``(I(k + 1) - I(k)) / (2 P)``, with P the probability of the number that was drawn. Over the random
+    numbers, the mean of the gradient of any loss that is quadratic in each pixel is that of the mean loss, exactly:
+    ``L(k + 1) - L(k)`` is the mean of both slopes times the difference of both images.
     """
     expected = [1 << bit for bit in range(len(layers))]
     if sorted(layers) != expected or not layers:
         raise ValueError(f"layers: expected independent layers of 1, 2, 4, ... samples, got {sorted(layers)}.")
     given = lax.stop_gradient(counts)
-    whole = jnp.clip(jnp.round(jnp.where(jnp.isfinite(given), given, 0.0)), 0, sum(layers)).astype(jnp.int32)
-    total = jnp.zeros_like(layers[1])
-    for samples in expected:
-        total = total + jnp.where((whole & samples) > 0, samples * layers[samples], 0.0)
-    taken = whole.astype(total.dtype)
-    image = total / jnp.maximum(taken, 1.0)
+    given = jnp.where(jnp.isfinite(given), given, 0.0)
+    given = given if uniform is None else _without_errors(given)
+    rounded = jnp.round(given) if uniform is None else round_stochastically(given, uniform)
+    image, taken = _sum_layers(layers, jnp.clip(rounded, 0, sum(layers)))
     if reference is None:
         return image, taken
     seen = taken > 0
@@ -43,7 +51,72 @@ def from_layers(
         crop(fill_holes(pad(image, _BLOCK), pad(seen, _BLOCK)), (image.shape[0], image.shape[1]))
     )
     none = more_samples(filled, taken, counts, reference) - filled
-    return jnp.where(seen, more_samples(image, taken, counts, reference), none), taken
+    whole = jnp.where(seen, more_samples(image, taken, counts, reference), none)
+    if uniform is None:
+        return whole, taken
+    below = jnp.clip(jnp.floor(given), 0, sum(layers))
+    share = jnp.clip(given, 0, sum(layers)) - below
+    fewer, more = (_sum_layers(layers, number)[0] for number in (below, jnp.minimum(below + 1, sum(layers))))
+    fewer = jnp.where(below > 0, fewer, jnp.where(seen, _fill_alone(image, taken), filled))
+    drawn = jnp.where(taken > below, share, 1.0 - share)
+    slope = lax.stop_gradient((more - fewer) / jnp.where(share > 0, 2.0 * drawn, 1.0))
+    return jnp.where(share > 0, image + slope * (counts - lax.stop_gradient(counts)), whole), taken
+
+
+def _sum_layers(layers: Mapping[int, jax.Array], counts: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The image [H, W, 3] with whole ``counts`` [H, W, 1] samples, which it returns in its own dtype, too."""
+    whole = counts.astype(jnp.int32)
+    total = jnp.zeros_like(layers[1])
+    for samples in sorted(layers):
+        total = total + jnp.where((whole & samples) > 0, samples * layers[samples], 0.0)
+    taken = whole.astype(total.dtype)
+    return total / jnp.maximum(taken, 1.0), taken
+
+
+def _fill_alone(image: jax.Array, taken: jax.Array) -> jax.Array:
+    """What would fill each pixel if it alone had no samples: the mean of the others of its 2x2 block, else 4x4, else 0.
+
+    ``image`` [H, W, 3], ``taken`` [H, W, 1].
+    """
+    size = image.shape[:2]
+    known = pad((taken > 0).astype(image.dtype), _BLOCK)
+    light = pad(image, _BLOCK) * known
+    found = jnp.zeros_like(light)
+    for side in (4, 2):
+        rows, columns = light.shape[0] // side, light.shape[1] // side
+        blocks = (each.reshape(rows, side, columns, side, -1).sum((1, 3)) for each in (light, known))
+        total, number = (jnp.repeat(jnp.repeat(each, side, axis=0), side, axis=1) for each in blocks)
+        others = number - known
+        found = jnp.where(others > 0, (total - light) / jnp.maximum(others, 1.0), found)
+    return lax.stop_gradient(crop(found, (size[0], size[1])))
+
+
+def round_stochastically(counts: jax.Array, uniform: jax.Array) -> jax.Array:
+    """Whole numbers whose mean over ``uniform`` in [0, 1) is ``counts``: up with the probability of the fraction.
+
+    Fractions within 0.0001 of a whole number are errors of rounding, and that number.
+    """
+    counts = _without_errors(counts)
+    down = jnp.floor(counts)
+    return down + (uniform < counts - down)
+
+
+def _without_errors(counts: jax.Array) -> jax.Array:
+    near = jnp.round(counts)
+    return jnp.where(jnp.abs(counts - near) < _ERROR, near, counts)
+
+
+def random_numbers(height: int, width: int, frame: jax.Array | int) -> jax.Array:
+    """Numbers [H, W, 1] in [0, 1) for a frame, for :func:`round_stochastically`; the same on every machine.
+
+    Those of two pixels are independent as far as a hash of their places is; those of one pixel move on by the golden
+    ratio from frame to frame, so that a pixel that gets a quarter of a sample gets one in about every fourth frame.
+    """
+    place = jnp.arange(height * width, dtype=jnp.uint32).reshape(height, width, 1)
+    for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
+        place = (place ^ (place >> shift)) * jnp.uint32(factor)
+    place = (place ^ (place >> 16)) + jnp.asarray(frame).astype(jnp.uint32) * jnp.uint32(2654435769)
+    return (place >> 8).astype(jnp.float32) * 2.0**-24
 
 
 @jax.custom_vjp
@@ -80,6 +153,8 @@ more_samples.defvjp(_more_samples, _of_samples)
 
 _BLOCK = 4
 """Pixels of the largest blocks that are filled."""
+_ERROR = 1e-4
+"""How far from a whole number a number of samples is taken for it."""
 
 
 def check_budget(budget: float, *, least: int, most: int) -> None:
@@ -92,22 +167,24 @@ def check_budget(budget: float, *, least: int, most: int) -> None:
 
 
 def sample_map(logits: jax.Array, budget: float, *, least: int = 0, most: int, rounding: str = "exact") -> jax.Array:
-    """Whole numbers of samples [H, W, 1] from ``least`` to ``most``, ``budget`` in the mean: a softmax over the image.
+    """Numbers of samples [H, W, 1] from ``least`` to ``most``, ``budget`` in the mean: a softmax over the image.
 
     ``logits`` [H, W, 1]: samples are in proportion to their exponentials; what is not finite counts as 0, and what is
-    more than 60 below the largest as 60 below it.
-    With M pixels, ``M budget softmax(logits)`` (Hasselgren et al. 2020, eq. 2) is scaled, until its clamped values
-    have the mean ``budget``. Then
+    more than 60 below the largest as 60 below it. They are whole but for ``rounding="stochastic"``. With M pixels, ``M
+    budget softmax(logits)`` (Hasselgren et al. 2020, eq. 2) is scaled, until its clamped values have the mean
+    ``budget``. Then
 
     * ``rounding="exact"``: they are rounded down, and the samples that are left go to the largest remainders: their
       sum is ``round(M budget)``;
-    * ``rounding="nearest"``: they are not scaled, only clamped and rounded, as in the paper: about that sum.
+    * ``rounding="nearest"``: they are not scaled, only clamped and rounded, as in the paper: about that sum;
+    * ``rounding="stochastic"``: they keep their fractions, for :func:`from_layers` with random numbers: ``budget`` in
+      the mean over pixels, and that many samples in the mean over random numbers.
 
     The gradient is that of the softmax, times the scale; none flows where a number is clamped, and rounding passes it
     on unchanged. Raises ValueError for a budget that is not within ``least`` and ``most``.
     """
     check_image(logits, "logits", channels=1)
-    check_option(rounding, "rounding", ("exact", "nearest"))
+    check_option(rounding, "rounding", ("exact", "nearest", "stochastic"))
     check_budget(budget, least=least, most=most)
     logits = jnp.asarray(logits)
     logits = jnp.where(jnp.isfinite(logits), logits, 0.0).astype(jnp.promote_types(logits.dtype, jnp.float32))
@@ -119,6 +196,8 @@ def sample_map(logits: jax.Array, budget: float, *, least: int = 0, most: int, r
         return wanted + lax.stop_gradient(jnp.round(wanted) - wanted)
     total = round(pixels * budget)
     wanted = jnp.clip(shares * _scale(lax.stop_gradient(shares), total, least, most), least, most)
+    if rounding == "stochastic":
+        return wanted
     return wanted + lax.stop_gradient(_whole(wanted, total, most) - wanted)
 
 

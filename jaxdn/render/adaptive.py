@@ -31,14 +31,22 @@ class SampledFrame(NamedTuple):
 
 
 def render_sampled(
-    scene: AnimatedScene, frame: int, ask: Ask, settings: RenderSettings, *, previous: View | None = None
+    scene: AnimatedScene,
+    frame: int,
+    ask: Ask,
+    settings: RenderSettings,
+    *,
+    previous: View | None = None,
+    sample_first: bool = True,
 ) -> SampledFrame:
     """Render a frame's buffers and one sample, ask how many samples each pixel gets, and render the rest of these.
 
     The first sample counts: a pixel that gets n has the samples 0 ... n - 1 of its frame, the same as in a frame that
-    has n of them everywhere. Buffers that describe one noisy image (:data:`jaxdn.core.frame.OF_SAMPLES`) are left out.
-    Raises ValueError with a scalar variant of Mitsuba, which renders whole images only, and for settings with other
-    layers than one of one sample, with a reference, with draws, with jitter, with filtered pixels, or without a plan.
+    has n of them everywhere. Without ``sample_first`` none is rendered before the question, for one who does not look
+    at it: no more paths are traced than are asked for. Buffers that describe one noisy image
+    (:data:`jaxdn.core.frame.OF_SAMPLES`) are left out. Raises ValueError with a scalar variant of Mitsuba, which
+    renders whole images only, and for settings with other layers than one of one sample, with a reference, with draws,
+    with jitter, with filtered pixels, or without a plan.
 
     Args:
       scene: to render.
@@ -46,6 +54,7 @@ def render_sampled(
       ask: decides.
       settings: how; their plan may let frames share the buffers of those before, which are then rendered again.
       previous: the ``view`` of the frame before.
+      sample_first: ``ask`` sees a sample of every pixel; else its radiance is 0.
     """
     others = settings.reference_spp or settings.draws or not settings.through_centres
     if settings.plan is None or settings.layers != (1,) or others:
@@ -60,13 +69,16 @@ def render_sampled(
         raise ValueError(
             f"samples for each pixel: expected an LLVM or CUDA variant of Mitsuba, got a scalar one. {advice()}"
         )
-    rendered = render_frame(scene, frame, settings, previous=previous)
+    # Paths of depth 1 are camera rays: they tell of emitted light, and buffers need them anyway.
+    begun = settings if sample_first else replace(settings, max_depth=1)
+    rendered = render_frame(scene, frame, begun, previous=previous)
     counts = np.maximum(np.round(np.asarray(ask(rendered.frame))[..., 0]), 0).astype(np.int64)
+    first = 1 if sample_first else 0
     total, bad = np.where(counts[..., None] > 0, rendered.frame.radiance, 0.0), rendered.bad_samples
     if settings.plan.integrator != "none" and settings.plan.indirect:
         built, stream = scene.build(frame, settings.width, settings.height), SampleStream(settings.seed, frame, NOISY)
-        rest = np.maximum(counts - 1, 0)
-        more = accumulate_per_pixel(built, stream, 1, rest, max_depth=settings.max_depth)
+        rest = np.maximum(counts - first, 0)
+        more = accumulate_per_pixel(built, stream, first, rest, max_depth=settings.max_depth)
         total = total + more.indirect + (more.direct if settings.light == "reflected" else 0.0)
         bad += more.bad
     radiance = (total / np.maximum(counts, 1)[..., None]).astype(np.float32)

@@ -73,6 +73,7 @@ def denoise_scene(
             "where samples go."
         )
     step = stream(method.denoiser, method.params)
+    sees_sample = method.denoiser.samples is not None and method.denoiser.sees_sample
     most = max(MOST, round(settings.budget * MOST))
 
     def ask(frame: Frame) -> np.ndarray:
@@ -84,7 +85,7 @@ def denoise_scene(
     files: list[Path] = []
     view = None
     for index in range(wanted[-1] + 1):
-        sampled = render_sampled(scene, index, ask, rendering, previous=view)
+        sampled = render_sampled(scene, index, ask, rendering, previous=view, sample_first=sees_sample)
         view, counts = sampled.view, np.asarray(sampled.frame.sample_count)
         image = np.asarray(step(sampled.frame))
         if index not in wanted:

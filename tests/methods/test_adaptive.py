@@ -210,6 +210,21 @@ def test_pixels_without_samples_are_filled_from_their_neighbours(rng, key):
     np.testing.assert_allclose(np.median(images, axis=(1, 2, 3)), 1.0, rtol=1e-3)
 
 
+@pytest.mark.parametrize("adaptive", [False, True])
+def test_budgets_below_one_sample_are_kept_in_the_mean_and_move_from_frame_to_frame(adaptive, rng, key):
+    denoiser = ntasd(size=TINY, adaptive=adaptive, budget=0.25, least=0, rounding="stochastic")
+    clip = clip_of(rng, 6)
+    found = np.stack(counts_of(denoiser, varied(denoiser, clip, key), clip))
+    np.testing.assert_array_equal(found, np.round(found))
+    np.testing.assert_allclose(found.mean((1, 2, 3)), 0.25, atol=0.06)
+    assert np.mean(found[0] != found[1]) > 0.2
+    if not adaptive:
+        assert found.max() == 1
+        assert np.mean(found[:5].sum(0) >= 1) > 0.9  # no pixel waits for long
+    assert not denoiser.sees_sample
+    assert dasr(size=TINY).sees_sample
+
+
 def test_pixels_without_samples_learn_what_a_sample_would_bring(rng, key):
     """They are filled; a sample would move what fills them towards the reference."""
     denoiser, clip = ntasd(size=TINY, least=0, budget=1, demodulate="none"), clip_of(rng, 1)
@@ -249,6 +264,8 @@ def test_options_that_make_no_sense_raise():
         dasr(least=0)
     with pytest.raises(ValueError, match=r"least: expected an odd number, .* got 2"):
         dasr(least=2)
+    with pytest.raises(ValueError, match=r"rounding: expected 'exact' or 'nearest', .* got 'stochastic'"):
+        dasr(rounding="stochastic")
     for name in METHODS:
         with pytest.raises(ValueError, match=r"budget: expected a number > 0, got 0"):
             METHODS[name](budget=0)

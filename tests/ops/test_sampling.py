@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.ops.sampling import from_layers, sample_map
+from jaxdn.ops.sampling import from_layers, random_numbers, round_stochastically, sample_map
 
 SIZE = (4, 5)
 
@@ -160,6 +160,102 @@ def test_the_slope_of_no_samples_is_that_of_what_fills_the_pixel():
     image, back = jax.vjp(lambda counts: from_layers(layers, counts, reference=jnp.ones((2, 2, 3)))[0], counts)
     np.testing.assert_array_equal(image[1, 0], 0.0)
     np.testing.assert_allclose(back(jnp.ones((2, 2, 3)))[0], jnp.full((2, 2, 1), -6.0))
+
+
+def test_stochastic_rounding_has_the_wanted_mean_and_leaves_whole_numbers(rng):
+    wanted = rng.uniform(0, 3, (6, 7, 1)).astype(np.float32)
+    wanted[0, 0], wanted[0, 1], wanted[0, 2] = 2.0, 2.99999, 0.0
+    frames = 4096
+    drawn = jax.vmap(lambda frame: round_stochastically(jnp.asarray(wanted), random_numbers(6, 7, frame)))
+    counts = np.asarray(drawn(jnp.arange(frames)))
+    assert set(np.unique(counts - np.floor(wanted))) == {0.0, 1.0}
+    np.testing.assert_allclose(counts.mean(0), wanted, atol=2e-3)  # from frame to frame they are evenly spread
+    assert (counts[:, 0, 0] == 2).all()
+    assert (counts[:, 0, 1] == 3).all()
+    assert not counts[:, 0, 2].any()
+
+
+def test_random_numbers_are_even_and_independent_between_pixels():
+    numbers = np.asarray(random_numbers(128, 128, 3))[..., 0]
+    assert 0 <= numbers.min() < numbers.max() < 1
+    np.testing.assert_allclose(np.histogram(numbers, 8, (0, 1))[0], 2048, rtol=0.1)
+    for shift in ((0, 1), (1, 0), (1, 1), (4, 0)):
+        moved = np.roll(numbers, shift, (0, 1))
+        assert abs(np.corrcoef(numbers.ravel(), moved.ravel())[0, 1]) < 0.03
+    quarter = np.stack([np.asarray(random_numbers(8, 8, frame)) > 0.75 for frame in range(40)])
+    gaps = [np.diff(np.nonzero(quarter[:, y, x, 0])[0]) for y, x in np.ndindex(8, 8)]
+    assert max(gap.max() for gap in gaps) <= 5  # no pixel waits for long
+
+
+def test_the_map_with_fractions_keeps_a_budget_below_one_sample(rng):
+    logits = jnp.asarray(2 * rng.normal(size=(16, 24, 1)), jnp.float32)
+    for budget in (0.25, 0.5, 1.0):
+        wanted = np.asarray(sample_map(logits, budget, most=7, rounding="stochastic"))
+        np.testing.assert_allclose(wanted.mean(), budget, rtol=1e-3)
+        assert np.any(wanted % 1 > 0.01)
+        frames = jnp.arange(256)
+        counts = jax.vmap(lambda frame, wanted=wanted: round_stochastically(wanted, random_numbers(16, 24, frame)))
+        np.testing.assert_allclose(np.mean(counts(frames)), budget, rtol=0.01)
+
+
+def loss_of_image(image, target):
+    """Quadratic in every pixel, and mixed between neighbours as a filter does."""
+    mixed = image + 0.5 * jnp.roll(image, 1, 0) - 0.25 * jnp.roll(image, 1, 1)
+    return jnp.sum((mixed - target) ** 2)
+
+
+def test_the_gradient_of_rounded_samples_is_that_of_the_mean_loss(rng):
+    """Monte Carlo over the random numbers, against the mean loss by enumeration of every pixel's two numbers."""
+    layers, target = single(drawn(rng, 2)), jnp.asarray(rng.normal(size=(*SIZE, 3)), jnp.float32)
+    wanted = np.full((*SIZE, 1), 2.0, np.float32)
+    places = [(0, 0), (0, 1), (2, 3), (3, 4)]
+    for place, number in zip(places, (1.3, 1.75, 2.5, 1.1), strict=True):
+        wanted[place] = number
+
+    def loss(counts, uniform):
+        return loss_of_image(from_layers(layers, counts, reference=target, uniform=uniform)[0], target)
+
+    def mean_loss(counts):
+        """Over the sixteen combinations, each with its probability."""
+        total = 0.0
+        for ups in np.ndindex(2, 2, 2, 2):
+            whole, probability = np.array(counts), 1.0
+            for place, up in zip(places, ups, strict=True):
+                share = float(counts[place][0]) % 1
+                whole[place] = np.floor(counts[place]) + up
+                probability *= share if up else 1 - share
+            total += probability * float(loss_of_image(from_layers(layers, jnp.asarray(whole))[0], target))
+        return total
+
+    numbers = jnp.asarray(np.random.default_rng(1).random((20000, *SIZE, 1)), jnp.float32)
+    slope = jax.jit(jax.vmap(jax.grad(loss), in_axes=(None, 0)))
+    slopes = np.asarray(slope(jnp.asarray(wanted), numbers), np.float64)
+    for place in places:
+        low, high = wanted.copy(), wanted.copy()
+        low[place] -= 0.05
+        high[place] += 0.05
+        exact = (mean_loss(high) - mean_loss(low)) / 0.1  # the mean loss is linear in each number
+        found, error = slopes[(slice(None), *place, 0)].mean(), slopes[(slice(None), *place, 0)].std() / 20000**0.5
+        assert abs(found - exact) < 5 * error + 0.01 * abs(exact)
+        assert error < 0.1 * abs(exact) + 0.05
+
+
+def test_the_gradient_below_one_sample_compares_a_sample_with_what_fills_the_pixel(rng):
+    """Whichever of both was drawn: 2 P times the slope is the same, and its mean is the difference of both images."""
+    layers = {1: jnp.asarray(rng.random((4, 4, 3)), jnp.float32)}
+    counts = jnp.ones((4, 4, 1)).at[1, 2].set(0.3)
+    filled = np.asarray([layers[1][0, 2], layers[1][0, 3], layers[1][1, 3]]).mean(0)
+    weights = jnp.asarray(rng.normal(size=(4, 4, 3)), jnp.float32)
+    found = []
+    for uniform, probability in ((0.1, 0.3), (0.9, 0.7)):
+
+        def total(counts, uniform=uniform):
+            given = {"reference": layers[1], "uniform": jnp.full((4, 4, 1), uniform)}
+            return jnp.sum(weights * from_layers(layers, counts, **given)[0])
+
+        found.append(2 * probability * jax.grad(total)(counts)[1, 2, 0])
+    expected = np.sum(np.asarray(weights)[1, 2] * (np.asarray(layers[1])[1, 2] - filled))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_even_logits_give_every_pixel_the_budget():

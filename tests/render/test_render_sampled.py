@@ -18,6 +18,7 @@ from jaxdn.data.exr.exr import read_exr
 from jaxdn.render import render_frame
 from jaxdn.render.adaptive import render_sampled
 from jaxdn.render.settings import RenderSettings
+from jaxdn.render.tracing import vectorised_path_tracer
 from jaxdn.zoo.weights import save_weights
 from tests.render.render_scenes import HEIGHT, WIDTH, Stage, fast_variants
 
@@ -68,6 +69,33 @@ def test_every_pixel_has_the_first_samples_of_its_frame(light, rng):
         np.testing.assert_allclose(found.frame.radiance[where], image[where], rtol=1e-4, atol=1e-6)
     np.testing.assert_array_equal(found.frame.sample_count, counts)
     assert found.bad_samples == 0
+
+
+def test_without_a_first_sample_no_more_paths_are_traced_than_are_asked_for(rng, monkeypatch):
+    """Camera rays alone before the question, then a path a sample; the image is the same as with the first sample."""
+    settings = RenderSettings(**SIZE, plan=planned(), seed=5, light="reflected")
+    counts = rng.integers(0, 3, (HEIGHT, WIDTH, 1)) * (rng.random((HEIGHT, WIDTH, 1)) < 0.4)
+    with_first = render_sampled(Stage(), 1, lambda frame: counts, settings)
+    traced, seen = {}, []
+    trace = vectorised_path_tracer._trace_lanes
+
+    def counting(scene, pixel, sample, key, max_depth, *more, **others):
+        traced[max_depth] = traced.get(max_depth, 0) + len(np.asarray(pixel))
+        return trace(scene, pixel, sample, key, max_depth, *more, **others)
+
+    def ask(frame: Frame) -> np.ndarray:
+        seen.append(frame)
+        return counts
+
+    monkeypatch.setattr(vectorised_path_tracer, "_trace_lanes", counting)
+    found = render_sampled(Stage(), 1, ask, settings, sample_first=False)
+    assert not np.any(seen[0].radiance)
+    assert sum(number for depth, number in traced.items() if depth > 1) == counts.sum()
+    for name, buffer in found.frame._asdict().items():
+        other = getattr(with_first.frame, name)
+        assert (buffer is None) == (other is None)
+        if buffer is not None:
+            np.testing.assert_allclose(buffer, other, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
 def test_settings_that_samples_for_each_pixel_do_not_have_are_refused():
