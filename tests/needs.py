@@ -106,6 +106,11 @@ NEEDS = {
     ),
     "bpy": Need(lambda: _runs(str(WITH_BPY), "-c", "import bpy, OpenEXR"), "make .venv-cycles/ready"),
     "fcntl": Need(_package("fcntl"), "a Unix system"),
+    "uv with an index": Need(
+        lambda: _runs("uv", "pip", "compile", "--quiet", "--no-deps", "-", given="tyro\n"),
+        "pip install uv, and a network",
+        "whether its machines reach an index of packages is not ours to say",
+    ),
     "LLVM 15": Need(LLVM_15.exists, "apt-get install libllvm15", "it aborts the processes that find it"),
 }
 """Name -> how a test finds out whether it is there."""

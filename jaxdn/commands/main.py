@@ -26,6 +26,7 @@ from jaxdn.commands.arguments import (
 from jaxdn.commands.errors import end_with_reader, plain_errors
 from jaxdn.runtime.interrupt import exit_on_interrupt
 from jaxdn.runtime.program_cache import keep_programs
+from jaxdn.runtime.terminal import print_any_letter
 
 _COMPUTING = (Train, Denoise, Compare, Doctor)
 """Commands whose programs are worth keeping between runs."""
@@ -247,6 +248,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def program() -> None:
     """The command ``jaxdn``: :func:`main` in a process that ends with it."""
+    print_any_letter()
     with end_with_reader(), exit_on_interrupt():
         main()
 

@@ -106,7 +106,7 @@ def _runs(process: int) -> bool:
 
 def _sync(path: Path) -> None:
     """Wait until a file is on disk: a full or failing disk may report its error only here."""
-    handle = os.open(path, os.O_RDONLY)
+    handle = os.open(path, os.O_RDWR)  # Windows does not flush what is open for reading alone
     try:
         os.fsync(handle)
     finally:

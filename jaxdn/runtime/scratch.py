@@ -5,7 +5,7 @@ import secrets
 import shutil
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
@@ -26,7 +26,7 @@ def scratch_folder(parent: Path, prefix: str) -> Iterator[Path]:
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         os.close(handle)
-        lock.unlink(missing_ok=True)
+        _remove(lock)
 
 
 def _new_lock(parent: Path, prefix: str) -> tuple[Path, int]:
@@ -59,7 +59,13 @@ def _remove_abandoned(parent: Path, prefix: str) -> None:
         finally:
             os.close(handle)
         if free:
-            lock.unlink(missing_ok=True)
+            _remove(lock)
+
+
+def _remove(lock: Path) -> None:
+    """Remove a file; on Windows it stays while another process looks at it, and the next run removes it."""
+    with suppress(OSError):
+        lock.unlink()
 
 
 def _try_lock(handle: int) -> bool:

@@ -221,7 +221,7 @@ def _array_of(buffer: _Buffer) -> np.ndarray:
 @functools.cache
 def _version() -> tuple[int, int]:
     """Of the interface that this jax was built with, as its header says."""
-    header = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
+    header = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text("utf-8")
     numbers = [int(line.split()[2]) for line in header.splitlines() if line.startswith("#define XLA_FFI_API_M")]
     return numbers[0], numbers[1]
 
