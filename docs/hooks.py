@@ -124,7 +124,7 @@ def _status(fact: Mapping[str, Any], paper: Mapping[str, Any]) -> str:
     if fact["status"] != "preset":
         return str(fact["status"])
     ways = [f"`preset={fact.get('preset', paper['preset'])!r}`"] if "options" in fact else []
-    ways += [f"`--recipe {paper['recipe']}`"] if "recipe" in fact else []
+    ways += [f"`--recipe {fact.get('of_recipe', paper['recipe'])}`"] if "recipe" in fact else []
     return ", ".join(ways)
 
 

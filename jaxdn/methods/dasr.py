@@ -26,7 +26,7 @@ from jaxdn.methods.sampler import Sampling, allocate_after_first, allocate_sampl
 from jaxdn.networks import LARGE, MULTIPLE, SMALL, Widths
 from jaxdn.ops.scales import pad
 from jaxdn.recipes.augmentation import NO_AUGMENTATION
-from jaxdn.recipes.objectives import compressed_illumination, pyramid_illumination
+from jaxdn.recipes.objectives import compressed_illumination, last_frames, pyramid_illumination
 from jaxdn.recipes.recipe import Recipe
 
 
@@ -73,6 +73,9 @@ class Options(Sampling):
         "usual": Recipe(pyramid_illumination()),
         "paper": Recipe(
             compressed_illumination(), frames=1, decay=False, clip_norm=0.0, variation=NO_AUGMENTATION, average=0.0
+        ),
+        "hasselgren": Recipe(
+            last_frames(), frames=5, decay=False, clip_norm=0.0, variation=NO_AUGMENTATION, average=0.0
         ),
     },
     variants={"dasr-large": {"size": "large"}, "dasr-small": {"size": "small"}},

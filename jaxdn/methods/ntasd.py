@@ -53,7 +53,6 @@ PAPER = Options(alpha_at="coarse", least=0, rounding="nearest", **ntd.AS_PUBLISH
     presets={"paper": PAPER},
     recipes={
         "usual": Recipe(unbiased_illumination()),
-        "without-occlusion": Recipe(unbiased_illumination(hidden=0.0)),
         "paper": Recipe(last_frames(), frames=5, decay=False, clip_norm=0.0, variation=NO_AUGMENTATION, average=0.0),
     },
     variants={"ntasd-large": {"size": "large"}, "ntasd-small": {"size": "small"}},

@@ -25,7 +25,7 @@ from jaxdn.methods.registry import method
 from jaxdn.networks import Widths
 from jaxdn.ops.scales import pad
 from jaxdn.recipes.augmentation import NO_AUGMENTATION
-from jaxdn.recipes.objectives import pyramid_illumination, recurrent_illumination
+from jaxdn.recipes.objectives import last_frames, pyramid_illumination, recurrent_illumination
 from jaxdn.recipes.recipe import Recipe
 
 LARGE: Widths = ((32, 43, 57, 76, 101, 101), (76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
@@ -68,7 +68,9 @@ RECIPES = {
     "paper": Recipe(
         recurrent_illumination(), crop=128, frames=7, decay=False, clip_norm=0.0, variation=NO_AUGMENTATION, average=0.0
     ),
+    "hasselgren": Recipe(last_frames(), frames=5, decay=False, clip_norm=0.0, variation=NO_AUGMENTATION, average=0.0),
 }
+"""Those of the same papers: the comparison trains all networks by one loss."""
 
 
 @method(

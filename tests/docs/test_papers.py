@@ -85,7 +85,7 @@ def test_a_fact_is_that_of_the_code(paper, fact):
         assert options_of(paper, preset)[name] == value, name
         if fact["status"] == "as published":
             assert options_of(paper, None)[name] == value, f"{name}: published, but not the default"
-    recipe = paper.get("recipe")
+    recipe = fact.get("of_recipe", paper.get("recipe"))
     for name, value in fact.get("recipe", {}).items():
         assert recipe_of(methods()[paper["method"]].recipe_named(recipe))[name] == value, name
     for address, value in fact.get("constants", {}).items():
@@ -127,7 +127,8 @@ def test_no_option_of_a_preset_is_left_unsaid(name):
         usual, published = options_of(paper, None), options_of(paper, preset)
         assert {option for option in usual if usual[option] != published[option]} <= said
     if "recipe" in paper:
-        said = {option for fact in paper["facts"] for option in fact.get("recipe", {})}
+        own = [fact for fact in paper["facts"] if "of_recipe" not in fact]
+        said = {option for fact in own for option in fact.get("recipe", {})}
         usual, published = (recipe_of(row.recipe_named(recipe)) for recipe in (None, paper["recipe"]))
         assert {option for option in usual if usual[option] != published[option]} <= said
 

@@ -115,7 +115,7 @@ def test_the_ladder_is_climbed_step_by_step() -> None:
 
 
 def test_stages_are_what_the_papers_compare() -> None:
-    """Single frames have no history and no sampler; one sample, and theirs without the loss of the other paper."""
+    """Single frames have no history and no sampler; each network has the loss of its paper."""
     for row in ntasd_sizes.LADDER[:2]:
         assert stages.STAGES[row].options["history"] == "none"
         assert stages.STAGES[row].options["adaptive"] is False
@@ -123,9 +123,12 @@ def test_stages_are_what_the_papers_compare() -> None:
     assert "adaptive" not in stages.STAGES[ntasd_sizes.LADDER[3]].options
     zeng = {row: stages.STAGES[row] for row in (zeng_methods.OURS, zeng_methods.NTASD)}
     assert zeng_methods.TABLE.spp == zeng[zeng_methods.OURS].spp == zeng[zeng_methods.NTASD].options["budget"] == 1
-    assert stages.objective_of(zeng_methods.NTASD) == "unbiased illumination, hidden 0, squares from 0.6"
-    assert stages.objective_of(zeng_methods.OURS) == "unbiased illumination, hidden 1, squares from 0.6"
-    assert stages.objective_of("svgf") == ""
+    assert stages.objective_of(zeng_methods.NTASD) == "last frames"
+    assert stages.objective_of(zeng_methods.OURS) == "indirect illumination"
+    # One loss for all networks of the table.
+    losses = {row: stages.objective_of(row) for row in ntasd_methods.ROWS}
+    assert set(losses.values()) == {"", "last frames"}
+    assert losses["svgf"] == losses["noisy"] == ""
 
 
 def test_curves_over_frames_are_means_over_clips() -> None:

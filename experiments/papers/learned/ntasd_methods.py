@@ -1,7 +1,7 @@
 """Hasselgren et al. 2020, table 1: samples where they pay against uniform ones, DASR, and direct prediction.
 
-The numbers of the paper are relative MSE at four samples of SunTemple, Classroom and Bathroom. There all networks are
-trained by one loss; here each by its own, which the table says.
+The numbers of the paper are relative MSE at four samples of SunTemple, Classroom and Bathroom. All networks
+are trained by one loss.
 """
 
 from experiments.papers.learned.scores import Claim, Table, error_ratio, ordinary, over_frames, psnr_gain

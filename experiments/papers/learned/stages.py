@@ -42,26 +42,26 @@ class Stage(NamedTuple):
     """Samples a pixel of what it is trained on, if it asks for none."""
 
 
-_OPTIONS = {"size": "small", "adaptive": False}
-_UNIFORM = Stage("ntasd", _OPTIONS)
-_SINGLE_FRAMES = {**_OPTIONS, "history": "none"}
+_EVEN = {"size": "small", "adaptive": False}
+_SINGLE_FRAMES = {**_EVEN, "history": "none"}
+_UNIFORM = Stage("ntasd", _EVEN, recipe="paper")
 STAGES = {
-    "ntasd": Stage("ntasd", {"size": "small"}),
-    "ntasd, large": Stage("ntasd", {"size": "large"}),
+    "ntasd": Stage("ntasd", {"size": "small"}, recipe="paper"),
+    "ntasd, large": Stage("ntasd", {"size": "large"}, recipe="paper"),
     "ntasd, uniform": _UNIFORM,
-    "ntasd, uniform, large": Stage("ntasd", {"size": "large", "adaptive": False}),
-    "single frames, three scales": Stage("ntasd", {**_SINGLE_FRAMES, "prediction": "three-scales"}),
-    "single frames, direct": Stage("ntasd", {**_SINGLE_FRAMES, "prediction": "direct"}),
-    "ntasd, uniform, 1 sample": Stage("ntasd", {**_OPTIONS, "budget": 1.0}, recipe="without-occlusion"),
-    "ntd, 1 sample": Stage("ntd", {"size": "small"}, spp=1),
-    "dasr": Stage("dasr", {"size": "small"}),
-    "dasr, uniform": Stage("dasr", {"size": "small", "adaptive": False}),
-    "ntd": Stage("ntd", {"size": "small"}),
-    "rae": Stage("rae", {"size": "small"}),
-    "arae": Stage("arae", {"size": "small"}),
+    "ntasd, uniform, large": Stage("ntasd", {"size": "large", "adaptive": False}, recipe="paper"),
+    "single frames, three scales": Stage("ntasd", {**_SINGLE_FRAMES, "prediction": "three-scales"}, recipe="paper"),
+    "single frames, direct": Stage("ntasd", {**_SINGLE_FRAMES, "prediction": "direct"}, recipe="paper"),
+    "ntasd, uniform, 1 sample": Stage("ntasd", {**_EVEN, "budget": 1.0}, recipe="paper"),
+    "ntd, 1 sample": Stage("ntd", {"size": "small"}, recipe="paper", spp=1),
+    "dasr": Stage("dasr", {"size": "small"}, recipe="hasselgren"),
+    "dasr, uniform": Stage("dasr", _EVEN, recipe="hasselgren"),
+    "rae": Stage("rae", {"size": "small"}, recipe="hasselgren"),
+    "arae": Stage("arae", {"size": "small"}, recipe="hasselgren"),
     **{f"ntasd, uniform, without {family}": _UNIFORM._replace(without=family) for family in HELD_OUT},
     **{f"ntasd, uniform, only {family}": _UNIFORM._replace(only=family) for family in HELD_OUT},
 }
+"""Each by the loss of its paper; those that Hasselgren et al. compare all by theirs."""
 
 
 @dataclass

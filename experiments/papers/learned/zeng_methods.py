@@ -1,7 +1,7 @@
 """Zeng et al. 2021, table 2: SVGF, NTASD with uniform samples, TRMV, and their own network, at one sample a pixel.
 
-Their PSNR has a peak of 255 on images in [0, 1]; the gaps below do not depend on it. NTASD is trained without the
-occlusion loss, which is theirs.
+Their PSNR has a peak of 255 on images in [0, 1]; the gaps below do not depend on it. Each network is trained by the
+loss of its own paper: NTASD without the occlusion loss, which is theirs.
 """
 
 from experiments.papers.learned.scores import Claim, Table, ordinary, psnr_gain
