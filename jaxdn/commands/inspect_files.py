@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from jaxdn.commands.channel_table import missing, show_channel_mapping
 from jaxdn.commands.progress import reporter
 from jaxdn.data.clip.folder import refuse_unfinished
-from jaxdn.data.errors import DamagedFile
+from jaxdn.data.errors import ClipError, DamagedFile
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import MappedBuffer, lacks_convention, read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
@@ -26,6 +26,9 @@ from jaxdn.data.foreign.views import open_views, select_view
 
 if TYPE_CHECKING:
     from jaxdn.evaluation.overlay import Overlay
+
+LEAST_SIDE = 4
+"""Pixels; smaller frames have no slopes to measure motion and orientation by."""
 
 
 def inspect_files(
@@ -105,6 +108,10 @@ def _inspect_shot(
             del opened[0]
     sequence = ForeignSequence(opened, naming)
     height, width = sequence.window.size
+    if overlay is not None and min(height, width) < LEAST_SIDE:
+        raise ClipError(
+            f"--overlay: expected {LEAST_SIDE} pixels a side or more, got {width} x {height}; leave it out."
+        )
     # Vectors of 0, as a first frame has them, count as missing in its table.
     unstated = lacks_convention(opened[0], naming)
     fitting = sequence.fitting_conventions() if unstated else None

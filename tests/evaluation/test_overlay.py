@@ -289,6 +289,38 @@ def test_frames_without_noise(tmp_path, inspect):
     assert names(inspect(write_shot(tmp_path / "shot", clean))) == ["no noise"]
 
 
+@pytest.mark.parametrize(
+    ("light", "expected"),
+    [(0.0, ["no light"]), (np.nan, ["light that is no number", "no light"])],
+)
+def test_frames_without_light(tmp_path, inspect, light, expected):
+    """They are not told to have been denoised already."""
+    record = inspect(
+        write_shot(tmp_path / "shot", lambda index, layers: layers | {"Combined": layers["Combined"] * light})
+    )
+    assert [name for name in names(record) if "light" in name or "noise" in name] == expected
+
+
+@pytest.mark.filterwarnings("error")
+def test_single_pixels_that_are_no_numbers(tmp_path, inspect):
+    def spoil(index, layers):
+        layers["Combined"][10 + index, 20] = np.inf
+        return layers
+
+    (finding,) = inspect(write_shot(tmp_path / "shot", spoil))["findings"]
+    assert finding["name"] == "light that is no number"
+    assert "0.01% of the pixels" in finding["evidence"]
+
+
+def test_frames_that_are_too_small(tmp_path, capsys):
+    shot = write_shot(tmp_path / "shot", lambda index, layers: {name: image[:3] for name, image in layers.items()})
+    with pytest.raises(SystemExit) as ended:
+        main.main(["inspect", str(shot), "--overlay", str(tmp_path / "out")])
+    assert ended.value.code == 2
+    assert "--overlay: expected 4 pixels a side or more, got 96 x 3" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+
+
 def test_ids_that_change_reject_the_history(tmp_path, inspect):
     def renumber(index, layers):
         return layers | {"Object Index": layers["Object Index"] + 2 * index}

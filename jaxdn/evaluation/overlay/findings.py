@@ -255,11 +255,17 @@ def _turned_guides(mean: Mapping[str, float]) -> list[Finding]:
 
 
 def _noise(mean: Mapping[str, float]) -> list[Finding]:
-    """Noise that stands still, that is not there, that sparks, or that is in the guides."""
+    """Noise that stands still, that is not there, that sparks, or that is in the guides; pixels without light."""
     found = []
-    noise = mean.get("noise", 0.0)
-    if noise < NOISE_FREE:
-        what = f"The noise is {noise:.2%} of the light."
+    if mean.get("invalid", 0.0) > 0:
+        what = f"{mean['invalid']:.2%} of the pixels are NaN or infinite."
+        remedy = "Look in the renderer for what makes them. jaxdn denoise replaces them by what is around."
+        found.append(Finding("light that is no number", what, remedy))
+    if "noise" not in mean:
+        remedy = "Name the layer that has the picture: --channels radiance=LAYER."
+        found.append(Finding("no light", "No pixel of any frame has light.", remedy))
+    elif mean["noise"] < NOISE_FREE:
+        what = f"The noise is {mean['noise']:.2%} of the light."
         found.append(Finding("no noise", what, "If the frames were denoised already, give those that were not."))
     elif mean.get("same noise", 0.0) > 0.8:
         what = f"{mean['same noise']:.0%} of the still pixels have the noise of the frame before."

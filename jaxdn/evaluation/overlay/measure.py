@@ -143,10 +143,12 @@ def _look_at_one(frame: Frame, albedo: np.ndarray | None) -> tuple[dict[str, np.
     layers: dict[str, np.ndarray] = {"noise": noise[..., None], "fireflies": bright[..., None]}
     lit = luminance(light) > 0
     figures = {
-        "noise": float(np.median(noise[lit])) if lit.any() else 0.0,
+        "invalid": float(np.mean(~np.isfinite(frame.radiance).all(axis=-1))),
         "fireflies": float(bright.mean()),
         "light": float(np.mean(np.minimum(luminance(light), 10 * lit_level(light)))),
     }
+    if lit.any():
+        figures["noise"] = float(np.median(noise[lit]))
     for guide in ("albedo", "normal"):
         if (buffer := getattr(frame, guide)) is not None:
             layers[f"{guide}_noise"] = noise_map(np.nan_to_num(buffer))[..., None]

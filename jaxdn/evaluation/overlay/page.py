@@ -17,6 +17,7 @@ FIGURES = {
     "albedo noise": ("noise of albedo", ".3f"),
     "normal noise": ("noise of normal", ".3f"),
     "fireflies": ("fireflies", ".3%"),
+    "invalid": ("NaN or infinite", ".3%"),
     "rejected": ("pixels without history", ".1%"),
     "history": ("mean history, frames", ".1f"),
     "certain": ("pixels with measured motion", ".0%"),

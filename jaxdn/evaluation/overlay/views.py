@@ -60,7 +60,7 @@ def draw_views(frame: Frame, layers: Mapping[str, np.ndarray]) -> dict[str, np.n
 def _display(radiance: np.ndarray) -> np.ndarray:
     """Radiance [H, W, 3] with its median at middle grey."""
     level = lit_level(radiance) or 1.0
-    x = np.maximum(radiance, 0) * (0.36 / level)
+    x = np.clip(radiance, 0, 1e6 * level) * (0.36 / level)
     return (x / (1 + x)) ** (1 / 2.2)
 
 
