@@ -60,8 +60,8 @@ def _write_completely() -> None:
     except ImportError:
         return
     kind: Any = lru_cache.LRUCache
-    in_place = kind.put
-    if in_place.__module__ == __name__:  # done before
+    in_place, ending = kind.put, getattr(lru_cache, "_CACHE_SUFFIX", None)
+    if in_place.__module__ == __name__ or ending is None:  # done before; or files have other names
         return
 
     def put(store: Any, key: str, value: bytes) -> None:
@@ -69,7 +69,7 @@ def _write_completely() -> None:
             in_place(store, key, value)
             return
         # Where there is a file already, it could not be read, or another process has compiled the same.
-        with atomic_write(Path(str(store.path)) / f"{key}-cache") as temporary:
+        with atomic_write(Path(str(store.path)) / f"{key}{ending}") as temporary:
             temporary.write_bytes(value)
 
     kind.put = put
