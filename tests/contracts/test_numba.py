@@ -4,7 +4,9 @@ import functools
 import os
 import subprocess
 import sys
+import tempfile
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -370,3 +372,63 @@ def test_what_was_compiled_before_functions_of_rows_changed_is_not_used(tmp_path
     subprocess.run([sys.executable, "-c", script], env=folder, check=True)
     assert not old.exists()
     assert new.exists()
+
+
+_LOOP = """
+import numpy as np
+from jaxdn.ops.numba_scales import fill_rows
+image, out = np.ones((4, 4, 1), np.float32), np.zeros((4, 4, 1), np.float32)
+fill_rows(0, 1, image, np.ones((4, 4), np.float32), out)
+assert (out == 1).all()
+print(sum(fill_rows.stats.cache_hits.values()), sum(fill_rows.stats.cache_misses.values()))
+"""
+"""Prints how often a loop was found compiled, and how often not."""
+_DROP, _WRITES_ANYTHING = 24, 1
+"""PR_CAPBSET_DROP and CAP_DAC_OVERRIDE of Linux."""
+
+
+def _reader():
+    """How a process is started that may not write what is read-only, which the superuser otherwise may."""
+    if sys.platform == "win32":
+        pytest.skip("the mode of a folder does not make it read-only")
+    if os.geteuid():
+        return [sys.executable]
+    if sys.platform != "linux":
+        pytest.skip("the superuser may write everything")
+    drop = f"ctypes.CDLL(None).prctl({_DROP}, {_WRITES_ANYTHING}, 0, 0, 0)"
+    start = "os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+    return [sys.executable, "-c", f"import ctypes, os, sys; {drop}; {start}"]
+
+
+def test_loops_are_kept_in_the_folder_of_programs_and_found_there_when_it_is_read_only():
+    """As in a container's image: filled once, and then read by users who may not write it."""
+    reader = _reader()
+    with tempfile.TemporaryDirectory() as place:
+        usual = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+        environment = {**usual, "JAXDN_CACHE_DIR": place}
+
+        def run(python):
+            command = [*python, "-c", _LOOP]
+            done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stderr
+            return done.stdout.split()
+
+        def set_mode(mode):
+            for folder in [Path(place), *Path(place).glob("loops"), *Path(place).glob("loops/*")]:
+                folder.chmod(mode)
+
+        assert run([sys.executable]) == ["0", "1"]
+        kept = list(Path(place).glob("loops/*/numba_scales.fill_rows-*"))
+        assert kept
+        set_mode(0o555)
+        try:
+            assert run(reader) == ["1", "0"]
+            set_mode(0o755)
+            for file in kept:
+                file.unlink()
+            set_mode(0o555)
+            # What is not there is compiled, and nobody fails for want of a place.
+            assert run(reader) == ["0", "1"]
+        finally:
+            set_mode(0o755)
+        assert not list(Path(place).glob("loops/*/numba_scales.fill_rows-*"))

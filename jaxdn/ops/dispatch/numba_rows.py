@@ -4,25 +4,56 @@ Exponential and logarithm are written out: a call of the C library's functions w
 """
 
 import contextlib
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numba import njit
+from numba.core import config
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, UserProvidedCacheLocator
 
+from jaxdn.runtime.program_cache import VARIABLE, cache_folder
+
+_numba: Any = config  # whose names are set while it is imported
 # Sums may be done in any order; what is not finite keeps its meaning.
 _options: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_model": "numpy"}
 # Into the loop itself: passing arrays to a function counts references, which takes longer than a short row.
 inlined = njit(**_options, inline="always")
 
 
+class _ReadOnlyLocator(UserProvidedCacheLocator):
+    def ensure_cache_path(self) -> None:
+        """Numba's own refuses what cannot be written."""
+
+
+class _ReadOnlyFiles(CompileResultCacheImpl):
+    _locator_classes = [_ReadOnlyLocator]  # noqa: RUF012, as the class above has it
+
+
+class _ReadOnlyCache(FunctionCache):
+    _impl_class = _ReadOnlyFiles
+
+    def save_overload(self, *_: Any) -> None:
+        """What is missing is compiled in every process."""
+
+
 def loop(function: Callable[..., None]) -> Callable[..., None]:
-    """Compiled when it is first called, without Python's lock; kept on disk where that can be written."""
-    try:
-        kept = njit(**_options, nogil=True, cache=True)(function)
-    except RuntimeError:  # no folder can be written
-        return njit(**_options, nogil=True)(function)
+    """Compiled when it is first called, without Python's lock; kept on disk.
+
+    It is kept below the folder of :data:`jaxdn.runtime.program_cache.VARIABLE` where that is set, which may be
+    read-only later; else beside its file, or in the user's own folder where that cannot be written.
+    """
+    with _kept_in(_chosen_folder()) as read_only:
+        if read_only:
+            found: Any = njit(**_options, nogil=True)(function)
+            found._cache = _ReadOnlyCache(function)
+            return found
+        try:
+            kept: Any = njit(**_options, nogil=True, cache=True)(function)
+        except RuntimeError:  # no folder can be written
+            return njit(**_options, nogil=True)(function)
     # Numba compiles anew where the loop's own file has changed, and knows nothing of this one.
     changed = Path(__file__).stat().st_mtime
     for file in Path(kept.stats.cache_path).glob(f"*.{function.__name__}-*.nb?"):
@@ -30,6 +61,22 @@ def loop(function: Callable[..., None]) -> Callable[..., None]:
             if file.stat().st_mtime < changed:
                 file.unlink()
     return kept
+
+
+def _chosen_folder() -> Path | None:
+    """Where the user wants loops to be kept; None: Numba decides, by its own variable or by itself."""
+    return cache_folder() / "loops" if os.environ.get(VARIABLE) and not _numba.CACHE_DIR else None
+
+
+@contextlib.contextmanager
+def _kept_in(folder: Path | None) -> Iterator[bool]:
+    """While it is entered, Numba keeps functions in a folder; gives whether that is there and cannot be written."""
+    before = _numba.CACHE_DIR
+    _numba.CACHE_DIR = before if folder is None else str(folder)
+    try:
+        yield folder is not None and folder.is_dir() and not os.access(folder, os.W_OK)
+    finally:
+        _numba.CACHE_DIR = before
 
 
 Array = np.ndarray
