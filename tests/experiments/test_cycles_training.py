@@ -15,7 +15,7 @@ from jaxdn.data.clip.folder import read_frames, read_record
 FRAMES, SIZE = 3, (16, 24)
 
 
-def _write(folder: Path, name: str) -> None:
+def write_cycles_clip(folder: Path, name: str) -> None:
     """A clip whose image of n samples has the light 1 + n and the albedo n / 20; the reference has the light 0.5."""
     for samples in (1, 4, 16):
         (folder / f"{samples}spp-0").mkdir(parents=True)
@@ -46,7 +46,7 @@ def _write(folder: Path, name: str) -> None:
 
 
 def test_each_image_keeps_its_own_guides(tmp_path: Path) -> None:
-    _write(tmp_path / "train" / "sun-0000", "train")
+    write_cycles_clip(tmp_path / "train" / "sun-0000", "train")
     out = tmp_path / "clips"
     assert training.main(training.Options(tmp_path / "train", out)) == 0
     record = read_record(out / "sun-0000")
@@ -67,7 +67,7 @@ def test_each_image_keeps_its_own_guides(tmp_path: Path) -> None:
 
 
 def test_clips_of_cycles_are_trained_on(tmp_path: Path) -> None:
-    _write(tmp_path / "train" / "sun-0000", "train")
+    write_cycles_clip(tmp_path / "train" / "sun-0000", "train")
     training.main(training.Options(tmp_path / "train", tmp_path / "clips"))
     given = {"batch": 4, "crop": 16, "frames": FRAMES, "seed": 0, "spp": (1, 4, 16), "threads": 0}
     batch = next(training_batches(tmp_path / "clips", buffers=("albedo", "motion"), augment=False, **given))
@@ -79,7 +79,7 @@ def test_clips_of_cycles_are_trained_on(tmp_path: Path) -> None:
 
 
 def test_a_clip_that_is_there_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    _write(tmp_path / "train" / "sun-0000", "train")
+    write_cycles_clip(tmp_path / "train" / "sun-0000", "train")
     options = training.Options(tmp_path / "train", tmp_path / "clips")
     training.main(options)
     before = (tmp_path / "clips/sun-0000/clip.json").stat().st_mtime_ns
@@ -90,7 +90,7 @@ def test_a_clip_that_is_there_is_left_alone(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_clips_for_tests_are_refused(tmp_path: Path) -> None:
-    _write(tmp_path / "test" / "sun-9000", "test")
+    write_cycles_clip(tmp_path / "test" / "sun-9000", "test")
     with pytest.raises(ValueError, match="nothing is trained on those"):
         training.main(training.Options(tmp_path / "test", tmp_path / "clips"))
     assert not (tmp_path / "clips").exists()

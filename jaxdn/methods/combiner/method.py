@@ -13,8 +13,9 @@ the mean of priors.
 """
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -84,6 +85,9 @@ _LEAST_ALBEDO = 0.03
 INPUTS = {"geometry": 32, "light": 20, "prior": 18}
 """Groups of the network's input channels."""
 
+if TYPE_CHECKING:
+    from jaxdn.networks.unet import Network
+
 _Planes = TypeVar("_Planes", jax.Array, Means)
 
 
@@ -134,17 +138,9 @@ def combiner(options: Options) -> Denoiser:
     frame. Raises ModuleNotFoundError where ``pyoidn`` is missing, when a step is traced; ValueError for an unknown
     option, and ``step`` for a frame of the wrong shape, never for its contents.
     """
-    # Flax is imported only when a network is built: filters without weights need only jax and numpy.
-    from jaxdn.networks.unet import unet
-
-    widths = WIDTHS[options.quality] if isinstance(options.quality, str) else options.quality
-    choice_widths = CHOICE_WIDTHS[options.quality if isinstance(options.quality, str) else "high"]
-    heads = (4 * (FEATURES + len(INITIAL)) + HALF_FEATURES + 1 + LEVELS,)
-    groups = tuple(INPUTS.values())
-    network = unet(groups, heads, widths=widths, head_size=1, implementation=options.implementation)
-    choice_shape = choice.count_inputs(), (4 * len(CANDIDATES),)
-    chooser = unet(*choice_shape, widths=choice_widths, head_size=1, implementation=options.implementation)
-    library = core_of(oidn(device=options.device))
+    chooser = build_chooser(options)
+    find = candidate_step(options)
+    network, network_shape = _build_network(options)
     reads = frozenset({"albedo", "normal", "roughness", "depth", "previous_depth", "motion", "ids"})
 
     def init(key: jax.Array, frame: Frame) -> Params:
@@ -163,6 +159,42 @@ def combiner(options: Options) -> Denoiser:
     def step(
         params: Params, state: CombinerState, frame: Frame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[CombinerState, jax.Array, jax.Array]:
+        state, found, invalid = find(params, state, frame, first, statistics)
+        image = mix_candidates(chooser, params["choice"], found, statistics.exposure)
+        image = jnp.clip(crop_planes(image, frame.radiance.shape[:2]), 0.0, RADIANCE_MAX)
+        return state, image.transpose(1, 2, 0), invalid
+
+    fields = [2 * graph.receptive_field_radius(shape) for shape in (network_shape, _chooser_shape(options))]
+    fields += [binding.RECEPTIVE_FIELD, STABILISED_FIELD, receptive_field(), choice.RECEPTIVE_FIELD]
+    core = Core(start, step, reads, init, prepare=prepare, requires_validity_mask=True)
+    return recurrent(core._replace(receptive_field=sum(fields)))
+
+
+class Found(NamedTuple):
+    """What there is to choose from in one frame; its sides are padded to multiples of 4."""
+
+    candidates: list[jax.Array]
+    """[3, H, W] each, in the order of :data:`jaxdn.methods.combiner.candidates.CANDIDATES`, linear radiance."""
+    noisy: jax.Array
+    """[3, H, W] the new frame's light."""
+    means: Means
+    """With the new frame in them."""
+
+
+CandidateStep = Callable[
+    [Params, CombinerState, Frame, jax.Array, FrameStatistics], tuple[CombinerState, Found, jax.Array]
+]
+"""(params, state, prepared frame, is it the first, statistics) -> the next state, what was found, invalid pixels."""
+
+
+def candidate_step(options: Options) -> CandidateStep:
+    """The first part of a step: all but the choice among the candidates."""
+    network, _ = _build_network(options)
+    library = core_of(oidn(device=options.device))
+
+    def find(
+        params: Params, state: CombinerState, frame: Frame, first: jax.Array, statistics: FrameStatistics
+    ) -> tuple[CombinerState, Found, jax.Array]:
         size = frame.radiance.shape[:2]
         prior = to_planes(jnp.clip(library.step({}, (), frame, first, statistics)[1], 0.0, RADIANCE_MAX))
         kept = state.stable, frame, prior.transpose(1, 2, 0), first, statistics.exposure
@@ -173,25 +205,54 @@ def combiner(options: Options) -> Denoiser:
         steady = jax.lax.stop_gradient(to_planes(steady_prior))
         inputs = _assemble_network_input(frame, now, past, steady, statistics)
         head = network.apply(weights, [group[None] for group in inputs])[0][0]
-        padded = tuple(side + -side % _BLOCKS for side in size)
-        parameters, follow = _split_head(head, padded)
+        parameters, follow = _split_head(head, tuple(side + -side % _BLOCKS for side in size))
         means = update_means(now, past, crop_planes(follow, size), most=options.history_max)
         depth = None if frame.depth is None else pad(frame.depth, _BLOCKS)
-        wide, gain = pad_planes(means), statistics.exposure
-        found = make_candidates(
-            params["guide"], wide, pad_planes(now.prior), pad_planes(steady), depth, parameters, statistics
-        )
-        evidence = choice.assemble_evidence(found, pad_planes(now.light), wide.albedo, wide.normal, wide.number, gain)
-        chosen = chooser.apply(params["choice"], [group[None] for group in evidence])[0][0]
-        mixed = _mix(choice.split_shares(chosen, padded), found, gain)
-        image = jnp.clip(crop_planes(mixed, size), 0.0, RADIANCE_MAX)
-        return keep_history(frame, means, stable), image.transpose(1, 2, 0), past.invalid + invalid
+        wide = pad_planes(means)
+        images = wide, pad_planes(now.prior), pad_planes(steady)
+        candidates = make_candidates(params["guide"], *images, depth, parameters, statistics)
+        found = Found(candidates, pad_planes(now.light), wide)
+        return keep_history(frame, means, stable), found, past.invalid + invalid
 
-    network_field = 2 * graph.receptive_field_radius(graph.unet(1, heads, widths=widths, head_size=1))
-    network_field += 2 * graph.receptive_field_radius(graph.unet(1, choice_shape[1], widths=choice_widths, head_size=1))
-    field = binding.RECEPTIVE_FIELD + STABILISED_FIELD + network_field + receptive_field() + choice.RECEPTIVE_FIELD
-    core = Core(start, step, reads, init, prepare=prepare, requires_validity_mask=True)
-    return recurrent(core._replace(receptive_field=field))
+    return find
+
+
+def mix_candidates(chooser: "Network", params: Params, found: Found, gain: jax.Array) -> jax.Array:
+    """[3, H, W] the candidates, mixed as the second network with ``params`` decides; ``gain`` is the exposure."""
+    guides = found.means.albedo, found.means.normal, found.means.number
+    evidence = choice.assemble_evidence(found.candidates, found.noisy, *guides, gain)
+    _, height, width = found.noisy.shape
+    head = chooser.apply(params, [group[None] for group in evidence])[0][0]
+    return _mix(choice.split_shares(head, (height, width)), found.candidates, gain)
+
+
+def build_chooser(options: Options) -> "Network":
+    """The second network."""
+    # Flax is imported only when a network is built: filters without weights need only jax and numpy.
+    from jaxdn.networks.unet import unet
+
+    widths, heads = CHOICE_WIDTHS[_quality(options)], (4 * len(CANDIDATES),)
+    return unet(choice.count_inputs(), heads, widths=widths, head_size=1, implementation=options.implementation)
+
+
+def _chooser_shape(options: Options) -> graph.GraphSpec:
+    return graph.unet(1, (4 * len(CANDIDATES),), widths=CHOICE_WIDTHS[_quality(options)], head_size=1)
+
+
+def _build_network(options: Options) -> tuple["Network", graph.GraphSpec]:
+    """The first network, and its layers."""
+    from jaxdn.networks.unet import unet
+
+    widths = WIDTHS[options.quality] if isinstance(options.quality, str) else options.quality
+    heads = (4 * (FEATURES + len(INITIAL)) + HALF_FEATURES + 1 + LEVELS,)
+    groups = tuple(INPUTS.values())
+    network = unet(groups, heads, widths=widths, head_size=1, implementation=options.implementation)
+    return network, graph.unet(1, heads, widths=widths, head_size=1)
+
+
+def _quality(options: Options) -> str:
+    """The quality by which the second network is chosen."""
+    return options.quality if isinstance(options.quality, str) else "high"
 
 
 def prepare(frame: Frame) -> tuple[FrameStatistics, Frame]:

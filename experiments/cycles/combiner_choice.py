@@ -1,0 +1,223 @@
+"""Train the second network of ``combiner`` alone: its candidates do not depend on it, and are made once.
+
+    python -m experiments.cycles.combiner_choice FOLDER/train --start runs/start.safetensors -o runs/chosen --minutes 10
+
+An update takes a fifth of the time that ``jaxdn train`` needs for one of everything. The loss of a pair of frames is
+the mean square of the error of x / (1 + x), and that of its change, each as a share of Open Image Denoise's: of clips
+and sample counts none outweighs another, and what counts is what PSNR measures. Squares have none of the references'
+noise (:mod:`experiments.cycles.score`). Clips whose names end in ``--held`` are left out of training, and scored.
+"""
+
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import tyro
+
+from experiments.cycles import reference as references
+from experiments.cycles.compare import find_done
+from experiments.cycles.record import RECORD, read_record
+from experiments.cycles.reference import compress, decibels
+from experiments.cycles.training import LAYERS
+from jaxdn import denoisers
+from jaxdn.clips import open_frames
+from jaxdn.commands.errors import plain_errors
+from jaxdn.core.frame import Frame, only
+from jaxdn.denoiser import Params
+from jaxdn.methods.combiner.history import Means, start_history
+from jaxdn.methods.combiner.method import (
+    Found,
+    build_chooser,
+    candidate_step,
+    mix_candidates,
+    prepare,
+)
+from jaxdn.methods.combiner.method import (
+    Options as Settings,
+)
+from jaxdn.zoo.weights import load_weights, save_weights
+
+BATCH, RATE, AVERAGE = 4, 2e-3, 0.99
+"""Pairs of frames an update; Adam's step; the running mean of the weights."""
+_LEAST = 1e-5
+"""Mean square below which an error is as good as none."""
+
+Stored = dict[str, np.ndarray]
+"""Of a clip at one sample count, frame by frame [T, ...]: what :class:`Found` has, in half precision, radiance as
+log(1 + gain x); the exposure ``gain``; ``targets`` [T, 3, 3, H, W]: the reference and its halves, as x / (1 + x)."""
+
+
+@dataclass
+class Options:
+    """Train the second network of combiner alone."""
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """A set: the folder of clips, such as FOLDER/train. The test set is refused."""
+    start: Path
+    """Weights of combiner; their first network stays as it is."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """The file of all weights, .safetensors."""
+    minutes: float = 10.0
+    """How long to train; what is made before does not count."""
+    held: list[str] = field(default_factory=lambda: ["-0100"])
+    """Endings of the names of clips that are scored, not trained on."""
+
+
+def main(options: Options) -> int:
+    """Train, score before and after, write the weights."""
+    _, params = load_weights(options.start)
+    clips: dict[str, dict[int, Stored]] = {}
+    for clip in find_done(options.folder, []):
+        record = read_record(clip / RECORD) or {}
+        if record["set"] == "test":
+            raise ValueError(
+                f"{clip}: expected clips to train on, got one of the test set: nothing is trained on those."
+            )
+        clips[clip.name] = collect(clip, params, record["frames"])
+    held = {name: clip for name, clip in clips.items() if name.endswith(tuple(options.held))}
+    trained = {name: clip for name, clip in clips.items() if name not in held}
+    if not trained:
+        raise ValueError(f"{options.folder}: expected clips to train on, got none that does not end in {options.held}.")
+    report("before", held, params["choice"])
+    chosen, updates = train(trained, params["choice"], options.minutes)
+    report(f"after {updates} updates", held, chosen)
+    record = {"start": options.start.name, "choice_updates": updates, "clips": sorted(trained)}
+    path = save_weights(
+        options.out, {**params, "choice": chosen}, factory="combiner", options={"quality": "high"}, record=record
+    )
+    print(path)
+    return 0
+
+
+def collect(clip: Path, params: Params, frames: int) -> dict[int, Stored]:
+    """What there is to choose from in each frame of a clip, for each sample count."""
+    find, reads = jax.jit(candidate_step(Settings())), denoisers.combiner().reads
+    halves = [references.read(clip / "reference" / f"{number:04d}.exr") for number in range(1, frames + 1)]
+    targets = np.stack(
+        [np.stack([compress(one) for one in (each.image, each.first, each.second)]) for each in halves]
+    ).transpose(0, 1, 4, 2, 3)
+    stored = {}
+    for samples in LAYERS:
+        images = [only(each.frame, reads) for each in open_frames(clip / f"{samples}spp-0")[1]]
+        rows, state = [], start_history(jax.tree.map(jnp.asarray, images[0]))
+        for index, frame in enumerate(images):
+            statistics, prepared = prepare(jax.tree.map(jnp.asarray, frame))
+            state, found, _ = find(params, state, prepared, jnp.asarray(index == 0), statistics)
+            rows.append(_pack(found, statistics.exposure, frame))
+        stored[samples] = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        stored[samples]["targets"] = targets.astype(np.float32)
+    return stored
+
+
+def _pack(found: Found, gain: jax.Array, frame: Frame) -> Stored:
+    """A frame of :data:`Stored` but its targets."""
+    height, width = (side - side % 4 for side in frame.radiance.shape[:2])
+    light = jnp.stack([*found.candidates, found.noisy])
+    packed = {"light": jnp.log1p(gain * jnp.maximum(light, 0.0))} | {
+        name: getattr(found.means, name) for name in ("albedo", "normal", "number")
+    }
+    arrays = {name: np.asarray(each, np.float16)[..., :height, :width] for name, each in packed.items()}
+    return {**arrays, "gain": np.asarray(gain, np.float32)}
+
+
+def unpack(row: dict[str, jax.Array]) -> Found:
+    """A frame of :data:`Stored`."""
+    light = jnp.expm1(row["light"].astype(jnp.float32)) / row["gain"]
+    albedo, normal, number = (row[name].astype(jnp.float32) for name in ("albedo", "normal", "number"))
+    zero = jnp.zeros_like(albedo)
+    return Found(list(light[:-1]), light[-1], Means(zero, zero, albedo, normal, number, number))
+
+
+def find_errors(image: jax.Array, row: dict[str, jax.Array]) -> jax.Array:
+    """[3, 3, H, W] of x / (1 + x), against the reference and its halves."""
+    light = jnp.maximum(image, 0.0)
+    height, width = image.shape[-2:]
+    return (light / (1.0 + light))[None] - row["targets"][..., :height, :width]
+
+
+def square(errors: jax.Array) -> jax.Array:
+    """The mean square of :func:`find_errors` without the references' noise."""
+    return jnp.mean(2.0 * errors[0] ** 2 - 0.5 * (errors[1] ** 2 + errors[2] ** 2))
+
+
+def train(clips: dict[str, dict[int, Stored]], params: Params, minutes: float) -> tuple[Params, int]:
+    """The running mean of the network's parameters, and how many updates there were."""
+    chooser, rng = build_chooser(Settings(implementation="onednn")), np.random.default_rng(0)
+    optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(RATE))
+
+    def loss(params: Params, batch: list[list[dict[str, jax.Array]]]) -> jax.Array:
+        total = jnp.zeros(())
+        for rows in batch:
+            found = [unpack(row) for row in rows]
+            mixed = [
+                find_errors(mix_candidates(chooser, params, one, row["gain"]), row)
+                for one, row in zip(found, rows, strict=True)
+            ]
+            prior = [find_errors(one.candidates[0], row) for one, row in zip(found, rows, strict=True)]
+            for measure in (_of_frames, _of_change):
+                total += measure(mixed) / jnp.maximum(measure(prior), _LEAST)
+        return total / len(batch)
+
+    @jax.jit
+    def update(params: Params, state: Any, mean: Params, batch: Any) -> tuple[Params, Any, Params]:
+        steps, state = optimizer.update(jax.grad(loss)(params, batch), state, params)
+        params = optax.apply_updates(params, steps)
+        return params, state, jax.tree.map(lambda old, new: AVERAGE * old + (1 - AVERAGE) * new, mean, params)
+
+    state, mean, updates, begin = optimizer.init(params), params, 0, time.monotonic()
+    while time.monotonic() < begin + 60 * minutes or not updates:
+        params, state, mean = update(params, state, mean, [draw(clips, rng) for _ in range(BATCH)])
+        updates += 1
+    return mean, updates
+
+
+def _of_frames(errors: list[jax.Array]) -> jax.Array:
+    return 0.5 * (square(errors[0]) + square(errors[1]))
+
+
+def _of_change(errors: list[jax.Array]) -> jax.Array:
+    return square(errors[1] - errors[0])
+
+
+def draw(clips: dict[str, dict[int, Stored]], rng: np.random.Generator) -> list[Stored]:
+    """Two consecutive frames of a clip, flipped and with their colours permuted at random."""
+    stored = clips[sorted(clips)[rng.integers(len(clips))]][int(rng.choice(LAYERS))]
+    first = int(rng.integers(len(stored["gain"]) - 1))
+    across, down = rng.random(2) < 0.5
+    colors = rng.permutation(3)
+
+    def vary(name: str, each: np.ndarray) -> np.ndarray:
+        if each.ndim < 2:
+            return each
+        each = each[..., :: -1 if down else 1, :: -1 if across else 1]
+        # Channels of normals are directions, and of light and albedo colours.
+        return np.ascontiguousarray(each if name in ("normal", "number") else np.take(each, colors, axis=-3))
+
+    return [{name: vary(name, stored[name][index]) for name in stored} for index in (first, first + 1)]
+
+
+def report(when: str, clips: dict[str, dict[int, Stored]], params: Params) -> None:
+    """Print PSNR and temporal PSNR of the held clips, means at each sample count."""
+    chooser = build_chooser(Settings())
+    score = jax.jit(lambda params, row: find_errors(mix_candidates(chooser, params, unpack(row), row["gain"]), row))
+    for samples in LAYERS if clips else ():
+        found = []
+        for clip in clips.values():
+            stored = clip[samples]
+            rows = [{name: stored[name][index] for name in stored} for index in range(len(stored["gain"]))]
+            errors = [score(params, row) for row in rows]
+            pairs = list(zip(errors[::2], errors[1::2], strict=False))
+            still, change = (float(np.mean([one(list(pair)) for pair in pairs])) for one in (_of_frames, _of_change))
+            found.append((decibels(still), decibels(change)))
+        print(f"{when}, {samples} samples: {np.mean(found, axis=0).round(2)} dB, of frames and of changes", flush=True)
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        sys.exit(main(tyro.cli(Options, description=__doc__)))
