@@ -12,6 +12,7 @@ import hashlib
 import os
 import platform
 import sys
+import warnings
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -27,15 +28,21 @@ def keep_programs() -> Path | None:
     """Let jax find compiled programs in a folder, and write new ones there if it can; returns the folder.
 
     None: nothing is kept, because no folder can be made or :data:`VARIABLE` is empty, or jax's own variable
-    ``JAX_COMPILATION_CACHE_DIR`` says where.
+    ``JAX_COMPILATION_CACHE_DIR`` says where. Warns of a folder of :data:`VARIABLE` that cannot be made.
     """
     if "JAX_COMPILATION_CACHE_DIR" in os.environ or os.environ.get(VARIABLE) == "":
         return None
     folder = cache_folder() / f"programs-{metadata.version('jaxlib')}-{_describe_cpu()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError:  # read-only, or no home
+    except OSError as error:  # read-only, or no home
         if not folder.is_dir():
+            if given := os.environ.get(VARIABLE):
+                warnings.warn(
+                    f"{VARIABLE}={given}: expected a folder that can be written ({error.strerror}); "
+                    "programs are not kept.",
+                    stacklevel=2,
+                )
             return None
     import jax
 

@@ -56,7 +56,8 @@ def test_without_a_folder_nothing_is_kept(tmp_path, monkeypatch):
     assert keep_programs() is None
     (tmp_path / "file").touch()
     monkeypatch.setenv(VARIABLE, str(tmp_path / "file"))
-    assert keep_programs() is None
+    with pytest.warns(UserWarning, match="file: expected a folder that can be written"):
+        assert keep_programs() is None
     monkeypatch.setenv(VARIABLE, str(tmp_path))
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "of jax"))
     assert keep_programs() is None
@@ -125,6 +126,16 @@ def test_what_killed_processes_left_is_removed(kept):
     left.touch()
     keep_programs()
     assert not left.exists()
+
+
+def test_a_usual_folder_that_cannot_be_made_is_no_matter(tmp_path, monkeypatch):
+    """Without a home, as in many containers, nobody has asked for one."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(program_cache, "cache_folder", lambda: tmp_path / "file")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert keep_programs() is None
 
 
 @pytest.mark.parametrize(
