@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from jaxdn.core.frame import Clip
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.recipes.recipe import Recipe
 from jaxdn.runtime.atomic_files import write_json
@@ -21,7 +20,7 @@ from jaxdn.training.devices import divide, make_mesh, put_on_all, take_from_firs
 from jaxdn.training.log import Log
 from jaxdn.training.processes import Stopping, writes
 from jaxdn.training.progress import ProgressBar
-from jaxdn.training.step import Report, TrainState, init_state, init_state_from, make_train_step
+from jaxdn.training.step import Batch, Report, TrainState, init_state, init_state_from, make_train_step
 from jaxdn.training.validation import ValidationClip, make_validation
 
 
@@ -36,7 +35,7 @@ class InitialWeights(NamedTuple):
 class ResumableBatches(Protocol):
     """Batches without end, whose position can be kept and returned to, as Grain's iterators have it."""
 
-    def __next__(self) -> Clip: ...
+    def __next__(self) -> Batch: ...
 
     def get_state(self) -> dict[str, Any]:
         """The position, as JSON."""

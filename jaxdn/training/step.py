@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.sharding import Mesh
 
@@ -15,10 +16,14 @@ from jaxdn.core.frame import Clip
 from jaxdn.denoiser import Denoiser, Params
 from jaxdn.denoiser.rollout import unroll
 from jaxdn.denoiser.sanitize import sanitize_image
+from jaxdn.recipes.augmentation import DrawnClip, vary_clip
 from jaxdn.recipes.objectives import Objective
 from jaxdn.recipes.recipe import Recipe
 from jaxdn.training.devices import CLIPS, DIVIDED, ON_ALL
 from jaxdn.training.xla_flags import training_options
+
+Batch = Clip | DrawnClip
+"""Stacked: a leading axis more."""
 
 
 class TrainState(NamedTuple):
@@ -83,9 +88,11 @@ def clip_loss(
     return loss, metrics.psnr(color.tonemap(last), color.tonemap(clip.reference[-1]))
 
 
-def init_state(denoiser: Denoiser, recipe: Recipe, batch: Clip) -> TrainState:
+def init_state(denoiser: Denoiser, recipe: Recipe, batch: Batch) -> TrainState:
     """Parameters drawn with the recipe's seed and a new optimiser state; ``batch`` gives the shapes."""
-    frame = jax.tree.map(lambda buffer: buffer[0, 0], batch.frames)
+    frames = batch.clip.frames if isinstance(batch, DrawnClip) else batch.frames
+    frame = jax.tree.map(lambda buffer: buffer[0, 0], frames)
+    frame = jax.tree.map(lambda image: image.astype(np.float32) if image.dtype == np.float16 else image, frame)
     params = denoiser.init(jax.random.key(recipe.seed), frame)
     return init_state_from(params, recipe)
 
@@ -98,8 +105,10 @@ def init_state_from(params: Params, recipe: Recipe) -> TrainState:
 
 def make_train_step(
     denoiser: Denoiser, recipe: Recipe, mesh: Mesh | None = None
-) -> Callable[[TrainState, Clip], tuple[TrainState, Report]]:
+) -> Callable[[TrainState, Batch], tuple[TrainState, Report]]:
     """The jitted update ``(state, batch of clips) -> (state, report)``; the old state's memory is donated.
+
+    Drawn clips (:class:`jaxdn.recipes.augmentation.DrawnClip`) are varied in it, on the device that trains on them.
 
     With a mesh (:mod:`jaxdn.training.devices`) each device takes its clips of the batch, and the mean of their
     gradients is all that the devices exchange: once an update, four bytes a weight.
@@ -109,8 +118,9 @@ def make_train_step(
     """
     update_rule = optimizer(recipe)
 
-    def batch_loss(params: Params, batch: Clip, progress: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def one(clip: Clip) -> tuple[jax.Array, jax.Array]:
+    def batch_loss(params: Params, batch: Batch, progress: jax.Array) -> tuple[jax.Array, jax.Array]:
+        def one(element: Clip | DrawnClip) -> tuple[jax.Array, jax.Array]:
+            clip = vary_clip(*element, recipe.variation) if isinstance(element, DrawnClip) else element
             return clip_loss(
                 denoiser, params, clip, recipe.objective, progress=progress, rematerialize=recipe.rematerialize
             )
@@ -118,7 +128,7 @@ def make_train_step(
         loss, psnr = jax.vmap(one)(batch)
         return jnp.mean(loss), jnp.mean(psnr)
 
-    def find_gradient(params: Params, batch: Clip, progress: jax.Array) -> Any:
+    def find_gradient(params: Params, batch: Batch, progress: jax.Array) -> Any:
         found = jax.value_and_grad(batch_loss, has_aux=True)(params, batch, progress)
         return found if mesh is None else jax.lax.pmean(found, CLIPS)
 
@@ -128,7 +138,7 @@ def make_train_step(
         specs: dict[str, Any] = {"in_specs": (ON_ALL, DIVIDED, ON_ALL), "out_specs": ON_ALL, "check_vma": False}
         find_gradient = jax.shard_map(find_gradient, mesh=mesh, **specs)
 
-    def train_step(state: TrainState, batch: Clip) -> tuple[TrainState, Report]:
+    def train_step(state: TrainState, batch: Batch) -> tuple[TrainState, Report]:
         progress = state.step / max(recipe.steps, 1)
         (loss, psnr), gradient = find_gradient(state.params, batch, progress)
         norm = optax.tree.norm(gradient)

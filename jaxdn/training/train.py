@@ -113,5 +113,6 @@ def recipe_batches(denoiser: Denoiser, recipe: Recipe, clips: Sequence[Path]) ->
         layers=denoiser.samples is not None,
         variation=recipe.variation,
         process=(jax.process_index(), jax.process_count()),
+        vary_later=True,
         threads=max(1, (os.cpu_count() or 1) // 2),  # a GPU takes a hundred elements a second, a thread makes twelve
     )

@@ -12,6 +12,7 @@ from jaxdn import clips
 from jaxdn.clips import ClipError, training_batches
 from jaxdn.core.frame import BUFFERS, Clip, Frame
 from jaxdn.data.training.cache import open_cached, read_window
+from jaxdn.recipes.augmentation import Augmentation, vary_clip
 
 HEIGHT, WIDTH = 12, 15
 
@@ -294,3 +295,17 @@ def test_headers_are_parsed_by_one_thread_at_a_time(folder: Path, monkeypatch: p
     for _ in range(4):
         next(batches)
     assert max(most) == 1
+
+
+def test_what_is_varied_later_is_what_is_varied_at_once(folder):
+    given = {"batch": 8, "crop": 5, "frames": 2, "seed": 7, "variation": Augmentation(missing=0.3, shadow=0.5)}
+    at_once, later = training_batches(folder, **given), training_batches(folder, **given, vary_later=True)
+    for _ in range(3):
+        wanted, drawn = next(at_once), next(later)
+        assert drawn.clip.frames.radiance.dtype == drawn.clip.reference.dtype == np.float16
+        assert drawn.clip.frames.depth.dtype == np.float32
+        vary = jax.vmap(lambda clip, draw: vary_clip(clip, draw, given["variation"]))
+        found = jax.jit(vary)(*drawn)
+        assert jax.tree.structure(found) == jax.tree.structure(wanted)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-3, atol=1e-4), found, wanted)
+    assert at_once.get_state() == later.get_state()

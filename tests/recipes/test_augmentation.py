@@ -1,10 +1,18 @@
 """Variations of clips: each leaves light transport true, and nothing else changes."""
 
+import jax
 import numpy as np
 import pytest
 
 from jaxdn.core.frame import Clip, Frame
-from jaxdn.recipes.augmentation import GROUPS, NO_AUGMENTATION, Augmentation, augment_clip
+from jaxdn.recipes.augmentation import (
+    GROUPS,
+    NO_AUGMENTATION,
+    Augmentation,
+    augment_clip,
+    draw_variation,
+    vary_clip,
+)
 
 SHAPE = (2, 4, 5)
 
@@ -128,6 +136,19 @@ def test_without_variation_nothing_changes(clip: Clip) -> None:
     found = one(NO_AUGMENTATION, clip)
     np.testing.assert_array_equal(found.reference, clip.reference)
     unchanged(found, clip, *(name for name in Frame._fields if getattr(clip.frames, name) is not None))
+
+
+def test_on_a_device_and_in_a_batch_clips_are_varied_as_by_numpy(clip: Clip) -> None:
+    variation = Augmentation(missing=0.5, shadow=0.5, exposure=16.0)
+    draws = [draw_variation(variation, SHAPE, np.random.default_rng(seed)) for seed in range(12)]
+    assert len({tuple(draw.absent) for draw in draws}) > 3
+    assert {bool(draw.shadow.any()) for draw in draws} == {True, False}
+    batch, stacked = (jax.tree.map(lambda *one: np.stack(one), *some) for some in ([clip] * 12, draws))
+    found = jax.jit(jax.vmap(lambda clip, draw: vary_clip(clip, draw, variation)))(batch, stacked)
+    wanted = jax.tree.map(lambda *one: np.stack(one), *(one(variation, clip, seed) for seed in range(12)))
+    assert jax.tree.structure(found) == jax.tree.structure(wanted)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6), found, wanted)
+    assert all(leaf.dtype in (np.float32, bool) for leaf in jax.tree.leaves(found))
 
 
 def test_values_out_of_range_are_refused_by_name() -> None:

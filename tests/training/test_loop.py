@@ -15,12 +15,14 @@ from jaxdn.denoiser import Core, recurrent
 from jaxdn.denoiser.rollout import denoise
 from jaxdn.denoisers import ntd
 from jaxdn.methods.registry import method_named
+from jaxdn.recipes.augmentation import Augmentation
 from jaxdn.recipes.objectives import Objective
 from jaxdn.recipes.recipe import Recipe
 from jaxdn.runtime.interrupt import Terminated
 from jaxdn.training import loop as loop
 from jaxdn.training.log import Log, read_curve, read_log
 from jaxdn.training.loop import Every, InitialWeights, fit, read_resumed_from
+from jaxdn.training.step import init_state, make_train_step
 from jaxdn.training.train import train
 from jaxdn.training.validation import load_validation
 from jaxdn.zoo.ready import find_model
@@ -169,6 +171,17 @@ def run_gain(clips, folder, recipe=SHORT, source=None, **options):
         every=Every(2, checkpoint=checkpoints),
         **options,
     )
+
+
+def test_an_update_varies_its_clips_as_they_were_drawn(clips):
+    variation = Augmentation(shadow=0.5)
+    recipe, given = SHORT._replace(variation=variation), {"batch": 2, "crop": 16, "frames": 4, "seed": 0}
+    drawn = next(training_batches(clips, **given, variation=variation, vary_later=True))
+    at_once = next(training_batches(clips, **given, variation=variation))
+    step = make_train_step(gain(), recipe)
+    losses = [float(step(init_state(gain(), recipe, batch), batch)[1].loss) for batch in (drawn, at_once, drawn.clip)]
+    assert losses[0] == pytest.approx(losses[1], rel=2e-3)
+    assert losses[0] != pytest.approx(losses[2], rel=0.1)
 
 
 @pytest.mark.parametrize(("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])

@@ -128,6 +128,7 @@ def read_window(
     light: tuple[np.ndarray, np.ndarray | None] | None = None,
     buffers: Collection[str] | None = None,
     layers: bool = False,
+    widen: bool = True,
 ) -> Clip:
     """The part ``window`` (frames, rows, columns) of a clip as a Clip of plain arrays with ``spp`` samples per pixel.
 
@@ -137,12 +138,13 @@ def read_window(
 
     Buffers have the dtypes of :attr:`jaxdn.core.frame.Buffer.dtype`. ``buffers`` names the ones to read (default:
     all there are); of a clip that was rendered by a plan, those that it lacks are written out. With ``layers`` the
-    clip's independent noisy layers of 1, 2, 4, ... samples are read too (``Clip.layers``).
+    clip's independent noisy layers of 1, 2, 4, ... samples are read too (``Clip.layers``). Without ``widen`` guides
+    stay in half precision where they are stored so.
     """
     asked = set(clip.buffers) if buffers is None else set(buffers) & set(GUIDES)
     if light is not None or layers_for(spp, clip.layers, clip.path) != [min(clip.layers)]:
         asked -= OF_SAMPLES
-    guides = {name: read_guide(clip, name, window, spp) for name in clip.buffers & asked}
+    guides = {name: read_guide(clip, name, window, spp, widen=widen) for name in clip.buffers & asked}
     if light is None:
         reference = read_array(clip, "reference", window) if "reference" in clip.arrays else None
         light = read_layers(clip, window, spp), reference
@@ -155,19 +157,22 @@ def read_window(
     )
 
 
-def read_layers(clip: CachedClip, window: tuple[slice, ...], spp: int) -> np.ndarray:
-    """Noisy radiance of ``spp`` samples a pixel, combined from the layers."""
+def read_layers(clip: CachedClip, window: tuple[slice, ...], spp: int, *, widen: bool = True) -> np.ndarray:
+    """Noisy radiance of ``spp`` samples a pixel, combined from the layers; one alone, without ``widen``, as stored."""
     chosen = layers_for(spp, clip.layers, clip.path)
+    if len(chosen) == 1 and not widen:
+        return read_stored(clip, _noisy(chosen[0]), window)
     return combine({samples: read_array(clip, _noisy(samples), window) for samples in chosen})
 
 
-def read_guide(clip: CachedClip, name: str, window: tuple[slice, ...], spp: int) -> np.ndarray:
+def read_guide(clip: CachedClip, name: str, window: tuple[slice, ...], spp: int, *, widen: bool = True) -> np.ndarray:
     """The part ``window`` of a buffer; one that is a mean over samples, of ``spp`` of them.
 
     Of the half of a reference there are no guides: those of all its samples are as good as free of noise, too.
     """
     if not clip.filtered or name not in AVERAGED:
-        return read_array(clip, name, window)
+        narrow = not widen and BUFFERS[name].stored == "half"
+        return read_stored(clip, name, window) if narrow else read_array(clip, name, window)
     if spp == clip.half_spp:
         return read_array(clip, f"reference_{name}", window)
     fewest = min(clip.layers)

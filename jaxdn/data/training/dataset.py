@@ -9,19 +9,21 @@ exactly where the other was.
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import grain
 import jax
 import numpy as np
 
-from jaxdn.core.frame import OF_SAMPLES, Clip, written_out
+from jaxdn.core.frame import BUFFERS, OF_SAMPLES, Buffer, Clip, Frame, written_out
 from jaxdn.data.clip.frames import doubling_layers
 from jaxdn.data.errors import ClipError
+from jaxdn.data.exr.exr import to_half
 from jaxdn.data.training.cache import CachedClip, read_window
 from jaxdn.data.training.light_samples import check_samples, sample_light
 from jaxdn.data.training.open_clips import open_clips
 from jaxdn.data.training.symmetries import transform_clip
-from jaxdn.recipes.augmentation import NO_AUGMENTATION, Augmentation, augment_clip
+from jaxdn.recipes.augmentation import NO_AUGMENTATION, Augmentation, DrawnClip, augment_clip, draw_variation
 
 
 def training_batches(
@@ -38,7 +40,8 @@ def training_batches(
     variation: Augmentation = NO_AUGMENTATION,
     threads: int = 1,
     process: tuple[int, int] = (0, 1),
-) -> grain.DatasetIterator[Clip]:
+    vary_later: bool = False,
+) -> grain.DatasetIterator[Any]:
     """An endless iterator over batches: a Clip of numpy arrays ``[B, T, H, W, C]``, reference included.
 
     Args:
@@ -59,6 +62,7 @@ def training_batches(
       process: index and number of processes that read one stream together: each gets every so many-th element of a
         batch, prepares nothing of the others', and all together have the batch of one process alone. The position is
         the same in all of them and counts whole batches, so that another number of processes may go on from it.
+      vary_later: batches are :class:`jaxdn.recipes.augmentation.DrawnClip`, which the update varies on its device.
 
     Buffers that belong to one noisy image (:data:`jaxdn.core.frame.OF_SAMPLES`: specular light, shadows) come with that
     image, the layer with the fewest samples, instead of noise drawn anew; with all other noise they are neutral.
@@ -92,7 +96,7 @@ def training_batches(
     # Each clip has the first layers of 1, 2, 4, ...: the clip with the fewest decides.
     common = min((doubling_layers(source.layers, source.path) for source in sources), key=len) if layers else []
 
-    def element(index: int, rng: np.random.Generator) -> Clip:
+    def element(index: int, rng: np.random.Generator) -> Clip | DrawnClip:
         source = sources[index]
         starts = [int(rng.integers(0, has - wants + 1)) for has, wants in zip(source.shape, sizes, strict=True)]
         window = tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))
@@ -102,14 +106,20 @@ def training_batches(
         if of_samples & source.buffers and samples == min(source.layers, default=0) and not beauty:
             clip = read_window(source, window, spp=samples, buffers=names, layers=layers)
         else:
-            light = sample_light(source, window, samples, rng, beauty=beauty)
-            clip = read_window(source, window, spp=samples, light=light, buffers=names, layers=layers)
+            light = sample_light(source, window, samples, rng, beauty=beauty, widen=not vary_later)
+            clip = read_window(
+                source, window, spp=samples, light=light, buffers=names, layers=layers, widen=not vary_later
+            )
         clip = clip._replace(frames=written_out(clip.frames, of_samples))
         if clip.layers is not None:
             clip = clip._replace(layers={count: clip.layers[count] for count in common})
+        if vary_later:
+            clip = _narrow(clip)
         if augment:
             turns = int(rng.integers(4)) if height == width else 2 * int(rng.integers(2))
             clip = transform_clip(clip, flip=bool(rng.integers(2)), turns=turns)
+        if vary_later:
+            return DrawnClip(clip, draw_variation(variation, sizes, rng))
         return clip if variation == NO_AUGMENTATION else augment_clip(clip, variation, rng)
 
     sizes = (frames, height, width)
@@ -126,7 +136,25 @@ def training_batches(
     return iter(batches.to_iter_dataset(options))
 
 
-def _stack(clips: Sequence[Clip]) -> Clip:
+def _narrow(clip: Clip) -> Clip:
+    """The clip in the precision of files: light and guides that these have in half precision."""
+
+    def narrow(image: Any, buffer: Buffer) -> Any:
+        if image is None or buffer.stored != "half" or image.dtype == np.float16:
+            return image
+        with np.errstate(over="ignore"):
+            half = image.astype(np.float16)
+        return to_half(image) if np.isinf(half).any() else half  # rarely: what is too large, and then clamped
+
+    light = BUFFERS["radiance"]
+    return Clip(
+        Frame(**{name: narrow(image, BUFFERS[name]) for name, image in clip.frames._asdict().items()}),
+        narrow(clip.reference, light),
+        jax.tree.map(lambda image: narrow(image, light), clip.layers),
+    )
+
+
+def _stack(clips: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *clips)
 
 

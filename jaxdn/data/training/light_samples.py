@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxdn.data.clip.frames import layers_for
 from jaxdn.data.errors import ClipError
-from jaxdn.data.training.cache import CachedClip, read_array, read_guide, read_layers
+from jaxdn.data.training.cache import CachedClip, read_array, read_guide, read_layers, read_stored
 
 Window = tuple[slice, ...]
 _BEAUTY = ("direct", "emission")
@@ -39,7 +39,7 @@ def check_samples(clip: CachedClip, spp: int) -> None:
 
 
 def sample_light(
-    clip: CachedClip, window: Window, spp: int, rng: np.random.Generator, *, beauty: bool = False
+    clip: CachedClip, window: Window, spp: int, rng: np.random.Generator, *, beauty: bool = False, widen: bool = True
 ) -> Light:
     """Light of ``spp`` samples a pixel in a window (frames, rows, columns) of a clip.
 
@@ -50,16 +50,17 @@ def sample_light(
       rng: chooses among the single samples.
       beauty: all light instead of the denoised part, if the clip has that many single samples, whose direct light is
         noisy too, or if its pixels were filtered, so that each image has its own direct and emitted light.
+      widen: in single precision; else in that of the files where nothing is computed.
     """
     if spp <= clip.draws:
         chosen = np.sort(rng.permutation(clip.draws)[:spp])
         samples = read_array(clip, "draws", (window[0], chosen, *window[1:])).astype(np.float32).mean(axis=1)
-        reference = read_array(clip, "reference", window)
+        reference = (read_array if widen or beauty else read_stored)(clip, "reference", window)
         if not beauty or samples.shape[-1] == 3:  # a packed set may have indirect light alone
             return Light(samples[..., :3], reference)
         direct, emission = (read_array(clip, name, window) if name in clip.arrays else 0.0 for name in _BEAUTY)
         return Light(samples[..., :3] + samples[..., 3:] + emission, reference + direct + emission)
-    light = _sample_stored(clip, window, spp)
+    light = _sample_stored(clip, window, spp, widen=widen or beauty)
     if beauty and clip.filtered:
         for name in set(_BEAUTY) & clip.arrays:
             clean = read_array(clip, f"reference_{name}", window)
@@ -67,11 +68,12 @@ def sample_light(
     return light
 
 
-def _sample_stored(clip: CachedClip, window: Window, spp: int) -> Light:
+def _sample_stored(clip: CachedClip, window: Window, spp: int, *, widen: bool) -> Light:
     """Light of layers, or of the halves of the reference."""
     if spp == clip.half_spp:
         half, both = (read_array(clip, name, window) for name in ("reference_half", "reference"))
         shares = np.float32(spp), np.float32(clip.reference_spp)
         other = (both * shares[1] - half * shares[0]) / (shares[1] - shares[0])
         return Light(half, np.maximum(other, 0.0, dtype=np.float32))
-    return Light(read_layers(clip, window, spp), read_array(clip, "reference", window))
+    reference = (read_array if widen else read_stored)(clip, "reference", window)
+    return Light(read_layers(clip, window, spp, widen=widen), reference)
