@@ -8,7 +8,9 @@ A lecture names the combination (of Chaitanya et al. 2017 and Schied et al. 2018
 into the network, and not its image into the mean, is our reading.
 """
 
-from typing import NamedTuple
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import jax
 
@@ -21,8 +23,28 @@ from jaxdn.methods import asvgf, rae, svgf
 from jaxdn.methods.demodulation import demodulated
 from jaxdn.methods.registry import method
 
-_ACCUMULATION = asvgf.Options()
+_ACCUMULATIONS = {"tested": asvgf.Options(), "published": asvgf.Options(significance=0.0, antilag=1.0)}
 """How the history is fetched, tested and blended."""
+
+
+@dataclass(frozen=True)
+class Options(rae.Options):
+    """Those of ``rae``, and that of the accumulation."""
+
+    accumulation: Literal["tested", "published"] = "tested"
+    """By what share light has changed: beyond two deviations of its noise and to the fourth power, as by default in
+    ``asvgf``; or lambda as it is."""
+
+
+def _with_accumulation(options: rae.Options, accumulation: Literal["tested", "published"]) -> Options:
+    own = {field.name: getattr(options, field.name) for field in dataclasses.fields(options)}
+    return Options(**own, accumulation=accumulation)
+
+
+PRESETS = {
+    "paper": _with_accumulation(rae.PRESETS["paper"], "published"),
+    "hasselgren": _with_accumulation(rae.PRESETS["hasselgren"], "tested"),
+}
 
 
 class AraeState(NamedTuple):
@@ -34,19 +56,19 @@ class AraeState(NamedTuple):
 
 
 @method(
-    rae.Options,
+    Options,
     title="Recurrent denoising autoencoder behind an adaptive temporal accumulation",
-    presets=rae.PRESETS,
+    presets=PRESETS,
     recipes=rae.RECIPES,
     variants={"arae-large": {"size": "large"}, "arae-small": {"size": "small"}},
     backends=("onednn",),
 )
-def arae(options: rae.Options) -> Denoiser:
+def arae(options: Options) -> Denoiser:
     """The recurrent autoencoder on accumulated light; ``params`` are those of ``rae``.
 
     Reads what ``rae`` and ``asvgf`` read. Raises ValueError as ``rae`` does.
     """
-    inner = rae.core_of(options)
+    inner, accumulation = rae.core_of(options), _ACCUMULATIONS[options.accumulation]
 
     def start(params: Params, frame: Frame) -> AraeState:
         return AraeState(svgf.start(params, frame), inner.start(params, frame))
@@ -55,7 +77,7 @@ def arae(options: rae.Options) -> Denoiser:
         params: Params, state: AraeState, frame: Frame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[AraeState, jax.Array, jax.Array]:
         texture = svgf.planar_texture(frame, options.demodulate, statistics)
-        history, invalid = asvgf.accumulate(_ACCUMULATION, state.light, frame, texture, first)
+        history, invalid = asvgf.accumulate(accumulation, state.light, frame, texture, first)
         light = svgf.SvgfState(history.transpose(1, 2, 0), guides_of(frame))
         mean = brdf.restore(history[:3], texture, history[6:])
         measured, prepared = inner.prepare(frame._replace(radiance=mean.transpose(1, 2, 0)))

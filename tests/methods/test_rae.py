@@ -219,6 +219,19 @@ def test_the_accumulation_gives_it_the_mean_of_all_frames(rng, key):
     np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-5)
 
 
+def test_light_that_changed_by_half_leaves_half_of_the_history_as_published(rng, key):
+    """Of two frames the second weighs 1 / 2, and half of what is left goes: a quarter of the first stays."""
+    frames, options = clip_of(rng, 2), {**PLAIN, "background": "filter"}
+    still = jax.tree.map(lambda buffer: jnp.broadcast_to(buffer[:1], buffer.shape), frames)
+    halved = jnp.broadcast_to(jnp.asarray([0.5, 1.0]), (2, *SIZE, 2))
+    still = still._replace(radiance=frames.radiance, luminance_gradient=halved)
+    params = varied(rae(**options), frames, key)
+    means = jnp.stack([frames.radiance[0], 0.25 * frames.radiance[0] + 0.75 * frames.radiance[1]])
+    found = images_of(arae(**options, accumulation="published"), params, still)
+    wanted = images_of(rae(**options), params, still._replace(radiance=means))
+    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-5)
+
+
 def test_the_papers_settings_are_presets():
     for name in ("rae", "arae"):
         row = methods()[name]
@@ -226,3 +239,4 @@ def test_the_papers_settings_are_presets():
         compared = row.parse_options({"preset": "hasselgren"})
         assert (compared.demodulate, compared.guides) == ("none", "materials")
         assert row.recipe_named("paper").frames == 7
+    assert methods()["arae"].parse_options({"preset": "paper"}).accumulation == "published"
