@@ -61,10 +61,12 @@ def share_of_old(image: np.ndarray, old: np.ndarray, new: np.ndarray, where: np.
     """How much of ``old`` is left in ``image`` where ``new`` is right: the s of ``image = new + s (old - new) +
     noise``.
 
-    By least squares over the pixels ``where`` [H, W] of images [H, W, 3] in tone-mapped light: noise averages out.
+    By least squares over the pixels ``where`` [H, W] of linear images [H, W, 3], relative to the brighter of both:
+    noise averages out. In tone-mapped light it would not: noise darkens that, as an old shadow does.
     """
-    away = (old - new)[where]
-    return float(np.sum((image - new)[where] * away) / max(np.sum(away * away), 1e-12))
+    brighter = np.maximum(np.maximum(old, new)[where].mean(-1, keepdims=True), 1e-6)
+    away = (old - new)[where] / brighter
+    return float(np.sum((image - new)[where] / brighter * away) / max(np.sum(away * away), 1e-12))
 
 
 def measure_failure(images: np.ndarray, reference: np.ndarray, affected: np.ndarray, *, moving: int) -> Failure:
@@ -72,10 +74,10 @@ def measure_failure(images: np.ndarray, reference: np.ndarray, affected: np.ndar
     shown, wanted = (np.asarray(color.tonemap(jnp.asarray(each))) for each in (images, reference))
     where = jnp.asarray(affected[..., None], jnp.float32)
     mean = float(metrics.mse(jnp.asarray(shown), jnp.asarray(wanted), mask=where))
-    old, new = wanted[moving - 1], wanted[moving]
-    light = [np.asarray(color.luminance(jnp.asarray(reference[index])))[..., 0] for index in (moving - 1, moving)]
+    old, new = reference[moving - 1], reference[moving]
+    light = [np.asarray(color.luminance(jnp.asarray(each)))[..., 0] for each in (old, new)]
     changed = np.abs(light[0] - light[1]) > CHANGED * np.maximum(np.maximum(*light), 1e-6)
-    left = [share_of_old(image, old, new, changed) for image in shown[moving:]]
+    left = [share_of_old(image, old, new, changed) for image in images[moving:]]
     response = next((index for index, share in enumerate(left) if share < GONE), None)
     return Failure(-10 * np.log10(max(mean, 1e-12)), response)
 
