@@ -15,7 +15,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.classify import ChannelNaming
-from jaxdn.data.foreign.views import find_views
+from jaxdn.data.foreign.views import ViewFile, find_views
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
@@ -68,8 +68,18 @@ def parts(path: Path, frame: int) -> None:
     OpenEXR.File(found).write(str(path))
 
 
-def blender(path: Path, frame: int) -> None:
+def blender_with_views(path: Path, frame: int) -> None:
     """A part for each pass of each view of a view layer; the channels repeat the name with the view."""
+    blender(path, frame, "ViewLayer.{}.{}", "ViewLayer.{}.{}")
+
+
+def blender_5(path: Path, frame: int) -> None:
+    """As Blender 5.0.1 writes them: the channels repeat the name without the view."""
+    blender(path, frame, "ViewLayer.{}-{}", "ViewLayer.{}")
+
+
+def blender(path: Path, frame: int, part_name: str, layer_name: str) -> None:
+    """Names of parts and of their layers, by pass and view."""
     found = []
     for view in VIEWS:
         now = seen(view, frame)
@@ -77,15 +87,16 @@ def blender(path: Path, frame: int) -> None:
         passes = {"Combined": (now.light, "RGBA"), "Depth": (now.depth, "Z"), "Vector": (vector, "XYZW")}
         for name, (values, letters) in passes.items():
             rgba = np.concatenate([values, now.alpha], axis=-1) if name == "Combined" else values
-            full = f"ViewLayer.{name}.{view}"
-            found.append(part(layer(full, rgba, letters), name=full, view=view))
+            channels = layer(layer_name.format(name, view), rgba, letters)
+            found.append(part(channels, name=part_name.format(name, view), view=view))
     OpenEXR.File(found).write(str(path))
 
 
 KINDS: dict[str, tuple[Callable[[Path, int], None], dict[str, str]]] = {
     "Nuke, one part": (nuke, {"right": "{}", "left": "left.{}"}),
     "parts": (parts, {"right": "rgba_right.{}", "left": "rgba_left.{}"}),
-    "Blender": (blender, {view: f"ViewLayer.Combined.{view}.{{}}" for view in VIEWS}),
+    "Blender, views in names": (blender_with_views, {view: f"ViewLayer.Combined.{view}.{{}}" for view in VIEWS}),
+    "Blender 5": (blender_5, {view: f"ViewLayer.Combined-{view}.ViewLayer.Combined.{{}}" for view in VIEWS}),
 }
 """How such a file is written, and view -> name of the channels of its beauty."""
 NAMING = ChannelNaming("forward-up")
@@ -116,14 +127,21 @@ def image(path: Path, kind: str, view: str) -> np.ndarray:
 
 
 def naming_of(kind: str, view: str | None = None) -> ChannelNaming:
-    return ChannelNaming(None if kind == "Blender" else "forward-up", view=view)
+    return ChannelNaming(None if kind.startswith("Blender") else "forward-up", view=view)
+
+
+@pytest.mark.parametrize("kind", ["Blender, views in names", "Blender 5"])
+def test_layers_of_a_view_have_their_plain_names(kind: str, tmp_path: Path) -> None:
+    file = ViewFile(write(kind, tmp_path / "in") / "shot.0000.exr", "left")
+    letters = {"Combined": "RGBA", "Depth": "Z", "Vector": "XYZW"}
+    assert set(file.windows) == {f"ViewLayer.{name}.{letter}" for name in letters for letter in letters[name]}
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_each_view_is_read_with_all_of_its_layers(kind: str, tmp_path: Path) -> None:
     source = write(kind, tmp_path / "in")
     assert find_views(ExrFile(source / "shot.0000.exr")) == VIEWS
-    stated = None if kind == "Blender" else "forward-up"
+    stated = None if kind.startswith("Blender") else "forward-up"
     for view in (None, *VIEWS):
         clip = clips.read_clip(source, motion_convention=stated, view=view)
         for frame in range(FRAMES):
@@ -165,7 +183,7 @@ def test_every_view_is_denoised_with_its_own_history(kind: str, bidirectional: b
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_view_is_chosen(kind: str, tmp_path: Path, capsys: Any) -> None:
     source = write(kind, tmp_path / "in")
-    arguments = [] if kind == "Blender" else ["--motion-convention", "forward-up"]
+    arguments = [] if kind.startswith("Blender") else ["--motion-convention", "forward-up"]
     main.main(["inspect", str(source), "--view", "left", *arguments])
     text = capsys.readouterr().out
     assert "(left): what is read" in text

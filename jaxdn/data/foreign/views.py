@@ -134,8 +134,13 @@ def _owner(name: str, views: Sequence[str], parts: Mapping[str, str], *, single:
 
 
 def _strip(name: str, view: str) -> str:
-    """A name without the view: ``left.R``, ``forward.left.u``, ``rgba_left.R``."""
+    """A name without the view: ``left.R``, ``forward.left.u``, ``rgba_left.R``; of what is twice in it, one.
+
+    Blender 5 calls a part ``ViewLayer.Depth-left`` and its channel ``ViewLayer.Depth.Z``.
+    """
     word = re.escape(view)
     layers, _, last = name.rpartition(".")
     kept = (re.sub(rf"^{word}$|^{word}[_\s-]|[_\s-]{word}$", "", one, flags=re.IGNORECASE) for one in layers.split("."))
-    return ".".join([*(one for one in kept if one), last])
+    found = [one for one in kept if one]
+    half = len(found) // 2
+    return ".".join([*(found[:half] if found[:half] == found[half:] else found), last])
