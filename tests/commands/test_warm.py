@@ -81,15 +81,17 @@ def test_denoise_finds_what_doctor_compiled(tmp_path: Path) -> None:
         assert steps(kept) == programs, name
 
 
-def test_what_cannot_be_compiled_is_told(tmp_path: Path) -> None:
+def test_what_cannot_be_compiled_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, message in (
         (["--width", "0"], "--width, --height: expected at least 1 pixel, got 0 x 1080"),
         (["--method", "nothing"], "method 'nothing': expected one of"),
     ):
-        done = run(tmp_path, "doctor", "--warm", *arguments)
-        assert done.returncode == 2
-        assert message in " ".join(done.stderr.split())
-        assert "Traceback" not in done.stderr
+        with pytest.raises(SystemExit) as ended:
+            main.main(["doctor", "--warm", *arguments])
+        assert ended.value.code == 2
+        told = capsys.readouterr().err
+        assert message in " ".join(told.split())
+        assert "Traceback" not in told
 
 
 def test_options_of_warm_alone_are_refused_without_it(capsys) -> None:

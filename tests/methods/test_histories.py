@@ -12,6 +12,7 @@ import pytest
 
 from jaxdn.core.frame import FAR, Frame
 from jaxdn.denoiser import Denoiser
+from jaxdn.denoiser.rollout import unroll
 from jaxdn.denoiser.statistics import measure_frame
 from jaxdn.methods.lobes import split_signals
 from jaxdn.methods.two_lobes.reblur import reblur
@@ -220,15 +221,13 @@ def test_pixels_without_a_surface_pass_through(kind, rng):
 
 @pytest.mark.slow  # test_fitted.py has the gradient by params of both
 def test_gradients_reach_both_kinds_of_light(kind, x64, rng):
-    frames = scene(rng, 2, np.float64)
+    frames = jax.tree.map(lambda *buffers: np.stack(buffers), *scene(rng, 2, np.float64))
     weights = np.cos(np.arange(HEIGHT * WIDTH * 3)).reshape(HEIGHT, WIDTH, 3)
 
     def loss(radiance, part):
-        state = kind.denoiser.start({}, frames[0])
-        for frame in frames:
-            lit = frame._replace(radiance=frame.radiance + radiance, specular=(frame.radiance + radiance) * part)
-            state, image = kind.denoiser.step({}, state, lit)
-        return jnp.mean(image * weights)
+        light = frames.radiance + radiance[None]
+        lit = frames._replace(radiance=light, specular=light * part[None])
+        return jnp.mean(unroll(kind.denoiser, {}, lit)[-1] * weights)
 
     both = jax.jit(jax.value_and_grad(loss, (0, 1)))
     zero, half = np.zeros((HEIGHT, WIDTH, 3)), np.full((HEIGHT, WIDTH, 1), 0.4)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxdn.core.frame import Frame, written_out
+from jaxdn.denoiser.rollout import unroll
 from jaxdn.methods.svgf import svgf
 from jaxdn.methods.trmv import trmv
 from tests.methods.lobe_scenes import compiled, run
@@ -178,17 +179,15 @@ def test_pixels_without_a_surface_pass_through(rng):
 
 @pytest.mark.slow  # test_fitted.py has the gradient by params
 def test_gradients_reach_every_part_of_light(x64, rng):
-    frames = all_light(rng, 2, np.float64)
+    frames = jax.tree.map(lambda *buffers: np.stack(buffers), *all_light(rng, 2, np.float64))
     weights = np.cos(np.arange(HEIGHT * WIDTH * 3)).reshape(HEIGHT, WIDTH, 3)
 
-    def loss(shadowed, unshadowed, specular, rest):
-        state = DENOISER.start({}, frames[0])
-        for frame in frames:
-            lit, free, shine = frame.shadowed + shadowed, frame.unshadowed + unshadowed, frame.specular + specular
-            whole = frame.radiance + shadowed + specular + rest
-            given = frame._replace(radiance=whole, shadowed=lit, unshadowed=free, specular=shine)
-            state, image = DENOISER.step({}, state, given)
-        return jnp.mean(image * jnp.asarray(weights))
+    def loss(*light):
+        shadowed, unshadowed, specular, rest = (part[None] for part in light)
+        lit, free, shine = frames.shadowed + shadowed, frames.unshadowed + unshadowed, frames.specular + specular
+        whole = frames.radiance + shadowed + specular + rest
+        given = frames._replace(radiance=whole, shadowed=lit, unshadowed=free, specular=shine)
+        return jnp.mean(unroll(DENOISER, {}, given)[-1] * jnp.asarray(weights))
 
     both = jax.jit(jax.value_and_grad(loss, (0, 1, 2, 3)))
     level = np.full((HEIGHT, WIDTH, 3), 0.3)
