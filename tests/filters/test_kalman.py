@@ -90,7 +90,7 @@ def test_single_precision_is_enough(rng):
 def test_sums_of_windows_are_those_of_their_pixels(radius, height, width):
     planes = np.random.default_rng(radius).normal(size=(2, height, width)).astype(np.float32)
     expected = np.stack([window_sums(plane, radius) for plane in planes])
-    # One program for each size; operation by operation there are ten.
+    # One program for each size, in place of one for each operation.
     np.testing.assert_allclose(jax.jit(partial(box_sum, radius=radius))(planes), expected, atol=1e-4)
 
 
