@@ -13,9 +13,15 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn import color
-from jaxdn.core.frame import FAR
 from jaxdn.denoiser.statistics import FrameStatistics
-from jaxdn.filters.surface_test import depth_slopes
+from jaxdn.filters import affinity_levels
+from jaxdn.filters.affinity_levels import (
+    LEAST_TRUST,
+    compute_inverse_depth,
+    halve_inverse_depth,
+    scale_guide,
+    weigh_enlarged,
+)
 from jaxdn.methods.combiner.history import Means
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
@@ -36,10 +42,6 @@ FULL_LEVELS, LEVELS = 2, 4
 """Levels of the filter at full resolution, taps 1 and 2 pixels apart, and at half, 2, 4, 8 and 16."""
 GUIDES = {"albedo": 3, "normal": 3, "light": 3}
 """What likeness is told by, besides learned features and depth, and its channels."""
-_LIKENESS = 0.02
-"""Weight of coarse pixels at which half of the enlarged image is taken."""
-_LEAST_TRUST = 1e-3
-"""So that a pixel is filtered even where none is trusted."""
 
 
 class FilterParameters(NamedTuple):
@@ -74,27 +76,18 @@ def make_candidates(
     prior, [3, H, W] are of this frame.
     """
     factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items()}
-    inverse_depth = measure_inverse_depth(depth, statistics, means.light)
+    inverse_depth = jnp.zeros_like(means.light) if depth is None else compute_inverse_depth(depth, statistics)
     seen = color.compress(statistics.exposure * means.prior)
     surfaces = jnp.concatenate([means.albedo, means.normal, seen])
     fine = both = jnp.concatenate([means.light, means.prior])
     features = join_planes([("planes", surfaces), ("blocks", parameters.features)])
-    at_full = _at_level(Guide(features, inverse_depth, parameters.trust + _LEAST_TRUST), factors, 0)
+    at_full = scale_guide(Guide(features, inverse_depth, parameters.trust + LEAST_TRUST), factors, 0, GUIDES)
     for index in range(FULL_LEVELS):
         fine = affinity_filter(fine, at_full, step=2**index)
     coarse = _filter_at_half(fine, surfaces, inverse_depth, at_full, parameters, factors)
     found = [prior, stable, both[:3], fine[:3], coarse[:3]]
     found += [prior + filtered[:3] - filtered[3:] for filtered in (fine, coarse)]
     return [*found, means.prior]
-
-
-def measure_inverse_depth(depth: jax.Array | None, statistics: FrameStatistics, like: jax.Array) -> jax.Array:
-    """[3, H, W] inverse depth relative to its mean, which is affine on planes, and its slopes; 0 without a surface."""
-    if depth is None:
-        return jnp.zeros_like(like)
-    known = (depth > 0) & (depth < FAR)
-    inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0) / statistics.mean_inverse_depth
-    return jnp.stack([inverse[..., 0], *depth_slopes(inverse, None)])
 
 
 def _filter_at_half(
@@ -106,23 +99,17 @@ def _filter_at_half(
     factors: Mapping[str, jax.Array],
 ) -> jax.Array:
     """Planes after the levels at half resolution, enlarged along the guides; where none is alike, as they were."""
-    trust = parameters.half_trust + _LEAST_TRUST
-    inverse_depth_half = inverse_depth[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
+    trust = parameters.half_trust + LEAST_TRUST
+    inverse_depth_half = halve_inverse_depth(inverse_depth)
     halved = _halve(surfaces)
     features = join_planes([("planes", halved), ("pixels", parameters.half_features)])
     at_half, planes = Guide(features, inverse_depth_half, trust), _halve(fine)
     for index in range(LEVELS):
-        filtered = affinity_filter(planes, _at_level(at_half, factors, 1 + index), step=2**index)
+        filtered = affinity_filter(planes, scale_guide(at_half, factors, 1 + index, GUIDES), step=2**index)
         planes = planes + parameters.level_weights[index][None] * (filtered - planes)
     there = join_planes([("planes", halved), ("corners", parameters.features)])
     enlarged, weight = joint_bilateral_upsample(planes, Guide(there, inverse_depth[:, ::2, ::2], trust), at_full)
-    return fine + (weight / (weight + _LIKENESS))[None] * (enlarged - fine)
-
-
-def _at_level(guide: Guide, factors: Mapping[str, jax.Array], index: int) -> Guide:
-    """The guide with the factors of one level."""
-    count = {**GUIDES, "learned": guide.features.shape[0] - sum(GUIDES.values()), "depth": 1}
-    return guide._replace(scales=jnp.concatenate([jnp.full(n, factors[name][index]) for name, n in count.items()]))
+    return fine + weigh_enlarged(weight)[None] * (enlarged - fine)
 
 
 def _halve(planes: jax.Array) -> jax.Array:
@@ -131,5 +118,5 @@ def _halve(planes: jax.Array) -> jax.Array:
 
 
 def receptive_field() -> int:
-    """How far, in pixels, :func:`make_candidates` sees; 16 of them for blocks, slopes and what is upsampled."""
-    return 2 * (2**FULL_LEVELS - 1) + sum(4 * 2**index for index in range(LEVELS)) + 16
+    """How far, in pixels, :func:`make_candidates` sees."""
+    return affinity_levels.receptive_field(FULL_LEVELS, LEVELS)

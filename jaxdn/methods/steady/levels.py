@@ -16,9 +16,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn import brdf
-from jaxdn.core.frame import FAR, Frame
+from jaxdn.core.frame import Frame
 from jaxdn.denoiser.statistics import FrameStatistics
-from jaxdn.filters.surface_test import depth_slopes, surface_mask
+from jaxdn.filters import affinity_levels
+from jaxdn.filters.affinity_levels import LEAST_TRUST, halve_inverse_depth, scale_guide, weigh_enlarged
+from jaxdn.filters.surface_test import surface_mask
 from jaxdn.methods.steady import lighting_change, regression
 from jaxdn.methods.steady.accumulation import FilteredLight
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
@@ -29,10 +31,8 @@ LEVELS = 4
 """Levels at half resolution, taps 2, 4, 8 and 16 pixels apart."""
 BLOCKS = 4
 """Height and width that the filters work on are multiples of this: blocks of 4x4 pixels are filled."""
-_LIKENESS = 0.02
-"""Weight of coarse pixels at which half of the enlarged image is taken."""
-_LEAST_TRUST = 1e-3
-"""So that a pixel is filtered even where none is trusted."""
+_CHANNELS = {"albedo": 3, "gloss": 1, "normal": 3}
+"""What likeness is told by, besides learned features and depth, and its channels."""
 
 
 class Surfaces(NamedTuple):
@@ -93,13 +93,10 @@ def surfaces_of(frame: Frame) -> Surfaces:
 
 
 def compute_inverse_depth(surfaces: Surfaces, statistics: FrameStatistics) -> jax.Array:
-    """[3, H, W] inverse depth relative to its mean, which is affine on planes, and its slopes; 0 without a surface."""
-    depth = surfaces.depth
-    if depth is None:
+    """[3, H, W] as :func:`jaxdn.filters.affinity_levels.compute_inverse_depth`; 0 without depth."""
+    if surfaces.depth is None:
         return jnp.zeros((3, *surfaces.hit.shape), surfaces.normal.dtype)
-    known = (depth > 0) & (depth < FAR)
-    inverse = jnp.where(known, 1.0 / jnp.where(known, depth, 1.0), 0.0) / statistics.mean_inverse_depth
-    return jnp.stack([inverse[..., 0], *depth_slopes(inverse, None)])
+    return affinity_levels.compute_inverse_depth(surfaces.depth, statistics)
 
 
 def filter_light(
@@ -127,7 +124,7 @@ def filter_light(
     at_full = _guide(
         [*surfaces.guides(), ("blocks", parameters.features)], inverse_depth, parameters.trust, surfaces.hit
     )
-    at_full = _at_level(at_full, factors, 0)
+    at_full = scale_guide(at_full, factors, 0, _CHANNELS)
     parts = [("planes", mean)]
     if parameters.regression_weight is not None:
         # Guides that light may follow go through the same filters as light, and so does texture.
@@ -165,7 +162,7 @@ def _filter_at_half(
 
     They are followed by the three of the change, if there may be one.
     """
-    inverse_depth_half = inverse_depth[:, ::2, ::2] * jnp.asarray([1.0, 2.0, 2.0])[:, None, None]
+    inverse_depth_half = halve_inverse_depth(inverse_depth)
     hit, own = _any_of_four(surfaces.hit), parameters.half_features
     halved = join_planes(surfaces.guides("means"))
     at_half = _guide([("planes", halved), ("pixels", own)], inverse_depth_half, parameters.half_trust, hit)
@@ -178,7 +175,7 @@ def _filter_at_half(
     features = [("planes", halved), ("corners", parameters.features)]
     there = _guide(features, inverse_depth[:, ::2, ::2], parameters.half_trust, hit)
     enlarged, weight = joint_bilateral_upsample(found, there, at_full)
-    return enlarged, weight / (weight + _LIKENESS)
+    return enlarged, weigh_enlarged(weight)
 
 
 def _any_of_four(hit: jax.Array) -> jax.Array:
@@ -188,18 +185,12 @@ def _any_of_four(hit: jax.Array) -> jax.Array:
 
 def _guide(features: Sequence[Channels], inverse_depth: jax.Array, trust: jax.Array, hit: jax.Array) -> Guide:
     """Surfaces and what else is learned, not yet scaled; what is no surface gives nothing."""
-    return Guide(join_planes(features), inverse_depth, (trust + _LEAST_TRUST) * hit)
-
-
-def _at_level(guide: Guide, factors: Mapping[str, jax.Array], index: int) -> Guide:
-    """The guide with the factors of one level."""
-    count = {"albedo": 3, "gloss": 1, "normal": 3, "learned": guide.features.shape[0] - 7, "depth": 1}
-    return guide._replace(scales=jnp.concatenate([jnp.full(n, factors[name][index]) for name, n in count.items()]))
+    return Guide(join_planes(features), inverse_depth, (trust + LEAST_TRUST) * hit)
 
 
 def _at_levels(guide: Guide, factors: Mapping[str, jax.Array]) -> list[Guide]:
     """The guide of every level at half resolution."""
-    return [_at_level(guide, factors, 1 + index) for index in range(LEVELS)]
+    return [scale_guide(guide, factors, 1 + index, _CHANNELS) for index in range(LEVELS)]
 
 
 def _downsample(planes: jax.Array, hit: jax.Array) -> jax.Array:
@@ -231,9 +222,8 @@ def _filter_change(residual: jax.Array, guides: list[Guide], light: jax.Array, h
 
 
 def receptive_field(full_levels: int, *, with_regression: bool, with_lighting_change: bool) -> int:
-    """How far, in pixels, :func:`filter_light` sees; 16 of them for blocks, slopes and what is upsampled."""
-    half = sum(4 * 2**index for index in range(LEVELS))
+    """How far, in pixels, :func:`filter_light` sees."""
     more = regression.receptive_field() if with_regression else 0
     if with_lighting_change:
         more = max(more, 2 * lighting_change.receptive_field())
-    return 2 * (2**full_levels - 1) + half + more + 16
+    return affinity_levels.receptive_field(full_levels, LEVELS) + more
