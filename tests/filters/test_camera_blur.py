@@ -7,7 +7,7 @@ import pytest
 from jaxdn.filters.camera_blur import blur_lens, blur_motion, confusion_radius
 
 HEIGHT, WIDTH = 40, 72
-RED, GREEN = np.float32([1, 0, 0]), np.float32([0, 1, 0])
+RED, GREEN = np.array([1, 0, 0], np.float32), np.array([0, 1, 0], np.float32)
 
 
 def noise(channels: int = 3) -> np.ndarray:
@@ -19,7 +19,7 @@ def flat(value: float) -> np.ndarray:
 
 
 def vectors(x: float, y: float) -> np.ndarray:
-    return np.broadcast_to(np.float32([x, y]), (HEIGHT, WIDTH, 2)).copy()
+    return np.broadcast_to(np.array([x, y], np.float32), (HEIGHT, WIDTH, 2)).copy()
 
 
 def box(image: np.ndarray, length: float, axis: int) -> np.ndarray:

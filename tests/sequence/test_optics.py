@@ -25,7 +25,7 @@ CAMERA = {
     "aperture": 2.0,
     "focus": 4.0,
     "nominalFocalLength": 50.0,
-    "sensorOverallDimensions": np.float32([36, 24]),
+    "sensorOverallDimensions": np.array([36, 24], np.float32),
 }
 
 
