@@ -32,6 +32,7 @@ from jaxdn.core.frame import Frame, only
 from jaxdn.denoiser import Params
 from jaxdn.methods.combiner.history import Means, start_history
 from jaxdn.methods.combiner.method import (
+    CandidateStep,
     Found,
     build_chooser,
     candidate_step,
@@ -72,6 +73,7 @@ class Options:
 def main(options: Options) -> int:
     """Train, score before and after, write the weights."""
     _, params = load_weights(options.start)
+    find = jax.jit(candidate_step(Settings()))
     clips: dict[str, dict[int, Stored]] = {}
     for clip in find_done(options.folder, []):
         record = read_record(clip / RECORD) or {}
@@ -79,7 +81,8 @@ def main(options: Options) -> int:
             raise ValueError(
                 f"{clip}: expected clips to train on, got one of the test set: nothing is trained on those."
             )
-        clips[clip.name] = collect(clip, params, record["frames"])
+        clips[clip.name] = collect(clip, find, params, record["frames"])
+        print(f"{clip.name}: candidates are made", flush=True)
     held = {name: clip for name, clip in clips.items() if name.endswith(tuple(options.held))}
     trained = {name: clip for name, clip in clips.items() if name not in held}
     if not trained:
@@ -95,9 +98,9 @@ def main(options: Options) -> int:
     return 0
 
 
-def collect(clip: Path, params: Params, frames: int) -> dict[int, Stored]:
-    """What there is to choose from in each frame of a clip, for each sample count."""
-    find, reads = jax.jit(candidate_step(Settings())), denoisers.combiner().reads
+def collect(clip: Path, find: CandidateStep, params: Params, frames: int) -> dict[int, Stored]:
+    """What there is to choose from in each frame of a clip, for each sample count; ``find`` is compiled."""
+    reads = denoisers.combiner().reads
     halves = [references.read(clip / "reference" / f"{number:04d}.exr") for number in range(1, frames + 1)]
     targets = np.stack(
         [np.stack([compress(one) for one in (each.image, each.first, each.second)]) for each in halves]
