@@ -17,6 +17,8 @@ import numpy as np
 from jaxdn.core.frame import Frame
 from jaxdn.core.options import Range
 from jaxdn.data.exr.file import ExrFile
+from jaxdn.data.foreign.classify import UNNAMED, ChannelNaming
+from jaxdn.data.foreign.layers import stack_channels
 from jaxdn.filters.camera_blur import LONGEST, WIDEST, blur_lens, blur_motion, confusion_radius
 
 _ABOVE_0 = Range(0.0, without_low=True)
@@ -88,9 +90,12 @@ def _number(header: Mapping[str, Any], name: str) -> float | None:
 class CameraBlur:
     """Blurs the images of consecutive frames."""
 
-    def __init__(self, given: Optics, log: Callable[[str], None]) -> None:
-        """``log`` is called with what is done to the first frame, and where something is cut."""
-        self._given, self._log = given, log
+    def __init__(self, given: Optics, log: Callable[[str], None], naming: ChannelNaming = UNNAMED) -> None:
+        """``log`` is called with what is done to the first frame, and where something is cut or not done.
+
+        ``naming`` says how the files' vectors are found.
+        """
+        self._given, self._log, self._naming = given, log, naming
         self._told: set[str] = set()
 
     def blur(self, file: ExrFile, frame: Frame, images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -112,16 +117,33 @@ class CameraBlur:
             radius = _find_radius(optics, file, depth)
             self._tell_size("lens", f"f/{optics.fstop:g}", 2 * float(radius.max()), 2 * WIDEST)
             stacked = np.asarray(blur_lens(stacked, radius, depth))
-        if optics.shutter is not None:
-            motion = _motion_of(file, frame)
+        if optics.shutter is not None and (motion := self._read_motion(file, frame)) is not None:
             longest = optics.shutter * float(np.max(np.linalg.norm(motion, axis=-1)))
             self._tell_size("shutter", f"shutter {optics.shutter:g}", longest, LONGEST)
             stacked = np.asarray(blur_motion(stacked, motion, depth, optics.shutter))
         ends = np.cumsum([image.shape[-1] for image in images.values()])
         return dict(zip(images, np.split(stacked, ends[:-1], axis=-1), strict=True))
 
+    def _read_motion(self, file: ExrFile, frame: Frame) -> np.ndarray | None:
+        """Vectors [H, W, 2], 0 where they are not known; None where all are 0, as while everything stands still.
+
+        Vectors that were 0 in all frames so far are left out of the frame, so the file is asked. Raises ValueError
+        where it has none.
+        """
+        if frame.motion is not None:
+            return np.where(np.isfinite(frame.motion), frame.motion, 0).astype(np.float32)
+        channels = self._naming.detect(list(file.windows)).get("motion")
+        if channels is None or np.any(np.nan_to_num(stack_channels(file.pixels, channels))):
+            raise ValueError(
+                f"{file.path}: --reblur shutter: expected motion vectors; render them (Blender: with motion blur off), "
+                "or name them, --channels motion=LAYER."
+            )
+        self._tell("still", f"--reblur: {file.path.name}: all vectors are 0, so nothing is blurred by the shutter")
+        return None
+
     def _tell_size(self, what: str, setting: str, size: float, most: float) -> None:
-        self._tell(what, f"--reblur: {setting}: what is sharp spreads over up to {size:.0f} pixels in the first frame")
+        spread = f"what is sharp spreads over up to {size:.0f} pixels in the first frame that is blurred"
+        self._tell(what, f"--reblur: {setting}: {spread}")
         if size > most:
             self._tell(f"{what} cut", f"--reblur: {setting}: {size:.0f} pixels are cut to {most:.0f}")
 
@@ -140,16 +162,6 @@ def _find_radius(optics: Optics, file: ExrFile, depth: np.ndarray) -> np.ndarray
     diameter = optics.lens / optics.fstop / 1000 / (optics.metres or 1.0)
     focal_pixels = optics.lens / (optics.sensor or _FULL_FRAME) * _width(file)
     return np.asarray(confusion_radius(jnp.asarray(depth), optics.focus, diameter * focal_pixels / (2 * optics.focus)))
-
-
-def _motion_of(file: ExrFile, frame: Frame) -> np.ndarray:
-    """Vectors [H, W, 2], 0 where they are not known. Raises ValueError where there are none."""
-    if frame.motion is None:
-        raise ValueError(
-            f"{file.path}: --reblur shutter: expected motion vectors; render them (Blender: with motion blur off), or "
-            "name them, --channels motion=LAYER."
-        )
-    return np.where(np.isfinite(frame.motion), frame.motion, 0).astype(np.float32)
 
 
 def _width(file: ExrFile) -> int:

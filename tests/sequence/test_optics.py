@@ -29,14 +29,17 @@ CAMERA = {
 }
 
 
-def write(folder: Path, *without: str, frames: int = 2, **attributes: Any) -> Path:
-    """A shot with a light layer, alpha, vectors and depth, and attributes; some layers may be left out."""
+def write(folder: Path, *without: str, frames: int = 2, still: int = 0, **attributes: Any) -> Path:
+    """A shot with a light layer, alpha, vectors and depth, and attributes; some layers may be left out.
+
+    In its first ``still`` frames all vectors are 0.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for frame in range(frames):
         now = truth(frame)
         channels = layer("", np.concatenate([now.light, now.alpha], axis=-1), "RGBA")
         channels |= layer("lamp", now.light, "RGB") | layer("albedo", now.albedo, "RGB")
-        both = np.concatenate([now.motion * [1, -1], -now.forward * [1, -1]], axis=-1)
+        both = np.concatenate([now.motion * [1, -1], -now.forward * [1, -1]], axis=-1) * (frame >= still)
         channels |= {} if "motion" in without else layer("V.Vector", both, "XYZW")
         channels |= {} if "depth" in without else layer("V.Depth", now.depth, "Z")
         OpenEXR.File([part(channels, **attributes)]).write(str(folder / f"s.{frame:04d}.exr"))
@@ -68,6 +71,22 @@ def test_beauty_alpha_and_light_layers_are_blurred_alike_and_the_rest_stays(tmp_
         np.testing.assert_allclose(np.stack([after[c] for c in "RGBA"], axis=-1), wanted, rtol=1e-5, atol=1e-6)
         np.testing.assert_array_equal(after["V.Depth.Z"], before["V.Depth.Z"])
     assert any("--reblur: shutter 0.8: what is sharp spreads over up to 3 pixels" in line for line in lines)
+
+
+def test_frames_that_stand_still_are_not_blurred_by_the_shutter_and_those_after_them_are(tmp_path: Path) -> None:
+    shot = write(tmp_path / "in", frames=3, still=2)
+    lines: list[str] = []
+    denoise_files([shot], tmp_path / "out", find_model(NOISY), Settings(reblur=Optics(shutter=0.8)), log=lines.append)
+    for frame in range(3):
+        before, after = (clips.read_exr(tmp_path / side / f"s.{frame:04d}.exr")["G"] for side in ("in", "out"))
+        if frame < 2:
+            np.testing.assert_array_equal(after, before)
+        else:
+            assert np.abs(after - before).max() > 0.05
+    told = [line for line in lines if line.startswith("--reblur")]
+    assert len(told) == 2
+    assert "s.0000.exr: all vectors are 0, so nothing is blurred by the shutter" in told[0]
+    assert "3 pixels in the first frame that is blurred" in told[1]
 
 
 def test_light_layers_still_add_up(tmp_path: Path) -> None:
