@@ -37,31 +37,37 @@ class Optics:
     lens: Annotated[float, _ABOVE_0] | None = None
     """The focal length in mm."""
     sensor: Annotated[float, _ABOVE_0] | None = None
-    """Of what the picture shows, the width on the sensor in mm; usually 36."""
+    """The width of the sensor in mm; usually 36."""
     focus: Annotated[float, _ABOVE_0] | None = None
     """The distance of what is sharp, in units of the scene's depth."""
     metres: Annotated[float, _ABOVE_0] | None = None
-    """Metres of such a unit; usually 1."""
+    """How many metres a unit of the scene is; usually 1."""
 
 
-def read_optics(file: ExrFile, given: Optics) -> Optics:
-    """What is ``given``, else what the file says; a panorama has no lens.
+def read_optics(file: ExrFile, given: Optics, *, wraps: bool = False) -> Optics:
+    """What is ``given``, else what the file says; a panorama, by its attribute or as it ``wraps``, has no lens.
 
-    Raises ValueError where neither says anything, or only half of what depth of field needs.
+    Where only the file speaks of a lens, and says half of what depth of field needs, there is none. Raises ValueError
+    where such a half is given, and where nothing is said at all.
     """
     told = _read(file.header, _width(file), given.metres or 1.0)
-    if file.is_panorama:
+    if file.is_panorama or wraps:
         told = replace(told, fstop=None)
         if given.fstop is not None:
             raise ValueError(f"{file.path}: --reblur fstop: a panorama has no lens; leave it out.")
     stated = {each.name: value for each in fields(given) if (value := getattr(given, each.name)) is not None}
     optics = replace(told, **stated)
-    if optics.fstop is not None and (missing := [name for name in ("lens", "focus") if getattr(optics, name) is None]):
-        raise ValueError(
-            f"{file.path}: --reblur fstop={optics.fstop:g}: expected {' and '.join(missing)} too: {_STATE}."
-        )
+    missing = [name for name in ("lens", "focus") if getattr(optics, name) is None]
+    if optics.fstop is not None and missing:
+        if stated.keys() & {"fstop", "lens", "focus"}:
+            raise ValueError(
+                f"{file.path}: --reblur fstop={optics.fstop:g}: expected {' and '.join(missing)} too: {_STATE}."
+            )
+        optics = replace(optics, fstop=None)
     if optics.fstop is None and optics.shutter is None:
-        raise ValueError(f"{file.path}: --reblur: expected a shutter or a lens, and the file names none: {_STATE}.")
+        raise ValueError(
+            f"{file.path}: --reblur: expected a shutter, or a lens with its focus, and the file names none: {_STATE}."
+        )
     return optics
 
 
@@ -90,12 +96,14 @@ def _number(header: Mapping[str, Any], name: str) -> float | None:
 class CameraBlur:
     """Blurs the images of consecutive frames."""
 
-    def __init__(self, given: Optics, log: Callable[[str], None], naming: ChannelNaming = UNNAMED) -> None:
+    def __init__(
+        self, given: Optics, log: Callable[[str], None], naming: ChannelNaming = UNNAMED, *, wraps: bool = False
+    ) -> None:
         """``log`` is called with what is done to the first frame, and where something is cut or not done.
 
-        ``naming`` says how the files' vectors are found.
+        ``naming`` says how the files' vectors are found, ``wraps`` that they are panoramas.
         """
-        self._given, self._log, self._naming = given, log, naming
+        self._given, self._log, self._naming, self._wraps = given, log, naming, wraps
         self._told: set[str] = set()
 
     def blur(self, file: ExrFile, frame: Frame, images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -104,7 +112,7 @@ class CameraBlur:
         Depth of field comes first, then motion blur. Raises ValueError where buffers are missing, and as
         :func:`read_optics` does.
         """
-        optics = read_optics(file, self._given)
+        optics = read_optics(file, self._given, wraps=self._wraps)
         if frame.depth is not None:
             depth = np.asarray(frame.depth, np.float32)
         elif optics.fstop is None:

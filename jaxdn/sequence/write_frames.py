@@ -64,7 +64,9 @@ class ForeignWriter:
         self.has_history = settings.aovs == "additive" or settings.alpha
         self._aovs = AdditiveAovs(settings.naming, log) if settings.aovs == "additive" else None
         self._alpha = AlphaDenoiser(safe=settings.safe) if settings.alpha else None
-        self._blur = None if settings.reblur is None else CameraBlur(settings.reblur, log, settings.naming)
+        self._blur = (
+            None if settings.reblur is None else CameraBlur(settings.reblur, log, settings.naming, wraps=settings.wrap)
+        )
         self._result, self._panorama = result, panorama
 
     def prepare(self, target: Path | None, source: ExrFile | None, frame: Frame, image: np.ndarray) -> Write | None:

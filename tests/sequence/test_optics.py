@@ -57,6 +57,26 @@ def test_the_camera_is_read_from_standard_attributes(tmp_path: Path) -> None:
     assert read_optics(angle, Optics()) == Optics(shutter=0.25, sensor=WIDTH)
 
 
+def test_half_a_lens_is_not_done_where_the_file_says_it_and_refused_where_it_is_stated(tmp_path: Path) -> None:
+    file = ExrFile(write(tmp_path, frames=1, aperture=2.0) / "s.0000.exr")
+    assert read_optics(file, Optics(shutter=0.5)) == Optics(shutter=0.5)
+    assert read_optics(file, Optics(lens=50, focus=3)).fstop == 2
+    for half in (Optics(shutter=0.5, fstop=4), Optics(shutter=0.5, lens=50)):
+        with pytest.raises(ValueError, match=r"expected (lens and )?focus too"):
+            read_optics(file, half)
+
+
+def test_a_panorama_has_no_lens_by_its_attribute_or_as_it_is_stated(tmp_path: Path) -> None:
+    shot = write(tmp_path / "in", frames=1, **CAMERA)
+    assert read_optics(ExrFile(shot / "s.0000.exr"), Optics(), wraps=True).fstop is None
+    around = write(tmp_path / "around", frames=1, envmap=OpenEXR.ENVMAP_LATLONG, **CAMERA)
+    assert read_optics(ExrFile(around / "s.0000.exr"), Optics()).fstop is None
+    settings = Settings(reblur=Optics(fstop=2), wrap=True)
+    with pytest.raises(ValueError, match="a panorama has no lens"):
+        denoise_files([shot], tmp_path / "out", find_model(NOISY), settings)
+    assert not list((tmp_path / "out").glob("*"))
+
+
 def test_beauty_alpha_and_light_layers_are_blurred_alike_and_the_rest_stays(tmp_path: Path) -> None:
     shot = write(tmp_path / "in")
     lines: list[str] = []
@@ -111,7 +131,7 @@ def test_the_command_takes_a_camera_by_words_and_blurs_what_is_out_of_focus(tmp_
 @pytest.mark.parametrize(
     ("without", "words", "message"),
     [
-        ([], [], "expected a shutter or a lens, and the file names none: --reblur shutter=0.5"),
+        ([], [], "expected a shutter, or a lens with its focus, and the file names none: --reblur shutter=0.5"),
         ([], ["fstop=2"], "expected lens and focus too"),
         ([], ["shutter=180"], "--reblur shutter: expected a number in [0, 1] or None, got 180"),
         ([], ["speed=1"], "expected options out of shutter, fstop"),
