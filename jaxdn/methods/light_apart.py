@@ -28,7 +28,8 @@ def light_apart(denoiser: Denoiser) -> Denoiser:
 
     Direct light is ``frame.shadowed``: diffuse light straight from the sampled points of lights. Frames without that
     buffer are filtered as a whole. The parameters are those of the filter, the same for both, and so are the frame's
-    statistics, which are those of all light. Reads ``shadowed`` in addition.
+    statistics, which are those of all light. So is ``luminance_gradient``: where direct light alone changes, both
+    histories are shortened by its share of all light. Reads ``shadowed`` in addition.
     """
     core = core_of(denoiser)
 

@@ -16,7 +16,7 @@ from tests.methods.test_svgf import HEIGHT, LUMINANCE, WIDTH, moving_frames, ref
 
 PLAIN = {"apart": False, "antialiasing": False}
 """The filter alone."""
-EVERY = ("asvgf", "dasr", "ntasd", "ntd", "rae", "reblur", "relax", "svgf", "taa", "trmv")
+EVERY = sorted(name for name, row in methods().items() if "paper" in row.presets)
 
 
 @pytest.mark.parametrize("name", EVERY)
@@ -199,6 +199,21 @@ def test_asvgf_as_published_leaves_half_of_the_history_of_light_that_doubles():
     _, images = run(asvgf(preset="paper", levels=1, antialiasing=False), frames)
     # lambda = 1/2, so the new frame weighs (1 - lambda) 0.1 + lambda, and the image is 1 + 0.55.
     np.testing.assert_allclose(images[-1], 1.55, rtol=0.01)
+
+
+def test_both_signals_of_asvgf_have_the_gradient_of_all_light():
+    """A quarter of the light is direct and goes out; of the indirect light's history as large a share goes with it."""
+    light, indirect = np.ones((24, 30, 3), np.float32), np.full((24, 30, 3), 0.75, np.float32)
+    rest = np.zeros((24, 30, 2), np.float32)
+    changed = rest + np.array([-0.25, 1.0], np.float32)
+    lit = Frame(light, shadowed=light - indirect, luminance_gradient=rest)
+    frames = [lit] * 20 + [Frame(indirect, shadowed=0 * light, luminance_gradient=changed)]
+    state, images = run(asvgf(preset="paper", levels=1, antialiasing=False), frames)
+    # lambda = 1/4, so the new frame weighs (1 - lambda) 0.1 + lambda = 0.325 in both.
+    np.testing.assert_allclose(images[-1], 0.75 + 0.675 * 0.25, rtol=0.01)
+    lengths = [np.asarray(part.history[..., 5]) for part in state.core]
+    np.testing.assert_array_equal(*lengths)
+    assert (lengths[0] < 4).all()  # of the light that stays as well, after 20 frames
 
 
 # relax, reblur
