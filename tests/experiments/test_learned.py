@@ -10,6 +10,7 @@ import pytest
 from experiments.papers.learned import __main__ as learned
 from experiments.papers.learned import maps, ntasd_holdout, ntasd_methods, ntasd_sizes, scores, stages, zeng_methods
 from jaxdn.evaluation.report import ClipResult, Results, Scores
+from jaxdn.methods.registry import method_named
 from jaxdn.sequence.render_jobs import render
 
 
@@ -125,6 +126,9 @@ def test_stages_are_what_the_papers_compare() -> None:
     assert zeng_methods.TABLE.spp == zeng[zeng_methods.OURS].spp == zeng[zeng_methods.NTASD].options["budget"] == 1
     assert stages.objective_of(zeng_methods.NTASD) == "last frames"
     assert stages.objective_of(zeng_methods.OURS) == "indirect illumination"
+    recipes = [method_named(zeng[row].method).recipe_named(zeng[row].recipe) for row in zeng]
+    assert recipes[0].learning_rate == recipes[1].learning_rate
+    assert recipes[0].steps == recipes[1].steps
     # One loss for all networks of the table.
     losses = {row: stages.objective_of(row) for row in ntasd_methods.ROWS}
     assert set(losses.values()) == {"", "last frames"}

@@ -53,7 +53,7 @@ STAGES = {
     "single frames, three scales": Stage("ntasd", {**_SINGLE_FRAMES, "prediction": "three-scales"}, recipe="paper"),
     "single frames, direct": Stage("ntasd", {**_SINGLE_FRAMES, "prediction": "direct"}, recipe="paper"),
     "ntasd, uniform, 1 sample": Stage("ntasd", {**_EVEN, "budget": 1.0}, recipe="paper"),
-    "ntd, 1 sample": Stage("ntd", {"size": "small"}, recipe="paper", spp=1),
+    "ntd, 1 sample": Stage("ntd", {"size": "small"}, recipe="paper-loss", spp=1),
     "dasr": Stage("dasr", {"size": "small"}, recipe="hasselgren"),
     "dasr, uniform": Stage("dasr", _EVEN, recipe="hasselgren"),
     "rae": Stage("rae", {"size": "small"}, recipe="hasselgren"),
