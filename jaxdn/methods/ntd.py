@@ -53,7 +53,7 @@ class Options:
     passes (:func:`jaxdn.methods.history_vectors.choose_vectors`)."""
     history: Literal["warped", "none"] = "warped"
     """The last image, along these vectors; or every frame is a first frame (the networks without recurrence that
-    Hasselgren et al. 2020 compare with)."""
+    Hasselgren et al. 2020 compare with), and ``motion`` is not looked at."""
     alpha_at: Literal["coarse", "fine"] = "coarse"
     """The blending weight of two scales: inside U, at the coarse scale; or outside it, for each fine pixel."""
     down: Literal["mean", "max"] = "mean"
@@ -261,7 +261,8 @@ def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES) -> Core:
     widths = sizes[options.size] if isinstance(options.size, str) else options.size
     scheme, backend = options.initialization, options.implementation
     network = unet(groups, heads, widths=widths, initialization=scheme, implementation=backend)
-    reads = frozenset({"albedo", "normal", "depth"}) | VECTORS_READ[options.motion]
+    reads = frozenset({"albedo", "normal", "depth"})
+    reads |= VECTORS_READ[options.motion] if options.history == "warped" else set()
     reads |= {"reflectance", "roughness"} if materials else set()
     reads |= extra.reads
 

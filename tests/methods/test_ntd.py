@@ -212,6 +212,8 @@ def test_without_a_history_every_frame_is_a_first_one(
 ) -> None:
     """Whatever came before; the networks without recurrence that papers compare with."""
     denoiser, usual = (tiny(preset=preset, **more) for more in ({"history": "none"}, {}))
+    assert usual.reads & {"motion", "dual_motion"}
+    assert not denoiser.reads & {"motion", "dual_motion"}
     frames = random_frames(rng)
     params, frame = initial(usual, key, frames), frame_at(frames, 1)
     start = usual.start(params, frame)
