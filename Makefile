@@ -48,7 +48,7 @@ test-all: setup  ## both, in one run: tests that share a module share what it co
 hard-cases: setup  ## run every operation and denoiser on every hard case: runs/hard-cases/table.html
 	$(BIN)/python -m tests.hard_cases $(SETTINGS)
 
-mutants: setup  ## change the code in known wrong ways and see that tests fail (tens of minutes; SETTINGS=NAME for some)
+mutants: setup  ## change the code in known wrong ways and see that tests fail (an hour on two cores; SETTINGS=NAME for some)
 	$(BIN)/python -m tests.mutants $(SETTINGS)
 
 # Common alternatives to compare with. Only a CPU build of PyTorch is installed, from pip's configured index or else

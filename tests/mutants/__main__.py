@@ -30,7 +30,7 @@ _PASSED, _FAILED = 0, 1
 
 @dataclass
 class Settings:
-    """Make every mutant and run the tests that have to fail; the exit code is 1 if one survives unexplained."""
+    """Make every mutant and run the tests that have to fail; the exit code is 1 if one survives."""
 
     names: Annotated[list[str], tyro.conf.Positional] = field(default_factory=list)
     """Words in the names of mutants; default: all."""
@@ -55,7 +55,7 @@ def main(settings: Settings) -> int:
 
 
 def _judge(tree: Path, one: Mutant) -> str:
-    """Run a mutant's tests and print its row: killed, lives (explained), SURVIVED."""
+    """Run a mutant's tests and print its row: killed or SURVIVED."""
     files = {edit.file: (tree / edit.file).read_text(encoding="utf-8") for edit in one.edits}
     begun = time.monotonic()
     try:
@@ -67,10 +67,9 @@ def _judge(tree: Path, one: Mutant) -> str:
             (tree / file).write_text(text, encoding="utf-8")
     if code not in (_PASSED, _FAILED):
         raise ValueError(f"{one.name}: expected tests that run, got exit code {code}:\n{said}")
-    result = "killed" if code == _FAILED else "lives" if one.lives else "SURVIVED"
+    result = "killed" if code == _FAILED else "SURVIVED"
     names = ", ".join(test.partition("::")[2] for test in one.tests)
-    why = f": {one.lives}" if result == "lives" else ""
-    print(f"| {one.name} | {result}{why} | {names} | {time.monotonic() - begun:.0f} |", flush=True)
+    print(f"| {one.name} | {result} | {names} | {time.monotonic() - begun:.0f} |", flush=True)
     return result
 
 

@@ -32,10 +32,8 @@ class Mutant(NamedTuple):
     edits: tuple[Edit, ...]
     tests: tuple[str, ...]
     """Names of tests as pytest takes them; at least one has to fail."""
-    lives: str = ""
-    """Why no test can tell it from the code; empty: one can."""
 
 
-def mutant(name: str, file: str, old: str, new: str, *tests: str, lives: str = "") -> Mutant:
+def mutant(name: str, file: str, old: str, new: str, *tests: str) -> Mutant:
     """A mutant of one edit."""
-    return Mutant(name, (Edit(file, old, new),), tests, lives)
+    return Mutant(name, (Edit(file, old, new),), tests)
