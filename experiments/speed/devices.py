@@ -3,7 +3,7 @@
     python -m experiments.speed.devices        # five minutes; runs/devices.json
 
 One step is timed on 1, 2, 4, ... devices, with the same number of clips on each. The real pipeline then reads clips
-from the disk: CPU milliseconds an element with NumPy's variation (as before) and with that of the update, and how
+from the disk: CPU milliseconds an element with NumPy's variation and with that of the update, and how
 long the loop waits for its batches. The model says what share of ideal speed communication leaves where no such
 machine was at hand.
 """
@@ -121,7 +121,7 @@ class Input(NamedTuple):
     """To be sent to a device."""
 
 
-def cost_of_input(place: Path, denoiser: Denoiser, recipe: Recipe, elements: int, *, vary_later: bool) -> Input:
+def measure_input(place: Path, denoiser: Denoiser, recipe: Recipe, elements: int, *, vary_later: bool) -> Input:
     """CPU time and size of the elements that a recipe asks for, with or without NumPy's variation."""
     batches = _batches(place, denoiser, recipe, vary_later=vary_later, threads=0)
     next(batches)
@@ -133,7 +133,7 @@ def cost_of_input(place: Path, denoiser: Denoiser, recipe: Recipe, elements: int
     return Input(1e3 * spent / (count * recipe.batch), size / 2**20)
 
 
-def share_of_waiting(place: Path, denoiser: Denoiser, recipe: Recipe, devices: int, budget_s: float) -> float:
+def measure_waiting(place: Path, denoiser: Denoiser, recipe: Recipe, devices: int, budget_s: float) -> float:
     """The share of the loop's time in which it has no batch, on so many devices, with as many clips on each."""
     whole = recipe._replace(batch=recipe.batch * devices)
     mesh = make_mesh(devices, whole.batch)
@@ -178,12 +178,12 @@ def main(settings: Settings) -> None:
         place, side = Path(folder) / "clips", settings.crop + settings.crop // 8
         for seed in range(4):
             write_clip(scene.clip(settings.frames + 2, side, side, seed=seed), place / f"clip-{seed}")
-        before = cost_of_input(place, denoiser, recipe, settings.elements, vary_later=False)
-        after = cost_of_input(place, denoiser, recipe, settings.elements, vary_later=True)
+        before = measure_input(place, denoiser, recipe, settings.elements, vary_later=False)
+        after = measure_input(place, denoiser, recipe, settings.elements, vary_later=True)
         held = next(_batches(place, denoiser, recipe, vary_later=True, threads=0))
         steps = time_steps(denoiser, recipe, held, settings.budget / 2)
         devices = max(steps.milliseconds)
-        waiting = share_of_waiting(place, denoiser, recipe, devices, settings.budget / 4)
+        waiting = measure_waiting(place, denoiser, recipe, devices, settings.budget / 4)
     rows = _rows(settings, steps, before, after, waiting)
     for name, value in rows:
         print(f"{name}: {value}", flush=True)

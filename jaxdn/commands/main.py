@@ -140,7 +140,7 @@ def _train_here(options: Train) -> None:
     if options.scale_rate != "no":
         if options.learning_rate is not None:
             raise ValueError("--scale-rate: expected none with --learning-rate, which is the rate; leave one out.")
-        changed["learning_rate"] = recipe.scaled_rate(options.batch or recipe.batch, _POWERS[options.scale_rate])
+        changed["learning_rate"] = recipe.scale_rate(options.batch or recipe.batch, _POWERS[options.scale_rate])
     recipe = recipe._replace(**{name: value for name, value in changed.items() if value is not None})
     path = train(
         method,

@@ -52,7 +52,7 @@ def accumulate(
     """
     level = luminance(now)
     length = jnp.minimum(past[5] + 1.0, history_max)
-    least = least_share(past[5], length, ramp=ramp)
+    least = find_least_share(past[5], length, ramp=ramp)
     share = jnp.maximum(alpha, least)
     share_moments = jnp.maximum(alpha_moments, least)
     if change is not None:
@@ -67,7 +67,7 @@ def accumulate(
     return jnp.concatenate(planes)
 
 
-def least_share(past: jax.Array, length: jax.Array, *, ramp: bool) -> jax.Array:
+def find_least_share(past: jax.Array, length: jax.Array, *, ramp: bool) -> jax.Array:
     """[H, W] what a new frame weighs at least: 1 / ``length``, or without ``ramp`` 1 where there is no ``past`` else 0.
 
     Both are lengths [H, W] in frames, before and after the frame.

@@ -59,7 +59,7 @@ class _Spread(NamedTuple):
     """Of the extent of q, that along which q was found, and their distance [..., 2]: whether q reaches p, 0 to 1."""
 
 
-def confusion_radius(depth: jax.Array, focus: jax.Array | float, infinity: jax.Array | float) -> jax.Array:
+def compute_confusion_radius(depth: jax.Array, focus: jax.Array | float, infinity: jax.Array | float) -> jax.Array:
     """The radius of the circle of confusion, ``infinity |1 - focus / z|``, in the unit of ``infinity`` and its shape.
 
     A lens of the diameter D and the focal length g, in pixels, spreads what is at the depth z over a circle of the
@@ -74,7 +74,7 @@ def blur_motion(image: jax.Array, motion: jax.Array, depth: jax.Array, shutter: 
     """An image [H, W, C] as a shutter sees it that is open around the moment of the sharp one.
 
     Everything goes straight on, half of its way before that moment and half after it. Beyond its borders the image
-    goes on as at them. Raises ValueError for arrays of other shapes or sizes.
+    goes on as at them. Has no reverse-mode gradient. Raises ValueError for arrays of other shapes or sizes.
 
     Args:
       image: any number of channels, linear.
@@ -111,11 +111,11 @@ def blur_motion(image: jax.Array, motion: jax.Array, depth: jax.Array, shutter: 
 def blur_lens(image: jax.Array, radius: jax.Array, depth: jax.Array) -> jax.Array:
     """An image [H, W, C] as a lens sees it that spreads each pixel over a disc.
 
-    Raises ValueError for arrays of other shapes or sizes.
+    Has no reverse-mode gradient. Raises ValueError for arrays of other shapes or sizes.
 
     Args:
       image: any number of channels, linear.
-      radius: [H, W, 1] of the circles of confusion in pixels (:func:`confusion_radius`).
+      radius: [H, W, 1] of the circles of confusion in pixels (:func:`compute_confusion_radius`).
       depth: [H, W, 1] > 0.
     """
     check_image(radius, "radius", channels=1)
@@ -199,9 +199,8 @@ def _cover(layer: jax.Array, otherwise: jax.Array) -> tuple[jax.Array, jax.Array
 
 
 def _length(vector: jax.Array) -> jax.Array:
-    """[..., D] -> [...], without a gradient where it is 0."""
-    squared = jnp.sum(vector * vector, axis=-1)
-    return jnp.sqrt(jnp.where(squared > 0, squared, 1.0)) * (squared > 0)
+    """[..., D] -> [...]."""
+    return jnp.sqrt(jnp.sum(vector * vector, axis=-1))
 
 
 def _largest_around(extent: jax.Array, reach: float) -> jax.Array:

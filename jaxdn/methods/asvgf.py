@@ -76,10 +76,10 @@ PAPER = Options(
     antilag=1.0,
 )
 """The settings of Schied et al. 2018: lambda is taken as it is, and alpha is 0.1. What the paper leaves open is that of
-the code its author released (KIT, 2018): 1 / N in short histories, whose colour comes from neighbours, at least 0.6 of
-the new frame in the moments, 64 frames, gradients averaged by five levels of 3x3 taps 2^i strata apart, stopped by
-depth and by three deviations of luminance, and each stratum's value for all of its pixels. The rest is SVGF's
-preset."""
+the code its author released (KIT, 2018): 1 / N in short histories, whose colour comes from neighbours (7x7 and 4 / N as
+in ``svgf``), at least 0.6 of the new frame in the moments, 64 frames, gradients averaged by five levels of 3x3 taps 2^i
+strata apart, stopped by depth and by three deviations of luminance, and each stratum's value for all of its pixels. The
+rest is SVGF's preset."""
 
 
 @method(

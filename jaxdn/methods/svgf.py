@@ -97,7 +97,7 @@ class SharedOptions:
 
 @dataclass(frozen=True)
 class Options(SharedOptions):
-    """The parameters, with the paper's defaults where it gives them, except for ``sigma_normal``."""
+    """All parameters; :data:`PAPER` says where the defaults are not those of the paper."""
 
     apart: bool = False
     """Direct light (``shadowed``) and all other light are two signals with histories and variances of their own, as in

@@ -23,7 +23,7 @@ from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, Prepared, State, core_of, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics
-from jaxdn.filters.accumulation import least_share
+from jaxdn.filters.accumulation import find_least_share
 from jaxdn.filters.catmull_rom import warp_cubic
 from jaxdn.filters.neighbourhood import (
     Box,
@@ -154,7 +154,7 @@ def resolve(
     length = jnp.minimum(past[..., 3:], 1.0 / options.alpha) + 1.0
     center, size = box_around(to_ycocg(image), options.box, options.gamma)
     clipped = jnp.maximum(from_ycocg(clip_to_box(to_ycocg(past[..., :3]), center, size)), 0.0)
-    share = jnp.maximum(options.alpha, least_share(past[..., 3:], length, ramp=options.ramp))
+    share = jnp.maximum(options.alpha, find_least_share(past[..., 3:], length, ramp=options.ramp))
     # In this form the image itself, to the last bit, where there is no history.
     return jnp.concatenate([share * image + (1.0 - share) * clipped, length], axis=-1), invalid
 

@@ -30,7 +30,7 @@ from jaxdn.core.frame import Array, Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics, count_reflectance_differs
-from jaxdn.filters.accumulation import after_shift, least_share, luminance, with_texture
+from jaxdn.filters.accumulation import after_shift, find_least_share, luminance, with_texture
 from jaxdn.filters.atrous import GAUSSIAN, stencil
 from jaxdn.filters.cascade import cascade
 from jaxdn.filters.clamping import clamp_to_fast
@@ -245,7 +245,7 @@ def _reproject_signal(
 
 def _mean(options: Options, past: jax.Array, now: jax.Array, length: jax.Array) -> jax.Array:
     """The running mean of colour [3, H, W] with the weights that ``accumulate`` has at a past of ``length``."""
-    least = least_share(length, jnp.minimum(length + 1.0, options.history_max), ramp=options.ramp)
+    least = find_least_share(length, jnp.minimum(length + 1.0, options.history_max), ramp=options.ramp)
     share = jnp.maximum(options.alpha, least)
     return past + share[None] * (now - past)
 

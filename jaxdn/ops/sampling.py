@@ -31,10 +31,11 @@ def from_layers(
     flows into them. Raises ValueError unless the layers are 1, 2, 4, ... without a gap.
 
     With ``uniform`` [H, W, 1], random numbers in [0, 1), fractions are rounded stochastically, down to k or up to
-    k + 1 (:func:`round_stochastically`), and those have another gradient, of which no reference is needed but whether
-    there is one: ``(I(k + 1) - I(k)) / (2 P)``, with P the probability of the number that was drawn. Over the random
-    numbers, the mean of the gradient of any loss that is quadratic in each pixel is that of the mean loss, exactly:
-    ``L(k + 1) - L(k)`` is the mean of both slopes times the difference of both images.
+    k + 1 (:func:`round_stochastically`), with another gradient: ``(I(k + 1) - I(k)) / (2 P)``, where P is the
+    probability of the number that was drawn. The reference does not enter it, but without one there is still none. For
+    a loss that is quadratic in each pixel, its mean over the random numbers is that of the mean loss: ``L(k + 1) -
+    L(k)`` is the mean of both slopes times the difference of both images. This is exact from one sample on. Below,
+    I(0) is what fills the pixel, and what the pixel fills in its neighbours is left out.
     """
     expected = [1 << bit for bit in range(len(layers))]
     if sorted(layers) != expected or not layers:
@@ -64,7 +65,7 @@ def from_layers(
 
 
 def _sum_layers(layers: Mapping[int, jax.Array], counts: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The image [H, W, 3] with whole ``counts`` [H, W, 1] samples, which it returns in its own dtype, too."""
+    """The image [H, W, 3] of whole ``counts`` [H, W, 1] of samples, and the counts in the image's dtype."""
     whole = counts.astype(jnp.int32)
     total = jnp.zeros_like(layers[1])
     for samples in sorted(layers):
@@ -106,7 +107,7 @@ def _without_errors(counts: jax.Array) -> jax.Array:
     return jnp.where(jnp.abs(counts - near) < _ERROR, near, counts)
 
 
-def random_numbers(height: int, width: int, frame: jax.Array | int) -> jax.Array:
+def draw_random_numbers(height: int, width: int, frame: jax.Array | int) -> jax.Array:
     """Numbers [H, W, 1] in [0, 1) for a frame, for :func:`round_stochastically`; the same on every machine.
 
     Those of two pixels are independent as far as a hash of their places is; those of one pixel move on by the golden

@@ -39,7 +39,7 @@ class Recipe(NamedTuple):
         check(self._asdict(), get_type_hints(Recipe, include_extras=True), of="recipe")
         self.variation.check()
 
-    def scaled_rate(self, batch: int, power: float) -> float:
+    def scale_rate(self, batch: int, power: float) -> float:
         """The learning rate for another batch: times ``(batch / self.batch)^power``.
 
         1 keeps how far the weights move in one pass over the data (Goyal et al. 2017), 1/2 the noise of an update of

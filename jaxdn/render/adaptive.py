@@ -42,11 +42,11 @@ def render_sampled(
     """Render a frame's buffers and one sample, ask how many samples each pixel gets, and render the rest of these.
 
     The first sample counts: a pixel that gets n has the samples 0 ... n - 1 of its frame, the same as in a frame that
-    has n of them everywhere. Without ``sample_first`` none is rendered before the question, for one who does not look
-    at it: no more paths are traced than are asked for. Buffers that describe one noisy image
-    (:data:`jaxdn.core.frame.OF_SAMPLES`) are left out. Raises ValueError with a scalar variant of Mitsuba, which
-    renders whole images only, and for settings with other layers than one of one sample, with a reference, with draws,
-    with jitter, with filtered pixels, or without a plan.
+    has n of them everywhere. Without ``sample_first`` no sample is rendered before ``ask`` is called; then no more
+    paths are traced than it asks for. Buffers that describe one noisy image (:data:`jaxdn.core.frame.OF_SAMPLES`) are
+    left out. Raises ValueError with a scalar variant of Mitsuba, which renders whole images only, and for settings with
+    other layers than one of one sample, with a reference, with draws, with jitter, with filtered pixels, or without a
+    plan.
 
     Args:
       scene: to render.

@@ -19,7 +19,7 @@ from jaxdn.core.options import Range
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.classify import UNNAMED, ChannelNaming
 from jaxdn.data.foreign.layers import stack_channels
-from jaxdn.filters.camera_blur import LONGEST, WIDEST, blur_lens, blur_motion, confusion_radius
+from jaxdn.filters.camera_blur import LONGEST, WIDEST, blur_lens, blur_motion, compute_confusion_radius
 
 _ABOVE_0 = Range(0.0, without_low=True)
 _FULL_FRAME = 36.0
@@ -169,7 +169,9 @@ def _find_radius(optics: Optics, file: ExrFile, depth: np.ndarray) -> np.ndarray
     assert optics.focus is not None
     diameter = optics.lens / optics.fstop / 1000 / (optics.metres or 1.0)
     focal_pixels = optics.lens / (optics.sensor or _FULL_FRAME) * _width(file)
-    return np.asarray(confusion_radius(jnp.asarray(depth), optics.focus, diameter * focal_pixels / (2 * optics.focus)))
+    return np.asarray(
+        compute_confusion_radius(jnp.asarray(depth), optics.focus, diameter * focal_pixels / (2 * optics.focus))
+    )
 
 
 def _width(file: ExrFile) -> int:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.filters.camera_blur import blur_lens, blur_motion, confusion_radius
+from jaxdn.filters.camera_blur import blur_lens, blur_motion, compute_confusion_radius
 
 HEIGHT, WIDTH = 40, 72
 RED, GREEN = np.array([1, 0, 0], np.float32), np.array([0, 1, 0], np.float32)
@@ -110,7 +110,7 @@ def test_the_circle_of_confusion_is_that_of_a_thin_lens() -> None:
     """Rays from both ends of a lens through the point in focus, traced to the depth and back through the middle."""
     focus, diameter, focal, depth = 3.0, 0.02, 1500.0, 7.0
     across = diameter * abs(depth - focus) / focus  # of both rays' points at the depth
-    radius = confusion_radius(jnp.asarray([depth, focus]), focus, diameter * focal / (2 * focus))
+    radius = compute_confusion_radius(jnp.asarray([depth, focus]), focus, diameter * focal / (2 * focus))
     np.testing.assert_allclose(radius, [across / depth * focal / 2, 0.0], rtol=1e-5)
 
 

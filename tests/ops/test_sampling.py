@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.ops.sampling import from_layers, random_numbers, round_stochastically, sample_map
+from jaxdn.ops.sampling import draw_random_numbers, from_layers, round_stochastically, sample_map
 
 SIZE = (4, 5)
 
@@ -166,7 +166,7 @@ def test_stochastic_rounding_has_the_wanted_mean_and_leaves_whole_numbers(rng):
     wanted = rng.uniform(0, 3, (6, 7, 1)).astype(np.float32)
     wanted[0, 0], wanted[0, 1], wanted[0, 2] = 2.0, 2.99999, 0.0
     frames = 4096
-    drawn = jax.vmap(lambda frame: round_stochastically(jnp.asarray(wanted), random_numbers(6, 7, frame)))
+    drawn = jax.vmap(lambda frame: round_stochastically(jnp.asarray(wanted), draw_random_numbers(6, 7, frame)))
     counts = np.asarray(drawn(jnp.arange(frames)))
     assert set(np.unique(counts - np.floor(wanted))) == {0.0, 1.0}
     np.testing.assert_allclose(counts.mean(0), wanted, atol=2e-3)  # from frame to frame they are evenly spread
@@ -176,13 +176,13 @@ def test_stochastic_rounding_has_the_wanted_mean_and_leaves_whole_numbers(rng):
 
 
 def test_random_numbers_are_even_and_independent_between_pixels():
-    numbers = np.asarray(random_numbers(128, 128, 3))[..., 0]
+    numbers = np.asarray(draw_random_numbers(128, 128, 3))[..., 0]
     assert 0 <= numbers.min() < numbers.max() < 1
     np.testing.assert_allclose(np.histogram(numbers, 8, (0, 1))[0], 2048, rtol=0.1)
     for shift in ((0, 1), (1, 0), (1, 1), (4, 0)):
         moved = np.roll(numbers, shift, (0, 1))
         assert abs(np.corrcoef(numbers.ravel(), moved.ravel())[0, 1]) < 0.03
-    quarter = np.stack([np.asarray(random_numbers(8, 8, frame)) > 0.75 for frame in range(40)])
+    quarter = np.stack([np.asarray(draw_random_numbers(8, 8, frame)) > 0.75 for frame in range(40)])
     gaps = [np.diff(np.nonzero(quarter[:, y, x, 0])[0]) for y, x in np.ndindex(8, 8)]
     assert max(gap.max() for gap in gaps) <= 5  # no pixel waits for long
 
@@ -194,7 +194,7 @@ def test_the_map_with_fractions_keeps_a_budget_below_one_sample(rng):
         np.testing.assert_allclose(wanted.mean(), budget, rtol=1e-3)
         assert np.any(wanted % 1 > 0.01)
         frames = jnp.arange(256)
-        counts = jax.vmap(lambda frame, wanted=wanted: round_stochastically(wanted, random_numbers(16, 24, frame)))
+        counts = jax.vmap(lambda frame, wanted=wanted: round_stochastically(wanted, draw_random_numbers(16, 24, frame)))
         np.testing.assert_allclose(np.mean(counts(frames)), budget, rtol=0.01)
 
 

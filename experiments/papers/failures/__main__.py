@@ -48,7 +48,7 @@ class Settings:
     """Measure the failures that the papers name."""
 
     quick: bool = False
-    """48 x 28 pixels, three filters."""
+    """48 x 28 pixels, 12 frames, references of 16 samples; the noisy image, svgf and trmv."""
     width: int = 96
     """Of the clips, in pixels."""
     height: int = 56

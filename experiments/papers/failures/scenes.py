@@ -158,5 +158,4 @@ SCENES: dict[str, tuple[Callable[[], Stage], dict[str, Any]]] = {
     "transparent": (transparent, {}),
     "blur": (blur, {"pixel_filter": "blackman-harris"}),
 }
-"""Name -> the scene, and what its clip is rendered with besides; nobody sees through a lens with an open shutter by one
-ray a pixel."""
+"""Name -> the scene, and what its clip is rendered with besides: with motion blur, pixels have to be filtered."""
