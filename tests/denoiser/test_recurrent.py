@@ -11,7 +11,7 @@ from jaxdn.core.frame import RADIANCE_MAX, Clip, Frame, frame_at, present
 from jaxdn.denoiser import Core, Recurrent, recurrent
 from jaxdn.denoiser.rollout import denoise, stream, unroll
 from jaxdn.methods.demodulation import demodulated
-from jaxdn.ops.sampling import from_layers
+from jaxdn.ops.sampling import draw_random_numbers, from_layers
 
 SIZE = (4, 6)
 BY_ALBEDO = partial(demodulated, by="albedo")
@@ -333,7 +333,9 @@ def test_requested_samples_come_from_the_layers(wrap, rng):
         frame = frame_at(clip.frames, index)
         divisor = np.asarray(frame.albedo) if wrap is BY_ALBEDO else np.ones((*SIZE, 3))
         bright = np.asarray(clip.layers[1][index], np.float64) / divisor  # what was rendered before: one sample
-        counts = np.round(6 * bright[..., :1] / (1 + bright[..., :1])).astype(int)
+        wanted = 6 * bright[..., :1] / (1 + bright[..., :1])
+        uniform = np.asarray(draw_random_numbers(*SIZE, index))
+        counts = (np.floor(wanted) + (uniform < wanted - np.floor(wanted))).astype(int)
         taken = sum(np.where(counts & n, n, 0) * np.asarray(layer[index]) for n, layer in clip.layers.items())
         light = taken / np.maximum(counts, 1) / divisor
         expected = 0.9 * light + (0 if state is None else 0.01 * state)
