@@ -204,14 +204,15 @@ class Train:
     """Consecutive frames of a clip per update."""
     learning_rate: float | None = None
     """Peak learning rate."""
-    scale_rate: Literal["no", "sqrt", "linear"] = "no"
-    """Multiply the recipe's learning rate by what --batch is of the recipe's batch, or by the square root of it."""
     rematerialize: bool | None = None
     """Recompute in the backward pass: a quarter of the memory for 1.1 to 1.4 times the time."""
     seed: int | None = None
     """Seed of the initial weights and of the data's order."""
     spp: list[int] | None = None
     """Samples per pixel of the noisy input; of several numbers, each clip of a batch has one at random."""
+    scale_rate: Literal["no", "sqrt", "linear"] = "no"
+    """Multiply the recipe's learning rate by --batch divided by the recipe's batch (linear), or by the square root of
+    that (sqrt)."""
     time_limit: float | None = None
     """Minutes after which training stops and writes its weights; the same command goes on from there."""
     devices: int | None = None

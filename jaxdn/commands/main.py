@@ -31,7 +31,6 @@ from jaxdn.runtime.terminal import print_any_letter
 _COMPUTING = (Train, Denoise, Compare, Doctor)
 """Commands whose programs are worth keeping between runs."""
 
-
 _POWERS = {"sqrt": 0.5, "linear": 1.0}
 """Of the batch, by which `--scale-rate` scales the learning rate."""
 
@@ -91,13 +90,12 @@ def _pack(options: Pack) -> None:
     from jaxdn.core.frame import GUIDES
     from jaxdn.data.training.windows import USUAL, Packing
 
+    usual = USUAL if options.format == "file" else tuple(GUIDES)
     packing = Packing(
         crop=options.crop,
         frames=options.frames,
         draws=options.draws,
-        buffers=(USUAL if options.format == "file" else tuple(GUIDES))
-        if options.buffers is None
-        else tuple(options.buffers),
+        buffers=usual if options.buffers is None else tuple(options.buffers),
         direct=not options.indirect_only,
         half=not options.without_half,
         seed=options.seed,

@@ -16,7 +16,7 @@ import pytest
 
 from jaxdn.clips import ClipError, training_batches
 from jaxdn.commands import main
-from jaxdn.core.frame import Clip
+from jaxdn.core.frame import GUIDES, Clip
 from jaxdn.data.training.cache import read_array, read_stored
 from jaxdn.data.training.open_clips import open_clips
 from jaxdn.data.training.shards import open_shards, write_shards
@@ -124,6 +124,21 @@ def test_less_is_stored_where_less_is_asked_for(folder: Path, tmp_path: Path) ->
     kept = [np.flatnonzero((all_draws == one[:, None]).all((0, 2, 3, 4))) for one in np.moveaxis(draws, 1, 0)]
     assert [len(each) for each in kept] == [1, 1]
     assert kept[0] < kept[1]
+
+
+def test_without_direct_light_neither_it_nor_emission_is_stored_though_all_buffers_are(
+    folder: Path, tmp_path: Path
+) -> None:
+    stored = {}
+    for direct in (True, False):
+        packing = WHOLE._replace(buffers=tuple(GUIDES), direct=direct)
+        write_shards(tmp_path / f"{direct}", open_clips(folder), size=2**23, packing=packing)
+        stored[direct] = open_shards(tmp_path / f"{direct}")[0].arrays
+    left_out = stored[True] - stored[False]
+    assert {"direct", "emission"} <= left_out
+    assert all(name.endswith(("direct", "emission")) for name in left_out)
+    assert stored[False] < stored[True]
+    assert not any(name.endswith(("direct", "emission")) for name in stored[False])
 
 
 def test_the_size_is_kept_and_the_same_arguments_give_the_same_files(folder: Path, tmp_path: Path) -> None:

@@ -241,7 +241,8 @@ def _write_shard(
 
 def _take_windows(clips: Sequence[CachedClip], packing: Packing) -> Iterator[Taken]:
     """Random windows with all arrays to store, as the clips have them."""
-    guides = set(packing.buffers) | ({"direct", "emission"} if packing.direct else set())
+    beauty = {"direct", "emission"}
+    guides = set(packing.buffers) | beauty if packing.direct else set(packing.buffers) - beauty
     for clip, window, rng in choose_windows(clips, packing):
         arrays = {}
         for name in sorted(clip.arrays - {"draws"}):
