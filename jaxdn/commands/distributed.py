@@ -1,6 +1,7 @@
 """``--distributed``: this process joins others, of this machine or of many, and leaves when all are done."""
 
 import os
+import socket
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,8 +28,10 @@ class Place(NamedTuple):
 def join_processes(place: Place) -> Iterator[None]:
     """Join the processes of a run, and wait for the others at the end.
 
-    Where another process is lost, this one ends with a message and exit code 1, or is ended by jax with 134. Raises
-    ValueError for a place that is incomplete, and where no cluster is found.
+    Where another process is lost, this one ends with a message and exit code 1, or is ended by jax with 134. What jax
+    reports of this process itself, memory that is full or Ctrl-C, is raised. Raises ValueError for a place that is
+    incomplete or has no port, or one that is taken, where no cluster is found, and where the processes do not find
+    each other.
     """
     given = place.coordinator, place.processes, place.process
     if any(value is not None for value in given) and None in given:
@@ -36,6 +39,8 @@ def join_processes(place: Place) -> Iterator[None]:
             "--distributed: expected all of --coordinator, --processes and --process, or none where jax finds them "
             "(Slurm, Open MPI, Kubernetes), got some; give the others too."
         )
+    if place.coordinator is not None:
+        _check_port(place.coordinator, opens=place.process == 0)
     # Signals are agreed upon by the training loop; jax's own service would take SIGTERM away from it.
     if hasattr(jax.config, "jax_enable_preemption_service"):
         jax.config.update("jax_enable_preemption_service", False)
@@ -48,9 +53,16 @@ def join_processes(place: Place) -> Iterator[None]:
             f"--distributed: jax cannot tell which processes there are ({error}). Start it under Slurm, Open MPI or "
             "Kubernetes, or give --coordinator HOST:PORT, --processes and --process."
         ) from error
+    except jax.errors.JaxRuntimeError as error:
+        raise ValueError(
+            f"--distributed: the processes do not find each other ({_shorten(error)}). Start all of them within five "
+            "minutes, and take a port of process 0's machine that is free and that the others can reach."
+        ) from error
     try:
         yield
     except jax.errors.JaxRuntimeError as error:
+        if _is_of_this_process(error):
+            raise
         _end_alone(error)
     try:
         jax.distributed.shutdown()
@@ -58,12 +70,38 @@ def join_processes(place: Place) -> Iterator[None]:
         _end_alone(error)
 
 
+def _check_port(address: str, *, opens: bool) -> None:
+    """Raise ValueError for no HOST:PORT, and for a port that this process ``opens`` and cannot: jax may crash there."""
+    host, _, port = address.rpartition(":")
+    if not (host and port.isdecimal() and 0 < int(port) < 1 << 16):
+        raise ValueError(f"--coordinator: expected HOST:PORT, such as head:5731, got {address}.")
+    if not opens:
+        return
+    try:
+        socket.create_server(("", int(port))).close()
+    except OSError as error:
+        raise ValueError(
+            f"--coordinator: expected a free port of process 0's machine, got {address} ({error.strerror or error}); "
+            "give all processes another."
+        ) from error
+
+
+def _is_of_this_process(error: Exception) -> bool:
+    """Whether this process's memory is full, or Ctrl-C has ended one of its callbacks
+    (:func:`jaxdn.runtime.interrupt.keep_interrupts`)."""
+    message = str(error).rstrip()
+    return "RESOURCE_EXHAUSTED" in message or message.endswith("KeyboardInterrupt:")
+
+
+def _shorten(error: Exception) -> str:
+    return str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+
+
 def _end_alone(error: Exception) -> None:
     """End at once: whatever else waits for the lost process would wait for minutes."""
-    told = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
     print(
-        f"jaxdn: another process of this run has gone, or cannot be reached ({told}). Give the same commands again: "
-        "training goes on from the newest checkpoint.",
+        f"jaxdn: another process of this run has gone, or cannot be reached ({_shorten(error)}). Give the same "
+        "commands again: training goes on from the newest checkpoint.",
         file=sys.stderr,
         flush=True,
     )

@@ -66,6 +66,12 @@ for run in sys.argv[1:]:
 """
 
 
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
 def give(clips: Path, run: Path, *more: object) -> list[str]:
     options = ["--method", "learned_kernel:kernel", "--batch", "8", "--crop", "16", "--frames", "2"]
     return ["train", str(clips), "-o", str(run), *options, *map(str, more)]
@@ -75,9 +81,7 @@ class Pair:
     """Two processes of one run."""
 
     def __init__(self, home: Path, arguments: Sequence[str]) -> None:
-        with socket.socket() as one:
-            one.bind(("127.0.0.1", 0))
-            place = f"127.0.0.1:{one.getsockname()[1]}"
+        place = f"127.0.0.1:{free_port()}"
         environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": f"{ROOT}{os.pathsep}{home}"}
         self.errors = [home / f"errors-{time.monotonic_ns()}-{index}" for index in range(2)]
         self.processes = []
@@ -204,6 +208,10 @@ def test_a_signal_at_one_process_stops_both_and_a_lost_one_ends_the_other(home: 
     [
         (["--coordinator", "127.0.0.1:1"], "expected --distributed too"),
         (["--distributed", "--coordinator", "127.0.0.1:1"], "expected all of --coordinator, --processes and --process"),
+        (
+            ["--distributed", "--coordinator", "head", "--processes", "2", "--process", "0"],
+            "--coordinator: expected HOST:PORT, such as head:5731, got head",
+        ),
         (["--scale-rate", "linear", "--learning-rate", "0.1"], "--scale-rate: expected none with --learning-rate"),
     ],
 )
@@ -215,3 +223,48 @@ def test_what_does_not_fit_together_is_refused(
     assert ended.value.code == 2
     assert problem in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "run").exists()
+
+
+def run_joined(port: int, work: str) -> subprocess.CompletedProcess[str]:
+    """The one process of a run, which does some work."""
+    program = f"""
+import jax, jax.numpy as jnp
+from jaxdn.commands.distributed import Place, join_processes
+from jaxdn.commands.errors import plain_errors
+
+def stop(value):
+    raise KeyboardInterrupt
+
+with plain_errors(), join_processes(Place("localhost:{port}", 1, 0)):
+    {work}
+"""
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": str(ROOT)}
+    run = [sys.executable, "-c", program]
+    return subprocess.run(run, capture_output=True, text=True, check=False, timeout=120, env=environment)
+
+
+@pytest.mark.parametrize(
+    ("work", "code", "told"),
+    [
+        ("print(jnp.zeros(1 << 50, jnp.int8)[0])", 1, "RESOURCE_EXHAUSTED"),
+        ("jax.jit(lambda x: jax.pure_callback(stop, x, x))(jnp.ones(3)).block_until_ready()", 130, "interrupted"),
+    ],
+)
+def test_full_memory_and_an_interrupted_callback_are_not_blamed_on_other_processes(
+    work: str, code: int, told: str
+) -> None:
+    done = run_joined(free_port(), work)
+    assert done.returncode == code, done.stderr
+    assert told in done.stderr
+    assert "another process" not in done.stderr
+
+
+def test_a_port_that_is_taken_is_one_message() -> None:
+    with socket.socket() as taken:
+        taken.bind(("", 0))
+        taken.listen()
+        done = run_joined(taken.getsockname()[1], "print('joined')")
+    assert done.returncode == 2
+    assert "jaxdn: --coordinator: expected a free port of process 0's machine, got localhost:" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert "joined" not in done.stdout
