@@ -40,7 +40,8 @@ def plain_errors() -> Iterator[None]:
     except OSError as error:
         if isinstance(error, BrokenPipeError) and reader_has_gone():
             raise  # nobody is there to read a message: `jaxdn ... | head`
-        where = f"{error.filename}: " if error.filename else ""
+        named = error.filename2 or error.filename  # of a rename the new name: the old one may be a hidden file of ours
+        where = f"{named}: " if named else ""
         _end(f"{where}{error.strerror or error}")
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]

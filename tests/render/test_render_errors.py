@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from jaxdn.commands.errors import plain_errors
+from jaxdn.runtime.atomic_files import write_atomically
 from jaxdn.runtime.optional import OPTIONAL_DEPENDENCIES, install
 
 WITHOUT_RENDERER = """
@@ -82,6 +83,17 @@ def test_the_extras_are_those_of_the_project(extra):
 def test_a_missing_package_of_no_extra_keeps_its_traceback(name):
     with pytest.raises(ModuleNotFoundError), plain_errors():
         raise ModuleNotFoundError("No module", name=name)
+
+
+def test_a_failed_rename_names_the_file_that_was_wanted(tmp_path, capsys):
+    target = tmp_path / "out.exr"
+    target.mkdir()  # which no file replaces
+    with pytest.raises(SystemExit) as ended, plain_errors():
+        write_atomically({target: "new"})
+    assert ended.value.code == 2
+    told = capsys.readouterr().err
+    assert told.startswith(f"jaxdn: {target}: ")
+    assert ".tmp" not in told.replace(str(tmp_path), "")
 
 
 def test_a_warning_is_one_line_without_a_place_in_the_code():
