@@ -73,7 +73,10 @@ def _renamed(paths: Sequence[Path]) -> Iterator[list[Path]]:
 
 
 def remove_abandoned(folder: str | Path) -> None:
-    """Remove the temporary files that killed processes left in a folder: of this machine, and any that is a day old."""
+    """Remove the temporary files that killed processes left in a folder: of this machine, and any that is a day old.
+
+    What cannot be removed stays: another user's file in a shared folder, or one that another program holds open.
+    """
     for path in Path(folder).glob(".*.tmp"):
         match = re.fullmatch(r"\..+\.(?P<host>[\w-]+)\.(?P<process>\d+)\.\d+\.tmp", path.name)
         if match is None:
@@ -82,7 +85,7 @@ def remove_abandoned(folder: str | Path) -> None:
             old = time.time() - path.stat().st_mtime > _ABANDONED_S
             if old or (match["host"] == _host() and not _runs(int(match["process"]))):
                 path.unlink()
-        except FileNotFoundError:
+        except OSError:
             continue
 
 

@@ -154,6 +154,16 @@ def test_what_killed_processes_left_behind_is_removed_and_nothing_of_living_ones
     assert {path.name for path in tmp_path.iterdir()} == {name for name, kept in names.items() if kept}
 
 
+def test_what_cannot_be_removed_stays_and_the_rest_is_removed(tmp_path: Path) -> None:
+    other, own = (tmp_path / f".{name}.exr.elsewhere.7.1.tmp" for name in ("a", "b"))
+    other.mkdir()  # no user may unlink it, root neither
+    own.write_text("half")
+    for path in (other, own):
+        os.utime(path, (0, 0))
+    atomic_files.remove_abandoned(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [other.name]
+
+
 def test_temporary_names_differ_between_machines(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     names = set()
     for host in ("node-1", "node-2", "", "a strange/name", "n" * 300):
