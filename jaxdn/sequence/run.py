@@ -3,7 +3,7 @@
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -158,6 +158,8 @@ class _Run:
         """Denoise consecutive frames of a shot, from a new history."""
         views = list(job.views) or [""]
         limit = self._settings.max_memory
+        count_channels = cache(job.count_channels)
+        count_channels()  # later the writing thread may drop the same file
         with Behind[list[Sequence[str]]]() as behind, ExitStack() as stack:
 
             def log_in_order(line: str) -> None:
@@ -168,7 +170,7 @@ class _Run:
                 FrameDenoiser,
                 self._method,
                 job.source,
-                channels=job.count_channels,
+                channels=count_channels,
                 limit=None if limit is None else limit / len(views),
             )
             logs = {view: log_in_order if view == "" else _with_view(view, log_in_order) for view in views}
