@@ -19,7 +19,7 @@ from jaxdn.zoo.ready import NOISY, find_model
 from tests.programs import WIDTH, layer, part, truth
 from tests.training.test_training import make_clip
 
-CAMERA = {
+CAMERA: dict[str, Any] = {
     "expTime": 0.02,
     "framesPerSecond": Fraction(25),
     "aperture": 2.0,
