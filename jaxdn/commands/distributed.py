@@ -28,10 +28,10 @@ class Place(NamedTuple):
 def join_processes(place: Place) -> Iterator[None]:
     """Join the processes of a run, and wait for the others at the end.
 
-    Where another process is lost, this one ends with a message and exit code 1, or is ended by jax with 134. What jax
-    reports of this process itself, memory that is full or Ctrl-C, is raised. Raises ValueError for a place that is
-    incomplete or has no port, or one that is taken, where no cluster is found, and where the processes do not find
-    each other.
+    Where another process is lost, or does not come within five minutes, this one ends with a message and exit code 1,
+    or is ended by jax with 134. What jax reports of this process itself, memory that is full or Ctrl-C, is raised.
+    Raises ValueError for a place that is incomplete or has no port, or one that is taken, where no cluster is found,
+    and where jax cannot join the processes.
     """
     given = place.coordinator, place.processes, place.process
     if any(value is not None for value in given) and None in given:
@@ -55,8 +55,8 @@ def join_processes(place: Place) -> Iterator[None]:
         ) from error
     except jax.errors.JaxRuntimeError as error:
         raise ValueError(
-            f"--distributed: the processes do not find each other ({_shorten(error)}). Start all of them within five "
-            "minutes, and take a port of process 0's machine that is free and that the others can reach."
+            f"--distributed: jax cannot join the processes ({_shorten(error)}). Take a port of process 0's machine "
+            "that is free and that the others can reach."
         ) from error
     try:
         yield

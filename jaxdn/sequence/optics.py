@@ -117,7 +117,7 @@ class CameraBlur:
             depth = np.asarray(frame.depth, np.float32)
         elif optics.fstop is None:
             depth = np.ones((*frame.radiance.shape[:2], 1), np.float32)
-            self._tell("no depth", "--reblur: there is no depth, so where two things cross, the faster one counts as in front")
+            self._tell("no depth", "--reblur: there is no depth, so where things cross, the faster one is in front")
         else:
             raise ValueError(f"{file.path}: --reblur fstop: expected depth; name it, --channels depth=LAYER.")
         stacked = np.concatenate(list(images.values()), axis=-1).astype(np.float32)
