@@ -389,17 +389,17 @@ _DROP, _WRITES_ANYTHING = 24, 1
 
 def _reader():
     """How a process is started that may not write what is read-only, which the superuser otherwise may."""
-    if sys.platform == "win32":
-        pytest.skip("the mode of a folder does not make it read-only")
     if os.geteuid():
         return [sys.executable]
-    if sys.platform != "linux":
-        pytest.skip("the superuser may write everything")
     drop = f"ctypes.CDLL(None).prctl({_DROP}, {_WRITES_ANYTHING}, 0, 0, 0)"
     start = "os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
     return [sys.executable, "-c", f"import ctypes, os, sys; {drop}; {start}"]
 
 
+@pytest.mark.skipif(
+    sys.platform == "win32" or (sys.platform != "linux" and os.geteuid() == 0),
+    reason="the mode of a folder does not make it read-only, or the superuser may write everything",
+)
 def test_loops_are_kept_in_the_folder_of_programs_and_found_there_when_it_is_read_only():
     """As in a container's image: filled once, and then read by users who may not write it."""
     reader = _reader()
