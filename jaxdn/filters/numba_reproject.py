@@ -76,6 +76,7 @@ def reproject(
             if normal is not None:
                 mx, my, mz = wanted_normal[i, j, 0], wanted_normal[i, j, 1], wanted_normal[i, j, 2]
                 nowhere = mx == 0 and my == 0 and mz == 0 and threshold < 1
+                anything = mx != mx  # NaN, where no normal is wanted
             # The four of the cell. No function tests taps: passing it the arrays would count references, which takes
             # longer than the test.
             mass = zero
@@ -92,7 +93,7 @@ def reproject(
                     nx, ny, nz = normal[row, column, 0], normal[row, column, 1], normal[row, column, 2]
                     # Where there is no surface in both, they are alike.
                     neither = nowhere & (nx == 0) & (ny == 0) & (nz == 0)
-                    accepted &= (nx * mx + ny * my + nz * mz > threshold) | neither
+                    accepted &= (nx * mx + ny * my + nz * mz > threshold) | neither | anything
                 if accepted:
                     doubt = np.uint32(0)
                     for channel in range(channels):
@@ -133,7 +134,7 @@ def reproject(
                     if normal is not None:
                         nx, ny, nz = normal[row, column, 0], normal[row, column, 1], normal[row, column, 2]
                         neither = nowhere & (nx == 0) & (ny == 0) & (nz == 0)
-                        accepted &= (nx * mx + ny * my + nz * mz > threshold) | neither
+                        accepted &= (nx * mx + ny * my + nz * mz > threshold) | neither | anything
                     for channel in range(channels):
                         value = history[row, column, channel]
                         accepted &= (value >= zero) & (value <= largest)

@@ -104,7 +104,7 @@ class ExpectedSurface(NamedTuple):
     tolerance: jax.Array | None
     """[H, W] of the depth; infinite where any depth is right."""
     normal: jax.Array | None
-    """[H, W, 3]."""
+    """[H, W, 3]; not numbers where any normal is right."""
     ids: jax.Array | None
     """[H, W]; not a number where any id is right."""
 
@@ -136,7 +136,8 @@ def same_surface(tap: Guides, expected: ExpectedSurface, *, normal_threshold: fl
     if tap.depth is not None and expected.depth is not None and expected.tolerance is not None:
         passed.append(jnp.abs(tap.depth[..., 0] - expected.depth) <= expected.tolerance)
     if tap.normal is not None and expected.normal is not None:
-        passed.append(cosine(tap.normal, expected.normal) > normal_threshold)
+        aligned = cosine(tap.normal, expected.normal) > normal_threshold
+        passed.append(aligned | jnp.isnan(expected.normal[..., 0]))
     if tap.ids is not None and expected.ids is not None:
         passed.append((tap.ids[..., 0] == expected.ids) | jnp.isnan(expected.ids))
     return functools.reduce(jnp.logical_and, passed, jnp.asarray(True))

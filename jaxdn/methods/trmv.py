@@ -224,7 +224,7 @@ def _reproject_signal(
 
     Where the vector is that of the surface, taps must show the same surface, as in ``svgf``. Elsewhere they show
     another place of it, whose depth tells nothing, or with ``any_surface`` one beside it: normals must agree there.
-    With ``untested`` whatever they show there counts, and normals are tested nowhere.
+    With ``untested`` whatever they show there counts.
     """
     expected = expect_surface(frame, before, depth_tolerance=options.depth_tolerance)
     if vector is not None:
@@ -234,8 +234,8 @@ def _reproject_signal(
             expected = expected._replace(tolerance=jnp.where(elsewhere, jnp.inf, expected.tolerance))
         if (any_surface or untested) and expected.ids is not None:
             expected = expected._replace(ids=jnp.where(elsewhere, jnp.nan, expected.ids))
-        if untested:
-            expected = expected._replace(normal=None)
+        if untested and expected.normal is not None:
+            expected = expected._replace(normal=jnp.where(elsewhere[..., None], jnp.nan, expected.normal))
     before = keep_shared(before, guides_of(frame))
     found = reproject_along(
         history, before, vector, expected, first, normal_threshold=options.normal_threshold, search_neighbours=True

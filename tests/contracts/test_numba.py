@@ -16,8 +16,8 @@ import pytest
 from jaxdn import brdf, color
 from jaxdn.core.frame import FAR, Frame
 from jaxdn.denoiser.statistics import sum_depths
-from jaxdn.filters.reproject import reproject
-from jaxdn.filters.surface_test import guides_of
+from jaxdn.filters.reproject import reproject, reproject_along
+from jaxdn.filters.surface_test import ExpectedSurface, Guides, guides_of
 from jaxdn.methods.steady.accumulation import (
     FilteredLight,
     History,
@@ -125,6 +125,27 @@ def test_the_recalled_history(left_out, search_neighbours, rng, both):
         np.testing.assert_allclose(found.history, wanted.history, rtol=1e-5, atol=1e-7)
         assert found.invalid == wanted.invalid
         assert first == (not found.valid.any())
+
+
+def test_the_recalled_history_where_any_normal_is_right(rng, both):
+    """Where none is wanted; elsewhere normals that are all alike leave nothing else to be right."""
+    shape = (23, 31)
+    normal = jnp.zeros((*shape, 3)).at[..., 2].set(1.0)
+    free = jnp.asarray(rng.random(shape) < 0.3)
+    wanted = jnp.where(free[..., None], jnp.nan, jnp.zeros((*shape, 3)).at[..., 0].set(1.0))
+    history = jnp.asarray(rng.uniform(0, 1, (*shape, 8)), jnp.float32)
+    vectors = jnp.asarray(rng.choice([-1.0, 0.0, 0.3], (*shape, 2)), jnp.float32)
+
+    def recalled(history, vectors, first):
+        expected = ExpectedSurface(None, None, wanted, None)
+        rules = {"normal_threshold": 0.9, "search_neighbours": True}
+        return reproject_along(history, Guides(None, normal, None), vectors, expected, first, **rules)
+
+    found, other = both(recalled, history, vectors, jnp.asarray(False))
+    np.testing.assert_array_equal(found.valid, other.valid)
+    np.testing.assert_allclose(found.history, other.history, rtol=1e-5, atol=1e-7)
+    inside = np.asarray(free)[1:-1, 1:-1]
+    np.testing.assert_array_equal(found.valid[1:-1, 1:-1, 0], inside)
 
 
 def of_earlier_frames(rng, height, width, light=1.0):

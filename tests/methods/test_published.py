@@ -277,3 +277,24 @@ def test_trmv_as_published_follows_dual_vectors_to_any_surface(rng):
     tested = run(trmv(preset="paper", **means, dual_tested=True), frames)[1][-1]
     # Column 15 finds its own shape one pixel beside the target.
     np.testing.assert_allclose(tested[:, 9:15], 2.0, rtol=1e-5)
+
+
+def test_trmv_as_published_tests_normals_where_the_vector_is_that_of_the_surface():
+    """A fold of one shape has moved by four pixels: what it shows now is new, but where a dual vector leads."""
+    columns, flat = np.arange(16)[None, :, None], np.ones((12, 1, 1), np.float32)
+    first, second = (
+        (np.where(columns < fold, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]) * flat).astype(np.float32) for fold in (4, 8)
+    )
+    still, ids = np.zeros((12, 16, 2), np.float32), np.ones((12, 16, 1), np.int32)
+    dual = np.zeros((12, 16, 2), np.float32)
+    dual[:, 5, 0], dual[:, 12, 0] = -5, -10  # to the same normal, and to another
+    frames = [
+        Frame(np.ones((12, 16, 3), np.float32), normal=first, ids=ids, motion=still),
+        Frame(np.full((12, 16, 3), 2.0, np.float32), normal=second, ids=ids, motion=still, dual_motion=dual),
+    ]
+    plain = {"levels": 0, "feedback_level": 0, "short_history": 0}
+    image = run(trmv(preset="paper", **plain), frames)[1][-1]
+    kept = 0.2 * 2 + 0.8 * 1
+    # Column 4 finds what it shows one pixel beside it.
+    expected = np.where((columns < 6) | (columns >= 8), kept, 2.0)
+    np.testing.assert_allclose(image, np.broadcast_to(expected, image.shape), rtol=1e-5)
