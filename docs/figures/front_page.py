@@ -1,4 +1,4 @@
-"""The picture of the README: a frame of a room before and after denoising, and its reference.
+"""The second picture of the first page: a frame of a room before and after denoising, and its reference.
 
     jaxdn render living-room/scene.xml --animation experiments/papers/rooms/living-room.json \\
         --frames 8 --width 320 --height 180 --reference-spp 64 --seeds 2000 --see-through -o data/rooms

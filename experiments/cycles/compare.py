@@ -83,7 +83,7 @@ def measure(clip: Path, spp: int, method: str, out: Path) -> None:
     files = sorted(noisy.glob("*.exr"))
     if not files or target.with_suffix(".json").is_file():
         return
-    images = _denoised(files, target, method)
+    images = denoise_frames(files, target, method)
     _, frames = open_frames(noisy)
     motion = {number: stored.frame.motion for number, stored in enumerate(frames, 1)}
     pairs = _paired(scored)
@@ -95,7 +95,7 @@ def measure(clip: Path, spp: int, method: str, out: Path) -> None:
     print(f"{clip.name} {spp} spp {method}: {found.figures()}", flush=True)
 
 
-def _denoised(files: Sequence[Path], target: Path, method: str) -> dict[int, np.ndarray]:
+def denoise_frames(files: Sequence[Path], target: Path, method: str) -> dict[int, np.ndarray]:
     """Number of a frame -> image, from the files that were written."""
     if method == NOISY:
         return {int(file.stem): read_beauty(file) for file in files}

@@ -10,11 +10,12 @@ import pytest
 import tyro
 from PIL import Image
 
-from docs.figures import before_after, front_page, vectors
+from docs.figures import before_after, cycles_page, front_page, vectors
 from jaxdn.clips import write_clip
 from jaxdn.commands.arguments import COMMANDS, Denoise
 from jaxdn.methods.registry import methods
 from jaxdn.zoo.ready import AUTO, DEFAULT_MODEL, choose_model
+from tests.experiments.test_cycles_score import write_clip_of_cycles
 from tests.training.test_training import make_clip
 
 ROOT = Path(__file__).parents[2]
@@ -135,6 +136,21 @@ def test_the_pictures_of_motion_vectors_are_drawn(tmp_path, capsys):
     write_clip(clip._replace(frames=frames._replace(visible=None)), tmp_path / "other")
     with pytest.raises(ValueError, match="expected a clip with visible"):
         vectors.main(vectors.Settings(tmp_path / "other", 1, out=tmp_path))
+
+
+def test_a_frame_of_cycles_stands_beside_what_methods_make_of_it(tmp_path):
+    write_clip_of_cycles(tmp_path / "sun-9000", np.random.default_rng(4))
+    out = tmp_path / "cycles.webp"
+    cycles_page.main(cycles_page.Settings(tmp_path / "sun-9000", (0, 0, 24, 16), 2, 4, ("svgf+no-safe",), out))
+    with Image.open(out) as picture:
+        shown = np.asarray(picture, np.float64)
+    assert shown.shape == (
+        front_page._LABEL + 32 + front_page._GAP + 32,
+        3 * (48 + front_page._GAP) - front_page._GAP,
+        3,
+    )
+    noisy, denoised, reference = (shown[front_page._LABEL :][:32, left : left + 48] for left in (0, 52, 104))
+    assert np.abs(denoised - reference).mean() < 0.5 * np.abs(noisy - reference).mean()
 
 
 def test_frames_stand_side_by_side_with_a_part_enlarged(tmp_path):

@@ -113,7 +113,7 @@ def test_a_folder_without_clips_says_how_to_make_some(tmp_path: Path) -> None:
         compare.find_done(tmp_path, [])
 
 
-def _write_clip(folder: Path, rng: np.random.Generator) -> None:
+def write_clip_of_cycles(folder: Path, rng: np.random.Generator) -> None:
     """A clip of four frames of 4 samples, as Cycles names its passes, with references of two of them."""
     truth = np.tile(_truth(rng)[:32, 24:72], (1, 1, 1)).astype(np.float32)
     guides = np.zeros((*truth.shape[:2], 7), np.float32)
@@ -137,7 +137,7 @@ def _write_clip(folder: Path, rng: np.random.Generator) -> None:
 def test_methods_are_compared_on_files_and_a_second_run_measures_nothing_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _write_clip(tmp_path / "test" / "sun-9000", np.random.default_rng(4))
+    write_clip_of_cycles(tmp_path / "test" / "sun-9000", np.random.default_rng(4))
     options = compare.Options(tmp_path / "test", tmp_path / "out", ["noisy", "svgf+no-safe"], [4])
     assert compare.main(options) == 0
     first = capsys.readouterr().out
