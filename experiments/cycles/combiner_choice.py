@@ -34,8 +34,8 @@ from jaxdn.methods.combiner.history import Means, start_history
 from jaxdn.methods.combiner.method import (
     CandidateStep,
     Found,
+    build_candidate_step,
     build_chooser,
-    candidate_step,
     mix_candidates,
     prepare,
 )
@@ -73,7 +73,7 @@ class Options:
 def main(options: Options) -> int:
     """Train, score before and after, write the weights."""
     _, params = load_weights(options.start)
-    find = jax.jit(candidate_step(Settings()))
+    find = jax.jit(build_candidate_step(Settings()))
     clips: dict[str, dict[int, Stored]] = {}
     for clip in find_done(options.folder, []):
         record = read_record(clip / RECORD) or {}

@@ -21,13 +21,13 @@ RADII = (1, 3)
 _MOST_RESIDUAL = 3.0
 """Residuals of noisy light that count, as shares of the prior's light plus middle grey: one firefly is no evidence."""
 _LEAST_SQUARE = 1e-5
-"""Of a difference between two images at one brightness, that counts as none."""
+"""Mean square of a difference of two images, at the exposure of the network, below which there is none."""
 _SLOPE_RANGE = -1.0, 2.0
 _MULTIPLE = 16
 """Height and width of the network's input are multiples of it."""
 RECEPTIVE_FIELD = 2 * max(RADII) + 2
 """Radius in pixels of what :func:`assemble_evidence` sees."""
-INITIAL = {
+INITIAL_LOGITS = {
     "prior": -1.0,
     "stabilised": 1.0,
     "mean": -5.0,
@@ -98,8 +98,8 @@ def _blocks(planes: Sequence[jax.Array]) -> jax.Array:
 
 
 def begin(params: Params) -> Params:
-    """The network's parameters before training, from those that were drawn: the shares of :data:`INITIAL`."""
-    logits = jnp.asarray([INITIAL[name] for name in CANDIDATES], jnp.float32)
+    """The network's parameters before training, from those that were drawn: the shares of :data:`INITIAL_LOGITS`."""
+    logits = jnp.asarray([INITIAL_LOGITS[name] for name in CANDIDATES], jnp.float32)
     head = {"kernel": _SMALL * params["head_0"]["kernel"], "bias": jnp.repeat(logits, 4)}
     return {**params, "head_0": head}
 

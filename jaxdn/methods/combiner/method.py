@@ -139,7 +139,7 @@ def combiner(options: Options) -> Denoiser:
     option, and ``step`` for a frame of the wrong shape, never for its contents.
     """
     chooser = build_chooser(options)
-    find = candidate_step(options)
+    find = build_candidate_step(options)
     network, network_shape = _build_network(options)
     reads = frozenset({"albedo", "normal", "roughness", "depth", "previous_depth", "motion", "ids"})
 
@@ -187,7 +187,7 @@ CandidateStep = Callable[
 """(params, state, prepared frame, is it the first, statistics) -> the next state, what was found, invalid pixels."""
 
 
-def candidate_step(options: Options) -> CandidateStep:
+def build_candidate_step(options: Options) -> CandidateStep:
     """The first part of a step: all but the choice among the candidates."""
     network, _ = _build_network(options)
     library = core_of(oidn(device=options.device))
