@@ -23,7 +23,7 @@ from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
 
 if TYPE_CHECKING:
-    from jaxtyping import Array, Float
+    from jaxtyping import Array, Bool, Float
 
     Image = Float[Array, "H W 3"]
 
@@ -48,7 +48,9 @@ have (``python -m experiments.papers.demodulation``).
 _STORED = Path(__file__).parent / "materials" / "directional-albedo.npz"
 
 
-def ggx_albedo_table(*, lobe: Lobe = "ggx", size: int = SIZE, samples: int = SAMPLES) -> np.ndarray:
+def ggx_albedo_table(
+    *, lobe: Lobe = "ggx", size: int = SIZE, samples: int = SAMPLES
+) -> Float[np.ndarray, "size size 2"]:
     """The table [size, size, 2] of A and B, float32, over n.v (first axis) and linear roughness r (second).
 
     Entry (i, j) stands for ``n.v = (i + 0.5) / size`` and ``r = (j + 0.5) / size``, with alpha = r^2. Half vectors
@@ -134,7 +136,7 @@ def _smith(lobe: Lobe, cosine: np.ndarray, alpha: float) -> np.ndarray:
 
 
 @functools.cache
-def albedo_table(lobe: Lobe = "ggx") -> np.ndarray:
+def albedo_table(lobe: Lobe = "ggx") -> Float[np.ndarray, "128 128 2"]:
     """The stored table [128, 128, 2] of a lobe, made by :func:`ggx_albedo_table`."""
     check_option(lobe, "lobe", LOBES)
     with np.load(_STORED, allow_pickle=False) as stored:
@@ -208,7 +210,7 @@ def remodulate(light: Image, reflectance: Image, *, floor: float = FLOOR) -> Ima
     return light * divisor(reflectance, floor=floor)
 
 
-def texture_left(reflectance: jax.Array, divided_by: jax.Array, light: jax.Array | None = None) -> jax.Array:
+def texture_left(reflectance: Image, divided_by: Image, light: Image | None = None) -> Image:
     """The texture that a division leaves: what light of 1 looks like after it, ``reflectance / divided_by``, <= 1.
 
     It is 1 where the reflectance is not small, and dark where the divisor is larger than the reflectance. It is 1, too,
@@ -222,7 +224,7 @@ def texture_left(reflectance: jax.Array, divided_by: jax.Array, light: jax.Array
     return jnp.where(black & (_largest(light) > 0), 1.0, texture)
 
 
-def hue_left(texture: jax.Array) -> jax.Array:
+def hue_left(texture: Image) -> Image:
     """The colour [..., 3] of what is left of a texture, without its brightness: about 1 in its brightest channel.
 
     For albedos that may not be all that a surface reflects: metal and gloss, whose albedo is 0 or dark, give light all
@@ -238,7 +240,7 @@ def _largest(colour: jax.Array) -> jax.Array:
 
 
 @operation
-def texture_or_hue(reflectance: jax.Array, light: jax.Array, hue: jax.Array) -> jax.Array:
+def texture_or_hue(reflectance: Image, light: Image, hue: Bool[Array, ""]) -> Image:
     """The texture [H, W, 3] that dividing ``light`` by :func:`divisor` leaves of a reflectance, or its colour alone.
 
     :func:`texture_left` where ``hue``, a bool scalar, is false, else :func:`hue_left` of it.

@@ -95,7 +95,7 @@ def exposure(radiance: Float[Array, "H W 3"]) -> Float[Array, ""]:
     return exposure_of(brightness(radiance))
 
 
-def brightness(radiance: jax.Array) -> jax.Array:
+def brightness(radiance: Float[Array, "H W 3"]) -> Float[Array, 2]:
     """[2] what :func:`exposure` is made of: the sum of log L over blocks that are not black, and their number.
 
     Those of images that lie side by side, with sides of whole blocks, add up to that of both. No gradient.
@@ -115,7 +115,7 @@ def brightness(radiance: jax.Array) -> jax.Array:
     return jnp.stack([jnp.sum(logs), jnp.sum(lit, dtype=light.dtype)])
 
 
-def exposure_of(brightness: jax.Array) -> jax.Array:
+def exposure_of(brightness: Float[Array, 2]) -> Float[Array, ""]:
     """The :func:`exposure` of an image with this :func:`brightness`."""
     logs, count = brightness
     return jnp.where(count > 0, _MIDDLE_GREY * jnp.exp(-logs / jnp.maximum(count, 1)), 1.0)
@@ -133,7 +133,7 @@ def luminance(image: Float[Array, "... 3"]) -> Float[Array, "... 1"]:
     return red * image[..., 0:1] + green * image[..., 1:2] + blue * image[..., 2:3]
 
 
-def luminance_of_planes(planes: jax.Array) -> jax.Array:
+def luminance_of_planes(planes: Float[Array, "3 H W"]) -> Float[Array, "H W"]:
     """The same of planes [3, H, W], as [H, W]."""
     red, green, blue = (weight * plane for weight, plane in zip(LUMINANCE, planes, strict=True))
     return red + green + blue
@@ -163,7 +163,9 @@ def tonemap(image: Float[Array, "... 3"], *, operator: Operator = "srgb") -> Flo
     return srgb_encode(jnp.minimum(x, 1.0))
 
 
-def tonemap_halves(first: jax.Array, second: jax.Array, *, operator: Operator = "srgb") -> tuple[jax.Array, jax.Array]:
+def tonemap_halves(
+    first: Float[Array, "... 3"], second: Float[Array, "... 3"], *, operator: Operator = "srgb"
+) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"]]:
     """Two halves of a reference, such that errors of tone-mapped images against them are free of the reference's noise.
 
     ``first`` and ``second`` [..., 3] are independent noisy radiance with the same expectation r. Tone-mapped one by

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 
 def unbiased(
-    denoised: jax.Array, reference: jax.Array, *, curve: Literal["compress", "reinhard"] = "compress"
-) -> tuple[jax.Array, jax.Array]:
+    denoised: Float[Array, ...], reference: Float[Array, ...], *, curve: Literal["compress", "reinhard"] = "compress"
+) -> tuple[Float[Array, ...], Float[Array, ...]]:
     """The pair (denoised, reference) as compressed near the denoised image: both times ``curve'(denoised)``.
 
     The curve is :func:`jaxdn.color.compress`, or Reinhard's ``x / (1 + x)``, of which PSNR is measured.

@@ -1,9 +1,14 @@
 """What a user's type checker sees: no error in a script that uses public names, and no ``Any`` among its results."""
 
+import inspect
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 import jaxdn
 
@@ -14,46 +19,47 @@ import jax.numpy as jnp
 import jaxdn
 from jaxdn import denoisers, losses, metrics
 from jaxdn.core.frame import frame_at
+from jaxdn.recipes.objectives import pyramid_illumination
+from jaxdn.recipes.recipe import Recipe
+from jaxdn.training.step import init_state
 
 clip = jaxdn.read_clip("data/clip")
 denoiser, params = jaxdn.load_weights("steady-balanced")
 images = jaxdn.denoise(denoiser, params, clip)
-image, state = images[0], denoiser.start(params, frame_at(clip.frames, 0))
+frame = frame_at(clip.frames, 0)
+state, image = denoiser.step(params, denoiser.start(params, frame), frame)
+streamed = next(jaxdn.stream(denoiser, params).each([frame]))
+unrolled = jaxdn.unroll(denoiser, params, clip.frames, rematerialize=True)
+decibels = metrics.psnr(images, images, average="mse")
+error = losses.spatial(images, images)
+shown = jaxdn.color.tonemap(images)
+divided = jaxdn.brdf.demodulate(image, image)
+
 motion = jnp.zeros((8, 8, 2))
 dual = jaxdn.dual_motion(motion, motion)
 warped = jaxdn.warp(image, dual, border="zeros")
 mask = jaxdn.occlusion_mask(motion, dual)
 kernels = jaxdn.normalize_kernels(jnp.zeros((8, 8, 25)))
 filtered = jaxdn.apply_kernels(warped, kernels)
+soft = jaxdn.softmax_filter(warped[None], jnp.zeros((8, 8, 25)))
 composed = jaxdn.compose_scales(filtered, filtered[::2, ::2], jnp.ones((4, 4, 1)), up="nearest")
-shown = jaxdn.color.tonemap(composed)
-decibels = metrics.psnr(shown, shown)
-error = losses.spatial(images, images)
-divided = jaxdn.brdf.demodulate(image, image)
+gradient = jax.grad(lambda scale: jnp.sum(jaxdn.warp(scale * image, motion)))(1.0)
+
 filter = denoisers.svgf(alpha=0.1)
 core = jaxdn.Core(start=lambda params, frame: (), step=lambda *given: ((), given[2].radiance, 0), reads=frozenset())
 own = jaxdn.recurrent(core)
-jaxdn.save_weights("weights.safetensors", params, factory="steady", options={}, record={})
-gradient = jax.grad(lambda scale: jnp.sum(jaxdn.warp(scale * image, motion)))(1.0)
+batches = jaxdn.training_batches("data/clips", batch=2, crop=64, seed=0)
+batch = next(batches)
+recipe = Recipe(pyramid_illumination())
+training, report = jaxdn.make_train_step(denoiser, recipe)(init_state(denoiser, recipe, batch), batch)
+loss = report.loss
+jaxdn.save_weights("weights.safetensors", training.params, factory="steady", options={}, record={})
 """
 RESULTS = [
-    "clip",
-    "clip.frames",
-    "denoiser",
-    "images",
-    "warped",
-    "dual",
-    "mask",
-    "kernels",
-    "filtered",
-    "composed",
-    "shown",
-    "decibels",
-    "error",
-    "divided",
-    "filter",
-    "own",
-    "params",
+    *("clip", "clip.frames", "clip.frames.radiance", "clip.frames.albedo", "clip.reference", "frame", "denoiser"),
+    *("params", "images", "image", "streamed", "unrolled", "decibels", "error", "shown", "divided", "dual", "warped"),
+    *("mask", "kernels", "filtered", "soft", "composed", "filter", "own", "batch", "training", "report", "loss"),
+    *("jaxdn.affinity_filter", "jaxdn.reproject", "jaxdn.stabilised"),
 ]
 
 
@@ -81,3 +87,25 @@ def test_wrong_uses_are_errors(tmp_path):
     wrong = 'jaxdn.warp(image, motion, border="mirror")\njaxdn.wrap(image)\njaxdn.denoise(params, denoiser, clip)\n'
     found = _checked(SCRIPT + wrong, tmp_path)
     assert len([each for each in found if each["severity"] == "error"]) >= 3
+
+
+def _public_functions() -> list[tuple[str, Any]]:
+    """Those of jaxdn, and those that its public rooms declare themselves."""
+    found = {name: getattr(jaxdn, name) for name in jaxdn.__all__}
+    for room in ("brdf", "color", "losses", "metrics"):
+        module = getattr(jaxdn, room)
+        own = {name: value for name, value in vars(module).items() if not name.startswith("_")}
+        found |= {f"{room}.{name}": value for name, value in own.items() if _module(value) == module.__name__}
+    return [(name, each) for name, each in found.items() if inspect.isroutine(each) or hasattr(each, "__wrapped__")]
+
+
+def _module(value: Any) -> str:
+    return getattr(value, "__module__", "")
+
+
+@pytest.mark.parametrize(("name", "function"), _public_functions())
+def test_public_signatures_state_shapes(name, function):
+    hints = inspect.signature(function).parameters.values()
+    written = [str(hint.annotation) for hint in hints] + [str(inspect.signature(function).return_annotation)]
+    bare = [text for text in written if re.search(r"jax\.Array|\bArray\b(?!,)|ndarray", text) and "Float[" not in text]
+    assert bare == [], f"{name}: its arrays have no shape, as Float[Array, 'H W 3'] would say"

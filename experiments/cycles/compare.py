@@ -85,7 +85,7 @@ def measure(clip: Path, spp: int, method: str, out: Path) -> None:
         return
     images = denoise_frames(files, target, method)
     _, frames = open_frames(noisy)
-    motion = {number: stored.frame.motion for number, stored in enumerate(frames, 1)}
+    motion: dict[int, Any] = {number: stored.frame.motion for number, stored in enumerate(frames, 1)}
     pairs = _paired(scored)
     halves = [references.read(clip / "reference" / f"{number:04d}.exr") for number in pairs]
     found = score([images[number] for number in pairs], halves, [motion[number] for number in pairs])

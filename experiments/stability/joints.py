@@ -19,7 +19,7 @@ import tyro
 from experiments.measurement import describe_measurement
 from experiments.speed.works import scene
 from jaxdn.commands.errors import plain_errors
-from jaxdn.core.frame import Clip, Frame
+from jaxdn.core.frame import Array, Clip, Frame
 from jaxdn.runtime.atomic_files import write_json
 from jaxdn.zoo.ready import Model, find_model
 
@@ -92,7 +92,7 @@ class Stepper:
         return images
 
 
-def measure_joint(whole: Sequence[np.ndarray], chunk: Sequence[np.ndarray], reference: np.ndarray, start: int) -> Joint:
+def measure_joint(whole: Sequence[np.ndarray], chunk: Sequence[np.ndarray], reference: Array, start: int) -> Joint:
     """``whole`` and ``reference`` from frame 0 on, ``chunk`` from frame ``start``."""
     first, before, same = chunk[0], whole[start - 1], whole[start]
     change = reference[start] - reference[start - 1]

@@ -22,8 +22,8 @@ RADIANCE_MAX = 65504.0
 FAR = 1e6
 """View-space depth stored where the camera ray left the scene: large and finite, so that differences stay finite."""
 
-Array = Any
-"""A jax or NumPy array, or None where the effect is absent."""
+Array = jax.Array | Any
+"""A jax or NumPy array, or None where the effect is absent. Type checkers offer what jax arrays have."""
 
 Kind = Literal["light", "signed", "fraction", "direction", "distance", "vector", "count", "flag", "id"]
 """The kind of values in a buffer; it decides how they are sanitized, stored and transformed:

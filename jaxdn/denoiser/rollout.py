@@ -67,7 +67,7 @@ def unroll(
     params: Params,
     frames: Frame,
     layers: Layers = None,
-    reference: jax.Array | None = None,
+    reference: Float[Array, "T H W 3"] | None = None,
     *,
     rematerialize: bool = False,
 ) -> Float[Array, "T H W 3"]:

@@ -6,9 +6,11 @@ which weights does not depend on the history's values, so that training needs on
 Fetches run by tiles: at 720p, fetching the taps of all pixels at once takes twice as long.
 """
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +34,9 @@ from jaxdn.ops.dispatch.row_tiles import evaluate_sparsely, map_row_tiles
 from jaxdn.ops.motion import find_targets
 from jaxdn.ops.warp import attach_mean_gradient, gather_windows, locate_cells
 
+if TYPE_CHECKING:
+    from jaxtyping import Array, Bool, Float, Int
+
 WEIGHT_MIN = 0.01
 """Minimum sum of accepted bilinear weights that counts as history."""
 _TILE_PIXELS = 5_000
@@ -45,19 +50,19 @@ _Position = tuple[jax.Array, jax.Array]
 class Reprojection(NamedTuple):
     """The history where it is now; no history where its surface was not visible before."""
 
-    history: jax.Array
+    history: Float[Array, "H W C"]
     """[H, W, C] the renormalised mean of the accepted taps; 0 where there is none."""
-    valid: jax.Array
+    valid: Bool[Array, "H W 1"]
     """[H, W, 1] bool."""
-    invalid: jax.Array
+    invalid: Int[Array, ""]
     """How many pixels of the history were not finite or negative."""
 
 
 def reproject(
-    history: jax.Array,
+    history: Float[Array, "H W C"],
     before: Guides,
     frame: Frame,
-    first: jax.Array,
+    first: Bool[Array, ""],
     *,
     depth_tolerance: float = 0.02,
     normal_threshold: float = 0.9,

@@ -15,7 +15,7 @@ the frames' PSNRs, so one perfect frame makes it infinite: ``average="mse"`` giv
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import jax
 import jax.numpy as jnp
@@ -154,7 +154,7 @@ def psnr(
     *,
     mask: Mask | None = None,
     peak: float = 1.0,
-    average: str = "frames",
+    average: Literal["frames", "mse"] = "frames",
 ) -> Scalar:
     """Peak signal-to-noise ratio in dB, ``10 log10(peak^2 / MSE)``; of a clip, the mean of its frames' PSNRs.
 
@@ -178,7 +178,7 @@ def temporal_psnr(
     *,
     mask: Mask | None = None,
     peak: float = 1.0,
-    average: str = "frames",
+    average: Literal["frames", "mse"] = "frames",
 ) -> Scalar:
     """PSNR of the frame-to-frame differences of two clips: measures flicker, independent of a constant error.
 

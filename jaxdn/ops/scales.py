@@ -37,7 +37,7 @@ def pad(image: jax.Array, multiple: int) -> jax.Array:
     return jnp.pad(image, ((0, below), (0, right), (0, 0)), mode="edge") if below or right else image
 
 
-def crop(image: jax.Array, size: tuple[int, int]) -> jax.Array:
+def crop(image: jax.Array, size: Sequence[int]) -> jax.Array:
     """The first rows and columns, ``size`` of them: the inverse of :func:`pad`."""
     return image[: size[0], : size[1]]
 

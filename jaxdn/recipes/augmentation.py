@@ -6,6 +6,7 @@ not write every buffer. Each element of a training stream is varied anew; the ei
 (:mod:`jaxdn.data.training.symmetries`).
 """
 
+from collections.abc import Sequence
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import jax
@@ -80,7 +81,7 @@ class DrawnClip(NamedTuple):
     draw: Draw
 
 
-def draw_variation(variation: Augmentation, shape: tuple[int, int, int], rng: np.random.Generator) -> Draw:
+def draw_variation(variation: Augmentation, shape: Sequence[int], rng: np.random.Generator) -> Draw:
     """Everything but ``beauty``, drawn for a clip of so many frames, rows and columns."""
     # Everything is drawn, whatever is varied: one variation must not change the numbers of the next.
     brighter, tints = rng.uniform(-1, 1), rng.uniform(-1, 1, 3)
@@ -150,7 +151,7 @@ def _drop(frames: Frame, absent: Any, numbers: Any) -> Frame:
     return frames
 
 
-def _draw_shadow(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+def _draw_shadow(shape: Sequence[int], rng: np.random.Generator) -> np.ndarray:
     """A shadow that leaves of the light between 1/2 and 1/1000, as :attr:`Draw.shadow` has it.
 
     Its edge is a straight line of any direction, 2 to 32 pixels soft, that reaches a random point of the image in a

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn.core.frame import FAR, Frame
+from jaxdn.core.frame import FAR, Array, Frame
 from jaxdn.data.clip.frames import StoredFrame, doubling_layers
 from jaxdn.denoiser.rollout import Layers, Stream, stream
 from jaxdn.denoiser.tiles import GRID, TiledStream, map_tiles, stream_tiled
@@ -70,11 +70,12 @@ class FrameDenoiser:
 
     def __call__(self, stored: StoredFrame) -> np.ndarray:
         """The image of the next frame. Raises ValueError where a limit that was given cannot be kept."""
+        noisy = np.asarray(stored.frame.radiance)
         if self._method.denoiser is None:
-            return np.asarray(light_of(stored.frame.radiance))
-        exponent = self._follow_light(stored.frame.radiance)
+            return np.asarray(light_of(noisy))
+        exponent = self._follow_light(noisy)
         image = self._denoise(bound_light(stored, exponent))
-        return restore_light(image, np.asarray(stored.frame.radiance), exponent)
+        return restore_light(image, noisy, exponent)
 
     def _denoise(self, stored: StoredFrame) -> np.ndarray:
         step = self._prepare(stored.frame)
@@ -88,7 +89,7 @@ class FrameDenoiser:
 
     def _follow_light(self, radiance: np.ndarray) -> int:
         """The exponent for the next frame; where it is another one, the history ends, as it is in another unit."""
-        exponent = choose_exponent(np.asarray(radiance), self._exponent)
+        exponent = choose_exponent(radiance, self._exponent)
         if self._exponent is not None and exponent != self._exponent and self._step is not None:
             self._log(f"the light changes by more than a factor of {2**DRIFT}: there the history begins anew")
             self._programs, self._sanitized = self.programs, self.sanitized
@@ -190,7 +191,7 @@ class FrameDenoiser:
         return step
 
 
-def light_of(radiance: np.ndarray | None) -> Any:
+def light_of(radiance: Array) -> Any:
     """Radiance that can be added: values that are not finite become 0, an absent part is 0."""
     return 0.0 if radiance is None else np.where(np.isfinite(radiance), radiance, 0).astype(np.float32)
 

@@ -78,8 +78,9 @@ def bound_light(stored: StoredFrame, exponent: int) -> StoredFrame:
     """
     frame = stored.frame
     most = math.ldexp(RADIANCE_MAX, -exponent)
-    lamps = find_lamps(frame.radiance, exponent)
-    if exponent == 0 and not np.any(lamps) and not np.any((frame.radiance < 0) | (frame.radiance > most)):
+    noisy = np.asarray(frame.radiance)
+    lamps = find_lamps(noisy, exponent)
+    if exponent == 0 and not np.any(lamps) and not np.any((noisy < 0) | (noisy > most)):
         return stored
 
     def scaled(light: np.ndarray, least: float) -> np.ndarray:
@@ -89,7 +90,7 @@ def bound_light(stored: StoredFrame, exponent: int) -> StoredFrame:
 
     given = {name: scaled(light, -most) for name in _LIGHT if (light := getattr(frame, name)) is not None}
     layers = {count: scaled(layer, 0.0) for count, layer in stored.layers.items()}
-    radiance = scaled(_dim(frame.radiance, lamps, exponent), 0.0)
+    radiance = scaled(_dim(noisy, lamps, exponent), 0.0)
     return stored._replace(frame=frame._replace(**given, radiance=radiance), layers=layers)
 
 

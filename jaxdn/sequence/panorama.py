@@ -33,7 +33,7 @@ class Panorama:
 
     def widen_frame(self, frame: Frame) -> Frame:
         """A frame of NumPy arrays with all of its buffers widened, and its vectors the short way round."""
-        wide: dict[str, Any] = {"radiance": self.widen(frame.radiance)}
+        wide: dict[str, Any] = {"radiance": self.widen(np.asarray(frame.radiance))}
         for name in GUIDES:
             if (buffer := getattr(frame, name)) is not None:
                 wide[name] = self.widen(_shorten(buffer) if BUFFERS[name].kind == "vector" else buffer)

@@ -128,7 +128,7 @@ class Run:
         key, found = point_key(name, spp), {}
         for clip in self.clips:
             noisy = clip.frames._replace(radiance=clip.noisy[spp])
-            images = noisy.radiance if denoise is None else denoise(noisy)
+            images = np.asarray(noisy.radiance) if denoise is None else denoise(noisy)
             found[clip.name] = score(images, clip)
             save_png(self._picture(key, clip), picture(images[clip.shown]))
         self.store.put("errors", key, found)

@@ -162,7 +162,7 @@ class ForeignSequence:
         self._told.update(derived)
         if mapping.forward is None:
             return frame, lines, None
-        frame = frame._replace(dual_motion=derive_dual_motion(frame.motion, forward))
+        frame = frame._replace(dual_motion=derive_dual_motion(np.asarray(frame.motion), forward))
         return frame, lines, convert_cycles_forward(stack_channels(pixels, mapping.forward))
 
     def _advise_convention(self) -> str:

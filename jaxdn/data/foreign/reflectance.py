@@ -60,7 +60,7 @@ def derive_reflectance(
         cosine, where = _cosine(frame, buffers, pixels, header)
         if cosine is None:
             return frame, f"not used: {layer!r}, as what it reflects depends on the angle of view, and {where}"
-        specular = _lobe(repairs.clamp("F0", layer, stack_channels(pixels, color)), frame.roughness, cosine)
+        specular = _lobe(repairs.clamp("F0", layer, stack_channels(pixels, color)), np.asarray(frame.roughness), cosine)
         how = f"{diffuse!r} + GGX lobe of F0 {layer!r}, roughness {layer_of(buffers['roughness'])!r} and {where}"
     reflectance = np.clip(albedo + specular, 0.0, 1.0)
     return frame._replace(reflectance=reflectance, specular_reflectance=specular), f"derived: reflectance = {how}"
@@ -94,7 +94,8 @@ def _cosine(
     if eye is None:
         return None, "the header has no worldToCamera with the place of the camera"
     where = f"{layer_of(buffers['normal'])!r} and {layer_of(places)!r} in world space"
-    return _between(frame.normal, eye.astype(np.float32) - stack_channels(pixels, places)), where
+    view = eye.astype(np.float32) - stack_channels(pixels, places)
+    return _between(np.asarray(frame.normal), view), where
 
 
 def _between(normal: np.ndarray, view: np.ndarray) -> np.ndarray:

@@ -41,7 +41,7 @@ def training_batches(
     threads: int = 1,
     process: tuple[int, int] = (0, 1),
     vary_later: bool = False,
-) -> grain.DatasetIterator[Any]:
+) -> grain.DatasetIterator[Clip | DrawnClip]:
     """An endless iterator over batches: a Clip of numpy arrays ``[B, T, H, W, C]``, reference included.
 
     Args:

@@ -89,7 +89,7 @@ class Measurer:
             history = self._add_history(before, frame, layers, figures)
             moved = None
             if camera is not None and self._camera is not None and frame.depth is not None:
-                moved = camera_motion(frame.depth, camera, self._camera)
+                moved = camera_motion(np.asarray(frame.depth), camera, self._camera)
             _compare_motion(before, frame, moved, layers, figures)
             _compare_noise(before, frame, figures)
         layers["history"] = np.asarray(history)

@@ -13,7 +13,7 @@ the mean of priors.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple, TypeVar
 
@@ -306,7 +306,7 @@ def _even(planes: jax.Array) -> jax.Array:
     return pad(planes.transpose(1, 2, 0), 2)
 
 
-def _split_head(head: jax.Array, size: tuple[int, int]) -> tuple[FilterParameters, jax.Array]:
+def _split_head(head: jax.Array, size: Sequence[int]) -> tuple[FilterParameters, jax.Array]:
     """Of the first network's output: the filter's parameters, and the share [H, W] of the new frame."""
     height, width = size[0] // 2, size[1] // 2
     own, logits, half, rest = jnp.split(crop(head, (height, width)), _SPLITS, axis=-1)
@@ -343,6 +343,6 @@ def pad_planes(tree: _Planes) -> _Planes:
     return padded
 
 
-def crop_planes(planes: jax.Array, size: tuple[int, int]) -> jax.Array:
+def crop_planes(planes: jax.Array, size: Sequence[int]) -> jax.Array:
     """The first rows and columns of planes [..., H, W]."""
     return planes[..., : size[0], : size[1]]

@@ -20,9 +20,11 @@ of opposite taps and compute the weights of one pair while they use those of the
 would compute every weight once for each channel that uses it.
 """
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,6 +35,9 @@ from jaxdn.ops.affinity import pallas_kernels
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.dispatch.row_tiles import rows_per_tile
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
 
 RADIUS = 2
 SPLINE = (0.375, 0.25, 0.0625)
@@ -47,20 +52,20 @@ Planes = list[jax.Array]
 class Guide(NamedTuple):
     """What the weights are made of."""
 
-    features: jax.Array
+    features: Float[Array, "F H W"]
     """[F, H, W]; a feature with standard deviation sigma of a Gaussian weight is divided by ``sqrt(2) sigma``."""
-    slanted: jax.Array
+    slanted: Float[Array, "3 H W"]
     """[3, H, W] a value that is affine on planes, scaled likewise, and its slopes along x and y per pixel."""
-    confidence: jax.Array
+    confidence: Float[Array, "H W"]
     """[H, W] >= 0; 0 for pixels that no other may take anything from."""
-    scales: jax.Array | None = None
+    scales: Float[Array, ...] | None = None
     """[F + 1] factors of every feature and of the slanted guide, where the same guide serves several filters."""
 
     def factors(self) -> jax.Array:
         """[F + 1] the scales, 1 where there are none."""
         return jnp.ones(self.features.shape[0] + 1, self.features.dtype) if self.scales is None else self.scales
 
-    def scaled(self) -> "Guide":
+    def scaled(self) -> Guide:
         """The same guide without scales, which have been multiplied into it."""
         if self.scales is None:
             return self
@@ -68,7 +73,9 @@ class Guide(NamedTuple):
         return Guide(factors[:-1] * self.features, factors[-1:] * self.slanted, self.confidence)
 
 
-def affinity_filter(image: jax.Array, guide: Guide, *, step: int = 1, implementation: str | None = None) -> jax.Array:
+def affinity_filter(
+    image: Float[Array, "C H W"], guide: Guide, *, step: int = 1, implementation: str | None = None
+) -> Float[Array, "C H W"]:
     """The filtered image [C, H, W], any colour space; taps are ``step`` pixels apart.
 
     Taps beyond the border do not count. A pixel whose weights sum to nothing keeps its value. Differentiable by the
@@ -108,7 +115,7 @@ def _by_numba(image: jax.Array, guide: Guide, step: int) -> jax.Array:
     return _numba_forward(image, guide, step)[0]
 
 
-def _numba_forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, "_Residuals"]:
+def _numba_forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array, _Residuals]:
     from jaxdn.ops.affinity.numba_kernels import filter_rows
 
     arrays = [image, *guide[:3], guide.factors()]
@@ -118,7 +125,7 @@ def _numba_forward(image: jax.Array, guide: Guide, step: int) -> tuple[jax.Array
     return found, (image, guide, found, weight[None])
 
 
-def _numba_backward(step: int, residuals: "_Residuals", cotangent: jax.Array) -> tuple[jax.Array, Guide]:
+def _numba_backward(step: int, residuals: _Residuals, cotangent: jax.Array) -> tuple[jax.Array, Guide]:
     from jaxdn.ops.affinity.numba_kernels import filter_gradient_rows
 
     image, given, filtered, weight = residuals

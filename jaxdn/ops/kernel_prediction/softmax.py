@@ -9,9 +9,12 @@ Kernels may be guided: features of the pixels, such as albedo and normals, add a
 (:mod:`jaxdn.ops.kernel_prediction.guide_distances`), so that little light crosses an edge whatever the logits are.
 """
 
+from __future__ import annotations
+
 import functools
 import math
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +26,9 @@ from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.kernel_prediction import apply, guide_distances
 from jaxdn.ops.kernel_prediction.apply import check_taps
 
+if TYPE_CHECKING:
+    from jaxtyping import Array, Float
+
 _TILE_LOGITS = 1_000_000
 """Approximate number of logits in a tile: 15 rows of two kernels at 720p."""
 
@@ -32,13 +38,13 @@ Planes = tuple[jax.Array, ...]
 
 
 def softmax_filter(
-    images: jax.Array,
-    logits: jax.Array,
+    images: Float[Array, "n H W C"],
+    logits: Float[Array, "H W m"],
     *,
-    features: jax.Array | None = None,
+    features: Float[Array, "H W F"] | None = None,
     taps: int = 25,
     implementation: str | None = None,
-) -> jax.Array:
+) -> Float[Array, "n H W C"]:
     """Filter images with kernels given as logits: ``apply_kernels(image, normalize_kernels(logits))``, faster.
 
     images: [n, H, W, C], any colour space. logits: [H, W, m] with m >= n * taps; image i has the ``taps`` = K*K, K odd,
