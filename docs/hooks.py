@@ -39,9 +39,16 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 
 def on_page_content(html: str, **_: Any) -> str:
-    """The page with the roles of its docstrings as links, which mkdocs-autorefs resolves."""
-    link = r'<autoref identifier="\1" optional><code>\1</code></autoref>'
-    return re.sub(r":(?:mod|func|class|data|meth|attr):<code>~?([\w.]+)</code>", link, html)
+    """The page with the roles of its docstrings as links, which mkdocs-autorefs resolves.
+
+    They may be broken after a dot, where a column of a table is narrow.
+    """
+    role = r":(?:mod|func|class|data|meth|attr):<code>~?([\w.]+)</code>"
+    return re.sub(role, lambda found: _link(found[1], found[1]), html)
+
+
+def _link(name: str, shown: str) -> str:
+    return f'<autoref identifier="{name}" optional><code>{shown.replace(".", ".<wbr>")}</code></autoref>'
 
 
 def modules(name: str) -> list[str]:
@@ -116,7 +123,7 @@ def _paper(match: re.Match[str]) -> str:
         settings += [f"recipe: `{name}` {value!r}" for name, value in fact.get("recipe", {}).items()]
         here = "; ".join(part for part in (fact["here"], ", ".join(settings)) if part)
         code = fact["code"].replace(":", ".")
-        rows.append([fact["says"], fact["at"], _status(fact, paper), here, f":func:`{code}`"])
+        rows.append([fact["says"], fact["at"], _status(fact, paper), here, _link(code, code.removeprefix("jaxdn."))])
     return _table(["Paper", "Where", "Status", "Here", "Code"], rows)
 
 

@@ -34,6 +34,23 @@ def test_links_to_files_lead_to_files(page):
     assert missing == []
 
 
+def _anchors(page: Path) -> set[str]:
+    """Of its headings, as MkDocs and GitHub make them: words in lower case, joined by hyphens."""
+    headings = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", page.read_text(), flags=re.S), flags=re.M)
+    plain = (re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading).lower() for heading in headings)
+    return {re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", heading).strip()) for heading in plain}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=pytest_id)
+def test_links_to_headings_lead_to_headings(page):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.S)
+    links = re.findall(r"\]\(([^)#\s:]*)#([^)\s]+)\)", text)
+    pages = [(page.parent / path if path else page, anchor) for path, anchor in links]
+    generated = ROOT / "docs" / "reference"  # its headings follow from the code; MkDocs checks them
+    missing = [anchor for path, anchor in pages if path.resolve().parent != generated and anchor not in _anchors(path)]
+    assert missing == []
+
+
 @pytest.mark.parametrize("page", PAGES, ids=pytest_id)
 def test_commands_parse(page):
     blocks = re.findall(r"```(?:text)?\n(.*?)```", page.read_text(), flags=re.S)
