@@ -1,6 +1,6 @@
 """The factories of all methods, by name: ``jaxdn.denoisers.ntd(size="small")`` returns a :class:`jaxdn.Denoiser`.
 
-The factories come from the table of methods (:mod:`jaxdn.methods.registry`); :data:`NAMES` lists them. ``demodulated``
+The factories come from the table of methods (:mod:`jaxdn.methods.registry`); ``NAMES`` lists them. ``demodulated``
 and ``stabilised`` wrap any denoiser. The methods are implemented in :mod:`jaxdn.methods`, one file each.
 """
 

@@ -1,11 +1,10 @@
 """What surfaces reflect, as the renderer finds it, against independent Monte Carlo averages.
 
-``python -m experiments.papers.reflectance`` prints, for every material of :data:`MATERIALS`, the mean and the largest
+``python -m experiments.papers.reflectance`` prints, for every material of :func:`materials`, the mean and the largest
 error of F_b over the pixels that show it, and how far a white furnace is from 1: constant light of radiance 1 from all
 around, of which every pixel divided by F_b should be 1 (Zhuang et al. 2021, eq. 12).
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,11 +77,6 @@ def ball(material: dict[str, Any]) -> Any:
         },
         optimize=False,
     )
-
-
-@functools.cache
-def _random(count: int) -> np.ndarray:
-    return np.random.default_rng(11).random((count, 3))
 
 
 def monte_carlo(scene: Any, samples: int = SAMPLES) -> np.ndarray:

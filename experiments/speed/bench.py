@@ -191,7 +191,10 @@ def input_rows(say: Callable[[str], None]) -> list[Row]:
 
 
 def file_rows(methods: Sequence[str], say: Callable[[str], None], **options: Any) -> list[Row]:
-    """From command to file, in turns with Open Image Denoise; ``options`` as :func:`files.measure` takes them."""
+    """From command to file, in turns with Open Image Denoise.
+
+    ``options`` are those of :func:`experiments.speed.works.files.measure`.
+    """
     if not files.measurable() or "pyoidn" in peers.missing():
         say("files: left out: expected pyoidn, and a system that tells what a child process took")
         return []

@@ -16,7 +16,7 @@ _HEARTBEAT_S = 60
 
 
 class Place(NamedTuple):
-    """Where the processes meet, as :func:`jax.distributed.initialize` names it; None is found by jax: Slurm, Open MPI,
+    """Where the processes meet, as ``jax.distributed.initialize`` names it; None is found by jax: Slurm, Open MPI,
     Kubernetes."""
 
     coordinator: str | None = None

@@ -71,7 +71,7 @@ def count_reflectance_differs(frame: Frame) -> jax.Array | float:
 
 
 def geometric_mean_depth(depth: jax.Array) -> jax.Array:
-    """The geometric mean of depth over surfaces, from :attr:`Whole.depth`; 1 without any."""
+    """The geometric mean of depth over surfaces, from :attr:`FrameStatistics.depth`; 1 without any."""
     return jnp.exp(depth[0] / jnp.maximum(depth[2], 1.0))
 
 

@@ -59,8 +59,8 @@ def surface_mask(depth: jax.Array | None, ids: jax.Array | None) -> jax.Array | 
 def depth_feature(depth: jax.Array, mean: jax.Array | float) -> jax.Array:
     """Depth as ``z / (z + mean)`` in [0, 1), for ``depth`` [H, W, 1] >= 0; 0 (the neutral value) gives 0.
 
-    With the frame's geometric mean over surfaces (:attr:`FrameStatistics.mean_depth`) it does not depend on the scene's
-    unit of length.
+    It does not depend on the scene's unit of length with the frame's geometric mean over surfaces
+    (:attr:`jaxdn.denoiser.statistics.FrameStatistics.mean_depth`).
     """
     return depth / (depth + mean)
 

@@ -16,7 +16,6 @@ import numpy as np
 from flax import nnx
 
 from jaxdn.core.checks import check_option
-from jaxdn.denoiser import Params
 from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, graph, onednn, onnx
 from jaxdn.networks.graph import FEATURES, GraphSpec, Weights, evaluate
 from jaxdn.ops.convolution.api import convolve
@@ -252,11 +251,6 @@ def select_weights(
         used = [part for part, group in zip(parts, features, strict=True) if group is not None]
         weights[first] = {**weights[first], "kernel": jnp.concatenate(used, axis=2)}
     return weights
-
-
-def count_weights(params: Params) -> int:
-    """The number of weights in ``params``."""
-    return sum(leaf.size for leaf in jax.tree.leaves(params))
 
 
 def draw_weights(rng: np.random.Generator, network: GraphSpec) -> Weights:

@@ -20,8 +20,6 @@ from jaxdn.runtime.optional import install
 MODULE = "pyoidn"
 RECEPTIVE_FIELD = 96
 """Radius in pixels, of all qualities: the overlap of the library's own tiles; 91 pixels are the farthest measured."""
-ALIGNMENT = 16
-"""The network halves an image four times, from its top left corner: tiles begin at multiples of this."""
 
 Quality = Literal["high", "balanced", "fast"]
 Auxiliary = Literal["noisy", "clean", "prefiltered"]

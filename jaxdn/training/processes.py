@@ -30,7 +30,7 @@ class Stopping:
     """Whether a run ends now: Ctrl-C, SIGTERM or its time limit, in any of its processes."""
 
     def __init__(self, interrupt: Interrupt, end: float):
-        """``end``: when time is over, by :func:`time.monotonic`."""
+        """``end``: when time is over, by ``time.monotonic()``."""
         self._interrupt, self._end = interrupt, end
         self._asked_for, self._reason = 0, StopReason.NONE
 

@@ -10,6 +10,7 @@ import pytest
 import tyro
 from PIL import Image
 
+import jaxdn
 from docs.figures import before_after, cycles_page, front_page, vectors
 from jaxdn.clips import write_clip
 from jaxdn.commands.arguments import COMMANDS, Denoise
@@ -97,6 +98,11 @@ def test_every_package_and_module_is_in_the_reference():
     there = {path.relative_to(ROOT).with_suffix("").parts for path in (ROOT / "jaxdn").rglob("*.py")}
     public = {f"jaxdn.{parts[1]}" for parts in there if not parts[1].startswith("_")}
     assert named == public - {"jaxdn.clips"}  # another name of jaxdn.data.clip
+
+
+def test_the_reference_lists_every_public_name():
+    table = (ROOT / "docs" / "reference" / "core.md").read_text().partition("<!--")[0]
+    assert {name for name in jaxdn.__all__ if f"`{name}`" not in table} == {"__version__"}
 
 
 def test_the_reference_pages_follow_from_the_code():

@@ -8,7 +8,8 @@ import pytest
 from jaxdn import clips
 from jaxdn.core.frame import Frame
 from jaxdn.data.foreign.classify import ChannelNaming
-from jaxdn.data.foreign.lighting import find_additive_layers
+from jaxdn.data.foreign.layers import stack_channels
+from jaxdn.data.foreign.lighting import coloured_layers, is_additive
 from jaxdn.sequence.aov_decomposition import add_layers, decompose, init_decomposition
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
@@ -83,8 +84,10 @@ def test_parts_of_the_beauty_are_found_by_their_values(name: str, tmp_path: Path
     PROGRAMS[name].write(tmp_path / "a.exr", 0)
     there = clips.read_exr(tmp_path / "a.exr")
     found = clips.detect_channels(list(there))
-    parts = find_additive_layers(there, PROGRAMS[name].beauty, found)
-    assert set(parts) == set(ADDITIVE[name][0])
+    layers = coloured_layers(there, PROGRAMS[name].beauty, found)
+    radiance = stack_channels(there, found["radiance"])
+    parts = {layer for layer, channels in layers.items() if is_additive(there, channels, radiance)}
+    assert parts == set(ADDITIVE[name][0])
 
 
 def test_the_beauty_once_more_is_denoised_but_is_no_part(tmp_path: Path) -> None:

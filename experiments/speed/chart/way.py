@@ -38,7 +38,8 @@ class Way(NamedTuple):
     variant: str
     """How it differs from the plain form: one marker in the plot."""
     reads: str
-    """The buffers that it needs of the renderer besides radiance, as :func:`render_cost.named` names them."""
+    """The buffers that it needs of the renderer besides radiance, by the name that
+    :func:`experiments.speed.chart.render_cost.named` gives them."""
     timed: Callable[[Frame], Call]
     """A call that denoises one frame [H, W, C], for timing."""
     images: Callable[[Frame], np.ndarray] | None

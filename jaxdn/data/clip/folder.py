@@ -140,7 +140,7 @@ def write_clip(clip: Clip, path: str | Path, *, record: Mapping[str, Any] | None
 
 
 def read_frames(path: str | Path, *, spp: int = 1, order: Iterable[int] | None = None) -> Iterator[StoredFrame]:
-    """The frames of a clip one by one, for clips that do not fit into memory. Raises as :func:`read_clip` does.
+    """The frames of a clip one by one, for clips that do not fit into memory. Raises as :func:`jaxdn.read_clip` does.
 
     ``order`` are the indices of those to read; None: all.
 

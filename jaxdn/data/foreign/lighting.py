@@ -51,18 +51,6 @@ def is_clearly_brighter(values: np.ndarray, beauty: np.ndarray) -> bool:
     return bool(lit.any() and np.mean(np.any(values > 1.1 * beauty + 1e-3, axis=-1)[lit]) > _CLEARLY)
 
 
-def find_additive_layers(
-    pixels: Mapping[str, np.ndarray], beauty: Channels, buffers: Mapping[str, Channels]
-) -> dict[str, Channels]:
-    """Layer -> channels of the additive parts of the beauty: coloured, never negative, nowhere brighter than it.
-
-    Takes what :func:`coloured_layers` takes.
-    """
-    radiance = stack_channels(pixels, buffers["radiance"])
-    layers = coloured_layers(pixels, beauty, buffers)
-    return {name: channels for name, channels in layers.items() if is_additive(pixels, channels, radiance)}
-
-
 def coloured_layers(names: Iterable[str], beauty: Channels, buffers: Mapping[str, Channels]) -> dict[str, Channels]:
     """Layer -> channels of what may be an additive part of the beauty, by names alone.
 

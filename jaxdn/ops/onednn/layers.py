@@ -40,7 +40,7 @@ def make_convolution(
       kind: the type in which the kernel is kept and multiplied, that of the images that are read.
       slope: that of a leaky rectifier of the result; None: none.
       adds: it adds to what is there.
-      upsamples: it is one by a 3x3 kernel of the images after :func:`upsampling`, with 4/9 of the operations.
+      upsamples: it is one by a 3x3 kernel of the images after :func:`make_upsampling`, with 4/9 of the operations.
     """
     if upsamples:
         kernel, name, algorithm = _of_upsampled(kernel), "dnnl_deconvolution_forward", _TRANSPOSED

@@ -127,7 +127,10 @@ def compute_motion(current: View, previous: View, *, disocclusion: bool = True) 
 def _find_visible(
     now: GBuffer, before: GBuffer, motion: np.ndarray, points: np.ndarray, normals: np.ndarray, z: np.ndarray
 ) -> np.ndarray:
-    """[H, W, 1] bool, the points that the previous frame shows; ``points`` and what follows as in :func:`_matches`."""
+    """[H, W, 1] bool, the points that the previous frame shows.
+
+    ``points`` and what follows are as in :func:`_compare_surfaces`.
+    """
     size, sky = now.ids.shape[:2], now.ids < 0
     lengths = np.linalg.norm(normals, axis=-1, keepdims=True)
     shown = (now.ids, points, normals / np.where(lengths > 0, lengths, 1.0), z)

@@ -26,11 +26,6 @@ def scatters(scene: Any) -> bool:
     return any(not absorbs(medium) for medium in list_media(scene).values())
 
 
-def has_bounds(scene: Any) -> bool:
-    """Whether media of a scene end at surfaces, instead of filling all of it."""
-    return any(shape.is_medium_transition() for shape in scene.shapes())
-
-
 def is_bound(bsdf: Any, active: Any) -> Any:
     """Whether surfaces are nothing but the bounds of a medium: rays pass them straight, whatever their length is."""
     flags = bsdf.flags()
