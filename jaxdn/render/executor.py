@@ -108,8 +108,8 @@ def _tell_failure(future: Future[None], clip: _Clip) -> str:
 
 def _finish(clips: Iterable[_Clip], failures: dict[str, str]) -> None:
     """Make the folders clips whose tasks have all ended, where none of those saw all frames; add those that fail."""
+    deadline = time.monotonic() + _SEEN_WITHIN_S  # one for all: every frame was written before
     for clip in clips:
-        deadline = time.monotonic() + _SEEN_WITHIN_S
         while not finish_clip(clip.folder) and time.monotonic() < deadline:
             time.sleep(0.5)
         if not is_clip(clip.folder):

@@ -263,6 +263,16 @@ def test_frames_that_others_wrote_to_another_disk_are_no_clip(tmp_path: Path, mo
         )
 
 
+def test_what_another_disk_has_is_waited_for_once_however_many_clips_there_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(executor, "_SEEN_WITHIN_S", 1.0)
+    farm, begun = Submitted(lambda future: future.set_result(None)), time.monotonic()
+    with pytest.raises(RenderError, match="12 of 12 clips failed"):
+        worker_pool.render_clips(list_jobs(tmp_path, 12), executor=farm, progress=False)
+    assert 1 <= time.monotonic() - begun < 6
+
+
 def test_ctrl_c_cancels_what_has_not_begun(tmp_path: Path) -> None:
     farm = Submitted(lambda future: None)
 
