@@ -3,6 +3,7 @@
 import os
 import socket
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -13,6 +14,8 @@ LOST_EXIT_CODE = 1
 """Of a process whose others have gone: the same commands, given again, go on from the newest checkpoint."""
 _HEARTBEAT_S = 60
 """After so long without a sign of life a process counts as lost."""
+_TELL_S = 10.0
+"""How long a process that has failed waits for the others, which may have failed by the same."""
 
 
 class Place(NamedTuple):
@@ -29,7 +32,8 @@ def join_processes(place: Place) -> Iterator[None]:
     """Join the processes of a run, and wait for the others at the end.
 
     Where another process is lost, or does not come within five minutes, this one ends with a message and exit code 1,
-    or is ended by jax with 134. What jax reports of this process itself, memory that is full or Ctrl-C, is raised.
+    or is ended by jax with 134. An error of this process itself, as a damaged file or full memory, is raised, and the
+    others count it as lost soon after.
     Raises ValueError for a place that is incomplete or has no port, or one that is taken, where no cluster is found,
     and where jax cannot join the processes.
     """
@@ -61,9 +65,13 @@ def join_processes(place: Place) -> Iterator[None]:
     try:
         yield
     except jax.errors.JaxRuntimeError as error:
-        if _is_of_this_process(error):
-            raise
-        _end_alone(error)
+        if not _is_of_this_process(error):
+            _end_alone(error)
+        _end_soon(1)
+        raise
+    except Exception as error:
+        _end_soon(2 if isinstance(error, (ValueError, OSError, ModuleNotFoundError)) else 1)
+        raise
     try:
         jax.distributed.shutdown()
     except jax.errors.JaxRuntimeError as error:
@@ -93,6 +101,23 @@ def _is_of_this_process(error: Exception) -> bool:
     return "RESOURCE_EXHAUSTED" in message or message.endswith("KeyboardInterrupt:")
 
 
+def _end_soon(code: int) -> None:
+    """End in a moment, with the exit code that an error has (:func:`jaxdn.commands.errors.plain_errors`).
+
+    At its end this process waits for the others, which may wait for it in an update: jax would abort all of them after
+    a minute.
+    """
+    timer = threading.Timer(_TELL_S, _end, [code])
+    timer.daemon = True
+    timer.start()
+
+
+def _end(code: int) -> None:
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
 def _shorten(error: Exception) -> str:
     return str(error).splitlines()[0][:200] if str(error) else type(error).__name__
 
@@ -105,5 +130,4 @@ def _end_alone(error: Exception) -> None:
         file=sys.stderr,
         flush=True,
     )
-    sys.stdout.flush()
-    os._exit(LOST_EXIT_CODE)
+    _end(LOST_EXIT_CODE)

@@ -19,22 +19,29 @@ _Tree = TypeVar("_Tree")
 def make_mesh(devices: int | None, batch: int) -> Mesh | None:
     """The first ``devices`` devices of each process (None: one, or all where there are several processes).
 
-    None for one device altogether, which needs no mesh. Raises ValueError for a number that jax does not have, and
-    unless they divide the batch.
+    None for one device altogether, which needs no mesh. Raises ValueError for a number that jax does not have, for
+    processes that have different numbers where none is given, and unless they divide the batch.
     """
     there, processes = jax.local_devices(), jax.process_count()
+    of_each = [[one for one in jax.devices() if one.process_index == index] for index in range(processes)]
+    counts = [len(some) for some in of_each]
     if devices is None:
+        if len(set(counts)) > 1:
+            raise ValueError(
+                f"devices: expected as many in each process, got {', '.join(map(str, counts))}; give --devices "
+                f"{min(counts)}, or start the processes with as many each."
+            )
         devices = len(there) if processes > 1 else 1
-    if not 1 <= devices <= len(there):
+    if not 1 <= devices <= min(counts):
+        where = "here" if processes == 1 else "in one of the processes"
         raise ValueError(
-            f"devices: expected 1 to {len(there)}, as jax has {len(there)} of {there[0].device_kind!r} here, got "
+            f"devices: expected 1 to {min(counts)}, as jax has {min(counts)} of {there[0].device_kind!r} {where}, got "
             f"{devices}; give another number."
         )
     count = devices * processes
     if batch % count:
         which = f"{count} devices" if processes == 1 else f"{count} devices of {processes} processes"
         raise ValueError(f"batch: expected a multiple of the {which}, got {batch}; change one of them.")
-    of_each = [[one for one in jax.devices() if one.process_index == index] for index in range(processes)]
     chosen = [one for some in of_each for one in some[:devices]]
     return Mesh(np.asarray(chosen), (CLIPS,)) if count > 1 else None
 

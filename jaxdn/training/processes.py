@@ -4,8 +4,12 @@ A program of several processes waits for all of them in every update. Whatever m
 signal or the clock, has to be known to the others before the same update.
 """
 
+import hashlib
+import json
 import time
+from collections.abc import Mapping
 from enum import IntEnum
+from typing import Any
 
 import jax
 import numpy as np
@@ -51,6 +55,28 @@ class Stopping:
         if self._interrupt.asked:
             return StopReason.TERMINATED if self._interrupt.terminated else StopReason.INTERRUPTED
         return StopReason.TIME if time.monotonic() >= self._end else StopReason.NONE
+
+
+def check_same(asked: Mapping[str, Any]) -> None:
+    """Raise ValueError, in all processes, unless all were asked for the same; ``asked`` has the names of its parts.
+
+    With another learning rate in one of them each would go on from weights of its own, and nobody would see it.
+    """
+    if jax.process_count() == 1:
+        return
+    found = {name: _digest(value) for name, value in asked.items()}
+    of_all = multihost_utils.process_allgather(np.stack(list(found.values())))
+    differing = [name for index, name in enumerate(found) if (of_all[:, index] != of_all[0, index]).any()]
+    if differing:
+        raise ValueError(
+            f"--distributed: expected the same command in all processes, got another {', '.join(differing)} in one of "
+            "them; give all of them the same."
+        )
+
+
+def _digest(value: Any) -> np.ndarray:
+    text = json.dumps(value, sort_keys=True, default=repr)
+    return np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint8)
 
 
 def writes() -> bool:

@@ -13,7 +13,7 @@ from jaxdn.methods.registry import Method
 from jaxdn.recipes.recipe import Recipe
 from jaxdn.training.devices import make_mesh
 from jaxdn.training.loop import InitialWeights, ResumableBatches, fit, read_resumed_from
-from jaxdn.training.processes import writes
+from jaxdn.training.processes import check_same, writes
 from jaxdn.training.validation import load_validation
 from jaxdn.zoo.weights import save_weights, starting_params
 
@@ -58,6 +58,11 @@ def train(
     if time_limit is not None and not time_limit > 0:
         raise ValueError(f"time limit: expected more than 0, got {time_limit:g} s; leave it out for no limit.")
     make_mesh(devices, recipe.batch)  # refused before clips are read
+    names = [place.name for place in clips]
+    check_same(
+        {"method": method.name, "options": dict(options), "devices": devices, "start": start, "clips": names}
+        | recipe.record()
+    )
     label = out.name if label is None else label
     backend = method.backend("training") if implementation == "auto" else implementation
     if backend not in (None, "reference"):

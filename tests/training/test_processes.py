@@ -17,6 +17,7 @@ from safetensors.numpy import load_file
 from jaxdn.clips import write_clip
 from jaxdn.commands import main
 from jaxdn.training.log import read_log
+from jaxdn.training.loop import read_resumed_from
 from tests.training.test_training import make_clip
 
 ROOT = Path(__file__).parents[2]
@@ -80,7 +81,10 @@ def give(clips: Path, run: Path, *more: object) -> list[str]:
 class Pair:
     """Two processes of one run."""
 
-    def __init__(self, home: Path, arguments: Sequence[str]) -> None:
+    def __init__(
+        self, home: Path, arguments: Sequence[str], *, second: Sequence[object] = (), devices: tuple[int, int] = (1, 1)
+    ) -> None:
+        """``second``: what only the second is told besides; ``devices``: how many each of them has."""
         place = f"127.0.0.1:{free_port()}"
         environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": f"{ROOT}{os.pathsep}{home}"}
         self.errors = [home / f"errors-{time.monotonic_ns()}-{index}" for index in range(2)]
@@ -88,8 +92,10 @@ class Pair:
         for index, errors in enumerate(self.errors):
             command = [sys.executable, "-m", "jaxdn.commands.main", *arguments, "--distributed"]
             command += ["--coordinator", place, "--processes", "2", "--process", str(index)]
+            command += [str(word) for word in second if index == 1]
+            own = environment | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices[index]}"}
             with errors.open("w") as out:
-                self.processes.append(subprocess.Popen(command, env=environment, stdout=out, stderr=out))
+                self.processes.append(subprocess.Popen(command, env=own, stdout=out, stderr=out))
 
     def wait_for(self, run: Path, step: int) -> None:
         end = time.monotonic() + 300
@@ -152,7 +158,7 @@ def test_two_processes_and_any_number_of_devices_learn_the_same(home: Path) -> N
     assert f"{home / 'two'}" not in second
     assert "step 5/5" in first
     assert "step" not in second
-    moved = Pair(home, give(home / "clips", home / "moved", "--steps", 2))
+    moved = Pair(home, give(home / "clips", home / "moved", "--steps", 1))
     assert moved.end() == [0, 0], moved.tell()
     steps = ("--steps", UPDATES)
     run_alone(
@@ -160,9 +166,12 @@ def test_two_processes_and_any_number_of_devices_learn_the_same(home: Path) -> N
         give(home / "clips", home / "one", *steps),
         give(home / "clips", home / "devices-2", *steps, "--devices", 2),
         give(home / "clips", home / "devices-8", *steps, "--devices", 8),
-        give(home / "clips", home / "moved", "--steps", 3),
-        give(home / "clips", home / "moved", "--steps", UPDATES, "--devices", 8),
+        give(home / "clips", home / "moved", "--steps", 2),
     )
+    moved = Pair(home, give(home / "clips", home / "moved", "--steps", 3), devices=(2, 2))
+    assert moved.end() == [0, 0], moved.tell()
+    run_alone(home, give(home / "clips", home / "moved", *steps, "--devices", 8))
+    assert read_resumed_from(home / "moved") == [1, 2, 3]
     assert np.ptp(weights(home / "one")) > 0.1
     for name in ("two", "devices-2", "devices-8", "moved"):
         assert distance(home / name, home / "one") < 1e-6, name
@@ -201,6 +210,34 @@ def test_a_signal_at_one_process_stops_both_and_a_lost_one_ends_the_other(home: 
     assert newest > newer
     run_alone(home, give(home / "clips", home / "long", "--steps", 10**6, "--time-limit", "0.00001"))
     assert json.loads((home / "long" / "weights.json").read_text())["updates"] == newest
+
+
+@pytest.mark.slow
+def test_processes_that_are_not_given_the_same_are_refused(home: Path) -> None:
+    run = give(home / "clips", home / "unlike", "--steps", 2)
+    unlike = Pair(home, run, second=("--learning-rate", 0.5, "--start", home / "nothing.safetensors"))
+    assert unlike.end(120) == [2, 2], unlike.tell()
+    uneven = Pair(home, run, devices=(2, 1))
+    assert uneven.end(120) == [2, 2], uneven.tell()
+    told = [[" ".join(path.read_text().split()) for path in pair.errors] for pair in (unlike, uneven)]
+    assert all("got another start, learning_rate in one of them" in each for each in told[0])
+    assert all("devices: expected as many in each process, got 2, 1; give --devices 1" in each for each in told[1])
+    assert not any("Traceback" in each for pair in told for each in pair)
+    assert not (home / "unlike").exists()
+
+
+@pytest.mark.slow
+def test_an_error_of_one_process_is_told_there_and_ends_the_other(home: Path) -> None:
+    run = give(home / "clips", home / "failing", "--steps", 2)
+    of_first = Pair(home, [*run, "--validation", str(home / "nothing")])  # which the first alone reads
+    of_second = Pair(home, run, second=("--implementation", "nothing"))
+    for pair, failing, what in ((of_first, 0, "nothing: there is no such folder"), (of_second, 1, "'implementation'")):
+        codes = pair.end(120)
+        assert codes[failing] == 2, pair.tell()
+        assert codes[1 - failing] in (1, 134, -signal.SIGABRT), pair.tell()
+        told = pair.errors[failing].read_text()
+        assert what in told.partition("jaxdn: ")[2]
+        assert "stack trace" not in told
 
 
 @pytest.mark.parametrize(
