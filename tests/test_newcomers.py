@@ -154,7 +154,7 @@ mended, count = sanitize(broken)
 lost = (toy[0] > 2).any(-1)
 assert count == lost.sum() > 0 and np.isnan(np.asarray(mended.toy)[lost]).all()  # sanitized
 assert present(written_out(Frame(clip.frames.radiance), ["toy"])) == ("toy",)
-assert inspect.channels(("toy",)) == ["toy.X", "toy.Y"] and BUFFERS["toy"].bytes == 8  # inspected
+assert inspect.list_channels(("toy",)) == ["toy.X", "toy.Y"] and BUFFERS["toy"].bytes == 8  # inspected
 print("found everywhere")
 """
 

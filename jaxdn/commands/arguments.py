@@ -387,7 +387,7 @@ def check_folder(out: Path, option: str = "-o") -> Path:
     return out
 
 
-def name_channels(options: Inspect | Denoise) -> "ChannelNaming":
+def make_channel_naming(options: Inspect | Denoise) -> "ChannelNaming":
     """What is stated about the channels of other renderers' files."""
     from jaxdn.core.options import parse
     from jaxdn.data.foreign.classify import ChannelNaming

@@ -23,7 +23,7 @@ CONSEQUENCES: dict[str, str] = {
 """What it costs not to have a buffer that other renderers have a name for."""
 
 
-def missing(mapping: Iterable[MappedBuffer], reads: frozenset[str] | None) -> dict[str, str]:
+def list_missing(mapping: Iterable[MappedBuffer], reads: frozenset[str] | None) -> dict[str, str]:
     """Buffer -> the consequence of its absence, for those that a denoiser reads (None: any) and files may have."""
     there = {mapped.buffer for mapped in mapping}
     wanted = [name for name in LAYERS if name in CONSEQUENCES and name not in there]
@@ -49,7 +49,7 @@ def show_channel_mapping(
         note = "" if used else " (added back)" if mapped.buffer in COMPOSED else " (not used)"
         letters = ", ".join(name.rpartition(".")[2] for name in mapped.channels)
         table.add_row(mapped.buffer + note, mapped.layer, letters, mapped.convention)
-    for name, consequence in missing(mapping, reads).items():
+    for name, consequence in list_missing(mapping, reads).items():
         if single and name == "motion":
             continue
         table.add_row(name, "missing", "", consequence, style="yellow")

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
-from jaxdn.commands.arguments import Denoise, check_folder, name_channels
+from jaxdn.commands.arguments import Denoise, check_folder, make_channel_naming
 from jaxdn.commands.channel_table import show_channel_mapping
 from jaxdn.commands.progress import reporter
 from jaxdn.core.options import make, numbers, parse
@@ -25,7 +25,7 @@ def run_denoise(options: Denoise) -> None:
     """Denoise what the options name. Raises ValueError for options that frames, or scenes, do not have."""
     if options.max_memory is None:  # else freed memory goes back to the system at once
         tune_malloc()
-    naming = name_channels(options)
+    naming = make_channel_naming(options)
     scene = _scene_of(options)
     if options.method == AUTO:
         options = _choose_method(options, of_scene=scene is not None)

@@ -131,7 +131,7 @@ def plan_record(planned: PlannedClip, reader: Denoiser | None) -> dict[str, Any]
         "remaining": None if depth is None else round(depth.remaining, 4),
         "motion": motion(made),
         "buffers": list(made.buffers),
-        "channels": channels(made.buffers),
+        "channels": list_channels(made.buffers),
         "programs": made.programs(None if reader is None else reader.reads),
         "buffers_left_out": len(left_out(made)),
         "frames_with_noise_alone": noise_alone(made),
@@ -155,7 +155,7 @@ def noise_alone(made: Plan) -> int:
     return sum(source != index for index, source in enumerate(made.shared_with))
 
 
-def channels(buffers: tuple[str, ...]) -> list[str]:
+def list_channels(buffers: tuple[str, ...]) -> list[str]:
     """The EXR channels of some buffers."""
     return [f"{name}.{letter}" for name in buffers for letter in BUFFERS[name].letters]
 

@@ -9,7 +9,7 @@ from contextlib import nullcontext, redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jaxdn.commands.channel_table import missing, show_channel_mapping
+from jaxdn.commands.channel_table import list_missing, show_channel_mapping
 from jaxdn.commands.progress import reporter
 from jaxdn.data.clip.folder import refuse_unfinished
 from jaxdn.data.errors import ClipError, DamagedFile
@@ -18,8 +18,7 @@ from jaxdn.data.foreign.channel_mapping import MappedBuffer, lacks_convention, r
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.foreign.passes import join_passes
-from jaxdn.data.foreign.shots import Shot, find_shots, ranges
-from jaxdn.data.foreign.shots import missing as missing_numbers
+from jaxdn.data.foreign.shots import Shot, find_missing, find_shots, ranges
 from jaxdn.data.foreign.soundness import find_unusable
 from jaxdn.data.foreign.vectors import CHOICES, MOTION_CONVENTIONS
 from jaxdn.data.foreign.views import open_views, select_view
@@ -115,7 +114,7 @@ def _inspect_shot(
     # Vectors of 0, as a first frame has them, count as missing in its table.
     unstated = lacks_convention(opened[0], naming)
     fitting = sequence.fitting_conventions() if unstated else None
-    gaps = f"{ranges(missing_numbers(shot.numbers))} missing" if missing_numbers(shot.numbers) else None
+    gaps = f"{ranges(find_missing(shot.numbers))} missing" if find_missing(shot.numbers) else None
     if not quiet:
         for note in notes:
             print(note)
@@ -137,7 +136,7 @@ def _inspect_shot(
         "width": width,
         "height": height,
         "sources": [mapped._asdict() for mapped in mapping],
-        "missing": missing(mapping, reads),
+        "missing": list_missing(mapping, reads),
         "notes": notes if gaps is None else [*notes, gaps],
         "unusable": unusable,
         "fitting_conventions": fitting,

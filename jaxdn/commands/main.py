@@ -21,7 +21,7 @@ from jaxdn.commands.arguments import (
     Render,
     Train,
     check_folder,
-    name_channels,
+    make_channel_naming,
 )
 from jaxdn.commands.errors import end_with_reader, plain_errors
 from jaxdn.runtime.interrupt import exit_on_interrupt
@@ -46,7 +46,7 @@ def _inspect(options: Inspect) -> None:
         height=options.height,
         frames=options.frames,
         as_json=options.json,
-        naming=name_channels(options),
+        naming=make_channel_naming(options),
         overlay=None if options.overlay is None else check_folder(options.overlay, "--overlay"),
     )
 

@@ -9,7 +9,7 @@ from jax import export
 import jaxdn
 from jaxdn.core.frame import BUFFERS
 from jaxdn.export.graph import IR_VERSION, OPSET, Graph, element_type
-from jaxdn.export.step import Step, channels
+from jaxdn.export.step import Step, name_buffer_channels
 from jaxdn.export.translate import translate
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -66,4 +66,4 @@ def about(step: Step, name: str) -> dict[str, str]:
     found = {"jaxdn": jaxdn.__version__, "method": name}
     if step.multiple is not None:
         found["multiple"] = str(step.multiple)
-    return found | {f"channels.{one}": " ".join(channels(one)) for one in step.inputs if one in BUFFERS}
+    return found | {f"channels.{one}": " ".join(name_buffer_channels(one)) for one in step.inputs if one in BUFFERS}

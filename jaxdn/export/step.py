@@ -68,7 +68,7 @@ def exported_step(
     raise ValueError("the step is not the same for all sizes; give --width and --height.")
 
 
-def channels(buffer: str) -> list[str]:
+def name_buffer_channels(buffer: str) -> list[str]:
     """The channels of a buffer in the files of our clips; the radiance's are ``R, G, B`` in most files."""
     return [f"{buffer}.{letter}" if buffer != "radiance" else letter for letter in BUFFERS[buffer].letters]
 

@@ -23,8 +23,8 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation = "brdf") -> Denoiser:
 
     Textures are thus removed before filtering and cannot be blurred. What a denoiser keeps is divided too, each frame
     by its own divisor. The divisor of a dark surface is larger than its reflectance, so some of its texture is left
-    (:func:`texture_left`). The filters of this library average that as they average light, over pixels and frames, and
-    so it is not blurred; a denoiser that does not mixes dark textures of several frames. ``by`` is
+    (:func:`find_texture_left`). The filters of this library average that as they average light, over pixels and
+    frames, and so it is not blurred; a denoiser that does not mixes dark textures of several frames. ``by`` is
 
     * ``"brdf"``: :func:`jaxdn.brdf.demodulate` by the frame's ``reflectance``, by its albedo where that is absent;
     * ``"albedo"``: by the albedo where that exceeds 0.01 and by 1 elsewhere: on dark and on glossy surfaces the divided
@@ -66,7 +66,7 @@ def demodulated(denoiser: Denoiser, *, by: Demodulation = "brdf") -> Denoiser:
     return recurrent(core._replace(start=start, step=step, reads=reads, samples=samples, prepare=prepare))
 
 
-def texture_left(frame: Frame, by: Demodulation, statistics: FrameStatistics) -> jax.Array | None:
+def find_texture_left(frame: Frame, by: Demodulation, statistics: FrameStatistics) -> jax.Array | None:
     """The texture [H, W, 3] that the division leaves in a frame inside :func:`demodulated`; None if it leaves none.
 
     A filter that averages it with the weights of the light can give it back (:func:`jaxdn.brdf.restore`). If the
@@ -83,7 +83,7 @@ def texture_left(frame: Frame, by: Demodulation, statistics: FrameStatistics) ->
 def texture_of(reflectance: jax.Array, frame: Frame, light: jax.Array, statistics: FrameStatistics) -> jax.Array:
     """The texture [H, W, 3] that a division leaves of a frame's reflectance, or of what of it is not specular.
 
-    As in :func:`texture_left`. ``light`` [H, W, 3] is what is divided by it, or was.
+    As in :func:`find_texture_left`. ``light`` [H, W, 3] is what is divided by it, or was.
     """
     if frame.albedo is None or frame.reflectance is None:
         return brdf.texture_or_hue(reflectance, light, jnp.asarray(frame.albedo is not None))

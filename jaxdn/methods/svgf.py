@@ -30,7 +30,7 @@ from jaxdn.filters.edge_stopping import Weight, depth_weight, normal_weight
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, guides_of, surface_mask
 from jaxdn.filters.variance import Spatial, estimate_variance
-from jaxdn.methods.demodulation import Demodulation, demodulated, texture_left
+from jaxdn.methods.demodulation import Demodulation, demodulated, find_texture_left
 from jaxdn.methods.learnable_options import (
     FITTING,
     LEARNABLE,
@@ -198,7 +198,7 @@ def reproject_history(
 
 def planar_texture(frame: Frame, by: Demodulation, statistics: FrameStatistics) -> jax.Array:
     """The texture [3, H, W] that the division leaves in a frame inside ``demodulated``; 1 if it leaves none."""
-    texture = texture_left(frame, by, statistics)
+    texture = find_texture_left(frame, by, statistics)
     return jnp.ones_like(frame.radiance).transpose(2, 0, 1) if texture is None else texture.transpose(2, 0, 1)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from jaxdn.data.clip.folder import frame_path, is_clip, read_record, refuse_unfinished
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.passes import join_passes
-from jaxdn.data.foreign.shots import Shot, find_shots, is_named, missing, ranges
+from jaxdn.data.foreign.shots import Shot, find_missing, find_shots, is_named, ranges
 from jaxdn.data.foreign.views import open_views, select_view
 
 WARM_UP = 16
@@ -156,7 +156,7 @@ def find_jobs(
             if frames is None or set(map(math.floor, shot.numbers[index : index + 1])) & set(frames)
         ]
         wanted = frozenset(index for index in chosen if not (skip_existing and targets[index].is_file()))
-        named |= bool(chosen) or not set(missing(shot.numbers)).isdisjoint(frames or ())
+        named |= bool(chosen) or not set(find_missing(shot.numbers)).isdisjoint(frames or ())
         notes = (
             *(joints if not jobs else ()),
             *_notes(shot, among_others=len(found) > 1, existing=len(chosen) - len(wanted)),
@@ -245,7 +245,7 @@ def _check_targets(jobs: Sequence[Job]) -> None:
 
 def _notes(shot: Shot, *, among_others: bool, existing: int) -> tuple[str, ...]:
     notes = []
-    gaps = missing(shot.numbers)
+    gaps = find_missing(shot.numbers)
     if gaps:
         notes.append(f"{shot.label}: {ranges(gaps)} missing; after a gap there is no history at first")
     if among_others and not shot.numbers:

@@ -52,7 +52,7 @@ class Model(NamedTuple):
         return None if self.method is None else self.method.backend(purpose)
 
 
-class Choice(NamedTuple):
+class ModelChoice(NamedTuple):
     """What :func:`choose_model` chose."""
 
     name: str
@@ -60,14 +60,14 @@ class Choice(NamedTuple):
     """For a person, with what to do for another choice."""
 
 
-def choose_model(*, own_clips: bool) -> Choice:
+def choose_model(*, own_clips: bool) -> ModelChoice:
     """What is best for the frames at hand: clips of our own renderer, or other renderers' files."""
     if own_clips:
-        return Choice(DEFAULT_MODEL, "best on clips that jaxdn renders")
+        return ModelChoice(DEFAULT_MODEL, "best on clips that jaxdn renders")
     best = _method_of(BEST_ELSEWHERE)
     if best.installed:
-        return Choice(BEST_ELSEWHERE, f"best on frames of other renderers; {DEFAULT_MODEL} is on our own clips")
-    return Choice(DEFAULT_MODEL, f"{BEST_ELSEWHERE} is better on such frames: {best.remedy}")
+        return ModelChoice(BEST_ELSEWHERE, f"best on frames of other renderers; {DEFAULT_MODEL} is on our own clips")
+    return ModelChoice(DEFAULT_MODEL, f"{BEST_ELSEWHERE} is better on such frames: {best.remedy}")
 
 
 def find_model(name: str, **options: Any) -> Model:

@@ -7,7 +7,7 @@ import pytest
 
 from jaxdn.data.errors import ClipError
 from jaxdn.data.foreign.frame_names import read_frame_names
-from jaxdn.data.foreign.shots import find_shots, missing, ranges
+from jaxdn.data.foreign.shots import find_missing, find_shots, ranges
 
 
 def shots(*names: str) -> dict[str, list[Fraction | None]]:
@@ -59,7 +59,7 @@ def test_names_tell_the_shot_and_the_frame(case: str) -> None:
 
 def test_subframes_have_gaps_of_their_own_step() -> None:
     numbers = [Fraction(n, 2) for n in (2, 3, 4, 6, 7)]
-    assert missing(numbers) == [Fraction(5, 2)]
+    assert find_missing(numbers) == [Fraction(5, 2)]
     assert ranges(numbers) == "1-2, 3-3.5"
     assert ranges([-3, -2, 0]) == "-3 to -2, 0"
 

@@ -9,7 +9,7 @@ import pytest
 
 from jaxdn.clips import MOTION_CONVENTIONS, ClipError, read_clip, write_clip
 from jaxdn.commands import main
-from jaxdn.commands.channel_table import CONSEQUENCES, missing
+from jaxdn.commands.channel_table import CONSEQUENCES, list_missing
 from jaxdn.commands.doctor import doctor
 from jaxdn.data.exr.exr import read_exr
 from jaxdn.data.exr.file import ExrFile
@@ -132,7 +132,7 @@ def test_a_single_image_is_not_asked_about_motion(tmp_path, capsys):
 def test_what_is_missing_is_said_with_its_consequence(tmp_path, capsys):
     path = write(tmp_path / "a_1.exr", ":RGB", "diffuseFilter:RGB", "Paint:RGB", "mvec:XY")
     reads = methods()["svgf"].factory().reads
-    lost = missing(read_channel_mapping(path), reads)
+    lost = list_missing(read_channel_mapping(path), reads)
     assert set(lost) == {"normal", "depth", "ids"} | ({"specular_reflectance"} & reads)
     options = ("--motion-convention", "uv", "--channels", "albedo=Paint")
     text = run(capsys, "denoise", path, "-o", tmp_path / "out", "--method", "svgf", *options)

@@ -168,7 +168,7 @@ def test_left_out_buffers_are_relative_to_rendering_without_a_plan():
     assert command.bytes_a_pixel(command.EVERYTHING) == 88
     assert set(command.left_out(nothing)) == {name for effect in EFFECTS for name in effect.buffers} - ON_REQUEST
     assert command.bytes_a_pixel(nothing) == 18 + sum(BUFFERS[name].bytes for name in nothing.buffers)
-    assert command.channels(("normal", "ids")) == ["normal.X", "normal.Y", "normal.Z", "ids.Y"]
+    assert command.list_channels(("normal", "ids")) == ["normal.X", "normal.Y", "normal.Z", "ids.Y"]
 
 
 @pytest.mark.parametrize("name", ["svgf", "ntd", "ntd-small"])

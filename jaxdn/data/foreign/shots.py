@@ -86,7 +86,7 @@ def is_named(path: Path) -> bool:
 
 def refuse_gaps(path: str | Path | Sequence[Path], shot: Shot) -> None:
     """Raise ClipError for a shot, found at a path, in which frame numbers are missing."""
-    gaps = missing(shot.numbers)
+    gaps = find_missing(shot.numbers)
     if gaps:
         shown = ", ".join(map(_text, gaps[:8])) + (" ..." if len(gaps) > 8 else "")
         raise ClipError(f"{path}: frames are missing between {shot.numbers[0]} and {shot.numbers[-1]}: {shown}.")
@@ -97,7 +97,7 @@ def frame_step(numbers: Sequence[Number]) -> Fraction:
     return Fraction(1, math.lcm(*(number.denominator for number in numbers)))
 
 
-def missing(numbers: Sequence[Number]) -> list[Number]:
+def find_missing(numbers: Sequence[Number]) -> list[Number]:
     """The numbers that lie between others and are not there."""
     if not numbers:
         return []

@@ -30,7 +30,7 @@ from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, depth_feature, guides_of
-from jaxdn.methods.demodulation import Demodulation, demodulated, texture_left
+from jaxdn.methods.demodulation import Demodulation, demodulated, find_texture_left
 from jaxdn.methods.registry import method
 from jaxdn.methods.steady.accumulation import (
     CHANNELS,
@@ -173,7 +173,7 @@ def steady(options: Options) -> Denoiser:
         head = network.apply(weights, [_network_input(noisy, past, surfaces, statistics)[None]])[0][0]
         parameters, shares = split_heads(head, (hit.shape[0] // 2, hit.shape[1] // 2))
         mean = update_mean(noisy, past, hit, shares["accumulation"], most=options.history_max)
-        texture = texture_left(frame, options.demodulate, statistics)
+        texture = find_texture_left(frame, options.demodulate, statistics)
         texture = None if texture is None else fill_holes(pad(texture, BLOCKS), hit[..., None])
         residual = mean.residual if quality.lighting_change else None
         geometry = surfaces, compute_inverse_depth(surfaces, statistics)

@@ -44,7 +44,7 @@ _PATTERNS = (
 )
 
 
-class Choice(NamedTuple):
+class VariantChoice(NamedTuple):
     """A variant that works, the LLVM library it needs ("" for none), and the reason of the choice."""
 
     variant: str
@@ -52,7 +52,7 @@ class Choice(NamedTuple):
     reason: str
 
 
-_choice: dict[str | None, Choice] = {}
+_choice: dict[str | None, VariantChoice] = {}
 
 
 def list_llvm_candidates() -> list[str]:
@@ -87,19 +87,21 @@ def has_cuda() -> bool:
     return os.path.exists("/dev/nvidiactl") or os.path.exists("/dev/dxg")
 
 
-def _find(requested: str | None) -> Choice:
+def _find(requested: str | None) -> VariantChoice:
     if requested in (None, "cuda_ad_rgb"):
         if (requested or has_cuda()) and _works("cuda_ad_rgb"):
-            return Choice("cuda_ad_rgb", "", "a CUDA device with OptiX was found")
+            return VariantChoice("cuda_ad_rgb", "", "a CUDA device with OptiX was found")
         if requested:
             raise ValueError(f"variant: {requested!r} does not run here (it needs an NVIDIA driver with OptiX).")
     if requested in (None, "llvm_ad_rgb"):
         for library in list_llvm_candidates():
             if _works("llvm_ad_rgb", library):
-                return Choice("llvm_ad_rgb", library, f"{library} works")
+                return VariantChoice("llvm_ad_rgb", library, f"{library} works")
         if requested:
             raise ValueError(f"variant: {requested!r} does not run here. {advice()}")
-    return Choice("scalar_rgb", "", f"no LLVM library works here. {advice()}" if not requested else "it was requested")
+    return VariantChoice(
+        "scalar_rgb", "", f"no LLVM library works here. {advice()}" if not requested else "it was requested"
+    )
 
 
 def separates_lobes(variant: str) -> bool:
@@ -115,7 +117,7 @@ def advice() -> str:
     )
 
 
-def choose_variant(requested: str | None = None) -> Choice:
+def choose_variant(requested: str | None = None) -> VariantChoice:
     """The variant to render with: ``requested``, else ``JAXDN_VARIANT``, else the fastest that works here.
 
     A probe runs once per process and choice; child processes find its result in their environment. Raises
@@ -130,7 +132,7 @@ def choose_variant(requested: str | None = None) -> Choice:
         entry = f"{_FOUND}_{requested or 'fastest'}".upper()
         inherited = os.environ.get(entry, "").split("|", 2)
         if len(inherited) == 3:
-            _choice[requested] = Choice(inherited[0], inherited[1], inherited[2])
+            _choice[requested] = VariantChoice(inherited[0], inherited[1], inherited[2])
         else:
             _choice[requested] = _find(requested)
             os.environ[entry] = "|".join(_choice[requested])

@@ -24,7 +24,7 @@ class Material(NamedTuple):
     """Effect -> why it could not be decided."""
 
 
-class Range(NamedTuple):
+class ParameterRange(NamedTuple):
     """The values of a parameter over a surface."""
 
     low: float
@@ -50,30 +50,30 @@ def _numbers(value: Any) -> np.ndarray | None:
     return array if array.size else None
 
 
-def range_of(texture: Any) -> Range:
+def range_of(texture: Any) -> ParameterRange:
     """The values of a texture or spectrum; unknown ones may have any value."""
     parameters = mi.traverse(texture)
     data = _numbers(parameters["data"]) if "data" in parameters else None
     if data is not None:
         varies = data.ndim > 2 and bool(np.any(np.ptp(data.reshape(-1, data.shape[-1]), axis=0) > 0))
-        return Range(float(data.min()), float(data.max()), varies)
+        return ParameterRange(float(data.min()), float(data.max()), varies)
     parts = [range_of(child) for _, child in list_children(texture)]
     if parts:
         low, high = min(part.low for part in parts), max(part.high for part in parts)
-        return Range(low, high, len({*parts}) > 1 or any(p.varies for p in parts), all(p.known for p in parts))
+        return ParameterRange(low, high, len({*parts}) > 1 or any(p.varies for p in parts), all(p.known for p in parts))
     value = _numbers(parameters["value"]) if "value" in parameters else None
     if value is not None:
-        return Range(float(value.min()), float(value.max()))
-    return Range(0.0, np.inf, varies=bool(texture.is_spatially_varying()), known=False)
+        return ParameterRange(float(value.min()), float(value.max()))
+    return ParameterRange(0.0, np.inf, varies=bool(texture.is_spatially_varying()), known=False)
 
 
-def _parameter(bsdf: Any, name: str, default: float) -> Range:
+def _parameter(bsdf: Any, name: str, default: float) -> ParameterRange:
     for label, child in list_children(bsdf):
         if label == name:
             return range_of(child)
     parameters = mi.traverse(bsdf)
     value = _numbers(parameters[name]) if name in parameters else None
-    return Range(default, default) if value is None else Range(float(value.min()), float(value.max()))
+    return ParameterRange(default, default) if value is None else ParameterRange(float(value.min()), float(value.max()))
 
 
 def _join(parts: list[Material]) -> Material:
@@ -101,9 +101,9 @@ def _rough(bsdf: Any, *, squared: bool) -> Material:
         name = "roughness"
     else:
         ranges = [_parameter(bsdf, name, 0.1) for name in ("alpha", "alpha_u", "alpha_v") if _has(bsdf, name)]
-        ranges = ranges or [Range(0.1, 0.1)]
+        ranges = ranges or [ParameterRange(0.1, 0.1)]
         low, high = min(one.low for one in ranges), max(one.high for one in ranges)
-        found = Range(low, high, any(one.varies for one in ranges), all(one.known for one in ranges))
+        found = ParameterRange(low, high, any(one.varies for one in ranges), all(one.known for one in ranges))
         name = "alpha"
     if not found.known:
         reason = f"{bsdf.class_name()}: the values of its {name} texture cannot be read"
