@@ -33,7 +33,7 @@ ROOMS: dict[str, Room] = {
     "losses": Room(2, "losses over clips"),
     "metrics": Room(2, "PSNR, SSIM, FLIP ..."),
     "materials": Room(2, "microfacets, glints, kernels of reflectance"),
-    "ops": Room(2, "warp, motion, scales, planes, sampling"),
+    "ops": Room(2, "warp, motion, scales, planes, windows, medians, sampling"),
     "ops.affinity": Room(2, "affinity filters"),
     "ops.convolution": Room(2, "convolutions for training"),
     "ops.kernel_prediction": Room(2, "predicted kernels"),

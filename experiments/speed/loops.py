@@ -40,6 +40,7 @@ from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import implementation
 from jaxdn.ops.scales import fill_holes, join_planes
 from jaxdn.runtime.malloc import tune_malloc
+from jaxdn.sequence.james_stein import combine
 
 Work = tuple[Callable[..., Any], tuple[Any, ...]]
 """A function and its arguments."""
@@ -103,6 +104,7 @@ def works(height: int, width: int) -> dict[str, Work]:
             (albedo, normal, learned),
         ),
         "unknown pixels filled": (fill_holes, (light, hit[..., None])),
+        "the safe blend": (combine, (light, noise(height, width, 3))),
     }
 
 

@@ -210,6 +210,11 @@ def to_planes(image: jax.Array) -> jax.Array:
     return image.transpose(2, 0, 1)
 
 
+def to_pixels(planes: jax.Array) -> jax.Array:
+    """[C, H, W] as [H, W, C]."""
+    return planes.transpose(1, 2, 0)
+
+
 def _depth_to_space(blocks: jax.Array) -> jax.Array:
     height, width, channels = blocks.shape
     parts = blocks.reshape(height, width, channels // 4, 2, 2).transpose(2, 0, 3, 1, 4)

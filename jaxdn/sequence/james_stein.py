@@ -34,6 +34,9 @@ median, which no lamp moves.
 
 Where many of the blocks around have no noise at all, the image is kept as it is. Where nothing was rendered, as in a
 sky, that says nothing.
+
+Colours are planes here, [3, H, W], and what a pixel has one of is [1, H, W]: XLA:CPU vectorises neither three colours
+side by side nor sums over them.
 """
 
 import functools
@@ -46,9 +49,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.core.checks import check_image, check_same_size
-from jaxdn.core.medians import median, median_3x3
-from jaxdn.core.separable import correlate
 from jaxdn.filters.atrous import B3_SPLINE
+from jaxdn.ops.medians import median
+from jaxdn.ops.scales import join_planes, to_pixels, to_planes
+from jaxdn.ops.windows import smooth, window_means
+from jaxdn.sequence.change import mean, mean_square, second_differences, winsorize
 
 GAINS = (0.8907**2, 0.2007**2, 0.0856**2, 0.0413**2, 0.0009009)
 """Variance of each band, and of the rest, of white noise of variance 1, in two dimensions (Starck and Murtagh)."""
@@ -59,17 +64,17 @@ frames gain 0.2 dB more."""
 MOST_DOUBT = 9.0
 RADII = (7, 7, 7, 15, 15)
 """Of each band's window: 2 r + 1 pixels a side."""
+BOUND = 3.0
+"""d counts as at most so many times the light."""
 SLOPE = 2.0
 """Least energy of lost detail in the finest band, relative to the next one. In frames of Cycles and of our renderer
 it is 3 to 18, of strongly blurred ones 1 to 2."""
-BOUND = 3.0
-"""d counts as at most so many times the light."""
 _DIRECTION_BIAS = 1.1
 """One over the mean of the least of four measured variances of noise in a window, relative to its variance."""
 _LEAST = 0.5
+_TAPS = tuple(map(float, B3_SPLINE[2:]))
 _NEAR = 4
 """Of the windows for what is mostly without noise."""
-_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 _DARK = 0.05
 """Differences are relative to the light plus this share of the image's median."""
 
@@ -159,28 +164,31 @@ def combine(
     """
     check_image(noisy, "noisy", channels=3)
     check_same_size(noisy, denoised, ("noisy", "denoised"))
-    usable = jnp.all(jnp.isfinite(noisy), axis=-1, keepdims=True)
     level = measure_level(denoised) if level is None else level
-    light = jnp.maximum(jnp.mean(denoised, axis=-1, keepdims=True), 0.0) + _DARK * level
+    planes, before = (join_planes([("pixels", jnp.asarray(image))]) for image in (denoised, noisy))
+    known = None if surface is None else to_planes(surface)
+    usable = jnp.all(jnp.isfinite(before), axis=0, keepdims=True)
+    light = jnp.maximum(mean(planes), 0.0) + _DARK * level
     light = jnp.where(light > 0, light, 1.0)
-    whole = jnp.where(usable, noisy - denoised, 0.0) / light
-    change, common = _winsorize(whole)
-    curved = _second_differences(change)
+    whole = jnp.where(usable, before - planes, 0.0) / light
+    change, common = winsorize(whole, BOUND)
+    curved = second_differences(change)
     bands = _split(change)
-    variance = _measure_noise(bands, curved, light, surface)
-    weights = _weigh(bands, _split(whole)[-1], variance)
+    energies = [_energy(band, radius) for band, radius in zip(bands, RADII, strict=True)]
+    variance = _measure_noise([energy for energy, _ in energies[:3]], curved, light, known)
+    weights = _weigh(energies, mean_square(_split(whole)[-1] - bands[-1]), variance)
     kept = sum(weight * band for weight, band in zip(weights, bands, strict=True))
     own = sum(weight * center for weight, center in zip(weights, _CENTERS, strict=True))
-    clean = _clean(curved, surface)
+    clean = _clean(curved, known)
     own, kept = own + clean * (1 - own), kept + clean * (change - kept)
     # A firefly among quiet blocks is noise none the less.
-    own, kept, clean = (jnp.where(usable & common, part, 0.0) for part in (own, kept, clean))
+    own, kept, clean = (jnp.where(usable & (common > 0), part, 0.0) for part in (own, kept, clean))
     # Stein's estimate: the mean square of what is left, less the noise in it, of which `own` stays in the image.
-    risk = _mean_square(change - kept) + (2 * own - 1) * variance
-    lost = jnp.sqrt(jnp.maximum(_window(_mean_square(change), RADII[0]) - variance, 0.0))
-    image = jnp.where(clean == 1, noisy, denoised + light * kept)
+    risk = mean_square(change - kept) + (2 * own - 1) * variance
+    lost = jnp.sqrt(jnp.maximum(window_means(mean_square(change), RADII[0]) - variance, 0.0))
+    image = jnp.where(clean == 1, before, planes + light * kept)
     seen = _visibility(light, level)
-    return JamesStein(image, own, jnp.sqrt(variance), lost, seen * risk, seen * variance)
+    return JamesStein(*map(to_pixels, (image, own, jnp.sqrt(variance), lost, seen * risk, seen * variance)))
 
 
 def keep_detail(noisy: jax.Array, denoised: jax.Array) -> jax.Array:
@@ -189,12 +197,11 @@ def keep_detail(noisy: jax.Array, denoised: jax.Array) -> jax.Array:
     As :func:`combine` in one band: ``denoised + w d`` with ``w = max(0, 1 - 2 V / E)``, where E is the mean square of d
     and V its noise by direction, in windows of :data:`_NEAR`. Blocks without noise say nothing of those beside them.
     """
-    change = noisy - denoised
-    by_direction = _window(_second_differences(change), _NEAR)
-    variance = _DIRECTION_BIAS * jnp.min(by_direction, axis=-1, keepdims=True)
-    energy = _window(_mean_square(change), _NEAR)
+    change = to_planes(noisy - denoised)
+    variance = _DIRECTION_BIAS * _least(window_means(second_differences(change), _NEAR))
+    energy = window_means(mean_square(change), _NEAR)
     weight = jnp.where(energy > 0, 1 - 2 * variance / jnp.where(energy > 0, energy, 1.0), 0.0)
-    return denoised + jnp.clip(weight, 0.0, 1.0) * change
+    return denoised + to_pixels(jnp.clip(weight, 0.0, 1.0)) * (noisy - denoised)
 
 
 def measure_confidence(combined: JamesStein) -> Confidence:
@@ -220,34 +227,14 @@ def measure_level(denoised: jax.Array) -> jax.Array:
     return jnp.nan_to_num(median(jnp.maximum(light, 0.0), light > 0))
 
 
-def _winsorize(change: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Changes within :data:`BOUND`, or the median size of the 3x3 around if that is more; and [H, W, 1] which were."""
-    size = jnp.mean(jnp.abs(change), axis=-1)
-    bound = jnp.maximum(median_3x3(size), BOUND)[..., None]
-    # Of a size of which the fourth power is finite.
-    bounded = jnp.clip(jnp.clip(change, -bound, bound), -1e8, 1e8)
-    return bounded, jnp.all(jnp.abs(change) <= bound, axis=-1, keepdims=True)
-
-
 def _split(image: jax.Array) -> list[jax.Array]:
-    """The bands [H, W, C] of an image, the finest first, and the rest; they add up to it."""
+    """The bands [3, H, W] of an image, the finest first, and the rest; they add up to it."""
     bands = []
     for band in range(len(GAINS) - 1):
-        smooth = _smooth(image, 2**band)
-        bands.append(image - smooth)
-        image = smooth
+        coarse = smooth(image, _TAPS, 2**band)
+        bands.append(image - coarse)
+        image = coarse
     return [*bands, image]
-
-
-def _smooth(image: jax.Array, step: int) -> jax.Array:
-    """[H, W, C] filtered with the B3 spline, whose taps are ``step`` apart, mirrored at the border."""
-    for axis in (-3, -2):
-        widths = [(0, 0)] * 3
-        widths[axis] = (2 * step, 2 * step)
-        wide, length = jnp.pad(image, widths, mode="symmetric"), image.shape[axis]
-        parts = [jax.lax.slice_in_dim(wide, k * step, k * step + length, axis=axis + 3) for k in range(5)]
-        image = functools.reduce(jnp.add, (float(tap) * part for tap, part in zip(B3_SPLINE, parts, strict=True)))
-    return image
 
 
 def _centers() -> tuple[float, ...]:
@@ -266,24 +253,20 @@ def _centers() -> tuple[float, ...]:
 _CENTERS = _centers()
 
 
-def _second_differences(change: jax.Array) -> jax.Array:
-    """[H, W, 4] the squares of a change's second differences along each direction; the mean is V for noise."""
-    height, width = change.shape[:2]
-    # Mirrored: repeated pixels at the border would look smooth.
-    padded = jnp.pad(change, ((1, 1), (1, 1), (0, 0)), mode="reflect")
-
-    def at(dy: int, dx: int) -> jax.Array:
-        return padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width]
-
-    along = [at(dy, dx) - 2 * change + at(-dy, -dx) for dy, dx in _DIRECTIONS]
-    return jnp.concatenate([_mean_square(one) / 6 for one in along], axis=-1)
+def _energy(band: jax.Array, radius: int) -> tuple[jax.Array, jax.Array]:
+    """The mean square of a band in windows, and the mean of the squares of that of pixels, [1, H, W] each."""
+    square = mean_square(band)
+    energy, fourth = jnp.split(window_means(jnp.concatenate([square, square**2]), radius), 2)
+    return energy, fourth
 
 
-def _measure_noise(bands: list[jax.Array], curved: jax.Array, light: jax.Array, surface: jax.Array | None) -> jax.Array:
-    """V of each pixel, [H, W, 1]."""
-    finest, next_one, third = (_window(_mean_square(band), RADII[0]) for band in bands[:3])
+def _measure_noise(
+    energies: list[jax.Array], curved: jax.Array, light: jax.Array, surface: jax.Array | None
+) -> jax.Array:
+    """V of each pixel, [1, H, W], by the energies of the three finest bands and the second differences."""
+    finest, next_one, third = energies
     by_scale = jnp.maximum(finest - SLOPE * next_one, 0.0) / (GAINS[0] - SLOPE * GAINS[1])
-    by_direction = _DIRECTION_BIAS * jnp.min(_window(curved, RADII[0]), axis=-1, keepdims=True)
+    by_direction = _DIRECTION_BIAS * _least(window_means(curved, RADII[0]))
     variance = jnp.clip(by_scale, _LEAST * by_direction, by_direction)
     quiet, some = _quietest(curved, light, surface), jnp.maximum(by_direction, _TINY)
     blurred = 1 - _falling(third / (GAINS[2] * some), *BLURRED)
@@ -292,37 +275,36 @@ def _measure_noise(bands: list[jax.Array], curved: jax.Array, light: jax.Array, 
 
 
 def _quietest(curved: jax.Array, light: jax.Array, surface: jax.Array | None) -> jax.Array:
-    """The least noise that blocks of surfaces near each pixel [H, W, 1] allow, without bias; interpolated between them.
+    """The least noise that blocks of surfaces near each pixel [1, H, W] allow, without bias; interpolated between them.
 
     A sky has no noise, and says nothing of what is beside it. The result is very large where there is no such block. A
     brighter block says how much noise there is in light, not in its share: where a sun adds light without noise, that
     share is smaller.
     """
-    blocks, bright = jnp.min(_mean_blocks(curved), axis=-1), _mean_blocks(light)[..., 0]
+    blocks, bright = _least(_mean_blocks(curved)), _mean_blocks(light)
     if surface is not None:
-        blocks = jnp.where(_mean_blocks(surface.astype(curved.dtype))[..., 0] == 1, blocks, _NO_BLOCK)
-    rows, columns = blocks.shape
-    around = [jnp.pad(image, QUIET, constant_values=value) for image, value in ((blocks, _NO_BLOCK), (bright, 0.0))]
+        blocks = jnp.where(_mean_blocks(surface.astype(curved.dtype)) == 1, blocks, _NO_BLOCK)
+    rows, columns = blocks.shape[1:]
+    widths = ((0, 0), (QUIET, QUIET), (QUIET, QUIET))
+    around = [jnp.pad(image, widths, constant_values=value) for image, value in ((blocks, _NO_BLOCK), (bright, 0.0))]
     least = jnp.full_like(blocks, _NO_BLOCK)
     for dy, dx in np.ndindex(2 * QUIET + 1, 2 * QUIET + 1):
-        noise, other = (image[dy : dy + rows, dx : dx + columns] for image in around)
+        noise, other = (image[:, dy : dy + rows, dx : dx + columns] for image in around)
         least = jnp.minimum(least, noise * jnp.maximum(other / bright, 1.0) ** 2)
-    return _QUIETEST * _enlarge(least[..., None], curved.shape[:2])
+    return _QUIETEST * _enlarge(least, light.shape[1:])
 
 
-def _weigh(bands: list[jax.Array], rest: jax.Array, variance: jax.Array) -> list[jax.Array]:
-    """The weight of each band, [H, W, 1] each.
+def _weigh(energies: list[tuple[jax.Array, jax.Array]], cut: jax.Array, variance: jax.Array) -> list[jax.Array]:
+    """The weight of each band, [1, H, W] each.
 
-    Where Winsorizing cut off light, the mean of what it left is too low: by how much tells ``rest`` [H, W, C], that of
-    the whole change. It counts as noise of the bands' rest. Of much noise that rest is not kept at all: the mean of
-    noisy over denoised light is not 1, where noise is left in both.
+    Where Winsorizing cut off light, the mean of what it left is too low: the square of that is ``cut`` [1, H, W], by
+    the rest of the whole change. It counts as noise of the bands' rest. Of much noise that rest is not kept at all: the
+    mean of noisy over denoised light is not 1, where noise is left in both.
     """
-    cut = [0.0] * (len(bands) - 1) + [_window(_mean_square(rest - bands[-1]), RADII[-1])]
+    biases = [0.0] * (len(energies) - 1) + [window_means(cut, RADII[-1])]
     weights = []
-    for band, bias, gain, doubt, radius in zip(bands, cut, GAINS, DOUBT, RADII, strict=True):
-        square = _mean_square(band)
-        energy, fourth = _window(square, radius), _window(square**2, radius)
-        noise = bias + gain * (variance if radius == RADII[0] else _window(variance, radius))
+    for (energy, fourth), bias, gain, doubt, radius in zip(energies, biases, GAINS, DOUBT, RADII, strict=True):
+        noise = bias + gain * (variance if radius == RADII[0] else window_means(variance, radius))
         number = (2 * radius + 1) ** 2 * energy**2 / jnp.where(fourth > 0, fourth, 1.0)
         excess = jnp.minimum(doubt / jnp.sqrt(jnp.maximum(number, 1.0)), MOST_DOUBT)
         weights.append(jnp.clip(1 - (1 + excess) * noise / jnp.where(energy > 0, energy, 1.0), 0.0, 1.0))
@@ -331,47 +313,37 @@ def _weigh(bands: list[jax.Array], rest: jax.Array, variance: jax.Array) -> list
 
 
 def _clean(curved: jax.Array, surface: jax.Array | None) -> jax.Array:
-    """How far pixels are among blocks without noise, [H, W, 1] in [0, 1]: by their share of the blocks with surfaces.
+    """How far pixels are among blocks without noise, [1, H, W] in [0, 1]: by their share of the blocks with surfaces.
 
     Between blocks it is interpolated, before it is decided.
     """
-    quiet = _falling(jnp.sqrt(jnp.min(_mean_blocks(curved), axis=-1, keepdims=True)), *CLEAN)
+    quiet = _falling(jnp.sqrt(_least(_mean_blocks(curved))), *CLEAN)
     known = jnp.ones_like(quiet)
     if surface is not None:
         known = (_mean_blocks(surface.astype(curved.dtype)) > 0.5).astype(curved.dtype)
-    number = _window(known, AROUND)
-    share = _window(quiet * known, AROUND) / jnp.where(number > 0, number, 1.0)
-    return 1 - _falling(_enlarge(share, curved.shape[:2]), *MANY)
+    number = window_means(known, AROUND)
+    share = window_means(quiet * known, AROUND) / jnp.where(number > 0, number, 1.0)
+    return 1 - _falling(_enlarge(share, curved.shape[1:]), *MANY)
 
 
 def _enlarge(blocks: jax.Array, size: tuple[int, ...]) -> jax.Array:
-    """[H, W, 1] blocks of :data:`BLOCK` pixels a side, interpolated."""
-    rows, columns = blocks.shape[:2]
+    """[1, h, w] blocks of :data:`BLOCK` pixels a side, interpolated."""
+    rows, columns = blocks.shape[1:]
     height, width = size
-    return jax.image.resize(blocks, (rows * BLOCK, columns * BLOCK, 1), "linear")[:height, :width]
+    return jax.image.resize(blocks, (1, rows * BLOCK, columns * BLOCK), "linear")[:, :height, :width]
 
 
 def _mean_blocks(image: jax.Array) -> jax.Array:
-    """[h, w, C] the means of blocks of [H, W, C]; at the end of the frame the last pixels are repeated."""
-    height, width, channels = image.shape
+    """[C, h, w] the means of blocks of [C, H, W]; at the end of the frame the last pixels are repeated."""
+    channels, height, width = image.shape
     rows, columns = -(-height // BLOCK), -(-width // BLOCK)
-    widths = ((0, rows * BLOCK - height), (0, columns * BLOCK - width), (0, 0))
-    return jnp.mean(jnp.pad(image, widths, mode="edge").reshape(rows, BLOCK, columns, BLOCK, channels), axis=(1, 3))
+    widths = ((0, 0), (0, rows * BLOCK - height), (0, columns * BLOCK - width))
+    return jnp.mean(jnp.pad(image, widths, mode="edge").reshape(channels, rows, BLOCK, columns, BLOCK), axis=(2, 4))
 
 
-def _window(image: jax.Array, radius: int) -> jax.Array:
-    """Means over windows of 2 radius + 1 pixels a side, of what of them is in the image [H, W, C]."""
-    ones = jnp.ones((*image.shape[:2], 1), image.dtype)
-    planes = jnp.concatenate([image, ones], axis=-1)
-    planes = jnp.pad(planes, ((radius, radius), (radius, radius), (0, 0)))
-    for axis in (-3, -2):
-        planes = correlate(planes, np.ones((2 * radius + 1, 1)), axis=axis)
-    return planes[..., :-1] / planes[..., -1:]
-
-
-def _mean_square(image: jax.Array) -> jax.Array:
-    """[H, W, 1] over the colours."""
-    return jnp.mean(image**2, axis=-1, keepdims=True)
+def _least(planes: jax.Array) -> jax.Array:
+    """[1, H, W] of planes [C, H, W], plane by plane as :func:`mean`."""
+    return functools.reduce(jnp.minimum, jnp.split(planes, len(planes)))
 
 
 def _visibility(light: jax.Array, level: jax.Array | float) -> jax.Array:

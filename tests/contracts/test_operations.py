@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import jaxdn.networks.recurrent  # noqa: F401  (declares its operation)
+import jaxdn.networks.recurrent  # declares its operation
+import jaxdn.sequence.james_stein  # noqa: F401  (likewise)
 from jaxdn.methods.registry import methods
 from jaxdn.ops.affinity import pallas_kernels
 from jaxdn.ops.dispatch.operation import OPERATIONS, REFERENCE

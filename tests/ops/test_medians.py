@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.core.medians import median, median_3x3, median_of_nine
+from jaxdn.ops.medians import median, median_3x3, median_of_nine
 
 
 @pytest.mark.parametrize("number", [1, 2, 3, 10, 1001, 4096])

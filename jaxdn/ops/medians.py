@@ -1,7 +1,13 @@
 """Medians of whole images and of windows, without sorting: XLA sorts one number at a time on CPUs."""
 
+from collections.abc import Iterator
+
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from jaxdn.ops.dispatch import numba_call
+from jaxdn.ops.dispatch.operation import Example, operation
 
 _BITS = 31
 """Of a float32 that is not negative."""
@@ -11,18 +17,26 @@ _NINE_END = ((1, 4), (2, 5), (4, 7), (4, 2), (6, 4), (4, 2))
 3x3 grid", Graphics Gems, 1990)."""
 
 
-def median(values: jax.Array, counted: jax.Array | None = None) -> jax.Array:
+def median(values: jax.Array, counted: jax.Array | None = None, *, implementation: str | None = None) -> jax.Array:
     """The median of numbers >= 0 in float32, the mean of the two in the middle where their number is even; exact.
-
-    The bits of such numbers are in their order. From the highest bit on, each is set if no more numbers are below than
-    shall be: 31 passes over the image instead of a sort.
 
     Args:
       values: of any shape, without NaN where they count.
       counted: bool of the same shape, which of them count; None: all. Without any, the median is 0.
+      implementation: see :mod:`jaxdn.ops.dispatch.operation`.
+    """
+    counted = jnp.ones(jnp.shape(values), bool) if counted is None else counted
+    return _median(jnp.ravel(values), jnp.ravel(counted), implementation=implementation)
+
+
+@operation(name="median")
+def _median(values: jax.Array, counted: jax.Array) -> jax.Array:
+    """:func:`median` of numbers in a row.
+
+    The bits of such numbers are in their order. From the highest bit on, each is set if no more numbers are below than
+    shall be: 31 passes over the image instead of a sort.
     """
     bits = jax.lax.bitcast_convert_type(jnp.asarray(values, jnp.float32) + 0.0, jnp.int32)
-    counted = jnp.ones(bits.shape, bool) if counted is None else counted
     number = jnp.sum(counted, dtype=jnp.int32)
 
     def set_bit(step: jax.Array, found: jax.Array) -> jax.Array:
@@ -36,6 +50,19 @@ def median(values: jax.Array, counted: jax.Array | None = None) -> jax.Array:
     upper = jnp.where(up_to > number // 2, lower, following)
     low, high = (jax.lax.bitcast_convert_type(one, jnp.float32) for one in (lower, upper))
     return jnp.where(number > 0, jnp.where(low == high, low, 0.5 * low + 0.5 * high), 0.0)
+
+
+@numba_call.implements(_median)
+def _median_by_numba(values: jax.Array, counted: jax.Array) -> jax.Array:
+    from jaxdn.ops.numba_medians import find_median
+
+    return numba_call.call(find_median, [(1,)], [values, counted], rows=1)[0][0]
+
+
+@_median.example
+def _median_example(rng: np.random.Generator, height: int, width: int) -> Iterator[Example]:
+    for number in (height * width, height * width + 1):
+        yield Example((rng.gamma(0.3, 1, number), rng.random(number) < 0.7))
 
 
 def median_of_nine(images: list[jax.Array]) -> jax.Array:
