@@ -202,6 +202,14 @@ def test_swapped_guides(tmp_path, inspect):
     assert "the other way around" in record["findings"][0]["remedy"]
 
 
+def test_swapped_guides_whose_normals_are_colours(tmp_path, inspect):
+    def swap(index, layers):
+        albedo, normal = layers["Denoising Albedo"], layers["Denoising Normal"]
+        return layers | {"Denoising Albedo": 0.5 + 0.5 * normal, "Denoising Normal": albedo}
+
+    assert names(inspect(write_shot(tmp_path / "shot", swap))) == ["swapped guides: albedo and normal"]
+
+
 def test_normals_stored_as_colours(tmp_path, inspect):
     def encode(index, layers):
         return layers | {"Denoising Normal": 0.5 + 0.5 * layers["Denoising Normal"]}
@@ -209,9 +217,9 @@ def test_normals_stored_as_colours(tmp_path, inspect):
     assert names(inspect(write_shot(tmp_path / "shot", encode))) == ["normals stored as colours"]
 
 
-@pytest.mark.parametrize("guide", ["Denoising Albedo"])
-def test_a_guide_that_is_upside_down(tmp_path, inspect, guide):
-    record = inspect(write_shot(tmp_path / "shot", lambda index, layers: layers | {guide: layers[guide][::-1]}))
+def test_an_albedo_that_is_upside_down(tmp_path, inspect):
+    turned = "Denoising Albedo"
+    record = inspect(write_shot(tmp_path / "shot", lambda index, layers: layers | {turned: layers[turned][::-1]}))
     assert "flipped guide: albedo" in names(record)
     assert "upside down" in next(f["evidence"] for f in record["findings"] if f["name"].startswith("flipped guide"))
 
@@ -470,6 +478,16 @@ def test_vectors_without_the_camera_are_a_finding():
     assert found.name == "vectors without the camera"
     moving = camera | {"left by camera": 0.2}  # what moves by itself explains the difference
     assert find_all(["a", "b"], [figures | moving] * 2, known) == []
+
+
+def test_a_little_texture_that_moves_otherwise_is_no_finding():
+    """As of what a mirror shows."""
+    figures = {"light": 1.0, "noise": 0.1, "fireflies": 0.0, "left as given": 0.01, "left turned around": 0.2}
+    figures |= {"disagrees": 0.6, "left by given": 0.02, "left by measured": 0.01}
+    known = Known("cycles", {}, "")
+    assert find_all(["a", "b"], [figures | {"certain": 0.02}] * 2, known) == []
+    (found,) = find_all(["a", "b"], [figures | {"certain": 0.4}] * 2, known)
+    assert found.name == "vectors of something else"
 
 
 @pytest.mark.browser

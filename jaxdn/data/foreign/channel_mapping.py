@@ -22,6 +22,9 @@ OWN = "previous-current"
 UNSTATED = "nothing says: state --motion-convention"
 """What motion vectors are taken for whose convention nobody has stated."""
 
+CAMERA_SPACE = "camera space"
+"""What normals are taken for that are said to be those of the camera."""
+
 
 class MappedBuffer(NamedTuple):
     """One buffer that is read."""
@@ -108,7 +111,7 @@ def _describe(name: str, channels: Channels, motion: str | None) -> str:
         along_ray = last == "denoising depth" or channels[0].lower().endswith(".t")  # Cycles; Mitsuba
         return "along the ray" if along_ray else "along the optical axis (view-space z), not along the ray"
     if name == "normal":
-        return "camera space" if last in CAMERA_NORMALS else "world space"
+        return CAMERA_SPACE if last in CAMERA_NORMALS else "world space"
     if name == "roughness":
         return "linear, GGX alpha is its square"
     if name == "ids" and is_cryptomatte(channels):

@@ -7,6 +7,7 @@ import numpy as np
 
 from jaxdn.data.foreign.vectors import MOTION_CONVENTIONS
 from jaxdn.evaluation.overlay.evidence import FLIPS
+from jaxdn.evaluation.overlay.geometry import AS_GIVEN, MIRRORED
 from jaxdn.evaluation.overlay.measure import MOVES, TURNED
 
 CLEARLY = 0.6
@@ -15,6 +16,8 @@ TURNED_BETTER = 0.75
 """... and vectors that are turned around if they leave less than this share."""
 MANY = 0.25
 """Share of the pixels from which on a disagreement is no matter of edges."""
+SEEN = 0.05
+"""Share of the picture on which given and measured motion have to differ: what less texture shows may be a mirror."""
 SPARKS = 0.002
 """Share of the pixels that are fireflies from which on they are told."""
 NOISE_FREE = 0.002
@@ -23,6 +26,16 @@ NOISY_GUIDE = 0.1
 """Median noise of a guide from which on it keeps noise in the picture."""
 BRIGHTER = 1.3
 """A frame so many times brighter or darker than both its neighbours, which agree, was rendered otherwise."""
+WRONG_ORDER = 0.3
+"""Share of newly visible pixels that are behind what hid them, below which depth falls with the distance."""
+AGREES = 0.6
+"""Share of the directions that has to agree with the depth before normals are called flipped ..."""
+CLEARER = 1.2
+"""... and how many times larger it has to be than that of the normals as they are."""
+POINT_AWAY = 0.05
+"""Share of the pixels from which on normals that point into the surface are told, if these and those that agree ..."""
+MOST_NORMALS = 0.9
+"""... are this share: on mirrors and glass, renderers write the normals of what is seen there."""
 
 _SIGNS = {"previous-current": (1, 1), "current-previous": (-1, -1), "cycles": (1, -1), "forward-up": (-1, 1)}
 """The factors of x and y of conventions in pixels."""
@@ -63,7 +76,8 @@ def find_all(names: Sequence[str], figures: Sequence[Mapping[str, float]], known
     keys = {key for each in figures for key in each}
     mean = {key: float(np.mean([each[key] for each in figures if key in each])) for key in keys}
     frames = [*_frames(known), *_brightness(names, figures)]
-    causes = [*_motion(mean, known), *_guides(mean)]
+    vectors, guides = _motion(mean, known), _guides(mean)
+    causes = [*vectors, *guides, *([] if vectors else _depth(mean)), *([] if guides else _normals(mean))]
     return [*frames, *causes, *([] if causes else _history(mean)), *_noise(mean)]
 
 
@@ -114,6 +128,8 @@ def _motion(mean: Mapping[str, float], known: Known) -> list[Finding]:
         if mean.get("measured motion", 0.0) > MANY:
             return [_missing_motion(mean)]
         return []
+    if forward := _exchanged_motion(mean):
+        return [forward]
     given = mean.get("left as given")
     tried = {name: mean[f"left {name}"] for name in (*TURNED, "swapped") if f"left {name}" in mean}
     if given is not None:
@@ -125,7 +141,8 @@ def _motion(mean: Mapping[str, float], known: Known) -> list[Finding]:
         if ratio < CLEARLY:
             return [_other_than_camera(mean, ratio)]
     ratio = mean.get("left by measured", 1.0) / max(mean.get("left by given", 1.0), 1e-12)
-    if mean.get("disagrees", 0.0) > MANY and ratio < CLEARLY:
+    disagrees = mean.get("disagrees", 0.0)
+    if disagrees > MANY and disagrees * mean["certain"] > SEEN and ratio < CLEARLY:
         return [_disagreeing_motion(mean, ratio)]
     return []
 
@@ -146,6 +163,20 @@ def _missing_motion(mean: Mapping[str, float]) -> Finding:
         f"{share:.0%} of the pixels with texture move by more than {MOVES} pixels, and the files have no vectors.",
         "Switch on the renderer's motion vectors (Blender: Passes > Vector, and motion blur off). Without them what "
         "moves leaves trails.",
+    )
+
+
+def _exchanged_motion(mean: Mapping[str, float]) -> Finding | None:
+    """Vectors that lead to the next frame; at even speed they are those to the frame before, turned around."""
+    before = min(mean.get("left as given", 0.0), mean.get("left turned around", 0.0))
+    after = min(mean.get("left as forward", np.inf), mean.get("left as forward turned", np.inf))
+    if not after < TURNED_BETTER * before:
+        return None
+    return Finding(
+        "exchanged vectors",
+        f"The vectors lead to the next frame: to it they leave {after / before:.0%} of what they leave otherwise.",
+        "Write those to the frame before (of Blender's Vector, X and Y are to the frame before, Z and W to the next). "
+        "--motion-convention none leaves them out.",
     )
 
 
@@ -224,6 +255,10 @@ def _guides(mean: Mapping[str, float]) -> list[Finding]:
         what = f"Normals have no negative component, and {mean['negative albedo']:.0%} of the albedo is negative."
         remedy = "Name the two layers the other way around: --channels albedo=... normal=..."
         found.append(Finding("swapped guides: albedo and normal", what, remedy))
+    elif max(unit, encoded) < 0.5 and mean.get("albedo of normals", 0.0) > 0.8:
+        what = f"{mean['albedo of normals']:.0%} of the albedo are normals stored as colours, and the normals are none."
+        remedy = "Name the two layers the other way around: --channels albedo=... normal=..., with signed normals."
+        found.append(Finding("swapped guides: albedo and normal", what, remedy))
     elif unit < 0.5 and encoded > 0.5:
         what = f"{encoded:.0%} of the normals have unit length as 2 n - 1, and {unit:.0%} as they are."
         found.append(Finding("normals stored as colours", what, "Write normals with their signs, from -1 to 1."))
@@ -236,6 +271,43 @@ def _guides(mean: Mapping[str, float]) -> list[Finding]:
         remedy = "Name the layer that holds the albedo, or leave this one out: --channels albedo=none."
         found.append(Finding("an albedo that is none", what, remedy))
     return found + _turned_guides(mean)
+
+
+def _depth(mean: Mapping[str, float]) -> list[Finding]:
+    """Depth that falls with the distance, or that has no unit."""
+    order = mean.get("occlusion order", 1.0)
+    leave = "or leave depth out: --channels depth=none."
+    if order < WRONG_ORDER:
+        what = f"{1 - order:.0%} of the pixels that come into sight have less depth than what hid them."
+        remedy = f"Write the distance itself, not 1 / z and nothing that falls with the distance, {leave}"
+        return [Finding("inverted depth", what, remedy)]
+    if mean.get("normalised depth", 0.0) > 0.5:
+        what = "Depth is from 0 to 1, and reaches 1: it was normalised, or is a z-buffer's value."
+        return [Finding("normalised depth", what, f"Write the distance in the scene's unit, {leave}")]
+    return []
+
+
+def _normals(mean: Mapping[str, float]) -> list[Finding]:
+    """Normals that contradict the slopes of the depth."""
+    prefix = "normals agree "
+    agree = {key.removeprefix(prefix): share for key, share in mean.items() if key.startswith(prefix)}
+    if not agree or mean.get("occlusion order", 1.0) < WRONG_ORDER:
+        return []
+    best = max(agree, key=lambda name: agree[name])
+    if agree[best] > AGREES and agree[best] > CLEARER * agree[AS_GIVEN]:
+        told = (
+            f"{agree[best]:.0%} of their directions agree with the slopes of the depth {best}, {agree[AS_GIVEN]:.0%} so"
+        )
+        axes = "one axis, or all three" if best == MIRRORED else best.removeprefix("with ").removesuffix(" turned")
+        remedy = f"Turn the sign of {axes} where normals are written, or leave them out: --channels normal=none."
+        if best == MIRRORED:
+            remedy += " If the renderer's world is left-handed, they are right."
+        return [Finding("flipped normals", f"{told}.", remedy)]
+    if mean["normals away"] > POINT_AWAY and mean["normals agreeing"] + mean["normals away"] > MOST_NORMALS:
+        what = f"{mean['normals away']:.1%} of the normals point into the surface, and those of other surfaces do not."
+        remedy = "Recalculate the normals of these meshes, or write those that face the camera."
+        return [Finding("normals that point away", what, remedy)]
+    return []
 
 
 def _turned_guides(mean: Mapping[str, float]) -> list[Finding]:

@@ -20,6 +20,7 @@ from jaxdn.evaluation.overlay.evidence import (
     relative_noise,
     second_difference,
 )
+from jaxdn.evaluation.overlay.geometry import Space, compare_normals, occlusion_order
 from jaxdn.evaluation.overlay.motion_search import box_mean, measure_motion
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import guides_of, surface_mask
@@ -70,7 +71,13 @@ class Measurer:
         self._before = self._camera = self._history = None
 
     def add(
-        self, name: str, frame: Frame, *, header: Mapping[str, Any] | None = None, albedo: np.ndarray | None = None
+        self,
+        name: str,
+        frame: Frame,
+        *,
+        header: Mapping[str, Any] | None = None,
+        stored: Mapping[str, np.ndarray] | None = None,
+        space: Space = "world",
     ) -> FrameOverlay:
         """Measure the next frame.
 
@@ -78,9 +85,11 @@ class Measurer:
           name: of its file.
           frame: its buffers, as NumPy arrays.
           header: the attributes of its file.
-          albedo: the albedo as it is in the file, before it is clamped.
+          stored: albedo and depth as they are in the file, before they are clamped.
+          space: what the normals are taken for.
         """
-        layers, figures = _look_at_one(frame, albedo)
+        layers, figures = _look_at_one(frame, stored or {})
+        figures.update(_look_at_geometry(frame, space))
         camera = read_camera(header or {})
         before = self._before
         history = jnp.ones((*frame.radiance.shape[:2], 1), jnp.float32)
@@ -136,7 +145,22 @@ def _tested(frame: Frame) -> Frame:
     )
 
 
-def _look_at_one(frame: Frame, albedo: np.ndarray | None) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+def _look_at_geometry(frame: Frame, space: Space) -> dict[str, float]:
+    """How well normals agree with depth."""
+    if frame.normal is None or frame.depth is None:
+        return {}
+    ids = None if frame.ids is None else np.asarray(frame.ids)[..., 0]
+    normal, depth = np.nan_to_num(np.asarray(frame.normal)), np.asarray(frame.depth)[..., 0]
+    found = compare_normals(normal, depth, ids, space=space)
+    if found is None:
+        return {}
+    return {f"normals agree {name}": share for name, share in found.agree.items()} | {
+        "normals agreeing": found.agreeing,
+        "normals away": found.away,
+    }
+
+
+def _look_at_one(frame: Frame, stored: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, float]]:
     """The maps and figures that need no other frame."""
     light = np.nan_to_num(np.asarray(frame.radiance, np.float64), posinf=0.0, neginf=0.0)
     noise, bright = relative_noise(light), fireflies(light)
@@ -160,8 +184,13 @@ def _look_at_one(frame: Frame, albedo: np.ndarray | None) -> tuple[dict[str, np.
             figures.update({f"{guide} {name}": value for name, value in found.items()})
     if frame.normal is not None:
         figures.update(normal_figures(np.nan_to_num(frame.normal)))
-    if albedo is not None:
-        figures["negative albedo"] = float(np.mean(np.nan_to_num(albedo).min(axis=-1) < -0.02))
+    if "albedo" in stored:
+        albedo = np.nan_to_num(stored["albedo"])
+        figures["negative albedo"] = float(np.mean(albedo.min(axis=-1) < -0.02))
+        figures["albedo of normals"] = normal_figures(albedo).get("encoded normals", 0.0)
+    if "depth" in stored:
+        low, high = float(np.nanmin(stored["depth"])), float(np.nanmax(stored["depth"]))
+        figures["normalised depth"] = float(0 <= low < high == 1)
     return layers, figures
 
 
@@ -205,6 +234,11 @@ def _compare_motion(
         for name, factors in TURNED.items():
             figures[f"left {name}"] = _left(first, second, filled * np.asarray(factors, np.float32), moves)
         figures["left swapped"] = _left(first, second, filled[..., ::-1], moves)
+    figures.update(_read_forward(before, first, second))
+    if frame.depth is not None and (frame.albedo is not None or frame.normal is not None):
+        change = np.abs(np.asarray(_warp(first, filled)) - second).mean(axis=-1)
+        order = occlusion_order(np.asarray(frame.depth)[..., 0], filled, change, tested)
+        figures |= {} if order is None else {"occlusion order": order}
     difference = np.linalg.norm(filled - found.motion, axis=-1)
     both = found.certain & tested & np.asarray(on_screen(jnp.asarray(filled)))[..., 0] & ~_hidden(layers, tested)
     layers["motion_error"] = np.where(both, difference, np.nan)[..., None]
@@ -221,6 +255,22 @@ def _compare_motion(
             figures["camera differs"] = float(np.mean(np.linalg.norm(filled - moved, axis=-1)[follows] > MOVES))
             figures["left by camera"] = _left(first, second, np.nan_to_num(moved), follows)
             figures["left beside camera"] = _left(first, second, filled, follows)
+
+
+def _read_forward(before: Frame, first: np.ndarray, second: np.ndarray) -> dict[str, float]:
+    """What the vectors of the frame before leave, taken for vectors to this frame, with both signs."""
+    if before.motion is None:
+        return {}
+    given = np.nan_to_num(np.asarray(before.motion, np.float32))
+    moves = np.abs(given).max(axis=-1) > MOVES
+    for sign in (1, -1):
+        moves &= np.asarray(on_screen(jnp.asarray(sign * given)))[..., 0]
+    if moves.sum() < FEWEST:
+        return {}
+    return {
+        "left as forward": _left(second, first, given, moves),
+        "left as forward turned": _left(second, first, -given, moves),
+    }
 
 
 def _hidden(layers: dict[str, np.ndarray], tested: np.ndarray) -> np.ndarray:

@@ -11,11 +11,12 @@ from jaxdn.core.frame import Frame
 from jaxdn.data.errors import ClipError, DamagedFile
 from jaxdn.data.exr.exr import to_half, write_exr
 from jaxdn.data.exr.file import ExrFile
-from jaxdn.data.foreign.channel_mapping import MappedBuffer
+from jaxdn.data.foreign.channel_mapping import CAMERA_SPACE, MappedBuffer
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
-from jaxdn.data.foreign.layers import stack_channels
+from jaxdn.data.foreign.layers import last_name, stack_channels
 from jaxdn.evaluation.overlay.findings import Finding, Known, find_all
+from jaxdn.evaluation.overlay.geometry import Space
 from jaxdn.evaluation.overlay.measure import FrameOverlay, Measurer
 from jaxdn.evaluation.overlay.page import overlay_page
 from jaxdn.evaluation.overlay.views import draw_views
@@ -93,14 +94,15 @@ def write_overlay(
     out.mkdir(parents=True, exist_ok=True)
     unusable = dict(unusable or {})
     naming = naming if unexplained is None else replace(naming, motion_convention="none")
-    albedo = next((mapped.channels for mapped in mapping if mapped.buffer == "albedo"), None)
+    kept = {mapped.buffer: mapped.channels for mapped in mapping if mapped.buffer in ("albedo", "depth")}
+    space = _space_of_normals(mapping)
     measurer, films = Measurer(), _Films()
     names: list[str] = []
     figures: list[dict[str, float]] = []
-    for file, frame, header, raw in _read(files, naming, albedo, unusable, measurer.restart):
+    for file, frame, header, stored in _read(files, naming, kept, unusable, measurer.restart):
         if file.path in breaks:
             measurer.restart()
-        overlay = measurer.add(file.path.name, frame, header=header, albedo=raw)
+        overlay = measurer.add(file.path.name, frame, header=header, stored=stored, space=space)
         films.add(frame, overlay)
         path = out / f"{file.path.stem}.exr"
         _write_layers(path, overlay.layers)
@@ -116,14 +118,23 @@ def write_overlay(
     return Overlay(out / PAGE, findings)
 
 
+def _space_of_normals(mapping: Sequence[MappedBuffer]) -> Space:
+    """What normals are taken for. The worlds of Unreal and pbrt are left-handed."""
+    normals = next((mapped for mapped in mapping if mapped.buffer == "normal"), None)
+    if normals is None or normals.convention == CAMERA_SPACE:
+        return "camera"
+    name = last_name(normals.channels)
+    return "either world" if name == "ns" or "worldnormal" in name else "world"
+
+
 def _read(
     files: Sequence[ExrFile],
     naming: ChannelNaming,
-    albedo: tuple[str, ...] | None,
+    kept: Mapping[str, tuple[str, ...]],
     unusable: dict[str, str],
     restart: Callable[[], None],
-) -> Iterator[tuple[ExrFile, Frame, Mapping[str, Any], np.ndarray | None]]:
-    """The frames, with their files' headers and the albedo as it is stored; damaged ones are added to ``unusable``."""
+) -> Iterator[tuple[ExrFile, Frame, Mapping[str, Any], dict[str, np.ndarray]]]:
+    """The frames, with their files' headers and the ``kept`` buffers as stored; damaged ones get into ``unusable``."""
     left = list(files)
     while left:
         sequence = ForeignSequence(left, naming)
@@ -136,8 +147,8 @@ def _read(
                 left = left[index + 1 :]
                 restart()
                 break
-            raw = None if albedo is None else stack_channels(file.placed(sequence.window), albedo)
-            yield file, frame, file.header, raw
+            pixels = file.placed(sequence.window)
+            yield file, frame, file.header, {name: stack_channels(pixels, kept[name]) for name in kept}
             file.drop()
         else:
             return
