@@ -43,7 +43,8 @@ HEAD = """# Results
 
 `make results` writes this page and the tables of the README from `docs/results/*.json`. Do not edit it.
 PSNR is in dB and higher is better. Lower is better for FLIP, L1 and relative MSE. *Disoccluded* pixels are those that
-the previous frame did not see. The revision is that of the commit that recorded the numbers. The best value of a
+the previous frame did not see. The revision is that of the commit that recorded the numbers, and has the command that
+did it; later ones may lack it. The best value of a
 column, of each group of its rows, or of a row that compares methods, is bold.
 """
 
