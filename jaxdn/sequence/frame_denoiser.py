@@ -24,7 +24,7 @@ PROGRAM = 0.6 * GIB
 HELD = 140
 """Bytes a pixel of what is there however a frame is denoised: its buffers, the state before and after, the image."""
 CHANNEL = 8
-"""Bytes a pixel of each channel of a file while it is written and read back."""
+"""Bytes a pixel of each channel of a file while it is written."""
 STEP = 1100
 """Bytes a pixel of what is denoised at once, a window or the whole frame. All four are upper bounds for the shipped
 methods on two cores, by ``python -m experiments.stability.memory``."""

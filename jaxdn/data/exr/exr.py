@@ -14,6 +14,7 @@ import numpy as np
 import OpenEXR
 
 from jaxdn.data.errors import ClipError
+from jaxdn.data.exr.completeness import check_complete
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.runtime.atomic_files import atomic_write
 
@@ -38,7 +39,7 @@ def to_half(values: np.ndarray) -> np.ndarray:
 def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
     """Write 2-D channels (float16, float32 or uint32, all of one size) as one ZIP-compressed scanline file.
 
-    The file is written under a temporary name, read back, and then renamed: it is complete or absent. Raises ValueError
+    The file is written under a temporary name, checked, and then renamed: it is complete or absent. Raises ValueError
     for channels that OpenEXR cannot store and OSError (``errno.ENOSPC`` for a full disk) if the file cannot be written.
     """
     path = Path(path)
@@ -50,7 +51,7 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
 
 
 def _write(path: Path, parts: Sequence[tuple[dict[str, Any], dict[str, np.ndarray]]]) -> None:
-    """Write parts of a header and channels each, decode them again, and rename; raises OSError as :func:`write_exr`."""
+    """Write parts of a header and channels each, see that all is there, and rename; raises OSError as its callers."""
     expected = [len(channels) for _, channels in parts]
     with atomic_write(path) as temporary:
         try:
@@ -59,9 +60,10 @@ def _write(path: Path, parts: Sequence[tuple[dict[str, Any], dict[str, np.ndarra
         except RuntimeError as error:
             code = errno.ENOSPC if "No space left" in str(error) else errno.EIO
             raise OSError(code, f"could not write the frame ({error})", str(path)) from error
-        # The writer does not notice a disk that fills up within the last buffer: check what was written.
+        # The writer does not notice a disk that fills up within the last buffer: the file ends before its last chunk.
         try:
-            written = [len(part.channels) for part in ExrFile(temporary).decode()]
+            check_complete(temporary)
+            written = [len(header["channels"]) for header in ExrFile(temporary).headers]
         except ClipError as error:
             raise OSError(errno.ENOSPC, "the file is incomplete after writing; is the disk full?", str(path)) from error
         if written != expected:
