@@ -38,8 +38,17 @@ def pytest_configure(config: pytest.Config) -> None:
     # A program of a test runs once or twice: compiled without optimisation it has the same operations, and takes a
     # third of the time. What users run is optimised: real processes compile so, and modules with optimised_programs.
     jax.config.update("jax_disable_most_optimizations", True)
+    # Tracing makes millions of small objects, few of them in cycles. To look for cycles as often as usual takes a
+    # seventh of the time of tracing and lowering.
+    gc.set_threshold(200_000, 20, 100)
     count_programs()
     _compile_quickly()
+
+
+def pytest_collection_finish() -> None:
+    """From now on the modules and tests, which live until the end, are not searched for cycles."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
