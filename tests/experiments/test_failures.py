@@ -8,6 +8,7 @@ import pytest
 from experiments.papers.failures import __main__ as failures
 from experiments.papers.failures import measure
 from experiments.papers.failures.scenes import MOVING, SCENES
+from experiments.papers.failures.sheet import make_sheet, make_table
 from jaxdn.core.frame import Frame
 
 
@@ -35,12 +36,16 @@ def test_the_share_of_an_old_image_is_found_in_noise(rng):
     where = rng.random((40, 50)) < 0.5
     for share in (0.0, 0.3, 1.0):
         image = new + share * (old - new) + 0.3 * rng.normal(size=new.shape)
-        assert measure.share_of_old(image, old, new, where) == pytest.approx(share, abs=0.03)
+        assert measure.share_of_old(image, new, old, new, where) == pytest.approx(share, abs=0.03)
+        # Blur that is there without a history is none of it.
+        blurred = 0.8 * new + 0.2 * old
+        left = measure.share_of_old(image + blurred - new, blurred, old, new, where)
+        assert left == pytest.approx(share, abs=0.03)
     # Light that finds few pixels, and these bright: black pixels are no old shadow.
     sparse = new * 4.0 * (rng.random((40, 50, 1)) < 0.25)
-    assert measure.share_of_old(sparse, 0.2 * new, new, where) == pytest.approx(0.0, abs=0.15)
+    assert measure.share_of_old(sparse, new, 0.2 * new, new, where) == pytest.approx(0.0, abs=0.15)
     image[~where] = 100.0
-    assert measure.share_of_old(image, old, new, where) == pytest.approx(1.0, abs=0.03)
+    assert measure.share_of_old(image, new, old, new, where) == pytest.approx(1.0, abs=0.03)
 
 
 def test_the_response_is_the_first_frame_with_a_tenth_left():
@@ -49,16 +54,18 @@ def test_the_response_is_the_first_frame_with_a_tenth_left():
     affected = np.zeros((9, 8, 9), bool)
     affected[3] = True
 
-    def measured(weight):
+    def measured(weight, blur=0.2):
         images = [*reference[:3]]
         for wanted in reference[3:]:
             images.append(weight * wanted + (1 - weight) * images[-1])
-        return measure.measure_failure(np.stack(images), reference, affected, moving=3)
+        # One that begins with the last movement errs by a fifth of the old image, for ever.
+        fresh = np.stack([0.8 * new + 0.2 * old] * 9)
+        return measure.measure_failure(np.stack(images) + blur * (old - new), fresh, reference, affected, moving=3)
 
     assert measured(1.0).response == 0
     assert measured(0.5).response == 3  # a sixteenth
     assert measured(0.1).response is None
-    assert measured(1.0).psnr > 100 > measured(0.5).psnr > measured(0.1).psnr
+    assert measured(1.0, blur=0.0).psnr > 100 > measured(0.5, blur=0.0).psnr > measured(0.1, blur=0.0).psnr
 
 
 def test_fallbacks_are_hidden_pixels_with_the_vector_of_their_surface():
@@ -74,6 +81,25 @@ def test_fallbacks_are_hidden_pixels_with_the_vector_of_their_surface():
     assert measure.count_fallbacks(frame._replace(motion=off, dual_motion=off)) == (12, 8)
 
 
+def test_a_sheet_has_every_image_enlarged_under_its_name(rng):
+    images = {f"method {number}": rng.random((6, 40, 3)) for number in range(6)}
+    sheet = make_sheet(images)
+    assert sheet.shape == (2 * (18 + 16), 4 * 120, 3)
+    for number, image in enumerate(images.values()):
+        top, left = 34 * (number // 4) + 16, 120 * (number % 4)
+        np.testing.assert_allclose(sheet[top + 1 : top + 18 : 3, left + 1 : left + 120 : 3], image, atol=0.5 / 255)
+        assert sheet[top - 16 : top, left : left + 120].min() < 0.2  # letters
+    assert sheet[34:, 240:].min() == 1.0
+    table = make_table({"a": [images["method 0"], images["method 1"]], "b": [images["method 2"]] * 2}, ["one", "two"])
+    assert table.shape == (16 + 2 * 6, 160 + 2 * 40, 3)
+    np.testing.assert_allclose(table[16:22, 200:], images["method 1"], atol=0.5 / 255)
+    np.testing.assert_allclose(table[22:, 160:200], images["method 2"], atol=0.5 / 255)
+    with pytest.raises(ValueError, match="expected 2 images in each, got others in b"):
+        make_table({"a": [images["method 0"]] * 2, "b": []}, ["one", "two"])
+    with pytest.raises(ValueError, match="expected one size"):
+        make_sheet({"a": images["method 0"], "b": images["method 1"][:3]})
+
+
 @pytest.mark.slow
 @pytest.mark.needs("llvm")
 def test_the_clips_fail_what_they_are_for(tmp_path, capsys):
@@ -85,11 +111,14 @@ def test_the_clips_fail_what_they_are_for(tmp_path, capsys):
     assert found["counts"]["border"]["dual vector leaves the image"] > 50
     assert found["counts"]["shadow"]["hidden"] == 0
     assert found["counts"]["shadow"]["affected"] > 50
-    assert [column["name"] for column in found["columns"]] == ["method", *scenes]
-    rows = {row[0]: row[1:] for row in found["rows"]}
-    assert set(rows) == {"noisy", "svgf"}
-    assert not rows["svgf"][1].endswith("/ 0")
+    response = json.loads((out / "failures-response.json").read_text())
+    for result in (found, response):
+        assert [column["name"] for column in result["columns"]] == ["method", *scenes]
+        assert [row[0] for row in result["rows"]] == ["noisy", "svgf"]
+    assert found["rows"][0][1] < found["rows"][1][1]  # of `border`
+    assert response["rows"][1][2] != 0  # of `shadow`
     assert (out / "pictures" / "shadow" / "svgf.png").is_file()
+    assert all((out / "sheets" / f"{sheet}.png").is_file() for sheet in ("shadow", "all"))
     assert len(capsys.readouterr().out.splitlines()) >= 6
 
 

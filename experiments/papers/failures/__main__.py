@@ -4,8 +4,9 @@
 
 Renders the clips of :mod:`experiments.papers.failures.scenes` into ``data/failures`` (again used if there) with one
 sample of all reflected light a pixel, runs every filter, the presets of the papers, the shipped weights, and ``ntd``
-with the vectors of shadows and reflections, and writes ``runs/failures/failures.json`` in the format of docs/results
-and every method's last moving frame as ``pictures/CLIP/METHOD.png``.
+with the vectors of shadows and reflections, and writes ``runs/failures/failures.json`` and ``failures-response.json``
+in the format of docs/results, every method's last moving frame as ``pictures/CLIP/METHOD.png``, all of a clip on one
+sheet as ``sheets/CLIP.png``, and all of all clips on ``sheets/all.png``.
 """
 
 import json
@@ -22,19 +23,17 @@ import tyro
 
 from experiments.measurement import describe_measurement
 from experiments.papers.failures import measure
+from experiments.papers.failures.clips import render_failure
 from experiments.papers.failures.scenes import MOVING, SCENES
+from experiments.papers.failures.sheet import make_sheet, make_table
 from experiments.papers.preintegration import file_name
 from jaxdn import color
 from jaxdn.clips import read_clip
 from jaxdn.commands.errors import plain_errors
-from jaxdn.core.frame import GUIDES, Clip, written_out
+from jaxdn.core.frame import Clip, Frame, written_out
 from jaxdn.denoiser.rollout import denoise
-from jaxdn.denoisers import svgf
 from jaxdn.evaluation.report.images import save_png
-from jaxdn.render.clip import render_clip
-from jaxdn.render.settings import RenderSettings
 from jaxdn.runtime.atomic_files import write_atomically
-from jaxdn.sequence.render_jobs import plan_clip
 from jaxdn.zoo.ready import NOISY, Model, filter_names, find_model, ready_names
 
 PAPERS = ("svgf", "asvgf", "trmv", "relax", "reblur")
@@ -70,32 +69,30 @@ def all_rows() -> dict[str, tuple[str, dict[str, Any]]]:
         name: (name, {}) for name in [NOISY, *filter_names(), *ready_names()]
     }
     papers = {f"{name}, as published": (name, {"preset": "paper"}) for name in PAPERS}
-    return plain | papers | {EFFECTS: ("ntd-small", {"motion": "effects"})}
+    more: dict[str, tuple[str, dict[str, Any]]] = {EFFECTS: ("ntd-small", {"motion": "effects"})}
+    if "oidn" in plain:
+        more["oidn, stabilised"] = ("stabilised:oidn", {})
+    return plain | papers | more
 
 
-def render(settings: Settings, name: str) -> Clip:
-    """The clip of a scene, with every buffer that any method reads."""
-    make, more = SCENES[name]
-    scene, folder = make(), settings.data / f"{name.replace(' ', '-')}-{settings.width}x{settings.height}"
-    size: dict[str, Any] = {"width": settings.width, "height": settings.height}
-    how: dict[str, Any] = size | {"light": "reflected", "reference_spp": settings.reference_spp} | more
-    reader = svgf()._replace(reads=frozenset(GUIDES))
-    planned = plan_clip(scene, RenderSettings(**how, max_depth=4), frames=settings.frames, denoiser=reader)
-    assert planned is not None
-    render_clip(scene, folder, RenderSettings(**how, max_depth=4, plan=planned.plan), frames=settings.frames)
-    return read_clip(folder)
-
-
-def images_of(models: Mapping[str, Model], clip: Clip) -> Iterator[tuple[str, np.ndarray]]:
-    """Label and images [T, H, W, 3] of every model."""
+def measure_models(models: Mapping[str, Model], clip: Clip) -> Iterator[tuple[str, measure.Failure, np.ndarray]]:
+    """Label, failure and images [T, H, W, 3] of every model on a clip."""
+    reference = np.asarray(clip.reference)
+    affected = measure.affected_pixels(reference, clip.frames, moving=MOVING)
+    late = np.minimum(MOVING + np.arange(len(reference)), len(reference) - 1)
+    began_late = jax.tree.map(lambda each: each[late], clip.frames)
     for label, model in models.items():
-        if model.denoiser is None:
-            yield label, np.asarray(clip.frames.radiance)
-            continue
-        # Written out, all clips have the same buffers, and a method is compiled once for all.
-        frames = written_out(clip.frames, model.denoiser.reads)
-        given = jax.tree.map(jnp.asarray, Clip(frames))
-        yield label, np.asarray(_run(model)(model.params, given))
+        images, fresh = _denoise(model, clip.frames), _denoise(model, began_late)
+        yield label, measure.measure_failure(images, fresh, reference, affected, moving=MOVING), images
+
+
+def _denoise(model: Model, frames: Frame) -> np.ndarray:
+    """The images [T, H, W, 3] of a model."""
+    if model.denoiser is None:
+        return np.asarray(frames.radiance)
+    # Written out, all clips have the same buffers, and a method is compiled once for all.
+    given = jax.tree.map(jnp.asarray, Clip(written_out(frames, model.denoiser.reads)))
+    return np.asarray(_run(model)(model.params, given))
 
 
 _COMPILED: dict[str, Any] = {}
@@ -123,60 +120,83 @@ def main(settings: Settings) -> None:
         raise ValueError(f"--frames: expected more than the {MOVING} in which something moves, got {settings.frames}.")
     models = {label: find_model(rows[label][0], **rows[label][1]) for label in wanted}
     found: dict[str, dict[str, measure.Failure]] = {label: {} for label in wanted}
-    counts = {}
+    counts: dict[str, dict[str, int]] = {}
+    shown: dict[str, dict[str, np.ndarray]] = {}
     for name in settings.scenes:
-        clip = render(settings, name)
+        size = (settings.width, settings.height)
+        folder = render_failure(
+            settings.data, name, size=size, frames=settings.frames, reference_spp=settings.reference_spp
+        )
+        clip = read_clip(folder)
         reference = np.asarray(clip.reference)
         affected = measure.affected_pixels(reference, clip.frames, moving=MOVING)
         hidden, fallbacks = measure.count_fallbacks(clip.frames)
         counts[name] = {"affected": int(affected.sum()), "hidden": hidden, "dual vector leaves the image": fallbacks}
         print(f"{name}: {counts[name]}", flush=True)
-        pictures = settings.out / "pictures" / name.replace(" ", "-")
-        _save(pictures / "reference.png", reference[MOVING])
-        for label, images in images_of(models, clip):
-            found[label][name] = one = measure.measure_failure(images, reference, affected, moving=MOVING)
-            print(f"  {label}: {one.psnr:.2f} dB, response {_frames(one.response)}", flush=True)
-            _save(pictures / f"{file_name(label)}.png", images[MOVING])
+        mask = np.repeat(affected[MOVING, ..., None], 3, 2)
+        shown[name] = {"reference": _display(reference[MOVING]), "affected pixels": mask}
+        for label, one, images in measure_models(models, clip):
+            found[label][name] = one
+            response = "never" if one.response is None else one.response
+            print(f"  {label}: {one.psnr:.2f} dB, response {response}", flush=True)
+            shown[name][label] = _display(images[MOVING])
         # After every clip: a run of hours may be cut off.
-        text = json.dumps(_describe(settings, found, counts), indent=1) + "\n"
-        write_atomically({settings.out / "failures.json": text.encode()})
+        _write(settings, shown, describe(settings, found, counts))
 
 
-def _frames(response: int | None) -> str:
-    return "-" if response is None else str(response)
+def _display(image: np.ndarray) -> np.ndarray:
+    return np.asarray(color.tonemap(jnp.asarray(image)))
 
 
-def _save(path: Path, image: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    save_png(path, np.asarray(color.tonemap(jnp.asarray(image))))
+def _write(
+    settings: Settings, shown: Mapping[str, Mapping[str, np.ndarray]], results: Mapping[str, dict[str, Any]]
+) -> None:
+    """The pictures of the last clip, those of all, and the results so far."""
+    name, of_clip = list(shown.items())[-1]
+    clip = name.replace(" ", "-")
+    pictures = {settings.out / "pictures" / clip / f"{file_name(label)}.png": image for label, image in of_clip.items()}
+    pictures[settings.out / "sheets" / f"{clip}.png"] = make_sheet(of_clip)
+    rows = {label: [images[label] for images in shown.values()] for label in of_clip}
+    pictures[settings.out / "sheets" / "all.png"] = make_table(rows, list(shown))
+    for path, image in pictures.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_png(path, image)
+    texts = {settings.out / f"{file}.json": json.dumps(result, indent=1) + "\n" for file, result in results.items()}
+    write_atomically({path: text.encode() for path, text in texts.items()})
 
 
-def _describe(
+def describe(
     settings: Settings, found: Mapping[str, Mapping[str, measure.Failure]], counts: Mapping[str, Mapping[str, int]]
-) -> dict[str, Any]:
-    """The measurement in the format of docs/results."""
-    rows = [
-        [label, *(f"{one.psnr:.1f} / {_frames(one.response)}" for one in clips.values())]
-        for label, clips in found.items()
-    ]
+) -> dict[str, dict[str, Any]]:
+    """Name of a file -> its measurement in the format of docs/results: the error, and the response."""
+    clips = f"Clips of what the papers fail at, {settings.width} x {settings.height}, 1 sample of all reflected light; "
+    clips += "something moves for eight frames and then rests. "
     pixels = ", ".join(f"{name} {count['affected']}" for name, count in counts.items())
-    border = counts.get("border", {})
-    what = (
-        f"Clips of what the papers fail at, {settings.width} x {settings.height}, 1 sample of all reflected light; "
-        "something moves for eight frames and then rests. PSNR in dB of the affected pixels while it moves, and the "
-        "frames at rest until less than a tenth of the old image is left (0: the first one; -: never). Affected are "
-        "pixels that were hidden or whose light differs by a quarter from that of their surface a frame ago: "
-        f"{pixels}."
-    )
-    if border:
-        what += (
+    error = "PSNR in dB of the affected pixels while it moves: those that were hidden, or whose light differs by a "
+    error += f"quarter from that of their surface a frame ago ({pixels})."
+    if border := counts.get("border"):
+        error += (
             f" In `border` the dual vectors of {border['dual vector leaves the image']} of {border['hidden']} hidden "
             "pixels would leave the image."
         )
-    about = describe_measurement(
-        "table", "Failures that the papers name", "Quality", 63, command=COMMAND, what=what, rows=rows
+    response = (
+        "Frames at rest until less than a tenth of the image before is left, in the pixels that changed last, over "
+        "what the same method shows that begins there; 0: the first frame; nothing: none of the "
+        f"{settings.frames - MOVING} frames."
     )
-    return about | {"columns": [{"name": "method"}, *({"name": name} for name in counts)], "counts": counts}
+    title = "Failures that the papers name"
+    errors = [[label, *(one.psnr for one in clips.values())] for label, clips in found.items()]
+    responses = [[label, *(one.response for one in clips.values())] for label, clips in found.items()]
+    about = describe_measurement(
+        "table", f"{title}: error", "Quality", 63, command=COMMAND, what=clips + error, rows=errors
+    )
+    names = [{"name": name, "decimals": 1, "best": "higher"} for name in counts]
+    about |= {"columns": [{"name": "method"}, *names], "counts": counts}
+    other = describe_measurement(
+        "table", f"{title}: response", "Quality", 64, command=COMMAND, what=clips + response, rows=responses
+    )
+    other |= {"columns": [{"name": "method"}, *({"name": name} for name in counts)]}
+    return {"failures": about, "failures-response": other}
 
 
 if __name__ == "__main__":

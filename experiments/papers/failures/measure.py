@@ -23,7 +23,8 @@ class Failure(NamedTuple):
     psnr: float
     """dB of tone-mapped light over all affected pixels of the frames in which something moves."""
     response: int | None
-    """Frames at rest until less than :data:`GONE` of the old image is left; 0: in the first one; None: never."""
+    """Frames at rest until less than :data:`GONE` of the old image is left of the history; 0: in the first one; None:
+    never."""
 
 
 def affected_pixels(reference: np.ndarray, frames: Frame, *, moving: int) -> np.ndarray:
@@ -57,27 +58,34 @@ def _blurred(planes: np.ndarray) -> np.ndarray:
     return sum(wide[:, y : y + height, x : x + width] for y in range(3) for x in range(3)) / 9  # type: ignore[return-value]
 
 
-def share_of_old(image: np.ndarray, old: np.ndarray, new: np.ndarray, where: np.ndarray) -> float:
-    """How much of ``old`` is left in ``image`` where ``new`` is right: the s of ``image = new + s (old - new) +
-    noise``.
+def share_of_old(image: np.ndarray, expected: np.ndarray, old: np.ndarray, new: np.ndarray, where: np.ndarray) -> float:
+    """How much of ``old`` is left in ``image`` where ``new`` is right: the s of ``image = expected + s (old - new) +
+    noise``. What is ``expected`` without any of it is ``new`` itself, or what a method without a history shows.
 
     By least squares over the pixels ``where`` [H, W] of linear images [H, W, 3], relative to the brighter of both:
     noise averages out. In tone-mapped light it would not: noise darkens that, as an old shadow does.
     """
     brighter = np.maximum(np.maximum(old, new)[where].mean(-1, keepdims=True), 1e-6)
     away = (old - new)[where] / brighter
-    return float(np.sum((image - new)[where] / brighter * away) / max(np.sum(away * away), 1e-12))
+    return float(np.sum((image - expected)[where] / brighter * away) / max(np.sum(away * away), 1e-12))
 
 
-def measure_failure(images: np.ndarray, reference: np.ndarray, affected: np.ndarray, *, moving: int) -> Failure:
-    """The error in the affected pixels and the response, of images [T, H, W, 3]."""
+def measure_failure(
+    images: np.ndarray, fresh: np.ndarray, reference: np.ndarray, affected: np.ndarray, *, moving: int
+) -> Failure:
+    """The error in the affected pixels and the response, of images [T, H, W, 3].
+
+    ``fresh`` are those of the same method that began in frame ``moving``, [T - moving, H, W, 3] at least: what of the
+    old image it seems to show is its blur, and no history.
+    """
     shown, wanted = (np.asarray(color.tonemap(jnp.asarray(each))) for each in (images, reference))
     where = jnp.asarray(affected[..., None], jnp.float32)
     mean = float(metrics.mse(jnp.asarray(shown), jnp.asarray(wanted), mask=where))
     old, new = reference[moving - 1], reference[moving]
     light = [np.asarray(color.luminance(jnp.asarray(each)))[..., 0] for each in (old, new)]
     changed = np.abs(light[0] - light[1]) > CHANGED * np.maximum(np.maximum(*light), 1e-6)
-    left = [share_of_old(image, old, new, changed) for image in images[moving:]]
+    pairs = zip(images[moving:], fresh, strict=False)
+    left = [share_of_old(*pair, old, new, changed) for pair in pairs]
     response = next((index for index, share in enumerate(left) if share < GONE), None)
     return Failure(-10 * np.log10(max(mean, 1e-12)), response)
 
