@@ -106,6 +106,17 @@ def test_threads_render_what_processes_do_after_a_renderer_is_killed(local: dict
     assert before.items() <= stamps(tmp_path).items()
 
 
+@pytest.mark.slow
+def test_two_renderers_of_one_clip_at_once_leave_one_set_of_files(local: dict[str, bytes], tmp_path: Path) -> None:
+    (job,) = list_jobs(tmp_path, 1)
+    task = ClipTask(job, None, 2, None, os.getcwd())
+    with ThreadPoolExecutor(2) as threads:
+        both = [threads.submit(render_apart, task) for _ in range(2)]
+        wait_until(lambda: len(find_renderers(os.getpid())) == 2)
+        assert [one.result() for one in both] == [None, None]
+    assert contents(tmp_path) == {name: file for name, file in local.items() if name.startswith("edge-0")}
+
+
 @contextmanager
 def start_cluster(folder: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
     """A scheduler and two workers with nannies on loopback, as the commands of Dask start them."""
