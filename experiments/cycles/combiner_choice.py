@@ -1,8 +1,9 @@
-"""Train the second network of ``combiner`` alone: its candidates do not depend on it, and are made once.
+"""Train the second network of ``combiner`` alone: its candidates are made once, but for the last result.
 
     python -m experiments.cycles.combiner_choice FOLDER/train --start runs/start.safetensors -o runs/chosen --minutes 10
 
-An update takes a fifth of the time that ``jaxdn train`` needs for one of everything. The loss of a pair of frames is
+An update takes a fifth of the time that ``jaxdn train`` needs for one of everything. The last results, which depend on
+the weights, are made again every 200 updates. The loss of a pair of frames is
 the mean square of the error of x / (1 + x), and that of its change, each as a share of Open Image Denoise's: of clips
 and sample counts none outweighs another, and what counts is what PSNR measures. Squares have none of the references'
 noise (:mod:`experiments.cycles.score`). Clips whose names end in ``--held`` are left out of training, and scored.
@@ -12,7 +13,7 @@ import sys
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,12 +31,16 @@ from jaxdn.clips import open_frames
 from jaxdn.commands.errors import plain_errors
 from jaxdn.core.frame import Frame, only
 from jaxdn.denoiser import Params
-from jaxdn.methods.combiner.history import Means, start_history
+from jaxdn.filters.resampling import find_whole
+from jaxdn.filters.sharp_history import fetch_sharply
+from jaxdn.methods.combiner.candidates import CANDIDATES
+from jaxdn.methods.combiner.history import Means, keep_history, start_history, tested_guides
 from jaxdn.methods.combiner.method import (
     CandidateStep,
     Found,
     build_candidate_step,
     build_chooser,
+    crop_planes,
     mix_candidates,
     prepare,
 )
@@ -48,10 +53,25 @@ BATCH, RATE, AVERAGE = 4, 2e-3, 0.99
 """Pairs of frames an update; Adam's step; the running mean of the weights."""
 _LEAST = 1e-5
 """Mean square below which an error is as good as none."""
+UPDATES = 200
+"""After so many updates the last results are made again."""
+_LAST = CANDIDATES.index("last result")
 
 Stored = dict[str, np.ndarray]
 """Of a clip at one sample count, frame by frame [T, ...]: what :class:`Found` has, in half precision, radiance as
 log(1 + gain x); the exposure ``gain``; ``targets`` [T, 3, 3, H, W]: the reference and its halves, as x / (1 + x)."""
+
+
+class Sequence(NamedTuple):
+    """A clip at one sample count."""
+
+    stored: Stored
+    frames: list[Frame]
+    """What tells where the last result is now: motion and the guides that are tested."""
+
+
+Clips = dict[str, dict[int, Sequence]]
+"""Name of a clip -> sample count -> frames."""
 
 
 @dataclass
@@ -74,7 +94,7 @@ def main(options: Options) -> int:
     """Train, score before and after, write the weights."""
     _, params = load_weights(options.start)
     find = jax.jit(build_candidate_step(Settings()))
-    clips: dict[str, dict[int, Stored]] = {}
+    clips: Clips = {}
     for clip in find_done(options.folder, []):
         record = read_record(clip / RECORD) or {}
         if record["set"] == "test":
@@ -98,24 +118,38 @@ def main(options: Options) -> int:
     return 0
 
 
-def collect(clip: Path, find: CandidateStep, params: Params, frames: int) -> dict[int, Stored]:
-    """What there is to choose from in each frame of a clip, for each sample count; ``find`` is compiled."""
+def collect(clip: Path, find: CandidateStep, params: Params, frames: int) -> dict[int, Sequence]:
+    """What there is to choose from in each frame of a clip, for each sample count; ``find`` is compiled.
+
+    In place of the last results, which are not known yet, are the priors of the frames before.
+    """
     reads = denoisers.combiner().reads
     halves = [references.read(clip / "reference" / f"{number:04d}.exr") for number in range(1, frames + 1)]
     targets = np.stack(
         [np.stack([compress(one) for one in (each.image, each.first, each.second)]) for each in halves]
     ).transpose(0, 1, 4, 2, 3)
-    stored = {}
+    sequences = {}
     for samples in LAYERS:
         images = [only(each.frame, reads) for each in open_frames(clip / f"{samples}spp-0")[1]]
         rows, state = [], start_history(jax.tree.map(jnp.asarray, images[0]))
         for index, frame in enumerate(images):
             statistics, prepared = prepare(jax.tree.map(jnp.asarray, frame))
-            state, found, _ = find(params, state, prepared, jnp.asarray(index == 0), statistics)
+            found, _ = find(params, state, prepared, jnp.asarray(index == 0), statistics)
             rows.append(_pack(found, statistics.exposure, frame))
-        stored[samples] = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-        stored[samples]["targets"] = targets.astype(np.float32)
-    return stored
+            means = crop_planes(found.means, frame.radiance.shape[:2])
+            state = keep_history(prepared, means, means.prior)
+        stored = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        stored["targets"] = targets.astype(np.float32)
+        size = stored["light"].shape[-2:]
+        sequences[samples] = Sequence(stored, [_crop_guides(frame, *size) for frame in images])
+    return sequences
+
+
+def _crop_guides(frame: Frame, height: int, width: int) -> Frame:
+    """What :func:`fetch_result` reads of a frame."""
+    few = frame._replace(radiance=frame.radiance[..., :1], albedo=None, normal=None)
+    cropped: Frame = jax.tree.map(lambda each: np.asarray(each)[:height, :width], few)
+    return cropped
 
 
 def _pack(found: Found, gain: jax.Array, frame: Frame) -> Stored:
@@ -137,6 +171,34 @@ def unpack(row: dict[str, jax.Array]) -> Found:
     return Found(list(light[:-1]), light[-1], Means(zero, zero, albedo, normal, number, number))
 
 
+def make_results(clips: Clips, params: Params) -> None:
+    """Put the results that the network with ``params`` makes, frame by frame, in place of the last ones."""
+    chooser = build_chooser(Settings(implementation="onednn-float32"))
+
+    @jax.jit
+    def mix(params: Params, row: dict[str, jax.Array]) -> jax.Array:
+        return mix_candidates(chooser, params, unpack(row), row["gain"])
+
+    for clip in clips.values():
+        for sequence in clip.values():
+            stored, before = sequence.stored, None
+            for index, frame in enumerate(sequence.frames):
+                row = {name: stored[name][index] for name in stored if name != "targets"}
+                if before is not None:
+                    row["light"][_LAST] = fetch_result(*before, frame, row["light"][0], row["gain"])
+                before = mix(params, row), sequence.frames[index]
+
+
+@jax.jit
+def fetch_result(result: jax.Array, then: Frame, now: Frame, prior: jax.Array, gain: jax.Array) -> jax.Array:
+    """The last result where it is now, the prior where it is not known, as :data:`Stored` has light."""
+    whole = find_whole(then)[..., None].astype(result.dtype)
+    history = jnp.concatenate([jnp.maximum(result, 0.0).transpose(1, 2, 0), whole], axis=-1)
+    found = fetch_sharply(history, tested_guides(then), now, jnp.asarray(False), colors=3)
+    light = jnp.log1p(gain * jnp.maximum(found.values[..., :3], 0.0))
+    return jnp.where(found.valid, light.transpose(2, 0, 1), prior.astype(light.dtype))
+
+
 def find_errors(image: jax.Array, row: dict[str, jax.Array]) -> jax.Array:
     """[3, 3, H, W] of x / (1 + x), against the reference and its halves."""
     light = jnp.maximum(image, 0.0)
@@ -149,7 +211,7 @@ def square(errors: jax.Array) -> jax.Array:
     return jnp.mean(2.0 * errors[0] ** 2 - 0.5 * (errors[1] ** 2 + errors[2] ** 2))
 
 
-def train(clips: dict[str, dict[int, Stored]], params: Params, minutes: float) -> tuple[Params, int]:
+def train(clips: Clips, params: Params, minutes: float) -> tuple[Params, int]:
     """The running mean of the network's parameters, and how many updates there were."""
     chooser, rng = build_chooser(Settings(implementation="onednn")), np.random.default_rng(0)
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(RATE))
@@ -175,6 +237,8 @@ def train(clips: dict[str, dict[int, Stored]], params: Params, minutes: float) -
 
     state, mean, updates, begin = optimizer.init(params), params, 0, time.monotonic()
     while time.monotonic() < begin + 60 * minutes or not updates:
+        if updates % UPDATES == 0:
+            make_results(clips, mean)
         params, state, mean = update(params, state, mean, [draw(clips, rng) for _ in range(BATCH)])
         updates += 1
     return mean, updates
@@ -188,9 +252,9 @@ def _of_change(errors: list[jax.Array]) -> jax.Array:
     return square(errors[1] - errors[0])
 
 
-def draw(clips: dict[str, dict[int, Stored]], rng: np.random.Generator) -> list[Stored]:
+def draw(clips: Clips, rng: np.random.Generator) -> list[Stored]:
     """Two consecutive frames of a clip, flipped and with their colours permuted at random."""
-    stored = clips[sorted(clips)[rng.integers(len(clips))]][int(rng.choice(LAYERS))]
+    stored = clips[sorted(clips)[rng.integers(len(clips))]][int(rng.choice(LAYERS))].stored
     first = int(rng.integers(len(stored["gain"]) - 1))
     across, down = rng.random(2) < 0.5
     colors = rng.permutation(3)
@@ -205,14 +269,15 @@ def draw(clips: dict[str, dict[int, Stored]], rng: np.random.Generator) -> list[
     return [{name: vary(name, stored[name][index]) for name in stored} for index in (first, first + 1)]
 
 
-def report(when: str, clips: dict[str, dict[int, Stored]], params: Params) -> None:
+def report(when: str, clips: Clips, params: Params) -> None:
     """Print PSNR and temporal PSNR of the held clips, means at each sample count."""
     chooser = build_chooser(Settings())
+    make_results(clips, params)
     score = jax.jit(lambda params, row: find_errors(mix_candidates(chooser, params, unpack(row), row["gain"]), row))
     for samples in LAYERS if clips else ():
         found = []
         for clip in clips.values():
-            stored = clip[samples]
+            stored = clip[samples].stored
             rows = [{name: stored[name][index] for name in stored} for index in range(len(stored["gain"]))]
             errors = [score(params, row) for row in rows]
             pairs = list(zip(errors[::2], errors[1::2], strict=False))

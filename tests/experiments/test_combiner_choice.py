@@ -8,7 +8,20 @@ import numpy as np
 import pytest
 
 from experiments.cycles import combiner_choice
-from experiments.cycles.combiner_choice import Options, draw, find_errors, main, square
+from experiments.cycles.combiner_choice import (
+    Options,
+    Sequence,
+    draw,
+    fetch_result,
+    find_errors,
+    main,
+    make_results,
+    square,
+)
+from jaxdn.core.frame import Frame
+from jaxdn.denoisers import combiner
+from jaxdn.methods.combiner.candidates import CANDIDATES
+from jaxdn.methods.combiner.history import fetch_past, keep_history, measure_now
 from jaxdn.zoo.weights import load_weights
 from tests.experiments.test_cycles_training import write_cycles_clip
 from tests.needs import require
@@ -30,7 +43,7 @@ def test_a_draw_is_two_neighbours_that_are_turned_alike(rng: np.random.Generator
     stored = {"light": light[:, None], "targets": light[:, None], "number": light[:, 0], "gain": np.ones(5)}
     seen = set()
     for _ in range(40):
-        first, second = draw({"one": {1: stored, 4: stored, 16: stored}}, rng)
+        first, second = draw({"one": dict.fromkeys((1, 4, 16), Sequence(stored, []))}, rng)
         np.testing.assert_array_equal(second["light"] - first["light"], 1000)
         np.testing.assert_array_equal(first["light"], first["targets"])
         assert set(first["light"].ravel() % 1000) == set(place.ravel())
@@ -38,6 +51,42 @@ def test_a_draw_is_two_neighbours_that_are_turned_alike(rng: np.random.Generator
         np.testing.assert_array_equal(first["light"][0, channel], first["number"])
         seen.add(tuple(first["light"][0, :, 0, 0] % 1000))
     assert len(seen) > 8
+
+
+def draw_frame(rng: np.random.Generator) -> Frame:
+    """On two planes, of which the nearer one is in the middle; all moves by parts of a pixel."""
+    depth = np.full((24, 32, 1), 5.0, np.float32)
+    depth[8:16, 8:20] = 2.0
+    motion = np.broadcast_to(np.float32([1.5, -0.25]), (24, 32, 2))
+    frame = Frame(rng.exponential(size=(24, 32, 3)).astype(np.float32), depth=depth, motion=motion)
+    return jax.tree.map(jnp.asarray, frame)
+
+
+def test_the_last_result_is_fetched_as_the_denoiser_does_it(rng: np.random.Generator) -> None:
+    then, now, gain = draw_frame(rng), draw_frame(rng), jnp.float32(0.7)
+    result, prior = jnp.asarray(rng.exponential(size=(2, 3, 24, 32)), jnp.float32)
+    means = measure_now(now, prior)
+    past = fetch_past(keep_history(then, measure_now(then, prior), result), now, means, jnp.asarray(False))
+    found = fetch_result(result, then, now, jnp.log1p(gain * prior), gain)
+    assert 0.5 < np.mean(past.valid) < 1.0
+    np.testing.assert_allclose(jnp.expm1(found) / gain, past.result, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(("trusted", "expected"), [("prior", [0, 0, 1, 2]), ("last result", [0, 0, 0, 0])])
+def test_results_are_made_in_the_order_of_frames(rng: np.random.Generator, trusted: str, expected: list[int]) -> None:
+    """Nothing moves: the last result of a frame is the prior of the frame before, or for ever the first one."""
+    require("pyoidn")
+    params = combiner().init(jax.random.key(0), Frame(jnp.zeros((16, 16, 3))))["choice"]
+    bias = np.repeat([0.0 if name == trusted else -1e3 for name in CANDIDATES], 4)
+    head = {"kernel": jnp.zeros_like(params["head_0"]["kernel"]), "bias": jnp.asarray(bias, jnp.float32)}
+    light = rng.uniform(0.2, 1.0, (4, len(CANDIDATES) + 1, 3, 24, 32)).astype(np.float16)
+    light[:, CANDIDATES.index("last result")] = light[:, 0]
+    planes = {name: np.ones((4, 3, 24, 32), np.float16) for name in ("albedo", "normal")}
+    stored = {"light": light.copy(), **planes, "number": planes["albedo"][:, 0], "gain": np.ones(4, np.float32)}
+    frames = [draw_frame(rng)._replace(motion=jnp.zeros((24, 32, 2))) for _ in range(4)]
+    make_results({"one": {4: Sequence(stored, frames)}}, {**params, "head_0": head})
+    found = stored["light"][:, CANDIDATES.index("last result")].astype(np.float32)
+    np.testing.assert_allclose(found, light[expected, 0].astype(np.float32), rtol=2e-3)
 
 
 @pytest.mark.slow

@@ -1,9 +1,8 @@
-"""The images that the result is mixed of: the prior, stabilised too, and means that affinities have filtered.
+"""The images that the result is mixed of: the prior, what corrects it, the mean of priors and the last result.
 
-Filtered means are of two kinds. A filter of noisy light itself has the light's own detail, and blurs it. A *correction*
-adds to the prior what the same filter finds between the mean of noisy light and that of the prior's images: its error,
-as far as it lasts, without blur of what the prior shows (in the manner of Back et al. 2020, "Deep Combiner for
-Independent and Correlated Pixel Estimates").
+A *correction* adds to the prior what a filter by affinities finds between the mean of noisy light and that of the
+prior's images: its error, as far as it lasts, without blur of what the prior shows (in the manner of Back et al. 2020,
+"Deep Combiner for Independent and Correlated Pixel Estimates").
 """
 
 from collections.abc import Mapping
@@ -29,13 +28,10 @@ from jaxdn.ops.scales import join_planes
 
 CANDIDATES = (
     "prior",
-    "stabilised",
-    "mean",
-    "fine",
-    "coarse",
     "fine correction",
     "coarse correction",
     "prior mean",
+    "last result",
 )
 """In the order of their weights."""
 FULL_LEVELS, LEVELS = 2, 4
@@ -63,7 +59,7 @@ def make_candidates(
     precisions: Mapping[str, jax.Array],
     means: Means,
     prior: jax.Array,
-    stable: jax.Array,
+    last: jax.Array,
     depth: jax.Array | None,
     parameters: FilterParameters,
     statistics: FrameStatistics,
@@ -72,22 +68,21 @@ def make_candidates(
 
     ``precisions`` [1 + LEVELS] of albedo, normal, light, depth and learned features are logarithms, one for full
     resolution and one for each level at half, of what squares of differences are multiplied by. Light is compared as
-    the mean of the prior's images, at the frame's exposure and compressed. ``prior`` and ``stable``, the stabilised
-    prior, [3, H, W] are of this frame.
+    the mean of the prior's images, at the frame's exposure and compressed. ``prior`` [3, H, W] is of this frame,
+    ``last`` the image of the frame before, where it is now.
     """
     factors = {name: jnp.exp(0.5 * logarithm) for name, logarithm in precisions.items()}
     inverse_depth = jnp.zeros_like(means.light) if depth is None else compute_inverse_depth(depth, statistics)
     seen = color.compress(statistics.exposure * means.prior)
     surfaces = jnp.concatenate([means.albedo, means.normal, seen])
-    fine = both = jnp.concatenate([means.light, means.prior])
+    fine = jnp.concatenate([means.light, means.prior])
     features = join_planes([("planes", surfaces), ("blocks", parameters.features)])
     at_full = scale_guide(Guide(features, inverse_depth, parameters.trust + LEAST_TRUST), factors, 0, GUIDES)
     for index in range(FULL_LEVELS):
         fine = affinity_filter(fine, at_full, step=2**index)
     coarse = _filter_at_half(fine, surfaces, inverse_depth, at_full, parameters, factors)
-    found = [prior, stable, both[:3], fine[:3], coarse[:3]]
-    found += [prior + filtered[:3] - filtered[3:] for filtered in (fine, coarse)]
-    return [*found, means.prior]
+    corrected = [prior + filtered[:3] - filtered[3:] for filtered in (fine, coarse)]
+    return [prior, *corrected, means.prior, last]
 
 
 def _filter_at_half(

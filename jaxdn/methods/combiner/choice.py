@@ -28,14 +28,11 @@ _MULTIPLE = 16
 RECEPTIVE_FIELD = 2 * max(RADII) + 2
 """Radius in pixels of what :func:`assemble_evidence` sees."""
 INITIAL_LOGITS = {
-    "prior": -1.0,
-    "stabilised": 1.0,
-    "mean": -5.0,
-    "fine": -3.0,
-    "coarse": -4.0,
+    "prior": 0.0,
     "fine correction": -2.5,
     "coarse correction": -2.0,
     "prior mean": 1.0,
+    "last result": 1.0,
 }
 """The logits of the candidates before training."""
 _SMALL = 0.2
@@ -105,6 +102,6 @@ def begin(params: Params) -> Params:
 
 
 def split_shares(head: jax.Array, size: tuple[int, int]) -> jax.Array:
-    """[8, H, W] the share of each candidate, which add up to 1, of the network's output [h, w, 32]."""
+    """[5, H, W] the share of each candidate, which add up to 1, of the network's output [h, w, 20]."""
     own = crop(head, (size[0] // 2, size[1] // 2))
     return jax.nn.softmax(join_planes([("blocks", own)]), axis=0)

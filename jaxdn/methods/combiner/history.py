@@ -1,7 +1,8 @@
 """Running means along motion: of noisy light, of the prior's images and of the guides.
 
 The mean of noisy light has no bias and much noise, the mean of the prior's images the reverse; albedo and normals of
-thin focus, fog and hair, as noisy as the light, become clean. All follow the new frame with one share a pixel.
+thin focus, fog and hair, as noisy as the light, become clean. All follow the new frame with one share a pixel. The last
+result is carried beside them, as it is.
 """
 
 from typing import NamedTuple
@@ -14,11 +15,9 @@ from jaxdn.core.frame import Frame
 from jaxdn.filters.resampling import find_whole
 from jaxdn.filters.sharp_history import SharpHistory, fetch_sharply
 from jaxdn.filters.surface_test import Guides, guides_of
-from jaxdn.methods.stabilised import StableHistory
-from jaxdn.methods.stabilised import start_history as start_stable
 from jaxdn.ops.scales import to_planes
 
-COLORS = 12
+COLORS = 15
 """Channels that are fetched by cubics."""
 CHANNELS = COLORS + 3
 _LEAST_COUNT = 1e-6
@@ -28,12 +27,10 @@ class CombinerState(NamedTuple):
     """What is carried from one frame to the next."""
 
     history: jax.Array
-    """[H, W, 15] :class:`Means` as far as light, prior, albedo and normal (as (n + 1) / 2); the mean's square, its
-    effective number of samples; 1 where all 3x3 pixels showed one surface, else 0."""
+    """[H, W, 18] :class:`Means` as far as light, prior, albedo and normal (as (n + 1) / 2); the result; the mean's
+    square, its effective number of samples; 1 where all 3x3 pixels showed one surface, else 0."""
     guides: Guides
     """Of the previous frame, as far as they test which surface it showed."""
-    stable: StableHistory
-    """Of the stabilised prior."""
 
 
 class Means(NamedTuple):
@@ -57,6 +54,8 @@ class Past(NamedTuple):
     """Of earlier frames, where it is now; the new frame's own where there is none."""
 
     means: Means
+    result: jax.Array
+    """[3, H, W] the last image; the new prior where there is no history."""
     valid: jax.Array
     """[H, W] bool, there is a history."""
     invalid: jax.Array
@@ -71,7 +70,7 @@ def tested_guides(frame: Frame) -> Guides:
 def start_history(frame: Frame) -> CombinerState:
     """The state before the first frame."""
     nothing = jnp.zeros((*frame.radiance.shape[:2], CHANNELS), frame.radiance.dtype)
-    return CombinerState(nothing, jax.tree.map(jnp.zeros_like, tested_guides(frame)), start_stable(frame))
+    return CombinerState(nothing, jax.tree.map(jnp.zeros_like, tested_guides(frame)))
 
 
 def measure_now(frame: Frame, prior: jax.Array) -> Means:
@@ -88,10 +87,10 @@ def fetch_past(state: CombinerState, frame: Frame, now: Means, first: jax.Array)
     plain = frame._replace(normal=None)
     found: SharpHistory = fetch_sharply(state.history, state.guides, plain, first, colors=COLORS)
     values, valid = to_planes(found.values), found.valid
-    light, prior, albedo, normal = jnp.split(values[:COLORS], 4)
+    light, prior, albedo, normal, result = jnp.split(values[:COLORS], 5)
     means = Means(light, prior, albedo, 2.0 * normal - 1.0, *values[COLORS:-1])
     means = jax.tree.map(lambda then, new: jnp.where(jnp.broadcast_to(valid, new.shape), then, new), means, now)
-    return Past(means, valid, found.invalid)
+    return Past(means, jnp.where(valid, jnp.maximum(result, 0.0), now.prior), valid, found.invalid)
 
 
 def update_means(now: Means, past: Past, follow: jax.Array, *, most: float) -> Means:
@@ -112,11 +111,11 @@ def update_means(now: Means, past: Past, follow: jax.Array, *, most: float) -> M
     return mixed._replace(number=jnp.where(past.valid, jnp.minimum(1.0 / variance, most), 1.0))
 
 
-def keep_history(frame: Frame, means: Means, stable: StableHistory) -> CombinerState:
-    """The next frame's state."""
+def keep_history(frame: Frame, means: Means, result: jax.Array) -> CombinerState:
+    """The next frame's state; ``result`` [3, H, W] >= 0 is this frame's image."""
     normal = jnp.clip(0.5 * (means.normal + 1.0), 0.0, 1.0)
     colors = [jnp.maximum(each, 0.0) for each in (means.light, means.prior, means.albedo)]
     whole = find_whole(frame._replace(normal=None)).astype(normal.dtype)
     rest = jnp.stack([jnp.maximum(means.square, 0.0), means.number, whole])
-    history = jnp.concatenate([*colors, normal, rest])
-    return CombinerState(history.transpose(1, 2, 0), tested_guides(frame), stable)
+    history = jnp.concatenate([*colors, normal, result, rest])
+    return CombinerState(history.transpose(1, 2, 0), tested_guides(frame))

@@ -1,15 +1,15 @@
 """``combiner``: Open Image Denoise, and what the samples and earlier frames know better, mixed pixel by pixel.
 
-For each frame: the library denoises it alone (the *prior*), and a history stabilises that
-(:mod:`jaxdn.methods.stabilised`); the noisy frame, the prior and the guides are blended into running means along motion
-(:mod:`jaxdn.methods.combiner.history`); affinities filter the means of noisy light and of the prior's images, at full
-and at half resolution (:mod:`jaxdn.methods.combiner.candidates`). The image is a mean of eight candidates: the prior,
-the stabilised one, the means, the filtered ones, and the prior with the correction that filtered samples tell of.
+For each frame: the library denoises it alone (the *prior*); the noisy frame, the prior and the guides are blended into
+running means along motion (:mod:`jaxdn.methods.combiner.history`); affinities filter the means of noisy light and of
+the prior's images, at full and at half resolution (:mod:`jaxdn.methods.combiner.candidates`). The image is a mean of
+five candidates: the prior, the prior with the correction that filtered samples tell of, at two scales, the mean of
+priors, and the last result.
 
 A U-Net at half resolution decides for every pixel how fast the means follow, the filter's features and how far a pixel
 is trusted. A second, smaller one sees the candidates and what noisy light says about each, and decides their weights
-(:mod:`jaxdn.methods.combiner.choice`). What both predict before training is plausible: mostly the stabilised prior and
-the mean of priors.
+(:mod:`jaxdn.methods.combiner.choice`). What both predict before training is plausible: mostly the mean of priors and
+the last result.
 """
 
 import functools
@@ -26,6 +26,7 @@ from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.core.options import Range
 from jaxdn.denoiser import Core, Denoiser, Params, core_of, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
+from jaxdn.filters.sharp_history import TAPS
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods.combiner import choice
 from jaxdn.methods.combiner.candidates import (
@@ -47,8 +48,6 @@ from jaxdn.methods.combiner.history import (
 )
 from jaxdn.methods.oidn import oidn
 from jaxdn.methods.registry import method
-from jaxdn.methods.stabilised import RECEPTIVE_FIELD as STABILISED_FIELD
-from jaxdn.methods.stabilised import blend_image
 from jaxdn.networks import Widths, graph
 from jaxdn.ops import oidn as binding
 from jaxdn.ops.scales import crop, downsample, fill_holes, join_planes, pad, space_to_depth, to_planes, upsample
@@ -70,8 +69,6 @@ INITIAL = {"trust": 4.0, "follow": 0.0}
 share of the new frame in the means."""
 PRECISIONS = {"albedo": 1.0, "normal": 1.0, "light": 4.0, "depth": 6.0, "learned": 0.0}
 """Guide of the filter -> the logarithm of its precision before training."""
-HISTORY_MAX = 16
-"""Frames of which the stabilised prior is a mean at most."""
 _LEVEL_WEIGHT = 4.0
 """Initial logit of the weight of each level at half resolution."""
 _SPLITS = np.cumsum([4 * FEATURES, 4 * len(INITIAL), HALF_FEATURES]).tolist()
@@ -82,7 +79,7 @@ _DARK = 1e-3
 """Light at the network's brightness that is as good as dark."""
 _LEAST_ALBEDO = 0.03
 """Added to the albedo before light is divided by it."""
-INPUTS = {"geometry": 32, "light": 20, "prior": 18}
+INPUTS = {"geometry": 32, "light": 20, "prior": 11}
 """Groups of the network's input channels."""
 
 if TYPE_CHECKING:
@@ -159,13 +156,14 @@ def combiner(options: Options) -> Denoiser:
     def step(
         params: Params, state: CombinerState, frame: Frame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[CombinerState, jax.Array, jax.Array]:
-        state, found, invalid = find(params, state, frame, first, statistics)
+        found, invalid = find(params, state, frame, first, statistics)
         image = mix_candidates(chooser, params["choice"], found, statistics.exposure)
         image = jnp.clip(crop_planes(image, frame.radiance.shape[:2]), 0.0, RADIANCE_MAX)
-        return state, image.transpose(1, 2, 0), invalid
+        means = crop_planes(found.means, frame.radiance.shape[:2])
+        return keep_history(frame, means, image), image.transpose(1, 2, 0), invalid
 
     fields = [2 * graph.receptive_field_radius(shape) for shape in (network_shape, _chooser_shape(options))]
-    fields += [binding.RECEPTIVE_FIELD, STABILISED_FIELD, receptive_field(), choice.RECEPTIVE_FIELD]
+    fields += [binding.RECEPTIVE_FIELD, TAPS, receptive_field(), choice.RECEPTIVE_FIELD]
     core = Core(start, step, reads, init, prepare=prepare, requires_validity_mask=True)
     return recurrent(core._replace(receptive_field=sum(fields)))
 
@@ -181,10 +179,8 @@ class Found(NamedTuple):
     """With the new frame in them."""
 
 
-CandidateStep = Callable[
-    [Params, CombinerState, Frame, jax.Array, FrameStatistics], tuple[CombinerState, Found, jax.Array]
-]
-"""(params, state, prepared frame, is it the first, statistics) -> the next state, what was found, invalid pixels."""
+CandidateStep = Callable[[Params, CombinerState, Frame, jax.Array, FrameStatistics], tuple[Found, jax.Array]]
+"""(params, state, prepared frame, is it the first, statistics) -> what was found, invalid pixels of the state."""
 
 
 def build_candidate_step(options: Options) -> CandidateStep:
@@ -194,25 +190,21 @@ def build_candidate_step(options: Options) -> CandidateStep:
 
     def find(
         params: Params, state: CombinerState, frame: Frame, first: jax.Array, statistics: FrameStatistics
-    ) -> tuple[CombinerState, Found, jax.Array]:
+    ) -> tuple[Found, jax.Array]:
         size = frame.radiance.shape[:2]
         prior = to_planes(jnp.clip(library.step({}, (), frame, first, statistics)[1], 0.0, RADIANCE_MAX))
-        kept = state.stable, frame, prior.transpose(1, 2, 0), first, statistics.exposure
-        stable, steady_prior, invalid = blend_image(*kept, history_max=HISTORY_MAX)
         now = measure_now(frame, jax.lax.stop_gradient(prior))
         past = fetch_past(state, frame, now, first)
         weights = {name: part for name, part in params.items() if name not in ("guide", "choice")}
-        steady = jax.lax.stop_gradient(to_planes(steady_prior))
-        inputs = _assemble_network_input(frame, now, past, steady, statistics)
+        inputs = _assemble_network_input(frame, now, past, statistics)
         head = network.apply(weights, [group[None] for group in inputs])[0][0]
         parameters, follow = _split_head(head, tuple(side + -side % _BLOCKS for side in size))
         means = update_means(now, past, crop_planes(follow, size), most=options.history_max)
         depth = None if frame.depth is None else pad(frame.depth, _BLOCKS)
         wide = pad_planes(means)
-        images = wide, pad_planes(now.prior), pad_planes(steady)
+        images = wide, pad_planes(now.prior), pad_planes(past.result)
         candidates = make_candidates(params["guide"], *images, depth, parameters, statistics)
-        found = Found(candidates, pad_planes(now.light), wide)
-        return keep_history(frame, means, stable), found, past.invalid + invalid
+        return Found(candidates, pad_planes(now.light), wide), past.invalid
 
     return find
 
@@ -266,32 +258,31 @@ def prepare(frame: Frame) -> tuple[FrameStatistics, Frame]:
 
 
 def _assemble_network_input(
-    frame: Frame, now: Means, past: Past, stable: jax.Array, statistics: FrameStatistics
+    frame: Frame, now: Means, past: Past, statistics: FrameStatistics
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The groups of :data:`INPUTS` [h, w, C], by blocks of 2x2 pixels, padded by the edge.
 
-    Surfaces; light divided by the albedo: noisy, the mean and the stabilised prior, at one brightness
-    (:func:`jaxdn.color.exposure`) and compressed; light as it is: the prior, its mean and the stabilised one, and where
-    there is a history.
+    Surfaces; light divided by the albedo: noisy, the mean and the prior, at one brightness
+    (:func:`jaxdn.color.exposure`) and compressed; light as it is: the prior and its mean, and where there is a history.
     """
     gain, like = statistics.exposure, now.light[:1]
     nearness = like * 0 if frame.depth is None else to_planes(depth_feature(frame.depth, statistics.mean_depth))
     roughness = like * 0 if frame.roughness is None else to_planes(frame.roughness) - 1.0
     geometry = now.albedo - 1.0, now.normal, nearness, roughness
     albedo = past.means.albedo + _LEAST_ALBEDO
-    divided = [color.compress(gain * light / albedo) for light in (now.light, past.means.light, stable)]
+    divided = [color.compress(gain * light / albedo) for light in (now.light, past.means.light, now.prior)]
     level = color.luminance_of_planes(past.means.light)
     spread = jnp.sqrt(jnp.maximum(past.means.square - level**2, 0.0) + 1e-12) / (level + _DARK / gain)
     count = jnp.where(past.valid, past.means.number, 0.0)
     facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + count), jnp.ones_like(level)]
-    plain = [color.compress(gain * light) for light in (now.prior, past.means.prior, stable)]
+    plain = [color.compress(gain * light) for light in (now.prior, past.means.prior)]
     valid = past.valid[None].astype(like.dtype)
 
     def by_blocks(planes: list[jax.Array]) -> list[jax.Array]:
         return [_even(each) for each in planes]
 
     four = [space_to_depth(each) for each in by_blocks([color.luminance_of_planes(one)[None] for one in divided[::2]])]
-    own = [space_to_depth(each) for each in by_blocks([color.luminance_of_planes(one)[None] for one in plain[::2]])]
+    own = [space_to_depth(each) for each in by_blocks([color.luminance_of_planes(one)[None] for one in plain[:1]])]
     groups = (
         [space_to_depth(each) for each in by_blocks(list(geometry))],
         [downsample(each) for each in by_blocks([*divided, *(fact[None] for fact in facts)])] + four,
@@ -319,7 +310,7 @@ def _split_head(head: jax.Array, size: Sequence[int]) -> tuple[FilterParameters,
 
 
 def _mix(shares: jax.Array, candidates: list[jax.Array], gain: jax.Array) -> jax.Array:
-    """[3, H, W] the mean of candidates with weights [8, H, W], of log(1 + x) at one brightness.
+    """[3, H, W] the mean of candidates with weights [5, H, W], of log(1 + x) at one brightness.
 
     In linear light a hundredth of a lamp that is beside the pixel in one candidate outshines what all others show.
     """
@@ -343,6 +334,7 @@ def pad_planes(tree: _Planes) -> _Planes:
     return padded
 
 
-def crop_planes(planes: jax.Array, size: Sequence[int]) -> jax.Array:
-    """The first rows and columns of planes [..., H, W]."""
-    return planes[..., : size[0], : size[1]]
+def crop_planes(tree: _Planes, size: Sequence[int]) -> _Planes:
+    """The first rows and columns of all planes [..., H, W]."""
+    cropped: _Planes = jax.tree.map(lambda planes: planes[..., : size[0], : size[1]], tree)
+    return cropped
