@@ -7,7 +7,7 @@ differs from the history. Where light has changed, both differ from it alike.
 
 For a pixel with new image y, noisy radiance x, history h, and the windows W of 7x7 and 15x15 pixels around it:
 
-* innovation ``d = y - h``, residual ``e = x - h``, at most 3 deviations of x; noise variance v of x;
+* innovation ``d = y - h``, residual ``e = x - h``, at most 3 deviations of x or as large as d; noise variance v of x;
 * regression of the residual on the innovation, ``a = sum_W e d / v``, ``b = sum_W d^2 / v``: its slope ``a / b`` has
   the standard error ``1 / sqrt(b)``;
 * support ``s = max_W (a / b - 3.5 / sqrt(b))`` in [0, 1]: the share of the innovation that is surely a change;
@@ -41,7 +41,8 @@ RECEPTIVE_FIELD = 2 * max(_WINDOWS) + _NOISE_WINDOW
 _STANDARD_ERRORS = 3.5
 """How surely a change must be one: with fewer, small changes trail less, and still surfaces flicker more."""
 _MOST_RESIDUAL = 3.0
-"""Residuals beyond so many deviations count as these: an outlier, which the denoiser lets through, is no proof."""
+"""Residuals beyond so many deviations count as these: an outlier, which the denoiser lets through, is no proof. Those
+that the innovation has too count whole: a lamp without noise that goes out is no outlier."""
 _SHARE = 0.2
 """Weight of the new frame in both variances."""
 _MOST_GROWTH = 3.0
@@ -132,7 +133,7 @@ def measure_support(residual: jax.Array, innovation: jax.Array, variance: jax.Ar
 
     ``variance`` [H, W] > 0 is that of the residual's noise.
     """
-    most = _MOST_RESIDUAL * jnp.sqrt(variance)[None]
+    most = jnp.maximum(_MOST_RESIDUAL * jnp.sqrt(variance)[None], jnp.abs(innovation))
     products = (
         jnp.stack([jnp.sum(jnp.clip(residual, -most, most) * innovation, axis=0), jnp.sum(innovation**2, axis=0)])
         / variance[None]

@@ -32,7 +32,8 @@ def blend_in_numpy(past, valid, image, noisy, exposure, fetch_error, history_max
     kept = np.where(valid, (exposure * past[5]) ** 2, 0)
     v = np.maximum(np.maximum(now, kept), 1e-8)
     tracked = np.where(kept > 0, 0.8 * kept + 0.2 * now, now)
-    e = np.clip(e, -3 * np.sqrt(v), 3 * np.sqrt(v))
+    most = np.maximum(3 * np.sqrt(v), np.abs(d))
+    e = np.clip(e, -most, most)
     s = np.zeros(valid.shape)
     for radius in (3, 7):
         a, b = window_sums((d * e).sum(axis=0) / v, radius), window_sums((d * d).sum(axis=0) / v, radius)
@@ -194,6 +195,32 @@ def test_light_that_is_switched_is_there_at_once(factor, noise, rng):
     left = np.abs((found[6:] - truth[6:]).mean(axis=(1, 2, 3))) / np.abs(truth[6] - truth[5]).mean()
     assert left[0] < 0.1
     assert left[3] < 0.02
+
+
+def test_a_lamp_in_view_that_goes_out_is_gone_at_once(rng):
+    """The lamp has no noise, the wall has much: a residual of many deviations that the image shows too is no outlier."""
+    truth = np.full((10, 3, *SIZE), 0.3)
+    truth[:6, :, 18:30, 24:36] = 20.0
+    noise = np.where(truth > 1, 0.001, 0.7)
+    found, _ = run(truth, rng, error=0.01, noise=noise[0])
+    lamp, around = (slice(20, 28), slice(26, 34)), (slice(10, 38), slice(16, 44))
+    for index in (6, 9):
+        assert np.abs(found[index][:, *lamp] - 0.3).mean() < 0.03
+        assert np.abs(found[index][:, *around] - 0.3).mean() < 0.03
+
+
+def test_an_outlier_is_no_proof(rng):
+    """One pixel of 1000, half of which the denoiser lets through, where nothing changed: it does not stay."""
+    truth = np.full((3, *SIZE), 0.5, np.float32)
+    past, blend = jnp.zeros((PLANES, *SIZE)), jax.jit(partial(kalman_blend, history_max=16))
+    for index in range(8):
+        image = truth * (1 + 0.03 * blur(rng.normal(size=truth.shape)))
+        noisy = truth * (1 + 0.7 * (rng.exponential(size=truth.shape) - 1))
+        if index == 7:
+            noisy[:, 20, 30], image[:, 19:22, 29:32] = 1000.0, 50.0
+        valid = np.full(SIZE, index > 0)
+        past = blend(past, valid, image.astype(np.float32), noisy.astype(np.float32), jnp.float32(0.3))
+    assert np.asarray(past[:3, 20, 30]).max() < 0.2 * 50
 
 
 def test_a_moving_shadow_does_not_trail(rng):
