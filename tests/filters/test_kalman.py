@@ -198,7 +198,7 @@ def test_light_that_is_switched_is_there_at_once(factor, noise, rng):
 
 
 def test_a_lamp_in_view_that_goes_out_is_gone_at_once(rng):
-    """The lamp has no noise, the wall has much: a residual of many deviations that the image shows too is no outlier."""
+    """The lamp has no noise, the wall has much: a residual of many deviations that the image has too is no outlier."""
     truth = np.full((10, 3, *SIZE), 0.3)
     truth[:6, :, 18:30, 24:36] = 20.0
     noise = np.where(truth > 1, 0.001, 0.7)
