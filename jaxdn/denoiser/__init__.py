@@ -3,6 +3,7 @@
 from jaxdn.denoiser.interface import Core as Core
 from jaxdn.denoiser.interface import Denoiser as Denoiser
 from jaxdn.denoiser.interface import Params as Params
+from jaxdn.denoiser.interface import Pattern as Pattern
 from jaxdn.denoiser.interface import Prepared as Prepared
 from jaxdn.denoiser.interface import Recurrent as Recurrent
 from jaxdn.denoiser.interface import Stages as Stages

@@ -19,6 +19,7 @@ from jaxdn.core.checks import check_image, check_same_size
 from jaxdn.core.frame import RADIANCE_MAX, Frame, only
 from jaxdn.denoiser.sanitize import sanitize
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
+from jaxdn.ops.sampling import draw_random_numbers
 
 Params = dict[str, Any]
 """Nested dicts of arrays; ``{}`` for a filter without weights."""
@@ -28,6 +29,8 @@ Prepared = Any
 """What a core makes of a frame before its step: the frame itself, or with it what statistics and step both need."""
 Step = Callable[[Params, State, Frame], tuple[State, jax.Array]]
 """(params, state, frame) -> (state, image [H, W, 3] >= 0)."""
+Pattern = Callable[[int, int, jax.Array | int], jax.Array]
+"""(height, width, number of the frame) -> [H, W, 1] in [0, 1): where fractions of samples are rounded up."""
 
 
 class Denoiser(NamedTuple):
@@ -57,6 +60,8 @@ class Denoiser(NamedTuple):
     processing, and wrappers take the functions above. Who replaces one of these replaces the core, too."""
     sees_sample: bool = True
     """``samples`` looks at the frame's radiance: a sample of every pixel has to be rendered before it is called."""
+    pattern: Pattern = draw_random_numbers
+    """The numbers below which a fraction that ``samples`` requests is rounded up."""
 
 
 class Core(NamedTuple):
@@ -84,6 +89,8 @@ class Core(NamedTuple):
     because a value was not finite, elsewhere the given one if it reads that, else 1. Without it such pixels look like
     pixels without light."""
     sees_sample: bool = True
+    """As of :class:`Denoiser`."""
+    pattern: Pattern = draw_random_numbers
     """As of :class:`Denoiser`."""
 
 
@@ -118,7 +125,9 @@ def recurrent(core: Core) -> Denoiser:
         def samples(params: Params, state: Recurrent, frame: Frame, most: int) -> jax.Array:
             return core_samples(params, state.core, sanitize(check_frame(frame, core.reads))[0], state.age == 0, most)
 
-    return Denoiser(core.init, start, step, core.reads, samples, core.receptive_field, core, core.sees_sample)
+    return Denoiser(
+        core.init, start, step, core.reads, samples, core.receptive_field, core, core.sees_sample, core.pattern
+    )
 
 
 class Stages(NamedTuple):
@@ -169,7 +178,9 @@ def core_of(denoiser: Denoiser) -> Core:
             return request(params, begin(params, state, frame, first), only(frame, denoiser.reads), most)
 
     core = Core(denoiser.start, step, denoiser.reads, denoiser.init, samples)
-    return core._replace(receptive_field=denoiser.receptive_field, sees_sample=denoiser.sees_sample)
+    return core._replace(
+        receptive_field=denoiser.receptive_field, sees_sample=denoiser.sees_sample, pattern=denoiser.pattern
+    )
 
 
 def _shared_stages(core: Core) -> Stages:

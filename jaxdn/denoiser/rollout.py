@@ -13,7 +13,7 @@ from jax import lax
 from jaxdn.core.checks import check_image
 from jaxdn.core.frame import RADIANCE_MAX, Clip, Frame, frame_at, only, present
 from jaxdn.denoiser import Denoiser, Params, Recurrent, State
-from jaxdn.ops.sampling import draw_random_numbers, from_layers, round_stochastically
+from jaxdn.ops.sampling import from_layers, round_stochastically
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Float
@@ -52,7 +52,7 @@ def render_requested(
     bounded = {
         n: jnp.where(jnp.isfinite(layer), jnp.minimum(layer, RADIANCE_MAX), layer) for n, layer in layers.items()
     }
-    uniform = draw_random_numbers(frame.radiance.shape[0], frame.radiance.shape[1], _age(state))
+    uniform = denoiser.pattern(frame.radiance.shape[0], frame.radiance.shape[1], _age(state))
     radiance, counts = from_layers(bounded, wanted, reference=reference, uniform=uniform)
     return only(frame._replace(radiance=radiance, sample_count=counts), denoiser.reads)
 
@@ -129,7 +129,7 @@ def _step(denoiser: Denoiser, params: Params, state: State, frame: Frame, layers
 def _ask(denoiser: Denoiser, params: Params, state: State, frame: Frame, most: int) -> jax.Array:
     assert denoiser.samples is not None
     wanted = denoiser.samples(params, state, frame, most)
-    uniform = draw_random_numbers(wanted.shape[0], wanted.shape[1], _age(state))
+    uniform = denoiser.pattern(wanted.shape[0], wanted.shape[1], _age(state))
     return jnp.clip(round_stochastically(wanted, uniform), 0, most)
 
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 
 from jaxdn import color
 from jaxdn.core.frame import Frame
-from jaxdn.denoiser import Core, Denoiser, Params, recurrent
+from jaxdn.denoiser import Core, Denoiser, Params, Pattern, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods import ntd
@@ -25,6 +25,7 @@ from jaxdn.methods.demodulation import demodulated
 from jaxdn.methods.history_vectors import Vectors
 from jaxdn.methods.registry import method
 from jaxdn.methods.sampler import Sampling, allocate_samples, gray, motion_feature, sampler
+from jaxdn.ops.sampling import draw_random_numbers, rotate_pattern
 from jaxdn.recipes.augmentation import NO_AUGMENTATION
 from jaxdn.recipes.objectives import last_frames, unbiased_illumination
 from jaxdn.recipes.recipe import Recipe
@@ -41,6 +42,9 @@ class Options(ntd.Options, Sampling):
     heads say; with its nearest U both are its eq. 3."""
     up: Literal["bilinear", "nearest"] = "nearest"
     """The upsampling U of coarser scales."""
+    pattern: Literal["random", "rotating"] = "random"
+    """Where fractions of samples are rounded up (``rounding="stochastic"``): at random, or in a fixed pattern that
+    rotates from frame to frame (:func:`jaxdn.ops.sampling.rotate_pattern`)."""
 
 
 PAPER = Options(alpha_at="coarse", least=0, rounding="nearest", **ntd.AS_PUBLISHED)
@@ -103,7 +107,11 @@ def ntasd(options: Options) -> Denoiser:
         return network.counts(params["sampler"], features, first, most)
 
     core = Core(start, step, inner.reads, init, samples, inner.prepare, sees_sample=False)
+    core = core._replace(pattern=_PATTERNS[options.pattern])
     return demodulated(recurrent(core), by=options.demodulate)
+
+
+_PATTERNS: dict[str, Pattern] = {"random": draw_random_numbers, "rotating": rotate_pattern}
 
 
 def _sample_features(frame: Frame) -> list[jax.Array | None]:

@@ -100,7 +100,8 @@ def stabilised(denoiser: Denoiser, *, history_max: int = 16) -> Denoiser:
     field = None if core.receptive_field is None else core.receptive_field + RECEPTIVE_FIELD
     mask = core.requires_validity_mask
     sees = core.sees_sample
-    return recurrent(Core(start, step, core.reads | _READS, core.init, samples, prepare, field, mask, sees))
+    reads = core.reads | _READS
+    return recurrent(Core(start, step, reads, core.init, samples, prepare, field, mask, sees, core.pattern))
 
 
 def _count_colors(frame: Frame) -> int:

@@ -120,7 +120,8 @@ def taa(options: Options) -> Denoiser:
     field = None if before.receptive_field is None else before.receptive_field + _RECEPTIVE_FIELD
     mask = before.requires_validity_mask
     sees = before.sees_sample
-    return recurrent(Core(start, step, before.reads | READS, before.init, samples, prepare, field, mask, sees))
+    reads = before.reads | READS
+    return recurrent(Core(start, step, reads, before.init, samples, prepare, field, mask, sees, before.pattern))
 
 
 _RECEPTIVE_FIELD = 4

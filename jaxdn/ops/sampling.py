@@ -117,7 +117,36 @@ def draw_random_numbers(height: int, width: int, frame: jax.Array | int) -> jax.
     for shift, factor in ((16, 0x7FEB352D), (15, 0x846CA68B)):
         place = (place ^ (place >> shift)) * jnp.uint32(factor)
     place = (place ^ (place >> 16)) + jnp.asarray(frame).astype(jnp.uint32) * jnp.uint32(2654435769)
-    return (place >> 8).astype(jnp.float32) * 2.0**-24
+    return _fraction(place)
+
+
+def rotate_pattern(height: int, width: int, frame: jax.Array | int) -> jax.Array:
+    """Numbers [H, W, 1] in [0, 1) for a frame, in place of :func:`draw_random_numbers`: a fixed pattern that rotates.
+
+    The binary digits of the ordered dither of 4x4 pixels (Bayer 1973), each flipped where the frame's number has a 1,
+    its lowest digit the first. With budgets of ``2^-n`` samples a pixel, ``round_stochastically`` gives every pixel one
+    sample in each run of ``2^n`` frames that begins at a multiple of it. Of a half, the pixels are a checkerboard in
+    every frame; of a quarter, each aligned 2x2 block has one.
+    """
+    rows, columns = (jnp.arange(size, dtype=jnp.uint32) for size in (height, width))
+    order = jnp.zeros((height, width), jnp.uint32)
+    for bit in (0, 1):
+        row, column = (rows[:, None] >> bit) & 1, (columns[None] >> bit) & 1
+        # 0 and 1 on the diagonal, 2 and 3 beside it.
+        order = 4 * order + 2 * (row ^ column) + row
+    return _fraction((order << 28) ^ _reverse_digits(jnp.asarray(frame).astype(jnp.uint32)))[..., None]
+
+
+def _reverse_digits(number: jax.Array) -> jax.Array:
+    """The 32 binary digits of ``number`` (uint32) in the opposite order."""
+    for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF)):
+        number = ((number >> shift) & jnp.uint32(mask)) | ((number & jnp.uint32(mask)) << shift)
+    return number
+
+
+def _fraction(number: jax.Array) -> jax.Array:
+    """``number`` (uint32) over 2^32, rounded down to what float32 tells from 1."""
+    return (number >> 8).astype(jnp.float32) * 2.0**-24
 
 
 @jax.custom_vjp

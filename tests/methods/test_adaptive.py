@@ -14,6 +14,8 @@ from jaxdn.denoiser.rollout import denoise, render_requested, unroll
 from jaxdn.methods.dasr import dasr
 from jaxdn.methods.ntasd import ntasd
 from jaxdn.methods.registry import methods
+from jaxdn.methods.stabilised import stabilised
+from jaxdn.methods.taa import taa
 from jaxdn.ops.sampling import from_layers
 
 TINY = ((4,), (4,), (5,), (5,), (6,))
@@ -125,6 +127,16 @@ def test_dasr_sees_the_first_sample_and_no_other_frame(rng, key):
     plain, moved, same = (counts_of(denoiser, params, each)[0] for each in (clip, brighter, other))
     assert np.any(plain != moved)
     np.testing.assert_array_equal(plain, same)
+
+
+@pytest.mark.parametrize("wrap", [lambda inner: inner, stabilised, lambda inner: taa(after=inner)])
+def test_a_quarter_of_a_sample_rotates_over_the_pixels(wrap, rng, key):
+    """Without a sampler, each pixel has one sample in four frames, and each 2x2 block one in every frame."""
+    options: dict[str, Any] = {"adaptive": False, "budget": 0.25, "least": 0, "rounding": "stochastic"}
+    denoiser, clip = wrap(ntasd(size=TINY, pattern="rotating", **options)), clip_of(rng, 4, (8, 12))
+    counts = np.stack(counts_of(denoiser, denoiser.init(key, frame_at(clip.frames, 0)), clip))
+    np.testing.assert_array_equal(counts.sum(0), 1)
+    np.testing.assert_array_equal(counts.reshape(4, 4, 2, 6, 2).sum((2, 4)), 1)
 
 
 @pytest.mark.parametrize("options", [{}, {"budget": 1}, {"least": 3, "budget": 5}, {"preset": "paper"}], ids=str)

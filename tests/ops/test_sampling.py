@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.ops.sampling import draw_random_numbers, from_layers, round_stochastically, sample_map
+from jaxdn.ops.sampling import draw_random_numbers, from_layers, rotate_pattern, round_stochastically, sample_map
 
 SIZE = (4, 5)
 
@@ -185,6 +185,32 @@ def test_random_numbers_are_even_and_independent_between_pixels():
     quarter = np.stack([np.asarray(draw_random_numbers(8, 8, frame)) > 0.75 for frame in range(40)])
     gaps = [np.diff(np.nonzero(quarter[:, y, x, 0])[0]) for y, x in np.ndindex(8, 8)]
     assert max(gap.max() for gap in gaps) <= 5  # no pixel waits for long
+
+
+@pytest.mark.parametrize("bits", [1, 2, 4])
+def test_a_rotating_pattern_comes_to_every_pixel_once(bits):
+    """Of 2^-bits samples a pixel: one in every run of 2^bits frames, and equally many pixels in each frame."""
+    period = 2**bits
+    taken = np.asarray(
+        jax.vmap(lambda frame: round_stochastically(jnp.full((8, 12, 1), 1 / period), rotate_pattern(8, 12, frame)))(
+            jnp.arange(3 * period)
+        )
+    )
+    np.testing.assert_array_equal(taken.reshape(3, period, 8, 12).sum(1), 1)
+    np.testing.assert_array_equal(taken.sum((1, 2, 3)), 96 / period)
+
+
+def test_a_rotating_pattern_is_spread_evenly_in_every_frame():
+    """Of a quarter, each 2x2 block has one; of a half, no pixel has what its neighbours have."""
+    numbers = np.stack([np.asarray(rotate_pattern(8, 12, frame))[..., 0] for frame in (0, 1, 2, 3, 1000003)])
+    assert 0 <= numbers.min() < numbers.max() < 1
+    blocks = (numbers < 0.25).reshape(-1, 4, 2, 6, 2).sum((2, 4))
+    np.testing.assert_array_equal(blocks, 1)
+    half = numbers < 0.5
+    assert (half[:, 1:] != half[:, :-1]).all()
+    assert (half[:, :, 1:] != half[:, :, :-1]).all()
+    # Sixteen thresholds, each in every 4x4 block.
+    assert sorted(16 * numbers[0, :4, 4:8].ravel()) == list(range(16))
 
 
 def test_the_map_with_fractions_keeps_a_budget_below_one_sample(rng):
