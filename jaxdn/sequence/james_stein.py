@@ -136,7 +136,7 @@ class Confidence(NamedTuple):
     """How far a denoised frame is to be trusted; scalars."""
 
     noise: jax.Array
-    """The median of its noise."""
+    """The median of its noise, of pixels that have more than :data:`CLEAN` if there are any: a sky has none."""
     lost: jax.Array
     """The root of the mean square of what was lost."""
     doubt: jax.Array
@@ -211,7 +211,9 @@ def measure_confidence(combined: JamesStein) -> Confidence:
     counts as noise, so that too much of it stays. Where the combined image's estimated error is about that of the noisy
     one, the noisy one is the result.
     """
-    noise, lost = median(combined.noise), jnp.sqrt(jnp.mean(combined.lost**2))
+    noise = median(combined.noise, combined.noise > CLEAN[0])
+    noise = jnp.where(noise > 0, noise, median(combined.noise))
+    lost = jnp.sqrt(jnp.mean(combined.lost**2))
     noisy_risk = jnp.sum(combined.noisy_risk)
     relative = jnp.sum(combined.risk) / jnp.where(noisy_risk > 0, noisy_risk, 1.0)
     much, ratio = 1 - _falling(lost, *LOST), lost / jnp.maximum(noise, 1e-6)

@@ -261,6 +261,17 @@ def test_half_of_a_frame_may_be_clean(rng):
     assert mse(image[:, 128:], truth[:, 128:]) < 1.01 * mse(blurred[:, 128:], truth[:, 128:])
 
 
+@pytest.mark.parametrize("samples", [1, 4])
+def test_a_sky_of_most_of_the_frame_costs_no_confidence(rng, samples):
+    """The median of the noise counts where there is some: over all of such a frame it was 0, and the frame came back."""
+    truth = np.full((96, 128, 3), 0.5, np.float32)
+    noisy = truth.copy()
+    noisy[60:] *= rng.gamma(samples, 1 / samples, noisy[60:].shape[:2] + (1,)).astype(np.float32)
+    confidence = measure_confidence(mixed(noisy, truth))
+    assert confidence.fallback < 0.01
+    assert abs(float(confidence.noise) - samples**-0.5) < 0.2 * samples**-0.5
+
+
 def test_fireflies_and_invalid_values_do_not_come_back():
     denoised = np.full((*SIZE, 3), 0.5, np.float32)
     noisy = denoised.copy()
