@@ -263,7 +263,7 @@ def test_half_of_a_frame_may_be_clean(rng):
 
 @pytest.mark.parametrize("samples", [1, 4])
 def test_a_sky_of_most_of_the_frame_costs_no_confidence(rng, samples):
-    """The median of the noise counts where there is some: over all of such a frame it was 0, and the frame came back."""
+    """The median of the noise counts where there is some: over all of the frame it was 0, and the frame came back."""
     truth = np.full((96, 128, 3), 0.5, np.float32)
     noisy = truth.copy()
     noisy[60:] *= rng.gamma(samples, 1 / samples, noisy[60:].shape[:2] + (1,)).astype(np.float32)
