@@ -197,7 +197,7 @@ def test_a_killed_pack_leaves_no_set_and_the_next_removes_what_is_left(folder: P
     running = subprocess.Popen([sys.executable, "-m", "jaxdn.commands.main", *arguments])
     try:
         end = time.monotonic() + 120
-        while not any(path.stat().st_size > 2**16 for path in tmp_path.glob(".set.packing-*/.*.tmp")):
+        while not any(tmp_path.glob(".set.packing-*/.*.tmp")):  # small sets stay in the writer's memory to the end
             assert running.poll() is None
             assert time.monotonic() < end
             time.sleep(0.02)
