@@ -10,7 +10,7 @@ was; the denoised frames stay, to be looked at. ``--table`` prints what is there
 
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -165,12 +165,9 @@ FIGURES = {
 
 def means(rows: Sequence[dict[str, Any]], options: Options) -> dict[str, Any]:
     """The means over all clips: a row for each sample count and method."""
-    columns: list[dict[str, Any]] = [{"name": "samples"}, {"name": "method"}]
-    for name, title in FIGURES.items():
-        style = {"decimals": 3, "best": "lower"} if name == "flip" else {"decimals": 2, "best": "higher"}
-        columns.append({"name": title, **style})
+    columns = [{"name": "samples"}, {"name": "method"}, *figure_columns()]
     lines = [
-        [spp, f"`{method}`", *(_mean(row[name] for row in rows if _is(row, spp, method)) for name in FIGURES)]
+        [spp, f"`{method}`", *mean_figures([row for row in rows if _is(row, spp, method)])]
         for spp in options.spp
         for method in options.methods
     ]
@@ -213,6 +210,17 @@ def _describe(title: str, order: int, what: str, rows: Sequence[Any], options: O
 
 def _is(row: dict[str, Any], spp: int, method: str) -> bool:
     return bool(row["spp"] == spp and row["method"] == method)
+
+
+def figure_columns() -> list[dict[str, Any]]:
+    """The columns of :func:`mean_figures` in a table of docs/results."""
+    lower, higher = {"decimals": 3, "best": "lower"}, {"decimals": 2, "best": "higher"}
+    return [{"name": title, **(lower if name == "flip" else higher)} for name, title in FIGURES.items()]
+
+
+def mean_figures(rows: Sequence[Mapping[str, Any]]) -> list[float | None]:
+    """The mean of each of :data:`FIGURES` over the clips that have it."""
+    return [_mean(row[name] for row in rows) for name in FIGURES]
 
 
 def _mean(values: Iterable[float | None]) -> float | None:

@@ -65,12 +65,12 @@ def denoise_files(
     A frame of another renderer is its own file with the denoised beauty in place of the noisy one
     (:func:`jaxdn.data.foreign.result.write_result`). A frame of one of our clips has the channels ``R, G, B``, the
     denoised radiance with the directly reflected and the emitted light added back, and ``denoised.R/G/B``, the denoised
-    part alone. What is no noise is kept as it was (``settings.safe``). While a frame is denoised, the next one is read
-    and the one before is written, so that a sequence of any length takes the memory of three frames, or of one where
-    that is all there is. Files are never left incomplete. Where frames are missing, the history begins anew. Files of
-    other renderers that are damaged, of another size or with other buffers than most of their shot count as missing,
-    unless ``settings.strict``. Raises ValueError for input that cannot be read or is inconsistent, before the frame
-    concerned is written.
+    part alone; where its pixels are filtered, that is all light (:mod:`jaxdn.sequence.all_light`). What is no noise is
+    kept as it was (``settings.safe``). While a frame is denoised, the next one is read and the one before is written,
+    so that a sequence of any length takes the memory of three frames, or of one where that is all there is. Files are
+    never left incomplete. Where frames are missing, the history begins anew. Files of other renderers that are damaged,
+    of another size or with other buffers than most of their shot count as missing, unless ``settings.strict``. Raises
+    ValueError for input that cannot be read or is inconsistent, before the frame concerned is written.
 
     Args:
       sources: folders of clips, and folders of, patterns for, or names of EXR files.

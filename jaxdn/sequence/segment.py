@@ -9,11 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxdn.data.clip.folder import read_record
 from jaxdn.data.clip.frames import StoredFrame
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.read import check_single_layer, open_frames
 from jaxdn.runtime.overlap import read_ahead
+from jaxdn.sequence.all_light import gather_light, is_filtered
 from jaxdn.sequence.backward_pass import BackwardImages, backward_pass
 from jaxdn.sequence.frame_denoiser import Fallback, FrameDenoiser
 from jaxdn.sequence.jobs import Job
@@ -187,6 +189,8 @@ class _ClipFrames:
     def read(self, log: Callable[[str], None], *, count: int, backwards: bool = False) -> Iterator[StoredFrame]:
         """So many frames, or the same from the last backwards with time turned around."""
         frames = open_frames(self._clip, spp=self._spp, part=self._segment, backwards=backwards, log=log)[1]
+        if is_filtered(read_record(self._clip)):
+            frames = map(gather_light, frames)
         return islice(frames, count)
 
     def file(self, index: int) -> ExrFile | None:
