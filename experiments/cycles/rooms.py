@@ -119,7 +119,7 @@ def measure(room: str, clip: Path, held: Sequence[Reference], spp: int, method: 
     found = score(
         [images[index] for index in paired],
         [held[index] for index in paired],
-        [np.asarray(frames[index].motion) for index in paired],
+        [None if (motion := frames[index].motion) is None else np.asarray(motion) for index in paired],
     ).figures()
     target.parent.mkdir(parents=True, exist_ok=True)
     write_json(target.with_suffix(".json"), {"clip": room, "kind": room, "spp": spp, "method": method, **found})
