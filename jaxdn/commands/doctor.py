@@ -25,7 +25,7 @@ _EXTRA_OF = {"onednn-bfloat16": "onednn", "onednn-float32": "onednn", "onnxrunti
 """Backend -> the extra that brings it."""
 
 
-class Finding(NamedTuple):
+class Diagnosis(NamedTuple):
     """One thing that was looked at."""
 
     what: str
@@ -34,7 +34,7 @@ class Finding(NamedTuple):
     """What to do for more; empty where nothing is missing."""
 
 
-def doctor() -> list[Finding]:
+def doctor() -> list[Diagnosis]:
     """Print the findings as a table, and return them."""
     found = list(_findings())
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
@@ -46,37 +46,39 @@ def doctor() -> list[Finding]:
     return found
 
 
-def _findings() -> Iterator[Finding]:
-    yield Finding("jaxdn", f"{jaxdn.__version__}, Python {platform.python_version()}, {os.cpu_count()} cores")
+def _findings() -> Iterator[Diagnosis]:
+    yield Diagnosis("jaxdn", f"{jaxdn.__version__}, Python {platform.python_version()}, {os.cpu_count()} cores")
     yield _device()
     for backend in BACKENDS.values():
         if backend.available() and backend.faster():
-            yield Finding(f"backend for {backend.purpose}", backend.name)
+            yield Diagnosis(f"backend for {backend.purpose}", backend.name)
         elif backend.available():
-            yield Finding(f"backend for {backend.purpose}", f"XLA: {backend.name} is slower on this CPU")
+            yield Diagnosis(f"backend for {backend.purpose}", f"XLA: {backend.name} is slower on this CPU")
         elif backend.name == "onednn-bfloat16" and library.available():
-            yield Finding(f"backend for {backend.purpose}", "no onednn-bfloat16: this CPU does not compute with it")
+            yield Diagnosis(f"backend for {backend.purpose}", "no onednn-bfloat16: this CPU does not compute with it")
         elif jax.default_backend() == "cpu":
-            yield Finding(f"backend for {backend.purpose}", "XLA alone", f"faster: {install(_EXTRA_OF[backend.name])}")
+            yield Diagnosis(
+                f"backend for {backend.purpose}", "XLA alone", f"faster: {install(_EXTRA_OF[backend.name])}"
+            )
         else:
-            yield Finding(f"backend for {backend.purpose}", "XLA, as on every GPU")
+            yield Diagnosis(f"backend for {backend.purpose}", "XLA, as on every GPU")
     yield from _operations()
     yield _packages("training", "train")
     yield _packages("Open Image Denoise", "oidn")
     yield _renderer()
 
 
-def _device() -> Finding:
+def _device() -> Diagnosis:
     """What jax computes on."""
     backend = jax.default_backend()
     names = ", ".join(dict.fromkeys(device.device_kind for device in jax.devices()))
     found = f"jax {jax.__version__} on {backend} ({names})"
     if backend == "cpu" and has_cuda():
-        return Finding("device", found, "an NVIDIA GPU is there too: pip install 'jax[cuda13]' or 'jax[cuda12]'")
-    return Finding("device", found)
+        return Diagnosis("device", found, "an NVIDIA GPU is there too: pip install 'jax[cuda13]' or 'jax[cuda12]'")
+    return Diagnosis("device", found)
 
 
-def _operations() -> Iterator[Finding]:
+def _operations() -> Iterator[Diagnosis]:
     """The implementation that each operation of the methods has here, and what would be faster."""
     methods()  # imports the modules that declare them, but for the networks
     chosen: dict[str, list[str]] = {}
@@ -85,27 +87,27 @@ def _operations() -> Iterator[Finding]:
         label = fastest if fastest == differentiable else f"{fastest}, gradients by {differentiable}"
         chosen.setdefault(label, []).append(name)
     for label, names in chosen.items():
-        yield Finding(f"operations: {label}", ", ".join(names))
+        yield Diagnosis(f"operations: {label}", ", ".join(names))
     if default_implementation() == REFERENCE:
-        yield Finding(VARIABLE, REFERENCE, "filters are twice as fast without it")
+        yield Diagnosis(VARIABLE, REFERENCE, "filters are twice as fast without it")
     elif jax.default_backend() == "cpu" and (reason := numba_call.unavailable()):
-        yield Finding("filters", "XLA alone", f"twice as fast; numba {reason}")
+        yield Diagnosis("filters", "XLA alone", f"twice as fast; numba {reason}")
 
 
-def _packages(what: str, extra: str) -> Finding:
+def _packages(what: str, extra: str) -> Diagnosis:
     missing = [module for module in OPTIONAL_DEPENDENCIES[extra].modules if find_spec(module) is None]
     if missing:
-        return Finding(what, f"without {', '.join(missing)}", f"to use it: {install(extra)}")
-    return Finding(
+        return Diagnosis(what, f"without {', '.join(missing)}", f"to use it: {install(extra)}")
+    return Diagnosis(
         what, ", ".join(f"{name} {metadata.version(name)}" for name in OPTIONAL_DEPENDENCIES[extra].packages)
     )
 
 
-def _renderer() -> Finding:
+def _renderer() -> Diagnosis:
     """Mitsuba, its variant, and the LLVM library that it needs."""
     if find_spec("mitsuba") is None:
         return _packages("rendering", "render")
     choice = choose_variant()
     found = f"mitsuba {metadata.version('mitsuba')}, {choice.variant}"
     reason, _, advice = choice.reason.partition(". ")
-    return Finding("rendering", f"{found}: {reason}", advice)
+    return Diagnosis("rendering", f"{found}: {reason}", advice)

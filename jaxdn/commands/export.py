@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from jaxdn.export.formats import onnx_model, stablehlo
-from jaxdn.export.step import Step, exported_step
+from jaxdn.export.step import ExportedStep, exported_step
 from jaxdn.runtime.atomic_files import write_atomically
 from jaxdn.zoo.ready import find_model
 
@@ -16,7 +16,7 @@ class Exported(NamedTuple):
     """What was written."""
 
     files: list[Path]
-    step: Step
+    step: ExportedStep
 
 
 def export(

@@ -9,23 +9,23 @@ from jax import export
 import jaxdn
 from jaxdn.core.frame import BUFFERS
 from jaxdn.export.graph import IR_VERSION, OPSET, Graph, element_type
-from jaxdn.export.step import Step, name_buffer_channels
+from jaxdn.export.step import ExportedStep, name_buffer_channels
 from jaxdn.export.translate import translate
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 """Where the StableHLO runs."""
 
 
-def stablehlo(step: Step) -> bytes:
+def stablehlo(step: ExportedStep) -> bytes:
     """The step as ``jax.export`` serialises it; ``jax.export.deserialize(data).call(inputs)`` runs it.
 
-    ``inputs`` and the result are dicts as in :class:`jaxdn.export.step.Step`. The StableHLO itself, a portable artifact
-    for compilers other than JAX's, is its ``mlir_module_serialized``.
+    ``inputs`` and the result are dicts as in :class:`jaxdn.export.step.ExportedStep`. The StableHLO itself, a portable
+    artifact for compilers other than JAX's, is its ``mlir_module_serialized``.
     """
     return bytes(export.export(jax.jit(step.function), platforms=PLATFORMS)(step.inputs).serialize())
 
 
-def onnx_model(step: Step, name: str) -> bytes:
+def onnx_model(step: ExportedStep, name: str) -> bytes:
     """The step as an ONNX model, with :func:`about` as its metadata.
 
     Raises ValueError for an operation without a translation (:mod:`jaxdn.export.translate`).
@@ -57,7 +57,7 @@ def onnx_model(step: Step, name: str) -> bytes:
     return bytes(model.SerializeToString())
 
 
-def about(step: Step, name: str) -> dict[str, str]:
+def about(step: ExportedStep, name: str) -> dict[str, str]:
     """What a program needs to know to run the step, as text.
 
     ``jaxdn`` is the version, ``method`` the name, ``multiple`` that of height and width, if they are free, and

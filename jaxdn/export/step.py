@@ -24,7 +24,7 @@ Networks halve an image several times."""
 _SMALLEST = 16
 
 
-class Step(NamedTuple):
+class ExportedStep(NamedTuple):
     """A step that can be exported."""
 
     function: Callable[[Arrays], Arrays]
@@ -40,7 +40,7 @@ class Step(NamedTuple):
 
 def exported_step(
     denoiser: Denoiser, params: Params, *, buffers: Collection[str] | None = None, size: tuple[int, int] | None = None
-) -> Step:
+) -> ExportedStep:
     """The step of a denoiser with these parameters.
 
     Args:
@@ -86,7 +86,7 @@ def _chosen(denoiser: Denoiser, buffers: Collection[str] | None) -> list[str]:
 
 def _traced(
     denoiser: Denoiser, params: Params, buffers: list[str], size: tuple[Any, Any], multiple: int | None
-) -> Step:
+) -> ExportedStep:
     """The step for frames of one size, whose numbers may be symbols."""
     frame = {name: _spec((*size, BUFFERS[name].channels), BUFFERS[name].dtype) for name in buffers}
     with portable():
@@ -114,7 +114,7 @@ def _traced(
             return [made[name] for name in outputs]
 
         program = jax.make_jaxpr(ordered)(*inputs.values())
-    return Step(function, inputs, program, outputs, multiple)
+    return ExportedStep(function, inputs, program, outputs, multiple)
 
 
 def _spec(shape: tuple[Any, ...], dtype: Any) -> jax.ShapeDtypeStruct:

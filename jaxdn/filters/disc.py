@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.filters.edge_stopping import Offset, Weight
+from jaxdn.filters.edge_stopping import TapOffset, Weight
 from jaxdn.ops.dispatch.row_tiles import map_row_tiles
 
 _PLACES = [(r, turn + 0.5 * np.pi * k) for r, turn in ((1.0, 0.0), (0.5, 0.25 * np.pi)) for k in range(4)]
@@ -71,7 +71,7 @@ def disc_average(
             on_screen = (at_row >= 0) & (at_row < height) & (at_column >= 0) & (at_column < width)
             index = jnp.clip(at_row, 0, height - 1) * width + jnp.clip(at_column, 0, width - 1)
             found = packed.at[index].get(mode="promise_in_bounds")
-            offset = Offset(column, row, jnp.sqrt(column * column + row * row))
+            offset = TapOffset(column, row, jnp.sqrt(column * column + row * row))
             weight = (
                 share * jnp.where(on_screen, found[..., channels], 0.0) * _weight(weights, found, ends, here, offset)
             )
@@ -86,7 +86,7 @@ def disc_average(
 
 
 def _weight(
-    weights: Sequence[Weight], found: jax.Array, ends: np.ndarray, here: Sequence[jax.Array], offset: Offset
+    weights: Sequence[Weight], found: jax.Array, ends: np.ndarray, here: Sequence[jax.Array], offset: TapOffset
 ) -> jax.Array:
     """The product of all weights [h, w] at a tap, where ``found`` [h, w, C] has their planes from ``ends[1]`` on."""
     planes = [

@@ -17,7 +17,7 @@ from jaxdn.filters.surface_test import depth_slopes
 Planes = list[jax.Array]
 
 
-class Offset(NamedTuple):
+class TapOffset(NamedTuple):
     """From the centre to the tap, in pixels (scalars, including the spacing of the taps)."""
 
     x: jax.Array
@@ -32,9 +32,9 @@ class Weight(NamedTuple):
     """[n, H, W] planes that are read at the tap."""
     here: jax.Array
     """[m, H, W] planes that are read at the centre."""
-    exponent: Callable[[Planes, Planes, Offset], jax.Array] | None = None
+    exponent: Callable[[Planes, Planes, TapOffset], jax.Array] | None = None
     """(there, here, offset) -> e >= 0 [h, w], for a factor ``exp(-e)``."""
-    factor: Callable[[Planes, Planes, Offset], jax.Array] | None = None
+    factor: Callable[[Planes, Planes, TapOffset], jax.Array] | None = None
     """(there, here, offset) -> a factor [h, w] in [0, 1]."""
 
 
@@ -49,7 +49,7 @@ def depth_weight(
     layers = jnp.stack([depth[..., 0], *depth_slopes(depth, ids)])
     share = 1e-3 / height
 
-    def exponent(there: Planes, here: Planes, offset: Offset) -> jax.Array:
+    def exponent(there: Planes, here: Planes, offset: TapOffset) -> jax.Array:
         z, slope_x, slope_y = here
         scale = sigma * jnp.abs(slope_x * offset.x + slope_y * offset.y) + share * offset.length * z + 1e-10
         return jnp.abs(there[0] - z) / scale
@@ -65,7 +65,7 @@ def plane_weight(depth: jax.Array, ids: jax.Array | None, *, tolerance: float) -
     """
     layers = jnp.stack([depth[..., 0], *depth_slopes(depth, ids)])
 
-    def factor(there: Planes, here: Planes, offset: Offset) -> jax.Array:
+    def factor(there: Planes, here: Planes, offset: TapOffset) -> jax.Array:
         z, slope_x, slope_y = here
         away = jnp.abs(there[0] - z - slope_x * offset.x - slope_y * offset.y)
         return (away <= tolerance * z).astype(depth.dtype)
@@ -81,7 +81,7 @@ def normal_weight(normal: jax.Array, *, sigma: float | jax.Array) -> Weight:
     absent = jnp.all(normal == 0, axis=-1, keepdims=True).astype(normal.dtype)
     layers = jnp.concatenate([normal, absent], axis=-1).transpose(2, 0, 1)
 
-    def factor(there: Planes, here: Planes, offset: Offset) -> jax.Array:
+    def factor(there: Planes, here: Planes, offset: TapOffset) -> jax.Array:
         aligned = sum((a * b for a, b in zip(there, here, strict=True)), start=jnp.zeros((), layers.dtype))
         return _power(jnp.maximum(aligned, 0.0), sigma)
 
@@ -114,7 +114,7 @@ def lobe_weight(normal: jax.Array, roughness: jax.Array, *, fraction: float) -> 
     angle = fraction * jnp.maximum(jnp.arctan(spread * roughness[..., 0] ** 2), _STEADY)
     here = jnp.concatenate([layers, (1.0 / (angle * angle))[None]])
 
-    def exponent(there: Planes, here: Planes, offset: Offset) -> jax.Array:
+    def exponent(there: Planes, here: Planes, offset: TapOffset) -> jax.Array:
         aligned = sum((a * b for a, b in zip(there, here[:4], strict=True)), start=jnp.zeros((), layers.dtype))
         return jnp.maximum(2.0 * (1.0 - aligned), 0.0) * here[4]
 
@@ -135,7 +135,7 @@ def closeness_weight(closeness: jax.Array, *, tolerance: float, least: float) ->
     """
     planes, most = closeness[None], -math.log(least)
 
-    def exponent(there: Planes, here: Planes, offset: Offset) -> jax.Array:
+    def exponent(there: Planes, here: Planes, offset: TapOffset) -> jax.Array:
         known = (there[0] > 0) & (here[0] > 0)
         return jnp.where(known, jnp.minimum(jnp.abs(there[0] - here[0]) / tolerance, most), 0.0)
 

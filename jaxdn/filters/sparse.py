@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.filters.edge_stopping import Offset, Weight
+from jaxdn.filters.edge_stopping import TapOffset, Weight
 from jaxdn.filters.stencil_tiles import NO_WEIGHT
 from jaxdn.ops.dispatch.operation import ANY, platform
 from jaxdn.ops.dispatch.row_tiles import evaluate_sparsely
@@ -69,7 +69,7 @@ def sparse_edge_average(
         planes = [found[..., index] for index in range(found.shape[-1])]
         wide = step[:, None].astype(dtype)
         x_step, y_step = (wide * vectors[None, :, axis].astype(dtype) for axis in (1, 0))
-        offset = Offset(x_step, y_step, wide * lengths)
+        offset = TapOffset(x_step, y_step, wide * lengths)
         factor, at = jnp.where(seen, planes[count], 0.0) * shares, count + 1
         for one, here in zip(weights, own, strict=True):
             there = planes[at : at + one.there.shape[0]]

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdn.filters.edge_stopping import Offset, Planes, Weight
+from jaxdn.filters.edge_stopping import Planes, TapOffset, Weight
 from jaxdn.ops.dispatch.row_tiles import rows_per_tile
 
 _STRIP_PIXELS = 16384
@@ -160,7 +160,7 @@ def weighted_sums(
     summed = [*planes, inside]
 
     def weigh(offset: jax.Array, number: jax.Array) -> jax.Array:
-        tap, factor = Offset(number[0], number[1], number[2]), jnp.full(shape, number[3])
+        tap, factor = TapOffset(number[0], number[1], number[2]), jnp.full(shape, number[3])
         around = [[tiles.shifted(top, plane, offset) for plane in own] for own in guides.there]
         samples = list(zip(weights, around, centre, strict=True))
         exponents = [one.exponent(there, here, tap) for one, there, here in samples if one.exponent]

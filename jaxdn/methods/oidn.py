@@ -61,7 +61,7 @@ def oidn(options: Options) -> Denoiser:
     Raises ModuleNotFoundError, saying what to install, where the package ``pyoidn`` is missing, when a step is traced;
     NotPortableError where a step is exported, and TypeError where a gradient is asked for.
     """
-    settings = binding.Settings(options.quality, options.hdr, options.auxiliary, options.device)
+    settings = binding.OidnSettings(options.quality, options.hdr, options.auxiliary, options.device)
     reads = _READS[options.guides]
 
     def step(
@@ -80,7 +80,7 @@ def _start(params: Params, frame: Frame) -> tuple[()]:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _denoise(settings: binding.Settings, scale: jax.Array, *images: jax.Array) -> jax.Array:
+def _denoise(settings: binding.OidnSettings, scale: jax.Array, *images: jax.Array) -> jax.Array:
     """The image [H, W, 3] of radiance and guides, in the dtype of the radiance."""
     if platform() == ANY:
         raise NotPortableError(
@@ -104,7 +104,7 @@ def _denoise(settings: binding.Settings, scale: jax.Array, *images: jax.Array) -
 
 
 @_denoise.defjvp
-def _refuse_gradient(settings: binding.Settings, primals: Any, tangents: Any) -> NoReturn:
+def _refuse_gradient(settings: binding.OidnSettings, primals: Any, tangents: Any) -> NoReturn:
     raise TypeError(
         "oidn: expected no gradient to be asked for: Open Image Denoise is a library that returns images alone; take a "
         "method that learns, such as steady, to train or to optimise through a denoiser."

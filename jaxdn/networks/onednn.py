@@ -65,7 +65,7 @@ class Value(NamedTuple):
     width: int
 
 
-class Step:
+class ProgramLayer:
     """One layer of a program."""
 
     def __init__(self, kind: str, inputs: Sequence[Value], result: Value, kernel: Any = None, bias: Any = None) -> None:
@@ -78,12 +78,12 @@ class ProgramBuilder:
     """The steps of a program (:class:`jaxdn.networks.graph.LayerBackend`)."""
 
     def __init__(self) -> None:
-        self.steps: list[Step] = []
+        self.steps: list[ProgramLayer] = []
 
     def _add(self, kind: str, inputs: Sequence[Value], channels: int, scale: float = 1.0, **weights: Any) -> Value:
         height, width = (int(size * scale) for size in inputs[0][2:])
         result = Value(len(self.steps), channels, height, width)
-        self.steps.append(Step(kind, inputs, result, **weights))
+        self.steps.append(ProgramLayer(kind, inputs, result, **weights))
         return result
 
     def convolution(self, inputs: Sequence[Value], kernels: Sequence[np.ndarray], bias: np.ndarray) -> Value:
@@ -112,7 +112,7 @@ class ProgramBuilder:
         """A step of its own, which a 3x3 convolution does without."""
         return self._add("upsample", [x], x.channels, 2.0)
 
-    def needed(self, outputs: set[int]) -> list[Step]:
+    def needed(self, outputs: set[int]) -> list[ProgramLayer]:
         """The steps whose results are outputs, by number, or read."""
         read = outputs | {value.number for step in self.steps if step.kind != "upsample" for value in step.inputs}
         return [step for step in self.steps if step.result.number in read]
@@ -149,7 +149,7 @@ class Program:
         kind = self._precision.kind if kind is None else kind
         return dnnl.describe_images(self._count, value.height, value.width, value.channels, kind)
 
-    def _add(self, step: Step, *, output: bool) -> None:
+    def _add(self, step: ProgramLayer, *, output: bool) -> None:
         """The primitive of a step, on its memory: of what nobody reads any more, else new."""
         result = self._description(step.result, dnnl.FLOAT32 if output else None)
         if len(step.inputs) > 1:

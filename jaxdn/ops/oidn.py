@@ -26,7 +26,7 @@ Auxiliary = Literal["noisy", "clean", "prefiltered"]
 Device = Literal["auto", "cpu", "cuda"]
 
 
-class Settings(NamedTuple):
+class OidnSettings(NamedTuple):
     """How an image is denoised."""
 
     quality: Quality = "high"
@@ -69,16 +69,16 @@ def denoise(
     albedo: np.ndarray | None = None,
     normal: np.ndarray | None = None,
     *,
-    settings: Settings = Settings(),  # noqa: B008, immutable
+    settings: OidnSettings = OidnSettings(),  # noqa: B008, immutable
     scale: float = float("nan"),
 ) -> np.ndarray:
     """The denoised image [H, W, 3] float32 of one frame.
 
     Args:
-      color: [H, W, 3] linear radiance >= 0, or what :attr:`Settings.hdr` says.
+      color: [H, W, 3] linear radiance >= 0, or what :attr:`OidnSettings.hdr` says.
       albedo: [H, W, 3] in [0, 1]; None: the network for images without guides, or without this one.
       normal: [H, W, 3] in [-1, 1], of any space; needs an albedo.
-      settings: see :class:`Settings`.
+      settings: see :class:`OidnSettings`.
       scale: the factor that makes radiance as bright as a photograph; NaN: the library measures it
         (as :func:`jaxdn.color.exposure`).
 
@@ -100,7 +100,7 @@ def denoise(
 class _Kernel:
     """One network of the library for images of one size, with its buffers. Its calls take turns."""
 
-    def __init__(self, height: int, width: int, settings: Settings, inputs: tuple[str, ...]) -> None:
+    def __init__(self, height: int, width: int, settings: OidnSettings, inputs: tuple[str, ...]) -> None:
         oidn = library()
         self._shape = (height, width, 3)
         self._lock = threading.Lock()

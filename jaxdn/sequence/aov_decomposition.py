@@ -21,7 +21,7 @@ from jax import lax
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser.sanitize import sanitize
 from jaxdn.filters.atrous import B3_SPLINE, edge_average, stencil
-from jaxdn.filters.edge_stopping import Offset, Planes, Weight, depth_weight, normal_weight
+from jaxdn.filters.edge_stopping import Planes, TapOffset, Weight, depth_weight, normal_weight
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import Guides, guides_of, surface_mask
 
@@ -143,7 +143,7 @@ def _color_weight(image: jax.Array) -> Weight:
     planes = jnp.maximum(image, 0.0).transpose(2, 0, 1)  # the ringing of a pixel filter is below 0
     here = jnp.concatenate([planes, 1.0 / (_EDGE * planes + 1e-4)])
 
-    def exponent(there: Planes, here: Planes, offset: Offset) -> jax.Array:
+    def exponent(there: Planes, here: Planes, offset: TapOffset) -> jax.Array:
         return sum((jnp.abs(there[c] - here[c]) * here[c + 3] for c in range(3)), start=jnp.zeros((), image.dtype))
 
     return Weight(planes, here, exponent)

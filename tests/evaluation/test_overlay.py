@@ -10,7 +10,7 @@ import pytest
 
 from jaxdn.commands import main
 from jaxdn.data.exr.exr import read_exr, write_exr
-from jaxdn.evaluation.overlay.camera import Camera, camera_motion, read_camera
+from jaxdn.evaluation.overlay.camera import CameraMatrices, camera_motion, read_camera
 from jaxdn.evaluation.overlay.evidence import fireflies, noise_map
 from jaxdn.evaluation.overlay.findings import Known, find_all
 from jaxdn.evaluation.overlay.motion_search import box_mean, measure_motion
@@ -441,7 +441,7 @@ def _camera(place, turn, focal=1.4, aspect=4 / 3):
     to_camera = np.eye(4)
     to_camera[:3, :3], to_camera[3, :3] = axes.T, -axes @ place
     screen = np.array([[focal, 0, 0, 0], [0, focal * aspect, 0, 0], [0, 0, 1, -1], [0, 0, 0.1, 0]])
-    return Camera(to_camera, to_camera @ screen), axes
+    return CameraMatrices(to_camera, to_camera @ screen), axes
 
 
 def test_the_cameras_motion_is_that_of_points_of_a_still_world():

@@ -20,7 +20,7 @@ from jaxdn.core.frame import BUFFERS, Clip, frame_at, written_out
 from jaxdn.data.exr.exr import read_exr
 from jaxdn.denoiser.rollout import stream
 from jaxdn.export.formats import onnx_model
-from jaxdn.export.step import Step
+from jaxdn.export.step import ExportedStep
 from jaxdn.zoo.ready import find_model
 from tests.needs import require, require_module
 from tests.training.test_training import make_clip
@@ -164,7 +164,7 @@ def test_each_rule_computes_what_jax_does(rule, rng):
     size = jax_export.symbolic_shape("h, w", constraints=["h >= 4", "w >= 4"])
     inputs = {"radiance": jax.ShapeDtypeStruct(size, np.float32)}
     program = jax.make_jaxpr(lambda radiance: [function({"radiance": radiance})["image"]])(inputs["radiance"])
-    model = onnx_model(Step(function, inputs, program, ("image",), 1), rule)
+    model = onnx_model(ExportedStep(function, inputs, program, ("image",), 1), rule)
     x = jnp.asarray(rng.random((8, 6), np.float32))
     session = onnxruntime.InferenceSession(model, providers=["CPUExecutionProvider"])
     np.testing.assert_allclose(session.run(None, {"radiance": np.asarray(x)})[0], RULES[rule](x), rtol=1e-5, atol=1e-30)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from jaxdn.filters.kalman import PLANES, RECEPTIVE_FIELD, box_sum, kalman_blend, measure_support
 
 SIZE = (48, 64)
+blend = jax.jit(kalman_blend, static_argnames=("history_max",))
 
 
 def window_sums(plane, radius):
@@ -75,13 +76,13 @@ def draw_frame(rng, size=SIZE):
 def test_it_is_what_its_equations_say(size, rng, x64):
     for history_max in (1, 16):
         arguments = (*draw_frame(rng, size), 0.3, 0.01 * rng.random(size) * (rng.random(size) > 0.5))
-        found = kalman_blend(*map(jnp.asarray, arguments), history_max=history_max)
+        found = blend(*map(jnp.asarray, arguments), history_max=history_max)
         np.testing.assert_allclose(found, blend_in_numpy(*arguments, history_max), rtol=1e-9, atol=1e-12)
 
 
 def test_single_precision_is_enough(rng):
     arguments = (*draw_frame(rng), 0.3)
-    single = kalman_blend(*map(jnp.asarray, arguments), history_max=16)
+    single = blend(*map(jnp.asarray, arguments), history_max=16)
     assert single.dtype == jnp.float32
     np.testing.assert_allclose(single, blend_in_numpy(*arguments, 0.0, 16), rtol=2e-3, atol=2e-4)
 
@@ -101,9 +102,9 @@ def test_gains_have_no_unit(exponent, seed):
     """Light in any unit has the same gains: by powers of two to the last bit."""
     past, valid, image, noisy = draw_frame(np.random.default_rng(seed), (16, 20))
     unit = 2.0 ** round(exponent)
-    usual = kalman_blend(past, valid, image, noisy, jnp.float32(0.25), history_max=16)
+    usual = blend(past, valid, image, noisy, jnp.float32(0.25), history_max=16)
     scaled = past * np.array([unit] * 3 + [1] + [unit] * 2)[:, None, None]
-    other = kalman_blend(scaled, valid, unit * image, unit * noisy, jnp.float32(0.25 / unit), history_max=16)
+    other = blend(scaled, valid, unit * image, unit * noisy, jnp.float32(0.25 / unit), history_max=16)
     np.testing.assert_allclose(other[3], usual[3], rtol=1e-6)
     np.testing.assert_allclose(other[:3] / unit, usual[:3], rtol=1e-6)
 
@@ -112,13 +113,14 @@ def test_gains_have_no_unit(exponent, seed):
 def test_the_gain_that_stays_has_the_least_error(ratio, rng):
     """Where every fetch errs by b alike: that of the minimum of ``(b (1 - k) / k)^2 + r k / (2 - k)``."""
     bias, size = np.sqrt(ratio) * 0.03, (40, 40)
-    blend = jax.jit(partial(kalman_blend, history_max=100))
     past, gains = jnp.zeros((PLANES, *size)), []
     for index in range(60):
         image = (0.5 + 0.03 * rng.normal(size=(3, *size))).astype(np.float32)
         noisy = (0.5 + rng.normal(size=(3, *size))).astype(np.float32)
         fetched = past.at[:3].add(bias)
-        past = blend(fetched, np.full(size, index > 0), image, noisy, jnp.float32(1), jnp.full(size, bias**2))
+        past = blend(
+            fetched, np.full(size, index > 0), image, noisy, jnp.float32(1), jnp.full(size, bias**2), history_max=100
+        )
         gains.append(float(jnp.median(past[3])))
     grid = np.linspace(0.01, 1, 1000)
     best = grid[np.argmin(ratio * (1 - grid) ** 2 / grid**2 + grid / (2 - grid))]
@@ -129,7 +131,7 @@ def test_the_gain_that_stays_has_the_least_error(ratio, rng):
 @settings(max_examples=20, deadline=None)
 def test_the_image_lies_between_the_new_one_and_the_history(seed):
     past, valid, image, noisy = draw_frame(np.random.default_rng(seed), (16, 20))
-    found = np.asarray(kalman_blend(past, valid, image, noisy, jnp.float32(0.3), history_max=16))
+    found = np.asarray(blend(past, valid, image, noisy, jnp.float32(0.3), history_max=16))
     low, high = np.minimum(past[:3], image), np.maximum(past[:3], image)
     assert (found[:3] >= low - 1e-5).all()
     assert (found[:3] <= high + 1e-5).all()
@@ -141,10 +143,10 @@ def test_the_image_lies_between_the_new_one_and_the_history(seed):
 def test_nothing_farther_than_the_receptive_field_counts(rng):
     past, valid, image, noisy = (np.asarray(each) for each in draw_frame(rng))
     exposure = jnp.float32(0.3)
-    usual = kalman_blend(past, valid, image, noisy, exposure, history_max=16)
+    usual = blend(past, valid, image, noisy, exposure, history_max=16)
     changed = noisy.copy()
     changed[:, 0, 0] += 100
-    other = np.asarray(kalman_blend(past, valid, image, changed, exposure, history_max=16))
+    other = np.asarray(blend(past, valid, image, changed, exposure, history_max=16))
     rows, columns = np.nonzero((other != np.asarray(usual)).any(axis=0))
     assert 0 < max(rows.max(), columns.max()) <= RECEPTIVE_FIELD
 
@@ -161,13 +163,12 @@ def blur(noise):
 
 def run(truth, rng, error, noise, history_max=16):
     """The images of a still camera over frames ``truth`` [T, 3, H, W], and the denoiser's own."""
-    blend = jax.jit(partial(kalman_blend, history_max=history_max))
     past, found, alone = jnp.zeros((PLANES, *truth.shape[2:])), [], []
     for index, light in enumerate(truth):
         image = np.maximum(light * (1 + error * blur(rng.normal(size=light.shape))), 0)
         noisy = light * (1 + noise * (rng.exponential(size=light.shape) - 1))
         valid = np.full(light.shape[1:], index > 0)
-        past = blend(past, valid, image.astype(np.float32), noisy.astype(np.float32), jnp.float32(0.3))
+        past = blend(past, valid, np.float32(image), np.float32(noisy), np.float32(0.3), history_max=history_max)
         found.append(np.asarray(past[:3]))
         alone.append(image)
     return np.stack(found), np.stack(alone)
@@ -212,14 +213,14 @@ def test_a_lamp_in_view_that_goes_out_is_gone_at_once(rng):
 def test_an_outlier_is_no_proof(rng):
     """One pixel of 1000, half of which the denoiser lets through, where nothing changed: it does not stay."""
     truth = np.full((3, *SIZE), 0.5, np.float32)
-    past, blend = jnp.zeros((PLANES, *SIZE)), jax.jit(partial(kalman_blend, history_max=16))
+    past = jnp.zeros((PLANES, *SIZE))
     for index in range(8):
         image = truth * (1 + 0.03 * blur(rng.normal(size=truth.shape)))
         noisy = truth * (1 + 0.7 * (rng.exponential(size=truth.shape) - 1))
         if index == 7:
             noisy[:, 20, 30], image[:, 19:22, 29:32] = 1000.0, 50.0
         valid = np.full(SIZE, index > 0)
-        past = blend(past, valid, image.astype(np.float32), noisy.astype(np.float32), jnp.float32(0.3))
+        past = blend(past, valid, np.float32(image), np.float32(noisy), np.float32(0.3), history_max=16)
     assert np.asarray(past[:3, 20, 30]).max() < 0.2 * 50
 
 
@@ -255,5 +256,6 @@ def test_support_is_no_more_than_chance_where_nothing_changed(rng):
     innovation = 0.05 * blur(rng.normal(size=(3, 96, 128))).astype(np.float32)
     noise = 0.7 * rng.normal(size=innovation.shape).astype(np.float32)
     variance = jnp.full((96, 128), 0.49)
-    assert measure_support(noise, innovation, variance).mean() < 0.01
-    assert measure_support(noise + 20 * innovation, 20 * innovation, variance).mean() > 0.7
+    measure = jax.jit(measure_support)
+    assert measure(noise, innovation, variance).mean() < 0.01
+    assert measure(noise + 20 * innovation, 20 * innovation, variance).mean() > 0.7

@@ -63,7 +63,8 @@ def run(denoiser, params, frames):
 
 def gains(frames):
     """[T, 1, 1, 1] the factor that brings each frame to the network's brightness."""
-    of = (prepare(jax.tree.map(jnp.asarray, frame_at(frames, index)))[0] for index in range(len(frames.radiance)))
+    statistics_of = jax.jit(lambda frame: prepare(frame)[0])
+    of = (statistics_of(jax.tree.map(jnp.asarray, frame_at(frames, index))) for index in range(len(frames.radiance)))
     return np.array([float(statistics.exposure) for statistics in of]).reshape(-1, 1, 1, 1)
 
 
@@ -100,17 +101,23 @@ def test_gradients_of_the_means(rng):
             found = update_means(now, past, follow, most=1e3)
             return found.light, found.square, found.number
 
-        check_grads(light, (rng.uniform(0.2, 0.8, (3, 4)),), order=1, modes=["rev"])
+        check_grads(jax.jit(light), (rng.uniform(0.2, 0.8, (3, 4)),), order=1, modes=["rev"])
 
 
 def test_the_light_of_a_still_clip_is_its_arithmetic_mean(rng):
     clip = clip_of(rng, count=4)
-    frames = [prepare(jax.tree.map(jnp.asarray, frame_at(clip, index)))[1] for index in range(4)]
-    state = start_history(frames[0])
-    for index, frame in enumerate(frames):
-        now = measure_now(frame, jnp.full((3, *SIZE), float(index)))
-        means = update_means(now, fetch_past(state, frame, now, index == 0), jnp.full(SIZE, 0.5), most=32.0)
-        state = keep_history(frame, means, means.prior)
+
+    @jax.jit
+    def step(state, frame, prior, first):
+        frame = prepare(frame)[1]
+        now = measure_now(frame, prior)
+        means = update_means(now, fetch_past(state, frame, now, first), jnp.full(SIZE, 0.5), most=32.0)
+        return means, keep_history(frame, means, means.prior)
+
+    state = start_history(prepare(jax.tree.map(jnp.asarray, frame_at(clip, 0)))[1])
+    for index in range(4):
+        prior = np.full((3, *SIZE), index, np.float32)
+        means, state = step(state, jax.tree.map(jnp.asarray, frame_at(clip, index)), prior, index == 0)
     planes = np.mean(clip.radiance, axis=0, dtype=np.float64).transpose(2, 0, 1)
     np.testing.assert_allclose(means.light, planes, rtol=1e-4)
     np.testing.assert_allclose(means.prior, 1.5, rtol=1e-5)
@@ -136,7 +143,7 @@ def candidates_of(means, prior, last):
     )
     precisions = {name: jnp.full(5, -9.0) for name in ("albedo", "normal", "light", "depth", "learned")}
     statistics, _ = prepare(Frame(jnp.ones((16, 20, 3))))
-    found = make_candidates(precisions, means, prior, last, None, parameters, statistics)
+    found = jax.jit(make_candidates)(precisions, means, prior, last, None, parameters, statistics)
     return dict(zip(CANDIDATES, found, strict=True))
 
 
@@ -253,7 +260,7 @@ def test_the_first_weights_take_over_what_steady_knows():
 def evidence_of(rng, candidates, noisy, gain=1.0):
     """The maps of slopes and errors [windows, candidates but the prior, h, w], of an area without borders."""
     size = noisy.shape[1:]
-    groups = assemble_evidence(
+    groups = jax.jit(assemble_evidence)(
         [jnp.asarray(each, jnp.float32) for each in candidates],
         jnp.asarray(noisy, jnp.float32),
         *jnp.asarray(rng.random((2, 3, *size)), jnp.float32),
@@ -306,7 +313,7 @@ def test_gradients_of_the_evidence(rng):
         def groups(candidates):
             return assemble_evidence(list(candidates), noisy, *guides, jnp.ones((16, 16)), jnp.asarray(1.0))
 
-        check_grads(groups, (candidates,), order=1, modes=["rev"], atol=1e-3, rtol=1e-3)
+        check_grads(jax.jit(groups), (candidates,), order=1, modes=["rev"], atol=1e-3, rtol=1e-3)
 
 
 def test_weights_are_saved_and_loaded(tmp_path, rng):

@@ -89,7 +89,7 @@ def test_images_are_the_librarys_own(library, quality, rng, monkeypatch):
 def test_it_removes_noise(library, rng):
     clean = np.full((*SIZE, 3), (2.0, 1.0, 0.5), np.float32)
     noisy = (clean * rng.exponential(size=clean.shape)).astype(np.float32)
-    for settings in map(binding.Settings, ("high", "balanced", "fast")):
+    for settings in map(binding.OidnSettings, ("high", "balanced", "fast")):
         image = binding.denoise(noisy, np.full_like(clean, 0.5), np.zeros_like(clean), settings=settings)
         assert np.abs(image - clean).mean() < 0.15 * np.abs(noisy - clean).mean()
 
@@ -116,7 +116,7 @@ def test_every_network_of_the_library_runs(library, guides, auxiliary, hdr, rng)
 
 def test_prefiltered_guides_are_those_that_the_library_denoised(library, rng):
     frame = frame_at(clip_of(rng, 1), 0)
-    settings = binding.Settings("fast", auxiliary="prefiltered", device="cpu")
+    settings = binding.OidnSettings("fast", auxiliary="prefiltered", device="cpu")
     image = binding.denoise(frame.radiance, frame.albedo, frame.normal, settings=settings)
     filtered = [
         binding._kernel(*SIZE, settings, (name,))({name: getattr(frame, name)}) for name in ("albedo", "normal")

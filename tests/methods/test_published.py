@@ -8,7 +8,7 @@ import pytest
 from jaxdn.core.frame import Frame
 from jaxdn.denoisers import asvgf, reblur, relax, svgf, taa, trmv
 from jaxdn.filters import gradients
-from jaxdn.filters.edge_stopping import Offset, plane_weight
+from jaxdn.filters.edge_stopping import TapOffset, plane_weight
 from jaxdn.methods.registry import methods
 from jaxdn.methods.taa import invert_tone_map, tone_map
 from tests.methods.lobe_scenes import run
@@ -228,7 +228,7 @@ def test_the_plane_test_knows_slanted_surfaces():
         weight = plane_weight(jnp.asarray(depth), None, tolerance=0.003)
         here, there = ([plane[3, at] for plane in planes] for planes, at in ((weight.here, 3), (weight.there, 6)))
         offset = jnp.asarray(3.0), jnp.asarray(0.0), jnp.asarray(3.0)
-        assert float(weight.factor(there, here, Offset(*offset))) == expected
+        assert float(weight.factor(there, here, TapOffset(*offset))) == expected
 
 
 def test_relax_as_published_filters_within_planes(rng):

@@ -24,7 +24,7 @@ from jaxdn.render.families.staging import (
     shift,
     turn,
 )
-from jaxdn.render.scenes.optics import Optics
+from jaxdn.render.scenes.optics import SceneOptics
 from jaxdn.render.scenes.scene import Camera
 
 MOVING = 8
@@ -145,7 +145,7 @@ def blur() -> Stage:
         return shift(-0.8 + move, 0.6, -0.3) @ turn("z", -100 * move) @ turn("x", 90) @ scale(0.4, 0.2, 0.4)
 
     stage.add("drum", shapes.drum(0.9), drum, paint)
-    stage.set_optics(Optics(shutter=0.5))
+    stage.set_optics(SceneOptics(shutter=0.5))
     return stage
 
 

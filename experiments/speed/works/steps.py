@@ -16,7 +16,7 @@ from jaxdn.denoiser import Denoiser
 from jaxdn.methods.registry import method_named
 from jaxdn.networks import LARGE, SMALL
 from jaxdn.networks.backends import BACKENDS, Purpose
-from jaxdn.ops.oidn import Quality, Settings, denoise
+from jaxdn.ops.oidn import OidnSettings, Quality, denoise
 
 HEIGHT, WIDTH = 720, 1280
 WIDTHS = {"large": LARGE, "small": SMALL}
@@ -56,7 +56,7 @@ def recurrent(denoiser: Denoiser, params: Any, frame: Frame) -> Call:
 def open_image_denoise(frame: Frame, quality: Quality) -> Call:
     """Open Image Denoise on radiance, albedo and normal; building the network is not timed."""
     arrays = tuple(np.asarray(buffer, np.float32) for buffer in (frame.radiance, frame.albedo, frame.normal))
-    call = partial(denoise, *arrays, settings=Settings(quality))
+    call = partial(denoise, *arrays, settings=OidnSettings(quality))
     call()
     return call
 

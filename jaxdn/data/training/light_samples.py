@@ -18,7 +18,7 @@ Window = tuple[slice, ...]
 _BEAUTY = ("direct", "emission")
 
 
-class Light(NamedTuple):
+class LightSamples(NamedTuple):
     """Noisy radiance and what it converges to, [T, H, W, 3]; their noise is independent."""
 
     noisy: np.ndarray
@@ -40,7 +40,7 @@ def check_samples(clip: CachedClip, spp: int) -> None:
 
 def sample_light(
     clip: CachedClip, window: Window, spp: int, rng: np.random.Generator, *, beauty: bool = False, widen: bool = True
-) -> Light:
+) -> LightSamples:
     """Light of ``spp`` samples a pixel in a window (frames, rows, columns) of a clip.
 
     Args:
@@ -57,23 +57,23 @@ def sample_light(
         samples = read_array(clip, "draws", (window[0], chosen, *window[1:])).astype(np.float32).mean(axis=1)
         reference = (read_array if widen or beauty else read_stored)(clip, "reference", window)
         if not beauty or samples.shape[-1] == 3:  # a packed set may have indirect light alone
-            return Light(samples[..., :3], reference)
+            return LightSamples(samples[..., :3], reference)
         direct, emission = (read_array(clip, name, window) if name in clip.arrays else 0.0 for name in _BEAUTY)
-        return Light(samples[..., :3] + samples[..., 3:] + emission, reference + direct + emission)
+        return LightSamples(samples[..., :3] + samples[..., 3:] + emission, reference + direct + emission)
     light = _sample_stored(clip, window, spp, widen=widen or beauty)
     if beauty and clip.filtered:
         for name in set(_BEAUTY) & clip.arrays:
             clean = read_array(clip, f"reference_{name}", window)
-            light = Light(light.noisy + read_guide(clip, name, window, spp), light.reference + clean)
+            light = LightSamples(light.noisy + read_guide(clip, name, window, spp), light.reference + clean)
     return light
 
 
-def _sample_stored(clip: CachedClip, window: Window, spp: int, *, widen: bool) -> Light:
+def _sample_stored(clip: CachedClip, window: Window, spp: int, *, widen: bool) -> LightSamples:
     """Light of layers, or of the halves of the reference."""
     if spp == clip.half_spp:
         half, both = (read_array(clip, name, window) for name in ("reference_half", "reference"))
         shares = np.float32(spp), np.float32(clip.reference_spp)
         other = (both * shares[1] - half * shares[0]) / (shares[1] - shares[0])
-        return Light(half, np.maximum(other, 0.0, dtype=np.float32))
+        return LightSamples(half, np.maximum(other, 0.0, dtype=np.float32))
     reference = (read_array if widen else read_stored)(clip, "reference", window)
-    return Light(read_layers(clip, window, spp, widen=widen), reference)
+    return LightSamples(read_layers(clip, window, spp, widen=widen), reference)

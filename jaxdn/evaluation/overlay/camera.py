@@ -8,7 +8,7 @@ import numpy as np
 from jaxdn.core.frame import FAR
 
 
-class Camera(NamedTuple):
+class CameraMatrices(NamedTuple):
     """Of one frame, for row vectors as OpenEXR has them: (x, y, z, 1) times the matrix."""
 
     to_camera: np.ndarray
@@ -17,7 +17,7 @@ class Camera(NamedTuple):
     """[4, 4] from the world to (x, y, z, w), where x / w and y / w are -1 to 1 over the picture, y up."""
 
 
-def read_camera(header: Mapping[str, Any]) -> Camera | None:
+def read_camera(header: Mapping[str, Any]) -> CameraMatrices | None:
     """The camera of a header with ``worldToCamera`` and ``worldToNDC``; None where one is missing or says nothing.
 
     Some programs write the transpose. A ``worldToNDC`` without perspective is no camera's.
@@ -29,10 +29,10 @@ def read_camera(header: Mapping[str, Any]) -> Camera | None:
         to_camera, to_screen = to_camera.T, to_screen.T
     sound = np.allclose(to_camera[:, 3], (0, 0, 0, 1)) and abs(np.linalg.det(to_camera)) > 1e-12
     perspective = np.abs(to_screen[:3, 3]).max() > 1e-9
-    return Camera(to_camera, to_screen) if sound and perspective else None
+    return CameraMatrices(to_camera, to_screen) if sound and perspective else None
 
 
-def camera_motion(depth: np.ndarray, now: Camera, before: Camera) -> np.ndarray:
+def camera_motion(depth: np.ndarray, now: CameraMatrices, before: CameraMatrices) -> np.ndarray:
     """[H, W, 2] the vectors of a still world, previous minus current, in pixels, y down; NaN where nothing was hit.
 
     The point p of a pixel at the screen position (x, y) with the depth d along the optical axis solves three linear

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.core.frame import Frame
-from jaxdn.evaluation.overlay.camera import Camera, camera_motion, read_camera
+from jaxdn.evaluation.overlay.camera import CameraMatrices, camera_motion, read_camera
 from jaxdn.evaluation.overlay.evidence import (
     fireflies,
     lit_level,
@@ -63,7 +63,7 @@ class Measurer:
 
     def __init__(self) -> None:
         self._before: Frame | None = None
-        self._camera: Camera | None = None
+        self._camera: CameraMatrices | None = None
         self._history: jax.Array | None = None
 
     def restart(self) -> None:

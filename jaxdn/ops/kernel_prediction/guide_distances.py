@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 
-class Offset(NamedTuple):
+class PlaneShift(NamedTuple):
     """Where a plane's distances lead, and where the taps lie in it."""
 
     down: int
@@ -28,11 +28,11 @@ class Offset(NamedTuple):
     """Columns to the neighbour, if it is to the left; else 0. The tap (-dy, -dx) of pixel 0 is at this column."""
 
 
-def half_offsets(taps: int) -> list[Offset]:
+def half_offsets(taps: int) -> list[PlaneShift]:
     """The offsets of the second half of the taps, in their order; the first half are their opposites, reversed."""
     radius = math.isqrt(taps) // 2
     after = [divmod(tap, 2 * radius + 1) for tap in range(taps // 2 + 1, taps)]
-    return [Offset(row - radius, max(column - radius, 0), max(radius - column, 0)) for row, column in after]
+    return [PlaneShift(row - radius, max(column - radius, 0), max(radius - column, 0)) for row, column in after]
 
 
 def _planar(features: jax.Array, radius: int) -> jax.Array:
@@ -40,7 +40,7 @@ def _planar(features: jax.Array, radius: int) -> jax.Array:
     return jnp.stack([jnp.pad(features[..., f], radius, mode="edge") for f in range(features.shape[-1])])
 
 
-def _slice_ends(extended: jax.Array, offset: Offset, radius: int) -> tuple[jax.Array, jax.Array]:
+def _slice_ends(extended: jax.Array, offset: PlaneShift, radius: int) -> tuple[jax.Array, jax.Array]:
     """The features of both ends of every distance in a plane, [F, H + dy, W + |dx|] each."""
     height = extended.shape[1] - 2 * radius + offset.down
     width = extended.shape[2] - 2 * radius + offset.left + offset.right

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxdn.render.buffers.gbuffer import trace_gbuffer
 from jaxdn.render.families.staging import Stage
-from jaxdn.render.scenes.optics import ENTRIES, Fog, Lens, Optics
+from jaxdn.render.scenes.optics import ENTRIES, Fog, Lens, SceneOptics
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.scenes.scene_file import SceneFile
 
@@ -41,12 +41,12 @@ def randomise_optics(scene: AnimatedScene, seed: int, frames: int) -> AnimatedSc
     return SceneFile.from_record({**record, "animation": own | draw_optics(scene, seed, frames).record()})
 
 
-def draw_optics(scene: AnimatedScene, seed: int, frames: int) -> Optics:
+def draw_optics(scene: AnimatedScene, seed: int, frames: int) -> SceneOptics:
     """Draw a lens, a shutter and fog for the first ``frames`` frames of a scene."""
     return draw_for_depths(_read_depths(scene, frames), scene.camera(0).x_fov, seed)
 
 
-def draw_for_depths(depth: np.ndarray, x_fov: float, seed: int) -> Optics:
+def draw_for_depths(depth: np.ndarray, x_fov: float, seed: int) -> SceneOptics:
     """The same by the view-space depths [n] that the camera sees, and its field of view in degrees."""
     rng = np.random.default_rng([seed, zlib.crc32(b"optics")])
     # All numbers are drawn whether or not they are used: one part must not change the others.
@@ -60,7 +60,7 @@ def draw_for_depths(depth: np.ndarray, x_fov: float, seed: int) -> Optics:
     left = _LEFT[0] + (_LEFT[1] - _LEFT[0]) * numbers[2]
     tint = 0.6 + 0.38 * numbers[3] - 0.1 * numbers[4:7]
     fog = Fog(_round(-np.log(left) / float(np.median(depth))), (_round(tint[0]), _round(tint[1]), _round(tint[2])))
-    return Optics(
+    return SceneOptics(
         lens if chances[0] < _LENS else None,
         _round(0.2 + 0.8 * numbers[7]) if chances[1] < _SHUTTER else 0.0,
         fog if chances[2] < _FOG else None,

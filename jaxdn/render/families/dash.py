@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxdn.render.families import shapes, textures
 from jaxdn.render.families.staging import (
-    Material,
+    Finish,
     Stage,
     attached,
     drifting_camera,
@@ -93,7 +93,7 @@ def _runners(stage: Stage) -> None:
     def sled(frame: float) -> np.ndarray:
         return shift(2.3 * shuttle(frame, period, phase), 0, -1.0)
 
-    parts: dict[str, tuple[str | shapes.Mesh, np.ndarray, Material]] = {
+    parts: dict[str, tuple[str | shapes.Mesh, np.ndarray, Finish]] = {
         "sled": (
             shapes.soft_box(0.3, 0.35),
             shift(0, 0.3, 0) @ scale(0.42, 0.16, 0.24),

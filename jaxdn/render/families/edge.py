@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxdn.render.families import shapes, textures
 from jaxdn.render.families.staging import (
-    Material,
+    Finish,
     Stage,
     attached,
     drifting_camera,
@@ -85,7 +85,7 @@ def _screen(stage: Stage) -> None:
     def screen(frame: float) -> np.ndarray:
         return shift(side * (1.45 + 0.85 * swing(frame, period, phase)), 0, -0.35)
 
-    parts: dict[str, tuple[str | shapes.Mesh, np.ndarray, Material]] = {
+    parts: dict[str, tuple[str | shapes.Mesh, np.ndarray, Finish]] = {
         "screen": ("cube", shift(0, 1.0, 0) @ scale(0.6, 0.88, 0.03), glossy(picture, 0.4)),
         "screen_foot": ("cube", shift(0, 0.1, 0) @ scale(0.6, 0.03, 0.16), metal((0.7, 0.68, 0.64), 0.35)),
         "screen_top": (

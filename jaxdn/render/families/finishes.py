@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxdn.render.families import textures
 from jaxdn.render.families.furniture import PALETTE
-from jaxdn.render.families.staging import Material, glass, glossy, matte, metal
+from jaxdn.render.families.staging import Finish, glass, glossy, matte, metal
 
 METALS = ((0.95, 0.93, 0.88), (0.95, 0.64, 0.54), (0.98, 0.78, 0.34), (0.56, 0.57, 0.58), (0.28, 0.27, 0.3))
 """Silver, copper, gold, steel, gunmetal."""
@@ -50,7 +50,7 @@ def pattern(rng: np.random.Generator, colors: list[np.ndarray]) -> np.ndarray:
     return deepened(image)
 
 
-def cloth(rng: np.random.Generator) -> Material:
+def cloth(rng: np.random.Generator) -> Finish:
     """Matte cloth, mostly patterned in strong colours."""
     if rng.random() < 0.25:
         return matte(any_color(rng))
@@ -59,7 +59,7 @@ def cloth(rng: np.random.Generator) -> Material:
     return matte(pattern(rng, colors), repeat=(times, times))
 
 
-def timber(rng: np.random.Generator) -> Material:
+def timber(rng: np.random.Generator) -> Finish:
     """Polished or raw wood, from birch to ebony."""
     hue, shade = rng.uniform(0.02, 0.11), rng.choice([0.2, 0.4, 0.65, 0.92])
     dark, light = textures.hsv(hue, 0.65, 0.6 * shade), textures.hsv(hue + 0.02, rng.uniform(0.3, 0.6), shade)
@@ -67,23 +67,23 @@ def timber(rng: np.random.Generator) -> Material:
     return matte(image) if rng.random() < 0.3 else glossy(image, rng.uniform(0.12, 0.5))
 
 
-def plastic(rng: np.random.Generator) -> Material:
+def plastic(rng: np.random.Generator) -> Finish:
     """Smooth to dull lacquer or plastic."""
     return glossy(any_color(rng), float(rng.choice([0.06, 0.12, 0.25, 0.5])))
 
 
-def any_metal(rng: np.random.Generator) -> Material:
+def any_metal(rng: np.random.Generator) -> Finish:
     """A metal from mirror-like (roughness 0.05) to rough."""
     color = METALS[int(rng.integers(len(METALS)))]
     return metal(color, float(rng.choice([0.05, 0.1, 0.2, 0.35, 0.6])))
 
 
-def hard(rng: np.random.Generator) -> Material:
+def hard(rng: np.random.Generator) -> Finish:
     """What furniture is made of: wood, plastic, metal or paint."""
     return (timber, timber, plastic, any_metal)[int(rng.integers(4))](rng)
 
 
-def small_thing(rng: np.random.Generator) -> Material:
+def small_thing(rng: np.random.Generator) -> Finish:
     """What small solid objects are made of; a third are metal, a sixth solid glass."""
     draw = rng.random()
     if draw < 0.17:
@@ -95,7 +95,7 @@ def small_thing(rng: np.random.Generator) -> Material:
     return glossy(pattern(rng, [strong_color(rng) for _ in range(4)]), rng.uniform(0.1, 0.5))
 
 
-def wall_finish(rng: np.random.Generator) -> Material:
+def wall_finish(rng: np.random.Generator) -> Finish:
     """Plaster, paper, brick, boards or paint, of any darkness."""
     kind, first = rng.integers(5), any_color(rng)
     if kind == 0:
@@ -110,7 +110,7 @@ def wall_finish(rng: np.random.Generator) -> Material:
     return matte(textures.speckled(rng, pale, 0.85 * pale, cells=10))
 
 
-def floor_finish(rng: np.random.Generator) -> Material:
+def floor_finish(rng: np.random.Generator) -> Finish:
     """Boards, tiles, marble or carpet."""
     kind = rng.integers(4)
     if kind == 0:

@@ -6,7 +6,7 @@ from jaxdn.render.families import shapes, textures
 from jaxdn.render.families.shapes import Mesh
 from jaxdn.render.families.staging import (
     RECTANGLE,
-    Material,
+    Finish,
     Motion,
     Stage,
     attached,
@@ -180,13 +180,13 @@ def _rolling(
     return motion
 
 
-def _apple(rng: np.random.Generator) -> tuple[Mesh, Material]:
+def _apple(rng: np.random.Generator) -> tuple[Mesh, Finish]:
     ripe = textures.hsv(rng.uniform(-0.02, 0.03), 0.9, 0.78)
     unripe = textures.hsv(rng.uniform(0.08, 0.22), 0.7, 0.85)
     return shapes.apple(), glossy(textures.apple_skin(rng, ripe, unripe), rng.uniform(0.25, 0.4))
 
 
-def _orange(rng: np.random.Generator, lemon: bool = False) -> tuple[Mesh, Material]:
+def _orange(rng: np.random.Generator, lemon: bool = False) -> tuple[Mesh, Finish]:
     hue = 0.145 if lemon else rng.uniform(0.06, 0.085)
     peel = textures.speckled(rng, textures.hsv(hue, 0.88, 0.95), textures.hsv(hue + 0.02, 0.8, 0.8), cells=20)
     turned = np.linspace(-np.pi / 2, np.pi / 2, 40)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxdn.materials.glints import flake_normals
 from jaxdn.render.families import textures
 from jaxdn.render.families.fruit import moving_still_life
-from jaxdn.render.families.staging import Material, Stage
+from jaxdn.render.families.staging import Finish, Stage
 
 TEXELS = 128
 REPEAT = (2.0, 1.0)
@@ -34,9 +34,9 @@ def glitter(seed: int, *, lamp: str = "mix") -> Stage:
     return stage
 
 
-def _glittering(rng: np.random.Generator) -> Material:
+def _glittering(rng: np.random.Generator) -> Finish:
     """Polished flakes of one metal in its varnish; they are inclined as the facets of a rougher surface are."""
     color = textures.hsv(rng.random(), rng.uniform(0.1, 0.8), 0.95)
     polish, inclination = rng.uniform(0.12, 0.25), rng.uniform(0.4, 0.65)
     normals = np.asarray(_flakes(jnp.float32(inclination), seed=int(rng.integers(2**31))))
-    return Material(color, float(polish), metallic=1.0, repeat=REPEAT, normals=normals)
+    return Finish(color, float(polish), metallic=1.0, repeat=REPEAT, normals=normals)

@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxdn.render.families import shapes, textures
 from jaxdn.render.families.staging import (
-    Material,
+    Finish,
     Motion,
     Stage,
     attached,
@@ -117,7 +117,7 @@ def _mobile(stage: Stage) -> None:
             _toy(stage, f"toy_{number}", shape, arm, (side * REACH, -rng.uniform(0.26, 0.42), 0), size, material)
 
 
-def _arm(stage: Stage, index: int, boom: Motion, end: float, rate: float, brass: Material) -> Motion:
+def _arm(stage: Stage, index: int, boom: Motion, end: float, rate: float, brass: Finish) -> Motion:
     """A small arm on a link below the boom's end; returns the joint from which its toys hang.
 
     Args:
@@ -139,7 +139,7 @@ def _arm(stage: Stage, index: int, boom: Motion, end: float, rate: float, brass:
     return arm
 
 
-def _toy_kind(stage: Stage, number: int, hue: float) -> tuple[str | shapes.Mesh, float, Material]:
+def _toy_kind(stage: Stage, number: int, hue: float) -> tuple[str | shapes.Mesh, float, Finish]:
     """A ringed planet's body, a star, a soft cube or a torus, each in its own finish."""
     rng = stage.rng
     color = textures.hsv(hue + 0.21 * number + 0.1, 0.65, 0.88)
@@ -161,7 +161,7 @@ def _toy(
     joint: Motion,
     place: tuple[float, float, float],
     size: float,
-    material: Material,
+    material: Finish,
 ) -> None:
     """A toy on a thread below a joint, slowly turning about its thread.
 

@@ -13,7 +13,7 @@ from jaxdn.render.families.parlour_motion import film, set_in_motion
 from jaxdn.render.families.parlour_things import furnish
 from jaxdn.render.families.rooms import Opening, Room
 from jaxdn.render.families.shapes import boxes, sheet
-from jaxdn.render.families.staging import Material, Stage, attached, glossy, matte, scale, shift, swing, turn
+from jaxdn.render.families.staging import Finish, Stage, attached, glossy, matte, scale, shift, swing, turn
 
 SKY_RADIUS, SUN_DISTANCE = 4.5, 4.2
 
@@ -160,7 +160,7 @@ def _door(room: Room, side: int, hole: Opening, kind: str) -> float:
         ((hole.half, hole.high / 2, 0), (0.04, hole.high / 2, 0.06)),
         ((0, hole.high, 0), (hole.half + 0.04, 0.04, 0.06)),
     )
-    trim: Material = finishes.hard(rng)
+    trim: Finish = finishes.hard(rng)
     stage.add("door_frame", frame, wall.frame @ shift(hole.middle, 0, 0), trim)
     deep = min(1.8 * hole.half, 0.9)
     room.claim(wall.frame, (hole.middle - hole.half - 0.05, 0, 0), (hole.middle + hole.half + 0.05, hole.high, deep))

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxdn.render.families import finishes, furniture, shapes
 from jaxdn.render.families.rooms import Opening, Room
-from jaxdn.render.families.staging import RECTANGLE, Material, attached, matte, rod, scale, shift, swing, turn
+from jaxdn.render.families.staging import RECTANGLE, Finish, attached, matte, rod, scale, shift, swing, turn
 
 BLACK = matte(np.zeros(3))
 Dimmer = Callable[[float], float]
@@ -116,7 +116,7 @@ def _hang(room: Room, name: str, flux: np.ndarray, dimmer: Dimmer | None, *, sha
     def joint(frame: float) -> np.ndarray:
         return shift(x, room.height - 0.001, z) @ turned @ turn("z", lean * swing(frame, period, phase))
 
-    parts: list[tuple[str, str | shapes.Mesh, np.ndarray, Material, np.ndarray | None]]
+    parts: list[tuple[str, str | shapes.Mesh, np.ndarray, Finish, np.ndarray | None]]
     parts = [("cord", shapes.drum(), cord, matte((0.05, 0.05, 0.05)), None)]
     if shade:
         mesh = furniture.lamp_shade(rng.uniform(0.12, 0.28), rng.uniform(0.03, 0.1), 0.2)

@@ -8,7 +8,7 @@ from jaxdn.render.families import finishes, furniture, shapes
 from jaxdn.render.families.rooms import Room
 from jaxdn.render.families.staging import (
     RECTANGLE,
-    Material,
+    Finish,
     Motion,
     attached,
     glass,
@@ -170,7 +170,7 @@ def _picture(room: Room, index: int) -> None:
         f"frame_{index}", furniture.picture_frame(wide, high, rng.uniform(0.008, 0.03)), middle, finishes.hard(rng)
     )
     canvas = finishes.picture(rng)
-    material = matte(canvas) if rng.random() < 0.6 else Material(canvas, rng.uniform(0.08, 0.4))
+    material = matte(canvas) if rng.random() < 0.6 else Finish(canvas, rng.uniform(0.08, 0.4))
     stage.add(f"canvas_{index}", RECTANGLE, middle @ shift(0, 0, 0.012) @ scale(wide, high, 1), material)
 
 
@@ -211,7 +211,7 @@ def _small_thing(room: Room, index: int) -> None:
         stage.add(f"thing_{index}", shape, place @ local, material)
 
 
-def _kind(rng: np.random.Generator, size: float) -> tuple[str | shapes.Mesh, np.ndarray, Material]:
+def _kind(rng: np.random.Generator, size: float) -> tuple[str | shapes.Mesh, np.ndarray, Finish]:
     """A shape that stands on the origin, its place and its material."""
     material, kind = finishes.small_thing(rng), rng.integers(7)
     if kind == 0:

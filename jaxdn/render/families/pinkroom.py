@@ -5,7 +5,7 @@ import numpy as np
 from jaxdn.render.families import shapes, textures
 from jaxdn.render.families.staging import (
     RECTANGLE,
-    Material,
+    Finish,
     Stage,
     attached,
     drifting_camera,
@@ -160,7 +160,7 @@ def _car(stage: Stage) -> None:
         return shift(x, 0.013, z) @ turn("y", heading)
 
     body, cabin = shapes.soft_box(0.35, 0.35), shapes.soft_box(0.45, 0.4)
-    parts: list[tuple[str, str | shapes.Mesh, np.ndarray, Material]] = [
+    parts: list[tuple[str, str | shapes.Mesh, np.ndarray, Finish]] = [
         ("car_body", body, shift(0, 0.13, 0) @ scale(0.13, 0.08, 0.24), paint)
     ]
     parts += [("car_cabin", cabin, shift(0, 0.24, -0.05) @ scale(0.1, 0.08, 0.12), trim)]

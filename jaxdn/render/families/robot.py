@@ -4,7 +4,7 @@ import numpy as np
 
 from jaxdn.render.families import shapes, textures
 from jaxdn.render.families.staging import (
-    Material,
+    Finish,
     Motion,
     Stage,
     attached,
@@ -154,7 +154,7 @@ def _walk(stage: Stage) -> None:
 
 
 def _part(
-    stage: Stage, name: str, shape: str | shapes.Mesh, joint: Motion, local: np.ndarray, material: Material
+    stage: Stage, name: str, shape: str | shapes.Mesh, joint: Motion, local: np.ndarray, material: Finish
 ) -> None:
     """A shape fixed to a moving joint.
 
@@ -177,8 +177,8 @@ def _arm(
     stride: float,
     phase: float,
     limb: shapes.Mesh,
-    shell: Material,
-    steel: Material,
+    shell: Finish,
+    steel: Finish,
 ) -> None:
     """One arm: arms swing opposite to the legs; the elbow bends as the arm comes forwards.
 
@@ -219,8 +219,8 @@ def _leg(
     stride: float,
     phase: float,
     limb: shapes.Mesh,
-    trim: Material,
-    steel: Material,
+    trim: Finish,
+    steel: Finish,
 ) -> None:
     """One leg with its foot.
 

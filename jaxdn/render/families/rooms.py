@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxdn.render.families.shapes import Mesh, holed_wall
-from jaxdn.render.families.staging import RECTANGLE, Material, Stage, scale, shift, turn
+from jaxdn.render.families.staging import RECTANGLE, Finish, Stage, scale, shift, turn
 
 
 class Wall(NamedTuple):
@@ -46,9 +46,9 @@ class Room:
         half: tuple[float, float, float],
         openings: dict[int, Opening],
         *,
-        walls: list[Material],
-        floor: Material,
-        ceiling: Material,
+        walls: list[Finish],
+        floor: Finish,
+        ceiling: Finish,
     ) -> None:
         width, height, length = half
         self.stage, self.rng, self.height = stage, stage.rng, height

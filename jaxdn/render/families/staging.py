@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxdn.render.families import textures
 from jaxdn.render.families.shapes import Mesh, boxes, dish, drum, holed_wall, ply_path
-from jaxdn.render.scenes.optics import ENTRIES, Optics, describe_optics
+from jaxdn.render.scenes.optics import ENTRIES, SceneOptics, describe_optics
 from jaxdn.render.scenes.scene import Camera
 
 Motion = Callable[[float], np.ndarray]
@@ -85,7 +85,7 @@ def shuttle(frame: float, period: float, phase: float = 0.0) -> float:
     return 4 * abs(time - 0.5) - 1
 
 
-class Material(NamedTuple):
+class Finish(NamedTuple):
     """A surface: one colour [3] or a texture [n,n,3], repeated over uv; without roughness it is purely diffuse.
 
     `normals` [n,n,3] are those of flakes in it, one for each texel, in the frame of the surface. `glass` is Mitsuba's
@@ -126,21 +126,21 @@ def _bitmap(values: np.ndarray, repeat: tuple[float, float] = (1.0, 1.0)) -> dic
     return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(values)), "raw": True, "to_uv": to_uv}
 
 
-def matte(color: Any, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Material:
-    return Material(np.asarray(color), repeat=repeat)
+def matte(color: Any, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Finish:
+    return Finish(np.asarray(color), repeat=repeat)
 
 
-def glossy(color: Any, roughness: float = 0.35, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Material:
-    return Material(np.asarray(color), roughness, repeat=repeat)
+def glossy(color: Any, roughness: float = 0.35, *, repeat: tuple[float, float] = (1.0, 1.0)) -> Finish:
+    return Finish(np.asarray(color), roughness, repeat=repeat)
 
 
-def metal(color: Any, roughness: float = 0.25) -> Material:
-    return Material(np.asarray(color), roughness, metallic=1.0)
+def metal(color: Any, roughness: float = 0.25) -> Finish:
+    return Finish(np.asarray(color), roughness, metallic=1.0)
 
 
-def glass(color: Any, *, thin: bool = False) -> Material:
+def glass(color: Any, *, thin: bool = False) -> Finish:
     """Clear glass: of a solid body, or of a `thin` wall that is a single sheet."""
-    return Material(np.asarray(color), glass="thindielectric" if thin else "dielectric")
+    return Finish(np.asarray(color), glass="thindielectric" if thin else "dielectric")
 
 
 class Part(NamedTuple):
@@ -152,7 +152,7 @@ class Part(NamedTuple):
     shape: str | Mesh
     pose: Motion
     moves: bool
-    material: Material
+    material: Finish
     glow: np.ndarray | None
     dimmer: Callable[[float], float] | None = None
 
@@ -184,14 +184,14 @@ class Stage:
         self.parts: dict[str, Part] = {}
         self.bounds = np.zeros((2, 3))
         self.view: Callable[[float], Camera] = lambda frame: Camera(np.eye(4), 60.0)
-        self.optics = Optics()
+        self.optics = SceneOptics()
 
     def add(
         self,
         name: str,
         shape: str | Mesh,
         pose: np.ndarray | Motion,
-        material: Material,
+        material: Finish,
         *,
         glow: Any = None,
         dimmer: Callable[[float], float] | None = None,
@@ -212,7 +212,7 @@ class Stage:
         radiance = None if glow is None else np.asarray(glow, float)
         self.parts[name] = Part(shape, motion, callable(pose), material, radiance, dimmer)
 
-    def set_optics(self, optics: Optics) -> None:
+    def set_optics(self, optics: SceneOptics) -> None:
         """Give the scene a lens, a shutter and fog; they are in its record."""
         self.optics = optics
         self.record = {name: self.record[name] for name in self.record if name not in ENTRIES} | optics.record()
@@ -283,10 +283,10 @@ def furnish_room(
     stage: Stage,
     half: tuple[float, float, float],
     *,
-    floor: Material,
-    wall: Material,
-    back: Material,
-    ceiling: Material,
+    floor: Finish,
+    wall: Finish,
+    back: Finish,
+    ceiling: Finish,
 ) -> None:
     """Floor, ceiling and four walls of a room.
 
@@ -316,7 +316,7 @@ def furnish_room(
         stage.add("wall_right", RECTANGLE, right, wall)
 
 
-def _window_wall(stage: Stage, half: tuple[float, float, float], wall: Material) -> None:
+def _window_wall(stage: Stage, half: tuple[float, float, float], wall: Finish) -> None:
     """The right wall with an opening, the bars and the sill of the window in it, and the sky outside."""
     width, height, length = half
     centre = stage.rng.uniform(-0.35, 0.15) * length

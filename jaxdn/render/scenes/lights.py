@@ -13,7 +13,7 @@ _SCALES = ("scale", "sky_scale", "sun_scale")
 """Factors on it, which emitters with a sky or an image have."""
 
 
-class Light(NamedTuple):
+class SceneLight(NamedTuple):
     """One light of a scene file."""
 
     owner: int
@@ -28,12 +28,12 @@ class Light(NamedTuple):
     """It is given in red, green and blue, each of which can be scaled by itself."""
 
 
-def list_lights(parser: SceneParser) -> dict[str, Light]:
+def list_lights(parser: SceneParser) -> dict[str, SceneLight]:
     """The lights of a scene by their names: those of lamps, of shapes that emit, and the ids of these shapes' emitters.
 
     An emitter that stands beside the shapes, and that one of them refers to, is that shape's.
     """
-    found: dict[str, Light] = {}
+    found: dict[str, SceneLight] = {}
     for owner in parser.children:
         kind = parser.type_of(owner)
         if kind not in ("Shape", "Emitter"):
@@ -49,17 +49,17 @@ def list_lights(parser: SceneParser) -> dict[str, Light]:
     return found
 
 
-def _read_light(parser: SceneParser, owner: int, emitter: int) -> Light:
+def _read_light(parser: SceneParser, owner: int, emitter: int) -> SceneLight:
     values = parser.values(emitter)
     powers = [values[name] for name in _POWERS if name in values]
     plain = [type(value).__name__ for value in powers if type(value).__name__ != "ResolvedReference"]
     scaled = parser.plugin(emitter) in ("envmap", "sky", "sun", "sunsky")
-    return Light(
+    return SceneLight(
         owner, emitter, bool(powers) or scaled, bool(plain), bool(plain) and all("Color" in name for name in plain)
     )
 
 
-def check_lights(parser: SceneParser, lights: Mapping[str, Light], keys: Mapping[str, Any]) -> None:
+def check_lights(parser: SceneParser, lights: Mapping[str, SceneLight], keys: Mapping[str, Any]) -> None:
     """Raise ValueError for a name that is not a light of the scene, or a light that cannot be scaled so."""
     for name in keys:
         if name not in lights:

@@ -40,7 +40,7 @@ class Fog(NamedTuple):
     """Share of the extinction that is scattering, for red, green and blue."""
 
 
-class Optics(NamedTuple):
+class SceneOptics(NamedTuple):
     """The lens, the shutter and the fog of a scene; none of them by default."""
 
     lens: Lens | None = None
@@ -64,10 +64,10 @@ class Optics(NamedTuple):
         return camera if self.lens is None else self.lens.fit(camera)
 
 
-ENTRIES = Optics._fields
+ENTRIES = SceneOptics._fields
 
 
-def read_optics(entries: Mapping[str, Any], where: str) -> Optics:
+def read_optics(entries: Mapping[str, Any], where: str) -> SceneOptics:
     """The optics of an animation or a record, which has other entries besides; ``where`` names it in errors.
 
     Raises ValueError for values that are out of range or no numbers.
@@ -75,7 +75,7 @@ def read_optics(entries: Mapping[str, Any], where: str) -> Optics:
     lens, fog, shutter = entries.get("lens"), entries.get("fog"), entries.get("shutter", 0.0)
     if not _is_number(shutter) or not 0 <= shutter <= 1:
         raise ValueError(f"{where} shutter: expected a share of a frame's time from 0 to 1, got {shutter!r}.")
-    return Optics(
+    return SceneOptics(
         None if lens is None else _read_lens(lens, f"{where} lens"),
         float(shutter),
         None if fog is None else _read_fog(fog, f"{where} fog"),
