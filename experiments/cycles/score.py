@@ -13,6 +13,7 @@ are averaged first, then in decibels.
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -127,4 +128,9 @@ def find_changed(before: Reference, now: Reference, motion: np.ndarray | None) -
 
 def _flip(image: np.ndarray, reference: np.ndarray) -> float:
     """FLIP of what a screen shows."""
-    return float(flip(*(color.tonemap(jnp.asarray(each, jnp.float32)) for each in (image, reference))))
+    return float(_flip_of_screens(np.asarray(image, np.float32), np.asarray(reference, np.float32)))
+
+
+@jax.jit
+def _flip_of_screens(image: jax.Array, reference: jax.Array) -> jax.Array:
+    return flip(color.tonemap(image), color.tonemap(reference))

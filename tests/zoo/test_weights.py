@@ -75,7 +75,7 @@ def test_training_continues_from_weights_that_see_less(tmp_path, rng):
         roughness=rng.uniform(size=(16, 16, 1)).astype(np.float32),
     )
     images = [
-        denoiser.step(weights, denoiser.start(weights, frame), frame)[1]
+        jax.jit(denoiser.step)(weights, denoiser.start(weights, frame), frame)[1]
         for denoiser, weights in ((old, params), (more, grown))
     ]
     np.testing.assert_allclose(images[1], images[0], rtol=1e-5)
