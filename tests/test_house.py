@@ -131,6 +131,7 @@ print("alone")
 """
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plain_processes")
 def test_the_maths_needs_only_jax_and_numpy():
     done = subprocess.run([sys.executable, "-c", ONLY_JAX], capture_output=True, text=True, check=False)

@@ -112,6 +112,7 @@ def test_a_new_method_is_trained_denoises_and_is_compared(toy, clips, tmp_path, 
     assert "gain" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_new_method_appears_in_the_hard_cases_and_the_chart(toy):
     function = next(function for function in list_denoisers() if function.name == "toy")
     cases = [CASES["radiance not a number"], CASES["every pixel off screen"]]

@@ -202,6 +202,7 @@ def test_its_frames_can_be_denoised_in_tiles(install):
         np.testing.assert_allclose(tiled(frame), whole(frame), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_weights_name_the_address_and_another_process_reads_them(install, clips, tmp_path):
     """A real command, in a process that has never seen the package."""
     site = install(entry_points=False)

@@ -73,6 +73,7 @@ def _checked(script: str, folder: Path) -> list[dict]:
     return json.loads(done.stdout)["generalDiagnostics"]
 
 
+@pytest.mark.slow
 def test_a_users_script_has_no_error_and_no_any(tmp_path):
     revealed = "".join(f"reveal_type({each})\n" for each in RESULTS)
     found = _checked(SCRIPT + revealed, tmp_path)

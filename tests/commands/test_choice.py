@@ -32,6 +32,7 @@ def _denoise(source: Path, out: Path, *options: str) -> np.ndarray:
     return next(values for name, values in sorted(channels.items()) if name.endswith(("Combined.R", "denoised.R")))
 
 
+@pytest.mark.slow
 def test_frames_of_other_renderers_are_denoised_by_what_is_best_there(
     shot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -41,6 +42,7 @@ def test_frames_of_other_renderers_are_denoised_by_what_is_best_there(
     np.testing.assert_array_equal(chosen, _denoise(shot, tmp_path / "named", "--method", BEST_ELSEWHERE))
 
 
+@pytest.mark.slow
 def test_without_its_package_our_own_is_used_and_the_package_named(
     shot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

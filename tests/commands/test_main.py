@@ -116,6 +116,7 @@ def test_denoise_adds_direct_and_emitted_light_back(clip, tmp_path):
         np.testing.assert_allclose(channels[letter] - channels[f"denoised.{letter}"], 0.75, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_one_frame_becomes_the_file_that_is_named(shot, tmp_path, capsys):
     one, out = shot / "shot_0000.exr", tmp_path / "new" / "clean.exr"
     main.main(["denoise", str(one), "-o", str(out), "--method", "svgf", "--preview"])
@@ -169,6 +170,7 @@ def test_short_and_small_clips_name_the_options_that_fit_them(clip, tmp_path, ca
         assert advice.split()[0][2:] in main.Train.__dataclass_fields__
 
 
+@pytest.mark.slow
 def test_denoise_plain_exr_files_with_the_shipped_network(tmp_path):
     rng = np.random.default_rng(0)
     for index in range(2):

@@ -417,6 +417,7 @@ def _reader():
     return [sys.executable, "-c", f"import ctypes, os, sys; {drop}; {start}"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     sys.platform == "win32" or (sys.platform != "linux" and os.geteuid() == 0),
     reason="the mode of a folder does not make it read-only, or the superuser may write everything",

@@ -214,6 +214,7 @@ def test_overshoot_of_a_pixel_filter_and_broken_pixels_are_no_reason_to_refuse(t
     assert np.isnan(frame.roughness[3, 3])  # sanitized, and counted, by the step
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plain_processes")
 def test_the_command_prints_what_it_read_and_derived(tmp_path, scene):
     folder = tmp_path / "shots"

@@ -198,6 +198,7 @@ def test_batches_are_those_of_the_clips(folder: Path, packed: Path, tmp_path: Pa
     assert mixed.reference.shape == (2, 3, 16, 16, 3)
 
 
+@pytest.mark.slow
 def test_indirect_light_alone_and_no_single_samples(folder: Path, tmp_path: Path) -> None:
     sources = open_clips(folder)
     write_pack(tmp_path / "a.pack", sources, size=2**19, packing=SMALL._replace(direct=False, half=False))
@@ -268,6 +269,7 @@ def test_clips_that_lack_what_is_asked_for_are_named(folder: Path, tmp_path: Pat
     refused(r"frames: expected at least 1, got 0", frames=0)
 
 
+@pytest.mark.slow
 def test_the_command_packs_and_fails_plainly(folder: Path, tmp_path: Path) -> None:
     def run(*arguments: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "jaxdn.commands.main", "pack", *map(str, arguments)]

@@ -93,6 +93,7 @@ def test_windows_cover_all_and_have_their_margins(length: int, halo: int, more: 
 WITH_SLOW_ONES = [pytest.param(name, marks=[pytest.mark.slow] * (name in {"steady", "ntd"})) for name in METHODS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "without",
     [
@@ -121,6 +122,7 @@ def test_tiles_make_the_image_of_the_whole_frame(name: str, without: tuple[str, 
     assert len(tiles.programs) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WITH_SLOW_ONES)
 def test_nothing_beyond_the_receptive_field_decides_about_a_pixel(name: str, x64: None) -> None:
     """Everything to the right of a column is other than it was, but not what is measured of the frame."""
@@ -209,6 +211,7 @@ def test_sums_of_tiles_are_those_of_the_frame() -> None:
     assert measure_frame(frame.radiance, None, frame._replace(albedo=None)).reflectance_differs == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("samples", [4, 4096])
 def test_the_safe_mixture_in_tiles_is_that_of_the_whole_frame(samples: int) -> None:
     rng = np.random.default_rng(0)

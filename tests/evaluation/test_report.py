@@ -808,6 +808,7 @@ def test_without_script_the_page_shows_a_still(visit):
     assert tab.locator("#scores tbody tr").count() == 6
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_the_player_fits_a_narrow_screen(visit):
     tab = visit(with_films(synthetic())._replace(about=ABOUT), width=420, height=800)

@@ -48,6 +48,7 @@ def test_the_first_call_is_separate_and_the_budget_ends_the_rounds():
     assert 2 <= timing.rounds < 12
 
 
+@pytest.mark.slow
 def test_peak_memory_is_what_a_call_touches():
     def allocate():
         return np.ones(8 << 20, np.float64).sum()

@@ -221,6 +221,7 @@ def denoisers():
     return chosen()
 
 
+@pytest.mark.slow
 def test_every_registered_method_is_there_with_its_variants(denoisers):
     listed = ways(denoisers)
     found = {each.name: each for each in listed}

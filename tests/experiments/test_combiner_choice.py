@@ -21,7 +21,7 @@ from experiments.cycles.combiner_choice import (
 from jaxdn.core.frame import Frame
 from jaxdn.denoisers import combiner
 from jaxdn.methods.combiner.candidates import CANDIDATES
-from jaxdn.methods.combiner.history import fetch_past, keep_history, measure_now
+from jaxdn.methods.combiner.history import Past, fetch_past, keep_history, measure_now
 from jaxdn.zoo.weights import load_weights
 from tests.experiments.test_cycles_training import write_cycles_clip
 from tests.needs import require
@@ -65,9 +65,14 @@ def draw_frame(rng: np.random.Generator) -> Frame:
 def test_the_last_result_is_fetched_as_the_denoiser_does_it(rng: np.random.Generator) -> None:
     then, now, gain = draw_frame(rng), draw_frame(rng), jnp.float32(0.7)
     result, prior = jnp.asarray(rng.exponential(size=(2, 3, 24, 32)), jnp.float32)
-    means = measure_now(now, prior)
-    past = fetch_past(keep_history(then, measure_now(then, prior), result), now, means, jnp.asarray(False))
-    found = fetch_result(result, then, now, jnp.log1p(gain * prior), gain)
+
+    @jax.jit
+    def fetch() -> tuple[Past, jax.Array]:
+        kept = keep_history(then, measure_now(then, prior), result)
+        past = fetch_past(kept, now, measure_now(now, prior), jnp.asarray(False))
+        return past, fetch_result(result, then, now, jnp.log1p(gain * prior), gain)
+
+    past, found = fetch()
     assert 0.5 < np.mean(past.valid) < 1.0
     np.testing.assert_allclose(jnp.expm1(found) / gain, past.result, rtol=1e-4, atol=1e-5)
 

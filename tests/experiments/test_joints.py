@@ -27,6 +27,7 @@ def test_the_figures_of_a_joint_are_those_of_known_images() -> None:
     assert measure_joint(whole, [whole, {**second, 4: second[2]}], reference, 2).equal_after is None
 
 
+@pytest.mark.slow
 def test_a_chunk_that_reads_all_frames_is_the_shot_and_any_is_after_a_cut(tmp_path) -> None:
     main(
         Settings(

@@ -64,6 +64,7 @@ def counts_of(denoiser: Denoiser, params: Any, clip: Clip) -> list[np.ndarray]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize("budget", [2.5, pytest.param(4.0, marks=pytest.mark.slow)])
 def test_every_frame_has_the_budget_and_every_pixel_its_own_number(name, budget, rng, key):
@@ -129,6 +130,7 @@ def test_dasr_sees_the_first_sample_and_no_other_frame(rng, key):
     np.testing.assert_array_equal(plain, same)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrap", [lambda inner: inner, stabilised, lambda inner: taa(after=inner)])
 def test_a_quarter_of_a_sample_rotates_over_the_pixels(wrap, rng, key):
     """Without a sampler, each pixel has one sample in four frames, and each 2x2 block one in every frame."""
@@ -212,6 +214,7 @@ def test_the_amplitude_slope_is_half_of_the_mixing_slope(rng, key):
         np.testing.assert_allclose(half, 0.5 * whole, rtol=1e-3, atol=1e-5 * largest)
 
 
+@pytest.mark.slow
 def test_pixels_without_samples_are_filled_from_their_neighbours(rng, key):
     """The paper's map may give none; black pixels would darken all around them."""
     denoiser, clip = ntasd(size=TINY, least=0, budget=1, demodulate="none"), clip_of(rng)
@@ -237,6 +240,7 @@ def test_budgets_below_one_sample_are_kept_in_the_mean_and_move_from_frame_to_fr
     assert dasr(size=TINY).sees_sample
 
 
+@pytest.mark.slow
 def test_pixels_without_samples_learn_what_a_sample_would_bring(rng, key):
     """They are filled; a sample would move what fills them towards the reference."""
     denoiser, clip = ntasd(size=TINY, least=0, budget=1, demodulate="none"), clip_of(rng, 1)

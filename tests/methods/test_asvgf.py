@@ -230,6 +230,7 @@ def frames_until_close(denoiser, *, samples):
     return int(np.argmax(close)) + 1
 
 
+@pytest.mark.slow
 def test_light_that_doubles_is_followed_at_once():
     slow = frames_until_close(svgf(), samples=False)
     assert slow >= 9
@@ -251,6 +252,7 @@ def test_the_variance_of_a_still_scene_falls_as_one_over_the_number_of_frames(sa
     assert np.var(found[-1][1]) / single == pytest.approx(0.125 / 1.875, rel=0.3)
 
 
+@pytest.mark.slow
 def test_without_a_change_of_light_it_is_svgf(rng):
     frames = moving_frames(rng)
     unchanged = np.zeros((*frames[0].radiance.shape[:2], 2), np.float32)

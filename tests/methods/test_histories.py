@@ -86,6 +86,7 @@ def kind(request: pytest.FixtureRequest) -> Kind:
     return request.param
 
 
+@pytest.mark.slow
 def test_a_constant_image_stays_with_all_of_its_border(kind, rng):
     frames = [
         frame._replace(
@@ -131,6 +132,7 @@ def test_by_default_the_error_of_a_static_scene_falls(kind, rng):
     assert np.mean(errors[20:]) < np.mean(errors[6:10]) < np.mean(errors[:3]) < np.var(noise) / 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "missing",
     [
@@ -177,6 +179,7 @@ def test_broken_history_is_dropped_where_it_is_broken(kind, rng, which):
     assert int(after.sanitized) > int(kind.stepped(state, frames[1])[0].sanitized)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [

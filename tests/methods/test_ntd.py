@@ -206,6 +206,7 @@ def test_the_history_lies_where_the_vector_points(method: Any, buffer: str, rng:
     np.testing.assert_allclose(image[2:, :-3], history[:-2, 3:], rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", [None, "paper"])
 def test_without_a_history_every_frame_is_a_first_one(
     preset: str | None, rng: np.random.Generator, key: jax.Array
@@ -267,6 +268,7 @@ def test_constant_radiance_stays(name: str, rng: np.random.Generator, key: jax.A
     np.testing.assert_allclose(images, frames.radiance, rtol=3e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1, 1), (33, 57)])
 def test_any_size(size: tuple[int, int], rng: np.random.Generator, key: jax.Array) -> None:
     denoiser = tiny()
@@ -471,6 +473,7 @@ def test_features_of_the_guides_are_scaled_means(rng: np.random.Generator) -> No
     assert guided_features(precisions, dict.fromkeys(precisions)) == [None] * 3
 
 
+@pytest.mark.slow
 def test_guided_kernels_keep_two_surfaces_apart(rng: np.random.Generator) -> None:
     """Dark and bright walls at a right angle, equal noise, a network that predicts nothing: the mean of each stays."""
     right = (np.arange(64) >= 32).astype(np.float32)[None, :, None]
@@ -494,6 +497,7 @@ def test_guided_kernels_keep_two_surfaces_apart(rng: np.random.Generator) -> Non
     assert errors["plain"] > 1.5
 
 
+@pytest.mark.slow
 def test_the_background_passes_through_and_gives_surfaces_no_light(rng: np.random.Generator, key: jax.Array) -> None:
     """Also in the second frame, when surfaces have moved over it."""
     frames = random_frames(rng)

@@ -231,6 +231,7 @@ def test_the_plane_test_knows_slanted_surfaces():
         assert float(weight.factor(there, here, TapOffset(*offset))) == expected
 
 
+@pytest.mark.slow
 def test_relax_as_published_filters_within_planes(rng):
     """Across a step of 1 % of the depth noisy light does not run, however alike the two sides are."""
     near = (np.arange(24) < 12)[None, :, None]

@@ -98,6 +98,7 @@ def test_four_taps_blur_the_frame_before_it_is_accumulated():
     np.testing.assert_allclose(spread(image), spread_of("four taps", 6.0), rtol=0.1)
 
 
+@pytest.mark.slow
 def test_discs_turn_with_the_frame_the_disc_and_the_kind_of_light():
     """What the taps of one frame miss those of others find: along the edge, their mean is smoother than each."""
     images = np.stack([after_edges(DISCS, 3, turned=turned)[1][..., 0] for turned in range(12)])
@@ -139,6 +140,7 @@ def test_what_is_reflected_from_far_is_not_mixed_with_what_is_near():
     assert 0.0 < leaked(45.0) < 0.35 * leaked(5.0)
 
 
+@pytest.mark.slow
 def test_a_mirror_is_not_blurred(rng):
     _, frames = mirror_frames(rng, 1)
     _, images = run(reblur(), frames)

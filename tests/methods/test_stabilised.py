@@ -58,6 +58,7 @@ def rolling(rng, count=10, size=SIZE, speed=2, error=0.05, noise=0.5):
     return jax.tree.map(lambda *each: np.stack(each), *frames), np.stack(truths)
 
 
+@pytest.mark.slow
 def test_the_first_frame_is_the_denoisers_and_later_ones_are_the_blend(rng):
     """Of a still image: the same as the filter, called by hand."""
     frames, _ = rolling(rng, 3, speed=0)
@@ -85,6 +86,7 @@ def test_what_moves_leaves_no_trail_and_what_stands_still_is_steady(rng):
     assert errors[inside].mean() < 0.5 * own[inside].mean(), "the history moves with the disc"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.3, 1.7])
 @pytest.mark.parametrize(("guide", "gain"), [("precise", 1.0), ("noisy", 0.0), ("none", 0.0)])
 def test_a_pan_over_fine_texture_is_no_worse_than_the_denoiser(speed, guide, gain, rng):
@@ -102,6 +104,7 @@ def test_a_pan_over_fine_texture_is_no_worse_than_the_denoiser(speed, guide, gai
         assert 10 * np.log10(own / found) > least - 0.1, (where.mean(), 10 * np.log10(own / found))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrap", [lambda inner: inner, demodulated], ids=["plain", "demodulated"])
 def test_tiles_give_the_image_of_the_whole(wrap, rng):
     denoiser = wrap(jaxdn.stabilised(recurrent(_core_of_means())))
@@ -125,6 +128,7 @@ def _core_of_means():
     return Core(lambda params, frame: (), step, frozenset(), receptive_field=1)
 
 
+@pytest.mark.slow
 def test_a_program_can_batch_it_and_half_precision_is_widened(rng):
     denoiser = jaxdn.stabilised(GIVEN)
     clips = [Clip(rolling(rng, 3)[0]) for _ in range(2)]
@@ -138,6 +142,7 @@ def test_a_program_can_batch_it_and_half_precision_is_widened(rng):
     np.testing.assert_allclose(found, images[0], rtol=0.1, atol=0.02)
 
 
+@pytest.mark.slow
 def test_gradients_reach_what_the_denoiser_learns(rng):
     """Finite, and that of the blend with the gains as they are."""
     frames, truth = rolling(rng, 3)
@@ -155,6 +160,7 @@ def test_gradients_reach_what_the_denoiser_learns(rng):
     assert gradient > 0, "a smaller gain is nearer to the truth"
 
 
+@pytest.mark.slow
 def test_its_step_can_be_exported(rng):
     frames, _ = rolling(rng, 3)
     denoiser = jaxdn.stabilised(svgf())

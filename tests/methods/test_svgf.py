@@ -589,6 +589,7 @@ def test_the_smallest_sums_of_weights_that_count_spoil_no_gradient():
     np.testing.assert_allclose(slopes[1], 0.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_pixel_without_a_surface_among_strangers_spoils_no_gradient(rng):
     """Its neighbours weigh 1e-20 together, the square of which, 0 in single precision, divided the variance."""
     values = jnp.asarray(rng.uniform(1, 2, (3, 5, 5)), jnp.float32)

@@ -59,6 +59,7 @@ def test_without_buffers_of_its_own_it_is_svgf(rng, by):
         np.testing.assert_allclose(image, other, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [
@@ -311,6 +312,7 @@ def test_other_light_is_fetched_along_the_dual_vectors(rng):
     np.testing.assert_allclose(image[1:, :-3, 0], expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_shadow_is_not_fetched_from_another_surface(rng):
     frames = passing_shadow(rng, 3)[0]
     history = []

@@ -124,6 +124,7 @@ def test_objects_move_visibly_and_never_jump(name: str) -> None:
         assert steps.max(axis=0).max() > 0.02
 
 
+@pytest.mark.slow
 def test_a_record_gives_the_same_scene_back() -> None:
     for name in NAMES:
         scene = FAMILIES[name](11, lamp="up")

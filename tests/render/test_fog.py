@@ -126,6 +126,7 @@ def test_light_is_that_of_mitsubas_integrator(box):
     assert np.all(error < 0.01 * means[1].mean(axis=0))  # a difference of 5 % would be seen
 
 
+@pytest.mark.slow
 @pytest.mark.needs("llvm")
 def test_a_scalar_frame_in_fog_has_the_same_light():
     options: dict[str, Any] = {"pixel_filter": "box", "light": "reflected", "max_depth": 3, **SIZE}
@@ -140,6 +141,7 @@ def test_a_scalar_frame_in_fog_has_the_same_light():
     assert means.std(ddof=1) < 0.1 * fast.reference.mean()
 
 
+@pytest.mark.slow
 @pytest.mark.needs("llvm")
 def test_a_family_in_fog_renders_and_its_record_keeps_it():
     record = {"family": "edge", "seed": 1, "fog": {"density": 0.08, "albedo": [0.9, 0.9, 0.9]}}

@@ -123,6 +123,7 @@ def test_the_reference_is_the_mean_over_the_pixel():
     assert deviation(whole, truth) < 0.15 * deviation(centres, truth)
 
 
+@pytest.mark.slow
 def test_taa_gathers_the_whole_pixel():
     """Of surfaces without light and noise, so that the error is that of edges alone."""
     stage = Stage(square=lambda frame: TURNED)

@@ -71,6 +71,7 @@ def test_moving_edges_cover_what_the_geometry_says(variant):
     assert np.max(np.abs(wanted - coverage())) > 0.25
 
 
+@pytest.mark.slow
 @pytest.mark.needs("llvm")
 def test_vectors_lie_between_the_middles_of_frames_and_every_image_is_blurred():
     options: dict[str, Any] = {"pixel_filter": "box", "variant": FAST, "light": "reflected", **SIZE}

@@ -60,6 +60,7 @@ def decibels(image: np.ndarray, frame: int) -> float:
     return float(psnr(color.tonemap(image), color.tonemap(picture(frame))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bidirectional", [False, True])
 def test_results_scale_with_their_input(tmp_path: Path, bidirectional: bool) -> None:
     """By powers of two exactly, by others nearly; float32 files."""

@@ -77,6 +77,7 @@ def test_a_panorama_has_no_lens_by_its_attribute_or_as_it_is_stated(tmp_path: Pa
     assert not list((tmp_path / "out").glob("*"))
 
 
+@pytest.mark.slow
 def test_beauty_alpha_and_light_layers_are_blurred_alike_and_the_rest_stays(tmp_path: Path) -> None:
     shot = write(tmp_path / "in")
     lines: list[str] = []

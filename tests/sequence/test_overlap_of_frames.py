@@ -48,6 +48,7 @@ def rot(path: Path) -> None:
     path.write_bytes(data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [{}, {"aovs": "additive", "preview": True}, {"bidirectional": True}], ids=str)
 def test_files_and_lines_are_those_of_one_frame_at_a_time(settings: Any, tmp_path: Path) -> None:
     """A damaged frame in the middle is told after the frames before it."""
