@@ -11,6 +11,7 @@ from jaxdn.data.clip.folder import is_clip
 from jaxdn.data.errors import DamagedFile
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
+from jaxdn.data.foreign.frame_names import label_file
 from jaxdn.runtime.malloc import tune_malloc
 from jaxdn.sequence.jobs import Job
 from jaxdn.sequence.optics import Optics
@@ -75,7 +76,7 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
             log=report.log,
         )
     if written.left_out:
-        names = ", ".join(path.name for path in written.left_out[:8]) + (" ..." if len(written.left_out) > 8 else "")
+        names = ", ".join(map(label_file, written.left_out[:8])) + (" ..." if len(written.left_out) > 8 else "")
         print(f"left out as missing: {_count(len(written.left_out), 'frame')}: {names} (--strict: end there)")
     if not written.files:
         print(f"nothing to do in {options.out}")

@@ -16,6 +16,7 @@ from jaxdn.data.errors import ClipError, DamagedFile
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import MappedBuffer, lacks_convention, read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
+from jaxdn.data.foreign.frame_names import label_file
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.foreign.passes import join_passes
 from jaxdn.data.foreign.shots import Shot, find_missing, find_shots, ranges
@@ -93,15 +94,15 @@ def _inspect_shot(
     quiet: bool,
 ) -> dict[str, Any]:
     """What is read of a shot, or of one view of it, for JSON; printed too unless ``quiet``."""
-    unusable = {every[index].path.name: reason for index, reason in find_unusable(every, naming).items()}
-    opened = [file for file in every if file.path.name not in unusable]
+    unusable = {label_file(every[index].path): reason for index, reason in find_unusable(every, naming).items()}
+    opened = [file for file in every if label_file(file.path) not in unusable]
     notes: list[str] = []
     mapping: list[MappedBuffer] | None = None
     while mapping is None:
         try:
             mapping = read_channel_mapping(opened[0], naming, log=notes.append)
         except DamagedFile as error:
-            unusable[error.path.name] = error.reason
+            unusable[label_file(error.path)] = error.reason
             if len(opened) == 1:
                 raise
             del opened[0]
@@ -191,7 +192,7 @@ def _without_one_before(shot: Shot, opened: Sequence[ExrFile]) -> set[Path]:
 
 def _to_state(files: Sequence[Path], fitting: Sequence[str]) -> list[str]:
     """What to state about motion vectors, as lines: the conventions that fit, or all where nothing is known."""
-    pair = " and ".join(file.name for file in files[:2])
+    pair = " and ".join(map(label_file, files[:2]))
     if fitting:
         order = ", the best first" if len(fitting) > 1 else ""
         request = f"State what brings {pair} onto each other{order}"

@@ -4,6 +4,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from jaxdn.data.errors import ClipError
+from jaxdn.data.foreign.frame_names import label_file
 from jaxdn.data.foreign.soundness import find_unusable
 from jaxdn.sequence.jobs import Job
 from jaxdn.sequence.settings import Settings
@@ -56,7 +57,7 @@ def _leave_out(job: Job, settings: Settings) -> tuple[Job, dict[Path, str]]:
 
 def explain_left_out(path: Path, reason: str) -> str:
     """Why a file counts as missing, as a line."""
-    return f"{path.name} is left out, as a missing frame: {reason}; after it there is no history at first"
+    return f"{label_file(path)} is left out, as a missing frame: {reason}; after it there is no history at first"
 
 
 def segments_around(job: Job, segment: range, index: int, written: Collection[Path]) -> list[range]:

@@ -12,6 +12,7 @@ import numpy as np
 from jaxdn.data.clip.folder import read_record
 from jaxdn.data.clip.frames import StoredFrame
 from jaxdn.data.exr.file import ExrFile
+from jaxdn.data.foreign.frame_names import label_file
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.read import check_single_layer, open_frames
 from jaxdn.runtime.overlap import read_ahead
@@ -153,7 +154,7 @@ class _FallbackReport:
         file, confidence = self._job.shot.files[index], fallback.confidence
         if index == min(self._job.wanted):
             noise = f"noise is about {confidence.noise:.1%} of the light"
-            self._log(f"{file.name}: {noise}; {fallback.kept:.0%} of the frame is kept (--no-safe: nothing)")
+            self._log(f"{label_file(file)}: {noise}; {fallback.kept:.0%} of the frame is kept (--no-safe: nothing)")
         if max(confidence.doubt, confidence.fallback) > 0.5 and index in self._job.wanted:
             if not self._doubtful:
                 self._log(_explain_fallback(file, fallback))
@@ -162,7 +163,7 @@ class _FallbackReport:
     def finish(self) -> None:
         """After the last frame of the segment."""
         if len(self._doubtful) > 1:
-            self._log(f"likewise {len(self._doubtful) - 1} more, up to {self._doubtful[-1].name}")
+            self._log(f"likewise {len(self._doubtful) - 1} more, up to {label_file(self._doubtful[-1])}")
 
 
 def _explain_fallback(file: Path, fallback: Fallback) -> str:
@@ -175,8 +176,8 @@ def _explain_fallback(file: Path, fallback: Fallback) -> str:
     )
     kept = max(fallback.kept, confidence.fallback)
     return (
-        f"{file.name}: the denoised image differs by {confidence.lost:.0%} of the light, of which noise explains "
-        f"{confidence.noise:.0%}: {reason} {kept:.0%} of the result is the frame as it came"
+        f"{label_file(file)}: the denoised image differs by {confidence.lost:.0%} of the light, of which noise "
+        f"explains {confidence.noise:.0%}: {reason} {kept:.0%} of the result is the frame as it came"
     )
 
 

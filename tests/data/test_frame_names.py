@@ -46,6 +46,14 @@ CASES = {
     "a size is no frame": (["s_2048x1024.exr", "s_512x256.exr"], {"s_2048x1024": [None], "s_512x256": [None]}),
     "takes are no subframes": (["1.0001.exr", "1.0002.exr", "2.0001.exr"], {"1.#": [1, 2], "2.#": [1]}),
     "upper case": (["S_01.EXR", "S_02.EXR"], {"S_#": [1, 2]}),
+    "a version after it, alike": (["shot_0001_v02.exr", "shot_0002_v02.exr"], {"shot_#_v02": [1, 2]}),
+    "a last number that is alike": (["render.0001.1.exr", "render.0002.1.exr"], {"render.#.1": [1, 2]}),
+    "a folder for each frame": (["0001/beauty.exr", "0002/beauty.exr"], {"#/beauty": [1, 2]}),
+    "folders, and passes": (["f-1/a.exr", "f-2/a.exr", "f-2/b.exr", "f-3/b.exr"], {"#/a": [1, 2], "#/b": [2, 3]}),
+    "named folders": (["Frame_08/b.exr", "Frame_10/b.exr"], {"#/b": [8, 10]}),
+    "a folder alone": (["0001/beauty.exr"], {"beauty": [None]}),
+    "folders of shots": (["sh010/b.exr", "sh020/b.exr", "v01/b.exr", "v02/b.exr"], {"b": [None] * 4}),
+    "numbers of their own come first": (["1/b.7.exr", "2/b.7.exr"], {"b.#": [7, 7]}),
     "no number": (["still.exr", "v2_final.exr"], {"still": [None], "v2_final": [None]}),
     "one frame": (["s.0007.beauty.exr"], {"s.#.beauty": [7]}),
 }  # fmt: skip
@@ -77,6 +85,17 @@ def test_folders_with_brackets_and_placeholders_of_numbers(pattern: str, tmp_pat
     (shot,) = find_shots(folder / pattern)
     assert [file.name for file in shot.files] == ["s_001.exr", "s_002.exr"]
     assert find_shots(folder)[0].label == f"{folder}/s_#.exr 1-2"
+
+
+@pytest.mark.parametrize("pattern", ["", "*/beauty.exr", "####/beauty.exr"])
+def test_a_folder_for_each_frame(pattern: str, tmp_path: Path) -> None:
+    for number in (1, 2, 4):
+        touch(tmp_path / f"{number:04d}", "beauty.exr")
+    touch(tmp_path / "cache", "beauty.exr")
+    shots = {shot.name: shot for shot in find_shots(tmp_path / pattern)}
+    assert shots["#/beauty"].numbers == (1, 2, 4)
+    assert shots["#/beauty"].label == f"{tmp_path}/#/beauty.exr 1-2, 4"
+    assert len(shots) == (2 if pattern[:1] == "*" else 1)
 
 
 def test_a_placeholder_is_a_number(tmp_path: Path) -> None:

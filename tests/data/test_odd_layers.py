@@ -74,6 +74,28 @@ def test_it_is_read_from_the_first_frame_on_that_has_something(name: str, tmp_pa
     assert [line for line in told if line.startswith(f"s.0002.exr: from here on {name} is read")] == told[-1:]
 
 
+@pytest.mark.parametrize("told_by", ["depth", "normal", "nothing"])
+def test_a_surface_without_a_number_is_a_surface(told_by: str, tmp_path: Path) -> None:
+    """Blender gives every object the index 0, and most users number those alone that they want to select."""
+    ids = (truth(0).ids + 1.0) * (truth(0).ids == 1)
+    sky = np.s_[:4]
+    ids[sky] = 0
+    depth, normal = truth(0).depth.copy(), truth(0).normal.copy()
+    depth[sky], normal[sky] = 1e10, 0
+    channels = blender(0, ids=ids, depth=depth, normal=normal)
+    lost = {"depth": (), "normal": ("Depth",), "nothing": ("Depth", "Normal")}[told_by]
+    (frame,), _ = read(tmp_path, {name: one for name, one in channels.items() if not any(n in name for n in lost)})
+    found, numbered = frame.ids[..., 0], ids[..., 0] == 2
+    assert 0.05 < numbered.mean() < 0.6
+    assert np.all(found[numbered] == 1)
+    floor = ~numbered
+    if told_by != "nothing":
+        assert np.all(found[sky] == -1)
+        floor[sky] = False
+    assert len(set(found[floor])) == 1
+    assert found[floor][0] not in (-1, 0, 1)
+
+
 def arnold(frame: int, light: float = 1.0, **other: np.ndarray) -> Channels:
     """A beauty with the lighting pass ``diffuse`` and no albedo."""
     now = truth(frame, samples=16)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_dilation
 
 from jaxdn import clips, color
 from jaxdn.core.frame import RADIANCE_MAX, Frame
@@ -90,6 +91,46 @@ def test_a_lamp_comes_back_and_its_brightness_does_not_matter(tmp_path: Path, me
     bulb = measure(12.0)
     for bright in (3000.0, 2e6):
         assert all(other > one - 1.0 for one, other in zip(bulb, measure(bright), strict=True))
+
+
+def test_a_lamp_lights_no_pixel_beside_it(tmp_path: Path) -> None:
+    """Denoisers spread what a lamp has: of 3000, a twentieth of the bound made a ring of several times the light."""
+    lamp = np.zeros(SIZE, bool)
+    lamp[LAMP_PIXELS] = True
+    ring = binary_dilation(lamp, np.ones((3, 3))) & ~lamp
+    images, _ = denoise(write(tmp_path / "in", 1.0, lamp=3000.0), method="oidn")
+    for frame, image in enumerate(images):
+        wanted = picture(frame)[ring].mean()
+        assert image[ring].mean() < 1.5 * wanted
+        assert np.all(image[ring] < 3.5 * wanted)
+
+
+def test_what_is_bright_beside_a_lamp_stays(rng: np.random.Generator) -> None:
+    """A denoiser that changes nothing changes nothing there: a lit shade, a pixel between two lamps."""
+    light = grey(rng)
+    light[LAMP_PIXELS] = 100
+    light[1, 50:60] = 1.2
+    light[-9:, -5:], light[-9:, -3] = 50, 0.3
+    bounded = np.asarray(bound_light(StoredFrame(Frame(light)), 0).frame.radiance)
+    np.testing.assert_allclose(restore_light(bounded, light, 0), light, rtol=1e-5)
+    between = bounded.copy()
+    between[-6, -3] = 2.0
+    assert restore_light(between, light, 0)[-6, -3, 0] == 2.0
+
+
+def test_a_bright_floor_with_little_noise_is_no_lamp(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Where half of a frame is a dim sky, a lit floor is as far above the median as a lamp is elsewhere."""
+    (tmp_path / "in").mkdir()
+    light = np.full((3, *SIZE), 0.05, np.float32)
+    floor = np.s_[SIZE[0] // 3 :]
+    light[:, floor] = rng.gamma(1100, 1 / 1100, light[:, floor].shape)  # noise of 3 %
+    for number, image in enumerate(light):
+        assert find_lamps(np.repeat(image[..., None], 3, axis=-1), 2).mean() < 0.01
+        clips.write_exr(tmp_path / "in" / f"a.{number:04d}.exr", dict.fromkeys("RGB", image))
+    images, _ = denoise(tmp_path / "in", safe=False)
+    inner = np.s_[SIZE[0] // 3 + 20 :, :, 0]
+    assert np.mean(images[-1][inner] != light[-1][inner[:2]]) > 0.98
+    assert images[-1][inner].std() < 0.5 * light[-1][inner[:2]].std()
 
 
 def test_half_files_are_clamped_when_they_are_written(tmp_path: Path) -> None:

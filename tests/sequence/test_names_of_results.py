@@ -20,6 +20,7 @@ def write(folder: Path, *names: str) -> Path:
     """Constant frames, each as bright as its place in the list."""
     folder.mkdir(parents=True, exist_ok=True)
     for light, name in enumerate(names, start=1):
+        (folder / name).parent.mkdir(exist_ok=True)
         clips.write_exr(folder / name, dict.fromkeys("RGB", np.full((8, 8), light, np.float32)))
     return folder
 
@@ -32,7 +33,7 @@ def denoise(sources: list[Path], out: Path, **settings: Any) -> tuple[list[str],
     """The files that were written, in order, and what was told."""
     told: list[str] = []
     written = denoise_files(sources, out, find_model("noisy"), Settings(**settings), log=told.append)
-    return [path.name for path in written.files], [line for line in told if "noise is" not in line]
+    return [str(path.relative_to(out)) for path in written.files], [line for line in told if "noise is" not in line]
 
 
 @pytest.mark.parametrize(
@@ -43,6 +44,9 @@ def denoise(sources: list[Path], out: Path, **settings: Any) -> tuple[list[str],
         ["0001_L.exr", "0002_L.exr", "0003_L.exr"],
         ["s.1.0.exr", "s.1.5.exr", "s.2.0.exr"],
         ["S_8.EXR", "S_9.EXR", "S_10.EXR"],
+        ["0001/beauty.exr", "0002/beauty.exr", "0003/beauty.exr"],
+        ["shot_0001_v02.exr", "shot_0002_v02.exr", "shot_0003_v02.exr"],
+        ["render.0001.1.exr", "render.0002.1.exr", "render.0003.1.exr"],
     ],
 )
 def test_one_shot_in_order_however_it_is_named(names: list[str], tmp_path: Path) -> None:
@@ -51,6 +55,23 @@ def test_one_shot_in_order_however_it_is_named(names: list[str], tmp_path: Path)
     for number, sources in enumerate(([source], [source / name for name in names])):
         assert denoise(sources, tmp_path / str(number)) == (names, [])
         assert [brightness(tmp_path / str(number) / name) for name in names] == [1.0, 2.0, 3.0]
+
+
+def test_a_folder_for_each_frame_with_files_for_its_passes(tmp_path: Path, capsys: Any) -> None:
+    """Messages and pages name the folder too, as all files are called alike."""
+    source = write(tmp_path / "in", *(f"{number:04d}/beauty.exr" for number in range(1, 5)))
+    for number in range(1, 5):
+        normal = np.full((8, 8), number / 9, np.float32)
+        clips.write_exr(source / f"{number:04d}/normal.exr", dict.fromkeys("RGB", normal))
+    (source / "0003/beauty.exr").write_bytes(b"")
+    files, told = denoise([source], tmp_path / "out")
+    assert files == ["0001/beauty.exr", "0002/beauty.exr", "0004/beauty.exr"]
+    assert any("a file for each pass, normal from normal.exr" in line for line in told)
+    assert any(line.startswith("0003/beauty.exr is left out, as a missing frame") for line in told)
+    main.main(["inspect", str(source)])
+    text = capsys.readouterr().out
+    assert "0003/beauty.exr counts as a missing frame" in text
+    assert "0001/beauty.exr counts" not in text
 
 
 def test_links_keep_their_own_names(tmp_path: Path) -> None:

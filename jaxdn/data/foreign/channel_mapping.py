@@ -116,5 +116,5 @@ def _describe(name: str, channels: Channels, motion: str | None) -> str:
         return "linear, GGX alpha is its square"
     if name == "ids" and is_cryptomatte(channels):
         return "hash of what covers most of the pixel (Cryptomatte)"
-    kinds = {"light": "linear light", "id": "whole numbers, 0 is nothing", "flag": "0 or 1"}
+    kinds = {"light": "linear light", "id": "whole numbers, 0 has none", "flag": "0 or 1"}
     return kinds.get(buffer.kind, "share of light, 0 to 1" if buffer.kind == "fraction" else buffer.kind)

@@ -2,7 +2,8 @@
 
 Which of several numbers counts the frames is told by the files together: it is the last one that differs among names
 that are otherwise alike. Numbers between dots may be subframes, ``shot.12.50.exr``; whole frames between them may lack
-the zero, ``shot.12.exr``, as Houdini's ``$FF`` writes them.
+the zero, ``shot.12.exr``, as Houdini's ``$FF`` writes them. Files without a number may lie in a folder for each frame,
+``0001/beauty.exr`` or ``frame_0001/beauty.exr``.
 """
 
 import re
@@ -15,6 +16,8 @@ _RUN = re.compile(r"(?:(?:^|(?<=[._-]))-)?\d+")
 """A number; a minus belongs to it after a separator or at the beginning."""
 _ENDS = "._- ()[]{}#,+=@"
 """What a name is parted by."""
+_FOLDER = re.compile(r"(?:(?:frame|fr|f)[._ -]?)?(-?\d+)", re.IGNORECASE)
+"""The name of a folder that holds one frame. ``sh010`` and ``v02`` are shots and versions."""
 _INSIDE = 4
 """Digits of a number that counts frames though letters touch it and more follows, as in ``frame0001_left``."""
 
@@ -24,7 +27,7 @@ class FrameName(NamedTuple):
 
     file: Path
     shot: str
-    """The name with ``#`` in place of the frame's number, without the suffix."""
+    """The name with ``#`` in place of the frame's number, without the suffix; ``#/beauty`` where a folder has it."""
     number: Fraction | None
     """None: there is no frame number in the name."""
 
@@ -39,7 +42,19 @@ def read_frame_names(files: Iterable[Path]) -> list[FrameName]:
     for alike in [alike for alike in groups if alike.name.count("#.#") == 1]:
         _add_whole_frames(groups, alike)
     named = {name.file: name for group in groups.values() for name in _read_group(group)}
+    named |= _read_folders(name.file for name in named.values() if name.number is None)
     return [named[file] for file in files]
+
+
+def is_frame_folder(folder: Path) -> bool:
+    """Whether the name of a folder is the number of a frame."""
+    return _FOLDER.fullmatch(folder.name) is not None
+
+
+def label_file(file: Path) -> str:
+    """What a file is called in messages: its name, with its folder where that alone has the frame's number."""
+    bare = is_frame_folder(file.parent) and not any(char.isdigit() for char in file.stem)
+    return f"{file.parent.name}/{file.name}" if bare else file.name
 
 
 class _Alike(NamedTuple):
@@ -87,6 +102,21 @@ def _read_group(files: Mapping[Path, str]) -> list[FrameName]:
         shot = f"{stems[index][:start]}#{stems[index][found[place].end() :]}"
         names.append(FrameName(file, shot, Fraction(values[index][place]) if parts is None else parts[index]))
     return names
+
+
+def _read_folders(files: Iterable[Path]) -> dict[Path, FrameName]:
+    """Those of the files, which have no number of their own, that lie in several folders with a number each."""
+    groups: dict[_Alike, dict[Path, int]] = {}
+    for file in files:
+        if found := _FOLDER.fullmatch(file.parent.name):
+            alike = _Alike(file.parent.parent, f"{_FOLDER.sub('#', file.parent.name)}/{file.stem}", file.suffix.lower())
+            groups.setdefault(alike, {})[file] = int(found[1])
+    return {
+        file: FrameName(file, alike.name, Fraction(number))
+        for alike, numbers in groups.items()
+        if len(numbers) > 1
+        for file, number in numbers.items()
+    }
 
 
 def _rank(runs: Sequence[re.Match[str]], place: int, stem: str) -> int:

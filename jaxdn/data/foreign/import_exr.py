@@ -16,6 +16,7 @@ from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.file import ExrFile, Window, union_of
 from jaxdn.data.foreign.classify import ChannelMapping, ChannelNaming, classify_channels
 from jaxdn.data.foreign.decisions import Decisions
+from jaxdn.data.foreign.frame_names import label_file
 from jaxdn.data.foreign.layers import Channels, is_cryptomatte, layer_of, stack_channels
 from jaxdn.data.foreign.measured_motion import fitting_conventions
 from jaxdn.data.foreign.reflectance import derive_reflectance
@@ -24,6 +25,9 @@ from jaxdn.data.foreign.shot_files import find_sequence
 from jaxdn.data.foreign.vectors import UnknownMotion, convert_cycles_forward, convert_motion, derive_dual_motion
 from jaxdn.data.foreign.views import open_views
 from jaxdn.filters.time_reversal import reverse_time
+
+UNNUMBERED = 2**31 - 1
+"""The id of all surfaces that have no number; numbers of files end below."""
 
 
 def plain_frames(
@@ -48,7 +52,8 @@ def plain_frames(
     :func:`jaxdn.data.foreign.channel_mapping.read_channel_mapping`. Of files with several views (stereo), ``view`` is
     read, by default the first (:mod:`jaxdn.data.foreign.views`). ``log`` is called with lines about what is derived
     or left unused, when the first frame is read. Depth is taken for view-space z (0, far and infinite become ``FAR``);
-    ids count from 1 with 0 for nothing, or are those of a Cryptomatte. A buffer in which no frame has had anything yet
+    ids count from 1, 0 is nothing or a surface that has no number (:func:`_mark_unnumbered`), or they are those of a
+    Cryptomatte. A buffer in which no frame has had anything yet
     is left out (:mod:`jaxdn.data.foreign.decisions`); values that are no fractions are clamped and counted
     (:mod:`jaxdn.data.foreign.repairs`). Normals are expected in world space, roughness linear (GGX alpha is its
     square).
@@ -117,7 +122,7 @@ class ForeignSequence:
             before = forward
             frame, lines, forward = self._read(file, before)
             for line in lines:
-                log(line if file is self.files[0] else f"{file.path.name}: {line}")
+                log(line if file is self.files[0] else f"{label_file(file.path)}: {line}")
             # Of large frames, memory is what there is least of.
             if not keep_pixels:
                 file.drop()
@@ -171,7 +176,7 @@ class ForeignSequence:
         if not fitting:
             return ""
         named = " or ".join(f"--motion-convention {name}" for name in fitting)
-        return f"{named} fits {self.files[0].path.name} and {self.files[1].path.name}.\n"
+        return f"{named} fits {label_file(self.files[0].path)} and {label_file(self.files[1].path)}.\n"
 
 
 def _make_frame(
@@ -184,6 +189,8 @@ def _make_frame(
     }
     for name in set(FRACTIONS) & set(buffers):
         buffers[name] = repairs.clamp(name, layer_of(mapping.buffers[name]), buffers[name])
+    if "ids" in buffers and not is_cryptomatte(mapping.buffers["ids"]):
+        buffers["ids"] = _mark_unnumbered(buffers["ids"], buffers.get("depth"), buffers.get("normal"))
     frame, derived = derive_reflectance(Frame(**buffers), mapping.buffers, pixels, file.header, repairs)
     return frame, [] if derived is None else [derived]
 
@@ -207,6 +214,20 @@ def _converted(name: str, image: np.ndarray, channels: Channels, convention: str
         # Where there is nothing, programs write 0, infinity or a large number.
         return np.where(np.isfinite(image) & (image > 0) & (image < FAR), image, np.float32(FAR))
     return image
+
+
+def _mark_unnumbered(ids: np.ndarray, depth: np.ndarray | None, normal: np.ndarray | None) -> np.ndarray:
+    """The ids [H, W, 1] with :data:`UNNUMBERED` in place of -1 where there is a surface.
+
+    Blender's objects have the index 0 until somebody numbers them. Where there is a surface, depth tells, or normals,
+    which are 0 where nothing is. Where neither is there, all counts as a surface: filters leave out what is none.
+    """
+    surface = np.ones(ids.shape, bool)
+    if depth is not None:
+        surface = depth < np.float32(FAR)
+    elif normal is not None:
+        surface = np.any(normal != 0, axis=-1, keepdims=True)
+    return np.where((ids < 0) & surface, np.int32(UNNUMBERED), ids)
 
 
 def _check_like_first(named: tuple[str, ...], first: tuple[str, ...]) -> None:

@@ -72,7 +72,7 @@ def join_passes(shots: Sequence[Shot], stated: Mapping[str, str]) -> tuple[list[
 
 def read_pass_name(shot: Shot) -> PassName:
     """The pass that the name of a shot's files, or of their folder, has a word for."""
-    folder, name = shot.files[0].parent, (shot.name or shot.files[0].stem)
+    folder, name = shot.folder, (shot.name or shot.files[0].stem)
     found = _find_word(name)
     if found is not None:
         word, rest = found

@@ -1,4 +1,4 @@
-"""Which EXR files are frames of one shot: by their names, ``shot_0001.exr`` ...; gaps, and files without a number."""
+"""Which EXR files are frames of one shot: by their names, ``shot_0001.exr`` ..., or their folders; gaps, and others."""
 
 import glob
 import math
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxdn.data.errors import ClipError
-from jaxdn.data.foreign.frame_names import read_frame_names
+from jaxdn.data.foreign.frame_names import is_frame_folder, read_frame_names
 
 Number = int | Fraction
 """Of a frame; a fraction between two frames that are counted."""
@@ -27,7 +27,8 @@ class Shot(NamedTuple):
     numbers: tuple[Number, ...]
     """Empty for an image without a number."""
     name: str = ""
-    """Of its files, with ``#`` for the number, without the suffix; "" for clips of ours."""
+    """Of its files, with ``#`` for the number, without the suffix; "" for clips of ours. With a folder for each frame
+    it is that of both, ``#/beauty``."""
     passes: tuple[Mapping[str, Path], ...] = ()
     """Of each frame, layer -> a further file that has it (:mod:`jaxdn.data.foreign.passes`); empty: there are none."""
 
@@ -38,7 +39,12 @@ class Shot(NamedTuple):
         if len(self.files) == 1:
             return str(first)
         name = self.name or re.sub(r"\d+$", "#", first.stem)
-        return f"{first.parent / name}{first.suffix} {ranges(self.numbers)}"
+        return f"{self.folder / name}{first.suffix} {ranges(self.numbers)}"
+
+    @property
+    def folder(self) -> Path:
+        """Where the files lie, or the folders of the frames."""
+        return self.files[0].parents[self.name.count("/")]
 
     @property
     def step(self) -> Fraction:
@@ -50,12 +56,13 @@ def find_shots(path: str | Path | Sequence[Path]) -> list[Shot]:
     """The shots of a folder or a pattern, or those of files. Raises ClipError if there are no EXR files.
 
     In a pattern, ``*``, ``?`` and ``[...]`` are those of a shell, and ``####``, ``%04d``, ``$F4`` and ``<frame>`` stand
-    for a number; ``.exr`` fits ``.EXR`` too. Folders whose names have brackets in them are taken as they are called.
+    for a number; ``.exr`` fits ``.EXR`` too. Of a folder without EXR files, those of its folders for frames are found
+    (``0001/beauty.exr``). Folders whose names have brackets in them are taken as they are called.
     """
     if not isinstance(path, str | Path):
         files = list(path)
     elif Path(path).is_dir():
-        files = sorted(file for file in Path(path).iterdir() if file.suffix.lower() == ".exr" and file.name[0] != ".")
+        files = _list_folder(Path(path))
     elif is_named(Path(path)):
         files = [Path(path)]
     else:
@@ -68,7 +75,7 @@ def find_shots(path: str | Path | Sequence[Path]) -> list[Shot]:
         if number is None:
             single.append(Shot((file,), ()))
             continue
-        frames = numbered.setdefault((file.parent, name, file.suffix.lower()), {})
+        frames = numbered.setdefault((file.parents[name.count("/")], name, file.suffix.lower()), {})
         if number in frames:
             raise ClipError(f"{file}: expected one file for each frame, but {frames[number]} has the same number.")
         frames[int(number) if number.denominator == 1 else number] = file
@@ -77,6 +84,15 @@ def find_shots(path: str | Path | Sequence[Path]) -> list[Shot]:
         for (_, name, _), frames in numbered.items()
     ]
     return [*shots, *single]
+
+
+def _list_folder(folder: Path) -> list[Path]:
+    """The EXR files of a folder; if there are none, those in its folders for a frame each."""
+    for folders in ([folder], sorted(each for each in folder.iterdir() if each.is_dir() and is_frame_folder(each))):
+        inside = sorted(file for each in folders for file in each.iterdir())
+        if files := [file for file in inside if file.suffix.lower() == ".exr" and file.name[0] != "."]:
+            return files
+    return []
 
 
 def is_named(path: Path) -> bool:
@@ -146,9 +162,10 @@ def _expand(pattern: Path) -> list[Path]:
         literal /= rest.pop(0)
     shells = [_SUFFIX.sub("[.][eE][xX][rR]", _PLACEHOLDER.sub("*", part)) for part in rest]
     found = [Path(name) for name in glob.glob(os.path.join(glob.escape(str(literal)), *shells))]
-    if rest and (place := _PLACEHOLDER.search(rest[-1])):
-        tail = rest[-1][place.end() :].rpartition("*")[2]
-        found = [file for file in found if _counts(file.name, rest[-1][: place.start()], tail)]
+    for depth, part in enumerate(rest, start=-len(rest)):
+        if place := _PLACEHOLDER.search(part):
+            tail = part[place.end() :].rpartition("*")[2]
+            found = [file for file in found if _counts(file.parts[depth], part[: place.start()], tail)]
     files = [file for file in sorted(found) if is_named(file)]
     return [file for file in files if file.suffix.lower() == ".exr"] or files
 

@@ -13,6 +13,7 @@ from jaxdn.data.exr.exr import to_half, write_exr
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import CAMERA_SPACE, MappedBuffer
 from jaxdn.data.foreign.classify import ChannelNaming
+from jaxdn.data.foreign.frame_names import label_file
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.foreign.layers import last_name, stack_channels
 from jaxdn.evaluation.overlay.findings import Finding, Known, find_all
@@ -102,9 +103,9 @@ def write_overlay(
     for file, frame, header, stored in _read(files, naming, kept, unusable, measurer.restart):
         if file.path in breaks:
             measurer.restart()
-        overlay = measurer.add(file.path.name, frame, header=header, stored=stored, space=space)
+        overlay = measurer.add(label_file(file.path), frame, header=header, stored=stored, space=space)
         films.add(frame, overlay)
-        path = out / f"{file.path.stem}.exr"
+        path = out / Path(label_file(file.path).replace("/", "_")).with_suffix(".exr")
         _write_layers(path, overlay.layers)
         names.append(overlay.name)
         figures.append(overlay.figures)
@@ -143,7 +144,7 @@ def _read(
             try:
                 frame = next(reader)
             except DamagedFile as error:
-                unusable[file.path.name] = error.reason
+                unusable[label_file(file.path)] = error.reason
                 left = left[index + 1 :]
                 restart()
                 break
