@@ -119,7 +119,7 @@ def fit(
                     progress.validated(psnr)
                 if logs:  # after the validation: the last line shows the last one
                     skipped = int(run.state.skipped)
-                    progress.advance(run.step, loss=float(report.loss), skipped=skipped)
+                    progress.advance(run.step, loss=float(report.loss), skipped=skipped, waited=run.waited)
                     divergence.check(run.step, skipped=skipped, norm=float(report.gradient_norm))
                 if run.is_due(every.checkpoint):
                     run.save()
@@ -169,6 +169,10 @@ class _Run:
             batches.set_state(position)
         self.state = state
         self.step = self._saved = int(state.step)
+        self.waited = 0.0
+        """Seconds in which the devices of this process had nothing to do because no batch was there."""
+        self._loss: Any = None
+        """Of the newest update. Any: jax's types do not know ``is_ready``."""
         self._log = Log(folder / "log.jsonl", keep_until=self.step) if writes() else None
         self._train_step = make_train_step(denoiser, recipe, mesh)
         # An interrupt may come between the batch and its update: this position always belongs to finished updates.
@@ -176,9 +180,14 @@ class _Run:
 
     def update(self) -> Report:
         """One update with the next batch."""
-        batch = divide(next(self._batches), self._mesh)
-        self.state, report = self._train_step(self.state, batch)
-        self.step, self._position = self.step + 1, self._batches.get_state()
+        asked = time.monotonic()
+        batch = next(self._batches)
+        # While an update is computed, the next batch may take its time. When the update ended is not known: where it
+        # has ended, all of the time counts.
+        if self._loss is None or self._loss.is_ready():
+            self.waited += time.monotonic() - asked
+        self.state, report = self._train_step(self.state, divide(batch, self._mesh))
+        self.step, self._position, self._loss = self.step + 1, self._batches.get_state(), report.loss
         return report
 
     def is_due(self, every: int) -> bool:

@@ -10,13 +10,14 @@ from jaxdn.recipes.recipe import Recipe
 
 
 class ProgressBar:
-    """A bar with loss, validation PSNR, frames/s and time left; plain lines without a terminal."""
+    """A bar with loss, validation PSNR, frames/s, waiting and time left; plain lines without a terminal."""
 
     def __init__(self, label: str, recipe: Recipe, start: int, *, shown: bool = True):
         self._label, self._recipe, self._first, self._shown = label, recipe, start, shown
         self._validation = float("nan")
         self._console = Console(stderr=False)
         self._began: float | None = None
+        self._waited_before = 0.0
         self._printed = 0.0
         self._bar = Progress(
             TextColumn("{task.description}"),
@@ -48,17 +49,19 @@ class ProgressBar:
         """Keep the newest validation PSNR."""
         self._validation = psnr
 
-    def advance(self, step: int, *, loss: float, skipped: int) -> None:
-        """Show the progress after ``step`` updates."""
+    def advance(self, step: int, *, loss: float, skipped: int, waited: float) -> None:
+        """Show the progress after ``step`` updates, between which the devices waited for input for so many seconds."""
         now = time.monotonic()
         if self._began is None:  # the first report comes after the compilation: measure speed from there
-            self._began, self._first = now, step
-        rate = (step - self._first) / max(now - self._began, 1e-9)
+            self._began, self._first, self._waited_before = now, step, waited
+        passed = max(now - self._began, 1e-9)
+        rate = (step - self._first) / passed
         state = f"loss {loss:.4f}"
         if self._validation == self._validation:
             state += f"  validation {self._validation:.2f} dB"
         if rate > 0:
             state += f"  {rate * self._recipe.batch * self._recipe.frames:.0f} frames/s"
+            state += f"  waiting for input {100 * (waited - self._waited_before) / passed:.0f} %"
         if skipped:
             state += f"  {skipped} skipped (gradient not finite)"
         self._bar.update(self._task, completed=step, state=state)

@@ -2,7 +2,9 @@
 
 import json
 import os
+import re
 import signal
+import time
 from functools import partial
 
 import jax
@@ -144,11 +146,14 @@ def test_training_stops_at_its_time_limit_and_goes_on_from_there(clips, tmp_path
     jax.tree.map(np.testing.assert_array_equal, whole.average, continued.average)
 
 
-def gain():
-    """The frame times a learned number: compiles at once, and the loop is the same."""
+def gain(products=0):
+    """The frame times a learned number: compiles at once, and the loop is the same. Products of matrices take time."""
 
     def step(params, state, frame, first, statistics):
         image = params["gain"] * frame.radiance
+        if products:
+            matrix = jnp.full((256, 256), jax.lax.stop_gradient(image[0, 0, 0]))
+            image += 1e-9 * jax.lax.fori_loop(0, products, lambda _, it: jnp.tanh(it @ it), matrix)[0, 0]
         return image, image, 0
 
     return recurrent(
@@ -254,6 +259,26 @@ def test_the_validation_reaches_the_terminal(clips, tmp_path, capsys):
     run_gain(clips, tmp_path, validation=load_validation(gain(), [clips[0]]))
     psnr = read_curve(tmp_path).validation_psnr[-1]
     assert f"validation {psnr:.2f} dB" in capsys.readouterr().out
+
+
+class Late:
+    """Batches that each come so many seconds late."""
+
+    def __init__(self, source, seconds):
+        self.source, self.seconds = source, seconds
+        self.get_state, self.set_state = source.get_state, source.set_state
+
+    def __next__(self):
+        time.sleep(self.seconds)
+        return next(self.source)
+
+
+@pytest.mark.parametrize(("products", "least", "most"), [(0, 60, 100), (10, 0, 30)])
+def test_the_terminal_says_how_long_training_waits_for_its_input(products, least, most, clips, tmp_path, capsys):
+    every, recipe = Every(5, checkpoint=100), SHORT._replace(steps=10)
+    fit(gain(products), recipe, Late(batches(clips), 0.2), tmp_path, label="gain", every=every)
+    (share,) = re.findall(r"step 10/10 .* waiting for input (\d+) %", capsys.readouterr().out)
+    assert least <= int(share) <= most
 
 
 def test_training_without_a_step_is_refused_before_anything_is_written(clips, tmp_path):
