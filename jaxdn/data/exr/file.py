@@ -244,7 +244,9 @@ def _decode(path: Path, file: Any) -> list[ExrPart]:
             if (channel.xSampling, channel.ySampling) != (1, 1):
                 pixels = None
             elif not isinstance(pixels, np.ndarray) or pixels.ndim != 2 or pixels.dtype == object:
-                raise ClipError(f"{path}: channel {name} is not a flat image; deep data cannot be read.")
+                raise ClipError(
+                    f"{path}: channel {name} is not a flat image; deep data cannot be read; save it flattened."
+                )
             channels.append(ExrChannel(_full_name(part.header, name, len(file.parts)), name, pixels))
         parts.append(ExrPart(dict(part.header), channels))
     return parts
@@ -259,6 +261,8 @@ def _check_header(path: Path, header: Mapping[str, Any]) -> None:
     tiles = header.get("tiles")
     if tiles is not None and tiles.mode != OpenEXR.ONE_LEVEL:
         raise ClipError(f"{path}: tiles in several levels (a mipmap) cannot be read; save it with one level.")
+    if {"RY", "BY"} <= {channel.name for channel in header.get("channels", ())}:
+        raise ClipError(f"{path}: luminance with chroma (Y, RY, BY) cannot be read; save it with R, G, B.")
     if sides.min() < 1 or sides.max() > _SIDE_LIMIT:
         raise DamagedFile(path, f"the header claims {sides[0]} x {sides[1]} pixels; the file is damaged")
 

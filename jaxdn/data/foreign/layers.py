@@ -183,6 +183,8 @@ def detect_channels(
             found[buffer] = fitting
     if "roughness" not in found and "roughness" not in stated and "normal" in found:
         found |= _packed_roughness(inside, found["normal"])
+    if "radiance" not in found and "radiance" not in stated:
+        found |= _grey(inside)
     if "radiance" not in found:
         raise ClipError(f"no radiance among the channels {', '.join(sorted(names))}; {advise_naming('radiance')}.")
     return _with_partner(inside, found, stated)
@@ -252,7 +254,7 @@ def stack_channels(pixels: Mapping[str, np.ndarray], channels: Channels) -> np.n
 
 def layer_of(channels: Channels) -> str:
     """The layer that the channels of a buffer lie in; the channels themselves where they have none."""
-    return channels[0].rpartition(".")[0] or ", ".join(channels)
+    return channels[0].rpartition(".")[0] or ", ".join(dict.fromkeys(channels))
 
 
 def advise_naming(buffer: str) -> str:
@@ -311,6 +313,12 @@ def _with_partner(groups: Groups, found: dict[str, Channels], stated: Mapping[st
     if partner is not None and ("albedo" not in stated or found.get("albedo") == partner):
         return {**found, "albedo": partner}
     return {buffer: channels for buffer, channels in found.items() if buffer != "specular_reflectance"}
+
+
+def _grey(groups: Groups) -> dict[str, Channels]:
+    """The radiance of a picture without colours, whose one channel is called ``Y``."""
+    luminance = groups.get("", {}).get("y")
+    return {} if luminance is None else {"radiance": (luminance,) * 3}
 
 
 def _packed_roughness(groups: Groups, normal: Channels) -> dict[str, Channels]:

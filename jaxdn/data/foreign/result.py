@@ -18,7 +18,7 @@ class NewPixels(NamedTuple):
     replaced: dict[str, np.ndarray]
     """Channel -> pixels of its data window."""
     beauty: dict[str, str]
-    """Channel -> R, G, B or A, of the beauty and of the alpha beside it."""
+    """Channel -> R, G, B (or Y, without colours) or A, of the beauty and of the alpha beside it."""
 
     def with_view(self, view: str, other: "NewPixels") -> "NewPixels":
         """These with those of another view of the same file."""
@@ -51,12 +51,16 @@ def replace_channels(
     replaced = {}
     for layer, image in images.items():
         channels = _color(groups, layer) if layer else beauty
+        if len(set(channels)) == 1:  # a picture without colours
+            image = np.repeat(image.mean(axis=-1, keepdims=True), 3, axis=-1)
         for channel, pixels in zip(channels, np.moveaxis(image, -1, 0), strict=True):
             replaced[channel] = crop(pixels, window, windows[channel])
     beside = find_alpha(names, beauty)
     if alpha is not None and beside is not None:
         replaced[beside] = crop(alpha, window, windows[beside])
-    kept = dict(zip(beauty, "RGB", strict=True)) | ({} if beside is None else {beside: "A"})
+    kept = dict(zip(beauty, "RGB" if len(set(beauty)) > 1 else "YYY", strict=True)) | (
+        {} if beside is None else {beside: "A"}
+    )
     return NewPixels(
         {source.full_name(name): pixels for name, pixels in replaced.items()},
         {source.full_name(name): letter for name, letter in kept.items()},
