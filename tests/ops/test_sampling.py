@@ -51,6 +51,16 @@ def test_every_pixel_has_its_own_number(rng):
     assert taken.dtype == image.dtype == jnp.float32
 
 
+def test_layers_in_half_precision_are_added_in_single(rng):
+    """They are light as a file has it; their sum over samples is not rounded again."""
+    layers = {samples: jnp.asarray(layer, jnp.bfloat16) for samples, layer in drawn(rng, 4).items()}
+    counts = rng.integers(0, 16, (*SIZE, 1)).astype(np.float32)
+    image, taken = jax.jit(from_layers)(layers, counts)
+    assert taken.dtype == image.dtype == jnp.float32
+    np.testing.assert_allclose(image, numpy_from_layers(layers, counts), rtol=1e-6)
+    np.testing.assert_array_equal(taken, counts)
+
+
 @pytest.mark.parametrize(
     ("asked", "had"),
     [
