@@ -57,10 +57,7 @@ def by_loops(history, frame, *, search_neighbours=False):
 
 
 def recalled(history, frame, *, first=False, search_neighbours=False):
-    frame = jax.tree.map(jnp.asarray, frame)
-    return program(search_neighbours, module._TILE_PIXELS)(
-        jnp.asarray(history), guides_of(frame), frame, jnp.asarray(first)
-    )
+    return program(search_neighbours, module._TILE_PIXELS)(history, guides_of(frame), frame, first)
 
 
 @functools.cache
@@ -107,9 +104,8 @@ def test_an_image_smaller_than_the_places_around(rng, x64):
 
     for vector in ([0.0, 0.0], [0.4, 0.0], [-0.6, 0.7]):
         moving = small._replace(motion=np.broadcast_to(np.array(vector), (2, 2, 2)), depth=None, normal=None)
-        before = guides_of(moving)._replace(ids=jnp.array([[[1.0], [1]], [[1], [0]]]))
-        rest = before, jax.tree.map(jnp.asarray, moving), jnp.asarray(False)
-        slope, found = summed(jnp.asarray(history[:2, :2]), *rest)
+        before = guides_of(moving)._replace(ids=np.array([[[1.0], [1]], [[1], [0]]]))
+        slope, found = jax.tree.map(np.asarray, summed(history[:2, :2], before, moving, False))
         assert found.valid.all()  # every place is near
         np.testing.assert_array_equal(found.history[0, 0], history[1, 1])  # the only pixel of its kind
         np.testing.assert_allclose(slope.sum(), 8.0)
@@ -122,15 +118,15 @@ def test_around_a_pixel_that_shows_something_else(rng, x64):
     changed = zero._replace(ids=frame.ids.copy())
     changed.ids[3, 5] = 1  # appears where there was nothing of its kind near by
 
-    def found(before, frame, **options):
-        given = jnp.asarray(history), Guides(None, None, jnp.asarray(before)), jax.tree.map(jnp.asarray, frame)
-        return reproject(*given, jnp.asarray(False), **options)
+    def found(before, frame, search_neighbours=True):
+        run = program(search_neighbours, module._TILE_PIXELS)
+        return jax.tree.map(np.asarray, run(history, Guides(None, None, before), frame, False))
 
+    assert not found(before, changed, search_neighbours=False).valid[3, 5]
     assert not found(before, changed).valid[3, 5]
-    assert not found(before, changed, search_neighbours=True).valid[3, 5]
     before[2, 4] = 1
-    np.testing.assert_array_equal(found(before, changed, search_neighbours=True).history[3, 5], history[2, 4])
-    still, moving = (found(before, changed._replace(motion=m), search_neighbours=True) for m in (None, changed.motion))
+    np.testing.assert_array_equal(found(before, changed).history[3, 5], history[2, 4])
+    still, moving = (found(before, changed._replace(motion=m)) for m in (None, changed.motion))
     np.testing.assert_array_equal(still.valid, moving.valid)
     np.testing.assert_allclose(still.history, moving.history, rtol=1e-12)
 
@@ -170,7 +166,7 @@ def test_motion_that_is_no_number_means_no_history(rng):
     motion = np.zeros((HEIGHT, WIDTH, 2), np.float32)
     motion[1, 1], motion[2, 2] = np.nan, 1e30
     found = recalled(history, frame._replace(motion=motion))
-    assert np.argwhere(~found.valid[..., 0]).tolist() == [[1, 1], [2, 2]]
+    assert np.argwhere(~np.asarray(found.valid)[..., 0]).tolist() == [[1, 1], [2, 2]]
     assert np.isfinite(found.history).all()
 
 

@@ -1,6 +1,6 @@
 """What a fetch may err by: against float64 NumPy, against real fetches, and where surfaces meet."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 
@@ -8,6 +8,8 @@ from jaxdn.core.frame import Frame
 from jaxdn.filters.catmull_rom import warp_cubic
 from jaxdn.filters.resampling import find_whole, measure_fetch_error
 from jaxdn.ops.warp import warp
+
+measure = jax.jit(measure_fetch_error)
 
 SIZE = (18, 22)
 
@@ -57,10 +59,10 @@ def test_it_is_what_its_equations_say(rng, x64):
     motion = np.broadcast_to([0.3, -1.6], (*SIZE, 2)).copy()
     for cubic in (np.zeros(SIZE, bool), np.ones(SIZE, bool)):
         arguments = image, albedo, rng.random(SIZE), motion, cubic, rng.random(SIZE) > 0.3
-        found = measure_fetch_error(*map(jnp.asarray, arguments))
+        found = measure(*arguments)
         np.testing.assert_allclose(found, error_in_numpy(*arguments), rtol=1e-9, atol=1e-12)
     arguments = image, albedo, rng.random(SIZE), rng.integers(-1, 2, (*SIZE, 2)) * 1.0, cubic, np.zeros(SIZE, bool)
-    found = measure_fetch_error(*map(jnp.asarray, arguments))
+    found = measure(*arguments)
     np.testing.assert_allclose(found, error_in_numpy(*arguments), rtol=1e-9, atol=1e-12)
 
 
@@ -77,21 +79,21 @@ def test_a_real_fetch_errs_by_no_more(cubic, step):
         for phase in np.arange(8) / 8 * np.pi:
             rows = [np.cos(2 * np.pi * (columns + shift) / length + phase) + 1 for shift in (0.0, step)]
             before, now = (np.broadcast_to(row[None, :, None], (5, 64, 3)).astype(np.float32) for row in rows)
-            motion = jnp.broadcast_to(jnp.array([step, 0.0]), (5, 64, 2))
-            fetched = (warp_cubic if cubic else warp)(jnp.asarray(before), motion)
+            motion = np.broadcast_to([step, 0.0], (5, 64, 2))
+            fetched = np.asarray(jax.jit(warp_cubic if cubic else warp)(before, motion))
             errors.append(np.mean((fetched - now)[2, 8:-8] ** 2))
-            planes = jnp.asarray(now).transpose(2, 0, 1)
-            flags = jnp.full((5, 64), cubic), jnp.ones((5, 64), bool)
-            bounds.append(np.mean(measure_fetch_error(planes, None, jnp.zeros((5, 64)), motion, *flags)[2, 8:-8]))
+            flags = np.full((5, 64), cubic), np.ones((5, 64), bool)
+            bound = measure(now.transpose(2, 0, 1), None, np.zeros((5, 64)), motion, *flags)
+            bounds.append(np.mean(np.asarray(bound)[2, 8:-8]))
         assert np.mean(errors) < (9 if cubic else 1.1) * np.mean(bounds) + 1e-5, length
 
 
 def test_what_moves_by_whole_pixels_is_not_blurred(rng):
-    image = jnp.asarray(rng.uniform(0, 1, (3, *SIZE)), jnp.float32)
-    motion = jnp.broadcast_to(jnp.array([2.0, -1.0]), (*SIZE, 2))
+    image = rng.uniform(0, 1, (3, *SIZE))
+    motion = np.broadcast_to([2.0, -1.0], (*SIZE, 2))
     for whole in (True, False):
-        flags = jnp.ones(SIZE, bool), jnp.full(SIZE, whole)
-        found = np.asarray(measure_fetch_error(image, None, jnp.zeros(SIZE), motion, *flags))
+        flags = np.ones(SIZE, bool), np.full(SIZE, whole)
+        found = np.asarray(measure(image, None, np.zeros(SIZE), motion, *flags))
         np.testing.assert_allclose(found[1:, :-2], 0, atol=1e-12)
         assert (found[0] > 0).all(), "what was beyond the border was not seen"
 
@@ -108,6 +110,7 @@ def test_pixels_at_silhouettes_and_creases_are_not_whole():
     expected[6:8, 7:11] = True
     expected[:, 15:17] = False
     expected[13:15] = False
-    found = find_whole(Frame(np.zeros((*SIZE, 3), np.float32), normal=normal, depth=depth, ids=ids))
+    find = jax.jit(find_whole)
+    found = find(Frame(np.zeros((*SIZE, 3), np.float32), normal=normal, depth=depth, ids=ids))
     np.testing.assert_array_equal(found, expected)
-    assert find_whole(Frame(np.zeros((*SIZE, 3), np.float32))).all()
+    assert np.asarray(find(Frame(np.zeros((*SIZE, 3), np.float32)))).all()

@@ -1,5 +1,7 @@
 """Virtual motion, lobes, clamps and fixed histories against float64 references and analytic geometry."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +20,8 @@ from jaxdn.filters.history_fix import fix_history
 from jaxdn.filters.virtual_motion import closeness, diffuseness, virtual_motion
 from tests.gradients import check_gradients
 from tests.recomputing import evaluate_recomputing
+
+attenuate = jax.jit(firefly_attenuation)
 
 FOCAL, SIZE = 160.0, np.array([320.0, 180.0])
 
@@ -56,7 +60,7 @@ def mirror_scene(rng, rotation, place, count=200):
     expected, _ = projected(image, rotation, place)
     near = closeness(length, np.linalg.norm(surface, axis=1, keepdims=True))
     shape = (1, count)
-    found = virtual_motion(
+    found = jax.jit(virtual_motion)(
         (before - pixel).reshape(*shape, 2),
         (far - pixel).reshape(*shape, 2),
         (previous_depth / depth).reshape(shape),
@@ -80,28 +84,34 @@ def test_virtual_motion_holds_where_the_camera_turns_too(x64, rng, axis):
 
 def test_virtual_motion_without_a_hit_distance_is_the_surfaces(rng):
     motion, far = rng.normal(size=(2, 3, 4, 2)).astype(np.float32)
-    unknown = virtual_motion(motion, far, None, jnp.zeros((3, 4)))
+    moved = jax.jit(virtual_motion)
+    unknown = moved(motion, far, None, np.zeros((3, 4)))
     np.testing.assert_array_equal(unknown, motion)
-    touching = virtual_motion(motion, far, None, jnp.ones((3, 4)))
+    touching = moved(motion, far, None, np.ones((3, 4)))
     np.testing.assert_allclose(touching, motion, rtol=1e-6)
-    assert np.all(np.asarray(closeness(jnp.array([0.0, 1.0, 1e9]), jnp.array([3.0, 3.0, 3.0]))) >= 0)
+    assert np.all(np.asarray(jax.jit(closeness)(np.array([0.0, 1.0, 1e9]), np.full(3, 3.0))) >= 0)
 
 
 def test_diffuseness_is_the_curve_and_has_a_slope_everywhere():
     rough = np.array([0.0, 0.01, 0.05, 0.3, 1.0])
     expected = (1 - 2.0 ** (-200 * rough**2)) * rough**0.25
-    np.testing.assert_allclose(diffuseness(jnp.asarray(rough)), expected, rtol=1e-5)
-    assert float(diffuseness(jnp.ones(()))) == 1.0
-    assert np.isfinite(jax.grad(diffuseness)(0.0))
+    np.testing.assert_allclose(jax.jit(diffuseness)(rough), expected, rtol=1e-5)
+    assert float(jax.jit(diffuseness)(1.0)) == 1.0
+    assert np.isfinite(jax.jit(jax.grad(diffuseness))(0.0))
 
 
 def test_the_lobes_weight_is_a_gaussian_of_the_angle_between_normals(x64, rng):
     """One tap beside the centre: its share of the mean is w / (1 + w)."""
+
+    @jax.jit
+    def average(normal, rough):
+        weight = lobe_weight(normal, rough, fraction=0.5)
+        return edge_average(jnp.array([[[0.0, 1.0]]]), None, [weight], np.array([[0, 0, 1], [0, 1, 1]]))[0]
+
     for rough, degrees in ((0.0, 0.3), (0.1, 0.4), (0.3, 3.0), (0.7, 20.0), (1.0, 50.0)):
         angle = np.radians(degrees)
         normal = np.array([[[0, 0, 1.0], [np.sin(angle), 0, np.cos(angle)]]])
-        weight = lobe_weight(jnp.asarray(normal), jnp.full((1, 2, 1), rough), fraction=0.5)
-        mean, _ = edge_average(jnp.array([[[0.0, 1.0]]]), None, [weight], np.array([[0, 0, 1], [0, 1, 1]]))
+        mean = average(normal, np.full((1, 2, 1), rough))
         lobe = 0.5 * max(np.arctan(rough**2 * np.sqrt(3)), 0.01)
         expected = np.exp(-2 * (1 - np.cos(angle)) / lobe**2)
         np.testing.assert_allclose(mean[0, 0, 0], expected / (1 + expected), rtol=1e-9)
@@ -115,9 +125,12 @@ def test_the_lobes_angle_contains_three_quarters_of_the_normals(rng):
 
 
 def test_roughness_stops_the_average(x64):
-    rough = jnp.array([[[0.4], [0.43]]])
-    weight = roughness_weight(rough, fraction=0.15)
-    mean, _ = edge_average(jnp.array([[[0.0, 1.0]]]), None, [weight], np.array([[0, 0, 1], [0, 1, 1]]))
+    @jax.jit
+    def average(rough):
+        weight = roughness_weight(rough, fraction=0.15)
+        return edge_average(jnp.array([[[0.0, 1.0]]]), None, [weight], np.array([[0, 0, 1], [0, 1, 1]]))[0]
+
+    mean = average(np.array([[[0.4], [0.43]]]))
     expected = np.exp(-0.03 / 0.06)
     np.testing.assert_allclose(mean[0, 0, 0], expected / (1 + expected), rtol=1e-9)
 
@@ -141,7 +154,7 @@ def reference_clamp(slow, fast, hit, sigma):
 def test_the_slow_history_is_clamped_to_the_fast_ones_neighbourhood(x64, rng):
     slow, fast = rng.gamma(0.7, 1.0, (2, 3, 7, 9))
     hit = rng.random((7, 9)) < 0.8
-    found = clamp_to_fast(slow, fast, jnp.asarray(hit), sigma=1.5)
+    found = np.asarray(jax.jit(partial(clamp_to_fast, sigma=1.5))(slow, fast, hit))
     np.testing.assert_allclose(found, reference_clamp(slow, fast, hit, 1.5), atol=1e-9)
     assert np.mean(np.abs(found - slow) > 1e-3) > 0.1
 
@@ -150,7 +163,7 @@ def test_histories_contradict_each_other_beyond_the_standard_error(x64, rng):
     slow, fast = rng.gamma(2.0, 1.0, (2, 9, 11))
     fast = fast + np.linspace(0, 3, 11)
     hit = rng.random((9, 11)) < 0.8
-    found = np.asarray(detect_lag(slow, fast, jnp.asarray(hit), sigma=1.5, radius=1))
+    found = np.asarray(jax.jit(partial(detect_lag, sigma=1.5, radius=1))(slow, fast, hit))
     for y, x in np.ndindex(9, 11):
         window = slice(max(y - 1, 0), y + 2), slice(max(x - 1, 0), x + 2)
         inside = hit[window]
@@ -159,11 +172,12 @@ def test_histories_contradict_each_other_beyond_the_standard_error(x64, rng):
         noise = 1.5 * now.std() / np.sqrt(inside.sum()) + 1e-4 * now.mean()
         np.testing.assert_allclose(found[y, x], np.clip(difference / noise - 1, 0, 1), atol=1e-9)
     assert np.mean(found > 0.3) > 0.1
-    assert not np.any(detect_lag(slow, slow, None, sigma=1.0, radius=3))
+    assert not np.asarray(jax.jit(partial(detect_lag, sigma=1.0, radius=3))(slow, slow, None)).any()
 
 
 def test_neighbourhoods_without_a_surface_are_zero(rng):
-    mean, deviation, number = measure_neighbourhood(rng.random((2, 5, 6)), jnp.zeros((5, 6), bool), radius=1)
+    measured = jax.jit(partial(measure_neighbourhood, radius=1))(rng.random((2, 5, 6)), np.zeros((5, 6), bool))
+    mean, deviation, number = map(np.asarray, measured)
     assert not np.any(mean)
     assert not np.any(number)
     assert np.all(deviation <= 1e-4)
@@ -175,7 +189,7 @@ def test_fireflies_take_the_range_of_their_neighbours(rng):
     color[:, 0, 6] = -1.0
     ids = np.zeros((1, 6, 7), np.float32)
     ids[0, 5, 0] = 1  # alone on its surface
-    found = np.asarray(clamp_fireflies(color, jnp.asarray(ids)))
+    found = np.asarray(jax.jit(clamp_fireflies)(color, ids))
     for y, x in np.ndindex(6, 7):
         near = [
             color[:, v, u]
@@ -190,16 +204,17 @@ def test_no_pixel_is_brighter_than_all_of_its_neighbours_but_by_what_it_is_sure_
     brightness = (1e-9 * rng.random((8, 9))).astype(np.float32)  # no size of its own
     hit, sure = rng.random((8, 9)) < 0.8, np.where(rng.random((8, 9)) < 0.5, rng.random((8, 9)), -1.0)
     hit[:3, :3] = False
-    found = np.asarray(firefly_attenuation(brightness, hit, jnp.asarray(sure, jnp.float32)))
+    found = np.asarray(attenuate(brightness, hit, sure))
     for y, x in np.ndindex(8, 9):
         near = [brightness[v, u] for v, u in np.ndindex(8, 9) if max(abs(v - y), abs(u - x)) == 1 and hit[v, u]]
         expected = min(1.0, max(max(near) / brightness[y, x], sure[y, x])) if near else 1.0
         np.testing.assert_allclose(found[y, x], expected, rtol=1e-6)
     assert 0.05 < np.mean(found < 1) < 0.5
-    nothing, everywhere = jnp.zeros((3, 3)), jnp.ones((3, 3), bool)
-    assert np.all(firefly_attenuation(nothing, everywhere, nothing) == 1)
-    faint = jnp.full((3, 3), 1e-30).at[1, 1].set(2e-30)
-    slope = jax.grad(lambda light: jnp.sum(light * firefly_attenuation(light, everywhere, nothing)))(faint)
+    nothing, everywhere = np.zeros((3, 3), np.float32), np.ones((3, 3), bool)
+    assert np.all(np.asarray(attenuate(nothing, everywhere, nothing)) == 1)
+    faint = np.full((3, 3), 1e-30, np.float32)
+    faint[1, 1] = 2e-30
+    slope = jax.jit(jax.grad(lambda light: jnp.sum(light * attenuate(light, everywhere, nothing))))(faint)
     assert np.all(np.isfinite(slope))
 
 
@@ -216,7 +231,7 @@ def test_short_histories_are_filled_from_sparse_taps(x64, rng, widest, strides):
     length[20, 21], length[19, 22], length[18, 18] = 1, 2.8, 4.4
     hit = rng.random((40, 44)) < 0.7
     hit[20, 21] = hit[19, 22] = hit[18, 18] = True
-    found = np.asarray(fix_history(color, jnp.asarray(length), jnp.asarray(hit), [], frames=4, widest=widest))
+    found = np.asarray(jax.jit(partial(fix_history, frames=4, widest=widest))(color, length, hit, []))
     expected = color.copy()
     for (y, x), stride in zip(((20, 21), (19, 22), (18, 18)), strides, strict=True):
         taps = [(y + stride * dy, x + stride * dx) for dy in range(-2, 3) for dx in range(-2, 3) if abs(dx * dy) < 4]
@@ -229,16 +244,19 @@ def test_short_histories_are_filled_from_sparse_taps(x64, rng, widest, strides):
 
 def test_a_short_history_alone_on_its_surface_gets_the_light_beside_it(rng):
     """Not a reflection's, and not where the history is long."""
-    color = jnp.asarray(rng.random((3, 9, 9)), jnp.float32)
+    color = rng.random((3, 9, 9)).astype(np.float32)
     normal = np.zeros((9, 9, 3), np.float32)
     normal[..., 2] = 1.0
     normal[4, 4] = normal[4, 7] = [1.0, 0.0, 0.0]  # not beside each other
-    length = jnp.full((9, 9), 9.0).at[4, 4].set(1.0)
-    weights = [normal_weight(jnp.asarray(normal), sigma=16.0)]
-    found, kept = (
-        np.asarray(fix_history(color, length, None, weights, frames=4, widest=4, isolated=beside))
-        for beside in (True, False)
-    )
+    length = np.full((9, 9), 9.0, np.float32)
+    length[4, 4] = 1.0
+
+    @partial(jax.jit, static_argnames="beside")
+    def fix(color, length, normal, *, beside):
+        weights = [normal_weight(normal, sigma=16.0)]
+        return fix_history(color, length, None, weights, frames=4, widest=4, isolated=beside)
+
+    found, kept = (np.asarray(fix(color, length, normal, beside=beside)) for beside in (True, False))
     expected = np.array(color)
     expected[:, 4, 4] = (expected[:, 3:6, 3:6].sum((1, 2)) - expected[:, 4, 4]) / 8
     np.testing.assert_allclose(found, expected, rtol=1e-5)
@@ -249,7 +267,7 @@ def test_gradients_of_every_part(x64, rng):
     slow, fast = rng.uniform(0.5, 1.5, (2, 3, 4, 5))
     check_gradients(lambda a, b: clamp_to_fast(a, b, None, sigma=0.5), (slow, fast), eps=1e-6)
     check_gradients(lambda a: clamp_fireflies(a, None), (slow,), eps=1e-6)
-    sure, seen = rng.uniform(0.1, 0.9, (4, 5)), jnp.ones((4, 5), bool)
+    sure, seen = rng.uniform(0.1, 0.9, (4, 5)), np.ones((4, 5), bool)
     check_gradients(lambda a: a * firefly_attenuation(a, seen, sure), (slow[0],), eps=1e-6)
     motion, far = rng.normal(size=(2, 4, 5, 2))
     near = rng.uniform(0.1, 0.9, (4, 5))

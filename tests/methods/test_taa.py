@@ -14,6 +14,9 @@ from jaxdn.methods.taa import Options, resolve, sharpen
 from tests.gradients import check_gradients
 from tests.methods.test_svgf import moving_frames
 
+fetch = jax.jit(warp_cubic)
+take_step = jax.jit(resolve, static_argnums=0)
+
 HEIGHT, WIDTH = 7, 9
 TO_YCOCG = np.array([[1, 2, 1], [2, 0, -2], [-1, 2, -1]]) / [[4], [4], [4]]
 
@@ -96,7 +99,7 @@ def moving(rng, dtype=np.float64):
 def run(denoiser, frames, params=None):
     """The last state and all images."""
     step = jax.jit(denoiser.step)
-    state, images = denoiser.start(params or {}, frames[0]), []
+    state, images = jax.jit(denoiser.start)(params or {}, frames[0]), []
     for frame in frames:
         state, image = step(params or {}, state, frame)
         images.append(np.asarray(image))
@@ -108,7 +111,7 @@ def run(denoiser, frames, params=None):
 
 def test_the_fetch_matches_a_loop(rng):
     _, history, frame = moving(rng, np.float32)
-    found = warp_cubic(jnp.asarray(history), jnp.asarray(frame.motion))
+    found = fetch(history, frame.motion)
     expected, on_screen = reference_fetch(history.astype(np.float64), frame.motion.astype(np.float64))
     assert 0 < on_screen.sum() < on_screen.size
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
@@ -117,22 +120,24 @@ def test_the_fetch_matches_a_loop(rng):
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (4, 2)])
 def test_the_fetch_of_small_images(size, rng):
     image = rng.random((*size, 2)).astype(np.float32)
-    still = warp_cubic(jnp.asarray(image), jnp.zeros((*size, 2)))
+    still = fetch(image, np.zeros((*size, 2)))
     np.testing.assert_array_equal(still, image)
-    half = warp_cubic(jnp.asarray(image), jnp.full((*size, 2), 0.49))
+    half = fetch(image, np.full((*size, 2), 0.49))
     np.testing.assert_allclose(half, reference_fetch(image, np.full((*size, 2), 0.49))[0], rtol=1e-4, atol=1e-6)
 
 
 def test_the_neighbourhood_matches_a_loop(rng):
+    @jax.jit
+    def measure(image):
+        boxes = (neighbourhood.box_around(image, box, 1.5) for box in ("variance", "minmax"))
+        return *boxes, neighbourhood.extremes_around(image), neighbourhood.mean_around(image)
+
     image = rng.exponential(size=(HEIGHT, WIDTH, 3))
-    given = jnp.asarray(image)
-    mean, deviation = neighbourhood.box_around(given, "variance", 1.5)
-    center, half = neighbourhood.box_around(given, "minmax", 1.5)
-    low, high = neighbourhood.extremes_around(given)
+    (mean, deviation), (center, half), (low, high), plain = jax.tree.map(np.asarray, measure(image))
     for y, x in np.ndindex(HEIGHT, WIDTH):
         nine = around(image, y, x)
         np.testing.assert_allclose(mean[y, x], nine.mean(0), rtol=1e-5)
-        np.testing.assert_allclose(neighbourhood.mean_around(given)[y, x], nine.mean(0), rtol=1e-5)
+        np.testing.assert_allclose(plain[y, x], nine.mean(0), rtol=1e-5)
         np.testing.assert_allclose(deviation[y, x], 1.5 * nine.std(0), rtol=1e-4, atol=1e-6)
         np.testing.assert_allclose(center[y, x] - half[y, x], nine.min(0), rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(center[y, x] + half[y, x], nine.max(0), rtol=1e-5)
@@ -142,16 +147,15 @@ def test_the_neighbourhood_matches_a_loop(rng):
 
 def test_ycocg_is_its_matrix_and_inverts(rng):
     image = rng.exponential(size=(3, 4, 3)).astype(np.float32)
-    np.testing.assert_allclose(neighbourhood.to_ycocg(jnp.asarray(image)), image @ TO_YCOCG.T, rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(
-        neighbourhood.from_ycocg(neighbourhood.to_ycocg(jnp.asarray(image))), image, rtol=1e-5, atol=1e-6
-    )
+    found = jax.jit(neighbourhood.to_ycocg)(image)
+    np.testing.assert_allclose(found, image @ TO_YCOCG.T, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(jax.jit(neighbourhood.from_ycocg)(found), image, rtol=1e-5, atol=1e-6)
 
 
 def test_a_clipped_colour_lies_in_the_box_and_towards_its_centre(rng):
     color, center = rng.normal(size=(2, 50, 1, 3))
     size = rng.uniform(0.1, 1, (50, 1, 3))
-    found = np.asarray(neighbourhood.clip_to_box(*map(jnp.asarray, (color, center, size))))
+    found = np.asarray(jax.jit(neighbourhood.clip_to_box)(color, center, size))
     assert (np.abs(found - center) <= size + 1e-5).all()
     parallel = np.cross(found - center, color - center)
     np.testing.assert_allclose(parallel, 0, atol=1e-5)
@@ -163,9 +167,10 @@ def test_a_clipped_colour_lies_in_the_box_and_towards_its_centre(rng):
 def test_a_pixel_takes_the_motion_of_the_nearest_thing_beside_it():
     motion = np.arange(2 * HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH, 2)
     flat = np.full((HEIGHT, WIDTH, 1), 2.0, np.float32)
-    np.testing.assert_array_equal(neighbourhood.nearest_motion(jnp.asarray(motion), jnp.asarray(flat)), motion)
+    nearest_motion = jax.jit(neighbourhood.nearest_motion)
+    np.testing.assert_array_equal(nearest_motion(motion, flat), motion)
     flat[3, 4] = 1.0
-    found = np.asarray(neighbourhood.nearest_motion(jnp.asarray(motion), jnp.asarray(flat)))
+    found = np.asarray(nearest_motion(motion, flat))
     np.testing.assert_array_equal(found[2:5, 3:6], np.broadcast_to(motion[3, 4], (3, 3, 2)))
     np.testing.assert_array_equal(found[:2], motion[:2])
 
@@ -176,7 +181,7 @@ def test_a_pixel_takes_the_motion_of_the_nearest_thing_beside_it():
 @pytest.mark.parametrize("first", [False, True])
 def test_a_step_matches_a_loop(options, first, rng):
     image, history, frame = moving(rng, np.float32)
-    found, _ = resolve(Options(**options), *map(jnp.asarray, (image, history)), frame, jnp.asarray(first))
+    found = np.asarray(take_step(Options(**options), image, history, frame, first)[0])
     expected = reference_resolve(image.astype(float), history.astype(float), frame, first=first, **options)
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
     if first:
@@ -228,19 +233,21 @@ def test_old_light_is_gone_at_once_where_there_is_no_noise(rng):
 def test_what_leaves_the_screen_has_no_history(rng):
     _, history, frame = moving(rng, np.float32)
     away = frame._replace(motion=np.full_like(frame.motion, 100.0))
-    found, _ = resolve(Options(), jnp.asarray(frame.radiance), jnp.asarray(history), away, jnp.asarray(False))
+    found = np.asarray(take_step(Options(), frame.radiance, history, away, False)[0])
     np.testing.assert_array_equal(found[..., :3], frame.radiance)
     np.testing.assert_array_equal(found[..., 3], 1.0)
 
 
 def test_a_broken_history_is_dropped_and_counted(rng):
     frame = Frame(rng.random((5, 6, 3)).astype(np.float32))
-    state, _ = run(taa(), [frame])
-    invalid = state._replace(core=state.core._replace(history=state.core.history.at[2, 3, 1].set(np.nan)))
-    after, image = taa().step({}, invalid, frame)
+    denoiser = taa()
+    state, _ = run(denoiser, [frame])
+    history = np.array(state.core.history)
+    history[2, 3, 1] = np.nan
+    after, image = jax.jit(denoiser.step)({}, state._replace(core=state.core._replace(history=history)), frame)
     assert np.isfinite(image).all()
     assert int(after.sanitized) == 1
-    assert float(after.core.history[2, 3, 3]) == 1.0
+    assert np.asarray(after.core.history)[2, 3, 3] == 1.0
 
 
 def test_none_is_the_neutral_value_written_out(rng):
@@ -249,10 +256,12 @@ def test_none_is_the_neutral_value_written_out(rng):
         frame._replace(motion=np.zeros((6, 8, 2), np.float32), depth=np.zeros((6, 8, 1), np.float32))
         for frame in frames
     ]
-    for one, two in zip(run(taa(), frames)[1], run(taa(), written)[1], strict=True):
+    denoiser = taa()
+    expected = run(denoiser, written)[1]
+    for one, two in zip(run(denoiser, frames)[1], expected, strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-6)
     only_motion = [frame._replace(depth=None) for frame in written]
-    np.testing.assert_allclose(run(taa(), only_motion)[1][-1], run(taa(), written)[1][-1], rtol=1e-6)
+    np.testing.assert_allclose(run(denoiser, only_motion)[1][-1], expected[-1], rtol=1e-6)
 
 
 def test_sharpening_changes_the_image_and_not_the_history(rng):
@@ -260,8 +269,8 @@ def test_sharpening_changes_the_image_and_not_the_history(rng):
     plain, images = run(taa(), frames)
     sharp, sharper = run(taa(sharpening=0.5), frames)
     np.testing.assert_array_equal(plain.core.history, sharp.core.history)
-    low, high = map(np.asarray, neighbourhood.extremes_around(jnp.asarray(images[-1])))
-    expected = images[-1] + 0.5 * (images[-1] - np.asarray(neighbourhood.mean_around(jnp.asarray(images[-1]))))
+    low, high = map(np.asarray, jax.jit(neighbourhood.extremes_around)(images[-1]))
+    expected = images[-1] + 0.5 * (images[-1] - np.asarray(jax.jit(neighbourhood.mean_around)(images[-1])))
     np.testing.assert_allclose(sharper[-1], np.clip(expected, low, high), rtol=1e-5)
     assert sharper[-1].std() > images[-1].std()
 
