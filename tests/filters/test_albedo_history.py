@@ -1,10 +1,12 @@
 """Histories that take their texture from the new albedo: against float64 NumPy, and on known textures."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 
 from jaxdn.filters.albedo_history import follow_albedo, measure_share
+
+share_of, moved_by = jax.jit(measure_share), jax.jit(follow_albedo)
 
 SIZE = (24, 32)
 
@@ -26,9 +28,9 @@ def test_the_share_is_what_its_equation_says(rng, x64):
     history, image = rng.uniform(0, 2, (2, 3, *SIZE))
     before, albedo = rng.uniform(0, 1, (2, 3, *SIZE))
     albedo[:, :12, :12] = before[:, :12, :12]
-    found = measure_share(*map(jnp.asarray, (history, before, albedo, image)), 0.3)
+    found = share_of(history, before, albedo, image, 0.3)
     np.testing.assert_allclose(found, share_in_numpy(history, before, albedo, image, 0.3), rtol=1e-9, atol=1e-12)
-    moved = follow_albedo(*map(jnp.asarray, (history, before, albedo)), found)
+    moved = moved_by(history, before, albedo, found)
     expected = history + np.asarray(found) * history * ((albedo + 0.02) / (before + 0.02) - 1)
     np.testing.assert_allclose(moved, expected, rtol=1e-9)
 
@@ -44,8 +46,7 @@ def test_texture_is_followed_and_noise_is_not(precise, rng):
         before, albedo = np.clip(0.5 + 0.2 * rng.normal(size=(2, 3, *SIZE)), 0, 1)
         history = truth = np.full((3, *SIZE), 1.5)
     image = truth * (1 + 0.05 * rng.normal(size=truth.shape))
-    given = [jnp.asarray(each, jnp.float32) for each in (history, before, albedo)]
-    share = measure_share(*given, jnp.asarray(image, jnp.float32), jnp.float32(0.2))
+    share = np.asarray(share_of(history, before, albedo, image, 0.2))
     assert (share > 0.85).all() if precise else share.mean() < 0.05
-    errors = [np.mean((np.asarray(each) - truth) ** 2) for each in (follow_albedo(*given, share), image)]
+    errors = [np.mean((np.asarray(each) - truth) ** 2) for each in (moved_by(history, before, albedo, share), image)]
     assert errors[0] < 0.3 * errors[1]

@@ -10,6 +10,8 @@ from jaxdn.filters.edge_stopping import closeness_weight, depth_weight, normal_w
 from jaxdn.filters.stabilisation import stabilise
 from tests.gradients import check_gradients
 
+stable = jax.jit(stabilise, static_argnames="sigma")
+
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 HEIGHT, WIDTH = 9, 11
 
@@ -59,31 +61,33 @@ def test_a_disc_matches_a_loop(rng, x64):
     depth, normal = surfaces(rng)
     values, hit = rng.exponential(size=(4, HEIGHT, WIDTH)), rng.random((HEIGHT, WIDTH)) < 0.8
     radius, angle = rng.uniform(0, 6, (HEIGHT, WIDTH)), rng.uniform(0, 7, (HEIGHT, WIDTH))
-    weights = [
-        depth_weight(jnp.asarray(depth)[..., None], None, sigma=1.0, height=len(depth)),
-        normal_weight(jnp.asarray(normal), sigma=16.0),
-    ]
-    found = disc_average(jnp.asarray(values), jnp.asarray(hit), weights, jnp.asarray(radius), jnp.asarray(angle))
+
+    @jax.jit
+    def average(values, hit, depth, normal, radius, angle):
+        by_depth = depth_weight(depth[..., None], None, sigma=1.0, height=len(depth))
+        return disc_average(values, hit, [by_depth, normal_weight(normal, sigma=16.0)], radius, angle)
+
+    found = average(values, hit, depth, normal, radius, angle)
     np.testing.assert_allclose(found, reference_disc(values, hit, depth, normal, radius, angle), rtol=1e-9)
 
 
 def test_tiles_do_not_show(rng, monkeypatch):
-    values = jnp.asarray(rng.random((3, HEIGHT, WIDTH)), jnp.float32)
-    place = jnp.full((HEIGHT, WIDTH), 3.0), jnp.asarray(rng.uniform(0, 6, (HEIGHT, WIDTH)), jnp.float32)
-    whole = disc_average(values, None, [], *place)
+    given = rng.random((3, HEIGHT, WIDTH)), None, [], np.full((HEIGHT, WIDTH), 3.0), rng.uniform(0, 6, (HEIGHT, WIDTH))
+    whole = jax.jit(lambda *given: disc_average(*given))(*given)
     monkeypatch.setattr("jaxdn.filters.disc._TILE_PIXELS", 2 * WIDTH)
-    np.testing.assert_allclose(disc_average(values, None, [], *place), whole, rtol=1e-6)
+    # Another function: what is compiled of the first has its tile.
+    np.testing.assert_allclose(jax.jit(lambda *given: disc_average(*given))(*given), whole, rtol=1e-6)
 
 
 def test_a_disc_of_no_size_changes_nothing(rng):
-    values = jnp.asarray(rng.random((3, HEIGHT, WIDTH)), jnp.float32)
-    nothing = jnp.zeros((HEIGHT, WIDTH))
-    np.testing.assert_allclose(disc_average(values, None, [], nothing, nothing), values, rtol=1e-6)
+    values, nothing = rng.random((3, HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH))
+    np.testing.assert_allclose(jax.jit(disc_average)(values, None, [], nothing, nothing), values, rtol=1e-6)
 
 
 def test_rotations_are_even_and_differ_from_frame_to_frame():
-    first, second = (np.asarray(rotations((64, 64), number, jnp.dtype("float32"))) for number in (3, 4))
-    np.testing.assert_array_equal(first, rotations((64, 64), 3, jnp.dtype("float32")))
+    turn = jax.jit(lambda number: rotations((64, 64), number, jnp.dtype("float32")))
+    first, second = (np.asarray(turn(number)) for number in (3, 4))
+    np.testing.assert_array_equal(first, turn(3))
     for angles in (first, second):
         np.testing.assert_allclose(np.histogram(angles, 8, (0, 2 * np.pi))[0], 512, rtol=0.2)
     assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.05
@@ -97,21 +101,25 @@ def test_the_taps_are_on_two_rings():
 
 def test_gradients_reach_values_and_guides(rng, x64):
     depth, _ = surfaces(rng)
-    radius, angle = (jnp.asarray(rng.uniform(1, 4, (HEIGHT, WIDTH))) for _ in range(2))
+    radius, angle = rng.uniform(1, 4, (2, HEIGHT, WIDTH))
 
     def mean(values, depth):
         return disc_average(
             values, None, [depth_weight(depth[..., None], None, sigma=1.0, height=len(depth))], radius, angle
         )
 
-    check_gradients(mean, (jnp.asarray(rng.random((2, HEIGHT, WIDTH))), jnp.asarray(depth)), eps=1e-7)
+    check_gradients(mean, (rng.random((2, HEIGHT, WIDTH)), depth), eps=1e-7)
 
 
 def test_the_weight_of_closeness_is_its_formula(rng, x64):
     here, there = rng.random((2, 5, 6))
     here[0], there[:, 0] = 0.0, 0.0
-    weight = closeness_weight(jnp.asarray(here), tolerance=0.2, least=0.1)
-    found = np.exp(-np.asarray(weight.exponent([jnp.asarray(there)], [jnp.asarray(here)], None)))
+
+    @jax.jit
+    def exponent(here, there):
+        return closeness_weight(here, tolerance=0.2, least=0.1).exponent([there], [here], None)
+
+    found = np.exp(-np.asarray(exponent(here, there)))
     expected = np.where((here > 0) & (there > 0), np.maximum(np.exp(-abs(here - there) / 0.2), 0.1), 1.0)
     np.testing.assert_allclose(found, expected, rtol=1e-9)
     assert (expected == 0.1).any()
@@ -121,7 +129,7 @@ def test_steady_luminance_matches_a_loop(rng, x64):
     color, past = rng.exponential(size=(3, HEIGHT, WIDTH)), rng.exponential(size=(HEIGHT, WIDTH))
     color[:, 2, 3] = 0.0
     share, hit = rng.uniform(0, 0.97, (HEIGHT, WIDTH)), rng.random((HEIGHT, WIDTH)) < 0.8
-    image, kept = stabilise(*map(jnp.asarray, (color, past, share, hit)), sigma=0.7)
+    image, kept = map(np.asarray, stable(color, past, share, hit, sigma=0.7))
     level = np.einsum("cyx,c->yx", color, LUMINANCE)
     for y, x in np.ndindex(HEIGHT, WIDTH):
         box = slice(max(y - 1, 0), y + 2), slice(max(x - 1, 0), x + 2)
@@ -139,7 +147,7 @@ def test_steady_luminance_matches_a_loop(rng, x64):
 
 @pytest.mark.parametrize("brightness", [0.0, 1e-9, 1.0, 1e4])
 def test_an_even_image_stays_even(brightness):
-    even = jnp.full((3, 4, 5), brightness)
-    image, kept = jax.jit(stabilise, static_argnames="sigma")(even, even[0], jnp.full((4, 5), 0.9), None, sigma=1.0)
+    even = np.full((3, 4, 5), brightness, np.float32)
+    image, kept = stable(even, even[0], np.full((4, 5), 0.9), None, sigma=1.0)
     np.testing.assert_allclose(image, even, rtol=1e-5)
     np.testing.assert_allclose(kept, even[0], rtol=1e-5)

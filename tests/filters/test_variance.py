@@ -1,6 +1,6 @@
 """Short histories: means over neighbours of the same surface, and over those beside where there are none."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 
@@ -55,14 +55,24 @@ def expected(history, hit, normal):
     return mixed, alone
 
 
+def estimate(*given, **options):
+    """Colour and variance of a history [6, H, W], by normals; a program of its own, as ``sparse`` may be patched."""
+
+    @jax.jit
+    def run(history, hit, normal):
+        weights = [normal_weight(normal, sigma=SIGMA)]
+        return estimate_variance(history, hit, weights, short_history=SHORT, **options)
+
+    return jax.tree.map(np.asarray, run(*given))
+
+
 @pytest.mark.parametrize("large", [False, True])
 def test_means_are_those_of_a_plain_loop(large, rng, x64, monkeypatch):
     if large:
         monkeypatch.setattr(sparse, "_WORTH", 0)
         monkeypatch.setattr(sparse, "_FEW", 1.1)
     history, hit, normal = drawn(rng)
-    weights = [normal_weight(jnp.asarray(normal), sigma=SIGMA)]
-    color, variance = estimate_variance(jnp.asarray(history), jnp.asarray(hit), weights, short_history=SHORT)
+    color, variance = estimate(history, hit, normal)
     wanted, alone = expected(history, hit, normal)
     assert (alone > 0.9).sum() > 5
     np.testing.assert_allclose(color, wanted[:3], rtol=1e-9)
@@ -75,20 +85,20 @@ def lone(sample):
     history[:3, 5, 4], history[3, 5, 4], history[4, 5, 4] = sample, sample, sample**2
     normal = np.broadcast_to([0.0, 0.0, 1.0], (HEIGHT, WIDTH, 3)).copy()
     normal[5, 4] = [0.0, 1.0, 0.0]
-    return jnp.asarray(history), [normal_weight(jnp.asarray(normal), sigma=SIGMA)]
+    return history, normal
 
 
 @pytest.mark.parametrize("sample", [0.0, 30.0])
 def test_a_pixel_alone_is_no_dot(sample):
-    history, weights = lone(sample)
-    color, _ = estimate_variance(history, None, weights, short_history=SHORT)
+    history, normal = lone(sample)
+    color, _ = estimate(history, None, normal)
     np.testing.assert_allclose(color, 1.0, rtol=1e-6)
-    kept, _ = estimate_variance(history, None, weights, short_history=SHORT, isolated=False)
+    kept, _ = estimate(history, None, normal, isolated=False)
     np.testing.assert_allclose(kept[:, 5, 4], sample)
 
 
 def test_pixels_that_are_all_alone_stay_as_they_are(rng):
-    history = jnp.asarray(np.concatenate([rng.exponential(size=(5, 3, 2)), np.ones((1, 3, 2))]))
+    history = np.concatenate([rng.exponential(size=(5, 3, 2)), np.ones((1, 3, 2))])
     normal = np.stack([np.eye(3), -np.eye(3)], axis=1)  # [3, 2, 3], no two within 90 degrees
-    color, _ = estimate_variance(history, None, [normal_weight(jnp.asarray(normal), sigma=SIGMA)], short_history=SHORT)
+    color, _ = estimate(history, None, normal)
     np.testing.assert_allclose(color, history[:3], rtol=1e-6)
