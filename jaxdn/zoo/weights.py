@@ -43,7 +43,7 @@ def unflatten(flat: dict[str, np.ndarray]) -> Params:
         place = params
         for parent in parents:
             place = place.setdefault(parent, {})
-        place[leaf] = jnp.asarray(value)
+        place[leaf] = jax.device_put(value)  # `jnp.asarray` compiles a copy for each shape
     return params
 
 
@@ -190,7 +190,7 @@ def _check_params(flat: dict[str, np.ndarray], denoiser: Denoiser, path: Path, i
 def _initial_shapes(denoiser: Denoiser) -> dict[str, tuple[tuple[int, ...], Any]]:
     """Name -> shape and type of the denoiser's initial parameters."""
     frame = Frame(jax.ShapeDtypeStruct((16, 16, 3), jnp.float32))
-    return _shapes(jax.eval_shape(denoiser.init, jax.random.key(0), frame))
+    return _shapes(jax.eval_shape(lambda: denoiser.init(jax.random.key(0), frame)))
 
 
 def _shapes(tree: dict[str, Any], prefix: str = "") -> dict[str, tuple[tuple[int, ...], Any]]:
