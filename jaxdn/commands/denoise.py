@@ -1,6 +1,8 @@
 """``jaxdn denoise``: frames that are there, or a scene that is rendered for the denoiser."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from jaxdn.commands.arguments import Denoise, check_folder, make_channel_naming
@@ -22,8 +24,11 @@ from jaxdn.zoo.ready import AUTO, Model, choose_model, find_model
 _OF_SCENES = ("width", "height", "animation", "seed")
 
 
-def run_denoise(options: Denoise) -> None:
-    """Denoise what the options name. Raises ValueError for options that frames, or scenes, do not have."""
+def run_denoise(options: Denoise, *, on_start: Callable[[], None] = lambda: None) -> None:
+    """Denoise what the options name. Raises ValueError for options that frames, or scenes, do not have.
+
+    ``on_start`` is called when the first frame is written: from then on nothing is imported or traced.
+    """
     if options.max_memory is None:  # else freed memory goes back to the system at once
         tune_malloc()
     naming = make_channel_naming(options)
@@ -31,9 +36,9 @@ def run_denoise(options: Denoise) -> None:
     if options.method == AUTO:
         options = _choose_method(options, of_scene=scene is not None)
     if scene is None:
-        _denoise_files(options, naming)
+        _denoise_files(options, naming, on_start)
     else:
-        _denoise_scene(options, scene)
+        _denoise_scene(options, scene, on_start)
 
 
 def _choose_method(options: Denoise, *, of_scene: bool) -> Denoise:
@@ -44,7 +49,7 @@ def _choose_method(options: Denoise, *, of_scene: bool) -> Denoise:
     return replace(options, method=choice.name)
 
 
-def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
+def _denoise_files(options: Denoise, naming: ChannelNaming, on_start: Callable[[], None]) -> None:
     """Frames of clips and of other renderers."""
     method, backend = select_backend(options.method, options.implementation, **_budget(options))
     settings = Settings(
@@ -72,7 +77,7 @@ def _denoise_files(options: Denoise, naming: ChannelNaming) -> None:
             method,
             settings,
             on_job=lambda job: _show_job(job, naming, method),
-            on_frame=report.on_frame,
+            on_frame=_after_first(on_start, report.on_frame),
             log=report.log,
         )
     if written.left_out:
@@ -106,7 +111,7 @@ def _show_job(job: Job, naming: ChannelNaming, method: Model) -> None:
             break
 
 
-def _denoise_scene(options: Denoise, scene: str) -> None:
+def _denoise_scene(options: Denoise, scene: str, on_start: Callable[[], None]) -> None:
     """Frames that are rendered with samples where the denoiser wants them."""
     from jaxdn.render.settings import RenderSettings
     from jaxdn.sequence.render_and_denoise import SceneSettings, denoise_scene
@@ -119,10 +124,29 @@ def _denoise_scene(options: Denoise, scene: str) -> None:
     out = check_folder(options.out)
     with reporter(options.method) as report:
         written = denoise_scene(
-            scene, options.animation, out, method, settings, on_frame=report.on_frame, log=report.log
+            scene,
+            options.animation,
+            out,
+            method,
+            settings,
+            on_frame=_after_first(on_start, report.on_frame),
+            log=report.log,
         )
     frames = _count(len(written.files), "frame")
     print(f"{frames} rendered, and denoised by {options.method}, in {options.out} ({backend})")
+
+
+def _after_first(
+    on_start: Callable[[], None], on_frame: Callable[[Path, int, int], None]
+) -> Callable[[Path, int, int], None]:
+    """``on_frame`` for every frame, with ``on_start`` after the first."""
+
+    def tell(path: Path, done: int, total: int) -> None:
+        on_frame(path, done, total)
+        if done == 1:
+            on_start()
+
+    return tell
 
 
 def _scene_of(options: Denoise) -> str | None:

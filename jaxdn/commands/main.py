@@ -24,12 +24,13 @@ from jaxdn.commands.arguments import (
     make_channel_naming,
 )
 from jaxdn.commands.errors import end_with_reader, plain_errors
+from jaxdn.runtime.garbage import put_off_collection
 from jaxdn.runtime.interrupt import exit_on_interrupt
 from jaxdn.runtime.program_cache import keep_programs
 from jaxdn.runtime.terminal import print_any_letter
 
-_COMPUTING = (Train, Denoise, Compare, Doctor)
-"""Commands whose programs are worth keeping between runs."""
+_COMPUTING = (Train, Compare, Doctor)
+"""Commands whose programs are worth keeping between runs, besides denoising."""
 
 _POWERS = {"sqrt": 0.5, "linear": 1.0}
 """Of the batch, by which `--scale-rate` scales the learning rate."""
@@ -157,9 +158,11 @@ def _train_here(options: Train) -> None:
 
 
 def _denoise(options: Denoise) -> None:
-    from jaxdn.commands.denoise import run_denoise
+    with put_off_collection() as begin_collection:
+        keep_programs()
+        from jaxdn.commands.denoise import run_denoise
 
-    run_denoise(options)
+        run_denoise(options, on_start=begin_collection)
 
 
 def _compare(options: Compare) -> None:
