@@ -15,7 +15,7 @@ from jaxdn.data.clip.frames import StoredFrame, doubling_layers
 from jaxdn.denoiser.rollout import Layers, Stream, stream
 from jaxdn.denoiser.tiles import GRID, TiledStream, map_tiles, stream_tiled
 from jaxdn.sequence.james_stein import REACH, Confidence, JamesStein, combine, measure_confidence, measure_level
-from jaxdn.sequence.light_range import DRIFT, bound_light, choose_exponent, restore_lamps, restore_light
+from jaxdn.sequence.light_range import DRIFT, bound_light, choose_exponent, find_lamps, restore_lamps, restore_light
 from jaxdn.zoo.ready import Model
 
 GIB = 2**30
@@ -65,6 +65,7 @@ class FrameDenoiser:
         self._room: bool | None = None
         self._lost_pixels = 0
         self._exponent: int | None = None  # of the unit in which this step's history is
+        self._lamps = np.zeros((0, 0, 1), bool)  # of the last frame
         self._programs: set[tuple[str, ...]] = set()  # of the steps before this one
         self._sanitized = 0
 
@@ -74,8 +75,9 @@ class FrameDenoiser:
         if self._method.denoiser is None:
             return np.asarray(light_of(noisy))
         exponent = self._follow_light(noisy)
-        image = self._denoise(bound_light(stored, exponent))
-        return restore_light(image, noisy, exponent)
+        self._lamps = find_lamps(noisy, exponent)
+        image = self._denoise(bound_light(stored, exponent, self._lamps))
+        return restore_light(image, noisy, exponent, self._lamps)
 
     def _denoise(self, stored: StoredFrame) -> np.ndarray:
         step = self._prepare(stored.frame)
@@ -132,14 +134,14 @@ class FrameDenoiser:
         return self._sanitized + (0 if self._step is None else self._step.sanitized)
 
     def blend_fallback(self, frame: Frame, image: np.ndarray) -> tuple[np.ndarray, Fallback]:
-        """The image of a frame with what is no noise as it was, and why (:mod:`jaxdn.sequence.james_stein`)."""
+        """The image of the last frame with what is no noise as it was, and why (:mod:`jaxdn.sequence.james_stein`)."""
         noisy = np.asarray(frame.radiance)
         combined = self._combine(noisy, image, None if frame.depth is None else np.asarray(frame.depth) < FAR)
         confidence: Confidence = jax.device_get(_measure_confidence(combined))
         image = np.asarray(combined.image)
         if confidence.fallback > 0:
             image = image + np.float32(confidence.fallback) * (np.asarray(light_of(noisy)) - image)
-        image = restore_lamps(image, noisy, self._exponent or 0)
+        image = restore_lamps(image, noisy, self._lamps)
         texture_unknown = frame.albedo is None and frame.reflectance is None
         return image, Fallback(confidence, float(np.mean(combined.noisy_weight)), texture_unknown)
 

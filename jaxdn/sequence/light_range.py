@@ -50,6 +50,8 @@ _ALIKE = 0.001
 above the median as a lamp is elsewhere, so that noise alone tells them apart."""
 _RING = 2
 """Pixels on each side among which a neighbour of a lamp that the lamp does not reach is sought."""
+_OFFSETS = tuple((dy, dx) for dy in range(3) for dx in range(3))
+"""Of the 3x3 pixels around one, in an image that is padded by one pixel."""
 _LIGHT = tuple(name for name in GUIDES if BUFFERS[name].kind in ("light", "signed"))
 
 
@@ -74,16 +76,15 @@ def choose_exponent(radiance: np.ndarray, before: int | None) -> int | None:
     return round(octaves)
 
 
-def bound_light(stored: StoredFrame, exponent: int) -> StoredFrame:
+def bound_light(stored: StoredFrame, exponent: int, lamps: np.ndarray) -> StoredFrame:
     """The frame with all its light times 2^exponent, within ``RADIANCE_MAX``; radiance and layers are not negative.
 
     Lamps have at most the luminance :data:`BRIGHTEST`, in their own colour. What is not finite stays, so that denoisers
-    see that it is no measurement.
+    see that it is no measurement. ``lamps``: :func:`find_lamps` of the radiance.
     """
     frame = stored.frame
     most = math.ldexp(RADIANCE_MAX, -exponent)
     noisy = np.asarray(frame.radiance)
-    lamps = find_lamps(noisy, exponent)
     if exponent == 0 and not np.any(lamps) and not np.any((noisy < 0) | (noisy > most)):
         return stored
 
@@ -98,13 +99,14 @@ def bound_light(stored: StoredFrame, exponent: int) -> StoredFrame:
     return stored._replace(frame=frame._replace(**given, radiance=radiance), layers=layers)
 
 
-def restore_light(image: np.ndarray, radiance: np.ndarray, exponent: int) -> np.ndarray:
+def restore_light(image: np.ndarray, radiance: np.ndarray, exponent: int, lamps: np.ndarray) -> np.ndarray:
     """The image [H, W, 3] in the unit of the noisy radiance, with what :func:`bound_light` set aside.
 
     Args:
       image: what was made of the bounded frame.
       radiance: [H, W, 3] as it came.
       exponent: as the frame was bounded with.
+      lamps: as the frame was bounded with.
     """
     image = np.ldexp(np.asarray(image, np.float32), -exponent)
     noisy = np.where(np.isfinite(radiance), radiance, 0).astype(np.float32)
@@ -113,13 +115,11 @@ def restore_light(image: np.ndarray, radiance: np.ndarray, exponent: int) -> np.
         image = image + _denoise_negative(np.minimum(noisy, 0), np.clip(noisy, 0, limit), image)
     if np.any(noisy > limit):
         image = image + _keep_groups(np.maximum(noisy - limit, 0))
-    lamps = find_lamps(radiance, exponent)
     return np.where(lamps, noisy, _bound_ring(image, noisy, lamps)) if np.any(lamps) else image
 
 
-def restore_lamps(image: np.ndarray, radiance: np.ndarray, exponent: int) -> np.ndarray:
-    """The image [H, W, 3] with the lamps of the noisy radiance as they came: they have no noise."""
-    lamps = find_lamps(radiance, exponent)
+def restore_lamps(image: np.ndarray, radiance: np.ndarray, lamps: np.ndarray) -> np.ndarray:
+    """The image [H, W, 3] with the ``lamps`` of the noisy radiance as they came: they have no noise."""
     return np.where(lamps, radiance, image) if np.any(lamps) else image
 
 
@@ -127,12 +127,19 @@ def find_lamps(radiance: np.ndarray, exponent: int) -> np.ndarray:
     """[H, W, 1] bool, where a frame [H, W, 3] shows bright light without noise, and one pixel around it."""
     with np.errstate(invalid="ignore", over="ignore"):
         light = np.asarray(radiance, np.float32) @ np.asarray(LUMINANCE, np.float32)
-        bright = (light[..., None] > math.ldexp(LAMP, -exponent)) & np.isfinite(light[..., None])
-        if not np.any(bright):
-            return bright
-        alike = np.abs(_window(light[..., None]) - light[..., None]) <= _ALIKE * np.abs(light[..., None])
-    steady = bright & (np.sum(alike, axis=0) > _GROUP)
-    return bright & np.any(_window(steady), axis=0)
+        bright = np.isfinite(light) & (light > math.ldexp(LAMP, -exponent))
+        # Few pixels are: nothing is compared elsewhere.
+        rows, columns = np.nonzero(bright)
+        own, padded = light[rows, columns], np.pad(light, 1)
+        alike = sum(
+            (np.abs(padded[rows + dy, columns + dx] - own) <= _ALIKE * np.abs(own)).astype(np.int8)
+            for dy, dx in _OFFSETS
+        )
+    group = np.flatnonzero(alike > _GROUP)
+    around = np.zeros_like(padded, bool)
+    for dy, dx in _OFFSETS:
+        around[rows[group] + dy, columns[group] + dx] = True
+    return (bright & around[1:-1, 1:-1])[..., None]
 
 
 def _bound_ring(image: np.ndarray, noisy: np.ndarray, lamps: np.ndarray) -> np.ndarray:
@@ -182,4 +189,4 @@ def _window(image: np.ndarray) -> np.ndarray:
     """[9, H, W, C] the 3x3 pixels around each; around the frame there is nothing."""
     height, width = image.shape[:2]
     padded = np.pad(image, ((1, 1), (1, 1), (0, 0)))
-    return np.stack([padded[dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)])
+    return np.stack([padded[dy : dy + height, dx : dx + width] for dy, dx in _OFFSETS])

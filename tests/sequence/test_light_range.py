@@ -111,11 +111,12 @@ def test_what_is_bright_beside_a_lamp_stays(rng: np.random.Generator) -> None:
     light[LAMP_PIXELS] = 100
     light[1, 50:60] = 1.2
     light[-9:, -5:], light[-9:, -3] = 50, 0.3
-    bounded = np.asarray(bound_light(StoredFrame(Frame(light)), 0).frame.radiance)
-    np.testing.assert_allclose(restore_light(bounded, light, 0), light, rtol=1e-5)
+    lamps = find_lamps(light, 0)
+    bounded = np.asarray(bound_light(StoredFrame(Frame(light)), 0, lamps).frame.radiance)
+    np.testing.assert_allclose(restore_light(bounded, light, 0, lamps), light, rtol=1e-5)
     between = bounded.copy()
     between[-6, -3] = 2.0
-    assert restore_light(between, light, 0)[-6, -3, 0] == 2.0
+    assert restore_light(between, light, 0, lamps)[-6, -3, 0] == 2.0
 
 
 def test_a_bright_floor_with_little_noise_is_no_lamp(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -198,16 +199,16 @@ def test_what_was_bounded_is_restored(rng: np.random.Generator) -> None:
     light[10:20, 10:20] *= 1e7  # noisy, beyond the limit
     light[40, 40] = [-0.02, 0.3, 0.1]
     light[45, 5] = np.nan
-    lamps = find_lamps(light, 0)[..., 0]
+    lamps = find_lamps(light, 0)
     assert lamps[LAMP_PIXELS].all()
     assert lamps.sum() <= 25 + 3
-    bounded = np.asarray(bound_light(StoredFrame(Frame(light)), 0).frame.radiance)
+    bounded = np.asarray(bound_light(StoredFrame(Frame(light)), 0, lamps).frame.radiance)
     assert np.isnan(bounded[45, 5]).all()
     known = np.isfinite(bounded)
     assert bounded[known].min() >= 0
     assert bounded[known].max() <= RADIANCE_MAX
     np.testing.assert_allclose(bounded[LAMP_PIXELS] @ color.LUMINANCE, BRIGHTEST, rtol=1e-5)
-    image = restore_light(np.nan_to_num(bounded), light, 0)
+    image = restore_light(np.nan_to_num(bounded), light, 0, lamps)
     np.testing.assert_allclose(image[LAMP_PIXELS], light[LAMP_PIXELS], rtol=1e-6)
     np.testing.assert_allclose(image[30, 10], RADIANCE_MAX)
     assert np.median(image[10:20, 10:20] / light[10:20, 10:20]) > 0.9
@@ -220,4 +221,40 @@ def test_what_was_bounded_is_restored(rng: np.random.Generator) -> None:
 
 def test_ordinary_frames_are_not_copied(rng: np.random.Generator) -> None:
     stored = StoredFrame(Frame(grey(rng)))
-    assert bound_light(stored, 0) is stored
+    assert bound_light(stored, 0, find_lamps(np.asarray(stored.frame.radiance), 0)) is stored
+
+
+def test_lamps_are_those_of_the_definition(rng: np.random.Generator) -> None:
+    """Pixel by pixel, at the borders too, with values that are no numbers and in any unit."""
+    light = grey(rng, level=6 * LEVEL, samples=0.5)
+    light[LAMP_PIXELS] = [30, 20, 10]
+    light[0, :3] = light[:2, -1] = 9.0
+    light[20:24, 20:24] = 7.0
+    light[21, 21, 0], light[22, 23, 1], light[30, 30] = np.nan, np.inf, -np.inf
+    luminance = np.full((SIZE[0] + 2, SIZE[1] + 2), 0.0, np.float32)
+    luminance[1:-1, 1:-1] = light @ np.asarray(color.LUMINANCE, np.float32)
+    steady, bright = np.zeros(luminance.shape, bool), np.zeros(luminance.shape, bool)
+    for y, x in np.ndindex(*SIZE):
+        own, around = luminance[y + 1, x + 1], luminance[y : y + 3, x : x + 3]
+        bright[y + 1, x + 1] = np.isfinite(own) and own > 8 * LEVEL
+        steady[y + 1, x + 1] = bright[y + 1, x + 1] and (np.abs(around - own) <= np.float32(0.001) * own).sum() > 3
+    expected = np.zeros((*SIZE, 1), bool)
+    for y, x in np.ndindex(*SIZE):
+        expected[y, x] = bright[y + 1, x + 1] and steady[y : y + 3, x : x + 3].any()
+    assert expected.sum() > 40
+    np.testing.assert_array_equal(find_lamps(light, 0), expected)
+    np.testing.assert_array_equal(find_lamps(np.ldexp(light, -9), 9), expected)
+
+
+def test_a_lamp_s_pixel_without_a_number_is_no_lamp_s(tmp_path: Path) -> None:
+    """It is denoised: with 0 in place of the missing colour it would be a coloured dot."""
+    source = write(tmp_path / "in", 1.0, lamp=50.0)
+    for path in source.iterdir():
+        channels = clips.read_exr(path)
+        channels["R"][4, 54] = np.nan
+        clips.write_exr(path, channels)
+    for safe in (True, False):
+        images, _ = denoise(source, safe=safe)
+        for image in images:
+            assert image[4, 54, 0] > 0.5 * image[4, 54, 1]
+            np.testing.assert_array_equal(image[3, 53], np.float32(50))
