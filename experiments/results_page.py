@@ -36,6 +36,7 @@ PEERS = {
     "torch-compiled": "of PyTorch compiled",
     "torch-eager": "of PyTorch eager",
     "oidn-high": f"of {OIDN}",
+    "oidn-files": "of Open Image Denoise, file to file",
     "roofline": "of the roofline",
 }
 """Peer in the rows of ``bench`` -> column."""

@@ -2,6 +2,7 @@
 
     python -m experiments.speed.bench                  # everything, half an hour on two cores
     python -m experiments.speed.bench --only steps     # one group
+    python -m experiments.speed.bench --only files --size 256x144    # from file to file, of other frames
 
 Writes ``runs/bench.json`` in the format of docs/results (:mod:`experiments.measurement`), with rows ``{"work",
 "implementation", "median_ms", "min_ms", "max_ms", "peak_mib", "against", "ratio"}`` with ``ratio`` = own median over
@@ -28,6 +29,7 @@ from rich.table import Table
 
 from experiments.measurement import describe_measurement
 from experiments.speed import peers, roofline
+from experiments.speed.frames import parsed
 from experiments.speed.roofline import Probe
 from experiments.speed.timing import Timing, summary
 from experiments.speed.workers import Team, WorkerError, apart
@@ -54,14 +56,19 @@ class Settings:
 
     only: Literal["all", "steps", "operations", "train", "compile", "input", "files"] = "all"
     """Run one group of workloads."""
+    size: str = f"{files.WIDTH}x{files.HEIGHT}"
+    """WIDTHxHEIGHT of the frames of the group `files`."""
+    frames: int = files.FRAMES
+    """Of the long runs of that group; a further frame takes their time less that of one frame."""
     out: Path = Path("runs/bench.json")
 
 
 class Report:
     """The rows so far, in a file that is complete after every workload."""
 
-    def __init__(self, path: Path, command: str) -> None:
-        self.path, self.command, self.rows = path, command, []  # type: Path, str, list[Row]
+    def __init__(self, path: Path, command: str, what: str = "Operations, steps and training.") -> None:
+        """``what`` the rows are, in a sentence."""
+        self.path, self.command, self.what, self.rows = path, command, what, []  # type: Path, str, str, list[Row]
         path.parent.mkdir(parents=True, exist_ok=True)
 
     def add(self, rows: Sequence[Row]) -> None:
@@ -72,7 +79,7 @@ class Report:
             describe_measurement(
                 *("bench", "Benchmark", "Speed", 310),
                 command=self.command,
-                what="Operations, steps and training. Ratios are the time of jaxdn divided by the time of the peer, "
+                what=f"{self.what} Ratios are the time of jaxdn divided by the time of the peer, "
                 "measured interleaved, each implementation in a process of its own. Below 1, jaxdn is faster. The "
                 "roofline counts each byte once and leaves out exponentials.",
                 rows=self.rows,
@@ -262,7 +269,7 @@ def compiled(
         yield work
 
 
-def groups(cache: Path, say: Callable[[str], None]) -> dict[str, Iterator[Callable[[], list[Row]]]]:
+def groups(settings: Settings, cache: Path, say: Callable[[str], None]) -> dict[str, Iterator[Callable[[], list[Row]]]]:
     """Group -> its workloads as calls that return rows."""
     probes = roofline.probes()
 
@@ -277,15 +284,28 @@ def groups(cache: Path, say: Callable[[str], None]) -> dict[str, Iterator[Callab
         "train": timed("train", compiled(train_steps.works, cache, taken, say=say)),
         "input": iter([partial(input_rows, say)]),
         "compile": (partial(compile_rows, program, cache, taken, say=say) for program in COMPILED),
-        "files": (partial(file_rows, (method,), say) for method in files.METHODS),
+        "files": (
+            partial(file_rows, (method,), say, size=parsed(settings.size), frames=settings.frames)
+            for method in files.METHODS
+        ),
     }
+
+
+def describe_rows(settings: Settings) -> str:
+    """What the rows are, in a sentence."""
+    whole = f"`files`: `jaxdn denoise` of {settings.frames} frames of {settings.size}, from the command to the files."
+    return {"all": f"Operations, steps and training. {whole}", "files": whole}.get(settings.only, f"`{settings.only}`.")
 
 
 def main(settings: Settings) -> None:
     """Run the groups, write the file after each workload, print the table."""
     began = time.monotonic()
+    if settings.frames < 2:
+        raise ValueError(f"--frames: expected at least 2, as a further frame is timed; got {settings.frames}.")
     command = "make bench" if settings.only == "all" else f"python -m experiments.speed.bench --only {settings.only}"
-    console, report = Console(width=max(Console().width, 160)), Report(settings.out, command)
+    if settings.only == "files":
+        command += f" --size {settings.size} --frames {settings.frames}"
+    console, report = Console(width=max(Console().width, 160)), Report(settings.out, command, describe_rows(settings))
 
     def say(line: str) -> None:
         console.print(f"[{time.monotonic() - began:5.0f} s] {line}", highlight=False, markup=False)
@@ -298,7 +318,7 @@ def main(settings: Settings) -> None:
     with tempfile.TemporaryDirectory() as place:
         # Programs that several groups use are compiled once.
         os.environ |= compilation.environment(Path(place))
-        for group, calls in groups(Path(place), say).items():
+        for group, calls in groups(settings, Path(place), say).items():
             if settings.only not in ("all", group):
                 continue
             with console.status(f"{group}: preparing ..."):

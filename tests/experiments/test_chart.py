@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import sys
 from dataclasses import dataclass
 
 import jax
@@ -12,6 +13,7 @@ import pytest
 import tyro
 
 from experiments.speed.chart import __main__ as chart
+from experiments.speed.chart import stacks
 from experiments.speed.chart.breakdown import WHOLE, breakdown, subjects
 from experiments.speed.chart.energy import find_meter
 from experiments.speed.chart.footage import EvaluationClip
@@ -32,6 +34,7 @@ from experiments.speed.chart.summary import (
 from experiments.speed.chart.way import way
 from experiments.speed.chart.ways import chosen, left_out, registered, ways
 from experiments.speed.works import scene
+from experiments.speed.works.stages import measure_stages
 from jaxdn.core.frame import Clip, frame_at
 from jaxdn.denoiser import Core, recurrent
 from jaxdn.denoiser.rollout import denoise
@@ -72,6 +75,12 @@ def data():
         "times": {"filter": {SIZE: TIMING, OWN: TIMING}, "wide net": {SIZE: TIMING}},
         "render": {SIZE: {"room": cost}, OWN: {"room": cost}},
         "breakdown": {},
+        "stages": {
+            "filter": {
+                "reads": MOTION,
+                "stages": {"starting": 2000.0, "reading": 60.0, "denoising": 500.0, "writing": 240.0},
+            }
+        },
         "left_out": {"here": ["A peer is not installed."]},
     }
 
@@ -197,6 +206,30 @@ def test_the_page_has_every_point_and_needs_no_network(data):
     assert "a &lt;fast&gt; one" in text
     assert "A peer is not installed." in text
     assert not re.search(r'(src|href)="(https?:)?//', text)
+
+
+def test_stacked_times_go_from_the_scene_to_the_file(data):
+    first, steady = stacks.stacks(data, SIZE)
+    assert first.name == "filter, first frame"
+    assert list(first.parts) == ["rendering", "buffers", "starting", "reading", "denoising", "writing"]
+    assert first.parts["rendering"] == pytest.approx(600)
+    assert first.parts["buffers"] == pytest.approx(250)
+    assert steady.total == pytest.approx(600 + 250 + 60 + 500 + 240)
+    assert first.total == pytest.approx(steady.total + 2000)
+    widths = [float(found) for found in re.findall(r'<rect [^>]*width="([\d.]+)"', stacks.draw([first, steady]))]
+    assert sum(widths[6:]) / sum(widths[:6]) == pytest.approx(steady.total / first.total, abs=1e-3)
+    text = page(data, points(data, LABELS), {}, (SIZE, OWN), {"room": {"reference": np.full((8, 8, 3), 0.5)}})
+    assert "<td>3650</td>" in text
+    data["render"] = {}
+    assert list(stacks.stacks(data, SIZE)[1].parts) == ["reading", "denoising", "writing"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="what a child process took is only known on Unix")
+def test_stages_are_those_of_real_files():
+    taken = measure_stages("taa", (32, 48), frames=3)
+    assert all(ms > 0 for ms in taken)
+    assert taken.starting > taken.reading + taken.denoising + taken.writing
 
 
 def test_the_fit_gives_back_the_cost():

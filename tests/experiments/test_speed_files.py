@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from experiments.results_page import read_results, results_page
 from experiments.speed import bench
 from experiments.speed.peers import oidn_files
 from experiments.speed.works import files
@@ -64,7 +65,7 @@ def test_a_frame_is_what_each_further_one_takes() -> None:
     assert works["files-frame"][files.PEER][0].median_ms == 300
 
 
-def test_rows_are_in_relation_to_open_image_denoise(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rows_are_in_relation_to_open_image_denoise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     require("pyoidn")
     monkeypatch.setattr(files, "measurable", lambda: True)
 
@@ -82,6 +83,10 @@ def test_rows_are_in_relation_to_open_image_denoise(monkeypatch: pytest.MonkeyPa
     assert ratios["files-frame", "svgf"] == 4
     assert ratios["files-frame", files.PEER] == 1
     assert "svgf: 1.00 frames a second" in said
+    bench.Report(tmp_path / "bench.json", "command").add(rows)
+    page = results_page(read_results(tmp_path))
+    assert "of Open Image Denoise, file to file |" in page
+    assert "| files-frame | svgf | 1,000 | 100 | 4.00 |" in page
 
 
 @unix

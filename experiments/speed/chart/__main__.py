@@ -37,7 +37,9 @@ from experiments.speed.chart.summary import RENDERER
 from experiments.speed.chart.way import DENOISED_SPP, Way
 from experiments.speed.chart.ways import chosen, left_out, ways
 from experiments.speed.timing import measure, peak_mib
-from experiments.speed.works import scene
+from experiments.speed.workers import WorkerError
+from experiments.speed.works import files, scene
+from experiments.speed.works.stages import measure_stages
 from jaxdn.commands.errors import plain_errors
 from jaxdn.core.frame import Frame, frame_at, written_out
 from jaxdn.evaluation.compare import describe_machine
@@ -207,6 +209,21 @@ class Run:
                 figures = ", ".join(f"{part} {timing.median_ms:.0f} ms" for part, timing in parts.items())
                 self.say(f"one frame of {subject.name}: {figures}")
 
+    def stages(self) -> None:
+        """From file to file, stage by stage, with the start of a first frame: what a person waits for."""
+        if not files.measurable():
+            return
+        for method in (name for name in files.METHODS if name in self.labels):
+            if not self.store.has("stages", method):
+                try:
+                    taken = measure_stages(method, self.sizes.timed)
+                except (RuntimeError, WorkerError) as error:
+                    self.say(f"{method} from file to file is left out: {error}")
+                    continue
+                self.store.put("stages", method, {"reads": self.labels[method][2], "stages": taken._asdict()})
+                figures = ", ".join(f"{stage} {ms:.0f} ms" for stage, ms in taken._asdict().items())
+                self.say(f"{method} from file to file: {figures}")
+
 
 def _forget_programs() -> None:
     """Compiled programs are forgotten, all of this process.
@@ -241,6 +258,7 @@ def main(settings: Settings) -> None:
     run.render_costs()
     run.times()
     run.breakdowns()
+    run.stages()
     found = summary.points(run.store.data, run.labels)
     equals = summary.equal_quality(found, summary.render_cost(run.store.data, run.timed_size))
     page = write_page(folder, run.store.data, found, equals, (run.timed_size, run.own_size))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from experiments.speed.chart import stacks
 from experiments.speed.chart.breakdown import WHOLE
 from experiments.speed.chart.scores import MEASURES
 from experiments.speed.chart.summary import RENDERER, Equal, Point, headline, in_words, pareto, render_cost
@@ -114,6 +115,7 @@ def page(
         _front(data, points, equals, sizes[0], most),
         _table(data, points, equals, sizes, most),
         _costs(data, sizes),
+        _stages(data, sizes[0]),
         _breakdown(data, sizes[0]),
         _making(data),
     ]
@@ -278,6 +280,25 @@ def _costs(data: Mapping[str, Any], sizes: tuple[str, str]) -> str:
         '<section id="rendering"><h2>Rendering one frame, ms</h2><p class="note">The first two are the bare renderer. '
         "The other rows are the buffers that denoisers read, each with the time that they add to a frame.</p>"
         f"{_rows(head, rows)}</section>"
+    )
+
+
+def _stages(data: Mapping[str, Any], size: str) -> str:
+    """What a person waits for, from the scene to the denoised file."""
+    bars = stacks.stacks(data, size)
+    rows = [
+        [escape(bar.name), *(number(bar.parts.get(stage)) for stage in stacks.COLORS), number(bar.total)]
+        for bar in bars
+    ]
+    return (
+        f'<section id="stages"><h2>One {size} frame end to end</h2><p class="note">Rendered with {stacks.SPP} '
+        "sample per pixel, read from a file with Blender's passes, denoised, and written: one after the other. A "
+        "sequence of frames is read, denoised and written at the same time, and takes less. The first frame starts "
+        "the command, "
+        f'with programs kept.</p>{stacks.draw(bars)}<p class="legend">{stacks.legend()}</p>'
+        f"{_rows(['ms', *stacks.COLORS, 'all'], rows)}</section>"
+        if bars
+        else ""
     )
 
 

@@ -11,9 +11,9 @@ from jaxdn.data.errors import read_json
 from jaxdn.evaluation.report.results import json_ready
 from jaxdn.runtime.atomic_files import write_json
 
-PARTS = ("clips", "errors", "times", "render", "breakdown", "left_out")
+PARTS = ("clips", "errors", "times", "render", "breakdown", "stages", "left_out")
 """errors: "method @ spp" -> clip -> measure -> number. times: method -> size -> what was measured. render: size ->
-clip -> cost. breakdown: network -> part -> timing."""
+clip -> cost. breakdown: network -> part -> timing. stages: method -> the buffers that it reads, and its times."""
 
 
 class Store:
