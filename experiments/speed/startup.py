@@ -58,7 +58,7 @@ def profile(method: str, source: Path, place: Path) -> dict[str, float]:
     return found
 
 
-def rows(taken: Mapping[str, Sequence[Mapping[str, float]]]) -> list[list[str | float | None]]:
+def rows(taken: Mapping[str, Sequence[Mapping[str, float]]]) -> list[tuple[str, list[float]]]:
     """Stage, and its median seconds for each method, the largest first; the sums last."""
     stages = dict.fromkeys(stage for runs in taken.values() for run in runs for stage in run)
     medians = {
@@ -66,7 +66,7 @@ def rows(taken: Mapping[str, Sequence[Mapping[str, float]]]) -> list[list[str | 
     }
     sums = [float(np.median([sum(run.values()) for run in runs])) for runs in taken.values()]
     shown = sorted((stage for stage in stages if max(medians[stage]) >= LEAST), key=lambda stage: -max(medians[stage]))
-    return [[stage, *medians[stage]] for stage in shown] + [["all (the median run)", *sums]]
+    return [*((stage, medians[stage]) for stage in shown), ("all (the median run)", sums)]
 
 
 def main(settings: Settings) -> None:
@@ -82,7 +82,7 @@ def main(settings: Settings) -> None:
                     runs.append(found)
                     print(f"{method}: {sum(found.values()):.2f} processor seconds", flush=True)
     shown = rows(taken)
-    for stage, *seconds in shown:
+    for stage, seconds in shown:
         print(f"{stage:24}", *(f"{each:8.3f}" for each in seconds))
     settings.out.parent.mkdir(parents=True, exist_ok=True)
     found = describe_measurement(
@@ -91,7 +91,7 @@ def main(settings: Settings) -> None:
         what=f"One frame of {settings.size.replace('x', ' x ')} by `jaxdn denoise`, from the command to the file, "
         "programs kept: processor seconds of all threads, by what the main thread does. "
         f"Medians of {settings.runs} runs.",
-        rows=shown,
+        rows=[[stage, *seconds] for stage, seconds in shown],
     )
     columns = [{"name": "stage"}, *({"name": f"`{method}`", "decimals": 2} for method in taken)]
     write_json(settings.out, {**found, "columns": columns})

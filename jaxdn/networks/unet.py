@@ -6,7 +6,6 @@ Its results are plain nested dicts of arrays and two pure functions.
 import functools
 import itertools
 import math
-import operator
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -212,7 +211,7 @@ def select_weights(
     Those of the convolution ``a/b`` are ``params["a"]["b"]``.
     """
     places: dict[str, Any] = {
-        name: functools.reduce(operator.getitem, name.split("/"), params) for name in network.kernels()
+        name: functools.reduce(lambda place, key: place[key], name.split("/"), params) for name in network.kernels()
     }
     weights = {name: {"kernel": place["kernel"], "bias": place["bias"]} for name, place in places.items()}
     if any(group is None for group in features):

@@ -45,7 +45,7 @@ def test_what_is_computed_is_counted_and_what_sleeps_is_not() -> None:
 
 def test_the_largest_stage_comes_first_and_the_sums_last() -> None:
     runs = {"a": [{"tracing": 1.0, "reading": 3.0}, {"tracing": 2.0}, {"tracing": 2.0, "reading": 1.0, "other": 0.001}]}
-    assert startup.rows(runs) == [["tracing", 2.0], ["reading", 1.0], ["all (the median run)", 3.001]]
+    assert startup.rows(runs) == [("tracing", [2.0]), ("reading", [1.0]), ("all (the median run)", [3.001])]
 
 
 @pytest.mark.slow

@@ -39,13 +39,15 @@ def stacks(data: Mapping[str, Any], size: str) -> list[Stack]:
 
     Rendering and buffers are left out where their cost was not measured.
     """
-    cost, found = render_cost(data, size), []
+    cost = render_cost(data, size)
+    found: list[Stack] = []
     for method, taken in data["stages"].items():
-        made = {} if cost is None else {"rendering": 1e3 * cost.at(SPP), "buffers": 1e3 * cost.buffers[taken["reads"]]}
-        for title, left_out in (("first frame", ()), ("steady state", ("starting",))):
-            times = {**made, **taken["stages"]}
-            parts = {stage: times[stage] for stage in COLORS if stage in times and stage not in left_out}
-            found.append(Stack(f"{method}, {title}", parts))
+        times: dict[str, float] = dict(taken["stages"])
+        if cost is not None:
+            times |= {"rendering": 1e3 * cost.at(SPP), "buffers": 1e3 * cost.buffers[taken["reads"]]}
+        first = {stage: times[stage] for stage in COLORS if stage in times}
+        later = {stage: ms for stage, ms in first.items() if stage != "starting"}
+        found += [Stack(f"{method}, first frame", first), Stack(f"{method}, steady state", later)]
     return found
 
 

@@ -61,7 +61,8 @@ def time_frames(method: str, source: Path, out: Path, programs: Path) -> list[tu
     channels = len(sequence.files[0].windows)
     denoiser = FrameDenoiser(select_backend(method)[0], source, channels=lambda: channels, log=_ignore)
     writer = ForeignWriter(sequence.window, settings, _ignore)
-    frames, taken = sequence.frames(keep_pixels=True), []
+    frames = sequence.frames(keep_pixels=True)
+    taken: list[tuple[float, float, float]] = []
     for file in sequence.files:
         times = [time.perf_counter()]
         frame = next(frames)
