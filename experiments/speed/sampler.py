@@ -11,7 +11,7 @@ import json
 import sys
 import threading
 import time
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
@@ -62,7 +62,7 @@ def _library_of(file: str) -> str:
 
 def sample(call: Callable[[], object]) -> dict[str, float]:
     """Stage -> processor seconds of all threads while ``call`` runs in this one."""
-    found: Counter[str] = Counter()
+    found: defaultdict[str, float] = defaultdict(float)
     main, ended = threading.get_ident(), threading.Event()
 
     def watch() -> None:
