@@ -157,7 +157,7 @@ class _FallbackReport:
             self._log(f"{label_file(file)}: {noise}; {fallback.kept:.0%} of the frame is kept (--no-safe: nothing)")
         if max(confidence.doubt, confidence.fallback) > 0.5 and index in self._job.wanted:
             if not self._doubtful:
-                self._log(_explain_fallback(file, fallback))
+                self._log(explain_fallback(file, fallback))
             self._doubtful.append(file)
 
     def finish(self) -> None:
@@ -166,7 +166,7 @@ class _FallbackReport:
             self._log(f"likewise {len(self._doubtful) - 1} more, up to {label_file(self._doubtful[-1])}")
 
 
-def _explain_fallback(file: Path, fallback: Fallback) -> str:
+def explain_fallback(file: Path, fallback: Fallback) -> str:
     """Why a frame was kept, as a line."""
     confidence = fallback.confidence
     reason = (
@@ -175,6 +175,11 @@ def _explain_fallback(file: Path, fallback: Fallback) -> str:
         else "do albedo, normals and depth belong to this frame?"
     )
     kept = max(fallback.kept, confidence.fallback)
+    if confidence.doubt <= 0.5:  # no guides to suspect: there is nothing to gain
+        return (
+            f"{label_file(file)}: with noise of {confidence.noise:.1%} of the light, the denoised image is estimated "
+            f"to be no better; {kept:.0%} of the result is the frame as it came (--no-safe: nothing)"
+        )
     return (
         f"{label_file(file)}: the denoised image differs by {confidence.lost:.0%} of the light, of which noise "
         f"explains {confidence.noise:.0%}: {reason} {kept:.0%} of the result is the frame as it came"

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -12,7 +14,10 @@ from jaxdn.data.read import open_frames
 from jaxdn.metrics import psnr
 from jaxdn.render import ClipJob, render_clips
 from jaxdn.render.settings import RenderSettings
+from jaxdn.sequence.frame_denoiser import Fallback
+from jaxdn.sequence.james_stein import Confidence
 from jaxdn.sequence.run import denoise_files
+from jaxdn.sequence.segment import explain_fallback
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import find_model
 
@@ -72,6 +77,14 @@ def test_no_frame_is_worse_than_it_was(tmp_path: Path, samples: int) -> None:
     plain, safe = (decibels(denoise(source, tmp_path / str(on), safe=on)[0]) for on in (False, True))
     assert all(now > then for now, then in zip(safe, before, strict=True))
     assert all(now > then - 0.02 for now, then in zip(safe, plain, strict=True))
+
+
+def test_a_frame_with_little_noise_that_is_kept_blames_no_guides() -> None:
+    """As of a Cycles frame with noise of 1.2 %: nothing is lost, and little to gain."""
+    confidence = jax.device_get(Confidence(*jnp.array([0.012, 0.004, 0.0, 1.0])))
+    line = explain_fallback(Path("a.exr"), Fallback(confidence, 1.0, texture_unknown=False))
+    assert line.startswith("a.exr: with noise of 1.2% of the light, the denoised image is estimated to be no better")
+    assert "albedo" not in line
 
 
 def test_guides_that_do_not_belong_to_the_frame_are_told(tmp_path: Path) -> None:
