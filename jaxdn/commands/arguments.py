@@ -255,8 +255,8 @@ class Denoise:
     method: str = "auto"
     """Shipped weights (combiner-high, ntd-large, ntd-small, relax-fitted, steady-balanced, steady-fast, steady-high,
     svgf-fitted), a filter (svgf, asvgf, taa, oidn), the path of a .safetensors file, or a filter of another package
-    (package.module:name); an unknown name lists all. auto: on other renderers' files combiner-high, if the extra oidn
-    is installed; else, and on jaxdn's own clips, steady-balanced."""
+    (package.module:name); an unknown name lists all. auto: on other renderers' files and jaxdn's own clips with
+    filtered pixels combiner-high, if the extra oidn is installed; else, and on all other clips, steady-balanced."""
     bidirectional: bool = False
     """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
     frames are about as good as the last."""

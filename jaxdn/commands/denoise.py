@@ -9,7 +9,8 @@ from jaxdn.commands.arguments import Denoise, check_folder, make_channel_naming
 from jaxdn.commands.channel_table import show_channel_mapping
 from jaxdn.commands.progress import reporter
 from jaxdn.core.options import make, numbers, parse
-from jaxdn.data.clip.folder import is_clip
+from jaxdn.data.clip.folder import is_clip, read_record
+from jaxdn.data.clip.record import is_filtered
 from jaxdn.data.errors import DamagedFile
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
@@ -43,8 +44,9 @@ def run_denoise(options: Denoise, *, on_start: Callable[[], None] = lambda: None
 
 def _choose_method(options: Denoise, *, of_scene: bool) -> Denoise:
     """The options with the method that is best for what they name; it is printed."""
-    own = of_scene or options.implementation != "auto" or any(is_clip(path) for path in options.clips)
-    choice = choose_model(own_clips=own)
+    ours = of_scene or options.implementation != "auto"
+    ours = ours or any(is_clip(path) and not is_filtered(read_record(path)) for path in options.clips)
+    choice = choose_model(through_centres=ours)
     print(f"method: {choice.name} ({choice.reason})")
     return replace(options, method=choice.name)
 

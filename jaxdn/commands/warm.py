@@ -30,7 +30,7 @@ def warm(size: tuple[int, int], method: str = AUTO) -> None:
     folder = keep_programs()
     if folder is None:
         print("programs are not kept: no folder for them can be written, or JAX_COMPILATION_CACHE_DIR names another")
-    name = choose_model(own_clips=False).name if method == AUTO else method
+    name = choose_model(through_centres=False).name if method == AUTO else method
     model = select_backend(name)[0]
     start = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="jaxdn-warm-") as scratch:

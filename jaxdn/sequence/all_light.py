@@ -6,9 +6,6 @@ and emitted light are means over its own few samples: at the edge of a lamp, and
 blurred by motion, they are as noisy as the rest, and no result may get them back.
 """
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 
 from jaxdn.core.frame import Array
@@ -16,11 +13,6 @@ from jaxdn.data.clip.frames import StoredFrame
 
 BESIDE = ("direct", "emission")
 """The light beside a frame's radiance."""
-
-
-def is_filtered(record: Mapping[str, Any]) -> bool:
-    """Whether the pixels of a clip were filtered, by its record; earlier versions kept no word of it, and did not."""
-    return bool(record.get("pixel_filter", "centre") != "centre")
 
 
 def gather_light(stored: StoredFrame) -> StoredFrame:

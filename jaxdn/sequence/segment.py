@@ -11,12 +11,13 @@ import numpy as np
 
 from jaxdn.data.clip.folder import read_record
 from jaxdn.data.clip.frames import StoredFrame
+from jaxdn.data.clip.record import is_filtered
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.frame_names import label_file
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.data.read import check_single_layer, open_frames
 from jaxdn.runtime.overlap import read_ahead
-from jaxdn.sequence.all_light import gather_light, is_filtered
+from jaxdn.sequence.all_light import gather_light
 from jaxdn.sequence.backward_pass import BackwardImages, backward_pass
 from jaxdn.sequence.frame_denoiser import Fallback, FrameDenoiser
 from jaxdn.sequence.jobs import Job

@@ -24,11 +24,11 @@ STABILISED = "stabilised:"
 """What stands before a name to have it stabilised (:func:`jaxdn.stabilised`)."""
 
 DEFAULT_MODEL = "steady-balanced"
-"""The shipped weights that reports open on: those that `jaxdn denoise` uses on our own clips."""
+"""The shipped weights that reports open on: those that `jaxdn denoise` uses on our own clips without a pixel filter."""
 
 BEST_ELSEWHERE = "combiner-high"
-"""What is best on frames of Cycles that nothing here was trained on or chosen by (``docs/results``): what `jaxdn
-denoise` uses on other renderers' files, where its package is installed."""
+"""What is best on filtered pixels, of Cycles and of ours, that nothing here was trained on or chosen by
+(``docs/results``): what `jaxdn denoise` uses there, and so on other renderers' files, if its package is installed."""
 
 AUTO = "auto"
 """The name that leaves the choice to :func:`choose_model`."""
@@ -60,13 +60,15 @@ class ModelChoice(NamedTuple):
     """For a person, with what to do for another choice."""
 
 
-def choose_model(*, own_clips: bool) -> ModelChoice:
-    """What is best for the frames at hand: clips of our own renderer, or other renderers' files."""
-    if own_clips:
-        return ModelChoice(DEFAULT_MODEL, "best on clips that jaxdn renders")
+def choose_model(*, through_centres: bool) -> ModelChoice:
+    """What is best for the frames at hand: with rays through the pixels' centres, as our renderer makes them unless it
+    is told otherwise, or with filtered pixels, as other renderers' files and our clips of ``--pixel-filter`` have them.
+    """
+    if through_centres:
+        return ModelChoice(DEFAULT_MODEL, "best where jaxdn renders through the pixels' centres")
     best = _method_of(BEST_ELSEWHERE)
     if best.installed:
-        return ModelChoice(BEST_ELSEWHERE, f"best on frames of other renderers; {DEFAULT_MODEL} is on our own clips")
+        return ModelChoice(BEST_ELSEWHERE, f"best on filtered pixels; {DEFAULT_MODEL} is on rays through their centres")
     return ModelChoice(DEFAULT_MODEL, f"{BEST_ELSEWHERE} is better on such frames: {best.remedy}")
 
 

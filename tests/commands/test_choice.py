@@ -63,11 +63,21 @@ def test_our_own_clips_and_a_backend_of_ours_are_for_our_own_method(
     shot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     light = np.random.default_rng(1).random((1, 32, 32, 3), np.float32)
-    write_clip(Clip(Frame(light)), tmp_path / "clip")
+    write_clip(Clip(Frame(light)), tmp_path / "clip", record={"pixel_filter": "centre"})
     _denoise(tmp_path / "clip", tmp_path / "own")
     assert f"method: {DEFAULT_MODEL} (" in capsys.readouterr().out
     _denoise(shot, tmp_path / "backend", "--implementation", "reference")
     assert f"method: {DEFAULT_MODEL} (" in capsys.readouterr().out
+
+
+def test_our_clips_with_filtered_pixels_are_as_other_renderers_frames(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    require("pyoidn")
+    light = np.random.default_rng(1).random((1, 32, 32, 3), np.float32)
+    write_clip(Clip(Frame(light)), tmp_path / "clip", record={"pixel_filter": "box"})
+    _denoise(tmp_path / "clip", tmp_path / "own")
+    assert f"method: {BEST_ELSEWHERE} (" in capsys.readouterr().out
 
 
 def test_a_method_that_is_named_is_not_explained(

@@ -131,7 +131,7 @@ def test_the_pictures_are_small():
 
 def test_the_default_of_denoise_on_our_clips_is_what_reports_open_on():
     assert Denoise.__dataclass_fields__["method"].default == AUTO
-    assert choose_model(own_clips=True).name == DEFAULT_MODEL
+    assert choose_model(through_centres=True).name == DEFAULT_MODEL
 
 
 def test_the_tutorials_denoiser_runs_and_learns(tmp_path, monkeypatch, capsys):

@@ -38,6 +38,14 @@ def is_planned(record: Mapping[str, Any]) -> bool:
     return record.get("plan") is not None
 
 
+def is_filtered(record: Mapping[str, Any]) -> bool:
+    """Whether a clip's pixels are means over an area, with guides as noisy as the light, as other renderers' are.
+
+    Records of earlier versions do not say it: all rays went through the centres of the pixels.
+    """
+    return bool(record.get("pixel_filter", "centre") != "centre")
+
+
 def shared_with(record: Mapping[str, Any]) -> list[int]:
     """For each frame of a clip the one whose buffers it shares."""
     return list(record["plan"]["held"]) if is_planned(record) else list(range(record["frames"]))
