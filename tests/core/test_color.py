@@ -14,6 +14,7 @@ TOE = np.expm1(1e-4)
 
 compress = jax.jit(color.compress)
 expand = jax.jit(color.expand)
+luminance = jax.jit(color.luminance)
 tonemap = jax.jit(color.tonemap, static_argnames="operator")
 round_trip = jax.jit(lambda x: color.srgb_decode(color.srgb_encode(x)))
 
@@ -41,21 +42,22 @@ def test_compress_is_the_formula() -> None:
 
 def test_compress_is_continuous_at_the_toe_with_slope_152_below() -> None:
     below, above = np.float32(TOE * (1 - 1e-6)), np.float32(TOE * (1 + 1e-6))
-    assert 0 <= compress(above) - compress(below) < 1e-6
-    np.testing.assert_allclose(jax.grad(compress)(0.0), 151.99, rtol=1e-4)
+    slope = jax.jit(jax.grad(compress))
+    assert 0 <= np.subtract(compress(above), compress(below)) < 1e-6
+    np.testing.assert_allclose(slope(0.0), 151.99, rtol=1e-4)
     # the slope at black is that of the toe from both sides: a black pixel learns
-    np.testing.assert_allclose(jax.grad(compress)(-1e-9), 151.99, rtol=1e-4)
+    np.testing.assert_allclose(slope(-1e-9), 151.99, rtol=1e-4)
 
 
 @pytest.mark.parametrize("curve", [compress, expand])
 def test_value_and_slope_are_finite_for_every_float(curve) -> None:
     x = magnitudes()
-    value, slope = jax.jit(jax.vmap(jax.value_and_grad(curve)))(x)
+    value, slope = map(np.asarray, jax.jit(jax.vmap(jax.value_and_grad(curve)))(x))
     assert np.all(np.isfinite(value))
     assert np.all(np.isfinite(slope))
     assert np.all(slope >= 0)
     assert np.all(np.diff(value) >= 0)
-    np.testing.assert_array_equal(value, -np.asarray(value)[::-1])
+    np.testing.assert_array_equal(value, -value[::-1])
 
 
 def test_infinity_counts_as_the_largest_number_and_nan_stays() -> None:
@@ -96,10 +98,10 @@ def test_half_precision_stays_finite() -> None:
 def test_luminance(rng: np.random.Generator) -> None:
     image = rng.random((2, 3, 4, 3)).astype(np.float32)
     expected = image.astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
-    result = color.luminance(image)
+    result = np.asarray(luminance(image))
     assert result.shape == (2, 3, 4, 1)
     np.testing.assert_allclose(result[..., 0], expected, rtol=1e-6)
-    np.testing.assert_allclose(color.luminance(jnp.ones(3)), [1.0], rtol=1e-6)
+    np.testing.assert_allclose(luminance(np.ones(3)), [1.0], rtol=1e-6)
 
 
 def test_luminance_needs_three_channels() -> None:
@@ -122,7 +124,7 @@ def tonemap_reference(x: np.ndarray, operator: str) -> np.ndarray:
 def test_tonemap(operator: str, rng: np.random.Generator) -> None:
     image = np.exp(rng.normal(-1, 3, (5, 6, 7, 3))).astype(np.float32)
     image[0, 0, 0] = 0
-    result = tonemap(image, operator=operator)
+    result = np.asarray(tonemap(image, operator=operator))
     np.testing.assert_allclose(result, tonemap_reference(image, operator), rtol=1e-5, atol=1e-6)
     assert np.all((result >= 0) & (result <= 1))
 
@@ -130,16 +132,16 @@ def test_tonemap(operator: str, rng: np.random.Generator) -> None:
 @pytest.mark.parametrize("operator", color.OPERATORS)
 def test_tonemap_is_finite_for_every_float(operator: str) -> None:
     colors = np.repeat(magnitudes()[:, None], 3, axis=1)
-    value = tonemap(colors, operator=operator)
-    slope = jax.grad(lambda x: jnp.sum(tonemap(x, operator=operator)))(colors)
+    value = np.asarray(tonemap(colors, operator=operator))
+    slope = jax.jit(jax.grad(lambda x: jnp.sum(tonemap(x, operator=operator))))(colors)
     assert np.all((value >= 0) & (value <= 1 + 1e-6))
     assert np.all(np.diff(value, axis=0) >= -1e-6)
     assert np.all(np.isfinite(slope))
-    assert np.all(np.isnan(tonemap(jnp.full(3, jnp.nan), operator=operator)))
+    assert np.all(np.isnan(tonemap(np.full(3, np.nan), operator=operator)))
 
 
 def test_tonemap_defaults_to_srgb_and_names_its_operators() -> None:
-    np.testing.assert_allclose(tonemap(jnp.full(3, 0.2158605)), 0.5019, atol=1e-4)  # code value 128
+    np.testing.assert_allclose(tonemap(np.full(3, 0.2158605)), 0.5019, atol=1e-4)  # code value 128
     with pytest.raises(ValueError, match="reinhard"):
         tonemap(jnp.ones(3), operator="filmic")
 
@@ -158,13 +160,16 @@ def exposure_reference(image: np.ndarray) -> float:
 def test_exposure(rng: np.random.Generator) -> None:
     image = rng.exponential(size=(32, 48, 3)).astype(np.float32)
     image[:16, :16] = 0
-    find = jax.jit(color.exposure)
+
+    def find(image: np.ndarray) -> np.ndarray:
+        return np.asarray(jax.jit(color.exposure)(image))
+
     np.testing.assert_allclose(find(image), exposure_reference(image), rtol=1e-5)
     # Rows and columns beyond the last whole block do not count.
-    np.testing.assert_allclose(find(jnp.pad(image, ((0, 5), (0, 7), (0, 0)))), find(image), rtol=1e-6)
+    np.testing.assert_allclose(find(np.pad(image, ((0, 5), (0, 7), (0, 0)))), find(image), rtol=1e-6)
     for factor in (2.0**-20, 3.0, 2.0**12):
         np.testing.assert_allclose(factor * find(factor * image), find(image), rtol=1e-5)
     np.testing.assert_allclose(find(np.full((3, 5, 3), 0.36, np.float32)), 0.5, rtol=1e-6)  # less than a block
     assert find(np.zeros((8, 8, 3), np.float32)) == 1
     assert np.isfinite(find(np.full((32, 32, 3), 65504, np.float32)))
-    assert not np.any(jax.grad(lambda x: color.exposure(x))(jnp.asarray(image)))
+    assert not np.asarray(jax.jit(jax.grad(color.exposure))(image)).any()

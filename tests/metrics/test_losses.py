@@ -1,5 +1,7 @@
 """Losses against loops and sums in float64 NumPy, and their derivatives."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,9 +60,9 @@ def test_temporal(rng: np.random.Generator) -> None:
 def test_temporal_ignores_a_constant_error_and_is_zero_for_one_frame(rng: np.random.Generator) -> None:
     x, _ = pair(rng)
     np.testing.assert_allclose(temporal(x + 0.25, x), 0, atol=1e-7)
-    value, slope = jax.value_and_grad(temporal)(x[:1], x[:1] + 1)
+    value, slope = jax.jit(jax.value_and_grad(temporal))(x[:1], x[:1] + 1)
     assert value == 0
-    assert np.all(slope == 0)
+    assert np.all(np.asarray(slope) == 0)
 
 
 def test_gradient_of_differences(rng: np.random.Generator) -> None:
@@ -78,10 +80,10 @@ def test_gradient_hfen(rng: np.random.Generator) -> None:
 
 def test_hfen_cancels_in_bfloat16_too() -> None:
     """A constant error has no high frequencies; taps summed in bfloat16 found 4e-4 of it."""
-    constant = jnp.full((1, 1, 1, 3), 0.3, jnp.bfloat16)
-    found = gradient(constant, jnp.zeros_like(constant), operator="hfen")
+    constant = np.full((1, 1, 1, 3), 0.3, jnp.bfloat16)
+    found = gradient(constant, np.zeros_like(constant), operator="hfen")
     assert found.dtype == jnp.bfloat16
-    assert found < 1e-7
+    assert float(found) < 1e-7
 
 
 @pytest.mark.parametrize("operator", ["difference", "hfen"])
@@ -91,9 +93,9 @@ def test_gradient_ignores_a_constant_offset(operator: str, rng: np.random.Genera
 
 
 def test_laplacian_of_a_ramp_is_zero_inside() -> None:
-    ramp = jnp.broadcast_to(jnp.arange(24.0)[:, None, None], (1, 24, 24, 1))
+    ramp = np.broadcast_to(np.arange(24.0)[:, None, None], (1, 24, 24, 1))
     response = jax.jit(losses._laplacian_of_gaussian)(ramp)
-    np.testing.assert_allclose(response[:, 7:-7], 0, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(response)[:, 7:-7], 0, atol=1e-5)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 3, 4])
@@ -109,26 +111,26 @@ def test_occlusion_weighs_the_last_three_masks() -> None:
     """One pixel disoccluded at frame 2 of 5, error 1 everywhere: 1, 0.8 and 0.6 at frames 2, 3 and 4."""
     m = np.zeros((5, 1, 1, 1), np.float32)
     m[2] = 1
-    slope = jax.grad(lambda x: occlusion(x, jnp.zeros((5, 1, 1, 1)), m))(jnp.ones((5, 1, 1, 1)))
-    np.testing.assert_allclose(slope.ravel() * 5, [0, 0, 1, 0.8, 0.6], rtol=1e-6)
+    slope = jax.jit(jax.grad(occlusion))(np.ones((5, 1, 1, 1)), np.zeros((5, 1, 1, 1)), m)
+    np.testing.assert_allclose(np.ravel(slope) * 5, [0, 0, 1, 0.8, 0.6], rtol=1e-6)
 
 
 def test_masks_before_the_first_frame_are_each_frames_own() -> None:
     """A pixel masked in frame 0 alone counts 2.4 there and 0.8 at frame 1; one masked in frame 1 alone counts 1.6."""
     m = np.zeros((2, 1, 2, 1), np.float32)
     m[0, 0, 0] = m[1, 0, 1] = 1
-    slope = jax.grad(lambda x: occlusion(x, jnp.zeros((2, 1, 2, 1)), m))(jnp.ones((2, 1, 2, 1)))
-    np.testing.assert_allclose(slope.reshape(2, 2) * 4, [[2.4, 0.0], [0.8, 1.6]], rtol=1e-6)
+    slope = jax.jit(jax.grad(occlusion))(np.ones((2, 1, 2, 1)), np.zeros((2, 1, 2, 1)), m)
+    np.testing.assert_allclose(np.asarray(slope).reshape(2, 2) * 4, [[2.4, 0.0], [0.8, 1.6]], rtol=1e-6)
 
 
 def test_occlusion_without_and_with_full_masks(rng: np.random.Generator) -> None:
     x, y = pair(rng)
     nothing = np.zeros((*SHAPE[:-1], 1), np.float32)
-    value, slope = jax.value_and_grad(occlusion)(x, y, nothing)
+    value, slope = jax.jit(jax.value_and_grad(occlusion))(x, y, nothing)
     assert value == 0
-    assert np.all(slope == 0)
+    assert np.all(np.asarray(slope) == 0)
     everything = np.ones((*SHAPE[:-1], 1), bool).astype(np.float32)
-    np.testing.assert_allclose(occlusion(x, y, everything), 2.4 * spatial(x, y), rtol=1e-5)
+    np.testing.assert_allclose(occlusion(x, y, everything), 2.4 * np.asarray(spatial(x, y)), rtol=1e-5)
 
 
 CASES = {
@@ -154,9 +156,9 @@ def test_symmetric_zero_on_identical_with_finite_gradient(name: str, rng: np.ran
     np.testing.assert_allclose(loss(x, y), loss(y, x), rtol=1e-6)
     value, slope = jax.jit(jax.value_and_grad(loss))(x, x)
     assert value == 0
-    assert np.all(slope == 0)
+    assert np.all(np.asarray(slope) == 0)
     assert loss(x, y).shape == ()
-    assert loss(x, y) > 0
+    assert float(loss(x, y)) > 0
 
 
 def test_shapes_are_checked(rng: np.random.Generator) -> None:
@@ -176,9 +178,10 @@ def test_shapes_are_checked(rng: np.random.Generator) -> None:
 def test_squared_losses_are_means_of_squares(rng: np.random.Generator) -> None:
     (x, y), m = pair(rng), masks(rng)
     error = x.astype(np.float64) - y
-    np.testing.assert_allclose(losses.spatial(x, y, squared=True), np.mean(error**2), rtol=1e-5)
-    np.testing.assert_allclose(losses.temporal(x, y, squared=True), np.mean(np.diff(error, axis=0) ** 2), rtol=1e-5)
-    found = losses.occlusion(x, y, m, weights=(1.0,), squared=True)
+    np.testing.assert_allclose(jax.jit(partial(losses.spatial, squared=True))(x, y), np.mean(error**2), rtol=1e-5)
+    found = jax.jit(partial(losses.temporal, squared=True))(x, y)
+    np.testing.assert_allclose(found, np.mean(np.diff(error, axis=0) ** 2), rtol=1e-5)
+    found = jax.jit(partial(losses.occlusion, weights=(1.0,), squared=True))(x, y, m)
     np.testing.assert_allclose(found, np.mean((error * m) ** 2), rtol=1e-5)
 
 
@@ -229,14 +232,16 @@ def test_pyramid_seeks_nearly_the_mean_of_noisy_targets(rng: np.random.Generator
 def test_the_unbiased_pair_is_the_compressed_pair_to_first_order(rng: np.random.Generator) -> None:
     x = 0.02 + np.exp(rng.normal(0, 2, SHAPE)).astype(np.float32)
     y = (x * (1 + 1e-3 * rng.standard_normal(SHAPE))).astype(np.float32)
-    first, second = losses.unbiased(jnp.asarray(x), jnp.asarray(y))
-    wanted = np.asarray(color.compress(x), np.float64) - np.asarray(color.compress(y), np.float64)
+    unbiased, compress = jax.jit(losses.unbiased, static_argnames="curve"), jax.jit(color.compress)
+    first, second = map(np.asarray, unbiased(x, y))
+    wanted = np.asarray(compress(x), np.float64) - np.asarray(compress(y), np.float64)
     np.testing.assert_allclose(first - second, wanted, rtol=2e-2, atol=2e-5)
-    first, second = losses.unbiased(jnp.asarray(x), jnp.asarray(y), curve="reinhard")
+    first, second = map(np.asarray, unbiased(x, y, curve="reinhard"))
     np.testing.assert_allclose(
         first - second, np.float64(x) / (1.0 + x) - np.float64(y) / (1.0 + y), rtol=2e-2, atol=2e-5
     )
     # One firefly in the target weighs as much as some hundred pixels, not as the whole image.
-    image, firefly = jnp.full(SHAPE, 0.2), jnp.full(SHAPE, 0.3).at[0, 0, 0].set(60000.0)
-    gap = np.subtract(*losses.unbiased(image, firefly))
+    image, firefly = np.full(SHAPE, 0.2), np.full(SHAPE, 0.3)
+    firefly[0, 0, 0] = 60000.0
+    gap = np.subtract(*unbiased(image, firefly))
     assert 10 < np.square(gap).max() / np.square(gap[-1, -1, -1]).max() < 1000
