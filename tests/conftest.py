@@ -52,6 +52,14 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def small_tiles() -> None:
+    """Images of tests are small: compiled loops fill them in several tiles nevertheless, so that borders are tested."""
+    from jaxdn.ops.dispatch import numba_call
+
+    numba_call.TILE = 1
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     for mark in item.iter_markers("needs"):
         require(*mark.args)

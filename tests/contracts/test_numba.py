@@ -363,6 +363,24 @@ def test_no_tile_is_written_any_more_after_an_error():
     assert written == there != []
 
 
+def test_a_small_image_is_one_tile_and_a_large_one_several(monkeypatch):
+    """Eight tiles of 256 x 144 pixels took threads twice as long to take up as to fill."""
+    monkeypatch.setattr(numba_call, "TILE", 1 << 16)
+    calls = []
+
+    def counts(top, bottom, image, out):
+        out[top:bottom] = image[top:bottom] + 1
+        calls.append((top, bottom))
+
+    for rows, tiles in ((144, 1), (1024, 4)):
+        calls.clear()
+        (found,) = numba_call.call(counts, [(rows, 256)], [jnp.zeros((rows, 256))], rows=rows)
+        np.testing.assert_array_equal(found, 1)
+        assert len(calls) == tiles
+        assert sorted(calls)[0][0] == 0
+        assert sorted(calls)[-1][1] == rows
+
+
 def test_every_row_belongs_to_one_tile():
     def counts(top, bottom, image, out):
         out[top:bottom] = image[top:bottom] + 1

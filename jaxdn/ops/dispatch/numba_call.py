@@ -1,6 +1,7 @@
 """Compiled loops called from inside a jitted program, tile by tile of rows, on all cores."""
 
 import functools
+import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -13,6 +14,9 @@ import numpy as np
 
 from jaxdn.ops.dispatch.host_call import call_host, name_of
 from jaxdn.ops.dispatch.operation import Operation, platform
+
+TILE = 1 << 16
+"""Values that a tile fills at the least: those of a small image take threads longer to take up than to fill."""
 
 Given = jax.Array | tuple[jax.Array, ...] | None
 
@@ -63,7 +67,10 @@ def call(
         read = jax.tree.unflatten(structure, given)
         pool, threads = _pool()
         # Several tiles for each thread, as some take longer.
-        height = max(least, -(-rows // (4 * threads)))
+        height = max(least, -(-rows // max(1, min(4 * threads, values // TILE))))
+        if height >= rows:
+            loop(0, rows, *read, *written, *numbers)
+            return
         tiles: list[Future[None]] = []
         try:
             for top in range(0, rows, height):
@@ -74,6 +81,7 @@ def call(
             wait(tiles)
 
     kinds = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    values = sum(map(math.prod, shapes))
     name = name_of(getattr(loop, "py_func", loop), str(structure), numbers, rows, least)
     return call_host(name, work, kinds, *leaves)
 
