@@ -70,6 +70,8 @@ def join_processes(place: Place) -> Iterator[None]:
         _end_soon(1)
         raise
     except Exception as error:
+        if "Gloo" in str(error):  # not every failed exchange is a JaxRuntimeError
+            _end_alone(error)
         _end_soon(2 if isinstance(error, (ValueError, OSError, ModuleNotFoundError)) else 1)
         raise
     try:

@@ -296,6 +296,12 @@ def test_full_memory_and_an_interrupted_callback_are_not_blamed_on_other_process
     assert "another process" not in done.stderr
 
 
+def test_an_exchange_that_fails_in_another_way_is_a_lost_process() -> None:
+    done = run_joined(free_port(), "raise ValueError('UNKNOWN: Gloo AllGather failed: Connection reset by peer')")
+    assert done.returncode == 1, done.stderr
+    assert "another process of this run has gone" in done.stderr
+
+
 def test_a_port_that_is_taken_is_one_message() -> None:
     with socket.socket() as taken:
         taken.bind(("", 0))
