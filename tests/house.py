@@ -41,7 +41,7 @@ ROOMS: dict[str, Room] = {
     "denoiser": Room(3, "the interface, sanitising, frame statistics, rollout, tiles"),
     "recipes": Room(3, "recipes, objectives, augmentation"),
     "filters": Room(4, "shared parts of filters: reprojection, variance, A-trous ..."),
-    "networks": Room(4, "U-Nets and their backends"),
+    "networks": Room(4, "U-Nets and their backends; the only place that imports Flax"),
     "planning": Room(4, "effects of a scene, and the rendering plan"),
     "data.clip": Room(4, "clips: folders of EXR frames and clip.json"),
     "methods": Room(5, "one file a method; the registry"),
@@ -72,6 +72,7 @@ ROOMS: dict[str, Room] = {
 }
 
 PACKAGES = {
+    "flax": {"networks"},
     "numba": {"ops.dispatch"},
     "optax": {"training"},
     "mitsuba": {"render"},

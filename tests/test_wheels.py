@@ -24,7 +24,7 @@ def test_wheels_of_the_pinned_versions_are_there(system: str, python: str) -> No
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr
     resolved = set(re.findall(r"^([\w-]+)==", done.stdout, flags=re.M))
-    assert {"jax", "jaxlib", "numba", "openexr", "mitsuba", "grain", "onnxruntime"} <= resolved
+    assert {"jax", "jaxlib", "numba", "flax", "openexr", "mitsuba", "grain", "onnxruntime"} <= resolved
     assert ("pyoidn" in resolved) == (system != "macos")
     assert ("onednn-cpu-gomp" in resolved) == (system == "linux")
 

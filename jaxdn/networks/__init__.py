@@ -1,6 +1,6 @@
 """The networks: each is an ``init`` and an ``apply`` on plain nested dicts.
 
-What a denoiser needs before it builds a network is defined here.
+Only modules of this package import Flax; what a denoiser needs before it builds a network is defined here.
 """
 
 LEVELS = 5

@@ -18,6 +18,7 @@ from jaxdn.networks.unet import (
     XLA,
     draw_initial_weights,
     draw_weights,
+    flax_structure,
     select_groups,
     select_weights,
 )
@@ -72,6 +73,8 @@ def recurrent_unet(
     def described(channels: int) -> GraphSpec:
         return graph.recurrent_unet(channels, outputs, widths=widths)
 
+    structure = flax_structure(described(sum(groups)))
+
     def init(key: jax.Array) -> dict[str, Any]:
         return draw_initial_weights(key, described(sum(groups)), scheme="he")
 
@@ -88,7 +91,7 @@ def recurrent_unet(
         network = described(sum(group.shape[-1] for group in present))
         inputs = {FEATURES: jnp.concatenate(present, axis=-1)}
         inputs |= {hidden(stage): state for stage, state in enumerate(states)}
-        weights = select_weights(network, params, features, groups)
+        weights = select_weights(network, structure, params, features, groups)
         output, *kept = run_recurrent_unet(weights, inputs, network=network, implementation=implementation)
         return output, tuple(kept)
 

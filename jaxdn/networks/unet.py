@@ -1,17 +1,19 @@
 """The U-Net that predicts kernels, and its backends.
 
-Its results are plain nested dicts of arrays and two pure functions.
+Flax NNX is used only inside this module. Its results are plain nested dicts of arrays and two pure functions, so that
+no other module depends on Flax.
 """
 
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import nnx
 
 from jaxdn.core.checks import check_option
 from jaxdn.networks import LARGE, LEVELS, MULTIPLE, Widths, graph, onednn, onnx
@@ -66,6 +68,30 @@ class XlaLayers(NamedTuple):
 
 XLA = XlaLayers(convolve, 16)  # 51 outputs take XLA:CPU 1.4 times as long as 64
 ONEDNN = XlaLayers(functools.partial(convolve, implementation="onednn"), 1)
+
+
+class Convolution(nnx.Module):
+    """One convolution's weights."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.kernel = nnx.Param(jnp.zeros(shape, jnp.float32))
+        self.bias = nnx.Param(jnp.zeros(shape[-1], jnp.float32))
+
+
+class Convolutions(nnx.Module):
+    """The weights of a described network: a convolution ``a/b`` is the attribute ``b`` of the attribute ``a``."""
+
+    def __init__(self, network: GraphSpec) -> None:
+        for name, shape in network.kernels().items():
+            level, _, layer = name.rpartition("/")
+            if level and not hasattr(self, level):
+                setattr(self, level, nnx.Module())
+            setattr(getattr(self, level) if level else self, layer, Convolution(shape))
+
+    def weights(self, names: Iterable[str]) -> dict[str, Any]:
+        """:data:`jaxdn.networks.graph.Weights`, by the names of the convolutions."""
+        found: dict[str, Any] = {name: functools.reduce(getattr, name.split("/"), self) for name in names}
+        return {name: {"kernel": one.kernel[...], "bias": one.bias[...]} for name, one in found.items()}
 
 
 def draw_initial_weights(key: jax.Array, network: GraphSpec, *, scheme: str) -> dict[str, Any]:
@@ -175,16 +201,23 @@ def unet(
     def described(channels: int) -> GraphSpec:
         return graph.unet(channels, heads, widths=widths, head_size=head_size)
 
+    structure = flax_structure(described(sum(groups)))
+
     def init(key: jax.Array) -> dict[str, Any]:
         return draw_initial_weights(key, described(sum(groups)), scheme=initialization)
 
     def apply(params: dict[str, Any], features: Sequence[jax.Array | None]) -> tuple[jax.Array, ...]:
         present = select_groups(features, groups, MULTIPLE)
         network = described(sum(group.shape[-1] for group in present))
-        weights = select_weights(network, params, features, groups)
+        weights = select_weights(network, structure, params, features, groups)
         return run_unet(weights, present, network=network, implementation=implementation)
 
     return Network(init, apply)
+
+
+def flax_structure(network: GraphSpec) -> Any:
+    """How Flax stores the weights of a network."""
+    return nnx.split(nnx.eval_shape(lambda: Convolutions(network)), nnx.Param, graph=False)[0]
 
 
 def select_groups(features: Sequence[jax.Array | None], groups: Sequence[int], multiple: int) -> list[jax.Array]:
@@ -204,16 +237,14 @@ def select_groups(features: Sequence[jax.Array | None], groups: Sequence[int], m
 
 
 def select_weights(
-    network: GraphSpec, params: dict[str, Any], features: Sequence[jax.Array | None], groups: Sequence[int]
+    network: GraphSpec,
+    structure: Any,
+    params: dict[str, Any],
+    features: Sequence[jax.Array | None],
+    groups: Sequence[int],
 ) -> dict[str, Any]:
-    """The weights of a network that sees only the groups which are there, out of those for all groups.
-
-    Those of the convolution ``a/b`` are ``params["a"]["b"]``.
-    """
-    places: dict[str, Any] = {
-        name: functools.reduce(lambda place, key: place[key], name.split("/"), params) for name in network.kernels()
-    }
-    weights = {name: {"kernel": place["kernel"], "bias": place["bias"]} for name, place in places.items()}
+    """The weights of a network that sees only the groups which are there, out of those for all groups."""
+    weights = nnx.merge(structure, params).weights(network.kernels())
     if any(group is None for group in features):
         first = next(iter(weights))
         parts = jnp.split(weights[first]["kernel"], list(itertools.accumulate(groups))[:-1], axis=2)

@@ -156,6 +156,16 @@ def test_errors_say_what_was_expected(rng: np.random.Generator, key: jax.Array) 
         network.apply(params, [None, None])
 
 
+def test_only_the_networks_package_imports_flax() -> None:
+    import pathlib
+
+    import jaxdn
+
+    package = pathlib.Path(jaxdn.__file__).parent
+    users = {path.parent.name for path in package.rglob("*.py") if "from flax" in path.read_text()}
+    assert users == {"networks"}
+
+
 def test_shipped_weights_are_those_of_the_description() -> None:
     """Neither more nor fewer convolutions, each of the described shape."""
     for name, groups, heads, widths, size in (
