@@ -8,10 +8,12 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxdn.core.frame import BUFFERS, RADIANCE_MAX, Buffer, Frame
+from jaxdn.core.frame import BUFFERS, FAR, RADIANCE_MAX, Buffer, Frame
 
 FARTHEST = 1e9
 """Larger distances are replaced by this."""
+_FAR_ROUNDED = 999_424.0
+"""What bfloat16 holds in place of ``FAR``: from here on there is no surface."""
 
 Sanitized = tuple[jax.Array, jax.Array]
 """The sanitized buffer, and which of its values were replaced (bool)."""
@@ -25,7 +27,8 @@ def sanitize(frame: Frame) -> tuple[Frame, jax.Array]:
     * light: not finite or negative -> 0, then at most ``RADIANCE_MAX``; signed: not finite -> 0, then at most that;
     * fraction: not finite -> the neutral value (1 for albedo and roughness), then [0, 1];
     * direction: not finite or shorter than 1e-6 -> 0, else unit length;
-    * distance: NaN or negative -> 0, above 1e9 -> 1e9; count: not finite or negative -> 0;
+    * distance: NaN or negative -> 0, above 1e9 -> 1e9, and ``FAR`` as bfloat16 rounds it -> ``FAR``; count: not finite
+      or negative -> 0;
     * vector: not finite -> NaN in both components, which means *no history there* (0 would be a legal vector);
     * flag, id: unchanged.
 
@@ -84,7 +87,8 @@ def _direction(values: jax.Array, buffer: Buffer) -> Sanitized:
 
 def _distance(values: jax.Array, buffer: Buffer) -> Sanitized:
     bad = ~(values >= 0)
-    return jnp.minimum(jnp.where(bad, 0.0, values), FARTHEST), bad | (values > FARTHEST)
+    known = jnp.where((values >= _FAR_ROUNDED) & (values < FAR), FAR, jnp.where(bad, 0.0, values))
+    return jnp.minimum(known, FARTHEST), bad | (values > FARTHEST)
 
 
 def _vector(values: jax.Array, buffer: Buffer) -> Sanitized:

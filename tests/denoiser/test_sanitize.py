@@ -101,6 +101,8 @@ def numpy_sanitize(values, name):
         name in NEUTRAL_ONE
     )
     right = finite & (values >= low) & (values <= high)
+    if kind == "distance":
+        values = np.where((values >= 999_424) & (values < FAR), FAR, values)
     return np.clip(np.where(unknown, instead, values), low, high), np.sum(~right)
 
 
@@ -186,6 +188,18 @@ def test_narrow_numbers_are_widened(name, dtype, rng):
     found, count = sanitized_buffer(name, values)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, values.astype(np.float32))
+    assert count == 0
+
+
+@pytest.mark.parametrize("name", ["depth", "previous_depth"])
+def test_no_surface_stays_none_in_half_precision(name):
+    """bfloat16 holds 1e6 as 999,424, float16 as infinity."""
+    for dtype in (jnp.bfloat16, np.float16, np.float32):
+        with np.errstate(over="ignore"):
+            found, _ = sanitized_buffer(name, np.full((6, 5, 1), FAR).astype(dtype))
+        assert (found >= FAR).all(), dtype
+    near, count = sanitized_buffer(name, np.full((6, 5, 1), 990_000, np.float32))
+    assert (near == 990_000).all()
     assert count == 0
 
 

@@ -216,9 +216,9 @@ def _operations() -> dict[str, Callable[[Inputs], Any]]:
         return glints.flake_normals(8, inputs.clip.frames.roughness[-1, 0, 0, 0], flakes=32, bins=3)
 
     def filled(inputs: Inputs) -> jax.Array:
-        frames = inputs.clip.frames
-        known = frames.depth[-1] < FAR
-        return scales.fill_holes(scales.pad(frames.radiance[-1], 16), scales.pad(known, 16))
+        frame = jax.tree.map(lambda buffer: buffer[-1], inputs.clip.frames)
+        known = sanitize(frame)[0].depth < FAR  # as the denoisers that fill pixels see it
+        return scales.fill_holes(scales.pad(frame.radiance, 16), scales.pad(known, 16))
 
     return {
         **{f"warp, {border}": partial(warped, border=border) for border in _BORDERS},
