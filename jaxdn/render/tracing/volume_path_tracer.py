@@ -29,9 +29,10 @@ def scatters(scene: Any) -> bool:
 def is_bound(bsdf: Any, active: Any) -> Any:
     """Whether surfaces are nothing but the bounds of a medium: rays pass them straight, whatever their length is."""
     flags = bsdf.flags()
-    plain = mi.has_flag(flags, mi.BSDFFlags.Null) & ~mi.has_flag(flags, mi.BSDFFlags.Smooth)
-    mirrors = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
-    return active & plain & ~mirrors
+    more = mi.has_flag(flags, mi.BSDFFlags.Smooth) | mi.has_flag(flags, mi.BSDFFlags.DeltaReflection)
+    more |= mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
+    # Not `~more`: without vectors it is Python's bool, whose inversion Python 3.16 no longer has.
+    return active & mi.has_flag(flags, mi.BSDFFlags.Null) & (more ^ True)
 
 
 def sample_distance(medium: Any, ray: Any, hit: Any, numbers: Any, active: Any) -> tuple[Any, Any, Any]:
