@@ -47,7 +47,7 @@ class Options:
 
 def main(options: Options) -> int:
     """Print a row for each clip, sample count and way, and write the table."""
-    method = options.method or choose_model(own_clips=False).name
+    method = options.method or choose_model(through_centres=False).name
     rows = []
     for clip in options.clips:
         blurred, sharp = options.blurred / clip, options.sharp / clip
