@@ -60,6 +60,8 @@ def _imported(name: str) -> str:
     return _room(".".join(parts)) or ""
 
 
+OF_LOOPS = "ops.dispatch.loop_compilers"
+"""Imports, in a process of its own, the modules of loops that the process which started it has imported."""
 MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path != PACKAGE / "__init__.py"]
 
 
@@ -92,6 +94,8 @@ def test_contributing_has_the_map():
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_packages_import_by_name_only_from_themselves(path):
     """An import without an import statement would bypass the test above."""
+    if _own(path) == OF_LOOPS:
+        return
     for argument in _imported_by_name(path):
         written = ast.unparse(argument)
         package = ".".join(path.parent.relative_to(PACKAGE.parent).parts)

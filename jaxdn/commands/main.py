@@ -161,8 +161,10 @@ def _denoise(options: Denoise) -> None:
     with put_off_collection() as begin_collection:
         keep_programs()
         from jaxdn.commands.denoise import run_denoise
+        from jaxdn.ops.dispatch.loop_compilers import loops_compiled_apart
 
-        run_denoise(options, on_start=begin_collection)
+        with loops_compiled_apart():
+            run_denoise(options, on_start=begin_collection)
 
 
 def _compare(options: Compare) -> None:

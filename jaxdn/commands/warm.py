@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxdn.data.exr.exr import write_exr
+from jaxdn.ops.dispatch.loop_compilers import loops_compiled_apart
 from jaxdn.runtime.program_cache import keep_programs
 from jaxdn.sequence.run import denoise_files, select_backend
 from jaxdn.sequence.settings import Settings
@@ -33,7 +34,7 @@ def warm(size: tuple[int, int], method: str = AUTO) -> None:
     name = choose_model(through_centres=False).name if method == AUTO else method
     model = select_backend(name)[0]
     start = time.monotonic()
-    with tempfile.TemporaryDirectory(prefix="jaxdn-warm-") as scratch:
+    with loops_compiled_apart(), tempfile.TemporaryDirectory(prefix="jaxdn-warm-") as scratch:
         for shot, objects in _OBJECTS.items():
             source = Path(scratch) / shot
             source.mkdir()

@@ -1,6 +1,5 @@
 """``jaxdn compare``: every method on the same clips, scored, timed and shown next to each other in one report."""
 
-import os
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +18,7 @@ from jaxdn.denoiser.rollout import denoise
 from jaxdn.evaluation.report import ClipResult, Results, Scores, TrainingCurve
 from jaxdn.evaluation.report.film import FRAMES, film
 from jaxdn.evaluation.report.results import headline_psnr
+from jaxdn.runtime.cores import count_cores
 from jaxdn.zoo.ready import DEFAULT_MODEL, Model
 
 Halves = tuple[Any, Any]
@@ -240,7 +240,7 @@ def describe_machine() -> dict[str, Any]:
     """The machine of a measurement: processor, cores, device, versions."""
     return {
         "processor": _processor(),
-        "cores": _cores(),
+        "cores": count_cores(),
         "device": jax.devices()[0].device_kind,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
@@ -257,7 +257,3 @@ def _processor() -> str:
     except OSError:
         pass
     return platform.processor() or platform.machine()
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

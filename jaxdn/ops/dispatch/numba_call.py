@@ -2,7 +2,6 @@
 
 import functools
 import math
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from importlib.util import find_spec
@@ -13,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdn.ops.dispatch.host_call import call_host, name_of
+from jaxdn.ops.dispatch.loop_compilers import compile_apart, example
 from jaxdn.ops.dispatch.operation import Operation, platform
+from jaxdn.runtime.cores import count_cores
 
 TILE = 1 << 16
 """Values that a tile fills at the least: those of a small image take threads longer to take up than to fill."""
@@ -62,8 +63,14 @@ def call(
     """
 
     leaves, structure = jax.tree.flatten(tuple(arrays))
+    kinds = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    read_types = jax.tree.unflatten(structure, [example(leaf, written=False) for leaf in leaves])
+    written_types = [example(kind, written=True) for kind in kinds]
+    compiled = compile_apart(loop, (0, rows, *read_types, *written_types, *numbers))
 
     def work(written: list[np.ndarray], *given: np.ndarray) -> None:
+        if compiled is not None:
+            compiled.result()
         read = jax.tree.unflatten(structure, given)
         pool, threads = _pool()
         # Several tiles for each thread, as some take longer.
@@ -80,7 +87,6 @@ def call(
         finally:  # after Ctrl-C, too, nothing may write into results that XLA frees
             wait(tiles)
 
-    kinds = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
     values = sum(map(math.prod, shapes))
     name = name_of(getattr(loop, "py_func", loop), str(structure), numbers, rows, least)
     return call_host(name, work, kinds, *leaves)
@@ -97,5 +103,5 @@ def _installed() -> bool:
 @functools.cache
 def _pool() -> tuple[ThreadPoolExecutor, int]:
     """Threads, one for each core that this process may use, and their number."""
-    threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads = count_cores()
     return ThreadPoolExecutor(threads, "jaxdn-tiles"), threads
