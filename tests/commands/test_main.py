@@ -105,6 +105,7 @@ def test_help_shows_examples(verb, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_processes")
 def test_denoise_adds_direct_and_emitted_light_back(clip, tmp_path):
     done = jaxdn("denoise", clip, "-o", tmp_path / "out", "--method", "svgf", "--preview")
     assert done.returncode == 0, done.stderr
@@ -238,6 +239,7 @@ def test_train_denoise_and_compare_with_new_weights(tmp_path, capsys):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_processes")
 def test_compare_ends_with_a_report(clip, tmp_path):
     done = jaxdn("compare", clip, "-o", tmp_path, "--methods", "noisy", "svgf")
     assert done.returncode == 0, done.stderr

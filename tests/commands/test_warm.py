@@ -17,7 +17,9 @@ SIZE = ["--width", "64", "--height", "48"]
 
 
 def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    usual = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    """Without the folder of programs that tests share."""
+    kept = ("JAX_COMPILATION_CACHE", "JAX_PERSISTENT_CACHE")
+    usual = {name: value for name, value in os.environ.items() if not name.startswith(kept)}
     environment = {**usual, "JAXDN_CACHE_DIR": str(folder)}
     command = [sys.executable, "-m", "jaxdn.commands.main", *arguments]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -63,6 +65,7 @@ def test_no_pass_of_a_drawn_frame_counts_as_missing(tmp_path: Path, objects: int
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_processes")
 def test_denoise_finds_what_doctor_compiled(tmp_path: Path) -> None:
     """Of files of that size with Blender's passes, of a method that reads them, whether objects have numbers or not."""
     kept = tmp_path / "kept"

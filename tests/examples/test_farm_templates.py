@@ -28,6 +28,7 @@ def run(*command: str | Path, **environment: str) -> str:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_processes")
 def test_a_shot_in_chunks_by_openjd_is_the_whole_shot_and_a_slurm_array_has_nothing_left_to_do(tmp_path):
     require("openjd", "bash")
     shot, whole, chunks = (str(tmp_path / name) for name in ("shot", "whole", "chunks"))

@@ -31,6 +31,7 @@ def test_the_page_of_results_reads_what_is_saved(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_processes")
 def test_figures_are_printed_and_saved(tmp_path, capsys):
     main(Settings(["taa"], ["48x32"], 2, tmp_path / "frames.json"))
     (result,) = read_results(tmp_path)
