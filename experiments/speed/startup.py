@@ -8,7 +8,6 @@ process of its own, and programs are kept by one before. Medians of the runs, in
 """
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -24,7 +23,6 @@ from experiments.speed.frames import parsed
 from experiments.speed.works import files
 from jaxdn.commands.errors import plain_errors
 from jaxdn.runtime.atomic_files import write_json
-from jaxdn.runtime.program_cache import VARIABLE
 
 LEAST = 0.005
 """Processor seconds from which on a stage has a row."""
@@ -34,7 +32,7 @@ LEAST = 0.005
 class Settings:
     """Profile the first frame of a method, with programs kept."""
 
-    methods: list[str] = field(default_factory=lambda: ["oidn", "steady-balanced"])
+    methods: list[str] = field(default_factory=lambda: ["oidn", "steady-balanced", "combiner-high"])
     size: str = "1280x720"
     """WIDTHxHEIGHT of the frame."""
     runs: int = 5
@@ -47,7 +45,7 @@ def profile(method: str, source: Path, place: Path) -> dict[str, float]:
     arguments = ["denoise", str(source), "-o", str(place / "out"), "--method", method]
     done = subprocess.run(
         [sys.executable, "-m", "experiments.speed.sampler", str(out), *arguments],
-        env=os.environ | {VARIABLE: str(place / "programs")},
+        env=files.environment(place / "programs"),
         capture_output=True,
         text=True,
         check=False,

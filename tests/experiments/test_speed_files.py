@@ -13,6 +13,7 @@ from experiments.speed.works import files
 from jaxdn.data.exr.exr import read_exr
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.read import read_clip
+from jaxdn.runtime.program_cache import VARIABLE
 from tests.needs import require
 
 unix = pytest.mark.skipif(sys.platform == "win32", reason="what a child process took is only known on Unix")
@@ -41,6 +42,17 @@ def test_open_image_denoise_goes_from_file_to_file(tmp_path: Path) -> None:
         images.append(after["ViewLayer.Combined.R"])
     assert (images[0] != images[1]).any()
     assert not any(ExrFile(path).path.name.startswith(".") for path in (tmp_path / "out").iterdir())
+
+
+def test_commands_keep_what_users_runs_keep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without bytecode each run compiles the modules of jax and NumPy from their source: a second of a first frame."""
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "elsewhere")
+    monkeypatch.setenv("HOME_OF_THE_TEST", "stays")
+    given = files.environment(tmp_path)
+    assert not {"PYTHONDONTWRITEBYTECODE", "JAX_COMPILATION_CACHE_DIR"} & given.keys()
+    assert given["HOME_OF_THE_TEST"] == "stays"
+    assert given[VARIABLE] == str(tmp_path)
 
 
 def runs(*walls: float, peak: float = 100.0) -> list[files.Run]:

@@ -23,9 +23,13 @@ from jaxdn.runtime.program_cache import VARIABLE
 
 HEIGHT, WIDTH, FRAMES = 720, 1280, 9
 PEER = "oidn-files"
-METHODS = ("oidn", "svgf", "steady-balanced")
-_OWN_CACHE = ("JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
-"""Variables of the benchmark's other groups, with which the command keeps nothing of its own."""
+METHODS = ("oidn", "svgf", "steady-balanced", "combiner-high")
+_KEEPING_NOTHING = (
+    "JAX_COMPILATION_CACHE_DIR",
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
+    "PYTHONDONTWRITEBYTECODE",
+)
+"""Variables with which the command keeps less than users' runs do: programs, or the bytecode of imported modules."""
 
 
 class Run(NamedTuple):
@@ -66,12 +70,18 @@ def command(method: str, source: Path, out: Path) -> list[str]:
     return [sys.executable, "-m", "jaxdn.commands.main", "denoise", str(source), "-o", str(out), "--method", method]
 
 
+def environment(programs: Path) -> dict[str, str]:
+    """Of a command as users run it, with a folder for compiled programs."""
+    return {name: value for name, value in os.environ.items() if name not in _KEEPING_NOTHING} | {
+        VARIABLE: str(programs)
+    }
+
+
 def run_apart(arguments: Sequence[str], programs: Path) -> Run:
     """Run a command with a folder for compiled programs. Raises RuntimeError, with its last words, where it fails."""
-    environment = {name: value for name, value in os.environ.items() if name not in _OWN_CACHE}
     done = subprocess.run(
         [sys.executable, "-c", _LAUNCHER, *arguments],
-        env=environment | {VARIABLE: str(programs)},
+        env=environment(programs),
         capture_output=True,
         text=True,
         check=False,
