@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 
-from tests.compiling import FLAGS, compiled, count_programs, join_flags
+from tests.compiling import FLAGS, compiled, count_programs, join_flags, share_contexts
 from tests.needs import NEEDS, WITH_BPY, require
 
 hypothesis.settings.register_profile(
@@ -43,6 +43,7 @@ def pytest_configure(config: pytest.Config) -> None:
     # seventh of the time of tracing and lowering.
     gc.set_threshold(200_000, 20, 100)
     count_programs()
+    share_contexts()
     _compile_quickly()
 
 

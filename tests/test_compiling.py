@@ -3,12 +3,14 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import numpy as np
 import pytest
+from jax._src.interpreters import mlir
 
-from tests.compiling import FLAGS, compiled, join_flags
+from tests.compiling import CONTEXT_USES, FLAGS, compiled, join_flags
 
 
 @pytest.mark.parametrize(
@@ -46,3 +48,17 @@ def test_compiled_programs_are_counted():
     program.clear_cache()  # its own: what other tests have compiled stays
     program(image)
     assert len(compiled) == before + 2, "forgotten, and compiled anew"
+
+
+def test_several_programs_are_lowered_in_one_context():
+    """Ours before jax 0.12, and jax's own from then on; each thread has its own."""
+    contexts = [mlir.make_ir_context() for _ in range(2 * CONTEXT_USES)]
+    assert len({id(context) for context in contexts}) in (2, 3)
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(mlir.make_ir_context).result() not in contexts
+
+
+def test_a_program_is_the_same_wherever_in_a_context_it_is_lowered():
+    image = np.ones(5, np.float32)
+    texts = {jax.jit(lambda x: 3 * x + 2).lower(image).as_text() for _ in range(2 * CONTEXT_USES)}
+    assert len(texts) == 1
