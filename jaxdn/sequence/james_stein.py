@@ -82,6 +82,11 @@ BLOCK = 8
 """Side of the blocks that may be without noise, in pixels."""
 CLEAN = (0.01, 0.02)
 """Noise, as a share of the light, up to which a block has none, and from which it has some."""
+LAMP = 5.0
+"""Light of a block, relative to the median, above which it may be a lamp in view, which has no noise whatever is beside
+it: what is white has 5 times the light of middle grey."""
+NONE = (0.001, 0.002)
+"""The same of light that is not drawn by samples at all; after 4,096 of them, light has more noise."""
 LITTLE = (0.2, 0.3)
 """Noise, as a share of the light, up to which that of the quietest block counts, and from which it does not."""
 QUIET = 2
@@ -175,11 +180,12 @@ def combine(
     curved = second_differences(change)
     bands = _split(change)
     energies = [_energy(band, radius) for band, radius in zip(bands, RADII, strict=True)]
-    variance = _measure_noise([energy for energy, _ in energies[:3]], curved, light, known)
+    sampled = _sampled(light, level, known)
+    variance = _measure_noise([energy for energy, _ in energies[:3]], curved, light, sampled)
     weights = _weigh(energies, mean_square(_split(whole)[-1] - bands[-1]), variance)
     kept = sum(weight * band for weight, band in zip(weights, bands, strict=True))
     own = sum(weight * center for weight, center in zip(weights, _CENTERS, strict=True))
-    clean = _clean(curved, known)
+    clean = _enlarge_clean(curved, sampled)
     own, kept = own + clean * (1 - own), kept + clean * (change - kept)
     # A firefly among quiet blocks is noise none the less.
     own, kept, clean = (jnp.where(usable & (common > 0), part, 0.0) for part in (own, kept, clean))
@@ -262,30 +268,30 @@ def _energy(band: jax.Array, radius: int) -> tuple[jax.Array, jax.Array]:
     return energy, fourth
 
 
-def _measure_noise(
-    energies: list[jax.Array], curved: jax.Array, light: jax.Array, surface: jax.Array | None
-) -> jax.Array:
+def _measure_noise(energies: list[jax.Array], curved: jax.Array, light: jax.Array, sampled: jax.Array) -> jax.Array:
     """V of each pixel, [1, H, W], by the energies of the three finest bands and the second differences."""
     finest, next_one, third = energies
     by_scale = jnp.maximum(finest - SLOPE * next_one, 0.0) / (GAINS[0] - SLOPE * GAINS[1])
     by_direction = _DIRECTION_BIAS * _least(window_means(curved, RADII[0]))
     variance = jnp.clip(by_scale, _LEAST * by_direction, by_direction)
-    quiet, some = _quietest(curved, light, surface), jnp.maximum(by_direction, _TINY)
+    quiet, some = _quietest(curved, light, sampled), jnp.maximum(by_direction, _TINY)
     blurred = 1 - _falling(third / (GAINS[2] * some), *BLURRED)
     texture = jnp.maximum(blurred, _falling(quiet / some, *QUIETER)) * _falling(jnp.sqrt(by_direction), *LITTLE)
     return variance + texture * (jnp.minimum(variance, quiet) - variance)
 
 
-def _quietest(curved: jax.Array, light: jax.Array, surface: jax.Array | None) -> jax.Array:
-    """The least noise that blocks of surfaces near each pixel [1, H, W] allow, without bias; interpolated between them.
+def _quietest(curved: jax.Array, light: jax.Array, sampled: jax.Array) -> jax.Array:
+    """The least noise that blocks near each pixel [1, H, W] allow, without bias; interpolated between them.
 
-    A sky has no noise, and says nothing of what is beside it. The result is very large where there is no such block. A
-    brighter block says how much noise there is in light, not in its share: where a sun adds light without noise, that
-    share is smaller.
+    Blocks count that are ``sampled`` altogether (:func:`_sampled`). Few without any noise, among others that have some,
+    may be a screen in view, and say nothing of what is beside it: they and those that they touch, whose pixels may be
+    theirs in part, count as if they had much. The result is very large where no block counts. A brighter block says how
+    much noise there is in light, not in its share: where a sun adds light without noise, that share is smaller.
     """
     blocks, bright = _least(_mean_blocks(curved)), _mean_blocks(light)
-    if surface is not None:
-        blocks = jnp.where(_mean_blocks(surface.astype(curved.dtype)) == 1, blocks, _NO_BLOCK)
+    few = _falling(jnp.sqrt(blocks), *NONE) * _falling(_share_of_quiet(blocks, sampled), *MANY)
+    touched = jax.lax.reduce_window(few, 0.0, jax.lax.max, (1, 3, 3), (1, 1, 1), "SAME")
+    blocks = jnp.where(sampled == 1, blocks + touched * LITTLE[1] ** 2, _NO_BLOCK)
     rows, columns = blocks.shape[1:]
     widths = ((0, 0), (QUIET, QUIET), (QUIET, QUIET))
     around = [jnp.pad(image, widths, constant_values=value) for image, value in ((blocks, _NO_BLOCK), (bright, 0.0))]
@@ -314,17 +320,26 @@ def _weigh(energies: list[tuple[jax.Array, jax.Array]], cut: jax.Array, variance
     return weights
 
 
-def _clean(curved: jax.Array, surface: jax.Array | None) -> jax.Array:
-    """How far pixels are among blocks without noise, [1, H, W] in [0, 1]: by their share of the blocks with surfaces.
+def _sampled(light: jax.Array, level: jax.Array | float, surface: jax.Array | None) -> jax.Array:
+    """[1, h, w] the share of each block that may have noise: none of a sky, nor of what may be a lamp in view."""
+    blocks = _mean_blocks(light)
+    known = jnp.ones_like(blocks) if surface is None else _mean_blocks(surface.astype(light.dtype))
+    return jnp.where(blocks > LAMP * jnp.asarray(level), 0.0, known)
 
-    Between blocks it is interpolated, before it is decided.
-    """
-    quiet = _falling(jnp.sqrt(_least(_mean_blocks(curved))), *CLEAN)
-    known = jnp.ones_like(quiet)
-    if surface is not None:
-        known = (_mean_blocks(surface.astype(curved.dtype)) > 0.5).astype(curved.dtype)
+
+def _share_of_quiet(blocks: jax.Array, sampled: jax.Array) -> jax.Array:
+    """[1, h, w] the share of blocks without noise, of those around that may have some."""
+    known = (sampled > 0.5).astype(blocks.dtype)
     number = window_means(known, AROUND)
-    share = window_means(quiet * known, AROUND) / jnp.where(number > 0, number, 1.0)
+    return window_means(_falling(jnp.sqrt(blocks), *CLEAN) * known, AROUND) / jnp.where(number > 0, number, 1.0)
+
+
+def _enlarge_clean(curved: jax.Array, sampled: jax.Array) -> jax.Array:
+    """How far pixels are among blocks without noise, [1, H, W] in [0, 1].
+
+    The share of such blocks is interpolated between blocks, before it is decided.
+    """
+    share = _share_of_quiet(_least(_mean_blocks(curved)), sampled)
     return 1 - _falling(_enlarge(share, curved.shape[1:]), *MANY)
 
 

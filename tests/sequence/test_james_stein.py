@@ -15,10 +15,12 @@ from jaxdn.sequence.james_stein import (
     CLEAN,
     DOUBT,
     GAINS,
+    LAMP,
     LITTLE,
     MANY,
     MOST_DOUBT,
     MUCH,
+    NONE,
     QUIET,
     QUIETER,
     RADII,
@@ -88,7 +90,8 @@ def reference(noisy, denoised):
     """Image, share of the noisy pixel and noise, in float64."""
     noisy, denoised = np.asarray(noisy, np.float64), np.asarray(denoised, np.float64)
     light = denoised.mean(axis=-1, keepdims=True)
-    light = light + 0.05 * np.median(light)
+    level = np.median(light)
+    light = light + 0.05 * level
     change = (noisy - denoised) / light
     height, width = change.shape[:2]
     size = np.pad(np.abs(change).mean(axis=-1), 1, mode="edge")
@@ -115,9 +118,16 @@ def reference(noisy, denoised):
         [c.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK).mean(axis=(1, 3)) for c in curved], axis=0
     )
     bright = light[..., 0].reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK).mean(axis=(1, 3))
+    sampled = bright <= LAMP * level
+    number = window(sampled.astype(float), AROUND)
+    quiet = falling(np.sqrt(blocks), *CLEAN)
+    share = window(quiet * sampled, AROUND) / np.where(number > 0, number, 1)
+    few = np.pad(falling(np.sqrt(blocks), *NONE) * falling(share, *MANY), 1)
+    touched = [[few[y : y + 3, x : x + 3].max() for x in range(width // BLOCK)] for y in range(height // BLOCK)]
+    counted = np.where(sampled, blocks + np.array(touched) * LITTLE[1] ** 2, 1e9)
     around = [
         [
-            (near(blocks, y, x) * np.maximum(near(bright, y, x) / bright[y, x], 1) ** 2).min()
+            (near(counted, y, x) * np.maximum(near(bright, y, x) / bright[y, x], 1) ** 2).min()
             for x in range(width // BLOCK)
         ]
         for y in range(height // BLOCK)
@@ -138,7 +148,6 @@ def reference(noisy, denoised):
         if band is bands[-1]:
             weights[-1] *= falling(np.sqrt(variance), *MUCH)
         kept = kept + weights[-1][..., None] * band
-    share = window(falling(np.sqrt(blocks), *CLEAN), AROUND)
     share = np.asarray(jax.image.resize(share, (height, width), "linear"))
     clean = 1 - falling(share, *MANY)
     # of the pixel itself, each band has the square of what a line of it has
@@ -161,6 +170,7 @@ def test_the_mixture_is_that_of_numpy(rng, deviation):
     truth, blurred = (image[:32, :40] for image in box(32, 40))
     noisy = (truth * rng.gamma(deviation**-2, deviation**2, truth.shape)).astype(np.float32)
     noisy[5, 7] = 9.0
+    truth[8:16, 16:32] = blurred[8:16, 16:32] = noisy[8:16, 16:32] = 6.0  # a lamp
     image, share, noise = reference(noisy, blurred)
     found = mixed(noisy, blurred)
     np.testing.assert_allclose(found.noise[..., 0], noise, rtol=1e-3, atol=1e-5)
@@ -202,6 +212,16 @@ def test_texture_of_single_pixels_comes_back_where_blocks_without_noise_are_near
     textured = np.arange(truth.shape[1])[None, :, None] < 64
     sky = np.broadcast_to(textured, truth[..., :1].shape)
     assert mse(mixed(truth, wall, surface=sky).image[:, :64], truth[:, :64]) > 0.5 * mse(wall[:, :64], truth[:, :64])
+
+
+@pytest.mark.parametrize(("light", "width"), [(3.0, 24), (3.0, 64), (0.4, 16)])
+def test_what_shines_in_view_brings_no_noise_back(rng, light, width):
+    """A lamp, large or small, and a small screen: neither has noise, and that says nothing of the wall beside it."""
+    truth = np.full((96, 160, 3), 0.5, np.float32)
+    truth[24:72, 40 : 40 + width] = light
+    lit = truth[..., :1] == light
+    noisy = np.where(lit, truth, truth * (1 + 0.2 * rng.standard_normal((96, 160, 1)))).astype(np.float32)
+    assert mse(mixed(noisy, truth).image, truth) < 0.02 * mse(noisy, truth)
 
 
 @pytest.mark.parametrize("sun", [1.0, 4.0])
