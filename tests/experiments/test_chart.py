@@ -226,6 +226,7 @@ def test_stacked_times_go_from_the_scene_to_the_file(data):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="what a child process took is only known on Unix")
+@pytest.mark.usefixtures("plain_processes")
 def test_stages_are_those_of_real_files():
     taken = measure_stages("taa", (32, 48), frames=3)
     assert all(ms > 0 for ms in taken)
