@@ -119,6 +119,20 @@ def test_what_is_bright_beside_a_lamp_stays(rng: np.random.Generator) -> None:
     assert restore_light(between, light, 0, lamps)[-6, -3, 0] == 2.0
 
 
+def test_the_pixels_beside_a_lamp_do_not_show_their_own_noise(rng: np.random.Generator) -> None:
+    """A denoiser that gave them a tenth too much: what is taken back does not differ by what each pixel drew."""
+    wall = np.full((48, 64, 3), 0.5, np.float32)
+    wall[12:36, 20:40] = 9.0
+    wall[11:37, [19, 40]] = wall[[11, 36], 19:41] = 0.6
+    ring = wall[..., 0] == np.float32(0.6)
+    noisy = np.where(wall == 9.0, wall, wall * rng.gamma(16, 1 / 16, (48, 64, 1))).astype(np.float32)
+    lamps = find_lamps(noisy, 0)
+    np.testing.assert_array_equal(lamps[..., 0], wall[..., 0] == 9.0)
+    image = restore_light(np.where(ring[..., None], 1.1 * wall, wall), noisy, 0, lamps)[ring][:, 0]
+    assert image.std() < 0.25 * noisy[ring][:, 0].std()
+    assert abs(image.mean() - 0.6) < 0.1
+
+
 def test_a_bright_floor_with_little_noise_is_no_lamp(tmp_path: Path, rng: np.random.Generator) -> None:
     """Where half of a frame is a dim sky, a lit floor is as far above the median as a lamp is elsewhere."""
     (tmp_path / "in").mkdir()
