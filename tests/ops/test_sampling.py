@@ -7,8 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.ops.sampling import draw_random_numbers, from_layers, rotate_pattern, round_stochastically, sample_map
+from jaxdn.ops import sampling
+from jaxdn.ops.sampling import draw_random_numbers, rotate_pattern, round_stochastically
 
+# One program each, and not one for each of their operations.
+from_layers = jax.jit(sampling.from_layers)
+sample_map = jax.jit(sampling.sample_map, static_argnames=("budget", "least", "most", "rounding"))
 SIZE = (4, 5)
 
 
@@ -34,10 +38,10 @@ def single(layers):
 
 @pytest.mark.parametrize("bits", [1, 2, 4])
 def test_every_number_of_samples_is_the_sum_over_its_bits(bits, rng):
-    layers, image_of = drawn(rng, bits), jax.jit(from_layers)
+    layers = drawn(rng, bits)
     for count in range(2**bits):
         counts = np.full((*SIZE, 1), count, np.float32)
-        image, taken = image_of(single(layers), counts)
+        image, taken = from_layers(single(layers), counts)
         np.testing.assert_allclose(image, numpy_from_layers(layers, counts), rtol=1e-6)
         np.testing.assert_array_equal(taken, counts)
 
@@ -55,7 +59,7 @@ def test_layers_in_half_precision_are_added_in_single(rng):
     """They are light as a file has it; their sum over samples is not rounded again."""
     layers = {samples: jnp.asarray(layer, jnp.bfloat16) for samples, layer in drawn(rng, 4).items()}
     counts = rng.integers(0, 16, (*SIZE, 1)).astype(np.float32)
-    image, taken = jax.jit(from_layers)(layers, counts)
+    image, taken = from_layers(layers, counts)
     assert taken.dtype == image.dtype == jnp.float32
     np.testing.assert_allclose(image, numpy_from_layers(layers, counts), rtol=1e-6)
     np.testing.assert_array_equal(taken, counts)
@@ -70,7 +74,7 @@ def test_layers_in_half_precision_are_added_in_single(rng):
 )
 def test_counts_are_rounded_and_clamped_to_the_available_samples(asked, had, rng):
     layers = drawn(rng, 3)
-    image, taken = from_layers(single(layers), jnp.full((*SIZE, 1), asked, jnp.float32))
+    image, taken = from_layers(single(layers), np.full((*SIZE, 1), asked, np.float32))
     np.testing.assert_array_equal(taken, had)
     np.testing.assert_allclose(image, numpy_from_layers(layers, np.full((*SIZE, 1), had)), rtol=1e-6)
 
@@ -81,7 +85,7 @@ def test_no_sample_is_black_and_an_unused_layer_may_be_anything(rng):
     counts = jnp.zeros((*SIZE, 1)).at[1, 1].set(1.0)
     image, _ = from_layers(layers, counts)
     np.testing.assert_array_equal(image, jnp.zeros((*SIZE, 3)).at[1, 1].set(layers[1][1, 1]))
-    slopes = jax.grad(lambda layers: jnp.sum(from_layers(layers, counts)[0]))(layers)
+    slopes = jax.jit(jax.grad(lambda layers: jnp.sum(from_layers(layers, counts)[0])))(layers)
     assert all(np.isfinite(slope).all() for slope in slopes.values())
 
 
@@ -94,8 +98,8 @@ def test_layers_with_a_gap_raise(numbers):
 
 def test_the_order_of_the_layers_does_not_matter(rng):
     layers, counts = single(drawn(rng, 3)), jnp.asarray(rng.integers(0, 8, (*SIZE, 1)), jnp.float32)
-    backwards = dict(reversed(layers.items()))
-    np.testing.assert_array_equal(from_layers(backwards, counts)[0], from_layers(layers, counts)[0])
+    backwards = dict(reversed(layers.items()))  # which jit would sort
+    np.testing.assert_array_equal(sampling.from_layers(backwards, counts)[0], sampling.from_layers(layers, counts)[0])
 
 
 def test_no_gradient_flows_into_the_counts_and_into_layers_their_share(rng):
@@ -105,7 +109,7 @@ def test_no_gradient_flows_into_the_counts_and_into_layers_their_share(rng):
         image, taken = from_layers(layers, counts)
         return jnp.sum(image) + jnp.sum(taken)
 
-    by_layer, by_count = jax.grad(total, (0, 1))(layers, counts)
+    by_layer, by_count = jax.jit(jax.grad(total, (0, 1)))(layers, counts)
     np.testing.assert_array_equal(by_count, 0)
     whole = np.asarray(counts).astype(int)
     for samples, slope in by_layer.items():
@@ -147,7 +151,7 @@ def test_a_further_sample_moves_the_image_towards_the_reference(rng):
     def total(counts, reference):
         return jnp.sum(weights * from_layers(layers, counts, reference=reference)[0])
 
-    by_count, by_reference = jax.grad(total, (0, 1))(counts, reference)
+    by_count, by_reference = jax.jit(jax.grad(total, (0, 1)))(counts, reference)
     image = numpy_from_layers(layers, counts)
     image_filled = np.where(counts > 0, image, filled_by_blocks(image, np.asarray(counts) > 0))
     wanted = (weights * (reference - image_filled)).sum(-1, keepdims=True) / np.maximum(counts, 1)
@@ -159,7 +163,8 @@ def test_a_further_sample_moves_the_image_towards_the_reference(rng):
 def test_no_samples_have_a_slope_where_the_reference_is_lit_and_none_where_it_is_black():
     layers = {1: jnp.zeros((2, 2, 3))}
     reference = jnp.zeros((2, 2, 3)).at[0].set(2.0)
-    slope = jax.grad(lambda counts: jnp.sum(from_layers(layers, counts, reference=reference)[0]))(jnp.zeros((2, 2, 1)))
+    slope = jax.jit(jax.grad(lambda counts: jnp.sum(from_layers(layers, counts, reference=reference)[0])))
+    slope = slope(jnp.zeros((2, 2, 1)))
     np.testing.assert_allclose(slope[..., 0], [[6.0, 6.0], [0.0, 0.0]])
 
 
@@ -177,7 +182,7 @@ def test_stochastic_rounding_has_the_wanted_mean_and_leaves_whole_numbers(rng):
     wanted[0, 0], wanted[0, 1], wanted[0, 2] = 2.0, 2.99999, 0.0
     frames = 4096
     drawn = jax.vmap(lambda frame: round_stochastically(jnp.asarray(wanted), draw_random_numbers(6, 7, frame)))
-    counts = np.asarray(drawn(jnp.arange(frames)))
+    counts = np.asarray(jax.jit(drawn)(jnp.arange(frames)))
     assert set(np.unique(counts - np.floor(wanted))) == {0.0, 1.0}
     np.testing.assert_allclose(counts.mean(0), wanted, atol=2e-3)  # from frame to frame they are evenly spread
     assert (counts[:, 0, 0] == 2).all()
@@ -201,11 +206,9 @@ def test_random_numbers_are_even_and_independent_between_pixels():
 def test_a_rotating_pattern_comes_to_every_pixel_once(bits):
     """Of 2^-bits samples a pixel: one in every run of 2^bits frames, and equally many pixels in each frame."""
     period = 2**bits
-    taken = np.asarray(
-        jax.vmap(lambda frame: round_stochastically(jnp.full((8, 12, 1), 1 / period), rotate_pattern(8, 12, frame)))(
-            jnp.arange(3 * period)
-        )
-    )
+    wanted = np.full((8, 12, 1), 1 / period, np.float32)
+    take = jax.jit(jax.vmap(lambda frame: round_stochastically(wanted, rotate_pattern(8, 12, frame))))
+    taken = np.asarray(take(np.arange(3 * period)))
     np.testing.assert_array_equal(taken.reshape(3, period, 8, 12).sum(1), 1)
     np.testing.assert_array_equal(taken.sum((1, 2, 3)), 96 / period)
 
@@ -231,7 +234,7 @@ def test_the_map_with_fractions_keeps_a_budget_below_one_sample(rng):
         assert np.any(wanted % 1 > 0.01)
         frames = jnp.arange(256)
         counts = jax.vmap(lambda frame, wanted=wanted: round_stochastically(wanted, draw_random_numbers(16, 24, frame)))
-        np.testing.assert_allclose(np.mean(counts(frames)), budget, rtol=0.01)
+        np.testing.assert_allclose(np.mean(jax.jit(counts)(frames)), budget, rtol=0.01)
 
 
 def loss_of_image(image, target):
@@ -251,6 +254,10 @@ def test_the_gradient_of_rounded_samples_is_that_of_the_mean_loss(rng):
     def loss(counts, uniform):
         return loss_of_image(from_layers(layers, counts, reference=target, uniform=uniform)[0], target)
 
+    @jax.jit
+    def loss_of_whole(counts):
+        return loss_of_image(from_layers(layers, counts)[0], target)
+
     def mean_loss(counts):
         """Over the sixteen combinations, each with its probability."""
         total = 0.0
@@ -260,7 +267,7 @@ def test_the_gradient_of_rounded_samples_is_that_of_the_mean_loss(rng):
                 share = float(counts[place][0]) % 1
                 whole[place] = np.floor(counts[place]) + up
                 probability *= share if up else 1 - share
-            total += probability * float(loss_of_image(from_layers(layers, jnp.asarray(whole))[0], target))
+            total += probability * float(loss_of_whole(whole))
         return total
 
     numbers = jnp.asarray(np.random.default_rng(1).random((20000, *SIZE, 1)), jnp.float32)
@@ -289,14 +296,14 @@ def test_the_gradient_below_one_sample_compares_a_sample_with_what_fills_the_pix
             given = {"reference": layers[1], "uniform": jnp.full((4, 4, 1), uniform)}
             return jnp.sum(weights * from_layers(layers, counts, **given)[0])
 
-        found.append(2 * probability * jax.grad(total)(counts)[1, 2, 0])
+        found.append(2 * probability * jax.jit(jax.grad(total))(counts)[1, 2, 0])
     expected = np.sum(np.asarray(weights)[1, 2] * (np.asarray(layers[1])[1, 2] - filled))
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_even_logits_give_every_pixel_the_budget():
     for value in (0.0, -50.0, 1e30):
-        np.testing.assert_array_equal(sample_map(jnp.full((7, 9, 1), value), 4, most=63), 4)
+        np.testing.assert_array_equal(sample_map(np.full((7, 9, 1), value, np.float32), 4, most=63), 4)
 
 
 @hypothesis.given(
@@ -305,7 +312,8 @@ def test_even_logits_give_every_pixel_the_budget():
 def test_the_budget_is_kept_exactly(seed, budget, spread, least):
     budget = max(budget, least)
     logits = spread * np.random.default_rng(seed).normal(size=(11, 13, 1)).astype(np.float32)
-    counts = np.asarray(jax.jit(lambda logits: sample_map(logits, budget, least=least, most=7))(logits))
+    # Operation by operation: each of them is compiled once, and the whole would be anew for every budget.
+    counts = np.asarray(sampling.sample_map(jnp.asarray(logits), budget, least=least, most=7))
     assert counts.sum() == round(143 * budget)
     assert counts.min() >= least
     assert counts.max() <= 7
@@ -347,12 +355,13 @@ def test_one_huge_logit_takes_what_a_pixel_can_have_and_a_nan_counts_as_zero():
 def test_the_gradient_is_that_of_the_softmax_and_sums_to_zero(rng):
     with jax.enable_x64(True):
         logits, weights = (jnp.asarray(rng.normal(size=(4, 5, 1))) for _ in range(2))
-        slope = jax.grad(lambda logits: jnp.sum(weights * sample_map(logits, 4, most=63)))(logits)
+        slope = jax.jit(jax.grad(lambda logits: jnp.sum(weights * sample_map(logits, 4, most=63))))(logits)
         smooth = jax.grad(lambda logits: jnp.sum(weights * 80 * jax.nn.softmax(logits.ravel()).reshape(4, 5, 1)))
+        smooth = jax.jit(smooth)
         np.testing.assert_allclose(slope, smooth(logits), rtol=1e-6)
         assert abs(float(jnp.sum(slope))) < 1e-9
         clamped = logits.at[0, 0].set(10.0)
-        steep = jax.grad(lambda logits: sample_map(logits, 4, most=20)[0, 0, 0])(clamped)
+        steep = jax.jit(jax.grad(lambda logits: sample_map(logits, 4, most=20)[0, 0, 0]))(clamped)
         np.testing.assert_array_equal(steep, 0)
 
 

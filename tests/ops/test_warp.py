@@ -7,13 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxdn.ops.motion import on_screen
-from jaxdn.ops.warp import warp
+import jaxdn.ops.motion
+import jaxdn.ops.warp
 from tests.gradients import check_gradients
+
+# One program each, and not one for each of their operations.
+on_screen = jax.jit(jaxdn.ops.motion.on_screen)
+warp = jax.jit(jaxdn.ops.warp.warp, static_argnames=("border", "implementation"))
 
 
 def _constant_motion(height, width, x, y):
-    return jnp.broadcast_to(jnp.array([x, y], jnp.float32), (height, width, 2))
+    return np.broadcast_to(np.float32([x, y]), (height, width, 2))
 
 
 @given(x=st.integers(-9, 9), y=st.integers(-7, 7), border=st.sampled_from(["clamp", "zeros"]))
@@ -37,7 +41,7 @@ def test_half_a_pixel_on_a_ramp():
 @given(seed=st.integers(0, 2**16), size=st.sampled_from([(6, 8), (1, 1), (1, 9), (9, 1)]))
 def test_a_constant_image_is_unchanged(seed, size):
     motion = np.random.default_rng(seed).uniform(-20, 20, (*size, 2)).astype(np.float32)
-    np.testing.assert_allclose(warp(jnp.full((*size, 3), 0.7), motion), 0.7, rtol=1e-6)
+    np.testing.assert_allclose(warp(np.full((*size, 3), 0.7, np.float32), motion), 0.7, rtol=1e-6)
 
 
 def test_no_motion_returns_the_image_itself(rng):
@@ -52,7 +56,7 @@ def test_vectors_that_are_not_finite_fetch_nothing(border):
     motion[0, 0, 0], motion[1, 1, 1], motion[2, 2] = np.nan, np.inf, -np.inf
     motion[2, 3] = 1e30
     image = jnp.ones((3, 4, 2))
-    out, gradient = jax.value_and_grad(lambda image: jnp.sum(warp(image, motion, border=border)))(image)
+    out, gradient = jax.jit(jax.value_and_grad(lambda image: jnp.sum(warp(image, motion, border=border))))(image)
     fetched = 12 - 3 - (border == "zeros")
     assert out == 2 * fetched
     assert jnp.sum(gradient) == 2 * fetched
@@ -65,7 +69,9 @@ def test_gradients(border, rng):
     image, motion = jnp.asarray(rng.random((4, 5, 2))), jnp.asarray(rng.uniform(-2, 2, (4, 5, 2)))
     check_gradients(lambda image: jnp.sin(warp(image, motion, border=border)), (image,))
     for implementation in ("reference", "pairs"):
-        by_motion = jax.grad(lambda m, i=implementation: jnp.sum(warp(image, m, border=border, implementation=i) ** 2))
+        by_motion = jax.jit(
+            jax.grad(lambda m, i=implementation: jnp.sum(warp(image, m, border=border, implementation=i) ** 2))
+        )
         np.testing.assert_array_equal(by_motion(motion), 0.0)
 
 
