@@ -197,7 +197,8 @@ def test_what_cannot_be_tiled_is_refused() -> None:
 def test_sums_of_tiles_are_those_of_the_frame() -> None:
     frame = frames(1, 4 * GRID, height=2 * GRID)[0]
     tiles = [jax.tree.map(lambda x, c=c: x[:, c : c + GRID], frame) for c in range(0, 4 * GRID, GRID)]
-    sums = [measure_frame(jnp.asarray(one.radiance), jnp.asarray(one.depth), one) for one in (frame, *tiles)]
+    measure = jax.jit(lambda one: measure_frame(one.radiance, one.depth, one))
+    sums = jax.device_get([measure(one) for one in (frame, *tiles)])
     total: FrameStatistics = jax.tree.map(lambda *each: sum(each), *sums[1:])
     whole = sums[0]
     for name in ("exposure", "mean_depth", "mean_inverse_depth", "reflectance_differs"):

@@ -73,8 +73,14 @@ def compiled(denoiser):
     return jax.jit(denoiser.step)
 
 
+@functools.cache
+def starting(denoiser):
+    """Its first state: one program, not one for each plane."""
+    return jax.jit(denoiser.start)
+
+
 def run(denoiser, frames):
-    step, state, images = compiled(denoiser), denoiser.start({}, frames[0]), []
+    step, state, images = compiled(denoiser), starting(denoiser)({}, frames[0]), []
     for frame in frames:
         state, image = step({}, state, frame)
         images.append(np.asarray(image))

@@ -40,7 +40,7 @@ def clip_of(rng: np.random.Generator, count: int = 3, size: tuple[int, int] = SI
         "motion": rng.normal(size=(*shape, 2)),
     }
     clip = Clip(Frame(**buffers), reference, layers)
-    return jax.tree.map(lambda values: jnp.maximum(jnp.asarray(values, jnp.float32), -9.0), clip)
+    return jax.tree.map(lambda values: jnp.asarray(np.maximum(values, -9.0), jnp.float32), clip)
 
 
 def varied(denoiser: Denoiser, clip: Clip, key: jax.Array) -> Any:

@@ -1,5 +1,7 @@
 """A-SVGF: its gradients against float64 loops, and what they are for: light that changes is seen at once."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +18,10 @@ from tests.methods.test_svgf import LUMINANCE, moving_frames, reference_average,
 
 HEIGHT, WIDTH = 48, 63
 STRATA = (16, 21)
+# One program each, and not one for each of their operations.
+stratum_sums, stratum_centers = jax.jit(gradients.stratum_sums), jax.jit(gradients.stratum_centers)
+compare_replayed = jax.jit(gradients.compare_replayed)
+blend = jax.jit(accumulate, static_argnames=("alpha", "alpha_moments", "history_max"))
 
 
 def by_strata(plane, each=np.sum):
@@ -45,12 +51,12 @@ def sparse_gradient(rng, shape, *, old=None, new=None):
 @pytest.mark.parametrize("shape", [(10, 13), (3, 3), (1, 1), (2, 9)])
 def test_strata_match_a_loop(shape, rng):
     plane = rng.normal(size=shape)
-    np.testing.assert_allclose(gradients.stratum_sums(jnp.asarray(plane)), by_strata(plane), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(stratum_sums(jnp.asarray(plane)), by_strata(plane), rtol=1e-5, atol=1e-6)
     gradient = sparse_gradient(rng, shape)
-    change = gradients.compare_replayed(jnp.asarray(gradient))
+    change = compare_replayed(jnp.asarray(gradient))
     np.testing.assert_allclose(change.delta, by_strata(gradient[..., 0]), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(change.size, by_strata(gradient[..., 1]), rtol=1e-5, atol=1e-6)
-    centers = gradients.stratum_centers(jnp.asarray(plane)[..., None])[..., 0]
+    centers = stratum_centers(jnp.asarray(plane)[..., None])[..., 0]
     middle = by_strata(plane, lambda part: part[min(1, part.shape[0] - 1), min(1, part.shape[1] - 1)])
     np.testing.assert_allclose(centers, middle, rtol=1e-6)
 
@@ -60,7 +66,7 @@ def test_the_observed_change_matches_a_loop(rng):
     now, hit = rng.exponential(size=shape), rng.random(shape) < 0.8
     past = rng.exponential(size=(6, *shape))
     past[5] = rng.integers(0, 3, shape)
-    change = gradients.compare_with_history(jnp.asarray(now), jnp.asarray(past), jnp.asarray(hit))
+    change = jax.jit(gradients.compare_with_history)(jnp.asarray(now), jnp.asarray(past), jnp.asarray(hit))
     there = hit & (past[5] > 0)
     count = np.maximum(by_strata(there), 1)
     new, old = by_strata(now * there) / count, by_strata(past[3] * there) / count
@@ -76,15 +82,14 @@ def test_the_reconstruction_matches_a_loop(significance, rng, x64):
     delta = rng.uniform(-1, 1, depth.shape) * size
     delta[5:, 7:], size[5:, 7:] = 0.0, 0.0  # a corner where nothing was replayed
     hit = ids >= 0
-    weights = [depth_weight(jnp.asarray(frame.depth), jnp.asarray(frame.ids), sigma=1.0, height=len(frame.depth))]
-    weights.append(normal_weight(jnp.asarray(normal), sigma=128.0))
-    found = gradients.reconstruct(
-        gradients.Change(jnp.asarray(delta), jnp.asarray(size)),
-        jnp.asarray(hit),
-        weights,
-        levels=3,
-        significance=significance,
-    )
+
+    @jax.jit
+    def reconstruct(change, hit, frame):
+        weights = [depth_weight(frame.depth, frame.ids, sigma=1.0, height=len(frame.depth))]
+        weights.append(normal_weight(frame.normal, sigma=128.0))
+        return gradients.reconstruct(change, hit, weights, levels=3, significance=significance)
+
+    found = reconstruct(gradients.Change(delta, size), hit, frame)
 
     geometry = (hit, depth, reference_slopes(depth, ids), normal)
     fields, variance = np.stack([delta, size], -1), delta**2
@@ -115,14 +120,15 @@ def test_enlarging_matches_a_loop(rng):
         for dy, dx in np.ndindex(2, 2):
             weight = (down if dy else 1 - down) * (right if dx else 1 - right)
             expected[y, x] += weight * largest[top + dy, left + dx]
-    np.testing.assert_allclose(gradients.to_pixels(jnp.asarray(share), 11, 13), expected, rtol=1e-5)
+    found = jax.jit(gradients.to_pixels, static_argnums=(1, 2))(jnp.asarray(share), 11, 13)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_blending_by_the_share_that_changed_matches_the_formula(rng):
     past, now, change = rng.exponential(size=(6, 4, 5)), rng.exponential(size=(3, 4, 5)), rng.random((4, 5))
     past[5] = rng.integers(0, 9, (4, 5))
     change[0, :2] = 0.0, 1.0
-    found = accumulate(*map(jnp.asarray, (past, now)), alpha=0.2, alpha_moments=0.3, history_max=6, change=change)
+    found = blend(*map(jnp.asarray, (past, now)), alpha=0.2, alpha_moments=0.3, history_max=6, change=change)
     length = np.minimum(past[5] + 1, 6)
     light = np.einsum("chw,c->hw", now, LUMINANCE)
     for planes, least, values in ((slice(0, 3), 0.2, now), (slice(3, 5), 0.3, np.stack([light, light**2]))):
@@ -131,7 +137,7 @@ def test_blending_by_the_share_that_changed_matches_the_formula(rng):
     np.testing.assert_allclose(found[5], 1 / ((1 - change) / length + change), rtol=1e-5)
     # Without a change of light it is what svgf computes, bit for bit.
     plain = [
-        accumulate(*map(jnp.asarray, (past, now)), alpha=0.2, alpha_moments=0.3, history_max=6, change=none)
+        blend(*map(jnp.asarray, (past, now)), alpha=0.2, alpha_moments=0.3, history_max=6, change=none)
         for none in (None, jnp.zeros((4, 5)))
     ]
     np.testing.assert_array_equal(*plain)
@@ -161,9 +167,13 @@ def test_gradients_of_the_formulas(rng, x64):
 # The gradients' meaning.
 
 
-def whole_share(gradient, **options):
-    strata = gradients.compare_replayed(jnp.asarray(gradient))
-    return np.asarray(gradients.reconstruct(strata, None, [], **{"levels": 3, "significance": 2.0, **options}))
+def whole_share(gradient, *, levels=3, significance=2.0):
+    return np.asarray(compiled_share(np.float32(gradient), levels, significance))
+
+
+@partial(jax.jit, static_argnums=(1, 2))
+def compiled_share(gradient, levels, significance):
+    return gradients.reconstruct(compare_replayed(gradient), None, [], levels=levels, significance=significance)
 
 
 @pytest.mark.parametrize(("new", "expected"), [(1.0, 0.0), (2.0, 0.5), (0.5, 0.5), (0.0, 1.0)])
@@ -201,7 +211,7 @@ def test_nothing_replayed_is_nothing_known(rng):
 def run(denoiser, frames):
     """The states and images of a list of frames."""
     step = jax.jit(denoiser.step)
-    state, found = denoiser.start({}, frames[0]), []
+    state, found = jax.jit(denoiser.start)({}, frames[0]), []
     for frame in frames:
         state, image = step({}, state, frame)
         found.append((state, np.asarray(image)))

@@ -1,5 +1,7 @@
 """The combiner: means of the history by independent NumPy, candidates, the mixture, what it refuses to spread."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,10 +43,26 @@ def clip_of(rng, count=3, size=SIZE):
     )
 
 
+# Once each: what runs them is compiled anew for every denoiser.
+fast = functools.cache(functools.partial(combiner, quality="fast"))
+prior_alone = functools.cache(oidn)
+
+
+@functools.cache
+def untrained(seed=0):
+    """Parameters of the fast network."""
+    return jax.jit(fast().init)(jax.random.key(seed), Frame(jnp.zeros((16, 16, 3))))
+
+
+@functools.cache
+def compiled(denoiser):
+    """Its images of parameters and frames."""
+    return jax.jit(lambda params, frames: denoise(denoiser, params, Clip(frames, frames.radiance)))
+
+
 def deciding(weights_of_candidates, follow=0.0):
     """The parameters of a network that decides the same everywhere."""
-    frame = Frame(jnp.zeros((16, 16, 3)))
-    params = combiner(quality="fast").init(jax.random.key(0), frame)
+    params = untrained()
     logits = {**dict.fromkeys(CANDIDATES, -1e3), **weights_of_candidates}
     bias = np.array(params["head_0"]["bias"])
     bias[4 * FEATURES : 4 * (FEATURES + len(INITIAL))] = np.repeat([4.0, follow], 4)
@@ -58,7 +76,7 @@ def deciding(weights_of_candidates, follow=0.0):
 
 def run(denoiser, params, frames):
     """The images of a clip."""
-    return np.asarray(denoise(denoiser, params, Clip(frames, frames.radiance)), np.float64)
+    return np.asarray(compiled(denoiser)(params, frames), np.float64)
 
 
 def gains(frames):
@@ -114,7 +132,7 @@ def test_the_light_of_a_still_clip_is_its_arithmetic_mean(rng):
         means = update_means(now, fetch_past(state, frame, now, first), jnp.full(SIZE, 0.5), most=32.0)
         return means, keep_history(frame, means, means.prior)
 
-    state = start_history(prepare(jax.tree.map(jnp.asarray, frame_at(clip, 0)))[1])
+    state = jax.jit(lambda frame: start_history(prepare(frame)[1]))(frame_at(clip, 0))
     for index in range(4):
         prior = np.full((3, *SIZE), index, np.float32)
         means, state = step(state, jax.tree.map(jnp.asarray, frame_at(clip, index)), prior, index == 0)
@@ -125,13 +143,16 @@ def test_the_light_of_a_still_clip_is_its_arithmetic_mean(rng):
 
 
 def test_another_depth_ends_a_history_and_another_normal_does_not(rng):
-    first, second = (jax.tree.map(jnp.asarray, frame_at(clip_of(rng), index)) for index in range(2))
-    second = second._replace(
-        depth=second.depth.at[:, 30:].set(9.0), normal=second.normal.at[:20].set(jnp.array([1.0, 0, 0]))
-    )
-    now = measure_now(first, jnp.zeros((3, *SIZE)))
-    kept = keep_history(first, now, now.prior)
-    past = fetch_past(kept, second, measure_now(second, now.prior), False)
+    first, second = (jax.tree.map(np.array, frame_at(clip_of(rng), index)) for index in range(2))
+    second.depth[:, 30:], second.normal[:20] = 9.0, [1.0, 0, 0]
+
+    @jax.jit
+    def fetch(first, second):
+        now = measure_now(first, jnp.zeros((3, *SIZE)))
+        kept = keep_history(first, now, now.prior)
+        return fetch_past(kept, second, measure_now(second, now.prior), False)
+
+    past = fetch(first, second)
     # Beside the new edge the depth has a slope, which widens the tolerance.
     assert np.asarray(past.valid)[:, :29].all()
     assert not np.asarray(past.valid)[:, 31:].any()
@@ -142,7 +163,7 @@ def candidates_of(means, prior, last):
         jnp.zeros((8, 10, 20)), jnp.ones((16, 20)), jnp.zeros((8, 10, 8)), jnp.ones((8, 10)), jnp.ones((4, 8, 10))
     )
     precisions = {name: jnp.full(5, -9.0) for name in ("albedo", "normal", "light", "depth", "learned")}
-    statistics, _ = prepare(Frame(jnp.ones((16, 20, 3))))
+    statistics, _ = jax.jit(prepare)(Frame(jnp.ones((16, 20, 3))))
     found = jax.jit(make_candidates)(precisions, means, prior, last, None, parameters, statistics)
     return dict(zip(CANDIDATES, found, strict=True))
 
@@ -163,13 +184,13 @@ def test_a_correction_is_what_the_samples_have_more_than_the_prior(rng):
 def test_a_network_that_trusts_the_prior_alone_shows_it(rng):
     require("pyoidn")
     clip = clip_of(rng)
-    images = run(combiner(quality="fast"), deciding({"prior": 0.0}), clip)
-    np.testing.assert_allclose(images, run(oidn(), {}, clip), atol=1e-5)
+    images = run(fast(), deciding({"prior": 0.0}), clip)
+    np.testing.assert_allclose(images, run(prior_alone(), {}, clip), atol=1e-5)
 
 
 def test_mixtures_are_means_of_logarithms_by_the_logits(rng):
     require("pyoidn")
-    clip, denoiser = clip_of(rng), combiner(quality="fast")
+    clip, denoiser = clip_of(rng), fast()
 
     def images(logits):
         return run(denoiser, deciding(logits), clip)
@@ -185,8 +206,8 @@ def test_a_network_that_trusts_the_last_result_alone_shows_the_first_one_where_i
     require("pyoidn")
     clip = clip_of(rng)
     clip = clip._replace(motion=np.broadcast_to(np.float32([2, 0]), clip.motion.shape))
-    images = run(combiner(quality="fast"), deciding({"last result": 0.0}), clip)
-    priors = run(oidn(), {}, clip)
+    images = run(fast(), deciding({"last result": 0.0}), clip)
+    priors = run(prior_alone(), {}, clip)
     np.testing.assert_allclose(images[0], priors[0], atol=1e-5)
     np.testing.assert_allclose(images[1][:, 2:-6], priors[0][:, 4:-4], rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(images[2][:, 2:-8], priors[0][:, 6:-4], rtol=1e-4, atol=1e-5)
@@ -197,8 +218,8 @@ def test_a_network_that_trusts_the_last_result_alone_shows_the_first_one_where_i
 def test_a_compiled_step_is_the_step(rng):
     """XLA once summed the stacked candidates wrongly."""
     require("pyoidn")
-    clip, denoiser = clip_of(rng), combiner(quality="fast")
-    params = denoiser.init(jax.random.key(1), frame_at(clip, 0))
+    clip, denoiser = clip_of(rng), fast()
+    params = untrained(1)
     plain = compiled = denoiser.start(params, frame_at(clip, 0))
     for index in range(3):
         frame = jax.tree.map(jnp.asarray, frame_at(clip, index))
@@ -209,8 +230,8 @@ def test_a_compiled_step_is_the_step(rng):
 
 def test_light_that_was_not_measured_does_not_spread(rng):
     require("pyoidn")
-    clip, denoiser = clip_of(rng), combiner(quality="fast")
-    params = denoiser.init(jax.random.key(1), frame_at(clip, 0))
+    clip, denoiser = clip_of(rng), fast()
+    params = untrained(1)
     holes = clip.radiance.copy()
     holes[:, 10:12, 10:12] = np.nan
     images = run(denoiser, params, clip._replace(radiance=holes))
@@ -222,11 +243,11 @@ def test_light_that_was_not_measured_does_not_spread(rng):
 @pytest.mark.slow
 def test_every_part_of_the_weights_learns(rng):
     require("pyoidn")
-    clip, denoiser = jax.tree.map(jnp.asarray, clip_of(rng)), combiner(quality="fast")
+    clip, denoiser = jax.tree.map(jnp.asarray, clip_of(rng)), fast()
     normal = jnp.asarray(rng.normal(size=clip.normal.shape), jnp.float32)
     rough = {"albedo": rng.random(clip.albedo.shape), "depth": rng.uniform(2, 4, clip.depth.shape)}
     clip = clip._replace(normal=normal, **{name: jnp.asarray(each, jnp.float32) for name, each in rough.items()})
-    params = denoiser.init(jax.random.key(1), frame_at(clip, 0))
+    params = untrained(1)
     truth = jnp.mean(clip.radiance, axis=0)
 
     @jax.jit
@@ -317,8 +338,7 @@ def test_gradients_of_the_evidence(rng):
 
 
 def test_weights_are_saved_and_loaded(tmp_path, rng):
-    frame = Frame(jnp.zeros((16, 16, 3)))
-    params = combiner(quality="fast").init(jax.random.key(0), frame)
+    params = untrained()
     path = save_weights(tmp_path / "w", params, factory="combiner", options={"quality": "fast"}, record={})
     loaded = load_weights(path)[1]
     jax.tree.map(np.testing.assert_array_equal, loaded, params)

@@ -17,7 +17,7 @@ from jaxdn.denoiser.statistics import measure_frame
 from jaxdn.methods.lobes import split_signals
 from jaxdn.methods.two_lobes.reblur import reblur
 from jaxdn.methods.two_lobes.relax import relax
-from tests.methods.lobe_scenes import HEIGHT, WIDTH, compiled, mirror_frames, neutral, run, scene
+from tests.methods.lobe_scenes import HEIGHT, WIDTH, compiled, mirror_frames, neutral, run, scene, starting
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def test_static_histories_are_the_means_until_their_caps(kind, rng):
     denoiser = kind.method(**kind.plain, history_max=10, fast_max=3)
     noise = rng.gamma(0.5, 1.0, (14, 60, 60, 3)).astype(np.float32)
     share = rng.random((14, 60, 60, 1)).astype(np.float32)
-    step, state = jax.jit(denoiser.step), denoiser.start({}, Frame(noise[0], specular=noise[0] * share[0]))
+    step, state = compiled(denoiser), starting(denoiser)({}, Frame(noise[0], specular=noise[0] * share[0]))
     spread = []
     for index, (radiance, part) in enumerate(zip(noise, share, strict=True)):
         state, image = step({}, state, Frame(radiance, specular=radiance * part))
@@ -156,7 +156,7 @@ def test_a_reflection_is_fetched_where_it_was(kind, rng, missing):
 
 def test_the_first_frame_reads_no_history_and_no_motion(kind, rng):
     frame = scene(rng, 1)[0]
-    clean = kind.denoiser.start({}, frame)
+    clean = starting(kind.denoiser)({}, frame)
     nothing = jax.tree.map(lambda leaf: leaf * np.nan, kind.histories(clean))
     poisoned = kind.with_histories(clean, nothing)
     elsewhere = frame._replace(motion=np.full_like(frame.motion, 3.3))
@@ -170,7 +170,7 @@ def test_the_first_frame_reads_no_history_and_no_motion(kind, rng):
 @pytest.mark.parametrize("which", ["diffuse", "specular"])
 def test_broken_history_is_dropped_where_it_is_broken(kind, rng, which):
     frames = scene(rng, 2)
-    state, _ = kind.stepped(kind.denoiser.start({}, frames[0]), frames[0])
+    state, _ = kind.stepped(starting(kind.denoiser)({}, frames[0]), frames[0])
     light = kind.histories(state)
     broken = kind.with_histories(state, light._replace(**{which: getattr(light, which).at[6, 4, 1].set(np.nan)}))
     after, image = kind.stepped(broken, frames[1])

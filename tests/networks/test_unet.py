@@ -74,7 +74,7 @@ def test_small_computes_a_third_of_large(key: jax.Array) -> None:
 def test_forward_is_the_numpy_network(rng: np.random.Generator, key: jax.Array) -> None:
     network = unet((3, 2), (5, 3, 2), widths=TINY)
     params = network.init(key)
-    params = jax.tree.map(lambda leaf: leaf + 0.1 * jnp.asarray(rng.normal(size=leaf.shape), leaf.dtype), params)
+    params = jax.tree.map(lambda leaf: np.float32(leaf + 0.1 * rng.normal(size=leaf.shape)), jax.device_get(params))
     inputs = features(rng, (3, 2))
     heads = jax.jit(network.apply)(params, inputs)
     assert [head.shape for head in heads] == [(2, 16, 32, 5), (2, 8, 16, 3), (2, 4, 8, 2)]
@@ -224,7 +224,7 @@ def test_a_backend_runs_the_same_network(
     """Values of the backend and its gradient, with all features and without some."""
     require(name)
     plain, backend = (unet(GROUPS, HEADS, widths=TINY, implementation=each) for each in (None, name))
-    params = jax.tree.map(lambda leaf: leaf + 0.01, plain.init(key))
+    params = jax.tree.map(lambda leaf: leaf + np.float32(0.01), jax.device_get(plain.init(key)))
     inputs = [None if index in absent else group for index, group in enumerate(features(rng, GROUPS))]
 
     def both(network: Network) -> tuple:

@@ -5,8 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.ops.motion import dual_motion, occlusion_mask
-from jaxdn.ops.warp import warp
+import jaxdn.ops.motion
+import jaxdn.ops.warp
+
+# One program each, and not one for each of their operations.
+dual_motion = jax.jit(jaxdn.ops.motion.dual_motion)
+occlusion_mask = jax.jit(jaxdn.ops.motion.occlusion_mask)
+warp = jax.jit(jaxdn.ops.warp.warp)
 
 SIZE = 24
 
@@ -34,14 +39,14 @@ def _square(position, speed, side=8, snap=True):
 def test_square_in_front_of_a_plane(speed, snap):
     """Uncovered pixels take over exactly the square's motion; the mask is exactly the trailing strip."""
     motion, forward, visible, uncovered = _square((8, 8), speed, snap=snap)
-    dual = dual_motion(motion, forward, visible=visible)
+    dual = np.asarray(dual_motion(motion, forward, visible=visible))
     np.testing.assert_array_equal(dual[uncovered], np.broadcast_to(-np.float32(speed), (uncovered.sum(), 2)))
     np.testing.assert_array_equal(dual[~uncovered], motion[~uncovered])
-    np.testing.assert_array_equal(occlusion_mask(motion, dual)[..., 0], uncovered)
+    np.testing.assert_array_equal(np.asarray(occlusion_mask(motion, dual))[..., 0], uncovered)
     # What the dual vector fetches is the plane, what the traditional one fetches is the square.
     before = (np.abs(forward).sum(-1, keepdims=True) > 0).astype(np.float32)
-    assert np.all(warp(before, motion)[uncovered] == 1)
-    assert np.all(warp(before, dual)[uncovered] == 0)
+    assert np.all(np.asarray(warp(before, motion))[uncovered] == 1)
+    assert np.all(np.asarray(warp(before, dual))[uncovered] == 0)
 
 
 def test_visible_may_lack_its_channel_axis():
