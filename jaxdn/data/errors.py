@@ -17,8 +17,8 @@ class DamagedFile(ClipError):
         self.path, self.reason = path, reason
 
 
-def read_json(path: str | Path) -> Any:
-    """Read strict JSON. Raises ClipError, naming the file and the place, if it is missing or broken."""
+def read_json(path: str | Path, advice: str = "restore it or render the clip again") -> Any:
+    """Read strict JSON. Raises ClipError, with the file, the place and ``advice``, if it is missing or broken."""
     path = Path(path)
 
     def refuse(word: str) -> None:
@@ -29,4 +29,4 @@ def read_json(path: str | Path) -> Any:
     except FileNotFoundError as error:
         raise ClipError(f"{path}: there is no such file.") from error
     except (OSError, ValueError, RecursionError) as error:
-        raise ClipError(f"{path}: not readable as JSON ({error}); restore it or render the clip again.") from error
+        raise ClipError(f"{path}: not readable as JSON ({error}); {advice}.") from error

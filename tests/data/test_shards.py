@@ -185,9 +185,18 @@ def test_a_damaged_shard_is_named(folder: Path, tmp_path: Path) -> None:
     (home / "shards.json").write_text(json.dumps(index | {"format": 9}))
     with pytest.raises(ClipError, match=r"shards\.json: expected format 1, got 9"):
         open_shards(home)
-    (home / "shards.json").write_text("[")
-    with pytest.raises(ClipError, match=r"shards\.json: not readable as JSON"):
-        open_shards(home)
+    for broken in ("[", "[]", '{"format": 1}', json.dumps(index | {"windows": [[0, 0, 7, 0]]})):
+        (home / "shards.json").write_text(broken)
+        with pytest.raises(ClipError, match=r"shards\.json: .*; copy it again, or pack the set again\."):
+            open_clips(home)
+
+
+def test_a_set_whose_index_was_not_copied_is_named(folder: Path, tmp_path: Path) -> None:
+    home = tmp_path / "set"
+    write_shards(home, open_clips(folder), size=2**23, packing=WHOLE)
+    (home / "shards.json").unlink()
+    with pytest.raises(ClipError, match=r"shards\.json: the index is missing; copy it again, or pack the set again\."):
+        open_clips(home)
 
 
 def test_a_killed_pack_leaves_no_set_and_the_next_removes_what_is_left(folder: Path, tmp_path: Path) -> None:

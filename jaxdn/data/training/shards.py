@@ -26,6 +26,8 @@ from jaxdn.runtime.scratch import scratch_folder
 
 _FORMAT = 1
 _INDEX = "shards.json"
+_SHARDS = "windows-*.arrayrecord"
+_ADVICE = "copy it again, or pack the set again"
 _OPTIONS = "group_size:1,zstd:1"
 """Each record can be read alone. Higher levels save 5 % more and take four times as long."""
 _LEAST = 2**17
@@ -73,8 +75,8 @@ class ShardedArrays(NamedTuple):
 
 
 def is_sharded(place: Path) -> bool:
-    """Whether a folder is a set of shards."""
-    return (place / _INDEX).is_file()
+    """Whether a folder is a set of shards, be it one whose index was not copied."""
+    return (place / _INDEX).is_file() or next(place.glob(_SHARDS), None) is not None
 
 
 def write_shards(
@@ -128,11 +130,22 @@ def open_shards(folder: str | Path) -> list[CachedClip]:
     or of another size, by name.
     """
     folder = Path(folder)
-    index = read_json(folder / _INDEX)
-    if index.get("format") != _FORMAT:
+    if not (folder / _INDEX).is_file():
+        raise ClipError(f"{folder / _INDEX}: the index is missing; {_ADVICE}.")
+    index = read_json(folder / _INDEX, _ADVICE)
+    if isinstance(index, dict) and index.get("format") != _FORMAT:
         raise ClipError(f"{folder / _INDEX}: expected format {_FORMAT}, got {index.get('format')}; pack the set again.")
-    for name, size in index["shards"]:
-        _check_size(folder / name, size)
+    try:
+        clips = _list_windows(folder, index)
+        sizes = {folder / str(name): int(size) for name, size in index["shards"]}
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise ClipError(f"{folder / _INDEX}: this is no index of shards ({error!r}); {_ADVICE}.") from error
+    for shard, size in sizes.items():
+        _check_size(shard, size)
+    return clips
+
+
+def _list_windows(folder: Path, index: Any) -> list[CachedClip]:
     shards = [folder / name for name, _ in index["shards"]]
     kinds = [_Kind.from_record(kind) for kind in index["kinds"]]
     clips = []
@@ -275,7 +288,7 @@ def _check_size(path: Path, size: int) -> None:
     try:
         found = path.stat().st_size
     except FileNotFoundError as error:
-        raise ClipError(f"{path}: the shard is missing; copy it again, or pack the set again.") from error
+        raise ClipError(f"{path}: the shard is missing; {_ADVICE}.") from error
     if found != size:
         raise ClipError(
             f"{path}: the shard is damaged: expected {size} bytes, got {found}; copy it again from where it was "
