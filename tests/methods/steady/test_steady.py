@@ -45,24 +45,31 @@ def room(rng, count=3, *, size=SIZE):
 
 def denoised(frames, *, key=None, sharper=0.0):
     """With the same decisions for all pixels, or (``key``) with random ones; guides that stop the filter more."""
-    denoiser, run = compiled()
-    params = denoiser.init(jax.random.key(0), frame_at(frames, 0))
+    init, vary, run = compiled()
+    params = init(jax.random.key(0), frame_at(frames, 0))
     # Not the scales of the regression, which stop nothing.
     sharpened = {name: value + sharper for name, value in params["guide"].items() if name != "regression"}
     params["guide"] = params["guide"] | sharpened
     if key is None:
         params["head_0"]["kernel"] = 0.0 * params["head_0"]["kernel"]
     else:
-        params = jax.tree.map(lambda leaf: leaf + 0.3 * jax.random.normal(key, leaf.shape), params)
+        params = vary(params, key)
     # Not of a weak type, as numbers without a type make them: else there are two programs.
     return np.asarray(run(jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), params), frames))
 
 
 @functools.cache
 def compiled():
-    """A small denoiser, and its images of params and frames: compiled once for each number of frames and buffers."""
+    """A small denoiser's first params, those varied by a key, and its images.
+
+    Each is compiled once for each number of frames and buffers.
+    """
     denoiser = tiny()
-    return denoiser, jax.jit(functools.partial(unroll, denoiser))
+
+    def vary(params, key):
+        return jax.tree.map(lambda leaf: leaf + 0.3 * jax.random.normal(key, leaf.shape), params)
+
+    return jax.jit(denoiser.init), jax.jit(vary), jax.jit(functools.partial(unroll, denoiser))
 
 
 def test_constant_light_comes_out_as_it_went_in(rng, key):
@@ -186,10 +193,10 @@ def test_a_moving_history_is_followed(rng):
 
 def test_broken_state_heals(rng):
     denoiser, frames = tiny(), room(rng, 3)
-    params = denoiser.init(jax.random.key(0), frame_at(frames, 0))
+    params = compiled()[0](jax.random.key(0), frame_at(frames, 0))
     step = jax.jit(denoiser.step)
-    state, _ = step(params, denoiser.start(params, frame_at(frames, 0)), frame_at(frames, 0))
-    state = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan) if x.dtype == jnp.float32 else x, state)
+    state, _ = step(params, jax.jit(denoiser.start)(params, frame_at(frames, 0)), frame_at(frames, 0))
+    state = jax.tree.map(lambda x: np.full_like(x, np.nan) if x.dtype == jnp.float32 else x, state)
     _, image = step(params, state, frame_at(frames, 1))
     assert np.isfinite(image).all()
 
