@@ -33,7 +33,7 @@ def test_svgf_as_published_matches_the_reference(rng):
     """Alpha 0.2 from the second frame on, the variance alone from neighbours, division by the albedo."""
     frames = moving_frames(rng, 5)
     denoiser = svgf(preset="paper", levels=1, **PLAIN)
-    step, state, past = jax.jit(denoiser.step), denoiser.start({}, frames[0]), None
+    step, state, past = jax.jit(denoiser.step), jax.jit(denoiser.start)({}, frames[0]), None
     for frame in frames:
         state, image = step({}, state, frame)
         past, expected, hit = reference_step(past, frame, 1, published=True)
@@ -69,7 +69,7 @@ def test_direct_light_that_comes_within_the_clip_begins_then(rng):
     second = with_direct(rng, second)
     denoiser = svgf(preset="paper", levels=0, feedback_level=0, antialiasing=False)
     step = jax.jit(denoiser.step)
-    state, _ = step({}, denoiser.start({}, first), first)
+    state, _ = step({}, jax.jit(denoiser.start)({}, first), first)
     assert state.core.direct is None
     after, image = step({}, state, second)
     hit = second.ids[..., 0] >= 0

@@ -5,7 +5,7 @@ import pytest
 
 from jaxdn.core.frame import Frame
 from jaxdn.methods.two_lobes.reblur import reblur
-from tests.methods.lobe_scenes import compiled, mirror_frames, run
+from tests.methods.lobe_scenes import compiled, mirror_frames, run, starting
 
 UNHELD = {"fix_frames": 0, "clamp_sigma": 1e6, "lag_sigma": 1e6, "demodulate": "none"}
 """The two means, neither filled nor clamped."""
@@ -45,7 +45,7 @@ def glossy_edge(radiance, specular, hit_distance):
 def after_edges(denoiser, frames_before, *, turned=0):
     """The state and the image of the edge, seen after as many frames, whose history is the edge itself."""
     frame = Frame(EDGE.astype(np.float32))
-    step, state = compiled(denoiser), denoiser.start({}, frame)
+    step, state = compiled(denoiser), starting(denoiser)({}, frame)
     state, _ = step({}, state, frame)
     light = state.core.light
     planes = light.diffuse.at[..., :3].set(frame.radiance).at[..., 4:7].set(frame.radiance)

@@ -9,7 +9,7 @@ from jaxdn.core.frame import Frame, written_out
 from jaxdn.denoiser.rollout import unroll
 from jaxdn.methods.svgf import svgf
 from jaxdn.methods.trmv import trmv
-from tests.methods.lobe_scenes import compiled, run
+from tests.methods.lobe_scenes import compiled, run, starting
 from tests.methods.test_svgf import HEIGHT, WIDTH, moving_frames
 
 DENOISER = trmv(levels=2)
@@ -136,7 +136,7 @@ def test_the_variance_of_a_still_scene_falls_as_one_over_the_number_of_frames(rn
 
 def test_the_first_frame_reads_no_history_and_no_motion(rng):
     frame = all_light(rng, 1)[0]
-    clean = DENOISER.start({}, frame)
+    clean = starting(DENOISER)({}, frame)
     poisoned = clean._replace(core=jax.tree.map(lambda leaf: leaf * np.nan, clean.core))
     elsewhere = frame._replace(shadow_motion=np.full_like(frame.motion, 3.3), glossy_motion=frame.motion * 2)
     expected = compiled(DENOISER)({}, clean, frame)[1]
@@ -149,7 +149,7 @@ def test_the_first_frame_reads_no_history_and_no_motion(rng):
 @pytest.mark.parametrize("which", ["rest", "shadows", "specular"])
 def test_broken_history_is_dropped_where_it_is_broken(rng, which):
     frames = all_light(rng, 2)
-    state, _ = compiled(DENOISER)({}, DENOISER.start({}, frames[0]), frames[0])
+    state, _ = compiled(DENOISER)({}, starting(DENOISER)({}, frames[0]), frames[0])
     broken = state._replace(core=state.core._replace(**{which: getattr(state.core, which).at[6, 6, 1].set(np.nan)}))
     after, image = compiled(DENOISER)({}, broken, frames[1])
     assert np.isfinite(image).all()

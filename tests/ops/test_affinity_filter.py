@@ -41,7 +41,8 @@ def by_formula(image, features, slanted, confidence, step):
 def test_it_is_the_formula(step, tile, rng, x64, monkeypatch):
     monkeypatch.setattr(module, "_TILE_PIXELS", tile)
     image, *guide = drawn(rng, 19)
-    found = affinity_filter(jnp.asarray(image), Guide(*map(jnp.asarray, guide)), step=step)
+    # A function of its own: one that is jitted for the whole module would keep the tiles of its first call.
+    found = jax.jit(lambda image, *guide: affinity_filter(image, Guide(*guide), step=step))(image, *guide)
     np.testing.assert_allclose(found, by_formula(image, *guide, step), rtol=1e-10)
 
 

@@ -1,5 +1,7 @@
 """Joint bilateral upsampling against its formula in float64."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,7 +45,8 @@ def by_formula(coarse, there, here):
 def test_it_is_the_formula(name, tile, rng, x64, monkeypatch):
     monkeypatch.setattr(module, "_TILE_PIXELS", tile)
     coarse, *guides = jax.tree.map(jnp.asarray, drawn(rng))
-    found, weight = joint_bilateral_upsample(coarse, *guides, implementation=name)
+    # A function of its own: one that is jitted for the whole module would keep the tiles of its first call.
+    found, weight = jax.jit(partial(joint_bilateral_upsample, implementation=name))(coarse, *guides)
     wanted, sums = by_formula(*jax.tree.map(np.asarray, (coarse, *guides)))
     np.testing.assert_allclose(found, wanted, rtol=1e-10)
     np.testing.assert_allclose(weight, sums, rtol=1e-10)
@@ -64,7 +67,8 @@ def test_gradients(name, rng, x64):
 def test_a_fine_pixel_that_nothing_resembles_has_no_weight(rng):
     coarse, there, here = drawn(rng)
     here.features[:, 4, 5] = 100.0
-    found, weight = joint_bilateral_upsample(jnp.asarray(coarse), *jax.tree.map(jnp.asarray, (there, here)))
+    upsample = jax.jit(lambda *given: joint_bilateral_upsample(*given))
+    found, weight = jax.device_get(upsample(jnp.asarray(coarse), *jax.tree.map(jnp.asarray, (there, here))))
     assert weight[4, 5] == 0
     assert (found[:, 4, 5] == 0).all()
     assert (weight > 0).sum() == weight.size - 1

@@ -43,7 +43,7 @@ def make_clip(seed, *, frames=4, size=16):
 
 
 def batch_of(*clips):
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *clips)
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *clips)
 
 
 @pytest.fixture(scope="module")
