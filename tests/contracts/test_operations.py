@@ -138,11 +138,11 @@ def test_a_batch_is_its_examples_one_by_one(operation, name):
     value, _ = expected(operation, *SIZE)[0]
     batch = jax.tree.map(lambda leaf: np.stack([leaf, leaf[..., ::-1] if leaf.ndim else leaf]), arguments)
     found = jax.jit(jax.vmap(runner(operation, name, options)))(*batch)
-    assert_close(jax.tree.map(lambda leaf: leaf[0], found), value, precision)
+    assert_close(jax.tree.map(lambda leaf: np.asarray(leaf)[0], found), value, precision)
     if name == REFERENCE:
         run = jax.vmap(functools.partial(OPERATIONS[operation], **options))
         looped = jax.jit(lambda *batch: jax.lax.scan(lambda carry, _: (carry, run(*batch)), 0, length=2)[1])(*batch)
-        assert_close(jax.tree.map(lambda leaf: leaf[1, 0], looped), value, None)
+        assert_close(jax.tree.map(lambda leaf: np.asarray(leaf)[1, 0], looped), value, None)
 
 
 def test_every_operation_declares_examples():
