@@ -83,8 +83,8 @@ BLOCK = 8
 CLEAN = (0.01, 0.02)
 """Noise, as a share of the light, up to which a block has none, and from which it has some."""
 LAMP = 5.0
-"""Light of a block, relative to the median, above which it may be a lamp in view, which has no noise whatever is beside
-it: what is white has 5 times the light of middle grey."""
+"""Light of a block without noise, relative to the median, above which it may be a lamp in view, which has none whatever
+is beside it: what is white has 5 times the light of middle grey."""
 NONE = (0.001, 0.002)
 """The same of light that is not drawn by samples at all; after 4,096 of them, light has more noise."""
 LITTLE = (0.2, 0.3)
@@ -180,7 +180,7 @@ def combine(
     curved = second_differences(change)
     bands = _split(change)
     energies = [_energy(band, radius) for band, radius in zip(bands, RADII, strict=True)]
-    sampled = _sampled(light, level, known)
+    sampled = _sampled(curved, light, level, known)
     variance = _measure_noise([energy for energy, _ in energies[:3]], curved, light, sampled)
     weights = _weigh(energies, mean_square(_split(whole)[-1] - bands[-1]), variance)
     kept = sum(weight * band for weight, band in zip(weights, bands, strict=True))
@@ -320,11 +320,14 @@ def _weigh(energies: list[tuple[jax.Array, jax.Array]], cut: jax.Array, variance
     return weights
 
 
-def _sampled(light: jax.Array, level: jax.Array | float, surface: jax.Array | None) -> jax.Array:
-    """[1, h, w] the share of each block that may have noise: none of a sky, nor of what may be a lamp in view."""
-    blocks = _mean_blocks(light)
-    known = jnp.ones_like(blocks) if surface is None else _mean_blocks(surface.astype(light.dtype))
-    return jnp.where(blocks > LAMP * jnp.asarray(level), 0.0, known)
+def _sampled(curved: jax.Array, light: jax.Array, level: jax.Array | float, surface: jax.Array | None) -> jax.Array:
+    """[1, h, w] the share of each block that may have noise: none of a sky, nor of what may be a lamp in view.
+
+    That is bright and has no noise. What is bright and noisy is none: a thing before black is far above the median.
+    """
+    bright = _mean_blocks(light) > LAMP * jnp.asarray(level)
+    known = jnp.ones_like(bright, light.dtype) if surface is None else _mean_blocks(surface.astype(light.dtype))
+    return jnp.where(bright, known * (1 - _falling(jnp.sqrt(_least(_mean_blocks(curved))), *CLEAN)), known)
 
 
 def _share_of_quiet(blocks: jax.Array, sampled: jax.Array) -> jax.Array:
