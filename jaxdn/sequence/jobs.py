@@ -193,12 +193,11 @@ def _as_exr(path: Path) -> Path:
 
 
 def _hold(job: Job) -> Job:
-    """The job with frames that are the file before once more (a link of a farm) as copies of that frame's result."""
+    """The job with frames that are the file before once more (a link of either kind) as copies of its result."""
     held: dict[int, int] = {}
     for index in range(1, len(job.files)):
         before, now = job.shot.files[index - 1], job.shot.files[index]
-        linked = now.is_symlink() or before.is_symlink()
-        if linked and now.exists() and before.exists() and now.samefile(before):
+        if now.exists() and before.exists() and now.samefile(before):
             held[index] = held.get(index - 1, index - 1)
     if not held:
         return job

@@ -173,7 +173,7 @@ def explain_fallback(file: Path, fallback: Fallback) -> str:
     reason = (
         "there is no albedo, so textures are lost; name one, --channels albedo=LAYER"
         if fallback.texture_unknown
-        else "do albedo, normals and depth belong to this frame?"
+        else "albedo, normals or depth may not belong to this frame"
     )
     kept = max(fallback.kept, confidence.fallback)
     if confidence.doubt <= 0.5:  # no guides to suspect: there is nothing to gain
@@ -183,7 +183,7 @@ def explain_fallback(file: Path, fallback: Fallback) -> str:
         )
     return (
         f"{label_file(file)}: the denoised image differs by {confidence.lost:.0%} of the light, of which noise "
-        f"explains {confidence.noise:.0%}: {reason} {kept:.0%} of the result is the frame as it came"
+        f"explains {confidence.noise:.0%}: {reason}; {kept:.0%} of the result is the frame as it came"
     )
 
 

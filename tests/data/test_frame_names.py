@@ -55,6 +55,13 @@ CASES = {
     "folders of shots": (["sh010/b.exr", "sh020/b.exr", "v01/b.exr", "v02/b.exr"], {"b": [None] * 4}),
     "numbers of their own come first": (["1/b.7.exr", "2/b.7.exr"], {"b.#": [7, 7]}),
     "no number": (["still.exr", "v2_final.exr"], {"still": [None], "v2_final": [None]}),
+    "negative, and nothing parts it": (["s-0002.exr", "s-0001.exr", "s0000.exr", "s0001.exr"], {"s#": [-2, -1, 0, 1]}),
+    "two shots, one with a dash": (["s-0001.exr", "s-0002.exr", "s0001.exr"], {"s-#": [1, 2], "s#": [1]}),
+    "quarters of one frame": ([f"s.0001.{n}.exr" for n in ("000", "250", "500", "750")],
+                              {"s.#": [1, Fraction(5, 4), Fraction(3, 2), Fraction(7, 4)]}),
+    "frames of a numbered shot": (["s.1.0.exr", "s.1.1.exr", "s.1.2.exr"], {"s.1.#": [0, 1, 2]}),
+    "steps around the middle": ([f"s.{n}.exr" for n in ("10.25", "10.75", "11.25", "11.75")],
+                                {"s.#": [Fraction(n, 4) for n in (41, 43, 45, 47)]}),
     "one frame": (["s.0007.beauty.exr"], {"s.#.beauty": [7]}),
 }  # fmt: skip
 

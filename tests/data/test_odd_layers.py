@@ -52,6 +52,21 @@ NOTHING = {
 }
 
 
+@pytest.mark.parametrize(
+    ("name", "values", "why"),
+    [
+        ("depth", np.ones((HEIGHT, WIDTH, 1)), "'V.Depth' is 1 everywhere"),
+        ("depth", np.full((HEIGHT, WIDTH, 1), 1e10), "'V.Depth' is 1e+10 everywhere"),
+        ("motion", np.full((HEIGHT, WIDTH, 4), 1e-8), "'V.Vector' is 0 everywhere"),
+        ("normal", np.full((HEIGHT, WIDTH, 3), 0.0), "'V.Denoising Normal' is (0, 0, 0) everywhere"),
+    ],
+)
+def test_other_values_that_say_nothing(name: str, values: np.ndarray, why: str, tmp_path: Path) -> None:
+    frames, told = read(tmp_path, blender(0, **{name: values}), blender(1, **{name: values}))
+    assert [getattr(frame, name) for frame in frames] == [None, None]
+    assert told[0].startswith(f"{name} counts as missing: {why}")
+
+
 @pytest.mark.parametrize("name", NOTHING)
 def test_a_layer_without_anything_in_it_counts_as_missing_and_that_is_told(name: str, tmp_path: Path) -> None:
     values, why = NOTHING[name]

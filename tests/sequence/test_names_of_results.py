@@ -97,10 +97,12 @@ def test_a_link_to_a_file_that_is_missing_is_a_missing_frame(tmp_path: Path, cap
     assert "s.0002.exr counts as a missing frame: No such file" in capsys.readouterr().out
 
 
-def test_a_held_frame_is_that_frame(tmp_path: Path) -> None:
+@pytest.mark.parametrize("hard", [False, True])
+def test_a_held_frame_is_that_frame(hard: bool, tmp_path: Path) -> None:
     source = write(tmp_path / "in", "s.0001.exr", "s.0002.exr", "s.0005.exr")
-    os.symlink(source / "s.0002.exr", source / "s.0003.exr")
-    os.symlink("s.0003.exr", source / "s.0004.exr")
+    link = os.link if hard else os.symlink
+    link(source / "s.0002.exr", source / "s.0003.exr")
+    link(source / "s.0003.exr", source / "s.0004.exr")
     files, told = denoise([source], tmp_path / "out", preview=True)
     assert files == [f"s.{number:04d}.exr" for number in range(1, 6)]
     assert [brightness(tmp_path / "out" / name) for name in files] == [1.0, 2.0, 2.0, 2.0, 3.0]

@@ -9,6 +9,7 @@ import pytest
 
 from jaxdn import clips
 from jaxdn.commands import main
+from jaxdn.data.errors import ClipError
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.passes import read_pass_name
 from jaxdn.data.foreign.shots import Shot
@@ -52,6 +53,18 @@ PLACES: dict[str, tuple[Place, str]] = {
         lambda name, frame: f"sh.{frame:04d}.exr" if name == "beauty" else f"sh.{name}.{frame:04d}.exr",
         "sh.{:04d}.exr",
     ),
+}
+
+
+_WORDS = {"albedo": "DiffuseAlbedo", "normal": "WorldNormal", "depth": "LinearDepth"}
+_LUX = {"beauty": "RGB_IMAGEPIPELINE", "normal": "AVG_SHADING_NORMAL"}
+PLACES |= {
+    "wordsInOne": (lambda name, frame: f"sh_{_WORDS.get(name, name)}_{frame:04d}.exr", "sh_beauty_{:04d}.exr"),
+    "the picture has another name": (
+        lambda name, frame: f"{'render' if name == 'beauty' else name}.{frame:04d}.exr",
+        "render.{:04d}.exr",
+    ),
+    "LuxCore": (lambda name, frame: f"{_LUX.get(name, name).upper()}{frame:04d}.exr", "RGB_IMAGEPIPELINE{:04d}.exr"),
 }
 
 
@@ -123,6 +136,39 @@ def test_a_data_pass_is_never_a_picture(tmp_path: Path, capsys: Any) -> None:
     assert ended.value.code == 2
     assert "not a picture but a data pass (albedo)" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "no").exists()
+
+
+@pytest.mark.parametrize("alone", [True, False])
+def test_normals_are_no_picture_though_none_is_beside_them(alone: bool, tmp_path: Path) -> None:
+    source = write(tmp_path / "in", PLACES["name.number"][0])
+    for name in ("beauty", "depth", *(["albedo"] if alone else [])):
+        for path in source.glob(f"{name}.*"):
+            path.unlink()
+    with pytest.raises(ClipError, match="not a picture but a data pass"):
+        denoise_files([source], tmp_path / "out", box_blur())
+
+
+def test_data_that_nobody_reads_is_no_picture_and_light_is_one(tmp_path: Path) -> None:
+    now, told = truth(1), list[str]()
+    more = {
+        "WorldPosition": layer("", 9 * now.normal, "RGB"),
+        "uv": layer("", now.albedo, "RGB"),
+        "cryptomatte": layer("", now.albedo, "RGB"),
+        "specular": layer("", now.light, "RGB"),
+        "diffuse": layer("", now.light, "RGB"),
+    }
+    source = write(tmp_path / "in", lambda name, frame: f"sh_{name}.{frame:04d}.exr", **more)
+    written = denoise_files([source], tmp_path / "out", box_blur(), log=told.append)
+    assert {path.name.partition(".")[0] for path in written.files} == {"sh_beauty", "sh_specular", "sh_diffuse"}
+    assert any("not a picture but a data pass (world_position), left out" in line for line in told)
+
+
+def test_a_pass_of_another_size_in_one_frame_is_a_missing_frame(tmp_path: Path) -> None:
+    source, told = write(tmp_path / "in", PLACES["name.number"][0]), list[str]()
+    clips.write_exr(source / "albedo.0002.exr", layer("", truth(2).albedo[::2, ::2], "RGB"))
+    written = denoise_files([source], tmp_path / "out", box_blur(), log=told.append)
+    assert [path.name for path in written.files] == ["beauty.0001.exr", "beauty.0003.exr"]
+    assert any("beauty.0002.exr is left out, as a missing frame" in line for line in told)
 
 
 def test_whole_frames_are_frames_whatever_they_are_called(tmp_path: Path) -> None:

@@ -14,6 +14,8 @@ from jaxdn.data.errors import ClipError
 from jaxdn.data.foreign.layers import UNSURE_ALBEDO, Channels, is_cryptomatte, last_name, layer_of, stack_channels
 from jaxdn.data.foreign.lighting import SLACK, explain_light, is_clearly_brighter
 
+_STILL = 1e-6
+"""Vectors are shorter where nothing moves, whatever their unit; a matrix product leaves so much of 0."""
 _MANY = 0.1
 """Share of the pixels; so many values above 1 are no lamps in an albedo."""
 
@@ -132,6 +134,10 @@ def _explain_empty(name: str, values: np.ndarray) -> str | None:
         return "(" + ", ".join(f"{value:g}" for value in first.ravel()) + ") everywhere" if same else None
     if name == "albedo" and np.all((values == 1) | ~known):
         return "1 everywhere"
+    if name == "depth" and known.any() and np.all((values == values[known][0]) | ~known):
+        return f"{values[known][0]:g} everywhere"
+    if name == "motion":
+        values = np.where(np.abs(np.nan_to_num(values)) < _STILL, 0, values)
     return "0 everywhere" if name in _ZEROS and not np.any((values != 0) & known) else None
 
 

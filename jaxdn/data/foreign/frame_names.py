@@ -12,12 +12,16 @@ from fractions import Fraction
 from pathlib import Path
 from typing import NamedTuple
 
-_RUN = re.compile(r"(?:(?:^|(?<=[._-]))-)?\d+")
-"""A number; a minus belongs to it after a separator or at the beginning."""
+_MINUS = "\N{MINUS SIGN}"
+"""In place of a dash that is a minus for sure."""
+_RUN = re.compile(rf"(?:(?:^|(?<=[._-]))-|{_MINUS})?\d+")
+"""A number; a dash is its minus after a separator or at the beginning."""
 _ENDS = "._- ()[]{}#,+=@"
 """What a name is parted by."""
 _FOLDER = re.compile(r"(?:(?:frame|fr|f)[._ -]?)?(-?\d+)", re.IGNORECASE)
 """The name of a folder that holds one frame. ``sh010`` and ``v02`` are shots and versions."""
+_PARTS = 2
+"""Digits that the parts of a single frame have; ``s.1.0``, ``s.1.5`` may be versions."""
 _INSIDE = 4
 """Digits of a number that counts frames though letters touch it and more follows, as in ``frame0001_left``."""
 
@@ -39,6 +43,8 @@ def read_frame_names(files: Iterable[Path]) -> list[FrameName]:
     for file in files:
         alike = _Alike(file.parent, _RUN.sub("#", file.stem), file.suffix.lower())
         groups.setdefault(alike, {})[file] = file.stem
+    for alike in [alike for alike in groups if "-#" in alike.name]:
+        _add_negative_frames(groups, alike)
     for alike in [alike for alike in groups if alike.name.count("#.#") == 1]:
         _add_whole_frames(groups, alike)
     named = {name.file: name for group in groups.values() for name in _read_group(group)}
@@ -66,6 +72,27 @@ class _Alike(NamedTuple):
     suffix: str
 
 
+def _add_negative_frames(groups: dict[_Alike, dict[Path, str]], alike: _Alike) -> None:
+    """Give ``s0000.exr``, ``s0001.exr`` ... the ``s-0001.exr`` beside them, as Blender calls the frame before 0.
+
+    A dash that parts a name from its number is none of them: where a number is there with it and without, or where no
+    frame 0 joins the two.
+    """
+    start = alike.name.rindex("-#")
+    plain = alike._replace(name=f"{alike.name[:start]}{alike.name[start + 1 :]}")
+    place = alike.name[:start].count("#")
+    below, above = groups[alike], groups.get(plain, {})
+    numbers = [[list(_RUN.finditer(stem))[place][0] for stem in stems.values()] for stems in (below, above)]
+    if "0" not in {number.lstrip("0") or "0" for number in numbers[1]} or "1" not in {
+        n.lstrip("0") for n in numbers[0]
+    }:
+        return
+    starts = {file: list(_RUN.finditer(stem))[place].start() for file, stem in below.items()}
+    minus = {file: f"{stem[: starts[file] - 1]}{_MINUS}{stem[starts[file] :]}" for file, stem in below.items()}
+    groups[plain] = above | minus
+    del groups[alike]
+
+
 def _add_whole_frames(groups: dict[_Alike, dict[Path, str]], alike: _Alike) -> None:
     """Give subframes the whole frames between them that lack the zero, as files of their group."""
     whole = alike._replace(name=alike.name.replace("#.#", "#"))
@@ -86,7 +113,7 @@ def _read_group(files: Mapping[Path, str]) -> list[FrameName]:
     """Names that are alike but for their numbers: file -> its stem."""
     stems = list(files.values())
     runs = [list(_RUN.finditer(stem)) for stem in stems]
-    values = [[int(run[0]) for run in each] for each in runs]
+    values = [[_value(run) for run in each] for each in runs]
     places = range(len(runs[0]))
     varying = [place for place in places if len({each[place] for each in values}) > 1]
     ranks = {place: _rank(runs[0], place, stems[0]) for place in places}
@@ -119,11 +146,15 @@ def _read_folders(files: Iterable[Path]) -> dict[Path, FrameName]:
     }
 
 
+def _value(run: re.Match[str]) -> int:
+    return int(run[0].replace(_MINUS, "-"))
+
+
 def _rank(runs: Sequence[re.Match[str]], place: int, stem: str) -> int:
     """How much like a frame number a number looks: 3 best, 0 not at all."""
     run = runs[place]
     before, after = stem[: run.start()][-1:], stem[run.end() :][:1]
-    digits = len(run[0].lstrip("-"))
+    digits = len(run[0].lstrip("-" + _MINUS))
     if before in _ENDS and after in _ENDS:  # "" is in every string: the beginning, and the end
         return 3
     if re.search(r"\dx$", stem[: run.start()]) or re.match(r"x\d", stem[run.end() :]):  # a size, 2048x1024
@@ -136,22 +167,26 @@ def _rank(runs: Sequence[re.Match[str]], place: int, stem: str) -> int:
 def _subframes(stems: Sequence[str], runs: Sequence[Sequence[re.Match[str]]], place: int) -> list[Fraction] | None:
     """Numbers with fractions, where the last two numbers are that: 1.0, 1.5, 2.0, or 1.00, 1.33, 1.67; None elsewhere.
 
-    Fractions are those of equal steps from 0 on. Others are no fractions but frames of numbered shots.
+    Fractions are those of equal steps, from 0 or from half a step on. Others are no fractions but frames of numbered
+    shots.
     """
     first, second = runs[0][place - 1], runs[0][place]
     if stems[0][first.end() : second.start()] != "." or any(run[place][0].startswith("-") for run in runs):
         return None
-    if len({run[place - 1][0] for run in runs}) == 1:  # of one number there are versions, not parts
-        return None
     digits = {run[place][0] for run in runs}
+    if len({run[place - 1][0] for run in runs}) == 1 and min(map(len, digits)) < _PARTS:  # versions, not parts
+        return None
     decimals = sorted({Fraction(int(text), 10 ** len(text)) for text in digits})
     steps = len(decimals)
+    if steps < 2:
+        return None
     rough = Fraction(1, 10 ** min(len(text) for text in digits))
-    if steps < 2 or any(abs(value - Fraction(i, steps)) >= rough for i, value in enumerate(decimals)):
+    first_part = Fraction(round(2 * steps * decimals[0]), 2 * steps)
+    if any(abs(value - first_part - Fraction(i, steps)) >= rough for i, value in enumerate(decimals)):
         return None
     numbers = []
     for run in runs:
         whole, text = run[place - 1][0], run[place][0]
-        part = Fraction(round(Fraction(int(text), 10 ** len(text)) * steps), steps)
+        part = first_part + Fraction(round((Fraction(int(text), 10 ** len(text)) - first_part) * steps), steps)
         numbers.append(int(whole) - part if whole.startswith("-") else int(whole) + part)
     return numbers

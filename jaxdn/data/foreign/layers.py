@@ -40,6 +40,8 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "noisy_color",
         "rgb",
         "image",
+        "rgb_imagepipeline",
+        "rgba_imagepipeline",
     ),
     "albedo": (
         "albedo",

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.layers import LAYERS, UNSURE_ALBEDO
@@ -20,6 +22,36 @@ _UNSURE = _MOTION | {UNSURE_ALBEDO, "id", "ids", "object id", "normal", "normals
 """Words that are names of shots, too: such files alone are pictures, unless one of a picture is beside them."""
 _SHORT = 4
 """Letters; shorter words tell nothing of a file that stands alone."""
+_UNREAD = "no buffer"
+"""In place of a buffer: data that no denoiser reads."""
+_UNREAD_WORDS = [
+    "position",
+    "world_position",
+    "pworld",
+    "pref",
+    "p",
+    "uv",
+    "uvmap",
+    "st",
+    "mist",
+    "alpha",
+    "mask",
+    "matte",
+    "tangent",
+    "material_id",
+    "material_index",
+    "indexma",
+    "facing_ratio",
+    "cryptomatte",
+    "crypto_object",
+    "crypto_material",
+    "crypto_asset",
+    "sample_count",
+    "variance",
+    "holdout",
+]
+_SIGNS = 0.01
+"""Share of values below 0 that no picture has; negative lobes of pixel filters and colours out of gamut are rarer."""
 
 
 class PassName(NamedTuple):
@@ -46,23 +78,22 @@ def join_passes(shots: Sequence[Shot], stated: Mapping[str, str]) -> tuple[list[
     others = {buffer: _by_number(find_shots(pattern)) for buffer, pattern in stated.items()}
     taken = {file.resolve() for files in others.values() for file in files.values()}
     shots = [shot for shot in shots if not {file.resolve() for file in shot.files} <= taken]
-    groups: dict[tuple[Path, str], list[tuple[Shot, PassName]]] = {}
-    for shot in shots:
-        name = read_pass_name(shot)
-        groups.setdefault(name.rest, []).append((shot, name))
     joined, notes = [], []
-    for group in groups.values():
-        pictures = [(shot, name) for shot, name in group if name.buffer in (None, "radiance")]
-        data = [(shot, name) for shot, name in group if name.buffer not in (None, "radiance")]
-        alone = not pictures
-        data = [(shot, name) for shot, name in data if _is_plain(shot) and (not alone or _is_sure(name))]
-        rest = [shot for shot, name in group if (shot, name) not in data]
-        if data and alone:
+    for pictures, data in _group(shots):
+        rest = [shot for shot, name in pictures]
+        read = [(shot, name) for shot, name in data if name.buffer != _UNREAD]
+        if not pictures:
             notes += [f"{shot.label}: not a picture but a data pass ({name.buffer}), left out" for shot, name in data]
-        elif data:
+            continue
+        notes += [
+            f"{shot.label}: not a picture but a data pass ({name.word}), left out"
+            for shot, name in data
+            if name.buffer == _UNREAD
+        ]
+        if read:
             best = min(pictures, key=lambda one: _BEAUTY.index(one[1].word) if one[1].word in _BEAUTY else len(_BEAUTY))
-            rest[rest.index(best[0])] = _with_passes(best[0], {name.word: _by_number([shot]) for shot, name in data})
-            names = ", ".join(f"{name.buffer} from {shot.files[0].name}" for shot, name in data)
+            rest[rest.index(best[0])] = _with_passes(best[0], {name.word: _by_number([shot]) for shot, name in read})
+            names = ", ".join(f"{name.buffer} from {shot.files[0].name}" for shot, name in read)
             notes.append(f"{best[0].label}: a file for each pass, {names} ...")
         joined += rest
     if shots and not joined:
@@ -70,45 +101,107 @@ def join_passes(shots: Sequence[Shot], stated: Mapping[str, str]) -> tuple[list[
     return [_with_passes(shot, {stated[buffer]: files for buffer, files in others.items()}) for shot in joined], notes
 
 
+_Named = tuple[Shot, "PassName"]
+
+
+def _group(shots: Sequence[Shot]) -> list[tuple[list[_Named], list[_Named]]]:
+    """The pictures and the data passes of each group of shots that belong together; either may be empty.
+
+    Data passes whose names are nothing but the word belong to the one picture of their folder, whatever it is called:
+    ``render.0001.exr`` beside ``albedo.0001.exr``.
+    """
+    groups: dict[tuple[Path, str], list[_Named]] = {}
+    for shot in shots:
+        name = read_pass_name(shot)
+        groups.setdefault(name.rest, []).append((shot, name))
+    found: dict[tuple[Path, str], tuple[list[_Named], list[_Named]]] = {}
+    for rest, group in groups.items():
+        alone = all(name.buffer not in (None, "radiance") for _, name in group)
+        sure = any(_is_sure(name) for _, name in group if name.buffer not in (None, "radiance"))
+        albedos = [name for _, name in group if name.buffer == "albedo"]
+        data = []
+        for shot, name in group:
+            second = name.word == UNSURE_ALBEDO and len(albedos) > 1  # light, as another is the albedo
+            if name.buffer in (None, "radiance") or second or not _is_plain(shot):
+                continue
+            if not alone or _is_sure(name) or (sure and name.buffer in _CERTAIN) or _has_signs(shot):
+                data.append((shot, name))
+        found[rest] = [one for one in group if one not in data], data
+    for bare, (pictures, data) in list(found.items()):
+        beside = [key for key, (others, _) in found.items() if key[0] == bare[0] and others]
+        if data and not pictures and bare[1] in ("", "#") and len(beside) == 1 and len(found[beside[0]][0]) == 1:
+            found[beside[0]][1].extend(data)
+            del found[bare]
+    return list(found.values())
+
+
 def read_pass_name(shot: Shot) -> PassName:
     """The pass that the name of a shot's files, or of their folder, has a word for."""
     folder, name = shot.folder, (shot.name or shot.files[0].stem)
-    found = _find_word(name)
+    tokens = _split(name)
+    found = _find_word(tokens)
     if found is not None:
         word, rest = found
-        return PassName((folder, rest), word, _WORDS[word])
-    word = _plain(folder.name)
-    if word in _WORDS:
-        return PassName((folder.parent, _plain(name)), word, _WORDS[word])
-    return PassName((folder, _plain(name)), "", None)
+        return PassName((folder, rest), word, _BUFFERS[word])
+    word = _WORDS.get("".join(_split(folder.name)), "")
+    if word:
+        return PassName((folder.parent, " ".join(tokens)), word, _BUFFERS[word])
+    return PassName((folder, " ".join(tokens)), "", None)
 
 
-_WORDS: dict[str, str] = {
+_BUFFERS: dict[str, str] = {
+    **dict.fromkeys(_UNREAD_WORDS, _UNREAD),
     # "sh_normal" is Mitsuba's name for a layer, and in names of files the normal of the shot "sh".
     **{name: buffer for buffer, names in LAYERS.items() for name in names if name not in ("", "sh_normal")},
     **dict.fromkeys(_BEAUTY, "radiance"),
 }
+"""Word -> buffer."""
+_CERTAIN = {"normal", "motion", "ids"}
+"""Buffers whose words names of shots have, too; beside a pass that is one for sure they are passes."""
 
 
-def _plain(text: str) -> str:
-    """Lower case, with one kind of separator and none at the ends."""
-    return re.sub(r"[\s._-]+", " ", text.lower()).strip()
+def _split(text: str) -> list[str]:
+    """The words of a name in lower case, and signs that part no words, such as the ``#`` of a number."""
+    return re.findall(r"[^\W_]+|[^\w\s.-]+", text.lower())
 
 
-def _find_word(name: str) -> tuple[str, str] | None:
+_WORDS: dict[str, str] = {"".join(_split(word)): word for word in _BUFFERS}
+"""Word without what parts its own words -> as it is: ``DiffuseAlbedo`` is ``diffuse_albedo``."""
+
+
+def _find_word(tokens: Sequence[str]) -> tuple[str, str] | None:
     """The longest word for a pass in a name, and the rest."""
-    text = _plain(name)
     best: tuple[str, str] | None = None
-    for word in _WORDS:
-        match = re.search(rf"(?<![a-z0-9]){re.escape(_plain(word))}(?![a-z0-9])", text)
-        if match is not None and (best is None or len(word) > len(best[0])):
-            best = word, _plain(text[: match.start()] + " " + text[match.end() :])
+    for start in range(len(tokens)):
+        for end in range(start + 1, len(tokens) + 1):
+            word = _WORDS.get("".join(tokens[start:end]), "")
+            if len(word) > len(best[0] if best else ""):
+                best = word, " ".join([*tokens[:start], *tokens[end:]])
     return best
 
 
 def _is_sure(name: PassName) -> bool:
     """Whether a file with such a word is a data pass though no picture is beside it."""
-    return len(name.word) >= _SHORT and name.word not in _UNSURE
+    return len(name.word) >= _SHORT and name.word not in _UNSURE and name.buffer != _UNREAD
+
+
+def _has_signs(shot: Shot) -> bool:
+    """Whether the first file that can be read has what no picture has: values below 0, or unit vectors everywhere."""
+    for file in shot.files:
+        try:
+            pixels = ExrFile(file).pixels
+        except ClipError:
+            continue
+        values = np.stack([np.asarray(each, np.float64) for each in pixels.values()], axis=-1)
+        as_colours = 2 * values - 1
+        return bool(np.mean(values < 0) > _SIGNS) or _are_unit(values) or _are_unit(as_colours)
+    return False
+
+
+def _are_unit(vectors: np.ndarray) -> bool:
+    """Whether vectors [H, W, 3] have the length 1, but for a few at edges; with another number of components, no."""
+    lengths = np.linalg.norm(vectors, axis=-1)
+    return vectors.shape[-1] == 3 and bool(np.mean(np.abs(lengths - 1) < 0.02) > 0.9)
 
 
 def _is_plain(shot: Shot) -> bool:
