@@ -6,7 +6,7 @@ Frames are another renderer's EXR files (beauty, albedo, normal, depth, motion).
 in a separate process, whose peak resident set is measured. Unix only.
 """
 
-import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -35,7 +35,7 @@ class Settings:
 
 
 def write_sequence(folder: Path, frames: int, height: int, width: int) -> None:
-    """Noise with every buffer that the networks read; all frames are the same file under other names."""
+    """Noise with every buffer that the networks read; all frames are copies: a link counts as a frame that is held."""
     rng = np.random.default_rng(0)
     layers = {"": "RGB", "albedo.": "RGB", "normal.": "XYZ", "motion.": "XY", "depth.": "Z"}
     channels = {
@@ -47,7 +47,7 @@ def write_sequence(folder: Path, frames: int, height: int, width: int) -> None:
     first = folder / "frame_0001.exr"
     write_exr(first, channels)
     for index in range(2, frames + 1):
-        os.link(first, folder / f"frame_{index:04d}.exr")
+        shutil.copyfile(first, folder / f"frame_{index:04d}.exr")
 
 
 def peak_mib(source: Path, out: Path, method: str, max_memory: float | None = None) -> float:

@@ -55,8 +55,6 @@ NOTHING = {
 @pytest.mark.parametrize(
     ("name", "values", "why"),
     [
-        ("depth", np.ones((HEIGHT, WIDTH, 1)), "'V.Depth' is 1 everywhere"),
-        ("depth", np.full((HEIGHT, WIDTH, 1), 1e10), "'V.Depth' is 1e+10 everywhere"),
         ("motion", np.full((HEIGHT, WIDTH, 4), 1e-8), "'V.Vector' is 0 everywhere"),
         ("normal", np.full((HEIGHT, WIDTH, 3), 0.0), "'V.Denoising Normal' is (0, 0, 0) everywhere"),
     ],

@@ -134,8 +134,6 @@ def _explain_empty(name: str, values: np.ndarray) -> str | None:
         return "(" + ", ".join(f"{value:g}" for value in first.ravel()) + ") everywhere" if same else None
     if name == "albedo" and np.all((values == 1) | ~known):
         return "1 everywhere"
-    if name == "depth" and known.any() and np.all((values == values[known][0]) | ~known):
-        return f"{values[known][0]:g} everywhere"
     if name == "motion":
         values = np.where(np.abs(np.nan_to_num(values)) < _STILL, 0, values)
     return "0 everywhere" if name in _ZEROS and not np.any((values != 0) & known) else None
