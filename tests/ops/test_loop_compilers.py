@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -89,3 +90,22 @@ def test_without_being_asked_no_process_is_started():
         assert inner is compilers
         assert not compilers.compilers
     assert compile_apart(find_median, ()) is None
+
+
+def test_nothing_is_imported_from_the_folder_where_a_command_runs(tmp_path, monkeypatch):
+    (tmp_path / "pickle.py").write_text("import pathlib\npathlib.Path('imported').touch()\n")
+    monkeypatch.chdir(tmp_path)
+    with loops_compiled_apart() as compilers:
+        compilers.compile(("jaxdn.ops.numba_medians", "no_such_loop"), ()).result(timeout=60)
+    assert not (tmp_path / "imported").exists()
+
+
+def test_threads_that_tell_loops_at_once_start_no_process_too_many():
+    with loops_compiled_apart() as compilers, ThreadPoolExecutor(8) as threads:
+        compilers.most = 1
+        loops = [("jaxdn.ops.numba_medians", f"no_such_loop_{number}") for number in range(200)]
+        for done in list(threads.map(lambda loop: compilers.compile(loop, ()), loops)):
+            done.result(timeout=60)
+        (compiler,) = compilers.compilers
+        assert compiler.given == len(loops)
+        assert compiler.process.poll() is None  # it has read every loop whole

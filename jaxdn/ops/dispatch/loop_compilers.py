@@ -34,7 +34,11 @@ class LoopCompiler:
 
     def __init__(self) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+            # -P: the folder where a command runs may hold a pickle.py.
+            [sys.executable, "-P", "-m", __name__],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
         )
         assert self.process.stdin is not None
         assert self.process.stdout is not None
@@ -86,12 +90,14 @@ class LoopCompilers:
         self.compilers: list[LoopCompiler] = []
         self._told: dict[tuple[tuple[str, str], tuple[Any, ...]], Future[None]] = {}
         self.places: dict[tuple[str, str], LoopCompiler] = {}
+        self._lock = threading.Lock()
 
     def compile(self, loop: tuple[str, str], signature: tuple[Any, ...]) -> Future[None]:
-        """Have a loop (module, name) compiled, once for a signature."""
-        if (loop, signature) not in self._told:
-            self._told[loop, signature] = self._compiler(loop).compile(loop, signature)
-        return self._told[loop, signature]
+        """Have a loop (module, name) compiled, once for a signature. Threads may call it at once."""
+        with self._lock:
+            if (loop, signature) not in self._told:
+                self._told[loop, signature] = self._compiler(loop).compile(loop, signature)
+            return self._told[loop, signature]
 
     def _compiler(self, loop: tuple[str, str]) -> LoopCompiler:
         """The one that has the fewest; the same for all signatures of a loop, as two cannot add to one file."""
