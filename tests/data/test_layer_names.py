@@ -58,6 +58,63 @@ PROGRAMS = {
         {"radiance": "Radiance", "normal": "Normal_Roughness", "roughness": "Normal_Roughness", "depth": "ViewZ",
          "motion": "MV", "specular_hit_distance": "spec_hit_dist"},
     ),
+    "Streamline's tags": (
+        {"kBufferTypeScalingInputColor": "RGB", "kBufferTypeScalingOutputColor": "RGB", "kBufferTypeAlbedo": "RGB",
+         "kBufferTypeSpecularAlbedo": "RGB", "kBufferTypeNormals": "RGB", "kBufferTypeRoughness": "R",
+         "kBufferTypeDepth": "R", "kBufferTypeMotionVectors": "RG", "kBufferTypeSpecularHitDistance": "R"},
+        {"radiance": "kBufferTypeScalingInputColor", "albedo": "kBufferTypeAlbedo",
+         "specular_reflectance": "kBufferTypeSpecularAlbedo", "normal": "kBufferTypeNormals",
+         "roughness": "kBufferTypeRoughness", "depth": "kBufferTypeDepth", "motion": "kBufferTypeMotionVectors",
+         "specular_hit_distance": "kBufferTypeSpecularHitDistance"},
+    ),
+    "Streamline's tags, roughness with the normals": (
+        {"color": "RGB", "kBufferTypeNormalRoughness": "RGBA", "kBufferTypeLinearDepth": "R"},
+        {"radiance": "color", "normal": "kBufferTypeNormalRoughness", "roughness": "kBufferTypeNormalRoughness",
+         "depth": "kBufferTypeLinearDepth"},
+    ),
+    "arguments of DLSS-RR": (
+        {"InColor": "RGB", "pInDiffuseAlbedo": "RGB", "pInSpecularAlbedo": "RGB", "InNormals": "XYZ",
+         "InRoughness": "R", "InDepth": "R", "InMotionVectors": "XY", "InSpecHitDist": "R"},
+        {"radiance": "InColor", "albedo": "pInDiffuseAlbedo", "specular_reflectance": "pInSpecularAlbedo",
+         "normal": "InNormals", "roughness": "InRoughness", "depth": "InDepth", "motion": "InMotionVectors",
+         "specular_hit_distance": "InSpecHitDist"},
+    ),
+    "short words": (
+        {"noisyRadiance": "RGB", "InDiffAlbedo": "RGB", "InSpecAlbedo": "RGB"},
+        {"radiance": "noisyRadiance", "albedo": "InDiffAlbedo", "specular_reflectance": "InSpecAlbedo"},
+    ),
+    "MetalFX": (
+        {"colorTexture": "RGBA", "diffuseAlbedoTexture": "RGB", "specularAlbedoTexture": "RGB",
+         "normalTexture": "RGB", "roughnessTexture": "R", "depthTexture": "R", "motionTexture": "RG",
+         "specularHitDistanceTexture": "R", "outputTexture": "RGB"},
+        {"radiance": "colorTexture", "albedo": "diffuseAlbedoTexture", "specular_reflectance": "specularAlbedoTexture",
+         "normal": "normalTexture", "roughness": "roughnessTexture", "depth": "depthTexture",
+         "motion": "motionTexture", "specular_hit_distance": "specularHitDistanceTexture"},
+    ),
+    "FSR-RR": (
+        {"radiance": "RGBA", "fusedAlbedo": "RGBA", "normals": "XYZ", "linearDepth": "R", "motionVectors": "RG"},
+        {"radiance": "radiance", "albedo": "fusedAlbedo", "normal": "normals", "depth": "linearDepth",
+         "motion": "motionVectors"},
+    ),
+    "Open Image Denoise's tools": (
+        {"hdr": "RGB", "alb": "RGB", "nrm": "RGB", "z": "R"},
+        {"radiance": "hdr", "albedo": "alb", "normal": "nrm", "depth": "z"},
+    ),
+    "a part called Main": ({"Main": "RGBA", "albedo": "RGB"}, {"radiance": "Main", "albedo": "albedo"}),
+    "V-Ray's frame buffer": (
+        {"VRayRGB": "RGBA", "effectsResult": "RGB", "VRayZDepth": "R"}, {"radiance": "VRayRGB", "depth": "VRayZDepth"},
+    ),
+    "effects alone": ({"effectsResult": "RGB", "diffuseFilter": "RGB"},
+                      {"radiance": "effectsResult", "albedo": "diffuseFilter"}),
+    "noisy beside the denoised": ({"beauty": "RGB", "beauty_noisy": "RGB"}, {"radiance": "beauty_noisy"}),
+    "noisy at the end": ({"beauty_noisy": "RGB", "depth": "Z"}, {"radiance": "beauty_noisy", "depth": "depth"}),
+    "a view layer in front of a tag": (
+        {"Room.InColor": "RGB", "Room.kBufferTypeDepth": "R"},
+        {"radiance": "Room.InColor", "depth": "Room.kBufferTypeDepth"},
+    ),
+    "words that only begin alike": (
+        {"": "RGB", "Texture": "RGB", "Indirect": "RGB", "IndexOB": "X"}, {"radiance": "R, G, B", "ids": "IndexOB"},
+    ),
     "a view layer in front": (
         {"Room.Image": "RGB", "Room.Z-Depth": "Z", "Room.Denoising_Albedo": "RGB"},
         {"radiance": "Room.Image", "depth": "Room.Z-Depth", "albedo": "Room.Denoising_Albedo"},

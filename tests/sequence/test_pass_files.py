@@ -58,7 +58,35 @@ PLACES: dict[str, tuple[Place, str]] = {
 
 _WORDS = {"albedo": "DiffuseAlbedo", "normal": "WorldNormal", "depth": "LinearDepth"}
 _LUX = {"beauty": "RGB_IMAGEPIPELINE", "normal": "AVG_SHADING_NORMAL"}
+_TAGS = {"beauty": "ScalingInputColor", "normal": "Normals"}
+_METAL = {"beauty": "color", "albedo": "diffuseAlbedo"}
+_OIDN = {"beauty": "hdr", "albedo": "alb", "normal": "nrm", "depth": "z"}
 PLACES |= {
+    "Streamline": (
+        lambda name, frame: f"kBufferType{_TAGS.get(name, name.title())}_{frame:04d}.exr",
+        "kBufferTypeScalingInputColor_{:04d}.exr",
+    ),
+    "MetalFX": (
+        lambda name, frame: f"{_METAL.get(name, name)}Texture.{frame:04d}.exr",
+        "colorTexture.{:04d}.exr",
+    ),
+    "Metal, words parted": (lambda name, frame: f"{name}_texture_{frame:04d}.exr", "beauty_texture_{:04d}.exr"),
+    "In": (
+        lambda name, frame: f"In{'Color' if name == 'beauty' else name.title()}{frame:04d}.exr",
+        "InColor{:04d}.exr",
+    ),
+    "Open Image Denoise": (lambda name, frame: f"scene.{frame:04d}.{_OIDN[name]}.exr", "scene.{:04d}.hdr.exr"),
+    "a shot called main": (
+        lambda name, frame: f"main_{name}_{frame:04d}.exr".replace("_beauty", ""),
+        "main_{:04d}.exr",
+    ),
+    **{
+        word: (
+            lambda name, frame, word=word: f"{word if name == 'beauty' else name}_{frame:04d}.exr",  # type: ignore[misc]
+            word + "_{:04d}.exr",
+        )
+        for word in ("noisyRadiance", "beauty_noisy", "hdr", "Main", "VRayRGB", "effectsResult")
+    },
     "wordsInOne": (lambda name, frame: f"sh_{_WORDS.get(name, name)}_{frame:04d}.exr", "sh_beauty_{:04d}.exr"),
     "the picture has another name": (
         lambda name, frame: f"{'render' if name == 'beauty' else name}.{frame:04d}.exr",

@@ -26,6 +26,11 @@ LAYERS: dict[str, tuple[str, ...]] = {
     "radiance": (
         "noisy image",
         "",
+        "noisy_radiance",
+        "noisy_beauty",
+        "radiance_noisy",
+        "beauty_noisy",
+        "color_noisy",
         "beauty",
         "rgba",
         "combined",
@@ -38,10 +43,15 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "radiance",
         "noisy",
         "noisy_color",
+        "scaling_input_color",  # Streamline's input; the output is the upscaled image
         "rgb",
         "image",
         "rgb_imagepipeline",
         "rgba_imagepipeline",
+        "vrayrgb",
+        "hdr",
+        "main",
+        "effectsresult",
     ),
     "albedo": (
         "albedo",
@@ -49,12 +59,15 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "diffuse_albedo",
         "diffuse_albedo_noice",
         "diffusealbedo",
+        "diff_albedo",
+        "alb",
         "visiblediffuse",
         "diffusefilter",
         "vraydiffusefilter",
         "cshading_albedo",
         "diffcol",
         "diffuse color",
+        "fused_albedo",
         "diffuse",  # V-Ray for Maya's filter, others' lighting: jaxdn.data.foreign.reflectance tells them apart
     ),
     "normal": (
@@ -64,6 +77,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "sh_normal",
         "n",
         "ns",
+        "nrm",
         "n_noice",
         "visiblenormals",
         "optixnormals",
@@ -129,6 +143,7 @@ LAYERS: dict[str, tuple[str, ...]] = {
         "specular_albedo",
         "denoising specular albedo",
         "specularalbedo",
+        "spec_albedo",
         "reflectionfilter",
         "vrayreflectionfilter",
     ),
@@ -141,6 +156,7 @@ _DIFFUSE_PARTNERS: dict[str, str] = {
     "specular_albedo": "diffuse_albedo",  # Arnold, whose "albedo" is the sum of all
     "denoising specular albedo": "denoising albedo",  # Blender 5.2; before, its albedo had rough reflections in it
     "specularalbedo": "diffusealbedo",  # Falcor, ray reconstruction
+    "spec_albedo": "diff_albedo",
     "reflectionfilter": "diffusefilter",  # V-Ray
     "vrayreflectionfilter": "vraydiffusefilter",
 }
@@ -212,9 +228,16 @@ def group_layers(names: Sequence[str]) -> Groups:
     return groups
 
 
+_AFFIXES = re.compile(r"(?:^|(?<=\.))(?:kBufferType|p?In(?=[A-Z_])|in_)(?=[^.])|(?<=[^.])[\s_-]?[Tt]exture(?=\.|$)")
+"""What interfaces put around the name of a buffer: Streamline's tags, arguments (``pInColor``), Metal's properties."""
+_STREAMLINE_ALBEDO = re.compile(r"kBufferTypeAlbedo(?=\.|$)")
+"""Beside a specular albedo it is the diffuse one."""
+
+
 def plain(name: str) -> str:
-    """A name in lower case, without what programs part its words by; dots stay."""
-    return re.sub(r"[\s_-]", "", name.lower())
+    """A name in lower case, without what interfaces put around it and programs part its words by; dots stay."""
+    inner = _AFFIXES.sub("", _STREAMLINE_ALBEDO.sub("diffuse_albedo", name))
+    return re.sub(r"[\s_-]", "", inner.lower())
 
 
 def is_called(layer: str, name: str) -> bool:

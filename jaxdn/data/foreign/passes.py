@@ -12,11 +12,13 @@ import numpy as np
 
 from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.file import ExrFile
-from jaxdn.data.foreign.layers import LAYERS, UNSURE_ALBEDO
+from jaxdn.data.foreign.layers import LAYERS, UNSURE_ALBEDO, plain
 from jaxdn.data.foreign.shots import Shot, find_shots
 
 _BEAUTY = [name for name in LAYERS["radiance"] if name]
 """Words in the names of files that hold the picture, the best first."""
+_WEAK = {"main", "hdr", "image"}
+"""Words for the picture that are names of shots, too: any word for data is stronger."""
 _MOTION = {"motion", "vector", "velocity", "backward", "forward"}
 _UNSURE = _MOTION | {UNSURE_ALBEDO, "id", "ids", "object id", "normal", "normals"}
 """Words that are names of shots, too: such files alone are pictures, unless one of a picture is beside them."""
@@ -114,6 +116,12 @@ def _group(shots: Sequence[Shot]) -> list[tuple[list[_Named], list[_Named]]]:
     for shot in shots:
         name = read_pass_name(shot)
         groups.setdefault(name.rest, []).append((shot, name))
+    for group in list(groups.values()):
+        if all(name.buffer in (None, "radiance") for _, name in group):  # a shot called "main"
+            for one in [(shot, name) for shot, name in group if name.word in _WEAK]:
+                group.remove(one)
+                groups.setdefault((one[0].folder, _join(_split(_name_of(one[0])))), []).append(one)
+    groups = {rest: group for rest, group in groups.items() if group}
     found: dict[tuple[Path, str], tuple[list[_Named], list[_Named]]] = {}
     for rest, group in groups.items():
         alone = all(name.buffer not in (None, "radiance") for _, name in group)
@@ -137,16 +145,20 @@ def _group(shots: Sequence[Shot]) -> list[tuple[list[_Named], list[_Named]]]:
 
 def read_pass_name(shot: Shot) -> PassName:
     """The pass that the name of a shot's files, or of their folder, has a word for."""
-    folder, name = shot.folder, (shot.name or shot.files[0].stem)
-    tokens = _split(name)
+    folder = shot.folder
+    tokens = _split(_name_of(shot))
     found = _find_word(tokens)
     if found is not None:
         word, rest = found
         return PassName((folder, rest), word, _BUFFERS[word])
-    word = _WORDS.get("".join(_split(folder.name)), "")
+    word = _WORDS.get(plain("".join(_split(folder.name))), "")
     if word:
-        return PassName((folder.parent, " ".join(tokens)), word, _BUFFERS[word])
-    return PassName((folder, " ".join(tokens)), "", None)
+        return PassName((folder.parent, _join(tokens)), word, _BUFFERS[word])
+    return PassName((folder, _join(tokens)), "", None)
+
+
+def _name_of(shot: Shot) -> str:
+    return shot.name or shot.files[0].stem
 
 
 _BUFFERS: dict[str, str] = {
@@ -161,22 +173,27 @@ _CERTAIN = {"normal", "motion", "ids"}
 
 
 def _split(text: str) -> list[str]:
-    """The words of a name in lower case, and signs that part no words, such as the ``#`` of a number."""
-    return re.findall(r"[^\W_]+|[^\w\s.-]+", text.lower())
+    """The words of a name, and signs that part no words, such as the ``#`` of a number."""
+    return re.findall(r"[^\W_]+|[^\w\s.-]+", text)
 
 
-_WORDS: dict[str, str] = {"".join(_split(word)): word for word in _BUFFERS}
+def _join(tokens: Sequence[str]) -> str:
+    return " ".join(tokens).lower()
+
+
+_WORDS: dict[str, str] = {plain("".join(_split(word))): word for word in _BUFFERS}
 """Word without what parts its own words -> as it is: ``DiffuseAlbedo`` is ``diffuse_albedo``."""
 
 
 def _find_word(tokens: Sequence[str]) -> tuple[str, str] | None:
     """The longest word for a pass in a name, and the rest."""
-    best: tuple[str, str] | None = None
+    best, highest = None, (False, 0, 0)
     for start in range(len(tokens)):
         for end in range(start + 1, len(tokens) + 1):
-            word = _WORDS.get("".join(tokens[start:end]), "")
-            if len(word) > len(best[0] if best else ""):
-                best = word, " ".join([*tokens[:start], *tokens[end:]])
+            word = _WORDS.get(plain("".join(tokens[start:end])), "")
+            score = word not in _WEAK, len(word), end - start
+            if word and score > highest:
+                best, highest = (word, _join([*tokens[:start], *tokens[end:]])), score
     return best
 
 
