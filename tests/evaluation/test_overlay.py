@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from jaxdn.commands import main
+from jaxdn.core.frame import Frame
 from jaxdn.data.exr.exr import read_exr, write_exr
 from jaxdn.evaluation.overlay.camera import CameraMatrices, camera_motion, read_camera
 from jaxdn.evaluation.overlay.evidence import fireflies, noise_map
 from jaxdn.evaluation.overlay.findings import Known, find_all
 from jaxdn.evaluation.overlay.motion_search import box_mean, measure_motion
+from jaxdn.evaluation.overlay.views import draw_views
 
 HEIGHT, WIDTH = 72, 96
 STEP = (3, -2)
@@ -295,6 +297,38 @@ def test_frames_without_noise(tmp_path, inspect):
         return layers | {"Combined": np.full((HEIGHT, WIDTH, 3), 0.5) + 0.2 * (layers["Depth"] < 5)}
 
     assert names(inspect(write_shot(tmp_path / "shot", clean))) == ["no noise"]
+
+
+@pytest.mark.parametrize(("noisy", "expected"), [(True, []), (False, ["no noise"])])
+def test_a_sky_that_fills_most_of_the_picture_is_no_sign_of_noise_or_none(tmp_path, inspect, noisy, expected):
+    """An object in front of an even world, as Blender starts with it."""
+
+    def over_sky(index, layers):
+        square = layers["Depth"] < 5
+        light = layers["Combined"] if noisy else np.full((HEIGHT, WIDTH, 3), 0.6)
+        layers["Denoising Normal"] = layers["Denoising Normal"] * square
+        return layers | {
+            "Combined": np.where(square, light, 0.05),
+            "Depth": np.where(square, layers["Depth"], 1e10),
+            "Vector": layers["Vector"] * square,
+            "Denoising Albedo": layers["Denoising Albedo"] * square,
+            "Object Index": layers["Object Index"] * square,
+        }
+
+    found = names(inspect(write_shot(tmp_path / "shot", over_sky)))
+    assert [name for name in found if "noise" in name] == expected
+
+
+def test_what_was_hidden_is_not_painted_as_another_surface(rng):
+    """Pixels that come into sight have no history because they cannot have one."""
+    frame = Frame(rng.uniform(0.2, 0.8, (4, 6, 3)).astype(np.float32))
+    layers = {name: np.zeros((4, 6, 1), bool) for name in ("rejected", "disoccluded", "outside", "fireflies")}
+    layers["rejected"][1:3, 1:4] = layers["disoccluded"][1:3, 2:5] = layers["outside"][:, 5:] = True
+    seen = draw_views(frame, layers | {"history": np.ones((4, 6, 1))})["rejected"]
+    red, yellow, blue = ((seen == colour).all(-1) for colour in ((0.9, 0.1, 0.1), (1, 0.85, 0), (0.2, 0.4, 1)))
+    np.testing.assert_array_equal(red, (layers["rejected"] & ~layers["disoccluded"])[..., 0])
+    np.testing.assert_array_equal(yellow, layers["disoccluded"][..., 0])
+    np.testing.assert_array_equal(blue, layers["outside"][..., 0])
 
 
 @pytest.mark.parametrize(

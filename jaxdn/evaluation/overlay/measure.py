@@ -172,7 +172,9 @@ def _look_at_one(frame: Frame, stored: Mapping[str, np.ndarray]) -> tuple[dict[s
         "light": float(np.mean(np.minimum(luminance(light), 10 * lit_level(light)))),
     }
     if lit.any():
-        figures["noise"] = float(np.median(noise[lit]))
+        surface = surface_mask(frame.depth, frame.ids)
+        shaded = lit if surface is None else lit & np.asarray(surface)  # a sky has no noise, however few the samples
+        figures["noise"] = float(np.median(noise[shaded if shaded.any() else lit]))
     for guide in ("albedo", "normal"):
         if (buffer := getattr(frame, guide)) is not None:
             layers[f"{guide}_noise"] = noise_map(np.nan_to_num(buffer))[..., None]

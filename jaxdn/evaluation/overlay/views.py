@@ -21,7 +21,7 @@ LEGEND = {
     "camera motion": "the same, from depth and camera",
     "motion error": "given against measured, black 0 to white 4 pixels; grey: not measured",
     "history": "black: none, white: 16 frames",
-    "rejected": "red: another surface, blue: outside of the frame before, yellow: hidden there",
+    "rejected": "red: another surface, yellow: hidden in the frame before, blue: outside of it",
     "noise": "of the light, black 0 to white 100%",
     "fireflies": "single bright pixels in magenta",
     "albedo noise": "black 0 to white 0.2",
@@ -48,7 +48,8 @@ def draw_views(frame: Frame, layers: Mapping[str, np.ndarray]) -> dict[str, np.n
     grey = 0.35 + 0.3 * luminance(beauty)[..., None].repeat(3, axis=-1)
     if "rejected" in layers:
         marked = grey
-        for layer, colour in (("disoccluded", (1, 0.85, 0)), ("rejected", (0.9, 0.1, 0.1)), ("outside", (0.2, 0.4, 1))):
+        # What was hidden is rejected, and ought to be: red is left for what nothing explains.
+        for layer, colour in (("rejected", (0.9, 0.1, 0.1)), ("disoccluded", (1, 0.85, 0)), ("outside", (0.2, 0.4, 1))):
             if layer in layers:
                 marked = np.where(layers[layer], np.array(colour), marked)
         views["rejected"] = marked
