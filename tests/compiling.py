@@ -15,7 +15,9 @@ from jax._src.interpreters import mlir
 
 _KNOWN = jax.__version_info__ < (0, 11)
 
-FLAGS = ("--xla_cpu_use_fusion_emitters=false " if _KNOWN else "") + "--xla_cpu_parallel_codegen_split_count=1"
+IN_ONE_PIECE = "--xla_cpu_parallel_codegen_split_count=1"
+"""For ``XLA_FLAGS``: a tenth of the time less, and what is compiled is what users have."""
+FLAGS = ("--xla_cpu_use_fusion_emitters=false " if _KNOWN else "") + IN_ONE_PIECE
 """For ``XLA_FLAGS``: without emitters where they can be left out, in one piece."""
 AS_USERS: dict[str, bool] = {"xla_cpu_use_fusion_emitters": True} if _KNOWN else {}
 """Options of one program: with them, whatever the flags of the process."""

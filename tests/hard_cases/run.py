@@ -8,6 +8,7 @@ import gc
 import hashlib
 import json
 import multiprocessing
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -23,6 +24,7 @@ from jaxdn import color
 from jaxdn.evaluation.report.images import data_address, encode_png
 from jaxdn.runtime.atomic_files import write_atomically
 from jaxdn.runtime.parent import end_with_parent
+from tests.compiling import IN_ONE_PIECE, join_flags
 from tests.hard_cases.cases import CASES
 from tests.hard_cases.functions import Function, list_denoisers, list_operations
 from tests.hard_cases.inputs import good
@@ -147,6 +149,7 @@ def _kind(name: str) -> str:
 def _prepare() -> None:
     """A worker keeps its compiled programs, so that a run after a fix compiles only what the fix has changed."""
     end_with_parent()
+    os.environ["XLA_FLAGS"] = join_flags(os.environ.get("XLA_FLAGS"), IN_ONE_PIECE)
     jax.config.update("jax_compilation_cache_dir", str(FOLDER.resolve() / "compiled"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
