@@ -53,7 +53,7 @@ def fetch_sharply(history: jax.Array, before: Guides, frame: Frame, first: jax.A
     values, valid = found.history, found.valid[..., 0]
     whole, cubic = values[..., -1] > _WHOLE, jnp.zeros_like(valid)
     if frame.motion is not None:
-        sharp = warp_cubic(history[..., :colors], frame.motion)
+        sharp = warp_cubic(history, frame.motion, channels=colors)
         inside = find_beyond(jnp.where(jnp.isfinite(frame.motion), frame.motion, 0.0)) == 0
         cubic = valid & inside & whole & jnp.all(jnp.isfinite(sharp), axis=-1)
         light = jnp.where(cubic[..., None], sharp, values[..., :colors])
