@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn.filters.kalman import box_sum
+from jaxdn.ops.scales import add_planes
 
 RECEPTIVE_FIELD = 3
 """Radius in pixels of the window."""
@@ -40,9 +41,9 @@ def measure_share(
     """
     history, image = exposure * history, exposure * image
     change = history * _change(before, albedo)
-    weight = 1.0 / (jnp.mean(image, axis=0) ** 2 + jnp.mean(history, axis=0) ** 2 + _LEAST_LIGHT)
-    both = jnp.sum((image - history) * change, axis=0)
-    own = jnp.sum(change**2, axis=0)
+    weight = 1.0 / ((add_planes(image) / 3.0) ** 2 + (add_planes(history) / 3.0) ** 2 + _LEAST_LIGHT)
+    both = add_planes((image - history) * change)
+    own = add_planes(change**2)
     both, own = box_sum(jnp.stack([weight * both, weight * own]), RECEPTIVE_FIELD)
     some = own > 0
     return jnp.clip(jnp.where(some, both / jnp.where(some, own, 1.0), 0.0), 0.0, 1.0)

@@ -30,6 +30,8 @@ Rudolf Kalman, "A New Approach to Linear Filtering and Prediction Problems", 196
 import jax
 import jax.numpy as jnp
 
+from jaxdn.ops.scales import add_planes
+
 PLANES = 6
 """Of a history: colour, gain, deviation of the image's own errors, deviation of the noise."""
 _WINDOWS = (3, 7)
@@ -135,7 +137,7 @@ def measure_support(residual: jax.Array, innovation: jax.Array, variance: jax.Ar
     """
     most = jnp.maximum(_MOST_RESIDUAL * jnp.sqrt(variance)[None], jnp.abs(innovation))
     products = (
-        jnp.stack([jnp.sum(jnp.clip(residual, -most, most) * innovation, axis=0), jnp.sum(innovation**2, axis=0)])
+        jnp.stack([add_planes(jnp.clip(residual, -most, most) * innovation), add_planes(innovation**2)])
         / variance[None]
     )
     support = jnp.zeros_like(variance)
@@ -174,7 +176,7 @@ def box_sum(planes: jax.Array, radius: int) -> jax.Array:
 
 def _mean_square(planes: jax.Array) -> jax.Array:
     """[H, W] the mean of the squares of planes [C, H, W]."""
-    return jnp.mean(planes**2, axis=0)
+    return add_planes(planes**2) / len(planes)
 
 
 def _root(values: jax.Array) -> jax.Array:

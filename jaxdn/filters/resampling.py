@@ -23,6 +23,7 @@ from jaxdn.filters.albedo_history import follow_albedo
 from jaxdn.filters.catmull_rom import catmull_rom
 from jaxdn.filters.surface_test import Guides, expect_surface, guides_of, same_surface
 from jaxdn.ops.motion import find_targets
+from jaxdn.ops.scales import add_planes
 
 _MIXED = 2.0
 """Factor of the squared error at silhouettes: of 3x3 pixels two thirds at least are on one side, which adds no
@@ -50,7 +51,7 @@ def measure_fetch_error(
         found = there[:3]
         if albedo is not None:
             found = follow_albedo(found, there[3:], albedo, share)
-        return jnp.mean((image - found) ** 2, axis=0)
+        return add_planes((image - found) ** 2) / 3.0
 
     across, down = (_weigh_there_and_back(fraction[..., axis], cubic) for axis in (0, 1))
     blurred = error(_filter(_filter(planes, across, 2), down, 1))
@@ -115,5 +116,5 @@ def _find_way(motion: jax.Array, beyond: jax.Array) -> jax.Array:
     """
     planes = motion.transpose(2, 0, 1)
     steps = jnp.round(planes)
-    ways = (jnp.sum((each - steps) ** 2, axis=0) for each in (planes, *_around(planes)))
+    ways = (add_planes((each - steps) ** 2) for each in (planes, *_around(planes)))
     return functools.reduce(jnp.maximum, ways, beyond**2)

@@ -1,4 +1,4 @@
-"""Numba loops of :mod:`jaxdn.ops.scales`: arrays of several layouts as planes, unknown pixels filled."""
+"""Numba loops of :mod:`jaxdn.ops.scales`: arrays of several layouts as planes or as pixels, unknown pixels filled."""
 
 import numpy as np
 
@@ -50,6 +50,45 @@ def join_rows(top: int, bottom: int, arrays: tuple[Array, ...], out: Array, layo
                         other = below[2 * x, channel] + below[2 * x + 1, channel]
                         row[x] = np.float32(0.25) * (one + other)
             first += count
+
+
+@loop
+def join_pixel_rows(top: int, bottom: int, arrays: tuple[Array, ...], out: Array, layouts: tuple[int, ...]) -> None:
+    """Rows of ``out`` [h, w, C]: what becomes of planes, by the numbers of :data:`jaxdn.ops.scales.PLANE_LAYOUTS`."""
+    quarter = np.float32(0.25)
+    for y in range(top, bottom):
+        row, first, width = out[y], 0, 0
+        for index in range(len(arrays)):
+            array, layout = arrays[index], layouts[index]
+            if layout == 0:  # as they are
+                above, width = min(y, array.shape[1] - 1), array.shape[2]
+                for channel in range(array.shape[0]):
+                    plane = array[channel, above]
+                    for x in range(width):
+                        row[x, first] = plane[x]
+                    first += 1
+                continue
+            above, width = 2 * min(y, (array.shape[1] - 1) // 2), (array.shape[2] + 1) // 2
+            below, whole = min(above + 1, array.shape[1] - 1), array.shape[2] // 2
+            for channel in range(array.shape[0]):
+                upper, lower = array[channel, above], array[channel, below]
+                if layout == 1:  # the pixels of 2x2
+                    for x in range(whole):
+                        row[x, first], row[x, first + 1] = upper[2 * x], upper[2 * x + 1]
+                        row[x, first + 2], row[x, first + 3] = lower[2 * x], lower[2 * x + 1]
+                    if whole < width:
+                        row[whole, first], row[whole, first + 1] = upper[2 * whole], upper[2 * whole]
+                        row[whole, first + 2], row[whole, first + 3] = lower[2 * whole], lower[2 * whole]
+                    first += 4
+                else:  # their means
+                    for x in range(whole):
+                        row[x, first] = quarter * (upper[2 * x] + upper[2 * x + 1] + lower[2 * x] + lower[2 * x + 1])
+                    if whole < width:
+                        row[whole, first] = quarter * (2 * upper[2 * whole] + 2 * lower[2 * whole])
+                    first += 1
+        for x in range(width, out.shape[1]):
+            for channel in range(first):
+                row[x, channel] = row[width - 1, channel]
 
 
 @loop

@@ -24,7 +24,7 @@ from jaxdn.filters.affinity_levels import (
 from jaxdn.methods.combiner.history import Means
 from jaxdn.ops.affinity.filter import Guide, affinity_filter
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
-from jaxdn.ops.scales import join_planes
+from jaxdn.ops.scales import halve_planes, join_planes
 
 CANDIDATES = (
     "prior",
@@ -96,20 +96,15 @@ def _filter_at_half(
     """Planes after the levels at half resolution, enlarged along the guides; where none is alike, as they were."""
     trust = parameters.half_trust + LEAST_TRUST
     inverse_depth_half = halve_inverse_depth(inverse_depth)
-    halved = _halve(surfaces)
+    halved = halve_planes(surfaces)
     features = join_planes([("planes", halved), ("pixels", parameters.half_features)])
-    at_half, planes = Guide(features, inverse_depth_half, trust), _halve(fine)
+    at_half, planes = Guide(features, inverse_depth_half, trust), halve_planes(fine)
     for index in range(LEVELS):
         filtered = affinity_filter(planes, scale_guide(at_half, factors, 1 + index, GUIDES), step=2**index)
         planes = planes + parameters.level_weights[index][None] * (filtered - planes)
     there = join_planes([("planes", halved), ("corners", parameters.features)])
     enlarged, weight = joint_bilateral_upsample(planes, Guide(there, inverse_depth[:, ::2, ::2], trust), at_full)
     return fine + weigh_enlarged(weight)[None] * (enlarged - fine)
-
-
-def _halve(planes: jax.Array) -> jax.Array:
-    """[C, H/2, W/2] the means of blocks of 2x2 pixels."""
-    return 0.25 * (planes[:, ::2, ::2] + planes[:, ::2, 1::2] + planes[:, 1::2, ::2] + planes[:, 1::2, 1::2])
 
 
 def receptive_field() -> int:

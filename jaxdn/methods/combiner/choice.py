@@ -14,7 +14,7 @@ from jaxdn import color
 from jaxdn.denoiser import Params
 from jaxdn.filters.kalman import box_sum
 from jaxdn.methods.combiner.candidates import CANDIDATES
-from jaxdn.ops.scales import crop, downsample, join_planes, pad, space_to_depth
+from jaxdn.ops.scales import add_planes, crop, halve_planes, join_pixels, join_planes
 
 RADII = (1, 3)
 """Of the windows over which the slopes are measured, in blocks of 2x2 pixels."""
@@ -71,27 +71,22 @@ def assemble_evidence(
         seen = color.luminance_of_planes(color.compress(gain * each))
         fine.append(4.0 * (seen - level))
         difference = jnp.clip(slant * (each - prior), -most, most)
-        both, own = jnp.sum(difference * residual, axis=0), jnp.sum(difference**2, axis=0)
-        products = downsample(jnp.stack([both, own, both**2], axis=-1)).transpose(2, 0, 1)
+        both, own = add_planes(difference * residual), add_planes(difference**2)
+        products = halve_planes(jnp.stack([both, own, both**2]))
         for radius in RADII:
             both, own, spread = box_sum(products, radius)
             own = own + (2.0 * radius + 1.0) ** 2 * _LEAST_SQUARE
             evidence += [jnp.clip(both / own, *_SLOPE_RANGE), jnp.minimum(0.5 * jnp.sqrt(spread + 1e-12) / own, 2.0)]
-    square = downsample(jnp.mean(residual**2, axis=0)[..., None])[..., 0]
-    noise = box_sum(square[None], RADII[0])[0] / (2.0 * RADII[0] + 1.0) ** 2
+    square = halve_planes(add_planes(residual**2)[None] / 3.0)
+    noise = box_sum(square, RADII[0])[0] / (2.0 * RADII[0] + 1.0) ** 2
     evidence.append(jnp.minimum(4.0 * jnp.sqrt(noise + 1e-12), 2.0))
     facts = [color.luminance_of_planes(albedo), 1.0 / (1.0 + number)]
     groups = (
-        _blocks(fine),
-        jnp.stack(evidence, axis=-1),
-        jnp.concatenate([_blocks(facts), downsample(normal.transpose(1, 2, 0))], axis=-1),
+        [("blocks", plane[None]) for plane in fine],
+        [("planes", plane[None]) for plane in evidence],
+        [*(("blocks", plane[None]) for plane in facts), ("means", normal)],
     )
-    return tuple(pad(group, _MULTIPLE) for group in groups)
-
-
-def _blocks(planes: Sequence[jax.Array]) -> jax.Array:
-    """[H/2, W/2, 4C] of planes [H, W]."""
-    return space_to_depth(jnp.stack(planes, axis=-1))
+    return tuple(join_pixels(group, multiple=_MULTIPLE) for group in groups)
 
 
 def begin(params: Params) -> Params:

@@ -50,7 +50,7 @@ from jaxdn.methods.oidn import oidn
 from jaxdn.methods.registry import method
 from jaxdn.networks import Widths, graph
 from jaxdn.ops import oidn as binding
-from jaxdn.ops.scales import crop, downsample, fill_holes, join_planes, pad, space_to_depth, to_planes, upsample
+from jaxdn.ops.scales import crop, downsample, fill_holes, join_pixels, join_planes, pad, to_planes, upsample
 from jaxdn.recipes.augmentation import Augmentation
 from jaxdn.recipes.objectives import squared_illumination
 from jaxdn.recipes.recipe import Recipe
@@ -276,25 +276,14 @@ def _assemble_network_input(
     count = jnp.where(past.valid, past.means.number, 0.0)
     facts = [jnp.minimum(spread, 8.0) / 8.0, 1.0 / (1.0 + count), jnp.ones_like(level)]
     plain = [color.compress(gain * light) for light in (now.prior, past.means.prior)]
-    valid = past.valid[None].astype(like.dtype)
+    means = [*divided, *(fact[None] for fact in facts)], [*plain, past.valid[None].astype(like.dtype)]
+    levels = [[color.luminance_of_planes(one)[None] for one in lights] for lights in (divided[::2], plain[:1])]
 
-    def by_blocks(planes: list[jax.Array]) -> list[jax.Array]:
-        return [_even(each) for each in planes]
+    def join(averaged: Sequence[jax.Array], whole: Sequence[jax.Array]) -> jax.Array:
+        parts = [*(("means", each) for each in averaged), *(("blocks", each) for each in whole)]
+        return join_pixels(parts, multiple=_MULTIPLE)
 
-    four = [space_to_depth(each) for each in by_blocks([color.luminance_of_planes(one)[None] for one in divided[::2]])]
-    own = [space_to_depth(each) for each in by_blocks([color.luminance_of_planes(one)[None] for one in plain[:1]])]
-    groups = (
-        [space_to_depth(each) for each in by_blocks(list(geometry))],
-        [downsample(each) for each in by_blocks([*divided, *(fact[None] for fact in facts)])] + four,
-        [downsample(each) for each in by_blocks([*plain, valid])] + own,
-    )
-    found = [pad(jnp.concatenate(group, axis=-1), _MULTIPLE) for group in groups]
-    return found[0], found[1], found[2]
-
-
-def _even(planes: jax.Array) -> jax.Array:
-    """[H, W, C] of planes, its sides padded to even numbers."""
-    return pad(planes.transpose(1, 2, 0), 2)
+    return join([], geometry), join(means[0], levels[0]), join(means[1], levels[1])
 
 
 def _split_head(head: jax.Array, size: Sequence[int]) -> tuple[FilterParameters, jax.Array]:

@@ -32,7 +32,7 @@ from jax import lax
 from jaxdn.ops.affinity.filter import SPLINE
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
-from jaxdn.ops.scales import join_planes
+from jaxdn.ops.scales import add_planes, join_planes
 
 SCALES = {"normal": 0.0, "position": 0.0, "gloss": 0.0, "depth": 0.0}
 """Logarithms of what the guides are multiplied by before training: more, and their slope is believed sooner."""
@@ -78,7 +78,7 @@ def regress_residual(
 
 def _level(after: jax.Array, floor: jax.Array) -> jax.Array:
     """[H, W] the brightness that light is relative to."""
-    return jnp.mean(after[:3], axis=0) + floor
+    return add_planes(after[:3]) / 3.0 + floor
 
 
 def _residual_regressors(before: jax.Array, after: jax.Array, hit: jax.Array, factors: jax.Array) -> jax.Array:
