@@ -1,6 +1,7 @@
-"""The shots of :mod:`experiments.stability.joints`: four synthetic ones, and a rendered one."""
+"""The shots of :mod:`experiments.stability.joints`: four synthetic ones, and those that Mitsuba renders."""
 
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -9,12 +10,12 @@ from experiments.speed.works import scene
 from jaxdn.clips import read_clip
 from jaxdn.core.frame import Clip
 from jaxdn.render import ClipJob, RenderSettings, render_clips
+from jaxdn.render.mitsuba.variant import use_variant
 
 LAMP_OUT = 8
 """The lamp goes out so many frames before the chunk begins."""
 CUT = 2
 """The cut comes so many frames after the chunk begins."""
-RENDERED = "robot walks, rendered"
 _REFERENCE_SPP = 128
 
 
@@ -44,8 +45,27 @@ def _cut(one: Clip, other: Clip, place: int) -> Clip:
     return Clip(joined.frames._replace(motion=motion, dual_motion=dual), joined.reference)
 
 
-def render_shot(folder: Path, frames: int, size: int) -> Clip:
-    """A shot of ``frames`` frames of Mitsuba's, 1 sample a pixel; its reference has 128, and their noise."""
+def render_shot(scene: str, folder: Path, frames: int, size: int) -> Clip:
+    """A shot of ``frames`` frames of Mitsuba's, 1 sample a pixel; its reference has 128, and their noise.
+
+    ``scene``: a family, or a file (.xml), through which a random camera moves past objects that move.
+    """
     settings = RenderSettings(width=size, height=size, reference_spp=_REFERENCE_SPP)
-    (clip,) = render_clips([ClipJob({"family": "robot", "seed": 1}, str(folder), frames, settings)], progress=False)
+    record = _animate(scene, frames) if scene.endswith(".xml") else {"family": scene, "seed": 1}
+    (clip,) = render_clips([ClipJob(record, str(folder), frames, settings)], progress=False)
     return read_clip(clip)
+
+
+def _animate(file: str, frames: int) -> dict[str, Any]:
+    """The record of a scene file with a random animation."""
+    use_variant()
+    # Its names of Mitsuba exist only after a variant is chosen.
+    from jaxdn.render.camera_paths.randomised_scene import randomise_scene
+
+    return randomise_scene(file, 1, frames).record
+
+
+def name_shot(scene: str) -> str:
+    """What the rows of a rendered shot are called."""
+    name = Path(scene).parent.name if scene.endswith(".xml") else scene
+    return f"{'robot walks' if name == 'robot' else name}, rendered"

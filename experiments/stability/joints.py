@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from experiments.measurement import describe_measurement
-from experiments.stability.joint_shots import CUT, LAMP_OUT, RENDERED, make_shots, render_shot
+from experiments.stability.joint_shots import CUT, LAMP_OUT, make_shots, name_shot, render_shot
 from jaxdn.commands.errors import plain_errors
 from jaxdn.core.frame import Array, Clip, Frame, frame_at
 from jaxdn.filters.time_reversal import HistoryLength, blend, reverse_time, update_history_length
@@ -42,8 +42,10 @@ class Settings:
     after: int = 32
     """Frames of the second chunk, to the end of the shot."""
     size: int = 64
-    rendered: bool = True
-    """Whether a shot is rendered too, which takes minutes."""
+    synthetic: bool = True
+    """Whether the synthetic shots are measured."""
+    rendered: tuple[str, ...] = ("robot", "parlour")
+    """Families and scene files (.xml) of which a shot is rendered, which takes minutes."""
     out: Path = field(default_factory=lambda: Path("runs/joints.json"))
 
 
@@ -133,10 +135,10 @@ def measure_shot(stepper: Stepper, clip: Clip, start: int, lead: int, whole: Ima
 def main(settings: Settings) -> None:
     """Measure, print, save."""
     end = settings.start + settings.after
-    shots = make_shots(end, settings.size, settings.start)
-    if settings.rendered:
+    shots = make_shots(end, settings.size, settings.start) if settings.synthetic else {}
+    for scene in settings.rendered:
         with tempfile.TemporaryDirectory() as folder:
-            shots[RENDERED] = render_shot(Path(folder) / "clip", end, settings.size)
+            shots[name_shot(scene)] = render_shot(scene, Path(folder) / "clip", end, settings.size)
     rows = []
     for method in settings.methods:
         stepper = Stepper(find_model(method))
@@ -166,8 +168,8 @@ def _describe(settings: Settings, rows: list[list[str | float]]) -> dict[str, ob
         "x / (1 + x), in dB) minus the whole shot's. Then the change from one to the other beyond the reference's, "
         "relative to the whole shot's, and the number of frames from which on the second chunk is bit-equal. "
         f"The lamp goes out {LAMP_OUT} frames before the joint: a chunk that begins there has no history of the lamp, "
-        f"which svgf drags along for a while. The cut comes {CUT} frames after it. The rendered shot has a reference "
-        "of 128 samples.",
+        f"which svgf drags along for a while. The cut comes {CUT} frames after it. The rendered shots have a "
+        "reference of 128 samples.",
         rows=rows,
     )
     names = ("method", "shot", "directions", "read", "distance", "PSNR", "flicker", "bit-equal after")

@@ -29,11 +29,7 @@ def test_the_figures_of_a_joint_are_those_of_known_images() -> None:
 
 @pytest.mark.slow
 def test_a_chunk_that_reads_all_frames_is_the_shot_and_any_is_after_a_cut(tmp_path) -> None:
-    main(
-        Settings(
-            methods=("taa",), leads=(0, 6), start=6, after=6, size=32, rendered=False, out=tmp_path / "joints.json"
-        )
-    )
+    main(Settings(methods=("taa",), leads=(0, 6), start=6, after=6, size=32, rendered=(), out=tmp_path / "joints.json"))
     rows = json.loads((tmp_path / "joints.json").read_text())["rows"]
     shots = ("camera pans", "camera stands", "lamp goes out", "cut")
     assert [row[1:3] for row in rows[::2]] == [[shot, both] for shot in shots for both in ("forwards", "both")]
@@ -46,7 +42,7 @@ def test_a_chunk_that_reads_all_frames_is_the_shot_and_any_is_after_a_cut(tmp_pa
 @pytest.mark.needs("mitsuba")
 @pytest.mark.slow
 def test_the_rendered_shot_moves_and_has_noise(tmp_path) -> None:
-    clip = render_shot(tmp_path / "clip", 2, 16)
+    clip = render_shot("robot", tmp_path / "clip", 2, 16)
     assert clip.frames.radiance.shape == clip.reference.shape == (2, 16, 16, 3)
     assert np.nanmax(np.abs(clip.frames.motion[1])) > 0.1
     assert np.mean((clip.frames.radiance - clip.reference) ** 2) > 1e-4
