@@ -96,7 +96,9 @@ NEEDS = {
     "pyoidn": Need(_package("pyoidn"), "pip install -e '.[oidn]'"),
     "distributed": Need(_package("distributed"), "pip install -e '.[farm]'"),
     "openjd": Need(_package("openjd"), "pip install --group dev"),
+    "yaml": Need(_package("yaml"), "pip install --group dev (openjd-cli brings it)"),
     "bash": Need(lambda: shutil.which("bash") is not None, "a Unix system"),
+    "node": Need(lambda: shutil.which("node") is not None, "apt-get install nodejs"),
     "g++": Need(lambda: shutil.which("g++") is not None, "apt-get install g++ pkg-config"),
     "headers of OpenEXR": Need(lambda: _runs("pkg-config", "--exists", "OpenEXR"), "apt-get install libopenexr-dev"),
     "headers of ONNX Runtime": Need(

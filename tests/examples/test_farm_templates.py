@@ -1,6 +1,8 @@
 """The templates of examples/farm: chunks of a shot, run by what they are for, are the whole shot."""
 
+import json
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -11,7 +13,7 @@ import tyro
 
 from jaxdn.clips import write_clip
 from jaxdn.commands.arguments import COMMANDS
-from tests.needs import require
+from tests.needs import require, require_module
 from tests.training.test_training import make_clip
 
 ROOT = Path(__file__).parents[2]
@@ -54,16 +56,87 @@ def test_the_openjd_template_is_one():
     assert "passes validation checks" in run(sys.executable, "-m", "openjd", "check", FARM / "openjd.yaml")
 
 
-def test_deadline_is_given_a_command_that_jaxdn_reads():
-    require("bash")
-    said = run("bash", FARM / "deadline.sh", "/shots/a", "/denoised/a", "1-400", DEADLINE="echo", CHUNK="48")
-    assert "-chunksize 48 " in said
-    assert "-frames 1-400 " in said
-    words = said.split("-arguments ")[1].split(" -frames 1-400")[0]
-    words = words.replace("<QUOTE>", "").replace("<STARTFRAME>", "1").replace("<ENDFRAME>", "48").split()
+def read_denoise(words: list[str]) -> list[str]:
+    """What the frames are of a command that denoises /shots/a into /denoised/a and leaves out what is there."""
     options = tyro.cli(COMMANDS, args=words)
-    assert (options.clips, options.out, options.frames) == ([Path("/shots/a")], Path("/denoised/a"), ["1-48"])
+    assert (options.clips, options.out) == ([Path("/shots/a")], Path("/denoised/a"))
     assert options.skip_existing
+    return list(options.frames)
+
+
+def test_deadline_is_given_what_it_documents_and_a_command_that_jaxdn_reads():
+    require("bash")
+    farm = {"DEADLINE": "printf %s\\n", "CHUNK": "48"}
+    job, *words = run("bash", FARM / "deadline.sh", "/shots/a", "/denoised/a", "1-400", **farm).splitlines()
+    given = dict(zip(words[::2], words[1::2], strict=True))
+    # The words of Deadline 10's manual, Manual Job Submission.
+    assert job == "-SubmitCommandLineJob"
+    assert list(given) == ["-executable", "-arguments", "-frames", "-chunksize", "-name"]
+    assert (given["-executable"], given["-frames"], given["-chunksize"]) == ("jaxdn", "1-400", "48")
+    assert set(re.findall("<.*?>", given["-arguments"])) == {"<QUOTE>", "<STARTFRAME>", "<ENDFRAME>"}
+    words = given["-arguments"].replace("<QUOTE>", "").replace("<STARTFRAME>", "1").replace("<ENDFRAME>", "48").split()
+    assert read_denoise(words) == ["1-48"]
+
+
+FLAMENCO = """
+const fs = require("fs"), vm = require("vm");
+// Sorted frames in chunks; of consecutive ones three or more are a range.
+function frameChunker(range, size) {
+  const frames = range.split(",").flatMap((part) => {
+    const [first, last = first] = part.split("-").map(Number);
+    return Array.from({ length: last - first + 1 }, (_, step) => first + step);
+  });
+  const chunks = [];
+  for (let from = 0; from < frames.length; from += size) {
+    const runs = [];
+    for (const frame of frames.slice(from, from + size)) {
+      if (runs.length && runs.at(-1).at(-1) === frame - 1) runs.at(-1).push(frame);
+      else runs.push([frame]);
+    }
+    chunks.push(runs.map((run) => (run.length > 2 ? `${run[0]}-${run.at(-1)}` : run.join(","))).join(","));
+  }
+  return chunks;
+}
+const author = {
+  Task: (name, type) => ({ name, type, commands: [], addCommand(command) { this.commands.push(command); } }),
+  Command: (name, parameters) => ({ name, parameters }),
+};
+const job = { settings: JSON.parse(process.argv[2]), tasks: [], addTask(task) { this.tasks.push(task); } };
+const scope = vm.createContext({ frameChunker, author, job });
+vm.runInContext(fs.readFileSync(process.argv[1], "utf8"), scope);
+const type = vm.runInContext("JOB_TYPE", scope);
+for (const { key, default: usual } of type.settings) job.settings[key] ??= usual;
+vm.runInContext("compileJob(job)", scope);
+console.log(JSON.stringify({ type, tasks: job.tasks }));
+"""
+
+
+def test_flamenco_is_given_tasks_that_jaxdn_reads():
+    require("node")
+    settings = {"input": "/shots/a", "output": "/denoised/a", "frames": "1-10,20", "chunk_size": 4}
+    said = json.loads(run("node", "-e", FLAMENCO, "--", FARM / "flamenco.js", json.dumps(settings)))
+    assert {setting["type"] for setting in said["type"]["settings"]} <= {"string", "int32", "float", "bool"}
+    assert {task["type"] for task in said["tasks"]} == {"misc"}  # a worker runs it without being configured
+    commands = [command for task in said["tasks"] for command in task["commands"]]
+    assert {(command["name"], command["parameters"]["exe"]) for command in commands} == {("exec", "jaxdn")}
+    read = [read_denoise(command["parameters"]["args"]) for command in commands]
+    assert read == [["1-4"], ["5-8"], ["9", "10", "20"]]
+
+
+def test_kubernetes_is_given_commands_that_jaxdn_reads():
+    require("bash")
+    jobs = list(require_module("yaml").safe_load_all((FARM / "kubernetes.yaml").read_text()))
+    said = {}
+    for job in jobs:
+        assert job["spec"]["completionMode"] == "Indexed"
+        (container,) = job["spec"]["template"]["spec"]["containers"]
+        shell, option, command = container["command"]
+        assert (shell, option, command[:11]) == ("sh", "-c", "exec jaxdn ")
+        told = run("sh", "-c", command.replace("exec jaxdn", "echo"), JOB_COMPLETION_INDEX="1")
+        said[job["metadata"]["name"]] = told.replace("/shared/", "/").split()
+    assert read_denoise(said["denoise-shot"]) == ["201-400"]
+    rendered = tyro.cli(COMMANDS, args=said["render-parlour"])
+    assert (rendered.scene, rendered.out, rendered.seeds) == ("parlour", Path("/train"), ["1"])
 
 
 PROGRAM = """
