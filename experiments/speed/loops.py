@@ -22,6 +22,7 @@ from experiments.speed.timing import Call, measure
 from jaxdn import brdf
 from jaxdn.commands.errors import plain_errors
 from jaxdn.core.frame import Frame
+from jaxdn.filters.catmull_rom import warp_cubic
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import guides_of
 from jaxdn.methods.steady import regression
@@ -38,7 +39,7 @@ from jaxdn.ops.affinity.filter import Guide, affinity_filter
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import implementation
-from jaxdn.ops.scales import fill_holes, join_planes
+from jaxdn.ops.scales import fill_holes, join_pixels, join_planes
 from jaxdn.runtime.malloc import tune_malloc
 from jaxdn.sequence.james_stein import combine
 
@@ -56,7 +57,7 @@ class Settings:
 
 
 def works(height: int, width: int) -> dict[str, Work]:
-    """Name -> what steady-high does in a frame, on noise: costs hardly depend on values."""
+    """Name -> what steady-high and combiner-high do in a frame, on noise: costs hardly depend on values."""
     rng = np.random.default_rng(0)
     half = height // 2, width // 2
 
@@ -73,6 +74,7 @@ def works(height: int, width: int) -> dict[str, Work]:
     frame = Frame(light, albedo, normal, depth, previous_depth=depth, motion=4 * noise(height, width, 2) - 2)
     seen_light, gain = (light, history, hit), jnp.float32(1.0)
     scales = {name: jnp.float32(value) for name, value in regression.SCALES.items()}
+    joined = "means", "means", "means", "means", "blocks"
     layouts, learned = ("pixels", "pixels", "blocks"), noise(*half, 20)
     return {
         "a level of the affinity filter, 13 channels, 12 features": (affinity_filter, (image, guide((height, width)))),
@@ -102,6 +104,14 @@ def works(height: int, width: int) -> dict[str, Work]:
         "11 channels as planes": (
             lambda *arrays: join_planes(list(zip(layouts, arrays, strict=True))),
             (albedo, normal, learned),
+        ),
+        "15 of 18 channels of a history fetched by cubics": (
+            partial(warp_cubic, channels=15),
+            (noise(height, width, 18), frame.motion),
+        ),
+        "20 channels of blocks and means as pixels": (
+            lambda *arrays: join_pixels(list(zip(joined, arrays, strict=True)), multiple=16),
+            (*(noise(3, height, width) for _ in range(4)), noise(2, height, width)),
         ),
         "unknown pixels filled": (fill_holes, (light, hit[..., None])),
         "the safe blend": (combine, (light, noise(height, width, 3))),
