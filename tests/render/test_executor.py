@@ -33,7 +33,7 @@ SETTINGS = RenderSettings(width=24, height=16, reference_spp=16, variant="scalar
 FRAMES = 5
 """Of the first clip; of the others one."""
 CLIPS = 6
-PATIENCE_S = 300
+PATIENCE_S = 900
 ROOT = Path(__file__).parents[2]
 
 
@@ -124,6 +124,48 @@ def test_two_renderers_of_one_clip_at_once_leave_one_set_of_files(local: dict[st
     assert contents(tmp_path) == {name: file for name, file in local.items() if name.startswith("edge-0")}
 
 
+THREADS = "from concurrent.futures import ThreadPoolExecutor as Threads\nwith Threads(2) as executor:"
+CLUSTER = "from jaxdn.commands.scheduler import open_scheduler\nwith open_scheduler({file!r}) as executor:"
+
+
+def start_client(out: Path, begin: str, frames_per_task: int | None = None) -> subprocess.Popen[str]:
+    """A process that renders the clips by the executor that ``begin`` opens."""
+    program = (
+        "from pathlib import Path; from tests.render.test_executor import list_jobs\n"
+        f"from jaxdn.render import render_clips\njobs = list_jobs(Path({str(out)!r}), {CLIPS})\n"
+        f"{begin} render_clips(jobs, executor=executor, frames_per_task={frames_per_task})"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(
+        [sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+@pytest.mark.slow
+def test_threads_render_only_what_is_missing_after_their_client_is_killed(
+    local: dict[str, bytes], tmp_path: Path
+) -> None:
+    first = Path(list_jobs(tmp_path)[0].folder)
+    client = start_client(tmp_path, THREADS)
+    wait_until(lambda: frame_path(first, 0).is_file())
+    renderers = find_renderers(client.pid)
+    client.kill()
+    client.wait()
+    psutil.wait_procs(renderers, PATIENCE_S)
+    before = stamps(tmp_path)
+    assert len(renderers) in (1, 2)
+    assert not is_clip(first)  # a renderer ends with its client, and does not go on to the end of its clip
+    assert not frame_path(first, FRAMES - 1).is_file()
+    assert not any(renderer.is_running() for renderer in renderers)
+
+    client = start_client(tmp_path, THREADS)
+    said, _ = client.communicate(timeout=PATIENCE_S)
+    assert client.returncode == 0, said
+    assert "rendered 10 of 10 frames" in said
+    assert contents(tmp_path) == local
+    assert before.items() <= stamps(tmp_path).items()
+
+
 @contextmanager
 def start_cluster(folder: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
     """A scheduler and two workers with nannies on loopback, as the commands of Dask start them."""
@@ -147,26 +189,13 @@ def start_cluster(folder: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
             process.wait()
 
 
-def start_client(out: Path, file: Path) -> subprocess.Popen[str]:
-    program = (
-        "import sys; from pathlib import Path; from jaxdn.commands.scheduler import open_scheduler\n"
-        "from tests.render.test_executor import list_jobs; from jaxdn.render import render_clips\n"
-        f"with open_scheduler({str(file)!r}) as executor:\n"
-        f"    render_clips(list_jobs(Path({str(out)!r}), {CLIPS}), executor=executor, frames_per_task=4)\n"
-    )
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    return subprocess.Popen(
-        [sys.executable, "-c", program], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-
-
 @pytest.mark.slow
 @pytest.mark.needs("distributed", "fcntl")
 def test_a_cluster_renders_the_same_whatever_is_killed(local: dict[str, bytes], tmp_path: Path) -> None:
-    out = tmp_path / "out"
+    out, cluster = tmp_path / "out", CLUSTER.format(file=str(tmp_path / "scheduler.json"))
 
     with start_cluster(tmp_path) as (_, *workers):
-        client = start_client(out, tmp_path / "scheduler.json")
+        client = start_client(out, cluster, 4)
         wait_until(lambda: len(stamps(out)) >= 1)
         client.kill()
         client.wait()
@@ -175,7 +204,7 @@ def test_a_cluster_renders_the_same_whatever_is_killed(local: dict[str, bytes], 
         assert 1 <= len(before) < FRAMES + CLIPS - 1
         assert not is_clip(out / f"edge-{CLIPS - 1}")
 
-        client = start_client(out, tmp_path / "scheduler.json")
+        client = start_client(out, cluster, 4)
 
         def wait_for_renderer() -> tuple[subprocess.Popen[bytes], psutil.Process]:
             wait_until(lambda: any(find_renderers(worker.pid) for worker in workers))
