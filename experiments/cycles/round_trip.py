@@ -62,7 +62,8 @@ def run_kind(name: str, out: Path, options: argparse.Namespace) -> dict[str, Any
     showing, _ = run_jaxdn(options.python, "inspect", noisy, "--overlay", page)
     denoising, _ = run_jaxdn(options.python, "denoise", noisy, "-o", denoised, *method, *kind.options)
     results, sources = [denoised / each for each in names], [noisy / each for each in names]
-    row: dict[str, Any] = {"kind": name, "frames": len(results), **compare(sources[-1], results[-1], kind.light)}
+    row: dict[str, Any] = {"kind": name, "frames": len(results)}
+    row |= compare(sources[-1], results[-1], kind.light, lossy=kind.lossy)
     row |= {"bytes in": _mean_size(sources), "bytes out": _mean_size(results)}
     row |= {"inspect, s": inspecting, "denoise, s": denoising, "frame, s": _seconds_a_frame(results)}
     row |= {"page, s": showing, "page, bytes": sum(path.stat().st_size for path in page.rglob("*") if path.is_file())}

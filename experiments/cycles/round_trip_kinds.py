@@ -30,6 +30,7 @@ class Kind:
       times: the frames' times; the picture moves from 1 to :data:`FRAMES`.
       path: the file of a time; ``{}`` is the frame's number, as Blender pads it.
       light: words of layers that jaxdn may change; Blender's beauty is always one.
+      lossy: whether the codec loses precision, each time that a file is written.
       recompress: a codec that OpenEXR writes and this Blender does not; the rendered files are written anew.
     """
 
@@ -38,6 +39,7 @@ class Kind:
     times: Sequence[float] = (1, 2, 3)
     path: Callable[[float], str] = lambda time: f"shot.{int(time):04d}.exr"
     light: Sequence[str] = ()
+    lossy: bool = False
     recompress: str = ""
 
     @property
@@ -110,7 +112,7 @@ KINDS = {
     ),
     "panorama": replace(PLAIN, prepare=_panorama, options=("--wrap",)),  # Blender writes no envmap attribute
     "half": replace(PLAIN, prepare=_stored("16", "ZIP")),
-    "half, DWAA": replace(PLAIN, prepare=_stored("16", "DWAA")),
+    "half, DWAA": replace(PLAIN, prepare=_stored("16", "DWAA"), lossy=True),
     "float, PIZ": replace(PLAIN, prepare=_stored("32", "PIZ")),
     "float, HTJ2K": replace(PLAIN, recompress="HTJ2K256_COMPRESSION"),
     "transparent": replace(PLAIN, prepare=_transparent, options=("--alpha",)),

@@ -24,11 +24,12 @@ def read(path: Path) -> Pixels:
         }
 
 
-def compare(noisy: Path, denoised: Path, light: Sequence[str]) -> dict[str, int]:
+def compare(noisy: Path, denoised: Path, light: Sequence[str], *, lossy: bool = False) -> dict[str, float]:
     """How many channels were changed and kept.
 
     The set of channels, their types and sizes, and the header of each part have to be those of the noisy file. Data
-    passes have to be the same bits; ``light`` are words of layers that may change besides the beauty.
+    passes have to be the same bits; ``light`` are words of layers that may change besides the beauty. Of ``lossy``
+    files data passes are compressed once more: ``recompressed`` is the largest difference of one, by its largest value.
     """
     one, two = read(noisy), read(denoised)
     if one.keys() != two.keys():
@@ -38,9 +39,14 @@ def compare(noisy: Path, denoised: Path, light: Sequence[str]) -> dict[str, int]
     if odd := sorted(_headers(noisy) ^ _headers(denoised)):
         raise ValueError(f"{denoised}: expected the attributes of {noisy}, others are {odd}")
     changed = [key for key in one if not np.array_equal(one[key], two[key], equal_nan=True)]
-    if wrong := [key for key in changed if not is_light(key[1], light)]:
+    wrong = [key for key in changed if not is_light(key[1], light)]
+    if wrong and not lossy:
         raise ValueError(f"{denoised}: expected data passes as they were, changed {wrong}")
-    return {"changed": len(changed), "kept": len(one) - len(changed)}
+    found: dict[str, float] = {"changed": len(changed), "kept": len(one) - len(changed)}
+    if lossy:
+        pairs = [(one[key].astype(np.float64), two[key].astype(np.float64)) for key in wrong]
+        found["recompressed"] = max((float(np.abs(x - y).max() / np.abs(x).max()) for x, y in pairs), default=0.0)
+    return found
 
 
 def _headers(path: Path) -> set[tuple[int, str, str]]:

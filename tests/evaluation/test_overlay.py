@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 import shutil
 from pathlib import Path
 
@@ -201,7 +202,9 @@ def test_swapped_guides(tmp_path, inspect):
 
     record = inspect(write_shot(tmp_path / "shot", swap))
     assert names(record) == ["swapped guides: albedo and normal"]
-    assert "the other way around" in record["findings"][0]["remedy"]
+    _, options = record["findings"][0]["remedy"].removesuffix(".").split("the other way around: ")
+    albedo, normal = "albedo=ViewLayer.Denoising Normal", "normal=ViewLayer.Denoising Albedo"
+    assert shlex.split(options) == ["--channels", albedo, normal]
 
 
 def test_swapped_guides_whose_normals_are_colours(tmp_path, inspect):

@@ -1,6 +1,7 @@
 """What is wrong with a shot, from the figures of its frames: each finding with what to do about it."""
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -63,6 +64,8 @@ class Known(NamedTuple):
     unexplained: Sequence[str] | None = None
     """Of vectors whose convention nobody has stated, so that they were left out, the conventions that fit; None: there
     are no such vectors."""
+    layers: Mapping[str, str] = MappingProxyType({})
+    """Buffer -> the layer that it is read from."""
 
 
 def find_all(names: Sequence[str], figures: Sequence[Mapping[str, float]], known: Known) -> list[Finding]:
@@ -76,7 +79,7 @@ def find_all(names: Sequence[str], figures: Sequence[Mapping[str, float]], known
     keys = {key for each in figures for key in each}
     mean = {key: float(np.mean([each[key] for each in figures if key in each])) for key in keys}
     frames = [*_frames(known), *_brightness(names, figures)]
-    vectors, guides = _motion(mean, known), _guides(mean)
+    vectors, guides = _motion(mean, known), _guides(mean, known)
     causes = [*vectors, *guides, *([] if vectors else _depth(mean)), *([] if guides else _normals(mean))]
     return [*frames, *causes, *([] if causes else _history(mean)), *_noise(mean)]
 
@@ -247,17 +250,23 @@ def _history(mean: Mapping[str, float]) -> list[Finding]:
     return [Finding("history is rejected", evidence, remedies[guide])]
 
 
-def _guides(mean: Mapping[str, float]) -> list[Finding]:
+def _exchange(known: Known) -> str:
+    """The option that reads albedo and normals from each other's layer."""
+    albedo, normal = (known.layers.get(buffer, "...") for buffer in ("albedo", "normal"))
+    return f'Name the two layers the other way around: --channels "albedo={normal}" "normal={albedo}"'
+
+
+def _guides(mean: Mapping[str, float], known: Known) -> list[Finding]:
     """Guides that hold something else, or lie otherwise than the picture."""
     found = []
     unit, encoded = mean.get("unit normals", 1.0), mean.get("encoded normals", 0.0)
     if mean.get("negative normals", 1.0) < 0.02 and mean.get("negative albedo", 0.0) > 0.05:
         what = f"Normals have no negative component, and {mean['negative albedo']:.0%} of the albedo is negative."
-        remedy = "Name the two layers the other way around: --channels albedo=... normal=..."
+        remedy = f"{_exchange(known)}."
         found.append(Finding("swapped guides: albedo and normal", what, remedy))
     elif max(unit, encoded) < 0.5 and mean.get("albedo of normals", 0.0) > 0.8:
         what = f"{mean['albedo of normals']:.0%} of the albedo are normals stored as colours, and the normals are none."
-        remedy = "Name the two layers the other way around: --channels albedo=... normal=..., with signed normals."
+        remedy = f"{_exchange(known)}, and write normals with their signs, from -1 to 1."
         found.append(Finding("swapped guides: albedo and normal", what, remedy))
     elif unit < 0.5 and encoded > 0.5:
         what = f"{encoded:.0%} of the normals have unit length as 2 n - 1, and {unit:.0%} as they are."

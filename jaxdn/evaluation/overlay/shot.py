@@ -112,7 +112,8 @@ def write_overlay(
         on_frame(path)
     if not names:
         raise ClipError(f"{title}: expected frames that can be read, found none.")
-    findings = find_all(names, figures, Known(convention, unusable, missing, unexplained))
+    layers = {mapped.buffer: mapped.layer for mapped in mapping}
+    findings = find_all(names, figures, Known(convention, unusable, missing, unexplained, layers))
     facts = {mapped.buffer: f"{mapped.layer} ({', '.join(mapped.channels)}): {mapped.convention}" for mapped in mapping}
     page = overlay_page(title, names, figures, findings, films.views, facts)
     write_atomically({out / PAGE: page.encode("utf-8", "replace")})
