@@ -3,12 +3,12 @@
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 from jaxdn.data.foreign.channel_mapping import MappedBuffer
 from jaxdn.data.foreign.layers import LAYERS
 from jaxdn.planning.plan import COMPOSED
+from jaxdn.runtime.terminal import plain_console
 
 CONSEQUENCES: dict[str, str] = {
     "albedo": "textures are blurred together with the noise",
@@ -53,4 +53,4 @@ def show_channel_mapping(
         if single and name == "motion":
             continue
         table.add_row(name, "missing", "", consequence, style="yellow")
-    Console().print(table)
+    plain_console().print(table)

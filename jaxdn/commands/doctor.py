@@ -8,7 +8,6 @@ from importlib.util import find_spec
 from typing import NamedTuple
 
 import jax
-from rich.console import Console
 from rich.table import Table
 
 import jaxdn
@@ -20,6 +19,7 @@ from jaxdn.ops.dispatch.operation import OPERATIONS, REFERENCE, VARIABLE, defaul
 from jaxdn.ops.onednn import library
 from jaxdn.render.mitsuba.variant import choose_variant, has_cuda
 from jaxdn.runtime.optional import OPTIONAL_DEPENDENCIES, install
+from jaxdn.runtime.terminal import plain_console
 
 _EXTRA_OF = {"onednn-bfloat16": "onednn", "onednn-float32": "onednn", "onnxruntime": "onnx", "onednn": "onednn"}
 """Backend -> the extra that brings it."""
@@ -42,7 +42,7 @@ def doctor() -> list[Diagnosis]:
         table.add_column(column, overflow="fold")
     for finding in found:
         table.add_row(*finding, style="yellow" if finding.advice else None)
-    Console().print(table)
+    plain_console().print(table)
     return found
 
 

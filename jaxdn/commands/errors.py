@@ -11,11 +11,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NoReturn, TextIO
 
-from rich.console import Console
-
 from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.runtime.interrupt import EXIT_CODE, TERMINATED_EXIT_CODE, Terminated, keep_interrupts
 from jaxdn.runtime.optional import find_group, install
+from jaxdn.runtime.terminal import plain_console
 
 NO_READER = 141
 """Of a process whose reader has gone, as shells expect it: 128 and the number of SIGPIPE."""
@@ -50,7 +49,7 @@ def plain_errors() -> Iterator[None]:
             raise
         _end(f"this needs the package {package!r}, which is not installed: {install(extra)}")
     except KeyboardInterrupt as interrupt:
-        Console(stderr=True).print("jaxdn: interrupted; what is finished is kept.", highlight=False)
+        plain_console(stderr=True).print("jaxdn: interrupted; what is finished is kept.")
         sys.exit(TERMINATED_EXIT_CODE if isinstance(interrupt, Terminated) else EXIT_CODE)
     finally:
         warnings.formatwarning = before
@@ -61,7 +60,7 @@ def _line(message: Warning | str, *place: Any, **more: Any) -> str:
 
 
 def _end(message: str) -> NoReturn:
-    Console(stderr=True, style="red").print(f"jaxdn: {message}", markup=False, highlight=False, soft_wrap=True)
+    plain_console(stderr=True, style="red").print(f"jaxdn: {message}", soft_wrap=True)
     sys.exit(2)
 
 

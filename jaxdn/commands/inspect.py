@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from jaxdn.commands.channel_table import show_channel_mapping
@@ -25,6 +24,7 @@ from jaxdn.denoiser import Denoiser
 from jaxdn.effects import EFFECTS, Plan, choose_all_effects, inspect, plan
 from jaxdn.render.open_scene import open_scene
 from jaxdn.render.settings import RenderSettings
+from jaxdn.runtime.terminal import plain_console
 from jaxdn.sequence.render_jobs import PlannedClip, find_denoiser, plan_clip
 
 EVERYTHING = plan(choose_all_effects(1))
@@ -185,7 +185,7 @@ def _nothing_else_on_stdout() -> Iterator[None]:
 
 def _show(source: str, planned: PlannedClip, reader: Denoiser | None, name: str | None) -> None:
     found, made, depth = planned
-    console = Console()
+    console = plain_console()
     table = Table(title=f"{source}: {len(found)} of {len(EFFECTS)} effects, {len(found.frames)} frames")
     for column in ("effect", "there", "frames", "why"):
         table.add_column(column, overflow="fold")

@@ -12,6 +12,8 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from jaxdn.runtime.terminal import plain_console
+
 _VARIABLE = "JAXDN_PROGRESS"
 """Environment variable: ``openjd`` prints lines for Open Job Description too."""
 _RECENT = 9
@@ -30,16 +32,23 @@ class Reporter(NamedTuple):
 @contextmanager
 def reporter(title: str, console: Console | None = None) -> Iterator[Reporter]:
     """A bar on the standard error of a terminal; without one, plain lines without any control characters."""
-    console = Console(stderr=True) if console is None else console
+    console = plain_console(stderr=True) if console is None else console
     if console.is_terminal:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        columns = (
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+        )
         with Progress(*columns, console=console, transient=True) as progress:
             task = progress.add_task(title, total=None)
 
             def advance(path: Path, done: int, total: int) -> None:
                 progress.update(task, completed=done, total=total, description=f"{title}: {path.name}")
 
-            yield Reporter(advance, lambda line: progress.console.print(line, markup=False, highlight=False))
+            yield Reporter(
+                advance, lambda line: progress.console.print(line, markup=False, emoji=False, highlight=False)
+            )
         return
     took: deque[float] = deque(maxlen=_RECENT)
     last = time.monotonic()

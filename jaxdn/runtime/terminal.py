@@ -1,6 +1,17 @@
-"""Terminals and pipes that cannot show every letter: what is printed never ends a run."""
+"""Text on terminals and pipes: as it is, and also where they cannot show every letter."""
 
 import sys
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def plain_console(**options: Any) -> "Console":
+    """A console that prints text as it is: ``[red]`` and ``:cat:`` in names of files and layers are no markup."""
+    from rich.console import Console
+
+    return Console(markup=False, emoji=False, highlight=False, **options)
 
 
 def print_any_letter() -> None:

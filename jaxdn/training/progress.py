@@ -3,10 +3,10 @@
 import sys
 import time
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from jaxdn.recipes.recipe import Recipe
+from jaxdn.runtime.terminal import plain_console
 
 
 class ProgressBar:
@@ -15,12 +15,12 @@ class ProgressBar:
     def __init__(self, label: str, recipe: Recipe, start: int, *, shown: bool = True):
         self._label, self._recipe, self._first, self._shown = label, recipe, start, shown
         self._validation = float("nan")
-        self._console = Console(stderr=False)
+        self._console = plain_console()
         self._began: float | None = None
         self._waited_before = 0.0
         self._printed = 0.0
         self._bar = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             TextColumn("{task.completed}/{task.total} steps  {task.fields[state]}"),
             TimeRemainingColumn(),
@@ -43,7 +43,7 @@ class ProgressBar:
     def print(self, line: str) -> None:
         """Print one line above the bar."""
         if self._shown:
-            self._console.print(line, highlight=False, markup=False)
+            self._console.print(line)
 
     def validated(self, psnr: float) -> None:
         """Keep the newest validation PSNR."""
