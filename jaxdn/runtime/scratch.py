@@ -17,7 +17,7 @@ def scratch_folder(parent: Path, prefix: str) -> Iterator[Path]:
     lock on the file beside each of them, which the system gives up with the process. Folders of other processes that
     still work stay, also those of other machines that share a disk with locks.
     """
-    _remove_abandoned(parent, prefix)
+    remove_abandoned_folders(parent, prefix)
     lock, handle = _new_lock(parent, prefix)
     folder = lock.with_suffix("")
     try:
@@ -40,8 +40,8 @@ def _new_lock(parent: Path, prefix: str) -> tuple[Path, int]:
         os.close(handle)
 
 
-def _remove_abandoned(parent: Path, prefix: str) -> None:
-    """Remove the folders, and the files beside them, whose process has gone."""
+def remove_abandoned_folders(parent: Path, prefix: str) -> None:
+    """Remove the scratch folders, and the files beside them, whose process has gone."""
     names = {path.name.removesuffix(".lock") for path in parent.iterdir() if path.name.startswith(prefix)}
     for name in names:
         lock = parent / f"{name}.lock"

@@ -13,6 +13,8 @@ from jaxdn.filters.time_reversal import HistoryLength, update_history_length
 from jaxdn.filters.time_reversal import blend as blend_directions
 from jaxdn.runtime.scratch import scratch_folder
 
+HIDDEN = ".backwards-"
+"""How the names of the folders begin in which images wait."""
 _HALF_OCTAVES = 15
 """Values below 2 to this power fit into half precision."""
 
@@ -69,7 +71,7 @@ def backward_pass(
       folder: created if it is missing.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with scratch_folder(folder, ".backwards-") as place:
+    with scratch_folder(folder, HIDDEN) as place:
         images = BackwardImages(place)
         state: HistoryLength | None = None
         for index, stored in frames:

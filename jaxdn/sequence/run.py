@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 from jaxdn.data.errors import DamagedFile
 from jaxdn.runtime.atomic_files import atomic_write
 from jaxdn.runtime.overlap import Behind
+from jaxdn.runtime.scratch import remove_abandoned_folders
+from jaxdn.sequence.backward_pass import HIDDEN
 from jaxdn.sequence.frame_denoiser import FrameDenoiser
 from jaxdn.sequence.jobs import Job, find_jobs
 from jaxdn.sequence.missing_frames import explain_left_out, leave_out_unusable, segments_around
@@ -93,6 +95,9 @@ def denoise_files(
         view=settings.naming.view,
     )
     _refuse_unused(jobs, settings)
+    for folder in {target.parent for job in jobs for target in job.targets}:
+        if folder.is_dir():
+            remove_abandoned_folders(folder, HIDDEN)
     checked = leave_out_unusable(jobs, settings, log)
     total = sum(len(job.wanted) + sum(map(len, job.copies.values())) for job, _ in checked)
     run = _Run(method, settings, total, on_frame, log)

@@ -17,6 +17,7 @@ from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.read import open_frames
 from jaxdn.filters.time_reversal import LENGTH_MAX, blend, reverse_time, update_history_length
 from jaxdn.ops.motion import on_screen
+from jaxdn.runtime.scratch import scratch_folder
 from jaxdn.sequence.jobs import WARM_UP
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
@@ -219,3 +220,18 @@ def test_ctrl_c_in_the_backward_pass_leaves_nothing_behind(tmp_path: Path) -> No
     assert process.returncode == 130, errors
     assert "interrupted" in errors
     assert list(out.iterdir()) == []
+
+
+def test_any_run_removes_what_a_killed_one_left_and_nothing_of_one_that_lives(tmp_path: Path) -> None:
+    source, out = noisy_wall(tmp_path / "in", 2), tmp_path / "out"
+    (out / ".backwards-0123").mkdir(parents=True)
+    (out / ".backwards-0123" / "0.npz").write_text("")
+    with scratch_folder(out, ".other-") as other, scratch_folder(out, ".backwards-") as living:
+        (out / ".backwards-4567").mkdir()
+        denoise_files([source], out, find_model("noisy"), Settings())
+        assert living.is_dir()
+        assert other.is_dir()
+        assert sorted(path.name for path in out.glob(".backwards-*")) == [living.name, f"{living.name}.lock"]
+    (out / ".backwards-89ab").mkdir()
+    denoise_files([source], out, find_model("noisy"), Settings(skip_existing=True))
+    assert sorted(path.name for path in out.iterdir()) == ["a.0000.exr", "a.0001.exr"]
