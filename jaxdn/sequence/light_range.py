@@ -177,8 +177,9 @@ def _bound_ring(image: np.ndarray, noisy: np.ndarray, lamps: np.ndarray) -> np.n
 def _dim(radiance: np.ndarray, lamps: np.ndarray, exponent: int) -> np.ndarray:
     """The frame with the luminance of lamps brought down to :data:`BRIGHTEST`."""
     most = np.float32(math.ldexp(BRIGHTEST, -exponent))
-    light = (radiance @ np.asarray(LUMINANCE, np.float32))[..., None]
-    return np.where(lamps, radiance * (most / np.maximum(light, most)), radiance)
+    with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is no lamp's
+        light = (radiance @ np.asarray(LUMINANCE, np.float32))[..., None]
+        return np.where(lamps, radiance * (most / np.maximum(light, most)), radiance)
 
 
 def _denoise_negative(negative: np.ndarray, positive: np.ndarray, image: np.ndarray) -> np.ndarray:

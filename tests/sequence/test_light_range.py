@@ -9,6 +9,7 @@ from scipy.ndimage import binary_dilation
 from jaxdn import clips, color
 from jaxdn.core.frame import RADIANCE_MAX, Frame
 from jaxdn.data.clip.frames import StoredFrame
+from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.metrics import psnr
 from jaxdn.sequence.light_range import (
     BRIGHTEST,
@@ -22,6 +23,7 @@ from jaxdn.sequence.light_range import (
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import find_model
+from tests.data.test_kept import box_blur
 from tests.sequence.test_safe import picture
 
 SIZE = (48, 64)
@@ -272,3 +274,25 @@ def test_a_lamp_s_pixel_without_a_number_is_no_lamp_s(tmp_path: Path) -> None:
         for image in images:
             assert image[4, 54, 0] > 0.5 * image[4, 54, 1]
             np.testing.assert_array_equal(image[3, 53], np.float32(50))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
+def test_numbers_that_are_none_warn_nobody(value: float, tmp_path: Path) -> None:
+    """In any channel, beside lamps, with everything that can be asked for."""
+    source = write(tmp_path / "in", 1.0, lamp=50.0)
+    for path in source.iterdir():
+        channels = clips.read_exr(path)
+        channels |= {"A": np.full(SIZE, 0.5, np.float32)}
+        channels |= {f"{part}.{letter}": 0.5 * channels[letter] for part in ("diffuse", "specular") for letter in "RGB"}
+        for place, (name, pixels) in enumerate(channels.items()):
+            pixels[10 + place, 10:13] = value
+            pixels[4, 54] = value if name == "G" else pixels[4, 54]
+        channels |= {"normal.X": channels["A"], "normal.Y": channels["R"], "normal.Z": channels["B"]}
+        channels |= {"depth.Z": channels["A"] + 1, "Vector.X": channels["A"], "Vector.Y": channels["R"]}
+        clips.write_exr(path, channels)
+    settings = Settings(
+        naming=ChannelNaming("previous-current"), alpha=True, aovs="additive", preview=True, bidirectional=True
+    )
+    files = denoise_files([source], tmp_path / "out", box_blur(), settings).files
+    assert len(files) == 3
