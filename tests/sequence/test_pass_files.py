@@ -225,3 +225,25 @@ def test_whole_frames_are_frames_whatever_they_are_called(tmp_path: Path) -> Non
 def test_words_for_passes_stand_alone(name: str, word: str, buffer: str | None) -> None:
     found = read_pass_name(Shot((Path(f"{name}.exr"),), (1,), name))
     assert (found.word, found.buffer) == (word, buffer)
+
+
+@pytest.mark.parametrize(
+    ("place", "result"), [("{0}/{1:04d}.exr", "{:04d}.exr"), ("{0}/s_{0}_{1:04d}.exr", "s_Beauty_{:04d}.exr")]
+)
+def test_the_parent_of_a_folder_for_each_pass(place: str, result: str, tmp_path: Path, capsys: Any) -> None:
+    source = write(tmp_path / "in", lambda name, frame: place.format(name.title(), frame))
+    (source / "previews").mkdir()
+    written = denoise_files([source], tmp_path / "out", box_blur())
+    assert written.files == [tmp_path / "out" / result.format(number) for number in range(1, FRAMES + 1)]
+    np.testing.assert_allclose(clips.read_clip(source).frames.albedo[0], truth(1).albedo, rtol=1e-6)
+    main.main(["inspect", str(source)])
+    assert "a file for each pass, albedo from" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("names", [("sh010", "sh020"), ("beauty", "sh010"), ("albedo", "normal")])
+def test_folders_whose_names_tell_nothing_are_no_passes(names: tuple[str, str], tmp_path: Path) -> None:
+    for name in names:
+        (tmp_path / name).mkdir()
+        clips.write_exr(tmp_path / name / "0001.exr", layer("", truth(0).light, "RGB"))
+    with pytest.raises(ClipError, match="found none"):
+        clips.read_clip(tmp_path)

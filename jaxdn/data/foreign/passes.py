@@ -3,7 +3,6 @@
 V-Ray, Redshift, LuxCore and Blender's File Output write such files, beside each other or in a folder for each pass.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -12,46 +11,24 @@ import numpy as np
 
 from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.file import ExrFile
-from jaxdn.data.foreign.layers import LAYERS, UNSURE_ALBEDO, plain
+from jaxdn.data.foreign.layers import UNSURE_ALBEDO
+from jaxdn.data.foreign.pass_names import (
+    BEAUTY,
+    PASSES,
+    UNREAD,
+    WEAK,
+    find_word,
+    join_words,
+    pass_of_folder,
+    split_words,
+)
 from jaxdn.data.foreign.shots import Shot, find_shots
 
-_BEAUTY = [name for name in LAYERS["radiance"] if name]
-"""Words in the names of files that hold the picture, the best first."""
-_WEAK = {"main", "hdr", "image"}
-"""Words for the picture that are names of shots, too: any word for data is stronger."""
 _MOTION = {"motion", "vector", "velocity", "backward", "forward"}
 _UNSURE = _MOTION | {UNSURE_ALBEDO, "id", "ids", "object id", "normal", "normals"}
 """Words that are names of shots, too: such files alone are pictures, unless one of a picture is beside them."""
 _SHORT = 4
 """Letters; shorter words tell nothing of a file that stands alone."""
-_UNREAD = "no buffer"
-"""In place of a buffer: data that no denoiser reads."""
-_UNREAD_WORDS = [
-    "position",
-    "world_position",
-    "pworld",
-    "pref",
-    "p",
-    "uv",
-    "uvmap",
-    "st",
-    "mist",
-    "alpha",
-    "mask",
-    "matte",
-    "tangent",
-    "material_id",
-    "material_index",
-    "indexma",
-    "facing_ratio",
-    "cryptomatte",
-    "crypto_object",
-    "crypto_material",
-    "crypto_asset",
-    "sample_count",
-    "variance",
-    "holdout",
-]
 _SIGNS = 0.01
 """Share of values below 0 that no picture has; negative lobes of pixel filters and colours out of gamut are rarer."""
 
@@ -83,17 +60,17 @@ def join_passes(shots: Sequence[Shot], stated: Mapping[str, str]) -> tuple[list[
     joined, notes = [], []
     for pictures, data in _group(shots):
         rest = [shot for shot, name in pictures]
-        read = [(shot, name) for shot, name in data if name.buffer != _UNREAD]
+        read = [(shot, name) for shot, name in data if name.buffer != UNREAD]
         if not pictures:
             notes += [f"{shot.label}: not a picture but a data pass ({name.buffer}), left out" for shot, name in data]
             continue
         notes += [
             f"{shot.label}: not a picture but a data pass ({name.word}), left out"
             for shot, name in data
-            if name.buffer == _UNREAD
+            if name.buffer == UNREAD
         ]
         if read:
-            best = min(pictures, key=lambda one: _BEAUTY.index(one[1].word) if one[1].word in _BEAUTY else len(_BEAUTY))
+            best = min(pictures, key=lambda one: BEAUTY.index(one[1].word) if one[1].word in BEAUTY else len(BEAUTY))
             rest[rest.index(best[0])] = _with_passes(best[0], {name.word: _by_number([shot]) for shot, name in read})
             names = ", ".join(f"{name.buffer} from {shot.files[0].name}" for shot, name in read)
             notes.append(f"{best[0].label}: a file for each pass, {names} ...")
@@ -118,9 +95,9 @@ def _group(shots: Sequence[Shot]) -> list[tuple[list[_Named], list[_Named]]]:
         groups.setdefault(name.rest, []).append((shot, name))
     for group in list(groups.values()):
         if all(name.buffer in (None, "radiance") for _, name in group):  # a shot called "main"
-            for one in [(shot, name) for shot, name in group if name.word in _WEAK]:
+            for one in [(shot, name) for shot, name in group if name.word in WEAK]:
                 group.remove(one)
-                groups.setdefault((one[0].folder, _join(_split(_name_of(one[0])))), []).append(one)
+                groups.setdefault((one[0].folder, join_words(split_words(_name_of(one[0])))), []).append(one)
     groups = {rest: group for rest, group in groups.items() if group}
     found: dict[tuple[Path, str], tuple[list[_Named], list[_Named]]] = {}
     for rest, group in groups.items():
@@ -145,61 +122,28 @@ def _group(shots: Sequence[Shot]) -> list[tuple[list[_Named], list[_Named]]]:
 
 def read_pass_name(shot: Shot) -> PassName:
     """The pass that the name of a shot's files, or of their folder, has a word for."""
-    folder = shot.folder
-    tokens = _split(_name_of(shot))
-    found = _find_word(tokens)
+    tokens, of_folder = split_words(_name_of(shot)), pass_of_folder(shot.folder.name)
+    found = find_word(tokens)
     if found is not None:
         word, rest = found
-        return PassName((folder, rest), word, _BUFFERS[word])
-    word = _WORDS.get(plain("".join(_split(folder.name))), "")
-    if word:
-        return PassName((folder.parent, _join(tokens)), word, _BUFFERS[word])
-    return PassName((folder, _join(tokens)), "", None)
+        twice = of_folder is not None and PASSES[of_folder] == PASSES[word]
+        return PassName((shot.folder.parent if twice else shot.folder, rest), word, PASSES[word])
+    if of_folder is not None:
+        return PassName((shot.folder.parent, join_words(tokens)), of_folder, PASSES[of_folder])
+    return PassName((shot.folder, join_words(tokens)), "", None)
 
 
 def _name_of(shot: Shot) -> str:
     return shot.name or shot.files[0].stem
 
 
-_BUFFERS: dict[str, str] = {
-    **dict.fromkeys(_UNREAD_WORDS, _UNREAD),
-    # "sh_normal" is Mitsuba's name for a layer, and in names of files the normal of the shot "sh".
-    **{name: buffer for buffer, names in LAYERS.items() for name in names if name not in ("", "sh_normal")},
-    **dict.fromkeys(_BEAUTY, "radiance"),
-}
-"""Word -> buffer."""
 _CERTAIN = {"normal", "motion", "ids"}
 """Buffers whose words names of shots have, too; beside a pass that is one for sure they are passes."""
 
 
-def _split(text: str) -> list[str]:
-    """The words of a name, and signs that part no words, such as the ``#`` of a number."""
-    return re.findall(r"[^\W_]+|[^\w\s.-]+", text)
-
-
-def _join(tokens: Sequence[str]) -> str:
-    return " ".join(tokens).lower()
-
-
-_WORDS: dict[str, str] = {plain("".join(_split(word))): word for word in _BUFFERS}
-"""Word without what parts its own words -> as it is: ``DiffuseAlbedo`` is ``diffuse_albedo``."""
-
-
-def _find_word(tokens: Sequence[str]) -> tuple[str, str] | None:
-    """The longest word for a pass in a name, and the rest."""
-    best, highest = None, (False, 0, 0)
-    for start in range(len(tokens)):
-        for end in range(start + 1, len(tokens) + 1):
-            word = _WORDS.get(plain("".join(tokens[start:end])), "")
-            score = word not in _WEAK, len(word), end - start
-            if word and score > highest:
-                best, highest = (word, _join([*tokens[:start], *tokens[end:]])), score
-    return best
-
-
 def _is_sure(name: PassName) -> bool:
     """Whether a file with such a word is a data pass though no picture is beside it."""
-    return len(name.word) >= _SHORT and name.word not in _UNSURE and name.buffer != _UNREAD
+    return len(name.word) >= _SHORT and name.word not in _UNSURE and name.buffer != UNREAD
 
 
 def _has_signs(shot: Shot) -> bool:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from jaxdn.data.errors import ClipError
 from jaxdn.data.foreign.frame_names import is_frame_folder, read_frame_names
+from jaxdn.data.foreign.pass_names import are_pass_folders, pass_of_folder
 
 Number = int | Fraction
 """Of a frame; a fraction between two frames that are counted."""
@@ -57,7 +58,8 @@ def find_shots(path: str | Path | Sequence[Path]) -> list[Shot]:
 
     In a pattern, ``*``, ``?`` and ``[...]`` are those of a shell, and ``####``, ``%04d``, ``$F4`` and ``<frame>`` stand
     for a number; ``.exr`` fits ``.EXR`` too. Of a folder without EXR files, those of its folders for frames are found
-    (``0001/beauty.exr``). Folders whose names have brackets in them are taken as they are called.
+    (``0001/beauty.exr``), or of those for passes (``beauty/0001.exr``, ``albedo/0001.exr``). Folders whose names have
+    brackets in them are taken as they are called.
     """
     if not isinstance(path, str | Path):
         files = list(path)
@@ -87,8 +89,11 @@ def find_shots(path: str | Path | Sequence[Path]) -> list[Shot]:
 
 
 def _list_folder(folder: Path) -> list[Path]:
-    """The EXR files of a folder; if there are none, those in its folders for a frame each."""
-    for folders in ([folder], sorted(each for each in folder.iterdir() if each.is_dir() and is_frame_folder(each))):
+    """The EXR files of a folder; if there are none, those in its folders for a frame each, or for a pass each."""
+    below = sorted(each for each in folder.iterdir() if each.is_dir())
+    frames = [each for each in below if is_frame_folder(each)]
+    passes = [each for each in below if pass_of_folder(each.name) is not None]
+    for folders in ([folder], frames, passes if are_pass_folders([each.name for each in passes]) else []):
         inside = sorted(file for each in folders for file in each.iterdir())
         if files := [file for file in inside if file.suffix.lower() == ".exr" and file.name[0] != "."]:
             return files
