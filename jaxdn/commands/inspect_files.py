@@ -18,11 +18,12 @@ from jaxdn.data.foreign.channel_mapping import MappedBuffer, lacks_convention, r
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.frame_names import label_file
 from jaxdn.data.foreign.import_exr import ForeignSequence
+from jaxdn.data.foreign.odd_values import choose_frames, find_odd_values
 from jaxdn.data.foreign.passes import join_passes
 from jaxdn.data.foreign.shots import Shot, find_missing, find_shots, ranges
 from jaxdn.data.foreign.soundness import find_unusable
 from jaxdn.data.foreign.vectors import CHOICES, MOTION_CONVENTIONS
-from jaxdn.data.foreign.views import open_views, select_view
+from jaxdn.data.foreign.views import explain_views, open_views, select_view
 
 if TYPE_CHECKING:
     from jaxdn.evaluation.overlay import Overlay
@@ -41,7 +42,8 @@ def inspect_files(
 ) -> None:
     """Print what is read of each shot, what is missing, and which conventions motion vectors may have.
 
-    Only the first two files of a shot are read, of the others the headers, unless there is an ``overlay``. Raises
+    Of a shot, the first two files and some others are read (:func:`jaxdn.data.foreign.odd_values.choose_frames`), of
+    the rest the headers, unless there is an ``overlay``. Raises
     ClipError as :func:`jaxdn.data.foreign.channel_mapping.read_channel_mapping` and
     :meth:`jaxdn.data.foreign.import_exr.ForeignSequence.fitting_conventions` do, where no file is usable, and for a
     clip of ours that was not finished.
@@ -56,13 +58,11 @@ def inspect_files(
     if isinstance(source, str):
         refuse_unfinished(source)
     shots, notes = join_passes(find_shots(source), naming.pass_files)
+    opened = [(shot, open_views(shot, naming.view)) for shot in select_view(shots, naming.view)]
+    notes += [note for shot, views in opened for note in explain_views(shot.label, views)]
     if not as_json:
         print("".join(f"{note}\n" for note in notes), end="")
-    views = [
-        (shot, view, files)
-        for shot in select_view(shots, naming.view)
-        for view, files in open_views(shot, naming.view).items()
-    ]
+    views = [(shot, view, files) for shot, there in opened for view, files in there.items()]
     folders = _overlay_folders([f"{shot.name or shot.files[0].stem} {view}" for shot, view, _ in views], overlay)
     records = {}
     # OpenEXR prints about damaged files, which would be no JSON.
@@ -115,6 +115,8 @@ def _inspect_shot(
     # Vectors of 0, as a first frame has them, count as missing in its table.
     unstated = lacks_convention(opened[0], naming)
     fitting = sequence.fitting_conventions() if unstated else None
+    looked = choose_frames(opened)
+    odd = [line for line in find_odd_values(looked, naming, unexplained=unstated) if line not in notes]
     gaps = f"{ranges(find_missing(shot.numbers))} missing" if find_missing(shot.numbers) else None
     if not quiet:
         for note in notes:
@@ -125,6 +127,9 @@ def _inspect_shot(
             print(f"{name} counts as a missing frame: {reason}")
         if gaps is not None:
             print(f"{gaps}; after a gap there is no history at first")
+        for line in odd:
+            print(line)
+        print(f"values were looked at in {_list_names(looked, len(opened))}")
         if fitting is not None:
             print("\n".join(_to_state([file.path for file in opened], fitting)))
     checked = (
@@ -138,10 +143,17 @@ def _inspect_shot(
         "height": height,
         "sources": [mapped._asdict() for mapped in mapping],
         "missing": list_missing(mapping, reads),
-        "notes": notes if gaps is None else [*notes, gaps],
+        "notes": [*notes, *odd, *([] if gaps is None else [gaps])],
+        "looked_at": [label_file(file.path) for file in looked],
         "unusable": unusable,
         "fitting_conventions": fitting,
     } | ({} if checked is None else {"overlay": str(checked.page), "findings": [f._asdict() for f in checked.findings]})
+
+
+def _list_names(looked: Sequence[ExrFile], count: int) -> str:
+    """The frames whose values were looked at, in words."""
+    names = ", ".join(label_file(file.path) for file in looked)
+    return f"all frames ({names})" if len(looked) == count > 1 else names
 
 
 def _check(

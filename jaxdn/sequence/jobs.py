@@ -12,7 +12,7 @@ from jaxdn.data.clip.folder import frame_path, is_clip, read_record, refuse_unfi
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.passes import join_passes
 from jaxdn.data.foreign.shots import Shot, find_missing, find_shots, is_named, ranges
-from jaxdn.data.foreign.views import open_views, select_view
+from jaxdn.data.foreign.views import explain_views, open_views, select_view
 
 WARM_UP = 16
 """Frames before a wanted one that are read for its history where only a part of a shot is denoised. After so many,
@@ -162,6 +162,7 @@ def find_jobs(
             *_notes(shot, among_others=len(found) > 1, existing=len(chosen) - len(wanted)),
         )
         views = {} if clip is not None else open_views(shot, view)
+        notes += tuple(explain_views(shot.label, views))
         jobs.append(_hold(Job(shot, clip, targets, wanted, notes, next(iter(views.values()), ()), views=views)))
     _check_targets(jobs)
     inputs = {file.resolve() for shot, _ in found for file in shot.files}

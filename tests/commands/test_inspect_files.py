@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from jaxdn import clips
@@ -12,7 +13,7 @@ from jaxdn.commands.channel_table import CONSEQUENCES
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.vectors import MOTION_CONVENTIONS
 from jaxdn.methods.registry import methods
-from tests.programs import HEIGHT, PROGRAMS, WIDTH, write_shot
+from tests.programs import HEIGHT, PROGRAMS, WIDTH, layer, truth, write_shot
 from tests.training.test_training import make_clip
 
 PLAN = ("integrator", "compiled", "rendered once", "on disk", "left out", "emission", "dual ", "uncertain", "effect")
@@ -94,7 +95,9 @@ def test_json_says_the_same_as_the_text(name: str, shots: dict[str, Path], run: 
         "notes",
         "fitting_conventions",
         "unusable",
+        "looked_at",
     }
+    assert len(record["looked_at"]) == record["frames"]  # a short shot: all
     assert record["sources"] == [
         {**one._asdict(), "channels": list(one.channels)} for one in read_channel_mapping(shots[name])
     ]
@@ -179,3 +182,41 @@ def test_the_help_says_that_files_are_read(capsys: pytest.CaptureFixture[str]) -
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "files of other renderers, what is read from which layer" in text
     assert "fitting_conventions" in text
+
+
+def write_frames(folder: Path, count: int, odd: int | None = None) -> Path:
+    """Frames with an albedo and a roughness; the odd one has a few values that no picture has."""
+    folder.mkdir(parents=True)
+    for frame in range(1, count + 1):
+        now = truth(frame % 4)
+        channels = layer("", now.light, "RGB") | layer("albedo", now.albedo, "RGB")
+        channels["roughness.Y"] = np.full((HEIGHT, WIDTH), 0.5, np.float32)
+        if frame == odd:
+            channels["roughness.Y"][3, 4] = 1.3
+            channels["R"][5, 6:8] = np.nan
+            channels["albedo.G"][0, 0] = np.nan
+        clips.write_exr(folder / f"s.{frame:04d}.exr", channels)
+    return folder
+
+
+def test_brackets_and_colons_in_names_are_printed(tmp_path: Path, run: Any) -> None:
+    source = write_frames(tmp_path / "[red] sh[010] :cat:", 1)
+    text = run(source)
+    assert "[red] sh[010] :cat:/s.0001.exr: what is read" in text
+    channels = clips.read_exr(source / "s.0001.exr")
+    channels = {f"[bold]x[/bold] :cat:.{name}" if name in "RGB" else name: pixels for name, pixels in channels.items()}
+    clips.write_exr(source / "s.0001.exr", channels)
+    assert "[bold]x[/bold] :cat:" in run(source, "--channels", "radiance=[bold]x[/bold] :cat:")
+
+
+@pytest.mark.parametrize(("count", "odd", "looked"), [(3, 2, "all"), (9, 5, "s.0001.exr, s.0003.exr, s.0005.exr")])
+def test_odd_values_of_later_frames_are_told(count: int, odd: int, looked: str, tmp_path: Path, run: Any) -> None:
+    source = write_frames(tmp_path / "in", count, odd)
+    text = run(source)
+    assert f"s.{odd:04d}.exr: roughness: 1 pixel of 'roughness' beyond [0, 1], such as 1.3: clamped" in text
+    assert f"s.{odd:04d}.exr: 2 pixels of radiance are NaN or infinite; they are replaced" in text
+    assert f"s.{odd:04d}.exr: 1 pixel of albedo is NaN or infinite; it is replaced" in text
+    assert f"values were looked at in {looked}" in text
+    told = json.loads(run(source, "--json"))
+    assert any("such as 1.3" in note for note in told["notes"])
+    assert "NaN" not in run(write_frames(tmp_path / "sound", 2))

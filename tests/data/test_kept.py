@@ -12,7 +12,7 @@ import pytest
 from jaxdn import clips
 from jaxdn.core.frame import Frame
 from jaxdn.data.exr.exr import rewrite_exr
-from jaxdn.data.exr.file import ExrFile, Window
+from jaxdn.data.exr.file import ExrFile, Window, utf8_name
 from jaxdn.data.foreign.classify import UNNAMED, ChannelNaming
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from jaxdn.denoiser import Core, recurrent
@@ -25,7 +25,7 @@ from tests.programs import PROGRAMS, truth, write_shot
 
 def parts(path: Path) -> list[tuple[dict[str, Any], dict[str, np.ndarray]]]:
     """Header and pixels of every part, as the OpenEXR package gives them."""
-    with OpenEXR.File(str(path), separate_channels=True) as file:
+    with utf8_name(path) as name, OpenEXR.File(name, separate_channels=True) as file:
         return [(dict(part.header), {name: one.pixels for name, one in part.channels.items()}) for part in file.parts]
 
 

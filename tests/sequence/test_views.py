@@ -252,3 +252,48 @@ def test_names_with_and_without_the_view(tmp_path: Path) -> None:
         np.testing.assert_allclose(frame.radiance, gain * now.light, rtol=1e-6)
         np.testing.assert_allclose(frame.normal, sign * now.normal, rtol=1e-6)
         np.testing.assert_allclose(frame.albedo, now.albedo, rtol=1e-6)
+
+
+def sides(path: Path, frame: int, left: str = "left", *, more: Channels | None = None) -> None:
+    """One part whose channels are called after the sides, and no word of views in the header."""
+    channels: Channels = dict(more or {})
+    for view, name in (("right", "right"), ("left", left)):
+        now = seen(view, frame)
+        channels |= layer(name, now.light, "RGB") | layer(f"{name}.albedo", now.albedo, "RGB")
+    clips.write_exr(path, channels)
+
+
+def test_sides_without_an_attribute_are_views(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "in").mkdir()
+    shared = layer("depth", truth(0).depth, "Z")
+    for frame in range(FRAMES):
+        sides(tmp_path / "in" / f"s.{frame:04d}.exr", frame, more=shared)
+    for view in VIEWS:
+        clip = clips.read_clip(tmp_path / "in", view=view)
+        np.testing.assert_allclose(clip.frames.radiance[1], seen(view, 1).light, rtol=1e-6)
+        np.testing.assert_allclose(clip.frames.albedo[1], seen(view, 1).albedo, rtol=1e-6)
+        np.testing.assert_allclose(clip.frames.depth[1], truth(0).depth, rtol=1e-6)
+    main.main(["inspect", str(tmp_path / "in")])
+    told = " ".join(capsys.readouterr().out.split())
+    assert "left and right are read as views, by their names" in told
+    assert told.count("3 frames of") == 2
+    lines: list[str] = []
+    written = denoise_files([tmp_path / "in"], tmp_path / "out", mean_so_far(), log=lines.append).files
+    assert any("left and right are read as views, by their names" in line for line in lines)
+    after = clips.read_exr(written[2])
+    for view in VIEWS:
+        expected = np.mean([seen(view, frame).light for frame in range(FRAMES)], axis=0)
+        image = np.stack([after[f"{view}.{letter}"] for letter in "RGB"], axis=-1)
+        assert np.abs(image - expected).max() < np.abs(image - seen(view, 2).light).max()
+
+
+def test_sides_that_are_not_whole_are_no_views(tmp_path: Path) -> None:
+    path = tmp_path / "s.0000.exr"
+    sides(path, 0, more=layer("", truth(0).light, "RGB"))
+    assert find_views(ExrFile(path)) == ()  # the file has an image of its own
+    sides(path, 0, more=layer("beauty", truth(0).light, "RGB"))
+    assert find_views(ExrFile(path)) == ()  # two lights
+    clips.write_exr(path, layer("left", truth(0).light, "RGB") | layer("right", truth(0).light[..., :1], "R"))
+    assert find_views(ExrFile(path)) == ()
+    sides(path, 0, left="middle")
+    assert find_views(ExrFile(path)) == ()

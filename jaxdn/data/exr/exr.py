@@ -15,7 +15,7 @@ import OpenEXR
 
 from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.completeness import check_complete
-from jaxdn.data.exr.file import ExrFile
+from jaxdn.data.exr.file import ExrFile, utf8_name
 from jaxdn.runtime.atomic_files import atomic_write
 
 HALF_MAX = 65504.0
@@ -56,7 +56,9 @@ def _write(path: Path, parts: Sequence[tuple[dict[str, Any], dict[str, np.ndarra
     with atomic_write(path) as temporary:
         try:
             # The dicts are changed by the call.
-            OpenEXR.File([OpenEXR.Part(header, dict(channels)) for header, channels in parts]).write(str(temporary))
+            file = OpenEXR.File([OpenEXR.Part(header, dict(channels)) for header, channels in parts])
+            with utf8_name(temporary) as name:
+                file.write(name)
         except RuntimeError as error:
             code = errno.ENOSPC if "No space left" in str(error) else errno.EIO
             raise OSError(code, f"could not write the frame ({error})", str(path)) from error

@@ -5,7 +5,9 @@ the picture (a region, a cropped bounding box that differs from frame to frame) 
 sequence are placed into the union of their data windows, so that motion vectors mean the same in each of them.
 """
 
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -183,7 +185,7 @@ class ExrFile:
             self._layout = (
                 window_of(headers[0], "displayWindow"),
                 {
-                    _full_name(header, channel.name, len(headers)): window_of(header, "dataWindow")
+                    full_name(header, channel.name, len(headers)): window_of(header, "dataWindow")
                     for header in headers
                     for channel in header["channels"]
                     if (channel.xSampling, channel.ySampling) == (1, 1)
@@ -222,10 +224,27 @@ class _Placed(Mapping[str, np.ndarray]):
         return len(self._pixels)
 
 
+@contextmanager
+def utf8_name(path: Path) -> Iterator[str]:
+    """The name of a file to read or to write, as the bindings want it: in UTF-8.
+
+    Names on Linux are any bytes; those of another encoding are given as a link, for as long as the block lasts.
+    """
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        with tempfile.TemporaryDirectory(prefix="jaxdn-") as folder:
+            link = Path(folder, "link.exr")
+            link.symlink_to(path.absolute())
+            yield str(link)
+    else:
+        yield str(path)
+
+
 def _open(path: Path, read: Callable[[Any], _T], **options: Any) -> _T:
     """What ``read`` makes of the opened file, with the errors of the bindings in words."""
     try:
-        with OpenEXR.File(str(path), separate_channels=True, **options) as file:
+        with utf8_name(path) as name, OpenEXR.File(name, separate_channels=True, **options) as file:
             return read(file)
     except ClipError:
         raise
@@ -247,7 +266,7 @@ def _decode(path: Path, file: Any) -> list[ExrPart]:
                 raise ClipError(
                     f"{path}: channel {name} is not a flat image; deep data cannot be read; save it flattened."
                 )
-            channels.append(ExrChannel(_full_name(part.header, name, len(file.parts)), name, pixels))
+            channels.append(ExrChannel(full_name(part.header, name, len(file.parts)), name, pixels))
         parts.append(ExrPart(dict(part.header), channels))
     return parts
 
@@ -274,6 +293,7 @@ def _has_chroma(header: Mapping[str, Any]) -> bool:
         return False
 
 
-def _full_name(header: Mapping[str, object], name: str, parts: int) -> str:
+def full_name(header: Mapping[str, object], name: str, parts: int) -> str:
+    """The name of a channel that no other of a file of so many parts has."""
     part = str(header.get("name", ""))
     return name if parts == 1 or not part or name == part or name.startswith(part + ".") else f"{part}.{name}"

@@ -163,8 +163,9 @@ class ForeignSequence:
             raise UnknownMotion(f"{file.path}: {self._advise_convention()}{error}") from error
         except ClipError as error:
             raise ClipError(f"{file.path}: {error}") from error
-        lines = [*mapping.notes, *self.repairs.news(), *(line for line in derived if line not in self._told)]
-        self._told.update(derived)
+        said = [*mapping.notes, *derived]
+        lines = [*(line for line in said if line not in self._told), *self.repairs.news()]
+        self._told.update(said)
         if mapping.forward is None:
             return frame, lines, None
         frame = frame._replace(dual_motion=derive_dual_motion(np.asarray(frame.motion), forward))

@@ -3,6 +3,7 @@
 A part of a file may have the attribute ``view`` (Blender, Nuke). A file of one part may have the attribute
 ``multiView``, a list of views (OpenEXR, "Storing Multi-View Images"): channels without a layer belong to the first,
 the hero, and those of the others have the view's name before the last part of theirs, ``left.R``, ``forward.left.u``.
+Without either attribute, ``left.R`` and ``right.R`` are two views where both have the same channels.
 """
 
 import re
@@ -12,13 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from jaxdn.core.frame import BUFFERS
 from jaxdn.data.errors import ClipError, DamagedFile
-from jaxdn.data.exr.file import ExrFile, Window
+from jaxdn.data.exr.file import ExrFile, Window, full_name
+from jaxdn.data.foreign.layers import LAYERS, find_layer, group_layers
 from jaxdn.data.foreign.shot_files import open_files
 from jaxdn.data.foreign.shots import Shot
 
 _SIDES = ({"l", "left"}, {"r", "right"})
 """Words in the names of files for the views of a stereo camera."""
+_PAIR = ("left", "right")
+"""Views that names of channels alone tell."""
 
 
 class ViewFile(ExrFile):
@@ -56,6 +61,15 @@ class ViewFile(ExrFile):
 def find_views(file: ExrFile) -> tuple[str, ...]:
     """The views in a file, the hero first; () if it says nothing of views. Raises as its headers do."""
     return tuple(_views_of(file.headers))
+
+
+def explain_views(label: str, views: Mapping[str, Sequence[ExrFile]]) -> list[str]:
+    """What to know about views that a shot's files tell by the names of their channels alone, in sentences."""
+    stated = next((file for files in views.values() for file in files if isinstance(file, ViewFile)), None)
+    if len(views) < 2 or stated is None or _stated_views(stated.headers):
+        return []
+    names = " and ".join(views)
+    return [f"{label}: {names} are read as views, by their names; for one alone, --view {next(iter(views))}"]
 
 
 def open_views(shot: Shot, wanted: str | None = None) -> dict[str, tuple[ExrFile, ...]]:
@@ -100,6 +114,37 @@ def _words(shot: Shot) -> set[str]:
 
 
 def _views_of(headers: Sequence[Mapping[str, Any]]) -> list[str]:
+    return _stated_views(headers) or _paired_views(headers)
+
+
+def _paired_views(headers: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The sides of a stereo camera, as the channels call them, in their order.
+
+    Both have the same channels, with a picture, and no picture is beside them: lights may be called so, too.
+    """
+    sides: dict[str, list[str]] = {side: [] for side in _PAIR}
+    words: dict[str, str] = {}
+    others = []
+    try:
+        names = [full_name(each, channel.name, len(headers)) for each in headers for channel in each["channels"]]
+    except UnicodeDecodeError:  # told where the pixels are read
+        return []
+    for name in names:
+        word = next((layer for layer in name.split(".")[:-1] if layer.lower() in sides), None)
+        if word is None:
+            others.append(name)
+        else:
+            words.setdefault(word.lower(), word)
+            sides[word.lower()].append(_strip(name, word))
+    whole = sorted(sides["left"]) == sorted(sides["right"]) and _has_picture(sides["left"])
+    return list(words.values()) if whole and not _has_picture(others) else []
+
+
+def _has_picture(names: Sequence[str]) -> bool:
+    return find_layer(group_layers(names), LAYERS["radiance"], BUFFERS["radiance"]) is not None
+
+
+def _stated_views(headers: Sequence[Mapping[str, Any]]) -> list[str]:
     stated = headers[0].get("multiView") if len(headers) == 1 else None
     if stated:
         return [str(view) for view in stated]
@@ -110,7 +155,8 @@ def _split(headers: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[s
     """View -> plain name of each channel -> full name."""
     views = _views_of(headers)
     parts = {str(header.get("name", "")): str(header["view"]) for header in headers if header.get("view")}
-    owners = {name: _owner(name, views, parts, single=len(headers) == 1) for name in names}
+    hero = views[0] if headers[0].get("multiView") and len(headers) == 1 else ""
+    owners = {name: _owner(name, views, parts, hero) for name in names}
     plain = {name: _strip(name, owner) if owner else name for name, owner in owners.items()}
     # A layer without a view that another view has too is the hero's.
     others = {plain[name] for name, owner in owners.items() if owner not in ("", views[0])}
@@ -122,15 +168,15 @@ def _split(headers: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[s
     return found
 
 
-def _owner(name: str, views: Sequence[str], parts: Mapping[str, str], *, single: bool) -> str:
-    """The view that a channel belongs to; "": to none."""
+def _owner(name: str, views: Sequence[str], parts: Mapping[str, str], hero: str) -> str:
+    """The view that a channel belongs to; "": to none. ``hero``: the view of what has no layer."""
     inside = [part for part in parts if part and (name == part or name.startswith(f"{part}."))]
-    if inside and not single:
+    if inside and not hero:
         return parts[max(inside, key=len)]
     layers = name.split(".")[:-1]
     if named := [view for view in views if view.lower() in (layer.lower() for layer in layers)]:
         return named[0]
-    return views[0] if single and not layers else ""
+    return hero if not layers else ""
 
 
 def _strip(name: str, view: str) -> str:
