@@ -1,4 +1,4 @@
-"""A training set in shards: windows of clips, exactly as they are stored, in ArrayRecord files of a gigabyte.
+"""A training set in shards: windows of clips, exactly as they are stored, in ArrayRecord files of one to two gigabytes.
 
 A set is a folder of ``windows-00000.arrayrecord`` ... and ``shards.json``, which is written last. Every array of a
 window is a record of its own, compressed by zstd, so that what a denoiser does not read is not decompressed either.
@@ -85,7 +85,7 @@ def write_shards(
     *,
     size: int,
     packing: Packing,
-    shard_size: int = 2**30,
+    shard_size: int = 2**31,
     progress: Callable[[int, int], None] = lambda windows, size: None,
 ) -> Packed:
     """Pack random windows of clips into a new folder of at most ``size`` bytes, of every clip one before any a second.
