@@ -297,3 +297,16 @@ def test_sides_that_are_not_whole_are_no_views(tmp_path: Path) -> None:
     assert find_views(ExrFile(path)) == ()
     sides(path, 0, left="middle")
     assert find_views(ExrFile(path)) == ()
+
+
+@pytest.mark.parametrize("kind", ["sides", "parts"])
+def test_a_first_file_that_is_damaged_is_a_missing_frame(kind: str, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    for frame in range(FRAMES):
+        (sides if kind == "sides" else parts)(tmp_path / "in" / f"s.{frame:04d}.exr", frame)
+    (tmp_path / "in" / "s.0000.exr").write_bytes(b"")
+    lines: list[str] = []
+    settings = Settings(naming=NAMING)
+    written = denoise_files([tmp_path / "in"], tmp_path / "out", mean_so_far(), settings, log=lines.append)
+    assert [path.name for path in written.files] == ["s.0001.exr", "s.0002.exr"]
+    assert any("read as views" in line for line in lines) == (kind == "sides")

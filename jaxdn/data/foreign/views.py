@@ -65,8 +65,15 @@ def find_views(file: ExrFile) -> tuple[str, ...]:
 
 def explain_views(label: str, views: Mapping[str, Sequence[ExrFile]]) -> list[str]:
     """What to know about views that a shot's files tell by the names of their channels alone, in sentences."""
-    stated = next((file for files in views.values() for file in files if isinstance(file, ViewFile)), None)
-    if len(views) < 2 or stated is None or _stated_views(stated.headers):
+    for file in next(iter(views.values()), ()) if len(views) > 1 else ():
+        try:
+            stated = bool(_stated_views(file.headers))
+        except ClipError:  # told when its turn comes
+            continue
+        if stated:
+            return []
+        break
+    else:
         return []
     names = " and ".join(views)
     return [f"{label}: {names} are read as views, by their names; for one alone, --view {next(iter(views))}"]
