@@ -35,7 +35,6 @@ from jaxdn.ops.affinity import pallas_kernels
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
 from jaxdn.ops.dispatch.row_tiles import rows_per_tile
-from jaxdn.ops.scales import add_planes
 
 if TYPE_CHECKING:
     from jaxtyping import Array, Float
@@ -303,7 +302,7 @@ def _gains(filtered: jax.Array, weight: jax.Array, cotangent: jax.Array) -> tupl
     """Where there is weight [1, H, W], the cotangent over it [C, H, W], and the product of that and the result."""
     some = weight > _NO_WEIGHT
     scaled = jnp.where(some, cotangent / jnp.where(some, weight, 1.0), 0.0)
-    return some, scaled, add_planes(scaled * filtered)
+    return some, scaled, jnp.sum(scaled * filtered, axis=0)
 
 
 def _gather_gradients(
