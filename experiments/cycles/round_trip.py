@@ -67,7 +67,8 @@ def run_kind(name: str, out: Path, options: argparse.Namespace) -> dict[str, Any
     row |= {"bytes in": _mean_size(sources), "bytes out": _mean_size(results)}
     row |= {"inspect, s": inspecting, "denoise, s": denoising, "frame, s": _seconds_a_frame(results)}
     row |= {"page, s": showing, "page, bytes": sum(path.stat().st_size for path in page.rglob("*") if path.is_file())}
-    row["parts"], row["OpenImageIO"] = [open_with_oiio(path) for path in results][-1]
+    row["parts"] = len({part for part, _ in read(results[-1])})
+    row["OpenImageIO"] = None if kind.recompress else max(open_with_oiio(path) for path in results)
     render_reference(kind, folder / "reference", options.reference)
     truth = beauty_of(folder / "reference" / names[-1])
     row |= {"noisy": _psnr(beauty_of(sources[-1]), truth), "denoised": _psnr(beauty_of(results[-1]), truth)}
@@ -79,9 +80,8 @@ def run_kind(name: str, out: Path, options: argparse.Namespace) -> dict[str, Any
         row["sum minus beauty"] = sum_minus_beauty(results[-1], kind.light)
     if name == "transparent":
         row["alpha"] = _alpha_errors(sources[-1], results[-1], folder / "reference" / names[-1])
-    row["Blender"] = max(
-        float(np.abs(composite(path, folder / "seen.exr") - beauty_of(path)).max()) for path in results
-    )
+    seen = [] if kind.recompress else [(composite(path, folder / "seen.exr"), beauty_of(path)) for path in results]
+    row["Blender"] = max((float(np.abs(image - wanted).max()) for image, wanted in seen), default=None)
     if name == "cryptomatte":
         given, kept = (composite(path, folder / "matte.exr", "Cube") for path in (sources[-1], results[-1]))
         if not (np.array_equal(given, kept) and 0.01 < kept.mean() < 0.9):

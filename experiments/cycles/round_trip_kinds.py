@@ -31,7 +31,8 @@ class Kind:
       path: the file of a time; ``{}`` is the frame's number, as Blender pads it.
       light: words of layers that jaxdn may change; Blender's beauty is always one.
       lossy: whether the codec loses precision, each time that a file is written.
-      recompress: a codec that OpenEXR writes and this Blender does not; the rendered files are written anew.
+      recompress: a codec that OpenEXR has and this Blender has not: the rendered files are written anew. Blender and
+        its OpenImageIO cannot read what comes back.
     """
 
     prepare: Callable[[], None] = _nothing
