@@ -205,6 +205,8 @@ def test_swapped_guides(tmp_path, inspect):
     _, options = record["findings"][0]["remedy"].removesuffix(".").split("the other way around: ")
     albedo, normal = "albedo=ViewLayer.Denoising Normal", "normal=ViewLayer.Denoising Albedo"
     assert shlex.split(options) == ["--channels", albedo, normal]
+    # Blender's normals have the letters X, Y and Z.
+    assert names(inspect(tmp_path / "shot", *shlex.split(options))) == []
 
 
 def test_swapped_guides_whose_normals_are_colours(tmp_path, inspect):

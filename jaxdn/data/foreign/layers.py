@@ -355,11 +355,14 @@ def _packed_roughness(groups: Groups, normal: Channels) -> dict[str, Channels]:
     return {"roughness": (fourth,)}
 
 
+_XYZ = ("x", "y", "z")
+
+
 def _components(buffer: Buffer) -> tuple[Channels, ...]:
     """What the channels of such a buffer may be called within their layer, lower case; the first that fits is taken."""
     color = (("r", "g", "b"), ("red", "green", "blue"))
     if buffer.channels == 3:
-        return (("x", "y", "z"), *color) if buffer.kind == "direction" else color
+        return (_XYZ, *color) if buffer.kind == "direction" else color
     if buffer.channels == 2:
         return (("x", "y"), ("r", "g"), ("u", "v"))
     if buffer.kind == "distance":
@@ -380,7 +383,11 @@ def _is_letter(name: str, group: Mapping[str, str]) -> bool:
 
 
 def _named(groups: Groups, buffer: str, layer: str) -> Channels:
-    channels = _fitting(groups.get(layer, {}), BUFFERS[buffer])
+    """The channels of a layer that was named outright: a colour may be called X, Y, Z, too."""
+    group = groups.get(layer, {})
+    channels = _fitting(group, BUFFERS[buffer])
+    if channels is None and BUFFERS[buffer].channels == 3 and group.keys() >= set(_XYZ):
+        channels = tuple(group[component] for component in _XYZ)
     if channels is None:
         there = [name for name, group in sorted(groups.items()) if name and not _is_letter(name, group)]
         raise ClipError(f"channels: no {buffer} in layer {layer!r}; there are {', '.join(map(repr, there)) or 'none'}.")
