@@ -33,7 +33,7 @@ from jaxdn.ops.affinity.filter import Guide, affinity_filter
 from jaxdn.ops.affinity.joint_upsample import joint_bilateral_upsample
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import implementation
-from jaxdn.ops.scales import fill_holes, join_planes
+from jaxdn.ops.scales import fill_holes, join_pixels, join_planes
 
 pytestmark = pytest.mark.needs("numba")
 
@@ -272,6 +272,23 @@ def unfolded(blocks):
     for channel, row, column in np.ndindex(channels // 4, 2, 2):
         planes[channel, row::2, column::2] = blocks[..., 4 * channel + 2 * row + column]
     return planes
+
+
+def test_planes_as_pixels(rng, both):
+    """Of odd sides, whose last row and column are repeated; the result is padded to multiples of four."""
+    height, width = 5, 7
+    shapes = {"planes": (2, 3, 4), "blocks": (1, height, width), "means": (2, height, width)}
+    arrays = [rng.normal(size=shape).astype(np.float32) for shape in shapes.values()]
+    found, wanted = both(lambda *given: join_pixels(list(zip(shapes, given, strict=True)), multiple=4), *arrays)
+    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
+    expected = np.zeros((4, 4, 2 + 4 + 2))
+    for y, x in np.ndindex(4, 4):
+        row, column = min(y, 2), min(x, 3)
+        rows, columns = [2 * row, min(2 * row + 1, height - 1)], [2 * column, min(2 * column + 1, width - 1)]
+        block = np.stack([arrays[1][0, i, j] for i in rows for j in columns])
+        means = [np.mean([plane[i, j] for i in rows for j in columns]) for plane in np.float64(arrays[2])]
+        expected[y, x] = [*arrays[0][:, row, column], *block, *means]
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
 
 
 def test_pixels_that_are_not_known(rng, both):
