@@ -43,7 +43,8 @@ OPERATIONS = [one for one in list_operations() if not one.name.startswith(LONG_T
 INNER = {
     *("find_targets", "check_taps", "tap_offsets", "angles", "alpha_of", "cosine_and_sine"),
     *("albedo_table", "ggx_albedo_table", "affinity", "locate_cells", "gather_windows", "attach_mean_gradient"),
-    *("draw_guide", "pad", "crop", "join_planes", "join_pixels", "to_planes", "to_pixels", "add_planes", "halve_planes"),
+    *("draw_guide", "pad", "crop", "join_planes", "join_pixels", "to_planes", "to_pixels"),
+    *("add_planes", "halve_planes"),
 }  # fmt: skip
 """Helpers of operations, which are tested through them, and tables that take no image."""
 PLAIN = [one for one in OPERATIONS if not one.name.endswith(", masked")]
