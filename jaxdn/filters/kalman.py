@@ -30,7 +30,7 @@ Rudolf Kalman, "A New Approach to Linear Filtering and Prediction Problems", 196
 import jax
 import jax.numpy as jnp
 
-from jaxdn.ops.scales import add_planes
+from jaxdn.ops.scales import add_planes, join_planes
 
 PLANES = 6
 """Of a history: colour, gain, deviation of the image's own errors, deviation of the noise."""
@@ -80,8 +80,10 @@ def kalman_blend(
     gain, flicker, noise = jax.lax.stop_gradient(
         _update(past, valid, exposure * image, exposure * noisy, exposure, bias, history_max)
     )
-    color = image + (1.0 - gain)[None] * jnp.where(valid[None], past[:3] - image, 0.0)
-    return jnp.concatenate([color, jnp.stack([gain, flicker / exposure, noise / exposure])])
+    # Joined by a loop on CPUs: XLA would compute the gain once for each colour.
+    tracked = join_planes([("planes", plane[None]) for plane in (gain, flicker / exposure, noise / exposure)])
+    color = image + (1.0 - tracked[:1]) * jnp.where(valid[None], past[:3] - image, 0.0)
+    return jnp.concatenate([color, tracked])
 
 
 def _update(

@@ -21,7 +21,7 @@ from jaxdn.filters.kalman import kalman_blend
 from jaxdn.filters.resampling import find_whole, measure_fetch_error
 from jaxdn.filters.sharp_history import TAPS, fetch_sharply
 from jaxdn.filters.surface_test import Guides, guides_of
-from jaxdn.ops.scales import to_planes
+from jaxdn.ops.scales import join_pixels, to_planes
 
 _READS = frozenset({"albedo", "normal", "depth", "previous_depth", "motion", "ids"})
 RECEPTIVE_FIELD = kalman.RECEPTIVE_FIELD + albedo_history.RECEPTIVE_FIELD + TAPS
@@ -146,5 +146,5 @@ def blend_image(
     parts = [blended[:3], blended[3:], whole[None].astype(image.dtype)]
     if albedo is not None and then is not None:
         parts.insert(1, albedo + (1.0 - blended[3:4]) * jnp.where(valid[None], then - albedo, 0.0))
-    values = jnp.concatenate(parts).transpose(1, 2, 0)
+    values = join_pixels([("planes", part) for part in parts])
     return StableHistory(values, guides_of(frame)), values[..., :3], found.invalid

@@ -15,7 +15,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.filters.resampling import find_whole
 from jaxdn.filters.sharp_history import SharpHistory, fetch_sharply
 from jaxdn.filters.surface_test import Guides, guides_of
-from jaxdn.ops.scales import to_planes
+from jaxdn.ops.scales import join_pixels, to_planes
 
 COLORS = 15
 """Channels that are fetched by cubics."""
@@ -116,6 +116,6 @@ def keep_history(frame: Frame, means: Means, result: jax.Array) -> CombinerState
     normal = jnp.clip(0.5 * (means.normal + 1.0), 0.0, 1.0)
     colors = [jnp.maximum(each, 0.0) for each in (means.light, means.prior, means.albedo)]
     whole = find_whole(frame._replace(normal=None)).astype(normal.dtype)
-    rest = jnp.stack([jnp.maximum(means.square, 0.0), means.number, whole])
-    history = jnp.concatenate([*colors, normal, result, rest])
-    return CombinerState(history.transpose(1, 2, 0), tested_guides(frame))
+    rest = [plane[None] for plane in (jnp.maximum(means.square, 0.0), means.number, whole)]
+    history = join_pixels([("planes", planes) for planes in (*colors, normal, result, *rest)])
+    return CombinerState(history, tested_guides(frame))
