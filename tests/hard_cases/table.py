@@ -1,6 +1,6 @@
 """All combinations of cases, functions, precisions and directions with their results: one row per cell."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -53,6 +53,8 @@ def rows(
     *,
     precisions: Sequence[str] = PRECISIONS,
     directions: Sequence[str] = DIRECTIONS,
+    compared: bool = True,
+    compiler_options: Mapping[str, bool] = AS_USERS,
     pictures: dict[tuple[str, str], np.ndarray] | None = None,
 ) -> Iterator[Row]:
     """Every cell; one compiled program for each function, direction, size and, where it does not widen, precision.
@@ -60,8 +62,12 @@ def rows(
     A function that widens its bfloat16 inputs before it computes (:mod:`tests.hard_cases.widening`) is one program for
     both precisions: it gets the same numbers as float32, and its gradients are rounded to bfloat16 afterwards.
 
-    ``pictures`` is filled with the last image [H, W, 3] that each case and pictured function gives in single precision.
+    Without ``compared`` no program in double precision is made, and no row has an ``error``: for functions that
+    sanitize, because double precision tells what others may pass on. ``compiler_options`` are those of the programs in
+    single precision. ``pictures`` is filled with the last image [H, W, 3] that each case and pictured function gives in
+    single precision.
     """
+    assert compared or all(function.sanitizes for function in functions)
     made = {case.name: case.make(good()) for case in cases}
     for function in functions:
         params = function.begin()
@@ -72,7 +78,7 @@ def rows(
             if not (forward or function.differentiable):
                 yield from _without_gradient(function, made, precisions)
                 continue
-            run = Program(function.run if forward else gradient_of(function.run), compiler_options=AS_USERS)
+            run = Program(function.run if forward else gradient_of(function.run), compiler_options=compiler_options)
             # The comparison runs once for each case: compiled without optimisation, in a fifth of the time.
             plain = {"xla_backend_optimization_level": 0, **SOON}
             double = Program(function.run if forward else gradient_of(function.run), compiler_options=plain)
@@ -84,11 +90,15 @@ def rows(
                         found = found if forward else narrow_gradient(found, given)
                     else:
                         found = run(params, given)
-                    with jax.enable_x64(True):
-                        truth = double(wide, _widened(given))
+                    truth = _exact(double, wide, given) if compared else None
                     yield _judge(name, function, precision, direction, found, truth, given)
                     if pictures is not None and function.pictured and forward and precision == "float32":
                         pictures[name, function.name] = np.asarray(found).reshape(-1, *found.shape[-3:])[-1]
+
+
+def _exact(double: Program, wide: Any, given: Inputs) -> Any:
+    with jax.enable_x64(True):
+        return double(wide, _widened(given))
 
 
 def _without_gradient(function: Function, cases: Iterable[str], precisions: Sequence[str]) -> Iterator[Row]:
@@ -133,7 +143,8 @@ def _leaves(tree: Any) -> np.ndarray:
 def _judge(
     case: str, function: Function, precision: str, direction: str, result: Any, exact: Any, inputs: Inputs
 ) -> Row:
-    found, truth = _leaves(result), _leaves(exact)
+    found = _leaves(result)
+    truth = found if exact is None else _leaves(exact)
     finite = np.isfinite(found)
     representable = np.isfinite(truth) & (np.abs(truth) <= _MOST)
     both = finite & representable
@@ -141,7 +152,7 @@ def _judge(
     lowest = float(np.min(found[finite], initial=0.0))
     error = None
     # A pure function of infinity saturates at the largest number of its own precision: nothing to compare there.
-    if function.sanitizes or not _infinite(inputs):
+    if exact is not None and (function.sanitizes or not _infinite(inputs)):
         # Below the smallest normal number XLA:CPU rounds to 0, as most hardware does.
         scale = max(float(np.max(np.abs(truth[both]), initial=0.0)), 1e3 * _LEAST)
         size = min(1.0, float(np.max(np.abs(_leaves(inputs.clip.frames.radiance)), initial=0.0)))
