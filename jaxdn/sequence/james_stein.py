@@ -24,8 +24,9 @@ V is the less of two estimates in windows, but at least half of the second:
 The first alone would be 0 where all was blurred. Texture of single pixels looks like noise to both, but it is seldom
 everywhere, and noise is: of little noise, V is at most that of the quietest block of surfaces around. Noise differs
 from place to place, too, so that this holds only where the denoiser blurred, because then band 2 has more energy than
-noise explains, or where the quietest block has a small part of the noise (:data:`QUIETER`). A brighter block tells how
-much noise there is in light, not in its share: sun beside a shadow adds light without noise. Of much noise all this
+noise explains, or where a block that is not brighter has a small part of the noise (:data:`QUIETER`). A brighter block
+tells how much noise there is in light, not in its share: sun beside a shadow adds light without noise. One that has far
+less noise besides may be a window or another lamp, whose own light is not drawn by samples. Of much noise all this
 would be far too little, because few samples are mostly dark, with a few bright ones. The first two hold for renderers
 that filter their pixels by drawing samples from the filter, as Cycles and our renderer do: the noise of two pixels is
 independent. Neither is moved by single values, because d is Winsorized (Tukey 1962): it counts as at most :data:`BOUND`
@@ -97,8 +98,10 @@ BLURRED = (1.0, 1.6)
 """Energy of the third band, relative to that of noise, up to which the denoiser blurred nothing here, and from which it
 did: half of the pixels of Open Image Denoise have 0.3 to 0.8, of ``svgf`` 3 to 12."""
 QUIETER = (0.08, 0.16)
-"""Noise (variance) of the quietest block around, relative to a pixel's, up to which that counts although nothing was
-blurred, and from which it does not. Rendered noise differs by so much where the light does."""
+"""Noise (variance) of the quietest block around that is not brighter, relative to a pixel's, up to which the quietest
+counts although nothing was blurred, and from which it does not. Rendered noise differs by so much where light does."""
+BRIGHTER = 1.02
+"""Light of a block, relative to that of a pixel's own, above which it is brighter: denoised walls are as even."""
 _NO_BLOCK = 1e9
 _TINY = 1e-12
 MANY = (0.25, 0.5)
@@ -274,14 +277,17 @@ def _measure_noise(energies: list[jax.Array], curved: jax.Array, light: jax.Arra
     by_scale = jnp.maximum(finest - SLOPE * next_one, 0.0) / (GAINS[0] - SLOPE * GAINS[1])
     by_direction = _DIRECTION_BIAS * _least(window_means(curved, RADII[0]))
     variance = jnp.clip(by_scale, _LEAST * by_direction, by_direction)
-    quiet, some = _quietest(curved, light, sampled), jnp.maximum(by_direction, _TINY)
+    quiet, darker = _quietest(curved, light, sampled)
+    some = jnp.maximum(by_direction, _TINY)
     blurred = 1 - _falling(third / (GAINS[2] * some), *BLURRED)
-    texture = jnp.maximum(blurred, _falling(quiet / some, *QUIETER)) * _falling(jnp.sqrt(by_direction), *LITTLE)
+    texture = jnp.maximum(blurred, _falling(darker / some, *QUIETER)) * _falling(jnp.sqrt(by_direction), *LITTLE)
     return variance + texture * (jnp.minimum(variance, quiet) - variance)
 
 
-def _quietest(curved: jax.Array, light: jax.Array, sampled: jax.Array) -> jax.Array:
+def _quietest(curved: jax.Array, light: jax.Array, sampled: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The least noise that blocks near each pixel [1, H, W] allow, without bias; interpolated between them.
+
+    And that of the blocks which are not brighter than the pixel's own, as it is.
 
     Blocks count that are ``sampled`` altogether (:func:`_sampled`). Few without any noise, among others that have some,
     may be a screen in view, and say nothing of what is beside it: they and those that they touch, whose pixels may be
@@ -295,11 +301,12 @@ def _quietest(curved: jax.Array, light: jax.Array, sampled: jax.Array) -> jax.Ar
     rows, columns = blocks.shape[1:]
     widths = ((0, 0), (QUIET, QUIET), (QUIET, QUIET))
     around = [jnp.pad(image, widths, constant_values=value) for image, value in ((blocks, _NO_BLOCK), (bright, 0.0))]
-    least = jnp.full_like(blocks, _NO_BLOCK)
+    least = darker = jnp.full_like(blocks, _NO_BLOCK)
     for dy, dx in np.ndindex(2 * QUIET + 1, 2 * QUIET + 1):
         noise, other = (image[:, dy : dy + rows, dx : dx + columns] for image in around)
         least = jnp.minimum(least, noise * jnp.maximum(other / bright, 1.0) ** 2)
-    return _QUIETEST * _enlarge(least, light.shape[1:])
+        darker = jnp.minimum(darker, jnp.where(other <= BRIGHTER * bright, noise, _NO_BLOCK))
+    return _QUIETEST * _enlarge(least, light.shape[1:]), _QUIETEST * _enlarge(darker, light.shape[1:])
 
 
 def _weigh(energies: list[tuple[jax.Array, jax.Array]], cut: jax.Array, variance: jax.Array) -> list[jax.Array]:

@@ -12,6 +12,7 @@ from jaxdn.sequence.james_stein import (
     BLOCK,
     BLURRED,
     BOUND,
+    BRIGHTER,
     CLEAN,
     DOUBT,
     GAINS,
@@ -133,9 +134,18 @@ def reference(noisy, denoised):
         ]
         for y in range(height // BLOCK)
     ]
-    quietest = 1.88 * np.asarray(jax.image.resize(np.array(around), (height, width), "linear"))
+    darker = [
+        [
+            np.where(near(bright, y, x) <= BRIGHTER * bright[y, x], near(counted, y, x), 1e9).min()
+            for x in range(width // BLOCK)
+        ]
+        for y in range(height // BLOCK)
+    ]
+    quietest, darkest = (
+        1.88 * np.asarray(jax.image.resize(np.array(each), (height, width), "linear")) for each in (around, darker)
+    )
     blurred = 1 - falling(window(squares[2], 7) / (GAINS[2] * by_direction), *BLURRED)
-    texture = np.maximum(blurred, falling(quietest / by_direction, *QUIETER))
+    texture = np.maximum(blurred, falling(darkest / by_direction, *QUIETER))
     little = texture * falling(np.sqrt(by_direction), *LITTLE)
     variance = little * np.minimum(variance, quietest) + (1 - little) * variance
     cut = window(np.mean((whole - smooth[-1]) ** 2, axis=-1), RADII[-1])
@@ -223,6 +233,17 @@ def test_what_shines_in_view_brings_no_noise_back(rng, light, width):
     lit = truth[..., :1] == light
     noisy = np.where(lit, truth, truth * (1 + 0.2 * rng.standard_normal((96, 160, 1)))).astype(np.float32)
     assert mse(mixed(noisy, truth).image, truth) < 0.02 * mse(noisy, truth)
+
+
+@pytest.mark.parametrize("light", [0.6, 0.9])
+def test_a_bright_window_with_little_noise_brings_none_back(rng, light):
+    """It is below what a lamp has at least, and motion blur gives it some noise: the wall beside it is no texture."""
+    truth = np.full((96, 160, 3), 0.5, np.float32)
+    truth[24:72, 40:104] = light
+    noise = np.where(truth[..., :1] == light, 0.015, 0.15) * rng.standard_normal((96, 160, 1))
+    noisy = (truth * (1 + noise)).astype(np.float32)
+    wall = truth[..., 0] == 0.5
+    assert mse(mixed(noisy, truth).image[wall], truth[wall]) < 0.05 * mse(noisy[wall], truth[wall])
 
 
 def test_a_noisy_thing_before_black_stays_denoised(rng):
