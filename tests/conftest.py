@@ -1,6 +1,6 @@
 """The settings of every test: strict broadcasting, full float32 precision, fixed seeds, a compilation cache.
 
-Markers: ``slow`` (more than 3 s of processor time), ``browser`` (opens a page in one), ``needs("llvm")``
+Markers: ``slow`` (more than a second of processor time), ``browser`` (opens a page in one), ``needs("llvm")``
 (:mod:`tests.needs`).
 """
 

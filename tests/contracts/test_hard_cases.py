@@ -185,6 +185,7 @@ class Options:
     size: Literal["large", "small"] = "large"
 
 
+@pytest.mark.slow
 def test_a_method_registered_at_run_time_has_its_rows(monkeypatch):
     monkeypatch.setattr(methods_table, "_METHODS", dict(methods()))
 

@@ -268,6 +268,7 @@ def test_a_named_implementation_runs_or_raises(op):
         known.named("no such")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("x64")
 @pytest.mark.parametrize("guided", [False, True])
 @pytest.mark.parametrize("height", [pytest.param(5, marks=pytest.mark.slow), 7, 8])

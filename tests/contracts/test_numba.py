@@ -160,6 +160,7 @@ def of_earlier_frames(rng, height, width, light=1.0):
 SEEN = functools.partial(assemble_network_input, multiple=16)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [1e-6, 1.0, 1e6, 1e30])
 @pytest.mark.parametrize("size", [(14, 38), (32, 64)])
 def test_what_a_network_sees(gain, size, rng, both):

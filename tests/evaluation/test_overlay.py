@@ -195,6 +195,7 @@ def test_missing_vectors(tmp_path, inspect):
     assert "Passes > Vector" in next(f["remedy"] for f in record["findings"] if f["name"] == "no motion vectors")
 
 
+@pytest.mark.slow
 def test_swapped_guides(tmp_path, inspect):
     def swap(index, layers):
         albedo, normal = layers["Denoising Albedo"], layers["Denoising Normal"]
@@ -529,6 +530,7 @@ def test_a_little_texture_that_moves_otherwise_is_no_finding():
     assert found.name == "vectors of something else"
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_the_page_plays_in_a_browser(tmp_path, inspect, browser):
     record = inspect(write_shot(tmp_path / "shot"))

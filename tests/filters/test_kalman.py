@@ -87,6 +87,7 @@ def test_single_precision_is_enough(rng):
     np.testing.assert_allclose(single, blend_in_numpy(*arguments, 0.0, 16), rtol=2e-3, atol=2e-4)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 9), st.integers(1, 40), st.integers(1, 40))
 @settings(max_examples=30, deadline=None)
 def test_sums_of_windows_are_those_of_their_pixels(radius, height, width):

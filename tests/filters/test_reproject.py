@@ -81,6 +81,7 @@ def test_it_is_the_mean_of_the_taps_of_the_same_surface(guide, tile, search_neig
     assert search_neighbours == (valid.sum() > by_loops(history, frame)[1].sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("search_neighbours", [False, True])
 def test_its_gradient(search_neighbours, rng, x64):
     history, frame = drawn(rng)
@@ -152,6 +153,7 @@ def test_a_broken_pixel_is_no_tap(rng, x64):
     assert not still.valid[2, 6]
 
 
+@pytest.mark.slow
 def test_the_first_frame_has_none(rng):
     history, frame = drawn(rng)
     for motion in (None, frame.motion):

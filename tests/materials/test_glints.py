@@ -126,6 +126,7 @@ def test_the_counting_rule_in_plain_integers():
         np.testing.assert_allclose(found, expected, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_cell_knows_nothing_of_its_batch(rng):
     shape = (6, 5)
     half, position = rng.normal(0, 0.3, (*shape, 3)) + [0, 0, 1], rng.uniform(-4, 4, (*shape, 2))
@@ -218,6 +219,7 @@ def test_no_case_gives_anything_but_numbers(lobe):
         assert np.mean(np.asarray(sparse)[..., 2] == 1) > 0.9
 
 
+@pytest.mark.slow
 def test_gradients(x64, rng):
     shape = (3, 4)
     half = rng.normal(0, 0.3, (*shape, 3)) + [0, 0, 1]

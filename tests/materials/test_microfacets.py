@@ -240,6 +240,7 @@ def test_distribution_is_finite_with_finite_slopes_everywhere(lobe):
         assert all(np.isfinite(one).all() for one in slopes)
 
 
+@pytest.mark.slow
 def test_gradients(x64, rng):
     data = backscatter("ggx", 0.4, cells=16) * rng.uniform(0.8, 1.2, 16)
     for shadowing in microfacets.SHADOWINGS:

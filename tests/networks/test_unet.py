@@ -216,6 +216,7 @@ def test_every_engine_runs_whatever_network_is_described(backend: str, rng: np.r
         np.testing.assert_allclose(got, wanted, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absent", [(), (1, 3)])
 @pytest.mark.parametrize("name", ["onnxruntime", "onednn"])
 def test_a_backend_runs_the_same_network(

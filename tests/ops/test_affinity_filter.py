@@ -46,6 +46,7 @@ def test_it_is_the_formula(step, tile, rng, x64, monkeypatch):
     np.testing.assert_allclose(found, by_formula(image, *guide, step), rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [1, 3])
 def test_gradients(step, rng, x64):
     def filtered(image, *guide):

@@ -114,6 +114,7 @@ def _run(folder):
     return done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_a_program_with_loops_is_compiled_once_for_all_processes(tmp_path):
     first, second = _run(tmp_path), _run(tmp_path)
     assert "cache hit for 'jit_fill_holes'" not in first

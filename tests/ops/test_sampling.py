@@ -306,6 +306,7 @@ def test_even_logits_give_every_pixel_the_budget():
         np.testing.assert_array_equal(sample_map(np.full((7, 9, 1), value, np.float32), 4, most=63), 4)
 
 
+@pytest.mark.slow
 @hypothesis.given(
     st.integers(0, 2**32 - 1), st.floats(0.3, 6), st.sampled_from([0.0, 1.0, 30.0, 1e4]), st.sampled_from([0, 1])
 )
@@ -323,6 +324,7 @@ def test_the_budget_is_kept_exactly(seed, budget, spread, least):
     assert np.all(np.diff(counts[inside][more]) >= -1)  # in the order of the logits, but for rounding
 
 
+@pytest.mark.slow
 def test_a_whole_frame_keeps_the_budget_exactly(rng):
     """Whose sum float32 no longer counts one by one."""
     logits = jnp.asarray(2 * rng.normal(size=(1080, 1920, 1)), jnp.float32)

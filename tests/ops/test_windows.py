@@ -44,6 +44,7 @@ def test_a_pixel_decides_nothing_beyond_its_reach(rng, name, value):
     np.testing.assert_array_equal(np.asarray(run(image))[0][away], before[0][away])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1, 1), (2, 9), (7, 3)])
 @pytest.mark.parametrize("name", FILTERS)
 def test_images_smaller_than_the_reach(rng, name, size):

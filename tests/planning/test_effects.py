@@ -189,6 +189,7 @@ def test_an_unknown_method_is_refused():
         command.find_denoiser("magic")
 
 
+@pytest.mark.slow
 def test_only_json_is_printed(tmp_path):
     path = CASES["a ball: textured roughness"].write(tmp_path)
     done = subprocess.run(
@@ -206,6 +207,7 @@ def test_only_json_is_printed(tmp_path):
     assert said["uncertain"] == []
 
 
+@pytest.mark.slow
 def test_a_user_error_ends_with_one_message(tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "jaxdn.commands.main", "inspect", str(tmp_path / "none.xml"), "--json"],

@@ -178,6 +178,7 @@ def test_training_mixes_clips_of_different_effects(tmp_path):
     assert sorted(moves) == [False, True]
 
 
+@pytest.mark.slow
 def test_a_finished_clip_is_inspected_without_its_scene(tmp_path):
     everything, auto = rendered(room("rough metal", "ball"), tmp_path)
     found = effects.inspect(auto)

@@ -89,6 +89,7 @@ def test_an_effect_that_is_not_read_changes_nothing(name):
     assert only(frame_for(*unread), reads) == only(frame_for(), reads)
 
 
+@pytest.mark.slow
 def test_one_program_per_distinct_set_and_none_per_frame():
     denoiser = jaxdn.denoisers.svgf(levels=1, feedback_level=0)
     traced = 0

@@ -119,6 +119,7 @@ with exit_on_interrupt(), plain_errors():
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="exit codes of signals are those of Unix")
 def test_a_process_ends_while_a_program_is_compiled():
     for _ in range(3):

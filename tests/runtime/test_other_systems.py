@@ -54,6 +54,7 @@ def find_unguarded(source: str) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_nothing_that_windows_lacks_is_called_without_asking() -> None:
     unguarded = {path.name: found for path in SOURCES if (found := find_unguarded(path.read_text("utf-8")))}
     assert unguarded == {}
@@ -148,6 +149,7 @@ def test_a_system_that_does_not_tell_its_memory_limits_nothing(monkeypatch: pyte
     assert measure_machine_memory() == float("inf")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
 def test_names_that_a_terminal_cannot_show_end_nothing(tmp_path: Path, encoding: str) -> None:
     """A shot's name in three scripts is printed, and so is a message about a file whose name is Latin-1."""

@@ -168,6 +168,7 @@ def test_shipped_weights_take_any_size(size, name):
     assert image.shape == (*size, 3)
 
 
+@pytest.mark.slow
 def test_what_trains_is_not_imported_to_denoise():
     """Flax, which holds the weights, brings optax."""
     load = "import sys, jaxdn; jaxdn.load_weights('steady-balanced'); print(*sys.modules)"
