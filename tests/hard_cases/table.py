@@ -54,7 +54,7 @@ def rows(
     precisions: Sequence[str] = PRECISIONS,
     directions: Sequence[str] = DIRECTIONS,
     compared: bool = True,
-    compiler_options: Mapping[str, bool] = AS_USERS,
+    compiler_options: Mapping[str, bool | str] = AS_USERS,
     pictures: dict[tuple[str, str], np.ndarray] | None = None,
 ) -> Iterator[Row]:
     """Every cell; one compiled program for each function, direction, size and, where it does not widen, precision.
