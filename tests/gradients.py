@@ -8,8 +8,10 @@ import numpy as np
 from jax.test_util import check_vjp
 
 
-def check_gradients(function: Callable[..., Any], arguments: Sequence[Any], **tolerances: float) -> None:
-    """Check the reverse-mode gradient of arrays (or trees of them) along one random direction.
+def check_gradients(function: Callable[..., Any], arguments: Sequence[Any], **tolerances: float) -> tuple[Any, ...]:
+    """Check the reverse-mode gradient of arrays (or trees of them) along one random direction, and return it.
+
+    What is returned is the gradient of the sum of all results, by each of the arguments.
 
     As ``jax.test_util.check_grads`` does it with ``order=1, modes=["rev"]``, which compiles three programs: the
     function, the function with what its gradient needs, and the gradient.
@@ -34,3 +36,4 @@ def check_gradients(function: Callable[..., Any], arguments: Sequence[Any], **to
         return run(*arguments), lambda cotangent: program(cotangent, *arguments)[1]
 
     check_vjp(run, pull_back, tuple(arguments), **tolerances)
+    return program(jax.tree.map(np.ones_like, nothing), *arguments)[1]

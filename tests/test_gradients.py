@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from tests.gradients import check_gradients
@@ -32,6 +33,12 @@ def given(rng):
 def test_a_right_gradient_passes(rng):
     check_gradients(times(1.0), given(rng))
     check_gradients(lambda tree: jnp.sin(tree["a"]) * tree["b"], [dict(zip("ab", given(rng), strict=True))])
+
+
+def test_the_gradient_of_the_sum_of_results_is_returned(rng):
+    a, b = given(rng)
+    for found, expected in zip(check_gradients(times(1.0), (a, b)), (b + 1, a + 1), strict=True):
+        np.testing.assert_allclose(found, expected)
 
 
 def test_a_wrong_gradient_fails(rng):

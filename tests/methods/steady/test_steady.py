@@ -15,8 +15,8 @@ from jaxdn.methods.steady.levels import LEVELS
 from jaxdn.methods.steady.method import FEATURES, HALF_FEATURES, INITIAL, split_heads, steady
 from jaxdn.ops.scales import space_to_depth
 from tests.gradients import check_gradients
+from tests.methods.steady.short import TINY, short_steady
 
-TINY = ((4,), (4,), (4,), (4,), (4,))
 SIZE = (24, 40)
 """Not a multiple of what the network works on."""
 
@@ -227,34 +227,26 @@ def test_the_share_of_the_newest_frame_hardly_knows_of_its_own_noise(rng):
 
 
 @pytest.mark.slow
-def test_gradients_through_time(rng, x64):
-    denoiser = tiny()
+def test_every_weight_learns_through_time(rng, x64, monkeypatch):
+    """And along a random direction of all weights the slope is that of central differences."""
+    denoiser = short_steady(monkeypatch)
     frames = room(rng, 2, size=(32, 32))
     frames = frames._replace(
         motion=frames.motion + 0.3,
         **{name: getattr(frames, name).astype(jnp.float64) for name in ("radiance", "albedo", "normal", "depth")},
     )
+    frames = frames._replace(reflectance=jnp.where(frames.ids == 1, 0.9, frames.albedo))  # the box shines
     params = denoiser.init(jax.random.key(0), frame_at(frames, 0))
     params = jax.tree.map(lambda x: x.astype(jnp.float64), params)
     noise = jax.random.normal(jax.random.key(1), frames.radiance.shape, jnp.float64)
 
-    @jax.jit
-    def loss(head, guide):
-        return jnp.sum(noise * unroll(denoiser, {**params, "head_0": head, "guide": guide}, frames))
+    def loss(params):
+        return jnp.sum(noise * unroll(denoiser, params, frames))
 
-    check_gradients(loss, (params["head_0"], params["guide"]), rtol=1e-4, eps=1e-5)
-
-
-@pytest.mark.slow
-def test_every_weight_learns(rng, key):
-    denoiser = tiny()
-    frames = room(rng, 3)
-    frames = frames._replace(reflectance=jnp.where(frames.ids == 1, 0.9, frames.albedo))  # the box shines
-    params = denoiser.init(key, frame_at(frames, 0))
-    gradient = jax.jit(jax.grad(lambda p: jnp.mean(jnp.square(unroll(denoiser, p, frames)))))(params)
-    still = [jax.tree_util.keystr(path) for path, leaf in jax.tree.leaves_with_path(gradient) if not np.any(leaf)]
+    (slopes,) = check_gradients(loss, (params,), rtol=1e-4, eps=1e-6)
+    still = [jax.tree_util.keystr(path) for path, leaf in jax.tree.leaves_with_path(slopes) if not np.any(leaf)]
     assert still == []
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(slopes))
 
 
 def test_every_quality_takes_fewer_operations_than_the_next(rng):
