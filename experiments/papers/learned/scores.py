@@ -57,10 +57,14 @@ def read(folder: Path, *, spp: int, layers: bool = False) -> EvaluationClip:
     return footage._replace(clip=clip, relative_to=near()(jax.tree.map(jnp.asarray, frames)))
 
 
+NEAR = "steady-balanced"
+"""A shipped network, which none of the tables' networks shares."""
+
+
 @cache
 def near() -> Callable[[Frame], jax.Array]:
-    """Frames [T, ...] -> images near the truth: a shipped network, which none of the tables' networks shares."""
-    one = find_model("steady-balanced")
+    """Frames [T, ...] -> images near the truth, by :data:`NEAR`."""
+    one = find_model(NEAR)
     assert one.denoiser is not None
     denoiser = one.denoiser
     return jax.jit(lambda frames: unroll(denoiser, one.params, frames))
