@@ -13,7 +13,7 @@ import pytest
 import tyro
 
 from experiments.speed.chart import __main__ as chart
-from experiments.speed.chart import stacks
+from experiments.speed.chart import render_cost, stacks
 from experiments.speed.chart.breakdown import WHOLE, breakdown, subjects
 from experiments.speed.chart.energy import find_meter
 from experiments.speed.chart.footage import EvaluationClip
@@ -41,10 +41,9 @@ from jaxdn.denoiser.rollout import denoise
 from jaxdn.methods import registry
 from jaxdn.methods.registry import method, method_named, methods
 from jaxdn.networks.backends import BACKENDS
-from jaxdn.zoo.ready import Model, untrained_model
+from jaxdn.zoo import ready
+from jaxdn.zoo.ready import Model, find_model, untrained_model
 
-DRAWN = ("taa", "ntd-small", "rae")
-"""The methods of the chart that is really made."""
 SIZE, OWN = "1280x720", "64x64"
 MOTION = "albedo, motion, normal"
 PSNR = MEASURES[0]
@@ -358,7 +357,11 @@ def number_of_programs():
 @pytest.mark.needs("mitsuba")
 def test_a_quick_chart_and_resuming_it(tmp_path, monkeypatch, capsys):
     """From the command line to the page, of a filter, shipped weights and new ones: others differ in their step."""
-    monkeypatch.setattr(chart, "chosen", lambda **how: [each for each in chosen(**how) if each.label in DRAWN])
+    recipe = method_named("ntd").recipe_named(None)
+    entered(monkeypatch, lambda options: mean_of_two(), "newcomer", recipes={"usual": recipe})
+    drawn = [find_model("taa"), find_model("ntd-small"), untrained_model(method_named("newcomer"))]
+    monkeypatch.setattr(ready, "all_models", lambda: drawn)
+    monkeypatch.setattr(render_cost, "ROUNDS", 2)
     programs, breakdowns = [], chart.Run.breakdowns
     monkeypatch.setattr(chart.Run, "breakdowns", lambda run: (programs.append(number_of_programs()), breakdowns(run)))
     out = tmp_path / "chart-quick"
@@ -368,7 +371,9 @@ def test_a_quick_chart_and_resuming_it(tmp_path, monkeypatch, capsys):
     raw = json.loads((out / "chart.json").read_text())
     assert {f"ntd-small @ {spp}" for spp in (1, 2, 4, 8)} <= set(raw["errors"])
     assert {"renderer @ 1", "renderer @ 16"} <= set(raw["errors"])
-    assert set(DRAWN) <= set(raw["times"])
+    assert set(raw["times"]) == {"taa", "ntd-small", "newcomer"}
+    assert not [point for point in raw["errors"] if point.startswith("newcomer")]
+    assert set(raw["breakdown"]) == {"ntd-small, reference"}
     assert (out / "chart.html").is_file()
     assert programs[0] < 20, "programs of all methods together are more than a process may hold"
     chart.main(settings)
