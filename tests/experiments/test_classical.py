@@ -7,7 +7,7 @@ import pytest
 from experiments.papers import classical
 from jaxdn.zoo.ready import NOISY
 
-WEIGHTS, FILTERS = "ntd-small", (classical.AGAINST, "trmv")
+WEIGHTS, FILTERS = "ntd-small", (classical.AGAINST, "taa")
 
 
 @pytest.mark.slow
@@ -34,7 +34,7 @@ def test_filters_are_scored_and_timed(tmp_path, capsys, monkeypatch):
     assert written.strip() in said
     for light in classical.LIGHTS:
         assert (tmp_path / "out" / light / "report.html").is_file()
-        assert (tmp_path / "out" / light / "pictures" / "fruit-2000" / "trmv.png").is_file()
+        assert (tmp_path / "out" / light / "pictures" / "fruit-2000" / "taa.png").is_file()
     rows = [line.split(" | ") for line in written.splitlines() if line.startswith("| ")]
     for name in [*FILTERS, WEIGHTS]:
         own = [row for row in rows if row[0] == f"| {name}"]
