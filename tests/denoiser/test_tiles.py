@@ -128,7 +128,7 @@ def test_tiles_make_the_image_of_the_whole_frame(
 def test_nothing_beyond_the_receptive_field_decides_about_a_pixel(name: str, x64: None) -> None:
     """Everything to the right of a column is other than it was, but not what is measured of the frame.
 
-    Of ``steady`` with few buffers, with which its filter goes farthest, and its program is half as large.
+    Of ``steady`` with few buffers: less of what it sees stops its filter.
     """
     denoiser = METHODS[name]()
     reads = denoiser.reads - LEFT_OUT if name == "steady" else denoiser.reads

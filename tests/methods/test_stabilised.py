@@ -1,6 +1,6 @@
 """The wrapper that gives any denoiser a history: along motion, in programs and tiles, by name, and on moving light."""
 
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,18 @@ def given_images(params, state, frame):
 
 
 GIVEN = Denoiser(lambda key, frame: {}, lambda params, frame: (), given_images, frozenset({"direct"}))
+STEADIER = jaxdn.stabilised(GIVEN)
+
+
+@cache
+def compiled(denoiser):
+    """Images of params and a clip: compiled once for clips of one size and one set of buffers."""
+    return jax.jit(partial(jaxdn.denoise, denoiser))
+
+
+def steadied(frames):
+    """The given images with a history."""
+    return np.asarray(compiled(STEADIER)({}, Clip(frames)))
 
 
 def rolling(rng, count=10, size=SIZE, speed=2, error=0.05, noise=0.5):
@@ -62,7 +74,7 @@ def rolling(rng, count=10, size=SIZE, speed=2, error=0.05, noise=0.5):
 def test_the_first_frame_is_the_denoisers_and_later_ones_are_the_blend(rng):
     """Of a still image: the same as the filter, called by hand."""
     frames, _ = rolling(rng, 3, speed=0)
-    images = jaxdn.denoise(jaxdn.stabilised(GIVEN), {}, Clip(frames))
+    images = steadied(frames)
     np.testing.assert_array_equal(images[0], frames.direct[0])
     past, valid, blend = jnp.zeros((6, *SIZE)), np.zeros(SIZE, bool), jax.jit(partial(kalman_blend, history_max=16))
     for index in range(3):
@@ -76,7 +88,7 @@ def test_the_first_frame_is_the_denoisers_and_later_ones_are_the_blend(rng):
 def test_what_moves_leaves_no_trail_and_what_stands_still_is_steady(rng):
     """The shadow and what the disc uncovers have the denoiser's own error, the wall far from both a quarter of it."""
     frames, truth = rolling(rng)
-    images = np.asarray(jaxdn.denoise(jaxdn.stabilised(GIVEN), {}, Clip(frames)))
+    images = steadied(frames)
     errors, own = (images - truth)[-1] ** 2, (frames.direct - truth)[-1] ** 2
     touched = (np.abs(np.diff(truth, axis=0)) > 0).any(axis=(0, 3))
     left = (np.abs(truth[-1] - truth[-3]) > 0).any(axis=-1)
@@ -94,7 +106,7 @@ def test_a_pan_over_fine_texture_is_no_worse_than_the_denoiser(speed, guide, gai
     frames, truth = pan(rng, speed, spread=0.3 if guide == "noisy" else 0.0)
     if guide == "none":
         frames = frames._replace(albedo=None)
-    images = np.asarray(jaxdn.denoise(jaxdn.stabilised(GIVEN), {}, Clip(frames)))[8:]
+    images = steadied(frames)[8:]
     alone, truth, edges = frames.direct[8:], truth[8:], np.zeros(truth[8:].shape[:3], bool)
     for axis in (1, 2):
         differ = np.diff(frames.ids[8:, ..., 0], axis=axis) != 0
@@ -130,14 +142,13 @@ def _core_of_means():
 
 @pytest.mark.slow
 def test_a_program_can_batch_it_and_half_precision_is_widened(rng):
-    denoiser = jaxdn.stabilised(GIVEN)
     clips = [Clip(rolling(rng, 3)[0]) for _ in range(2)]
     batch = jax.tree.map(lambda *each: np.stack(each), *clips)
-    images = jax.jit(jax.vmap(lambda clip: jaxdn.denoise(denoiser, {}, clip)))(batch)
+    images = jax.jit(jax.vmap(lambda clip: jaxdn.denoise(STEADIER, {}, clip)))(batch)
     for image, clip in zip(images, clips, strict=True):
-        np.testing.assert_allclose(image, jaxdn.denoise(denoiser, {}, clip), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(image, steadied(clip.frames), rtol=1e-5, atol=1e-6)
     half = jax.tree.map(lambda x: jnp.asarray(x, jnp.bfloat16) if x.dtype == np.float32 else x, clips[0])
-    found = jaxdn.denoise(denoiser, {}, half)
+    found = compiled(STEADIER)({}, half)
     assert found.dtype == jnp.float32
     np.testing.assert_allclose(found, images[0], rtol=0.1, atol=0.02)
 
@@ -155,7 +166,7 @@ def test_gradients_reach_what_the_denoiser_learns(rng):
     def loss(gain):
         return jnp.mean((jaxdn.denoise(denoiser, {"gain": gain}, Clip(frames)) - truth) ** 2)
 
-    gradient = jax.grad(loss)(jnp.float32(1.5))
+    gradient = jax.jit(jax.grad(loss))(jnp.float32(1.5))
     assert np.isfinite(gradient)
     assert gradient > 0, "a smaller gain is nearer to the truth"
 
@@ -166,7 +177,7 @@ def test_its_step_can_be_exported(rng):
     denoiser = jaxdn.stabilised(svgf())
     exported = exported_step(denoiser, {}, size=SIZE, buffers=("motion", "depth", "ids"))
     state = {name: jnp.zeros(spec.shape, spec.dtype) for name, spec in exported.inputs.items() if "state" in name}
-    function, expected = jax.jit(exported.function), jaxdn.denoise(denoiser, {}, Clip(frames))
+    function, expected = jax.jit(exported.function), compiled(denoiser)({}, Clip(frames))
     for index in range(3):
         buffers = {name: getattr(frames, name)[index] for name in ("radiance", "motion", "depth", "ids")}
         found = function({**buffers, **state, "first": jnp.asarray(index == 0)})
