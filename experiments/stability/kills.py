@@ -67,14 +67,16 @@ def train(clips: Path, folder: Path, sizes: Sizes) -> None:
     jax.config.update("jax_compilation_cache_dir", str(clips.parent / "programs"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     method = method_named("ntd")
-    denoiser = method.factory(size=WIDTHS, implementation=method.backend("training"))
+    # By XLA alone: programs that call another library are not kept, and every process would compile them again.
+    options = {"size": WIDTHS, "prediction": "direct"}
+    denoiser = method.factory(**options)
     recipe = method.recipe_named(None)._replace(steps=sizes.steps, batch=2, crop=16, frames=4)
     batches = training_batches(
         clips, buffers=denoiser.reads, batch=recipe.batch, crop=recipe.crop, frames=recipe.frames, seed=recipe.seed
     )
     every = sizes.checkpoint_every
     state = fit(denoiser, recipe, batches, folder, label="killed", every=Every(1, checkpoint=every))
-    save_weights(folder / "weights.safetensors", state.params, factory=method.name, options={"size": WIDTHS}, record={})
+    save_weights(folder / "weights.safetensors", state.params, factory=method.name, options=options, record={})
 
 
 def start(clips: Path, folder: Path, sizes: Sizes) -> subprocess.Popen[str]:

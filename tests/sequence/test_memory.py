@@ -45,7 +45,7 @@ def test_frames_in_parts_are_the_same_files(tmp_path):
     images, told = {}, []
     for name, limit in (("whole", enough), ("tiles", enough - STEP * (height * width - 288 * 288))):
         settings = Settings(naming=ChannelNaming("previous-current"), max_memory=limit)
-        files = denoise_files([tmp_path / "in"], tmp_path / name, find_model("svgf"), settings, log=told.append).files
+        files = denoise_files([tmp_path / "in"], tmp_path / name, find_model("taa"), settings, log=told.append).files
         images[name] = [np.stack([read_exr(file)[letter] for letter in "RGB"], axis=-1) for file in files]
     assert [line for line in told if "in tiles of at most 288 x 288 pixels" in line] == told[-2:-1]
     np.testing.assert_allclose(images["tiles"], images["whole"], rtol=1e-4, atol=1e-5)

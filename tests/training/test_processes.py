@@ -158,20 +158,18 @@ def test_two_processes_and_any_number_of_devices_learn_the_same(home: Path) -> N
     assert f"{home / 'two'}" not in second
     assert "step 5/5" in first
     assert "step" not in second
-    moved = Pair(home, give(home / "clips", home / "moved", "--steps", 1))
-    assert moved.end() == [0, 0], moved.tell()
     steps = ("--steps", UPDATES)
     run_alone(
         home,
         give(home / "clips", home / "one", *steps),
         give(home / "clips", home / "devices-2", *steps, "--devices", 2),
         give(home / "clips", home / "devices-8", *steps, "--devices", 8),
-        give(home / "clips", home / "moved", "--steps", 2),
+        give(home / "clips", home / "moved", "--steps", 1),
     )
     moved = Pair(home, give(home / "clips", home / "moved", "--steps", 3), devices=(2, 2))
     assert moved.end() == [0, 0], moved.tell()
     run_alone(home, give(home / "clips", home / "moved", *steps, "--devices", 8))
-    assert read_resumed_from(home / "moved") == [1, 2, 3]
+    assert read_resumed_from(home / "moved") == [1, 3]
     assert np.ptp(weights(home / "one")) > 0.1
     for name in ("two", "devices-2", "devices-8", "moved"):
         assert distance(home / name, home / "one") < 1e-6, name
