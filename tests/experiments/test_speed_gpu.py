@@ -20,6 +20,7 @@ def settings(out: Path, **changed: Any) -> gpu.Settings:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="what a child process took is only known on Unix")
+@pytest.mark.usefixtures("plain_processes")
 def test_every_item_is_measured_on_a_cpu(tmp_path: Path) -> None:
     require("pyoidn")
     assert gpu.main(settings(tmp_path / "gpu.json")) == 0
