@@ -119,6 +119,11 @@ class FrameDenoiser:
         return self._method.denoiser is not None
 
     @property
+    def reads_motion(self) -> bool:
+        """Whether the denoiser follows motion vectors."""
+        return self._method.denoiser is not None and "motion" in self._method.denoiser.reads
+
+    @property
     def receptive_field(self) -> int | None:
         """How many pixels around a pixel decide about it; None: unknown."""
         return None if self._method.denoiser is None else self._method.denoiser.receptive_field

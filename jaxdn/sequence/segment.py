@@ -19,6 +19,7 @@ from jaxdn.data.read import check_single_layer, open_frames
 from jaxdn.runtime.overlap import read_ahead
 from jaxdn.sequence.all_light import gather_light
 from jaxdn.sequence.backward_pass import BackwardImages, backward_pass
+from jaxdn.sequence.empty_vectors import fill_empty_motion
 from jaxdn.sequence.frame_denoiser import Fallback, FrameDenoiser
 from jaxdn.sequence.jobs import Job
 from jaxdn.sequence.panorama import Panorama, find_panorama
@@ -66,7 +67,9 @@ def denoise_segment(
         panorama = find_panorama(
             sequence.files[0], sequence.window, denoisers[0].receptive_field, stated=settings.wrap, log=log
         )
-        source = _ForeignFrames(sequence, segment, panorama)
+        # Frames that are blurred once more afterwards are sharp: zeros are right there, or nobody knows better.
+        measures = denoisers[0].reads_motion and settings.reblur is None
+        source = _ForeignFrames(sequence, segment, panorama, measures=measures)
         writer = ForeignWriter(sequence.window, settings, log, result, panorama)
 
     def roomy(stored: StoredFrame) -> bool:
@@ -211,13 +214,16 @@ class _ClipFrames:
 class _ForeignFrames:
     """Frames of another renderer, whose results are written into copies of their files."""
 
-    def __init__(self, sequence: ForeignSequence, segment: range, panorama: Panorama | None) -> None:
-        """``panorama``: its frames are widened."""
-        self._sequence, self._start, self._panorama = sequence, segment.start, panorama
+    def __init__(self, sequence: ForeignSequence, segment: range, panorama: Panorama | None, *, measures: bool) -> None:
+        """``panorama``: its frames are widened. ``measures``: motion is measured where vectors are empty."""
+        self._sequence, self._start = sequence, segment.start
+        self._panorama, self._measures = panorama, measures
 
     def read(self, log: Callable[[str], None], *, count: int, backwards: bool = False) -> Iterator[StoredFrame]:
         """So many frames, or the same from the last backwards with time turned around; forwards, files stay decoded."""
         frames = self._sequence.frames(backwards=backwards, keep_pixels=not backwards, log=log)
+        if self._measures and len(self._sequence.files) > 1:
+            frames = fill_empty_motion(frames, lambda: self._sequence.has_empty_vectors, log)
         if self._panorama is not None:
             frames = map(self._panorama.widen_frame, frames)
         return map(StoredFrame, islice(frames, count))  # unlike a loop, this keeps no frame while the next one is read

@@ -13,9 +13,8 @@ from jaxdn.commands import main
 from jaxdn.core.frame import Frame
 from jaxdn.data.exr.exr import read_exr, write_exr
 from jaxdn.evaluation.overlay.camera import CameraMatrices, camera_motion, read_camera
-from jaxdn.evaluation.overlay.evidence import fireflies, noise_map
+from jaxdn.evaluation.overlay.evidence import box_mean, fireflies, noise_map
 from jaxdn.evaluation.overlay.findings import Known, find_all
-from jaxdn.evaluation.overlay.motion_search import box_mean, measure_motion
 from jaxdn.evaluation.overlay.views import draw_views
 
 HEIGHT, WIDTH = 72, 96
@@ -433,23 +432,6 @@ def test_no_file_that_is_read_is_overwritten(tmp_path, capsys):
         assert ended.value.code == 2
         assert "expected another folder than that of the shot" in " ".join(capsys.readouterr().err.split())
         assert {path: path.read_bytes() for path in tmp_path.glob("*/*.exr")} == before
-
-
-def test_motion_is_found_between_pixels(rng):
-    x, y = np.meshgrid(np.arange(80.0), np.arange(64.0))
-    waves = rng.uniform(0.15, 0.6, (12, 2)), rng.uniform(0, 6.28, 12)
-
-    def image(dx, dy):
-        phases = [kx * (x - dx) + ky * (y - dy) + p for (kx, ky), p in zip(*waves, strict=True)]
-        return np.stack([np.sin(phases[i]) * 0.2 + np.sin(phases[i + 4]) * 0.2 + 0.5 for i in range(4)], -1)
-
-    found = measure_motion(image(0, 0), image(5.4, -3.7))
-    assert found.certain.mean() > 0.5
-    error = np.abs(found.motion - [-5.4, 3.7])[found.certain]
-    assert np.median(error) < 0.1
-    flat = measure_motion(np.full((40, 40, 3), 0.5), np.full((40, 40, 3), 0.5))
-    assert not flat.certain.any()
-    assert (flat.motion == 0).all()
 
 
 def test_box_means_are_those_of_what_is_in_the_image(rng):

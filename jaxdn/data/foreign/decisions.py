@@ -35,6 +35,11 @@ class Decisions:
     albedo: bool | None = None
     """Whether a layer called ``diffuse`` is an albedo; None: no frame has told."""
 
+    @property
+    def has_empty_vectors(self) -> bool:
+        """Whether there are motion vectors, and were 0 everywhere in all frames so far."""
+        return "motion" in self.empty
+
     def drop_empty(
         self, pixels: Mapping[str, np.ndarray], buffers: Mapping[str, Channels], forward: Channels | None
     ) -> tuple[dict[str, Channels], list[str]]:
@@ -120,7 +125,7 @@ _SAID = {
     "roughness": "",
     "specular_hit_distance": "",
     "motion": "; right where nothing moves, but Blender writes zeros where motion blur is on: "
-    "what moves leaves trails then, so render without motion blur, or add it afterwards",
+    "what moves leaves trails without vectors, so render without motion blur, or add it afterwards",
 }
 """Buffers whose emptiness is told, with what to know about it; ids are zeros in most files."""
 

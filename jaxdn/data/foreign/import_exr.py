@@ -103,6 +103,11 @@ class ForeignSequence:
             file.drop_windows()
         return union_of(windows) if windows else Window(0, 0, 0, 0)
 
+    @property
+    def has_empty_vectors(self) -> bool:
+        """Whether the files have motion vectors that were 0 everywhere in all frames that have been read."""
+        return self._decisions.has_empty_vectors
+
     def frames(
         self,
         *,

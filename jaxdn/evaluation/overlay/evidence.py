@@ -3,7 +3,6 @@
 import numpy as np
 
 from jaxdn.color import LUMINANCE
-from jaxdn.evaluation.overlay.motion_search import box_mean
 
 _NOISE = np.outer((1, -2, 1), (1, -2, 1)) / 6.0
 """A second difference in both directions: straight edges and slopes leave nothing, noise keeps its variance
@@ -17,6 +16,20 @@ FLIPS = {"upside down": (-1, 1), "mirrored": (1, -1), "turned by 180 degrees": (
 def luminance(image: np.ndarray) -> np.ndarray:
     """[H, W] of linear Rec.709 [H, W, 3]."""
     return np.asarray(image, np.float64) @ np.asarray(LUMINANCE)
+
+
+def box_mean(image: np.ndarray, radius: int) -> np.ndarray:
+    """Means over windows of 2 radius + 1 pixels a side, of what of them is in the image [H, W] or [H, W, C]."""
+    for axis in (0, 1):
+        length = image.shape[axis]
+        widths = [(0, 0)] * image.ndim
+        widths[axis] = (1, 0)
+        sums = np.pad(np.cumsum(image, axis=axis, dtype=np.float64), widths)
+        last = np.minimum(np.arange(length) + radius + 1, length)
+        first = np.maximum(np.arange(length) - radius, 0)
+        count = (last - first).reshape([-1 if each == axis else 1 for each in range(image.ndim)])
+        image = (np.take(sums, last, axis) - np.take(sums, first, axis)) / count
+    return image
 
 
 def second_difference(image: np.ndarray) -> np.ndarray:

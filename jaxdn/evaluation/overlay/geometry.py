@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from jaxdn.core.frame import FAR
-from jaxdn.evaluation.overlay.motion_search import box_mean
+from jaxdn.evaluation.overlay.evidence import box_mean
 
 Space = Literal["camera", "world", "either world"]
 """Of normals: the camera's, a right-handed world's, or a world's that may be left-handed."""

@@ -11,6 +11,7 @@ import numpy as np
 from jaxdn.core.frame import Frame
 from jaxdn.evaluation.overlay.camera import CameraMatrices, camera_motion, read_camera
 from jaxdn.evaluation.overlay.evidence import (
+    box_mean,
     fireflies,
     lit_level,
     luminance,
@@ -21,7 +22,7 @@ from jaxdn.evaluation.overlay.evidence import (
     second_difference,
 )
 from jaxdn.evaluation.overlay.geometry import Space, compare_normals, occlusion_order
-from jaxdn.evaluation.overlay.motion_search import box_mean, measure_motion
+from jaxdn.filters.motion_search import MeasuredMotion, measure_motion, measure_nearness, reduce_size
 from jaxdn.filters.reproject import reproject
 from jaxdn.filters.surface_test import guides_of, surface_mask
 from jaxdn.ops.motion import occlusion_mask, on_screen
@@ -210,12 +211,21 @@ def features(frame: Frame) -> np.ndarray:
     return np.clip(np.nan_to_num(np.concatenate(parts, axis=-1)), -2, 2).astype(np.float32)
 
 
+def _measure_motion(first: np.ndarray, second: np.ndarray, frame: Frame) -> MeasuredMotion:
+    """The motion between two frames' features, as NumPy arrays; depth tells what a camera moves."""
+    nearness = None if frame.depth is None else measure_nearness(jnp.asarray(frame.depth)[..., 0])
+    found = measure_motion(
+        reduce_size(jnp.asarray(first)), reduce_size(jnp.asarray(second)), nearness, size=second.shape[:2]
+    )
+    return MeasuredMotion(*map(np.asarray, found))
+
+
 def _compare_motion(
     before: Frame, frame: Frame, moved: np.ndarray | None, layers: dict[str, np.ndarray], figures: dict[str, float]
 ) -> None:
     """Given vectors against measured ones, against themselves turned around, and against those of the camera."""
     first, second = features(before), features(frame)
-    found = measure_motion(first, second)
+    found = _measure_motion(first, second, frame)
     layers["measured_motion"] = np.where(found.certain[..., None], found.motion, np.nan)
     length = np.abs(found.motion).max(axis=-1)
     figures["certain"] = float(found.certain.mean())
@@ -248,7 +258,7 @@ def _compare_motion(
         bound = DISAGREES[0] + DISAGREES[1] * np.linalg.norm(found.motion, axis=-1)
         figures["disagrees"] = float(np.mean(difference[both] > bound[both]))
         figures["left by given"] = _left(first, second, filled, both)
-        figures["left by measured"] = _left(first, second, found.motion, both)
+        figures["left by measured"] = _left(first, second, np.asarray(found.motion), both)
     if moved is not None:
         layers["camera_motion"] = moved
         follows = tested & np.isfinite(moved).all(-1)

@@ -5,8 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from jaxdn.core.frame import FAR, Frame
-from jaxdn.evaluation.overlay.evidence import lit_level, luminance
-from jaxdn.evaluation.overlay.motion_search import box_mean
+from jaxdn.evaluation.overlay.evidence import box_mean, lit_level, luminance
 from jaxdn.evaluation.report.images import ERROR_COLORS
 
 LONGEST = 64.0
