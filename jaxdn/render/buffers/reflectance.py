@@ -215,14 +215,17 @@ def _averages(hit: Any, bsdf: Any, points: Any, active: Any) -> tuple[Any, Any]:
 
 def _average(hit: Any, bsdf: Any, points: np.ndarray) -> np.ndarray:
     """The same of one hit as one array [6], for the variant without vectorisation."""
-    context, total = mi.BSDFContext(), np.zeros(6)
+    # Numbers one by one: arrays of three take longer to make and to add than a sample takes.
+    context, diffuse, total = mi.BSDFContext(), int(mi.BSDFFlags.Diffuse), [0.0] * 6
     for lobe, x, y in points.tolist():
         sampled, weight = bsdf.sample(context, hit, lobe, [x, y])
         if sampled.pdf > 0:
-            light = np.array(weight, np.float64) * sampled.eta**2
-            total[:3] += light
-            total[3:] += 0.0 if int(sampled.sampled_type) & int(mi.BSDFFlags.Diffuse) else light
-    return total / len(points)
+            square, specular = sampled.eta**2, not int(sampled.sampled_type) & diffuse
+            for channel in range(3):
+                light = weight[channel] * square
+                total[channel] += light
+                total[3 + channel] += light if specular else 0.0
+    return np.array(total) / len(points)
 
 
 _made: dict[str, np.ndarray] = {}
