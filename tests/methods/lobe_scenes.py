@@ -85,3 +85,29 @@ def run(denoiser, frames):
         state, image = step({}, state, frame)
         images.append(np.asarray(image))
     return state, images
+
+
+def check_light_and_options(loss, light, params, rng, *, by):
+    """The gradient of ``loss(*light, params)`` in float64, by one program.
+
+    All of the light has one, two of the params at the least, and along random directions of all params and of each of
+    the arrays ``by`` it is that of central differences.
+    """
+    program = jax.jit(jax.value_and_grad(loss, tuple(range(len(light) + 1))))
+    found = program(*light, params)[1]
+    for each in found[:-1]:
+        assert each.dtype == np.float64
+        assert np.isfinite(each).all()
+        assert np.abs(each).max() > 1e-6
+    slopes = jax.tree.leaves(found[-1])
+    assert all(np.isfinite(slope).all() for slope in slopes)
+    assert sum(float(np.abs(slope).max()) > 0 for slope in slopes) >= 2
+    at = (*light, params)
+    for index in (*by, len(light)):
+        way = jax.tree.map(lambda leaf: rng.normal(size=np.shape(leaf)) * 1e-6, at[index])
+        ahead, behind = (
+            program(*at[:index], jax.tree.map(lambda a, b, s=sign: a + s * b, at[index], way), *at[index + 1 :])[0]
+            for sign in (1, -1)
+        )
+        told = sum(np.sum(a * b) for a, b in zip(*map(jax.tree.leaves, (found[index], way)), strict=True))
+        np.testing.assert_allclose(told, (ahead - behind) / 2, rtol=2e-2)

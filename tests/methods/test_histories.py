@@ -10,14 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdn.core.frame import FAR, Frame
+from jaxdn.core.frame import FAR, Frame, only
 from jaxdn.denoiser import Denoiser
 from jaxdn.denoiser.rollout import unroll
 from jaxdn.denoiser.statistics import measure_frame
 from jaxdn.methods.lobes import split_signals
 from jaxdn.methods.two_lobes.reblur import reblur
 from jaxdn.methods.two_lobes.relax import relax
-from tests.methods.lobe_scenes import HEIGHT, WIDTH, compiled, mirror_frames, neutral, run, scene, starting
+from tests.methods.lobe_scenes import (
+    HEIGHT,
+    WIDTH,
+    check_light_and_options,
+    compiled,
+    mirror_frames,
+    neutral,
+    run,
+    scene,
+    starting,
+)
 
 
 @dataclass(frozen=True)
@@ -188,9 +198,9 @@ def test_broken_history_is_dropped_where_it_is_broken(kind, rng, which):
             pytest.param(names, marks=pytest.mark.slow)
             for names in (
                 ("specular_hit_distance", "hit_distance"),
-                ("far_motion",),
                 ("roughness",),
-                ("ray_length", "reflectance", "albedo", "specular_reflectance"),
+                # Two at once: one is read where light is fetched, the other where it is divided.
+                ("far_motion", "ray_length", "reflectance", "albedo", "specular_reflectance"),
                 ("motion", "far_motion", "previous_depth"),
             )
         ),
@@ -222,26 +232,25 @@ def test_pixels_without_a_surface_pass_through(kind, rng):
     np.testing.assert_array_equal(run(kind.denoiser, [sky])[1][0], frame.radiance)
 
 
-@pytest.mark.slow  # test_fitted.py has the gradient by params of both
-def test_gradients_reach_both_kinds_of_light(kind, x64, rng):
-    frames = jax.tree.map(lambda *buffers: np.stack(buffers), *scene(rng, 2, np.float64))
+LOBES = frozenset({"specular", "depth", "motion", "far_motion", "roughness", "specular_hit_distance", "hit_distance"})
+"""What is read of a frame where its guides are not what a test is about: they are a fourth of its program."""
+
+
+@pytest.mark.slow
+def test_gradients_reach_both_kinds_of_light_and_the_options(kind, x64, rng):
+    """In one program; at the options' declared values, where training begins."""
+    few = [only(frame, LOBES) for frame in scene(rng, 2, np.float64)]
+    frames = jax.tree.map(lambda *buffers: np.stack(buffers), *few)
+    params = jax.tree.map(np.float64, kind.denoiser.init(jax.random.key(0), few[0]))
     weights = np.cos(np.arange(HEIGHT * WIDTH * 3)).reshape(HEIGHT, WIDTH, 3)
 
-    def loss(radiance, part):
+    def loss(radiance, part, params):
         light = frames.radiance + radiance[None]
         lit = frames._replace(radiance=light, specular=light * part[None])
-        return jnp.mean(unroll(kind.denoiser, {}, lit)[-1] * weights)
+        return jnp.mean(unroll(kind.denoiser, params, lit)[-1] * weights)
 
-    both = jax.jit(jax.value_and_grad(loss, (0, 1)))
     zero, half = np.zeros((HEIGHT, WIDTH, 3)), np.full((HEIGHT, WIDTH, 1), 0.4)
-    found = both(zero, half)[1]
-    for each in found:
-        assert each.dtype == np.float64
-        assert np.isfinite(each).all()
-        assert np.abs(each).max() > 1e-6
-    direction = rng.normal(size=zero.shape) * 1e-6
-    slope = (both(direction, half)[0] - both(-direction, half)[0]) / 2
-    np.testing.assert_allclose(np.sum(found[0] * direction), slope, rtol=2e-2)
+    check_light_and_options(loss, (zero, half), params, rng, by=[0])
 
 
 def test_specular_light_is_not_mixed_with_that_of_another_roughness(kind):
