@@ -86,6 +86,7 @@ def clips(tmp_path: Path) -> Path:
     return tmp_path / "clips"
 
 
+@pytest.mark.slow
 def test_a_new_method_is_trained_denoises_and_is_compared(toy, clips, tmp_path, capsys):
     run = tmp_path / "run"
     main.main(

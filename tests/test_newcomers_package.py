@@ -173,6 +173,7 @@ def drive(clips: Path, out: Path, filter: str, learned: str) -> None:
     np.testing.assert_allclose(outputs["next.history"], light[0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_installed_package_has_its_methods_by_name(install, clips, tmp_path):
     install(entry_points=True)
     with pytest.warns(UserWarning, match=r"method 'broken' \(outsider.missing:nothing\) cannot be imported"):
@@ -183,6 +184,7 @@ def test_an_installed_package_has_its_methods_by_name(install, clips, tmp_path):
         drive(clips, tmp_path / "out", "half_and_half", "gain")
 
 
+@pytest.mark.slow
 def test_a_module_on_the_path_has_its_methods_by_address(install, clips, tmp_path):
     install(entry_points=False)
     assert "half_and_half" not in methods()

@@ -59,6 +59,7 @@ def test_without_its_package_our_own_is_used_and_the_package_named(
     np.testing.assert_array_equal(chosen, _denoise(shot, tmp_path / "named", "--method", DEFAULT_MODEL))
 
 
+@pytest.mark.slow
 def test_our_own_clips_and_a_backend_of_ours_are_for_our_own_method(
     shot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -70,6 +71,7 @@ def test_our_own_clips_and_a_backend_of_ours_are_for_our_own_method(
     assert f"method: {DEFAULT_MODEL} (" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_our_clips_with_filtered_pixels_are_as_other_renderers_frames(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -80,6 +82,7 @@ def test_our_clips_with_filtered_pixels_are_as_other_renderers_frames(
     assert f"method: {BEST_ELSEWHERE} (" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_method_that_is_named_is_not_explained(
     shot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -200,6 +200,7 @@ def test_denoise_plain_exr_files_with_the_shipped_network(tmp_path, capsys):
     np.testing.assert_allclose(reds[0], reds[-1], rtol=2e-3, atol=2e-3)  # stored in half precision
 
 
+@pytest.mark.slow
 def test_a_layer_named_on_the_command_line_is_the_buffer(shot, tmp_path):
     """Divided by its colours the wall is uniform, and its checks are not blurred; without the layer they would be."""
     checks = np.where(np.indices((24, 32)).sum(axis=0) // 3 % 2 == 0, 0.9, 0.1)
@@ -314,6 +315,7 @@ def test_wrong_arguments_end_a_process_with_a_message(clip, tmp_path):
     assert f"expected one of {', '.join(all_names())}" in fails("denoise", clip, "-o", tmp_path, "--method", "magic")
 
 
+@pytest.mark.slow
 def test_a_truncated_frame_names_the_file(clip, tmp_path, capsys):
     damaged = tmp_path / "damaged"
     damaged.mkdir()

@@ -36,6 +36,7 @@ def test_help():
     assert without_reader("-m", "jaxdn.commands.main", "denoise", "--help") == (141, "")
 
 
+@pytest.mark.slow
 def test_a_table_that_rich_prints():
     assert without_reader("-m", "jaxdn.commands.main", "doctor") == (141, "")
 
@@ -47,6 +48,7 @@ def test_an_error_of_the_user_keeps_its_exit_code():
     assert "Traceback" not in said
 
 
+@pytest.mark.slow
 def test_messages_without_a_reader_too():
     assert without_reader("-m", "jaxdn.commands.main", "inspect", "/nowhere", stderr=subprocess.STDOUT) == (141, None)
 

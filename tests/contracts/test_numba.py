@@ -301,6 +301,7 @@ def test_pixels_that_are_not_known(rng, both):
     assert np.all(found[4:8, :8] == 0)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_a_level_of_the_filter(rng, both):
     """Taps eight pixels apart; test_operations.py has one and two, and other sizes."""
     size, step = (33, 70), 8

@@ -106,6 +106,7 @@ def assert_close(found, wanted, precision, *, rounding=0.0):
         np.testing.assert_allclose(one, other, rtol=error, atol=least)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("operation", "name"), PAIRS)
 def test_value_and_gradient_are_those_of_the_reference(operation, name):
     """Gradients of an implementation that computes more coarsely are those of the reference, and not coarse."""

@@ -218,6 +218,7 @@ def test_indirect_light_alone_and_no_single_samples(folder: Path, tmp_path: Path
         load_validation(svgf(), [tmp_path / "b.pack"], spp=2)
 
 
+@pytest.mark.slow
 def test_the_size_is_kept_and_used_fairly_and_the_same_each_time(folder: Path, tmp_path: Path) -> None:
     sources, counts = open_clips(folder), []
     for kib in (20, 45, 90):

@@ -105,6 +105,7 @@ def run(capsys, *arguments):
     return " ".join(capsys.readouterr().out.split())
 
 
+@pytest.mark.slow
 def test_denoise_begins_with_the_table(shot, tmp_path, capsys):
     text = run(capsys, "denoise", shot, "-o", tmp_path / "out", "--method", "svgf", "--layer", "Hall")
     for row in (
@@ -118,6 +119,7 @@ def test_denoise_begins_with_the_table(shot, tmp_path, capsys):
     assert "missing" not in text.partition("1 frame ")[0].replace("specular_reflectance missing", "")
 
 
+@pytest.mark.slow
 def test_a_single_image_is_not_asked_about_motion(tmp_path, capsys):
     layers = ":RGB", "albedo:RGB", "normal:XYZ", "depth:Z"
     for name, vectors in (("with", ("mvec:XY",)), ("without", ())):
@@ -129,6 +131,7 @@ def test_a_single_image_is_not_asked_about_motion(tmp_path, capsys):
         assert ("'mvec', as nothing says what these vectors mean; a single image needs none" in text) == bool(vectors)
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_said_with_its_consequence(tmp_path, capsys):
     path = write(tmp_path / "a_1.exr", ":RGB", "diffuseFilter:RGB", "Paint:RGB", "mvec:XY")
     reads = methods()["svgf"].factory().reads

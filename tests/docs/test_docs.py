@@ -161,6 +161,7 @@ def test_the_pictures_of_motion_vectors_are_drawn(tmp_path, capsys):
         vectors.main(vectors.Settings(tmp_path / "other", 1, out=tmp_path))
 
 
+@pytest.mark.slow
 def test_a_frame_of_cycles_stands_beside_what_methods_make_of_it(tmp_path):
     write_clip_of_cycles(tmp_path / "sun-9000", np.random.default_rng(4))
     out = tmp_path / "cycles.webp"

@@ -798,6 +798,7 @@ def test_the_player_shows_the_error_of_the_frame_in_the_colours_of_the_page(visi
     assert np.abs(drawn(tab, 3) - np.stack(wanted, -1)).mean() > 5 or np.abs(before - drawn(tab, 3)).mean() > 5
 
 
+@pytest.mark.slow
 @pytest.mark.browser
 def test_without_script_the_page_shows_a_still(visit):
     tab = visit(with_films(synthetic(clips=1))._replace(opens_on="ntd A"), java_script_enabled=False)

@@ -45,6 +45,7 @@ def test_a_clip_without_a_half_has_none(tmp_path):
     assert read_halves(tmp_path / "clip") is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("halves", [True, False])
 def test_the_references_noise_is_not_in_the_score(tmp_path, halves):
     write(tmp_path / "clip", halves=halves)

@@ -166,6 +166,7 @@ def test_an_answer_that_does_not_come_is_not_awaited_for_ever(worker, monkeypatc
         worker.turn()
 
 
+@pytest.mark.slow
 def test_rows_of_a_real_workload(tmp_path, monkeypatch):
     lacking = {"torch-compiled": "not compiled in a fast test", **peers.missing()}
     monkeypatch.setattr(peers, "missing", lambda: lacking)
@@ -217,6 +218,7 @@ def test_every_implementation_is_compared_with_every_peer():
     }
 
 
+@pytest.mark.slow
 def test_without_ceilings_there_are_no_rows_of_the_roofline():
     said = []
     work = Work("nothing", {"xla": NAP, "engine": REFUSE}, {"peer": NAP}, [roofline.Cost(1e6, 1e6)])
@@ -240,6 +242,7 @@ def test_the_roofline_counts_what_the_network_computes():
     assert roofline.milliseconds([roofline.Cost(0, 1e9)], CEILINGS) == pytest.approx(100)
 
 
+@pytest.mark.slow
 def test_the_recurrent_call_carries_its_state():
     _, work = steps.works(height=16, width=32, title="16p")
     assert work.name == "step-small-16p"

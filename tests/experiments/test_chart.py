@@ -166,6 +166,7 @@ def test_the_chart_is_read_without_the_noise_of_the_references_where_every_clip_
     assert equals["filter @ 1"].spp == pytest.approx(2**1.5)
 
 
+@pytest.mark.slow
 def test_a_clip_without_halves_has_no_unbiased_errors(rng):
     clip = rng.exponential(0.3, (6, 8, 9, 3)).astype(np.float32)
     noise = [(clip * rng.gamma(50, 1 / 50, clip.shape)).astype(np.float32) for _ in range(2)]
@@ -273,6 +274,7 @@ def test_every_registered_method_is_there_with_its_variants(denoisers):
     assert all(f"{name} requests samples" in told for name in ("ntasd", "dasr"))
 
 
+@pytest.mark.slow
 def test_quick_measures_the_fastest_of_each_method():
     found = [each.name for each in ways(chosen(quick=True), quick=True)]
     assert {"svgf", "ntd-small"} <= set(found)

@@ -62,6 +62,7 @@ def draw_frame(rng: np.random.Generator) -> Frame:
     return jax.tree.map(jnp.asarray, frame)
 
 
+@pytest.mark.slow
 def test_the_last_result_is_fetched_as_the_denoiser_does_it(rng: np.random.Generator) -> None:
     then, now, gain = draw_frame(rng), draw_frame(rng), jnp.float32(0.7)
     result, prior = jnp.asarray(rng.exponential(size=(2, 3, 24, 32)), jnp.float32)
@@ -77,6 +78,7 @@ def test_the_last_result_is_fetched_as_the_denoiser_does_it(rng: np.random.Gener
     np.testing.assert_allclose(jnp.expm1(found) / gain, past.result, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("trusted", "expected"), [("prior", [0, 0, 1, 2]), ("last result", [0, 0, 0, 0])])
 def test_results_are_made_in_the_order_of_frames(rng: np.random.Generator, trusted: str, expected: list[int]) -> None:
     """Nothing moves: the last result of a frame is the prior of the frame before, or for ever the first one."""

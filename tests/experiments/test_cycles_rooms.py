@@ -44,6 +44,7 @@ def make_clip(folder: Path, seed: int) -> None:
     clips.finish_record({**size, "reference_spp": SAMPLES, "pixel_filter": "box"}, folder)
 
 
+@pytest.mark.slow
 def test_rooms_are_scored_against_the_references_of_all_seeds(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     for seed in range(3):
         make_clip(tmp_path / "rooms" / f"hall-{seed}", seed)

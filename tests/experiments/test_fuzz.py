@@ -12,6 +12,7 @@ def source(tmp_path_factory):
     return fuzz.prepare(tmp_path_factory.mktemp("fuzz") / "source")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["exr", *(pytest.param(kind, marks=pytest.mark.slow) for kind in fuzz.KINDS[1:])])
 def test_broken_files_only_raise_documented_errors(kind, source):
     counts = fuzz.run_kind(kind, 0, 150, source)

@@ -55,6 +55,7 @@ def test_buffers_that_a_renderer_does_not_write_are_absent(folder: Path) -> None
     np.testing.assert_allclose(frames.radiance, 0.35, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_table_scores_what_a_view_reads(folder: Path) -> None:
     """The noisy image is off by 0.1 of indirect light, and by 0.2 of all light, from the mean of the references."""
     lines = {}

@@ -87,6 +87,7 @@ def slow(*values):
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "sizes"),
     [
@@ -119,6 +120,7 @@ def test_absent_buffers_are_no_inputs(tmp_path):
     assert_same(run_onnx(done.files[0], frames, 2), expected("taa", frames, 2))
 
 
+@pytest.mark.slow
 def test_stablehlo_runs_without_the_denoiser(tmp_path):
     frames = moving_clip(3, 20).frames
     (file,) = export("taa", tmp_path, format="stablehlo").files
@@ -179,6 +181,7 @@ def fails(capsys, *arguments):
     return " ".join(told.split())
 
 
+@pytest.mark.slow
 def test_a_method_whose_step_needs_a_size_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"^asvgf: the step is not the same for all sizes; give --width and --height"):
         export("asvgf", tmp_path / "out")

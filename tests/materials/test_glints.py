@@ -169,6 +169,7 @@ def test_normals_of_the_flakes_follow_the_distribution(lobe):
     assert stats.kstest(np.arctan2(y, x) / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lobe", microfacets.LOBES)
 def test_the_normal_map_shows_the_flakes_that_are_counted(lobe):
     options = {"lobe": lobe, "flakes": 20, "bins": 9, "seed": 4}
@@ -189,6 +190,7 @@ def test_the_normal_map_shows_the_flakes_that_are_counted(lobe):
         assert np.all(np.asarray(glint_distribution(half, position, width, here, **options))[~occupied] == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lobe", microfacets.LOBES)
 def test_no_case_gives_anything_but_numbers(lobe):
     halves = [[0, 0, 1], [0, 0, 0], [1, 0, 0], [1, 0, 1e-20], [0, 1, -1], [0, 1e-30, 1e-30], [3e38, 1, 3e38]]

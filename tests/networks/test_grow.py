@@ -30,6 +30,7 @@ def larger(trained, widths, groups=GROUPS):
     return network, unflatten(grow(trained, flatten(network.init(jax.random.key(1)))))
 
 
+@pytest.mark.slow
 def test_wider_levels_and_more_inputs_change_no_output(trained, features):
     wanted = jax.jit(unet(GROUPS, HEADS, widths=SMALL).apply)(unflatten(trained), features)
     network, grown = larger(trained, ((6,), (5,), (7, 8), (4,), (9,)), (*GROUPS, 4))

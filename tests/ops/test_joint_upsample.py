@@ -52,6 +52,7 @@ def test_it_is_the_formula(name, tile, rng, x64, monkeypatch):
     np.testing.assert_allclose(weight, sums, rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["reference", "unrolled"])
 def test_gradients(name, rng, x64):
     coarse, there, here = drawn(rng, 3, 4)

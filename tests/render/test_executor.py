@@ -248,6 +248,7 @@ class Submitted(Executor):
         return self.futures[-1]
 
 
+@pytest.mark.slow
 def test_a_thousand_clips_are_submitted_without_planning_one(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     farm = Submitted(lambda future: future.set_exception(RenderError("not today")))
     source = ClipSource("fruit", range(1024), FRAMES)
@@ -344,6 +345,7 @@ def test_options_of_the_other_way_are_refused(tmp_path: Path) -> None:
     assert not farm.tasks
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "told"),
     [(["--frames-per-task", "2"], "--frames-per-task: expected none without --scheduler"),

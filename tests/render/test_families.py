@@ -69,6 +69,7 @@ def test_indirect_light_is_well_exposed_whatever_the_lamp(mitsuba: Any, name: st
             assert direct.mean() < 0.3 * indirect.mean(), (name, direct.mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_posed_shapes_exist_and_move_rigidly_and_others_are_static(mitsuba: Any, name: str) -> None:
     scene = scene_of(name, SEEDS[1])

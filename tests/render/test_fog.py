@@ -52,6 +52,7 @@ class Foggy(Stage):
 GLOW = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("box", [False, True])
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_transmittance_is_that_of_beer_and_guides_know_it(variant, box):
@@ -96,6 +97,7 @@ def test_transmittance_is_that_of_beer_and_guides_know_it(variant, box):
     assert abs(expected[0] - expected[1]) < 4.5 * np.sqrt(np.sum(share * (1 - share)))
 
 
+@pytest.mark.slow
 @pytest.mark.needs("llvm")
 @pytest.mark.parametrize("box", [False, True])
 def test_light_is_that_of_mitsubas_integrator(box):

@@ -44,6 +44,7 @@ def stage(bsdf, *, wall=(0.0, 0.0, 0.0), mirror=(0.0, 0.0, 0.0), camera=(0.0, 0.
     return Places(parts | (shapes or {}), eye)
 
 
+@pytest.mark.slow
 @needs_fast
 @pytest.mark.parametrize(
     "moved",
@@ -150,6 +151,7 @@ def test_a_curved_mirror_is_followed_to_where_it_showed_the_same(moved):
     assert np.median(surface) > 10 * np.median(error)
 
 
+@pytest.mark.slow
 @needs_fast
 def test_a_rough_mirror_has_the_vectors_of_its_microfacets():
     """Around those of a mirror, the more so the smoother it is; beyond a roughness of 0.6 none."""
@@ -182,6 +184,7 @@ def test_what_stands_still_does_not_move():
     assert not np.any(rendered(stage(MIRROR), light="indirect").frame.glossy_motion)
 
 
+@pytest.mark.slow
 @needs_fast
 def test_what_a_thing_in_the_mirror_hid_takes_over_the_motion_of_its_image():
     """A board slides in front of the wall: behind its image the mirror shows the wall again, which stands still."""

@@ -107,6 +107,7 @@ class _At(Stage):
         return self._scene.build(self._time, width, height)
 
 
+@pytest.mark.slow
 def test_a_shutter_needs_filtered_pixels_and_stays_in_records(tmp_path):
     record = {"family": "fruit", "seed": 0, "shutter": 0.4}
     scene = scene_from_record(record)
@@ -119,6 +120,7 @@ def test_a_shutter_needs_filtered_pixels_and_stays_in_records(tmp_path):
             scene_from_record({**record, "shutter": wrong})
 
 
+@pytest.mark.slow
 @pytest.mark.needs("llvm")
 def test_a_blurred_clip_is_resumed_to_the_same_frames(tmp_path):
     options: dict[str, Any] = {"pixel_filter": "box", "variant": FAST, "max_depth": 2, "reference_spp": 2, **SIZE}

@@ -176,6 +176,7 @@ def test_guides_and_light_go_through_the_same_points(variant):
         assert np.all((rest[half] > SQUARE - 1e-3) & (rest[half] < WALL + 1e-3))
 
 
+@pytest.mark.slow
 @pytest.mark.needs("llvm")
 def test_light_is_unbiased_and_noise_of_guides_falls_faster_than_that_of_independent_samples():
     options: dict[str, Any] = {**SIZE, "pixel_filter": "gaussian", "variant": FAST, "light": "reflected"}

@@ -15,6 +15,7 @@ from tests.render.render_scenes import Stage
 FRAMES, SEEDS = 3, range(4)
 
 
+@pytest.mark.slow
 def test_the_same_seed_draws_the_same_and_records_build_it_again():
     use_variant()
     from jaxdn.render.camera_paths.random_optics import randomise_optics
@@ -52,6 +53,7 @@ def test_blur_and_fog_are_what_the_ranges_say():
     assert all(0.2 <= shutter <= 1 for shutter in shutters)
 
 
+@pytest.mark.slow
 def test_jobs_have_the_optics_of_their_seeds(tmp_path: Path):
     settings = RenderSettings(width=16, height=12, pixel_filter="box", max_depth=3)
     source = ClipSource("edge", seeds=SEEDS, frames=FRAMES, effects="all", random_optics=True)

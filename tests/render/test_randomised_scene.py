@@ -81,6 +81,7 @@ def randomised(folder):
     return [randomise_scene(folder / "scene.xml", seed, FRAMES) for seed in SEEDS]
 
 
+@pytest.mark.slow
 def test_a_seed_always_gives_the_same_animation_and_another_seed_another(randomised, folder):
     from jaxdn.render.camera_paths.randomised_scene import randomise_scene
 
@@ -90,6 +91,7 @@ def test_a_seed_always_gives_the_same_animation_and_another_seed_another(randomi
     assert json.loads(json.dumps(again.record)) == again.record
 
 
+@pytest.mark.slow
 def test_cameras_keep_clear_of_everything(randomised, folder):
     empty = SceneFile(folder / "scene.xml").build(0, 4, 4)
     directions = np.random.default_rng(7).normal(size=(40, 3))
@@ -114,6 +116,7 @@ def test_cameras_move_within_bounds(randomised):
             assert np.linalg.norm(second.to_world[:3, 3] - first.to_world[:3, 3]) < 1.5
 
 
+@pytest.mark.slow
 def test_inserted_objects_are_seen_and_moved_ones_of_the_room_are_not_its_lights(randomised):
     from jaxdn.render.buffers.gbuffer import trace_gbuffer
 
@@ -127,6 +130,7 @@ def test_inserted_objects_are_seen_and_moved_ones_of_the_room_are_not_its_lights
         assert not {"lamp", "bulb"} & set(scene.record["animation"].get("shapes", {}))
 
 
+@pytest.mark.slow
 def test_the_record_rebuilds_the_scene_bit_for_bit(randomised):
     record = json.loads(json.dumps(randomised[1].record))
     images = [
@@ -204,6 +208,7 @@ def test_motion_to_and_fro_has_its_speed_and_passes_its_place():
     np.testing.assert_allclose(inner, 0.7)
 
 
+@pytest.mark.slow
 def test_the_command_renders_randomised_scenes_and_does_not_search_again(randomised, folder, tmp_path, monkeypatch):
     from jaxdn.commands.main import main
     from jaxdn.render.camera_paths import randomised_scene

@@ -249,6 +249,7 @@ render_clip(Stage(), sys.argv[1], settings, frames=3, progress=kill)
 """
 
 
+@pytest.mark.slow
 def test_a_killed_rendering_leaves_no_clip_and_resumes(tmp_path: Path) -> None:
     settings = RenderSettings(reference_spp=2, variant="scalar_rgb", **SIZE)
     parts = tmp_path / "parts"
@@ -469,6 +470,7 @@ def begin(folder: Path, scene: dict[str, Any], variant: str) -> None:
         )
 
 
+@pytest.mark.slow
 def test_a_job_keeps_the_variant_that_its_clip_was_started_with(tmp_path: Path) -> None:
     scene = {"family": "fruit", "seed": 0}
     begin(tmp_path, scene, "scalar_rgb")

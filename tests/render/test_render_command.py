@@ -41,6 +41,7 @@ def counted(monkeypatch):
     return seen
 
 
+@pytest.mark.slow
 def test_a_scene_file_is_opened_and_planned_once_for_all_seeds(counted, tmp_path, capsys):
     path = CASES["moving: ball"].write(tmp_path)
     render(path, tmp_path / "out", seeds=[3, 5, 8])
@@ -56,6 +57,7 @@ def test_a_scene_file_is_opened_and_planned_once_for_all_seeds(counted, tmp_path
     assert lines[1:] == [f"{name}-{seed}: {found}" for seed in (3, 5, 8)]
 
 
+@pytest.mark.slow
 def test_every_seed_of_a_family_is_a_different_scene(counted, tmp_path):
     render("fruit", tmp_path, seeds=[0, 1])
     assert (counted["opened"], counted["planned"]) == (2, 2)
@@ -129,6 +131,7 @@ def planned_clip(scene, folder, frames, seed=1, max_depth=3):
     render_clip(scene, folder, replace(settings, plan=planned.plan), frames=frames)
 
 
+@pytest.mark.slow
 def test_a_clip_gets_more_frames_and_other_settings_are_said_in_words(tmp_path):
     path = CASES["moving: ball"].write(tmp_path)
     scene = SceneFile(path)

@@ -71,6 +71,7 @@ def test_every_pixel_has_the_first_samples_of_its_frame(light, rng):
     assert found.bad_samples == 0
 
 
+@pytest.mark.slow
 def test_without_a_first_sample_no_more_paths_are_traced_than_are_asked_for(rng, monkeypatch):
     """Camera rays alone before the question, then a path a sample; the image is the same as with the first sample."""
     settings = RenderSettings(**SIZE, plan=planned(), seed=5, light="reflected")

@@ -199,6 +199,7 @@ def test_what_cannot_be_scaled_is_said(folder):
         animate(write(folder, CONSTRUCTS["a lamp with a texture"]), lights={"bulb": [{"frame": 0, "scale": [1, 2, 1]}]})
 
 
+@pytest.mark.slow
 def test_a_crop_and_hidden_lights_are_not_ignored_in_silence(folder):
     crop = '<integer name="crop_width" value="12"/>'
     path = write(folder, LAMP.format(x=0, power=20), film=FILM.format(id="", crop=crop))
@@ -215,6 +216,7 @@ def test_a_crop_and_hidden_lights_are_not_ignored_in_silence(folder):
     np.testing.assert_allclose(kept, mitsubas(path), rtol=0.03)  # without the emission, as the warning says
 
 
+@pytest.mark.slow
 def test_a_scene_that_begins_in_the_dark_keeps_its_light(folder):
     from jaxdn.render.path_depth import measure_depth
 
@@ -271,6 +273,7 @@ def test_fog_without_filtered_pixels_is_refused_by_the_name_of_what_bounds_it(fo
     check_scene(scene.build(0, WIDTH, HEIGHT), filtered=True)
 
 
+@pytest.mark.slow
 def test_a_medium_around_the_camera_is_kept(folder):
     medium = """<medium type="homogeneous" id="air"><rgb name="albedo" value="{albedo}"/>
       <rgb name="sigma_t" value="0.05, 0.1, 0.2"/></medium>"""

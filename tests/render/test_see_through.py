@@ -79,6 +79,7 @@ MOVES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", MOVES)
 def test_a_mirror_shows_what_would_stand_behind_it(what):
     options, mirror, square = MOVES[what]
@@ -121,6 +122,7 @@ def behind_glass(kind: str, **options: Any) -> Stage:
     return Stage(shapes={"pane": pane}, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["thin", "slab"])
 def test_glass_shows_what_is_behind_it_less_what_it_reflects(kind):
     def move(frame: float) -> np.ndarray:
@@ -217,6 +219,7 @@ def test_the_scalar_variant_is_refused():
         render_frame(Stage(), 0, RenderSettings(see_through=True, variant="scalar_rgb", **SIZE))
 
 
+@pytest.mark.slow
 def test_a_clip_keeps_to_its_setting_and_the_command_says_what_is_left_out(tmp_path, capsys):
     settings, through = (RenderSettings(max_depth=3, see_through=on, **SIZE) for on in (False, True))
     source = ClipSource("fruit", frames=2, effects="all", denoiser="svgf")

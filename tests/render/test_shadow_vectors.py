@@ -66,6 +66,7 @@ def on_floor(lamp, point):
     return lamp - onward * (lamp[1] / onward[:, 1:2])
 
 
+@pytest.mark.slow
 @needs_fast
 @pytest.mark.parametrize(
     ("ball", "lamp_step", "camera"),
@@ -161,6 +162,7 @@ def test_light_without_shadow_is_what_a_scene_without_blocker_shows():
 GLOSSY = {"type": "roughplastic", "alpha": 0.3, "diffuse_reflectance": {"type": "rgb", "value": 0.4}}
 
 
+@pytest.mark.slow
 @needs_fast
 @pytest.mark.parametrize("bsdf", [grey(0.6), GLOSSY])
 def test_noisy_direct_light_has_the_mean_of_direct_light(bsdf):

@@ -68,6 +68,7 @@ def error(alpha: np.ndarray, now: Veil) -> float:
     return float(np.mean((alpha - now.cover) ** 2))
 
 
+@pytest.mark.slow
 def test_alpha_has_less_noise_and_stays_a_share(denoised: Path) -> None:
     for frame in range(4):
         now, after = veil(frame), clips.read_exr(denoised / "out" / f"s.{frame:04d}.exr")["V.Combined.A"]

@@ -26,6 +26,7 @@ def frame_of(index: int, samples: int = 4, **changes: object) -> Frame:
     return frame._replace(**changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("guides", [True, False])
 def test_every_set_of_parts_adds_up(guides: bool) -> None:
     """Diffuse and specular light, and two light groups, each pair a decomposition of its own."""
@@ -90,6 +91,7 @@ def test_parts_of_the_beauty_are_found_by_their_values(name: str, tmp_path: Path
     assert parts == set(ADDITIVE[name][0])
 
 
+@pytest.mark.slow
 def test_the_beauty_once_more_is_denoised_but_is_no_part(tmp_path: Path) -> None:
     source, told = write_shot("Blender", tmp_path / "in"), list[str]()
     denoise_files([source], tmp_path / "out", box_blur(), Settings(aovs="additive"), log=told.append)
@@ -103,6 +105,7 @@ def test_the_beauty_once_more_is_denoised_but_is_no_part(tmp_path: Path) -> None
             np.testing.assert_allclose(copy, beauty, rtol=2e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_in_files_they_add_up_and_the_rest_stays(tmp_path: Path) -> None:
     program, told = PROGRAMS["Arnold"], list[str]()
     source, out = write_shot("Arnold", tmp_path / "in"), tmp_path / "out"
@@ -149,6 +152,7 @@ LIT_LATER = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", LIT_LATER)
 def test_a_light_that_is_switched_on_later_is_a_part_from_then_on(case: str, tmp_path: Path) -> None:
     lit, settings = LIT_LATER[case]
@@ -164,6 +168,7 @@ def test_a_light_that_is_switched_on_later_is_a_part_from_then_on(case: str, tmp
         assert before["R"].max() == 0 or np.abs(after["R"] - before["R"]).max() > 0.01  # denoised
 
 
+@pytest.mark.slow
 def test_layers_that_are_added_have_been_black(rng: np.random.Generator) -> None:
     """The same as with the black layer from the first frame on."""
     frames = [frame_of(index) for index in range(2)]

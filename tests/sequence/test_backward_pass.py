@@ -85,6 +85,7 @@ def test_broken_vectors_and_depths_stay_local() -> None:
     assert np.isnan(broken[differs]).all()
 
 
+@pytest.mark.slow
 def test_what_was_seen_longer_counts_more() -> None:
     """The numbers of a square that moves: it and the wall count on, what it uncovers begins anew."""
     state = None
@@ -146,6 +147,7 @@ def denoised(source: Path, out: Path, name: str = "svgf", **settings: Any) -> li
     return [np.stack([clips.read_exr(path)[letter] for letter in "RGB"], axis=-1) for path in written.files]
 
 
+@pytest.mark.slow
 def test_the_first_frame_is_as_good_as_the_last_and_time_has_no_direction(tmp_path: Path) -> None:
     source = noisy_wall(tmp_path / "in", 8)
     images = denoised(source, tmp_path / "out")

@@ -81,6 +81,7 @@ def test_both_directions_decode_once_each(tmp_path: Path, monkeypatch: Any) -> N
     assert counts == expected(source, headers=1, decodes=2, results=FRAMES) | first
 
 
+@pytest.mark.slow
 def test_pixels_are_dropped_while_a_frame_is_denoised_in_tiles(tmp_path: Path, monkeypatch: Any) -> None:
     """Memory is short then: they are decoded once more to be written."""
     height, width = 300, 520

@@ -44,6 +44,7 @@ def denoise(clip: Path, method: str, **settings: Any) -> dict[str, np.ndarray]:
     return clips.read_exr(clips.frame_path(out, FRAMES - 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spp", LAYERS)
 def test_a_lamp_out_of_focus_is_denoised(spp: int, tmp_path: Path) -> None:
     clip = make_clip(tmp_path / "clip", pixel_filter="box")

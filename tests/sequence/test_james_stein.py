@@ -214,6 +214,7 @@ def speckled(rng, height=96, width=128):
     return truth, wall
 
 
+@pytest.mark.slow
 def test_texture_of_single_pixels_comes_back_where_blocks_without_noise_are_near(rng):
     """It looks like noise; the wall beside it has none. Of a sky beside it, that says nothing."""
     truth, wall = speckled(rng)

@@ -276,6 +276,7 @@ def test_a_lamp_s_pixel_without_a_number_is_no_lamp_s(tmp_path: Path) -> None:
             np.testing.assert_array_equal(image[3, 53], np.float32(50))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
 def test_numbers_that_are_none_warn_nobody(value: float, tmp_path: Path) -> None:

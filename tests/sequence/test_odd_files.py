@@ -55,6 +55,7 @@ def changed(before: ExrFile, after: ExrFile) -> set[str]:
     return {name for name in one if not np.array_equal(one[name], two[name])}
 
 
+@pytest.mark.slow
 def test_a_picture_without_colours(tmp_path: Path) -> None:
     """OpenEXR calls luminance ``Y``; R, G and B would be what Blender calls *BW* no longer."""
     shot: list[list[Part]] = []

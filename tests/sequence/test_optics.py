@@ -110,6 +110,7 @@ def test_frames_that_stand_still_are_not_blurred_by_the_shutter_and_those_after_
     assert "3 pixels in the first frame that is blurred" in told[1]
 
 
+@pytest.mark.slow
 def test_light_layers_still_add_up(tmp_path: Path) -> None:
     shot = write(tmp_path / "in")
     settings = Settings(reblur=Optics(shutter=1.0), aovs="additive")

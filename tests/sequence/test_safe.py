@@ -60,6 +60,7 @@ def denoise(source: Path, out: Path, **settings: Any) -> tuple[list[Path], list[
     return written.files, told
 
 
+@pytest.mark.slow
 def test_a_clean_render_comes_back(tmp_path: Path) -> None:
     source = write(tmp_path / "in", None)
     plain, _ = denoise(source, tmp_path / "plain", safe=False)

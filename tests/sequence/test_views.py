@@ -151,6 +151,7 @@ def test_each_view_is_read_with_all_of_its_layers(kind: str, tmp_path: Path) -> 
             np.testing.assert_allclose(clip.frames.motion[frame], now.motion, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "bidirectional"), [*((kind, False) for kind in KINDS), ("parts", True)])
 def test_every_view_is_denoised_with_its_own_history(kind: str, bidirectional: bool, tmp_path: Path) -> None:
     """As if each were alone; everything else in the files stays."""

@@ -204,6 +204,7 @@ def test_a_gradient_that_is_not_finite_changes_nothing(denoiser, step, state):
     )
 
 
+@pytest.mark.slow
 def test_without_motion_nothing_is_disoccluded(denoiser, state):
     clip = make_clip(0)
     still = clip._replace(frames=clip.frames._replace(motion=None, dual_motion=None))

@@ -56,6 +56,7 @@ def run(clips, folder, recipe=test_loop.RECIPE, source=None, every=2):
     return fit(brighter(), recipe, batches, folder, label="t", every=Every(1, checkpoint=every))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:overflow encountered in cast")  # 1e39 is infinite in single precision
 @pytest.mark.parametrize(("rate", "kept"), [(1e30, 1), (1e39, 0)])
 def test_a_diverging_learning_rate_ends_with_advice_and_finite_weights(clips, tmp_path, rate, kept):
@@ -97,6 +98,7 @@ def test_a_log_is_strict_json_whatever_the_loss(tmp_path):
     np.testing.assert_array_equal(read_curve(tmp_path).loss, [np.nan, 0.5])
 
 
+@pytest.mark.slow
 def test_with_the_newest_checkpoint_truncated_it_continues_from_the_previous_one_to_the_same_weights(clips, tmp_path):
     whole = run(clips, tmp_path / "whole", every=100)
     stopping = test_loop.Stopping(test_loop.batches(clips), 5)

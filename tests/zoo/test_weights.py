@@ -63,6 +63,7 @@ def test_guided_kernels_continue_from_plain_ones(tmp_path):
     np.testing.assert_array_equal(more["reflectance"], np.full((3, 3), 3.0))
 
 
+@pytest.mark.slow
 def test_training_continues_from_weights_that_see_less(tmp_path, rng):
     """New guides begin with weights of zero: the first image is that of the old weights, whatever the guides show."""
     options = {"size": TINY, "kernels": "plain", "background": "filter", "demodulate": "albedo"}
