@@ -224,6 +224,11 @@ def test_a_mixture_of_all_candidates_has_each_of_them(rng):
     logarithms = [np.log1p(gain * run(denoiser, deciding({name: 0.0}), clip)[0]) for name in CANDIDATES]
     expected = np.expm1(np.tensordot(shares, logarithms, 1)) / gain
     np.testing.assert_allclose(run(denoiser, deciding(logits), clip)[0], expected, rtol=2e-4, atol=2e-5)
+    # And each counts whole: of even light all are that light.
+    even = clip._replace(radiance=np.full_like(clip.radiance, 0.5))
+    for name in CANDIDATES:
+        image = run(denoiser, deciding({name: 0.0}), even)[0]
+        np.testing.assert_allclose(np.median(image), 0.5, rtol=0.03, err_msg=name)
 
 
 def test_light_that_was_not_measured_does_not_spread(rng):
