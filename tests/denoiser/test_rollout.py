@@ -35,6 +35,7 @@ def frames_of(clip, numbers=np):
     return [jax.tree.map(lambda buffer, i=i: numbers.asarray(buffer[i]), clip.frames) for i in range(COUNT)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers", [np, jnp])
 def test_a_stream_gives_the_images_of_the_whole_clip(method, clip, numbers):
     denoiser, params, expected = method
@@ -91,6 +92,7 @@ def test_a_program_is_compiled_for_each_set_of_buffers_that_is_read(clip):
     assert len(traced) == len(one.programs)
 
 
+@pytest.mark.slow
 def test_buffers_that_come_and_go_are_their_neutral_values(method, clip):
     """Frames without vectors among frames with them, as a renderer writes them where nothing moves."""
     denoiser, params, _ = method

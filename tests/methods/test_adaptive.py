@@ -86,6 +86,7 @@ def test_every_frame_has_the_budget_and_every_pixel_its_own_number(name, budget,
         assert 1 <= counts.min() < budget < counts.max() <= 15
 
 
+@pytest.mark.slow
 def test_the_first_frame_is_sampled_evenly(rng, key):
     denoiser, clip = ntasd(size=TINY), clip_of(rng)
     first, second, _ = counts_of(denoiser, varied(denoiser, clip, key), clip)
@@ -93,6 +94,7 @@ def test_the_first_frame_is_sampled_evenly(rng, key):
     assert len(np.unique(second)) > 2
 
 
+@pytest.mark.slow
 def test_the_sampler_of_ntasd_sees_the_last_image_along_the_vectors(rng, key):
     """Another last image gives other numbers of samples, and so do other vectors."""
     denoiser, clip = ntasd(size=TINY, demodulate="none", exposure="given"), clip_of(rng, 1, (16, 32))
@@ -126,6 +128,7 @@ def test_without_a_sampler_all_pixels_have_the_budget(name, rng, key):
     np.testing.assert_array_equal(images, run(other))
 
 
+@pytest.mark.slow
 def test_dasr_sees_the_first_sample_and_no_other_frame(rng, key):
     denoiser, clip = dasr(size=TINY), clip_of(rng)
     params = varied(denoiser, clip, key)
@@ -238,6 +241,7 @@ def test_pixels_without_samples_are_filled_from_their_neighbours(rng, key):
     np.testing.assert_allclose(np.median(images, axis=(1, 2, 3)), 1.0, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adaptive", [False, True])
 def test_budgets_below_one_sample_are_kept_in_the_mean_and_move_from_frame_to_frame(adaptive, rng, key):
     denoiser = ntasd(size=TINY, adaptive=adaptive, budget=0.25, least=0, rounding="stochastic")

@@ -273,6 +273,7 @@ def test_without_a_change_of_light_it_is_svgf(rng):
         np.testing.assert_allclose(image, other, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gradient", [0.0, 0.3])
 def test_a_constant_image_stays(gradient, rng):
     frame = moving_frames(rng, 1)[0]
@@ -283,6 +284,7 @@ def test_a_constant_image_stays(gradient, rng):
         np.testing.assert_allclose(image, 0.37, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_no_samples_are_those_of_the_neutral_value(rng):
     frames = moving_frames(rng)
     zeros = np.zeros((*frames[0].radiance.shape[:2], 2), np.float32)
@@ -294,6 +296,7 @@ def test_no_samples_are_those_of_the_neutral_value(rng):
         np.testing.assert_allclose(image, other, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_no_buffer_has_to_be_there(rng):
     """That of a frame without any of them is finite is a slow test."""
     denoiser = asvgf(levels=1)
@@ -313,6 +316,7 @@ def test_without_any_buffer_images_are_finite(rng):
     assert all(np.isfinite(image).all() for _, image in run(denoiser, bare))
 
 
+@pytest.mark.slow
 def test_a_larger_luminance_that_is_smaller_than_the_change_is_mended(rng):
     """Noise in a file may have either sign in both channels."""
     frame = moving_frames(rng, 1)[0]

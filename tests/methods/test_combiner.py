@@ -122,6 +122,7 @@ def test_gradients_of_the_means(rng):
         check_grads(jax.jit(light), (rng.uniform(0.2, 0.8, (3, 4)),), order=1, modes=["rev"])
 
 
+@pytest.mark.slow
 def test_the_light_of_a_still_clip_is_its_arithmetic_mean(rng):
     clip = clip_of(rng, count=4)
 
@@ -142,6 +143,7 @@ def test_the_light_of_a_still_clip_is_its_arithmetic_mean(rng):
     np.testing.assert_allclose(means.number, 4.0, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_another_depth_ends_a_history_and_another_normal_does_not(rng):
     first, second = (jax.tree.map(np.array, frame_at(clip_of(rng), index)) for index in range(2))
     second.depth[:, 30:], second.normal[:20] = 9.0, [1.0, 0, 0]
@@ -181,6 +183,7 @@ def test_a_correction_is_what_the_samples_have_more_than_the_prior(rng):
     np.testing.assert_array_equal(found["prior mean"], means.prior)
 
 
+@pytest.mark.slow
 def test_a_network_that_trusts_the_prior_alone_shows_it(rng):
     require("pyoidn")
     clip = clip_of(rng)
@@ -326,6 +329,7 @@ def test_the_slope_is_that_of_an_independent_computation(rng):
         np.testing.assert_allclose(slopes[index, 10, 7], np.clip(expected, -1, 2), rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_evidence(rng):
     with jax.enable_x64(True):
         candidates = jnp.asarray(rng.uniform(0.3, 1.0, (len(CANDIDATES), 3, 16, 16)))

@@ -111,6 +111,7 @@ def test_a_constant_image_stays_with_all_of_its_border(kind, rng):
         np.testing.assert_allclose(image, 0.37, rtol=2e-5)
 
 
+@pytest.mark.slow
 def test_static_histories_are_the_means_until_their_caps(kind, rng):
     denoiser = kind.method(**kind.plain, history_max=10, fast_max=3)
     noise = rng.gamma(0.5, 1.0, (14, 60, 60, 3)).astype(np.float32)
@@ -135,6 +136,7 @@ def test_static_histories_are_the_means_until_their_caps(kind, rng):
     assert single / 19 * 0.9 < spread[-1] < single / 10 * 1.1
 
 
+@pytest.mark.slow
 def test_by_default_the_error_of_a_static_scene_falls(kind, rng):
     noise = rng.gamma(0.5, 2.0, (24, 24, 24, 3)).astype(np.float32)
     _, images = run(kind.default, [Frame(each) for each in noise])
@@ -164,6 +166,7 @@ def test_a_reflection_is_fetched_where_it_was(kind, rng, missing):
         assert error < 0.06  # a single frame has 0.5, a mean of twelve 0.042
 
 
+@pytest.mark.slow
 def test_the_first_frame_reads_no_history_and_no_motion(kind, rng):
     frame = scene(rng, 1)[0]
     clean = starting(kind.denoiser)({}, frame)
@@ -253,6 +256,7 @@ def test_gradients_reach_both_kinds_of_light_and_the_options(kind, x64, rng):
     check_light_and_options(loss, (zero, half), params, rng, by=[0])
 
 
+@pytest.mark.slow
 def test_specular_light_is_not_mixed_with_that_of_another_roughness(kind):
     """A bright rough half beside a dark smooth one: as wide as diffuse light, it would go there."""
     left = (np.arange(WIDTH) < WIDTH // 2)[None, :, None] & np.ones((HEIGHT, 1, 1), bool)

@@ -59,6 +59,7 @@ def test_what_is_absent_is_the_neutral_value():
     np.testing.assert_array_equal(np.asarray(unknown)[..., 0].max(), 3.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", READS)
 def test_ntd_reads_and_follows_what_its_vectors_are_made_of(motion, key):
     """With a history of 5 in one place, that place shows up where the vector points to it."""

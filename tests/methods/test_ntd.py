@@ -236,6 +236,7 @@ def blending(params: Any, logit: float) -> Any:
     return {**params, "head_0": {"kernel": kernel, "bias": bias}}
 
 
+@pytest.mark.slow
 def test_alpha_weighs_the_current_frame_and_missing_history_is_not_used(
     rng: np.random.Generator, key: jax.Array
 ) -> None:
@@ -258,6 +259,7 @@ def test_alpha_weighs_the_current_frame_and_missing_history_is_not_used(
     assert image(50.0, 1000.0).max() < 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["default", "plain", *(pytest.param(name, marks=pytest.mark.slow) for name in SELDOM)])
 def test_constant_radiance_stays(name: str, rng: np.random.Generator, key: jax.Array) -> None:
     """Softmax kernels, means and maxima keep a constant, including the border, whatever the network predicts."""
@@ -285,6 +287,7 @@ def test_any_size(size: tuple[int, int], rng: np.random.Generator, key: jax.Arra
     assert np.std(images) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", [None, "paper"])
 def test_none_is_the_neutral_value_written_out(preset: str | None, rng: np.random.Generator, key: jax.Array) -> None:
     denoiser = tiny(preset=preset)
@@ -320,6 +323,7 @@ def test_without_motion_nothing_is_gathered(rng: np.random.Generator, key: jax.A
     assert "gather" not in text(frame._replace(motion=None, dual_motion=None))
 
 
+@pytest.mark.slow
 def test_dual_motion_falls_back_and_traditional_ignores_it(rng: np.random.Generator, key: jax.Array) -> None:
     frames = random_frames(rng)
     dual, traditional = tiny(), tiny(motion="traditional")
@@ -332,6 +336,7 @@ def test_dual_motion_falls_back_and_traditional_ignores_it(rng: np.random.Genera
     assert np.abs(with_dual - fallen_back).max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", [None, "paper"])
 def test_first_frame_uses_no_history_and_no_motion(
     preset: str | None, rng: np.random.Generator, key: jax.Array
@@ -423,6 +428,7 @@ def test_batch_is_each_clip_alone(rng: np.random.Generator, key: jax.Array) -> N
         np.testing.assert_allclose(whole, (first + second) / 2, atol=1e-4 * max(1e-3, np.abs(whole).max()))
 
 
+@pytest.mark.slow
 def test_a_clip_is_one_program(rng: np.random.Generator, key: jax.Array) -> None:
     denoiser, traced = tiny(), []
 

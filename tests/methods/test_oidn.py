@@ -165,6 +165,7 @@ def test_tiles_give_the_image_of_the_whole(library, rng):
     np.testing.assert_allclose(tiled(frame_at(frames, 0)), whole(frame_at(frames, 0)), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_files_are_denoised_by_name(library, rng, tmp_path, capsys):
     """Demodulation and the safe blend are the command's: here the image is the denoiser's own."""
     frames = clip_of(rng)

@@ -50,6 +50,7 @@ def with_direct(rng, frame):
     return frame._replace(radiance=frame.radiance + lit, shadowed=lit)
 
 
+@pytest.mark.slow
 def test_direct_and_indirect_light_are_two_signals(rng):
     frames = [with_direct(rng, frame) for frame in moving_frames(rng)]
     options = {"preset": "paper", "levels": 1, "antialiasing": False}
@@ -78,6 +79,7 @@ def test_direct_light_that_comes_within_the_clip_begins_then(rng):
     np.testing.assert_allclose(image, step({}, state, whole)[1] + second.shadowed, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_last_stage_is_antialiasing_of_tone_mapped_light(rng):
     frames = moving_frames(rng)
     options = {"preset": "paper", "levels": 1, "apart": False}
@@ -160,6 +162,7 @@ def test_the_light_of_strata_is_that_of_what_their_middle_shows(rng):
         np.testing.assert_allclose(found.variance[row, column], own[shown == middle].var(), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_stop_at_the_edge_of_a_shadow(rng):
     """Where a light goes out on one side only, the other keeps its history; by default they are averaged together."""
     height = width = 45
@@ -201,6 +204,7 @@ def test_asvgf_as_published_leaves_half_of_the_history_of_light_that_doubles():
     np.testing.assert_allclose(images[-1], 1.55, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_both_signals_of_asvgf_have_the_gradient_of_all_light():
     """A quarter of the light is direct and goes out; of the indirect light's history as large a share goes with it."""
     light, indirect = np.ones((24, 30, 3), np.float32), np.full((24, 30, 3), 0.75, np.float32)
@@ -250,6 +254,7 @@ def test_relax_as_published_filters_within_planes(rng):
     assert beside[1] < 0.4 * beside[0]
 
 
+@pytest.mark.slow
 def test_reblur_as_published_blurs_wider_at_first():
     """How much light arrives 14 to 20 pixels inside the dark half."""
     light = np.where(np.arange(48) < 24, 1.0, 2.0)[None, :, None] * np.ones((48, 1, 3))
@@ -261,6 +266,7 @@ def test_reblur_as_published_blurs_wider_at_first():
 # trmv
 
 
+@pytest.mark.slow
 def test_trmv_as_published_follows_dual_vectors_to_any_surface(rng):
     """The history beside an occluder is of another shape: by default it is rejected there, in the paper it counts."""
     shape = (12, 16)
@@ -280,6 +286,7 @@ def test_trmv_as_published_follows_dual_vectors_to_any_surface(rng):
     np.testing.assert_allclose(tested[:, 9:15], 2.0, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_trmv_as_published_tests_normals_where_the_vector_is_that_of_the_surface():
     """A fold of one shape has moved by four pixels: what it shows now is new, but where a dual vector leads."""
     columns, flat = np.arange(16)[None, :, None], np.ones((12, 1, 1), np.float32)

@@ -104,6 +104,7 @@ def numpy_compress(x: np.ndarray) -> np.ndarray:
     return np.where(u <= 1e-4, 1e-4 ** (1 / 2.2) / 1e-4 * u, np.maximum(u, 1e-300) ** (1 / 2.2))
 
 
+@pytest.mark.slow
 def test_three_frames_are_those_of_the_numpy_network(rng, key):
     frames, denoiser = clip_of(rng), plain()
     params = varied(denoiser, frames, key)
@@ -208,6 +209,7 @@ def test_gradients_flow_through_the_hidden_states(rng, key):
         assert np.abs(slopes[1]).max() > 0
 
 
+@pytest.mark.slow
 def test_the_accumulation_gives_it_the_mean_of_all_frames(rng, key):
     """Nothing moves and no light changes: the last image is that of rae on the mean of the frames so far."""
     frames, options = clip_of(rng), {**PLAIN, "background": "filter"}
@@ -221,6 +223,7 @@ def test_the_accumulation_gives_it_the_mean_of_all_frames(rng, key):
     np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_light_that_changed_by_half_leaves_half_of_the_history_as_published(rng, key):
     """Of two frames the second weighs 1 / 2, and half of what is left goes: a quarter of the first stays."""
     frames, options = clip_of(rng, 2), {**PLAIN, "background": "filter"}

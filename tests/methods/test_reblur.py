@@ -65,6 +65,7 @@ def test_light_that_doubles_arrives_within_the_slow_historys_length(rng):
     assert abs(means[55] - 2.0) < 0.1
 
 
+@pytest.mark.slow
 def test_near_light_is_blurred_least(rng):
     """The sharpness of an edge of light: it is blurred less with a nearer occluder."""
     light = np.where(np.arange(40) < 20, 1.0, 2.0)[None, :, None] * np.ones((40, 1, 3))
@@ -129,6 +130,7 @@ def test_a_luminance_is_steadied_by_what_the_image_shows_around_it(rng):
     np.testing.assert_allclose((np.asarray(image) @ weights)[1:-1, 1:-1], expected, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_what_is_reflected_from_far_is_not_mixed_with_what_is_near():
     """A bright reflection of something near beside a dark one of something far: taps of the other weigh a tenth."""
     light = 2.0 - EDGE

@@ -153,6 +153,7 @@ def test_presets_are_what_the_given_options_override(given, expected, monkeypatc
     assert built(monkeypatch, lambda factory: factory(**given)) == expected
 
 
+@pytest.mark.slow
 def test_ntds_own_preset_is_that_of_the_paper(rng):
     """Not the spy's: with the options of PAPER written out it computes the same, and with others it does not."""
     frame = Frame(jnp.asarray(rng.exponential(size=(16, 16, 3)), jnp.float32), depth=jnp.full((16, 16, 1), 4.0))

@@ -43,6 +43,7 @@ def test_metal_darkens_no_diffuse_neighbour():
     np.testing.assert_allclose(relax().step({}, relax().start({}, frame), frame)[1][0, :4], 0.4, rtol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("levels", [2, 0])
 def test_colours_of_a_texture_do_not_run(rng, levels):
     """Even light of both kinds on surfaces that hardly reflect some colours, from the first frame on."""
@@ -68,6 +69,7 @@ def test_light_that_doubles_arrives_within_the_slow_historys_length(rng):
     assert frames_late(MEANS) == 30
 
 
+@pytest.mark.slow
 def test_a_reflection_that_is_another_has_no_history(rng):
     _, frames = mirror_frames(rng, 4)
     # Nearer: at a closeness of 0.3, its virtual image moves by 0.9 px and the surface by 3.
@@ -76,6 +78,7 @@ def test_a_reflection_that_is_another_has_no_history(rng):
     assert np.asarray(state.core.specular)[..., 5].max() < 1.5
 
 
+@pytest.mark.slow
 def test_a_slow_history_is_held_to_the_fast_one_and_keeps_its_variance(rng):
     """Light of both kinds that the slow mean still shows and the fast one does not; its moments move with it."""
     frame = rough_light(rng)
@@ -107,6 +110,7 @@ def test_a_history_that_begins_is_filled_from_around(rng):
     np.testing.assert_allclose(run(HELD, [mirror])[1][0], frame.radiance, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_nothing_that_was_filtered_in_space_comes_back(rng):
     frames = [rough_light(rng) for _ in range(2)]
     plain, filtered = (run(each, frames)[0].core for each in (HELD, relax(levels=2, lag_sigma=1e6, demodulate="none")))
@@ -114,6 +118,7 @@ def test_nothing_that_was_filtered_in_space_comes_back(rng):
         np.testing.assert_allclose(getattr(plain, name), getattr(filtered, name), rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_both_kinds_of_light_have_their_own_tolerance_of_differences(rng):
     frame, denoiser = rough_light(rng), relax(levels=2, lag_sigma=1e6, demodulate="none")
     mirror = frame._replace(specular=frame.radiance)

@@ -85,6 +85,7 @@ def test_the_first_frame_is_the_denoisers_and_later_ones_are_the_blend(rng):
         np.testing.assert_allclose(images[index], np.moveaxis(np.asarray(past[:3]), 0, -1), rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_what_moves_leaves_no_trail_and_what_stands_still_is_steady(rng):
     """The shadow and what the disc uncovers have the denoiser's own error, the wall far from both a quarter of it."""
     frames, truth = rolling(rng)
@@ -206,6 +207,7 @@ def test_it_is_chosen_by_name():
     assert jaxdn.denoisers.stabilised is jaxdn.stabilised
 
 
+@pytest.mark.slow
 def test_files_are_denoised_by_name(rng, tmp_path, capsys):
     frames, _ = rolling(rng, 3)
     write_clip(Clip(frames._replace(direct=None)), tmp_path / "noisy")
@@ -223,6 +225,7 @@ def test_a_history_without_frames_is_refused():
             jaxdn.stabilised(GIVEN, history_max=wrong)
 
 
+@pytest.mark.slow
 def test_open_image_denoise_is_steadier_with_it(rng):
     """On a still wall: what its images change by from frame to frame falls to less than half."""
     require("pyoidn")

@@ -500,6 +500,7 @@ def test_a_lamp_that_reflects_nothing_stays_bright(rng):
         assert inside.min() > 0.3, (name, inside.min())  # black: 0.003
 
 
+@pytest.mark.slow
 def test_params_before_training_change_nothing(rng):
     clip, denoiser = clip_of(moving_frames(rng)), LEARNING
     params = denoiser.init(jax.random.key(0), moving_frames(rng, 1)[0])
@@ -508,6 +509,7 @@ def test_params_before_training_change_nothing(rng):
     np.testing.assert_allclose(image, plain, rtol=2e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_params_are_the_options_that_they_stand_for(rng):
     clip = clip_of(moving_frames(rng))
     factors = {"alpha": 3.0, "sigma_depth": 2.0, "sigma_normal": 0.5, "sigma_luminance": 0.25}

@@ -275,6 +275,7 @@ def test_sharpening_changes_the_image_and_not_the_history(rng):
     assert sharper[-1].std() > images[-1].std()
 
 
+@pytest.mark.slow
 def test_after_a_denoiser_it_smooths_that_ones_images(rng):
     frames, before = moving_frames(rng), svgf(levels=1)
     state, images = run(taa(after=before), frames)

@@ -50,6 +50,7 @@ def all_light(rng, count=3, dtype=np.float32):
 # What it is without its own buffers.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by", ["brdf", "albedo", "none"])
 def test_without_buffers_of_its_own_it_is_svgf(rng, by):
     frames = moving_frames(rng, 3)
@@ -105,6 +106,7 @@ def test_no_buffer_has_to_be_there(rng):
 # What must hold for any filter of its kind.
 
 
+@pytest.mark.slow
 def test_a_constant_image_stays_with_all_of_its_border(rng):
     frames = []
     for frame in all_light(rng, 4):
@@ -115,6 +117,7 @@ def test_a_constant_image_stays_with_all_of_its_border(rng):
         np.testing.assert_allclose(image, 0.5, rtol=2e-5)
 
 
+@pytest.mark.slow
 def test_the_variance_of_a_still_scene_falls_as_one_over_the_number_of_frames(rng):
     denoiser = trmv(**UNHELD, alpha=0.1)
     ones = np.ones((40, 40, 1), np.float32)
@@ -168,6 +171,7 @@ def test_parts_of_light_may_come_and_go_within_a_clip(rng):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state))
 
 
+@pytest.mark.slow
 def test_parts_beyond_all_light_are_cut_off(rng):
     frame = all_light(rng, 1)[0]
     too_much = dict.fromkeys(("shadowed", "unshadowed", "specular"), 10 * frame.radiance + 1)
@@ -262,6 +266,7 @@ def light_with_vectors(lit, free, rest, *, shadow, dual):
     return Frame(**{name: np.asarray(each, np.float32) for name, each in buffers.items()})
 
 
+@pytest.mark.slow
 def test_a_shadow_brings_its_share_and_no_light_of_where_it_was():
     """It moves by 2 px a frame from dim to bright light; what it leaves is a share of the light that is there."""
     _, x = np.mgrid[:16, :48]
@@ -276,6 +281,7 @@ def test_a_shadow_brings_its_share_and_no_light_of_where_it_was():
         np.testing.assert_allclose(image[:, 4:], frame.radiance[:, 4:], rtol=0.01)
 
 
+@pytest.mark.slow
 def test_the_share_of_a_shadow_is_held_to_what_the_frame_shows():
     """A shadow that is gone without a vector: where no pixel around is shadowed, none has been."""
     free = np.full((16, 48), 0.7)
@@ -291,6 +297,7 @@ def glossy(light):
     return Frame(light, specular=light, roughness=np.ones_like(light[..., :1]))
 
 
+@pytest.mark.slow
 def test_nothing_that_was_filtered_in_space_comes_back(rng):
     frames = [glossy(rng.gamma(2.0, 0.5, (16, 24, 3))) for _ in range(2)]
     plain, filtered = (run(denoiser, frames) for denoiser in (HELD, FILTERED))
@@ -345,6 +352,7 @@ def mirror_frames(rng, count=12):
     return truth, frames
 
 
+@pytest.mark.slow
 def test_a_reflection_is_fetched_where_it_was(rng):
     truth, frames = mirror_frames(rng)
     errors = {}

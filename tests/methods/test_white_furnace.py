@@ -57,6 +57,7 @@ def whiteness(name, frames):
     return np.stack([image / frame.reflectance for image, frame in zip(images, frames, strict=True)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("glossy", [False, True], ids=["matt", "glossy"])
 @pytest.mark.parametrize("change", DARK)
 @pytest.mark.parametrize("name", FILTERS)

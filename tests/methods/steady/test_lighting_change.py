@@ -69,6 +69,7 @@ def test_noise_is_no_change(rng):
     assert np.mean(added) < 0.2 * np.mean(plain)
 
 
+@pytest.mark.slow
 def test_noise_does_not_darken(rng):
     """Shares that know the bright samples that they are taken of make it 13 %, four standard errors."""
     added = [np.asarray(noticed(noise(rng))) for _ in range(400)]
@@ -123,6 +124,7 @@ def test_no_further_than_it_says(rng):
     assert differs.max() == 64 + receptive_field()
 
 
+@pytest.mark.slow
 def test_gradients(rng, x64):
     filtered = rng.uniform(0.5, 1.5, (8, 12, 14))
     filtered[6:] *= 0.4

@@ -221,6 +221,7 @@ def test_no_further_than_it_says(rng):
     assert middle + receptive_field() // 2 < differs.max() <= middle + receptive_field()
 
 
+@pytest.mark.slow
 def test_gradients(rng, x64):
     arrays = [jnp.asarray(each, jnp.float64) for each in given(rng, size=(24, 20))]
     scales = {name: jnp.asarray(0.1) for name in SCALES}
@@ -229,6 +230,7 @@ def test_gradients(rng, x64):
     check_gradients(lambda scales, *given: given_back(scales, *given, hit, 0.01), (scales, *arrays), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_its_gradient_in_single_precision_is_that_of_the_plain_form(rng):
     """In training, and where nothing is seen at all."""
     arrays = given(rng, size=(32, 48))

@@ -72,12 +72,14 @@ def compiled():
     return jax.jit(denoiser.init), jax.jit(vary), jax.jit(functools.partial(unroll, denoiser))
 
 
+@pytest.mark.slow
 def test_constant_light_comes_out_as_it_went_in(rng, key):
     frames = room(rng)
     flat = frames._replace(radiance=jnp.full_like(frames.radiance, 0.5), albedo=jnp.ones_like(frames.albedo))
     np.testing.assert_allclose(denoised(flat, key=key), flat.radiance, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_noise_falls_within_a_frame_and_with_every_further_one(rng):
     # Of a smaller image, a filter leaves one cloud of noise, which looks like a change of light.
     frames = room(rng, 8, size=(96, 160))
@@ -123,6 +125,7 @@ def test_the_sky_passes_through_and_gives_nothing(rng, key):
     np.testing.assert_allclose(denoised(frames, key=key), frames.radiance, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_firefly_leaves_no_speck_and_a_lamp_of_one_pixel_stays(rng):
     """On surfaces of their own, where nothing is alike to share their light with; the lamp shines in all frames."""
     frames = room(rng, 4)
@@ -177,6 +180,7 @@ def test_invalid_pixels_of_the_first_frame_are_filled_from_their_neighbours(rng,
     np.testing.assert_allclose(denoised(broken, key=key), flat.radiance, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_moving_history_is_followed(rng):
     """A camera that pans along a wall of boards, each lit in its own way: all stay in their place."""
     frames = room(rng, 6)
@@ -191,6 +195,7 @@ def test_a_moving_history_is_followed(rng):
     np.testing.assert_allclose(denoised(moving, sharper=3.0), moving.radiance, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_broken_state_heals(rng):
     denoiser, frames = tiny(), room(rng, 3)
     params = compiled()[0](jax.random.key(0), frame_at(frames, 0))
@@ -201,6 +206,7 @@ def test_broken_state_heals(rng):
     assert np.isfinite(image).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absent", [("albedo", "motion"), ("normal", "depth", "ids")])
 def test_an_absent_buffer_equals_its_neutral_value(absent, rng, key):
     frames = room(rng)
