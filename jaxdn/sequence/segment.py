@@ -19,9 +19,9 @@ from jaxdn.data.read import check_single_layer, open_frames
 from jaxdn.runtime.overlap import read_ahead
 from jaxdn.sequence.all_light import gather_light
 from jaxdn.sequence.backward_pass import BackwardImages, backward_pass
-from jaxdn.sequence.empty_vectors import fill_empty_motion
 from jaxdn.sequence.frame_denoiser import Fallback, FrameDenoiser
 from jaxdn.sequence.jobs import Job
+from jaxdn.sequence.missing_motion import fill_motion
 from jaxdn.sequence.panorama import Panorama, find_panorama
 from jaxdn.sequence.settings import Settings
 from jaxdn.sequence.write_frames import ClipWriter, ForeignWriter, SharedResult, Write
@@ -215,7 +215,7 @@ class _ForeignFrames:
     """Frames of another renderer, whose results are written into copies of their files."""
 
     def __init__(self, sequence: ForeignSequence, segment: range, panorama: Panorama | None, *, measures: bool) -> None:
-        """``panorama``: its frames are widened. ``measures``: motion is measured where vectors are empty."""
+        """``panorama``: its frames are widened. ``measures``: motion is measured where there is none."""
         self._sequence, self._start = sequence, segment.start
         self._panorama, self._measures = panorama, measures
 
@@ -223,7 +223,7 @@ class _ForeignFrames:
         """So many frames, or the same from the last backwards with time turned around; forwards, files stay decoded."""
         frames = self._sequence.frames(backwards=backwards, keep_pixels=not backwards, log=log)
         if self._measures and len(self._sequence.files) > 1:
-            frames = fill_empty_motion(frames, lambda: self._sequence.has_empty_vectors, log)
+            frames = fill_motion(frames, lambda: self._sequence.lacks_motion, log)
         if self._panorama is not None:
             frames = map(self._panorama.widen_frame, frames)
         return map(StoredFrame, islice(frames, count))  # unlike a loop, this keeps no frame while the next one is read

@@ -35,11 +35,6 @@ class Decisions:
     albedo: bool | None = None
     """Whether a layer called ``diffuse`` is an albedo; None: no frame has told."""
 
-    @property
-    def has_empty_vectors(self) -> bool:
-        """Whether there are motion vectors, and were 0 everywhere in all frames so far."""
-        return "motion" in self.empty
-
     def drop_empty(
         self, pixels: Mapping[str, np.ndarray], buffers: Mapping[str, Channels], forward: Channels | None
     ) -> tuple[dict[str, Channels], list[str]]:

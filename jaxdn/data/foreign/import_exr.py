@@ -78,6 +78,7 @@ class ForeignSequence:
         self._decisions = Decisions()
         self._named: tuple[str, ...] | None = None
         self._told: set[str] = set()
+        self._lacks_motion = False
 
     @cached_property
     def window(self) -> Window:
@@ -104,9 +105,12 @@ class ForeignSequence:
         return union_of(windows) if windows else Window(0, 0, 0, 0)
 
     @property
-    def has_empty_vectors(self) -> bool:
-        """Whether the files have motion vectors that were 0 everywhere in all frames that have been read."""
-        return self._decisions.has_empty_vectors
+    def lacks_motion(self) -> bool:
+        """Whether the frame that was read last has no motion: there are no vectors, or they were 0 everywhere so far.
+
+        Not where none are to be read (``motion_convention="none"``).
+        """
+        return self._lacks_motion and self.naming.motion_convention != "none"
 
     def frames(
         self,
@@ -164,6 +168,7 @@ class ForeignSequence:
                 self._named = mapping.named
             _check_like_first(mapping.named, self._named)
             frame, derived = _make_frame(file, pixels, mapping, self.repairs)
+            self._lacks_motion = frame.motion is None
         except UnknownMotion as error:
             raise UnknownMotion(f"{file.path}: {self._advise_convention()}{error}") from error
         except ClipError as error:

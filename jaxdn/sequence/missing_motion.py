@@ -1,7 +1,7 @@
-"""Motion of frames whose files have vectors that are 0 everywhere, though something moves: measured from the frames.
+"""Motion of frames whose files have no vectors, or vectors of 0 everywhere, though something moves: it is measured.
 
-Blender writes such vectors where motion blur is on. Without them a history stays where it is, and what moves leaves
-trails or has no history. Each frame is compared with the one before it and with nothing else, so that a run that goes
+Blender writes zeros where motion blur is on. Without vectors a history stays where it is, and what moves leaves trails
+or has no history. Each frame is compared with the one before it and with nothing else, so that a run that goes
 on, and a part of a shot, measure the same.
 """
 
@@ -13,29 +13,29 @@ from jaxdn.core.frame import Frame
 from jaxdn.filters.motion_search import Look, measure_motion, see, something_moves
 
 MEASURED = (
-    "something moves though the vectors are 0: motion is measured from albedo, normals and depth; shadows, reflections "
-    "and what is small and fast are not followed, so render vectors without motion blur where that shows "
-    "(--motion-convention none: as if nothing moved)"
+    "something moves, and there are no motion vectors, or they are 0: motion is measured from albedo, normals and "
+    "depth; shadows, reflections and what is small and fast are not followed, so render vectors, without motion blur, "
+    "where that shows (--motion-convention none: as if nothing moved)"
 )
 """What is told, once."""
 
 
-def fill_empty_motion(
-    frames: Iterable[Frame], is_empty: Callable[[], bool], log: Callable[[str], None]
+def fill_motion(
+    frames: Iterable[Frame], lacks_motion: Callable[[], bool], log: Callable[[str], None]
 ) -> Iterator[Frame]:
-    """The frames, with motion to the one before where that is empty and something moves.
+    """The frames, with motion to the one before where there is none and something moves.
 
     Of frames that come from the last to the first it is the motion to the frame after, as time is turned around then.
     Where nothing moves, or without albedo and normals, frames stay as they are.
 
     Args:
       frames: consecutive ones.
-      is_empty: whether the vectors of the last frame were there, and 0 everywhere in it and in those before.
+      lacks_motion: whether vectors are wanted and none were found in the last frame and in those before.
       log: called with :data:`MEASURED`.
     """
     before: Look | None = None
     for frame in frames:
-        if not is_empty():
+        if not lacks_motion():
             before = None
         else:
             now = see(frame)

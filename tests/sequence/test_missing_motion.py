@@ -1,4 +1,4 @@
-"""Vectors that are 0 everywhere though something moves: motion is measured. Where nothing moves, nothing changes."""
+"""No vectors, or zeros, though something moves: motion is measured. Where nothing moves, nothing changes."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,12 +6,13 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxdn import clips
 from jaxdn.core.frame import Frame
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.denoiser import Core, recurrent
-from jaxdn.sequence.empty_vectors import MEASURED
+from jaxdn.sequence.missing_motion import MEASURED
 from jaxdn.sequence.optics import Optics
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
@@ -87,8 +88,13 @@ def is_motion(found: np.ndarray | None, x: float) -> bool:
     return bool(np.quantile(np.abs(found[6:-6, 6:-6] - [x, 0]).max(axis=-1), 0.95) < 0.3)
 
 
-def test_motion_is_measured_and_that_is_told(tmp_path: Path) -> None:
-    found, told = shown(write(tmp_path / "in"), tmp_path / "out")
+def without_vectors(frame: int) -> Channels:
+    return {name: values for name, values in passes(frame).items() if "Vector" not in name}
+
+
+@pytest.mark.parametrize("make", [passes, without_vectors])
+def test_motion_is_measured_and_that_is_told(make: Callable[[int], Channels], tmp_path: Path) -> None:
+    found, told = shown(write(tmp_path / "in", make), tmp_path / "out")
     assert found.pop("s.0000") is None
     assert len(found) == FRAMES - 1
     assert all(is_motion(motion, -STEP) for motion in found.values())
@@ -98,11 +104,13 @@ def test_motion_is_measured_and_that_is_told(tmp_path: Path) -> None:
 def test_where_nothing_moves_nothing_changes(tmp_path: Path) -> None:
     """In spite of noise; nor where vectors are left out, and for a single frame."""
     still, moving = (write(tmp_path / f"{step}", lambda frame, s=step: passes(frame, step=s)) for step in (0, STEP))  # type: ignore[misc]
+    bare = write(tmp_path / "bare", without_vectors)
     for number, (source, settings) in enumerate(
         (
             (still, {}),
             (moving, {"naming": ChannelNaming("none")}),
             (moving / "s.0001.exr", {}),
+            (bare, {"naming": ChannelNaming("none")}),
         )
     ):
         found, told = shown(source, tmp_path / f"out-{number}", **settings)
@@ -144,9 +152,10 @@ def test_the_same_is_measured_in_a_part_and_in_a_run_that_goes_on(tmp_path: Path
         assert all((tmp_path / folder / name).read_bytes() == (whole / name).read_bytes() for name in names)
 
 
-def test_backwards_it_is_the_motion_to_the_next_frame(tmp_path: Path) -> None:
+@pytest.mark.parametrize("make", [passes, without_vectors])
+def test_backwards_it_is_the_motion_to_the_next_frame(make: Callable[[int], Channels], tmp_path: Path) -> None:
     """The first frame has motion in the backward pass alone, the last one in the forward pass, of the other sign."""
-    found, told = shown(write(tmp_path / "in"), tmp_path / "out", bidirectional=True)
+    found, told = shown(write(tmp_path / "in", make), tmp_path / "out", bidirectional=True)
     first, last = (found[name] for name in ("s.0000", "s.0004"))
     assert first is not None
     assert last is not None
