@@ -12,7 +12,16 @@ import numpy as np
 import pytest
 
 from experiments.papers.learned import __main__ as learned
-from experiments.papers.learned import maps, ntasd_holdout, ntasd_methods, ntasd_sizes, scores, stages, zeng_methods
+from experiments.papers.learned import (
+    maps,
+    ntasd_budgets,
+    ntasd_holdout,
+    ntasd_methods,
+    ntasd_sizes,
+    scores,
+    stages,
+    zeng_methods,
+)
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, Denoiser, recurrent
 from jaxdn.evaluation.report import ClipResult, Results, Scores
@@ -188,6 +197,32 @@ def test_stages_are_what_the_papers_compare() -> None:
     losses = {row: stages.objective_of(row) for row in ntasd_methods.ROWS}
     assert set(losses.values()) == {"", "last frames"}
     assert losses["svgf"] == losses["noisy"] == ""
+
+
+def test_budgets_compare_what_differs_in_the_place_of_samples_alone() -> None:
+    for budget in stages.BUDGETS:
+        chosen, uniform = (
+            stages.STAGES[stages.stage_of_budget(kind, budget)]
+            for kind in (ntasd_budgets.CHOSEN, ntasd_budgets.UNIFORM)
+        )
+        assert uniform.options == chosen.options | {"adaptive": False}
+        assert (chosen.options["budget"], chosen.options["least"], chosen.recipe) == (budget, 0, uniform.recipe)
+        if budget in stages.ROTATING:
+            rotating = stages.STAGES[stages.stage_of_budget(ntasd_budgets.PATTERN, budget)]
+            assert rotating.options == uniform.options | {"pattern": "rotating"}
+
+
+def test_each_budget_has_its_own_ratio() -> None:
+    errors = dict.fromkeys(ntasd_budgets.ROWS, 0.04) | {
+        "ntasd, 0.25 samples": 0.02,
+        "ntasd, rotating, 0.25 samples": 0.08,
+    }
+    nothing = {"unbiased_psnr": 20.0, "ms_per_frame": 5.0}
+    found = results_of(**{row: {"unbiased_relative_mse": error} | nothing for row, error in errors.items()})
+    claims = {claim.text: (claim.paper, claim.ours, claim.holds) for claim in ntasd_budgets.claims(found)}
+    assert claims["chosen / uniform, relative MSE, 0.25 samples"] == ("not stated", "0.50", True)
+    assert claims["chosen / uniform, relative MSE, 4 samples"] == ("0.66 to 0.75", "1.00", False)
+    assert "| 0.25 | 0.50 | 0.25 | +0.00 dB | 0.0 |" in ntasd_budgets.text(found)
 
 
 def test_curves_over_frames_are_means_over_clips() -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import tyro
 
 from experiments.papers.learned import (
+    ntasd_budgets,
     ntasd_holdout,
     ntasd_methods,
     ntasd_sizes,
@@ -30,7 +31,7 @@ from jaxdn.zoo.ready import find_model
 
 TABLES = {
     file.__name__.rpartition(".")[2]: file.TABLE
-    for file in (ntasd_methods, ntasd_holdout, ntasd_sizes, rae_methods, zeng_methods)
+    for file in (ntasd_methods, ntasd_budgets, ntasd_holdout, ntasd_sizes, rae_methods, zeng_methods)
 }
 REFERENCES = ("noisy", "svgf", "steady-balanced")
 """In every run, whatever the tables."""

@@ -1,6 +1,6 @@
 """What the tables are made from: clips with layers, and networks that are trained on them alike."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,6 +43,31 @@ class Stage(NamedTuple):
 
 
 _EVEN = {"size": "small", "adaptive": False}
+BUDGETS = (0.25, 0.5, 1.0, 4.0)
+"""Mean samples a pixel of the table of budgets."""
+ROTATING = (0.25, 0.5)
+"""Those for which pixels can have a pattern that rotates."""
+
+
+def stage_of_budget(kind: str, budget: float) -> str:
+    """The name of a stage of the table of budgets."""
+    return f"{kind}, {budget:g} samples"
+
+
+def _budget_stages() -> Iterator[tuple[str, Stage]]:
+    """A network that chooses its pixels, one with pixels at random, and one with a pattern, for each budget."""
+    for budget in BUDGETS:
+        fractions = {"size": "small", "budget": budget, "least": 0, "rounding": "stochastic"}
+        even = {**fractions, "adaptive": False}
+        yield stage_of_budget("ntasd", budget), Stage("ntasd", fractions, recipe="paper")
+        yield stage_of_budget("ntasd, uniform", budget), Stage("ntasd", even, recipe="paper")
+        if budget in ROTATING:
+            yield (
+                stage_of_budget("ntasd, rotating", budget),
+                Stage("ntasd", {**even, "pattern": "rotating"}, recipe="paper"),
+            )
+
+
 _SINGLE_FRAMES = {**_EVEN, "history": "none"}
 _UNIFORM = Stage("ntasd", _EVEN, recipe="paper")
 STAGES = {
@@ -60,6 +85,7 @@ STAGES = {
     "arae": Stage("arae", {"size": "small"}, recipe="hasselgren"),
     **{f"ntasd, uniform, without {family}": _UNIFORM._replace(without=family) for family in HELD_OUT},
     **{f"ntasd, uniform, only {family}": _UNIFORM._replace(only=family) for family in HELD_OUT},
+    **dict(_budget_stages()),
 }
 """Each by the loss of its paper; those that Hasselgren et al. compare all by theirs."""
 
