@@ -122,7 +122,7 @@ def test_the_table_names_the_layers(
     for source in found:
         assert f"{source.buffer} {source.layer} {', '.join(c.rpartition('.')[2] for c in source.channels)} " in text
     if "motion" not in PROGRAMS[name].buffers:
-        assert "motion missing everything counts as still" in text
+        assert "motion missing it is measured from albedo or normals" in text
 
 
 def test_what_the_numbers_are_taken_for(shots: dict[str, Path]) -> None:

@@ -120,7 +120,7 @@ _SAID = {
     "roughness": "",
     "specular_hit_distance": "",
     "motion": "; right where nothing moves, but Blender writes zeros where motion blur is on: "
-    "what moves leaves trails without vectors, so render without motion blur, or add it afterwards",
+    "what moves is then measured, and true vectors need a render without motion blur, which may be added afterwards",
 }
 """Buffers whose emptiness is told, with what to know about it; ids are zeros in most files."""
 
