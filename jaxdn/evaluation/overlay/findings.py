@@ -164,8 +164,8 @@ def _missing_motion(mean: Mapping[str, float]) -> Finding:
     return Finding(
         "no motion vectors",
         f"{share:.0%} of the pixels with texture move by more than {MOVES} pixels, and the files have no vectors.",
-        "Switch on the renderer's motion vectors (Blender: Passes > Vector, and motion blur off). Without them motion is "
-        "measured, which does not follow shadows, reflections and what is small and fast.",
+        "Switch on the renderer's motion vectors (Blender: Passes > Vector, and motion blur off). Without them motion "
+        "is measured, which does not follow shadows, reflections and what is small and fast.",
     )
 
 
