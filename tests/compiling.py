@@ -27,6 +27,8 @@ AS_USERS: dict[str, bool | str] = {"xla_cpu_opt_preset": "CPU_OPT_PRESET_DEFAULT
 """Options of one program: with them, whatever the flags of the process."""
 SOON: dict[str, bool] = {"xla_cpu_use_fusion_emitters": False} if _KNOWN else {}
 """Options of one program: without."""
+PLAIN: dict[str, bool | int] = {"xla_backend_optimization_level": 0, **SOON}
+"""Options of a program that runs once: LLVM does not optimise it, which takes a fifth of the time."""
 
 
 def join_flags(*flags: str | None) -> str:

@@ -99,7 +99,7 @@ def test_a_function_that_widens_its_inputs_first_is_known(name):
     wide = table.widen(NARROW)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6),
-        *(Program(function)((), inputs) for inputs in (NARROW, wide)),
+        *(Program(function, lambda _: {})((), inputs) for inputs in (NARROW, wide)),
     )
 
 

@@ -1,6 +1,6 @@
 """Functions of parameters and inputs, compiled and run no more often than their results can differ."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -12,6 +12,8 @@ from tests.hard_cases.widening import widen, widens_first
 
 Run = Callable[[Any, Inputs], Any]
 """(params, inputs) -> arrays."""
+Options = Mapping[str, bool | str | int]
+"""XLA's, of one program."""
 
 
 class Program:
@@ -21,8 +23,10 @@ class Program:
     batched: 97 % of the time is compilation, and under ``jax.vmap`` an operation may have another implementation.
     """
 
-    def __init__(self, function: Run, **options: Any) -> None:
-        self._jitted = jax.jit(function, **options)
+    def __init__(self, function: Run, options: Callable[[Inputs], Options]) -> None:
+        """``options``: XLA's for some inputs."""
+        self._jitted = jax.jit(function)
+        self._options = options
         self._compiled: dict[Any, tuple[Callable[..., Any], list[int]]] = {}
         self._results: dict[Any, Any] = {}
 
@@ -31,7 +35,8 @@ class Program:
         types = types_of(inputs)
         if types not in self._compiled:
             traced = self._jitted.trace(params, inputs)
-            self._compiled[types] = traced.lower().compile(), _read(traced.jaxpr.jaxpr, len(leaves))
+            compiled = traced.lower().compile(compiler_options=dict(self._options(inputs)))
+            self._compiled[types] = compiled, _read(traced.jaxpr.jaxpr, len(leaves))
         compiled, read = self._compiled[types]
         given = (types, *(leaves[index].tobytes() for index in read))
         if given not in self._results:

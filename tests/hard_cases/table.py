@@ -1,17 +1,18 @@
 """All combinations of cases, functions, precisions and directions with their results: one row per cell."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from tests.compiling import AS_USERS, SOON
+from tests.compiling import AS_USERS, PLAIN
 from tests.hard_cases.cases import Case
 from tests.hard_cases.functions import Function, gradient_of, narrow_gradient
-from tests.hard_cases.inputs import Inputs, good
-from tests.hard_cases.programs import Program, Widening
+from tests.hard_cases.inputs import HEIGHT, WIDTH, Inputs, good
+from tests.hard_cases.programs import Options, Program, Widening
 from tests.hard_cases.widening import widen
 
 PRECISIONS = ("float32", "bfloat16 inputs")
@@ -54,7 +55,7 @@ def rows(
     precisions: Sequence[str] = PRECISIONS,
     directions: Sequence[str] = DIRECTIONS,
     compared: bool = True,
-    compiler_options: Mapping[str, bool | str] = AS_USERS,
+    compiler_options: Options = AS_USERS,
     pictures: dict[tuple[str, str], np.ndarray] | None = None,
 ) -> Iterator[Row]:
     """Every cell; one compiled program for each function, direction, size and, where it does not widen, precision.
@@ -64,8 +65,8 @@ def rows(
 
     Without ``compared`` no program in double precision is made, and no row has an ``error``: for functions that
     sanitize, because double precision tells what others may pass on. ``compiler_options`` are those of the programs in
-    single precision. ``pictures`` is filled with the last image [H, W, 3] that each case and pictured function gives in
-    single precision.
+    single precision, but for gradients of the sizes that one case has, which LLVM does not optimise. ``pictures`` is
+    filled with the last image [H, W, 3] that each case and pictured function gives in single precision.
     """
     assert compared or all(function.sanitizes for function in functions)
     made = {case.name: case.make(good()) for case in cases}
@@ -78,10 +79,10 @@ def rows(
             if not (forward or function.differentiable):
                 yield from _without_gradient(function, made, precisions)
                 continue
-            run = Program(function.run if forward else gradient_of(function.run), compiler_options=compiler_options)
-            # The comparison runs once for each case: compiled without optimisation, in a fifth of the time.
-            plain = {"xla_backend_optimization_level": 0, **SOON}
-            double = Program(function.run if forward else gradient_of(function.run), compiler_options=plain)
+            called = function.run if forward else gradient_of(function.run)
+            run = Program(called, partial(_options_of_size, compiler_options, forward=forward))
+            # The comparison runs once for each case.
+            double = Program(called, lambda _: PLAIN)
             for precision in precisions:
                 for name, inputs in made.items():
                     given = cast(inputs, precision)
@@ -94,6 +95,11 @@ def rows(
                     yield _judge(name, function, precision, direction, found, truth, given)
                     if pictures is not None and function.pictured and forward and precision == "float32":
                         pictures[name, function.name] = np.asarray(found).reshape(-1, *found.shape[-3:])[-1]
+
+
+def _options_of_size(usual: Options, inputs: Inputs, *, forward: bool) -> Options:
+    """Of gradients, those of the usual size alone are compiled as ``usual``: each of the others has one case."""
+    return usual if forward or inputs.clip.frames.radiance.shape[1:3] == (HEIGHT, WIDTH) else PLAIN
 
 
 def _exact(double: Program, wide: Any, given: Inputs) -> Any:
