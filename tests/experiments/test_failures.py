@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from experiments.papers.failures import __main__ as failures
-from experiments.papers.failures import measure
+from experiments.papers.failures import kept, measure
+from experiments.papers.failures.clips import digest_scene
 from experiments.papers.failures.scenes import MOVING, SCENES
 from experiments.papers.failures.sheet import make_sheet, make_table
 from jaxdn.core.frame import Frame
@@ -139,3 +140,71 @@ def test_every_scene_moves_and_then_rests():
 def test_what_cannot_be_measured_is_told(wrong, words):
     with pytest.raises(ValueError, match=words):
         failures.main(failures.Settings(**wrong))
+
+
+def _box_in_light(frame: float) -> float:
+    """The share of the front and the top of the box from which nothing hides the lamp, of `dark to light`."""
+    parts = SCENES["dark to light"][0]().parts
+    places, depths = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21))
+    front = np.stack([places, depths, np.ones_like(places)], -1)
+    top = np.stack([places, np.ones_like(places), depths], -1)
+    faces = np.concatenate([front.reshape(-1, 3), top.reshape(-1, 3)])
+    box, board, lamp = (parts[name].pose(frame) for name in ("box", "board", "lamp"))
+    points = faces @ box[:3, :3].T + box[:3, 3]
+    # In the board's own space, where it is the cube from -1 to 1: where the way to the lamp crosses its three slabs.
+    inverse = np.linalg.inv(board)
+    begins = points @ inverse[:3, :3].T + inverse[:3, 3]
+    way = inverse[:3, :3] @ lamp[:3, 3] + inverse[:3, 3] - begins
+    crossings = np.sort(np.stack([(side - begins) / way for side in (-1, 1)]), axis=0)
+    enters, leaves = crossings[0].max(-1), crossings[1].min(-1)
+    hidden = (enters < leaves) & (leaves > 0) & (enters < 1)
+    return float(1 - hidden.mean())
+
+
+def test_the_box_shoots_into_the_light_in_the_last_frames_that_move():
+    """Were it lit sooner, what is measured at the end would be floor that it uncovers."""
+    assert _box_in_light(MOVING) == 1.0
+    assert _box_in_light(MOVING - 1) < 0.8
+    assert _box_in_light(MOVING - 2) < 0.4
+    assert all(_box_in_light(frame) == 0.0 for frame in range(MOVING - 2))
+
+
+@pytest.mark.parametrize("name", ["moving mirror", "curved mirror", "transparent"])
+def test_no_path_by_way_of_a_mirror_or_glass_makes_a_bright_pixel_of_a_reference(name):
+    """Of 128 samples one that finds the lamp by chance adds as much as a surface in the room shows, at most."""
+    lamp = SCENES[name][0]().parts["lamp"]
+    assert np.max(lamp.glow) / failures.Settings().reference_spp < 0.02
+
+
+def test_a_changed_scene_has_a_folder_of_its_own():
+    digests = {digest_scene(make(), 3) for make, _ in SCENES.values()}
+    assert len(digests) == len(SCENES)
+    assert digest_scene(SCENES["shadow"][0](), 3) == digest_scene(SCENES["shadow"][0](), 3)
+    moved = SCENES["shadow"][0]()
+    part = moved.parts["lamp"]
+    moved.parts["lamp"] = part._replace(pose=lambda frame: part.pose(frame) + 0.01 * (frame == 2))
+    assert digest_scene(moved, 3) not in digests
+    assert digest_scene(moved, 2) == digest_scene(SCENES["shadow"][0](), 2)
+
+
+def test_a_row_is_kept_for_its_own_commit_and_clip(tmp_path, monkeypatch, rng):
+    image, path = rng.random((4, 5, 3)), tmp_path / "rows" / "a.npz"
+    (tmp_path / "frame_0000.exr").write_bytes(b"one")
+    monkeypatch.setattr(kept, "find_revision", lambda: "0123abc")
+    origin = kept.name_origin(tmp_path, 1)
+    for response in (None, 3):
+        kept.keep_row(path, origin, measure.Failure(31.25, response), image)
+        failure, there = kept.find_row(path, origin)
+        assert failure == measure.Failure(31.25, response)
+        np.testing.assert_array_equal(there, image)
+    (tmp_path / "frame_0000.exr").write_bytes(b"two")
+    assert kept.find_row(path, kept.name_origin(tmp_path, 1)) is None
+    (tmp_path / "frame_0000.exr").write_bytes(b"one")
+    monkeypatch.setattr(kept, "find_revision", lambda: "0123abd")
+    assert kept.find_row(path, kept.name_origin(tmp_path, 1)) is None
+    monkeypatch.setattr(kept, "find_revision", lambda: "0123abc-dirty")
+    assert kept.name_origin(tmp_path, 1) is None
+    other = tmp_path / "rows" / "b.npz"
+    kept.keep_row(other, None, measure.Failure(31.25, 3), image)
+    assert not other.exists()
+    assert kept.find_row(path, None) is None

@@ -6,11 +6,12 @@ Renders the clips of :mod:`experiments.papers.failures.scenes` into ``data/failu
 sample of all reflected light a pixel, runs every filter, the presets of the papers, the shipped weights, and ``ntd``
 with the vectors of shadows and reflections, and writes ``runs/failures/failures.json`` and ``failures-response.json``
 in the format of docs/results, every method's last moving frame as ``pictures/CLIP/METHOD.png``, all of a clip on one
-sheet as ``sheets/CLIP.png``, and all of all clips on ``sheets/all.png``.
+sheet as ``sheets/CLIP.png``, and all of all clips on ``sheets/all.png`` and ``failures.webp``. A run that was cut off
+goes on where it was: finished frames are kept, and so are rows of the same commit.
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -24,8 +25,9 @@ import tyro
 from experiments.measurement import describe_measurement
 from experiments.papers.failures import measure
 from experiments.papers.failures.clips import render_failure
+from experiments.papers.failures.kept import find_row, keep_row, name_origin
 from experiments.papers.failures.scenes import MOVING, SCENES
-from experiments.papers.failures.sheet import make_sheet, make_table
+from experiments.papers.failures.sheet import make_sheet, make_table, save_webp
 from experiments.papers.preintegration import file_name
 from jaxdn import color
 from jaxdn.clips import read_clip
@@ -39,6 +41,8 @@ from jaxdn.zoo.ready import NOISY, Model, filter_names, find_model, ready_names
 PAPERS = ("svgf", "asvgf", "trmv", "relax", "reblur")
 """Filters with a preset of the paper."""
 EFFECTS = "ntd-small, vectors of effects"
+PICTURE = "failures.webp"
+"""Of all clips, for the results page."""
 COMMAND = "python -m experiments.papers.failures"
 
 
@@ -75,15 +79,13 @@ def all_rows() -> dict[str, tuple[str, dict[str, Any]]]:
     return plain | papers | more
 
 
-def measure_models(models: Mapping[str, Model], clip: Clip) -> Iterator[tuple[str, measure.Failure, np.ndarray]]:
-    """Label, failure and images [T, H, W, 3] of every model on a clip."""
+def measure_model(model: Model, clip: Clip, affected: np.ndarray) -> tuple[measure.Failure, np.ndarray]:
+    """The failure of a model on a clip, and its image [H, W, 3] of the last frame in which something moves."""
     reference = np.asarray(clip.reference)
-    affected = measure.affected_pixels(reference, clip.frames, moving=MOVING)
     late = np.minimum(MOVING + np.arange(len(reference)), len(reference) - 1)
-    began_late = jax.tree.map(lambda each: each[late], clip.frames)
-    for label, model in models.items():
-        images, fresh = _denoise(model, clip.frames), _denoise(model, began_late)
-        yield label, measure.measure_failure(images, fresh, reference, affected, moving=MOVING), images
+    images = _denoise(model, clip.frames)
+    fresh = _denoise(model, jax.tree.map(lambda each: each[late], clip.frames))
+    return measure.measure_failure(images, fresh, reference, affected, moving=MOVING), images[MOVING]
 
 
 def _denoise(model: Model, frames: Frame) -> np.ndarray:
@@ -123,25 +125,45 @@ def main(settings: Settings) -> None:
     counts: dict[str, dict[str, int]] = {}
     shown: dict[str, dict[str, np.ndarray]] = {}
     for name in settings.scenes:
-        size = (settings.width, settings.height)
-        folder = render_failure(
-            settings.data, name, size=size, frames=settings.frames, reference_spp=settings.reference_spp
-        )
-        clip = read_clip(folder)
-        reference = np.asarray(clip.reference)
-        affected = measure.affected_pixels(reference, clip.frames, moving=MOVING)
-        hidden, fallbacks = measure.count_fallbacks(clip.frames)
-        counts[name] = {"affected": int(affected.sum()), "hidden": hidden, "dual vector leaves the image": fallbacks}
-        print(f"{name}: {counts[name]}", flush=True)
-        mask = np.repeat(affected[MOVING, ..., None], 3, 2)
-        shown[name] = {"reference": _display(reference[MOVING]), "affected pixels": mask}
-        for label, one, images in measure_models(models, clip):
-            found[label][name] = one
-            response = "never" if one.response is None else one.response
-            print(f"  {label}: {one.psnr:.2f} dB, response {response}", flush=True)
-            shown[name][label] = _display(images[MOVING])
+        counts[name], shown[name], failures = measure_clip(settings, name, models)
+        for label, failure in failures.items():
+            found[label][name] = failure
         # After every clip: a run of hours may be cut off.
         _write(settings, shown, describe(settings, found, counts))
+
+
+def measure_clip(
+    settings: Settings, name: str, models: Mapping[str, Model]
+) -> tuple[dict[str, int], dict[str, np.ndarray], dict[str, measure.Failure]]:
+    """The counts of a clip, its images [H, W, 3] to look at, and label -> failure; what is kept is not measured again.
+
+    Args:
+      settings: of the run.
+      name: of the clip.
+      models: label -> model.
+    """
+    size = (settings.width, settings.height)
+    folder = render_failure(
+        settings.data, name, size=size, frames=settings.frames, reference_spp=settings.reference_spp
+    )
+    origin, clip = name_origin(folder, settings.frames), read_clip(folder)
+    reference = np.asarray(clip.reference)
+    affected = measure.affected_pixels(reference, clip.frames, moving=MOVING)
+    hidden, fallbacks = measure.count_fallbacks(clip.frames)
+    counts = {"affected": int(affected.sum()), "hidden": hidden, "dual vector leaves the image": fallbacks}
+    print(f"{name}: {counts}", flush=True)
+    shown = {"reference": _display(reference[MOVING]), "affected pixels": np.repeat(affected[MOVING, ..., None], 3, 2)}
+    failures = {}
+    for label, model in models.items():
+        path = settings.out / "rows" / name.replace(" ", "-") / f"{file_name(label)}.npz"
+        row = find_row(path, origin)
+        if row is None:
+            row = measure_model(model, clip, affected)
+            keep_row(path, origin, *row)
+        failures[label], shown[label] = row[0], _display(row[1])
+        response = "never" if row[0].response is None else row[0].response
+        print(f"  {label}: {row[0].psnr:.2f} dB, response {response}", flush=True)
+    return counts, shown, failures
 
 
 def _display(image: np.ndarray) -> np.ndarray:
@@ -161,6 +183,7 @@ def _write(
     for path, image in pictures.items():
         path.parent.mkdir(parents=True, exist_ok=True)
         save_png(path, image)
+    save_webp(settings.out / PICTURE, pictures[settings.out / "sheets" / "all.png"])
     texts = {settings.out / f"{file}.json": json.dumps(result, indent=1) + "\n" for file, result in results.items()}
     write_atomically({path: text.encode() for path, text in texts.items()})
 
@@ -191,7 +214,9 @@ def describe(
         "table", f"{title}: error", "Quality", 63, command=COMMAND, what=clips + error, rows=errors
     )
     names = [{"name": name, "decimals": 1, "best": "higher"} for name in counts]
-    about |= {"columns": [{"name": "method"}, *names], "counts": counts}
+    caption = "The last frame in which something moves: the reference, the affected pixels, and every method."
+    picture = {"file": PICTURE, "alt": "Every clip in a column, every method in a row", "caption": caption}
+    about |= {"columns": [{"name": "method"}, *names], "counts": counts, "picture": picture}
     other = describe_measurement(
         "table", f"{title}: response", "Quality", 64, command=COMMAND, what=clips + response, rows=responses
     )

@@ -31,6 +31,9 @@ MOVING = 8
 """From this frame on everything rests."""
 SPEED = 0.2
 """Metres a frame of what is fast: 8 pixels."""
+WIDE = 1.5
+"""Radius of the lamp, in metres, where mirrors and glass lead paths to it by chance: each such path is a bright pixel,
+the brighter the smaller the lamp."""
 _HALF = (4.0, 2.6, 2.4)
 _MIRROR = metal((0.9, 0.9, 0.9), 0.03)
 
@@ -68,12 +71,12 @@ def border() -> Stage:
 
 
 def dark_to_light() -> Stage:
-    """A box shoots out of the shadow of a board into the light."""
-    stage = _room("dark-to-light", lamp=(2.0, 2.4, 0.0))
-    stage.add("board", "cube", shift(0.55, 1.95, -0.3) @ scale(0.03, 0.62, 1.4), matte((0.5, 0.45, 0.4)))
+    """A box shoots out of the shadow of a board: the last three steps bring it into the light."""
+    stage = _room("dark-to-light", lamp=(1.0, 2.45, 0.8), size=0.06)
+    stage.add("board", "cube", shift(0.65, 1.95, -0.3) @ scale(0.03, 0.65, 1.4), matte((0.5, 0.45, 0.4)))
 
     def place(frame: float) -> np.ndarray:
-        return shift(-0.9 + SPEED * _time(frame), 0.35, -0.4) @ scale(0.28, 0.3, 0.2)
+        return shift(-0.9 + SPEED * _time(frame), 0.35, -0.4) @ scale(0.2, 0.3, 0.2)
 
     stage.add("box", "cube", place, matte(textures.hsv(0.55, 0.5, 0.85)))
     return stage
@@ -84,7 +87,7 @@ def shadow() -> Stage:
     stage = _room("shadow", lamp=(0.0, 2.5, 0.6))
 
     def place(frame: float) -> np.ndarray:
-        return shift(-0.36 + 0.08 * _time(frame), 2.15, 0.2) @ scale(0.13)
+        return shift(-0.44 + 0.08 * _time(frame), 2.15, 0.2) @ scale(0.13)
 
     stage.add("ball", "sphere", place, matte((0.5, 0.5, 0.5)))
     return stage
@@ -99,7 +102,7 @@ def _reflected_things(stage: Stage) -> None:
 
 def moving_mirror() -> Stage:
     """A standing mirror turns on its axis: its surface hardly moves, what it shows moves fast."""
-    stage = _room("moving-mirror")
+    stage = _room("moving-mirror", size=WIDE)
     _reflected_things(stage)
 
     def place(frame: float) -> np.ndarray:
@@ -111,7 +114,7 @@ def moving_mirror() -> Stage:
 
 def curved_mirror() -> Stage:
     """A mirror ball that rests; a bright box passes before it."""
-    stage = _room("curved-mirror")
+    stage = _room("curved-mirror", size=WIDE)
     stage.add("ball", "sphere", shift(0.0, 0.85, -0.7) @ scale(0.7), _MIRROR)
 
     def place(frame: float) -> np.ndarray:
@@ -123,7 +126,7 @@ def curved_mirror() -> Stage:
 
 def transparent() -> Stage:
     """A glass ball rolls past a row of posts: it shows them upside down, and moves otherwise than what it shows."""
-    stage = _room("transparent")
+    stage = _room("transparent", size=WIDE)
     for index in range(6):
         place = shift(-1.25 + 0.5 * index, 0.7, -1.2) @ scale(0.1, 0.7, 0.1)
         stage.add(f"post_{index}", "cube", place, matte(textures.hsv(0.17 * index, 0.65, 0.85)))

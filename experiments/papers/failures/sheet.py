@@ -1,11 +1,14 @@
 """Small images side by side under their names: of one clip, or of all."""
 
+import io
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from jaxdn.evaluation.report.images import displayed_bytes
+from jaxdn.runtime.atomic_files import write_atomically
 
 COLUMNS = 4
 ENLARGED = 3
@@ -55,3 +58,10 @@ def make_table(rows: Mapping[str, Sequence[np.ndarray]], columns: Sequence[str])
             place = (_NAMES + number * width, _LINE + row * height)
             sheet.paste(Image.fromarray(displayed_bytes(image)), place)
     return np.asarray(sheet, np.float64) / 255.0
+
+
+def save_webp(path: Path, image: np.ndarray) -> None:
+    """Write a display-encoded image [H, W, 3] in 0..1 as a small file for a page."""
+    file = io.BytesIO()
+    Image.fromarray(displayed_bytes(image)).save(file, "WEBP", quality=90)
+    write_atomically({path: file.getvalue()})
