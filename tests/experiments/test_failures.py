@@ -169,6 +169,17 @@ def test_the_box_shoots_into_the_light_in_the_last_frames_that_move():
     assert all(_box_in_light(frame) == 0.0 for frame in range(MOVING - 2))
 
 
+def test_only_the_ball_shows_the_boxes_that_pass_before_it():
+    """Below the image, or a box itself would be what fails in `curved mirror`."""
+    stage, corners = SCENES["curved mirror"][0](), np.array(np.meshgrid(*[[-1, 1]] * 3, [1])).reshape(4, 8)
+    camera = stage.camera(0)
+    for frame in range(MOVING + 1):
+        for pose in stage.pose(frame).values():
+            seen = (np.linalg.inv(camera.to_world) @ pose @ corners)[:3]
+            assert np.all(seen[2] > 0)
+            assert np.all(seen[1] / seen[2] < -np.tan(np.radians(camera.x_fov / 2)) * 56 / 96)
+
+
 @pytest.mark.parametrize("name", ["moving mirror", "curved mirror", "transparent"])
 def test_no_path_by_way_of_a_mirror_or_glass_makes_a_bright_pixel_of_a_reference(name):
     """Of 128 samples one that finds the lamp by chance adds as much as a surface in the room shows, at most."""

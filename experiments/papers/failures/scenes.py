@@ -113,14 +113,16 @@ def moving_mirror() -> Stage:
 
 
 def curved_mirror() -> Stage:
-    """A mirror ball that rests; a bright box passes before it."""
+    """A mirror ball that rests; bright boxes below the image pass before it."""
     stage = _room("curved-mirror", size=WIDE)
     stage.add("ball", "sphere", shift(0.0, 0.85, -0.7) @ scale(0.7), _MIRROR)
+    for index in range(4):
+        begins = -1.9 + 0.6 * index
 
-    def place(frame: float) -> np.ndarray:
-        return shift(-0.8 + SPEED * _time(frame), 0.25, 0.55) @ scale(0.2, 0.22, 0.2)
+        def place(frame: float, begins: float = begins) -> np.ndarray:
+            return shift(begins + SPEED * _time(frame), 0.25, 0.55) @ scale(0.17, 0.22, 0.2)
 
-    stage.add("box", "cube", place, glossy(textures.hsv(0.02, 0.75, 0.9), 0.5))
+        stage.add(f"box_{index}", "cube", place, glossy(textures.hsv(0.02 + 0.27 * index, 0.75, 0.9), 0.5))
     return stage
 
 
