@@ -40,7 +40,8 @@ from jaxdn.zoo.ready import NOISY, Model, filter_names, find_model, ready_names
 
 PAPERS = ("svgf", "asvgf", "trmv", "relax", "reblur")
 """Filters with a preset of the paper."""
-EFFECTS = "ntd-small, vectors of effects"
+WITH_VECTORS = ("ntd-small", "ntd-large")
+"""Shipped weights that are measured with vectors of effects too, for which they were not trained."""
 PICTURE = "failures.webp"
 """Of all clips, for the results page."""
 COMMAND = "python -m experiments.papers.failures"
@@ -73,7 +74,9 @@ def all_rows() -> dict[str, tuple[str, dict[str, Any]]]:
         name: (name, {}) for name in [NOISY, *filter_names(), *ready_names()]
     }
     papers = {f"{name}, as published": (name, {"preset": "paper"}) for name in PAPERS}
-    more: dict[str, tuple[str, dict[str, Any]]] = {EFFECTS: ("ntd-small", {"motion": "effects"})}
+    more: dict[str, tuple[str, dict[str, Any]]] = {
+        f"{name}, vectors of effects": (name, {"motion": "effects"}) for name in WITH_VECTORS
+    }
     if "oidn" in plain:
         more["oidn, stabilised"] = ("stabilised:oidn", {})
     return plain | papers | more
