@@ -117,7 +117,8 @@ def denoise(denoiser: Denoiser, params: Params, clip: Clip) -> Float[Array, "T H
 # Jitted once for all streams: a denoiser that is used on many clips is compiled once.
 @functools.partial(jax.jit, static_argnums=0)
 def _start(denoiser: Denoiser, params: Params, frame: Frame) -> State:
-    return denoiser.start(params, frame)
+    """The state before the first frame, in memory of its own: a jitted function returns what it was given as it is."""
+    return jax.tree.map(jnp.copy, denoiser.start(params, frame))
 
 
 @functools.partial(jax.jit, static_argnums=0, donate_argnums=2)
@@ -168,8 +169,7 @@ class Stream:
         """What is read of a frame; the state starts with the first one."""
         frame = only(frame, self._denoiser.reads)
         if self._state is None:
-            # Copied: two donated arrays must not share memory.
-            self._state = jax.tree.map(jnp.copy, _start(self._denoiser, self._params, frame))
+            self._state = _start(self._denoiser, self._params, frame)
         return frame
 
     def each(self, frames: Iterable[Frame]) -> Iterator[jax.Array]:

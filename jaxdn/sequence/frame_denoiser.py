@@ -148,7 +148,7 @@ class FrameDenoiser:
             image = image + np.float32(confidence.fallback) * (np.asarray(light_of(noisy)) - image)
         image = restore_lamps(image, noisy, self._lamps)
         texture_unknown = frame.albedo is None and frame.reflectance is None
-        return image, Fallback(confidence, float(np.mean(combined.noisy_weight)), texture_unknown)
+        return image, Fallback(confidence, float(np.mean(np.asarray(combined.noisy_weight))), texture_unknown)
 
     def _combine(self, noisy: np.ndarray, image: np.ndarray, surface: np.ndarray | None) -> JamesStein:
         if not isinstance(self._step, TiledStream):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxdn.core.frame import Clip, Frame, frame_at
-from jaxdn.denoiser import Core, recurrent
+from jaxdn.denoiser import Core, Denoiser, recurrent
 from jaxdn.denoiser.rollout import denoise, stream
 from jaxdn.denoisers import ntd, svgf
 from tests.hard_cases.inputs import good
@@ -126,8 +126,6 @@ def test_what_was_sanitized_is_counted_over_all_frames(method, clip):
 
 
 def test_a_denoiser_without_a_count_has_sanitized_nothing(clip):
-    from jaxdn.denoiser import Denoiser
-
     def step(params, state, frame):
         return state + 1, frame.radiance * state
 
@@ -146,3 +144,44 @@ def test_a_clip_with_different_sizes_is_refused(method, clip):
         denoise(denoiser, params, shorter)
     with pytest.raises(ValueError, match=r"clip\.frames\.radiance"):
         denoise(denoiser, params, Clip(frame_at(clip.frames, 0)))
+
+
+def test_a_state_may_be_what_was_given_and_hold_it_twice():
+    """Its memory is used again, and that of frames and parameters is not."""
+
+    def start(params, frame):
+        return frame.radiance, frame.radiance, params["light"], jnp.zeros(()), jnp.zeros(())
+
+    def step(params, state, frame):
+        state = jax.tree.map(lambda x: x + 1, state)
+        return state, state[0] + state[1] + params["light"]
+
+    given = Frame(jnp.full((4, 4, 3), 0.5))
+    params = {"light": jnp.full((4, 4, 3), 0.25)}
+    one = stream(Denoiser(lambda key, frame: params, start, step, frozenset()), params)
+    images = [np.asarray(one(given)) for _ in range(3)]
+    np.testing.assert_array_equal([image[0, 0, 0] for image in images], [3.25, 5.25, 7.25])
+    np.testing.assert_array_equal(given.radiance, 0.5)
+    np.testing.assert_array_equal(params["light"], 0.25)
+
+
+def test_the_first_frame_takes_two_programs(clip):
+    """Each has to be traced, and compiled or loaded, before there is an image."""
+    names = []
+
+    def note(event, duration_secs, **about):
+        if event.endswith("backend_compile_duration"):
+            names.append(about.get("fun_name", ""))
+
+    def step(params, state, frame):
+        return state + frame.radiance, state
+
+    bare = Denoiser(lambda key, frame: {}, lambda params, frame: 0 * frame.radiance, step, frozenset())
+    frame = frames_of(clip)[0]
+    jax.monitoring.register_event_duration_secs_listener(note)
+    try:
+        image = stream(bare, {})(frame)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(note)
+    np.testing.assert_array_equal(image, 0)
+    assert len(names) == 2, names
