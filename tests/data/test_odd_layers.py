@@ -1,5 +1,6 @@
 """Layers in which a frame has nothing, and values that no guide can have: told, and never the end of a shot."""
 
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.classify import UNNAMED
+from jaxdn.data.foreign.decisions import Decisions
 from jaxdn.data.foreign.import_exr import ForeignSequence
 from tests.programs import HEIGHT, WIDTH, Channels, layer, truth
 
@@ -75,6 +77,33 @@ def test_a_layer_without_anything_in_it_counts_as_missing_and_that_is_told(name:
     assert ("motion blur" in told[0]) == (name == "motion")
     assert all(frame.dual_motion is None for frame in frames) == (name == "motion")
     assert name not in [mapped.buffer for mapped in read_channel_mapping(tmp_path)]
+
+
+@pytest.mark.parametrize("name", NOTHING)
+@pytest.mark.parametrize("row", [0, 5, HEIGHT - 1])
+def test_a_single_pixel_is_something(name: str, row: int, tmp_path: Path) -> None:
+    """Wherever it is: not all rows are looked at first."""
+    values = np.array(NOTHING[name][0])
+    values[row, 7] = 0.5
+    frames, told = read(tmp_path, blender(0, **{name: values}))
+    assert getattr(frames[0], name) is not None
+    assert told == []
+
+
+def test_few_rows_tell_that_a_layer_has_something() -> None:
+    """A frame of film has a hundred megabytes of layers, and the first one waits for this."""
+    rng = np.random.default_rng(0)
+    buffers = {"albedo": ("R", "G", "B"), "normal": ("X", "Y", "Z"), "motion": ("U", "V"), "depth": ("D",)}
+    pixels = {name: rng.random((512, 512), np.float32) for channels in buffers.values() for name in channels}
+    tracemalloc.start()
+    try:
+        kept, notes = Decisions().drop_empty(pixels, buffers, forward=None)
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert kept == buffers
+    assert notes == []
+    assert most < pixels["D"].nbytes
 
 
 @pytest.mark.parametrize("name", [*NOTHING, "ids"])

@@ -18,6 +18,8 @@ _STILL = 1e-6
 """Vectors are shorter where nothing moves, whatever their unit; a matrix product leaves so much of 0."""
 _MANY = 0.1
 """Share of the pixels; so many values above 1 are no lamps in an albedo."""
+_EVERY = 16
+"""Of so many rows one is looked at first."""
 
 
 @dataclass
@@ -50,7 +52,7 @@ class Decisions:
             if name in self.filled:
                 continue
             read = channels + (forward or ()) if name == "motion" else channels
-            why = _explain_empty(name, stack_channels(pixels, read))
+            why = _look_for_emptiness(name, pixels, read)
             if why is None:
                 self.filled.add(name)
                 if name in self.empty:
@@ -123,6 +125,17 @@ _SAID = {
     "what moves is then measured, and true vectors need a render without motion blur, which may be added afterwards",
 }
 """Buffers whose emptiness is told, with what to know about it; ids are zeros in most files."""
+
+
+def _look_for_emptiness(name: str, pixels: Mapping[str, np.ndarray], channels: Channels) -> str | None:
+    """:func:`_explain_empty` of a buffer's channels.
+
+    What has nothing in it has nothing in some of its rows, and hardly any layer passes that: few rows tell of most.
+    """
+    few = {channel: pixels[channel][::_EVERY] for channel in set(channels)}
+    if _explain_empty(name, stack_channels(few, channels)) is None:
+        return None
+    return _explain_empty(name, stack_channels(pixels, channels))
 
 
 def _explain_empty(name: str, values: np.ndarray) -> str | None:

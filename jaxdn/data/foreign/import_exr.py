@@ -215,7 +215,7 @@ def _converted(name: str, image: np.ndarray, channels: Channels, convention: str
             return np.where(bits == 0, -1, bits.astype(np.int64)).astype(np.int32)
         ids = np.nan_to_num(image.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
         return (np.clip(np.rint(ids), 0, 2**31 - 1) - 1).astype(np.int32)
-    image = image.astype(buffer.dtype)
+    image = image.astype(buffer.dtype, copy=False)
     if buffer.kind == "vector" and convention is not None:
         return convert_motion(image, convention)
     if buffer.kind == "distance":
