@@ -73,7 +73,7 @@ def recurrent_unet(
     def described(channels: int) -> GraphSpec:
         return graph.recurrent_unet(channels, outputs, widths=widths)
 
-    structure = flax_structure(described(sum(groups)))
+    structure = flax_structure(tuple(described(sum(groups)).kernels().items()))
 
     def init(key: jax.Array) -> dict[str, Any]:
         return draw_initial_weights(key, described(sum(groups)), scheme="he")

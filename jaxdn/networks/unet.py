@@ -78,11 +78,15 @@ class Convolution(nnx.Module):
         self.bias = nnx.Param(jnp.zeros(shape[-1], jnp.float32))
 
 
+Kernels = tuple[tuple[str, tuple[int, ...]], ...]
+"""Names and shapes, as :meth:`jaxdn.networks.graph.GraphSpec.kernels` has them."""
+
+
 class Convolutions(nnx.Module):
     """The weights of a described network: a convolution ``a/b`` is the attribute ``b`` of the attribute ``a``."""
 
-    def __init__(self, network: GraphSpec) -> None:
-        for name, shape in network.kernels().items():
+    def __init__(self, kernels: Kernels) -> None:
+        for name, shape in kernels:
             level, _, layer = name.rpartition("/")
             if level and not hasattr(self, level):
                 setattr(self, level, nnx.Module())
@@ -201,7 +205,7 @@ def unet(
     def described(channels: int) -> GraphSpec:
         return graph.unet(channels, heads, widths=widths, head_size=head_size)
 
-    structure = flax_structure(described(sum(groups)))
+    structure = flax_structure(tuple(described(sum(groups)).kernels().items()))
 
     def init(key: jax.Array) -> dict[str, Any]:
         return draw_initial_weights(key, described(sum(groups)), scheme=initialization)
@@ -215,9 +219,10 @@ def unet(
     return Network(init, apply)
 
 
-def flax_structure(network: GraphSpec) -> Any:
-    """How Flax stores the weights of a network."""
-    return nnx.split(nnx.eval_shape(lambda: Convolutions(network)), nnx.Param, graph=False)[0]
+@functools.cache
+def flax_structure(kernels: Kernels) -> Any:
+    """How Flax stores the weights of a network; made once, as a denoiser is built several times until it is chosen."""
+    return nnx.split(nnx.eval_shape(lambda: Convolutions(kernels)), nnx.Param, graph=False)[0]
 
 
 def select_groups(features: Sequence[jax.Array | None], groups: Sequence[int], multiple: int) -> list[jax.Array]:

@@ -62,6 +62,15 @@ def test_weight_counts(widths: tuple, weights: int, key: jax.Array) -> None:
     assert sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(network.init, key))) == weights
 
 
+def test_a_network_that_is_built_again_is_not_described_to_flax_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A denoiser is built up to three times before its first frame, and each time takes a hundredth of a second."""
+    unet((3, 2), HEADS, widths=TINY)
+    monkeypatch.delattr("jaxdn.networks.unet.nnx.eval_shape")
+    unet((3, 2), HEADS, widths=TINY)
+    with pytest.raises(AttributeError):
+        unet((3, 3), HEADS, widths=TINY)
+
+
 def test_small_computes_a_third_of_large(key: jax.Array) -> None:
     def flops(widths: tuple) -> float:
         network = unet(GROUPS, HEADS, widths=widths)
