@@ -161,9 +161,10 @@ def _denoise(options: Denoise) -> None:
     with put_off_collection() as begin_collection:
         keep_programs()
         from jaxdn.commands.denoise import run_denoise
+        from jaxdn.data.exr.threads import exr_on_all_cores
         from jaxdn.ops.dispatch.loop_compilers import loops_compiled_apart
 
-        with loops_compiled_apart():
+        with loops_compiled_apart(), exr_on_all_cores():
             run_denoise(options, on_start=begin_collection)
 
 
