@@ -5,7 +5,9 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -365,12 +367,15 @@ def test_an_error_in_a_loop_is_raised(rng):
         jax.block_until_ready(numba_call.call(fails, [(4, 4)], [jnp.ones((4, 4))], rows=4))
 
 
-def test_no_tile_is_written_any_more_after_an_error():
-    written = []
+def test_no_tile_is_written_any_more_after_an_error(monkeypatch):
+    written, begun, pool = [], threading.Event(), ThreadPoolExecutor(1)
+    monkeypatch.setattr(numba_call, "_pool", lambda: (pool, 2))
 
     def fails_first(top, bottom, image, out):
         if top == 0:
+            begun.wait(20)
             raise RuntimeError("the tile is torn")
+        begun.set()
         time.sleep(0.1)
         out[top:bottom] = 1
         written.append(top)

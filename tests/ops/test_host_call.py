@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 
 import jax
 import jax.numpy as jnp
@@ -121,3 +122,30 @@ def test_a_program_with_loops_is_compiled_once_for_all_processes(tmp_path):
     assert "cache hit for 'jit_fill_holes'" in second
     told = [[line for line in text.splitlines() if line.startswith("sum ")] for text in (first, second)]
     assert told[0] == told[1] != []
+
+
+def test_threads_of_programs_are_known_between_calls():
+    """Python makes and unmakes its record of a thread that it does not know at every call: half of a short call."""
+    here, visits = threading.local(), []
+
+    def visit(results, array):
+        visits.append((threading.get_ident(), hasattr(here, "known")))
+        here.known = True
+        results[0][...] = array
+
+    @jax.jit
+    def busy(array):
+        for _ in range(4):
+            (array,) = call_host("test_threads_of_programs", visit, KINDS[:1], array)
+            product = jnp.ones((300, 300)) * array.sum()
+            for _ in range(4):
+                product = product @ product / 300
+            array = array + product[:3, :4]
+        return array
+
+    for _ in range(6):
+        jax.block_until_ready(busy(jnp.ones((3, 4))))
+    threads = {thread for thread, _ in visits}
+    assert len(visits) == 24
+    assert threads != {threading.get_ident()}, "all calls came from this thread: nothing is tested"
+    assert sum(not known for _, known in visits) == len(threads)

@@ -75,17 +75,22 @@ def call(
         pool, threads = _pool()
         # Several tiles for each thread, as some take longer.
         height = max(least, -(-rows // max(1, min(4 * threads, values // TILE))))
-        if height >= rows:
-            loop(0, rows, *read, *written, *numbers)
-            return
-        tiles: list[Future[None]] = []
+        tops = iter(range(0, rows, height))
+
+        def fill() -> None:
+            for top in tops:  # that no other thread has taken
+                loop(top, min(rows, top + height), *read, *written, *numbers)
+
+        helpers: list[Future[None]] = []
         try:
-            for top in range(0, rows, height):
-                tiles.append(pool.submit(loop, top, min(rows, top + height), *read, *written, *numbers))
-            for tile in tiles:
-                tile.result()
+            for _ in range(min(threads, -(-rows // height)) - 1):
+                helpers.append(pool.submit(fill))
+            fill()
         finally:  # after Ctrl-C, too, nothing may write into results that XLA frees
-            wait(tiles)
+            begun = [helper for helper in helpers if not helper.cancel()]
+            wait(begun)
+        for helper in begun:
+            helper.result()
 
     values = sum(map(math.prod, shapes))
     name = name_of(getattr(loop, "py_func", loop), str(structure), numbers, rows, least)
@@ -102,6 +107,6 @@ def _installed() -> bool:
 
 @functools.cache
 def _pool() -> tuple[ThreadPoolExecutor, int]:
-    """Threads, one for each core that this process may use, and their number."""
+    """Threads that help the one that calls a loop, and how many fill tiles with it: one for each core to be used."""
     threads = count_cores()
-    return ThreadPoolExecutor(threads, "jaxdn-tiles"), threads
+    return ThreadPoolExecutor(max(1, threads - 1), "jaxdn-tiles"), threads
