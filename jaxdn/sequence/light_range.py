@@ -36,6 +36,8 @@ DRIFT = 8
 """Octaves by which a frame's median may differ from :data:`LEVEL` before another factor is chosen."""
 _BLOCK = 8
 """Side of the blocks, in pixels, whose means are compared: of few samples most pixels are much darker than the mean."""
+_STRIP = 4 * _BLOCK
+"""Rows whose blocks are summed at once."""
 _GROUP = 3
 """Pixels of a 3x3 window that must be as bright for light beyond the limit to be a lamp's."""
 LAMP = 8 * LEVEL
@@ -60,12 +62,22 @@ def measure_octaves(radiance: np.ndarray) -> float | None:
 
     2 to this power is the factor that brings the frame to the level. Values that are not finite or negative are 0.
     """
-    light = np.where(np.isfinite(radiance) & (radiance > 0), radiance, 0).astype(np.float64) @ np.asarray(LUMINANCE)
-    rows, columns = (np.arange(0, size, _BLOCK) for size in light.shape)
-    sums = np.add.reduceat(np.add.reduceat(light, rows, axis=0), columns, axis=1)
-    means = sums / np.outer(np.diff([*rows, light.shape[0]]), np.diff([*columns, light.shape[1]]))
+    height, width = radiance.shape[:2]
+    rows, columns = (np.arange(0, size, _BLOCK) for size in (height, width))
+    # Strip by strip, whose numbers stay in the cache.
+    strips = (radiance[top : top + _STRIP] for top in range(0, height, _STRIP))
+    sums = np.concatenate([_sum_blocks(strip, columns) for strip in strips])
+    means = sums / np.outer(np.diff([*rows, height]), np.diff([*columns, width]))
     lit = means[means > 0]
     return float(np.log2(LEVEL) - np.median(np.log2(lit))) if lit.size else None
+
+
+def _sum_blocks(radiance: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """The luminance in blocks that begin at every eighth row and at ``columns``, float64."""
+    lit = np.isfinite(radiance) & (radiance > 0)
+    light = np.where(lit, radiance, 0).astype(np.float64) @ np.asarray(LUMINANCE)
+    in_rows = np.add.reduceat(light, np.arange(0, len(light), _BLOCK), axis=0)
+    return np.add.reduceat(in_rows, columns, axis=1)
 
 
 def choose_exponent(radiance: np.ndarray, before: int | None) -> int | None:
@@ -84,18 +96,20 @@ def bound_light(stored: StoredFrame, exponent: int, lamps: np.ndarray) -> Stored
     """
     frame = stored.frame
     most = math.ldexp(RADIANCE_MAX, -exponent)
-    noisy = np.asarray(frame.radiance)
-    if exponent == 0 and not np.any(lamps) and not np.any((noisy < 0) | (noisy > most)):
+    noisy, shines = np.asarray(frame.radiance), bool(np.any(lamps))
+    if exponent == 0 and not shines and not np.any((noisy < 0) | (noisy > most)):
         return stored
 
     def scaled(light: np.ndarray, least: float) -> np.ndarray:
         wide = np.asarray(light, np.result_type(light, np.float32))
-        bounded = np.clip(wide, wide.dtype.type(least), wide.dtype.type(most))
-        return np.ldexp(np.where(np.isfinite(wide), bounded, wide), exponent)
+        bounded, known = np.clip(wide, wide.dtype.type(least), wide.dtype.type(most)), np.isfinite(wide)
+        if not known.all():
+            bounded = np.where(known, bounded, wide)
+        return np.ldexp(bounded, exponent, out=bounded)
 
     given = {name: scaled(light, -most) for name in _LIGHT if (light := getattr(frame, name)) is not None}
     layers = {count: scaled(layer, 0.0) for count, layer in stored.layers.items()}
-    radiance = scaled(_dim(noisy, lamps, exponent), 0.0)
+    radiance = scaled(_dim(noisy, lamps, exponent) if shines else noisy, 0.0)
     return stored._replace(frame=frame._replace(**given, radiance=radiance), layers=layers)
 
 
@@ -109,7 +123,8 @@ def restore_light(image: np.ndarray, radiance: np.ndarray, exponent: int, lamps:
       lamps: as the frame was bounded with.
     """
     image = np.ldexp(np.asarray(image, np.float32), -exponent)
-    noisy = np.where(np.isfinite(radiance), radiance, 0).astype(np.float32)
+    known = np.isfinite(radiance)
+    noisy = np.asarray(radiance if known.all() else np.where(known, radiance, 0), np.float32)
     limit = np.float32(math.ldexp(RADIANCE_MAX, -exponent))
     if np.any(noisy < 0):
         image = image + _denoise_negative(np.minimum(noisy, 0), np.clip(noisy, 0, limit), image)
@@ -126,20 +141,19 @@ def restore_lamps(image: np.ndarray, radiance: np.ndarray, lamps: np.ndarray) ->
 def find_lamps(radiance: np.ndarray, exponent: int) -> np.ndarray:
     """[H, W, 1] bool, where a frame [H, W, 3] shows bright light without noise, and one pixel around it."""
     with np.errstate(invalid="ignore", over="ignore"):
-        light = np.asarray(radiance, np.float32) @ np.asarray(LUMINANCE, np.float32)
+        light = np.pad(np.asarray(radiance, np.float32) @ np.asarray(LUMINANCE, np.float32), 1)
         bright = np.isfinite(light) & (light > math.ldexp(LAMP, -exponent))
-        # Few pixels are: nothing is compared elsewhere.
-        rows, columns = np.nonzero(bright)
-        own, padded = light[rows, columns], np.pad(light, 1)
-        alike = sum(
-            (np.abs(padded[rows + dy, columns + dx] - own) <= _ALIKE * np.abs(own)).astype(np.int8)
-            for dy, dx in _OFFSETS
-        )
-    group = np.flatnonzero(alike > _GROUP)
-    around = np.zeros_like(padded, bool)
-    for dy, dx in _OFFSETS:
-        around[rows[group] + dy, columns[group] + dx] = True
-    return (bright & around[1:-1, 1:-1])[..., None]
+        # Few pixels are: nothing is compared elsewhere. Places count along all rows, one after the other.
+        places, values = np.flatnonzero(bright), light.ravel()
+        steps = [(dy - 1) * light.shape[1] + dx - 1 for dy, dx in _OFFSETS]
+        own = values[places]
+        near = _ALIKE * np.abs(own)
+        alike = sum((np.abs(values[places + step] - own) <= near).astype(np.int8) for step in steps)
+    group = places[alike > _GROUP]
+    around = np.zeros(light.size, bool)
+    for step in steps:
+        around[group + step] = True
+    return (bright & around.reshape(light.shape))[1:-1, 1:-1, None]
 
 
 def _bound_ring(image: np.ndarray, noisy: np.ndarray, lamps: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from jaxdn.sequence.light_range import (
     bound_light,
     choose_exponent,
     find_lamps,
+    measure_octaves,
     restore_light,
 )
 from jaxdn.sequence.run import denoise_files
@@ -195,6 +196,20 @@ def test_the_factor_follows_the_median_and_stays(rng: np.random.Generator) -> No
     assert choose_exponent(dark, None) == exponent
     assert choose_exponent(dark * 2.0 ** (DRIFT - 1), exponent) == exponent
     assert choose_exponent(dark * 2.0 ** (DRIFT + 1), exponent) == exponent - DRIFT - 1
+
+
+@pytest.mark.parametrize("size", [(1, 1), (8, 8), (31, 9), (32, 40), (33, 17), (75, 100)])
+def test_the_median_is_that_of_blocks_of_any_size(size: tuple[int, int], rng: np.random.Generator) -> None:
+    """Blocks at the border are smaller; black ones, and what is no light, tell nothing."""
+    light = rng.gamma(0.3, 1, (*size, 3)).astype(np.float32)
+    light[::5], light[3::7] = np.nan, -1
+    light[:8, :8] *= 0 if size != (1, 1) and size != (8, 8) else 1
+    usable = np.where(np.isfinite(light) & (light > 0), light, 0).astype(np.float64) @ np.asarray(color.LUMINANCE)
+    rows, columns = (range(0, side, 8) for side in size)
+    means = np.array([usable[y : y + 8, x : x + 8].mean() for y in rows for x in columns])
+    lit = means[means > 0]
+    expected = np.log2(LEVEL) - np.median(np.log2(lit)) if lit.size else None
+    assert measure_octaves(light) == (None if expected is None else pytest.approx(expected, abs=1e-12))
 
 
 def test_light_that_drifts_begins_the_history_anew_and_says_so(tmp_path: Path) -> None:
