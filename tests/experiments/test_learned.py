@@ -1,5 +1,6 @@
 """The tables of the papers on learned denoisers: on one family and after two updates, and from results made up."""
 
+import json
 import re
 from dataclasses import dataclass
 from functools import cache
@@ -13,6 +14,7 @@ import pytest
 
 from experiments.papers.learned import __main__ as learned
 from experiments.papers.learned import (
+    curves,
     maps,
     ntasd_budgets,
     ntasd_holdout,
@@ -65,8 +67,7 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
     monkeypatch.setattr(registry, "_METHODS", dict(registry._METHODS))
     method(Options, title="A gain", recipes={"paper": recipe})(weighted)
     cheap = {name: stage._replace(method="weighted") for name, stage in stages.STAGES.items()}
-    for module in (stages, learned):
-        monkeypatch.setattr(module, "STAGES", cheap)
+    monkeypatch.setattr(stages, "STAGES", cheap)
     monkeypatch.setattr(stages, "FAMILIES", ("fruit", "parlour"))
     monkeypatch.setattr(ntasd_holdout, "HELD_OUT", ("parlour",))
     # Shipped weights are a row like any other, and take longer to compile than all others.
@@ -75,9 +76,10 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
     monkeypatch.setattr(scores, "near", cache(scores.near.__wrapped__))
     # Of each clip, as many frames as give a network a history after its two, and what these methods read.
     monkeypatch.setattr(stages, "render", lambda source, *how, **more: render(source._replace(frames=3), *how, **more))
-    monkeypatch.setattr(stages, "LAYERS", (1, 2, 4, 8))
+    for module in (stages, curves):
+        monkeypatch.setattr(module, "LAYERS", (1, 2, 4, 8))
+        monkeypatch.setattr(module, "COMPARED", "svgf")
     monkeypatch.setattr(stages, "TRAINED", "svgf")
-    monkeypatch.setattr(stages, "COMPARED", "svgf")
     seen = ntasd_holdout.SEEN
     rows = (seen, f"{seen}, only parlour", f"{seen}, without parlour")
     tables = {
@@ -86,8 +88,10 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
         "single": scores.Table("Two", ("svgf",), lambda found: scores.ordinary(found, ["svgf"]), no_claims, spp=1),
     }
     monkeypatch.setattr(learned, "TABLES", tables)
+    monkeypatch.setattr(curves, "FAMILY", "fruit")
+    monkeypatch.setattr(zeng_methods, "ROWS", ("ntasd",))
     settings = stages.Settings(
-        clips=1, steps=2, frames=2, size=32, data=tmp_path / "data", out=tmp_path / "runs", workers=1
+        clips=1, steps=2, frames=2, size=32, data=tmp_path / "data", out=tmp_path / "runs", workers=1, curve_frames=4
     )
     learned.main(settings)
     text = (tmp_path / "runs" / "report.md").read_text()
@@ -99,6 +103,10 @@ def test_the_learned_relatives_are_trained_and_compared(tmp_path: Path, monkeypa
     for folder in ("", "1-samples"):
         assert (tmp_path / "runs" / folder / "report.html").is_file()
     assert re.search(r"## Two, 1 samples a pixel\n\n.*\n.*\n\| svgf \| \d", text), text
+    drawn = json.loads((tmp_path / "runs" / "curves.json").read_text())
+    assert [len(drawn["ntasd"][name]) for name in ("ssim", "mse")] == [4, 4]
+    assert min(drawn["ntasd"]["mse"]) > 0
+    assert (tmp_path / "runs" / "curves.png").is_file()
     with_it, without = (
         tmp_path / "runs" / each / "weights.safetensors" for each in ("ntasd-uniform", "ntasd-uniform-without-parlour")
     )
@@ -223,6 +231,35 @@ def test_each_budget_has_its_own_ratio() -> None:
     assert claims["chosen / uniform, relative MSE, 0.25 samples"] == ("not stated", "0.50", True)
     assert claims["chosen / uniform, relative MSE, 4 samples"] == ("0.66 to 0.75", "1.00", False)
     assert "| 0.25 | 0.50 | 0.25 | +0.00 dB | 0.0 |" in ntasd_budgets.text(found)
+
+
+def test_as_published_is_the_preset_with_what_a_stage_is_for() -> None:
+    for name, stage in stages.STAGES.items():
+        row, made = method_named(stage.method), stages.publish(stage)
+        options = row.parse_options(made.options)
+        assert options == row.parse_options({"preset": "paper"} | stage.options), name
+        assert options.exposure == row.presets["paper"].exposure != row.options().exposure, name
+        recipe = row.recipe_named(made.recipe)
+        assert (recipe.decay, recipe.clip_norm, recipe.average) == (False, 0.0, 0.0), name
+    assert method_named("ntd").recipe_named(stages.publish(stages.STAGES["ntd, 1 sample"]).recipe).learning_rate == 1e-4
+
+
+def test_as_published_filters_have_the_presets_of_their_papers() -> None:
+    settings = stages.Settings(as_published=True, out=Path("runs"))
+    assert stages.ready("svgf", settings).options == {"preset": "paper"}
+    assert stages.ready("svgf", stages.Settings()).options == {}
+    assert stages.ready("noisy", settings).denoiser is None
+    assert settings.results == Path("runs/as-published")
+
+
+def test_errors_of_a_long_clip_are_given_frame_by_frame() -> None:
+    values = {"ssim": [0.0, 0.5, 0.7, 0.9, 0.9], "mse": [1.0, 0.25, 0.25, 0.25, 0.25]}
+    text = curves.make_table({"svgf": values})
+    assert "| method | | frame 2 | frame 5 | mean from 2 on |" in text
+    assert "| svgf | SSIM | 0.5000 | 0.9000 | 0.7500 |" in text
+    assert "| svgf | MSE | 0.2500 | 0.2500 | 0.2500 |" in text
+    with pytest.raises(ValueError, match="--curve-frames: expected at least 2, or 0 for none, got 1"):
+        curves.draw_curves(stages.Settings(curve_frames=1))
 
 
 def test_curves_over_frames_are_means_over_clips() -> None:

@@ -20,14 +20,14 @@ from experiments.papers.learned import (
     rae_methods,
     zeng_methods,
 )
+from experiments.papers.learned.curves import draw_curves
 from experiments.papers.learned.maps import asks, save_maps
 from experiments.papers.learned.scores import Table, claims_table, read
-from experiments.papers.learned.stages import BUDGET, STAGES, Settings, render_all, trained
+from experiments.papers.learned.stages import BUDGET, Settings, ready, render_all
 from experiments.papers.preintegration import save_pictures
 from jaxdn.commands.errors import plain_errors
 from jaxdn.evaluation.compare import compare
 from jaxdn.evaluation.report import Results, write_report
-from jaxdn.zoo.ready import find_model
 
 TABLES = {
     file.__name__.rpartition(".")[2]: file.TABLE
@@ -56,11 +56,14 @@ def main(settings: Settings) -> None:
     """Render, train, compare, report. Raises ValueError for an unknown table."""
     tables = tables_named(settings.tables)
     folders = render_all(settings)
-    text = [f"# The papers' tables after {settings.steps} updates"]
+    how = ", as published" if settings.as_published else ""
+    text = [f"# The papers' tables after {settings.steps} updates{how}"]
     text += [f"{len(folders)} test clips. Means without the noise of the references, but for FLIP, L1 and SSIM."]
     for spp in sorted({one.spp for one in tables}, reverse=True):
         text += compared([one for one in tables if one.spp == spp], folders, settings, spp)
-    report = settings.out / "report.md"
+    if settings.curve_frames:
+        text.append(draw_curves(settings))
+    report = settings.results / "report.md"
     report.write_text("\n\n".join(text) + "\n")
     print("\n\n".join(text))
     print(f"\nreport: {report}")
@@ -69,10 +72,10 @@ def main(settings: Settings) -> None:
 def compared(tables: list[Table], folders: list[Path], settings: Settings, spp: int) -> list[str]:
     """The sections of the tables with so many samples a pixel; their report and pictures are written."""
     rows = dict.fromkeys([*REFERENCES, *(row for one in tables for row in one.rows)])
-    methods = [trained(row, settings) if row in STAGES else find_model(row) for row in rows]
+    methods = [ready(row, settings) for row in rows]
     title = f"The papers' tables after {settings.steps} updates, {spp} samples a pixel"
     found = compare(methods, folders, title=title, settings={"clips": len(folders)}, spp=spp, read=read)
-    out = settings.out if spp == BUDGET else settings.out / f"{spp}-samples"
+    out = settings.results if spp == BUDGET else settings.results / f"{spp}-samples"
     write_report(found, out)
     save_pictures(found, out / "pictures")
     text = sections(tables, found)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from experiments.papers import rooms
 from experiments.papers.preintegration import file_name
 from jaxdn.clips import find_clips
-from jaxdn.methods.registry import method_named
+from jaxdn.methods.registry import is_method, method_named
 from jaxdn.render.settings import RenderSettings
 from jaxdn.sequence.render_jobs import ClipSource, render
 from jaxdn.training.train import train
@@ -110,8 +110,18 @@ class Settings:
     """Width and height of the clips in pixels; of rooms that are tested on, twice that and as high."""
     data: Path = Path("data/papers")
     out: Path = Path("runs/papers")
+    as_published: bool = False
+    """Networks, their training and filters by the presets and recipes of their papers. Results are in the folder
+    ``as-published`` of ``--out``."""
+    curve_frames: int = 0
+    """Frames of a clip of its own whose errors are drawn frame by frame (Zeng et al. 2021, fig. 8: 310); 0: none."""
     workers: int | None = None
     """Number of rendering processes; default: the number of cores."""
+
+    @property
+    def results(self) -> Path:
+        """The folder of this run's networks, tables and pictures."""
+        return self.out / "as-published" if self.as_published else self.out
 
 
 def render_all(settings: Settings) -> list[Path]:
@@ -131,17 +141,35 @@ def render_all(settings: Settings) -> list[Path]:
     return find_clips(place)
 
 
+def publish(stage: Stage) -> Stage:
+    """A stage by the preset of its paper, which the stage's own options replace, and, of ``ntd``, by its recipe.
+
+    The recipes of the other stages are those of papers anyway.
+    """
+    recipe = "paper" if stage.method == "ntd" else stage.recipe
+    return stage._replace(options={"preset": "paper", **stage.options}, recipe=recipe)
+
+
+def ready(name: str, settings: Settings) -> Model:
+    """A row of a table: a stage, trained if it is not, or what is ready to use."""
+    if name in STAGES:
+        return trained(name, settings)
+    presets = method_named(name).presets if is_method(name) else {}
+    return find_model(name, preset="paper") if settings.as_published and "paper" in presets else find_model(name)
+
+
 def trained(name: str, settings: Settings) -> Model:
     """A stage, trained if it is not."""
-    stage = STAGES[name]
+    stage = publish(STAGES[name]) if settings.as_published else STAGES[name]
     method = method_named(stage.method)
     recipe = method.recipe_named(stage.recipe)._replace(
         steps=settings.steps,
         frames=settings.frames,
-        average=0.99,
         spp=(1,) if method.has_option("budget") else (stage.spp,),
     )
-    out = settings.out / file_name(name)
+    if not settings.as_published:
+        recipe = recipe._replace(average=0.99)
+    out = settings.results / file_name(name)
     clips = clips_of(stage, find_clips(settings.data / "train"))
     weights = train(method, recipe, clips, out, options=stage.options, label=name)
     return find_model(str(weights))._replace(label=name)
