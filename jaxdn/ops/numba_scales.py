@@ -60,6 +60,8 @@ def join_pixel_rows(top: int, bottom: int, arrays: tuple[Array, ...], out: Array
         row, first, width = out[y], 0, 0
         for index in range(len(arrays)):
             array, layout = arrays[index], layouts[index]
+            if array.shape[0] == 0:  # a part that has nothing
+                continue
             if layout == 0:  # as they are
                 above, width = min(y, array.shape[1] - 1), array.shape[2]
                 for channel in range(array.shape[0]):

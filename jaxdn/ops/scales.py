@@ -7,7 +7,7 @@ arrays side by side once for each of the channels: a compiled loop keeps both ap
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Literal
 
 import jax
@@ -212,7 +212,8 @@ def _join_planes_by_numba(*arrays: jax.Array, layouts: tuple[str, ...]) -> jax.A
 
     reference = functools.partial(_join_planes, layouts=layouts, implementation="reference")
     shape = jax.eval_shape(reference, *arrays).shape
-    return numba_call.call(join_rows, [shape], [arrays], tuple(map(LAYOUTS.index, layouts)), rows=shape[1])[0]
+    parts = _fill_up(arrays, map(LAYOUTS.index, layouts), _FEW)
+    return numba_call.call(join_rows, [shape], parts[:1], parts[1], rows=shape[1])[0]
 
 
 def join_pixels(parts: Sequence[Planes], *, multiple: int = 1, implementation: str | None = None) -> jax.Array:
@@ -234,8 +235,25 @@ def _join_pixels_by_numba(*arrays: jax.Array, layouts: tuple[str, ...], multiple
 
     reference = functools.partial(_join_pixels, layouts=layouts, multiple=multiple, implementation="reference")
     shape = jax.eval_shape(reference, *arrays).shape
-    numbers = tuple(map(PLANE_LAYOUTS.index, layouts))
-    return numba_call.call(join_pixel_rows, [shape], [arrays], numbers, rows=shape[0])[0]
+    parts = _fill_up(arrays, map(PLANE_LAYOUTS.index, layouts), _MANY)
+    return numba_call.call(join_pixel_rows, [shape], parts[:1], parts[1], rows=shape[0])[0]
+
+
+_FEW, _MANY = 4, 20
+"""Parts of which planes and pixels are joined: with more of them, twice as many, and so on."""
+
+
+def _fill_up(
+    arrays: Sequence[jax.Array], layouts: Iterable[int], multiple: int
+) -> tuple[tuple[jax.Array, ...], tuple[int, ...]]:
+    """Arrays and their layouts with parts that have nothing at the end, so that there is a ``multiple`` of them.
+
+    A loop is compiled for each number of parts that it is called with, which takes half a second. A first frame of
+    ``combiner`` joins three, four, five, eight and seventeen.
+    """
+    spare = -len(arrays) % multiple
+    nothing = jnp.zeros((0, 1, 1), arrays[0].dtype)
+    return (*arrays, *[nothing] * spare), (*layouts, *[0] * spare)
 
 
 def to_planes(image: jax.Array) -> jax.Array:

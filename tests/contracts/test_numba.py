@@ -334,6 +334,25 @@ def test_gradients_of_batches_that_share_their_scales(rng, both):
     assert np.abs(wanted[0]).min() > 1e-3
 
 
+@pytest.mark.parametrize(
+    ("join", "name", "numbers"), [(join_planes, "join_rows", 4), (join_pixels, "join_pixel_rows", 20)]
+)
+def test_parts_are_joined_by_one_loop_however_many_there_are(rng, join, name, numbers):
+    """Another loop for each number takes half a second each, on a first run."""
+    from jaxdn.ops import numba_scales
+
+    loop, planes = getattr(numba_scales, name), jnp.asarray(rng.random((2 * numbers, 1, 4, 6)), jnp.float32)
+    jax.block_until_ready(join([("planes", planes[0])]))
+    before = list(loop.signatures)
+    for number in (2, 3, numbers):
+        found = join([("planes", plane) for plane in planes[:number]])
+        wanted = planes[:number, 0] if join is join_planes else planes[:number, 0].transpose(1, 2, 0)
+        np.testing.assert_array_equal(found, wanted)
+    assert list(loop.signatures) == before
+    more = join([("planes", plane) for plane in planes[: numbers + 1]])
+    assert more.size == planes[: numbers + 1].size
+
+
 @pytest.mark.slow
 def test_what_has_no_loop_for_its_gradient_is_left_to_jax(rng, both):
     coarse, there = jnp.asarray(rng.random((2, 4, 6)), jnp.float32), drawn(rng, 4, 6)
