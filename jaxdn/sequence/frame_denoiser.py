@@ -56,11 +56,15 @@ class FrameDenoiser:
         *,
         channels: Callable[[], int],
         limit: float | None = None,
+        blends: bool = False,
         log: Callable[[str], None],
     ) -> None:
-        """``source`` is named in errors, ``channels`` counts those of its files, ``log`` is called with lines."""
+        """``source`` is named in errors, ``channels`` counts those of its files, ``log`` is called with lines.
+
+        ``blends``: :meth:`blend_fallback` will be called, whose programs are made while the first frame is computed.
+        """
         self._method, self._source, self._count_channels = method, source, channels
-        self._limit, self._log = limit, log
+        self._limit, self._blends, self._log = limit, blends, log
         self._step: Stream | TiledStream | None = None
         self._room: bool | None = None
         self._lost_pixels = 0
@@ -76,13 +80,18 @@ class FrameDenoiser:
             return np.asarray(light_of(noisy))
         exponent = self._follow_light(noisy)
         self._lamps = find_lamps(noisy, exponent)
-        image = self._denoise(bound_light(stored, exponent, self._lamps))
+        image = self._denoise(bound_light(stored, exponent, self._lamps), stored.frame)
         return restore_light(image, noisy, exponent, self._lamps)
 
-    def _denoise(self, stored: StoredFrame) -> np.ndarray:
+    def _denoise(self, stored: StoredFrame, came: Frame) -> np.ndarray:
+        """The image of a bounded frame; ``came``: as it was."""
         step = self._prepare(stored.frame)
         if isinstance(step, Stream):
-            return np.asarray(step(stored.frame, self._layers(stored)))
+            image = step(stored.frame, self._layers(stored))
+            if self._blends:
+                self._blends = False
+                compile_blend(came)
+            return np.asarray(image)
         image = step(stored.frame)
         if step.beyond_halo > self._lost_pixels:
             self._lost_pixels = step.beyond_halo
@@ -196,6 +205,23 @@ class FrameDenoiser:
             return stream(denoiser, params)
         self._log(f"in tiles of at most {side} x {side} pixels: {whole} (--max-memory)")
         return step
+
+
+def compile_blend(frame: Frame) -> None:
+    """Make the programs of :meth:`FrameDenoiser.blend_fallback` for such a frame, so that its call finds them.
+
+    Tracing takes a tenth of a second, while the threads of a program that has been started leave a core idle.
+    """
+    height, width = frame.radiance.shape[:2]
+
+    def like(dtype: Any, channels: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((height, width, channels), dtype)
+
+    surface = None if frame.depth is None else like(np.bool_, 1)
+    images = like(frame.radiance.dtype, 3), like(np.float32, 3)
+    combined = _combine.lower(*images, surface=surface)
+    combined.compile()
+    _measure_confidence.lower(combined.out_info).compile()
 
 
 def light_of(radiance: Array) -> Any:
