@@ -28,6 +28,7 @@ from jaxdn.runtime.garbage import put_off_collection
 from jaxdn.runtime.interrupt import exit_on_interrupt
 from jaxdn.runtime.program_cache import keep_programs
 from jaxdn.runtime.terminal import print_any_letter
+from jaxdn.runtime.turns import short_turns
 
 _COMPUTING = (Train, Compare, Doctor)
 """Commands whose programs are worth keeping between runs, besides denoising."""
@@ -164,7 +165,7 @@ def _denoise(options: Denoise) -> None:
         from jaxdn.data.exr.threads import exr_on_all_cores
         from jaxdn.ops.dispatch.loop_compilers import loops_compiled_apart
 
-        with loops_compiled_apart(), exr_on_all_cores():
+        with loops_compiled_apart(), exr_on_all_cores(), short_turns():
             run_denoise(options, on_start=begin_collection)
 
 
