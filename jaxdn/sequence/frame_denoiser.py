@@ -87,11 +87,11 @@ class FrameDenoiser:
         """The image of a bounded frame; ``came``: as it was."""
         step = self._prepare(stored.frame)
         if isinstance(step, Stream):
-            image = step(stored.frame, self._layers(stored))
+            computed = step(stored.frame, self._layers(stored))
             if self._blends:
                 self._blends = False
                 compile_blend(came)
-            return np.asarray(image)
+            return np.asarray(computed)
         image = step(stored.frame)
         if step.beyond_halo > self._lost_pixels:
             self._lost_pixels = step.beyond_halo
