@@ -179,7 +179,8 @@ class _Run:
                 limit=None if limit is None else limit / len(views),
             )
             logs = {view: log_in_order if view == "" else _with_view(view, log_in_order) for view in views}
-            blends = [self._settings.safe, False][: 1 + self._settings.bidirectional]  # what is backward is blended in
+            # Not what is backward; and where memory is little, nothing is compiled beside a step.
+            blends = [self._settings.safe and limit is None, False][: 1 + self._settings.bidirectional]
             denoisers = {view: [make(log=logs[view], blends=each) for each in blends] for view in views}
             stack.callback(self._count, denoisers)
             result = SharedResult(views) if len(views) > 1 else None

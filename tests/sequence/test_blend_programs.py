@@ -58,11 +58,13 @@ def test_nothing_is_made_for_frames_that_are_not_blended(rng: np.random.Generato
     assert "combine" not in traced
 
 
+@pytest.mark.parametrize("memory", [None, 1e12])
 @pytest.mark.parametrize("safe", [True, False])
 @pytest.mark.parametrize("bidirectional", [True, False])
 def test_forward_frames_of_a_safe_run_are_blended(
-    safe: bool, bidirectional: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    safe: bool, bidirectional: bool, memory: float | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Where memory is limited, nothing is compiled beside a step."""
     asked = []
 
     class Recorded(FrameDenoiser):
@@ -73,7 +75,6 @@ def test_forward_frames_of_a_safe_run_are_blended(
     monkeypatch.setattr(run, "FrameDenoiser", Recorded)
     naming = ChannelNaming(PROGRAMS["Arnold"].motion_convention)
     source = write_shot("Arnold", tmp_path / "in", 2)
-    denoise_files(
-        [source], tmp_path / "out", box_blur(), Settings(naming=naming, safe=safe, bidirectional=bidirectional)
-    )
-    assert asked == ([safe, False] if bidirectional else [safe])
+    settings = Settings(naming=naming, safe=safe, bidirectional=bidirectional, max_memory=memory)
+    denoise_files([source], tmp_path / "out", box_blur(), settings)
+    assert asked == [safe and memory is None, False][: 1 + bidirectional]
