@@ -32,6 +32,15 @@ def test_affected_is_what_was_hidden_or_shows_other_light_than_its_surface_did()
     assert not measure.affected_pixels(reference, Frame(reference, motion=motion, visible=visible), moving=1)[2].any()
 
 
+def test_noise_of_a_dark_reference_is_no_change_of_light(rng):
+    """Means over 3x3 pixels that scatter by an eighth, as in the dark half of `dark to light`; a third darkens."""
+    reference = 0.01 * (1.0 + 0.37 * rng.normal(size=(2, 56, 96, 1))) * np.ones(3)
+    reference[1, 10:30, 20:50] *= 0.33
+    found = measure.affected_pixels(reference, Frame(reference), moving=1)[1]
+    assert found[12:28, 22:48].mean() > 0.98
+    assert found[:, 55:].mean() < 0.03
+
+
 def test_the_share_of_an_old_image_is_found_in_noise(rng):
     old, new = rng.random((2, 40, 50, 3))
     where = rng.random((40, 50)) < 0.5

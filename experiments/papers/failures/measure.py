@@ -31,7 +31,8 @@ def affected_pixels(reference: np.ndarray, frames: Frame, *, moving: int) -> np.
     """[T, H, W] bool: what the surface showed a frame ago is wrong today; false in frame 0 and after ``moving``.
 
     A pixel is affected that was hidden (``visible``), or whose reference differs from the last one at the place
-    ``motion`` tells by more than :data:`CHANGED` of the larger, both as means over 3x3 pixels against their noise.
+    ``motion`` tells by more than :data:`CHANGED` of the larger. Against noise both are means over 3x3 pixels, and most
+    of the 3x3 pixels around it must differ.
 
     Args:
       reference: [T, H, W, 3].
@@ -45,7 +46,8 @@ def affected_pixels(reference: np.ndarray, frames: Frame, *, moving: int) -> np.
         if frames.motion is not None:
             before = warp(before, jnp.nan_to_num(jnp.asarray(frames.motion[index])))
         then, now = np.asarray(before)[..., 0], light[index]
-        found[index] = np.abs(now - then) > CHANGED * np.maximum(np.maximum(now, then), 1e-6)
+        differs = np.abs(now - then) > CHANGED * np.maximum(np.maximum(now, then), 1e-6)
+        found[index] = _blurred(differs[None].astype(float))[0] > 0.5
         if frames.visible is not None:
             found[index] |= ~np.asarray(frames.visible[index], bool)[..., 0]
     return found
