@@ -24,6 +24,7 @@ from experiments.papers.learned import (
     stages,
     zeng_methods,
 )
+from jaxdn import denoisers
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, Denoiser, recurrent
 from jaxdn.evaluation.report import ClipResult, Results, Scores
@@ -31,6 +32,7 @@ from jaxdn.methods import registry
 from jaxdn.methods.registry import method, method_named
 from jaxdn.methods.sampler import Sampling, allocate_samples
 from jaxdn.sequence.render_jobs import render
+from jaxdn.zoo.ready import find_model
 
 
 @dataclass(frozen=True)
@@ -250,6 +252,18 @@ def test_as_published_filters_have_the_presets_of_their_papers() -> None:
     assert stages.ready("svgf", stages.Settings()).options == {}
     assert stages.ready("noisy", settings).denoiser is None
     assert settings.results == Path("runs/as-published")
+
+
+def test_antialiasing_follows_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = find_model("svgf")
+    monkeypatch.setattr(stages, "trained", lambda name, settings: before._replace(label=name))
+    row = f"rae{stages.AFTERWARDS}"
+    plain, published = (stages.ready(row, stages.Settings(as_published=wanted)) for wanted in (False, True))
+    assert plain.label == published.label == row
+    assert plain.denoiser is not None
+    assert plain.denoiser is not before.denoiser
+    assert plain.denoiser.reads == denoisers.taa(after=denoisers.svgf()).reads
+    assert stages.objective_of(row) == stages.objective_of("rae")
 
 
 def test_errors_of_a_long_clip_are_given_frame_by_frame() -> None:

@@ -5,6 +5,7 @@ are trained by one loss.
 """
 
 from experiments.papers.learned.scores import Claim, Table, error_ratio, ordinary, over_frames, psnr_gain
+from experiments.papers.learned.stages import AFTERWARDS
 from jaxdn.evaluation.report import Results
 from jaxdn.evaluation.report.results import mean_scores
 
@@ -18,6 +19,8 @@ ROWS = (
     "dasr",
     "dasr, uniform",
     "rae",
+    f"rae{AFTERWARDS}",
+    f"ntasd{AFTERWARDS}",
 )
 
 
@@ -33,11 +36,13 @@ def claims(found: Results) -> list[Claim]:
     direct = error_ratio(found, "single frames, direct", "single frames, three scales")
     means = mean_scores(found)
     steadier = means["ntasd"].unbiased_temporal_psnr - means["dasr"].unbiased_temporal_psnr
+    smoothed = means[f"rae{AFTERWARDS}"].unbiased_temporal_psnr - means["rae"].unbiased_temporal_psnr
     return [
         Claim("adaptive / uniform sampling, relative MSE", "0.66 to 0.75", f"{adaptive:.2f}", adaptive <= 0.75),
         Claim("DASR / NTASD, relative MSE", "1.4 to 1.8", f"{dasr:.2f}", dasr > 1),
         Claim("direct prediction / kernels, single frames, relative MSE", "1.7 to 2.1", f"{direct:.2f}", direct > 1),
         Claim("NTASD is steadier than DASR, temporal PSNR", "above 0", f"{steadier:+.2f} dB", steadier > 0),
+        Claim("TAA makes RAE steadier, temporal PSNR", "above 0", f"{smoothed:+.2f} dB", smoothed > 0),
         Claim(
             "NTASD is better than RAE, PSNR",
             "above 0",

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from experiments.papers import rooms
 from experiments.papers.preintegration import file_name
 from jaxdn.clips import find_clips
+from jaxdn.denoisers import taa
 from jaxdn.methods.registry import is_method, method_named
 from jaxdn.render.settings import RenderSettings
 from jaxdn.sequence.render_jobs import ClipSource, render
@@ -150,8 +151,16 @@ def publish(stage: Stage) -> Stage:
     return stage._replace(options={"preset": "paper", **stage.options}, recipe=recipe)
 
 
+AFTERWARDS = ", then taa"
+"""At the end of a row's name: temporal antialiasing follows, as in the comparison of Hasselgren et al. 2020."""
+
+
 def ready(name: str, settings: Settings) -> Model:
     """A row of a table: a stage, trained if it is not, or what is ready to use."""
+    if name.endswith(AFTERWARDS):
+        before = ready(name.removesuffix(AFTERWARDS), settings)
+        options = {"preset": "paper"} if settings.as_published else {}
+        return before._replace(label=name, denoiser=taa(after=before.denoiser, **options))
     if name in STAGES:
         return trained(name, settings)
     presets = method_named(name).presets if is_method(name) else {}
@@ -183,6 +192,7 @@ def clips_of(stage: Stage, folders: Sequence[Path]) -> list[Path]:
 
 def objective_of(name: str) -> str:
     """The name of what a stage is trained by; empty for a method that is not trained here."""
+    name = name.removesuffix(AFTERWARDS)
     if name not in STAGES:
         return ""
     return method_named(STAGES[name].method).recipe_named(STAGES[name].recipe).objective.name
