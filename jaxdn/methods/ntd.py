@@ -106,6 +106,14 @@ AS_PUBLISHED: dict[str, Any] = {
     "demodulate": "none",
 }
 """The settings that this paper and that of ``ntasd`` share."""
+_TRAINING: dict[str, Any] = {
+    "learning_rate": 1e-4,
+    "decay": False,
+    "clip_norm": 0.0,
+    "variation": NO_AUGMENTATION,
+    "average": 0.0,
+}
+"""Entries of the recipe of this paper."""
 PAPER = Options(down="max", **AS_PUBLISHED)
 """The settings of the paper: D is max-pooling (eq. 4), taps outside the image are 0, the first history is noisy."""
 
@@ -190,14 +198,8 @@ def warp_history(
         "paper-loss-without-occlusion": Recipe(
             indirect_illumination(occlusion=False), variation=NO_AUGMENTATION, average=0.0
         ),
-        "paper": Recipe(
-            indirect_illumination(),
-            learning_rate=1e-4,
-            decay=False,
-            clip_norm=0.0,
-            variation=NO_AUGMENTATION,
-            average=0.0,
-        ),
+        "paper": Recipe(indirect_illumination(), **_TRAINING),
+        "paper-without-occlusion": Recipe(indirect_illumination(occlusion=False), **_TRAINING),
     },
     variants={"ntd-large": {"size": "large"}, "ntd-small": {"size": "small"}},
     backends=("onednn-bfloat16", "onednn-float32", "onnxruntime", "onednn"),

@@ -297,7 +297,7 @@ def test_compare_ends_with_a_report(clip, tmp_path):
         (("train", "CLIP", "-o", "out", "--variant", "ntd-huge"), "expected a variant out of ntd-large, ntd-small"),
         (
             ("train", "CLIP", "-o", "out", "--recipe", "wild"),
-            "paper-loss-without-occlusion, paper, got 'wild'",
+            "paper-loss-without-occlusion, paper, paper-without-occlusion, got 'wild'",
         ),
         (("train", "CLIP", "-o", "out", "--set", "motoin=dual"), "expected options out of size, motion,"),
         (("train", "CLIP", "-o", "out", "--set", "motion=wild"), "motion: expected one of 'dual', 'traditional'"),

@@ -22,6 +22,7 @@ from experiments.papers.learned import (
     ntasd_sizes,
     scores,
     stages,
+    zeng_ablation,
     zeng_methods,
 )
 from jaxdn import denoisers
@@ -243,7 +244,23 @@ def test_as_published_is_the_preset_with_what_a_stage_is_for() -> None:
         assert options.exposure == row.presets["paper"].exposure != row.options().exposure, name
         recipe = row.recipe_named(made.recipe)
         assert (recipe.decay, recipe.clip_norm, recipe.average) == (False, 0.0, 0.0), name
-    assert method_named("ntd").recipe_named(stages.publish(stages.STAGES["ntd, 1 sample"]).recipe).learning_rate == 1e-4
+    ntd = method_named("ntd")
+    recipes = [ntd.recipe_named(stages.publish(stages.STAGES[row]).recipe) for row in zeng_ablation.ROWS]
+    assert [recipe.learning_rate for recipe in recipes] == [1e-4, 1e-4, 1e-4]
+    assert recipes[0].record() == recipes[1].record() != recipes[2].record()
+
+
+def test_the_ablation_adds_dual_vectors_and_then_the_loss() -> None:
+    a, b, c = (stages.STAGES[row] for row in zeng_ablation.ROWS)
+    assert a.options == b.options | {"motion": "traditional"}
+    assert b.options == c.options
+    assert (a.recipe, c.recipe) == (b.recipe, "paper-loss")
+    psnr = dict(zip(zeng_ablation.ROWS, (20.0, 21.0, 20.5), strict=True))
+    found = results_of(**{row: {"disoccluded_psnr": value} for row, value in psnr.items()})
+    assert [(claim.ours, claim.holds) for claim in zeng_ablation.claims(found)] == [
+        ("+1.00 dB", True),
+        ("-0.50 dB", False),
+    ]
 
 
 def test_as_published_filters_have_the_presets_of_their_papers() -> None:

@@ -18,6 +18,7 @@ from experiments.papers.learned import (
     ntasd_methods,
     ntasd_sizes,
     rae_methods,
+    zeng_ablation,
     zeng_methods,
 )
 from experiments.papers.learned.curves import draw_curves
@@ -31,7 +32,7 @@ from jaxdn.evaluation.report import Results, write_report
 
 TABLES = {
     file.__name__.rpartition(".")[2]: file.TABLE
-    for file in (ntasd_methods, ntasd_budgets, ntasd_holdout, ntasd_sizes, rae_methods, zeng_methods)
+    for file in (ntasd_methods, ntasd_budgets, ntasd_holdout, ntasd_sizes, rae_methods, zeng_methods, zeng_ablation)
 }
 REFERENCES = ("noisy", "svgf", "steady-balanced")
 """In every run, whatever the tables."""

@@ -71,6 +71,7 @@ def _budget_stages() -> Iterator[tuple[str, Stage]]:
 
 _SINGLE_FRAMES = {**_EVEN, "history": "none"}
 _UNIFORM = Stage("ntasd", _EVEN, recipe="paper")
+_WITHOUT = "paper-loss-without-occlusion"
 STAGES = {
     "ntasd": Stage("ntasd", {"size": "small"}, recipe="paper"),
     "ntasd, large": Stage("ntasd", {"size": "large"}, recipe="paper"),
@@ -80,6 +81,10 @@ STAGES = {
     "single frames, direct": Stage("ntasd", {**_SINGLE_FRAMES, "prediction": "direct"}, recipe="paper"),
     "ntasd, uniform, 1 sample": Stage("ntasd", {**_EVEN, "budget": 1.0}, recipe="paper"),
     "ntd, 1 sample": Stage("ntd", {"size": "small"}, recipe="paper-loss", spp=1),
+    "ntd, without occlusion": Stage("ntd", {"size": "small"}, recipe=_WITHOUT, spp=1),
+    "ntd, traditional, without occlusion": Stage(
+        "ntd", {"size": "small", "motion": "traditional"}, recipe=_WITHOUT, spp=1
+    ),
     "dasr": Stage("dasr", {"size": "small"}, recipe="hasselgren"),
     "dasr, uniform": Stage("dasr", _EVEN, recipe="hasselgren"),
     "rae": Stage("rae", {"size": "small"}, recipe="hasselgren"),
@@ -147,7 +152,7 @@ def publish(stage: Stage) -> Stage:
 
     The recipes of the other stages are those of papers anyway.
     """
-    recipe = "paper" if stage.method == "ntd" else stage.recipe
+    recipe = (stage.recipe or "").replace("paper-loss", "paper") or None
     return stage._replace(options={"preset": "paper", **stage.options}, recipe=recipe)
 
 
