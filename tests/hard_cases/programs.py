@@ -67,7 +67,7 @@ class Widening:
 
 def types_of(inputs: Inputs) -> tuple[Any, ...]:
     """Shape and type of every array."""
-    return tuple((np.shape(leaf), np.asarray(leaf).dtype) for leaf in jax.tree.leaves(inputs))
+    return tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(inputs))
 
 
 def _read(program: Any, count: int) -> list[int]:

@@ -1,7 +1,7 @@
 """All combinations of cases, functions, precisions and directions with their results: one row per cell."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -69,7 +69,7 @@ def rows(
     filled with the last image [H, W, 3] that each case and pictured function gives in single precision.
     """
     assert compared or all(function.sanitizes for function in functions)
-    made = {case.name: case.make(good()) for case in cases}
+    cases = list(cases)
     for function in functions:
         params = function.begin()
         wide = _widened(params)
@@ -77,24 +77,24 @@ def rows(
         for direction in directions:
             forward = direction == "forward"
             if not (forward or function.differentiable):
-                yield from _without_gradient(function, made, precisions)
+                yield from _without_gradient(function, cases, precisions)
                 continue
             called = function.run if forward else gradient_of(function.run)
             run = Program(called, partial(_options_of_size, compiler_options, forward=forward))
             # The comparison runs once for each case.
             double = Program(called, lambda _: PLAIN)
             for precision in precisions:
-                for name, inputs in made.items():
-                    given = cast(inputs, precision)
-                    if widening(params, given):
-                        found = run(params, widen(given))
-                        found = found if forward else narrow_gradient(found, given)
+                for case in cases:
+                    given = _given(case, precision)
+                    if widening(params, given.inputs):
+                        found = run(params, given.single)
+                        found = found if forward else narrow_gradient(found, given.inputs)
                     else:
-                        found = run(params, given)
-                    truth = _exact(double, wide, given) if compared else None
-                    yield _judge(name, function, precision, direction, found, truth, given)
+                        found = run(params, given.inputs)
+                    truth = _exact(double, wide, given.double) if compared else None
+                    yield _judge(case.name, function, precision, direction, found, truth, given)
                     if pictures is not None and function.pictured and forward and precision == "float32":
-                        pictures[name, function.name] = np.asarray(found).reshape(-1, *found.shape[-3:])[-1]
+                        pictures[case.name, function.name] = np.asarray(found).reshape(-1, *found.shape[-3:])[-1]
 
 
 def _options_of_size(usual: Options, inputs: Inputs, *, forward: bool) -> Options:
@@ -102,17 +102,38 @@ def _options_of_size(usual: Options, inputs: Inputs, *, forward: bool) -> Option
     return usual if forward or inputs.clip.frames.radiance.shape[1:3] == (HEIGHT, WIDTH) else PLAIN
 
 
-def _exact(double: Program, wide: Any, given: Inputs) -> Any:
+class _Given(NamedTuple):
+    """The inputs of a case in one precision, and what every function has to know of them."""
+
+    inputs: Inputs
+    single: Inputs
+    """The same numbers with no bfloat16 among them."""
+    double: Inputs
+    infinite: bool
+    brightest: float
+    """The largest magnitude of their radiance."""
+
+
+@cache
+def _given(case: Case, precision: str) -> _Given:
+    """Made once: no function can change what the next one is given."""
+    inputs = cast(case.make(good()), precision)
+    for leaf in jax.tree.leaves(inputs):
+        leaf.setflags(write=False)
+    brightest = float(np.max(np.abs(_leaves(inputs.clip.frames.radiance)), initial=0.0))
+    return _Given(inputs, widen(inputs), _widened(inputs), _infinite(inputs), brightest)
+
+
+def _exact(double: Program, wide: Any, inputs: Inputs) -> Any:
     with jax.enable_x64(True):
-        return double(wide, _widened(given))
+        return double(wide, inputs)
 
 
-def _without_gradient(function: Function, cases: Iterable[str], precisions: Sequence[str]) -> Iterator[Row]:
+def _without_gradient(function: Function, cases: Iterable[Case], precisions: Sequence[str]) -> Iterator[Row]:
     for precision in precisions:
         for case in cases:
-            yield Row(
-                *(case, function.name, function.kind, precision, "gradient", True, 0.0, None, "none", "no gradient")
-            )
+            about = (case.name, function.name, function.kind, precision, "gradient")
+            yield Row(*about, True, 0.0, None, "none", "no gradient")
 
 
 def cast(inputs: Inputs, precision: str) -> Inputs:
@@ -147,7 +168,7 @@ def _leaves(tree: Any) -> np.ndarray:
 
 
 def _judge(
-    case: str, function: Function, precision: str, direction: str, result: Any, exact: Any, inputs: Inputs
+    case: str, function: Function, precision: str, direction: str, result: Any, exact: Any, given: _Given
 ) -> Row:
     found = _leaves(result)
     truth = found if exact is None else _leaves(exact)
@@ -158,10 +179,10 @@ def _judge(
     lowest = float(np.min(found[finite], initial=0.0))
     error = None
     # A pure function of infinity saturates at the largest number of its own precision: nothing to compare there.
-    if exact is not None and (function.sanitizes or not _infinite(inputs)):
+    if exact is not None and (function.sanitizes or not given.infinite):
         # Below the smallest normal number XLA:CPU rounds to 0, as most hardware does.
         scale = max(float(np.max(np.abs(truth[both]), initial=0.0)), 1e3 * _LEAST)
-        size = min(1.0, float(np.max(np.abs(_leaves(inputs.clip.frames.radiance)), initial=0.0)))
+        size = min(1.0, given.brightest)
         if scale < 1e-9 * size:  # 0 because its terms cancel: equal up to the rounding of the terms
             scale = 1e-4 * size
         error = float(np.max(np.abs(found[both] - truth[both]), initial=0.0)) / scale
