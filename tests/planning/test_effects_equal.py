@@ -2,7 +2,6 @@
 
 import contextlib
 import io
-import os
 import re
 
 import jax
@@ -14,12 +13,12 @@ from experiments.speed.small_rooms import ANIMATIONS, BEHIND, CASES, MATERIALS, 
 from jaxdn import effects
 from jaxdn.clips import read_clip, read_exr, read_frame
 from jaxdn.core.frame import Frame, only, present, written_out
-from jaxdn.data.clip.folder import frame_path, is_clip, read_record
+from jaxdn.data.clip.folder import frame_path, read_record
 from jaxdn.methods.registry import methods
 from jaxdn.render.clip import render_clip
 from jaxdn.render.scenes.scene_file import SceneFile
 from jaxdn.render.settings import RenderSettings
-from tests.needs import require_module
+from tests.sharing import make_once
 
 WIDTH, HEIGHT, FRAMES = 24, 16, 4
 LAYERS = [1, 2, 4]
@@ -51,17 +50,10 @@ def rendered(case, folder):
 @pytest.fixture(scope="session")
 def clips(tmp_path_factory):
     """The two clips of a room by its name, rendered once for all tests, and for all processes of pytest-xdist."""
-    fcntl = require_module("fcntl")
-    base = tmp_path_factory.getbasetemp()
-    place = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "rooms"
-    place.mkdir(exist_ok=True)
 
     def both(name):
-        folder = place / re.sub(r"\W+", "-", name)
-        with open(folder.with_suffix(".lock"), "w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            found = folder / "all", folder / "auto"
-            return found if all(map(is_clip, found)) else rendered(ROOMS[name], folder)
+        folder = make_once(tmp_path_factory, re.sub(r"\W+", "-", name), lambda place: rendered(ROOMS[name], place))
+        return folder / "all", folder / "auto"
 
     return both
 

@@ -21,6 +21,7 @@ from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.segment import explain_fallback
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import find_model
+from tests.sharing import make_once
 
 SIZE = (48, 64)
 
@@ -109,8 +110,11 @@ def test_guides_that_do_not_belong_to_the_frame_are_told(tmp_path: Path) -> None
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_once(tmp_path_factory, "rendered-safe", render_files) / "files"
+
+
+def render_files(folder: Path) -> None:
     """A clip with wallpaper, pictures and thin edges at 64 samples, all light, as files of another renderer."""
-    folder = tmp_path_factory.mktemp("rendered")
     scene = {"family": "pinkroom", "seed": 5}
     job = ClipJob(
         scene, str(folder / "clip"), 2, RenderSettings(width=128, height=128, layers=(64,), reference_spp=512)
@@ -135,7 +139,6 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
         }
         (folder / "files").mkdir(exist_ok=True)
         clips.write_exr(folder / "files" / f"a.{index:04d}.exr", channels)
-    return folder / "files"
 
 
 @pytest.mark.slow
