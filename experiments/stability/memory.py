@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import tyro
 
-from jaxdn.clips import write_exr
 from jaxdn.commands.errors import plain_errors
 from jaxdn.runtime.atomic_files import write_json
 
@@ -45,7 +45,8 @@ def write_sequence(folder: Path, frames: int, height: int, width: int) -> None:
     }
     folder.mkdir()
     first = folder / "frame_0001.exr"
-    write_exr(first, channels)
+    # As they are: to compress noise, once to write it here and once in each result, takes most of a run's time.
+    OpenEXR.File({"compression": OpenEXR.NO_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(str(first))
     for index in range(2, frames + 1):
         shutil.copyfile(first, folder / f"frame_{index:04d}.exr")
 
