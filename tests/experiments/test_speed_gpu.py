@@ -1,14 +1,16 @@
 """The script that measures a device: everything in it, tiny, on a CPU; and that it goes on where it ended."""
 
+import contextlib
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from experiments.speed import gpu
-from experiments.speed.workers import WorkerError
+from experiments.speed.workers import Process, WorkerError, apart
 from experiments.speed.works import files, on_device
 from tests.needs import require
 
@@ -21,9 +23,16 @@ def settings(out: Path, **changed: Any) -> gpu.Settings:
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="what a child process took is only known on Unix")
 @pytest.mark.usefixtures("plain_processes")
-def test_every_item_is_measured_on_a_cpu(tmp_path: Path) -> None:
+def test_every_item_is_measured_on_a_cpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images by two processes, as users' runs, and files by commands; what else has a process has the same one here."""
     require("pyoidn")
-    assert gpu.main(settings(tmp_path / "gpu.json")) == 0
+    with contextlib.closing(Process()) as shared:
+
+        def ask(function: Callable[..., Any], *arguments: Any) -> Any:
+            return (apart if function is on_device.denoise_clip else shared.ask)(function, *arguments)
+
+        monkeypatch.setattr(gpu, "apart", ask)
+        assert gpu.main(settings(tmp_path / "gpu.json")) == 0
     items = json.loads((tmp_path / "gpu.json").read_text())["items"]
     keys = ["device", "images taa", "frame 48x32 Open Image Denoise", "frame 48x32 taa", "kernels 48x32", "files 48x32"]
     assert list(items) == keys
