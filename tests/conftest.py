@@ -54,10 +54,21 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def small_tiles() -> None:
+def small_tiles() -> int:
     """Images of tests are small: compiled loops fill them in several tiles nevertheless, so that borders are tested."""
     from jaxdn.ops.dispatch import numba_call
 
+    usual, numba_call.TILE = numba_call.TILE, 1
+    return usual
+
+
+@pytest.fixture(scope="module")
+def usual_tiles(small_tiles: int) -> Iterator[None]:
+    """This module's images are one tile, as users' are of such a size: thousands of them take half of the time."""
+    from jaxdn.ops.dispatch import numba_call
+
+    numba_call.TILE = small_tiles
+    yield
     numba_call.TILE = 1
 
 

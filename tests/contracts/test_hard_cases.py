@@ -31,6 +31,8 @@ from tests.hard_cases.page import write_page
 from tests.hard_cases.programs import Widening
 from tests.hard_cases.table import PRECISIONS, cast, rows
 
+pytestmark = pytest.mark.usefixtures("usual_tiles")  # as `make hard-cases` runs; of tiles the operations' tests are
+
 
 def shapes(case):
     return [np.shape(leaf) for leaf in jax.tree.leaves(case.make(good()))]
