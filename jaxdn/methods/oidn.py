@@ -89,11 +89,11 @@ def _denoise(settings: binding.OidnSettings, scale: jax.Array, *images: jax.Arra
         )
     binding.library()  # where it is missing, the error comes now and not out of the running program
 
-    def call(scale: Any, *images: Any) -> np.ndarray:
-        return binding.denoise(*map(np.asarray, images), settings=settings, scale=float(np.asarray(scale)))
+    def call(scale: Any, *images: Any, **place: Any) -> np.ndarray:
+        return binding.denoise(*map(np.asarray, images), settings=settings, scale=float(np.asarray(scale)), **place)
 
     def fill(results: list[np.ndarray], *given: np.ndarray) -> None:
-        np.copyto(results[0], call(*given))
+        call(*given, out=results[0])
 
     like = jax.ShapeDtypeStruct(images[0].shape, jnp.float32)
     if platform() == "cpu":  # the program's own memory; arrays of jax may wait for a thread that waits for this call

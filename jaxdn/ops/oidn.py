@@ -1,6 +1,6 @@
 """Binding of Open Image Denoise, a library of networks that denoise single images, by the package ``pyoidn``.
 
-Each call copies its images into buffers of the library's device, which may be a GPU, and copies the result back.
+On a CPU the library reads and writes the arrays of each call; on a GPU they are copied to buffers of its own and back.
 Building a network takes longer than running it, so the last few are kept.
 
 Attila T. Áfra, "Intel Open Image Denoise", 2019-2025, https://www.openimagedenoise.org.
@@ -11,6 +11,7 @@ import importlib.util
 import os
 import threading
 import weakref
+from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -71,6 +72,7 @@ def denoise(
     *,
     settings: OidnSettings = OidnSettings(),  # noqa: B008, immutable
     scale: float = float("nan"),
+    out: np.ndarray | None = None,
 ) -> np.ndarray:
     """The denoised image [H, W, 3] float32 of one frame.
 
@@ -81,6 +83,7 @@ def denoise(
       settings: see :class:`OidnSettings`.
       scale: the factor that makes radiance as bright as a photograph; NaN: the library measures it
         (as :func:`jaxdn.color.exposure`).
+      out: [H, W, 3] float32, contiguous: the array to fill and to return; None: a new one.
 
     Raises ModuleNotFoundError without the package, ValueError for images of different sizes, and RuntimeError with the
     library's own message where it fails.
@@ -94,11 +97,11 @@ def denoise(
     kernel_of = functools.partial(_kernel, height, width, settings)
     if settings.auxiliary == "prefiltered":
         guides = {name: kernel_of((name,))({name: image}) for name, image in guides.items()}
-    return kernel_of(("color", *guides))({"color": color, **guides}, scale)
+    return kernel_of(("color", *guides))({"color": color, **guides}, scale, out)
 
 
 class _Kernel:
-    """One network of the library for images of one size, with its buffers. Its calls take turns."""
+    """One network of the library for images of one size, on a GPU with its buffers. Its calls take turns."""
 
     def __init__(self, height: int, width: int, settings: OidnSettings, inputs: tuple[str, ...]) -> None:
         oidn = library()
@@ -110,10 +113,11 @@ class _Kernel:
             self._device.set_int("numThreads", os.cpu_count() or 1)
         self._device.commit()
         self._check()
-        self._buffers = {name: oidn.Buffer(self._device, height * width * 12) for name in (*inputs, "output")}
+        names = () if settings.device == "cpu" else (*inputs, "output")
+        self._buffers = {name: oidn.Buffer(self._device, height * width * 12) for name in names}
         self._filter = oidn.Filter(self._device, oidn.OIDN_FILTER_TYPE_RT)
-        for name, buffer in self._buffers.items():
-            self._filter.set_image(name, buffer, oidn.OIDN_FORMAT_FLOAT3, width, height)
+        self._format = oidn.OIDN_FORMAT_FLOAT3
+        self._place(self._buffers)
         qualities = {
             "high": oidn.OIDN_QUALITY_HIGH,
             "balanced": oidn.OIDN_QUALITY_BALANCED,
@@ -124,22 +128,32 @@ class _Kernel:
         if self._has_color:
             self._filter.set_bool("hdr", settings.hdr)
             self._filter.set_bool("cleanAux", settings.auxiliary != "noisy" and len(inputs) > 1)
-        self._filter.commit()
-        self._check()
         weakref.finalize(self, _release, (self._filter, *self._buffers.values(), self._device))
 
-    def __call__(self, images: dict[str, np.ndarray], scale: float = float("nan")) -> np.ndarray:
-        output = np.empty(self._shape, np.float32)
+    def __call__(
+        self, images: dict[str, np.ndarray], scale: float = float("nan"), out: np.ndarray | None = None
+    ) -> np.ndarray:
+        output = np.empty(self._shape, np.float32) if out is None else out
+        given = {name: np.ascontiguousarray(image, np.float32) for name, image in images.items()}
         with self._lock:
-            for name, image in images.items():
-                self._buffers[name].write(0, output.nbytes, np.ascontiguousarray(image, np.float32))
+            if not self._buffers:
+                self._place({**given, "output": output})
+            for name in self._buffers.keys() & given.keys():
+                self._buffers[name].write(0, output.nbytes, given[name])
             if self._has_color:
                 self._filter.set_float("inputScale", scale)
-                self._filter.commit()
+            self._filter.commit()  # the network is built the first time; other arrays of the same size take no time
             self._filter.execute()
             self._check()
-            self._buffers["output"].read(0, output.nbytes, output)
+            if self._buffers:
+                self._buffers["output"].read(0, output.nbytes, output)
         return output
+
+    def _place(self, images: Mapping[str, Any]) -> None:
+        """Let the library use buffers or arrays, by name."""
+        height, width = self._shape[:2]
+        for name, image in images.items():
+            self._filter.set_image(name, image, self._format, width, height)
 
     def _check(self) -> None:
         error = self._device.get_error()

@@ -65,14 +65,34 @@ def directly(library, frame, quality, scale=None):
     return arrays["output"]
 
 
+def test_on_a_cpu_the_library_has_the_arrays_that_it_is_given(library, rng, monkeypatch):
+    """And those of another call when that comes: the network is built once."""
+    placed, real = [], library.Filter.set_image
+    monkeypatch.setattr(
+        library.Filter,
+        "set_image",
+        lambda kernel, name, image, *rest: placed.append(image) or real(kernel, name, image, *rest),
+    )
+    settings, frames = binding.OidnSettings(device="cpu"), clip_of(rng)
+    for index in range(2):
+        frame = frame_at(frames, index)
+        out = np.empty((*SIZE, 3), np.float32)
+        placed.clear()
+        found = binding.denoise(frame.radiance, frame.albedo, frame.normal, settings=settings, scale=0.7, out=out)
+        assert found is out
+        np.testing.assert_array_equal(found, directly(library, frame, "high", 0.7))
+        for array, wanted in zip(placed, (frame.radiance, frame.albedo, frame.normal, out), strict=False):
+            assert np.shares_memory(array, wanted)
+
+
 @pytest.mark.parametrize("quality", ["high", "balanced", "fast"])
 def test_images_are_the_librarys_own(library, quality, rng, monkeypatch):
     """To the last bit for the numbers that it is given, and to rounding where it measures the brightness itself."""
     given, call = [], binding.denoise
 
-    def spy(*images, settings, scale):
+    def spy(*images, settings, scale, out):
         given.append((Frame(*(image.copy() for image in images)), scale))
-        return call(*images, settings=settings, scale=scale)
+        return call(*images, settings=settings, scale=scale, out=out)
 
     monkeypatch.setattr(binding, "denoise", spy)
     frames = clip_of(rng)
