@@ -192,7 +192,8 @@ class Train:
     """Shipped weights or a .safetensors file to continue from; default: new weights."""
     recipe: str | None = None
     """One of the method's recipes; for ntd: usual, finish, without-occlusion, paper-loss, paper-loss-without-occlusion,
-    paper, paper-without-occlusion; for steady: usual, finish (goes on from trained weights, in crops of 128). Default: the usual one."""
+    paper, paper-without-occlusion; for steady: usual, finish (goes on from trained weights, in crops of 128). Default:
+    the usual one."""
     steps: int | None = None
     """Parameter updates, more than before to go on with a finished run; default, as for the next seven options: as in
     the recipe."""
