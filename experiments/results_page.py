@@ -37,6 +37,7 @@ PEERS = {
     "torch-eager": "of PyTorch eager",
     "oidn-high": f"of {OIDN}",
     "oidn-files": "of Open Image Denoise, file to file",
+    "step": "of the method's step alone",
     "roofline": "of the roofline",
 }
 """Peer in the rows of ``bench`` -> column."""

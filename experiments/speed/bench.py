@@ -33,19 +33,21 @@ from experiments.speed.frames import parsed
 from experiments.speed.roofline import Probe
 from experiments.speed.timing import Timing, summary
 from experiments.speed.workers import Team, WorkerError, apart
-from experiments.speed.works import Work, compilation, files, input_share, operations, steps, train_steps
+from experiments.speed.works import Work, compilation, files, input_share, on_device, operations, steps, train_steps
 from jaxdn.commands.errors import plain_errors
 from jaxdn.runtime.atomic_files import write_json
 
 Row = dict[str, Any]
 
 BUDGET_S = {"steps": 180, "operations": 300, "train": 240, "input": 90, "compile": 60, "files": 300}
-"""Seconds for each group, in the order in which they run: a workload starts only while its group has time left.
-Compiling in advance does not count; on two cores it takes about as long as all of this."""
+"""Seconds for each group, in the order in which they run: a workload starts only while its group has time left, unless
+it is asked for alone. Compiling in advance does not count; on two cores it takes about as long as all of this."""
 ONE_WORK_S = {"steps": 45, "operations": 6, "train": 60}
 """Seconds for the rounds of one workload; at least two rounds are run."""
 COMPILED = ("step-large-720p", "train-large-64")
 """The programs whose compile time is measured."""
+STEP_ROUNDS = 7
+"""Calls of a step that a frame from file to file is compared with."""
 COMPILE_S = 240
 """Time limit of one compilation, in seconds."""
 
@@ -55,7 +57,7 @@ class Settings:
     """Time jaxdn, compared with its roofline, PyTorch and Open Image Denoise; write runs/bench.json."""
 
     only: Literal["all", "steps", "operations", "train", "compile", "input", "files"] = "all"
-    """Run one group of workloads."""
+    """Run one group of workloads, all of them however long they take."""
     size: str = f"{files.WIDTH}x{files.HEIGHT}"
     """WIDTHxHEIGHT of the frames of the group `files`."""
     frames: int = files.FRAMES
@@ -198,7 +200,7 @@ def input_rows(say: Callable[[str], None]) -> list[Row]:
 
 
 def file_rows(methods: Sequence[str], say: Callable[[str], None], **options: Any) -> list[Row]:
-    """From command to file, in turns with Open Image Denoise.
+    """From command to file, in turns with Open Image Denoise; a further frame is compared with its step as well.
 
     ``options`` are those of :func:`experiments.speed.works.files.measure`.
     """
@@ -208,15 +210,19 @@ def file_rows(methods: Sequence[str], say: Callable[[str], None], **options: Any
     with tempfile.TemporaryDirectory() as place:
         try:
             taken = files.measure([files.PEER, *methods], Path(place), **options)
-        except RuntimeError as error:
+            size = options.get("size", (files.HEIGHT, files.WIDTH))
+            step_ms = {name: apart(on_device.step_ms, name, *size, STEP_ROUNDS) for name in methods}
+        except (RuntimeError, WorkerError) as error:
             say(f"files: {', '.join(methods)} is left out: {error}")
             return []
     rows = []
     for work, found in files.timings(taken, **{k: v for k, v in options.items() if k == "frames"}).items():
         other = found[files.PEER][0]
         rows += [row(work, name, timing, peak, files.PEER, other.median_ms) for name, (timing, peak) in found.items()]
+        if work == "files-frame":
+            rows += [row(work, name, *found[name], "step", step_ms[name]) for name in methods]
     for each in rows:
-        if each["work"] == "files-frame":
+        if each["work"] == "files-frame" and each["against"] == files.PEER:
             say(f"{each['implementation']}: {1e3 / each['median_ms']:.2f} frames a second")
     return rows
 
@@ -325,7 +331,7 @@ def main(settings: Settings) -> None:
                 call = next(calls, None)
             started = time.monotonic()
             while call is not None:
-                if time.monotonic() - started > BUDGET_S[group]:
+                if settings.only == "all" and time.monotonic() - started > BUDGET_S[group]:
                     say(f"{group}: its {BUDGET_S[group]} s are used up; the remaining workloads are left out")
                     break
                 with console.status(f"{group} ..."):

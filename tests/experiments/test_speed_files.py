@@ -9,7 +9,7 @@ import pytest
 from experiments.results_page import read_results, results_page
 from experiments.speed import bench
 from experiments.speed.peers import oidn_files
-from experiments.speed.works import files
+from experiments.speed.works import files, on_device
 from jaxdn.data.exr.exr import read_exr
 from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.read import read_clip
@@ -86,19 +86,29 @@ def test_rows_are_in_relation_to_open_image_denoise(tmp_path: Path, monkeypatch:
         own = files.Taken(runs(9000)[0], runs(3000), runs(11000))
         return {files.PEER: files.Taken(None, runs(1000), runs(3000)), "svgf": own}
 
+    def step_ms(name: str, height: int, width: int, rounds: int) -> float:
+        assert (name, height, width) == ("svgf", files.HEIGHT, files.WIDTH)
+        return 800.0
+
     monkeypatch.setattr(files, "measure", measure)
+    monkeypatch.setattr(bench, "apart", lambda function, *arguments: function(*arguments))
+    monkeypatch.setattr(on_device, "step_ms", step_ms)
     said: list[str] = []
     rows = bench.file_rows(["svgf"], said.append)
-    ratios = {(row["work"], row["implementation"]): row["ratio"] for row in rows}
+    ratios = {(row["work"], row["implementation"]): row["ratio"] for row in rows if row["against"] == files.PEER}
     assert ratios["files-first-frame", "svgf-cold"] == 9
     assert ratios["files-first-frame", "svgf-warm"] == 3
     assert ratios["files-frame", "svgf"] == 4
     assert ratios["files-frame", files.PEER] == 1
-    assert "svgf: 1.00 frames a second" in said
+    assert [row["ratio"] for row in rows if row["against"] == "step"] == [1.25]
+    assert [line for line in said if "frames a second" in line] == [
+        "oidn-files: 4.00 frames a second",
+        "svgf: 1.00 frames a second",
+    ]
     bench.Report(tmp_path / "bench.json", "command").add(rows)
     page = results_page(read_results(tmp_path))
     assert "of Open Image Denoise, file to file |" in page
-    assert "| files-frame | svgf | 1,000 | 100 | 4.00 |" in page
+    assert "| files-frame | svgf | 1,000 | 100 | 4.00 | 1.25 |" in page
 
 
 @unix
