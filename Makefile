@@ -70,7 +70,7 @@ $(VENV)/tools: $(VENV)/ready
 		uv pip install --quiet --python .venv-cycles/bin/python -r experiments/cycles/requirements.txt; \
 	else \
 		python3.11 -m venv .venv-cycles && \
-		.venv-cycles/bin/python -m pip install --quiet -r experiments/cycles/requirements.txt; \
+		.venv-cycles/bin/python -m pip install --quiet --no-compile -r experiments/cycles/requirements.txt; \
 	fi
 	@touch $@
 
