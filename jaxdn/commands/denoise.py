@@ -44,8 +44,7 @@ def run_denoise(options: Denoise, *, on_start: Callable[[], None] = lambda: None
 
 def _choose_method(options: Denoise, *, of_scene: bool) -> Denoise:
     """The options with the method that is best for what they name; it is printed."""
-    ours = of_scene or options.implementation != "auto"
-    ours = ours or any(is_clip(path) and not is_filtered(read_record(path)) for path in options.clips)
+    ours = of_scene or any(is_clip(path) and not is_filtered(read_record(path)) for path in options.clips)
     choice = choose_model(through_centres=ours)
     print(f"method: {choice.name} ({choice.reason})")
     return replace(options, method=choice.name)

@@ -9,6 +9,8 @@ import pytest
 
 from jaxdn.clips import read_exr, write_clip, write_exr
 from jaxdn.commands import main
+from jaxdn.commands.arguments import Denoise
+from jaxdn.commands.denoise import _choose_method
 from jaxdn.core.frame import Clip, Frame
 from jaxdn.zoo.ready import BEST_ELSEWHERE, DEFAULT_MODEL
 from tests.needs import require
@@ -60,15 +62,20 @@ def test_without_its_package_our_own_is_used_and_the_package_named(
 
 
 @pytest.mark.slow
-def test_our_own_clips_and_a_backend_of_ours_are_for_our_own_method(
-    shot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_our_own_clips_are_for_our_own_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     light = np.random.default_rng(1).random((1, 32, 32, 3), np.float32)
     write_clip(Clip(Frame(light)), tmp_path / "clip", record={"pixel_filter": "centre"})
     _denoise(tmp_path / "clip", tmp_path / "own")
     assert f"method: {DEFAULT_MODEL} (" in capsys.readouterr().out
-    _denoise(shot, tmp_path / "backend", "--implementation", "reference")
-    assert f"method: {DEFAULT_MODEL} (" in capsys.readouterr().out
+
+
+def test_an_engine_that_is_named_does_not_choose_another_method(
+    shot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    require("pyoidn")
+    options = Denoise([shot], tmp_path / "out", implementation="reference")
+    assert _choose_method(options, of_scene=False).method == BEST_ELSEWHERE
+    assert f"method: {BEST_ELSEWHERE} (" in capsys.readouterr().out
 
 
 @pytest.mark.slow
