@@ -39,14 +39,16 @@ class Inspect:
     """Plan for this denoiser (svgf, steady-balanced ...), or several (svgf,relax); default: for every buffer that a
     denoiser may read."""
     width: int = 128
+    """Width of a scene's frames in pixels."""
     height: int = 128
+    """Height of a scene's frames in pixels."""
     frames: int | None = None
     """Number of frames of a scene or clip to inspect; default: all of the animation."""
     json: bool = False
     """Print only one JSON object: {"effects": [...], "plan": {...}, "uncertain": [...]}, of a clip also "sources". Of
     files of other renderers {"frames": 8, "width": 320, "height": 180, "sources": [...], "missing": {...}, "notes":
-    [...], "unusable": {...}, "fitting_conventions": [...]}, the last null where there is nothing to
-    state; of several shots {"shots": [...]}."""
+    [...], "looked_at": [...], "unusable": {...}, "fitting_conventions": [...]}, the last null where there is nothing to
+    state; with --overlay also "overlay" and "findings"; of several shots {"shots": [...]}."""
     motion_convention: str | None = None
     """Convention of the motion vectors in files of other renderers; an unknown name lists the known ones."""
     channels: list[str] = field(default_factory=list)
@@ -87,8 +89,11 @@ class Render:
     seeds: list[str] = field(default_factory=lambda: ["0"])
     """One clip of the family, or tour of the scene, for each seed, such as 3 or 0-49; else the seeds of the noise."""
     width: int = 128
+    """Width of the frames in pixels."""
     height: int = 128
+    """Height of the frames in pixels."""
     frames: int = 10
+    """Number of frames of each clip."""
     reference_spp: int = 256
     """Samples per pixel of the reference; 0 for none."""
     layers: list[int] = field(default_factory=lambda: [1])
@@ -143,7 +148,7 @@ class Pack:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """The file to write, or with `--format arrayrecord` the folder."""
     mib: float
-    """Largest size of it in MiB."""
+    """Largest size of the file or folder in MiB."""
     format: Literal["file", "arrayrecord"] = "file"
     """One file of rounded values, unpacked where it is used first; or shards of exact values (ArrayRecord, zstd), read
     where they lie. Not on Windows."""
@@ -160,7 +165,7 @@ class Pack:
     without_half: bool = False
     """Leave out the reference's first half: a quarter smaller, but no inputs of half the reference's samples."""
     seed: int = 0
-    """Of the choice of windows."""
+    """Seed of the choice of windows."""
 
 
 @dataclass
@@ -182,8 +187,7 @@ class Train:
     """Folder of held-out clips, or a file of `jaxdn pack`, for validation, used whole; its PSNR is free of the noise of
     references that keep one half (those of `jaxdn render` do)."""
     method: str = "ntd"
-    """Method to train, by default ntd (`jaxdn denoise` uses weights of the method steady by itself); an
-    unknown name lists the available ones."""
+    """Method to train; an unknown name lists the available ones."""
     variant: str | None = None
     """One of the method's variants (ntd-large, ntd-small); default: the fastest."""
     set: list[str] = field(default_factory=list)
@@ -195,8 +199,8 @@ class Train:
     paper, paper-without-occlusion; for steady: usual, finish (goes on from trained weights, in crops of 128). Default:
     the usual one."""
     steps: int | None = None
-    """Parameter updates, more than before to go on with a finished run; default, as for the next seven options: as in
-    the recipe."""
+    """Parameter updates; give more than before to go on with a finished run. Default, here and for the next seven
+    options: that of the recipe."""
     batch: int | None = None
     """Clips per update."""
     crop: int | None = None
@@ -229,7 +233,7 @@ class Train:
     process: int | None = None
     """With --coordinator: which of them this is, from 0."""
     implementation: str = "auto"
-    """Backend for convolutions: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest available."""
+    """Engine for convolutions: reference (XLA), onednn (CPU; the extra onednn); auto: the fastest available."""
 
 
 @dataclass
@@ -262,7 +266,7 @@ class Denoise:
     """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
     frames are about as good as the last."""
     safe: bool = True
-    """Measure the noise, and keep of the frames what is none of it: clean ones come back as they are."""
+    """Keep what is not recognised as noise; clean frames come back unchanged."""
     frames: list[str] = field(default_factory=list)
     """Numbers of the frames to denoise, such as 7 or 10-40; frames before them are read for their history."""
     skip_existing: bool = False
@@ -301,19 +305,19 @@ class Denoise:
     view: str | None = None
     """For files of other renderers with several views (stereo): the only one to read; default: every view."""
     implementation: str = "auto"
-    """Backend for the network: reference (XLA), onednn-bfloat16 (CPUs with AVX-512 BF16 or AMX; the extra onednn),
+    """Engine for the network: reference (XLA), onednn-bfloat16 (CPUs with AVX-512 BF16 or AMX; the extra onednn),
     onednn-float32 (CPUs; the extra onednn), onnxruntime (CPUs; the extra onnx); auto: the fastest available."""
     budget: float | None = None
     """Samples per pixel for a method that says where they go (ntasd, dasr), and for a scene: their mean; default: the
     method's own, else 4."""
     width: int | None = None
-    """For a scene: the width in pixels; default, as for the next three: as `jaxdn render` has it."""
+    """For a scene: the width in pixels; default: that of `jaxdn render`."""
     height: int | None = None
-    """For a scene: the height in pixels."""
+    """For a scene: the height in pixels; default: that of `jaxdn render`."""
     animation: Path | None = None
     """For a scene: its animation file; default: the one next to it."""
     seed: int | None = None
-    """For a scene: the seed of its noise."""
+    """For a scene: the seed of its noise; default: 0."""
 
 
 @dataclass
@@ -367,7 +371,7 @@ class Doctor:
     """Show what this machine computes, denoises, trains and renders with, and what to install for more."""
 
     warm: bool = False
-    """Compile what `jaxdn denoise` runs on other renderers' frames, and keep it: for images and farms."""
+    """Compile what `jaxdn denoise` runs on other renderers' frames, and keep it: for container images and farms."""
     method: str = "auto"
     """With --warm: the method, as of `jaxdn denoise`."""
     width: int = 1920

@@ -15,7 +15,7 @@ CONSEQUENCES: dict[str, str] = {
     "normal": "edges where two surfaces of one depth meet are blurred",
     "depth": "edges between near and far are blurred, and what comes into view may keep a wrong history",
     "roughness": "every surface counts as diffuse: sharp reflections are blurred",
-    "motion": "it is measured from albedo or normals; without those everything counts as still, and leaves trails",
+    "motion": "it is measured from albedo or normals; without those too, everything that moves leaves trails",
     "ids": "things that touch are told apart by their normals and depths alone",
     "specular_hit_distance": "reflections are looked for where their surface was",
     "specular_reflectance": "light is divided by the albedo alone: more noise stays on glossy surfaces",

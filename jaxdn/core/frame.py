@@ -83,7 +83,7 @@ class Frame(NamedTuple):
     """
 
     radiance: Annotated[Array, Buffer(3, "light")]
-    """[H, W, 3] noisy radiance to denoise (for ``ntd``: the indirect part), linear Rec.709, >= 0."""
+    """[H, W, 3] noisy radiance to denoise, linear Rec.709, >= 0: indirect light, or all light."""
     albedo: Annotated[Array, Buffer(3, "fraction", 1.0, averaged=True)] = None
     """[H, W, 3] first-hit diffuse reflectance in [0, 1]; neutral: 1."""
     normal: Annotated[Array, Buffer(3, "direction", averaged=True)] = None

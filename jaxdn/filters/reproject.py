@@ -69,7 +69,10 @@ def reproject(
     search_neighbours: bool = False,
     implementation: str | None = None,
 ) -> Reprojection:
-    """Fetch ``history`` [H, W, C] >= 0 of the previous frame at ``p + motion(p)``.
+    """Fetch ``history`` [H, W, C] >= 0 of the previous frame at ``p + motion(p)``, from taps of the same surface.
+
+    Of the four taps of a bilinear fetch, those that show another id, depth or normal are left out, and the weights of
+    the others are renormalised (Schied et al. 2017).
 
     Args:
       history: pixels with a value that is not finite or negative are no taps.

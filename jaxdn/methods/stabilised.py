@@ -47,7 +47,7 @@ class StabilisedState(NamedTuple):
 
 
 def stabilised(denoiser: Denoiser, *, history_max: int = 16) -> Denoiser:
-    """The denoiser with a history: its images, less what differs in them from frame to frame for no reason.
+    """The denoiser with a history, so that its images flicker less.
 
     Each image is blended into the last result, as :func:`jaxdn.filters.kalman.kalman_blend` says. That is fetched along
     motion: by Catmull-Rom interpolation where all taps show one surface, elsewhere by bilinear interpolation with a

@@ -20,7 +20,8 @@ from tests.experiments.test_cycles_score import write_clip_of_cycles
 from tests.training.test_training import make_clip
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING")]
+PAGES += sorted((ROOT / "docs").rglob("*.md"))
 
 
 def pytest_id(path):

@@ -76,10 +76,12 @@ class Guide(NamedTuple):
 def affinity_filter(
     image: Float[Array, "C H W"], guide: Guide, *, step: int = 1, implementation: str | None = None
 ) -> Float[Array, "C H W"]:
-    """The filtered image [C, H, W], any colour space; taps are ``step`` pixels apart.
+    """The mean of ``image`` [C, H, W], any colour space, weighted by how alike the features of two pixels are.
 
-    Taps beyond the border do not count. A pixel whose weights sum to nothing keeps its value. Differentiable by the
-    image and by all of the guide. Raises ValueError for shapes that do not fit each other.
+    ``out(p) = sum_q w(p, q) x(q) / sum_q w(p, q)`` over 5x5 taps that are ``step`` pixels apart. The weights w are
+    those of :mod:`jaxdn.ops.affinity.filter`, from Isik et al. 2021. Taps beyond the border do not count. A pixel whose
+    weights sum to nothing keeps its value. Differentiable by the image and by all of the guide. ``implementation``:
+    "reference", "numba" or "pallas"; None selects the fastest. Raises ValueError for shapes that do not fit each other.
     """
     image = jnp.asarray(image)
     size = image.shape[1:]
