@@ -29,7 +29,7 @@ from jaxdn.recipes.objectives import last_frames, pyramid_illumination, recurren
 from jaxdn.recipes.recipe import Recipe
 
 LARGE: Widths = ((32, 43, 57, 76, 101, 101), (76, 76), (57, 57), (43, 43), (32, 32), (128, 64))
-"""Channels of the encoder's stages, then of the decoder's convolutions from coarse to fine: 1.95 million weights. The
+"""Channels of the encoder's stages, then of the decoder's convolutions from coarse to fine: 1.94 million weights. The
 paper's figure, as far as it is known; Hasselgren et al. 2020 count 2.6 million."""
 SMALL: Widths = ((16, 22, 28, 38, 50, 50), (38, 38), (28, 28), (22, 22), (16, 16), (32, 16))
 """Half of these, and a quarter at full resolution, where the most time is spent."""
