@@ -49,10 +49,10 @@ class Job:
         """What tells of which layers it consists: the clip's folder, or the first file."""
         return self.clip or self.shot.files[0]
 
-    def count_channels(self) -> int:
-        """The number of channels of the first file."""
-        first = self.files[0] if self.files else ExrFile(self.shot.files[0])
-        return len(first.windows)
+    def count_channels(self, index: int) -> int:
+        """The number of channels of a frame's file."""
+        file = self.files[index] if self.files else ExrFile(self.shot.files[index])
+        return len(file.windows)
 
     def without(self, indices: Collection[int]) -> "Job":
         """The same job without some of its frames."""

@@ -149,9 +149,10 @@ class _Run:
             try:
                 self._denoise_segment(job, segment, log_once)
             except DamagedFile as error:
-                if self._settings.strict or job.clip is not None or error.path not in job.shot.files:
+                read = job.shot.files[segment.start : segment.stop]
+                if self._settings.strict or job.clip is not None or error.path not in read:
                     raise
-                index = job.shot.files.index(error.path)
+                index = segment.start + read.index(error.path)
                 segments[:0] = segments_around(job, segment, index, self.files)
                 if not segments and len(self.files) == before:
                     raise
@@ -163,7 +164,7 @@ class _Run:
         """Denoise consecutive frames of a shot, from a new history."""
         views = list(job.views) or [""]
         limit = self._settings.max_memory
-        count_channels = cache(job.count_channels)
+        count_channels = cache(partial(job.count_channels, segment.start))
         count_channels()  # later the writing thread may drop the same file
         with Behind[list[Sequence[str]]]() as behind, ExitStack() as stack:
 

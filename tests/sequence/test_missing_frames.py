@@ -13,6 +13,7 @@ from jaxdn import clips
 from jaxdn.commands import main
 from jaxdn.data.errors import DamagedFile
 from jaxdn.data.exr.completeness import check_complete
+from jaxdn.sequence.jobs import WARM_UP
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import find_model
@@ -124,6 +125,18 @@ def test_the_command_line_ends_with_their_names(tmp_path: Path, capsys: Any) -> 
     command = ["denoise", str(source), "-o", str(tmp_path / "out"), "--method", "noisy"]
     main.main(command)
     text = " ".join(capsys.readouterr().out.split())
+def test_a_damaged_frame_that_is_not_read_is_no_matter(tmp_path: Path) -> None:
+    """Neither for its own history, nor to tell of what all frames consist."""
+    (tmp_path / "in").mkdir()
+    for number in range(WARM_UP + 2):
+        write(tmp_path / "in" / f"s.{number:04d}.exr", size=(2, 3))
+    (tmp_path / "in" / "s.0000.exr").write_bytes(b"")
+    last = WARM_UP + 1
+    done = denoise_files([tmp_path / "in"], tmp_path / "out", box_blur(), Settings(frames=[last]))
+    assert [path.name for path in done.files] == [f"s.{last:04d}.exr"]
+    assert not done.left_out
+
+
     assert "left out as missing: 3 frames: s.0001.exr, s.0004.exr, s.0002.exr (--strict: end there)" in text
     assert "2 frames denoised by noisy" in text
     with pytest.raises(SystemExit) as ended:
