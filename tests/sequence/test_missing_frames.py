@@ -40,6 +40,11 @@ def rot(path: Path) -> None:
     path.write_bytes(data)
 
 
+def rename(path: Path) -> None:
+    """A channel with a name in Latin letters of one byte, as an old program writes it."""
+    path.write_bytes(path.read_bytes().replace(b"albedo.R", b"alb\xe9do.R"))
+
+
 DAMAGES: dict[str, tuple[Damage, str]] = {
     "placeholder": (lambda path: path.write_bytes(b""), "the file is empty (0 bytes), as a placeholder"),
     "truncated": (lambda path: path.write_bytes(path.read_bytes()[:-40]), "the file is incomplete"),
@@ -51,6 +56,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
         lambda path: write(path, "Z"),
         "expected the buffers of the other frames, got a file without depth",
     ),
+    "letters": (rename, "a channel has a name that is not in UTF-8"),
     "no light": (lambda path: write(path, "R", "G", "B"), "no radiance among the channels"),
 }
 
@@ -119,12 +125,6 @@ def test_most_frames_say_what_the_shot_is_among_those_that_are_read(tmp_path: Pa
     assert denoise(source, tmp_path / "few", frames=[1, 2]) == (["s.0001.exr", "s.0002.exr"], [])
 
 
-def test_the_command_line_ends_with_their_names(tmp_path: Path, capsys: Any) -> None:
-    source = shot(tmp_path / "in", DAMAGES["placeholder"][0], 1, 4)
-    rot(source / "s.0002.exr")
-    command = ["denoise", str(source), "-o", str(tmp_path / "out"), "--method", "noisy"]
-    main.main(command)
-    text = " ".join(capsys.readouterr().out.split())
 def test_a_damaged_frame_that_is_not_read_is_no_matter(tmp_path: Path) -> None:
     """Neither for its own history, nor to tell of what all frames consist."""
     (tmp_path / "in").mkdir()
@@ -137,6 +137,12 @@ def test_a_damaged_frame_that_is_not_read_is_no_matter(tmp_path: Path) -> None:
     assert not done.left_out
 
 
+def test_the_command_line_ends_with_their_names(tmp_path: Path, capsys: Any) -> None:
+    source = shot(tmp_path / "in", DAMAGES["placeholder"][0], 1, 4)
+    rot(source / "s.0002.exr")
+    command = ["denoise", str(source), "-o", str(tmp_path / "out"), "--method", "noisy"]
+    main.main(command)
+    text = " ".join(capsys.readouterr().out.split())
     assert "left out as missing: 3 frames: s.0001.exr, s.0004.exr, s.0002.exr (--strict: end there)" in text
     assert "2 frames denoised by noisy" in text
     with pytest.raises(SystemExit) as ended:

@@ -280,17 +280,14 @@ def _check_header(path: Path, header: Mapping[str, Any]) -> None:
     tiles = header.get("tiles")
     if tiles is not None and tiles.mode != OpenEXR.ONE_LEVEL:
         raise ClipError(f"{path}: tiles in several levels (a mipmap) cannot be read; save it with one level.")
-    if _has_chroma(header):
+    try:
+        names = {channel.name for channel in header.get("channels", ())}
+    except UnicodeDecodeError as error:
+        raise DamagedFile(path, "a channel has a name that is not in UTF-8; write the frame with another") from error
+    if {"RY", "BY"} <= names:
         raise ClipError(f"{path}: luminance with chroma (Y, RY, BY) cannot be read; save it with R, G, B.")
     if sides.min() < 1 or sides.max() > _SIDE_LIMIT:
         raise DamagedFile(path, f"the header claims {sides[0]} x {sides[1]} pixels; the file is damaged")
-
-
-def _has_chroma(header: Mapping[str, Any]) -> bool:
-    try:
-        return {"RY", "BY"} <= {channel.name for channel in header.get("channels", ())}
-    except UnicodeDecodeError:  # a name that is no UTF-8 is told where the pixels are read
-        return False
 
 
 def full_name(header: Mapping[str, object], name: str, parts: int) -> str:

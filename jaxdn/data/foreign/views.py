@@ -132,10 +132,7 @@ def _paired_views(headers: Sequence[Mapping[str, Any]]) -> list[str]:
     sides: dict[str, list[str]] = {side: [] for side in _PAIR}
     words: dict[str, str] = {}
     others = []
-    try:
-        names = [full_name(each, channel.name, len(headers)) for each in headers for channel in each["channels"]]
-    except UnicodeDecodeError:  # told where the pixels are read
-        return []
+    names = [full_name(each, channel.name, len(headers)) for each in headers for channel in each["channels"]]
     for name in names:
         word = next((layer for layer in name.split(".")[:-1] if layer.lower() in sides), None)
         if word is None:
