@@ -15,6 +15,10 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar, Union, get_args
 T = TypeVar("T")
 
 
+_MOST = 10**7
+"""Numbers of a range: more would fill the memory before anything else is done."""
+
+
 class Range(NamedTuple):
     """The allowed values of an option: finite numbers from ``low`` to ``high``."""
 
@@ -69,6 +73,8 @@ def numbers(words: list[str], option: str, *, negative: bool = False) -> list[in
         first, last = int(match[1]), int(match[2] or match[1])
         if last < first:
             raise ValueError(f"{option}: expected a range from low to high, got {word!r}; swap its ends.")
+        if last - first >= _MOST:
+            raise ValueError(f"{option}: expected ranges of at most {_MOST:,} numbers, got {word!r}; name its end.")
         found += range(first, last + 1)
     return found
 

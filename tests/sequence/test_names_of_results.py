@@ -138,3 +138,8 @@ def test_numbers_below_zero_can_be_named(tmp_path: Path) -> None:
         numbers(["-1--3"], "--frames", negative=True)
     with pytest.raises(ValueError, match="expected whole numbers >= 0"):
         numbers(["-1"], "--seeds")
+
+
+def test_a_range_that_would_fill_the_memory_is_refused() -> None:
+    with pytest.raises(ValueError, match="--frames: expected ranges of at most 10,000,000 numbers, got '1-10000001'"):
+        numbers(["1-10000001"], "--frames")
