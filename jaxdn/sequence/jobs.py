@@ -55,18 +55,20 @@ class Job:
         return len(file.windows)
 
     def without(self, indices: Collection[int]) -> "Job":
-        """The same job without some of its frames."""
+        """The same job without some of its frames, and without the copies of their results."""
         kept = [index for index in range(len(self.shot.files)) if index not in indices]
         numbers = tuple(self.shot.numbers[index] for index in kept) if self.shot.numbers else ()
         shot = self.shot._replace(files=tuple(self.shot.files[index] for index in kept), numbers=numbers)
         views = {view: tuple(files[index] for index in kept) for view, files in self.views.items()}
+        targets = tuple(self.targets[index] for index in kept)
         return replace(
             self,
             views=views,
             shot=shot,
-            targets=tuple(self.targets[index] for index in kept),
+            targets=targets,
             wanted=frozenset(new for new, index in enumerate(kept) if index in self.wanted),
             files=tuple(self.files[index] for index in kept),
+            copies={target: copies for target, copies in self.copies.items() if target in targets},
         )
 
     def of_view(self, view: str) -> "Job":

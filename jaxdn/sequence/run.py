@@ -1,7 +1,7 @@
 """``jaxdn denoise``: noisy clips in, denoised EXR frames out, one frame at a time."""
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack, closing
 from functools import cache, partial
 from pathlib import Path
@@ -203,20 +203,24 @@ class _Run:
             # Frame by frame, so that a file has all of its views when it is written.
             while pending := [one for view in running if (one := next(view, None)) is not None]:
                 path, beside = pending[0].target, pending[0].beside
-                done = partial(self._tell, path, job.copies.get(path, ()), list(logs.values()))
+                done = partial(self._tell, path, job.copies.get(path, ()), logs)
                 behind.start(partial(_write, [one.write for one in pending]), done, beside=beside)
                 del pending, done  # and what is to be written
 
     def _tell(
-        self, path: Path, copies: Sequence[Path], logs: Sequence[Callable[[str], None]], notes: list[Sequence[str]]
+        self,
+        path: Path,
+        copies: Sequence[Path],
+        logs: Mapping[str, Callable[[str], None]],
+        notes: list[Sequence[str]],
     ) -> None:
         """A file is written, with these notes about each view: copy it for frames that are held, and tell."""
-        for log, lines in zip(logs, notes, strict=True):
+        for log, lines in zip(logs.values(), notes, strict=True):
             for line in lines:
                 log(line)
         for written in (path, *copies):
             if written != path:
-                _copy(path, written)
+                _copy(path, written, logs)
             self.files.append(written)
             self._on_frame(written, len(self.files), self._total)
 
@@ -237,12 +241,14 @@ def _with_view(view: str, log: Callable[[str], None]) -> Callable[[str], None]:
     return lambda line: log(f"{view}: {line}")
 
 
-def _copy(result: Path, target: Path) -> None:
-    """The result of one frame as that of another, with its preview."""
-    for suffix in (result.suffix, ".png"):
-        if result.with_suffix(suffix).is_file():
-            with atomic_write(target.with_suffix(suffix)) as temporary:
-                shutil.copyfile(result.with_suffix(suffix), temporary)
+def _copy(result: Path, target: Path, views: Collection[str]) -> None:
+    """The result of one frame as that of another, with its previews."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    for ending in (result.suffix, ".png", *(f".{view}.png" for view in views)):
+        source = result.with_name(f"{result.stem}{ending}")
+        if source.is_file():
+            with atomic_write(target.with_name(f"{target.stem}{ending}")) as temporary:
+                shutil.copyfile(source, temporary)
 
 
 def _once(log: Callable[[str], None]) -> Callable[[str], None]:

@@ -112,6 +112,26 @@ def test_a_held_frame_is_that_frame(hard: bool, tmp_path: Path) -> None:
     assert denoise([source], tmp_path / "some", frames=[4])[0] == ["s.0002.exr", "s.0004.exr"]
 
 
+def test_a_held_frame_has_the_folder_of_its_own(tmp_path: Path) -> None:
+    source = write(tmp_path / "in", "0001/beauty.exr", "0003/beauty.exr")
+    (source / "0002").mkdir()
+    os.symlink(source / "0001/beauty.exr", source / "0002/beauty.exr")
+    files, _ = denoise([source], tmp_path / "out")
+    assert files == [f"{number:04d}/beauty.exr" for number in (1, 2, 3)]
+    assert brightness(tmp_path / "out/0002/beauty.exr") == 1.0
+
+
+def test_what_is_held_of_a_damaged_frame_is_not_waited_for(tmp_path: Path) -> None:
+    source = write(tmp_path / "in", "s.0001.exr", "s.0002.exr")
+    (source / "s.0002.exr").write_bytes(b"")
+    os.symlink(source / "s.0002.exr", source / "s.0003.exr")
+    told: list[tuple[int, int]] = []
+    denoise_files(
+        [source], tmp_path / "out", find_model("noisy"), on_frame=lambda path, done, total: told.append((done, total))
+    )
+    assert told == [(1, 1)]
+
+
 def test_inspect_takes_files_and_several_shots(tmp_path: Path, capsys: Any) -> None:
     source = write(tmp_path, "a.0001.exr", "a.0003.exr", "still.exr")
     main.main(["inspect", *(str(source / name) for name in ("a.0001.exr", "a.0003.exr"))])

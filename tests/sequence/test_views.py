@@ -212,6 +212,16 @@ def test_the_beauty_alone_of_each_view_can_be_read_again(kind: str, tmp_path: Pa
         assert (tmp_path / "out" / f"shot.0000.{view}.png").is_file()
 
 
+def test_previews_of_views_are_held_too(tmp_path: Path) -> None:
+    source, out = write("parts", tmp_path / "in"), tmp_path / "out"
+    (source / "shot.0001.exr").unlink()
+    (source / "shot.0001.exr").symlink_to(source / "shot.0000.exr")
+    denoise_files([source], out, mean_so_far(), Settings(naming=NAMING, safe=False, preview=True))
+    for view in VIEWS:
+        held, first = (out / f"shot.{frame:04d}.{view}.png" for frame in (1, 0))
+        assert held.read_bytes() == first.read_bytes()
+
+
 def test_a_frame_without_one_of_the_views_is_missing(tmp_path: Path) -> None:
     source = write("parts", tmp_path / "in")
     now = buffers("right", 1)
