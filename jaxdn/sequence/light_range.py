@@ -199,11 +199,14 @@ def _dim(radiance: np.ndarray, lamps: np.ndarray, exponent: int) -> np.ndarray:
 def _denoise_negative(negative: np.ndarray, positive: np.ndarray, image: np.ndarray) -> np.ndarray:
     """The negative part [H, W, 3] of a frame as free of noise as the image of its positive part.
 
-    Where there is no positive light around, as in the ringing of a pixel filter, it stays.
+    Where there is less positive light around than negative, as in the ringing of a pixel filter, it stays: it is no
+    share of that light.
     """
     light = _window(np.sum(positive, axis=-1, keepdims=True)).sum(axis=0)
-    share = _window(negative).sum(axis=0) / np.where(light > 0, light, 1)
-    return np.where(light > 0, share * np.sum(image, axis=-1, keepdims=True), negative)
+    around = _window(negative).sum(axis=0)
+    lit = light > -np.sum(around, axis=-1, keepdims=True)
+    share = around / np.where(lit, light, 1)
+    return np.where(lit, share * np.sum(image, axis=-1, keepdims=True), negative)
 
 
 def _keep_groups(excess: np.ndarray) -> np.ndarray:

@@ -186,6 +186,16 @@ def test_negative_light_comes_back(tmp_path: Path) -> None:
         assert abs(image[..., 0].mean() / wanted[..., 0].mean() - 1) < 0.1
 
 
+def test_the_ringing_of_a_pixel_filter_is_no_share_of_what_a_denoiser_draws_over_it() -> None:
+    """Beside an edge there is nearly no positive light of which the negative could be a share."""
+    light = np.zeros((1, 9, 3), np.float32)
+    light[0, :3], light[0, 3:6], light[0, 6:] = 1.0, -0.02, 1e-5
+    blurred = np.maximum(light, 0)
+    blurred[0, 3:8] = 0.02
+    image = restore_light(blurred, light, 0, np.zeros((1, 9, 1), bool))
+    assert image.min() >= -0.05
+
+
 def test_the_factor_follows_the_median_and_stays(rng: np.random.Generator) -> None:
     dark = grey(rng, 1e-6)
     assert choose_exponent(np.zeros_like(dark), None) is None
