@@ -115,10 +115,13 @@ class ForeignWriter:
         return self._alpha.denoise(noisy, frame, compose_beauty(frame, image))
 
     def _read_alpha(self, source: ExrFile) -> np.ndarray | None:
-        """The alpha [H, W] beside the beauty of a frame, if there is one."""
+        """The alpha [H, W] beside the beauty of a frame, if there is one; 0 where it is not finite."""
         names = list(source.windows)
         channel = find_alpha(names, self._settings.naming.detect(names)["radiance"])
-        return None if channel is None else self._place(source)[channel]
+        if channel is None:
+            return None
+        alpha = self._place(source)[channel]
+        return np.where(np.isfinite(alpha), alpha, 0)
 
     def _reblur(
         self,

@@ -10,6 +10,7 @@ from jaxdn import clips
 from jaxdn.commands import main
 from jaxdn.core.frame import Frame
 from jaxdn.sequence.alpha import AlphaDenoiser
+from jaxdn.sequence.optics import Optics
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import find_model
@@ -149,6 +150,15 @@ def test_half_and_the_beauty_alone(only_beauty: bool, tmp_path: Path) -> None:
     after = clips.read_exr(tmp_path / "out" / "s.0000.exr")["A" if only_beauty else "V.Combined.A"]
     assert after.dtype == np.float16
     assert error(after, veil(0)) < 0.6 * error(veil(0).alpha, veil(0))
+
+
+@pytest.mark.parametrize("settings", [Settings(alpha=True), Settings(reblur=Optics(shutter=0.5))])
+def test_alpha_that_is_no_number_is_none_of_its_neighbours(settings: Settings, tmp_path: Path) -> None:
+    now = channels(veil(0)) | layer("V.Depth", np.ones((HEIGHT, WIDTH, 1)), "Z")
+    now["V.Combined.A"][5, 7], now["V.Combined.A"][20, 30] = np.nan, np.inf
+    clips.write_exr(tmp_path / "s.0000.exr", now)
+    denoise_files([tmp_path / "s.0000.exr"], tmp_path / "out", find_model("noisy"), settings)
+    assert np.isfinite(clips.read_exr(tmp_path / "out" / "s.0000.exr")["V.Combined.A"]).all()
 
 
 def test_the_option_and_files_without_alpha(tmp_path: Path, capsys: Any) -> None:
