@@ -42,7 +42,7 @@ def split_axis(length: int, side: int, halo: int) -> list[Span]:
     """
     if length <= side:
         return [Span(0, length, 0, length)]
-    size = side - (side - length) % GRID
+    size = _fit(length, side)
     if size < 2 * (halo + GRID):
         raise ValueError(
             f"tiles: expected sides of {2 * (halo + GRID) + GRID} pixels or more, as {halo} around a pixel decide "
@@ -55,6 +55,11 @@ def split_axis(length: int, side: int, halo: int) -> list[Span]:
         stop = start + size
         spans.append(Span(start, stop, keep_start, length if stop == length else stop - halo))
     return spans
+
+
+def _fit(length: int, side: int) -> int:
+    """The size of tiles of at most ``side`` pixels along an axis that is longer."""
+    return side - (side - length) % GRID
 
 
 def map_tiles(
@@ -178,8 +183,7 @@ class TiledStream:
             # The first step does not look at it.
             start = functools.partial(stages_of(self._denoiser).start, self._params)
             self._state = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(start, frame))
-        limit = (self.side - GRID) // 2 - GRID - self._receptive_field
-        history_halo, self.beyond_halo = find_history_halo(frame, limit)
+        history_halo, self.beyond_halo = find_history_halo(frame, self._limit((height, width)))
         first = jnp.asarray(self._first)
 
         def step(given: tuple[State, Frame]) -> tuple[tuple[State, jax.Array], Any]:
@@ -199,6 +203,11 @@ class TiledStream:
         self.sanitized += sum(map(int, invalid))
         self._first = False
         return image
+
+    def _limit(self, size: tuple[int, int]) -> int:
+        """How far away history may be fetched, in pixels: :func:`split_axis` has room for such halos."""
+        sizes = [_fit(length, self.side) for length in size if length > self.side]
+        return min(sizes) // 2 - GRID - self._receptive_field if sizes else max(size) + _TAPS_AROUND
 
     def _measure(self, frame: Frame, size: tuple[int, int]) -> FrameStatistics:
         """The statistics of a frame, tile by tile; values that are replaced are counted."""

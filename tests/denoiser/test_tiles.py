@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from jaxdn import color
 from jaxdn.core.frame import FAR, Frame, only
-from jaxdn.denoiser import Denoiser, stages_of
+from jaxdn.denoiser import Core, Denoiser, recurrent, stages_of
 from jaxdn.denoiser.rollout import stream
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.denoiser.tiles import GRID, find_history_halo, map_tiles, split_axis, stream_tiled
@@ -176,6 +176,25 @@ def test_history_from_too_far_away_is_counted_and_begins_anew() -> None:
     assert apart[10:14, 100:120].any()
     assert not apart[:, : 100 - far].any()
     assert not apart[:, 120 + far :].any()
+
+
+def test_the_smallest_tiles_have_room_for_what_stands_still() -> None:
+    field = 10
+    core = Core(
+        lambda params, frame: jnp.zeros_like(frame.radiance),
+        lambda params, state, frame, first, statistics: (frame.radiance, frame.radiance, 0),
+        frozenset({"motion"}),
+        receptive_field=field,
+    )
+    side = 2 * (field + 3 + GRID)
+    size = (6, side + 2 * GRID)
+    tiles = stream_tiled(recurrent(core), {}, side, size)
+    frame = Frame(np.ones((*size, 3), np.float32), motion=np.zeros((*size, 2), np.float32))
+    tiles(frame)
+    assert tiles.beyond_halo == 0
+    frame.motion[3, 5] = 1.5, 0
+    tiles(frame)
+    assert tiles.beyond_halo == 1
 
 
 def test_how_far_history_is_fetched() -> None:
