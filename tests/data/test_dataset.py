@@ -155,6 +155,21 @@ def test_the_cache_holds_the_clip_and_follows_it(folder: Path) -> None:
     assert os.listdir(folder / ".cache") != kept
 
 
+def test_caches_of_clips_whose_names_begin_alike_stay(folder: Path) -> None:
+    (folder / "clip1").rename(folder / "clip0.new")
+    longer, shorter = open_cached(folder / "clip0.new"), open_cached(folder / "clip0")
+    assert len(os.listdir(folder / ".cache")) == 2
+    for clip in (longer, shorter):
+        read_window(clip, (slice(None),) * 3)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such rights")
+def test_a_cache_can_be_read_by_those_who_can_read_the_clip(folder: Path) -> None:
+    open_cached(folder / "clip0")
+    (kept,) = (folder / ".cache").iterdir()
+    assert kept.stat().st_mode == (folder / "clip0").stat().st_mode
+
+
 def test_every_buffer_of_the_table_comes_back_from_the_cache(tmp_path: Path, rng: np.random.Generator) -> None:
     shape = (2, 5, 7)
     frames = Frame(**{name: 1e5 * rng.random((*shape, row.channels), np.float32) for name, row in BUFFERS.items()})

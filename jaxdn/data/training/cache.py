@@ -9,8 +9,8 @@ import glob
 import hashlib
 import itertools
 import os
+import secrets
 import shutil
-import tempfile
 import threading
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
@@ -220,7 +220,8 @@ def _stamp(files: Iterable[Path]) -> str:
 
 def _build(name: str, home: Path, fill: Callable[[Path], Mapping[str, Any]]) -> None:
     home.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{name}.", dir=home.parent))
+    temporary = home.parent / f".{name}.{secrets.token_hex(4)}"
+    temporary.mkdir()  # with the rights of any folder: a temporary one of Python's is its owner's alone
     try:
         write_json(temporary / "facts.json", fill(temporary))
         try:
@@ -285,5 +286,5 @@ def _noisy(samples: int) -> str:
 def _remove_stale(root: Path, name: str, home: Path) -> None:
     """Remove this clip's caches of earlier stamps; maps that other processes hold open stay valid for them."""
     for old in root.glob(f"{glob.escape(name)}.*"):
-        if old != home and old.suffix[1:].isalnum() and len(old.suffix) == 17:
+        if old != home and old.stem == name and old.suffix[1:].isalnum() and len(old.suffix) == 17:
             shutil.rmtree(old, ignore_errors=True)
