@@ -129,6 +129,7 @@ class _Kernel:
             self._filter.set_bool("hdr", settings.hdr)
             self._filter.set_bool("cleanAux", settings.auxiliary != "noisy" and len(inputs) > 1)
         weakref.finalize(self, _release, (self._filter, *self._buffers.values(), self._device))
+        self._check()  # one that lacks a buffer must not be kept
 
     def __call__(
         self, images: dict[str, np.ndarray], scale: float = float("nan"), out: np.ndarray | None = None
@@ -144,9 +145,9 @@ class _Kernel:
                 self._filter.set_float("inputScale", scale)
             self._filter.commit()  # the network is built the first time; other arrays of the same size take no time
             self._filter.execute()
-            self._check()
             if self._buffers:
                 self._buffers["output"].read(0, output.nbytes, output)
+            self._check()
         return output
 
     def _place(self, images: Mapping[str, Any]) -> None:

@@ -1,5 +1,6 @@
 """Open Image Denoise as a method: the library's own images, in programs, tiles and files; what it cannot do is said."""
 
+import functools
 import importlib.util
 from itertools import product
 
@@ -104,6 +105,80 @@ def test_images_are_the_librarys_own(library, quality, rng, monkeypatch):
             np.testing.assert_allclose(getattr(frame, name), getattr(asked, name), atol=1e-6)
         np.testing.assert_allclose(scale, color.exposure(asked.radiance), rtol=1e-5)
         np.testing.assert_allclose(images[index], directly(library, asked, quality), atol=1e-4)
+
+
+class Gpu:
+    """Stands for the package where there is a GPU whose memory is full at first: the image is twice the colour."""
+
+    OIDN_DEVICE_TYPE_CPU = OIDN_DEVICE_TYPE_CUDA = OIDN_FORMAT_FLOAT3 = 0
+    OIDN_QUALITY_HIGH = OIDN_QUALITY_BALANCED = OIDN_QUALITY_FAST = 0
+    OIDN_FILTER_TYPE_RT = "RT"
+
+    def __init__(self):
+        gpu, self.full, self.errors, self.released = self, True, [], 0
+
+        class Handle:
+            def release(self):
+                gpu.released += 1
+
+        class Device(Handle):
+            def __init__(self, kind):
+                pass
+
+            def commit(self):
+                pass
+
+            def get_error(self):
+                return gpu.errors.pop(0) if gpu.errors else None
+
+        class Buffer(Handle):
+            def __init__(self, device, size):
+                self.memory = None if gpu.full else np.zeros(size, np.uint8)
+                gpu.errors += ["out of memory"] * gpu.full
+
+            def write(self, start, size, array):
+                self.memory[start : start + size] = array.reshape(-1).view(np.uint8)
+
+            def read(self, start, size, array):
+                array.reshape(-1).view(np.uint8)[:] = self.memory[start : start + size]
+
+        class Filter(Handle):
+            def __init__(self, device, kind):
+                self.images = {}
+
+            def set_image(self, name, buffer, *size):
+                self.images[name] = buffer
+
+            def set_quality(self, quality):
+                pass
+
+            def set_bool(self, name, value):
+                pass
+
+            def set_float(self, name, value):
+                pass
+
+            def commit(self):
+                pass
+
+            def execute(self):
+                color, output = (self.images[name].memory.view(np.float32) for name in ("color", "output"))
+                output[:] = 2 * color
+
+        self.Device, self.Buffer, self.Filter = Device, Buffer, Filter
+
+
+def test_on_a_gpu_images_are_copied_and_what_fails_is_made_anew(monkeypatch, rng):
+    gpu, settings = Gpu(), binding.OidnSettings(device="cuda")
+    monkeypatch.setattr(binding, "library", lambda: gpu)
+    monkeypatch.setattr(binding, "_kernel", functools.lru_cache(4)(binding._Kernel))
+    image = rng.random((5, 7, 3), np.float32)
+    with pytest.raises(RuntimeError, match="Open Image Denoise: out of memory"):
+        binding.denoise(image, settings=settings)
+    gpu.full = False
+    gpu.errors.clear()
+    for light in (image, image[::-1]):
+        np.testing.assert_array_equal(binding.denoise(light, settings=settings), 2 * light)
 
 
 def test_it_removes_noise(library, rng):
