@@ -1,5 +1,6 @@
 """Writing files so that they are either complete or absent: the one place that writes."""
 
+import hashlib
 import json
 import os
 import platform
@@ -12,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 _ABANDONED_S = 24 * 3600
+_LONGEST = 128
+"""Bytes of a name that a host, a process, a thread and an ending are added to."""
 
 
 @contextmanager
@@ -60,7 +63,7 @@ def _renamed(paths: Sequence[Path]) -> Iterator[list[Path]]:
             raise FileNotFoundError(f"{path}: the folder {path.parent} does not exist; create it first.")
     # Two machines, processes, or threads of one, may write the same file: each needs its own temporary file.
     writer = f"{_host()}.{os.getpid()}.{threading.get_ident()}"
-    temporaries = [path.with_name(f".{path.name}.{writer}.tmp") for path in paths]
+    temporaries = [path.with_name(f".{_shorten(path.name)}.{writer}.tmp") for path in paths]
     try:
         yield temporaries
         for temporary in temporaries:
@@ -87,6 +90,12 @@ def remove_abandoned(folder: str | Path) -> None:
                 path.unlink()
         except OSError:
             continue
+
+
+def _shorten(name: str) -> str:
+    """The name of a file, or a digest of one that leaves no room for more: a name has at most 255 bytes."""
+    coded = name.encode(errors="surrogatepass")
+    return name if len(coded) <= _LONGEST else hashlib.sha256(coded).hexdigest()
 
 
 def _host() -> str:

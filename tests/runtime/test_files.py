@@ -122,6 +122,13 @@ def test_threads_do_not_write_into_each_others_file(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_text() in texts
 
 
+@pytest.mark.parametrize("letter", ["a", "\N{CJK UNIFIED IDEOGRAPH-5F71}"])
+def test_names_may_be_as_long_as_the_system_allows(tmp_path: Path, letter: str) -> None:
+    stem = letter * (240 // len(letter.encode()))
+    write_atomically({tmp_path / f"{stem}.{ending}": ending for ending in ("exr", "png")})
+    assert contents(tmp_path) == {f"{stem}.exr": "exr", f"{stem}.png": "png"}
+
+
 def test_json_round_trips(tmp_path: Path) -> None:
     write_json(tmp_path / "a.json", {"é": [1, 2.5, None, True]})
     text = (tmp_path / "a.json").read_text(encoding="utf-8")
