@@ -139,6 +139,15 @@ def test_patterns_name_the_files_of_a_pass(pattern: str, tmp_path: Path, capsys:
     assert "none_*.exr: expected a folder of EXR files, a pattern" in " ".join(capsys.readouterr().err.split())
 
 
+def test_a_picture_in_files_of_its_own_is_what_is_denoised(tmp_path: Path) -> None:
+    """Its result would have no place in the files that were named."""
+    source = write(tmp_path / "in", lambda name, frame: f"{'noisy' if name == 'beauty' else name}.{frame:04d}.exr")
+    naming = ChannelNaming(channels={"radiance": str(source / "noisy.*.exr")})
+    with pytest.raises(ClipError, match=r"--channels radiance=.*noisy.*: expected a layer of the files that are"):
+        denoise_files([source / "depth.*.exr"], tmp_path / "out", box_blur(), Settings(naming=naming))
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_frame_without_one_of_its_passes_is_missing(tmp_path: Path) -> None:
     source, told = write(tmp_path / "in", PLACES["name.number"][0]), list[str]()
     (source / "albedo.0001.exr").unlink()

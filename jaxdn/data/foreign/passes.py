@@ -48,12 +48,18 @@ def join_passes(shots: Sequence[Shot], stated: Mapping[str, str]) -> tuple[list[
     """The shots, those that are passes of another joined to it, and what to know, in sentences.
 
     A data pass (albedo, normals, depth ...) is never a picture: without one beside it, it is left out. Raises ClipError
-    if nothing else is left, or if a pattern that is stated fits no files.
+    if nothing else is left, if a pattern that is stated fits no files, and for one of the radiance: a result is written
+    into a copy of its own file.
 
     Args:
       shots: of one call.
       stated: buffer -> pattern for its files, which are joined to every shot.
     """
+    if "radiance" in stated:
+        raise ClipError(
+            f"--channels radiance={stated['radiance']}: expected a layer of the files that are denoised, got other "
+            "files; denoise those, and name the others by their buffers."
+        )
     others = {buffer: _by_number(find_shots(pattern)) for buffer, pattern in stated.items()}
     taken = {file.resolve() for files in others.values() for file in files.values()}
     shots = [shot for shot in shots if not {file.resolve() for file in shot.files} <= taken]
