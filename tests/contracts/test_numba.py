@@ -1,5 +1,6 @@
 """The loops that Numba compiles against the operations in jax that they stand for, and when they are used."""
 
+import errno
 import functools
 import os
 import subprocess
@@ -438,6 +439,45 @@ def test_loops_are_compiled_where_no_folder_can_be_written():
     nowhere = {**os.environ, "NUMBA_CACHE_DIR": f"{os.devnull}/folder"}
     done = subprocess.run([sys.executable, "-c", script], env=nowhere, capture_output=True, text=True, check=False)
     assert done.stdout == "compiled\n", done.stderr
+
+
+def _double(top, bottom, values):
+    for x in range(top, bottom):
+        values[x] *= 2
+
+
+@pytest.fixture
+def loop(tmp_path, monkeypatch):
+    """The decorator of loops, which are kept in an empty folder."""
+    from jaxdn.ops.dispatch import numba_rows
+
+    monkeypatch.setenv("JAXDN_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(numba_rows._numba, "CACHE_DIR", "")
+    return numba_rows.loop
+
+
+def test_half_a_file_of_a_loop_is_written_again(loop, tmp_path):
+    """As a machine leaves it that crashes."""
+    values = np.ones(3, np.float32)
+    loop(_double)(0, 3, values)
+    for ending in ("nbc", "nbi"):
+        (file,) = tmp_path.glob(f"loops/*/*_double-*.{ending}")
+        file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+        loop(_double)(0, 3, values)
+    kept = loop(_double)
+    kept(0, 3, values)
+    np.testing.assert_array_equal(values, 16)
+    assert sum(kept.stats.cache_hits.values()) == 1
+
+
+def test_a_full_disk_ends_no_loop(loop, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile.save", refuse)
+    values = np.ones(3, np.float32)
+    loop(_double)(0, 3, values)
+    np.testing.assert_array_equal(values, 2)
 
 
 def test_what_was_compiled_before_functions_of_rows_changed_is_not_used(tmp_path):

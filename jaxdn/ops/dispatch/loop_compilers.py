@@ -152,9 +152,9 @@ def example(kind: Any, *, written: bool) -> np.ndarray:
 
 
 def _can_be_kept(loop: Any) -> bool:
-    from numba.core.caching import FunctionCache
+    from jaxdn.ops.dispatch.numba_rows import KeptLoops
 
-    return type(getattr(loop, "_cache", None)) is FunctionCache
+    return type(getattr(loop, "_cache", None)) is KeptLoops
 
 
 def _is_kept(loop: Any) -> bool:

@@ -23,6 +23,28 @@ _options: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_m
 inlined = njit(**_options, inline="always")
 
 
+class KeptLoops(FunctionCache):
+    """Numba's files of a loop; those that cannot be read or written cost time alone.
+
+    A machine that crashes leaves half a file, and a disk may be full: Numba's own would end every run there.
+    """
+
+    def load_overload(self, *which: Any) -> Any:
+        """What is kept; None if there is nothing, or nothing that can be read, which is removed."""
+        try:
+            return super().load_overload(*which)
+        except Exception:  # what pickle and LLVM say of half a file has no common base class
+            for file in Path(self.cache_path).glob(f"*.{self._py_func.__name__}-*.nb?"):
+                with contextlib.suppress(OSError):
+                    file.unlink()
+            return None
+
+    def save_overload(self, *which: Any) -> None:
+        """What cannot be written is compiled in every process."""
+        with contextlib.suppress(OSError):
+            super().save_overload(*which)
+
+
 class _ReadOnlyLocator(UserProvidedCacheLocator):
     def ensure_cache_path(self) -> None:
         """Numba's own refuses what cannot be written."""
@@ -32,8 +54,8 @@ class _ReadOnlyFiles(CompileResultCacheImpl):
     _locator_classes = [_ReadOnlyLocator]  # noqa: RUF012, as the class above has it
 
 
-class _ReadOnlyCache(FunctionCache):
-    _impl_class = _ReadOnlyFiles
+class _ReadOnlyCache(KeptLoops):
+    _impl_class: Any = _ReadOnlyFiles
 
     def save_overload(self, *_: Any) -> None:
         """What is missing is compiled in every process."""
@@ -45,15 +67,15 @@ def loop(function: Callable[..., None]) -> Callable[..., None]:
     It is kept below the folder of :data:`jaxdn.runtime.program_cache.VARIABLE` where that is set, which may be
     read-only later; else beside its file, or in the user's own folder where that cannot be written.
     """
+    kept: Any = njit(**_options, nogil=True)(function)
     with _kept_in(_chosen_folder()) as read_only:
         if read_only:
-            found: Any = njit(**_options, nogil=True)(function)
-            found._cache = _ReadOnlyCache(function)
-            return found
+            kept._cache = _ReadOnlyCache(function)
+            return kept
         try:
-            kept: Any = njit(**_options, nogil=True, cache=True)(function)
+            kept._cache = KeptLoops(function)
         except RuntimeError:  # no folder can be written
-            return njit(**_options, nogil=True)(function)
+            return kept
     # Numba compiles anew where the loop's own file has changed, and knows nothing of this one.
     changed = Path(__file__).stat().st_mtime
     for file in Path(kept.stats.cache_path).glob(f"*.{function.__name__}-*.nb?"):
