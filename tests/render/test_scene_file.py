@@ -170,6 +170,14 @@ def test_the_record_builds_the_same_scene(folder, monkeypatch):
     np.testing.assert_array_equal(*images)
 
 
+def test_a_scene_may_lie_on_another_drive(folder, monkeypatch):
+    def refuse(path):
+        raise ValueError("path is on mount 'D:', start on mount 'C:'")
+
+    monkeypatch.setattr("os.path.relpath", refuse)
+    assert SceneFile(folder / "scene.xml").record["file"] == (folder / "scene.xml").resolve().as_posix()
+
+
 def test_an_animation_next_to_the_scene_is_found(folder):
     (folder / "scene.json").write_text(json.dumps({"frames": 7}))
     assert SceneFile(folder / "scene.xml").frames == 7

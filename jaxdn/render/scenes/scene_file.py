@@ -79,8 +79,7 @@ class SceneFile:
         self.name = self.name_of(path)
         self.frames = int(animation.get("frames", 1))
         self.max_depth = _read_path_length(parser)
-        near = os.path.relpath(path)
-        self.record = {"file": path.resolve().as_posix() if near.startswith("..") else near, "animation": animation}
+        self.record = {"file": _shorten(path), "animation": animation}
         self._camera = CameraKeys(animation["camera"]) if "camera" in animation else None
         self._motions = {
             name: RigidKeys(motion["keys"], np.array(motion.get("pivot", (0, 0, 0)), float))
@@ -195,6 +194,15 @@ class SceneFile:
             "sampler": {"type": "independent"},
             "film": {**film, "pixel_format": "rgb", "component_format": "float32"},
         }
+
+
+def _shorten(path: Path) -> str:
+    """The path from the folder where the command runs, if it lies in there; else the whole one."""
+    try:
+        near = os.path.relpath(path)
+    except ValueError:  # on another drive of Windows
+        near = ".."
+    return path.resolve().as_posix() if near.startswith("..") else near
 
 
 def _read_camera(parser: SceneParser) -> tuple[Camera | None, float, float, int | None]:
