@@ -22,6 +22,8 @@ _FOLDER = re.compile(r"(?:(?:frame|fr|f)[._ -]?)?(-?\d+)", re.IGNORECASE)
 """The name of a folder that holds one frame. ``sh010`` and ``v02`` are shots and versions."""
 _PARTS = 2
 """Digits that the parts of a single frame have; ``s.1.0``, ``s.1.5`` may be versions."""
+_FARTHEST = 10**7
+"""Numbers that lie farther apart are times, and no frames are missing between them."""
 _INSIDE = 4
 """Digits of a number that counts frames though letters touch it and more follows, as in ``frame0001_left``."""
 
@@ -120,14 +122,15 @@ def _read_group(files: Mapping[Path, str]) -> list[FrameName]:
     # A number that differs comes first, but for one that letters touch: of sh0010_0001, sh0020_0001 it is the shot's.
     scores = [(rank + 1.5 * (rank > 0 and place in varying), place) for place, rank in ranks.items()]
     rank, place = max(scores, default=(0, -1))
-    if rank == 0:
+    parts = _subframes(stems, runs, place) if rank > 0 and place > 0 else None
+    numbers = [Fraction(each[place] if rank > 0 else 0) for each in values] if parts is None else parts
+    if rank == 0 or max(numbers) - min(numbers) > _FARTHEST:
         return [FrameName(file, stem, None) for file, stem in files.items()]
-    parts = _subframes(stems, runs, place) if place > 0 else None
     names = []
     for index, (file, found) in enumerate(zip(files, runs, strict=True)):
         start = found[place].start() if parts is None else found[place - 1].start()
         shot = f"{stems[index][:start]}#{stems[index][found[place].end() :]}"
-        names.append(FrameName(file, shot, Fraction(values[index][place]) if parts is None else parts[index]))
+        names.append(FrameName(file, shot, numbers[index]))
     return names
 
 
@@ -141,7 +144,7 @@ def _read_folders(files: Iterable[Path]) -> dict[Path, FrameName]:
     return {
         file: FrameName(file, alike.name, Fraction(number))
         for alike, numbers in groups.items()
-        if len(numbers) > 1
+        if len(numbers) > 1 and max(numbers.values()) - min(numbers.values()) <= _FARTHEST
         for file, number in numbers.items()
     }
 
