@@ -91,6 +91,15 @@ def test_parts_of_the_beauty_are_found_by_their_values(name: str, tmp_path: Path
     assert parts == set(ADDITIVE[name][0])
 
 
+def test_a_filter_that_rings_hides_no_part() -> None:
+    scene = truth(0)
+    light, diffuse = (np.array(each, np.float32) for each in (scene.light, scene.diffuse))
+    light[3, 4], diffuse[3, 4] = -0.02, -0.01
+    for part, wanted in ((diffuse, True), (1e-3 * scene.normal, False)):
+        pixels = programs.layer("part", part, "RGB")
+        assert is_additive(pixels, tuple(pixels), light) is wanted
+
+
 @pytest.mark.slow
 def test_the_beauty_once_more_is_denoised_but_is_no_part(tmp_path: Path) -> None:
     source, told = write_shot("Blender", tmp_path / "in"), list[str]()
