@@ -209,8 +209,8 @@ class Session:
         """Fill ``outputs``; the arguments are views of XLA's own buffers."""
         with self._lock:
             if not same_weights(list(weights), self._weights):
-                self._weights = [weight.copy() for weight in weights]
-                self._program = self._describe(self._weights)
+                own = [weight.copy() for weight in weights]
+                self._program, self._weights = self._describe(own), own  # where that fails, all stays as it was
             with dnnl.LOCK:
                 self._program(dnnl.address_of(features), [dnnl.address_of(output) for output in outputs])
 

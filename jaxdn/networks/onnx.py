@@ -142,10 +142,9 @@ class Session:
         options.enable_cpu_mem_arena = False
         options.intra_op_num_threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 0
         options.log_severity_level = 3
-        self._weights = [weight.copy() for weight in weights]
-        self._session = onnxruntime.InferenceSession(
-            self._describe(self._weights), options, providers=["CPUExecutionProvider"]
-        )
+        own = [weight.copy() for weight in weights]
+        self._session = onnxruntime.InferenceSession(self._describe(own), options, providers=["CPUExecutionProvider"])
+        self._weights = own  # after what may fail
 
 
 def run(network: GraphSpec, weights: Weights, groups: list[jax.Array]) -> tuple[jax.Array, ...]:

@@ -169,6 +169,24 @@ def test_other_types_are_refused(pair, precision):
         fast(params, [group.astype(jnp.bfloat16) for group in groups])
 
 
+def test_weights_for_which_no_program_could_be_made_are_no_program_s():
+    """Memory may be full once: the next call must not run with the weights of the one before."""
+    ran, full = [], [2.0]
+
+    def describe(weights):
+        if weights[0][0] in full:
+            full.clear()
+            raise MemoryError
+        return lambda features, heads: ran.append(float(weights[0][0]))
+
+    session = onednn.Session(describe)
+    session([], np.zeros(1), np.full(1, 1.0))
+    with pytest.raises(MemoryError):
+        session([], np.zeros(1), np.full(1, 2.0))
+    session([], np.zeros(1), np.full(1, 2.0))
+    assert ran == [1.0, 2.0]
+
+
 def test_a_cpu_without_it_is_told(monkeypatch):
     monkeypatch.setattr(dnnl, "available", lambda: True)
     monkeypatch.setattr(dnnl, "computes_bfloat16", lambda: False)
