@@ -106,15 +106,20 @@ def _inspect_shot(
             if len(opened) == 1:
                 raise
             del opened[0]
-    sequence = ForeignSequence(opened, naming)
-    height, width = sequence.window.size
+    height, width = ForeignSequence(opened, naming).window.size
     if overlay is not None and min(height, width) < LEAST_SIDE:
         raise ClipError(
             f"--overlay: expected {LEAST_SIDE} pixels a side or more, got {width} x {height}; leave it out."
         )
     # Vectors of 0, as a first frame has them, count as missing in its table.
     unstated = lacks_convention(opened[0], naming)
-    fitting = sequence.fitting_conventions() if unstated else None
+    fitting: list[str] | None = None
+    while unstated and fitting is None:
+        try:
+            fitting = ForeignSequence(opened, naming).fitting_conventions()
+        except DamagedFile as error:  # the second one: the first is decoded already
+            unusable[label_file(error.path)] = error.reason
+            del opened[1]
     looked = choose_frames(opened)
     odd = [line for line in find_odd_values(looked, naming, unexplained=unstated) if line not in notes]
     gaps = f"{ranges(find_missing(shot.numbers))} missing" if find_missing(shot.numbers) else None

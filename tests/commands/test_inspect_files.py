@@ -1,6 +1,7 @@
 """``jaxdn inspect`` on files of other renderers: what is read, what is missing, what to state, and nothing else."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +130,23 @@ def test_one_frame_cannot_tell_and_all_conventions_are_listed(shots: dict[str, P
     assert "One frame alone does not tell, and needs no motion" in text
     assert f"1 frame of {WIDTH - 2} x {HEIGHT - 2} pixels" in text
     assert json.loads(run(alone, "--json"))["fitting_conventions"] == []
+
+
+def test_a_second_file_that_is_damaged_tells_nothing_of_conventions(
+    shots: dict[str, Path], tmp_path: Path, run: Any, fails: Any
+) -> None:
+    name = UNSTATED[0]
+    source = Path(shutil.copytree(shots[name], tmp_path / "in"))
+    first, second, third = sorted(source.iterdir())
+    data = second.read_bytes()
+    second.write_bytes(data[:-20] + bytes(20))
+    text = run(source)
+    assert f"{second.name} counts as a missing frame: the pixel data is truncated or damaged" in text
+    assert "2 frames of " in text
+    assert f"{first.name} and {third.name}" in text
+    message = fails("denoise", source, "-o", tmp_path / "out", "--method", "taa")
+    assert "state --motion-convention" in " ".join(message.split())
+    assert not list((tmp_path / "out").glob("*.exr"))
 
 
 def test_where_nothing_moves_that_is_said(tmp_path: Path, run: Any) -> None:

@@ -183,7 +183,10 @@ class ForeignSequence:
 
     def _advise_convention(self) -> str:
         """What the first two frames tell about the convention of their motion vectors, as a line; "" for nothing."""
-        fitting = self.fitting_conventions()
+        try:
+            fitting = self.fitting_conventions()
+        except ClipError:  # the second file is told of when its turn comes
+            return ""
         if not fitting:
             return ""
         named = " or ".join(f"--motion-convention {name}" for name in fitting)
