@@ -33,6 +33,8 @@ def keep_programs() -> Path | None:
     if "JAX_COMPILATION_CACHE_DIR" in os.environ or os.environ.get(VARIABLE) == "":
         return None
     folder = cache_folder() / f"programs-{metadata.version('jaxlib')}-{_describe_cpu()}"
+    if not folder.is_absolute() and VARIABLE not in os.environ:  # no home: it would be made where the command runs
+        return None
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:  # read-only, or no home

@@ -135,6 +135,15 @@ def test_a_usual_folder_that_cannot_be_made_is_no_matter(tmp_path, monkeypatch):
         assert keep_programs() is None
 
 
+def test_without_a_home_nothing_is_made_where_the_command_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for variable in (VARIABLE, "XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setattr(program_cache.os.path, "expanduser", lambda path: path)  # as of a user that is not known
+    assert keep_programs() is None
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("system", "variable", "tail"),
     [("linux", "XDG_CACHE_HOME", "jaxdn"), ("win32", "LOCALAPPDATA", "cache"), ("darwin", None, "jaxdn")],
