@@ -3,7 +3,6 @@
 import os
 import platform
 from collections.abc import Iterator
-from importlib import metadata
 from importlib.util import find_spec
 from typing import NamedTuple
 
@@ -18,7 +17,7 @@ from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import OPERATIONS, REFERENCE, VARIABLE, default_implementation
 from jaxdn.ops.onednn import library
 from jaxdn.render.mitsuba.variant import choose_variant, has_cuda
-from jaxdn.runtime.optional import OPTIONAL_DEPENDENCIES, install
+from jaxdn.runtime.optional import OPTIONAL_DEPENDENCIES, find_version, install
 from jaxdn.runtime.terminal import plain_console
 
 _EXTRA_OF = {"onednn-bfloat16": "onednn", "onednn-float32": "onednn", "onnxruntime": "onnx", "onednn": "onednn"}
@@ -98,9 +97,7 @@ def _packages(what: str, extra: str) -> Diagnosis:
     missing = [module for module in OPTIONAL_DEPENDENCIES[extra].modules if find_spec(module) is None]
     if missing:
         return Diagnosis(what, f"without {', '.join(missing)}", f"to use it: {install(extra)}")
-    return Diagnosis(
-        what, ", ".join(f"{name} {metadata.version(name)}" for name in OPTIONAL_DEPENDENCIES[extra].packages)
-    )
+    return Diagnosis(what, ", ".join(f"{name} {find_version(name)}" for name in OPTIONAL_DEPENDENCIES[extra].packages))
 
 
 def _renderer() -> Diagnosis:
@@ -108,6 +105,6 @@ def _renderer() -> Diagnosis:
     if find_spec("mitsuba") is None:
         return _packages("rendering", "render")
     choice = choose_variant()
-    found = f"mitsuba {metadata.version('mitsuba')}, {choice.variant}"
+    found = f"mitsuba {find_version('mitsuba')}, {choice.variant}"
     reason, _, advice = choice.reason.partition(". ")
     return Diagnosis("rendering", f"{found}: {reason}", advice)

@@ -1,6 +1,5 @@
 """Render a clip into a folder of OpenEXR frames, resumable at any point."""
 
-import importlib.metadata
 import json
 import platform
 from collections.abc import Callable, Mapping
@@ -23,6 +22,7 @@ from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.settings import RenderSettings
 from jaxdn.render.tracing.tracer import choose_tracer
 from jaxdn.runtime.atomic_files import remove_abandoned
+from jaxdn.runtime.optional import find_version
 
 
 def render_clip(
@@ -177,7 +177,7 @@ def _record_camera(scene: AnimatedScene, frame: int) -> dict[str, Any]:
 def _list_versions() -> dict[str, str]:
     return {
         "python": platform.python_version(),
-        **{name: importlib.metadata.version(name) for name in ("mitsuba", "drjit")},
+        **{name: find_version(name) for name in ("mitsuba", "drjit")},
     }
 
 

@@ -1,5 +1,6 @@
 """The packages that not everybody needs, and how to install them. jaxdn itself is on no package index."""
 
+from importlib import metadata
 from typing import NamedTuple
 
 
@@ -33,3 +34,11 @@ def install(extra: str) -> str:
 def find_group(module: str) -> str | None:
     """The extra that brings a top-level module; None if none does."""
     return next((name for name, extra in OPTIONAL_DEPENDENCIES.items() if module in extra.modules), None)
+
+
+def find_version(package: str) -> str:
+    """The version of a package that is there; "unknown" of one that was built here, and not installed."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "unknown"

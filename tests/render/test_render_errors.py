@@ -4,11 +4,14 @@ import re
 import subprocess
 import sys
 import tomllib
+from importlib import metadata
 from pathlib import Path
 
 import pytest
 
+from jaxdn.commands import doctor
 from jaxdn.commands.errors import plain_errors
+from jaxdn.render import clip
 from jaxdn.runtime.atomic_files import write_atomically
 from jaxdn.runtime.optional import OPTIONAL_DEPENDENCIES, install
 
@@ -77,6 +80,18 @@ def test_the_extras_are_those_of_the_project(extra):
     declared = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     needed = declared["optional-dependencies"][extra]
     assert OPTIONAL_DEPENDENCIES[extra].packages == tuple(re.match(r"[\w-]+", requirement)[0] for requirement in needed)
+
+
+def test_a_renderer_of_ones_own_has_no_version(monkeypatch):
+    """Mitsuba is often built, and found by PYTHONPATH, without having been installed."""
+
+    def version(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", version)
+    monkeypatch.setattr(doctor, "find_spec", lambda name: name)
+    assert doctor._packages("rendering", "render").found == "mitsuba unknown"
+    assert clip._list_versions()["drjit"] == "unknown"
 
 
 @pytest.mark.parametrize("name", ["jaxdn.nowhere", "PIL", None])
