@@ -110,7 +110,7 @@ def find_model(name: str, **options: Any) -> Model:
     denoiser, params = load_weights(name, **options)
     path = Path(name)
     # A run's folder is a better label than the file name, which is the same for all runs.
-    label = path.parent.name if path.stem == "weights" else path.stem
+    label = (path.absolute().parent.name if path.stem == "weights" else "") or path.stem
     return Model(label, denoiser, params, method, describe(name)["options"] | options)
 
 

@@ -11,6 +11,7 @@ import pytest
 import jaxdn
 from jaxdn.core.frame import Frame
 from jaxdn.denoisers import ntd
+from jaxdn.zoo.ready import find_model
 from jaxdn.zoo.weights import flatten, save_weights, shipped_names, starting_params, unflatten
 
 TINY = ((4,), (4,), (4,), (4,), (4,))
@@ -95,6 +96,15 @@ def test_weights_of_another_network_are_no_start(tmp_path, options):
     path = save_weights(tmp_path / "w", params, factory="ntd", options={"size": size}, record={})
     with pytest.raises(ValueError, match=r"expected a network that training can continue from, but .* is \("):
         starting_params(path, ntd(**options))
+
+
+def test_a_run_s_weights_are_called_after_their_folder_from_anywhere(saved, tmp_path, monkeypatch):
+    (tmp_path / "mine").mkdir()
+    for ending in (".safetensors", ".json"):
+        saved[0].with_suffix(ending).rename(tmp_path / "mine" / f"weights{ending}")
+    monkeypatch.chdir(tmp_path / "mine")
+    for name in ("weights.safetensors", "../mine/weights.safetensors", tmp_path / "mine" / "weights.safetensors"):
+        assert find_model(str(name)).label == "mine"
 
 
 def test_flatten_and_back():
