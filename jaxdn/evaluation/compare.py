@@ -115,7 +115,7 @@ def compare(
     one half of the samples of its reference, PSNR, temporal PSNR, MSE and relative MSE are given without the noise of
     the reference too (:func:`jaxdn.metrics.unbiased_mse`). Disoccluded pixels are those whose point was hidden in the
     previous frame (``visible`` is false). Milliseconds are the median of three runs of the compiled clip, divided by
-    its frames, without compilation. Raises ValueError for a clip without a reference.
+    its frames, without compilation. Raises ValueError for methods of one label, and for a clip without a reference.
 
     Args:
       methods: what to compare.
@@ -128,6 +128,12 @@ def compare(
       read: (folder, spp, layers) -> what to score by.
       log: called with one line per clip.
     """
+    labels = [method.label for method in methods]
+    if twice := sorted({label for label in labels if labels.count(label) > 1}):
+        raise ValueError(
+            f"methods: expected every label once, got {', '.join(twice)} twice; name each method once, and let the "
+            "folders of weights have different names."
+        )
     compiled: dict[str, Callable[[Params, Clip], jax.Array]] = {}
     for method in methods:
         if method.denoiser is not None:
@@ -146,7 +152,6 @@ def compare(
             f"{result.noise_floor_psnr:.1f} dB)  {time.monotonic() - began:.0f} s"
         )
         clips.append(result)
-    labels = [method.label for method in methods]
     known = {method.label: method.method.title for method in methods if method.method is not None}
     opens_on = DEFAULT_MODEL if DEFAULT_MODEL in labels else _last_network(methods)
     descriptions = {**known, **(about or {})}

@@ -74,3 +74,9 @@ def test_the_report_says_which_score_to_read(tmp_path, halves):
     assert ("unbiased" in text_table(results)) == halves
     page = write_report(results, tmp_path / "report").read_text()
     assert ("Temporal PSNR dB, unbiased" in page) == halves
+
+
+def test_methods_of_one_name_are_refused_before_a_clip_is_read(tmp_path):
+    noisy = Model("noisy", None, {}, None, {})
+    with pytest.raises(ValueError, match="methods: expected every label once, got noisy twice"):
+        compare([noisy, noisy], [tmp_path / "nowhere"], title="", settings={})
