@@ -167,7 +167,7 @@ class FrameDenoiser:
             lambda given: (_combine(given[0], given[1], level, given[2]), None),
             (noisy, image, surface),
             image.shape[:2],
-            side=self._step.side,
+            side=max(self._step.side, 2 * (REACH + GRID) + GRID),  # a method may look less far
             halo=REACH,
         )
         return combined

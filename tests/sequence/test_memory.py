@@ -52,6 +52,16 @@ def test_frames_in_parts_are_the_same_files(tmp_path):
     assert np.abs(images["whole"][1] - images["whole"][0]).mean() > 1e-4, "the history of the first frame is used"
 
 
+@pytest.mark.slow
+def test_tiles_of_a_method_that_looks_less_far_than_the_safe_mixture(tmp_path):
+    """Pixels decide about one from 4 away in taa, and from 64 away in the mixture."""
+    height, width, side = 120, 330, 160
+    write_sequence(tmp_path / "in", 1, height, width)
+    enough = estimate_bytes(height, width, len(ExrFile(tmp_path / "in/frame_0001.exr").windows))
+    settings = Settings(naming=ChannelNaming("previous-current"), max_memory=enough - STEP * (height * width - side**2))
+    assert denoise_files([tmp_path / "in"], tmp_path / "out", find_model("taa"), settings).files
+
+
 def test_too_little_memory_is_refused_before_anything_is_written(tmp_path):
     write_sequence(tmp_path / "in", 1, 200, 300)
     settings = Settings(naming=ChannelNaming("previous-current"), max_memory=0.61 * 2**30)
