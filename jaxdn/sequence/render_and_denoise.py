@@ -57,8 +57,8 @@ def denoise_scene(
     a scene, for a budget that is out of range, and where Mitsuba has only scalar variants.
     """
     scene = open_scene(source, animation)
-    wanted = sorted(range(scene.frames) if settings.frames is None else settings.frames)
-    if not wanted or wanted[-1] >= scene.frames:
+    wanted = sorted(set(range(scene.frames) if settings.frames is None else settings.frames))
+    if not wanted or wanted[0] < 0 or wanted[-1] >= scene.frames:
         raise ValueError(f"--frames: expected some of 0 to {scene.frames - 1}, which {source} has, got {wanted}.")
     if method.denoiser is None:
         raise ValueError(f"--method {method.label}: expected a denoiser for a scene, got the noisy image itself.")

@@ -172,6 +172,7 @@ WRONG = {
     "a budget below one sample": (("fruit", "--budget", "0.5"), "budget: expected a mean number of samples above 0"),
     "no budget": (("fruit", "--budget", "0"), "budget: expected"),
     "a frame that is not there": (("fruit", "--frames", "400"), "--frames: expected some of 0 to"),
+    "a frame before the first": (("fruit", "--frames=-1-1"), "--frames: expected some of 0 to"),
     "an option of files": (("fruit", "--layer", "View"), "--layer: expected frames that are there, got a scene"),
     "two sources": (("fruit", "robot"), "expected one scene and nothing else, got 2 sources"),
     "no such scene": (("nowhere.xml",), "nowhere.xml"),
