@@ -15,6 +15,7 @@ from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES
 from jaxdn.render.adaptive import render_sampled
 from jaxdn.render.open_scene import open_scene
 from jaxdn.render.settings import RenderSettings
+from jaxdn.runtime.atomic_files import remove_abandoned
 from jaxdn.sequence.frame_denoiser import light_of
 from jaxdn.sequence.render_jobs import plan_clip
 from jaxdn.sequence.run import Written
@@ -72,6 +73,8 @@ def denoise_scene(
             f"--budget {settings.budget:g}: expected a whole number of at least 1, as {method.label} does not say "
             "where samples go."
         )
+    if out.is_dir():
+        remove_abandoned(out)
     step = stream(method.denoiser, method.params)
     sees_sample = method.denoiser.samples is not None and method.denoiser.sees_sample
     most = max(MOST, round(settings.budget * MOST))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxdn.data.errors import DamagedFile
-from jaxdn.runtime.atomic_files import atomic_write
+from jaxdn.runtime.atomic_files import atomic_write, remove_abandoned
 from jaxdn.runtime.overlap import Behind
 from jaxdn.runtime.scratch import remove_abandoned_folders
 from jaxdn.sequence.backward_pass import HIDDEN
@@ -98,6 +98,7 @@ def denoise_files(
     for folder in {target.parent for job in jobs for target in job.targets}:
         if folder.is_dir():
             remove_abandoned_folders(folder, HIDDEN)
+            remove_abandoned(folder)
     checked = leave_out_unusable(jobs, settings, log)
     total = sum(len(job.wanted) + sum(map(len, job.copies.values())) for job, _ in checked)
     run = _Run(method, settings, total, on_frame, log)

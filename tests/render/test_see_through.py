@@ -1,5 +1,6 @@
 """Guides of what flat mirrors and glass show: those of a scene where the mirrored things really stand there."""
 
+import os
 from typing import Any
 
 import jax
@@ -269,9 +270,14 @@ def test_what_a_mirror_shows_stays_sharp(tmp_path):
 def test_a_scene_is_denoised_with_the_guides_of_what_is_seen(tmp_path):
     (tmp_path / "checks.xml").write_text(CHECKS)
     told: dict[str, list[str]] = {"svgf": [], "trmv": []}
+    (tmp_path / "svgf").mkdir()
+    half = tmp_path / "svgf" / ".frame_0000.exr.elsewhere.7.1.tmp"  # of a killed run
+    half.write_text("half")
+    os.utime(half, (0, 0))
     for name, lines in told.items():
         settings = SceneSettings(RenderSettings(width=16, height=16), frames=[0], budget=1)
         denoise_scene(str(tmp_path / "checks.xml"), None, tmp_path / name, find_model(name), settings, log=lines.append)
     line = "guides of flat mirrors and glass are those of what they show"
     assert line in told["svgf"]
     assert line not in told["trmv"], "trmv follows reflections by the mirror's own guides"
+    assert [path.name for path in (tmp_path / "svgf").iterdir()] == ["frame_0000.exr"]

@@ -237,3 +237,16 @@ def test_any_run_removes_what_a_killed_one_left_and_nothing_of_one_that_lives(tm
     (out / ".backwards-89ab").mkdir()
     denoise_files([source], out, find_model("noisy"), Settings(skip_existing=True))
     assert sorted(path.name for path in out.iterdir()) == ["a.0000.exr", "a.0001.exr"]
+
+
+def test_half_written_frames_of_a_killed_run_are_removed_from_the_folders_of_the_results_alone(tmp_path: Path) -> None:
+    source, out = noisy_wall(tmp_path / "in", 1), tmp_path / "out"
+    name = ".a.0000.exr.elsewhere.7.1.tmp"
+    for folder in (source, out, out / "other"):
+        folder.mkdir(exist_ok=True)
+        (folder / name).write_text("half")
+        os.utime(folder / name, (0, 0))  # older than a day
+    denoise_files([source], out, find_model("noisy"), Settings())
+    assert sorted(path.name for path in out.iterdir()) == ["a.0000.exr", "other"]
+    assert (source / name).exists()
+    assert (out / "other" / name).exists()
