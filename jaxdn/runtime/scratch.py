@@ -34,10 +34,11 @@ def _new_lock(parent: Path, prefix: str) -> tuple[Path, int]:
     while True:
         lock = parent / f"{prefix}{secrets.token_hex(4)}.lock"
         handle = os.open(lock, os.O_CREAT | os.O_EXCL | os.O_RDWR)
-        _try_lock(handle)
-        if lock.exists():  # else another process has taken it for abandoned, before it was locked
+        # Another process may take it for abandoned before it is locked: it has the lock, or has removed the file.
+        if _try_lock(handle) is not False and lock.exists():
             return lock, handle
         os.close(handle)
+        _remove(lock)
 
 
 def remove_abandoned_folders(parent: Path, prefix: str) -> None:
@@ -68,8 +69,8 @@ def _remove(lock: Path) -> None:
         lock.unlink()
 
 
-def _try_lock(handle: int) -> bool:
-    """Lock a file for as long as it is open in this process; False if another has locked it, or nobody can."""
+def _try_lock(handle: int) -> bool | None:
+    """Lock a file for as long as it is open in this process; False if another has locked it, None if nobody can."""
     try:
         if sys.platform == "win32":
             import msvcrt
@@ -79,6 +80,8 @@ def _try_lock(handle: int) -> bool:
             import fcntl
 
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except (BlockingIOError, PermissionError):  # the second on Windows
         return False
+    except OSError:  # the disk has no locks
+        return None
     return True

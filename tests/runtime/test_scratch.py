@@ -1,12 +1,15 @@
 """Scratch folders: gone with the run, of a killed run with the next, and never those of a run that still works."""
 
+import errno
+import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from jaxdn.runtime.scratch import scratch_folder
+from jaxdn.runtime.scratch import remove_abandoned_folders, scratch_folder
 
 WORK = """
 import pathlib, sys
@@ -57,3 +60,37 @@ def test_what_a_killed_process_left_is_removed_by_the_next_and_nothing_else(tmp_
     working.communicate("\n", timeout=30)
     assert working.returncode == 0
     assert [path.name for path in tmp_path.iterdir()] == ["frame.exr"]
+
+
+def refuse_locks(monkeypatch: pytest.MonkeyPatch, refusals: Iterator[int | None]) -> None:
+    """Locking a file fails with these error numbers, one a call; None: it succeeds."""
+    fcntl = pytest.importorskip("fcntl")
+
+    def lock(handle: int, mode: int) -> None:
+        if (number := next(refusals)) is not None:
+            raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", lock)
+
+
+def test_a_folder_whose_file_another_process_has_locked_first_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other process takes it for abandoned and removes it in a moment."""
+    refuse_locks(monkeypatch, iter([errno.EWOULDBLOCK, None]))
+    names = iter(["taken", "mine"])
+    monkeypatch.setattr("secrets.token_hex", lambda count: next(names))
+    with scratch_folder(tmp_path, ".work-") as folder:
+        assert folder.name == ".work-mine"
+        assert not (tmp_path / ".work-taken").exists()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_without_locks_has_scratch_folders_that_nobody_removes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse_locks(monkeypatch, iter([errno.ENOLCK] * 2))
+    with scratch_folder(tmp_path, ".work-") as folder:
+        remove_abandoned_folders(tmp_path, ".work-")
+        assert folder.is_dir()
+    assert list(tmp_path.iterdir()) == []
