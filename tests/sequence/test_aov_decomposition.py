@@ -9,7 +9,7 @@ from jaxdn import clips
 from jaxdn.core.frame import Frame
 from jaxdn.data.foreign.classify import ChannelNaming
 from jaxdn.data.foreign.layers import stack_channels
-from jaxdn.data.foreign.lighting import coloured_layers, is_additive
+from jaxdn.data.foreign.lighting import coloured_layers, explain_light, is_additive, is_clearly_brighter
 from jaxdn.sequence.aov_decomposition import add_layers, decompose, init_decomposition
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
@@ -98,6 +98,22 @@ def test_a_filter_that_rings_hides_no_part() -> None:
     for part, wanted in ((diffuse, True), (1e-3 * scene.normal, False)):
         pixels = programs.layer("part", part, "RGB")
         assert is_additive(pixels, tuple(pixels), light) is wanted
+
+
+def test_what_is_a_part_does_not_depend_on_the_unit_of_light(rng: np.random.Generator) -> None:
+    """Light in nits has other figures than light in watts."""
+    beauty = rng.uniform(0.01, 1, (16, 16, 3)).astype(np.float32)
+    dim = 0.003 * beauty
+    dim[::3] *= 400  # brighter than the beauty in a third of the image
+    noisy = 0.9 * rng.exponential(0.01, (16, 16, 3)).astype(np.float32)
+    for exponent in range(-30, 31):
+        light = np.ldexp(beauty, exponent)
+        for values, part in ((0.5 * beauty, True), (dim, False), (1.01 * beauty, False)):
+            pixels = programs.layer("part", np.ldexp(values, exponent), "RGB")
+            assert is_additive(pixels, tuple(pixels), light) is part, exponent
+            assert is_clearly_brighter(np.ldexp(values, exponent), light) is (values is dim), exponent
+        if exponent <= 0:  # an albedo has a unit: it is at most 1
+            assert explain_light(np.ldexp(noisy, exponent), 0 * light) is not None, exponent
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ def explain_light(values: np.ndarray, beauty: np.ndarray) -> str | None:
 def is_clearly_brighter(values: np.ndarray, beauty: np.ndarray) -> bool:
     """Whether many pixels of a layer [H, W, 3] are brighter than the beauty, so that it is surely no part of it."""
     lit = np.any(values > 0, axis=-1)
-    return bool(lit.any() and np.mean(np.any(values > 1.1 * beauty + 1e-3, axis=-1)[lit]) > _CLEARLY)
+    return bool(lit.any() and np.mean(np.any(values > 1.1 * beauty + 1e-3 * _level(beauty), axis=-1)[lit]) > _CLEARLY)
 
 
 def coloured_layers(names: Iterable[str], beauty: Channels, buffers: Mapping[str, Channels]) -> dict[str, Channels]:
@@ -102,8 +102,14 @@ def find_beauty_copies(
 def _is_part(values: np.ndarray, beauty: np.ndarray) -> bool:
     """Whether values [H, W, 3] are nowhere brighter than the beauty, and anywhere above 0."""
     lit = np.any(values > 0, axis=-1)
-    part = np.all(values <= 1.002 * np.asarray(beauty, np.float64) + 1e-4, axis=-1)[lit]
+    part = np.all(values <= 1.002 * np.asarray(beauty, np.float64) + 1e-4 * _level(beauty), axis=-1)[lit]
     return bool(part.size and part.mean() >= _PART)
+
+
+def _level(beauty: np.ndarray) -> float:
+    """Median of the finite values above 0, which a few lamps do not change; 0 if there are none."""
+    lit = beauty[(beauty > 0) & np.isfinite(beauty)]
+    return float(np.median(lit)) if lit.size else 0.0
 
 
 def _noise(values: np.ndarray) -> float:
@@ -112,5 +118,5 @@ def _noise(values: np.ndarray) -> float:
     if min(light.shape) < 3:
         return 0.0
     around = (light[:-2, 1:-1] + light[2:, 1:-1] + light[1:-1, :-2] + light[1:-1, 2:]) / 4
-    lit = around > 1e-3
+    lit = around > 1e-2 * np.mean(np.maximum(around, 0))
     return float(np.median(np.abs(light[1:-1, 1:-1] - around)[lit] / around[lit])) if lit.any() else 0.0
