@@ -71,8 +71,9 @@ def denoise_files(
     kept as it was (``settings.safe``). While a frame is denoised, the next one is read and the one before is written,
     so that a sequence of any length takes the memory of three frames, or of one where that is all there is. Files are
     never left incomplete. Where frames are missing, the history begins anew. Files of other renderers that are damaged,
-    of another size or with other buffers than most of their shot count as missing, unless ``settings.strict``. Raises
-    ValueError for input that cannot be read or is inconsistent, before the frame concerned is written.
+    of another size or with other buffers than most of their shot count as missing, unless ``settings.strict``. A shot
+    of which nothing is left is left out with a line. Raises ValueError for input that cannot be read or is
+    inconsistent, before the frame concerned is written, and where nothing is left of all shots.
 
     Args:
       sources: folders of clips, and folders of, patterns for, or names of EXR files.
@@ -100,16 +101,21 @@ def denoise_files(
             remove_abandoned_folders(folder, HIDDEN)
             remove_abandoned(folder)
     checked = leave_out_unusable(jobs, settings, log)
-    total = sum(len(job.wanted) + sum(map(len, job.copies.values())) for job, _ in checked)
-    run = _Run(method, settings, total, on_frame, log)
+    run = _Run(method, settings, sum(_count_results(job) for job, _ in checked), on_frame, log)
+    lost = 0
     for job, reasons in checked:
         for note in job.notes:
             log(note)
         for path, reason in reasons.items():
             run.leave_out(path, reason)
-        if job.wanted:
-            on_job(job)
-        run.denoise(job)
+        try:
+            if job.wanted:
+                on_job(job)
+            run.denoise(job)
+        except DamagedFile as error:
+            lost += 1
+            if lost == len(checked) or not run.leave_out_shot(job, error):
+                raise
     return Written(run.files, len(run.programs), run.sanitized, run.left_out)
 
 
@@ -137,13 +143,21 @@ class _Run:
         self.left_out.append(path)
         self._log(explain_left_out(path, reason))
 
+    def leave_out_shot(self, job: Job, error: DamagedFile) -> bool:
+        """Whether the run goes on without a shot of another renderer of which nothing is left; if so, tell."""
+        if self._settings.strict or job.clip is not None or error.path not in job.shot.files:
+            return False
+        self._total -= _count_results(job)
+        self._log(f"{job.shot.label} is left out: {error}")
+        return True
+
     def denoise(self, job: Job) -> None:
         """Denoise a shot; a file of another renderer that cannot be decoded counts as missing.
 
-        Raises DamagedFile for one of a clip of ours, and where nothing else is left.
+        Raises DamagedFile for one of a clip of ours, and where nothing else of the shot is left.
         """
         log_once = _once(self._log)
-        before = len(self.files)
+        before, total = len(self.files), self._total
         segments = list(job.segments(both_directions=self._settings.bidirectional))
         while segments:
             segment = segments.pop(0)
@@ -156,6 +170,7 @@ class _Run:
                 index = segment.start + read.index(error.path)
                 segments[:0] = segments_around(job, segment, index, self.files)
                 if not segments and len(self.files) == before:
+                    self._total = total
                     raise
                 if index in job.wanted:
                     self._total -= 1 + len(job.copies.get(job.targets[index], ()))
@@ -230,6 +245,11 @@ class _Run:
         for each in denoisers.values():
             self.programs |= {program for denoiser in each for program in denoiser.programs}
             self.sanitized += each[0].sanitized  # the other direction repairs the same frames
+
+
+def _count_results(job: Job) -> int:
+    """The number of files to write."""
+    return len(job.wanted) + sum(map(len, job.copies.values()))
 
 
 def _write(views: list[Write]) -> list[Sequence[str]]:

@@ -119,6 +119,38 @@ def test_a_shot_of_which_nothing_is_left_is_an_error(kind: str, tmp_path: Path) 
     assert why in str(error.value)
 
 
+@pytest.mark.parametrize("kind", ["truncated", "rotten"])
+def test_a_shot_of_which_nothing_is_left_ends_no_run_of_others(kind: str, tmp_path: Path, capsys: Any) -> None:
+    """Whether a header tells of the damage or not; the damaged shot comes first, or last."""
+    sources = [shot(tmp_path / name, lambda path: None) for name in ("a", "b", "c")]
+    for source in (sources[0], sources[2]):
+        for path in source.iterdir():
+            DAMAGES[kind][0](path)
+    command = ["denoise", *map(str, sources), "-o", str(tmp_path / "out"), "--method", "noisy"]
+    main.main(command)
+    assert [path.parent.name for path in (tmp_path / "out").rglob("*.exr")] == ["b"] * FRAMES
+    text = " ".join(capsys.readouterr().out.split())
+    assert f"s.#.exr 1-{FRAMES} is left out: " in text
+    with pytest.raises(SystemExit) as ended:
+        main.main([*command, "--strict"])
+    assert ended.value.code == 2
+    with pytest.raises(SystemExit) as ended:
+        main.main(["denoise", *map(str, sources[::2]), "-o", str(tmp_path / "none"), "--method", "noisy"])
+    assert ended.value.code == 2
+
+
+def test_frames_of_a_shot_that_is_left_out_are_no_frames_to_come(tmp_path: Path) -> None:
+    sources, totals = [shot(tmp_path / name, lambda path: None) for name in ("a", "b")], list[int]()
+    for path in sources[0].iterdir():
+        rot(path)
+
+    def note(path: Path, done: int, total: int) -> None:
+        totals.append(total)
+
+    denoise_files(sources, tmp_path / "out", find_model("noisy"), on_frame=note)
+    assert totals == [FRAMES] * FRAMES
+
+
 def test_most_frames_say_what_the_shot_is_among_those_that_are_read(tmp_path: Path) -> None:
     source = shot(tmp_path / "in", lambda path: write(path, "Z"), 1, 2)
     assert denoise(source, tmp_path / "out")[0] == ["s.0003.exr", "s.0004.exr", "s.0005.exr"]
