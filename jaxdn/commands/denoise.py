@@ -7,6 +7,7 @@ from typing import Any
 
 from jaxdn.commands.arguments import Denoise, check_folder, make_channel_naming
 from jaxdn.commands.channel_table import show_channel_mapping
+from jaxdn.commands.errors import engine_errors
 from jaxdn.commands.progress import reporter
 from jaxdn.core.options import make, numbers, parse
 from jaxdn.data.clip.folder import is_clip, read_record
@@ -26,7 +27,10 @@ _OF_SCENES = ("width", "height", "animation", "seed")
 
 
 def run_denoise(options: Denoise, *, on_start: Callable[[], None] = lambda: None) -> None:
-    """Denoise what the options name. Raises ValueError for options that frames, or scenes, do not have.
+    """Denoise what the options name.
+
+    Raises ValueError for options that frames, or scenes, do not have, for full memory, and where Open Image Denoise
+    fails.
 
     ``on_start`` is called when the first frame is written: from then on nothing is imported or traced.
     """
@@ -36,10 +40,11 @@ def run_denoise(options: Denoise, *, on_start: Callable[[], None] = lambda: None
     scene = _scene_of(options)
     if options.method == AUTO:
         options = _choose_method(options, of_scene=scene is not None)
-    if scene is None:
-        _denoise_files(options, naming, on_start)
-    else:
-        _denoise_scene(options, scene, on_start)
+    with engine_errors("--max-memory" if scene is None else "a smaller --width and --height"):
+        if scene is None:
+            _denoise_files(options, naming, on_start)
+        else:
+            _denoise_scene(options, scene, on_start)
 
 
 def _choose_method(options: Denoise, *, of_scene: bool) -> Denoise:

@@ -18,6 +18,10 @@ from jaxdn.runtime.terminal import plain_console
 
 NO_READER = 141
 """Of a process whose reader has gone, as shells expect it: 128 and the number of SIGPIPE."""
+_FULL = "RESOURCE_EXHAUSTED"
+"""What XLA's message has where memory is full, of a GPU or of the machine."""
+_OIDN = "Open Image Denoise: "
+"""What the message of that library begins with (:mod:`jaxdn.ops.oidn`)."""
 _RICH = 1
 """What rich exits with where it has caught the error itself."""
 
@@ -53,6 +57,26 @@ def plain_errors() -> Iterator[None]:
         sys.exit(TERMINATED_EXIT_CODE if isinstance(interrupt, Terminated) else EXIT_CODE)
     finally:
         warnings.formatwarning = before
+
+
+@contextmanager
+def engine_errors(less_memory: str) -> Iterator[None]:
+    """Raise ValueError, with what to change, for full memory and for a failure of Open Image Denoise.
+
+    ``less_memory`` names the option by which a command needs less. XLA raises RuntimeError for both: of a failure in a
+    callback the message holds that of the library.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        lines = str(error).splitlines() or [type(error).__name__]
+        if isinstance(error, MemoryError) or _FULL in str(error):
+            full = next((line for line in lines if _FULL in line), lines[0])
+            raise ValueError(f"memory is full ({full[:200]}); give {less_memory}, or another --method.") from error
+        failed = next((line[line.index(_OIDN) :] for line in lines if _OIDN in line), None)
+        if failed is None:
+            raise
+        raise ValueError(f"{failed}; give {less_memory} if memory is full, or another --method.") from error
 
 
 def _line(message: Warning | str, *place: Any, **more: Any) -> str:
