@@ -91,8 +91,10 @@ def fit(
     end = math.inf if time_limit is None else time.monotonic() + time_limit
     mesh = make_mesh(devices, recipe.batch)
     folder.mkdir(parents=True, exist_ok=True)
-    extended = _record_recipe(folder / "recipe.json", recipe, None if start is None else start.name)
-    run = _Run(denoiser, recipe, batches, folder, start, mesh)
+    record, extended = _match_recipe(folder / "recipe.json", recipe, None if start is None else start.name)
+    run = _Run(denoiser, recipe, batches, folder, start, mesh)  # refuses checkpoints of another network
+    if record is not None and writes():
+        write_json(folder / "recipe.json", record)
     validate = make_validation(denoiser, validation)
     divergence = _Divergence(label, recipe, run.step, int(run.state.skipped))
     with (
@@ -216,8 +218,8 @@ class _Run:
             self._log.close()
 
 
-def _record_recipe(path: Path, recipe: Recipe, start: str | None) -> int | None:
-    """Write the recipe of a new run, or of one that is made longer, and return how long the latter was.
+def _match_recipe(path: Path, recipe: Recipe, start: str | None) -> tuple[dict[str, Any] | None, int | None]:
+    """What to write as the recipe of a new run, or of one that is made longer, and how long the latter was.
 
     Raises ValueError if an existing run has another recipe.
     """
@@ -236,10 +238,8 @@ def _record_recipe(path: Path, recipe: Recipe, start: str | None) -> int | None:
                 "name, or delete the folder to start over."
             )
         else:
-            return None
-    if writes():
-        write_json(path, wanted)
-    return extended
+            return None, None
+    return wanted, extended
 
 
 def read_resumed_from(folder: Path) -> list[int]:

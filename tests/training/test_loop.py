@@ -21,6 +21,7 @@ from jaxdn.recipes.objectives import Objective
 from jaxdn.recipes.recipe import Recipe
 from jaxdn.runtime.interrupt import Terminated
 from jaxdn.training import loop as loop
+from jaxdn.training.checkpoint import Checkpoints
 from jaxdn.training.log import Log, read_curve, read_log
 from jaxdn.training.loop import Every, InitialWeights, fit, read_resumed_from
 from jaxdn.training.step import init_state, make_train_step
@@ -230,6 +231,19 @@ def test_a_finished_run_goes_on_with_more_steps_and_says_so(clips, tmp_path, cap
         with pytest.raises(ValueError, match="steps 8 -> "):
             run_gain(clips, tmp_path, other)
     assert read_resumed_from(tmp_path) == [4]
+
+
+def test_a_run_whose_checkpoints_are_of_another_network_is_not_made_longer(clips, tmp_path, monkeypatch):
+    run_gain(clips, tmp_path, SHORT._replace(steps=1))
+    before = (tmp_path / "recipe.json").read_text()
+
+    def misfit(*_):
+        raise ValueError("other shapes")
+
+    monkeypatch.setattr(Checkpoints, "_read", misfit)
+    with pytest.raises(ValueError, match="expected the parameters of this network"):
+        run_gain(clips, tmp_path, SHORT._replace(steps=2))
+    assert (tmp_path / "recipe.json").read_text() == before
 
 
 def test_the_validation_reaches_the_terminal(clips, tmp_path, capsys):
