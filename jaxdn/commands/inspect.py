@@ -19,7 +19,7 @@ from jaxdn.core.frame import BUFFERS, OF_SAMPLES
 from jaxdn.data.clip.folder import is_clip
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.data.foreign.classify import ChannelNaming
-from jaxdn.data.foreign.shots import is_named, ranges
+from jaxdn.data.foreign.shots import is_named, is_pattern, ranges
 from jaxdn.denoiser import Denoiser
 from jaxdn.effects import EFFECTS, Plan, choose_all_effects, inspect, plan
 from jaxdn.render.open_scene import open_scene
@@ -64,7 +64,7 @@ def inspect_to_terminal(
     if other := [name for name in sources if len(sources) > 1 and not is_named(Path(name))]:
         raise ValueError(f"{other[0]}: expected one scene, clip, folder or pattern, or several EXR files; name one.")
     clip = is_clip(source)
-    if not clip and (len(sources) > 1 or Path(source).is_dir() or source.lower().endswith(".exr")):
+    if not clip and (len(sources) > 1 or _are_frames(source)):
         if animation is not None or frames is not None:
             raise ValueError(f"{source}: expected none of --animation, --frames, which are for scenes and own clips.")
         reads = None if reader is None else reader.reads
@@ -100,6 +100,14 @@ def inspect_to_terminal(
         print(json.dumps(record, indent=1))
         return
     _show(source, planned, reader, denoiser)
+
+
+def _are_frames(source: str) -> bool:
+    """Whether a name is that of a folder or of a file, or a pattern, and not a scene."""
+    path = Path(source)
+    if path.suffix == ".xml" and not path.is_dir():
+        return False
+    return path.is_dir() or is_named(path) or source.lower().endswith(".exr") or is_pattern(source)
 
 
 def _planned(

@@ -163,3 +163,19 @@ def test_numbers_below_zero_can_be_named(tmp_path: Path) -> None:
 def test_a_range_that_would_fill_the_memory_is_refused() -> None:
     with pytest.raises(ValueError, match="--frames: expected ranges of at most 10,000,000 numbers, got '1-10000001'"):
         numbers(["1-10000001"], "--frames")
+
+
+@pytest.mark.parametrize("name", ["render.*", "render.####", "render.0001"])
+def test_inspect_takes_what_is_denoised_without_a_suffix_too(name: str, tmp_path: Path, capsys: Any) -> None:
+    for number in (1, 2):
+        clips.write_exr(tmp_path / "a.exr", dict.fromkeys("RGB", np.ones((4, 4), np.float32)))
+        (tmp_path / "a.exr").rename(tmp_path / f"render.{number:04d}")
+    main.main(["inspect", str(tmp_path / name)])
+    text = capsys.readouterr().out
+    assert text.count("1 frame of 4 x 4 pixels") == (1 if name == "render.0001" else 2)
+    with pytest.raises(SystemExit):
+        main.main(["inspect", str(tmp_path / "none.*")])
+    assert "expected a folder of EXR files, a pattern that fits some" in " ".join(capsys.readouterr().err.split())
+    with pytest.raises(SystemExit):
+        main.main(["inspect", str(tmp_path / "none")])
+    assert "expected a Mitsuba scene (.xml)" in " ".join(capsys.readouterr().err.split())

@@ -105,6 +105,11 @@ def is_named(path: Path) -> bool:
     return path.is_file() or (path.is_symlink() and not path.exists())
 
 
+def is_pattern(path: str | Path) -> bool:
+    """Whether a name has what stands for more than itself in a pattern (:func:`find_shots`)."""
+    return re.search(r"[*?[]", str(path)) is not None or _PLACEHOLDER.search(str(path)) is not None
+
+
 def refuse_gaps(path: str | Path | Sequence[Path], shot: Shot) -> None:
     """Raise ClipError for a shot, found at a path, in which frame numbers are missing."""
     gaps = find_missing(shot.numbers)
