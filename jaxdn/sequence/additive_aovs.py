@@ -28,12 +28,15 @@ class AdditiveAovs:
         self._state: DecompositionState | None = None
         self._exponent: int | None = None  # of the unit in which the history is
 
-    def denoise(self, pixels: Mapping[str, np.ndarray], frame: Frame, image: np.ndarray) -> dict[str, np.ndarray]:
+    def denoise(
+        self, pixels: Mapping[str, np.ndarray], frame: Frame, image: np.ndarray, beside: Collection[str] = ()
+    ) -> dict[str, np.ndarray]:
         """Layer -> denoised image [H, W, 3], of the channels of a file, its frame and its denoised beauty.
 
-        Empty without additive layers.
+        Channels ``beside`` it, in files of their own, are not written and so not denoised. Empty without additive
+        layers.
         """
-        there = self._find(pixels, frame)
+        there = self._find(pixels, frame, beside)
         if not self._layers:
             return {}
         exponent = self._follow_light(np.asarray(frame.radiance))
@@ -62,7 +65,7 @@ class AdditiveAovs:
         self._exponent = exponent
         return 0 if exponent is None else exponent
 
-    def _find(self, pixels: Mapping[str, np.ndarray], frame: Frame) -> dict[str, Channels]:
+    def _find(self, pixels: Mapping[str, np.ndarray], frame: Frame, beside: Collection[str]) -> dict[str, Channels]:
         """Layer -> channels of all that may be parts of the beauty; those that are new parts are added and logged."""
         buffers = self._naming.detect(list(pixels))
         if frame.albedo is None:  # what its name promises may be light
@@ -72,7 +75,13 @@ class AdditiveAovs:
         new, waiting = {}, False
         for layer in [layer for layer in layers if layer not in self._rejected and layer not in self._layers]:
             additive = is_additive(pixels, layers[layer], radiance)
-            if additive:
+            if additive and not set(layers[layer]).isdisjoint(beside):
+                self._rejected.add(layer)
+                self._log(
+                    f"--aovs additive: {layer} lies in files of its own and is not denoised; render it as a layer of "
+                    "the beauty's files"
+                )
+            elif additive:
                 new[layer] = layers[layer]
             waiting |= additive is None
             if additive is False:

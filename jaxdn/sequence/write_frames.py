@@ -75,7 +75,7 @@ class ForeignWriter:
         None: without a target they are for the history alone.
         """
         assert source is not None
-        layers = {} if self._aovs is None else self._aovs.denoise(self._place(source), frame, image)
+        layers = {} if self._aovs is None else self._aovs.denoise(self._place(source), frame, image, source.beside)
         alpha = self._denoise_alpha(source, frame, image)
         if target is None:
             source.drop()

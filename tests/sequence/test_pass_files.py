@@ -15,6 +15,7 @@ from jaxdn.data.foreign.passes import read_pass_name
 from jaxdn.data.foreign.shots import Shot
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
+from jaxdn.zoo.ready import find_model
 from tests.data.test_kept import box_blur
 from tests.programs import Channels, layer, truth
 
@@ -256,3 +257,17 @@ def test_folders_whose_names_tell_nothing_are_no_passes(names: tuple[str, str], 
         clips.write_exr(tmp_path / name / "0001.exr", layer("", truth(0).light, "RGB"))
     with pytest.raises(ClipError, match="found none"):
         clips.read_clip(tmp_path)
+
+
+def test_light_in_files_of_its_own_is_not_said_to_be_denoised(tmp_path: Path) -> None:
+    for frame in (1, 2):
+        light = truth(frame).light
+        clips.write_exr(tmp_path / f"in_beauty.{frame:04d}.exr", layer("", light, "RGB"))
+        clips.write_exr(tmp_path / f"in_diffuse.{frame:04d}.exr", layer("", 0.5 * light, "RGB"))
+    told: list[str] = []
+    settings = Settings(aovs="additive")
+    denoise_files([tmp_path / "in_*.exr"], tmp_path / "out", find_model("noisy"), settings, log=told.append)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {f"in_beauty.{frame:04d}.exr" for frame in (1, 2)}
+    text = "\n".join(told)
+    assert text.count("--aovs additive: diffuse lies in files of its own and is not denoised; ") == 1
+    assert "denoised with the beauty" not in text

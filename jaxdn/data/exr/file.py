@@ -117,6 +117,11 @@ class ExrFile:
         return (self.path,)
 
     @property
+    def beside(self) -> frozenset[str]:
+        """The channels that lie in other files than the one at :attr:`path`: none."""
+        return frozenset()
+
+    @property
     def is_panorama(self) -> bool:
         """Whether the attribute ``envmap`` says that the picture is an equirectangular panorama."""
         if not self._sound:

@@ -28,6 +28,11 @@ class PassesFile(ExrFile):
         return self.path, *(file.path for file in self._passes.values())
 
     @property
+    def beside(self) -> frozenset[str]:
+        """The channels of the passes."""
+        return frozenset(self.windows) - super().windows.keys()
+
+    @property
     def windows(self) -> dict[str, Window]:
         """Full name of each channel -> its data window."""
         found = dict(super().windows)
