@@ -1,6 +1,7 @@
 """The stream of training batches: contents, reproducibility, resuming, and refused input."""
 
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -163,7 +164,7 @@ def test_caches_of_clips_whose_names_begin_alike_stay(folder: Path) -> None:
         read_window(clip, (slice(None),) * 3)
 
 
-@pytest.mark.skipif(os.name == "nt", reason="Windows has no such rights")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such rights")
 def test_a_cache_can_be_read_by_those_who_can_read_the_clip(folder: Path) -> None:
     open_cached(folder / "clip0")
     (kept,) = (folder / ".cache").iterdir()

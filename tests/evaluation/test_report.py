@@ -549,7 +549,8 @@ def test_a_clip_is_unpacked_when_it_is_opened_and_then_owns_the_keys(visit):
     tab = visit(synthetic(clips=3))
     assert tab.locator("#clip-1 img").count() == 0
     tab.locator("#overview a", has_text="robot").locator("visible=true").click()
-    assert tab.locator("#clip-1 .flip img").count() == 12
+    # The link changes the address, and the page hears of that later.
+    tab.wait_for_function("document.querySelectorAll('#clip-1 .flip img').length === 12")
     tab.locator("#clip-1 .flip").hover()
     tab.keyboard.press("1")
     assert shown_label(tab, 1) == "noisy"

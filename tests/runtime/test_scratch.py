@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from jaxdn.runtime.scratch import remove_abandoned_folders, scratch_folder
+from tests.needs import require_module
 
 WORK = """
 import pathlib, sys
@@ -64,7 +65,7 @@ def test_what_a_killed_process_left_is_removed_by_the_next_and_nothing_else(tmp_
 
 def refuse_locks(monkeypatch: pytest.MonkeyPatch, refusals: Iterator[int | None]) -> None:
     """Locking a file fails with these error numbers, one a call; None: it succeeds."""
-    fcntl = pytest.importorskip("fcntl")
+    fcntl = require_module("fcntl")
 
     def lock(handle: int, mode: int) -> None:
         if (number := next(refusals)) is not None:
