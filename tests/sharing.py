@@ -1,12 +1,23 @@
-"""What takes long to make, made once for all processes of pytest-xdist."""
+"""What takes long to make, made once: for all processes of pytest-xdist, or for all tests of one."""
 
+import functools
 import os
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from jaxdn.zoo.ready import Model, find_model
 from tests.needs import require_module
+
+
+@functools.cache
+def share_model(name: str) -> Model:
+    """:func:`jaxdn.zoo.ready.find_model`, asked once: a step is traced for a denoiser, not for its name.
+
+    For tests that change nothing that a step depends on while it is traced.
+    """
+    return find_model(name)
 
 
 def make_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:

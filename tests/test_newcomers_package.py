@@ -3,13 +3,14 @@
 The package is a wheel that pip installs, without a network, into a folder of its own.
 """
 
+import functools
 import json
 import os
 import subprocess
 import sys
 import warnings
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -115,17 +116,29 @@ def write_wheel(folder: Path, *, entry_points: bool) -> Path:
     return wheel
 
 
+@pytest.fixture(scope="module")
+def sites(tmp_path_factory) -> Callable[..., Path]:
+    """A function that gives the folder where pip has installed the package, with entry points or without."""
+
+    @functools.cache
+    def site(*, entry_points: bool) -> Path:
+        folder = tmp_path_factory.mktemp("package")
+        wheel = write_wheel(folder, entry_points=entry_points)
+        pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target"]
+        done = subprocess.run([*pip, str(folder / "site"), str(wheel)], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        return folder / "site"
+
+    return site
+
+
 @pytest.fixture
-def install(tmp_path, monkeypatch) -> Iterator:
-    """A function that installs the package for this test; returns the folder that it is in."""
+def install(sites, monkeypatch) -> Iterator:
+    """A function that puts the installed package on the path for this test; returns the folder that it is in."""
     known = dict(registry._METHODS)
 
     def installed(*, entry_points: bool) -> Path:
-        site = tmp_path / "site"
-        pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
-        wheel = write_wheel(tmp_path, entry_points=entry_points)
-        done = subprocess.run([*pip, str(wheel)], capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
+        site = sites(entry_points=entry_points)
         monkeypatch.syspath_prepend(site)
         registry._entry_points.cache_clear()
         return site
@@ -205,6 +218,7 @@ def test_its_frames_can_be_denoised_in_tiles(install):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_processes")
 def test_weights_name_the_address_and_another_process_reads_them(install, clips, tmp_path):
     """A real command, in a process that has never seen the package."""
     site = install(entry_points=False)

@@ -1,5 +1,6 @@
 """Nothing of a renderer's file is lost: only the beauty's pixels change."""
 
+import functools
 import struct
 from pathlib import Path
 from typing import Any
@@ -56,8 +57,9 @@ def assert_same_but(source: Path, target: Path, changed: tuple[str, ...]) -> Non
     assert found == set(changed)
 
 
+@functools.cache
 def box_blur() -> Model:
-    """The smallest denoiser: what is kept does not depend on the method, and svgf takes half a minute to compile."""
+    """The smallest denoiser: what is kept does not depend on the method. Made once: a step is traced for a denoiser."""
 
     def step(params: Any, state: Any, frame: Frame, first: Any, statistics: Any) -> Any:
         padded = jnp.pad(frame.radiance, ((1, 1), (1, 1), (0, 0)), mode="edge")

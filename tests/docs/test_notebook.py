@@ -19,6 +19,7 @@ def test_every_notebook_is_run():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_processes")
 @pytest.mark.parametrize("name", PRINTED)
 def test_a_notebook_runs(name):
     notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)

@@ -35,8 +35,8 @@ def test_a_shot_in_chunks_by_openjd_is_the_whole_shot_and_a_slurm_array_has_noth
     require("openjd", "bash")
     shot, whole, chunks = (str(tmp_path / name) for name in ("shot", "whole", "chunks"))
     write_clip(make_clip(0, frames=6, size=40), shot)
-    run(*JAXDN.split(), "denoise", shot, "-o", whole, "--method", "svgf")
-    parameters = {"Input": shot, "Output": chunks, "Frames": "0-5", "ChunkSize": "3", "Method": "svgf", "Jaxdn": JAXDN}
+    run(*JAXDN.split(), "denoise", shot, "-o", whole, "--method", "taa")
+    parameters = {"Input": shot, "Output": chunks, "Frames": "0-5", "ChunkSize": "3", "Method": "taa", "Jaxdn": JAXDN}
     options = [word for name, value in parameters.items() for word in ("-p", f"{name}={value}")]
     said = run(sys.executable, "-m", "openjd", "run", FARM / "openjd.yaml", *options)
     assert "Chunks run: 2" in said
@@ -45,7 +45,7 @@ def test_a_shot_in_chunks_by_openjd_is_the_whole_shot_and_a_slurm_array_has_noth
     files = {path.name: path.read_bytes() for path in Path(whole).iterdir()}
     assert sum(name.endswith(".exr") for name in files) == 6
     assert {path.name: path.read_bytes() for path in Path(chunks).iterdir()} == files
-    slurm = {"SLURM_ARRAY_TASK_ID": "1", "CHUNK": "3", "FIRST": "0", "METHOD": "svgf", "JAXDN": JAXDN}
+    slurm = {"SLURM_ARRAY_TASK_ID": "1", "CHUNK": "3", "FIRST": "0", "METHOD": "taa", "JAXDN": JAXDN}
     said = run("bash", FARM / "slurm.sh", shot, chunks, **slurm)
     assert "3 frames are there already" in said
     assert "nothing to do" in said

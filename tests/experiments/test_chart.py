@@ -33,6 +33,7 @@ from experiments.speed.chart.summary import (
 )
 from experiments.speed.chart.way import way
 from experiments.speed.chart.ways import chosen, left_out, registered, ways
+from experiments.speed.timing import Timing
 from experiments.speed.works import scene
 from experiments.speed.works.stages import measure_stages
 from jaxdn.core.frame import Clip, frame_at
@@ -358,12 +359,16 @@ def number_of_programs():
 @pytest.mark.slow
 @pytest.mark.needs("mitsuba")
 def test_a_quick_chart_and_resuming_it(tmp_path, monkeypatch, capsys):
-    """From the command line to the page, of a filter, shipped weights and new ones: others differ in their step."""
+    """From the command line to the page, of a filter, shipped weights and new ones: others differ in their step.
+
+    The parts of a step are those of a test of their own.
+    """
     recipe = method_named("ntd").recipe_named(None)
     entered(monkeypatch, lambda options: mean_of_two(), "newcomer", recipes={"usual": recipe})
     drawn = [find_model("taa"), find_model("ntd-small"), untrained_model(method_named("newcomer"))]
     monkeypatch.setattr(ready, "all_models", lambda: drawn)
     monkeypatch.setattr(render_cost, "ROUNDS", 2)
+    monkeypatch.setattr(chart, "breakdown", lambda subject, frame, rounds: {WHOLE: Timing(1.0, 1.0, 1.0, 1.0, rounds)})
     programs, breakdowns = [], chart.Run.breakdowns
     monkeypatch.setattr(chart.Run, "breakdowns", lambda run: (programs.append(number_of_programs()), breakdowns(run)))
     out = tmp_path / "chart-quick"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from experiments.speed.devices import Link, predict_efficiency
-from tests.training.test_processes import METHOD
+from tests.training.test_processes import METHOD, have_devices
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,11 +24,12 @@ def test_the_model_is_that_of_a_ring() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_processes")
 def test_two_devices_are_measured_and_told(tmp_path: Path) -> None:
     (tmp_path / "learned_kernel.py").write_text(METHOD)
     environment = os.environ | {
         "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=2",
+        "XLA_FLAGS": have_devices(2),
         "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}",
     }
     command = [sys.executable, "-m", "experiments.speed.devices", "--method", "learned_kernel:kernel", "--variant", ""]

@@ -24,6 +24,7 @@ from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import find_model
 from tests.programs import PROGRAMS, truth, write_shot
 from tests.sequence.test_frames import part_of
+from tests.sharing import share_model
 from tests.training.test_training import make_clip
 
 
@@ -142,7 +143,7 @@ def noisy_wall(folder: Path, count: int, seed: int = 0) -> Path:
 
 
 def denoised(source: Path, out: Path, name: str = "svgf", **settings: Any) -> list[np.ndarray]:
-    written = denoise_files([source], out, find_model(name), Settings(bidirectional=True, **settings))
+    written = denoise_files([source], out, share_model(name), Settings(bidirectional=True, **settings))
     assert not [path for path in out.rglob("*") if ".backwards" in path.name]
     return [np.stack([clips.read_exr(path)[letter] for letter in "RGB"], axis=-1) for path in written.files]
 
@@ -152,7 +153,7 @@ def test_the_first_frame_is_as_good_as_the_last_and_time_has_no_direction(tmp_pa
     source = noisy_wall(tmp_path / "in", 8)
     images = denoised(source, tmp_path / "out")
     errors = [float(np.sqrt(np.mean((image - 1) ** 2))) for image in images]
-    once = denoise_files([source], tmp_path / "once", find_model("svgf")).files[0]
+    once = denoise_files([source], tmp_path / "once", share_model("svgf")).files[0]
     assert errors[0] < 1.3 * errors[-1]
     assert errors[-1] < 1.3 * errors[0]
     assert errors[0] < 0.7 * np.sqrt(np.mean((clips.read_exr(once)["R"] - 1) ** 2))
@@ -182,16 +183,17 @@ def test_an_error_and_an_interrupt_leave_nothing_behind(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        denoise_files([source], tmp_path / "out", find_model("svgf"), Settings(bidirectional=True), on_frame=stop)
+        denoise_files([source], tmp_path / "out", share_model("svgf"), Settings(bidirectional=True), on_frame=stop)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.0000.exr"]
     data = (source / "a.0001.exr").read_bytes()
     (source / "a.0001.exr").write_bytes(data[: len(data) // 2] + bytes(len(data) // 2))  # no header tells
     with pytest.raises(clips.ClipError, match=r"a\.0001"):
-        denoise_files([source], tmp_path / "bad", find_model("svgf"), Settings(bidirectional=True, strict=True))
+        denoise_files([source], tmp_path / "bad", share_model("svgf"), Settings(bidirectional=True, strict=True))
     assert list((tmp_path / "bad").iterdir()) == []
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("plain_processes")
 def test_ctrl_c_in_the_backward_pass_leaves_nothing_behind(tmp_path: Path) -> None:
     source, out = noisy_wall(tmp_path / "in", 400), tmp_path / "out"
     command = [
@@ -203,7 +205,7 @@ def test_ctrl_c_in_the_backward_pass_leaves_nothing_behind(tmp_path: Path) -> No
         "-o",
         out,
         "--method",
-        "svgf",
+        "taa",
         "--bidirectional",
     ]
     # A shell lets processes that it puts into the background ignore Ctrl-C, and theirs inherit that.

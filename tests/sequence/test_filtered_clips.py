@@ -11,7 +11,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.sequence.all_light import gather_light
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import find_model
+from tests.sharing import share_model
 
 SIDE, FRAMES = 48, 4
 LAYERS = (1, 4)
@@ -40,7 +40,7 @@ def make_clip(folder: Path, **record: Any) -> Path:
 def denoise(clip: Path, method: str, **settings: Any) -> dict[str, np.ndarray]:
     """The channels of the last frame."""
     out = clip.parent / method
-    denoise_files([clip], out, find_model(method), Settings(**settings))
+    denoise_files([clip], out, share_model(method), Settings(**settings))
     return clips.read_exr(clips.frame_path(out, FRAMES - 1))
 
 

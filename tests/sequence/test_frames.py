@@ -16,7 +16,7 @@ from jaxdn.data.foreign.shots import Shot, find_shots, ranges
 from jaxdn.sequence.jobs import WARM_UP, Job, find_jobs
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import find_model
+from tests.sharing import share_model
 from tests.training.test_training import make_clip
 
 SIZE = (8, 8)
@@ -40,7 +40,7 @@ def denoise(sources: Any, out: Path, name: str = "noisy", **settings: Any) -> tu
     """The files written, below ``out``, and what was told besides the noise that was measured."""
     told: list[str] = []
     sources = sources if isinstance(sources, list) else [sources]
-    written = denoise_files(sources, out, find_model(name), Settings(**settings), log=told.append)
+    written = denoise_files(sources, out, share_model(name), Settings(**settings), log=told.append)
     return [str(path.relative_to(out)) for path in written.files], [line for line in told if "noise is" not in line]
 
 

@@ -23,9 +23,9 @@ from jaxdn.sequence.light_range import (
 )
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import find_model
 from tests.data.test_kept import box_blur
 from tests.sequence.test_safe import picture
+from tests.sharing import share_model
 
 SIZE = (48, 64)
 LAMP_PIXELS = np.s_[2:7, 52:57]
@@ -56,7 +56,7 @@ def write(folder: Path, scale: float, *, samples: int | None = 4, dtype: type = 
 def denoise(source: Path, *, method: str = "svgf", **settings: bool) -> tuple[list[np.ndarray], list[str]]:
     told: list[str] = []
     out = source.with_name(f"{source.name}-out{len(list(source.parent.iterdir()))}")
-    files = denoise_files([source], out, find_model(method), Settings(**settings), log=told.append).files
+    files = denoise_files([source], out, share_model(method), Settings(**settings), log=told.append).files
     return [np.stack([clips.read_exr(file)[letter] for letter in "RGB"], axis=-1) for file in files], told
 
 

@@ -1,5 +1,6 @@
 """No vectors, or zeros, though something moves: motion is measured. Where nothing moves, nothing changes."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,7 @@ def write(folder: Path, make: Callable[[int], Channels] = passes, frames: int = 
     return folder
 
 
+@functools.cache
 def showing_motion() -> Model:
     """A method whose image is the motion that it is given, or 0 where there is none, 64 added, and 64."""
 

@@ -13,8 +13,8 @@ from jaxdn.data.exr.file import ExrFile
 from jaxdn.data.foreign.channel_mapping import read_channel_mapping
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import find_model
 from tests.programs import Channels, layer, truth
+from tests.sharing import share_model
 
 Part = tuple[dict[str, Any], Channels]
 FRAMES = 3
@@ -41,7 +41,7 @@ def denoise(source: Path, **settings: Any) -> tuple[list[tuple[ExrFile, ExrFile]
     """The file of each frame with its result, and what was told."""
     told: list[str] = []
     out = source.with_name("out" + "".join(settings))
-    written = denoise_files([source], out, find_model("svgf"), Settings(**settings), log=told.append)
+    written = denoise_files([source], out, share_model("svgf"), Settings(**settings), log=told.append)
     return [(ExrFile(source / path.name), ExrFile(path)) for path in written.files], told
 
 

@@ -1,5 +1,6 @@
 """Equirectangular panoramas: no seam, where filters and what moves go over the edge."""
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,7 @@ def write(folder: Path, frames: int = 4, shift: int = 0, long_way: bool = False,
     return folder
 
 
+@functools.cache
 def follow_motion() -> Model:
     """The smallest denoiser that follows motion: an exponential mean, blurred a little."""
 

@@ -20,8 +20,7 @@ from jaxdn.sequence.missing_motion import MEASURED
 from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.segment import explain_fallback
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import find_model
-from tests.sharing import make_once
+from tests.sharing import make_once, share_model
 
 SIZE = (48, 64)
 
@@ -58,7 +57,7 @@ def decibels(files: list[Path]) -> list[float]:
 
 def denoise(source: Path, out: Path, **settings: Any) -> tuple[list[Path], list[str]]:
     told: list[str] = []
-    written = denoise_files([source], out, find_model("svgf"), Settings(**settings), log=told.append)
+    written = denoise_files([source], out, share_model("svgf"), Settings(**settings), log=told.append)
     return written.files, told
 
 
@@ -158,7 +157,7 @@ def test_no_rendered_frame_is_worse_than_it_was(
         clips.write_exr(tmp_path / "in" / file.name, light | {"all": rest, "none": {}, "turned": turned}[guides])
     convention = None if guides == "none" else "previous-current"
     files = denoise_files(
-        [tmp_path / "in"], tmp_path / "out", find_model(method), Settings(naming=ChannelNaming(convention))
+        [tmp_path / "in"], tmp_path / "out", share_model(method), Settings(naming=ChannelNaming(convention))
     ).files
     for file in files:
         there = clips.read_exr(rendered / file.name)

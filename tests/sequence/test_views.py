@@ -1,5 +1,6 @@
 """Views of a stereo camera, in one file or in several: each is denoised, with a history of its own."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,7 @@ KINDS: dict[str, tuple[Callable[[Path, int], None], dict[str, str]]] = {
 NAMING = ChannelNaming("forward-up")
 
 
+@functools.cache
 def mean_so_far() -> Model:
     """The smallest denoiser with a history: the mean of the frames up to this one."""
 

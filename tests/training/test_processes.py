@@ -18,8 +18,10 @@ from jaxdn.clips import write_clip
 from jaxdn.commands import main
 from jaxdn.training.log import read_log
 from jaxdn.training.loop import read_resumed_from
+from tests.compiling import join_flags
 from tests.training.test_training import make_clip
 
+pytestmark = pytest.mark.usefixtures("plain_processes")  # what processes exchange does not depend on optimisation
 ROOT = Path(__file__).parents[2]
 UPDATES = 5
 
@@ -73,6 +75,11 @@ def free_port() -> int:
         return int(one.getsockname()[1])
 
 
+def have_devices(count: int) -> str:
+    """``XLA_FLAGS`` of a process with so many devices."""
+    return join_flags(os.environ.get("XLA_FLAGS"), f"--xla_force_host_platform_device_count={count}")
+
+
 def give(clips: Path, run: Path, *more: object) -> list[str]:
     options = ["--method", "learned_kernel:kernel", "--batch", "8", "--crop", "16", "--frames", "2"]
     return ["train", str(clips), "-o", str(run), *options, *map(str, more)]
@@ -93,7 +100,7 @@ class Pair:
             command = [sys.executable, "-m", "jaxdn.commands.main", *arguments, "--distributed"]
             command += ["--coordinator", place, "--processes", "2", "--process", str(index)]
             command += [str(word) for word in second if index == 1]
-            own = environment | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices[index]}"}
+            own = environment | {"XLA_FLAGS": have_devices(devices[index])}
             with errors.open("w") as out:
                 self.processes.append(subprocess.Popen(command, env=own, stdout=out, stderr=out))
 
@@ -132,7 +139,7 @@ def run_alone(home: Path, *runs: Sequence[str]) -> None:
     """Runs one after the other in one process of eight devices."""
     environment = os.environ | {
         "JAX_PLATFORMS": "cpu",
-        "XLA_FLAGS": "--xla_force_host_platform_device_count=8",
+        "XLA_FLAGS": have_devices(8),
         "PYTHONPATH": f"{ROOT}{os.pathsep}{home}",
     }
     command = [sys.executable, "-c", ALONE, *("|".join(run) for run in runs)]
