@@ -3,7 +3,8 @@
 import json
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -60,6 +61,7 @@ def fit(
     *,
     label: str,
     start: InitialWeights | None = None,
+    method: Mapping[str, Any] | None = None,
     validation: Sequence[ValidationClip] = (),
     every: Every = Every(),  # noqa: B008, immutable
     time_limit: float | None = None,
@@ -68,7 +70,7 @@ def fit(
     """Train to ``recipe.steps`` updates, resuming from the newest checkpoint in ``folder`` to the same result.
 
     A run that was started with fewer steps goes on to ``recipe.steps``, along the schedule of that many. On Ctrl-C, or
-    SIGTERM, the update is finished, logged and saved before KeyboardInterrupt (:class:`jaxdn.runtime.interrupt.
+    SIGTERM, the update is finished and saved before KeyboardInterrupt (:class:`jaxdn.runtime.interrupt.
     Terminated`) is raised; at the time limit the state is returned. Of several processes (:mod:`jaxdn.training.
     processes`) all stop where one is asked to, and the first writes.
     Raises ValueError for impossible values in the recipe, and, with what to change, after many updates in a row that
@@ -81,6 +83,7 @@ def fit(
       folder: gets recipe.json, log.jsonl and the checkpoints.
       label: the run's name in messages.
       start: what to begin with; None draws parameters with the recipe's seed.
+      method: what ``denoiser`` is, by name, as JSON has it: a run in the same folder goes on with the same alone.
       validation: see :func:`jaxdn.training.validation.load_validation`.
       every: updates between log entries, validations and checkpoints.
       time_limit: seconds after which no further update begins, counted from the call; None: no limit.
@@ -91,7 +94,9 @@ def fit(
     end = math.inf if time_limit is None else time.monotonic() + time_limit
     mesh = make_mesh(devices, recipe.batch)
     folder.mkdir(parents=True, exist_ok=True)
-    record, extended = _match_recipe(folder / "recipe.json", recipe, None if start is None else start.name)
+    record, extended = _match_recipe(
+        folder / "recipe.json", recipe, None if start is None else start.name, dict(method or {})
+    )
     run = _Run(denoiser, recipe, batches, folder, start, mesh)  # refuses checkpoints of another network
     if record is not None and writes():
         write_json(folder / "recipe.json", record)
@@ -218,16 +223,18 @@ class _Run:
             self._log.close()
 
 
-def _match_recipe(path: Path, recipe: Recipe, start: str | None) -> tuple[dict[str, Any] | None, int | None]:
+def _match_recipe(
+    path: Path, recipe: Recipe, start: str | None, method: dict[str, Any]
+) -> tuple[dict[str, Any] | None, int | None]:
     """What to write as the recipe of a new run, or of one that is made longer, and how long the latter was.
 
-    Raises ValueError if an existing run has another recipe.
+    Raises ValueError if an existing run has another recipe, or is of another method.
     """
-    wanted = {**recipe.record(), "start": start}
+    wanted = {**recipe.record(), "start": start, **json.loads(json.dumps(method))}
     extended: int | None = None
     if path.is_file():
         there = json.loads(path.read_text())
-        differing = {key: (there.get(key), value) for key, value in wanted.items() if there.get(key) != value}
+        differing = _find_differences(there, wanted, method.keys() - there.keys())
         if differing.keys() == {"steps"} and there["steps"] < recipe.steps:
             extended = there["steps"]
             wanted["begun_with"] = [*there.get("begun_with", []), extended]
@@ -240,6 +247,17 @@ def _match_recipe(path: Path, recipe: Recipe, start: str | None) -> tuple[dict[s
         else:
             return None, None
     return wanted, extended
+
+
+def _find_differences(
+    there: dict[str, Any], wanted: dict[str, Any], unknown: AbstractSet[str]
+) -> dict[str, tuple[Any, Any]]:
+    """What differs, before and now; of options those that differ. Runs of before methods were kept have none."""
+    found = {key: (there.get(key), wanted[key]) for key in wanted if key not in unknown}
+    if "options" in found:
+        before, now = found.pop("options")
+        found |= {f"option {key}": (before.get(key), now.get(key)) for key in sorted(before.keys() | now.keys())}
+    return {key: (old, new) for key, (old, new) in found.items() if old != new}
 
 
 def read_resumed_from(folder: Path) -> list[int]:

@@ -1,5 +1,6 @@
 """``jaxdn train``: a learned method, trained on rendered clips."""
 
+import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -81,6 +82,7 @@ def train(
         out,
         label=label,
         start=first,
+        method={"method": method.name, "options": _list_options(method, options)},
         validation=held_out,
         time_limit=time_limit,
         devices=devices,
@@ -99,6 +101,12 @@ def train(
     if writes():
         save_weights(path, state.average, factory=method.name, options=dict(options), record=about)
     return path
+
+
+def _list_options(method: Method, options: Mapping[str, Any]) -> dict[str, Any]:
+    """All options but the backend, with which a run may go on that began with another."""
+    listed = dataclasses.asdict(method.parse_options(options))
+    return {name: value for name, value in listed.items() if name != "implementation"}
 
 
 def recipe_batches(denoiser: Denoiser, recipe: Recipe, clips: Sequence[Path]) -> ResumableBatches:

@@ -100,12 +100,36 @@ def test_the_options_of_a_filter_are_fitted_and_its_weights_denoise(clips, tmp_p
     image, plain = (denoise(fitted.denoiser, params, clip) for params in (fitted.params, {}))
     assert jnp.isfinite(image).all()
     assert float(jnp.max(jnp.abs(image - plain))) > 1e-5
+    before = weights.read_bytes(), weights.with_suffix(".json").read_bytes()
+    with pytest.raises(ValueError, match=r"got option alpha 0.2 -> 0.5;"):  # these weights are offsets from 0.2
+        train(method, recipe, clips, tmp_path, options={"levels": 1, "alpha": 0.5})
+    assert before == (weights.read_bytes(), weights.with_suffix(".json").read_bytes())
 
 
 def test_another_recipe_in_the_same_folder_is_refused(clips, tmp_path):
     (tmp_path / "recipe.json").write_text(json.dumps({**SHORT.record(), "learning_rate": 7.0}))
     with pytest.raises(ValueError, match=r"learning_rate 7.0 -> 0.001"):
         run_gain(clips, tmp_path)
+
+
+def test_a_run_goes_on_with_the_method_and_options_it_began_with(clips, tmp_path):
+    made = {"method": "gain", "options": {"sizes": (1, 2), "alpha": 0.2}}
+    run_gain(clips, tmp_path, method=made)
+    run_gain(clips, tmp_path, method=made, source=Stopping(batches(clips), 1))
+    for other, change in (
+        ({"method": "gain", "options": {"sizes": (1, 2), "alpha": 0.5}}, r"got option alpha 0.2 -> 0.5;"),
+        (
+            {"method": "loss", "options": {"sizes": (1, 3)}},
+            "got method 'gain' -> 'loss', option alpha 0.2 -> None, opt",
+        ),
+    ):
+        with pytest.raises(ValueError, match=change):
+            run_gain(clips, tmp_path, method=other)
+
+
+def test_a_run_of_before_methods_were_kept_goes_on(clips, tmp_path):
+    (tmp_path / "recipe.json").write_text(json.dumps({**SHORT.record(), "start": None}))
+    assert int(run_gain(clips, tmp_path, method={"method": "gain", "options": {}}).step) == SHORT.steps
 
 
 def test_a_torn_log_line_is_left_out(tmp_path):
