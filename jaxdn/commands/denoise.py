@@ -40,7 +40,8 @@ def run_denoise(options: Denoise, *, on_start: Callable[[], None] = lambda: None
     scene = _scene_of(options)
     if options.method == AUTO:
         options = _choose_method(options, of_scene=scene is not None)
-    with engine_errors("--max-memory" if scene is None else "a smaller --width and --height"):
+    less = "--max-memory" if scene is None else "a smaller --width and --height"
+    with engine_errors(f"{less}, or another --method"):
         if scene is None:
             _denoise_files(options, naming, on_start)
         else:

@@ -60,11 +60,11 @@ def plain_errors() -> Iterator[None]:
 
 
 @contextmanager
-def engine_errors(less_memory: str) -> Iterator[None]:
+def engine_errors(remedy: str) -> Iterator[None]:
     """Raise ValueError, with what to change, for full memory and for a failure of Open Image Denoise.
 
-    ``less_memory`` names the option by which a command needs less. XLA raises RuntimeError for both: of a failure in a
-    callback the message holds that of the library.
+    ``remedy`` names the options by which a command needs less memory, or another method. XLA raises RuntimeError for
+    both: of a failure in a callback the message holds that of the library.
     """
     try:
         yield
@@ -72,11 +72,11 @@ def engine_errors(less_memory: str) -> Iterator[None]:
         lines = str(error).splitlines() or [type(error).__name__]
         if isinstance(error, MemoryError) or _FULL in str(error):
             full = next((line for line in lines if _FULL in line), lines[0])
-            raise ValueError(f"memory is full ({full[:200]}); give {less_memory}, or another --method.") from error
+            raise ValueError(f"memory is full ({full[:200]}); give {remedy}.") from error
         failed = next((line[line.index(_OIDN) :] for line in lines if _OIDN in line), None)
         if failed is None:
             raise
-        raise ValueError(f"{failed}; give {less_memory} if memory is full, or another --method.") from error
+        raise ValueError(f"{failed}; give {remedy}.") from error
 
 
 def _line(message: Warning | str, *place: Any, **more: Any) -> str:

@@ -23,7 +23,7 @@ from jaxdn.commands.arguments import (
     check_folder,
     make_channel_naming,
 )
-from jaxdn.commands.errors import end_with_reader, plain_errors
+from jaxdn.commands.errors import end_with_reader, engine_errors, plain_errors
 from jaxdn.runtime.garbage import put_off_collection
 from jaxdn.runtime.interrupt import exit_on_interrupt
 from jaxdn.runtime.program_cache import keep_programs
@@ -114,16 +114,21 @@ def _pack(options: Pack) -> None:
     print(f"{options.out}: {packed.windows} windows of {packed.clips} clips, {packed.size / 2**20:.1f} MiB")
 
 
+_LESS_TO_TRAIN = "a smaller --batch or --crop, or --rematerialize"
+
+
 def _train(options: Train) -> None:
     given = options.coordinator, options.processes, options.process
     if not options.distributed:
         if any(value is not None for value in given):
             raise ValueError("--coordinator, --processes, --process: expected --distributed too; give it, or none.")
-        _train_here(options)
+        with engine_errors(_LESS_TO_TRAIN):
+            _train_here(options)
         return
     from jaxdn.commands.distributed import Place, join_processes
 
-    with join_processes(Place(*given)):
+    # Outside: which of jax's own errors it is tells whether another process is lost.
+    with engine_errors(_LESS_TO_TRAIN), join_processes(Place(*given)):
         _train_here(options)
 
 
@@ -179,7 +184,9 @@ def _compare(options: Compare) -> None:
     methods = [find_model(name) for name in names]
     folders = find_clips(options.clips)
     settings = {"clips": len(folders), "spp": options.spp, "methods": names}
-    results = compare(methods, folders, title=f"Denoisers on {options.clips.name}", settings=settings, spp=options.spp)
+    title = f"Denoisers on {options.clips.name}"
+    with engine_errors("other --methods, or smaller clips"):
+        results = compare(methods, folders, title=title, settings=settings, spp=options.spp)
     page = write_report(results, out)
     print(text_table(results))
     print(f"report: {page}")
