@@ -192,14 +192,23 @@ def divisor(reflectance: Image, *, floor: float = FLOOR) -> Image:
 
     It is smooth everywhere: neighbours of similar reflectance have similar divisors, however dark they are. With a
     threshold (1 below it), reflectances of 0.009 and 0.011 would differ by a factor of 90 after the division.
+
+    Raises ValueError for a ``floor`` that is a Python number and not more than 0.
     """
+    if isinstance(floor, int | float) and not floor > 0:
+        raise ValueError(
+            f"floor: expected more than 0, got {floor}; it is the divisor of surfaces that reflect nothing."
+        )
     larger, smaller = jnp.maximum(reflectance, floor), jnp.minimum(reflectance, floor)
     # Two square roots: XLA:CPU does not vectorise powers.
     return larger * jnp.sqrt(jnp.sqrt(1 + (smaller / larger) ** 4)) / (1 + floor**4) ** 0.25
 
 
 def demodulate(radiance: Image, reflectance: Image, *, floor: float = FLOOR) -> Image:
-    """Radiance [H, W, 3] divided by the surface's reflectance; finite for any reflectance >= 0."""
+    """Radiance [H, W, 3] divided by the surface's reflectance; finite for any reflectance >= 0.
+
+    Raises ValueError for sizes that differ, and as :func:`divisor` does.
+    """
     check_same_size(radiance, reflectance, ("radiance", "reflectance"))
     return radiance / divisor(reflectance, floor=floor)
 

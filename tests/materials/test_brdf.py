@@ -148,6 +148,15 @@ def test_slopes_are_finite_at_zero_reflectance():
     assert np.isfinite(slope(np.zeros((1, 1, 3)))).all()
 
 
+def test_a_floor_that_divides_by_zero_is_refused():
+    ones, black = np.ones((2, 3, 3), np.float32), np.zeros((2, 3, 3), np.float32)
+    for wrong in (0, 0.0, -0.1, float("nan")):
+        for function in (brdf.demodulate, brdf.remodulate):
+            with pytest.raises(ValueError, match=r"floor: expected more than 0, got"):
+                function(ones, black, floor=wrong)
+    assert np.isfinite(demodulate(ones, black, floor=jnp.float32(0.04))).all()
+
+
 def test_wrong_shapes_raise():
     color, one = jnp.ones((2, 2, 3)), jnp.ones((2, 2, 1))
     with pytest.raises(ValueError, match="specular"):
