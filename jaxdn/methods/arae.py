@@ -13,12 +13,13 @@ from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from jaxdn import brdf
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Core, Denoiser, Params, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics
-from jaxdn.filters.surface_test import guides_of
+from jaxdn.filters.surface_test import guides_of, surface_mask
 from jaxdn.methods import asvgf, rae, svgf
 from jaxdn.methods.demodulation import demodulated
 from jaxdn.methods.registry import method
@@ -79,8 +80,11 @@ def arae(options: Options) -> Denoiser:
         texture = svgf.planar_texture(frame, options.demodulate, statistics)
         history, invalid = asvgf.accumulate(accumulation, state.light, frame, texture, first)
         light = svgf.SvgfState(history.transpose(1, 2, 0), guides_of(frame))
-        mean = brdf.restore(history[:3], texture, history[6:])
-        measured, prepared = inner.prepare(frame._replace(radiance=mean.transpose(1, 2, 0)))
+        mean = brdf.restore(history[:3], texture, history[6:]).transpose(1, 2, 0)
+        hit = surface_mask(frame.depth, None) if options.background == "pass" else None
+        if hit is not None:  # the network passes through what it is given
+            mean = jnp.where(hit[..., None], mean, frame.radiance)
+        measured, prepared = inner.prepare(frame._replace(radiance=mean))
         hidden, image, hidden_invalid = inner.step(params, state.hidden, prepared, first, measured)
         return AraeState(light, hidden), image, invalid + hidden_invalid
 

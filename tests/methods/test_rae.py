@@ -224,6 +224,20 @@ def test_the_accumulation_gives_it_the_mean_of_all_frames(rng, key):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("background", ["pass", "filter"])
+def test_the_sky_keeps_its_radiance_behind_the_accumulation_too(background, rng, key):
+    """Sky that goes out is dark at once, and not the mean of the frames so far."""
+    frames = clip_of(rng, 6)
+    sky = np.arange(SIZE[1])[None, :, None] < 4
+    still = jax.tree.map(lambda buffer: np.broadcast_to(buffer[:1], buffer.shape), frames)
+    light = np.where(sky, np.float32([1, 1, 1, 0, 0, 0])[:, None, None, None], frames.radiance)
+    still = still._replace(radiance=light, depth=np.where(sky, np.float32(FAR), still.depth))
+    denoiser = arae(**PLAIN, background=background)
+    images = images_of(denoiser, varied(denoiser, frames, key), still)
+    assert np.array_equal(images[:, :, :4], light[:, :, :4]) == (background == "pass")
+
+
+@pytest.mark.slow
 def test_light_that_changed_by_half_leaves_half_of_the_history_as_published(rng, key):
     """Of two frames the second weighs 1 / 2, and half of what is left goes: a quarter of the first stays."""
     frames, options = clip_of(rng, 2), {**PLAIN, "background": "filter"}
