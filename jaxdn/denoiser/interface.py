@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdn.core.checks import check_image, check_same_size
-from jaxdn.core.frame import RADIANCE_MAX, Frame, only
+from jaxdn.core.frame import BUFFERS, RADIANCE_MAX, Frame, only
 from jaxdn.denoiser.sanitize import sanitize
 from jaxdn.denoiser.statistics import FrameStatistics, measure_frame
 from jaxdn.ops.sampling import draw_random_numbers
@@ -31,6 +31,9 @@ Step = Callable[[Params, State, Frame], tuple[State, jax.Array]]
 """(params, state, frame) -> (state, image [H, W, 3] >= 0)."""
 Pattern = Callable[[int, int, jax.Array | int], jax.Array]
 """(height, width, number of the frame) -> [H, W, 1] in [0, 1): where fractions of samples are rounded up."""
+
+_COUNTED = frozenset({"count", "flag", "id"})
+"""Kinds of buffers that may be integers."""
 
 
 class Denoiser(NamedTuple):
@@ -208,10 +211,20 @@ def _shared_stages(core: Core) -> Stages:
 
 
 def check_frame(frame: Frame, reads: frozenset[str]) -> Frame:
-    """The buffers of a frame that a denoiser reads. Raises ValueError unless they are [H, W, C], all of one size."""
+    """The buffers of a frame that a denoiser reads.
+
+    Raises ValueError unless they are [H, W, C], all of one size, with the channels of the table
+    (:data:`jaxdn.core.frame.BUFFERS`), and of floating point where they are no numbers of shapes, flags or counts.
+    """
     frame = only(frame, reads)
     check_image(frame.radiance, "frame.radiance", channels=3)
-    for name, buffer in frame._asdict().items():
-        if buffer is not None:
-            check_same_size(frame.radiance, buffer, ("frame.radiance", f"frame.{name}"))
+    for name, values in frame._asdict().items():
+        if values is None:
+            continue
+        buffer = BUFFERS[name]
+        check_same_size(frame.radiance, values, ("frame.radiance", f"frame.{name}"))
+        if jnp.shape(values)[-1] != buffer.channels:
+            raise ValueError(f"frame.{name}: expected {buffer.channels} channels, got shape {jnp.shape(values)}.")
+        if buffer.kind not in _COUNTED:
+            check_image(values, f"frame.{name}")
     return frame

@@ -141,6 +141,12 @@ WRONG = {
     "integers": (lambda frame: frame._replace(radiance=frame.radiance.astype(int)), r"frame\.radiance.*floating"),
     "another height": (lambda frame: frame._replace(depth=frame.depth[1:]), r"frame\.depth.*same size"),
     "another width": (lambda frame: frame._replace(depth=frame.depth[:, 1:]), r"frame\.depth.*same size"),
+    "a vector of one number": (
+        lambda frame: frame._replace(motion=frame.motion[..., :1]),
+        r"frame\.motion.*2 channels",
+    ),
+    "three depths": (lambda frame: frame._replace(depth=frame.depth[..., [0, 0, 0]]), r"frame\.depth.*1 channels"),
+    "a depth in bytes": (lambda frame: frame._replace(depth=frame.depth.astype(jnp.uint8)), r"frame\.depth.*floating"),
     "one axis too many": (lambda frame: frame._replace(depth=frame.depth[None]), r"frame\.depth.*same size"),
 }
 
@@ -149,8 +155,9 @@ WRONG = {
 @pytest.mark.parametrize("wrap", [lambda denoiser: denoiser, demodulated], ids=["plain", "demodulated"])
 def test_shapes_that_do_not_fit_raise(wrong, wrap, rng):
     spoil, told = WRONG[wrong]
-    frame = frame_of(rng, depth=jnp.ones((*SIZE, 1)), albedo=jnp.ones((*SIZE, 3)))
-    denoiser = wrap(recurrent(identity(reads={"depth"}, samples=lambda params, state, frame, first, most: frame.depth)))
+    frame = frame_of(rng, depth=jnp.ones((*SIZE, 1)), albedo=jnp.ones((*SIZE, 3)), motion=jnp.zeros((*SIZE, 2)))
+    reads = {"depth", "motion"}
+    denoiser = wrap(recurrent(identity(reads=reads, samples=lambda params, state, frame, first, most: frame.depth)))
     state = denoiser.start({}, frame)
     for function in (
         lambda given: denoiser.start({}, given),
