@@ -189,6 +189,26 @@ def test_turns_longer_than_half_a_circle():
     np.testing.assert_allclose(keys(6)[:3, :3], make_rotation(np.array([0, 0, 1]), 180), atol=1e-12)
 
 
+@pytest.mark.parametrize("angle", [270, 720])
+def test_a_turn_begins_after_a_rest_about_its_own_axis(angle):
+    keys = RigidKeys([{"frame": 0}, {"frame": 5}, {"frame": 15, "axis": [0, 0, 1], "angle": angle}], np.zeros(3))
+    np.testing.assert_array_equal(keys(3), np.eye(4))
+    for frame in range(5, 16):
+        turned = make_rotation(np.array([0, 0, 1]), angle * (frame - 5) / 10)
+        np.testing.assert_allclose(keys(frame)[:3, :3], turned, atol=1e-12)
+
+
+def test_a_rest_lies_between_turns_about_two_axes():
+    turns = [
+        {"frame": 0, "axis": [1, 0, 0], "angle": 270},
+        {"frame": 10},
+        {"frame": 20, "axis": [0, 0, 1], "angle": 270},
+    ]
+    keys = RigidKeys(turns, np.zeros(3))
+    np.testing.assert_allclose(keys(5)[:3, :3], make_rotation(np.array([1, 0, 0]), 135), atol=1e-12)
+    np.testing.assert_allclose(keys(15)[:3, :3], make_rotation(np.array([0, 0, 1]), 135), atol=1e-12)
+
+
 @pytest.mark.parametrize("angle", [1e-7, 30.0, 179.999, 180.0])
 def test_slerp_turns_evenly_about_one_axis(angle):
     axis = np.array([2.0, -1.0, 2.0]) / 3

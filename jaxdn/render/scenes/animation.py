@@ -53,18 +53,15 @@ class RigidKeys:
         self.axes = np.array([_unit(key.get("axis", (0.0, 1.0, 0.0))) for key in keys])
         self.angles = np.array([float(key.get("angle", 0.0)) for key in keys])
         self.pivot = pivot
-        # A zero rotation takes the axis of its neighbour, so that 0 to 720 degrees are two full turns.
-        for index in (*range(1, len(keys)), *range(len(keys) - 2, -1, -1)):
-            other = index - 1 if index else min(1, len(keys) - 1)
-            if self.angles[index] == 0.0 and self.angles[other] != 0.0:
-                self.axes[index] = self.axes[other]
 
     def __call__(self, frame: float) -> np.ndarray:
         """[4, 4] float64: rotate about the pivot, then translate."""
         first, second, share = _between(self.frames, frame)
-        if np.allclose(self.axes[first], self.axes[second]):
+        # No rotation has any axis: it takes that of the other key, so that 0 to 720 degrees are two full turns.
+        one, other = (self.axes[key if self.angles[key] else far] for key, far in ((first, second), (second, first)))
+        if np.allclose(one, other):
             angle = _mix(self.angles[first], self.angles[second], share)
-            rotation = make_rotation(self.axes[first], angle)
+            rotation = make_rotation(one, angle)
         else:
             ends = [make_rotation(self.axes[end], self.angles[end]) for end in (first, second)]
             rotation = slerp(ends[0], ends[1], share)
