@@ -17,7 +17,7 @@ from jaxdn.denoiser import Denoiser, Params
 from jaxdn.denoiser.rollout import denoise
 from jaxdn.evaluation.report import ClipResult, Results, Scores, TrainingCurve
 from jaxdn.evaluation.report.film import FRAMES, film
-from jaxdn.evaluation.report.results import headline_psnr
+from jaxdn.evaluation.report.results import REFERENCE, headline_psnr
 from jaxdn.runtime.cores import count_cores
 from jaxdn.zoo.ready import DEFAULT_MODEL, Model
 
@@ -115,7 +115,8 @@ def compare(
     one half of the samples of its reference, PSNR, temporal PSNR, MSE and relative MSE are given without the noise of
     the reference too (:func:`jaxdn.metrics.unbiased_mse`). Disoccluded pixels are those whose point was hidden in the
     previous frame (``visible`` is false). Milliseconds are the median of three runs of the compiled clip, divided by
-    its frames, without compilation. Raises ValueError for methods of one label, and for a clip without a reference.
+    its frames, without compilation. Raises ValueError for methods of one label, for the label "reference", and for a
+    clip without a reference.
 
     Args:
       methods: what to compare.
@@ -133,6 +134,11 @@ def compare(
         raise ValueError(
             f"methods: expected every label once, got {', '.join(twice)} twice; name each method once, and let the "
             "folders of weights have different names."
+        )
+    if REFERENCE in labels:
+        raise ValueError(
+            f"methods: expected no label {REFERENCE!r}, as reports call the clips' references so, got one; "
+            "rename the folder of weights."
         )
     compiled: dict[str, Callable[[Params, Clip], jax.Array]] = {}
     for method in methods:

@@ -80,3 +80,9 @@ def test_methods_of_one_name_are_refused_before_a_clip_is_read(tmp_path):
     noisy = Model("noisy", None, {}, None, {})
     with pytest.raises(ValueError, match="methods: expected every label once, got noisy twice"):
         compare([noisy, noisy], [tmp_path / "nowhere"], title="", settings={})
+
+
+def test_a_method_with_the_name_of_the_reference_is_refused_before_a_clip_is_read(tmp_path):
+    named = Model("reference", None, {}, None, {})
+    with pytest.raises(ValueError, match=r"methods: expected no label 'reference'.* rename the folder of weights"):
+        compare([named], [tmp_path / "nowhere"], title="", settings={})
