@@ -63,7 +63,7 @@ def _list_surfaces(built: Any, shapes: Mapping[str, Any]) -> tuple[list[Surface]
     from jaxdn.render.scenes.plugins import list_children, list_shape_groups
 
     grouped = [part for group in list_shape_groups(built) for _, part in list_children(group) if hasattr(part, "bsdf")]
-    scattering = {name for name, medium in list_media(built).items() if not absorbs(medium)}
+    scattering = {name for name, medium in list_media(built) if not absorbs(medium)}
     surfaces: list[Surface] = []
     uncertain: dict[str, str] = {}
     for name, shape in shapes.items():

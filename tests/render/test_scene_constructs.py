@@ -273,6 +273,22 @@ def test_fog_without_filtered_pixels_is_refused_by_the_name_of_what_bounds_it(fo
     check_scene(scene.build(0, WIDTH, HEIGHT), filtered=True)
 
 
+def test_media_on_both_sides_of_a_shape_are_seen(folder):
+    from jaxdn.effects import inspect
+    from jaxdn.render.buffers.gbuffer import check_scene
+    from jaxdn.render.tracing.volume_path_tracer import scatters
+
+    smoke = GLASS.format(x=0, bsdf="null").replace('name="albedo" value="0"', 'name="albedo" value="0.5"')
+    around = """<medium type="homogeneous" name="exterior"><rgb name="albedo" value="0"/>
+      <rgb name="sigma_t" value="0.1"/></medium></shape>"""
+    scene = SceneFile(write(folder, LAMP.format(x=0, power=20) + smoke.replace("</shape>", around)))
+    built = scene.build(0, WIDTH, HEIGHT)
+    assert scatters(built)
+    with pytest.raises(ValueError, match=r"fog \('glass' has it\)"):
+        check_scene(built)
+    assert "media" in inspect(scene, width=WIDTH, height=HEIGHT)
+
+
 @pytest.mark.slow
 def test_a_medium_around_the_camera_is_kept(folder):
     medium = """<medium type="homogeneous" id="air"><rgb name="albedo" value="{albedo}"/>

@@ -75,14 +75,14 @@ def check_scene(scene: Any, *, filtered: bool = False) -> None:
     know nothing of that.
     """
     sensor = scene.sensors()[0]
-    scattering = {name: medium for name, medium in list_media(scene).items() if not absorbs(medium)}
-    varying = [name for name, medium in scattering.items() if not medium.is_homogeneous()]
+    scattering = [(name, medium) for name, medium in list_media(scene) if not absorbs(medium)]
+    varying = [name for name, medium in scattering if not medium.is_homogeneous()]
     if varying:
         raise ValueError(
             f"scene: media that vary in space are not supported, but {varying[0]!r} has one; make it homogeneous, or "
             "remove it."
         )
-    fog = f"fog ({next(iter(scattering), '')!r} has it)"
+    fog = f"fog ({next((name for name, _ in scattering), '')!r} has it)"
     for what, there in (("depth of field", sensor.needs_aperture_sample()), (fog, bool(scattering))):
         if there and not filtered:
             raise ValueError(

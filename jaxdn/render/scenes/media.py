@@ -12,15 +12,11 @@ import mitsuba as mi
 import numpy as np
 
 
-def list_media(scene: Any) -> dict[str, Any]:
-    """The media of a loaded scene: name of a shape -> the one inside it or around it, and ``"camera"``."""
-    found: dict[str, Any] = {}
-    for shape in scene.shapes():
-        for medium in (shape.interior_medium(), shape.exterior_medium()):
-            if medium is not None:
-                found[shape.id()] = medium
-    around = scene.sensors()[0].get_medium()
-    return found if around is None else {**found, "camera": around}
+def list_media(scene: Any) -> list[tuple[str, Any]]:
+    """The media of a loaded scene: those inside and around shapes, with the shape's name, and that of ``"camera"``."""
+    sides = [(shape.id(), (shape.interior_medium(), shape.exterior_medium())) for shape in scene.shapes()]
+    sides.append(("camera", (scene.sensors()[0].get_medium(),)))
+    return [(name, medium) for name, media in sides for medium in media if medium is not None]
 
 
 def absorbs(medium: Any) -> bool:

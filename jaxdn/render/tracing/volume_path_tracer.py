@@ -23,7 +23,7 @@ _CROSSINGS = 32
 
 def scatters(scene: Any) -> bool:
     """Whether a loaded scene has a medium that scatters light."""
-    return any(not absorbs(medium) for medium in list_media(scene).values())
+    return any(not absorbs(medium) for _, medium in list_media(scene))
 
 
 def is_bound(bsdf: Any, active: Any) -> Any:
