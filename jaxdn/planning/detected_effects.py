@@ -64,21 +64,23 @@ def detect_effects(scene: SceneProperties) -> Effects:
 
 
 def choose_effects(names: Iterable[str], frames: int) -> Effects:
-    """Only the named effects, in every frame. Raises ValueError for an unknown name, listing the known ones."""
+    """Only the named effects, in every frame. Raises ValueError for an unknown name, listing the known ones.
+
+    No frame shares what another shows: that the effects of motion are not chosen does not say that nothing moves.
+    """
     wanted = set(names)
     unknown = sorted(wanted - set(NAMES))
     if unknown:
         raise ValueError(f"effects: unknown {', '.join(map(repr, unknown))}; expected auto, all or {', '.join(NAMES)}.")
-    still = not wanted & IN_TIME
     return Effects(
         tuple(name for name in NAMES if name in wanted),
         dict.fromkeys(wanted, "requested"),
         {},
         (frozenset(wanted),) * frames,
-        (0,) * frames if still else tuple(range(frames)),
+        tuple(range(frames)),
     )
 
 
 def choose_all_effects(frames: int) -> Effects:
-    """Every effect in every frame: rendering without inspection."""
+    """Every effect in every frame, whatever the scene is."""
     return choose_effects(NAMES, frames)

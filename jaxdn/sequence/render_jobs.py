@@ -14,6 +14,7 @@ from jaxdn.denoiser import Denoiser
 from jaxdn.effects import Effects, Plan, choose_all_effects, choose_effects, inspect, plan
 from jaxdn.methods.registry import is_method, method_named
 from jaxdn.planning.catalogue import OF_PRIMARY_SURFACES, THROUGH_CENTRES
+from jaxdn.planning.detected_effects import IN_TIME
 from jaxdn.planning.plan import SCORED
 from jaxdn.render.clip_job import ClipJob, UnplannedClip
 from jaxdn.render.families import FAMILIES
@@ -35,6 +36,8 @@ class PlannedClip(NamedTuple):
     plan: Plan
     depth: PathDepth | None = None
     """How the plan's path length was measured; None if it was not."""
+    left_out: str = ""
+    """In words, the buffers that the denoiser reads and that the scene cannot have; "" if there are none."""
 
 
 def find_denoiser(names: str) -> Denoiser | None:
@@ -62,7 +65,9 @@ def plan_clip(
 ) -> PlannedClip | None:
     """The effects to render an animated scene for, and the plan; None means no plan: ``"all"`` without a denoiser.
 
-    Raises ValueError for a name that is not an effect.
+    Whatever effects are chosen, the scene is inspected for what they do not say: frames in which nothing changes share
+    their buffers, where no chosen effect concerns two frames, and in fog or with a shutter there are no buffers of
+    samples. Raises ValueError for a name that is not an effect.
 
     Args:
       scene: what is rendered.
@@ -72,26 +77,42 @@ def plan_clip(
       denoiser: plan for the buffers that it reads; None: for any denoiser, without the buffers that only few read.
     """
 
-    def make(detected: Effects, max_depth: int | None = settings.max_depth) -> PlannedClip:
+    if effects == "all" and denoiser is None:
+        return None
+    chosen = None if effects == "auto" else _choose(effects, frames)
+    detected = inspect(scene, width=settings.width, height=settings.height, frames=frames)
+    if chosen is not None and not IN_TIME & set(chosen.names):
+        chosen = replace(chosen, shared_with=detected.shared_with)
+
+    def make(max_depth: int | None = settings.max_depth) -> PlannedClip:
+        shown = detected if chosen is None else chosen
         # Filtered samples go through other points in every frame, as jittered ones do.
         jitter, through = not settings.through_centres, settings.see_through
-        made = plan(detected, denoiser, max_depth=max_depth, light=settings.light, jitter=jitter, see_through=through)
-        if get_shutter(scene) > 0 or "media" in detected.names:  # nothing is told of these samples
-            frames = tuple(tuple(name for name in frame if name not in OF_SAMPLES) for frame in made.frames)
-            made = made._replace(frames=frames)
-        return PlannedClip(detected, made)
+        made = plan(shown, denoiser, max_depth=max_depth, light=settings.light, jitter=jitter, see_through=through)
+        # Nothing is told of samples that fog scatters, or of those of several times.
+        where = "with a shutter" if get_shutter(scene) > 0 else "in fog" if "media" in detected else ""
+        lost = OF_SAMPLES & set(made.buffers) if where else frozenset[str]()
+        if not lost:
+            return PlannedClip(shown, made)
+        kept = tuple(tuple(name for name in frame if name not in lost) for frame in made.frames)
+        told = f"{where} there is no {', '.join(sorted(lost))}: left out"
+        return PlannedClip(shown, made._replace(frames=kept), left_out=told)
 
-    if effects == "all":
-        return None if denoiser is None else make(choose_all_effects(frames))
-    if effects != "auto":
-        return make(choose_effects([name.strip() for name in effects.split(",") if name.strip()], frames))
-    detected = inspect(scene, width=settings.width, height=settings.height, frames=frames)
-    planned = make(detected)
+    planned = make()
+    if chosen is not None:
+        return planned
     # Measuring needs a path tracer, and indirect light that longer paths may add.
     if settings.max_depth is not None or not planned.plan.indirect or planned.plan.integrator != "path":
         return planned
     depth = measure_depth(scene, frames=frames)
-    return make(detected, depth.max_depth)._replace(depth=depth)
+    return make(depth.max_depth)._replace(depth=depth)
+
+
+def _choose(effects: str, frames: int) -> Effects:
+    """The effects of ``"all"``, or of names separated by commas."""
+    if effects == "all":
+        return choose_all_effects(frames)
+    return choose_effects([name.strip() for name in effects.split(",") if name.strip()], frames)
 
 
 class ClipSource(NamedTuple):
@@ -184,7 +205,9 @@ def plan_jobs(source: ClipSource, out: Path, settings: RenderSettings) -> list[C
             clip = f"{name}-{seed}"
             if planned is not None:
                 detected = ", ".join(planned.effects) or "no effects"
-                print(f"{clip}: {detected}; paths of depth {planned.plan.max_depth}", flush=True)
+                print(f"{clip}: {detected}; paths of depth {planned.plan.max_depth or scene.max_depth}", flush=True)
+                if planned.left_out:
+                    print(f"{clip}: {planned.left_out}", flush=True)
             own = replace(settings, seed=seed, plan=None if planned is None else planned.plan)
             jobs.append(ClipJob(scene.record, str(out / clip), source.frames, own))
     return jobs

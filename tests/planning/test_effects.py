@@ -145,6 +145,10 @@ def test_every_entry_of_a_plan_is_used():
     assert set(effects.Plan._fields) == {"integrator", "max_depth", "indirect", "effects", "frames", "shared_with"}
 
 
+def test_chosen_effects_do_not_say_that_nothing_changes():
+    assert effects.choose_effects(["indirect"], 3).shared_with == (0, 1, 2)
+
+
 def test_unknown_effects_raise_with_the_known_ones():
     with pytest.raises(ValueError, match=r"unknown 'fog'; expected auto, all or camera-motion, .*media"):
         effects.choose_effects(["fog"], 1)

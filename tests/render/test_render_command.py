@@ -1,5 +1,6 @@
 """``jaxdn render``: scenes are opened and planned once, and the clips match the options."""
 
+import json
 from dataclasses import replace
 
 import pytest
@@ -7,6 +8,7 @@ import pytest
 from experiments.speed.small_rooms import CASES
 from jaxdn.clips import ClipError
 from jaxdn.commands import main
+from jaxdn.core.frame import OF_SAMPLES
 from jaxdn.data.clip.folder import is_clip, read_record
 from jaxdn.render.clip import render_clip
 from jaxdn.render.scenes.scene_file import SceneFile
@@ -65,10 +67,46 @@ def test_every_seed_of_a_family_is_a_different_scene(counted, tmp_path):
 
 
 @pytest.mark.parametrize(("effects", "planned"), [("all", False), ("indirect, glossy", True)])
-def test_chosen_effects_are_not_inspected(counted, tmp_path, effects, planned):
+def test_chosen_effects_are_planned_and_no_others(counted, tmp_path, effects, planned):
     render("fruit", tmp_path, effects=effects)
-    assert counted["planned"] == 0
-    assert (counted["jobs"][0].settings.plan is not None) == planned
+    assert counted["planned"] == planned
+    plan = counted["jobs"][0].settings.plan
+    assert (None if plan is None else plan.effects) == (("indirect", "glossy") if planned else None)
+
+
+@pytest.mark.parametrize(("case", "shared"), [("moving: ball", (0, 1)), ("static grey box", (0, 0))])
+def test_frames_are_shared_where_nothing_changes_whatever_is_chosen(counted, tmp_path, case, shared):
+    render(CASES[case].write(tmp_path), tmp_path / "out", effects="indirect")
+    assert counted["jobs"][0].settings.plan.shared_with == shared
+
+
+@pytest.mark.needs("llvm")
+@pytest.mark.parametrize("effects", ["all", "indirect, specular"])
+def test_samples_keep_their_buffers_where_nothing_forbids_it(counted, tmp_path, capsys, effects):
+    path = CASES["static grey box"].write(tmp_path)
+    render(path, tmp_path / "out", effects=effects, denoiser="relax")
+    assert {"specular", "specular_hit_distance"} <= set(counted["jobs"][0].settings.plan.frames[0])
+    said = capsys.readouterr().out
+    assert "left out" not in said
+    assert f"paths of depth {SceneFile(path).max_depth}" in said
+
+
+@pytest.mark.needs("llvm")
+@pytest.mark.parametrize("effects", ["auto", "all", "specular"])
+@pytest.mark.parametrize(
+    ("optics", "why"),
+    [({"fog": {"density": 0.1, "albedo": [0.9, 0.9, 0.9]}}, "in fog"), ({"shutter": 0.5}, "a shutter")],
+)
+def test_buffers_that_fog_or_a_shutter_forbids_are_said(counted, tmp_path, capsys, optics, why, effects):
+    path, animation = CASES["a ball: rough metal"].write(tmp_path), tmp_path / "optics.json"
+    animation.write_text(json.dumps({"frames": 2, **optics}))
+    filtered = replace(SETTINGS, pixel_filter="blackman-harris", max_depth=3)
+    render(path, tmp_path / "out", filtered, effects=effects, denoiser="relax", animation=animation)
+    assert not OF_SAMPLES & set(counted["jobs"][0].settings.plan.buffers)
+    lines = [line for line in capsys.readouterr().out.splitlines() if why in line]
+    assert len(lines) == 1
+    assert "there is no " in lines[0]
+    assert "specular, specular_hit_distance: left out" in lines[0]
 
 
 @pytest.mark.parametrize("reference_spp", [0, 4])

@@ -83,8 +83,7 @@ def test_wrong_settings_cannot_be_made_or_changed_to(wrong, message):
 
 def test_a_plan_that_was_made_for_other_settings_is_refused():
     everything = effects.choose_all_effects(2)
-    still = effects.plan(effects.choose_effects(["indirect"], 2))
-    assert still.shared_with == (0, 0)
+    still = effects.plan(dataclasses.replace(effects.choose_effects(["indirect"], 2), shared_with=(0, 0)))
     for wrong, message in (
         ({"plan": effects.plan(everything), "light": "reflected"}, "pass light='reflected'"),
         ({"plan": still, "jitter": True}, "pass jitter=True"),
