@@ -37,7 +37,7 @@ def render_clip(
     """Render the frames 0 ... ``frames`` - 1 into ``folder``: one ``frame_0000.exr`` each, and then ``clip.json``.
 
     Existing complete frames are kept, so that an interrupted rendering is resumed; the folder must have been started
-    with the same settings (ClipError otherwise). It only becomes a clip when all frames exist
+    with the same settings and no more frames (ClipError otherwise). It only becomes a clip when all frames exist
     (:func:`jaxdn.data.clip.folder.begin_record`); a clip that has them all is left as it is. Returns the folder. Raises
     RenderError, naming the clip and the frame, if a frame cannot be rendered or written.
 

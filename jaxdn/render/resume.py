@@ -12,8 +12,11 @@ _FREE = ("frames", "cameras", "versions", "bad_samples")
 
 
 def check_resumable(folder: Path, wanted: Mapping[str, Any], begun: Mapping[str, Any]) -> None:
-    """Raise ClipError if the frames in a folder were rendered with other settings, naming those; both are records."""
-    # Frames may be added: what both records say about the same ones is compared.
+    """Raise ClipError if the frames in a folder were rendered with other settings, naming those; both are records.
+
+    A clip may get more frames, but not fewer than it was begun with.
+    """
+    # What both records say about the same frames is compared.
     common = min(int(begun["frames"]), int(wanted["frames"]))
     both = [{**LATER_SETTINGS, **record, "plan": _cut_plan(record.get("plan"), common)} for record in (begun, wanted)]
     names = [name for name in wanted if name not in _FREE]
@@ -21,7 +24,7 @@ def check_resumable(folder: Path, wanted: Mapping[str, Any], begun: Mapping[str,
     cameras = zip(begun.get("cameras", []), wanted["cameras"], strict=False)
     if any(_make_plain(first) != _make_plain(second) for first, second in cameras):
         differing.append("another camera path")
-    if differing:
+    if differing or wanted["frames"] < begun["frames"]:
         if begun["frames"] != wanted["frames"]:
             differing.insert(0, f"{begun['frames']} frames there, {wanted['frames']} wanted")
         what = "; ".join(dict.fromkeys(differing))

@@ -293,6 +293,15 @@ def test_a_finished_clip_that_gets_more_frames_is_unfinished_until_it_has_them(t
     assert read_record(tmp_path)["frames"] == 2
 
 
+def test_a_clip_does_not_lose_frames(tmp_path: Path) -> None:
+    settings = RenderSettings(variant="scalar_rgb", **SIZE)
+    render_clip(Stage(), tmp_path, settings, frames=2)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ClipError, match="2 frames there, 1 wanted"):
+        render_clip(Stage(), tmp_path, settings, frames=1)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_without_a_plan_every_buffer_of_every_effect_is_rendered() -> None:
     frame = render_frame(Stage(), 0, RenderSettings(variant="scalar_rgb", **SIZE)).frame
     assert set(present(frame)) == set(effects.plan(effects.choose_all_effects(1)).buffers)
