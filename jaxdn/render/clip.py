@@ -17,7 +17,7 @@ from jaxdn.render.bad_samples import count_noted, note_bad_samples, remove_notes
 from jaxdn.render.buffers.geometry import View
 from jaxdn.render.frame import RenderedFrame, render_frame
 from jaxdn.render.mitsuba.errors import RenderError
-from jaxdn.render.resume import check_resumable
+from jaxdn.render.resume import check_resumable, digest_scene_file
 from jaxdn.render.scenes.scene import AnimatedScene
 from jaxdn.render.settings import RenderSettings
 from jaxdn.render.tracing.tracer import choose_tracer
@@ -161,6 +161,7 @@ def _make_record(scene: AnimatedScene, frames: int, settings: RenderSettings) ->
         "jittered": choose_tracer(settings.variant or "").jittered or settings.pixel_filter != "centre",
         "cameras": [_record_camera(scene, frame) for frame in range(frames)],
         "scene": dict(scene.record),
+        **digest_scene_file(scene.record),
         "versions": _list_versions(),
         "bad_samples": 0,
     }

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from jaxdn.data.clip.folder import begun_record, frame_path, is_clip, read_record
 from jaxdn.render.open_scene import scene_from_record
+from jaxdn.render.resume import digest_scene_file, is_scene_edited
 from jaxdn.render.settings import RenderSettings
 
 
@@ -39,10 +40,15 @@ def keep_variant(job: ClipJob) -> ClipJob:
 
 
 def is_finished(job: ClipJob) -> bool:
-    """Whether the clip exists with all its frames and the wanted settings; this needs no separate process."""
+    """Whether the clip exists with all its frames, the wanted settings and a scene file that nobody has edited since.
+
+    This needs no separate process.
+    """
     if not is_clip(job.folder):
         return False
     record = read_record(job.folder)
+    if is_scene_edited(record, digest_scene_file(job.scene)):
+        return False
     wanted = {"scene": job.scene, "frames": job.frames, **job.settings.record()}
     # What a job leaves open was chosen when the clip was started.
     open_names = {name for name in ("max_depth", "variant") if wanted[name] is None}

@@ -302,6 +302,28 @@ def test_a_clip_does_not_lose_frames(tmp_path: Path) -> None:
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_frames_of_an_edited_scene_file_are_not_added_to_a_clip(tmp_path: Path) -> None:
+    file, clip = tmp_path / "scene.xml", tmp_path / "clip"
+    file.write_text("a red wall")
+    scene, settings = Stage(), RenderSettings(variant="scalar_rgb", **SIZE)
+    scene.record = {"file": str(file)}
+    job = ClipJob(scene.record, str(clip), 1, settings)
+    render_clip(scene, clip, settings, frames=1)
+    assert is_finished(job)
+    file.write_text("a blue wall")
+    assert not is_finished(job)
+    for frames in (1, 2):
+        with pytest.raises(ClipError, match=r"the scene file .*scene\.xml has been edited"):
+            render_clip(scene, clip, settings, frames=frames)
+    # Clips of earlier versions do not say what their scene file held.
+    record = json.loads((clip / "clip.json").read_text())
+    del record["scene_file_sha256"]
+    (clip / "clip.json").write_text(json.dumps(record))
+    assert is_finished(job)
+    render_clip(scene, clip, settings, frames=2)
+    assert read_record(clip)["frames"] == 2
+
+
 def test_without_a_plan_every_buffer_of_every_effect_is_rendered() -> None:
     frame = render_frame(Stage(), 0, RenderSettings(variant="scalar_rgb", **SIZE)).frame
     assert set(present(frame)) == set(effects.plan(effects.choose_all_effects(1)).buffers)
