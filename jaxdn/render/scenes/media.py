@@ -14,7 +14,9 @@ import numpy as np
 
 def list_media(scene: Any) -> list[tuple[str, Any]]:
     """The media of a loaded scene: those inside and around shapes, with the shape's name, and that of ``"camera"``."""
-    sides = [(shape.id(), (shape.interior_medium(), shape.exterior_medium())) for shape in scene.shapes()]
+    sides: list[tuple[str, tuple[Any, ...]]] = [
+        (shape.id(), (shape.interior_medium(), shape.exterior_medium())) for shape in scene.shapes()
+    ]
     sides.append(("camera", (scene.sensors()[0].get_medium(),)))
     return [(name, medium) for name, media in sides for medium in media if medium is not None]
 
