@@ -100,8 +100,8 @@ class Frame(NamedTuple):
     """[H, W, 1] bool, the point was seen in the previous frame; neutral: true."""
     previous_depth: Annotated[Array, Buffer(1, "distance", "depth")] = None
     """[H, W, 1] view-space z that the point had in the previous frame; neutral: ``depth``."""
-    ids: Annotated[Array, Buffer(1, "id", -1.0)] = None
-    """[H, W, 1] int32 shape id, -1 for nothing (and where it is unknown)."""
+    ids: Annotated[Array, Buffer(1, "id")] = None
+    """[H, W, 1] int32 shape id, -1 where the ray left the scene; neutral: 0, all is one surface."""
     direct: Annotated[Array, Buffer(3, "light", averaged=True)] = None
     """[H, W, 3] directly reflected light; neutral: 0."""
     emission: Annotated[Array, Buffer(3, "light", averaged=True)] = None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxdn.core.frame import BUFFERS, GUIDES, Frame, frame_at, only, present, written_out
+from jaxdn.filters.surface_test import surface_mask
 
 SIZE = (4, 5)
 NUMBERS = [np, jnp]
@@ -19,7 +20,7 @@ CHAINS = {
     "shadow_motion": "motion",
     "glossy_motion": "motion",
 }
-ENDS = {"albedo": 1, "roughness": 1, "visible": 1, "sample_count": 1, "reflectance": 1, "ids": -1}
+ENDS = {"albedo": 1, "roughness": 1, "visible": 1, "sample_count": 1, "reflectance": 1}
 """The neutral values that are not 0, from the docstrings of the fields."""
 
 
@@ -74,6 +75,11 @@ def test_none_written_out_is_its_neutral_value(name, numbers):
     assert found.shape == (*SIZE, buffer.channels)
     assert found.dtype == buffer.dtype
     np.testing.assert_array_equal(found, ENDS.get(name, 0))
+
+
+def test_written_out_ids_are_a_surface():
+    """As no ids are: filters leave out pixels without one."""
+    assert surface_mask(None, written_out(Frame(light(np)), ["ids"]).ids).all()
 
 
 @pytest.mark.parametrize("numbers", NUMBERS)
