@@ -8,6 +8,7 @@ is padded at the frame's border is padded likewise.
 """
 
 import functools
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -212,14 +213,24 @@ class TiledStream:
     def _measure(self, frame: Frame, size: tuple[int, int]) -> FrameStatistics:
         """The statistics of a frame, tile by tile; values that are replaced are counted."""
         sums = []
-        for row in range(0, size[0], step := max(self.side // GRID, 1) * GRID):
-            for column in range(0, size[1], step):
-                tile = jax.tree.map(lambda x, r=row, c=column: x[r : r + step, c : c + step], frame)
-                statistics, replaced = _measure_tile(self._denoiser, tile)
-                self.sanitized += int(replaced)
-                sums.append(statistics)
+        for rows, columns in itertools.product(*(_split_for_measuring(length, self.side) for length in size)):
+            tile = jax.tree.map(lambda x, r=rows, c=columns: x[r, c], frame)
+            statistics, replaced = _measure_tile(self._denoiser, tile)
+            self.sanitized += int(replaced)
+            sums.append(statistics)
         total = functools.reduce(lambda one, other: jax.tree.map(jnp.add, one, other), sums)
         return total._replace(height=jnp.asarray(size[0], total.height.dtype))
+
+
+def _split_for_measuring(length: int, side: int) -> list[slice]:
+    """Slices of about ``side`` pixels that lie side by side and begin at multiples of :data:`GRID`.
+
+    Less than :data:`GRID` pixels at the end go with the last slice: alone they would be measured as blocks of that
+    size, which the whole frame does not have.
+    """
+    step = max(side // GRID, 1) * GRID
+    starts = range(0, max(length - GRID + 1, 1), step)
+    return [slice(start, stop) for start, stop in itertools.pairwise([*starts, length])]
 
 
 _TAPS_AROUND = 3

@@ -236,6 +236,22 @@ def test_sums_of_tiles_are_those_of_the_frame() -> None:
     assert measure_frame(frame.radiance, None, frame._replace(albedo=None)).reflectance_differs == 0
 
 
+@pytest.mark.parametrize("size", [(260, 20), (20, 260)])
+def test_a_last_tile_of_less_than_a_block_is_measured_as_in_the_whole_frame(size: tuple[int, int]) -> None:
+    """The whole frame drops the 4 rows or columns: a core shows the exposure that it is given."""
+
+    def step(params: Any, state: Any, frame: Frame, first: jax.Array, statistics: FrameStatistics) -> Any:
+        return state, jnp.full_like(frame.radiance, statistics.exposure), 0
+
+    denoiser = recurrent(Core(lambda params, frame: (), step, frozenset(), receptive_field=0))
+    light = np.ones((260, 20, 3), np.float32)
+    light[256:] = 1000.0
+    frame = Frame(light if size[0] == 260 else light.transpose(1, 0, 2))
+    image = stream_tiled(denoiser, {}, 128, size)(frame)
+    np.testing.assert_allclose(image, stream(denoiser, {})(frame), rtol=1e-6)
+    np.testing.assert_allclose(image, 0.18, rtol=1e-6)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("samples", [4, 4096])
 def test_the_safe_mixture_in_tiles_is_that_of_the_whole_frame(samples: int) -> None:
