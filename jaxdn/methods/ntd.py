@@ -81,7 +81,8 @@ class Options:
     paper."""
     background: Literal["pass", "filter"] = "pass"
     """Pixels without a surface (depth at ``FAR``) keep their radiance, which has no noise, and surfaces get none of it:
-    for the filters these pixels hold the light of surfaces next to them. Or they are filtered as all others."""
+    for the filters these pixels hold the light of surfaces next to them. Or they are filtered as all others. Of those
+    without samples the radiance is filled from others, see :func:`fill_background`."""
     exposure: Literal["measured", "given"] = "measured"
     """The network sees radiance times :func:`jaxdn.color.exposure` of each frame, so that twice the light gives twice
     the image; or radiance as it is given."""
@@ -184,6 +185,24 @@ def warp_history(
         history = jnp.where(off_screen, noisy, history)
         absent = absent | off_screen
     return history, absent, invalid
+
+
+def fill_background(frame: Frame, hit: jax.Array) -> jax.Array:
+    """The radiance [H, W, 3] of pixels without a surface, where ``hit`` [H, W] is false.
+
+    Those without samples have the mean of those with samples in the same block (:func:`jaxdn.ops.scales.fill_holes`),
+    or else in the frame; 0 where none has any.
+    """
+    light, count = frame.radiance, frame.sample_count
+    if count is None:
+        return light
+    known = ~hit[..., None] & (count > 0)
+    padded = pad(jnp.concatenate([light, jnp.ones_like(count)], axis=-1), MULTIPLE)
+    around = crop(fill_holes(padded, pad(known, MULTIPLE)), light.shape[:2])
+    mean = jnp.sum(jnp.where(known, light, 0.0), axis=(0, 1)) / jnp.maximum(jnp.sum(known, dtype=light.dtype), 1.0)
+    filled = jnp.where(around[..., 3:] > 0, around[..., :3], mean)
+    # As where surfaces are filled: the gradient of its own value stays.
+    return jnp.where(count > 0, light, filled + light - jax.lax.stop_gradient(light))
 
 
 @method(
@@ -324,7 +343,7 @@ def core_of(options: Options, extra: ExtraFeatures = NO_EXTRA_FEATURES) -> Core:
             prior = guided_features(params["guide"] if guided else {}, guides)
             image = blend(options, predicted, prior, noisy, history, absent)
         image = jnp.clip(crop(image, size), 0.0, RADIANCE_MAX)
-        shown = image if hit is None else jnp.where(hit[..., None], image, frame.radiance)
+        shown = image if hit is None else jnp.where(hit[..., None], image, fill_background(frame, hit))
         return image, shown, invalid
 
     field = graph.receptive_field_radius(graph.unet(1, heads, widths=widths, head_size=3)) + _FILTERS_FIELD

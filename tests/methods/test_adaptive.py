@@ -10,7 +10,7 @@ import numpy as np
 import optax
 import pytest
 
-from jaxdn.core.frame import Clip, Frame, frame_at, only
+from jaxdn.core.frame import FAR, Clip, Frame, frame_at, only
 from jaxdn.denoiser import Denoiser, Recurrent, State
 from jaxdn.denoiser.rollout import denoise, render_requested, unroll
 from jaxdn.methods.dasr import dasr
@@ -239,6 +239,20 @@ def test_pixels_without_samples_are_filled_from_their_neighbours(rng, key):
     assert counts_of(denoiser, params, flat)[1].min() == 0
     images = jax.jit(lambda clip: denoise(denoiser, params, clip))(flat)
     np.testing.assert_allclose(np.median(images, axis=(1, 2, 3)), 1.0, rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_background_without_samples_is_filled_from_background_with_samples(rng, key):
+    """Of the same block, or else of the frame; surfaces give it none of their light."""
+    denoiser, clip = ntasd(size=TINY, least=0, demodulate="none"), clip_of(rng, 1)
+    params, frame = varied(denoiser, clip, key), only(frame_at(clip.frames, 0), denoiser.reads)
+    sky = np.arange(SIZE[1])[:, None] < 10
+    counts = (rng.random((*SIZE, 1)) < 0.3).astype(np.float32)
+    counts[:8, :8] = 0.0
+    light = counts * np.where(sky, np.float32(2.0), frame.radiance)
+    frame = frame._replace(radiance=light, depth=np.where(sky, np.float32(FAR), frame.depth), sample_count=counts)
+    _, image = jax.jit(denoiser.step)(params, denoiser.start(params, frame), frame)
+    np.testing.assert_allclose(image[:, :10], 2.0, rtol=1e-6)
 
 
 @pytest.mark.slow
