@@ -58,7 +58,8 @@ class Options(histories.Options):
     stable_sigma: Annotated[float, Range(0), LEARNABLE] = 1.0
     """Steady luminance may be this many standard deviations from the mean of 3x3 pixels."""
     stable_max: Annotated[int, Range(1)] = 30
-    """Maximum length of the mean of luminance in frames; 1: it is not steadied."""
+    """Maximum length of the mean of luminance in frames; 1: it is not steadied. It is no longer than the history: more
+    than ``history_max`` is the same as that."""
 
 
 PAPER = Options(
@@ -72,8 +73,8 @@ PAPER = Options(
     **histories.AS_PUBLISHED,
 )
 """The constants of ReBLUR in NRD 4.14, which no paper describes: three frames are filled, discs of 30 pixels before the
-accumulation (of diffuse light; NRD has 50 for specular light) and after it, at least 1, a luminance of 63 frames, 0.15
-of the lobe's angle, and planes within 0.02 of the depth."""
+accumulation (of diffuse light; NRD has 50 for specular light) and after it, at least 1, a luminance of 63 frames, of
+which only the 30 of the history count here, 0.15 of the lobe's angle, and planes within 0.02 of the depth."""
 
 
 class ReblurState(NamedTuple):
