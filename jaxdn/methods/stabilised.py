@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxdn.core.frame import RADIANCE_MAX, Frame
+from jaxdn.core.frame import RADIANCE_MAX, Array, Frame
 from jaxdn.denoiser import Core, Denoiser, Params, Prepared, State, core_of, recurrent
 from jaxdn.denoiser.statistics import FrameStatistics
 from jaxdn.filters import albedo_history, kalman
@@ -32,7 +32,7 @@ class StableHistory(NamedTuple):
     """What is kept of the images."""
 
     values: jax.Array
-    """[H, W, 7 or 10] colour; its albedo, if the frames have one; 3 as of :func:`jaxdn.filters.kalman.kalman_blend`;
+    """[H, W, 7 or 10] colour; its albedo, if a frame had one; 3 as of :func:`jaxdn.filters.kalman.kalman_blend`;
     1 where all 3x3 pixels showed one surface, else 0."""
     guides: Guides
     """Of the previous frame, as far as present."""
@@ -104,30 +104,40 @@ def stabilised(denoiser: Denoiser, *, history_max: int = 16) -> Denoiser:
     return recurrent(Core(start, step, reads, core.init, samples, prepare, field, mask, sees, core.pattern))
 
 
-def _count_colors(frame: Frame) -> int:
-    """Planes of the history that are colours: light and, if there is one, its albedo."""
-    return 3 if frame.albedo is None else 6
-
-
 def start_history(frame: Frame) -> StableHistory:
     """The history before the first frame."""
-    nothing = jnp.zeros((*frame.radiance.shape[:2], 4 + _count_colors(frame)), frame.radiance.dtype)
+    planes = 7 if frame.albedo is None else 10
+    nothing = jnp.zeros((*frame.radiance.shape[:2], planes), frame.radiance.dtype)
     return StableHistory(nothing, jax.tree.map(jnp.zeros_like, guides_of(frame)))
+
+
+def _meet(values: jax.Array, albedo: Array) -> tuple[jax.Array, Array]:
+    """The planes of a history and the new frame's albedo, both with an albedo or both without.
+
+    Where one of them has none, because it comes or goes within a stream, its albedo is 1.
+    """
+    followed = values.shape[-1] == 10
+    if albedo is None:
+        return values, jnp.ones_like(values[..., :3]) if followed else None
+    if not followed:
+        values = jnp.concatenate([values[..., :3], jnp.ones_like(values[..., :3]), values[..., 3:]], axis=-1)
+    return values, albedo
 
 
 def blend_image(
     before: StableHistory, frame: Frame, image: jax.Array, first: jax.Array, exposure: jax.Array, *, history_max: int
 ) -> tuple[StableHistory, jax.Array, jax.Array]:
     """The next history, the blended image [H, W, 3], and how many pixels of the last history were invalid."""
-    colors = _count_colors(frame)
-    found = fetch_sharply(before.values, before.guides, frame, first, colors=colors)
+    values, texture = _meet(before.values, frame.albedo)
+    colors = 3 if texture is None else 6
+    found = fetch_sharply(values, before.guides, frame, first, colors=colors)
     fetched, valid = to_planes(found.values), found.valid
     past, tracked = fetched[:colors], fetched[colors:-1]
     whole = find_whole(frame)
     planes, share, albedo, then = image.transpose(2, 0, 1), jnp.zeros_like(fetched[0]), None, None
     color = past[:3]
-    if frame.albedo is not None:
-        albedo, then = frame.albedo.transpose(2, 0, 1), past[3:]
+    if texture is not None:
+        albedo, then = texture.transpose(2, 0, 1), past[3:]
         share = jax.lax.stop_gradient(measure_share(color, then, albedo, planes, exposure)) * valid
         color = follow_albedo(color, then, albedo, share)
         then = then + share[None] * (albedo - then)

@@ -100,6 +100,19 @@ def test_what_moves_leaves_no_trail_and_what_stands_still_is_steady(rng):
 
 
 @pytest.mark.slow
+def test_an_albedo_that_comes_or_goes_is_white_where_it_is_absent(rng):
+    frames, _ = rolling(rng, 3)
+    albedo = rng.uniform(0.2, 1, frames.radiance.shape).astype(np.float32)
+    albedo[[0, 2]] = 1.0
+    written, absent = stream(STEADIER, {}), stream(STEADIER, {})
+    for index in range(3):
+        frame = frame_at(frames._replace(albedo=albedo), index)
+        expected = written(frame)
+        found = absent(frame if index == 1 else frame._replace(albedo=None))
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("speed", [0.3, 1.7])
 @pytest.mark.parametrize(("guide", "gain"), [("precise", 1.0), ("noisy", 0.0), ("none", 0.0)])
 def test_a_pan_over_fine_texture_is_no_worse_than_the_denoiser(speed, guide, gain, rng):
