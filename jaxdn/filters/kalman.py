@@ -23,6 +23,9 @@ d^2 / (1 + p / r + (b / k')^2 / r)`` along motion; after the first frame half th
 over 15x15 pixels. The gain follows 1, 1/2, 1/3 ... on a still surface. All thresholds are relative: k does not depend
 on the unit of radiance.
 
+Where x is no measurement, as a pixel without samples is 0, it says nothing of light: v is the mean over pixels that are
+measured, and sums a and b are over these alone.
+
 Rudolf Kalman, "A New Approach to Linear Filtering and Prediction Problems", 1960; gains from innovations: Raman Mehra,
 "Approaches to Adaptive Filtering", 1972.
 """
@@ -60,6 +63,7 @@ def kalman_blend(
     noisy: jax.Array,
     exposure: jax.Array,
     fetch_error: jax.Array | None = None,
+    measured: jax.Array | None = None,
     *,
     history_max: int,
 ) -> jax.Array:
@@ -74,11 +78,13 @@ def kalman_blend(
       noisy: [3, H, W] the radiance that it was made of.
       exposure: scalar, the factor that makes radiance as bright as a photograph.
       fetch_error: [H, W] the square of what the fetch of the history errs by; None: nothing moves.
+      measured: [H, W] bool, ``noisy`` is the mean of samples; None: everywhere.
       history_max: the gain is at least its inverse.
     """
     bias = jnp.zeros_like(image[0]) if fetch_error is None else exposure**2 * fetch_error
+    seen = jnp.ones_like(image[0]) if measured is None else measured.astype(image.dtype)
     gain, flicker, noise = jax.lax.stop_gradient(
-        _update(past, valid, exposure * image, exposure * noisy, exposure, bias, history_max)
+        _update(past, valid, exposure * image, exposure * noisy, exposure, bias, seen, history_max)
     )
     # Joined by a loop on CPUs: XLA would compute the gain once for each colour.
     tracked = join_planes([("planes", plane[None]) for plane in (gain, flicker / exposure, noise / exposure)])
@@ -93,6 +99,7 @@ def _update(
     noisy: jax.Array,
     exposure: jax.Array,
     bias: jax.Array,
+    seen: jax.Array,
     history_max: int,
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The gain, and the deviations of the image's own errors and of the noise, each [H, W], all times ``exposure``."""
@@ -102,8 +109,9 @@ def _update(
     drift, total_bias = (jnp.where(valid, bias * factor, 0.0) for factor in ((2.0 - last) ** 2 / last, 1.0 / last**2))
     innovation = (image - exposure * past[:3]) * inside[None]
     residual = (noisy - exposure * past[:3]) * inside[None]
-    noise, tracked_noise = _measure_noise(image, noisy, jnp.where(valid, (exposure * past[5]) ** 2, 0.0))
-    support = measure_support(residual, innovation, jnp.maximum(noise, _LEAST_NOISE**2))
+    noise, tracked_noise = _measure_noise(image, noisy, seen, jnp.where(valid, (exposure * past[5]) ** 2, 0.0))
+    # Without a measurement the residual is minus the history: it would prove any light that falls a little.
+    support = measure_support(residual, seen[None] * innovation, jnp.maximum(noise, _LEAST_NOISE**2))
     square = _mean_square(innovation)
     unexplained = (1.0 - support**2) * square
     *sums, number = box_sum(jnp.stack([square, unexplained, inside]), 1)
@@ -122,13 +130,15 @@ def _update(
     return gain, _root(flicker), _root(tracked_noise)
 
 
-def _measure_noise(image: jax.Array, noisy: jax.Array, before: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The noise variance that counts now, and the one to be kept [H, W].
+def _measure_noise(
+    image: jax.Array, noisy: jax.Array, seen: jax.Array, before: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The noise variance that counts now, and the one to be kept [H, W]. ``seen`` [H, W] is 1 where noise is, else 0.
 
     Where few samples find the light, a window may show none of it: what was seen before counts too.
     """
-    sums = box_sum(jnp.stack([_mean_square(noisy - image), jnp.ones(image.shape[1:], image.dtype)]), _NOISE_WINDOW)
-    now = sums[0] / sums[1]
+    total, number = box_sum(jnp.stack([seen * _mean_square(noisy - image), seen]), _NOISE_WINDOW)
+    now = jnp.where(number > 0, total / jnp.maximum(number, 1.0), before)
     return jnp.maximum(now, before), jnp.where(before > 0, before + _SHARE * (now - before), now)
 
 

@@ -23,7 +23,7 @@ from jaxdn.filters.sharp_history import TAPS, fetch_sharply
 from jaxdn.filters.surface_test import Guides, guides_of
 from jaxdn.ops.scales import join_pixels, to_planes
 
-_READS = frozenset({"albedo", "normal", "depth", "previous_depth", "motion", "ids"})
+_READS = frozenset({"albedo", "normal", "depth", "previous_depth", "motion", "ids", "sample_count"})
 RECEPTIVE_FIELD = kalman.RECEPTIVE_FIELD + albedo_history.RECEPTIVE_FIELD + TAPS
 """Radius in pixels of all that decides about one, besides the denoiser's."""
 
@@ -55,8 +55,9 @@ def stabilised(denoiser: Denoiser, *, history_max: int = 16) -> Denoiser:
     Frames without noise keep their images.
 
     Any denoiser can be wrapped; it is of use for those without a history. The parameters are those of the denoiser.
-    Reads albedo, motion, depth, previous_depth, normal and ids in addition; without motion the image is taken to stand
-    still, without an albedo there is no texture to follow.
+    Reads albedo, motion, depth, previous_depth, normal, ids and sample_count in addition; without motion the image is
+    taken to stand still, without an albedo there is no texture to follow. Pixels that have no samples, or whose
+    radiance is not finite, do not count for what the noisy frame shows.
 
     Args:
       denoiser: of all light that ``radiance`` has.
@@ -71,8 +72,11 @@ def stabilised(denoiser: Denoiser, *, history_max: int = 16) -> Denoiser:
     def start(params: Params, frame: Frame) -> StabilisedState:
         return StabilisedState(core.start(params, frame), start_history(frame))
 
+    counts_samples = "sample_count" in core.reads or core.requires_validity_mask
+
     def prepare(frame: Frame) -> tuple[FrameStatistics, tuple[Prepared, Frame]]:
-        statistics, prepared = core.prepare(frame)
+        # Alone, a denoiser that does not read sample_count is given none either.
+        statistics, prepared = core.prepare(frame if counts_samples else frame._replace(sample_count=None))
         return statistics, (prepared, frame)
 
     def step(
@@ -98,10 +102,9 @@ def stabilised(denoiser: Denoiser, *, history_max: int = 16) -> Denoiser:
             return request(params, state.inner, frame, first, most)
 
     field = None if core.receptive_field is None else core.receptive_field + RECEPTIVE_FIELD
-    mask = core.requires_validity_mask
     sees = core.sees_sample
     reads = core.reads | _READS
-    return recurrent(Core(start, step, reads, core.init, samples, prepare, field, mask, sees, core.pattern))
+    return recurrent(Core(start, step, reads, core.init, samples, prepare, field, True, sees, core.pattern))
 
 
 def start_history(frame: Frame) -> StableHistory:
@@ -151,6 +154,7 @@ def blend_image(
         frame.radiance.transpose(2, 0, 1),
         exposure,
         error,
+        None if frame.sample_count is None else frame.sample_count[..., 0] > 0,
         history_max=history_max,
     )
     parts = [blended[:3], blended[3:], whole[None].astype(image.dtype)]

@@ -23,21 +23,23 @@ def window_sums(plane, radius):
     return np.array([[wide[y : y + side, x : x + side].sum() for x in range(width)] for y in range(height)])
 
 
-def blend_in_numpy(past, valid, image, noisy, exposure, fetch_error, history_max):
+def blend_in_numpy(past, valid, image, noisy, exposure, fetch_error, history_max, measured=True):
     """The equations of the module's docstring, in the order in which they stand."""
+    measured = measured * np.ones(valid.shape)
     d = np.where(valid, exposure * (image - past[:3]), 0)
     e = np.where(valid, exposure * (noisy - past[:3]), 0)
     before = np.where(valid, past[3], 0)
-    count = window_sums(np.ones(valid.shape), 3)
-    now = window_sums(((exposure * (noisy - image)) ** 2).mean(axis=0), 3) / count
     kept = np.where(valid, (exposure * past[5]) ** 2, 0)
+    count = window_sums(measured, 3)
+    now = window_sums(measured * ((exposure * (noisy - image)) ** 2).mean(axis=0), 3)
+    now = np.where(count > 0, now / np.maximum(count, 1), kept)
     v = np.maximum(np.maximum(now, kept), 1e-8)
     tracked = np.where(kept > 0, 0.8 * kept + 0.2 * now, now)
     most = np.maximum(3 * np.sqrt(v), np.abs(d))
     e = np.clip(e, -most, most)
     s = np.zeros(valid.shape)
     for radius in (3, 7):
-        a, b = window_sums((d * e).sum(axis=0) / v, radius), window_sums((d * d).sum(axis=0) / v, radius)
+        a, b = (window_sums(measured * (d * each).sum(axis=0) / v, radius) for each in (e, d))
         with np.errstate(divide="ignore", invalid="ignore"):
             s = np.maximum(s, np.where(b > 0, a / b - 3.5 / np.sqrt(b), 0))
     s = np.minimum(s, 1)
@@ -78,6 +80,17 @@ def test_it_is_what_its_equations_say(size, rng, x64):
         arguments = (*draw_frame(rng, size), 0.3, 0.01 * rng.random(size) * (rng.random(size) > 0.5))
         found = blend(*map(jnp.asarray, arguments), history_max=history_max)
         np.testing.assert_allclose(found, blend_in_numpy(*arguments, history_max), rtol=1e-9, atol=1e-12)
+
+
+def test_what_is_not_measured_counts_for_nothing(rng, x64):
+    """Whatever its radiance, also where nothing around a pixel is measured."""
+    past, valid, image, noisy = draw_frame(rng, (40, 36))
+    measured, bias = rng.random(valid.shape) < 0.3, 0.01 * rng.random(valid.shape)
+    measured[:18, :18] = False
+    expected = blend_in_numpy(past, valid, image, noisy, 0.3, bias, 16, measured)
+    for other in (noisy, np.where(measured, noisy, 0.0)):
+        found = blend(*map(jnp.asarray, (past, valid, image, other, 0.3, bias, measured)), history_max=16)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_single_precision_is_enough(rng):

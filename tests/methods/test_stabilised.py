@@ -100,6 +100,17 @@ def test_what_moves_leaves_no_trail_and_what_stands_still_is_steady(rng):
 
 
 @pytest.mark.slow
+def test_pixels_without_a_measurement_prove_nothing(rng):
+    """A still scene, a quarter of whose pixels has samples, or is finite, is as steady as where all are."""
+    frames, truth = rolling(rng, speed=0)
+    seen = rng.random((*frames.radiance.shape[:3], 1)) < 0.25
+    sampled = frames._replace(radiance=frames.radiance * seen, sample_count=seen.astype(np.float32))
+    broken = frames._replace(radiance=np.where(seen, frames.radiance, np.nan))
+    errors = [np.mean((steadied(each)[-1] - truth[-1]) ** 2) for each in (frames, sampled, broken)]
+    assert max(errors[1:]) < 1.3 * errors[0], errors
+
+
+@pytest.mark.slow
 def test_an_albedo_that_comes_or_goes_is_white_where_it_is_absent(rng):
     frames, _ = rolling(rng, 3)
     albedo = rng.uniform(0.2, 1, frames.radiance.shape).astype(np.float32)
