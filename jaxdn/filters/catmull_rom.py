@@ -40,7 +40,7 @@ def warp_cubic(image: jax.Array, motion: jax.Array, *, channels: int | None = No
             flat, (start + row * (width + 4) * channels)[..., None], four, (4 * channels,), mode="promise_in_bounds"
         ).reshape(height, width, 4, channels)
         total = total + down[..., None] * sum(weight[..., None] * found[:, :, i] for i, weight in enumerate(across))
-    return jnp.where(inside[..., None], jnp.maximum(total, 0.0), 0.0)
+    return jnp.where(inside[..., None], jnp.maximum(total, 0.0), 0.0).astype(image.dtype)
 
 
 @numba_call.implements(warp_cubic)

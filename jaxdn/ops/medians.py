@@ -24,8 +24,12 @@ def median(values: jax.Array, counted: jax.Array | None = None, *, implementatio
       values: of any shape, without NaN where they count.
       counted: bool of the same shape, which of them count; None: all. Without any, the median is 0.
       implementation: see :mod:`jaxdn.ops.dispatch.operation`.
+
+    Raises ValueError if the shapes differ.
     """
     counted = jnp.ones(jnp.shape(values), bool) if counted is None else counted
+    if jnp.shape(counted) != jnp.shape(values):
+        raise ValueError(f"counted: expected the shape {jnp.shape(values)} of values, got {jnp.shape(counted)}.")
     return _median(jnp.ravel(values), jnp.ravel(counted), implementation=implementation)
 
 

@@ -27,6 +27,11 @@ def _inside(position: jax.Array, height: int, width: int) -> jax.Array:
     return (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
 
 
+def _position_dtype(motion: jax.Array) -> jnp.dtype:
+    """float32 or more: positions of a large image do not fit into half precision."""
+    return jnp.promote_types(motion.dtype, jnp.float32)
+
+
 def _pixels(height: int, width: int, dtype: jnp.dtype) -> jax.Array:
     """The index position (x, y) of every pixel, [H, W, 2]."""
     x = jnp.broadcast_to(jnp.arange(width, dtype=dtype)[None, :], (height, width))
@@ -55,7 +60,7 @@ def dual_motion(
     check_same_size(motion, forward_motion, ("motion", "forward_motion"))
     motion, forward_motion = jnp.asarray(motion), jnp.asarray(forward_motion)
     height, width = motion.shape[:2]
-    here = _pixels(height, width, motion.dtype)
+    here = _pixels(height, width, _position_dtype(motion))
     position = here + motion
     known = _inside(position, height, width)
     # floor(x + 0.5) of a position on the right border is W: the last pixel is meant. NaN must not become an integer.
@@ -85,16 +90,19 @@ def occlusion_mask(
     check_image(motion, "motion", channels=2)
     check_image(dual_motion, "dual_motion", channels=2)
     check_same_size(motion, dual_motion, ("motion", "dual_motion"))
-    difference = jnp.asarray(dual_motion) - jnp.asarray(motion)
+    motion, dual_motion = jnp.asarray(motion), jnp.asarray(dual_motion)
+    difference = dual_motion - motion
     squared = jnp.sum(difference * difference, axis=-1, keepdims=True)
-    return (squared > threshold * threshold).astype(difference.dtype)
+    finite = jnp.all(jnp.isfinite(motion) & jnp.isfinite(dual_motion), axis=-1, keepdims=True)
+    return (finite & (squared > threshold * threshold)).astype(difference.dtype)
 
 
 def find_targets(motion: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The array position (x, y) that each pixel's vector points to."""
     height, width = motion.shape[:2]
-    x = jnp.arange(width, dtype=motion.dtype)[None, :] + motion[..., 0]
-    y = jnp.arange(height, dtype=motion.dtype)[:, None] + motion[..., 1]
+    dtype = _position_dtype(motion)
+    x = jnp.arange(width, dtype=dtype)[None, :] + motion[..., 0]
+    y = jnp.arange(height, dtype=dtype)[:, None] + motion[..., 1]
     return x, y
 
 

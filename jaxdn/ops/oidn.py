@@ -8,7 +8,6 @@ Attila T. Áfra, "Intel Open Image Denoise", 2019-2025, https://www.openimageden
 
 import functools
 import importlib.util
-import os
 import threading
 import weakref
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from jaxdn.runtime.cores import count_cores
 from jaxdn.runtime.optional import install
 
 MODULE = "pyoidn"
@@ -110,7 +110,7 @@ class _Kernel:
         types = {"cpu": oidn.OIDN_DEVICE_TYPE_CPU, "cuda": oidn.OIDN_DEVICE_TYPE_CUDA}
         self._device = oidn.Device(types[settings.device])
         if settings.device == "cpu":
-            self._device.set_int("numThreads", os.cpu_count() or 1)
+            self._device.set_int("numThreads", count_cores())
         self._device.commit()
         self._check()
         names = () if settings.device == "cpu" else (*inputs, "output")

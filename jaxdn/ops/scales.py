@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdn.core.checks import check_image, check_option
+from jaxdn.core.checks import check_image, check_option, check_same_size
 from jaxdn.ops.dispatch import numba_call
 from jaxdn.ops.dispatch.operation import Example, operation
 
@@ -82,9 +82,10 @@ def fill_holes(image: jax.Array, known: jax.Array, *, implementation: str | None
     """[H, W, C] with the mean of the known pixels of the same 2x2 block, else 4x4 block, where a pixel is not known.
 
     ``known`` [H, W, 1] is bool. Blocks without a known pixel are 0. Means of the result thus hold nothing of what was
-    there. Sizes that are not multiples of 4 raise ValueError.
+    there. Sizes that are not multiples of 4, or that differ, raise ValueError.
     """
     check_image(image, "image")
+    check_same_size(image, known, ("image", "known"))
     if image.shape[0] % 4 or image.shape[1] % 4:
         raise ValueError(
             f"image: expected a height and width that are multiples of 4, got {image.shape[0]} x {image.shape[1]}; "

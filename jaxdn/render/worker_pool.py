@@ -20,6 +20,7 @@ from jaxdn.render.executor import render_by_executor
 from jaxdn.render.frame_counter import open_counter
 from jaxdn.render.mitsuba.errors import RenderError
 from jaxdn.render.mitsuba.variant import choose_variant
+from jaxdn.runtime.cores import count_cores
 from jaxdn.runtime.parent import end_with_parent
 
 _THREADS = 2
@@ -88,7 +89,7 @@ def _render_here(
     """Render in processes of this machine; returns the reasons of the clips that failed."""
     total = sum(job.frames for job in jobs)
     waiting = [job for job in map(keep_variant, jobs) if not is_finished(job)]
-    limit = max(1, min(workers or os.cpu_count() or 1, len(waiting)))
+    limit = max(1, min(workers or count_cores(), len(waiting)))
     threads = threads or (_THREADS if limit > 1 else 0)
     for job in waiting:
         try:

@@ -57,9 +57,10 @@ def remove_abandoned_folders(parent: Path, prefix: str) -> None:
             free = _try_lock(handle)
             if free:
                 shutil.rmtree(parent / name, ignore_errors=True)
+                _remove(lock)  # while it is locked: once it is not, whoever has made it may lock it and go on
         finally:
             os.close(handle)
-        if free:
+        if free:  # Windows does not remove what is open
             _remove(lock)
 
 

@@ -1,7 +1,6 @@
 """``jaxdn train``: a learned method, trained on rendered clips."""
 
 import dataclasses
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from jaxdn.data.training.dataset import training_batches
 from jaxdn.denoiser import Denoiser
 from jaxdn.methods.registry import Method
 from jaxdn.recipes.recipe import Recipe
+from jaxdn.runtime.cores import count_cores
 from jaxdn.training.devices import make_mesh
 from jaxdn.training.loop import InitialWeights, ResumableBatches, fit, read_resumed_from
 from jaxdn.training.processes import check_same, writes
@@ -127,5 +127,5 @@ def recipe_batches(denoiser: Denoiser, recipe: Recipe, clips: Sequence[Path]) ->
         variation=recipe.variation,
         process=(jax.process_index(), jax.process_count()),
         vary_later=True,
-        threads=max(1, (os.cpu_count() or 1) // 2),  # a GPU takes a hundred elements a second, a thread makes twelve
+        threads=max(1, count_cores() // 2),  # a GPU takes a hundred elements a second, a thread makes twelve
     )

@@ -302,6 +302,8 @@ def test_pixels_that_are_not_known(rng, both):
     found, wanted = both(fill_holes, image, jnp.asarray(known))
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-7)
     assert np.all(found[4:8, :8] == 0)
+    with pytest.raises(ValueError, match="image and known: expected the same size"):
+        fill_holes(image, jnp.asarray(known[:, :4]))
 
 
 @pytest.mark.slow
@@ -480,20 +482,36 @@ def test_a_full_disk_ends_no_loop(loop, monkeypatch):
     np.testing.assert_array_equal(values, 2)
 
 
-def test_what_was_compiled_before_functions_of_rows_changed_is_not_used(tmp_path):
-    script = "from jaxdn.ops.affinity import numba_kernels"
-    folder = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    subprocess.run(
-        [sys.executable, "-c", script + "; print(numba_kernels.filter_rows.stats.cache_path)"], env=folder, check=True
-    )
-    (own,) = tmp_path.iterdir()
-    old, new = own / "numba_kernels.filter_rows-1.py311.nbi", own / "numba_kernels.upsample_rows-1.py311.nbi"
-    for file in (old, new):
-        file.touch()
-    os.utime(old, (0, 0))
-    subprocess.run([sys.executable, "-c", script], env=folder, check=True)
-    assert not old.exists()
-    assert new.exists()
+def test_what_was_compiled_with_other_functions_of_rows_is_not_used(loop, monkeypatch):
+    """Whatever the times of the files are, and where they cannot be written, too."""
+    from jaxdn.ops.dispatch import numba_rows
+
+    def count():
+        kept = loop(_double)
+        kept(0, 3, np.ones(3, np.float32))
+        return sum(kept.stats.cache_hits.values()), sum(kept.stats.cache_misses.values())
+
+    assert count() == (0, 1)
+    assert count() == (1, 0)
+    assert loop(_double)._cache.has_any()
+    monkeypatch.setattr(numba_rows, "_ROWS", "another")
+    assert not loop(_double)._cache.has_any()
+    assert count() == (0, 1)
+
+
+def test_a_file_of_other_arguments_is_not_used(loop, tmp_path):
+    """Two processes that save two signatures at once may give both the same file."""
+    kinds = np.float32, np.float64
+    for kind in kinds:
+        loop(_double)(0, 3, np.ones(3, kind))
+    one, other = tmp_path.glob("loops/*/*_double-*.nbc")
+    other.write_bytes(one.read_bytes())
+    for kind in kinds * 2:
+        values = np.ones(3, kind)
+        kept = loop(_double)
+        kept(0, 3, values)
+        np.testing.assert_array_equal(values, 2)
+    assert sum(kept.stats.cache_hits.values()) == 1
 
 
 _LOOP = """

@@ -113,6 +113,21 @@ def test_a_constant_stays_and_shapes_are_checked(rng):
     np.testing.assert_allclose(affinity_filter(flat, Guide(features, slanted, confidence), step=2), flat, rtol=1e-6)
     with pytest.raises(ValueError, match=r"slanted \[3, H, W\].* got \(3, 9, 11\), \(2, 9, 11\)"):
         affinity_filter(flat, Guide(features, slanted[:2], confidence))
+    for wrong in (features.shape[0], 2):
+        with pytest.raises(ValueError, match=rf"guide.scales: expected {len(features) + 1} factors.* got shape"):
+            affinity_filter(flat, Guide(features, slanted, confidence, np.ones(wrong, np.float32)))
+
+
+def test_a_guide_may_be_the_slanted_one_alone(rng):
+    """Its gradient too, by every implementation that runs here."""
+    image, features, slanted, confidence = (np.float32(each) for each in drawn(rng))
+
+    def total(slanted, implementation):
+        guide = Guide(jnp.asarray(features[:0]), slanted, confidence)
+        return jnp.sum(affinity_filter(image, guide, implementation=implementation) ** 2)
+
+    found, wanted = (jax.grad(total)(slanted, one) for one in ("numba", "reference"))
+    np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-5)
 
 
 def test_batches_are_single_images(rng):

@@ -66,6 +66,16 @@ def test_errors_arrive_with_name_and_message(error, named):
     assert str(raised.value).rstrip().endswith(f"{type(error).__name__}: {error}".rstrip())
 
 
+def test_a_message_that_is_no_text_arrives_too():
+    """As of a file whose name is not UTF-8."""
+
+    def fails(results, array):
+        raise ValueError("no frame \udcff.exr")
+
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"ValueError: no frame .*udcff.exr"):
+        jax.block_until_ready(call_host("a message", fails, KINDS[:1], jnp.ones((3, 4))))
+
+
 def test_names_tell_functions_and_constants_apart():
     large = np.zeros(5000, np.float32)
     other = large.copy()

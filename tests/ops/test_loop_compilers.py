@@ -1,5 +1,6 @@
 """Loops that processes of their own compile: real processes, an empty folder of compiled loops each time."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -68,6 +69,27 @@ def test_what_cannot_be_compiled_is_no_wait_for_ever():
         compiler.reader.join(60)
         # Of a process that has ended nothing is expected.
         assert compilers.compile(("jaxdn.ops.numba_medians", "another"), ()).result(timeout=60) is None
+
+
+def test_what_a_loop_prints_is_no_reply(monkeypatch):
+    """Numba prints what it reads and writes, if it is asked to."""
+    monkeypatch.setenv("NUMBA_DEBUG_CACHE", "1")
+    monkeypatch.setenv("PYTHONUNBUFFERED", "1")
+    with loops_compiled_apart() as compilers:
+        for number in range(2):
+            compilers.compile(("tests.ops.printing_loop", "prints"), (number,)).result(timeout=60)
+        (compiler,) = compilers.compilers
+        assert compiler.reader.is_alive()
+
+
+def test_where_no_process_can_be_started_loops_are_compiled_where_they_are_called(monkeypatch):
+    def refuse(*_, **__):
+        raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(subprocess, "Popen", refuse)
+    with loops_compiled_apart() as compilers:
+        assert compilers.compile(("module", "loop"), (1,)).result(timeout=1) is None
+    assert not compilers.compilers
 
 
 def test_a_loop_goes_to_the_process_that_has_its_files():

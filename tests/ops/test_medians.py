@@ -35,6 +35,8 @@ def test_only_what_counts_is_counted(rng):
     wanted = np.median(values[counted])
     np.testing.assert_allclose(median(np.where(counted, values, np.nan), counted), wanted, rtol=1e-7)
     assert float(median(values, jnp.zeros(values.shape, bool))) == 0.0
+    with pytest.raises(ValueError, match=r"counted: expected the shape \(17, 23\) of values, got \(17, 1\)"):
+        median(values, jnp.ones((17, 1), bool))
 
 
 def test_nine_images(rng):

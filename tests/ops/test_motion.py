@@ -114,6 +114,25 @@ def test_non_finite_vectors_give_no_mask_and_do_not_spread():
     assert occlusion_mask(motion, dual_motion(motion, forward))[10, 6, 0] == 0
 
 
+@pytest.mark.parametrize("endless", [np.inf, -np.inf, np.nan])
+def test_one_vector_that_is_not_finite_gives_no_mask(endless):
+    there, still = np.full((2, 2, 2), endless, np.float32), np.zeros((2, 2, 2), np.float32)
+    np.testing.assert_array_equal(occlusion_mask(still, there), 0)
+    np.testing.assert_array_equal(occlusion_mask(there, still), 0)
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16])
+def test_positions_of_large_images_do_not_fit_into_half_precision(dtype, rng):
+    """Steps of 4 pixels in bfloat16 from column 512 on, of 2 in float16 from 2,048 on."""
+    motion, forward = (rng.choice([-2.0, 0.0, 1.0, 3.0], (2, 2100, 2)).astype(np.float32) for _ in range(2))
+    half = dual_motion(jnp.asarray(motion, dtype), jnp.asarray(forward, dtype))
+    assert half.dtype == dtype
+    np.testing.assert_array_equal(np.float32(half), dual_motion(motion, forward))
+    x, y = jaxdn.ops.motion.find_targets(jnp.asarray(motion, dtype))
+    np.testing.assert_array_equal(x, np.arange(2100) + motion[..., 0])
+    np.testing.assert_array_equal(y, np.arange(2)[:, None] + motion[..., 1])
+
+
 def test_mask_threshold_is_a_length():
     motion = jnp.zeros((1, 1, 2))
     other = jnp.array([[[0.3, 0.41]]])  # 0.508 px long

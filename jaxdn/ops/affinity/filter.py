@@ -91,6 +91,11 @@ def affinity_filter(
             f"guide: expected features [F, H, W], slanted [3, H, W] and confidence [H, W] for an image [C, H, W], got "
             f"{guide.features.shape}, {guide.slanted.shape} and {guide.confidence.shape} for {image.shape}."
         )
+    if guide.scales is not None and jnp.shape(guide.scales) != (guide.features.shape[0] + 1,):
+        raise ValueError(
+            f"guide.scales: expected {guide.features.shape[0] + 1} factors, of each feature and of the slanted guide, "
+            f"got shape {jnp.shape(guide.scales)}."
+        )
     return _filter_by_affinity(image, guide, step=step, implementation=implementation)
 
 
@@ -372,7 +377,8 @@ def _gather_gradients(
     rest = jax.tree.map(lambda one, other: jnp.concatenate([one, other]), _drop_first(pairs, 2), nothing)
     (sums, _, _), _ = lax.scan(body, carry, rest)
     by_guides = sums[len(x) + 1 :]
-    return jnp.stack(sums[: len(x)]), Guide(jnp.stack(by_guides[:-3]), jnp.stack(by_guides[-3:]), sums[len(x)])
+    by_features, by_slanted = jnp.split(jnp.stack(by_guides), [len(by_guides) - 3])  # there may be no features
+    return jnp.stack(sums[: len(x)]), Guide(by_features, by_slanted, sums[len(x)])
 
 
 _by_xla = _differentiable(_sum_taps, _gather_gradients)

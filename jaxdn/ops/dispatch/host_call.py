@@ -201,7 +201,7 @@ def _handle(pointer: Any) -> int | None:
         work(results, *arrays)
     except BaseException as error:  # nothing may leave a function that C calls
         # As in jax's own callbacks, jaxdn.runtime.interrupt finds Ctrl-C by the end of the message.
-        message = f"{type(error).__name__}: {error}".encode()
+        message = f"{type(error).__name__}: {error}".encode(errors="backslashreplace")
         given = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, _UNKNOWN_ERROR)
         return frame.api.contents.create_error(ctypes.byref(given))
     return None

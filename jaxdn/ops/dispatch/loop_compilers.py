@@ -18,7 +18,6 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future
 from importlib.machinery import PathFinder
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -96,7 +95,11 @@ class LoopCompilers:
         """Have a loop (module, name) compiled, once for a signature. Threads may call it at once."""
         with self._lock:
             if (loop, signature) not in self._told:
-                self._told[loop, signature] = self._compiler(loop).compile(loop, signature)
+                try:
+                    self._told[loop, signature] = self._compiler(loop).compile(loop, signature)
+                except OSError:  # no further process may be started: the loop is compiled where it is called
+                    self._told[loop, signature] = Future()
+                    self._told[loop, signature].set_result(None)
             return self._told[loop, signature]
 
     def _compiler(self, loop: tuple[str, str]) -> LoopCompiler:
@@ -136,7 +139,7 @@ def compile_apart(loop: Any, arguments: Sequence[Any]) -> Future[None] | None:
 
     Returns what is done when that is; None where there is nothing to wait for. Of arrays only the types count.
     """
-    if _active is None or not _can_be_kept(loop) or _is_kept(loop):
+    if _active is None or not _is_left_to_compile(loop):
         return None
     from numba.core.typing.typeof import Purpose, typeof
 
@@ -151,22 +154,19 @@ def example(kind: Any, *, written: bool) -> np.ndarray:
     return array
 
 
-def _can_be_kept(loop: Any) -> bool:
+def _is_left_to_compile(loop: Any) -> bool:
+    """Whether files of a loop can be written, and there are none."""
     from jaxdn.ops.dispatch.numba_rows import KeptLoops
 
-    return type(getattr(loop, "_cache", None)) is KeptLoops
-
-
-def _is_kept(loop: Any) -> bool:
-    """Whether there are files of a loop, no older than its source: Numba takes no others."""
-    source = Path(loop.py_func.__code__.co_filename).stat().st_mtime
-    files = Path(loop.stats.cache_path).glob(f"*.{loop.py_func.__name__}-*.nbi")
-    return any(file.stat().st_mtime >= source for file in files)
+    cache = getattr(loop, "_cache", None)
+    return type(cache) is KeptLoops and not cache.has_any()
 
 
 def _compile_what_comes() -> None:
     """In a process of its own: a byte on standard output for each loop that standard input names, compiled or not."""
     replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb", buffering=0)
+    with open(os.devnull, "wb") as nowhere:  # what Numba prints is no reply
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
     while True:
         try:
             (module, name), signature = pickle.load(sys.stdin.buffer)

@@ -4,6 +4,7 @@ Exponential and logarithm are written out: a call of the C library's functions w
 """
 
 import contextlib
+import hashlib
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,16 +24,24 @@ _options: dict[str, Any] = {"fastmath": {"contract", "reassoc", "nsz"}, "error_m
 inlined = njit(**_options, inline="always")
 
 
+_ROWS = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
+"""Of this file: its functions are parts of the loops that call them, and Numba compares a loop's own file alone."""
+
+
 class KeptLoops(FunctionCache):
     """Numba's files of a loop; those that cannot be read or written cost time alone.
 
-    A machine that crashes leaves half a file, and a disk may be full: Numba's own would end every run there.
+    A machine that crashes leaves half a file, and a disk may be full: Numba's own would end every run there. It locks
+    nothing either: two processes that save two signatures at once may give both the same file.
     """
 
-    def load_overload(self, *which: Any) -> Any:
-        """What is kept; None if there is nothing, or nothing that can be read, which is removed."""
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """What is kept; None if there is nothing, or nothing that can be read or is right, which is removed."""
         try:
-            return super().load_overload(*which)
+            found = super().load_overload(sig, target_context)
+            if found is not None and tuple(found.signature.args) != tuple(sig):
+                raise ValueError(f"expected a loop of {sig}, got one of {found.signature.args}")
+            return found
         except Exception:  # what pickle and LLVM say of half a file has no common base class
             for file in Path(self.cache_path).glob(f"*.{self._py_func.__name__}-*.nb?"):
                 with contextlib.suppress(OSError):
@@ -43,6 +52,17 @@ class KeptLoops(FunctionCache):
         """What cannot be written is compiled in every process."""
         with contextlib.suppress(OSError):
             super().save_overload(*which)
+
+    def has_any(self) -> bool:
+        """Whether there is something of this state of the loop, for whatever arguments."""
+        try:
+            return any(key[-1] == _ROWS for key in self._cache_file._load_index())
+        except Exception:  # half a file: load_overload removes it
+            return False
+
+    def _index_key(self, *which: Any) -> tuple[Any, ...]:
+        """What is kept is found by, with the functions of rows that it was compiled with."""
+        return (*super()._index_key(*which), _ROWS)
 
 
 class _ReadOnlyLocator(UserProvidedCacheLocator):
@@ -76,12 +96,6 @@ def loop(function: Callable[..., None]) -> Callable[..., None]:
             kept._cache = KeptLoops(function)
         except RuntimeError:  # no folder can be written
             return kept
-    # Numba compiles anew where the loop's own file has changed, and knows nothing of this one.
-    changed = Path(__file__).stat().st_mtime
-    for file in Path(kept.stats.cache_path).glob(f"*.{function.__name__}-*.nb?"):
-        with contextlib.suppress(FileNotFoundError):  # another process was faster
-            if file.stat().st_mtime < changed:
-                file.unlink()
     return kept
 
 
