@@ -1,7 +1,7 @@
 """A network as data: named layers, written once; XLA and ONNX are made from them by :func:`evaluate`."""
 
 from collections.abc import Mapping, Sequence
-from itertools import accumulate
+from itertools import accumulate, count, takewhile
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -171,6 +171,31 @@ def recurrent_unet(inputs: int, outputs: int, *, widths: Widths) -> GraphSpec:
         x = builder.level(f"decoder_{depth}", level, larger, states[depth], slope=RECURRENT_SLOPE)
     head = builder.add("output", "convolution", x, channels=outputs, size=3)
     return GraphSpec(builder.layers, (head, *states))
+
+
+def find_graph(kernels: Mapping[str, tuple[int, ...]]) -> GraphSpec | None:
+    """The U-Net or the recurrent autoencoder whose :meth:`GraphSpec.kernels` these are; None if neither has them."""
+    if any(len(shape) != 4 for shape in kernels.values()):
+        return None
+
+    def numbered(name: str) -> list[str]:
+        return list(takewhile(kernels.__contains__, (f"{name}{index}" for index in count())))
+
+    def widths(level: str) -> tuple[int, ...]:
+        return tuple(kernels[name][3] for name in numbered(f"{level}/convolution_"))
+
+    encoder = tuple(takewhile(bool, (widths(f"encoder_{depth}") for depth in count())))
+    heads = [kernels[name] for name in numbered("head_")]
+    found = None
+    if encoder and "output" in kernels:
+        decoder = [widths(f"decoder_{depth}") for depth in reversed(range(len(encoder) - 1))]
+        stages = tuple(stage[0] for stage in encoder)
+        found = recurrent_unet(kernels["encoder_0/convolution_0"][2], kernels["output"][3], widths=(stages, *decoder))
+    elif len(encoder) == LEVELS and heads:
+        size: Any = heads[0][0]
+        outputs = [head[3] for head in heads]
+        found = unet(kernels["encoder_0/convolution_0"][2], outputs, widths=encoder, head_size=size)
+    return found if found is not None and found.kernels() == dict(kernels) else None
 
 
 def hidden(stage: int) -> str:
