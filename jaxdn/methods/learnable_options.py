@@ -42,6 +42,11 @@ def zero_offsets(options: Any) -> Params:
     return {name: jnp.zeros(shape) for name, shape in counts.items() if 0 not in shape}
 
 
+def learnable_values(options: Any) -> dict[str, float]:
+    """Name -> value of the options that training may move: what the params of a filter are offsets from."""
+    return {name: getattr(options, name) for name in _marked(options)}
+
+
 def apply_offsets(options: Options, params: Params) -> Options:
     """The options with those that ``params`` names as arrays, () or [levels]; the others as they are.
 

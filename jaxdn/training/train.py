@@ -74,7 +74,9 @@ def train(
         print(f"{label}: {engine}", flush=True)
     batches = recipe_batches(denoiser, recipe, clips)
     held_out = load_validation(denoiser, validation, spp=min(recipe.spp)) if writes() else []
-    first = None if start is None else InitialWeights(str(start), starting_params(start, denoiser))
+    first = None
+    if start is not None:
+        first = InitialWeights(str(start), starting_params(start, denoiser, factory=method.name, options=options))
     state = fit(
         denoiser,
         recipe,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from safetensors.numpy import load_file, save
 
 from jaxdn.core.frame import Frame
 from jaxdn.denoiser import Denoiser, Params
+from jaxdn.methods.learnable_options import learnable_values
 from jaxdn.methods.registry import method_named
 from jaxdn.networks.grow import grow
 from jaxdn.runtime.atomic_files import write_atomically
@@ -100,19 +102,31 @@ def load_weights(name_or_path: str | Path, **options_instead: Any) -> tuple[Deno
     return denoiser, unflatten(flat)
 
 
-def starting_params(name_or_path: str | Path, denoiser: Denoiser) -> Params:
+def starting_params(
+    name_or_path: str | Path, denoiser: Denoiser, *, factory: str, options: Mapping[str, Any]
+) -> Params:
     """Parameters to continue training ``denoiser`` from: those of shipped weights or of a file.
 
-    The denoiser may see more than the one that the weights were trained for, and its network may be larger
-    (:func:`jaxdn.networks.grow.grow`): its first images are those of the stored weights. Arrays beside the network's
+    The denoiser may see more than the one that the weights were trained for, and its networks may be larger
+    (:func:`jaxdn.networks.grow.grow`, which says by how much its first images differ). Arrays beside the networks'
     layers that the stored weights lack, such as the precisions of guided kernels, have the values that training starts
-    from, and the first images differ. Raises ValueError as :func:`load_weights` does, and for weights of another
-    network.
+    from, and the first images differ. Without a network, weights are offsets from the values of options
+    (:mod:`jaxdn.methods.learnable_options`), and these have to be the same.
+
+    Args:
+      denoiser: what is to be trained.
+      factory: the name of its method, as in :func:`save_weights`.
+      options: keyword arguments of that factory.
+
+    Raises ValueError as :func:`load_weights` does, for weights of another network, and where there is no network for
+    those of another method or of other values of the options that training moves.
     """
     path = weights_path(name_or_path)
     trained = flatten(load_weights(path)[1])
     initial = flatten(denoiser.init(jax.random.key(0), Frame(np.zeros((16, 16, 3), np.float32))))
     layers = {name for name in initial.keys() | trained.keys() if name.endswith(("/kernel", "/bias"))}
+    if not layers:
+        _check_same_values(path, factory, options)
 
     def network(weights: dict[str, np.ndarray], kept: bool) -> dict[str, np.ndarray]:
         return {name: array for name, array in weights.items() if (name in layers) == kept}
@@ -128,6 +142,27 @@ def starting_params(name_or_path: str | Path, denoiser: Denoiser) -> Params:
             "options, and the same or a larger size."
         ) from error
     return unflatten(beside | grown)
+
+
+def _check_same_values(path: Path, factory: str, options: Mapping[str, Any]) -> None:
+    """Raise ValueError unless stored offsets are from the same options of the same method as those to be trained."""
+    description, method = describe(path), method_named(factory)
+    stored = method_named(description["factory"])
+    if stored.factory is not method.factory:
+        raise ValueError(
+            f"weights {path}: expected weights of {method.name}, as a filter's are offsets from the values of its "
+            f"options, but they are those of {stored.name}; train {stored.name}, or leave --start out."
+        )
+    there, here = (
+        learnable_values(each.parse_options(given))
+        for each, given in ((stored, description["options"]), (method, options))
+    )
+    if differing := sorted(name for name in {*there, *here} if there.get(name) != here.get(name)):
+        was, now = (" ".join(f"{name}={values.get(name)}" for name in differing) for values in (there, here))
+        raise ValueError(
+            f"weights {path}: expected the options that they were trained with, as they are offsets from these values, "
+            f"{was}, but got {now}; choose the same (--set)."
+        )
 
 
 def weights_path(name_or_path: str | Path) -> Path:

@@ -17,7 +17,8 @@ def test_every_run_can_begin(name: str) -> None:
         assert recipe.steps == run.steps
         assert bool(recipe.objective.reads) == (run.label == "C"), "only the occlusion loss needs buffers of its own"
         if preset.start is not None:
-            params = starting_params(preset.start, method.factory(**run.options))
+            denoiser = method.factory(**run.options)
+            params = starting_params(preset.start, denoiser, factory=method.name, options=run.options)
             jax.tree.map(np.testing.assert_array_equal, params, load_weights(preset.start)[1])
 
 

@@ -11,6 +11,7 @@ import pytest
 import jaxdn
 from jaxdn.core.frame import Frame
 from jaxdn.denoisers import ntd
+from jaxdn.methods.registry import method_named
 from jaxdn.zoo.ready import find_model
 from jaxdn.zoo.weights import flatten, save_weights, shipped_names, starting_params, unflatten
 
@@ -25,6 +26,12 @@ def saved(tmp_path):
     params = ntd(size=TINY).init(jax.random.key(0), FRAME)
     path = save_weights(tmp_path / "w", params, factory="ntd", options=SAVED, record={"note": "test"})
     return path, params
+
+
+def start_of(path, factory, **options):
+    """The parameters that training of a method would start from."""
+    denoiser = method_named(factory).factory(**options)
+    return starting_params(path, denoiser, factory=factory, options=options)
 
 
 def test_round_trip(saved):
@@ -52,14 +59,14 @@ def test_guided_kernels_continue_from_plain_ones(tmp_path):
     path = save_weights(tmp_path / "plain", params, factory="ntd", options=options, record={})
     with pytest.raises(ValueError, match=r"that kernels=guided needs, .* guide/albedo: .*jaxdn train --start"):
         jaxdn.load_weights(path, kernels="guided")
-    guided = starting_params(path, ntd(size=TINY))
+    guided = start_of(path, "ntd", size=TINY)
     np.testing.assert_array_equal(guided["guide"]["depth"], np.full((3, 1), 6.0))
     jax.tree.map(np.testing.assert_array_equal, {n: guided[n] for n in params}, params)
     assert set(guided) == {*params, "guide"}
 
     guided["guide"]["depth"] = guided["guide"]["depth"] - 1
     path = save_weights(tmp_path / "guided", guided, factory="ntd", options=SAVED, record={})
-    more = starting_params(path, ntd(size=TINY, guides="materials"))["guide"]
+    more = start_of(path, "ntd", size=TINY, guides="materials")["guide"]
     np.testing.assert_array_equal(more["depth"], np.full((3, 1), 5.0))
     np.testing.assert_array_equal(more["reflectance"], np.full((3, 3), 3.0))
 
@@ -71,7 +78,7 @@ def test_training_continues_from_weights_that_see_less(tmp_path, rng):
     params = ntd(**options).init(jax.random.key(0), FRAME)
     path = save_weights(tmp_path / "w", params, factory="ntd", options=options, record={})
     old, more = jaxdn.load_weights(path)[0], ntd(**options, guides="materials")
-    grown = starting_params(path, more)
+    grown = start_of(path, "ntd", **options, guides="materials")
     frame = FRAME._replace(
         radiance=rng.exponential(size=(16, 16, 3)).astype(np.float32),
         albedo=rng.uniform(0.2, 1, (16, 16, 3)).astype(np.float32),
@@ -83,7 +90,7 @@ def test_training_continues_from_weights_that_see_less(tmp_path, rng):
         for denoiser, weights in ((old, params), (more, grown))
     ]
     np.testing.assert_allclose(images[1], images[0], rtol=1e-5)
-    jax.tree.map(np.testing.assert_array_equal, starting_params(path, old), params)
+    jax.tree.map(np.testing.assert_array_equal, start_of(path, "ntd", **options), params)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +102,25 @@ def test_weights_of_another_network_are_no_start(tmp_path, options):
     params = ntd(size=size).init(jax.random.key(0), FRAME)
     path = save_weights(tmp_path / "w", params, factory="ntd", options={"size": size}, record={})
     with pytest.raises(ValueError, match=r"expected a network that training can continue from, but .* is \("):
-        starting_params(path, ntd(**options))
+        start_of(path, "ntd", **options)
+
+
+@pytest.mark.parametrize(
+    ("factory", "options", "told"),
+    [
+        ("svgf", {}, r"sigma_normal=128\.0.* sigma_normal=16\.0"),
+        ("svgf", {"preset": "paper", "alpha": 0.1}, r"alpha=0\.2.* alpha=0\.1"),
+        ("asvgf", {"preset": "paper", "alpha": 0.2, "alpha_moments": 0.2}, "weights of asvgf, .* those of svgf"),
+    ],
+)
+def test_offsets_of_other_values_are_no_start(tmp_path, factory, options, told):
+    """What a filter learns is how far its options move: from other values the same numbers lead elsewhere."""
+    fitted = method_named("svgf").factory(preset="paper").init(jax.random.key(0), FRAME)
+    path = save_weights(tmp_path / "w", fitted, factory="svgf", options={"preset": "paper"}, record={})
+    same = start_of(path, "svgf", preset="paper", antialiasing=False)
+    jax.tree.map(np.testing.assert_array_equal, same, fitted)
+    with pytest.raises(ValueError, match=told):
+        start_of(path, factory, **options)
 
 
 def test_a_run_s_weights_are_called_after_their_folder_from_anywhere(saved, tmp_path, monkeypatch):
