@@ -84,11 +84,12 @@ class Options(Sampling):
 def dasr(options: Options) -> Denoiser:
     """Adaptive sampling of single frames; it requests samples, from stored layers of 1, 2, 4, ... or from the renderer.
 
-    ``budget`` counts the sample that is rendered first: the layer of one sample. Its numbers of samples are odd, that
-    one and pairs of further ones, as layers hold the first sample in odd numbers alone.
-    ``params`` has the two networks, "sampler" (absent with ``adaptive=False``) and "predictor". Reads albedo, normal,
-    depth and sample_count. Raises ValueError for options out of range and for a budget that the layers cannot give, and
-    ``step`` for a frame of the wrong shape, never for its contents.
+    ``budget`` counts the sample that is rendered first: the layer of one sample. The network's numbers of samples are
+    odd, that one and pairs of further ones, as layers hold the first sample in odd numbers alone; with
+    ``adaptive=False`` every pixel has the budget. ``params`` has the two networks, "sampler" (absent with
+    ``adaptive=False``) and "predictor". Reads albedo, normal, depth, sample_count (one sample without it), and
+    reflectance with ``demodulate="brdf"``. Raises ValueError for options out of range and for a budget that the layers
+    cannot give, and ``step`` for a frame of the wrong shape, never for its contents.
     """
     from jaxdn.networks.unet import unet
 
@@ -114,9 +115,10 @@ def dasr(options: Options) -> Denoiser:
     ) -> tuple[tuple[()], jax.Array, int]:
         frame, gain = prepared.frame, direct.choose_gain(options.exposure, statistics)
         surfaces = _surfaces(frame, statistics)
-        count = None if frame.sample_count is None else 1.0 / (1.0 + frame.sample_count)
+        # An absent group is 0 to the network, but a frame without numbers has one sample everywhere.
+        count = jnp.ones_like(frame.radiance[..., :1]) if frame.sample_count is None else frame.sample_count
         groups: list[jax.Array | None] = [color.compress(gain * prepared.light)]
-        groups += [None if group is None else pad(group, MULTIPLE) for group in (*surfaces, count)]
+        groups += [None if group is None else pad(group, MULTIPLE) for group in (*surfaces, 1.0 / (1.0 + count))]
         features = [None if group is None else group[None] for group in groups]
         output = predictor.apply(params["predictor"], features)[0][0]
         return (), direct.expand_output(output, prepared, gain), 0

@@ -67,8 +67,9 @@ def ntasd(options: Options) -> Denoiser:
 
     The first frame has the same number of samples everywhere. ``params`` has the two networks, "sampler" (absent with
     ``adaptive=False``) and "denoiser", whose parts are those of ``ntd``. Reads albedo, normal, depth, motion and
-    sample_count. Raises ValueError for an unknown option and for a budget that the layers cannot give, and ``step`` for
-    a frame of the wrong shape, never for its contents.
+    sample_count (one sample without it); reflectance with ``demodulate="brdf"``, and with ``guides="materials"``
+    roughness, too. Raises ValueError for an unknown option and for a budget that the layers cannot give, and ``step``
+    for a frame of the wrong shape, never for its contents.
     """
     inner = ntd.core_of(options, ntd.ExtraFeatures((2, 1), _sample_features, frozenset({"motion", "sample_count"})))
     flagged = options.missing_history == "current"
@@ -115,8 +116,6 @@ _PATTERNS: dict[str, Pattern] = {"random": draw_random_numbers, "rotating": rota
 
 
 def _sample_features(frame: Frame) -> list[jax.Array | None]:
-    """Motion, and how noisy each pixel is: ``1 / (1 + n)`` for n samples."""
-    return [
-        None if frame.motion is None else motion_feature(frame.motion),
-        None if frame.sample_count is None else 1.0 / (1.0 + frame.sample_count),
-    ]
+    """Motion, and how noisy each pixel is: ``1 / (1 + n)`` for n samples, 1 where nobody says how many."""
+    count = jnp.ones_like(frame.radiance[..., :1]) if frame.sample_count is None else frame.sample_count
+    return [None if frame.motion is None else motion_feature(frame.motion), 1.0 / (1.0 + count)]

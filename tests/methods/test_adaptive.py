@@ -318,3 +318,17 @@ def test_options_that_make_no_sense_raise():
         with pytest.raises(ValueError, match=r"budget: expected a number > 0, got 0"):
             METHODS[name](budget=0)
         assert methods()[name].parse_options({"preset": "paper"}).rounding == "nearest"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
+def test_an_absent_number_of_samples_is_one(name, rng, key):
+    denoiser = METHODS[name](size=TINY)
+    clip = clip_of(rng, count=1)
+    frame, params = frame_at(clip.frames, 0), varied(denoiser, clip, key)
+    ones = jnp.ones_like(frame.depth)
+    absent, written = (
+        jax.jit(denoiser.step)(params, denoiser.start(params, only(given, denoiser.reads)), given)[1]
+        for given in (frame, frame._replace(sample_count=ones))
+    )
+    np.testing.assert_array_equal(absent, written)
