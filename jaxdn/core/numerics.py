@@ -2,8 +2,8 @@
 
 Their true derivatives are infinite or undefined at 0, and one such pixel would make the gradient of a whole clip NaN.
 Each function states which finite derivative it has instead. *Tiny* below is the smallest normal number of the
-dtype (1.2e-38 in float32); an infinite argument counts as the largest finite one. NaN stays NaN: only
-``repair.repair`` replaces it.
+dtype (1.2e-38 in float32); an infinite argument counts as the largest finite one. NaN stays NaN:
+frames are sanitized before (:func:`jaxdn.denoiser.sanitize.sanitize`).
 """
 
 from functools import partial

@@ -46,7 +46,8 @@ class Options(svgf.Options):
     alpha: Annotated[float, Range(0, 1, without_low=True), LEARNABLE] = 0.1
     """Minimum weight of the new frame in colour, where light has not changed."""
     gradient_levels: Annotated[int, Range(0, 5)] = 3
-    """Levels of the filter over strata: it averages over ``3 * gradient_spacing^levels`` pixels in each direction."""
+    """Levels of the filter over strata of 3x3 pixels: with s = ``gradient_spacing`` it averages over squares of
+    ``3 + 6 (s^levels - 1) / (s - 1)`` pixels along a side, which is ``3^(levels + 1)`` for s = 3."""
     gradient_spacing: Annotated[int, Range(2, 3)] = 3
     """Taps of level i of that filter are ``gradient_spacing^i`` strata apart."""
     gradient_stops: Literal["surface", "light"] = "surface"

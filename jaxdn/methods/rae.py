@@ -86,9 +86,9 @@ def rae(options: Options) -> Denoiser:
 
     Light is compressed (:func:`jaxdn.color.compress`) before the network sees it, and the network predicts compressed
     light. Normals are in world space, where the paper has them in the camera's: the recipe "usual" turns them at
-    random, "paper" does not. Reads albedo, reflectance, normal, depth and roughness; an absent buffer is neutral.
-    Raises ValueError for an unknown option, and ``step`` for a frame of the wrong shape or of another size than the
-    first, never for its contents.
+    random, "paper" does not. Reads normal, depth and roughness; albedo with ``guides="materials"`` or divided light,
+    and reflectance with ``demodulate="brdf"``; an absent buffer is neutral. Raises ValueError for an unknown option,
+    and ``step`` for a frame of the wrong shape or of another size than the first, never for its contents.
     """
     return demodulated(recurrent(core_of(options)), by=options.demodulate)
 

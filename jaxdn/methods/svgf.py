@@ -140,8 +140,9 @@ class SvgfState(NamedTuple):
 def svgf(options: Options) -> Denoiser:
     """SVGF, a filter that needs no weights: ``params`` are ``{}``, or move alpha, alpha_moments and the sigmas.
 
-    Reads reflectance, albedo, normal, depth, previous_depth, motion and ids; without a buffer, its test or weight is
-    left out. With ``apart`` it reads shadowed, too. Pixels without a surface (depth at ``FAR`` or id -1) pass through.
+    Reads normal, depth, previous_depth, motion and ids; without a buffer, its test or weight is left out. With
+    ``demodulate="brdf"`` it reads reflectance and albedo, with ``"albedo"`` albedo, with ``apart`` shadowed, too.
+    Pixels without a surface (depth at ``FAR`` or id -1) pass through.
     Raises ValueError for options out of range and radiance that is not [H, W, 3].
     """
 

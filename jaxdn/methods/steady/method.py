@@ -131,9 +131,10 @@ class SteadyState(NamedTuple):
 def steady(options: Options) -> Denoiser:
     """The denoiser.
 
-    Reads reflectance, albedo, normal, roughness, depth, previous_depth, motion and ids; without a buffer, what it would
-    guide or test is left out. Pixels without a surface (depth at ``FAR`` or id -1) pass through. Raises ValueError for
-    an unknown option, and ``step`` for a frame of the wrong shape, never for its contents.
+    Reads albedo, normal, roughness, depth, previous_depth, motion and ids, and reflectance with ``demodulate="brdf"``;
+    without a buffer, what it would guide or test is left out. Pixels without a surface (depth at ``FAR`` or id -1) pass
+    through. Raises ValueError for an unknown option, and ``step`` for a frame of the wrong shape, never for its
+    contents.
     """
     # Flax is imported only when a network is built: filters without weights need only jax and numpy.
     from jaxdn.networks.unet import unet

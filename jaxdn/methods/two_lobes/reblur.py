@@ -94,7 +94,8 @@ class ReblurState(NamedTuple):
     filter=True,
 )
 def reblur(options: Options) -> Denoiser:
-    """The filter; ``params`` are ``{}``, or move its sigmas and fractions; its radii have no gradient.
+    """The filter; ``params`` are ``{}``, or move its sigmas, its fractions, ``history_max`` and ``fast_max``; its
+    radii have no gradient.
 
     Reads what ``relax`` reads, and hit_distance. Without ``hit_distance`` and ``specular_hit_distance`` the radius of
     the discs depends on the history alone. Without ``specular`` all light is filtered as diffuse; without

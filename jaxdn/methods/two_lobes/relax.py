@@ -81,7 +81,7 @@ fewer than three, sigmas 2 of diffuse (the default) and 1 of specular light, hal
     filter=True,
 )
 def relax(options: Options) -> Denoiser:
-    """The filter; ``params`` are ``{}``, or move its sigmas and fractions.
+    """The filter; ``params`` are ``{}``, or move its sigmas, its fractions, ``history_max`` and ``fast_max``.
 
     Reads specular, reflectance, specular_reflectance, albedo, normal, depth, previous_depth, roughness, motion, ids,
     specular_hit_distance, ray_length and far_motion. Without ``specular`` all light is filtered as diffuse; without
