@@ -192,7 +192,7 @@ def _nothing_else_on_stdout() -> Iterator[None]:
 
 
 def _show(source: str, planned: PlannedClip, reader: Denoiser | None, name: str | None) -> None:
-    found, made, depth = planned
+    found, made, depth = planned.effects, planned.plan, planned.depth
     console = plain_console()
     table = Table(title=f"{source}: {len(found)} of {len(EFFECTS)} effects, {len(found.frames)} frames")
     for column in ("effect", "there", "frames", "why"):

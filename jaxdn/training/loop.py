@@ -254,8 +254,8 @@ def _find_differences(
 ) -> dict[str, tuple[Any, Any]]:
     """What differs, before and now; of options those that differ. Runs of before methods were kept have none."""
     found = {key: (there.get(key), wanted[key]) for key in wanted if key not in unknown}
-    if "options" in found:
-        before, now = found.pop("options")
+    before, now = found.pop("options", ({}, {}))
+    if before is not None and now is not None:
         found |= {f"option {key}": (before.get(key), now.get(key)) for key in sorted(before.keys() | now.keys())}
     return {key: (old, new) for key, (old, new) in found.items() if old != new}
 
