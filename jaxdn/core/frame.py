@@ -37,6 +37,10 @@ _STORED = {"light": "half", "fraction": "half", "direction": "half", "flag": "fl
 _DTYPES = {"flag": np.dtype(bool), "id": np.dtype(np.int32)}
 
 
+UNNUMBERED = 2**31 - 1
+"""The id of all surfaces that have no number; numbers of files end below."""
+
+
 class Buffer(NamedTuple):
     """One row of the table: everything that the other modules need to know about a buffer."""
 
@@ -100,8 +104,8 @@ class Frame(NamedTuple):
     """[H, W, 1] bool, the point was seen in the previous frame; neutral: true."""
     previous_depth: Annotated[Array, Buffer(1, "distance", "depth")] = None
     """[H, W, 1] view-space z that the point had in the previous frame; neutral: ``depth``."""
-    ids: Annotated[Array, Buffer(1, "id")] = None
-    """[H, W, 1] int32 shape id, -1 where the ray left the scene; neutral: 0, all is one surface."""
+    ids: Annotated[Array, Buffer(1, "id", UNNUMBERED)] = None
+    """[H, W, 1] int32 shape id, -1 where the ray left the scene; neutral: :data:`UNNUMBERED`, all is one surface."""
     direct: Annotated[Array, Buffer(3, "light", averaged=True)] = None
     """[H, W, 3] directly reflected light; neutral: 0."""
     emission: Annotated[Array, Buffer(3, "light", averaged=True)] = None

@@ -20,7 +20,7 @@ CHAINS = {
     "shadow_motion": "motion",
     "glossy_motion": "motion",
 }
-ENDS = {"albedo": 1, "roughness": 1, "visible": 1, "sample_count": 1, "reflectance": 1}
+ENDS = {"albedo": 1, "roughness": 1, "visible": 1, "sample_count": 1, "reflectance": 1, "ids": 2**31 - 1}
 """The neutral values that are not 0, from the docstrings of the fields."""
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxdn.core.frame import BUFFERS, FAR, Buffer, Frame
+from jaxdn.core.frame import BUFFERS, FAR, UNNUMBERED, Buffer, Frame
 from jaxdn.data.errors import ClipError
 from jaxdn.data.exr.file import ExrFile, Window, union_of
 from jaxdn.data.foreign.classify import ChannelMapping, ChannelNaming, classify_channels
@@ -25,9 +25,6 @@ from jaxdn.data.foreign.shot_files import find_sequence
 from jaxdn.data.foreign.vectors import UnknownMotion, convert_cycles_forward, convert_motion, derive_dual_motion
 from jaxdn.data.foreign.views import open_views
 from jaxdn.filters.time_reversal import reverse_time
-
-UNNUMBERED = 2**31 - 1
-"""The id of all surfaces that have no number; numbers of files end below."""
 
 
 def plain_frames(
