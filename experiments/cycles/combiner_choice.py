@@ -50,11 +50,14 @@ from jaxdn.methods.combiner.method import (
 from jaxdn.zoo.weights import load_weights, save_weights
 
 BATCH, RATE, AVERAGE = 4, 2e-3, 0.99
-"""Pairs of frames an update; Adam's step; the running mean of the weights."""
+"""Pairs of frames an update; Adam's step at the start, which falls to nothing as a cosine; the running mean of the
+weights."""
 _LEAST = 1e-5
 """Mean square below which an error is as good as none."""
 UPDATES = 200
 """After so many updates the last results are made again."""
+REPORTS = 4
+"""How often the held clips are scored while the network is trained, the end included."""
 _LAST = CANDIDATES.index("last result")
 
 Stored = dict[str, np.ndarray]
@@ -108,8 +111,7 @@ def main(options: Options) -> int:
     if not trained:
         raise ValueError(f"{options.folder}: expected clips to train on, got none that does not end in {options.held}.")
     report("before", held, params["choice"])
-    chosen, updates = train(trained, params["choice"], options.minutes)
-    report(f"after {updates} updates", held, chosen)
+    chosen, updates = train(trained, held, params["choice"], options.minutes)
     record = {"start": options.start.name, "choice_updates": updates, "clips": sorted(trained)}
     path = save_weights(
         options.out, {**params, "choice": chosen}, factory="combiner", options={"quality": "high"}, record=record
@@ -211,10 +213,10 @@ def square(errors: jax.Array) -> jax.Array:
     return jnp.mean(2.0 * errors[0] ** 2 - 0.5 * (errors[1] ** 2 + errors[2] ** 2))
 
 
-def train(clips: Clips, params: Params, minutes: float) -> tuple[Params, int]:
-    """The running mean of the network's parameters, and how many updates there were."""
+def train(clips: Clips, held: Clips, params: Params, minutes: float) -> tuple[Params, int]:
+    """The running mean of the network's parameters, and how many updates there were; reports of ``held`` clips."""
     chooser, rng = build_chooser(Settings(implementation="onednn")), np.random.default_rng(0)
-    optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(RATE))
+    optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
 
     def loss(params: Params, batch: list[list[dict[str, jax.Array]]]) -> jax.Array:
         total = jnp.zeros(())
@@ -230,17 +232,24 @@ def train(clips: Clips, params: Params, minutes: float) -> tuple[Params, int]:
         return total / len(batch)
 
     @jax.jit
-    def update(params: Params, state: Any, mean: Params, batch: Any) -> tuple[Params, Any, Params]:
+    def update(params: Params, state: Any, mean: Params, batch: Any, rate: jax.Array) -> tuple[Params, Any, Params]:
         steps, state = optimizer.update(jax.grad(loss)(params, batch), state, params)
-        params = optax.apply_updates(params, steps)
+        params = optax.apply_updates(params, jax.tree.map(lambda step: -rate * step, steps))
         return params, state, jax.tree.map(lambda old, new: AVERAGE * old + (1 - AVERAGE) * new, mean, params)
 
-    state, mean, updates, begin = optimizer.init(params), params, 0, time.monotonic()
-    while time.monotonic() < begin + 60 * minutes or not updates:
+    state, mean, updates = optimizer.init(params), params, 0
+    spent, reported, begin = 0.0, 0, time.monotonic()
+    while spent < 1:
         if updates % UPDATES == 0:
             make_results(clips, mean)
-        params, state, mean = update(params, state, mean, [draw(clips, rng) for _ in range(BATCH)])
+        rate = jnp.asarray(0.5 * RATE * (1 + np.cos(np.pi * spent)), jnp.float32)
+        params, state, mean = update(params, state, mean, [draw(clips, rng) for _ in range(BATCH)], rate)
         updates += 1
+        spent = (time.monotonic() - begin) / (60 * minutes) if minutes else 1.0
+        if min(int(REPORTS * spent), REPORTS) > reported:
+            reporting, reported = time.monotonic(), min(int(REPORTS * spent), REPORTS)
+            report(f"after {updates} updates", held, mean)
+            begin += time.monotonic() - reporting
     return mean, updates
 
 

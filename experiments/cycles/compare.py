@@ -79,14 +79,14 @@ def find_done(folder: Path, kinds: Sequence[str]) -> list[Path]:
 def measure(clip: Path, spp: int, method: str, out: Path) -> None:
     """Denoise a clip's frames of one sample count and write their scores, unless that is done or they do not exist."""
     noisy, target = clip / f"{spp}spp-0", out / clip.name / f"{spp}spp" / method.replace("/", "_")
-    scored = sorted(int(path.stem) for path in (clip / "reference").glob("[0-9]*.exr"))
     files = sorted(noisy.glob("*.exr"))
-    if not files or target.with_suffix(".json").is_file():
+    there = {file.stem for file in files}
+    pairs = _paired(sorted(int(path.stem) for path in (clip / "reference").glob("[0-9]*.exr") if path.stem in there))
+    if not pairs or target.with_suffix(".json").is_file():
         return
     images = denoise_frames(files, target, method)
     _, frames = open_frames(noisy)
     motion: dict[int, Any] = {number: stored.frame.motion for number, stored in enumerate(frames, 1)}
-    pairs = _paired(scored)
     halves = [references.read(clip / "reference" / f"{number:04d}.exr") for number in pairs]
     found = score([images[number] for number in pairs], halves, [motion[number] for number in pairs])
     row = {"clip": clip.name, "kind": (read_record(clip / RECORD) or {})["kind"], "spp": spp, "method": method}

@@ -7,16 +7,23 @@ from typing import NamedTuple
 from experiments.cycles.sets import LARGE, Clip, clip, kinds_of, rounds
 
 
+class Draw(NamedTuple):
+    """Noisy frames: of ``samples`` a pixel, ``images`` of independent noise each, of the first ``frames`` of a clip."""
+
+    samples: int
+    images: int = 1
+    frames: int = 24
+
+
 class Level(NamedTuple):
     """What a clip has when a step is done.
 
-    ``draws``: for each sample count, how many images of independent noise a frame. ``reference_frames``: the frames
-    that have references (numbers from 1), all if empty. ``decibels``: the PSNR of a reference's own noise, of
-    x / (1 + x), at which it is good enough; ``seconds``: the processor time after which a frame's reference is left
-    as it is.
+    ``reference_frames``: the frames that have references (numbers from 1), all if empty. ``decibels``: the PSNR of a
+    reference's own noise, of x / (1 + x), at which it is good enough; ``seconds``: the processor time after which a
+    frame's reference is left as it is.
     """
 
-    draws: tuple[tuple[int, int], ...]
+    draws: tuple[Draw, ...]
     reference_frames: tuple[int, ...]
     decibels: float
     seconds: float
@@ -24,21 +31,25 @@ class Level(NamedTuple):
 
 SOME = (5, 6, 14, 15, 23, 24)
 """Pairs of frames, for temporal errors: early, after the middle (where lights switch and shots are cut), late."""
+FEW = tuple(Draw(samples, frames=16) for samples in (1, 4, 16))
+MANY = tuple(Draw(samples) for samples in (1, 4, 16, 64))
+"""The noisy frames of coarse steps, and of those that refine them."""
 
 LEVELS = {
-    "train": (Level(((1, 2), (4, 1), (16, 1)), (), 42.0, 6.0),),
-    "validation": (Level(((1, 1), (4, 1), (16, 1)), SOME, 52.0, 90.0),),
+    "train": (Level((Draw(1, 2), Draw(4), Draw(16)), (), 42.0, 6.0),),
+    "validation": (Level(MANY[:3], SOME, 52.0, 90.0),),
     "test": (
-        Level(((1, 1), (4, 1), (16, 1)), SOME, 52.0, 90.0),
-        Level(((1, 1), (4, 1), (16, 1), (64, 1)), SOME, 58.0, 900.0),
-        Level(((1, 1), (4, 1), (16, 1), (64, 1)), (), 58.0, 900.0),
+        Level(FEW, SOME[:4], 52.0, 40.0),
+        Level((*FEW, Draw(64, frames=6)), SOME[:4], 52.0, 40.0),
+        Level(MANY, SOME, 58.0, 900.0),
+        Level(MANY, (), 58.0, 900.0),
     ),
 }
 """The steps of a set's clips, each having what the one before it has."""
 
 LARGE_LEVELS = (
-    Level(((1, 1), (4, 1), (16, 1)), SOME, 50.0, 900.0),
-    Level(((1, 1), (4, 1), (16, 1), (64, 1)), SOME, 56.0, 3600.0),
+    Level(MANY[:3], SOME, 50.0, 900.0),
+    Level(MANY, SOME, 56.0, 3600.0),
 )
 """The steps of a clip of 1280x720: sixteen times the pixels."""
 
@@ -97,10 +108,10 @@ def _testing(sets: tuple[str, ...], kinds: tuple[str, ...], seeds: range | None)
         return
     for number, row in enumerate(rounds("test", _chosen("test", kinds), seeds)):
         small = [one for one in row if one.seed not in LARGE]
-        yield from (Step(one, level) for level in (0, 1) for one in small)
+        yield from (Step(one, level) for level in (0, 1, 2) for one in small)
         if seeds is not None:
             yield from (Step(one, level) for one in row if one.seed in LARGE for level in (0, 1))
         elif number == 0:
             large = [clip("test", kind, LARGE.start) for kind in ("lamps", "sun") if kind in _chosen("test", kinds)]
             yield from (Step(one, 0) for one in large)
-        yield from (Step(one, 2) for one in small)
+        yield from (Step(one, 3) for one in small)

@@ -36,13 +36,13 @@ def render_clip(folder: Path, of: Clip, level: int) -> None:
     build(of)
     check_scene(folder, of.frames)
     spent: dict[str, list[float]] = {}
-    for samples, draws in wanted.draws:
-        for draw in range(draws):
-            name = f"{samples}spp-{draw}"
-            for frame in range(1, of.frames + 1):
+    for draw in wanted.draws:
+        for image in range(draw.images):
+            name = f"{draw.samples}spp-{image}"
+            for frame in range(1, min(draw.frames, of.frames) + 1):
                 path = folder / name / f"{frame:04d}.exr"
                 if not path.exists():
-                    used = render(path, frame, samples, seed_of(of, name))
+                    used = render(path, frame, draw.samples, seed_of(of, name))
                     spent.setdefault(name, []).append(used)
     found = {}
     for frame in range(1, of.frames + 1):

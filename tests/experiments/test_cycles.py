@@ -106,7 +106,7 @@ def test_steps_of_given_kinds_and_seeds_end() -> None:
         Step(clip("train", kind, seed), 0) for seed in (3, 4) for kind in ("sun", "fog")
     ]
     levels_of_one = [(step.clip.seed, step.level) for step in steps(("test",), ("sun",), range(9000, 9001))]
-    assert levels_of_one == [(9000, 0), (9000, 1), (9000, 2)]
+    assert levels_of_one == [(9000, 0), (9000, 1), (9000, 2), (9000, 3)]
     large = list(steps(("test",), ("sun",), range(9900, 9901)))
     assert [step.level for step in large] == [0, 1]
     assert large[0].clip.size == (1280, 720)
@@ -115,7 +115,10 @@ def test_steps_of_given_kinds_and_seeds_end() -> None:
 def test_a_step_has_all_that_the_step_before_it_has() -> None:
     for of in (clip("test", "sun", 9000), clip("test", "sun", LARGE.start), clip("train", "sun", 0)):
         for before, after in itertools.pairwise(levels(of)):
-            assert set(before.draws) <= set(after.draws)
+            now = {draw.samples: draw for draw in after.draws}
+            for draw in before.draws:
+                assert draw.images <= now[draw.samples].images
+                assert draw.frames <= now[draw.samples].frames
             assert not after.reference_frames or set(before.reference_frames) <= set(after.reference_frames)
             assert after.decibels >= before.decibels
         assert all(frame <= of.frames for level in levels(of) for frame in level.reference_frames)

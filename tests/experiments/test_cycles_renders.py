@@ -25,7 +25,9 @@ import sys
 from experiments.cycles import levels, sets, shot
 sets.Clip.size = (32, 18)
 sets.Clip.frames = 4
-few = (levels.Level(((1, 2), (4, 1)), (2, 3), 30.0, 5.0), levels.Level(((1, 2), (4, 1)), (), 34.0, 20.0))
+draws = levels.Draw(1, 2), levels.Draw(4)
+first = levels.Draw(1, 2), levels.Draw(4, frames=3)
+few = levels.Level(first, (2, 3), 30.0, 5.0), levels.Level(draws, (), 34.0, 20.0)
 levels.LEVELS.update(test=few)
 """
 """Clips of 32x18 pixels and four frames, with two levels that take seconds."""
@@ -87,11 +89,13 @@ def test_a_clip_is_refined_level_by_level(blender: Path, tmp_path: Path) -> None
     first = json.loads((folder / "cycles.json").read_text())
     assert set(first["references"]) == {"2", "3"}
     assert sorted(path.name for path in (folder / "1spp-1").iterdir()) == [f"{i:04d}.exr" for i in range(1, 5)]
+    assert sorted(path.name for path in (folder / "4spp-0").iterdir()) == [f"{i:04d}.exr" for i in range(1, 4)]
     noisy = (folder / "4spp-0" / "0002.exr").stat().st_mtime_ns
     coarse = read(folder / "reference" / "0002.exr")
     _run(blender, code, str(folder), "1")
     second = json.loads((folder / "cycles.json").read_text())
     assert set(second["references"]) == {"1", "2", "3", "4"}
+    assert sorted(path.name for path in (folder / "4spp-0").iterdir()) == [f"{i:04d}.exr" for i in range(1, 5)]
     assert second["reference_noise_db"] > max(first["reference_noise_db"], 33.0)
     assert (folder / "4spp-0" / "0002.exr").stat().st_mtime_ns == noisy  # kept, not rendered again
     fine = read(folder / "reference" / "0002.exr")

@@ -134,6 +134,21 @@ def write_clip_of_cycles(folder: Path, rng: np.random.Generator) -> None:
     (folder / "cycles.json").write_text('{"kind": "sun", "level": 0}')
 
 
+def test_sample_counts_of_fewer_frames_are_scored_on_the_pairs_that_they_have(tmp_path: Path) -> None:
+    clip = tmp_path / "test" / "sun-9000"
+    write_clip_of_cycles(clip, np.random.default_rng(5))
+    for spp, frames in ((64, 3), (16, 2)):  # the references are of the frames 2 and 3
+        (clip / f"{spp}spp-0").mkdir()
+        for number in range(1, frames + 1):
+            name = f"{number:04d}.exr"
+            (clip / f"{spp}spp-0" / name).write_bytes((clip / "4spp-0" / name).read_bytes())
+    assert compare.main(compare.Options(tmp_path / "test", tmp_path / "out", ["noisy"], [4, 16, 64])) == 0
+    rows = {row["spp"]: row for row in compare.read_rows(tmp_path / "out", ["sun-9000"])}
+    assert rows.keys() == {4, 64}
+    assert rows[64]["frames"] == [2, 3]
+    assert rows[64]["psnr"] == rows[4]["psnr"]
+
+
 def test_methods_are_compared_on_files_and_a_second_run_measures_nothing_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
