@@ -31,6 +31,8 @@ from jaxdn.zoo.ready import NOISY
 
 PLAIN = "+no-safe"
 """Ending of a method that is run with ``--no-safe``."""
+PREFILTERED = "+prefiltered"
+"""Ending of Open Image Denoise that denoises the guides first, as Blender has it do by default."""
 
 
 @dataclass
@@ -42,7 +44,8 @@ class Options:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("runs/cycles-compare")
     """Denoised frames and scores."""
     methods: list[str] = field(default_factory=lambda: [NOISY, "svgf", "steady-balanced" + PLAIN])
-    """Names as of ``jaxdn denoise --method``; with ``+no-safe`` at the end, without the safe step."""
+    """Names as of ``jaxdn denoise --method``; with ``+no-safe`` at the end, without the safe step; with
+    ``+prefiltered``, of Open Image Denoise, with guides that it denoises first."""
     spp: list[int] = field(default_factory=lambda: [1, 4, 16])
     """Sample counts."""
     kinds: list[str] = field(default_factory=list)
@@ -99,9 +102,11 @@ def denoise_frames(files: Sequence[Path], target: Path, method: str) -> dict[int
     """Number of a frame -> image, from the files that were written."""
     if method == NOISY:
         return {int(file.stem): read_beauty(file) for file in files}
-    model, _ = select_backend(method.removesuffix(PLAIN))
+    name, _, _ = method.partition("+")
+    options = {"auxiliary": "prefiltered"} if PREFILTERED in method else {}
+    model, _ = select_backend(name, **options)
     target.mkdir(parents=True, exist_ok=True)
-    settings = Settings(only_beauty=True, safe=not method.endswith(PLAIN))
+    settings = Settings(only_beauty=True, safe=PLAIN not in method)
     written = denoise_files([files[0].parent], target, model, settings)
     return {int(file.stem): read_beauty(file) for file in written.files}
 

@@ -31,7 +31,7 @@ class Level(NamedTuple):
 
 SOME = (5, 6, 14, 15, 23, 24)
 """Pairs of frames, for temporal errors: early, after the middle (where lights switch and shots are cut), late."""
-FEW = tuple(Draw(samples, frames=16) for samples in (1, 4, 16))
+FEW = tuple(Draw(samples, frames=15) for samples in (1, 4, 16))
 MANY = tuple(Draw(samples) for samples in (1, 4, 16, 64))
 """The noisy frames of coarse steps, and of those that refine them."""
 
@@ -39,8 +39,8 @@ LEVELS = {
     "train": (Level((Draw(1, 2), Draw(4), Draw(16)), (), 42.0, 6.0),),
     "validation": (Level(MANY[:3], SOME, 52.0, 90.0),),
     "test": (
-        Level(FEW, SOME[:4], 52.0, 40.0),
-        Level((*FEW, Draw(64, frames=6)), SOME[:4], 52.0, 40.0),
+        Level(FEW, SOME[:4], 52.0, 30.0),
+        Level((*FEW, Draw(64, frames=6)), SOME[:4], 52.0, 30.0),
         Level(MANY, SOME, 58.0, 900.0),
         Level(MANY, (), 58.0, 900.0),
     ),

@@ -38,7 +38,9 @@ class Options:
     """What the network sees besides radiance."""
     auxiliary: binding.Auxiliary = "noisy"
     """What is known of the guides: ``"noisy"``: nothing; ``"clean"``: they have no noise, and may show every detail;
-    ``"prefiltered"``: they are noisy, and the library denoises them first."""
+    ``"prefiltered"``: they are noisy, and the library denoises them first, as Blender has it do by default."""
+    guide_quality: binding.Quality = "high"
+    """Size and precision of the networks that denoise prefiltered guides."""
     hdr: bool = True
     """Radiance is linear and may exceed 1. Without it, it is encoded with the sRGB curve, in [0, 1]."""
     device: binding.Device = "auto"
@@ -61,7 +63,9 @@ def oidn(options: Options) -> Denoiser:
     Raises ModuleNotFoundError, saying what to install, where the package ``pyoidn`` is missing, when a step is traced;
     NotPortableError where a step is exported, and TypeError where a gradient is asked for.
     """
-    settings = binding.OidnSettings(options.quality, options.hdr, options.auxiliary, options.device)
+    settings = binding.OidnSettings(
+        options.quality, options.hdr, options.auxiliary, options.device, options.guide_quality
+    )
     reads = _READS[options.guides]
 
     def step(
@@ -72,7 +76,7 @@ def oidn(options: Options) -> Denoiser:
         scale = statistics.exposure if options.hdr else jnp.ones((), whole.radiance.dtype)
         return state, _denoise(settings, scale, *images), 0
 
-    return recurrent(Core(_start, step, frozenset(reads), receptive_field=binding.RECEPTIVE_FIELD))
+    return recurrent(Core(_start, step, frozenset(reads), receptive_field=settings.receptive_field))
 
 
 def _start(params: Params, frame: Frame) -> tuple[()]:

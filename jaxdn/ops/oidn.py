@@ -19,8 +19,9 @@ from jaxdn.runtime.cores import count_cores
 from jaxdn.runtime.optional import install
 
 MODULE = "pyoidn"
-RECEPTIVE_FIELD = 96
-"""Radius in pixels, of all qualities: the overlap of the library's own tiles; 91 pixels are the farthest measured."""
+_FIELD, _LARGE_FIELD = 96, 112
+"""Radius in pixels of what a network sees, and of the larger ones that the library takes for guides without noise, and
+to denoise guides, in its quality ``"high"``: 91 and 103 pixels are the farthest measured."""
 
 Quality = Literal["high", "balanced", "fast"]
 Auxiliary = Literal["noisy", "clean", "prefiltered"]
@@ -37,6 +38,15 @@ class OidnSettings(NamedTuple):
     """What is known of albedo and normal: they may be noisy, they have no noise, or the library denoises them first."""
     device: Device = "auto"
     """``"auto"`` is an NVIDIA GPU if the library can use one, else the CPU."""
+    guide_quality: Quality = "high"
+    """How prefiltered guides are denoised."""
+
+    @property
+    def receptive_field(self) -> int:
+        """How far, in pixels, a pixel of the image sees."""
+        high = self.quality == "high" and self.auxiliary != "noisy"
+        guides = _LARGE_FIELD if self.guide_quality == "high" else _FIELD
+        return (_LARGE_FIELD if high else _FIELD) + (guides if self.auxiliary == "prefiltered" else 0)
 
 
 def available() -> bool:
@@ -96,7 +106,8 @@ def denoise(
     settings = settings._replace(device=choose_device(settings.device))
     kernel_of = functools.partial(_kernel, height, width, settings)
     if settings.auxiliary == "prefiltered":
-        guides = {name: kernel_of((name,))({name: image}) for name, image in guides.items()}
+        careful = settings._replace(quality=settings.guide_quality)
+        guides = {name: _kernel(height, width, careful, (name,))({name: image}) for name, image in guides.items()}
     return kernel_of(("color", *guides))({"color": color, **guides}, scale, out)
 
 

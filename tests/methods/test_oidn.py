@@ -222,6 +222,28 @@ def test_prefiltered_guides_are_those_that_the_library_denoised(library, rng):
     )
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "settings",
+    [
+        binding.OidnSettings(device="cpu"),
+        binding.OidnSettings(auxiliary="clean", device="cpu"),
+        binding.OidnSettings(auxiliary="prefiltered", device="cpu"),
+        binding.OidnSettings(auxiliary="prefiltered", guide_quality="fast", device="cpu"),
+    ],
+)
+def test_a_pixel_sees_no_farther_than_the_settings_say(library, settings, rng):
+    """Larger networks see farther, and prefiltered guides see twice: tiles overlap by that."""
+    height, width, changed = 32, 640, 8
+    images = [rng.uniform(0.1, 1.0, (height, width, 3)).astype(np.float32) for _ in range(3)]
+    others = [image.copy() for image in images]
+    for image in others:
+        image[:, :changed] = 1.1 - image[:, :changed]
+    first, second = (binding.denoise(*each, settings=settings, scale=0.5) for each in (images, others))
+    differs = np.nonzero(np.any(first != second, axis=(0, 2)))[0]
+    assert 64 < differs.max() - (changed - 1) <= settings.receptive_field
+
+
 def test_missing_guides_are_neutral(library, rng):
     frame = frame_at(clip_of(rng, 1), 0)._replace(albedo=None, normal=None)
     written = frame._replace(albedo=np.ones_like(frame.radiance), normal=np.zeros_like(frame.radiance))
