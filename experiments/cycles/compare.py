@@ -31,6 +31,8 @@ from jaxdn.zoo.ready import NOISY
 
 PLAIN = "+no-safe"
 """Ending of a method that is run with ``--no-safe``."""
+ALONE = "oidn"
+"""The method that sees one frame at a time."""
 PREFILTERED = "+prefiltered"
 """Ending of Open Image Denoise that denoises the guides first, as Blender has it do by default."""
 
@@ -87,7 +89,7 @@ def measure(clip: Path, spp: int, method: str, out: Path) -> None:
     pairs = _paired(sorted(int(path.stem) for path in (clip / "reference").glob("[0-9]*.exr") if path.stem in there))
     if not pairs or target.with_suffix(".json").is_file():
         return
-    images = denoise_frames(files, target, method)
+    images = denoise_frames(files, target, method, pairs)
     _, frames = open_frames(noisy)
     motion: dict[int, Any] = {number: stored.frame.motion for number, stored in enumerate(frames, 1)}
     halves = [references.read(clip / "reference" / f"{number:04d}.exr") for number in pairs]
@@ -98,15 +100,15 @@ def measure(clip: Path, spp: int, method: str, out: Path) -> None:
     print(f"{clip.name} {spp} spp {method}: {found.figures()}", flush=True)
 
 
-def denoise_frames(files: Sequence[Path], target: Path, method: str) -> dict[int, np.ndarray]:
-    """Number of a frame -> image, from the files that were written."""
+def denoise_frames(files: Sequence[Path], target: Path, method: str, scored: Sequence[int]) -> dict[int, np.ndarray]:
+    """Number of a frame -> image, from the files that were written; ``scored`` ones alone where none needs others."""
     if method == NOISY:
         return {int(file.stem): read_beauty(file) for file in files}
     name, _, _ = method.partition("+")
     options = {"auxiliary": "prefiltered"} if PREFILTERED in method else {}
     model, _ = select_backend(name, **options)
     target.mkdir(parents=True, exist_ok=True)
-    settings = Settings(only_beauty=True, safe=PLAIN not in method)
+    settings = Settings(only_beauty=True, safe=PLAIN not in method, frames=scored if name == ALONE else None)
     written = denoise_files([files[0].parent], target, model, settings)
     return {int(file.stem): read_beauty(file) for file in written.files}
 
