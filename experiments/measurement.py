@@ -13,7 +13,7 @@ from jaxdn.evaluation.compare import describe_machine
 
 
 def describe_measurement(
-    kind: str, title: str, section: str, order: int, *, command: str, what: str, rows: Sequence[Any]
+    kind: str, title: str, section: str, order: float, *, command: str, what: str, rows: Sequence[Any]
 ) -> dict[str, Any]:
     """The contents of the file.
 

@@ -5,7 +5,7 @@
 For every clip, sample count and method the noisy files are denoised as ``jaxdn denoise`` does it, and scored on the
 frames that have references (:mod:`experiments.cycles.score`). One JSON file for each, so that a run goes on where it
 was; the denoised frames stay, to be looked at. ``--table`` prints what is there. The tables are written as
-``quality-cycles.json`` and ``quality-cycles-kinds.json``, in the format of docs/results.
+``quality-cycles-test.json`` and ``quality-cycles-test-kinds.json``, in the format of docs/results.
 """
 
 import json
@@ -67,7 +67,7 @@ def main(options: Options) -> int:
     rows = read_rows(options.out, [clip.name for clip in clips])
     for spp in options.spp:
         print_table([row for row in rows if row["spp"] == spp and row["method"] in options.methods], spp)
-    for name, measurement in (("cycles", means), ("cycles-kinds", kinds)):
+    for name, measurement in (("cycles-test", means), ("cycles-test-kinds", kinds)):
         write_json(options.out / f"quality-{name}.json", measurement(rows, options))
     return 0
 
@@ -179,13 +179,15 @@ def means(rows: Sequence[dict[str, Any]], options: Options) -> dict[str, Any]:
         for method in options.methods
     ]
     what = (
-        f"Means over {_count(rows)} of Blender's Cycles that nothing was trained on or chosen by (`make cycles`), as a "
-        "user runs them: `jaxdn denoise` on the files, all light; `+no-safe` is `--no-safe`. PSNR of x / (1 + x) in "
-        "dB, without the references' noise; *edges* are the tenth of the pixels whose guides differ most from their "
-        "neighbours'; *temporal* is the PSNR of the change between two frames."
+        f"Means over {_count(rows)} of Blender's Cycles that nothing was trained on or chosen by (`make cycles`); "
+        "`ball` and `leaves` are kinds that nothing was trained on. Files through `jaxdn denoise`, all light; "
+        "`+no-safe` is `--no-safe`, `+prefiltered` is Open Image Denoise as Blender runs it by default, with guides "
+        "that it denoises first. Open Image Denoise is that of the quality high. PSNR of x / (1 + x) in dB, without "
+        "the references' noise. *Edges* are the tenth of the pixels whose guides differ most from their neighbours'. "
+        "*Temporal* is the PSNR of the change between two frames."
     )
     return {
-        **_describe("Cycles frames", 10, what, lines, options),
+        **_describe("Cycles test clips", 9, what, lines, options),
         "columns": columns,
         "group": "samples",
         "readme": {},
@@ -206,11 +208,11 @@ def kinds(rows: Sequence[dict[str, Any]], options: Options) -> dict[str, Any]:
         for spp in options.spp
     ]
     what = f"The PSNR of the table above, by kind; {_count(rows)}."
-    described = _describe("Kinds of Cycles frames", 11, what, lines, options)
+    described = _describe("Kinds of Cycles test clips", 9.5, what, lines, options)
     return {**described, "columns": columns, "best_in_row": "higher"}
 
 
-def _describe(title: str, order: int, what: str, rows: Sequence[Any], options: Options) -> dict[str, Any]:
+def _describe(title: str, order: float, what: str, rows: Sequence[Any], options: Options) -> dict[str, Any]:
     command = f"python -m experiments.cycles.compare {options.folder.name} --methods {' '.join(options.methods)}"
     return describe_measurement("table", title, "Quality", order, command=command, what=what, rows=rows)
 

@@ -168,10 +168,10 @@ def test_methods_are_compared_on_files_and_a_second_run_measures_nothing_again(
     assert "4 samples" in again
     assert "sun" in again
     results = {result["file"]: result for result in read_results(tmp_path / "out")}
-    row = results["quality-cycles.json"]["rows"][1]
+    row = results["quality-cycles-test.json"]["rows"][1]
     assert row[:2] == [4, "`svgf+no-safe`"]
     assert row[2] == pytest.approx(rows["svgf+no-safe"]["psnr"], abs=1e-3)
-    assert results["quality-cycles-kinds.json"]["rows"] == [["sun", 4, *(rows[m]["psnr"] for m in options.methods)]]
+    assert results["quality-cycles-test-kinds.json"]["rows"] == [["sun", 4, *(rows[m]["psnr"] for m in options.methods)]]
     page = results_page(list(results.values()))
     assert "1 clip of 1 kind" in page
     assert "| sun | 4 |" in page
