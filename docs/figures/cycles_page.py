@@ -50,11 +50,11 @@ def main(settings: Settings) -> None:
     files = sorted((settings.clip / f"{settings.spp}spp-0").glob("*.exr"))
     gain = _GREY / np.exp(np.mean(np.log(held.image.mean(axis=-1) + 1e-3)))
     samples = f"{settings.spp} sample{'s' * (settings.spp > 1)}"
-    images = {f"Cycles, {samples} per pixel": denoise_frames(files, settings.clip, NOISY)}
+    images = {f"Cycles, {samples} per pixel": denoise_frames(files, settings.clip, NOISY, [settings.frame])}
     with tempfile.TemporaryDirectory() as place:
         for method in settings.methods:
             name = method.removesuffix(PLAIN)
-            images[NAMES.get(name, name)] = denoise_frames(files, Path(place) / name, method)
+            images[NAMES.get(name, name)] = denoise_frames(files, Path(place) / name, method, [settings.frame])
     shown = {name: found[settings.frame] for name, found in images.items()}
     shown[f"reference: {2 * held.samples} samples"] = held.image
     pictures = {name: np.asarray(color.tonemap((gain * image).astype(np.float32))) for name, image in shown.items()}

@@ -258,10 +258,11 @@ class Denoise:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the denoised frames; for a single frame, also the name of an EXR file."""
     method: str = "auto"
-    """Shipped weights (combiner-high, ntd-large, ntd-small, relax-fitted, steady-balanced, steady-fast, steady-high,
-    svgf-fitted), a filter (svgf, asvgf, taa, oidn), the path of a .safetensors file, or a filter of another package
-    (package.module:name); an unknown name lists all. auto: on other renderers' files and jaxdn's own clips with
-    filtered pixels combiner-high, if the extra oidn is installed; else, and on all other clips, steady-balanced."""
+    """Shipped weights (combiner-best, combiner-high, ntd-large, ntd-small, relax-fitted, steady-balanced, steady-fast,
+    steady-high, svgf-fitted), a filter (svgf, asvgf, taa, oidn), the path of a .safetensors file, or a filter of
+    another package (package.module:name); an unknown name lists all. auto: on other renderers' files and jaxdn's own
+    clips with filtered pixels combiner-high, if the extra oidn is installed; else, and on all other clips,
+    steady-balanced."""
     bidirectional: bool = False
     """Denoise backwards too, from the last frame to the first, and blend both passes: twice the time, and the first
     frames are about as good as the last."""
