@@ -25,6 +25,7 @@ from experiments.measurement import describe_measurement
 from jaxdn.clips import open_frames, read_exr
 from jaxdn.commands.errors import plain_errors
 from jaxdn.runtime.atomic_files import write_json
+from jaxdn.runtime.program_cache import keep_programs
 from jaxdn.sequence.run import denoise_files, select_backend
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import NOISY
@@ -58,6 +59,7 @@ class Options:
 
 def main(options: Options) -> int:
     """Measure what is missing, and print the table."""
+    keep_programs()
     clips = find_done(options.folder, options.kinds)
     if not options.table:
         for clip in clips:

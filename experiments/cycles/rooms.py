@@ -28,6 +28,7 @@ from jaxdn.clips import frame_path, read_frames, read_record
 from jaxdn.commands.errors import plain_errors
 from jaxdn.core.frame import Frame
 from jaxdn.runtime.atomic_files import write_json
+from jaxdn.runtime.program_cache import keep_programs
 from jaxdn.sequence.all_light import gather_light
 from jaxdn.sequence.run import denoise_files, select_backend
 from jaxdn.sequence.settings import Settings
@@ -55,6 +56,7 @@ class Options:
 
 def main(options: Options) -> int:
     """Measure what is missing, and print the table."""
+    keep_programs()
     rooms = find_rooms(options.folder, options.rooms)
     for room, clips in rooms.items():
         held = read_references(clips)
