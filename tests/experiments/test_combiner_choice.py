@@ -114,7 +114,7 @@ def test_a_network_with_one_more_candidate_begins_as_the_one_without(rng: np.ran
     number, gain = jnp.asarray(rng.uniform(1, 9, (32, 48)), jnp.float32), jnp.float32(0.8)
 
     def shares(params: Params, candidates: jax.Array) -> jax.Array:
-        evidence = assemble_evidence(candidates, noisy, albedo, normal, number, gain)
+        evidence = assemble_evidence(list(candidates), noisy, albedo, normal, number, gain)
         head = build_chooser(choose_settings(params)).apply(params, [group[None] for group in evidence])[0][0]
         return split_shares(head, (32, 48))
 

@@ -169,12 +169,8 @@ def combiner(options: Options) -> Denoiser:
         return keep_history(frame, means, image), image.transpose(1, 2, 0), invalid
 
     fields = [2 * graph.receptive_field_radius(shape) for shape in (network_shape, _chooser_shape(options))]
-    fields += [
-        max(core_of(prior).receptive_field for prior in _priors(options)),
-        TAPS,
-        receptive_field(),
-        choice.RECEPTIVE_FIELD,
-    ]
+    fields += [max(prior.receptive_field or 0 for prior in _priors(options)), TAPS]
+    fields += [receptive_field(), choice.RECEPTIVE_FIELD]
     core = Core(start, step, reads, init, prepare=prepare, requires_validity_mask=True)
     return recurrent(core._replace(receptive_field=sum(fields)))
 
