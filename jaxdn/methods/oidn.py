@@ -39,8 +39,8 @@ class Options:
     auxiliary: binding.Auxiliary = "noisy"
     """What is known of the guides: ``"noisy"``: nothing; ``"clean"``: they have no noise, and may show every detail;
     ``"prefiltered"``: they are noisy, and the library denoises them first, as Blender has it do by default."""
-    guide_quality: binding.Quality = "high"
-    """Size and precision of the networks that denoise prefiltered guides."""
+    guide_quality: binding.Quality | None = None
+    """Size and precision of the networks that denoise prefiltered guides; None: ``quality``."""
     hdr: bool = True
     """Radiance is linear and may exceed 1. Without it, it is encoded with the sRGB curve, in [0, 1]."""
     device: binding.Device = "auto"

@@ -23,6 +23,10 @@ _FIELD, _LARGE_FIELD = 96, 112
 """Radius in pixels of what a network sees, and of the larger ones that the library takes for guides without noise, and
 to denoise guides, in its quality ``"high"``: 91 and 103 pixels are the farthest measured."""
 
+_SCRATCH, _LEAST_SCRATCH = 450, 100
+"""Bytes a pixel, and megabytes at least, that the larger networks compute in: as much as the others need. They take the
+image in parts for it, with the same result."""
+
 Quality = Literal["high", "balanced", "fast"]
 Auxiliary = Literal["noisy", "clean", "prefiltered"]
 Device = Literal["auto", "cpu", "cuda"]
@@ -38,14 +42,14 @@ class OidnSettings(NamedTuple):
     """What is known of albedo and normal: they may be noisy, they have no noise, or the library denoises them first."""
     device: Device = "auto"
     """``"auto"`` is an NVIDIA GPU if the library can use one, else the CPU."""
-    guide_quality: Quality = "high"
-    """How prefiltered guides are denoised."""
+    guide_quality: Quality | None = None
+    """How prefiltered guides are denoised; None: as the image."""
 
     @property
     def receptive_field(self) -> int:
         """How far, in pixels, a pixel of the image sees."""
         high = self.quality == "high" and self.auxiliary != "noisy"
-        guides = _LARGE_FIELD if self.guide_quality == "high" else _FIELD
+        guides = _LARGE_FIELD if (self.guide_quality or self.quality) == "high" else _FIELD
         return (_LARGE_FIELD if high else _FIELD) + (guides if self.auxiliary == "prefiltered" else 0)
 
 
@@ -106,7 +110,7 @@ def denoise(
     settings = settings._replace(device=choose_device(settings.device))
     kernel_of = functools.partial(_kernel, height, width, settings)
     if settings.auxiliary == "prefiltered":
-        careful = settings._replace(quality=settings.guide_quality)
+        careful = settings._replace(quality=settings.guide_quality or settings.quality)
         guides = {name: _kernel(height, width, careful, (name,))({name: image}) for name, image in guides.items()}
     return kernel_of(("color", *guides))({"color": color, **guides}, scale, out)
 
@@ -118,12 +122,7 @@ class _Kernel:
         oidn = library()
         self._shape = (height, width, 3)
         self._lock = threading.Lock()
-        types = {"cpu": oidn.OIDN_DEVICE_TYPE_CPU, "cuda": oidn.OIDN_DEVICE_TYPE_CUDA}
-        self._device = oidn.Device(types[settings.device])
-        if settings.device == "cpu":
-            self._device.set_int("numThreads", count_cores())
-        self._device.commit()
-        self._check()
+        self._device = _open_device(settings.device, count_cores())
         names = () if settings.device == "cpu" else (*inputs, "output")
         self._buffers = {name: oidn.Buffer(self._device, height * width * 12) for name in names}
         self._filter = oidn.Filter(self._device, oidn.OIDN_FILTER_TYPE_RT)
@@ -139,7 +138,9 @@ class _Kernel:
         if self._has_color:
             self._filter.set_bool("hdr", settings.hdr)
             self._filter.set_bool("cleanAux", settings.auxiliary != "noisy" and len(inputs) > 1)
-        weakref.finalize(self, _release, (self._filter, *self._buffers.values(), self._device))
+        if settings.auxiliary != "noisy":
+            self._filter.set_int("maxMemoryMB", max(_LEAST_SCRATCH, _SCRATCH * height * width // 2**20))
+        weakref.finalize(self, _release, (self._filter, *self._buffers.values()))
         self._check()  # one that lacks a buffer must not be kept
 
     def __call__(
@@ -168,9 +169,25 @@ class _Kernel:
             self._filter.set_image(name, image, self._format, width, height)
 
     def _check(self) -> None:
-        error = self._device.get_error()
-        if error is not None:
-            raise RuntimeError(f"Open Image Denoise: {error}")
+        _check(self._device)
+
+
+@functools.cache
+def _open_device(kind: str, cores: int) -> Any:
+    """The library's device for all networks: they use the same scratch memory, one after the other."""
+    oidn = library()
+    device = oidn.Device({"cpu": oidn.OIDN_DEVICE_TYPE_CPU, "cuda": oidn.OIDN_DEVICE_TYPE_CUDA}[kind])
+    if kind == "cpu":
+        device.set_int("numThreads", cores)
+    device.commit()
+    _check(device)
+    return device
+
+
+def _check(device: Any) -> None:
+    error = device.get_error()
+    if error is not None:
+        raise RuntimeError(f"Open Image Denoise: {error}")
 
 
 _kernel = functools.lru_cache(maxsize=4)(_Kernel)

@@ -2,6 +2,8 @@
 
 import functools
 import importlib.util
+import subprocess
+import sys
 from itertools import product
 
 import jax
@@ -172,6 +174,7 @@ def test_on_a_gpu_images_are_copied_and_what_fails_is_made_anew(monkeypatch, rng
     gpu, settings = Gpu(), binding.OidnSettings(device="cuda")
     monkeypatch.setattr(binding, "library", lambda: gpu)
     monkeypatch.setattr(binding, "_kernel", functools.lru_cache(4)(binding._Kernel))
+    monkeypatch.setattr(binding, "_open_device", functools.cache(binding._open_device.__wrapped__))
     image = rng.random((5, 7, 3), np.float32)
     with pytest.raises(RuntimeError, match="Open Image Denoise: out of memory"):
         binding.denoise(image, settings=settings)
@@ -242,6 +245,28 @@ def test_a_pixel_sees_no_farther_than_the_settings_say(library, settings, rng):
     first, second = (binding.denoise(*each, settings=settings, scale=0.5) for each in (images, others))
     differs = np.nonzero(np.any(first != second, axis=(0, 2)))[0]
     assert 64 < differs.max() - (changed - 1) <= settings.receptive_field
+
+
+@pytest.mark.slow
+def test_prefiltered_guides_take_hardly_more_memory(library):
+    """The networks share what they compute in, and the larger ones take the image in parts."""
+    code = """
+import resource, sys
+import numpy as np
+from jaxdn.ops import oidn
+height, width = 720, 1280
+images = [np.full((height, width, 3), 0.5, np.float32)] * 3
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+for auxiliary in sys.argv[1:]:
+    oidn.denoise(*images, settings=oidn.OidnSettings(auxiliary=auxiliary, guide_quality="fast", device="cpu"))
+    print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) * 1024 / (height * width))
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code, "noisy", "prefiltered"], check=True, capture_output=True, text=True
+    )
+    plain, both = map(float, ended.stdout.split())
+    assert 300 < plain < 900
+    assert both < plain + 150
 
 
 def test_missing_guides_are_neutral(library, rng):
