@@ -2,8 +2,6 @@
 
     python -m experiments.cycles.combiner_choice FOLDER/train --start runs/start.safetensors -o runs/chosen --minutes 10
 
-With ``--prefilter`` there are two priors, and the network is extended by what sees and chooses the second.
-
 An update takes a fifth of the time that ``jaxdn train`` needs for one of everything. The last results, which depend on
 the weights, are made again every 200 updates. The loss of a pair of frames is
 the mean square of the error of x / (1 + x), and that of its change, each as a share of Open Image Denoise's: of clips
@@ -36,7 +34,6 @@ from jaxdn.denoiser import Params
 from jaxdn.filters.resampling import find_whole
 from jaxdn.filters.sharp_history import fetch_sharply
 from jaxdn.methods.combiner.candidates import CANDIDATES
-from jaxdn.methods.combiner.choice import count_inputs
 from jaxdn.methods.combiner.history import Means, keep_history, start_history, tested_guides
 from jaxdn.methods.combiner.method import (
     CandidateStep,
@@ -92,8 +89,6 @@ class Options:
     """The file of all weights, .safetensors."""
     minutes: float = 10.0
     """How long to train; what is made before does not count."""
-    prefilter: bool = False
-    """Train what chooses among two priors (weights combiner-best)."""
     held: list[str] = field(default_factory=lambda: ["-0100"])
     """Endings of the names of clips that are scored, not trained on."""
 
@@ -101,9 +96,7 @@ class Options:
 def main(options: Options) -> int:
     """Train, score before and after, write the weights."""
     _, params = load_weights(options.start)
-    if options.prefilter:
-        params = {**params, "choice": extend(params["choice"])}
-    find = jax.jit(build_candidate_step(choose_settings(params["choice"])))
+    find = jax.jit(build_candidate_step(Settings()))
     clips: Clips = {}
     for clip in find_done(options.folder, []):
         record = read_record(clip / RECORD) or {}
@@ -121,43 +114,10 @@ def main(options: Options) -> int:
     chosen, updates = train(trained, held, params["choice"], options.minutes)
     record = {"start": options.start.name, "choice_updates": updates, "clips": sorted(trained)}
     path = save_weights(
-        options.out,
-        {**params, "choice": chosen},
-        factory="combiner",
-        options={"quality": "high"} | ({"prefilter": True} if options.prefilter else {}),
-        record=record,
+        options.out, {**params, "choice": chosen}, factory="combiner", options={"quality": "high"}, record=record
     )
     print(path)
     return 0
-
-
-def choose_settings(params: Params, implementation: Any = None) -> Settings:
-    """The options of the denoiser whose second network has such parameters."""
-    count = params["head_0"]["bias"].size // 4
-    return Settings(prefilter=count > len(CANDIDATES), implementation=implementation)
-
-
-def extend(params: Params) -> Params:
-    """The second network's parameters with one more candidate; those that have it already as they are.
-
-    At first it does not see the candidate, and gives it little.
-    """
-    if choose_settings(params).prefilter:
-        return params
-    first, head = params["encoder_0"]["convolution_0"], params["head_0"]
-    count = len(CANDIDATES)
-    seen = np.cumsum([count_inputs(count)[0], count_inputs(count)[1] - 1])
-    parts = jnp.split(first["kernel"], seen, axis=2)
-    new = [
-        jnp.zeros((*first["kernel"].shape[:2], after - before, first["kernel"].shape[3]))
-        for before, after in zip(count_inputs(count)[:2], count_inputs(count + 1)[:2], strict=True)
-    ]
-    kernel = jnp.concatenate([parts[0], new[0], parts[1], new[1], parts[2]], axis=2)
-    wide = {
-        "kernel": jnp.pad(head["kernel"], ((0, 0), (0, 0), (0, 0), (0, 4))),
-        "bias": jnp.concatenate([head["bias"], head["bias"][:4] - 1.0]),
-    }
-    return {**params, "encoder_0": {"convolution_0": {**first, "kernel": kernel}}, "head_0": {**head, **wide}}
 
 
 def collect(clip: Path, find: CandidateStep, params: Params, frames: int) -> dict[int, Sequence]:
@@ -215,7 +175,7 @@ def unpack(row: dict[str, jax.Array]) -> Found:
 
 def make_results(clips: Clips, params: Params) -> None:
     """Put the results that the network with ``params`` makes, frame by frame, in place of the last ones."""
-    chooser = build_chooser(choose_settings(params, "onednn-float32"))
+    chooser = build_chooser(Settings(implementation="onednn-float32"))
 
     @jax.jit
     def mix(params: Params, row: dict[str, jax.Array]) -> jax.Array:
@@ -255,7 +215,7 @@ def square(errors: jax.Array) -> jax.Array:
 
 def train(clips: Clips, held: Clips, params: Params, minutes: float) -> tuple[Params, int]:
     """The running mean of the network's parameters, and how many updates there were; reports of ``held`` clips."""
-    chooser, rng = build_chooser(choose_settings(params, "onednn")), np.random.default_rng(0)
+    chooser, rng = build_chooser(Settings(implementation="onednn")), np.random.default_rng(0)
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
 
     def loss(params: Params, batch: list[list[dict[str, jax.Array]]]) -> jax.Array:
@@ -320,7 +280,7 @@ def draw(clips: Clips, rng: np.random.Generator) -> list[Stored]:
 
 def report(when: str, clips: Clips, params: Params) -> None:
     """Print PSNR and temporal PSNR of the held clips, means at each sample count."""
-    chooser = build_chooser(choose_settings(params))
+    chooser = build_chooser(Settings())
     make_results(clips, params)
     score = jax.jit(lambda params, row: find_errors(mix_candidates(chooser, params, unpack(row), row["gain"]), row))
     for samples in LAYERS if clips else ():

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from experiments.cycles.combiner_choice import extend
 from experiments.cycles.combiner_start import take_over
 from jaxdn.core.frame import Clip, Frame, frame_at
 from jaxdn.denoiser.rollout import denoise
@@ -185,22 +184,17 @@ def test_a_correction_is_what_the_samples_have_more_than_the_prior(rng):
 
 
 @pytest.mark.slow
-def test_two_priors_are_the_mean_of_both_and_the_careful_one(rng):
+def test_two_priors_are_mixed_by_their_logarithms(rng):
     require("pyoidn")
     clip = clip_of(rng)
     clip = clip._replace(albedo=rng.uniform(0.2, 0.9, clip.albedo.shape).astype(np.float32))
     careful = oidn(auxiliary="prefiltered", guide_quality="fast")
     plain, second = (run(each, {}, clip) for each in (prior_alone(), careful))
     assert np.abs(plain - second).mean() > 1e-3
-    denoiser, params, gain = combiner(quality="fast", prefilter=True), untrained(), gains(clip)
-    shares = extend(params["choice"])
+    gain = gains(clip)
     mean = np.expm1(0.5 * (np.log1p(gain * plain) + np.log1p(gain * second))) / gain
-    for index, expected in ((0, mean), (len(CANDIDATES), second)):
-        bias = np.full(4 * (len(CANDIDATES) + 1), -1e3, np.float32)
-        bias[4 * index : 4 * index + 4] = 0.0
-        head = {"kernel": jnp.zeros_like(shares["head_0"]["kernel"]), "bias": jnp.asarray(bias)}
-        images = run(denoiser, {**params, "choice": {**shares, "head_0": head}}, clip)
-        np.testing.assert_allclose(images, expected, rtol=1e-4, atol=1e-5)
+    images = run(combiner(quality="fast", prefilter=True), deciding({"prior": 0.0}), clip)
+    np.testing.assert_allclose(images, mean, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -311,7 +305,7 @@ def evidence_of(rng, candidates, noisy, gain=1.0):
         jnp.ones(size),
         jnp.float32(gain),
     )
-    assert tuple(group.shape[-1] for group in groups) == count_inputs(len(CANDIDATES))
+    assert tuple(group.shape[-1] for group in groups) == count_inputs()
     maps = np.asarray(groups[1], np.float64)[: size[0] // 2, : size[1] // 2, :-1]
     return maps.reshape(*maps.shape[:2], len(candidates) - 1, len(RADII), 2).transpose(4, 3, 2, 0, 1)
 

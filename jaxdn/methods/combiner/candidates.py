@@ -34,8 +34,6 @@ CANDIDATES = (
     "last result",
 )
 """In the order of their weights."""
-PREFILTERED = "prefiltered prior"
-"""One more, the last, where there are two priors."""
 FULL_LEVELS, LEVELS = 2, 4
 """Levels of the filter at full resolution, taps 1 and 2 pixels apart, and at half, 2, 4, 8 and 16."""
 GUIDES = {"albedo": 3, "normal": 3, "light": 3}

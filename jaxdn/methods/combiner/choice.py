@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxdn import color
 from jaxdn.denoiser import Params
 from jaxdn.filters.kalman import box_sum
-from jaxdn.methods.combiner.candidates import CANDIDATES, PREFILTERED
+from jaxdn.methods.combiner.candidates import CANDIDATES
 from jaxdn.ops.scales import add_planes, crop, halve_planes, join_pixels, join_planes
 
 RADII = (1, 3)
@@ -33,21 +33,16 @@ INITIAL_LOGITS = {
     "coarse correction": -2.0,
     "prior mean": 1.0,
     "last result": 1.0,
-    PREFILTERED: 0.0,
 }
 """The logits of the candidates before training."""
 _SMALL = 0.2
 """Factor of the head's kernel before training: shares begin nearly the same everywhere."""
 
 
-def name_candidates(prefilter: bool) -> tuple[str, ...]:
-    """The candidates, with one of a second prior or without."""
-    return (*CANDIDATES, PREFILTERED) if prefilter else CANDIDATES
-
-
-def count_inputs(candidates: int) -> tuple[int, ...]:
-    """Channels of the groups that :func:`assemble_evidence` makes of so many candidates."""
-    return 4 * candidates, 2 * len(RADII) * (candidates - 1) + 1, 4 * 2 + 3
+def count_inputs() -> tuple[int, ...]:
+    """Channels of the groups that :func:`assemble_evidence` makes of all candidates."""
+    others = len(CANDIDATES) - 1
+    return 4 * len(CANDIDATES), 2 * len(RADII) * others + 1, 4 * 2 + 3
 
 
 def assemble_evidence(
@@ -94,14 +89,14 @@ def assemble_evidence(
     return tuple(join_pixels(group, multiple=_MULTIPLE) for group in groups)
 
 
-def begin(params: Params, candidates: Sequence[str]) -> Params:
+def begin(params: Params) -> Params:
     """The network's parameters before training, from those that were drawn: the shares of :data:`INITIAL_LOGITS`."""
-    logits = jnp.asarray([INITIAL_LOGITS[name] for name in candidates], jnp.float32)
+    logits = jnp.asarray([INITIAL_LOGITS[name] for name in CANDIDATES], jnp.float32)
     head = {"kernel": _SMALL * params["head_0"]["kernel"], "bias": jnp.repeat(logits, 4)}
     return {**params, "head_0": head}
 
 
 def split_shares(head: jax.Array, size: tuple[int, int]) -> jax.Array:
-    """[N, H, W] the share of each candidate, which add up to 1, of the network's output [h, w, 4 N]."""
+    """[5, H, W] the share of each candidate, which add up to 1, of the network's output [h, w, 20]."""
     own = crop(head, (size[0] // 2, size[1] // 2))
     return jax.nn.softmax(join_planes([("blocks", own)]), axis=0)

@@ -5,7 +5,7 @@ running means along motion (:mod:`jaxdn.methods.combiner.history`); affinities f
 the prior's images, at full and at half resolution (:mod:`jaxdn.methods.combiner.candidates`). The image is a mean of
 five candidates: the prior, the prior with the correction that filtered samples tell of, at two scales, the mean of
 priors, and the last result. With ``prefilter`` the library denoises each frame twice, the second time with guides that
-it denoises first: the prior is the mean of both, and the second image is a candidate.
+it denoises first, and the prior is the mean of both.
 
 A U-Net at half resolution decides for every pixel how fast the means follow, the filter's features and how far a pixel
 is trusted. A second, smaller one sees the candidates and what noisy light says about each, and decides their weights
@@ -31,6 +31,7 @@ from jaxdn.filters.sharp_history import TAPS
 from jaxdn.filters.surface_test import depth_feature
 from jaxdn.methods.combiner import choice
 from jaxdn.methods.combiner.candidates import (
+    CANDIDATES,
     LEVELS,
     FilterParameters,
     make_candidates,
@@ -95,7 +96,8 @@ class Options:
     quality: Literal["fast", "high"] | Widths = "high"
     """By name, or the first network's widths as tuples; the second is then that of ``"high"``."""
     prefilter: bool = False
-    """A second prior, of guides that Open Image Denoise denoises first, as Blender does: seven times its time."""
+    """The prior is the mean of two images of Open Image Denoise: the second has guides that the library denoises first,
+    as Blender has it do by default. Both take five times as long as one."""
     history_max: Annotated[float, Range(1)] = 32.0
     """Largest effective number of samples of the running means, in frames."""
     device: binding.Device = "auto"
@@ -148,7 +150,7 @@ def combiner(options: Options) -> Denoiser:
 
     def init(key: jax.Array, frame: Frame) -> Params:
         params = network.init(key)
-        chosen = choice.begin(chooser.init(jax.random.fold_in(key, 1)), choice.name_candidates(options.prefilter))
+        chosen = choice.begin(chooser.init(jax.random.fold_in(key, 1)))
         pixel = [0.0] * FEATURES + list(INITIAL.values())
         bias = [value for value in pixel for _ in range(4)] + [0.0] * HALF_FEATURES
         bias += [INITIAL["trust"]] + [_LEVEL_WEIGHT] * LEVELS
@@ -179,7 +181,7 @@ class Found(NamedTuple):
     """What there is to choose from in one frame; its sides are padded to multiples of 4."""
 
     candidates: list[jax.Array]
-    """[3, H, W] each, in the order of :func:`jaxdn.methods.combiner.choice.name_candidates`, linear radiance."""
+    """[3, H, W] each, in the order of :data:`jaxdn.methods.combiner.candidates.CANDIDATES`, linear radiance."""
     noisy: jax.Array
     """[3, H, W] the new frame's light."""
     means: Means
@@ -199,14 +201,12 @@ def build_candidate_step(options: Options) -> CandidateStep:
         params: Params, state: CombinerState, frame: Frame, first: jax.Array, statistics: FrameStatistics
     ) -> tuple[Found, jax.Array]:
         size = frame.radiance.shape[:2]
-        images = [
-            jax.lax.stop_gradient(
-                to_planes(jnp.clip(core.step({}, (), frame, first, statistics)[1], 0.0, RADIANCE_MAX))
-            )
-            for core in priors
+        alone = [
+            to_planes(jnp.clip(core.step({}, (), frame, first, statistics)[1], 0.0, RADIANCE_MAX)) for core in priors
         ]
-        equal = jnp.full((len(images), 1, 1), 1.0 / len(images), frame.radiance.dtype)
-        now = measure_now(frame, _mix(equal, images, statistics.exposure) if options.prefilter else images[0])
+        equal = jnp.full((len(alone), 1, 1), 1.0 / len(alone), frame.radiance.dtype)
+        prior = _mix(equal, alone, statistics.exposure) if options.prefilter else alone[0]
+        now = measure_now(frame, jax.lax.stop_gradient(prior))
         past = fetch_past(state, frame, now, first)
         weights = {name: part for name, part in params.items() if name not in ("guide", "choice")}
         inputs = _assemble_network_input(frame, now, past, statistics)
@@ -215,9 +215,8 @@ def build_candidate_step(options: Options) -> CandidateStep:
         means = update_means(now, past, crop_planes(follow, size), most=options.history_max)
         depth = None if frame.depth is None else pad(frame.depth, _BLOCKS)
         wide = pad_planes(means)
-        light = wide, pad_planes(now.prior), pad_planes(past.result)
-        candidates = make_candidates(params["guide"], *light, depth, parameters, statistics)
-        candidates += map(pad_planes, images[1:])
+        images = wide, pad_planes(now.prior), pad_planes(past.result)
+        candidates = make_candidates(params["guide"], *images, depth, parameters, statistics)
         return Found(candidates, pad_planes(now.light), wide), past.invalid
 
     return find
@@ -237,13 +236,12 @@ def build_chooser(options: Options) -> "Network":
     # Flax is imported only when a network is built: filters without weights need only jax and numpy.
     from jaxdn.networks.unet import unet
 
-    count = len(choice.name_candidates(options.prefilter))
-    widths, groups = CHOICE_WIDTHS[_quality(options)], choice.count_inputs(count)
-    return unet(groups, (4 * count,), widths=widths, head_size=1, implementation=options.implementation)
+    widths, heads = CHOICE_WIDTHS[_quality(options)], (4 * len(CANDIDATES),)
+    return unet(choice.count_inputs(), heads, widths=widths, head_size=1, implementation=options.implementation)
 
 
 def _chooser_shape(options: Options) -> graph.GraphSpec:
-    return graph.unet(1, (4,), widths=CHOICE_WIDTHS[_quality(options)], head_size=1)
+    return graph.unet(1, (4 * len(CANDIDATES),), widths=CHOICE_WIDTHS[_quality(options)], head_size=1)
 
 
 def _priors(options: Options) -> list[Denoiser]:
@@ -322,7 +320,7 @@ def _split_head(head: jax.Array, size: Sequence[int]) -> tuple[FilterParameters,
 
 
 def _mix(shares: jax.Array, candidates: list[jax.Array], gain: jax.Array) -> jax.Array:
-    """[3, H, W] the mean of N candidates with weights [N, H, W], of log(1 + x) at one brightness.
+    """[3, H, W] the mean of N images with weights [N, H, W], of log(1 + x) at one brightness.
 
     In linear light a hundredth of a lamp that is beside the pixel in one candidate outshines what all others show.
     """
