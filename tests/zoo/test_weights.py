@@ -13,7 +13,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.denoisers import ntd
 from jaxdn.methods.registry import method_named
 from jaxdn.zoo.ready import find_model
-from jaxdn.zoo.weights import flatten, save_weights, shipped_names, starting_params, unflatten
+from jaxdn.zoo.weights import describe, flatten, save_weights, shipped_names, starting_params, unflatten
 
 TINY = ((4,), (4,), (4,), (4,), (4,))
 
@@ -212,3 +212,9 @@ def test_what_trains_is_not_imported_to_denoise():
     loaded = set(done.stdout.split())
     assert "jaxdn.networks.unet" in loaded
     assert not loaded & {"orbax", "grain", "matplotlib", "mitsuba"}
+
+
+def test_the_best_combiner_has_the_weights_of_the_other():
+    best, high = (flatten(jaxdn.load_weights(name)[1]) for name in ("combiner-best", "combiner-high"))
+    jax.tree.map(np.testing.assert_array_equal, best, high)
+    assert describe("combiner-best")["options"] == describe("combiner-high")["options"] | {"prefilter": True}
