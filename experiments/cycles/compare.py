@@ -28,7 +28,7 @@ from jaxdn.runtime.atomic_files import write_json
 from jaxdn.runtime.program_cache import keep_programs
 from jaxdn.sequence.run import denoise_files, select_backend
 from jaxdn.sequence.settings import Settings
-from jaxdn.zoo.ready import NOISY
+from jaxdn.zoo.ready import NOISY, Model
 
 PLAIN = "+no-safe"
 """Ending of a method that is run with ``--no-safe``."""
@@ -106,13 +106,17 @@ def denoise_frames(files: Sequence[Path], target: Path, method: str, scored: Seq
     """Number of a frame -> image, from the files that were written; ``scored`` ones alone where none needs others."""
     if method == NOISY:
         return {int(file.stem): read_beauty(file) for file in files}
-    name, _, _ = method.partition("+")
-    options = {"auxiliary": "prefiltered"} if PREFILTERED in method else {}
-    model, _ = select_backend(name, **options)
+    model, safe = find_method(method)
     target.mkdir(parents=True, exist_ok=True)
-    settings = Settings(only_beauty=True, safe=PLAIN not in method, frames=scored if name == ALONE else None)
+    settings = Settings(only_beauty=True, safe=safe, frames=scored if method.partition("+")[0] == ALONE else None)
     written = denoise_files([files[0].parent], target, model, settings)
     return {int(file.stem): read_beauty(file) for file in written.files}
+
+
+def find_method(method: str) -> tuple[Model, bool]:
+    """The denoiser of a name with its endings, on its fastest backend, and whether it has the safe blend."""
+    options = {"auxiliary": "prefiltered"} if PREFILTERED in method else {}
+    return select_backend(method.partition("+")[0], **options)[0], PLAIN not in method
 
 
 def read_beauty(file: Path) -> np.ndarray:

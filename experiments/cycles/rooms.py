@@ -20,7 +20,15 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from experiments.cycles.compare import PLAIN, figure_columns, mean_figures, print_table, read_beauty, read_rows
+from experiments.cycles.compare import (
+    PLAIN,
+    figure_columns,
+    find_method,
+    mean_figures,
+    print_table,
+    read_beauty,
+    read_rows,
+)
 from experiments.cycles.reference import Reference, decibels, noise
 from experiments.cycles.score import score
 from experiments.measurement import describe_measurement
@@ -30,7 +38,7 @@ from jaxdn.core.frame import Frame
 from jaxdn.runtime.atomic_files import write_json
 from jaxdn.runtime.program_cache import keep_programs
 from jaxdn.sequence.all_light import gather_light
-from jaxdn.sequence.run import denoise_files, select_backend
+from jaxdn.sequence.run import denoise_files
 from jaxdn.sequence.settings import Settings
 from jaxdn.zoo.ready import NOISY
 
@@ -47,7 +55,7 @@ class Options:
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("runs/rooms-all-light")
     """Denoised frames and scores."""
     methods: list[str] = field(default_factory=lambda: [NOISY, "svgf" + PLAIN, "combiner-high" + PLAIN])
-    """Names as of ``jaxdn denoise --method``; with ``+no-safe`` at the end, without the safe step."""
+    """Names as of :mod:`experiments.cycles.compare`."""
     spp: list[int] = field(default_factory=lambda: [1, 4, 16])
     """Sample counts: layers of the clips, or sums of them."""
     rooms: list[str] = field(default_factory=list)
@@ -132,8 +140,8 @@ def denoise_clip(clip: Path, frames: Sequence[Frame], spp: int, method: str, tar
     """The images of a clip's frames, from the files that were written: all light."""
     if method == NOISY:
         return [np.asarray(frame.radiance) for frame in frames]
-    model, _ = select_backend(method.removesuffix(PLAIN))
-    denoise_files([clip], target, model, Settings(spp=spp, safe=not method.endswith(PLAIN)))
+    model, safe = find_method(method)
+    denoise_files([clip], target, model, Settings(spp=spp, safe=safe))
     return [read_beauty(frame_path(target, index)) for index in range(len(frames))]
 
 
