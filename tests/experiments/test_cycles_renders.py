@@ -120,7 +120,7 @@ def test_a_killed_run_leaves_whole_files_and_the_next_one_ends_the_clip(blender:
     _run(blender, code, str(folder), "0")
     assert json.loads((folder / "cycles.json").read_text())["level"] == 0
     names = [path.name for path in folder.rglob("*") if path.is_file() and path.parent != folder]
-    assert len(names) == 4 * 3 + 2
+    assert len(names) == 2 * 4 + 3 + 2  # twice 1 sample, 4 samples of three frames, references of two
     assert not [name for name in names if name.startswith(".")]
 
 
