@@ -48,6 +48,7 @@ LEVELS = {
 """The steps of a set's clips, each having what the one before it has."""
 
 LARGE_LEVELS = (
+    Level(tuple(Draw(samples, frames=6) for samples in (1, 4, 16)), SOME[:2], 50.0, 600.0),
     Level(MANY[:3], SOME, 50.0, 900.0),
     Level(MANY, SOME, 56.0, 3600.0),
 )
@@ -110,7 +111,8 @@ def _testing(sets: tuple[str, ...], kinds: tuple[str, ...], seeds: range | None)
         small = [one for one in row if one.seed not in LARGE]
         yield from (Step(one, level) for level in (0, 1, 2) for one in small)
         if seeds is not None:
-            yield from (Step(one, level) for one in row if one.seed in LARGE for level in (0, 1))
+            large = [one for one in row if one.seed in LARGE]
+            yield from (Step(one, level) for level in range(len(LARGE_LEVELS)) for one in large)
         elif number == 0:
             large = [clip("test", kind, LARGE.start) for kind in ("lamps", "sun") if kind in _chosen("test", kinds)]
             yield from (Step(one, 0) for one in large)
