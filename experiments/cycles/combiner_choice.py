@@ -11,9 +11,10 @@ noise (:mod:`experiments.cycles.score`). Clips whose names end in ``--held`` are
 
 import sys
 import time
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -70,7 +71,7 @@ class Sequence(NamedTuple):
 
     stored: Stored
     frames: list[Frame]
-    """What tells where the last result is now: motion and the guides that are tested."""
+    """What tells where the last result is now: motion and the guides that are tested; none if it is no candidate."""
 
 
 Clips = dict[str, dict[int, Sequence]]
@@ -91,6 +92,10 @@ class Options:
     """How long to train; what is made before does not count."""
     held: list[str] = field(default_factory=lambda: ["-0100"])
     """Endings of the names of clips that are scored, not trained on."""
+    without: list[Literal["fine correction", "coarse correction", "prior mean", "last result"]] = field(
+        default_factory=list
+    )
+    """Candidates that are the prior instead: what they are worth. Such weights are for the scores alone."""
 
 
 def main(options: Options) -> int:
@@ -104,7 +109,7 @@ def main(options: Options) -> int:
             raise ValueError(
                 f"{clip}: expected clips to train on, got one of the test set: nothing is trained on those."
             )
-        clips[clip.name] = collect(clip, find, params, record["frames"])
+        clips[clip.name] = collect(clip, find, params, record["frames"], options.without)
         print(f"{clip.name}: candidates are made", flush=True)
     held = {name: clip for name, clip in clips.items() if name.endswith(tuple(options.held))}
     trained = {name: clip for name, clip in clips.items() if name not in held}
@@ -113,6 +118,8 @@ def main(options: Options) -> int:
     report("before", held, params["choice"])
     chosen, updates = train(trained, held, params["choice"], options.minutes)
     record = {"start": options.start.name, "choice_updates": updates, "clips": sorted(trained)}
+    if options.without:
+        record["without"] = options.without
     path = save_weights(
         options.out, {**params, "choice": chosen}, factory="combiner", options={"quality": "high"}, record=record
     )
@@ -120,11 +127,15 @@ def main(options: Options) -> int:
     return 0
 
 
-def collect(clip: Path, find: CandidateStep, params: Params, frames: int) -> dict[int, Sequence]:
+def collect(
+    clip: Path, find: CandidateStep, params: Params, frames: int, without: Collection[str] = ()
+) -> dict[int, Sequence]:
     """What there is to choose from in each frame of a clip, for each sample count; ``find`` is compiled.
 
-    In place of the last results, which are not known yet, are the priors of the frames before.
+    In place of the last results, which are not known yet, are the priors of the frames before. The prior itself stands
+    for the candidates named in ``without``.
     """
+    gone = [CANDIDATES.index(name) for name in without]
     reads = denoisers.combiner().reads
     halves = [references.read(clip / "reference" / f"{number:04d}.exr") for number in range(1, frames + 1)]
     targets = np.stack(
@@ -141,9 +152,10 @@ def collect(clip: Path, find: CandidateStep, params: Params, frames: int) -> dic
             means = crop_planes(found.means, frame.radiance.shape[:2])
             state = keep_history(prepared, means, means.prior)
         stored = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+        stored["light"][:, gone] = stored["light"][:, :1]
         stored["targets"] = targets.astype(np.float32)
         size = stored["light"].shape[-2:]
-        sequences[samples] = Sequence(stored, [_crop_guides(frame, *size) for frame in images])
+        sequences[samples] = Sequence(stored, [] if _LAST in gone else [_crop_guides(frame, *size) for frame in images])
     return sequences
 
 

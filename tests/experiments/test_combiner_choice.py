@@ -11,6 +11,7 @@ from experiments.cycles import combiner_choice
 from experiments.cycles.combiner_choice import (
     Options,
     Sequence,
+    collect,
     draw,
     fetch_result,
     find_errors,
@@ -18,13 +19,18 @@ from experiments.cycles.combiner_choice import (
     make_results,
     square,
 )
+from experiments.cycles.record import RECORD, read_record
 from jaxdn.core.frame import Frame
 from jaxdn.denoisers import combiner
 from jaxdn.methods.combiner.candidates import CANDIDATES
 from jaxdn.methods.combiner.history import Past, fetch_past, keep_history, measure_now
+from jaxdn.methods.combiner.method import Options as Settings
+from jaxdn.methods.combiner.method import build_candidate_step
 from jaxdn.zoo.weights import load_weights
 from tests.experiments.test_cycles_training import write_cycles_clip
 from tests.needs import require
+
+START = Path(combiner_choice.__file__).parents[2] / "jaxdn/zoo/shipped/combiner-high.safetensors"
 
 
 def test_the_mean_square_has_none_of_the_references_noise(rng: np.random.Generator) -> None:
@@ -101,16 +107,31 @@ def test_training_changes_the_second_network_alone(tmp_path: Path, capsys: pytes
     require("pyoidn")
     for name in ("sun-0000", "sun-0100"):
         write_cycles_clip(tmp_path / "train" / name, "train")
-    start = Path(combiner_choice.__file__).parents[2] / "jaxdn/zoo/shipped/combiner-high.safetensors"
-    assert main(Options(tmp_path / "train", start, tmp_path / "out.safetensors", minutes=0.0)) == 0
+    assert main(Options(tmp_path / "train", START, tmp_path / "out.safetensors", minutes=0.0)) == 0
     said = capsys.readouterr().out
     assert "before, 1 samples" in said
     assert "after 1 updates, 16 samples" in said
-    before, after = load_weights(start)[1], load_weights(tmp_path / "out.safetensors")[1]
+    before, after = load_weights(START)[1], load_weights(tmp_path / "out.safetensors")[1]
     for name in before.keys() - {"choice"}:
         jax.tree.map(np.testing.assert_array_equal, before[name], after[name])
     changed = jax.tree.map(lambda old, new: bool(np.any(old != new)), before["choice"], after["choice"])
     assert any(jax.tree.leaves(changed))
+
+
+@pytest.mark.slow
+def test_the_prior_stands_for_what_is_left_out(tmp_path: Path) -> None:
+    require("pyoidn")
+    write_cycles_clip(tmp_path / "sun-0000", "train")
+    frames = (read_record(tmp_path / "sun-0000" / RECORD) or {})["frames"]
+    find, params = jax.jit(build_candidate_step(Settings())), load_weights(START)[1]
+    sequence = collect(tmp_path / "sun-0000", find, params, frames, ["coarse correction", "last result"])[1]
+    prior, fine, coarse, _, last = np.moveaxis(sequence.stored["light"][:, :-1], 1, 0)
+    np.testing.assert_array_equal(coarse, prior)
+    np.testing.assert_array_equal(last, prior)
+    assert np.any(fine != prior)
+    held = sequence.stored["light"].copy()
+    make_results({"one": {1: sequence}}, params["choice"])
+    np.testing.assert_array_equal(sequence.stored["light"], held)
 
 
 def test_clips_for_tests_are_not_trained_on(tmp_path: Path) -> None:
