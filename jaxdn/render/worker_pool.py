@@ -66,6 +66,7 @@ def render_clips(
     if len({os.path.abspath(folder) for folder in folders}) != len(folders):
         raise ValueError("render_clips: expected a different folder for every clip.")
     check_at_least(2, threads=_THREADS if threads is None else threads)
+    check_at_least(1, workers=1 if workers is None else workers)
     if executor is None and frames_per_task is not None:
         raise ValueError("frames_per_task: expected none without an executor; leave it out, or pass an executor.")
     if executor is not None and workers is not None:

@@ -348,6 +348,8 @@ def test_options_of_the_other_way_are_refused(tmp_path: Path) -> None:
         worker_pool.render_clips(jobs, frames_per_task=2)
     with pytest.raises(ValueError, match="threads: expected at least 2, got 1"):
         worker_pool.render_clips(jobs, threads=1)
+    with pytest.raises(ValueError, match="workers: expected at least 1, got 0"):
+        worker_pool.render_clips(jobs, workers=0)
     assert not farm.tasks
 
 
