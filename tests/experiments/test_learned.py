@@ -234,6 +234,7 @@ def test_each_budget_has_its_own_ratio() -> None:
     assert claims["chosen / uniform, relative MSE, 0.25 samples"] == ("not stated", "0.50", True)
     assert claims["chosen / uniform, relative MSE, 4 samples"] == ("0.66 to 0.75", "1.00", False)
     assert "| 0.25 | 0.50 | 0.25 | +0.00 dB | 0.0 |" in ntasd_budgets.text(found)
+    assert ntasd_budgets.TABLE.heading == "Samples where they pay, by budget"
 
 
 def test_as_published_is_the_preset_with_what_a_stage_is_for() -> None:

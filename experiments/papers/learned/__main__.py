@@ -47,10 +47,7 @@ def tables_named(names: list[str]) -> list[Table]:
 
 def sections(tables: list[Table], found: Results) -> list[str]:
     """Each table with its claims, as Markdown."""
-    return [
-        f"## {one.title}, {one.spp} samples a pixel\n\n{one.text(found)}\n\n{claims_table(one.claims(found))}"
-        for one in tables
-    ]
+    return [f"## {one.heading}\n\n{one.text(found)}\n\n{claims_table(one.claims(found))}" for one in tables]
 
 
 def main(settings: Settings) -> None:

@@ -54,4 +54,4 @@ def claims(found: Results) -> list[Claim]:
     return made
 
 
-TABLE = Table("Samples where they pay, by budget", ROWS, text, claims)
+TABLE = Table("Samples where they pay, by budget", ROWS, text, claims, budgets=True)

@@ -39,6 +39,13 @@ class Table(NamedTuple):
     claims: Callable[[Results], list[Claim]]
     spp: int = BUDGET
     """Samples a pixel of what the methods are given."""
+    budgets: bool = False
+    """Whether the methods differ by their samples a pixel."""
+
+    @property
+    def heading(self) -> str:
+        """The title, with the samples a pixel where all methods have the same."""
+        return self.title if self.budgets else f"{self.title}, {self.spp} samples a pixel"
 
 
 def read(folder: Path, *, spp: int, layers: bool = False) -> EvaluationClip:
