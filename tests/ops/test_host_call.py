@@ -134,6 +134,43 @@ def test_a_program_with_loops_is_compiled_once_for_all_processes(tmp_path):
     assert told[0] == told[1] != []
 
 
+_ENDS = """
+import sys, time
+import jax, jax.numpy as jnp
+from jaxdn.ops.dispatch.host_call import call_host
+
+def wait(results, array):
+    time.sleep(0.1)
+    results[0][...] = array
+
+@jax.jit
+def program(x):
+    for _ in range(3):
+        (x,) = call_host("wait", wait, [jax.ShapeDtypeStruct(x.shape, x.dtype)], x @ x / len(x))
+    return x
+
+def main(way):
+    images = [program(x) for _ in range(3)]
+    if way == "raise":
+        raise ValueError("in the middle")
+    return images if way == "keep" else None
+
+x = jnp.ones((300, 300))
+program(x).block_until_ready()
+kept = main(sys.argv[1])
+"""
+
+
+@pytest.mark.parametrize(
+    ("way", "code"),
+    [("raise", 1), pytest.param("keep", 0, marks=pytest.mark.slow), pytest.param("drop", 0, marks=pytest.mark.slow)],
+)
+def test_a_process_ends_while_programs_run_that_nobody_waits_for(way, code):
+    done = subprocess.run([sys.executable, "-c", _ENDS, way], capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == code, done.stderr
+    assert ("ValueError: in the middle" in done.stderr) == (way == "raise")
+
+
 def test_threads_of_programs_are_known_between_calls():
     """Python makes and unmakes its record of a thread that it does not know at every call: half of a short call."""
     here, visits = threading.local(), []

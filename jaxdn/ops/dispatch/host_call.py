@@ -9,11 +9,14 @@ The handler's C structures: ``xla/ffi/api/c_api.h``, in the folder that ``jax.ff
 of jax has others, or refuses the handler, its own callbacks are used, and programs are compiled in every process.
 """
 
+import atexit
+import contextlib
 import ctypes
 import functools
 import hashlib
 import math
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -37,6 +40,10 @@ _DTYPES = {
 """The interface's numbers of dtypes."""
 _WORK: dict[str, Work] = {}
 _here = threading.local()
+_calling: set[int] = set()
+"""The threads that are in a call."""
+_QUIET = 20
+"""Milliseconds without a call, after which at the end of the process none is expected any more."""
 
 
 def call_host(
@@ -53,6 +60,7 @@ def call_host(
       kinds: of the results.
       arrays: what is read.
     """
+    _end_with_process()
     if name is None or not _register():
         return list(buffer_callback(functools.partial(_as_callback, work), kinds, vmap_method="sequential")(*arrays))
     _WORK[name] = work
@@ -183,12 +191,13 @@ _Handler = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_CallFrame))
 @_Handler
 def _handle(pointer: Any) -> int | None:
     """What XLA calls: once to ask for the version of the interface, then for every call of a program."""
-    frame = pointer.contents
+    frame, thread = pointer.contents, threading.get_ident()
     if frame.extension and frame.extension.contents.type == _METADATA:
         extension = ctypes.cast(frame.extension, ctypes.POINTER(_MetadataExtension)).contents
         version = extension.metadata.contents.version
         version.major, version.minor = _version()
         return None
+    _calling.add(thread)
     try:
         _keep_thread()
         work = _WORK[_name_of(frame.attributes)]
@@ -204,7 +213,33 @@ def _handle(pointer: Any) -> int | None:
         message = f"{type(error).__name__}: {error}".encode(errors="backslashreplace")
         given = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, _UNKNOWN_ERROR)
         return frame.api.contents.create_error(ctypes.byref(given))
+    finally:
+        _calling.discard(thread)
     return None
+
+
+@functools.cache
+def _end_with_process() -> None:
+    """Have :func:`_finish` called before jax's own functions for the end of the process."""
+    atexit.register(_finish)
+
+
+def _finish() -> None:
+    """Wait for what the process still holds and for calls that have begun, and keep XLA's client for ever.
+
+    As a process ends, jax deletes the client, which waits for all programs and keeps Python's lock meanwhile: one that
+    nobody has waited for, and that has a call to make, would never end. Those not yet begun end with the process.
+    """
+    with contextlib.suppress(RuntimeError):  # there is no CPU among jax's platforms, or an array is an error
+        client = jax.local_devices(backend="cpu")[0].client
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(client))
+    for array in jax.live_arrays():
+        with contextlib.suppress(RuntimeError):
+            array.block_until_ready()
+    quiet = _QUIET if not _calling else 0
+    while quiet < _QUIET:
+        time.sleep(1e-3)
+        quiet = 0 if _calling else quiet + 1
 
 
 def _keep_thread() -> None:
